@@ -10,6 +10,8 @@ from typing import Any
 
 LONGEST = 100  # characters of one value in a line
 LINE = 199  # characters of a whole line: two lines of a terminal
+SHORT = ("can't allocate memory", "out of memory", "bad_alloc", "can't start new thread")
+"""How torch and the C++ library say in a RuntimeError that memory is short."""
 STYLE = "text-align:left;padding:1px 10px 1px 0"  # notebooks centre cells by default
 
 
@@ -105,3 +107,14 @@ def error_line(error: BaseException) -> str:
     """The first line of an error, with its type before it and at most 200 characters of its own."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0][:200] if lines else ''}".rstrip(": ")
+
+
+def short_of_memory(error: BaseException) -> bool:
+    """Whether an error says that memory is short: of Python, NumPy, torch on the CPU or on a GPU.
+
+    Example:
+        >>> short_of_memory(MemoryError()), short_of_memory(RuntimeError("shapes differ"))
+        (True, False)
+    """
+    said = str(error).lower() if isinstance(error, RuntimeError) else ""
+    return isinstance(error, MemoryError) or any(words in said for words in SHORT)

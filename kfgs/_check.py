@@ -8,17 +8,32 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import functools
+import inspect
 import math
 import numbers
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ._card import error_line
+from ._card import error_line, short_of_memory
 
+P = ParamSpec("P")
+R = TypeVar("R")
+MADE = {
+    "Scene": "load_scene(path) reads one",
+    "SemanticField": "SemanticField.load(path) reads one",
+    "LabelSet": "load_label_set(path) reads one",
+    "Gaussians": "read_splats(path).gaussians are some",
+    "SplatFile": "read_splats(path) reads one",
+    "Camera": "a Scene has .cameras",
+}
+"""How to make what `typed` misses."""
 PARTS = ("embeddings", "codewords", "map", "means", "gaussians")  # where our objects keep what is mostly meant
 
 
@@ -114,6 +129,8 @@ def moved_to(value: Tensor, *args: Any, **kwargs: Any) -> Tensor:
     try:
         return value.to(*args, **kwargs)
     except (AssertionError, RuntimeError) as error:  # torch without CUDA; no driver, no such GPU, no such name
+        if short_of_memory(error):
+            raise
         asked = ", ".join(map(str, (*args, *kwargs.values())))
         raise ValueError(
             f"device: expected one that this torch can use, got {asked} ({error_line(error)}); use 'cpu', or install a torch "
@@ -197,6 +214,54 @@ def _instead(value: object) -> str:
     return f"pass its .{part}" if part else "convert it with torch.as_tensor"
 
 
+def typed(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorator of public functions: check arguments that are to be objects of kfgs, or functions.
+
+    An argument is checked if its type is one or more of classes of kfgs, paths, functions and None. Those with lists, tensors
+    or numbers are left to the checks of the function. Raises a TypeError that names the argument and how to make the object.
+    """
+    signature = inspect.signature(function)
+    kinds: dict[str, tuple[type, ...]] = {}
+
+    @functools.wraps(function)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+        if not kinds:  # not before all modules are there
+            kinds.update({name: _kinds(hint) for name, hint in get_type_hints(function).items()})
+        given = signature.bind(*args, **kwargs).arguments
+        for name, value in given.items():
+            expected = kinds.get(name, ())
+            if expected and not isinstance(value, expected):
+                raise TypeError(
+                    f"{name}: expected {_in_words(expected)}, got {type(value).__name__}; {_made(expected)}"
+                )
+        return function(*args, **kwargs)
+
+    return checked
+
+
+def _kinds(hint: Any) -> tuple[type, ...]:
+    """The classes of a type hint that `typed` checks; empty if it checks none."""
+    members = get_args(hint) if isinstance(hint, UnionType) or get_origin(hint) is Union else (hint,)
+    found = tuple(Callable if get_origin(one) is Callable else one for one in members)
+    ours = [one for one in found if one is Callable or getattr(one, "__module__", "").startswith("kfgs.")]
+    plain = all(one in (*ours, str, Path, NoneType) and not getattr(one, "_is_protocol", False) for one in found)
+    return found if ours and plain and all(isinstance(one, type) for one in found) else ()
+
+
+def _in_words(kinds: tuple[type, ...]) -> str:
+    words = {str: "a path", Path: "a path", NoneType: "None", Callable: "a function"}
+    return " or ".join(dict.fromkeys(words.get(kind, f"a {kind.__name__}") for kind in kinds))
+
+
+def _made(kinds: tuple[type, ...]) -> str:
+    kind = next(kind for kind in kinds if kind not in (str, Path, NoneType))
+    return (
+        MADE.get(kind.__name__, f"pass {kind.__name__}(...)")
+        if kind is not Callable
+        else "pass one, for instance print"
+    )
+
+
 def check_choice(name: str, value: object, choices: Iterable[object]) -> None:
     """Raise a ValueError unless `value` is one of `choices`."""
     options = list(choices)
@@ -213,6 +278,9 @@ def check_range(
     if isinstance(value, Tensor | np.ndarray) and math.prod(value.shape) != 1:
         got = f"{type(value).__name__} of shape {tuple(value.shape)}"
         raise TypeError(f"{name}: expected one number, got {got}; pass a float")
+    kind = getattr(value, "dtype", None)
+    if isinstance(value, bool) or kind in (torch.bool, np.bool_) or not (isinstance(value, numbers.Real) or kind):
+        raise TypeError(f"{name}: expected a number, got {value!r:.80} ({type(value).__name__}); pass a float")
     over = value >= low if closed[0] else value > low
     under = value <= high if closed[1] else value < high
     if not (over and under and -math.inf < value < math.inf):  # NaN fails every comparison
@@ -222,7 +290,7 @@ def check_range(
         raise ValueError(f"{name}: expected a number in {left}{low:g}, {high:g}{right}, got {value!r}{hint}")
 
 
-def check_whole(name: str, value: float, low: int, high: float = float("inf")) -> None:
+def check_whole(name: str, value: float, low: float, high: float = float("inf")) -> None:
     """Raise a ValueError unless `value` is an integer (no float, no bool) from `low` to `high`, both included."""
     if not isinstance(value, numbers.Integral) or isinstance(value, bool):
         raise ValueError(f"{name}: expected a whole number, got {value!r}; pass an int")

@@ -19,7 +19,7 @@ from .atomic import (
     open_current,
 )
 from .locks import InUseError, locked
-from .paths import as_path, check_output
+from .paths import as_path, check_output, real_path
 
 __all__ = [
     "HIDDEN",
@@ -39,6 +39,7 @@ __all__ = [
     "open_current",
     "parse_json",
     "read_json",
+    "real_path",
     "seconds_in_words",
     "write_json",
 ]
@@ -81,6 +82,11 @@ def parse_json(text: str | bytes, **options: Any) -> Any:
         value = json.loads(text, **{"parse_int": _whole_number} | options)
     except RecursionError:
         raise ValueError(deep) from None
+    if "\\ud" in (text if isinstance(text, str) else text.decode("utf-8", "ignore")).lower():
+        try:
+            json.dumps(value, ensure_ascii=False).encode()
+        except UnicodeEncodeError:
+            raise ValueError("a text has half of a pair of surrogates, which is no character") from None
     level, depth = [value], 0  # in a loop: recursion ends at some 1,000 levels
     while level := [part for one in level for part in _inside(one) if type(part) in (dict, list)]:
         depth += 1

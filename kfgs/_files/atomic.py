@@ -25,7 +25,7 @@ from typing import TypeVar
 
 from .former import sweep_former
 from .locks import try_lock
-from .paths import as_path
+from .paths import as_path, check_ordinary
 
 HIDDEN, WAITING, LOCK = ".kfgs-unfinished", "waiting", ".kfgs-lock"
 ATTEMPTS = 100  # to put a folder where other processes put theirs
@@ -54,11 +54,15 @@ UMASK = _read_umask()  # once: it can only be read by setting it, for all thread
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Give a hidden path of the same name to write a file to, and move it to `path` if the block succeeds.
 
+    If `path` is a link, the new file takes its place; the file that it leads to stays as it is.
+
     Raises:
         FullDiskError: if the disk is full.
         OSError: if `path` cannot be written; all errors name `path`, none the hidden one.
+        ValueError: if `path` is a device or a pipe.
     """
     target = as_path(path)
+    check_ordinary(target)
     with hidden_folder(target.parent, target) as place:
         new = place / target.name
         yield new
@@ -314,15 +318,29 @@ def _retold(error: Exception, place: Path, target: Path) -> OSError | None:
     rust = re.search(r"\(os error (\d+)\)", text)  # of safetensors
     code = int(rust[1]) if rust else getattr(error, "errno", None)
     free = _free(place)
+    most = _largest_file()
+    if code == errno.EFBIG or (SHORT in text and LEAST < most < free):
+        return FullDiskError(
+            f"{target}: expected to write it whole, but files may have at most {most:,} bytes here; raise that limit (ulimit -f)"
+        )
     if told or code in FULL or SHORT in text or free < LEAST:
         return FullDiskError(
-            f"{target}: expected space on the disk to write it, got {free:,} bytes free; free some (or raise the "
-            "limit on files), or choose another disk"
+            f"{target}: expected space on the disk to write it, got {free:,} bytes free; free some, or choose another disk"
         )
     unnamed = code in UNNAMED and getattr(error, "filename", None) is None
     if code is not None and (unnamed or str(place) in text):
         return OSError(code, os.strerror(code), str(target))
     return None
+
+
+def _largest_file() -> float:
+    """The most bytes that the system lets this process write to a file."""
+    with suppress(ImportError):  # Windows
+        import resource
+
+        soft = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+        return math.inf if soft == resource.RLIM_INFINITY else soft
+    return math.inf
 
 
 def _free(place: Path) -> float:

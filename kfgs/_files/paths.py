@@ -22,6 +22,11 @@ def as_path(path: str | Path) -> Path:
     return Path(os.path.expanduser(path))
 
 
+def real_path(path: str | Path) -> Path:
+    """The absolute path with all links followed. One that leads to itself stays: `Path.resolve` raises before Python 3.13."""
+    return Path(os.path.realpath(as_path(path)))
+
+
 def check_output(
     name: str,
     path: str | Path,
@@ -43,22 +48,23 @@ def check_output(
         The path, with `~` expanded.
 
     Raises:
-        ValueError: if a folder is in place of a file, or a file in place of a folder or above; or if `apart` or
-            `other` forbid it.
+        ValueError: if a folder is in place of a file, or a file in place of a folder or above; if a device or a pipe is
+            there; or if `apart` or `other` forbid it.
         OSError: if it cannot be written to, or the disk is full.
     """
     target = as_path(path)
     if target.exists() and target.is_dir() != (kind == "a folder"):
-        got = "a file" if kind == "a folder" else "a folder"
+        got = "a folder" if target.is_dir() else "a file"
         raise ValueError(f"{name}: expected {kind} or nothing at {path}, got {got}; give another name")
+    check_ordinary(target, name)
     above = next(place for place in target.absolute().parents if place.exists())
     if not above.is_dir():
         raise ValueError(f"{name}: expected a folder to write to, got {path} below the file {above}; give another")
-    real = Path(os.path.realpath(target))
+    real = real_path(target)
     forbidden = [(folder, (real, *real.parents)) for folder in apart]
     forbidden += [(folder, (real,)) for folder in other if folder is not None]
     for folder, places in forbidden:
-        if Path(os.path.realpath(folder)) in places:
+        if real_path(folder) in places:
             raise ValueError(
                 f"{name}: expected a place apart from the pictures and feature maps in {folder}, got {path}; give another"
             )
@@ -74,3 +80,9 @@ def check_output(
     if full:
         raise OSError(f"{name}: expected space on the disk for {path}, got none; free some, or choose another place")
     return target
+
+
+def check_ordinary(path: Path, name: str = "path") -> None:
+    """Raise a ValueError if a device, a pipe or a socket is there: a file would take its place."""
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise ValueError(f"{name}: expected a file or nothing at {path}, got a device, a pipe or a socket; name a file")

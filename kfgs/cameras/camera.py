@@ -20,6 +20,9 @@ COEFFICIENTS = {"brown_conrady": (4, 5, 8), "kannala_brandt": (4,)}
 NEAR = 0.2
 """World units: the smallest depth that 3DGS draws, meant for scenes of metres."""
 
+PIXELS = 2**31 - 1
+"""Most pixels of a picture: the rasteriser numbers them in 32 bits."""
+
 UP = (0.0, 0.0, 1.0)
 """The direction that is up in the world, by default."""
 
@@ -74,6 +77,11 @@ class Camera:
             if not (isinstance(size, numbers.Real) and math.isfinite(size) and size >= 1 and int(size) == size):
                 raise ValueError(f"{name}: expected a positive whole number of pixels, got {size!r}; pass an integer")
             object.__setattr__(self, name, int(size))
+        if self.width * self.height > PIXELS:
+            raise ValueError(
+                f"width, height: expected at most {PIXELS:,} pixels, got {self.width:,} x {self.height:,}; make the camera "
+                "smaller with .resized(height, width)"
+            )
         if not torch.compiler.is_compiling():  # a traced matrix has no values yet
             self._check_values()
 

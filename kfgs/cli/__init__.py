@@ -16,10 +16,12 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, get_type_hints
 
 import tyro
 
+from .._card import error_line, short_of_memory
 from .._interrupts import interruptible
 from .._ranks import LostError, PeerError, place, together
 from .batch import batch
@@ -27,7 +29,7 @@ from .blocks import blocks, join
 from .evaluate import compare, evaluate
 from .features import features, plan
 from .fit import color, demo, fit, sfm, uplift
-from .output import called, said_on_stderr, say, warnings_as_notes
+from .output import called, open_streams, said_on_stderr, said_whole, say, warnings_as_notes
 from .pack import pack
 from .query import info, label, segment, select
 from .render import render
@@ -49,6 +51,7 @@ GROUPS: dict[str, tuple[Any, ...]] = {
 COMMANDS = {command.__name__: command for group in GROUPS.values() for command in group}
 RESUMED = {"demo", "features", "fit", "color", "batch", "blocks", "search"}  # commands that reuse their earlier work
 SHARED = {"fit", "uplift", "color"}  # commands that several processes (torchrun) do together
+NARROW = 40  # columns: in a few, tyro never ends
 STYLE = (
     tyro.conf.DisallowNone,
     tyro.conf.FlagCreatePairsOff,
@@ -59,12 +62,44 @@ STYLE = (
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; return the exit code."""
+    open_streams()
     # Read when torch is first imported: waiting threads sleep instead of spinning. With other busy programs this makes 25
     # training steps a second instead of one (measured on two cores).
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if not sys.stderr.isatty():  # read when tqdm is imported: a log gets two lines a minute, not ten a second
         os.environ.setdefault("TQDM_MININTERVAL", "30")
-    name, *given = [_expand_home(word) for word in (sys.argv[1:] if arguments is None else arguments)] or [""]
+    if shutil.get_terminal_size().columns < NARROW:
+        os.environ["COLUMNS"] = str(NARROW)
+    words, names = sys.argv[1:] if arguments is None else arguments, dict[str, str]()
+    rank, _ = place()
+
+    def failed(message: object) -> int:
+        with suppress(OSError):  # nobody can be told
+            say(f"error: {_in_options(str(message), names)}", sys.stderr)
+        return 1
+
+    try:
+        return _run(words, names)
+    except PeerError as error:  # that process has said it, perhaps into another log
+        return failed(error) if rank == 0 else 1
+    except KeyboardInterrupt:
+        goes_on = bool(RESUMED & {*words[:1]})
+        say("interrupted" + ("; the same command goes on where it stopped" if goes_on else ""), sys.stderr)
+        return 130
+    except BrokenPipeError:
+        return 141
+    except (ValueError, TypeError, OSError, ImportError, ArithmeticError) as error:
+        return failed(error) if rank == 0 or isinstance(error, LostError) else 1  # the first process says it for all
+    except (MemoryError, RuntimeError) as error:
+        if not short_of_memory(error):
+            raise
+        advice = "close other programs, give fewer or smaller inputs, or use a larger machine"
+        return failed(f"expected enough memory, but it ran out ({error_line(error)}); {advice}")
+
+
+def _run(words: list[str], names: dict[str, str]) -> int:
+    """Run the command that the words ask for; `names` receives the command-line names of its parameters."""
+    name, *given = [_expand_home(word) for word in words] or [""]
     if name in ("-h", "--help"):
         say(_overview())
         return 0
@@ -76,9 +111,9 @@ def main(arguments: list[str] | None = None) -> int:
     if name not in COMMANDS:
         say(_unknown(name), sys.stderr)
         raise SystemExit(2)
+    _check_working_directory()
     command = COMMANDS[name]
     called[:] = ["kfgs", name, *given]
-    names: dict[str, str] = {}
     rank, size = place()
     if size > 1 and name not in SHARED:
         if rank == 0:
@@ -88,28 +123,19 @@ def main(arguments: list[str] | None = None) -> int:
     def spoken(message: str) -> str:
         return _in_options(message, names)
 
-    try:
-        with interruptible(), warnings_as_notes(spoken), said_on_stderr(), together():
-            names |= _shown_names(command)
-            command.__doc__ = re.sub(
-                r"\n {8,}(?!kfgs)", " ", inspect.getdoc(command) or ""
-            )  # an option's text on one line
-            tyro.cli(command, prog=f"kfgs {name}", description=_description(command), args=given, config=STYLE)
-    except PeerError as error:  # that process has said it, perhaps into another log
-        if rank == 0:
-            say(f"error: {spoken(str(error))}", sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        say("interrupted" + ("; the same command goes on where it stopped" if name in RESUMED else ""), sys.stderr)
-        return 130
-    except BrokenPipeError:  # the reader of the output has ended, for instance `head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter complains when it ends
-        return 141
-    except (ValueError, TypeError, OSError, ImportError, ArithmeticError) as error:
-        if rank == 0 or isinstance(error, LostError):  # the first process says it for all
-            say(f"error: {spoken(str(error))}", sys.stderr)
-        return 1
+    with interruptible(), warnings_as_notes(spoken), said_on_stderr(), said_whole(), together():
+        names |= _shown_names(command)
+        command.__doc__ = re.sub(r"\n {8,}(?!kfgs)", " ", inspect.getdoc(command) or "")  # an option's text on one line
+        tyro.cli(command, prog=f"kfgs {name}", description=_description(command), args=given, config=STYLE)
     return 0
+
+
+def _check_working_directory() -> None:
+    """Raise an OSError if it was deleted: torch's libraries then end the process."""
+    try:
+        os.getcwd()
+    except FileNotFoundError as error:
+        raise OSError("expected a working directory, got one that was deleted; change to another (cd)") from error
 
 
 def _expand_home(word: str) -> str:

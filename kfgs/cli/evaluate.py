@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from .._files import check_output
+from .._files import check_output, real_path
 from .files import is_field
 from .options import Classes, Flag, Given, GivenRule, Name, Positional, Several, Teacher
 from .output import say, wrote
@@ -80,7 +80,7 @@ def evaluate(
     say(found.text if long else "\n".join([str(found), *(f"note: {note}" for note in found.notes)]))
     if out is not None:
         inputs = {"field": field, "with_file": with_file, "truth": truth, **dataclasses.asdict(classes)}
-        places = {name: None if place is None else str(place.resolve()) for name, place in inputs.items()}
+        places = {name: None if place is None else str(real_path(place)) for name, place in inputs.items()}
         words = {"split": split, "labels": labels, "set": list(set), **dataclasses.asdict(teacher)}
         write_json(out, {**found.to_json(), "inputs": {**places, **words}})
         wrote([out])

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from .._files import check_output
+from .._files import check_output, real_path
 
 # Heavy imports happen inside the functions, so that `kfgs --help` answers at once.
 
@@ -35,7 +35,7 @@ def check_target(name: str, target: Path, *sources: Path, apart: Iterable[Path] 
         )
     check_output(name, target, "a file", apart=apart)
     for source in sources:
-        if target.resolve() == source.resolve():
+        if real_path(target) == real_path(source):
             raise ValueError(f"{name}: expected another file than {source}, got the same; give another name")
 
 

@@ -8,7 +8,7 @@ import shlex
 from pathlib import Path
 from typing import Any, Literal
 
-from .._files import check_output
+from .._files import check_output, real_path
 from .._ranks import once
 from .features import check_discard, choose_teacher, stored_maps
 from .files import check_alone, inputs_of, is_field, open_field, open_splats
@@ -90,7 +90,7 @@ def sfm(
     beside = out / "images"
     if link_images(images, out):
         written.append(beside)
-    elif beside.resolve() != images.resolve():
+    elif real_path(beside) != real_path(images):
         say(f"note: {beside} is another folder; pass --images {images} to the other commands")
     wrote(written)
 

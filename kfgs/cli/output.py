@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -22,9 +23,53 @@ def say(text: str, file: TextIO | None = None) -> None:
 
     Names from foreign files may hold anything: what is not printable is shown as Python writes it (`\x1b`), and the middle
     of a very long line is left out. Of several processes on one job, only the first prints.
+
+    Raises:
+        BrokenPipeError: if the reader of the stream has ended, for instance `head`.
+        OSError: if the stream cannot take the line, for instance because the disk is full.
     """
-    if first():
-        print("\n".join(_shown(line) for line in text.split("\n")), file=file, flush=True)
+    if not first():
+        return
+    stream = file or sys.stdout
+    with _writing(stream):
+        print("\n".join(_shown(line) for line in text.split("\n")), file=stream, flush=True)
+
+
+@contextmanager
+def said_whole() -> Iterator[None]:
+    """Write what others printed in the block when it ends, not when the interpreter does; raises as `say` does."""
+    try:
+        yield
+    finally:
+        with _writing(sys.stdout):
+            sys.stdout.flush()
+
+
+@contextmanager
+def _writing(stream: TextIO) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        with suppress(OSError):  # else the interpreter tries again to write what is left, and complains
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        if isinstance(error, BrokenPipeError):
+            raise
+        raise type(error)(
+            f"standard output cannot be written ({error.strerror}); choose another place for it"
+        ) from error
+
+
+def open_streams() -> None:
+    """Give closed standard streams (`2>&-`) an end that takes everything.
+
+    Otherwise the next file that is opened gets the number of the stream, and what a library says there is written into it.
+    """
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(number, True)
+    os.close(number)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (it lives as long as the process)
 
 
 def _shown(line: str) -> str:

@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
-from .._files import atomic_folder, check_output
+from .._files import atomic_folder, check_output, real_path
 from .files import check_alone, inputs_of, is_field, open_field, open_splats
 from .options import Classes, Given, Positional, Teacher, remembered_scene
 from .output import say, say_counts, wrote
@@ -226,7 +226,7 @@ def label(
     loaded = classes.open_field("field", field)
     label_set = classes.of_field(loaded)
     carried = None if cloud is None else read_cloud(cloud)
-    if cloud is not None and cloud.resolve() in {(out / name).resolve() for name in ("gaussians.ply", "cloud.ply")}:
+    if cloud is not None and real_path(cloud) in {real_path(out / name) for name in ("gaussians.ply", "cloud.ply")}:
         raise ValueError(f"out: expected another folder than that of --cloud, got {out}; {cloud} would be overwritten")
     if query is None:
         labels, scores = loaded.classify(label_set, rule=rule)

@@ -8,7 +8,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any, Literal
 
-from .._files import check_output
+from .._files import check_output, real_path
 from .edit_syntax import Edits, check_parts, inserted_files, parse_edits
 from .files import check_alone, check_target, inputs_of, open_splats
 from .options import Classes, Flag, Given, GivenBy, Positional, SceneOption, Several
@@ -194,7 +194,7 @@ def _edits_beside(out: Path, replay: Path | None) -> Path:
     """The file for the edits of a splat file; a ValueError if it is the file to replay, or cannot be written."""
     saved = out.with_suffix(".edits.json")
     check_output("out", saved, "a file")
-    if replay is not None and replay.resolve() == saved.resolve():
+    if replay is not None and real_path(replay) == real_path(saved):
         raise ValueError(
             f"replay: expected another file than {saved}, where the edits behind {out} are saved, got the same; give --out "
             "another name"

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from .._files import check_output
+from .._files import check_output, real_path
 from .files import check_alone, inputs_of, is_field, open_splats
 from .options import Classes, Given, Positional, Teacher
 from .output import say, wrote
@@ -115,7 +115,7 @@ def _key(source: Path, color: Path | None, *options: Any) -> str | None:
     """What the page's scene depends on; see `scene_key`."""
     from ..page.kept import scene_key
 
-    words = [source.resolve(), color and color.resolve(), *options]
+    words = [real_path(source), color and real_path(color), *options]
     named = [value for option in options if dataclasses.is_dataclass(option) for value in vars(option).values()]
     files = [Path(value) for value in named if isinstance(value, str | Path) and Path(value).exists()]
     run = source.parent if source.name == "field" else source  # its colours are shown, too
@@ -170,7 +170,7 @@ def _viewer(state: Any, source: Path, out: Path, classes: Classes, display: Disp
 
 def _title(source: Path) -> str:
     """What tells one page from another: the run of RUN/field, else the file."""
-    path = source.resolve()
+    path = real_path(source)
     return path.parent.name if path.name == "field" else path.stem
 
 

@@ -78,6 +78,15 @@ class SegmentationReport:
         }
 
 
+def check_truth(target: Tensor, classes: int, name: str) -> None:  # target: [H, W] int64
+    """Raise a ValueError that begins with `name` if a true label has no class; call it before long work."""
+    if target.numel() and int(target.max()) >= classes:
+        raise ValueError(
+            f"{name}: expected labels below {classes} (from names), got {int(target.max())}; "
+            "is this the label picture of another set of classes?"
+        )
+
+
 def evaluate_segmentation(
     predict: Callable[[str], Tensor],  # stem -> labels [h, w]
     truth: Mapping[str, Path | Tensor],  # stem -> label picture, or its labels [H, W] with -1 = void
@@ -99,12 +108,7 @@ def evaluate_segmentation(
     pooled = ConfusionMatrix(len(names))
     for stem, given in truth.items():
         target = given if isinstance(given, Tensor) else load_label_map(given)
-        if int(target.max()) >= len(names):
-            where = f"truth[{stem!r}]" if isinstance(given, Tensor) else given
-            raise ValueError(
-                f"{where}: expected labels below {len(names)} (from names), got {int(target.max())}; "
-                "is this the label picture of another set of classes?"
-            )
+        check_truth(target, len(names), f"truth[{stem!r}]" if isinstance(given, Tensor) else str(given))
         labels = predict(stem)
         if labels.shape != target.shape:
             labels = resize_labels(labels, (int(target.shape[0]), int(target.shape[1])))

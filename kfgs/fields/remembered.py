@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from .._files import digest_file
+from .._files import digest_file, real_path
 from ..labels import LabelSet, load_label_set
 
 CLASSES = ("classes.json", "text.npy"), ("classes.json", "text.safetensors"), ("text.safetensors",)
@@ -44,13 +44,13 @@ def check_notes(info: object) -> dict[str, Any]:
 
 def rebased(info: dict[str, Any], old: Path | None, new: Path) -> dict[str, Any]:
     """The notes of a field that moves to another folder."""
-    if old is None or old.resolve() == new.resolve():
+    if old is None or real_path(old) == real_path(new):
         return info
     moved = dict(info)
     if isinstance(info.get("scene"), str):
-        moved["scene"] = _relative(old.resolve() / info["scene"], new)
+        moved["scene"] = _relative(real_path(old) / info["scene"], new)
     if info.get("classes"):
-        moved["classes"] = [one | {"path": _relative(old.resolve() / one["path"], new)} for one in info["classes"]]
+        moved["classes"] = [one | {"path": _relative(real_path(old) / one["path"], new)} for one in info["classes"]]
     return moved
 
 
@@ -97,9 +97,9 @@ def _is_of(files: list[Path], channels: int) -> bool:
 
 
 def _relative(path: Path, field: Path) -> str:
-    return Path(os.path.relpath(path.resolve(), field.resolve())).as_posix()
+    return Path(os.path.relpath(real_path(path), real_path(field))).as_posix()
 
 
 def _absolute(field: Path, noted: str) -> Path:
     """The absolute form of a noted path. Links are resolved first: notes are relative to the field's real folder."""
-    return Path(os.path.normpath(field.resolve() / noted))
+    return Path(os.path.normpath(real_path(field) / noted))

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .._card import html_card
-from .._check import as_tensor, check_choice
+from .._check import as_tensor, check_choice, typed
 from .._files import as_path
 from .._rows import check_directions, unit_embeddings, unit_rows
 from ..cameras import Camera
@@ -121,6 +121,7 @@ class SemanticField:
 
     # Maps
 
+    @typed
     def render(self, camera: Camera, *, engine: str = "auto") -> Rendering:
         """The latent map F_r (Eq. 3) from a viewpoint, with its alpha. No gradient."""
         with torch.no_grad():
@@ -235,6 +236,7 @@ class SemanticField:
         against = None if asked.negatives is None else cosines[:, 1:]
         return select_by_similarity(cosines[:, 0], against, threshold, known, score=score, logit_scale=logit_scale)
 
+    @typed
     def segment(
         self, camera: Camera, classes: Classes | None = None, *, rule: Rule = "fused"
     ) -> Tensor:  # [H, W] int64

@@ -19,11 +19,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._card import short_repr
-from .._check import check_range, check_whole
+from .._check import check_range, check_whole, typed
 from .._progress import as_bar
 from .._ranks import first, in_order
 from .._rows import row_norms, unit_rows
 from ..cameras import Camera, resize_map
+from ..formats import SplatFile
+from ..formats.values import check_splats
 from ..gaussians import Gaussians
 from ..labels.views import sum_pixels
 from ..quant import FeatureMaps
@@ -87,6 +89,7 @@ class Uplifted:
     __repr__ = short_repr
 
 
+@typed
 def uplift_maps(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
@@ -119,7 +122,8 @@ def uplift_maps(
 
     Raises:
         TypeError: if `progress` is a function: there are no rows to call it with.
-        ValueError: if counts or shapes disagree, a map is not finite, or no view shows any Gaussian.
+        ValueError: if counts or shapes disagree, `write_splats` would refuse the Gaussians, a map is not finite, no map has
+            features, or no view shows any Gaussian.
 
     Note:
         To continue by training, start `fit_field` with `GaussianParams.from_gaussians(found.gaussians)` and the maps
@@ -134,6 +138,7 @@ def uplift_maps(
             f"maps: expected one per camera ({len(cameras)}, at least one), got {len(maps)}; pass the views that have maps"
         )
     cloud = gaussians.replace(sh=None, features=None, labels=None).detach()
+    check_splats(SplatFile(cloud))
     cloud = cloud.to(torch.promote_types(cloud.means.dtype, torch.float32))
     steps = len(cameras) * (1 + config.corrections + (config.max_gaussians is not None and config.corrections > 0))
     with torch.no_grad(), tqdm(total=steps, desc="uplift", unit="view", disable=not progress) as bar:

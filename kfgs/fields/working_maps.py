@@ -148,7 +148,7 @@ def working_directions(maps: FeatureMaps, count: int = WORKING, most: int | None
             check_shapes((f"maps[{i}]", rows, ("n", channels)))
         rows = rows.float()
         check_directions(f"maps[{i}]", rows, advice=ENCODE)
-        rows = unit_rows(rows)
+        rows = unit_rows(rows) * (row_norms(rows) > EPS)[:, None]
         return {"moment": rows.T @ rows}
 
     for part in in_order(views, look):

@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from .._files import atomic_path, parse_json
+from .._files import atomic_path, parse_json, real_path
 
 MAGIC = b"glTF"
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
@@ -130,8 +130,8 @@ class Document:
                 f"{self.path}: {where}: expected a file in the same folder, got the uri {uri!r:.80}; "
                 "kfgs opens nothing elsewhere, pack the scene as .glb"
             )
-        folder = self.path.resolve().parent
-        file = (folder / name).resolve()
+        folder = real_path(self.path).parent
+        file = real_path(folder / name)
         if not file.is_relative_to(folder):
             raise ValueError(
                 f"{self.path}: {where}: expected a file in the same folder, got a link to {file}; copy it there"

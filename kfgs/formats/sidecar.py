@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from .._arrays import read_arrays
-from .._files import as_path, atomic_path, digest_file, read_json, write_json
+from .._files import as_path, atomic_path, digest_file, read_json, real_path, write_json
 from .splat_file import SCORE, SplatFile
 
 _NPZ_HEADERS = 1 << 16  # bytes of headers in an .npz file of three arrays
@@ -96,7 +96,7 @@ def find_names(path: str | Path) -> Path | None:
 
 def _places(path: str | Path) -> tuple[Path, ...]:
     """A path, and the file that it leads to if it is a link."""
-    return (as_path(path), as_path(path).resolve())
+    return (as_path(path), real_path(path))
 
 
 def _first(paths: Iterable[Path]) -> Path | None:

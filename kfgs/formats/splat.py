@@ -17,7 +17,16 @@ from .._files import atomic_path
 from ..gaussians import Gaussians
 from .render_mode import describe_lost_mode
 from .splat_file import Precision, SplatFile
-from .values import SH_C0, byte_error, check_finite, colours_to_write, describe_loss, positive_scales, unit_quats
+from .values import (
+    SH_C0,
+    byte_error,
+    check_finite,
+    colours_to_write,
+    describe_cut,
+    describe_loss,
+    positive_scales,
+    unit_quats,
+)
 
 NAME = "splat"
 SUFFIXES = (".splat",)
@@ -75,7 +84,8 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
     rows["quats"] = (quats * 128 + 128).round().clamp(0, 255).numpy()
     with atomic_path(path) as temporary:
         rows.tofile(temporary)
-    return describe_loss(splats, ".splat", 0) + describe_lost_mode(splats.info, ".splat")
+    cut = describe_cut(rgba[:, :3], 0.0, 1.0, "colours", ".splat")
+    return describe_loss(splats, ".splat", 0) + cut + describe_lost_mode(splats.info, ".splat")
 
 
 def precision(gaussians: Gaussians) -> Precision:

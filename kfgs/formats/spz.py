@@ -36,6 +36,7 @@ from .render_mode import ANTIALIASED as ANTIALIASED_MODE
 from .render_mode import describe_lost_mode
 from .splat_file import SCORE, Precision, SplatFile
 from .spz_codec import (
+    DC,
     LOG_SCALES,
     choose_fractional_bits,
     most_fractional_bits,
@@ -44,7 +45,7 @@ from .spz_codec import (
     unpack,
 )
 from .spz_streams import ANTIALIASED, GZIP, MAGIC, MAX_FRACTIONAL_BITS, Container, read_container, write_container
-from .values import UP_AND_BACK, check_splats, colours_to_write, describe_loss
+from .values import UP_AND_BACK, check_splats, colours_to_write, describe_cut, describe_loss
 
 NAME = "spz"
 SUFFIXES = (".spz",)
@@ -240,6 +241,9 @@ def _lost(splats: SplatFile, g: Gaussians, fractional_bits: int) -> tuple[str, .
             f"positions finer than {2.0**-fractional_bits:g} units: the cloud reaches {g.means.abs().max().item():g} units "
             "from the origin, and .spz has 24 bits a coordinate"
         )
+    assert g.sh is not None
+    lost += describe_cut(g.sh[:, :1], -DC, DC, "colours", ".spz")
+    lost += describe_cut(g.sh[:, 1:], -1.0, 127 / 128, "higher harmonics", ".spz")
     low, high = (exp(end) for end in LOG_SCALES)
     cut = int(((g.scales < low / 1.032) | (g.scales > high * 1.032)).any(1).sum())
     if cut:

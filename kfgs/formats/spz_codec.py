@@ -24,7 +24,7 @@ from .spz_streams import MAX_FRACTIONAL_BITS, Container
 from .values import UP_AND_BACK, byte_error, check_finite, flip_axes, unit_quats
 
 Bytes = NDArray[np.uint8]
-_DC = 0.5 / 0.15  # the degree-0 coefficient of byte 255
+DC = 0.5 / 0.15  # the degree-0 coefficient of byte 255
 LOG_SCALES = (-10.0, 255 / 16 - 10)
 _MAX_FIXED = (1 << 23) - 1
 _COMMON_BITS, _STEPS = 12, 14  # bits that every writer uses; a small cloud gets 2^14 steps across
@@ -99,7 +99,7 @@ def precision_of(g: Gaussians, fractional_bits: int) -> Precision:
         scales=(exp(max(1 / 32, cut)) - 1) * (1 + 1e-5) + 1e-4,  # float32, of what is cut off far too
         rotation=0.005,  # 2 x sqrt(3 + 3^2) half steps of sqrt(0.5) / 511: the largest component makes up for the others
         opacities=0.5 / 255 + 1e-6,
-        sh0=byte_error(sh[:, :1], -_DC, _DC),
+        sh0=byte_error(sh[:, :1], -DC, DC),
         sh_rest=byte_error(sh[:, 1:], -1.0, 127 / 128) + 1e-5,
     )
 

@@ -24,6 +24,7 @@ from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
+from .._check import typed
 from .._files import as_path
 from ..gaussians import Gaussians
 from .order import morton_order
@@ -61,8 +62,13 @@ def find_format(path: str | Path) -> ModuleType:
         raise FileNotFoundError(f"{path}: no such file; expected a splat file there")
     head = b""
     if path.is_file():
-        with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
+        try:
+            with path.open("rb") as file:
+                head = file.read(_HEAD_BYTES)
+        except OSError as error:  # Python names no file if reading fails
+            raise type(error)(
+                f"{path}: expected a splat file that can be read ({error.strerror}); copy it again"
+            ) from error
     for module in formats().values():
         if module.matches(head) or (path.is_dir() and module.NAME == "sog" and (path / "meta.json").is_file()):
             return module
@@ -95,6 +101,7 @@ def read_splats(path: str | Path) -> SplatFile:
     return splats
 
 
+@typed
 def write_splats(path: str | Path, splats: SplatFile | Gaussians, *, format: str | None = None) -> Written:
     """Write a cloud in the format of the file's ending.
 

@@ -27,6 +27,12 @@ _EXPECTED = {
     "features": "finite numbers",
 }
 
+_RAW = {
+    "scales": "if they are logarithms, as 3DGS trains them, take scales.exp()",
+    "opacities": "if they are logits, as 3DGS trains them, take opacities.sigmoid()",
+}
+"""What to do if most values are out of range."""
+
 
 def check_finite(path: Path, **values: NDArray[np.float32]) -> None:
     """Raise a ValueError that names the file, the kind of value and the first Gaussian with NaN or infinity."""
@@ -90,10 +96,19 @@ def check_splats(splats: SplatFile) -> None:
         elif name == "opacities":
             good &= (values >= 0) & (values <= 1)
         _check_rows(name, expected, values, good)
+    for name, column in splats.extra.items():
+        if np.asarray(column).dtype.kind not in "biuf":
+            raise ValueError(
+                f"extra[{name!r:.80}]: expected numbers, got {np.asarray(column).dtype}; number them, or leave the column out"
+            )
     if g.labels is None:
         return
     most = len(splats.classes) - 1 if splats.classes else _LABELS
     expected = f"-1 (none) to {most}" + (" (the named classes)" if splats.classes else "")
+    if "class_id" in splats.extra:
+        raise ValueError(
+            "extra['class_id']: expected no such column beside labels, which are stored under that name, got both; leave it out"
+        )
     _check_rows("labels", expected, g.labels, (g.labels >= -1) & (g.labels <= most))
     if SCORE in splats.extra:
         score = torch.from_numpy(np.asarray(splats.extra[SCORE], np.float32))
@@ -105,9 +120,11 @@ def _check_rows(name: str, expected: str, values: Tensor, good: Tensor) -> None:
         return
     bad = ~good.reshape(len(good), -1).all(1)
     row = int(bad.nonzero()[0])
+    raw = values.isfinite().all() and 2 * int(bad.sum()) > len(bad) and name in _RAW
+    advice = _RAW[name] if raw else "correct them, or leave these Gaussians out (in Python: with select)"
     raise ValueError(
         f"{name}: expected {expected} in every Gaussian, got {values[row].flatten()[:4].tolist()} at {row} and others at "
-        f"{int(bad.sum()) - 1} more of {len(bad)}; correct them, or leave these Gaussians out (in Python: with select)"
+        f"{int(bad.sum()) - 1} more of {len(bad)}; {advice}"
     )
 
 
@@ -133,6 +150,14 @@ def describe_loss(splats: SplatFile, name: str, degree: int) -> tuple[str, ...]:
     if columns:
         lost.append(f"the columns {', '.join(columns)}: {name} has no place for them")
     return tuple(lost)
+
+
+def describe_cut(values: Tensor, low: float, high: float, what: str, name: str) -> tuple[str, ...]:  # values: [N, ...]
+    """Describe the loss of a format that holds values in 256 steps from `low` to `high`: those beyond become the ends."""
+    step = (high - low) / 255
+    beyond = ((values < low - step) | (values > high + step)).flatten(1).any(1)
+    count = int(beyond.sum())
+    return (f"{what} of {count} of {len(values)} Gaussians beyond what {name} holds: cut off",) if count else ()
 
 
 def byte_error(values: Tensor, low: float, high: float) -> float:

@@ -61,6 +61,11 @@ class LabelSet:
             raise ValueError(f"names: expected different names, got {list(self.names)}; rename or leave out repeats")
         if any(not isinstance(name, str) or not name for name in (*self.names, *self.negative_names)):
             raise ValueError(f"names: expected words, got {list(self.names)!r:.200}; give each class a name")
+        for name in (*self.names, *self.negative_names):
+            if any("\ud800" <= character <= "\udfff" for character in name):
+                raise ValueError(
+                    f"names: expected text, got {name!a}, which has half of a pair of surrogates; write it again"
+                )
         expected = (len(self.negative_names), self.dim)
         if (self.negatives is not None or self.negative_names) and _shape(self.negatives) != expected:
             raise ValueError(

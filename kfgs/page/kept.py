@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from .._files import atomic_path, digest_value
+from .._files import atomic_path, digest_value, real_path
 
 MOST = 8  # scenes that are kept; the one that was not used for the longest time goes first
 MOST_FILES = 20_000  # of all inputs together: looking at more takes longer than Python
@@ -37,7 +37,7 @@ def scene_key(words: Iterable[object], inputs: Iterable[Path]) -> str | None:
     Files beside an input count if their names begin as its own does: labels lie there. None if there are too many files.
     """
     code = (file for folder in (CODE / "page", CODE / "viz/explorer") for file in folder.iterdir())
-    files = [file for path in inputs for file in _files_of(path.resolve())]
+    files = [file for path in inputs for file in _files_of(real_path(path))]
     if len(files) > MOST_FILES:
         return None
     try:

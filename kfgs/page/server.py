@@ -13,8 +13,10 @@ import secrets
 import socket
 import struct
 import sys
+import time
 import zlib
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import ip_address
 from threading import Event, Thread
@@ -22,12 +24,17 @@ from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
 from .._card import error_line
+from .._files import parse_json
 
 REFUSED = "This page opens with the whole link that kfgs gave.\n"
 LONGEST_CALL = 16 << 20
 """Bytes: a selection of many million Gaussians, as bits."""
 PATIENCE = 60.0
-"""Seconds after which a connection that neither sends nor reads is closed."""
+"""Seconds after which a connection is closed that neither sends nor reads, or that has not shown the secret."""
+STRANGERS = 64
+"""Most connections that have not shown the secret; the oldest is closed for a new one."""
+PAUSE = 0.1
+"""Seconds until a connection is accepted for which no file handle is left."""
 POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' blob:; style-src 'unsafe-inline'; img-src 'self' blob: data:; "
     "connect-src 'self'; worker-src blob:; form-action 'none'; base-uri 'none'; frame-ancestors 'self'"
@@ -169,8 +176,8 @@ def read_message(message: bytes) -> tuple[dict[str, Any], bytes]:
         raise ValueError(f"message: expected at least 4 bytes, got {len(message)}; send what the page's script makes")
     (length,) = struct.unpack_from("<I", message)
     try:
-        answer = json.loads(message[4 : 4 + length])
-    except (ValueError, RecursionError) as error:
+        answer = parse_json(message[4 : 4 + length])
+    except ValueError as error:
         raise ValueError(
             f"message: expected JSON ({type(error).__name__}); send what the page's script makes"
         ) from None
@@ -183,7 +190,10 @@ def answer_call(call: Call, read: Callable[[], tuple[Mapping[str, Any], bytes]])
     """Read a call, {"name", "args"} and attached bytes, and answer it; whatever fails is told to the page, and Python goes on."""
     try:
         asked, attached = read()
-        return call(str(asked.get("name")), dict(asked.get("args") or {}), attached)
+        args = asked.get("args") or {}
+        if not isinstance(args, Mapping):
+            raise ValueError(f"args: expected an object, got {args!r:.80}; send what the page's script makes")
+        return call(str(asked.get("name")), dict(args), attached)
     except Exception as error:
         return _error_answer(error)
 
@@ -207,6 +217,44 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
 
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self._strangers: dict[
+            socket.socket, float
+        ] = {}  # until when each has time to show the secret, the oldest first
+        super().__init__(*args, **kwargs)
+
+    def get_request(self) -> tuple[socket.socket, Any]:
+        try:
+            return super().get_request()
+        except OSError:  # no file handle is left; the connection waits, and asking again at once would only burn time
+            self._hang_up(1)
+            time.sleep(PAUSE)
+            raise
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        self._strangers[request] = time.monotonic() + PATIENCE
+        self._hang_up(len(self._strangers) - STRANGERS)
+        super().process_request(request, client_address)
+
+    def service_actions(self) -> None:
+        now = time.monotonic()
+        self._hang_up(sum(until < now for until in list(self._strangers.values())))
+
+    def know(self, request: Any) -> None:
+        """A connection has shown the secret: it may take its time."""
+        self._strangers.pop(request, None)
+
+    def shutdown_request(self, request: Any) -> None:
+        self.know(request)
+        super().shutdown_request(request)
+
+    def _hang_up(self, count: int) -> None:
+        """End the oldest connections that have not shown the secret; their threads find the end of the request."""
+        for request in list(self._strangers)[: max(count, 0)]:
+            self.know(request)
+            with suppress(OSError):
+                request.shutdown(socket.SHUT_RDWR)
+
     def handle_error(self, request: Any, client_address: Any) -> None:
         """One line for a bug of ours; nothing if the browser hung up."""
         error = sys.exception()
@@ -216,6 +264,7 @@ class _Server(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     page: PageServer
+    server: _Server
     timeout = PATIENCE
 
     def do_GET(self) -> None:
@@ -251,6 +300,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not allowed:
             self._answer(403, "text/plain", REFUSED.encode())
             return None
+        self.server.know(self.request)
         return parts[2]
 
     def _answer(self, status: int, kind: str, content: bytes) -> None:

@@ -12,11 +12,11 @@ from PIL import Image
 from torch import Tensor
 from tqdm import tqdm
 
-from .._check import check_range
+from .._check import check_range, typed
 from .._files import as_path, atomic_path, check_output, write_json
 from ..cameras import resize_labels, undistort_labels
 from ..evaluation import SegmentationReport, evaluate_segmentation, load_label_map
-from ..evaluation.segmentation import VOID
+from ..evaluation.segmentation import VOID, check_truth
 from ..fields import Rule, SemanticField
 from ..formats.ply import Columns, other_elements, points_from_columns, read_ply, write_ply
 from ..formats.ply_3dgs import columns_from_gaussians
@@ -58,6 +58,7 @@ def _save_bytes(path: Path, labels: Tensor, colors: Array | None = None) -> None
         picture.save(temporary, format="PNG")
 
 
+@typed
 def segment_scene(
     field: SemanticField,
     scene: Scene,
@@ -92,15 +93,18 @@ def segment_scene(
     out = as_path(out)
     check_range("pictures", pictures, 0)
     pictures_in = {one.parent for one in scene.image_paths}
-    apart = [*pictures_in - {scene.folder}, *([] if scene.folder is None else [scene.folder / "features"])]
+    inputs = {*pictures_in, *([] if maps is None else [as_path(maps)])}
+    apart = [*inputs - {scene.folder}, *([] if scene.folder is None else [scene.folder / "features"])]
     for name in SEGMENTED if pictures else SEGMENTED[:2]:
-        check_output("out", out / name, "a folder", apart=apart, other=[maps, *pictures_in])
+        check_output("out", out / name, "a folder", apart=apart, other=inputs)
     if len(classes) > VOID:
         raise ValueError(
             f"classes: expected at most {VOID} (label pictures hold a byte per pixel, {VOID} = none), got {len(classes)}; "
             "segment with fewer classes, or call SemanticField.segment, which has no such limit"
         )
     class_rows(classes, field.dim, field.info)  # checks the classes before any file is written
+    for stem, known in (truth or {}).items():
+        check_truth(known, len(classes), f"truth[{stem!r}]")
     views = scene.views(split)
     shown = {views[i] for i in np.linspace(0, len(views) - 1, min(pictures, len(views))).round().astype(int)}
     colors = feature_colors(field)
@@ -144,6 +148,7 @@ def true_labels(scene: Scene, folder: Path, split: str) -> dict[str, Tensor]:
     return truth
 
 
+@typed
 def score_scene(labels: dict[str, Tensor], truth: dict[str, Tensor], classes: LabelSet) -> SegmentationReport:
     """Score segmented views against the truth of those that have one (`true_labels`)."""
     known = {stem: target for stem, target in truth.items() if stem in labels}

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .._card import LINE, cut
-from .._check import check_choice, check_range
+from .._check import check_choice, check_range, typed
 from ..align.by_cameras import Alignment, align_by_cameras
 from ..align.by_shape import align_clouds
 from ..align.frames import frames_agree
@@ -64,6 +64,7 @@ class Attached:
         return self.splats.gaussians.labels
 
 
+@typed
 def attach(
     field: SemanticField,
     splats: SplatFile | Gaussians | str | Path,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor
 
 from .._card import short_repr
-from .._check import check_range, check_whole
+from .._check import check_range, check_whole, typed
 from .._files import check_output, read_json
 from .._progress import Progress, as_progress
 from .._ranks import once
@@ -47,6 +48,7 @@ class ColorConfig:
     field: FieldConfig = default(default_factory=FieldConfig)
 
     def __post_init__(self) -> None:
+        check_whole("seed", self.seed, -math.inf)
         check_whole("sh_degree", self.sh_degree, 0, 3)
         check_range("picture_scale", self.picture_scale, 0, 1, closed=(False, True))
         check_range("ssim_weight", self.ssim_weight, 0, 1)
@@ -178,6 +180,7 @@ class Photos(Sequence[Tensor]):
         return bytes_, None if bool(known.all()) else inside > 1 - 1e-4
 
 
+@typed
 def fit_color(
     scene: Scene,
     folder: str | Path,

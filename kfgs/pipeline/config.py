@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from dataclasses import field as default
 from typing import Any, Literal
 
-from .._check import check_choice
+from .._check import check_choice, check_whole
 from ..fields import FieldConfig, UpliftConfig
 from ..quant import AutoencoderConfig, CodebookConfig
 from .color import ColorConfig
@@ -46,6 +47,7 @@ class FitConfig:
     def __post_init__(self) -> None:
         check_choice("method", self.method, METHODS)
         check_choice("mode", self.mode, MODES)
+        check_whole("seed", self.seed, -math.inf)
 
     @property
     def needs_maps(self) -> bool:

@@ -6,12 +6,13 @@ from pathlib import Path
 
 from .._check import one_line
 from .._files import as_path, bytes_in_words
+from ..features import FeatureFolder
 from ..features.manifest import MANIFEST, read_manifest
 from ..fields import SemanticField
 from ..fields.store import find_field
 from ..formats import SplatFile, find_format, read_splats
 from ..formats.ply import read_ply
-from ..scenes import load_scene
+from ..scenes import SceneError, load_scene
 from .stages import read_stage
 
 
@@ -42,7 +43,14 @@ def describe(path: str | Path) -> str:
         done = [read_stage(file) for file in sorted((path / "stages").glob("[!.]*/stage.json"))]
         lines = [f"  {one_line(about['name'])}: done in {about['seconds']:.1f} s" for about in done]
         return "\n".join([f"{path}: unfinished run; start `kfgs fit` again to go on", *lines])
-    scene = load_scene(path)
+    try:
+        scene = load_scene(path)
+    except SceneError:
+        maps = FeatureFolder(path)
+        if not maps.files:
+            raise
+        h, w, D = maps.shape
+        return f"{path}: {len(maps)} feature maps of another program\n  {h} x {w} cells, {D} channels"
     sizes = sorted({camera.size for camera in scene.cameras})
     splits = ", ".join(f"{name} {len(views)}" for name, views in scene.splits.items())
     lines = [

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from .._card import short_repr
+from .._check import typed
 from .._files import as_path, check_output, digest_value, read_json, write_json
 from .._progress import Progress, as_progress
 from .._ranks import once
@@ -192,6 +193,7 @@ def _check_inputs(scene: Scene, views: Sequence[int], maps: Maps, config: FitCon
         )
 
 
+@typed
 def fit_scene(
     scene: Scene,
     maps: Maps | Sequence[Tensor],  # teacher maps of the views of config.split, in their order

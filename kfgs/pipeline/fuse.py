@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from .._arrays import read_safetensors
+from .._check import typed
 from .._files import as_path, write_json
 from .._progress import Progress
 from .._ranks import once
@@ -109,6 +110,7 @@ def without_lens(scene: Scene, maps: Maps, config: FitConfig) -> Maps:
     return UndistortedMaps(maps, [scene.lenses[i] for i in scene.views(config.split)])
 
 
+@typed
 def uplift(
     scene: Scene,
     maps: Maps,  # teacher maps of the views of `config.split`, in their order

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from .._files import atomic_path, bytes_in_words, current_file, seconds_in_words
+from .._files import atomic_path, bytes_in_words, current_file, real_path, seconds_in_words
 from ..fields import SemanticField
 from ..fields.store import DESCRIPTION, TENSORS
 from ..labels import LabelSet
@@ -112,7 +112,7 @@ def write_run_report(
     stages = [(one.name, seconds_in_words(one.seconds), "found" if one.reused else "made") for one in result.stages]
     stages.append(("all", seconds_in_words(result.seconds), ""))
     repeat = command or f"kfgs.pipeline.fit_scene(scene, maps, {str(result.folder)!r}, config)"
-    title = f"kfgs: {result.folder.resolve().name}"
+    title = f"kfgs: {real_path(result.folder).name}"
     unused = ("codebook", "autoencoder", "field", "mode") if config.method == "fuse" else ("uplift", "color")
     options = json.dumps({name: value for name, value in asdict(config).items() if name not in unused}, indent=1)
     parts = [

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from .._arrays import reading
 from .._compiling import say_compiling
-from .._files import atomic_folder, digest_file, digest_value, finish_writing, locked, read_json, write_json
+from .._files import atomic_folder, digest_file, digest_value, finish_writing, locked, read_json, real_path, write_json
 from .._ranks import first, meet, once
 from ..cameras import Camera
 from ..cameras.camera import NEAR
@@ -147,18 +147,18 @@ class Run:
 
     def _digests(self, paths: Sequence[Path]) -> list[list[str]]:
         cache_path = self.folder / "digests.json"
-        cache: dict[str, Any] = read_json(cache_path) if cache_path.is_file() else {}
+        cache = _known_digests(cache_path)
         result, changed = [], False
         for path in paths:
             info = path.stat()
             mark = [info.st_size, info.st_mtime_ns, info.st_ctime_ns]
-            known = cache.get(str(path.resolve()))
+            known = cache.get(str(real_path(path)))
             if known is None or known[:-1] != mark:
                 if self.look_only:
                     result.append([path.name, "unknown"])
                     continue
                 known = [*mark, digest_file(path)]
-                cache[str(path.resolve())] = known
+                cache[str(real_path(path))] = known
                 changed = True
             result.append([path.name, known[-1]])
         if changed:
@@ -169,6 +169,15 @@ class Run:
         """Report a line, if anyone listens; of several processes, only the first does."""
         if self.report is not None and first():
             self.report(text)
+
+
+def _known_digests(path: Path) -> dict[str, Any]:
+    """Size, two times and the digest of files by path. It only saves time, so nothing is taken from a damaged file."""
+    try:
+        found = read_json(path)
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) and all(isinstance(one, list) for one in found.values()) else {}
 
 
 def _key(name: str, inputs: dict[str, Any]) -> str:

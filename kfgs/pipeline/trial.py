@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._files import as_path
+from .._files import real_path
 from ..features import FeatureFolder, Picture, extract_features
 from ..fields import FieldConfig, GaussianParams
 from ..scenes import Scene
@@ -257,7 +257,7 @@ def _largest_so_far() -> int | None:
 
 def disk_free(folder: str | Path) -> int:
     """Free bytes on the disk of a folder, which may not exist yet."""
-    path = as_path(folder).resolve()
+    path = real_path(folder)
     while not path.exists():
         path = path.parent
     return shutil.disk_usage(path).free

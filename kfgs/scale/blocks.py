@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from .._check import as_array, check_whole
-from .._files import as_path, check_output, read_json, write_json
+from .._files import as_path, check_output, read_json, real_path, write_json
 from ..features import FeatureFolder
 from ..fields import SemanticField, sample_latents, select_gaussians
 from ..formats import read_splats, write_splats
@@ -216,4 +216,6 @@ def _link(place: Path, target: Path) -> None:
     """A link to a file or folder, relative, so that both can move together."""
     if not place.is_symlink():
         place.parent.mkdir(parents=True, exist_ok=True)
-        place.symlink_to(os.path.relpath(target.resolve(), place.parent.resolve()), target_is_directory=target.is_dir())
+        place.symlink_to(
+            os.path.relpath(real_path(target), real_path(place.parent)), target_is_directory=target.is_dir()
+        )

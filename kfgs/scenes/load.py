@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from .._check import check_choice
-from .._files import as_path
+from .._files import as_path, real_path
 from .colmap import load_colmap
 from .colmap_model import has_model
 from .files import SceneError, natural_key, some
@@ -100,7 +100,7 @@ def picture_folders(path: str | Path, images: str | Path | None = None) -> list[
             found = {file.parent for file in _load_views(path, given).image_paths}
     except (OSError, ValueError):
         return []
-    return sorted(folder for folder in found if folder.resolve() not in (root.resolve(), *root.resolve().parents))
+    return sorted(folder for folder in found if real_path(folder) not in (real_path(root), *real_path(root).parents))
 
 
 def _given_folder(root: Path, images: str | Path | None) -> str | Path | None:
@@ -154,14 +154,14 @@ def _advice(path: Path) -> str:
     inside = [folder.name for folder in folders[:100] if is_scene(folder)]
     if inside:
         return f"it holds scenes ({some(inside)}): give one of them, as in {path / inside[0]}"
-    if is_scene(path.resolve().parent):
-        return f"the folder above is a scene: give {path.resolve().parent}"
+    if is_scene(real_path(path).parent):
+        return f"the folder above is a scene: give {real_path(path).parent}"
     return "estimate the cameras first: `kfgs sfm <images> <scene>` or kfgs.scenes.run_sfm"
 
 
 def find_images(root: Path, model: Path) -> Path:
     """The folder with the pictures of a scene's model; see `load_scene`."""
-    places = list(dict.fromkeys((root, model.resolve().parent, model.resolve().parent.parent)))
+    places = list(dict.fromkeys((root, real_path(model).parent, real_path(model).parent.parent)))
     for above in places:
         if (above / "images").is_dir():
             return above / "images"

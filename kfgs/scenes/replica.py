@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .._files import as_path
+from .._files import as_path, real_path
 from .files import MAX_SIDE, SceneError, read_scene_json
 from .posed import Matrix, numbered_pictures, picture_size, points_from_depth, scene_of_poses
 from .scene import Scene
@@ -72,7 +72,7 @@ def load_semantic_nerf(folder: str | Path) -> Scene:
 
 def _cam_params(folder: Path) -> tuple[Matrix, tuple[int, int], float]:
     """K, (width, height) and the scale of the depth pictures."""
-    places = [folder / "cam_params.json", folder.resolve().parent / "cam_params.json"]
+    places = [folder / "cam_params.json", real_path(folder).parent / "cam_params.json"]
     path = next((place for place in places if place.is_file()), None)
     if path is None:
         raise FileNotFoundError(

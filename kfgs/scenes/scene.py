@@ -63,9 +63,11 @@ class Scene:
                 f"got {twice!r} twice; rename one of the images"
             )
         for name, indices in self.splits.items():
-            wrong = [i for i in indices if not 0 <= i < views]
+            wrong = [i for i in indices if not _is_index(i, views)]
             if wrong:
-                raise ValueError(f"splits[{name!r}]: expected views in [0, {views}), got {wrong[0]}; correct the split")
+                raise ValueError(
+                    f"splits[{name!r}]: expected whole numbers in [0, {views}), got {wrong[0]!r:.80}; correct the split"
+                )
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -201,3 +203,10 @@ class Scene:
         if len(set(indices)) != len(indices):
             raise ValueError("which: expected each view once, got one twice; remove the repetition")
         return indices
+
+
+def _is_index(value: object, views: int) -> bool:
+    try:
+        return 0 <= index(value) < views  # type: ignore[arg-type]
+    except TypeError:
+        return False

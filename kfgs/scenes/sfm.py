@@ -13,7 +13,7 @@ from typing import Any, Literal
 from tqdm import tqdm
 
 from .._check import check_choice, check_range
-from .._files import as_path, atomic_folder, check_output
+from .._files import as_path, atomic_folder, check_output, real_path
 from .colmap import SUPPORTED_MODELS
 from .colmap_model import has_model
 from .files import SceneError, list_images, some
@@ -156,7 +156,7 @@ def link_images(images: str | Path, out: str | Path) -> bool:
     beside = as_path(out) / "images"
     if os.path.lexists(beside):
         return False
-    beside.symlink_to(as_path(images).resolve(), target_is_directory=True)
+    beside.symlink_to(real_path(images), target_is_directory=True)
     return True
 
 
@@ -216,6 +216,13 @@ class SfmRun:
             if single and "existing_camera_id" not in reader:
                 reader.update(self._camera_of(some_names))
             self.bar.update(len(some_names))
+        with colmap.Database.open(self.database) as database:
+            read = {image.name for image in database.read_all_images()}
+        if len(read) < min(3, len(self.names)):
+            raise SceneError(
+                f"{self.images}: expected at least 3 images that can be decoded, got {len(read)} of {len(self.names)}; not "
+                f"{some([name for name in self.names if name not in read], 3)}: save them again as PNG or JPEG"
+            )
 
     def _camera_of(self, names: list[str]) -> dict[str, Any]:
         """The option that makes the next images share the camera of these; empty while no image could be read."""

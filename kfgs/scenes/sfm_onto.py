@@ -8,7 +8,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from .._files import as_path, atomic_folder, check_output
+from .._files import as_path, atomic_folder, check_output, real_path
 from .colmap import load_colmap
 from .colmap_model import ColmapModel, has_model, read_model
 from .files import SceneError, file_stem, list_images, some
@@ -73,7 +73,7 @@ def extend_sfm(
         _link(larger / "images", {**dict.fromkeys(names, pictures), **dict.fromkeys(new, images)})
         for name in KEPT:
             if (scene / name).is_file():
-                (larger / name).symlink_to((scene / name).resolve())
+                (larger / name).symlink_to(real_path(scene / name))
         run = SfmRun(pycolmap, larger / "images", [*names, *new], Path(scratch), config, bar)
         known = pycolmap.Reconstruction(str(model))
         _fill_database(pycolmap, run.database, known)
@@ -147,7 +147,7 @@ def _link(folder: Path, sources: dict[str, Path]) -> None:
     for name, source in sources.items():
         place = folder / name
         place.parent.mkdir(parents=True, exist_ok=True)
-        place.symlink_to((source / name).resolve())
+        place.symlink_to(real_path(source / name))
 
 
 def _fill_database(pycolmap: Any, path: str, known: Any) -> None:

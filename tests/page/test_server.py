@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from urllib.parse import urlsplit
 
 import pytest
@@ -282,3 +283,72 @@ def test_the_page_needs_no_torch():
         "server.PageServer(document.document('t', document.PYTHON_START)).close()\nassert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True)
+
+
+@pytest.mark.parametrize("args", [5, "words", [["a", 1]], 1.5, True])
+def test_arguments_that_are_no_object_are_named(server, args):
+    status, body, _ = ask(server, f"{secret(server)}call", "POST", pack_message({"name": "a", "args": args}))
+    told, _ = read_message(body)
+    assert status == 200
+    assert "args: expected an object" in told["error"]
+
+
+def connect(server):
+    address = urlsplit(server.url)
+    return socket.create_connection((address.hostname, address.port), timeout=20)
+
+
+def test_a_byte_now_and_then_does_not_keep_a_stranger_connected(monkeypatch):
+    monkeypatch.setattr("kfgs.page.server.PATIENCE", 1.0)
+    with PageServer(PAGE) as server, connect(server) as stranger:
+        server.show(PACK, answer)
+        began = time.monotonic()
+        with suppress(OSError):  # reset, or a broken pipe
+            while time.monotonic() - began < 15:
+                stranger.sendall(b"G")
+                time.sleep(0.1)
+        assert 0.9 < time.monotonic() - began < 10
+
+
+def test_one_who_has_shown_the_secret_may_take_his_time(monkeypatch):
+    monkeypatch.setattr("kfgs.page.server.PATIENCE", 1.0)
+    with PageServer(PAGE) as server:
+        server.show(PACK, answer)
+        body = pack_message({"name": "wait", "args": {"seconds": 2.5}})
+        assert ask(server, f"{secret(server)}call", "POST", body)[0] == 200
+
+
+def test_many_strangers_do_not_keep_the_owner_out(server, monkeypatch):
+    monkeypatch.setattr("kfgs.page.server.STRANGERS", 8)
+    strangers = [connect(server) for _ in range(30)]
+    try:
+        assert ask(server, secret(server))[0] == 200
+        assert strangers[0].recv(100) == b""  # the oldest was closed
+    finally:
+        for one in strangers:
+            one.close()
+
+
+FULL = """
+import os, resource, socket, time
+from contextlib import suppress
+from urllib.parse import urlsplit
+from kfgs.page.server import PageServer
+asked, accept = [], socket.socket.accept
+socket.socket.accept = lambda self: asked.append(1) or accept(self)
+with PageServer("<p>page</p>") as server:
+    address = urlsplit(server.url)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (40, 40))
+    one = socket.socket()
+    with suppress(OSError):
+        while True:
+            os.dup(0)
+    one.connect((address.hostname, address.port))  # the server has no handle for it
+    time.sleep(2)
+    print(len(asked))
+"""
+
+
+def test_without_file_handles_the_server_does_not_spin():
+    done = subprocess.run([sys.executable, "-c", FULL], capture_output=True, text=True, timeout=60)
+    assert 1 < int(done.stdout) < 40, done.stderr  # one in 0.1 s

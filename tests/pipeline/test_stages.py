@@ -172,3 +172,14 @@ def test_runs_from_before_cameras_had_a_near_plane_stay_valid() -> None:
     intrinsics = torch.stack([camera.K for camera in scene.cameras])
     sizes = torch.tensor([[48, 64], [48, 64]])
     assert digest_scene(scene, [0, 1]) == digest_tensors(poses, intrinsics, sizes, scene.points)
+
+
+@pytest.mark.parametrize("damage", ["", "[1, 2]", '"text"', "{", '{"a": 5}', "[" * 1000])
+def test_damaged_digests_are_made_again(damage, tmp_path):
+    (tmp_path / "a").write_text("a")
+    run = Run(tmp_path / "run")
+    right = run.digests([tmp_path / "a"])
+    kept = (tmp_path / "run" / "digests.json").read_text()
+    (tmp_path / "run" / "digests.json").write_text(damage)
+    assert Run(tmp_path / "run").digests([tmp_path / "a"]) == right
+    assert (tmp_path / "run" / "digests.json").read_text() == kept

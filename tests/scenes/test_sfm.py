@@ -172,3 +172,12 @@ def test_a_model_is_replaced_only_when_asked_and_other_files_stay(tmp_path: Path
     run_sfm(tmp_path / "photos", tmp_path / "scene", replace=True)
     assert (model / "cameras.bin").read_bytes() == b"new"
     assert (model / "notes.txt").read_text() == "mine"
+
+
+def test_files_that_are_no_pictures_are_named(tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    for name in "abcd":
+        (images / f"{name}.png").write_bytes(b"no picture")
+    with pytest.raises(SceneError, match=tells("can be decoded", "0 of 4", "a.png", "save them again")):
+        run_sfm(images, tmp_path / "scene")

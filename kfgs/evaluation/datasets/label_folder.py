@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from ..._files import as_path, read_json
+from ..._files import as_path, read_json, real_path
 from ...scenes.files import file_stem, list_images, some
 from ..class_lists import VOID_NAMES, name_key
 from ..truth import LabelTruth
@@ -75,7 +75,7 @@ def load_labels(path: str | Path, table: str | Path | None = None, void: int = 2
 
 
 def _find_table(folder: Path) -> Path:
-    places = [place / name for place in (folder, folder.resolve().parent) for name in TABLES]
+    places = [place / name for place in (folder, real_path(folder).parent) for name in TABLES]
     found = next((place for place in places if place.is_file()), None)
     if found is None:
         raise FileNotFoundError(

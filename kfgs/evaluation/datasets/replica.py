@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..._arrays import reading
-from ..._files import as_path, read_json
+from ..._files import as_path, read_json, real_path
 from ...formats.ply import points_from_columns
 from ...formats.ply_mesh import read_mesh
 from ...scenes.files import natural_key, some
@@ -80,7 +80,7 @@ def load_semantic_nerf_labels(path: str | Path, info: str | Path | None = None) 
         raise FileNotFoundError(
             f"{folder}: expected semantic_class_0.png and so on, found none; give the sequence's folder"
         )
-    above = [path, *list(path.resolve().parents)[:2]]
+    above = [path, *list(real_path(path).parents)[:2]]
     places = [as_path(info)] if info is not None else [f / name for f in above for name in (INFO, f"habitat/{INFO}")]
     found = next((place for place in places if place.is_file()), None)
     if found is None:

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import torch
 
-from ..._files import as_path
+from ..._files import real_path
 from ...cameras.similarity import Similarity
 from ...formats.splat_file import SplatFile
 from ...formats.table import read_splats
@@ -81,7 +81,7 @@ class Insert(Edit):
         """The same edit with its path relative to the folder if it lies in it, else in full."""
         if isinstance(self.source, SplatFile):
             return self
-        path, folder = as_path(self.source).resolve(), folder.resolve()
+        path, folder = real_path(self.source), real_path(folder)
         inside = path.is_relative_to(folder)
         return replace(self, source=path.relative_to(folder).as_posix() if inside else str(path))
 
@@ -118,7 +118,7 @@ def read_source(value: Any, name: str, folder: Path, anywhere: bool) -> Path:
     rooted = PurePosixPath(value).is_absolute() or bool(PureWindowsPath(value).drive or PureWindowsPath(value).root)
     path = folder / value
     real = Path(os.path.realpath(path))  # unlike resolve(), also of a name that no file system takes
-    if not anywhere and (rooted or ".." in parts or not real.is_relative_to(folder.resolve())):
+    if not anywhere and (rooted or ".." in parts or not real.is_relative_to(real_path(folder))):
         raise ValueError(
             f"{name}: expected a file in {folder} or below, got {value!r:.200}; copy it there, or load with "
             "anywhere=True if you trust these edits"

@@ -75,6 +75,9 @@ class Session:
             TypeError: for arguments of another type.
         """
         check_choice("name", name, list(self._calls))
+        for key, kind in (("sides", list), ("edits", dict)):
+            if not isinstance(args.get(key, kind()), kind):
+                raise ValueError(f"{key}: expected a {kind.__name__}, got {args[key]!r:.80}; send what the page makes")
         with self._lock:
             try:
                 return self._calls[name](args, attached)

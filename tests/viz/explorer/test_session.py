@@ -150,6 +150,8 @@ def test_what_is_like_a_selection(session):
         ),
         ("save_edits", {"edits": {"left": []}}, b"", ["side"]),
         ("save_edits", {"edits": {}}, b"", ["edits"]),
+        ("save_selection", {"sides": 5}, b"", ["sides: expected a list", "5"]),
+        ("save_edits", {"edits": 5}, b"", ["edits: expected a dict", "5"]),
         ("similar", {}, bytes(10), ["selection"]),
         ("delete", {}, b"", ["name"]),
     ],
