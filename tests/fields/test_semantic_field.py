@@ -550,7 +550,7 @@ def test_names_and_whole_numbers_in_the_place_of_embeddings():
         made.cosines("chair")
     with pytest.raises(TypeError, match=tells("target", "int64", ".float()")):
         made.query(torch.ones(DIM, dtype=torch.int64))
-    with pytest.raises(TypeError, match=tells("camera", "Gaussians", "scene.cameras")):
+    with pytest.raises(TypeError, match=tells("camera", "Gaussians", ".cameras")):
         made.render(made.gaussians)
 
 
