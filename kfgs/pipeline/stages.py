@@ -21,12 +21,14 @@ from torch import Tensor
 
 from .._arrays import reading
 from .._compiling import say_compiling
-from .._files import atomic_folder, digest_file, digest_value, finish_writing, locked, read_json, write_json
+from .._files import atomic_folder, check_inside, digest_file, digest_value, finish_writing, locked, read_json, write_json
 from ..cameras import Camera
 from ..cameras.camera import NEAR
 from ..scenes import Scene
 
-STAGE_FILE, LOCK = "stage.json", ".run.lock"
+STAGE_FILE, LOCK, DIGESTS = "stage.json", ".run.lock", "digests.json"
+WRITTEN = ("field", "field@*", "stages", "stages/*", "unfinished", "unfinished/*", "teacher", "teacher/*")
+"""The folders in a run folder that are written to."""
 STAGE_VERSION = 2
 """Part of every key: raised if the same inputs give another result in a new version, so that old stages are not reused."""
 
@@ -119,8 +121,10 @@ class Run:
         """Keep other processes from working in the folder, and finish what a killed one began to write there.
 
         Raises:
-            ValueError: if one works there already; the message says which. Nothing is written then.
+            ValueError: if one works there already; the message says which. Also if a folder in it is a link. Nothing is
+                written then.
         """
+        check_inside(self.folder, (place.relative_to(self.folder) for name in WRITTEN for place in self.folder.glob(name)))
         with locked(self.folder, LOCK):
             for place in (self.folder, self.folder / "field"):  # a run that finds all it needs writes neither
                 finish_writing(place)
@@ -135,14 +139,13 @@ class Run:
 
         With `look_only`, a file that would have to be read gets "unknown", which matches no finished stage.
         """
-        cache_path = self.folder / "digests.json"
-        cache: dict[str, Any] = read_json(cache_path) if cache_path.is_file() else {}
+        cache = _known_digests(self.folder / DIGESTS)
         result, changed = [], False
         for path in paths:
             info = path.stat()
             mark = [info.st_size, info.st_mtime_ns, info.st_ctime_ns]
             known = cache.get(str(path.resolve()))
-            if known is None or known[:-1] != mark:
+            if not (isinstance(known, list) and known[:-1] == mark and isinstance(known[-1], str)):
                 if self.look_only:
                     result.append([path.name, "unknown"])
                     continue
@@ -151,13 +154,22 @@ class Run:
                 changed = True
             result.append([path.name, known[-1]])
         if changed:
-            write_json(cache_path, cache)
+            write_json(self.folder / DIGESTS, cache)
         return result
 
     def say(self, text: str) -> None:
         """Report a line, if anyone listens."""
         if self.report is not None:
             self.report(text)
+
+
+def _known_digests(path: Path) -> dict[str, Any]:
+    """The digests that are kept; none if the file is missing or damaged: it is made again."""
+    try:
+        found = read_json(path)
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def _key(name: str, inputs: dict[str, Any]) -> str:

@@ -96,3 +96,26 @@ def test_pictures_and_maps_stay_apart(tmp_path):
     assert check_output("out", tmp_path / "run", "a folder", apart=[images])
     refused(tmp_path / "link", "a folder", "pictures", other=[None, images])
     assert check_output("out", images / "run", "a folder", other=[None, images])
+
+
+def test_an_empty_path_is_not_the_current_folder():
+    with pytest.raises(ValueError, match=tells("path:", "empty")):
+        as_path("")
+    refused("", "a folder", "empty")
+
+
+def test_a_pipe_is_no_output(tmp_path):
+    os.mkfifo(tmp_path / "pipe.ply")
+    with pytest.raises(ValueError, match=tells(tmp_path / "pipe.ply", "pipe")):
+        check_output("out", tmp_path / "pipe.ply", "a file")
+
+
+@pytest.mark.parametrize("place", ["sparse", "sparse/0"])
+def test_links_inside_an_output_are_refused_and_the_output_itself_may_be_one(tmp_path, place):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "out" / place).parent.mkdir(parents=True)
+    (tmp_path / "out" / place).symlink_to(tmp_path / "mine")
+    (tmp_path / "link").symlink_to("mine")
+    with pytest.raises(ValueError, match=tells(tmp_path / "out" / place, "a link", tmp_path / "mine")):
+        check_output("out", tmp_path / "out", "a folder", inside=["sparse/0"])
+    assert check_output("out", tmp_path / "link", "a folder", inside=["sparse/0"])
