@@ -40,7 +40,7 @@ def check_own(path: Path, ours: Callable[[Path], bool], writer: str) -> None:
 
     Args:
         path: the file.
-        ours: whether an existing file is what `writer` wrote; if it raises an OSError or a ValueError, it is not.
+        ours: whether an existing file is what `writer` wrote; if it cannot be read, or has no such part, it is not.
         writer: for the message: "kfgs edit".
 
     Raises:
@@ -50,7 +50,7 @@ def check_own(path: Path, ours: Callable[[Path], bool], writer: str) -> None:
         return
     try:
         known = path.is_file() and not path.is_symlink() and ours(path)
-    except (OSError, ValueError):
+    except (OSError, ValueError, LookupError, TypeError):
         known = False
     if not known:
         raise FileExistsError(

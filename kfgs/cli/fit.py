@@ -8,7 +8,7 @@ import shlex
 from pathlib import Path
 from typing import Any, Literal
 
-from .._files import check_output
+from .._files import check_output, check_own, read_json
 from .features import check_discard, choose_teacher, stored_maps
 from .files import check_alone, inputs_of, is_field, open_field, open_splats
 from .options import FieldMethod, Flag, Given, Maps, MapTeacher, Positional, SceneFolder, Training, Views, fit_config
@@ -66,8 +66,7 @@ def sfm(
     """
     from ..scenes import SfmConfig, run_sfm
 
-    check_output("out", out, "a folder", other=[images])
-
+    check_output("out", out, "a folder", other=[images], inside=["sparse/0"])
     config = SfmConfig(
         matching=matching,
         camera_model=camera_model,
@@ -238,12 +237,15 @@ def color(
         fields = dataclasses.replace(fields, max_gaussians=training.max_gaussians)
     config = dataclasses.replace(config, seed=training.seed, split=views.split, field=fields)
     loaded = views.load(scene).undistorted()
+    tested = [loaded.stem(i) for i in loaded.views("test")] if loaded.splits.get("test") else []
+    if tested:
+        check_own(out / "scores.json", lambda path: bool(read_json(path)["color"]), "kfgs color")
+        beside = PhotoPictures(out / "views", tested, pictures)
     result = fit_color(loaded, out, config, report=say, progress=True, device=training.device)
     took = f"{result.seconds / 60:.1f} min" if result.seconds >= 60 else f"{result.seconds:.0f} s"
     say(f"{result.gaussians!r} in {took}")
     written = [result.path]
-    if loaded.splits.get("test"):
-        beside = PhotoPictures(out / "views", [loaded.stem(i) for i in loaded.views("test")], pictures)
+    if tested:
         scores = score_views(result.gaussians, loaded, "test", show=beside)
         say(str(scores))
         write_report(out / "scores.json", color=scores)

@@ -13,13 +13,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._check import one_line
-from .._files import as_path, bytes_in_words, digest_file, locked, seconds_in_words
+from .._files import as_path, bytes_in_words, check_inside, digest_file, locked, seconds_in_words
 from ..scenes import Scene
 from ..teachers.protocol import Teacher, as_teacher, identify
 from .layouts import map_file, write_npy_map
 from .manifest import MANIFEST, Manifest, MapRecord, read_manifest
 from .pictures import Picture, Split, as_pictures
-from .writer import LOCK, MapWriter, encode_half
+from .writer import LOCK, MapWriter, check_maps, encode_half
 
 
 def extract_features(
@@ -63,8 +63,11 @@ def extract_features(
         OSError: if the folder cannot be written to, or the disk has no space for the maps.
     """
     folder, teacher, chosen = as_path(folder), as_teacher(teacher), as_pictures(pictures, split, exist=True)
+    check_inside(folder, (Path(picture.stem).parent for picture in chosen))
+    identity = identify(teacher)
+    check_maps(folder, identity, chosen, overwrite=overwrite)  # a folder that is refused stays as it is
     with locked(folder, LOCK):
-        writer = MapWriter(folder, identify(teacher), chosen, overwrite=overwrite)
+        writer = MapWriter(folder, identity, chosen, overwrite=overwrite)
         digests = {picture.stem: digest_file(picture.path) for picture in chosen}
         doubts = {stem: writer.doubt(stem, digest) for stem, digest in digests.items()}
         todo = [picture for picture in chosen if doubts[picture.stem] is not None]

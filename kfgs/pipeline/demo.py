@@ -16,6 +16,7 @@ from ..formats import SplatFile, write_splats
 from ..formats.ply import write_ply
 from ..gaussians import Gaussians
 from ..labels import EditList, OfClass, Recolor, Remove, connected_parts, parse_color
+from ..labels.edits.edit_list import edits_path
 from ..scenes import Scene, load_scene
 from ..toy.room_folder import ToyConfig, make_toy_room
 from .apply import (
@@ -36,6 +37,7 @@ from .run_report import write_run_report
 
 REMOVED, PAINTED, PAINT = "chair", "plant", "#c04040"  # the edits of the paper's Figures 5 and 4
 TITLES = ("before", "after")
+FOLDERS = ("scene", "run", "segmentation")
 
 
 def run(
@@ -55,7 +57,7 @@ def run(
         report: called with one line per step.
         progress: show progress bars.
     """
-    out, say = check_output("out", out, "a folder"), report or (lambda text: None)
+    out, say = check_output("out", out, "a folder", inside=FOLDERS), report or (lambda text: None)
     config = config or FitConfig.cpu()
     say("making the toy room")
     folder = make_toy_room(out / "scene", room or ToyConfig())
@@ -132,7 +134,7 @@ def _edit_colors(
     edits = {"removed": EditList((Remove(OfClass(REMOVED)),)), "recolored": EditList((Recolor(OfClass(PAINTED), rgb),))}
     after = {name: edit.apply(splats) for name, edit in edits.items()}
     for name, edit in edits.items():
-        written += [*write_splats(out / f"{name}.ply", after[name]).paths, edit.save(out / f"{name}.edits.json")]
+        written += [*write_splats(out / f"{name}.ply", after[name]).paths, edit.save(edits_path(out / f"{name}.ply"))]
         before_after = splats.gaussians, after[name].gaussians
         views = views_of_change(*before_after, scene.cameras)
         picture = out / f"{name}.png"
