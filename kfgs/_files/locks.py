@@ -89,7 +89,8 @@ def locked(folder: Path, name: str) -> Iterator[None]:
         os.lseek(handle, 0, os.SEEK_SET)
         os.truncate(handle, 0)
         command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])[:200]
-        os.write(handle, f"{MARK.decode()}{os.getpid()} of {socket.gethostname()} ({command}, since {time.ctime()})".encode())
+        holder = f"{os.getpid()} of {socket.gethostname()} ({command}, since {time.ctime()})"
+        os.write(handle, MARK + holder.encode())
         yield
     finally:
         os.close(handle)

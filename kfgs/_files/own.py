@@ -10,7 +10,9 @@ from pathlib import Path
 def check_ordinary(path: Path) -> None:
     """Raise a ValueError if there is a pipe, socket or device at a path, or behind a link there."""
     if path.exists() and not path.is_file() and not path.is_dir():
-        raise ValueError(f"{path}: expected an ordinary file or nothing there, got a pipe or a device; give another name")
+        raise ValueError(
+            f"{path}: expected an ordinary file or nothing there, got a pipe or a device; give another name"
+        )
 
 
 def check_inside(folder: Path, names: Iterable[str | Path]) -> None:

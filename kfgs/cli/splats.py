@@ -153,7 +153,8 @@ def edit(
     if cameras and pictures and not shown:
         say("note: no view of the scene shows a change")
     if shown:
-        paths.append(write_comparison(out.with_name(f"{out.name}.png"), before.gaussians, after.gaussians, shown, titles=TITLES))
+        picture = out.with_name(f"{out.name}.png")
+        paths.append(write_comparison(picture, before.gaussians, after.gaussians, shown, titles=TITLES))
         say("before and after from " + ", ".join(camera.name for camera in shown))
     wrote(paths)
 

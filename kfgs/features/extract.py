@@ -65,7 +65,8 @@ def extract_features(
     folder, teacher, chosen = as_path(folder), as_teacher(teacher), as_pictures(pictures, split, exist=True)
     check_inside(folder, (Path(picture.stem).parent for picture in chosen))
     identity = identify(teacher)
-    check_maps(folder, identity, chosen, overwrite=overwrite)  # a folder that is refused stays as it is
+    if folder.is_dir():  # one that is refused stays as it is, without a lock file
+        check_maps(folder, identity, chosen, overwrite=overwrite)
     with locked(folder, LOCK):
         writer = MapWriter(folder, identity, chosen, overwrite=overwrite)
         digests = {picture.stem: digest_file(picture.path) for picture in chosen}

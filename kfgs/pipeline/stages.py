@@ -21,7 +21,16 @@ from torch import Tensor
 
 from .._arrays import reading
 from .._compiling import say_compiling
-from .._files import atomic_folder, check_inside, digest_file, digest_value, finish_writing, locked, read_json, write_json
+from .._files import (
+    atomic_folder,
+    check_inside,
+    digest_file,
+    digest_value,
+    finish_writing,
+    locked,
+    read_json,
+    write_json,
+)
 from ..cameras import Camera
 from ..cameras.camera import NEAR
 from ..scenes import Scene
@@ -124,7 +133,9 @@ class Run:
             ValueError: if one works there already; the message says which. Also if a folder in it is a link. Nothing is
                 written then.
         """
-        check_inside(self.folder, (place.relative_to(self.folder) for name in WRITTEN for place in self.folder.glob(name)))
+        check_inside(
+            self.folder, (place.relative_to(self.folder) for name in WRITTEN for place in self.folder.glob(name))
+        )
         with locked(self.folder, LOCK):
             for place in (self.folder, self.folder / "field"):  # a run that finds all it needs writes neither
                 finish_writing(place)

@@ -195,9 +195,14 @@ def test_a_folder_in_a_folder_is_not_joined_with_what_a_link_leads_to(tmp_path):
     (tmp_path / "mine" / "a.png").write_text("mine")
     (tmp_path / "scene").mkdir()
     (tmp_path / "scene" / "images").symlink_to("../mine")
-    with pytest.raises(ValueError, match=tells("images", "a link")), atomic_folder(tmp_path / "scene") as temporary:
-        (temporary / "images").mkdir()
-        (temporary / "images" / "a.png").write_text("new")
+
+    def write():
+        with atomic_folder(tmp_path / "scene") as new:
+            (new / "images").mkdir()
+            (new / "images" / "a.png").write_text("new")
+
+    with pytest.raises(ValueError, match=tells("images", "a link")):
+        write()
     assert (tmp_path / "mine" / "a.png").read_text() == "mine"
 
 

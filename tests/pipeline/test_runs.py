@@ -14,7 +14,15 @@ from kfgs.features import FeatureFolder
 from kfgs.fields import SemanticField
 from kfgs.gaussians import Gaussians
 from kfgs.pipeline import FitConfig, fit_scene
-from kfgs.pipeline.runs import check_current, compare_fields, find_run_field, keep_field, list_fields, restore_field, say_kept
+from kfgs.pipeline.runs import (
+    check_current,
+    compare_fields,
+    find_run_field,
+    keep_field,
+    list_fields,
+    restore_field,
+    say_kept,
+)
 from kfgs.pipeline.stages import LOCK, Run
 from kfgs.scenes import load_scene
 
