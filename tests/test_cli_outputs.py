@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
 from messages import tells
@@ -14,6 +15,7 @@ from small_room import fit_run, make_room
 from kfgs.cli import main
 from kfgs.fields import SemanticField
 from kfgs.formats import write_splats
+from kfgs.formats.ply import write_ply
 from kfgs.gaussians import Gaussians
 from kfgs.pipeline.runs import list_fields
 
@@ -301,12 +303,20 @@ def test_what_killed_commands_left_is_swept_by_the_next(splat, tmp_path):
         shutil.rmtree(place)
 
 
-@pytest.mark.parametrize("limit", [200, 3_000, 9_000, 20_000])
-@pytest.mark.parametrize("words", ["label {run}/field", "select chair {run}/field --scene {room}"])
-def test_a_disk_that_takes_no_more_leaves_the_older_folder_whole(words, limit, room, run, tmp_path):
-    """A limit between the sizes of the files: one of them could be written."""
+@pytest.mark.parametrize(
+    ("words", "limit"),
+    [
+        ("label {run}/field --cloud {cloud} --distance 1", 600_000),  # gaussians.ply is smaller, cloud.ply larger
+        ("label {run}/field", 3_000),
+        ("select chair {run}/field --scene {room}", 20_000),  # selection.ply and selection.json are smaller
+        ("select chair {run}/field --scene {room}", 200),
+    ],
+)
+def test_a_disk_that_takes_no_more_leaves_no_half_of_a_folder(words, limit, room, run, tmp_path):
+    """A limit between the sizes of the files: some of them can be written."""
+    write_ply(tmp_path / "cloud.ply", {name: np.random.default_rng(0).random(100_000, np.float32) for name in "xyz"})
     out = tmp_path / "out"
-    arguments = [*words.format(room=room, run=run).split(), "--out", str(out)]
+    arguments = [*words.format(room=room, run=run, cloud=tmp_path / "cloud.ply").split(), "--out", str(out)]
     done = subprocess.run([sys.executable, "-c", LIMITED, str(limit), *arguments], capture_output=True, text=True)
     assert done.returncode == 1, done.stderr
     (error,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]

@@ -13,7 +13,15 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._check import one_line
-from .._files import as_path, bytes_in_words, check_inside, digest_file, locked, seconds_in_words
+from .._files import (
+    as_path,
+    bytes_in_words,
+    check_inside,
+    digest_file,
+    finish_writing,
+    locked,
+    seconds_in_words,
+)
 from ..scenes import Scene
 from ..teachers.protocol import Teacher, as_teacher, identify
 from .layouts import map_file, write_npy_map
@@ -68,6 +76,8 @@ def extract_features(
     if folder.is_dir():  # one that is refused stays as it is, without a lock file
         check_maps(folder, identity, chosen, overwrite=overwrite)
     with locked(folder, LOCK):
+        for place in {folder, *(map_file(folder, picture.stem).parent for picture in chosen)}:
+            finish_writing(place)  # if all maps are there, nothing is written that would sweep
         writer = MapWriter(folder, identity, chosen, overwrite=overwrite)
         digests = {picture.stem: digest_file(picture.path) for picture in chosen}
         doubts = {stem: writer.doubt(stem, digest) for stem, digest in digests.items()}

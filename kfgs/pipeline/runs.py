@@ -1,7 +1,7 @@
 """The fields of a run folder: the current one (`field`), and earlier ones (`field@<key>`), which are kept and can come back.
 
-What shows a field to people, its report and pictures, lies in the run folder while the field is current, and beside the field
-while it is kept. It is moved out before the field changes, so that a kill leaves no report rather than another field's.
+What shows a field to people, its report and pictures, lies in the run folder while the field is current. Before another one
+takes its place, they are moved to the kept field, so that a kill leaves no report rather than another field's.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from .._check import one_line
-from .._files import as_path, atomic_folder, current_file, digest_value
+from .._files import as_path, atomic_folder, atomic_path, current_file, digest_value
 from ..fields.store import DESCRIPTION, TENSORS, check_place, describes_field, load_field, read_description
 from .stages import Run
 
@@ -116,7 +116,8 @@ def keep_field(folder: Path) -> RunField | None:
     kept = _place_of(now)
     if not _holds(kept, now.key, whole=True):
         _copy(now.path, kept)
-    _move_shown(folder, kept)
+    for shown in _shown_in(folder):
+        os.replace(shown, kept / shown.name)
     return _read(kept)
 
 
@@ -125,7 +126,8 @@ def say_kept(run: Run, before: RunField | None) -> None:
     if before is None:
         return
     if _read(run.folder / FIELD).key == before.key:
-        _move_shown(before.path, run.folder)
+        for shown in _shown_in(before.path):
+            os.replace(shown, run.folder / shown.name)
         for name in (DESCRIPTION, TENSORS):
             current_file(before.path, name).unlink()
         with suppress(OSError):  # it holds files of the user
@@ -153,7 +155,9 @@ def restore_field(folder: str | Path, key: str) -> RunField:
         if not wanted.current:
             keep_field(folder)
             _copy(wanted.path, folder / FIELD)
-        _move_shown(_place_of(wanted) if wanted.current else wanted.path, folder)  # also if a killed one came so far
+        for shown in _shown_in(_place_of(wanted) if wanted.current else wanted.path):  # also after a kill
+            with atomic_path(folder / shown.name) as new:
+                shutil.copy2(shown, new)
     return _read(folder / FIELD, current=True)
 
 
@@ -224,11 +228,9 @@ def _check_whole(path: Path) -> None:
         ) from error
 
 
-def _move_shown(source: Path, target: Path) -> None:
-    """Move the report and the pictures of a field."""
-    for name in SHOWN:
-        with suppress(FileNotFoundError):
-            os.replace(source / name, target / name)
+def _shown_in(folder: Path) -> list[Path]:
+    """The report and the pictures of a field."""
+    return [folder / name for name in SHOWN if (folder / name).is_file()]
 
 
 def _copy(source: Path, target: Path) -> None:

@@ -209,6 +209,10 @@ def test_killed_in_the_middle_it_goes_on_and_redoes_no_picture(tmp_path, monkeyp
     exec(CHILD, {})
     assert len(log.read_text().split()) == 3 + 3  # the third was in hand
     assert sorted(path.name for path in folder.iterdir()) == [LOCK, *(f"{i}.npy" for i in range(5)), "features.json"]
+    left.mkdir(parents=True)
+    (left / ".kfgs-lock").touch()  # as if it had died after its last map, before it could tidy up
+    exec(CHILD, {})
+    assert sorted(path.name for path in folder.iterdir()) == [LOCK, *(f"{i}.npy" for i in range(5)), "features.json"]
     monkeypatch.setattr(sys, "argv", ["", str(tmp_path), str(tmp_path / "log2"), "quick", "whole"])
     exec(CHILD, {})
     assert contents(folder) == contents(tmp_path / "whole")
