@@ -329,8 +329,7 @@ def _retold(error: Exception, place: Path, target: Path) -> OSError | None:
     code = int(rust[1]) if rust else getattr(error, "errno", None)
     if code == errno.ENOENT and place.name.startswith(NEW) and not place.exists():
         return FileNotFoundError(
-            f"{target}: expected its folder to stay while it is written, but it was deleted or moved meanwhile; start again, "
-            "and what is still there will be used"
+            f"{target}: expected its folder to stay while it is written, but it was deleted or moved meanwhile; start again"
         )
     free = _free(place)
     if told or code in FULL or SHORT in text or free < LEAST:

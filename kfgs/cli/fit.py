@@ -118,6 +118,7 @@ def fit(
     from .._files import bytes_in_words
     from ..features import RecomputedMaps, discard_maps
     from ..pipeline import fit_scene, write_run_report
+    from ..pipeline.run_report import check_report
     from ..pipeline.train import check_scene
 
     config = fit_config(
@@ -125,6 +126,7 @@ def fit(
     )
     config = dataclasses.replace(config, undistorted_features=maps.undistorted_features, device=training.device)
     check_output("out", out, "a folder", apart=inputs_of(scene, views.images), other=[maps.features])
+    check_report(out)
     if method.method == "paper":
         check_alone("splat", splat, "with --method paper, which trains its own Gaussians")
     elif splat is not None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from .._files import check_output
+from .._files import check_output, check_own
 from ..evaluation import LabelSet, load_label_set, score_recolor, score_removal, score_surface, score_views
 from ..evaluation.datasets.surface_points import load_surface_points
 from ..evaluation.surface import SurfaceReport
@@ -38,6 +38,8 @@ from .run_report import write_run_report
 REMOVED, PAINTED, PAINT = "chair", "plant", "#c04040"  # the edits of the paper's Figures 5 and 4
 TITLES = ("before", "after")
 FOLDERS = ("scene", "run", "segmentation")
+SPLATS, PICTURES = ("gaussians", "surface", "color", "removed", "recolored"), ("removed", "recolored")
+FILES = (*(f"{name}.ply" for name in SPLATS), *(f"{name}.png" for name in PICTURES), "scores.json")
 
 
 def run(
@@ -59,6 +61,9 @@ def run(
     """
     out, say = check_output("out", out, "a folder", inside=FOLDERS), report or (lambda text: None)
     config = config or FitConfig.cpu()
+    if not (out / "scene" / "toy.json").is_file():  # then no demo was here
+        for name in FILES:
+            check_own(out / name, lambda _: False, "kfgs demo")
     say("making the toy room")
     folder = make_toy_room(out / "scene", room or ToyConfig())
     scene = load_scene(folder)
