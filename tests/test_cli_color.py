@@ -262,7 +262,16 @@ def test_edit_takes_the_parts_that_select_lists(labelled, tmp_path, capsys):
     found, cloud = read_splats(tmp_path / "e.ply"), read_splats(labelled)
     assert torch.equal(found.gaussians.means, cloud.gaussians.means[parts[1]["indices"]])
     assert (
-        main(["edit", str(labelled), "--out", str(tmp_path / "again.ply"), "--replay", str(tmp_path / "e.edits.json")])
+        main(
+            [
+                "edit",
+                str(labelled),
+                "--out",
+                str(tmp_path / "again.ply"),
+                "--replay",
+                str(tmp_path / "e.ply.edits.json"),
+            ]
+        )
         == 0
     )
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "e.ply").read_bytes()
@@ -303,11 +312,11 @@ def test_edits_are_replayed_to_the_same_bytes_from_anywhere(labelled, tmp_path, 
     moved = before.gaussians.means[old["lamp"]] + torch.tensor([0.0, 0.0, 0.5])
     torch.testing.assert_close(found.gaussians.means[masks["lamp"]], moved)
     # The inserted file lies in another folder than the saved edits: they are the user's own, and trusted.
-    arguments = ["edit", str(labelled), "--out", str(again), "--replay", str(tmp_path / "b" / "e.edits.json")]
+    arguments = ["edit", str(labelled), "--out", str(again), "--replay", str(tmp_path / "b" / "e.ply.edits.json")]
     assert main(arguments) == 0
     assert again.read_bytes() == whole.read_bytes()
     assert main([*arguments, "--remove", "chair"]) == 0
-    assert [one["op"] for one in json.loads((tmp_path / "c" / "e.edits.json").read_text())["edits"]] == [
+    assert [one["op"] for one in json.loads((tmp_path / "c" / "e.ply.edits.json").read_text())["edits"]] == [
         "remove",
         "insert",
         "remove",
@@ -320,31 +329,31 @@ def test_edit_shows_before_and_after(labelled, room, tmp_path, capsys):
     assert main([*arguments, "--pictures", "1"]) == 0
     said = capsys.readouterr().out
     assert "before and after from view_" in said
-    picture = np.asarray(Image.open(tmp_path / "e.png")).astype(int)
+    picture = np.asarray(Image.open(tmp_path / "e.spz.png")).astype(int)
     left, right = picture[-66:-6, 6:86], picture[-66:-6, 92:172]
     assert (np.abs(left - right).max(-1) > 8).mean() > 0.02
     assert main([*arguments, "--views", "view_003", "--views", "view_001.png"]) == 0
     assert "from view_003.png, view_001.png" in capsys.readouterr().out
-    with Image.open(tmp_path / "e.png") as both:
+    with Image.open(tmp_path / "e.spz.png") as both:
         assert both.height == picture.shape[0] + 66
-    (tmp_path / "e.png").unlink()
+    (tmp_path / "e.spz.png").unlink()
     assert main([*arguments, "--recolor", "lamp:#00ff00", "--pictures", "2"]) == 0
     chosen = capsys.readouterr().out.split("before and after from ")[1].splitlines()[0].split(", ")
-    before, edits = read_splats(labelled), EditList.load(tmp_path / "e.edits.json")
+    before, edits = read_splats(labelled), EditList.load(tmp_path / "e.spz.edits.json")
     cameras = load_scene(room).cameras
     states = [before, *(EditList(edits.edits[: i + 1]).apply(before) for i in range(2))]
     expected = views_of_edits([state.gaussians for state in states], cameras, 2)
     assert chosen == [cameras[i].name for i in expected]
-    (tmp_path / "e.png").unlink()
+    (tmp_path / "e.spz.png").unlink()
     assert main([*arguments, "--pictures", "0"]) == 0
-    assert not (tmp_path / "e.png").exists()
+    assert not (tmp_path / "e.spz.png").exists()
 
 
 def test_an_edit_that_no_view_shows_gets_no_picture(labelled, room, tmp_path, capsys):
     arguments = ["edit", str(labelled), "--out", str(tmp_path / "e.ply"), "--move", "table:0,0,0"]
     assert main([*arguments, "--scene", str(room)]) == 0
     assert "no view of the scene shows a change" in capsys.readouterr().out
-    assert not (tmp_path / "e.png").exists()
+    assert not (tmp_path / "e.ply.png").exists()
 
 
 def test_everything_may_be_removed(labelled, room, tmp_path, capsys):

@@ -126,12 +126,12 @@ ERRORS = {
             ("--views:", "got 'view_001.png' twice"),
         ),
         (
-            ["{labelled}", "--out", "{same}.ply", "--replay", "{same}.edits.json"],
-            ("--replay:", "{same}.edits.json", "{same}.ply", "got the same", "--out"),
+            ["{labelled}", "--out", "{same}.ply", "--replay", "{same}.ply.edits.json"],
+            ("--replay:", "{same}.ply.edits.json", "{same}.ply", "got the same", "--out"),
         ),
         (
             ["{labelled}", "--out", "{taken}.ply", "--remove", "rug"],
-            ("--out:", "{taken}.edits.json", "got a folder"),
+            ("--out:", "{taken}.ply.edits.json", "got a folder"),
         ),
         (
             ["{labelled}", "--out", "{o}.ply", "--remove", "chair/0"],
@@ -191,8 +191,8 @@ def places(tmp_path_factory):
     write_splats(folder / "plain.ply", SplatFile(cloud.gaussians.replace(sh=None), {}, cloud.classes))
     four = read_splats(splat).gaussians.select(torch.arange(4))
     write_splats(folder / "four.ply", four.replace(means=four.means + 100))
-    same = EditList((Remove("rug"),)).save(folder / "same.edits.json")
-    (folder / "taken.edits.json").mkdir()
+    same = EditList((Remove("rug"),)).save(folder / "same.ply.edits.json")
+    (folder / "taken.ply.edits.json").mkdir()
     paths = {"room": room, "field": field, "run": field.parent, "splat": splat, "labelled": labelled, "saved": same}
     paths |= {"same": folder / "same", "taken": folder / "taken"}
     paths |= {name: folder / f"{name}.ply" for name in ("plain", "four")}

@@ -19,6 +19,7 @@ from .atomic import (
     open_current,
 )
 from .locks import InUseError, locked
+from .own import check_inside, check_own
 from .paths import as_path, check_output, real_path
 
 __all__ = [
@@ -29,7 +30,9 @@ __all__ = [
     "atomic_folder",
     "atomic_path",
     "bytes_in_words",
+    "check_inside",
     "check_output",
+    "check_own",
     "current_file",
     "digest_file",
     "digest_value",

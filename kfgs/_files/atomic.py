@@ -24,10 +24,11 @@ from pathlib import Path
 from typing import TypeVar
 
 from .former import sweep_former
-from .locks import try_lock
-from .paths import as_path, check_ordinary
+from .locks import open_lock, try_lock
+from .own import check_inside, check_ordinary
+from .paths import as_path
 
-HIDDEN, WAITING, LOCK = ".kfgs-unfinished", "waiting", ".kfgs-lock"
+HIDDEN, WAITING, LOCK, NEW = ".kfgs-unfinished", "waiting", ".kfgs-lock", "new-"
 ATTEMPTS = 100  # to put a folder where other processes put theirs
 FULL = (errno.ENOSPC, errno.EDQUOT)
 UNNAMED = (*FULL, errno.EIO, errno.EFBIG, errno.EROFS)  # errors of writing, which Python raises without a file
@@ -54,12 +55,12 @@ UMASK = _read_umask()  # once: it can only be read by setting it, for all thread
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Give a hidden path of the same name to write a file to, and move it to `path` if the block succeeds.
 
-    If `path` is a link, the new file takes its place; the file that it leads to stays as it is.
+    If `path` is a link, the new file takes its place; what the link leads to stays as it is.
 
     Raises:
+        ValueError: if a pipe or device is there, or a link in place of the hidden folder.
         FullDiskError: if the disk is full.
         OSError: if `path` cannot be written; all errors name `path`, none the hidden one.
-        ValueError: if `path` is a device or a pipe.
     """
     target = as_path(path)
     check_ordinary(target)
@@ -76,7 +77,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Give a hidden folder to fill, and put it to `path` if the block succeeds. Errors are those of `atomic_path`.
 
     If `path` holds files already, the new ones replace those of the same names, all others stay. Read such a folder with
-    `current_file`. A link to a folder stays a link.
+    `current_file`. A link to a folder stays a link; links in that folder to others are not followed.
     """
     target = Path(os.path.realpath(as_path(path)))
     used = _is_used(target)
@@ -95,8 +96,9 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 
 def current_file(folder: Path, name: str) -> Path:
     """Where a file of a folder is that `atomic_folder` wrote, also if its writer was killed while moving the files."""
-    waiting = folder / HIDDEN / WAITING / name
-    return waiting if waiting.exists() else folder / name
+    waiting = folder / HIDDEN / WAITING
+    there = (waiting / name).exists() and not waiting.is_symlink() and not waiting.parent.is_symlink()
+    return waiting / name if there else folder / name
 
 
 def open_current(folder: Path, read: Callable[[Callable[[str], Path]], T]) -> T:
@@ -156,9 +158,13 @@ def hidden_folder(parent: Path, target: Path | None = None) -> Iterator[Path]:
     Args:
         parent: a folder.
         target: what is written, for errors: they name it instead of the hidden folder.
+
+    Raises:
+        ValueError: if a link is in place of the hidden folder: it could lead anywhere.
     """
     shown = parent if target is None else target
     hidden = parent / HIDDEN
+    check_inside(parent, [f"{HIDDEN}/{WAITING}"])
     try:
         _sweep(hidden)
         place, handle = _take(hidden)
@@ -183,8 +189,8 @@ def _take(hidden: Path) -> tuple[Path, int]:
     while True:
         try:
             hidden.mkdir(parents=True, exist_ok=True)
-            place = Path(tempfile.mkdtemp(prefix="new-", dir=hidden))
-            handle = os.open(place / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+            place = Path(tempfile.mkdtemp(prefix=NEW, dir=hidden))
+            handle = open_lock(place / LOCK)
         except (FileNotFoundError, FileExistsError):  # another process deleted one of them, which was empty
             if not hidden.parent.is_dir() or hidden.is_file():
                 raise
@@ -200,12 +206,12 @@ def _sweep(hidden: Path) -> None:
         names = [] if hidden.is_symlink() else os.listdir(hidden)
     except FileNotFoundError:  # never there, or another process has just deleted it
         return
-    for place in (hidden / name for name in names if name.startswith("new-")):
+    for place in (hidden / name for name in names if name.startswith(NEW)):
         if place.is_symlink():
             continue
         try:
-            handle = os.open(place / LOCK, os.O_RDWR)
-        except OSError:  # its writer ended before locking it; if it lives, it makes another
+            handle = open_lock(place / LOCK, new=False)
+        except (OSError, ValueError):  # its writer ended before locking it; if it lives, it makes another
             with suppress(OSError):
                 place.rmdir()
             continue
@@ -262,6 +268,7 @@ def _put(new: Path, target: Path) -> None:
 def finish_writing(folder: Path) -> None:
     """Finish what killed writers began in a folder, and delete what they left. A reader needs it not; it tidies up."""
     hidden = folder / HIDDEN
+    check_inside(folder, [f"{HIDDEN}/{WAITING}"])
     if hidden.is_dir():
         _settle(folder)
         _tidy(hidden)
@@ -269,11 +276,11 @@ def finish_writing(folder: Path) -> None:
 
 def _settle(folder: Path) -> None:
     """Move waiting files to their places in a folder. Several processes may do so at once."""
+    check_inside(folder, [f"{HIDDEN}/{WAITING}"])
     waiting = folder / HIDDEN / WAITING
-    if not waiting.is_symlink() and not waiting.parent.is_symlink():  # a stranger's link could lead anywhere
-        _move_in(waiting, folder)
-        with suppress(OSError):
-            waiting.parent.rmdir()
+    _move_in(waiting, folder)
+    with suppress(OSError):
+        waiting.parent.rmdir()
 
 
 def _move_in(source: Path, target: Path) -> None:
@@ -285,6 +292,7 @@ def _move_in(source: Path, target: Path) -> None:
     for entry in entries:
         with suppress(FileNotFoundError):  # another process moved it
             if entry.is_dir(follow_symlinks=False) and (target / entry.name).is_dir():
+                check_inside(target, [entry.name])
                 _move_in(Path(entry.path), target / entry.name)
             else:
                 os.replace(entry.path, target / entry.name)
@@ -296,6 +304,8 @@ def _check_kinds(new: Path, target: Path) -> None:
     """Raise unless files would replace files, and folders join folders: a move that has begun must come to its end."""
     for path in new.rglob("*"):
         there = target / path.relative_to(new)
+        if path.is_dir():
+            check_inside(target, [path.relative_to(new)])
         if os.path.lexists(there) and path.is_dir() != there.is_dir():
             raise IsADirectoryError(errno.EISDIR, "a folder is in place of a file, or a file of a folder", str(there))
 
@@ -317,6 +327,10 @@ def _retold(error: Exception, place: Path, target: Path) -> OSError | None:
         return None
     rust = re.search(r"\(os error (\d+)\)", text)  # of safetensors
     code = int(rust[1]) if rust else getattr(error, "errno", None)
+    if code == errno.ENOENT and place.name.startswith(NEW) and not place.exists():
+        return FileNotFoundError(
+            f"{target}: expected its folder to stay while it is written, but it was deleted or moved meanwhile; start again"
+        )
     free = _free(place)
     most = _largest_file()
     if code == errno.EFBIG or (SHORT in text and LEAST < most < free):

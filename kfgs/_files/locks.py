@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import socket
+import stat
 import sys
 import time
 from collections.abc import Iterator
@@ -16,11 +17,33 @@ try:
 except ImportError:  # Windows: two processes that write to one place are not noticed there
     fcntl = None  # type: ignore[assignment]
 
+MARK = b"process "  # begins what a lock file says
 LONGEST = 300  # characters of a lock file that are read and shown
 
 
 class InUseError(ValueError):
     """Another process works in a folder; the message says which."""
+
+
+def open_lock(file: Path, *, new: bool = True) -> int:
+    """Open a lock file for reading and writing; `new` makes it if it is missing.
+
+    Raises:
+        ValueError: if a link, a pipe or a device is there.
+        OSError: if it cannot be opened.
+    """
+    harmless = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)  # Windows has neither
+    handle = None
+    if not file.is_symlink():
+        handle = os.open(file, os.O_RDWR | harmless | (os.O_CREAT if new else 0), 0o666)
+        if stat.S_ISREG(os.fstat(handle).st_mode):
+            return handle
+        os.close(handle)
+    raise _no_lock(file, "a link" if handle is None else "a pipe or a device")
+
+
+def _no_lock(file: Path, got: str) -> ValueError:
+    return ValueError(f"{file}: expected a lock file of kfgs or nothing there, got {got}; delete it")
 
 
 def try_lock(handle: int) -> bool | None:
@@ -47,25 +70,31 @@ def locked(folder: Path, name: str) -> Iterator[None]:
 
     Raises:
         InUseError: if another process holds the lock; the message says which.
+        ValueError: if a link or another file is in place of the lock file.
         OSError: if the folder cannot be made or written to; the message says so.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        handle = os.open(folder / name, os.O_RDWR | os.O_CREAT, 0o666)
+        handle = open_lock(folder / name)
     except OSError as error:
         raise type(error)(
             f"folder: expected a folder that can be written to, got {folder} ({error.strerror}); choose another"
         ) from error
     try:
+        there = os.read(handle, LONGEST)
         if try_lock(handle) is False:
-            holder = ascii(os.read(handle, LONGEST).decode(errors="replace").strip())[1:-1] or "another process"
+            holder = ascii(there.decode(errors="replace").strip())[1:-1] or "another process"
             raise InUseError(
                 f"folder: expected one that no other process writes to, got {folder}, which is in use by {holder}; wait "
                 "until that process has ended, or name another folder"
             )
+        if there and not there.startswith(MARK):  # somebody else's file, perhaps linked from elsewhere
+            raise _no_lock(folder / name, "another file")
+        os.lseek(handle, 0, os.SEEK_SET)
         os.truncate(handle, 0)
         command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])[:200]
-        os.write(handle, f"process {os.getpid()} of {socket.gethostname()} ({command}, since {time.ctime()})".encode())
+        holder = f"{os.getpid()} of {socket.gethostname()} ({command}, since {time.ctime()})"
+        os.write(handle, MARK + holder.encode())
         yield
     finally:
         os.close(handle)

@@ -8,6 +8,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
+from .own import check_inside, check_ordinary
+
 BLOCK = 4096  # bytes written on trial: a disk without them is full
 
 
@@ -18,7 +20,10 @@ def as_path(path: str | Path) -> Path:
 
     Raises:
         TypeError: if it is no path.
+        ValueError: if it is an empty text, which would be the current folder.
     """
+    if path == "":
+        raise ValueError("path: expected the name of a file or folder, got an empty text; '.' is the current folder")
     return Path(os.path.expanduser(path))
 
 
@@ -34,6 +39,7 @@ def check_output(
     *,
     apart: Iterable[Path] = (),
     other: Iterable[Path | None] = (),
+    inside: Iterable[str | Path] = (),
 ) -> Path:
     """Check before the work that its result can be written.
 
@@ -43,20 +49,24 @@ def check_output(
         kind: which of the two.
         apart: folders in which nothing may be written: those of a scene for its pictures and feature maps.
         other: folders that it must not be, but may lie in; None is skipped.
+        inside: names of the folders in it that will be written to; none may be a link.
 
     Returns:
         The path, with `~` expanded.
 
     Raises:
-        ValueError: if a folder is in place of a file, or a file in place of a folder or above; if a device or a pipe is
-            there; or if `apart` or `other` forbid it.
+        ValueError: if the path is empty; if a folder is in place of a file, a file in place of a folder or above, or a pipe or
+            device in place of either; or if `apart`, `other` or `inside` forbid it.
         OSError: if it cannot be written to, or the disk is full.
     """
+    if path == "":
+        raise ValueError(f"{name}: expected the name of {kind}, got an empty text; '.' is the current folder")
     target = as_path(path)
+    check_ordinary(target)
+    check_inside(target, inside)
     if target.exists() and target.is_dir() != (kind == "a folder"):
         got = "a folder" if target.is_dir() else "a file"
         raise ValueError(f"{name}: expected {kind} or nothing at {path}, got {got}; give another name")
-    check_ordinary(target, name)
     above = next(place for place in target.absolute().parents if place.exists())
     if not above.is_dir():
         raise ValueError(f"{name}: expected a folder to write to, got {path} below the file {above}; give another")
@@ -80,9 +90,3 @@ def check_output(
     if full:
         raise OSError(f"{name}: expected space on the disk for {path}, got none; free some, or choose another place")
     return target
-
-
-def check_ordinary(path: Path, name: str = "path") -> None:
-    """Raise a ValueError if a device, a pipe or a socket is there: a file would take its place."""
-    if path.exists() and not path.is_file() and not path.is_dir():
-        raise ValueError(f"{name}: expected a file or nothing at {path}, got a device, a pipe or a socket; name a file")

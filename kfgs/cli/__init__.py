@@ -123,6 +123,7 @@ def _run(words: list[str], names: dict[str, str]) -> int:
     def spoken(message: str) -> str:
         return _in_options(message, names)
 
+    _check_words(given)
     with interruptible(), warnings_as_notes(spoken), said_on_stderr(), said_whole(), together():
         names |= _shown_names(command)
         command.__doc__ = re.sub(r"\n {8,}(?!kfgs)", " ", inspect.getdoc(command) or "")  # an option's text on one line
@@ -146,6 +147,15 @@ def _expand_home(word: str) -> str:
     if option.startswith("--") and value.startswith("~"):
         return f"{option}={as_path(value)}"
     return str(as_path(word)) if word.startswith("~") else word
+
+
+def _check_words(words: list[str]) -> None:
+    """Raise a ValueError for an empty word, which as a path would be the current folder."""
+    for before, word in zip(["", *words], words, strict=False):
+        option = word[:-1] if word.startswith("--") and word.endswith("=") else before if not word else None
+        if option is not None:
+            about = option if option.startswith("-") else "arguments"
+            raise ValueError(f"{about}: expected a name, got an empty text; leave it out, or write . for this folder")
 
 
 def _overview() -> str:

@@ -8,7 +8,7 @@ import shlex
 from pathlib import Path
 from typing import Any, Literal
 
-from .._files import check_output, real_path
+from .._files import check_output, check_own, read_json, real_path
 from .._ranks import once
 from .features import check_discard, choose_teacher, stored_maps
 from .files import check_alone, inputs_of, is_field, open_field, open_splats
@@ -71,8 +71,7 @@ def sfm(
     """
     from ..scenes import SfmConfig, extend_sfm, link_images, run_sfm
 
-    check_output("out", out, "a folder", apart=inputs_of(onto), other=[images])
-
+    check_output("out", out, "a folder", apart=inputs_of(onto), other=[images], inside=["sparse/0"])
     config = SfmConfig(
         matching=matching,
         camera_model=camera_model,
@@ -128,6 +127,7 @@ def fit(
     from .._files import bytes_in_words
     from ..features import RecomputedMaps, discard_maps
     from ..pipeline import fit_scene, write_run_report
+    from ..pipeline.run_report import check_report
     from ..pipeline.train import check_scene
 
     config = fit_config(
@@ -140,6 +140,7 @@ def fit(
     )
     config = dataclasses.replace(config, undistorted_features=maps.undistorted_features, device=training.device)
     check_output("out", out, "a folder", apart=inputs_of(scene, views.images), other=[maps.features])
+    check_report(out)
     if method.method == "paper":
         check_alone("splat", splat, "with --method paper, which trains its own Gaussians")
     elif splat is not None:
@@ -258,14 +259,17 @@ def color(
         fields = dataclasses.replace(fields, max_gaussians=training.max_gaussians)
     config = dataclasses.replace(config, seed=training.seed, split=views.split, field=fields)
     loaded = views.load(scene).undistorted()
+    tested = [loaded.stem(i) for i in loaded.views("test")] if loaded.splits.get("test") else []
+    if tested:
+        check_own(out / "scores.json", lambda path: bool(read_json(path)["color"]), "kfgs color")
+        beside = PhotoPictures(out / "views", tested, pictures)
     result = fit_color(loaded, out, config, report=say, progress=True, device=training.device)
     took = f"{result.seconds / 60:.1f} min" if result.seconds >= 60 else f"{result.seconds:.0f} s"
     say(f"{result.gaussians!r} in {took}")
 
     def finish() -> None:
         written = [result.path]
-        if loaded.splits.get("test"):
-            beside = PhotoPictures(out / "views", [loaded.stem(i) for i in loaded.views("test")], pictures)
+        if tested:
             scores = score_views(result.gaussians, loaded, "test", show=beside)
             say(str(scores))
             write_report(out / "scores.json", color=scores)

@@ -6,8 +6,8 @@ import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
-from .._files import atomic_folder, check_output, real_path
-from .files import check_alone, inputs_of, is_field, open_field, open_splats
+from .._files import atomic_folder, check_output, check_own, read_json, real_path
+from .files import check_alone, check_splat, inputs_of, is_field, open_field, open_splats
 from .options import Classes, Given, Positional, Teacher, remembered_scene
 from .output import say, say_counts, wrote
 from .text import ask
@@ -61,6 +61,7 @@ def select(
         raise ValueError(f"query, source: expected a class, then a file, got {query!r}, {str(source)!r}; swap them")
     if out is not None:
         check_output("out", out, "a folder", apart=inputs_of(classes.scene, classes.images))
+        _check_older(out)
     if threshold is not None:
         check_range("threshold", threshold, 0, 1)
     classes.check_images()
@@ -128,11 +129,11 @@ def segment(
         rule: fused: the classes of the field's Gaussians; paper: decode every pixel (Sec. 3.4), seconds a view.
         pictures: How many views get pictures: a sheet (photo, truth, teacher, field, errors), an overlay and features.
     """
-    from .._files import read_json
     from ..fields import recall_scene
     from ..pipeline import score_scene, segment_scene, true_labels, write_report
     from ..pipeline.apply import SEGMENTED
     from ..viz import plot_iou, plot_largest_confusions
+    from ..viz.pictures import check_pictures
 
     check_output("out", out, "a folder")
     loaded_field = open_field("field", field)
@@ -156,6 +157,9 @@ def segment(
     if features is not None and not features.is_dir():
         raise ValueError(f"features: expected a folder of feature maps, got {features}, which is none; name another")
     maps = features or (scene / "features" if (scene / "features").is_dir() else None)
+    if truth:
+        check_own(out / "scores.json", lambda path: bool(read_json(path)["segmentation"]), "kfgs segment")
+        check_pictures(out, ("confusion", "iou"), "kfgs segment")
     found = segment_scene(
         loaded_field,
         loaded,
@@ -213,6 +217,7 @@ def label(
 
     from .._check import check_range
     from ..pipeline import label_cloud, read_cloud, save_labelled
+    from ..pipeline.apply import COMMENTS
 
     for name, value, other, needed in (
         ("threshold", threshold, "query", query),
@@ -223,6 +228,8 @@ def label(
     check_output("out", out, "a folder", apart=inputs_of(classes.scene, classes.images))
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
+    for name, comment in list(COMMENTS.items())[: 1 if cloud is None else 2]:
+        check_splat(out / name, comment, "kfgs label")
     loaded = classes.open_field("field", field)
     label_set = classes.of_field(loaded)
     carried = None if cloud is None else read_cloud(cloud)
@@ -262,6 +269,18 @@ def info(path: Positional[Path]) -> None:
     from ..pipeline import describe
 
     say(describe(path))
+
+
+def _check_older(out: Path) -> None:
+    """Raise a FileExistsError if a folder has files of the names that `select` writes, but not from an older selection."""
+    from ..viz.pictures import check_pictures
+
+    facts = out / "selection.json"
+    check_own(facts, lambda path: "parts" in read_json(path) and bool(read_json(path)["query"]), "kfgs select")
+    check_splat(out / "selection.ply", "written by kfgs", "kfgs select")
+    check_pictures(out, ["parts"], "kfgs select")
+    if not facts.is_file():
+        check_own(out / "selection.ply", lambda _: False, "kfgs select")
 
 
 def _save(folder: Path, query: str, cloud: Any, found: Any, things: list[Any]) -> None:

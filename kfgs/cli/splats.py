@@ -8,7 +8,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any, Literal
 
-from .._files import check_output, real_path
+from .._files import check_output, check_own, read_json, real_path
 from .edit_syntax import Edits, check_parts, inserted_files, parse_edits
 from .files import check_alone, check_target, inputs_of, open_splats
 from .options import Classes, Flag, Given, GivenBy, Positional, SceneOption, Several
@@ -107,12 +107,12 @@ def edit(
     Examples:
         kfgs edit labelled.ply --out edited.ply --remove chair --recolor "plant:#c04040" --scene scene/
         kfgs edit labelled.ply --out edited.spz --move table:0.5,0,0 --opacity lamp:0.3
-        kfgs edit other.ply --out edited.ply --replay edited.edits.json
+        kfgs edit other.ply --out again.ply --replay edited.ply.edits.json
 
     Args:
         splats: A splat with classes, for instance from `kfgs attach`.
-        out: The edited splat; its ending chooses the format. The edits go to a file next to it (edited.edits.json for
-            edited.ply), and with --scene the views before and after to a picture (edited.png).
+        out: The edited splat; its ending chooses the format. The edits go to a file next to it (edited.ply.edits.json for
+            edited.ply), and with --scene the views before and after to a picture (edited.ply.png).
         replay: Saved edits; they come first.
         views: Name of a view to show (with --scene). By default one for each edit, then those in which most changes.
         pictures: How many views to show if none is named.
@@ -121,10 +121,13 @@ def edit(
     from ..formats import write_splats
     from ..labels.edits import EditList
     from ..pipeline.compare import views_of_edits, write_comparison
+    from ..viz.pictures import check_pictures
 
     check_target("out", out, splats, apart=inputs_of(scene.scene, scene.images))
     saved = _edits_beside(out, replay)
     check_whole("pictures", pictures, 0)
+    if scene.scene is not None and pictures:
+        check_pictures(out.parent, [out.name], "kfgs edit")
     if scene.scene is None:
         check_alone("views", ", ".join(views) or None, "without --scene, whose views they are")
         scene.check_images()
@@ -150,7 +153,8 @@ def edit(
     if cameras and pictures and not shown:
         say("note: no view of the scene shows a change")
     if shown:
-        paths.append(write_comparison(out.with_suffix(".png"), before.gaussians, after.gaussians, shown, titles=TITLES))
+        picture = out.with_name(f"{out.name}.png")
+        paths.append(write_comparison(picture, before.gaussians, after.gaussians, shown, titles=TITLES))
         say("before and after from " + ", ".join(camera.name for camera in shown))
     wrote(paths)
 
@@ -191,9 +195,12 @@ def _apply(edits: Any, splats: Any, asked: list[str]) -> Any:
 
 
 def _edits_beside(out: Path, replay: Path | None) -> Path:
-    """The file for the edits of a splat file; a ValueError if it is the file to replay, or cannot be written."""
-    saved = out.with_suffix(".edits.json")
+    """The file for the edits of a splat file; an error if it is the file to replay, another file, or cannot be written."""
+    from ..labels.edits.edit_list import FORMAT, edits_path
+
+    saved = edits_path(out)
     check_output("out", saved, "a file")
+    check_own(saved, lambda path: read_json(path)["format"] == FORMAT, "kfgs edit")
     if replay is not None and real_path(replay) == real_path(saved):
         raise ValueError(
             f"replay: expected another file than {saved}, where the edits behind {out} are saved, got the same; give --out "

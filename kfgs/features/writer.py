@@ -46,9 +46,11 @@ class MapWriter:
         overwrite: bool = False,
         part: str | None = None,
     ) -> None:
-        wanted, stems, finder = plain_identity(identity), [picture.stem for picture in pictures], MapFinder(folder)
-        known = finder.manifest if part is None else _known(finder.manifest, read_manifest(folder, part), stems)
-        found = _make_room(finder, known, stems, wanted, overwrite=overwrite)
+        wanted = plain_identity(identity)
+        found = check_maps(folder, wanted, pictures, overwrite=overwrite, part=part)
+        if found is not None and found.teacher != wanted:
+            _delete_maps(folder, found, [picture.stem for picture in pictures])
+            found = None
         self.folder, self.part, self.manifest = folder, part, found or Manifest(wanted)
         self._missing = {stem for stem, one in self.manifest.maps.items() if not (folder / one.file).is_file()}
         if found is None:
@@ -106,11 +108,16 @@ def _known(whole: Manifest | None, begun: Manifest | None, stems: list[str]) -> 
     return replace(whole, maps={stem: record for stem, record in found.items() if record is not None})
 
 
-def _make_room(
-    finder: MapFinder, found: Manifest | None, stems: list[str], identity: dict[str, Any], *, overwrite: bool
+def check_maps(
+    folder: Path, identity: Mapping[str, Any], pictures: Sequence[Picture], *, overwrite: bool, part: str | None = None
 ) -> Manifest | None:
-    """The manifest, if this teacher made the maps in the folder. Other maps are an error, or replaced with `overwrite`."""
-    folder, hint = finder.path, "use another folder, or pass overwrite=True (--overwrite)"
+    """The manifest of a folder that a teacher may write maps to; arguments and errors are those of `MapWriter`.
+
+    Maps of others are an error; with `overwrite` they may be replaced. Nothing is written here.
+    """
+    finder, stems, identity = MapFinder(folder), [picture.stem for picture in pictures], plain_identity(identity)
+    found = finder.manifest if part is None else _known(finder.manifest, read_manifest(folder, part), stems)
+    hint = "use another folder, or pass overwrite=True (--overwrite)"
     expected = "folder: expected one without maps of other programs, got"
     files = [map_file(folder, stem) for stem in stems]
     finder.own |= set(files)
@@ -119,17 +126,20 @@ def _make_room(
             raise ValueError(f"{expected} {file}, which would be read instead of ours; use another folder")
         if found is None and not overwrite and file in files:
             raise ValueError(f"{expected} {file} and no {MANIFEST}; {hint}")
-    if found is None or found.teacher == identity:
-        return found
-    if not overwrite:
+    if found is not None and found.teacher != identity and not overwrite:
         raise ValueError(
             f"folder: expected maps of the same teacher as now, got others in {folder} "
             f"({differences(found.teacher, identity)}); {hint} to give up its {len(found.maps)} maps"
         )
-    for stem in found.maps:
-        if (file := map_file(folder, stem)) in finder.own:  # never a file outside of the folder
+    return found
+
+
+def _delete_maps(folder: Path, manifest: Manifest, stems: Sequence[str]) -> None:
+    """Delete the maps that another teacher made."""
+    own = MapFinder(folder).own | {map_file(folder, stem) for stem in stems}
+    for stem in manifest.maps:
+        if (file := map_file(folder, stem)) in own:  # never a file outside of the folder
             file.unlink(missing_ok=True)
-    return None
 
 
 def encode_half(teacher: Teacher, picture: Tensor, path: Path) -> Tensor:  # [H, W, 3] -> [h, w, D] float16

@@ -26,6 +26,8 @@ PYTHON_START = """\
     const version = fetch("version").then((answer) => (answer.ok ? answer.text() : shown));
     version.then((text) => text === shown || location.reload()).catch(() => null);
     window.viewer = await kfgs.mount(root, { header, data }, link);"""
+ROOT = '<div id="kfgs"></div>'
+"""Holds the viewer, and shows that a page is one of kfgs."""
 PAGE = """\
 <!doctype html>
 <html lang="en">
@@ -41,7 +43,7 @@ html, body {{ height: 100%; margin: 0; }}
 </style>
 </head>
 <body>
-<div id="kfgs"></div>
+{root}
 {data}
 <script>
 {script}
@@ -69,4 +71,4 @@ def document(title: str, start: str, data: str = "", policy: str = "") -> str:
         policy: an element that says what may be loaded, where no server does.
     """
     parts = {"title": html.escape(title), "style": read_text("app.css"), "script": inline_script(APP)}
-    return PAGE.format(start=start, data=data, policy=policy, **parts)
+    return PAGE.format(root=ROOT, start=start, data=data, policy=policy, **parts)

@@ -13,7 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._check import check_range, typed
-from .._files import as_path, atomic_path, check_output, write_json
+from .._files import as_path, check_output, write_json
 from ..cameras import resize_labels, undistort_labels
 from ..evaluation import SegmentationReport, evaluate_segmentation, load_label_map
 from ..evaluation.segmentation import VOID, check_truth
@@ -29,12 +29,14 @@ from ..scenes import Scene
 from ..viz import overlay_labels, palette, plot_codebook_history, plot_training, save_picture
 from ..viz.field_colors import feature_colors
 from ..viz.palette import UNLABELLED
-from ..viz.pictures import Array
+from ..viz.pictures import Array, check_pictures, write_png
 from .fit import FitResult, load_history
 from .sheets import segmentation_sheet, teacher_labels
 
 SEGMENTED = ("predicted", "colored", "sheets", "overlay", "features")
 """The folders that `segment_scene` makes."""
+COMMENTS = {"gaussians.ply": "kfgs labelled Gaussians", "cloud.ply": "labels carried by kfgs"}
+"""What the headers of the files of `kfgs label` say."""
 
 
 def save_label_map(path: Path, labels: Tensor) -> None:  # [H, W] int64
@@ -54,8 +56,7 @@ def _save_bytes(path: Path, labels: Tensor, colors: Array | None = None) -> None
     picture = Image.fromarray(torch.where(labels < 0, VOID, labels).to(torch.uint8).cpu().numpy())
     if colors is not None:
         picture.putpalette(colors.tobytes())  # mode P
-    with atomic_path(path) as temporary:
-        picture.save(temporary, format="PNG")
+    write_png(path, picture)
 
 
 @typed
@@ -97,6 +98,7 @@ def segment_scene(
     apart = [*inputs - {scene.folder}, *([] if scene.folder is None else [scene.folder / "features"])]
     for name in SEGMENTED if pictures else SEGMENTED[:2]:
         check_output("out", out / name, "a folder", apart=apart, other=inputs)
+        check_pictures(out, (f"{name}/{scene.stem(i)}" for i in scene.views(split)), "kfgs segment")
     if len(classes) > VOID:
         raise ValueError(
             f"classes: expected at most {VOID} (label pictures hold a byte per pixel, {VOID} = none), got {len(classes)}; "
@@ -212,7 +214,7 @@ def save_labelled(
     path = as_path(path)
     assert gaussians.labels is not None
     columns = columns_from_gaussians(gaussians) | label_columns(gaussians.labels, classes.names, scores)
-    write_ply(path, columns, comments=("kfgs labelled Gaussians",))
+    write_ply(path, columns, comments=(COMMENTS["gaussians.ply"],))
     return [path, write_names(path, classes.names, **{"labelled by": rule})]
 
 
@@ -269,7 +271,7 @@ def label_cloud(
     added = label_columns(moved.labels, classes.names)
     if {"red", "green", "blue"} & set(cloud):
         added = {"class_id": added["class_id"]}
-    write_ply(out, cloud | added, comments=("labels carried by kfgs",))
+    write_ply(out, cloud | added, comments=(COMMENTS["cloud.ply"],))
     return moved, [
         as_path(out),
         write_names(out, classes.names, **{"distance": moved.distance, "distance from": moved.how}),

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from .._files import check_output
+from .._files import check_output, check_own
 from ..evaluation import LabelSet, load_label_set, score_recolor, score_removal, score_surface, score_views
 from ..evaluation.datasets.surface_points import load_surface_points
 from ..evaluation.surface import SurfaceReport
@@ -16,6 +16,7 @@ from ..formats import SplatFile, write_splats
 from ..formats.ply import write_ply
 from ..gaussians import Gaussians
 from ..labels import EditList, OfClass, Recolor, Remove, connected_parts, parse_color
+from ..labels.edits.edit_list import edits_path
 from ..scenes import Scene, load_scene
 from ..toy.room_folder import ToyConfig, make_toy_room
 from .apply import (
@@ -36,6 +37,9 @@ from .run_report import write_run_report
 
 REMOVED, PAINTED, PAINT = "chair", "plant", "#c04040"  # the edits of the paper's Figures 5 and 4
 TITLES = ("before", "after")
+FOLDERS = ("scene", "run", "segmentation")
+SPLATS, PICTURES = ("gaussians", "surface", "color", "removed", "recolored"), ("removed", "recolored")
+FILES = (*(f"{name}.ply" for name in SPLATS), *(f"{name}.png" for name in PICTURES), "scores.json")
 
 
 def run(
@@ -55,8 +59,11 @@ def run(
         report: called with one line per step.
         progress: show progress bars.
     """
-    out, say = check_output("out", out, "a folder"), report or (lambda text: None)
+    out, say = check_output("out", out, "a folder", inside=FOLDERS), report or (lambda text: None)
     config = config or FitConfig.cpu()
+    if not (out / "scene" / "toy.json").is_file():  # then no demo was here
+        for name in FILES:
+            check_own(out / name, lambda _: False, "kfgs demo")
     say("making the toy room")
     folder = make_toy_room(out / "scene", room or ToyConfig())
     scene = load_scene(folder)
@@ -132,7 +139,7 @@ def _edit_colors(
     edits = {"removed": EditList((Remove(OfClass(REMOVED)),)), "recolored": EditList((Recolor(OfClass(PAINTED), rgb),))}
     after = {name: edit.apply(splats) for name, edit in edits.items()}
     for name, edit in edits.items():
-        written += [*write_splats(out / f"{name}.ply", after[name]).paths, edit.save(out / f"{name}.edits.json")]
+        written += [*write_splats(out / f"{name}.ply", after[name]).paths, edit.save(edits_path(out / f"{name}.ply"))]
         before_after = splats.gaussians, after[name].gaussians
         views = views_of_change(*before_after, scene.cameras)
         picture = out / f"{name}.png"

@@ -13,20 +13,22 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from .._files import atomic_path, bytes_in_words, current_file, real_path, seconds_in_words
+from .._files import atomic_path, bytes_in_words, check_own, current_file, real_path, seconds_in_words
 from ..fields import SemanticField
 from ..fields.store import DESCRIPTION, TENSORS
 from ..labels import LabelSet
 from ..scenes import Scene
 from ..viz import overlay_labels, save_picture
 from ..viz.field_colors import feature_colors
-from ..viz.pictures import as_bytes, legend_strip, picture_grid, resize_photo
+from ..viz.pictures import as_bytes, check_pictures, legend_strip, picture_grid, resize_photo
 from ..viz.region_names import write_region_names
 from .apply import write_training_pictures
 from .config import FitConfig
 from .fit import FitResult
+from .runs import SHOWN
 
 WIDTH = 400  # pixels of a picture
+REPORT, TITLE = "report.html", "<title>kfgs: "
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 1240px; margin: 2em auto; padding: 0 1em; color: #1b1b1b }
 img { max-width: 100%; height: auto } h2 { margin-top: 2em } code, pre { background: #f3f3f5; border-radius: 4px }
@@ -72,6 +74,13 @@ def write_preview(
     return path
 
 
+def check_report(folder: Path) -> None:
+    """Raise a FileExistsError if a run folder has files of the names that `write_run_report` writes, but not from it."""
+    pictures = [Path(name).stem for name in SHOWN if name != REPORT]
+    check_pictures(folder, pictures, "kfgs fit")
+    check_own(folder / REPORT, lambda path: TITLE in path.read_text(encoding="utf-8"), "kfgs fit")
+
+
 def write_run_report(
     result: FitResult,
     scene: Scene,
@@ -112,11 +121,11 @@ def write_run_report(
     stages = [(one.name, seconds_in_words(one.seconds), "found" if one.reused else "made") for one in result.stages]
     stages.append(("all", seconds_in_words(result.seconds), ""))
     repeat = command or f"kfgs.pipeline.fit_scene(scene, maps, {str(result.folder)!r}, config)"
-    title = f"kfgs: {real_path(result.folder).name}"
+    title = f"{real_path(result.folder).name}"
     unused = ("codebook", "autoencoder", "field", "mode") if config.method == "fuse" else ("uplift", "color")
     options = json.dumps({name: value for name, value in asdict(config).items() if name not in unused}, indent=1)
     parts = [
-        f"<h1>{_text(title)}</h1>",
+        f"<h1>kfgs: {_text(title)}</h1>",
         *([] if preview is None else [_image(preview, "three views of the field")]),
         "<h2>What was fitted</h2>",
         _table((name, value) for name, value in facts.items() if value not in (None, "")),
@@ -131,9 +140,9 @@ def write_run_report(
         "<h2>What to do next</h2>",
         f"<pre>{_text(_next(result.field_path, field))}</pre>",
     ]
-    head = f'<meta charset="utf-8"><title>{_text(title)}</title><style>{STYLE}</style>'
+    head = f'<meta charset="utf-8">{TITLE}{_text(title)}</title><style>{STYLE}</style>'
     page = f'<!doctype html>\n<html lang="en"><head>{head}</head><body>\n' + "\n".join(parts) + "\n</body></html>\n"
-    path = result.folder / "report.html"
+    path = result.folder / REPORT
     with atomic_path(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return [*([] if preview is None else [preview]), *training, path]

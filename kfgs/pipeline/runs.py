@@ -6,6 +6,7 @@ takes its place, they are moved to the kept field, so that a kill leaves no repo
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -18,13 +19,14 @@ from pathlib import Path
 from typing import Any
 
 from .._check import one_line
-from .._files import as_path, atomic_folder, atomic_path, current_file
+from .._files import as_path, atomic_folder, atomic_path, current_file, digest_value
 from .._files.fields import KEPT
 from ..fields.store import DESCRIPTION, TENSORS, check_place, describes_field, load_field, read_description
 from .stages import Run
 
 FIELD = "field"
 KEY = 12  # hexadecimal digits of a key
+UNDECIDED = ("seconds", "kfgs")  # notes that differ between two undisturbed fits
 SHOWN = ("report.html", "preview.png", "codebook.png", "field.png")  # what `write_run_report` writes
 LONGEST = 40  # characters of a value in a comparison
 
@@ -35,7 +37,7 @@ class RunField:
 
     path: Path
     key: str
-    """The first digits of the SHA-256 of its numbers."""
+    """The first digits of a SHA-256 of its numbers and notes, except times and the version of kfgs."""
     current: bool
     """Whether `RUN/field` holds it."""
     saved: float
@@ -65,17 +67,19 @@ def list_fields(folder: str | Path) -> list[RunField]:
     """
     folder = as_path(folder)
     found, earlier = _read_all([folder / FIELD], current=True), _read_all(sorted(folder.glob(f"{KEPT}*")))
-    known = {one.key for one in found}
-    found += sorted((one for one in earlier if one.key not in known), key=lambda one: -one.saved)
+    found += sorted(earlier, key=lambda one: -one.saved)
     if not found:
         raise FileNotFoundError(f"{folder}: expected a run folder with a field, got none; make one with `kfgs fit`")
-    return found
+    first = dict[str, RunField]()  # a field that was restored lies in two places
+    for one in found:
+        first.setdefault(one.key, one)
+    return list(first.values())
 
 
 def find_run_field(folder: str | Path, key: str) -> RunField:
     """The field of a run folder whose key begins with `key`; a ValueError if there is none, or more than one."""
-    fields = list_fields(folder)
-    found = [one for one in fields if key and one.key.startswith(key.removeprefix(KEPT))]
+    fields, digits = list_fields(folder), key.removeprefix(KEPT)
+    found = [one for one in fields if digits and one.key.startswith(digits)]
     if len(found) != 1:
         raise ValueError(
             f"key: expected the key of one field ({', '.join(one.key for one in fields)}), got {one_line(key)!r}; "
@@ -88,12 +92,17 @@ def check_current(folder: Path) -> None:
     """Check before the work that `RUN/field` is free, or holds a whole field, which can be kept.
 
     Raises:
-        FileExistsError: if something else is there.
+        FileExistsError: if something else is there, or in the place where it is kept.
         ValueError: if it holds a damaged field.
     """
     check_place(folder / FIELD)
     if describes_field(folder / FIELD):
         _check_whole(folder / FIELD)
+        kept = _place_of(_read(folder / FIELD))
+        if kept.exists() and not kept.is_dir():
+            raise FileExistsError(
+                f"{kept}: expected a folder or nothing there, where the current field will be kept, got a file; move it away"
+            )
 
 
 def keep_field(folder: Path) -> RunField | None:
@@ -105,8 +114,8 @@ def keep_field(folder: Path) -> RunField | None:
     if not describes_field(folder / FIELD):
         return None
     now = _read(folder / FIELD, current=True)
-    kept = folder / f"{KEPT}{now.key}"
-    if not describes_field(kept):
+    kept = _place_of(now)
+    if not _holds(kept, now.key, whole=True):
         _copy(now.path, kept)
     for shown in _shown_in(folder):
         os.replace(shown, kept / shown.name)
@@ -114,7 +123,7 @@ def keep_field(folder: Path) -> RunField | None:
 
 
 def say_kept(run: Run, before: RunField | None) -> None:
-    """After another field became current, say so; if it has the same numbers, drop the copy of the earlier one."""
+    """After another field became current, say so; if it is the same one, made again, drop the copy of the earlier one."""
     if before is None:
         return
     if _read(run.folder / FIELD).key == before.key:
@@ -147,7 +156,7 @@ def restore_field(folder: str | Path, key: str) -> RunField:
         if not wanted.current:
             keep_field(folder)
             _copy(wanted.path, folder / FIELD)
-        for shown in _shown_in(folder / f"{KEPT}{wanted.key}"):  # also if a killed process had come so far
+        for shown in _shown_in(_place_of(wanted) if wanted.current else wanted.path):  # also after a kill
             with atomic_path(folder / shown.name) as new:
                 shutil.copy2(shown, new)
     return _read(folder / FIELD, current=True)
@@ -178,7 +187,9 @@ def _read(path: Path, *, current: bool = False) -> RunField:
         raise ValueError(
             f"{path}: expected info, sha256 and a number of gaussians in {DESCRIPTION}; fit the field again"
         )
-    return RunField(path, str(digest)[:KEY], current, current_file(path, DESCRIPTION).stat().st_mtime, count, info)
+    notes = {name: value for name, value in info.items() if name not in UNDECIDED}
+    key = digest_value(json.dumps({**about, "info": notes, "version": None}, sort_keys=True))[:KEY]
+    return RunField(path, key, current, current_file(path, DESCRIPTION).stat().st_mtime, count, info)
 
 
 def _read_all(paths: Iterable[Path], *, current: bool = False) -> list[RunField]:
@@ -191,6 +202,22 @@ def _read_all(paths: Iterable[Path], *, current: bool = False) -> list[RunField]
         except (OSError, ValueError) as error:
             warnings.warn(f"{error}; it is left out", stacklevel=3)
     return found
+
+
+def _place_of(field: RunField) -> Path:
+    """Where a field is kept while another one is current: a folder that holds it already, or a new one."""
+    others = sorted(field.path.parent.glob(f"{KEPT}*"))
+    return next((one for one in others if _holds(one, field.key)), field.path.with_name(f"{KEPT}{field.key}"))
+
+
+def _holds(path: Path, key: str, *, whole: bool = False) -> bool:
+    """Whether a folder describes the field with this key; with `whole`, whether its numbers are there, too."""
+    try:
+        if whole:
+            _check_whole(path)
+        return _read(path).key == key
+    except (OSError, ValueError):
+        return False
 
 
 def _check_whole(path: Path) -> None:

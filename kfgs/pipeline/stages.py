@@ -22,13 +22,25 @@ from torch import Tensor
 
 from .._arrays import reading
 from .._compiling import say_compiling
-from .._files import atomic_folder, digest_file, digest_value, finish_writing, locked, read_json, real_path, write_json
+from .._files import (
+    atomic_folder,
+    check_inside,
+    digest_file,
+    digest_value,
+    finish_writing,
+    locked,
+    read_json,
+    real_path,
+    write_json,
+)
 from .._ranks import first, meet, once
 from ..cameras import Camera
 from ..cameras.camera import NEAR
 from ..scenes import Scene
 
-STAGE_FILE, LOCK = "stage.json", ".run.lock"
+STAGE_FILE, LOCK, DIGESTS = "stage.json", ".run.lock", "digests.json"
+WRITTEN = ("field", "field@*", "stages", "stages/*", "unfinished", "unfinished/*", "teacher", "teacher/*")
+"""The folders in a run folder that are written to."""
 STAGE_VERSION = 2
 """Part of every key: raised if the same inputs give another result in a new version, so that old stages are not reused."""
 
@@ -124,8 +136,12 @@ class Run:
         """Keep other processes from working in the folder, and finish what a killed one began to write there.
 
         Raises:
-            ValueError: if one works there already; the message says which. Nothing is written then.
+            ValueError: if one works there already; the message says which. Also if a folder in it is a link. Nothing is
+                written then.
         """
+        check_inside(
+            self.folder, (place.relative_to(self.folder) for name in WRITTEN for place in self.folder.glob(name))
+        )
         with locked(self.folder, LOCK) if first() else nullcontext():
             if first():
                 for place in (self.folder, self.folder / "field"):  # a run that finds all it needs writes neither
@@ -146,14 +162,13 @@ class Run:
         return once(lambda: self._digests(paths))  # type: ignore[no-any-return]
 
     def _digests(self, paths: Sequence[Path]) -> list[list[str]]:
-        cache_path = self.folder / "digests.json"
-        cache = _known_digests(cache_path)
+        cache = _known_digests(self.folder / DIGESTS)
         result, changed = [], False
         for path in paths:
             info = path.stat()
             mark = [info.st_size, info.st_mtime_ns, info.st_ctime_ns]
             known = cache.get(str(real_path(path)))
-            if known is None or known[:-1] != mark:
+            if not (isinstance(known, list) and known[:-1] == mark and isinstance(known[-1], str)):
                 if self.look_only:
                     result.append([path.name, "unknown"])
                     continue
@@ -162,7 +177,7 @@ class Run:
                 changed = True
             result.append([path.name, known[-1]])
         if changed:
-            write_json(cache_path, cache)
+            write_json(self.folder / DIGESTS, cache)
         return result
 
     def say(self, text: str) -> None:
@@ -172,12 +187,12 @@ class Run:
 
 
 def _known_digests(path: Path) -> dict[str, Any]:
-    """Size, two times and the digest of files by path. It only saves time, so nothing is taken from a damaged file."""
+    """The digests that are kept; none if the file is missing or damaged: it is made again."""
     try:
         found = read_json(path)
     except (OSError, ValueError):
         return {}
-    return found if isinstance(found, dict) and all(isinstance(one, list) for one in found.values()) else {}
+    return found if isinstance(found, dict) else {}
 
 
 def _key(name: str, inputs: dict[str, Any]) -> str:

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from .._check import as_array, check_whole
-from .._files import as_path, check_output, read_json, real_path, write_json
+from .._files import as_path, check_inside, check_output, read_json, real_path, write_json
 from ..features import FeatureFolder
 from ..fields import SemanticField, sample_latents, select_gaussians
 from ..formats import read_splats, write_splats
@@ -81,6 +81,7 @@ def split_scene(
         "blocks": [b.to_json() for b in blocks],
     }
     _check_same(out, facts)
+    check_inside(out, [f"{block.name}/sparse/0" for block in blocks])
     training = {whole.cameras[i].name for i in whole.views("train")}
     for block in blocks:
         if not training & set(block.views):
@@ -131,6 +132,7 @@ def fit_block(
     """
     folder, config = as_path(folder), config or FitConfig()
     block = Block.from_json(read_json(folder / "block.json"))
+    check_inside(folder, ["run", CORE])
     as_taken = load_scene(folder)
     maps = FeatureFolder(folder / "features").of(as_taken, config.split)
     splat = folder / SPLAT

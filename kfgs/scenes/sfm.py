@@ -113,7 +113,7 @@ def run_sfm(
     images, out, config = as_path(images), as_path(out), config or SfmConfig()
     if not images.is_dir():
         raise FileNotFoundError(f"{images}: no such folder; expected the images there")
-    check_output("out", out, "a folder", other=[images])
+    check_output("out", out, "a folder", other=[images], inside=["sparse/0"])
     model = out / "sparse" / "0"
     if has_model(model) and not replace:
         raise FileExistsError(

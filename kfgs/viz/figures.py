@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .._files import as_path, atomic_path
+from .pictures import DRAWN
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -68,7 +69,8 @@ def save_figure(figure: Figure, path: str | Path) -> None:
     if as_path(path).suffix.lower() != ".png":
         raise ValueError(f"path: expected a name that ends in .png, got {as_path(path).name!r}; rename it")
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", bbox_inches="tight")  # otherwise labels beside square pictures are cut
+        # tight: otherwise labels beside square pictures are cut
+        figure.savefig(temporary, format="png", bbox_inches="tight", metadata=DRAWN)
 
 
 def add_legend_below(axes: Axes, own: bool) -> None:

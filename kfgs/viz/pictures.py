@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import numbers
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from PIL.Image import Resampling
+from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 from torch.nn.functional import interpolate
 
 from .._check import as_array, check_range, check_shapes
-from .._files import as_path, atomic_path
+from .._files import as_path, atomic_path, check_inside, check_own
 from .palette import palette
 
 Array = np.ndarray[Any, Any]
+DRAWN = {"Software": "kfgs"}  # in the header of each picture
+HEAD = 4096  # bytes at the beginning of a file, in which a PNG file has its header
 GAP = 6  # pixels between pictures of a grid
 LEGEND_INK, LEGEND_PAPER = (20, 20, 20), (255, 255, 255)
 
@@ -153,9 +156,41 @@ def save_picture(
         )
     if values.ndim not in (2, 3) or (values.ndim == 3 and values.shape[2] not in (3, 4)) or 0 in values.shape:
         raise ValueError(f"picture: expected [H, W], [H, W, 3] or [H, W, 4], got {values.shape}; move channels last")
-    data = as_bytes(values)
-    with atomic_path(target) as temporary:
-        Image.fromarray(np.ascontiguousarray(data)).save(temporary, format="PNG")
+    write_png(target, Image.fromarray(np.ascontiguousarray(as_bytes(values))))
+
+
+def write_png(path: Path, picture: Image.Image) -> None:
+    """Write a picture whole or not at all; it says that kfgs drew it."""
+    note = PngInfo()
+    for key, value in DRAWN.items():
+        note.add_text(key, value)
+    with atomic_path(path) as temporary:
+        picture.save(temporary, format="PNG", pnginfo=note)
+
+
+def is_drawn(path: Path) -> bool:
+    """Whether kfgs drew a picture (`write_png`, `save_figure`)."""
+    with path.open("rb") as file:
+        head = file.read(HEAD)
+    return head.startswith(b"\x89PNG") and all(f"tEXt{key}\0{value}".encode() in head for key, value in DRAWN.items())
+
+
+def check_pictures(folder: Path, names: Iterable[str], writer: str) -> None:
+    """Check before the work that it may write pictures: no link leads elsewhere, and those that are there it drew itself.
+
+    Args:
+        folder: the output folder.
+        names: of the pictures in it, without ".png": "sheets/view_1".
+        writer: for the message: "kfgs segment".
+
+    Raises:
+        ValueError: if a folder in `folder` is a link.
+        FileExistsError: if a picture is not one of kfgs.
+    """
+    for name in names:
+        picture = folder / f"{name}.png"
+        check_inside(folder, [picture.parent.relative_to(folder)])
+        check_own(picture, is_drawn, writer)
 
 
 def picture_grid(

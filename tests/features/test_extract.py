@@ -569,3 +569,24 @@ def test_what_a_notebook_shows_of_a_folder_is_short(scene, tmp_path):
     discard_maps(folder)
     assert repr(read_manifest(folder)) == "Manifest(2 maps by counting, discarded)"
     assert "\n" not in repr(Manifest({"name": "a\nb"}))
+
+
+def test_a_folder_that_is_refused_stays_as_it_is(pictures, tmp_path):
+    folder = tmp_path / "maps"
+    folder.mkdir()
+    np.save(folder / "a.npy", np.zeros((2, 2, 2), np.float16))
+    before = contents(folder)
+    with pytest.raises(ValueError, match=tells("folder:", folder / "a.npy")):
+        extract_features(Counting(), pictures, folder)
+    assert [path.name for path in folder.iterdir()] == ["a.npy"]
+    assert contents(folder) == before
+
+
+def test_links_among_maps_are_not_followed(pictures, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "maps").mkdir()
+    (tmp_path / "maps" / "sub").symlink_to("../mine")
+    with pytest.raises(ValueError, match=tells(tmp_path / "maps" / "sub", "a link")):
+        extract_features(Counting(), pictures, tmp_path / "maps")
+    assert not any((tmp_path / "mine").iterdir())
+    assert not (tmp_path / "maps" / LOCK).exists()

@@ -1,8 +1,9 @@
 import os
+import shutil
 import stat
 import subprocess
 import sys
-from contextlib import suppress
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from killed import kill_everywhere
 from messages import tells
 from safetensors.torch import save_file
 
-from kfgs._files import FullDiskError, atomic, atomic_folder, atomic_path, current_file, open_current
+from kfgs._files import FullDiskError, atomic, atomic_folder, atomic_path, current_file, finish_writing, open_current
 
 
 def names(folder):
@@ -165,13 +166,76 @@ def test_links_in_a_strangers_folder_move_and_delete_nothing_elsewhere(tmp_path,
     for name in ("a.txt", ".kfgs-lock", "waiting/a.txt", "new-x/.kfgs-lock", "new-x/a.txt"):
         (mine / name).parent.mkdir(parents=True, exist_ok=True)
         (mine / name).write_text("mine")
-    before = sorted(mine.rglob("*"))
+    before = {path: path.read_text() for path in mine.rglob("*") if path.is_file()}
     (tmp_path / "folder" / link).parent.mkdir(parents=True)
     (tmp_path / "folder" / "a.txt").touch()
     (tmp_path / "folder" / link).symlink_to(mine)
-    with suppress(OSError), atomic_folder(tmp_path / "folder") as temporary:
+    expected = nullcontext() if link.endswith("new-x") else pytest.raises(ValueError, match=tells(link, "a link"))
+    with expected, atomic_folder(tmp_path / "folder") as temporary:
         (temporary / "a.txt").write_text("new")
-    assert sorted(mine.rglob("*")) == before
+    assert {path: path.read_text() for path in mine.rglob("*") if path.is_file()} == before
+    assert (tmp_path / "folder" / "a.txt").read_text() == ("new" if link.endswith("new-x") else "")
+
+
+@pytest.mark.parametrize("link", [".kfgs-unfinished", ".kfgs-unfinished/waiting"])
+def test_a_reader_takes_no_waiting_file_behind_a_link(tmp_path, link):
+    (tmp_path / "mine" / "waiting").mkdir(parents=True)
+    for name in ("a.txt", "waiting/a.txt"):
+        (tmp_path / "mine" / name).write_text("mine")
+    (tmp_path / "folder" / link).parent.mkdir(parents=True)
+    (tmp_path / "folder" / "a.txt").write_text("theirs")
+    (tmp_path / "folder" / link).symlink_to(tmp_path / "mine")
+    assert current_file(tmp_path / "folder", "a.txt").read_text() == "theirs"
+    with pytest.raises(ValueError, match=tells(link, "a link")):
+        finish_writing(tmp_path / "folder")
+
+
+def test_a_folder_in_a_folder_is_not_joined_with_what_a_link_leads_to(tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "a.png").write_text("mine")
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "images").symlink_to("../mine")
+
+    def write():
+        with atomic_folder(tmp_path / "scene") as new:
+            (new / "images").mkdir()
+            (new / "images" / "a.png").write_text("new")
+
+    with pytest.raises(ValueError, match=tells("images", "a link")):
+        write()
+    assert (tmp_path / "mine" / "a.png").read_text() == "mine"
+
+
+def test_a_file_takes_the_place_of_a_link_and_leaves_what_it_leads_to(tmp_path):
+    (tmp_path / "far.bin").write_text("mine")
+    (tmp_path / "a.bin").symlink_to("far.bin")
+    with atomic_path(tmp_path / "a.bin") as new:
+        new.write_text("new")
+    assert (tmp_path / "far.bin").read_text() == "mine"
+    assert not (tmp_path / "a.bin").is_symlink()
+    assert (tmp_path / "a.bin").read_text() == "new"
+
+
+@pytest.mark.parametrize("linked", [False, True])
+def test_a_pipe_is_not_replaced(tmp_path, linked):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("pipe")
+    with pytest.raises(ValueError, match=tells("a pipe")), atomic_path(tmp_path / ("link" if linked else "pipe")):
+        pass
+    assert stat.S_ISFIFO((tmp_path / "pipe").stat().st_mode)
+    assert (tmp_path / "link").is_symlink()
+
+
+@pytest.mark.parametrize("block", [atomic_path, atomic_folder])
+def test_a_folder_that_is_deleted_meanwhile_is_said(tmp_path, block):
+    def write():
+        with block(tmp_path / "run" / "out") as new:
+            shutil.rmtree(tmp_path / "run")
+            save_file({"a": torch.zeros(2)}, new if block is atomic_path else new / "a.safetensors")
+
+    with pytest.raises(FileNotFoundError, match=tells(tmp_path / "run" / "out", "deleted or moved", "again")) as caught:
+        write()
+    assert "kfgs-unfinished" not in str(caught.value)
 
 
 def test_files_that_came_meanwhile_stay(tmp_path):

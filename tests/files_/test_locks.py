@@ -57,3 +57,29 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path):
         locked(tmp_path / "file" / "run", "lock"),
     ):
         pass
+
+
+def link(place):
+    place.symlink_to("../mine")
+
+
+def dangling(place):
+    place.symlink_to("../new")
+
+
+def hard_link(place):
+    os.link(place.parent.parent / "mine", place)
+
+
+@pytest.mark.parametrize("make", [link, dangling, hard_link, os.mkfifo])
+def test_a_lock_that_is_no_lock_file_is_named_and_nothing_is_written(tmp_path, make):
+    (tmp_path / "mine").write_text("mine")
+    (tmp_path / "run").mkdir()
+    make(tmp_path / "run" / "lock")
+    with (
+        pytest.raises(ValueError, match=tells(tmp_path / "run" / "lock", "lock file", "delete it")),
+        locked(tmp_path / "run", "lock"),
+    ):
+        pass
+    assert (tmp_path / "mine").read_text() == "mine"
+    assert not (tmp_path / "new").exists()

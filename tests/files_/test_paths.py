@@ -1,83 +1,121 @@
-"""Links that lead to themselves, devices and pipes in the place of files, and a limit on the size of files."""
-
+import ast
 import os
-import resource
-import stat
-import subprocess
-import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from messages import tells
 
 import kfgs
-from kfgs._files import atomic_path, check_output, parse_json, read_json, real_path, write_json
-from kfgs.cli import main
-from kfgs.formats.ply import write_ply
-from kfgs.labels import LabelSet
+from kfgs._files import as_path, check_output
+from kfgs._files import paths as paths_module
+
+ROOT = Path(kfgs.__file__).parent
 
 
-def test_a_link_that_leads_to_itself_is_no_traceback(tmp_path, capsys):
-    loop = tmp_path / "loop.ply"
-    loop.symlink_to("loop.ply")
-    assert real_path(loop).parent == real_path(tmp_path)
-    write_ply(tmp_path / "a.ply", {"x": np.zeros(3, np.float32)})
-    for words in (["info", loop], ["convert", loop, tmp_path / "b.ply"], ["convert", tmp_path / "a.ply", loop]):
-        assert main([str(word) for word in words]) == 1
-        assert capsys.readouterr().err.startswith("error: ")
+def test_home_is_expanded_as_in_a_shell(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert as_path("~/scene") == as_path(Path("~/scene")) == tmp_path / "scene"
+    assert as_path("~") == tmp_path
+    assert as_path("~no such user/a") == Path("~no such user/a")
+    assert as_path("a/~/b~") == Path("a/~/b~")
 
 
-def test_no_file_of_kfgs_resolves_paths_in_another_way():
-    root = Path(kfgs.__file__).parent
-    found = [file for file in root.rglob("*.py") if ".resolve(" in file.read_text(encoding="utf-8")]
-    assert [file.relative_to(root).as_posix() for file in found] == []
+def test_no_public_function_reads_a_path_in_another_way():
+    """A parameter that is a text or a path goes through `as_path`, so that `~` never becomes a folder of that name."""
+    found = []
+    for file in ROOT.rglob("*.py"):
+        if file.parts[len(ROOT.parts)] == "_files":
+            continue
+        for function in ast.walk(ast.parse(file.read_text())):
+            if not isinstance(function, ast.FunctionDef):
+                continue
+            arguments = [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]
+            given = {a.arg for a in arguments if a.annotation and "str | Path" in ast.unparse(a.annotation)}
+            for call in ast.walk(function):
+                is_path = isinstance(call, ast.Call) and ast.unparse(call.func) == "Path" and call.args
+                if is_path and ast.unparse(call.args[0]) in given:
+                    found.append(f"{file.relative_to(ROOT)}:{call.lineno}")
+    assert found == []
 
 
-def test_a_link_in_the_place_of_a_file_is_replaced_and_what_it_leads_to_stays(tmp_path):
-    (tmp_path / "mine.json").write_text("mine")
-    (tmp_path / "out.json").symlink_to("mine.json")
-    write_json(tmp_path / "out.json", [1])
-    assert read_json(tmp_path / "out.json") == [1]
-    assert not (tmp_path / "out.json").is_symlink()
-    assert (tmp_path / "mine.json").read_text() == "mine"
+def refused(path, kind, *parts, error=ValueError, **places):
+    with pytest.raises(error, match=tells("out:", path, *parts)) as caught:
+        check_output("out", path, kind, **places)
+    assert "kfgs-unfinished" not in str(caught.value)
 
 
-def test_a_pipe_or_a_device_is_never_replaced(tmp_path):
-    pipe = tmp_path / "pipe.json"
-    os.mkfifo(pipe)
-    with pytest.raises(ValueError, match=tells("out", "pipe.json", "a pipe", "name a file")):
-        check_output("out", pipe, "a file")
-    with pytest.raises(ValueError, match=tells("pipe.json", "a pipe")), atomic_path(pipe) as new:
-        new.write_text("1")
-    assert stat.S_ISFIFO(pipe.stat().st_mode)
-    assert os.listdir(tmp_path) == ["pipe.json"]
-    with pytest.raises(ValueError, match="/dev/null"):
-        check_output("out", "/dev/null", "a file")
+def test_what_can_be_written_is_returned_and_nothing_is_left(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old.ply").touch()
+    for name, kind in (
+        ("old", "a folder"),
+        ("old.ply", "a file"),
+        ("new/deep", "a folder"),
+        ("new/deep.ply", "a file"),
+    ):
+        assert check_output("out", f"~/{name}", kind) == tmp_path / name
+    monkeypatch.chdir(tmp_path)
+    assert check_output("out", "new", "a folder") == Path("new")
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["old", "old.ply"]
 
 
-@pytest.mark.parametrize("write", ["new.write_bytes(bytes(9_000_000))", "np.zeros(9_000_000).tofile(new)"])
-def test_a_limit_on_the_size_of_files_is_told_as_such(write, tmp_path):
-    code = "import sys, numpy as np\nfrom kfgs._files import atomic_path\n"
-    code += f"with atomic_path('big.bin') as new:\n    {write}\n"
-
-    def limited():
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
-
-    env = os.environ | {"PYTHONPATH": str(Path(kfgs.__file__).parents[1]), "PYTHONDONTWRITEBYTECODE": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, preexec_fn=limited, env=env, capture_output=True, text=True
-    )
-    assert "big.bin: expected to write it whole, but files may have at most 1,000,000 bytes here" in done.stderr
-    assert "ulimit -f" in done.stderr
-    assert os.listdir(tmp_path) == []
+def test_files_and_folders_are_not_mistaken(tmp_path):
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    refused(tmp_path / "file", "a folder", "got a file")
+    refused(tmp_path / "folder", "a file", "got a folder")
+    refused(tmp_path / "file" / "deep" / "a", "a file", f"below the file {tmp_path / 'file'}")
 
 
-def test_half_of_a_pair_of_surrogates_is_named_with_its_file(tmp_path):
-    file = tmp_path / "classes.json"
-    file.write_text('["wall", "chair\\ud83d"]')
-    with pytest.raises(ValueError, match=tells("classes.json", "surrogates")):
-        read_json(file)
-    assert parse_json('"\\ud83d\\ude00"') == "\N{GRINNING FACE}"
-    with pytest.raises(ValueError, match=tells("names", "surrogates", r"'chair\ud83d'")):
-        LabelSet(("wall", "chair\ud83d"), np.eye(2, dtype=np.float32))
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs a folder that nobody can write to")
+def test_what_cannot_be_written_is_named_as_it_was_given():
+    refused("/proc/a.ply", "a file", "can be written", error=OSError)
+    refused("/proc/deep/run", "a folder", "can be written", error=OSError)
+
+
+def test_a_file_that_is_read_only_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "a.ply").touch(0o444)
+    monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path / "a.ply")  # the superuser may write it
+    refused(tmp_path / "a.ply", "a file", "Permission denied", error=OSError)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's full device")
+def test_a_full_disk_is_refused(tmp_path, monkeypatch):
+    with Path("/dev/full").open("wb", buffering=0) as full:
+        monkeypatch.setattr(paths_module.tempfile, "TemporaryFile", lambda **_: full)
+        refused(tmp_path / "run", "a folder", "No space left", error=OSError)
+
+
+def test_pictures_and_maps_stay_apart(tmp_path):
+    images = tmp_path / "images"
+    images.mkdir()
+    (tmp_path / "link").symlink_to(images)
+    for path in (images, images / "deep" / "run", tmp_path / "link" / "run"):
+        refused(path, "a folder", "pictures", apart=[images])
+    assert check_output("out", tmp_path / "run", "a folder", apart=[images])
+    refused(tmp_path / "link", "a folder", "pictures", other=[None, images])
+    assert check_output("out", images / "run", "a folder", other=[None, images])
+
+
+def test_an_empty_path_is_not_the_current_folder():
+    with pytest.raises(ValueError, match=tells("path:", "empty")):
+        as_path("")
+    refused("", "a folder", "empty")
+
+
+def test_a_pipe_is_no_output(tmp_path):
+    os.mkfifo(tmp_path / "pipe.ply")
+    with pytest.raises(ValueError, match=tells(tmp_path / "pipe.ply", "pipe")):
+        check_output("out", tmp_path / "pipe.ply", "a file")
+
+
+@pytest.mark.parametrize("place", ["sparse", "sparse/0"])
+def test_links_inside_an_output_are_refused_and_the_output_itself_may_be_one(tmp_path, place):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "out" / place).parent.mkdir(parents=True)
+    (tmp_path / "out" / place).symlink_to(tmp_path / "mine")
+    (tmp_path / "link").symlink_to("mine")
+    with pytest.raises(ValueError, match=tells(tmp_path / "out" / place, "a link", tmp_path / "mine")):
+        check_output("out", tmp_path / "out", "a folder", inside=["sparse/0"])
+    assert check_output("out", tmp_path / "link", "a folder", inside=["sparse/0"])

@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import os
+import shutil
 from collections.abc import Callable
 
 import pytest
@@ -13,7 +14,15 @@ from kfgs.features import FeatureFolder
 from kfgs.fields import SemanticField
 from kfgs.gaussians import Gaussians
 from kfgs.pipeline import FitConfig, fit_scene
-from kfgs.pipeline.runs import compare_fields, find_run_field, keep_field, list_fields, restore_field, say_kept
+from kfgs.pipeline.runs import (
+    check_current,
+    compare_fields,
+    find_run_field,
+    keep_field,
+    list_fields,
+    restore_field,
+    say_kept,
+)
 from kfgs.pipeline.stages import LOCK, Run
 from kfgs.scenes import load_scene
 
@@ -104,13 +113,36 @@ def test_a_field_without_a_report_shows_none(run):
 
 
 def test_the_report_stays_if_the_field_turns_out_the_same(tmp_path):
-    a_field(1).save(tmp_path / "field")
+    a_field(1, seconds={"color": 1}).save(tmp_path / "field")
     report(tmp_path, "field 1")
     before = keep_field(tmp_path)
-    a_field(1, more="notes").save(tmp_path / "field")
+    a_field(1, seconds={"color": 2}, kfgs="9").save(tmp_path / "field")
     say_kept(Run(tmp_path), before)
     assert (tmp_path / "report.html").read_text() == "field 1"
     assert [path.name for path in tmp_path.glob("field@*")] == []
+
+
+def test_a_field_of_equal_numbers_and_other_notes_is_another_one(run):
+    for note in ("mine", "theirs"):
+        before = keep_field(run)
+        a_field(2, note=note).save(run / "field")
+        say_kept(Run(run), before)
+    fields = list_fields(run)
+    assert [field.info.get("note") for field in fields[:1]] == ["theirs"]
+    assert {field.info.get("note") for field in fields[1:]} == {"mine", None}
+    assert len({field.key for field in fields}) == 5
+    restored = restore_field(run, next(field.key for field in fields if field.info.get("note") == "mine"))
+    assert restored.info["note"] == json.loads((run / "field" / "field.json").read_text())["info"]["note"] == "mine"
+
+
+def test_a_kept_field_is_found_under_another_name_and_not_copied_again(run):
+    """Older versions of kfgs named it by its numbers alone; a user may have renamed or copied it."""
+    earlier = list_fields(run)[1]
+    earlier.path.rename(run / "field@old")
+    shutil.copytree(run / "field@old", run / "field@old copy")
+    restore_field(run, earlier.key)
+    assert keep_field(run).path == run / "field@old"
+    assert len(list_fields(run)) == len(list(run.glob("field@*"))) - 1 == 3
 
 
 REPORTS = (
@@ -156,8 +188,34 @@ def test_a_comparison_names_what_differs_and_nothing_else(run):
     assert compare_fields(fields[0], fields[0]) == []
 
 
-@pytest.mark.parametrize("key", ["", "nonsense", "../field"])
+@pytest.mark.parametrize("what", ["numbers cut", "numbers missing", "text cut", "text is a list", "other numbers"])
+def test_a_damaged_copy_does_not_count_as_kept(run, what):
+    before = keep_field(run)  # an earlier fit made it, and it was damaged since
+    if what == "text is a list":
+        (before.path / "field.json").write_text("[]")
+    elif what == "other numbers":
+        a_field(7).save(before.path)
+    else:
+        damage(before.path, what)
+    assert keep_field(run).key == before.key
+    a_field(3).save(run / "field")
+    restore_field(run, before.key)
+    assert first(run / "field") == 2
+
+
+def test_a_file_where_the_field_is_kept_is_named_before_the_work(run):
+    place = run / f"field@{list_fields(run)[0].key}"
+    place.write_text("mine")
+    with pytest.raises(FileExistsError, match=tells(place, "a file", "move it")):
+        check_current(run)
+    assert place.read_text() == "mine"
+
+
+@pytest.mark.parametrize("key", ["", "field@", "nonsense", "../field"])
 def test_an_unknown_key_is_refused_with_those_that_are_there(run, key):
+    shutil.rmtree(list_fields(run)[2].path)
+    if key == "field@":
+        shutil.rmtree(list_fields(run)[1].path)  # the current one is the only one
     with pytest.raises(ValueError, match=tells("key:", *(field.key for field in list_fields(run)), repr(key))):
         find_run_field(run, key)
 

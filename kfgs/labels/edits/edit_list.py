@@ -20,6 +20,12 @@ FORMAT, VERSION = "kfgs.edits", 1
 OPS: dict[str, type[Edit]] = {op.op: op for op in (Remove, Extract, Recolor, Opacity, Move, Duplicate, Insert)}
 
 
+def edits_path(path: str | Path) -> Path:
+    """`scene.ply` -> `scene.ply.edits.json`: the edits that made this one splat file."""
+    path = as_path(path)
+    return path.with_name(path.name + ".edits.json")
+
+
 class EditError(ValueError):
     """An edit of a list that cannot be done: its place in the list, and why."""
 
