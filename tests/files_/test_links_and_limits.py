@@ -46,7 +46,7 @@ def test_a_link_in_the_place_of_a_file_is_replaced_and_what_it_leads_to_stays(tm
 def test_a_pipe_or_a_device_is_never_replaced(tmp_path):
     pipe = tmp_path / "pipe.json"
     os.mkfifo(pipe)
-    with pytest.raises(ValueError, match=tells("out", "pipe.json", "a pipe", "name a file")):
+    with pytest.raises(ValueError, match=tells("pipe.json", "a pipe", "another name")):
         check_output("out", pipe, "a file")
     with pytest.raises(ValueError, match=tells("pipe.json", "a pipe")), atomic_path(pipe) as new:
         new.write_text("1")
