@@ -98,7 +98,7 @@ def test_nothing_of_the_users_is_overwritten(run, room, tmp_path, capsys):
     before = cloud.read_bytes()
     arguments = ["label", str(run / "field"), "--scene", str(room), "--out", str(tmp_path), "--cloud", str(cloud)]
     assert main(arguments) == 1
-    assert "what an earlier `kfgs label` wrote" in capsys.readouterr().err
+    assert "would be overwritten" in capsys.readouterr().err
     assert cloud.read_bytes() == before
 
 
