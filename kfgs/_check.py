@@ -225,6 +225,8 @@ def typed(function: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(function)
     def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+        if torch.compiler.is_compiling():  # it cannot trace this
+            return function(*args, **kwargs)
         if not kinds:  # not before all modules are there
             kinds.update({name: _kinds(hint) for name, hint in get_type_hints(function).items()})
         given = signature.bind(*args, **kwargs).arguments
@@ -272,14 +274,17 @@ def check_choice(name: str, value: object, choices: Iterable[object]) -> None:
 
 
 def check_range(
-    name: str, value: float, low: float, high: float = float("inf"), *, closed: tuple[bool, bool] = (True, True)
+    name: str, value: Any, low: float, high: float = float("inf"), *, closed: tuple[bool, bool] = (True, True)
 ) -> None:
     """Raise a ValueError unless `value` is a finite number between `low` and `high` (`closed`: are the ends included)."""
-    if isinstance(value, Tensor | np.ndarray) and math.prod(value.shape) != 1:
+    array = isinstance(
+        value, Tensor | np.ndarray | np.generic
+    )  # no getattr: a number may be a symbol while torch traces
+    if array and math.prod(value.shape) != 1:
         got = f"{type(value).__name__} of shape {tuple(value.shape)}"
         raise TypeError(f"{name}: expected one number, got {got}; pass a float")
-    kind = getattr(value, "dtype", None)
-    if isinstance(value, bool) or kind in (torch.bool, np.bool_) or not (isinstance(value, numbers.Real) or kind):
+    odd = value.dtype in (torch.bool, np.bool_) if array else not isinstance(value, int | float | numbers.Real)
+    if odd or isinstance(value, bool):
         raise TypeError(f"{name}: expected a number, got {value!r:.80} ({type(value).__name__}); pass a float")
     over = value >= low if closed[0] else value > low
     under = value <= high if closed[1] else value < high

@@ -50,8 +50,14 @@ _group: _Group | None = None
 
 def place() -> tuple[int, int]:
     """(rank, number of processes) as torchrun numbered them; (0, 1) without torchrun."""
-    size = int(os.environ.get("WORLD_SIZE", 1))
-    return (int(os.environ["RANK"]), size) if size > 1 and "RANK" in os.environ else (0, 1)
+    numbers = []
+    for name, usual in (("RANK", "0"), ("WORLD_SIZE", "1")):
+        word = os.environ.get(name) or usual
+        if not word.isdecimal():
+            raise ValueError(f"{name}: expected a whole number, as torchrun sets it, got {word!r:.40}; unset it")
+        numbers.append(int(word))
+    rank, size = numbers
+    return (rank, size) if size > 1 and os.environ.get("RANK") else (0, 1)
 
 
 def first() -> bool:

@@ -71,7 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
     if shutil.get_terminal_size().columns < NARROW:
         os.environ["COLUMNS"] = str(NARROW)
     words, names = sys.argv[1:] if arguments is None else arguments, dict[str, str]()
-    rank, _ = place()
+    rank = 0
 
     def failed(message: object) -> int:
         with suppress(OSError):  # nobody can be told
@@ -79,12 +79,14 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
 
     try:
+        rank, _ = place()
         return _run(words, names)
     except PeerError as error:  # that process has said it, perhaps into another log
         return failed(error) if rank == 0 else 1
     except KeyboardInterrupt:
         goes_on = bool(RESUMED & {*words[:1]})
-        say("interrupted" + ("; the same command goes on where it stopped" if goes_on else ""), sys.stderr)
+        with suppress(OSError):  # the same Ctrl-C may have ended who read it
+            say("interrupted" + ("; the same command goes on where it stopped" if goes_on else ""), sys.stderr)
         return 130
     except BrokenPipeError:
         return 141

@@ -84,7 +84,13 @@ def batch(
     else:
         check_teacher_name(teacher.teacher)
         given = teacher_options(teacher.teacher, teacher.fast, teacher.size)
-    config = fit_config(method, seed=training.seed, steps=training.steps, max_gaussians=training.max_gaussians)
+    config = fit_config(
+        method,
+        seed=training.seed,
+        steps=training.steps,
+        max_gaussians=training.max_gaussians,
+        views_per_step=training.views_per_step,
+    )
     options = BatchOptions(
         teacher=teacher.teacher,
         weights=teacher.weights,

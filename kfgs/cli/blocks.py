@@ -46,7 +46,13 @@ def blocks(
     from ..scale import fit_blocks, open_client, split_scene
 
     check_output("out", out, "a folder", apart=inputs_of(scene), other=[maps.features])
-    config = fit_config(FieldMethod(), seed=training.seed, steps=training.steps, max_gaussians=training.max_gaussians)
+    config = fit_config(
+        FieldMethod(),
+        seed=training.seed,
+        steps=training.steps,
+        max_gaussians=training.max_gaussians,
+        views_per_step=training.views_per_step,
+    )
     config = dataclasses.replace(config, undistorted_features=maps.undistorted_features, device=training.device)
     split_scene(scene, out, count, features=maps.folder(scene), splat=splat, latents=latents, report=say)
     with nullcontext() if workers is None else open_client(workers=workers) as client:

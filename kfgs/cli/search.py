@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from .._files import InUseError
 from .files import check_alone
 from .options import Given, Positional, Teacher
 from .output import say, wrote
@@ -99,7 +100,7 @@ def _up_to_date(known: Any) -> Any:
         return known
     try:
         known, changes = known.update(progress=True)
-    except ValueError as error:
+    except InUseError as error:
         if len(known) == 0:
             raise
         say(f"note: the index is not extended now: {error}")

@@ -118,9 +118,9 @@ def _key(source: Path, color: Path | None, *options: Any) -> str | None:
 
     words = [real_path(source), color and real_path(color), *options]
     named = [value for option in options if dataclasses.is_dataclass(option) for value in vars(option).values()]
-    files = [Path(value) for value in named if isinstance(value, str | Path) and Path(value).exists()]
     run = source.parent if source.name == "field" else source  # its colours are shown, too
-    return scene_key(words, [run, *([color] if color else []), *files])
+    inputs = [run, *([color] if color else []), *(value for value in named if isinstance(value, Path))]
+    return scene_key(words, inputs)
 
 
 def _check_drawing(place: Where) -> None:

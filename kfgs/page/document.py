@@ -24,7 +24,7 @@ PYTHON_START = """\
     const link = new kfgs.PythonLink(kfgs.callPage, header);
     const shown = loaded.headers.get("ETag"); // the scene may have been kept, and be outdated
     const version = fetch("version").then((answer) => (answer.ok ? answer.text() : shown));
-    version.then((text) => text === shown || location.reload()).catch(() => null);
+    version.then((text) => text === shown || (sessionStorage.clear(), location.reload())).catch(() => null);
     window.viewer = await kfgs.mount(root, { header, data }, link);"""
 ROOT = '<div id="kfgs"></div>'
 """Holds the viewer, and shows that a page is one of kfgs."""

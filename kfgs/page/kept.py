@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import sys
 from collections.abc import Iterable
 from contextlib import suppress
+from importlib.metadata import version
 from pathlib import Path
 
 from .._files import atomic_path, digest_value, real_path
 
-MOST = 8  # scenes that are kept; the one that was not used for the longest time goes first
+MOST, MOST_BYTES = 8, 1 << 30  # scenes that are kept; those that were not used for the longest time go first
+ODD = (OSError, ValueError, RuntimeError, MemoryError)  # no reason to fail: no home, a full disk, an odd name
 MOST_FILES = 20_000  # of all inputs together: looking at more takes longer than Python
 CODE = Path(__file__).parents[1]
 
@@ -27,8 +30,9 @@ def scenes_folder() -> Path:
     elif sys.platform == "darwin":
         base = Path.home() / "Library/Caches"
     else:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "kfgs" / "scenes"
+        given = os.environ.get("XDG_CACHE_HOME", "")
+        base = given if os.path.isabs(given) else Path.home() / ".cache"
+    return Path(base) / "kfgs" / "view-scenes"
 
 
 def scene_key(words: Iterable[object], inputs: Iterable[Path]) -> str | None:
@@ -36,20 +40,18 @@ def scene_key(words: Iterable[object], inputs: Iterable[Path]) -> str | None:
 
     Files beside an input count if their names begin as its own does: labels lie there. None if there are too many files.
     """
-    code = (file for folder in (CODE / "page", CODE / "viz/explorer") for file in folder.iterdir())
-    files = [file for path in inputs for file in _files_of(real_path(path))]
-    if len(files) > MOST_FILES:
-        return None
-    try:
-        dates = [(str(file), (state := file.stat()).st_size, state.st_mtime_ns) for file in sorted({*files, *code})]
-    except OSError:  # deleted meanwhile
-        return None
-    return digest_value([[str(word) for word in words], dates])
+    with suppress(*ODD):
+        code = (file for folder in (CODE / "page", CODE / "viz/explorer") for file in folder.iterdir())
+        files = [file for path in inputs for file in _files_of(real_path(path))]
+        if len(files) <= MOST_FILES:
+            dates = [(str(file), (state := file.stat()).st_size, state.st_mtime_ns) for file in sorted({*files, *code})]
+            return digest_value([version("kfgs"), [str(word) for word in words], dates])
+    return None
 
 
 def read_scene(key: str) -> bytes | None:
     """The packed scene, if it is kept and whole."""
-    with suppress(OSError):
+    with suppress(*ODD):
         path = scenes_folder() / key
         content = path.read_bytes()
         if hashlib.sha256(content[32:]).digest() == content[:32]:
@@ -60,14 +62,20 @@ def read_scene(key: str) -> bytes | None:
 
 def keep_scene(key: str, packed: bytes) -> None:
     """Keep a packed scene for the next time. Where no file can be written, nothing is kept."""
-    with suppress(OSError, RuntimeError):  # RuntimeError: there is no home folder
+    with suppress(*ODD):
         folder = scenes_folder()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with atomic_path(folder / key) as path:
-            path.write_bytes(hashlib.sha256(packed).digest() + packed)
-        kept = sorted((file for file in folder.iterdir() if file.is_file()), key=lambda file: file.stat().st_mtime_ns)
-        for file in kept[:-MOST]:
-            file.unlink(missing_ok=True)
+        with atomic_path(folder / key) as path, path.open("wb") as new:
+            new.write(hashlib.sha256(packed).digest())
+            new.write(packed)
+        kept = [
+            file for file in folder.iterdir() if re.fullmatch("[0-9a-f]{64}", file.name)
+        ]  # the user's own files stay
+        total = 0
+        for number, file in enumerate(sorted(kept, key=lambda file: -file.stat().st_mtime_ns)):
+            total += file.stat().st_size
+            if number >= MOST or total > MOST_BYTES:
+                file.unlink(missing_ok=True)
 
 
 def _files_of(path: Path) -> list[Path]:

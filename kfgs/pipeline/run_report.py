@@ -121,7 +121,7 @@ def write_run_report(
     stages = [(one.name, seconds_in_words(one.seconds), "found" if one.reused else "made") for one in result.stages]
     stages.append(("all", seconds_in_words(result.seconds), ""))
     repeat = command or f"kfgs.pipeline.fit_scene(scene, maps, {str(result.folder)!r}, config)"
-    title = f"{real_path(result.folder).name}"
+    title = real_path(result.folder).name
     unused = ("codebook", "autoencoder", "field", "mode") if config.method == "fuse" else ("uplift", "color")
     options = json.dumps({name: value for name, value in asdict(config).items() if name not in unused}, indent=1)
     parts = [

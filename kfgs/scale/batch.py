@@ -205,8 +205,9 @@ class _Record:
         """Read what an earlier batch left; whether its failure is to be forgotten."""
         self._log = self.place.read_text(LOG) or ""
         before = self.place.read_json(STATE)
-        if before.get("format") == FORMAT and before.get("failure") and not retry_failed:
-            self.row.failure = Failure(**before["failure"])
+        failure = before.get("failure") if before.get("format") == FORMAT else None
+        if isinstance(failure, dict) and {"stage", "message"} <= set(failure) and not retry_failed:
+            self.row.failure = Failure(*(str(failure.get(name, "")) for name in ("stage", "message", "traceback")))
             self.row.stages = {self.row.failure.stage: "failed"}
             return False
         return True

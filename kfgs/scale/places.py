@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from .._files import atomic_path
+from .._files import atomic_path, parse_json
 from .scene_list import is_url
 
 LOCAL_ONLY = ("digests.json",)  # a run's notes about files of this machine
@@ -46,7 +46,7 @@ class Place:
     def read_text(self, name: str) -> str | None:
         """A text; None if there is none."""
         try:
-            return (self.path / name).read_text(encoding="utf-8")
+            return (self.path / name).read_text(encoding="utf-8", errors="replace")
         except FileNotFoundError:
             return None
 
@@ -66,7 +66,7 @@ class Place:
     def read_json(self, name: str) -> dict[str, Any]:
         """A JSON object that a batch wrote; an empty one if there is none, or it is damaged."""
         with suppress(ValueError):
-            found = json.loads(self.read_text(name) or "{}")
+            found = parse_json(self.read_text(name) or "{}")
             if isinstance(found, dict):
                 return found
         return {}

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from .._card import short_repr
 from ..cameras import Camera
 from ..fields import SemanticField
 from ..gaussians import Gaussians
@@ -31,6 +32,9 @@ class Described(NamedTuple):
     book: SharedCodebook
     outside: float  # share of the known Gaussians whose word is farther than the tolerance
 
+    def __repr__(self) -> str:
+        return short_repr(self)
+
 
 class Grouped(NamedTuple):
     """Gaussians in disjoint groups, by number."""
@@ -39,6 +43,9 @@ class Grouped(NamedTuple):
     word: Array  # [A] int64
     pooled: Array  # [A] bool
     links: Array  # [L, 2] int32, pairs of groups that touch
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def describe(field: SemanticField, book: SharedCodebook, classes: LabelSet | None) -> Described:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .._card import short_repr
 from .._files import atomic_path, parse_json
 
 Array = NDArray[Any]
@@ -74,6 +75,9 @@ class Entry:
     rows: dict[str, Rows]
     """By kind: see `COLUMNS`."""
 
+    def __repr__(self) -> str:
+        return short_repr(self)
+
 
 @dataclass(frozen=True, eq=False)
 class Space:
@@ -82,6 +86,9 @@ class Space:
     teacher: dict[str, Any] | None
     tolerance: float
     words: Array  # [K, D] float32, unit rows
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +101,9 @@ class Table:
     info: dict[str, Any]
     embeddings: Array  # [C, D] float32
     negatives: Array  # [M, D] float32; M may be 0
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 @dataclass(frozen=True)
@@ -114,6 +124,9 @@ class Contents:
     """By path."""
     unread: dict[str, Unread] = field(default_factory=dict)
     """By path."""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def empty_rows(kind: str) -> dict[str, Array]:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+from .._card import short_repr
 from .._files import current_file, digest_file
 from .._files.fields import DESCRIPTION, fields_below
 from .search_file import Contents, Entry, Unread
@@ -21,6 +22,9 @@ class State(NamedTuple):
     removed: tuple[str, ...]
     unread: dict[str, Unread]
     """Fields that could not be read before, and have not changed since."""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def mark_of(path: Path) -> tuple[Path, tuple[int, int]]:

@@ -77,13 +77,25 @@ def test_a_damaged_file_is_none(inputs):
 
 def test_the_oldest_goes(monkeypatch):
     monkeypatch.setattr(kept, "MOST", 2)
+    scenes_folder().mkdir(parents=True)
+    for number in range(5):
+        (scenes_folder() / f"mine_{number}").write_text("my own")
     for number, name in enumerate("abc"):
-        keep_scene(name, name.encode())
-        os.utime(scenes_folder() / name, ns=(number, number))
-    assert read_scene("a") is None
-    assert read_scene("b") == b"b"  # and is now the one that was used last
-    keep_scene("d", b"d")
-    assert [read_scene(name) for name in "bcd"] == [b"b", None, b"d"]
+        keep_scene(64 * name, name.encode())
+        os.utime(scenes_folder() / (64 * name), ns=(number, number))
+    assert read_scene(64 * "a") is None
+    assert read_scene(64 * "b") == b"b"  # and is now the one that was used last
+    keep_scene(64 * "d", b"d")
+    assert [read_scene(64 * name) for name in "bcd"] == [b"b", None, b"d"]
+    assert len(list(scenes_folder().glob("mine_*"))) == 5  # not ours
+
+
+def test_large_scenes_push_others_out(monkeypatch):
+    monkeypatch.setattr(kept, "MOST_BYTES", 100)
+    for number, name in enumerate("ab"):
+        keep_scene(64 * name, bytes(40))
+        os.utime(scenes_folder() / (64 * name), ns=(number, number))
+    assert [read_scene(64 * name) is None for name in "ab"] == [True, False]
 
 
 def test_no_folder_is_no_reason_to_fail(tmp_path, monkeypatch):
@@ -94,6 +106,14 @@ def test_no_folder_is_no_reason_to_fail(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path / "caches"))
     keep_scene("a", b"a")
     assert read_scene("a") is None
+
+    def homeless():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(kept.Path, "home", homeless)
+    keep_scene("a", b"a")
+    assert read_scene("a") is None
+    assert scene_key([], [tmp_path / ("x" * 5000)]) is None
 
 
 @needs_chromium[0]
