@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from .._files import check_output
+from .._files import check_output, real_path
 from .files import inputs_of
 from .options import FieldMethod, Given, Maps, Positional, SceneFolder, Training, fit_config
 from .output import say, wrote
@@ -83,6 +83,8 @@ def join(
     check_output("out", out, "a folder")
     check_place(out)
     found = FieldInBlocks.open(city)
+    if real_path(out).is_relative_to(real_path(city)):
+        raise ValueError(f"out: expected a place outside {city}, which is read, got {out}; give another")
     field = found.joined() if corners is None else found.within(corners[:3], corners[3:])
     field.save(out)
     say(field.summary())
@@ -98,6 +100,6 @@ def _corners(box: str | None) -> list[float] | None:
         numbers = [float(word) for word in words]
     except ValueError:
         numbers = []
-    if len(numbers) != 6 or any(low > high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
+    if len(numbers) != 6 or not all(low <= high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
         raise ValueError(f"box: expected six numbers, low corner and high corner, as in 0,0,-2,40,10,8, got {box!r}")
     return numbers

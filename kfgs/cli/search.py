@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from .._files import InUseError
+from .._files import InUseError, check_own, read_json
 from .files import check_alone
 from .options import Given, Positional, Teacher
 from .output import say, wrote
@@ -71,6 +71,9 @@ def search(
         from .._files import check_output
 
         check_output("json", json, "a file")
+    if json is not None:
+        check_output("json", json, "a file")
+        check_own(json, lambda path: "query" in read_json(path), "kfgs search")
     known = _up_to_date(SearchIndex.open(folder))
     if len(known) == 0:
         raise ValueError(f"folder: expected fields below {folder}, got none that can be read; make one with `kfgs fit`")

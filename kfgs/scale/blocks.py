@@ -16,19 +16,20 @@ from typing import Any
 import torch
 
 from .._check import as_array, check_whole
-from .._files import as_path, check_inside, check_output, read_json, real_path, write_json
+from .._files import as_path, check_inside, check_output, digest_file, locked, read_json, real_path, write_json
 from ..features import FeatureFolder
 from ..fields import SemanticField, sample_latents, select_gaussians
-from ..formats import read_splats, write_splats
+from ..formats import SplatFile, read_splats, write_splats
 from ..pipeline import FitConfig, fit_scene
 from ..quant import LinearLatents
 from ..scenes import Scene, SceneError, load_scene
 from ..scenes.blocks import Block, partition, write_part
 from ..scenes.load import find_model
 from .batch import map_scenes
-from .in_blocks import BLOCKS, CORE, FORMAT, FieldInBlocks, read_blocks
+from .in_blocks import BLOCKS, CORE, FACTS, FORMAT, FieldInBlocks, read_blocks
 
 LATENTS, SPLAT = "latents.safetensors", "splat.ply"
+RUN = ".run"  # hidden: its field has the Gaussians of the reach, too, and `kfgs search` must not count them
 BESIDE = ("classes.json", "text.npy", "text.safetensors", "labels", "labels_scored")
 """Files and folders of a scene that belong to each of its blocks, too."""
 REACH = 3.0  # standard deviations: farther out, a Gaussian is below 1/255 of any pixel
@@ -63,12 +64,15 @@ def split_scene(
     Raises:
         SceneError: as `scenes.partition`.
         FileNotFoundError: if views have no maps.
-        ValueError: if OUT holds another scene's blocks, or others of this scene.
+        ValueError: if OUT holds another scene's blocks, or was cut from other maps, another splat or in another way; if another
+            process cuts there; if OUT is the scene, or lies among its maps.
     """
-    source, out, say = as_path(scene), check_output("out", out, "a folder"), report or (lambda text: None)
+    source, say = as_path(scene), report or (lambda text: None)
+    maps_folder = source / "features" if features is None else as_path(features)
+    out = check_output("out", out, "a folder", apart=[maps_folder], other=[source])
     check_whole("latents", latents, 1)
     whole = load_scene(source)
-    maps_folder = source / "features" if features is None else as_path(features)
+    cloud = None if splat is None else read_splats(splat)
     maps = FeatureFolder(maps_folder).of(whole, "train")
     model = find_model(source)
     if model is None:
@@ -78,6 +82,9 @@ def split_scene(
         "format": FORMAT,
         "version": 1,
         "scene": os.path.relpath(source, out),
+        "features": os.path.relpath(real_path(maps_folder), real_path(out)),
+        "splat": None if splat is None else digest_file(splat),
+        "latents": latents,
         "blocks": [b.to_json() for b in blocks],
     }
     _check_same(out, facts)
@@ -88,25 +95,32 @@ def split_scene(
             raise SceneError(
                 f"{block.name}: expected training views that see it, got none; ask for fewer blocks than {count}"
             )
-    out.mkdir(parents=True, exist_ok=True)
-    sample_latents(maps, count=latents).save(out / LATENTS)
-    cloud = None if splat is None else read_splats(splat)
-    for block in blocks:
-        folder = out / block.name
-        write_part(model, block.views, folder / "sparse" / "0")
-        _link(folder / "images", _picture_folder(whole))
-        _link(folder / "features", maps_folder)
-        for name in BESIDE:
-            if (source / name).exists():
-                _link(folder / name, source / name)
-        write_json(folder / "split.json", _splits(whole, block))
-        if cloud is not None:
-            means, radii = as_array(cloud.gaussians.means), REACH * as_array(cloud.gaussians.scales).max(1)
-            write_splats(folder / SPLAT, cloud.select(torch.from_numpy(block.needs(means, radii))))
-        write_json(folder / "block.json", block.to_json())
-        say(f"{block.name}: {len(block.views)} views")
-    write_json(out / BLOCKS, facts)
+    with locked(out, ".blocks.lock"):
+        _check_same(out, facts)
+        write_json(out / BLOCKS, facts)  # first, so that another cut is refused even if this one is killed
+        sample_latents(maps, count=latents).save(out / LATENTS)
+        for block in blocks:
+            _write_block(out / block.name, block, whole, maps_folder, cloud)
+            say(f"{block.name}: {len(block.views)} views")
     return blocks
+
+
+def _write_block(folder: Path, block: Block, whole: Scene, maps_folder: Path, cloud: SplatFile | None) -> None:
+    """Make the scene folder of a block."""
+    assert whole.folder is not None
+    model = find_model(whole.folder)
+    assert model is not None
+    write_part(model, block.views, folder / "sparse" / "0")
+    _link(folder / "images", _picture_folder(whole))
+    _link(folder / "features", maps_folder)
+    for name in BESIDE:
+        if (whole.folder / name).exists():
+            _link(folder / name, whole.folder / name)
+    write_json(folder / "split.json", _splits(whole, block))
+    if cloud is not None:
+        means, radii = as_array(cloud.gaussians.means), REACH * as_array(cloud.gaussians.scales).max(1)
+        write_splats(folder / SPLAT, cloud.select(torch.from_numpy(block.needs(means, radii))))
+    write_json(folder / "block.json", block.to_json())
 
 
 def fit_block(
@@ -116,7 +130,7 @@ def fit_block(
     report: Callable[[str], None] | None = None,
     progress: bool = False,
 ) -> dict[str, Any]:
-    """Fit the field of one block, and keep its core in `folder/core`. Finished stages in `folder/run` are reused.
+    """Fit the field of one block, and keep its core in `folder/core`. Finished stages in `folder/.run` are reused.
 
     Args:
         folder: what `split_scene` made.
@@ -125,31 +139,38 @@ def fit_block(
         progress: show bars.
 
     Returns:
-        Counts and seconds, as JSON.
+        Counts, the box of the core's Gaussians (None if there is none) and seconds, as JSON.
 
     Raises:
-        ValueError: as `fit_scene`, or if no Gaussian lies in the core.
+        ValueError: as `fit_scene`.
     """
     folder, config = as_path(folder), config or FitConfig()
     block = Block.from_json(read_json(folder / "block.json"))
-    check_inside(folder, ["run", CORE])
+    check_inside(folder, [RUN, CORE])
+    (folder / FACTS).unlink(missing_ok=True)  # until the new core is there, the block counts as not fitted
     as_taken = load_scene(folder)
     maps = FeatureFolder(folder / "features").of(as_taken, config.split)
-    splat = folder / SPLAT
-    result = fit_scene(
-        as_taken.undistorted(), maps, folder / "run", config, splat=splat if splat.is_file() else None,
-        latents=LinearLatents.load(folder.parent / LATENTS), report=report, progress=progress,
-    )  # fmt: skip
-    own = torch.from_numpy(block.holds(as_array(result.field.gaussians.means)))
-    if not bool(own.any()):
-        raise ValueError(
-            f"{folder}: expected Gaussians in the block's core, got none of {len(own)}; ask for fewer blocks"
+    splat = read_splats(folder / SPLAT) if (folder / SPLAT).is_file() else None
+    facts: dict[str, Any] = {"gaussians": 0, "of": 0, "box": None, "seconds": 0.0}
+    if splat is None or block.holds(as_array(splat.gaussians.means)).any():
+        latents = LinearLatents.load(folder.parent / LATENTS)
+        result = fit_scene(
+            as_taken.undistorted(),
+            maps,
+            folder / RUN,
+            config,
+            splat=splat,
+            latents=latents,
+            report=report,
+            progress=progress,
         )
-    core = select_gaussians(result.field, own)
-    core.save(folder / CORE)
-    low, high = _box(core)
-    facts = {"gaussians": len(core), "of": len(own), "box": [low, high], "seconds": round(result.seconds, 1)}
-    write_json(folder / "core.json", facts)
+        own = torch.from_numpy(block.holds(as_array(result.field.gaussians.means)))
+        facts |= {"gaussians": int(own.sum()), "of": len(own), "seconds": round(result.seconds, 1)}
+        if bool(own.any()):
+            core = select_gaussians(result.field, own)
+            core.save(folder / CORE)
+            facts["box"] = _box(core)
+    write_json(folder / FACTS, facts)
     return facts
 
 
@@ -173,16 +194,24 @@ def fit_blocks(
     """
     out, say = as_path(out), report or (lambda text: None)
     folders = {block.name: out / block.name for block in read_blocks(out)}
+    facts, failed = dict[str, Any](), list[str]()
     if client is None:
-        facts = {name: fit_block(folder, config) for name, folder in folders.items()}
+        for name, folder in folders.items():
+            try:
+                facts[name] = fit_block(folder, config)
+            except (ValueError, OSError) as error:
+                failed.append(f"{folder}: {error}")
     else:
-        results = map_scenes(functools.partial(fit_block, config=config), folders.values(), client=client)
-        for result in results:
-            if result.failure is not None:
-                raise ValueError(f"{out / result.name}: {result.failure.message}")
-        facts = {result.name: result.value for result in results}
+        for result in map_scenes(functools.partial(fit_block, config=config), folders.values(), client=client):
+            if result.failure is None:
+                facts[result.name] = result.value
+            else:
+                failed.append(f"{out / result.name}: {result.failure.message}")
     for name, found in facts.items():
         say(f"{name}: {found['gaussians']:,} Gaussians of {found['of']:,} in {found['seconds']} s")
+    if failed:
+        more = f" (and {len(failed) - 1} more blocks failed)" if len(failed) > 1 else ""
+        raise ValueError(failed[0] + more)
     return FieldInBlocks.open(out)
 
 
@@ -190,7 +219,8 @@ def _check_same(out: Path, facts: dict[str, Any]) -> None:
     """Raise a ValueError if the folder holds other blocks."""
     if (out / BLOCKS).is_file() and read_json(out / BLOCKS) != facts:
         raise ValueError(
-            f"out: expected a new folder, or one with these blocks, got {out} with others; choose another, or delete it"
+            f"out: expected a new folder, or one with these blocks, got {out} with others (of another scene, splat, maps, ...); "
+            "choose another, or delete it"
         )
 
 

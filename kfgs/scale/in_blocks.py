@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -12,21 +13,20 @@ import torch
 from torch import Tensor
 
 from .._arrays import reading
-from .._check import as_array
-from .._files import as_path, read_json
+from .._check import as_array, check_range
+from .._files import as_path, read_json, real_path
 from ..cameras import Camera
-from ..fields import SemanticField, join_fields, select_gaussians
+from ..fields import SemanticField, join_fields, remember, select_gaussians
 from ..gaussians import Gaussians
 from ..labels import LabelSet, Selection, transfer_labels
 from ..scenes.blocks import Array, Block
 
-BLOCKS, CORE, FORMAT = "blocks.json", "core", "kfgs.blocks"
-GRID = 9  # points along each side of a box that are tried for being in view
+BLOCKS, CORE, FACTS, FORMAT = "blocks.json", "core", "core.json", "kfgs.blocks"
 
 
 @dataclass(frozen=True)
 class FieldInBlocks:
-    """The fitted blocks of a scene. `blocks[i]` has the Gaussians of its core, whose box is `boxes[i]`.
+    """The fitted blocks of a scene that hold Gaussians. `blocks[i]` has those of its core, whose box is `boxes[i]`.
 
     Example:
         for name, found in city.query("chair"):  # one block in memory at a time
@@ -49,17 +49,18 @@ class FieldInBlocks:
             ValueError: if a file is damaged.
         """
         folder = as_path(folder)
-        blocks = read_blocks(folder)
-        counts, boxes = [], []
-        for block in blocks:
-            file = folder / block.name / "core.json"
+        blocks, counts, boxes = [], [], []
+        for block in read_blocks(folder):
+            file = folder / block.name / FACTS
             if not file.is_file():
                 raise FileNotFoundError(f"{file}: no such file; fit the block first, with fit_blocks or `kfgs blocks`")
             facts = read_json(file)
             with reading(file, "the facts of a block", "fit the block again"):
-                low, high = (list(map(float, corner)) for corner in facts["box"])
-                counts.append(int(facts["gaussians"]))
-                boxes.append((low, high))
+                if facts["gaussians"]:  # else nothing lies in this part of space
+                    low, high = (list(map(float, corner)) for corner in facts["box"])
+                    blocks.append(block)
+                    counts.append(int(facts["gaussians"]))
+                    boxes.append((low, high))
         return FieldInBlocks(folder, tuple(blocks), tuple(counts), tuple(boxes))
 
     def __len__(self) -> int:
@@ -70,13 +71,25 @@ class FieldInBlocks:
         return SemanticField.load(self.folder / name / CORE)
 
     def query(self, target: str | Tensor, *args: Any, **options: Any) -> Iterator[tuple[str, Selection]]:
-        """Ask each block in turn, as `SemanticField.query`; yields its name and the selection of its Gaussians."""
+        """Ask each block in turn, as `SemanticField.query`; yields its name and the selection of its Gaussians.
+
+        Where gamma follows from the scores (questions without negatives), each block has its own: give `threshold` then.
+        """
         for block in self.blocks:
             yield block.name, self.field(block.name).query(target, *args, **options)
 
     def joined(self) -> SemanticField:
         """All blocks as one field, in memory."""
-        return join_fields([self.field(block.name) for block in self.blocks])
+        return self._join([self.field(block.name) for block in self.blocks])
+
+    def _join(self, parts: list[SemanticField]) -> SemanticField:
+        """Parts as one field, which remembers the scene of all blocks."""
+        field = join_fields(parts)
+        scene = real_path(self.folder / str(read_json(self.folder / BLOCKS)["scene"]))
+        info = {
+            name: value for name, value in field.info.items() if name not in ("geometry", "seconds", "scene", "classes")
+        }
+        return replace(field, info=info | remember(scene, self.folder, field.dim), folder=self.folder)
 
     def within(self, low: Sequence[float], high: Sequence[float]) -> SemanticField:
         """The Gaussians whose centres lie in a box, as one field; only blocks that touch the box are read.
@@ -88,10 +101,17 @@ class FieldInBlocks:
         Raises:
             ValueError: if there is no Gaussian.
         """
-        parts = self._touching(np.asarray(low, np.float64), np.asarray(high, np.float64))
+        corners = np.array([low, high], np.float64)
+        if corners.shape != (2, 3) or not np.isfinite(corners).all():
+            raise ValueError(f"low, high: expected three finite numbers each, got {list(low)} and {list(high)}")
+        parts = self._touching(*corners)
         if not parts:
-            raise ValueError(f"low, high: expected a box with Gaussians, got none from {list(low)} to {list(high)}")
-        return join_fields(parts)
+            around = np.min([box[0] for box in self.boxes], 0), np.max([box[1] for box in self.boxes], 0)
+            raise ValueError(
+                f"low, high: expected a box with Gaussians, got none from {list(low)} to {list(high)}; they lie from "
+                f"{around[0].round(2).tolist()} to {around[1].round(2).tolist()}"
+            )
+        return self._join(parts)
 
     def _touching(self, low: Array, high: Array) -> list[SemanticField]:
         """The Gaussians of each block whose centres lie in a box."""
@@ -110,7 +130,7 @@ class FieldInBlocks:
         names = [block.name for block, box in zip(self.blocks, self.boxes, strict=True) if _in_view(camera, *box)]
         if not names:
             raise ValueError(f"camera: expected one that sees a block, got {camera.name!r}, which sees none")
-        return join_fields([self.field(name) for name in names])
+        return self._join([self.field(name) for name in names])
 
     def segment(self, camera: Camera, *args: Any, **options: Any) -> Tensor:  # [H, W] int64
         """As `SemanticField.segment`; only the blocks that the camera may see are read."""
@@ -127,6 +147,7 @@ class FieldInBlocks:
             classes: to label with; None: those that the field remembers.
             options: of `transfer_labels`.
         """
+        check_range("distance", distance, 0, closed=(False, False))
         means = as_array(dst.means)
         labels = torch.full((len(means),), -1, dtype=torch.int64)
         for block in self.blocks:
@@ -151,16 +172,9 @@ def read_blocks(folder: Path) -> list[Block]:
 
 
 def _in_view(camera: Camera, low: list[float], high: list[float]) -> bool:
-    """Whether a point of a grid through the box is in the picture, or the camera in the box."""
-    center = as_array(camera.center).astype(np.float64)
-    if ((center >= low) & (center <= high)).all():
-        return True
-    axes = [np.linspace(a, b, GRID) for a, b in zip(low, high, strict=True)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    """Whether a box may be in the picture: False only if all its corners are beyond one side of what the camera sees."""
+    corners = np.array(list(product(*zip(low, high, strict=True))))
     viewmat, K = as_array(camera.viewmat).astype(np.float64), as_array(camera.K).astype(np.float64)
-    seen = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-    front = seen[seen[:, 2] > camera.near]
-    xy = (front @ K.T)[:, :2] / front[:, 2:]
-    # a cell of the grid may reach into the picture though its corners do not
-    margin = 0.5 * max(camera.width, camera.height)
-    return bool(((xy > -margin) & (xy < np.array([camera.width, camera.height]) + margin)).all(1).any())
+    x, y, z = K @ (viewmat[:3, :3] @ corners.T + viewmat[:3, 3:])
+    beyond = (z < camera.near, x < 0, x > camera.width * z, y < 0, y > camera.height * z)
+    return not any(side.all() for side in beyond)

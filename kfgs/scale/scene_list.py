@@ -83,6 +83,11 @@ def as_entries(scenes: Iterable[str | Path | SceneEntry]) -> list[SceneEntry]:
         )
     entries = [scene if isinstance(scene, SceneEntry) else _entry(str(scene), Path()) for scene in scenes]
     names = [entry.name for entry in entries]
+    for name in names:
+        if NAME.fullmatch(name) is None:
+            raise ValueError(
+                f"scenes: expected names that folders can have, got {one_line(name)!r}; pass SceneEntry(name, source)"
+            )
     if not entries or len(set(names)) < len(names):
         twice = next((name for name in names if names.count(name) > 1), None)
         got = "none" if twice is None else f"{twice!r} more than once"

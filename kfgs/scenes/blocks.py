@@ -110,11 +110,11 @@ def partition(
         raise SceneError(
             "model: expected images that say which points they see, got none; make it with COLMAP (`kfgs sfm`)"
         )
-    if len(found.points) < count:
+    inside = _robust(found.points)
+    if inside.sum() < count:
         raise SceneError(
             f"count: expected at most as many blocks as points ({len(found.points)}), got {count}; ask for fewer"
         )
-    inside = _robust(found.points)
     centers = np.array([-image.pose[:3, :3].T @ image.pose[:3, 3] for image in images if image.pose is not None])
     blocks = []
     for number, core in enumerate(_cut(found.points[inside], count)):
@@ -184,6 +184,10 @@ def _cut(points: Array, count: int) -> list[Array]:  # [P, 3] -> count x [2, 3]
         lower, upper = box.copy(), box.copy()
         lower[1, axis] = upper[0, axis] = middle
         below = rows[:, axis] < middle
+        if not 0 < below.sum() < len(rows):
+            raise SceneError(
+                f"count: expected points at different places, got too many at one for {count} blocks; ask for fewer blocks"
+            )
         return [*halve(rows[below], lower, first), *halve(rows[~below], upper, count - first)]
 
     return halve(points, np.array([[-np.inf] * 3, [np.inf] * 3]), count)

@@ -13,13 +13,22 @@ from messages import tells
 from kfgs.cli import main
 from kfgs.evaluation import load_label_map
 from kfgs.features import FeatureFolder
-from kfgs.fields import SemanticField, UpliftConfig, join_fields, sample_latents, select_gaussians, uplift_maps
+from kfgs.fields import (
+    SemanticField,
+    UpliftConfig,
+    join_fields,
+    recall_scene,
+    sample_latents,
+    select_gaussians,
+    uplift_maps,
+)
 from kfgs.formats import SplatFile, read_splats, write_splats
 from kfgs.gaussians import Gaussians
 from kfgs.labels import transfer_labels
 from kfgs.pipeline import FitConfig
 from kfgs.quant import LinearLatents
 from kfgs.scale import FieldInBlocks, fit_block, fit_blocks, split_scene
+from kfgs.scale.in_blocks import _in_view
 from kfgs.scenes import SceneError, load_scene
 from kfgs.toy.room_folder import ToyConfig
 from kfgs.toy.town import make_toy_town
@@ -140,7 +149,7 @@ def test_any_engine_fits_blocks(fitted, town, splat, tmp_path):
     split_scene(town, tmp_path / "pool", 2, splat=splat, latents=12)
     with ThreadPoolExecutor(2) as pool:
         one = fit_blocks(tmp_path / "pool", EVERY, client=pool)
-        shutil.rmtree(tmp_path / "pool/block01/run")
+        shutil.rmtree(tmp_path / "pool/block01/.run")
         (tmp_path / "pool/block01/splat.ply").write_bytes(b"damaged")
         with pytest.raises(ValueError, match=tells("block01", "splat.ply")):
             fit_blocks(tmp_path / "pool", EVERY, client=pool)
@@ -203,3 +212,65 @@ def test_the_commands(town, splat, tmp_path, capsys):
     assert "six numbers" in capsys.readouterr().err
     assert main(["join", str(tmp_path), "--out", str(tmp_path / "x")]) == 1
     assert "blocks.json" in capsys.readouterr().err
+
+
+def test_a_search_counts_every_gaussian_once(fitted, capsys):
+    expected = sum(int(selection.mask.sum()) for _, selection in fitted.query("chair"))
+    assert main(["search", "chair", str(fitted.folder)]) == 0
+    assert f"{expected} Gaussians" in capsys.readouterr().out
+    (fitted.folder / "search.kfgs").unlink()
+
+
+def test_a_joined_field_remembers_the_whole_scene(fitted, town, tmp_path):
+    fitted.joined().save(tmp_path / "deep/field")
+    field = SemanticField.load(tmp_path / "deep/field")
+    assert recall_scene(field.info, field.folder).samefile(town)
+    assert "geometry" not in field.info
+    assert field.label_set().names == fitted.field("block00").label_set().names
+
+
+def test_other_inputs_are_refused_also_after_a_kill(town, splat, tmp_path):
+    split_scene(town, tmp_path / "city", 2, splat=splat, latents=4)
+    for path in (tmp_path / "city").glob("block*"):
+        if path.is_dir():
+            shutil.rmtree(path)  # killed before the first block
+    split_scene(town, tmp_path / "city", 2, splat=splat, latents=4)
+    shutil.copytree(town / "features", tmp_path / "maps")
+    for other in ({}, {"splat": splat, "latents": 5}, {"splat": splat, "features": tmp_path / "maps"}):
+        with pytest.raises(ValueError, match=tells("out", "others", "delete")):
+            split_scene(town, tmp_path / "city", 2, **{"latents": 4} | other)
+    with pytest.raises(ValueError, match=tells("out")):
+        split_scene(town, town, 2, latents=4)
+
+
+def test_a_part_of_space_may_be_empty(town, splat, tmp_path):
+    half = read_splats(splat)
+    half = half.select(half.gaussians.means[:, 0] < 4)  # the first room
+    write_splats(tmp_path / "half.ply", half)
+    split_scene(town, tmp_path / "city", 4, splat=tmp_path / "half.ply", latents=4)
+    made = fit_blocks(tmp_path / "city", EVERY)
+    assert 0 < len(made.blocks) < 4
+    assert len(made) == len(made.joined()) == len(half)
+
+
+def test_what_may_be_in_a_picture_is_read(town):
+    camera = load_scene(town).cameras[0]
+    generator = np.random.default_rng(0)
+    viewmat, K = camera.viewmat.double().numpy(), camera.K.double().numpy()
+    for scale in (0.1, 1, 10, 300):
+        for _ in range(50):
+            low = generator.normal(0, scale, 3)
+            high = low + generator.exponential(scale, 3) * generator.choice([0.01, 1], 3)
+            points = generator.uniform(low, high, (2000, 3))
+            x, y, z = K @ (viewmat[:3, :3] @ points.T + viewmat[:3, 3:])
+            seen = (z > camera.near) & (x > 0) & (y > 0) & (x < camera.width * z) & (y < camera.height * z)
+            assert _in_view(camera, low.tolist(), high.tolist()) or not seen.any()
+    assert not _in_view(camera, [500, 500, 500], [501, 501, 501]) or not _in_view(camera, [-501] * 3, [-500] * 3)
+
+
+def test_a_city_is_not_joined_into_itself(fitted, capsys):
+    before = sorted(fitted.folder.rglob("*"))
+    for place in ("block00/core", "block01", "field"):
+        assert main(["join", str(fitted.folder), "--out", str(fitted.folder / place)]) == 1
+        assert "--out" in capsys.readouterr().err
+    assert sorted(fitted.folder.rglob("*")) == before
