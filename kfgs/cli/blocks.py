@@ -81,10 +81,10 @@ def join(
 
     corners = _corners(box)
     check_output("out", out, "a folder")
-    check_place(out)
     found = FieldInBlocks.open(city)
     if real_path(out).is_relative_to(real_path(city)):
         raise ValueError(f"out: expected a place outside {city}, which is read, got {out}; give another")
+    check_place(out)
     field = found.joined() if corners is None else found.within(corners[:3], corners[3:])
     field.save(out)
     say(field.summary())
