@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -79,10 +81,14 @@ def open_client(
 
 
 def _slurm(partition: str, threads: int, memory: str, scheduler: dict[str, Any]) -> Any:
+    before = signal.getsignal(signal.SIGINT)
     try:
         from dask_jobqueue import SLURMCluster
     except ImportError as error:
         raise ImportError(f"slurm: expected dask-jobqueue, got {error}; pip install 'kfgs[scale]'") from error
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, before)  # the package replaces it: Ctrl-C would be an exit with code 0
     return SLURMCluster(
         queue=partition,
         cores=1,  # Dask's threads: one task at a time
