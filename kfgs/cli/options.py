@@ -141,7 +141,7 @@ class Training:
     views_per_step: int = 1
     """Views whose gradients are averaged in a step; several processes (torchrun) share them."""
     max_gaussians: Given[int] = None
-    """Stop growing at this many Gaussians (each point starts as one); the preset's when not given."""
+    """At most this many Gaussians (training begins with one per point, even if these are more); the preset's when not given."""
     seed: int = 0
     """Every random choice follows from it."""
     device: Device = "auto"
