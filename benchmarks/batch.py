@@ -1,11 +1,11 @@
 """Many scenes on one and on two workers: the speed-up, and whether killed workers change a byte.
 
-    python benchmarks/batch.py OUT [--rooms 6] [--room-0 FOLDER] [--kills 3] [--teacher NAME --weights FILE] [--steps N]
+    python benchmarks/batch.py OUT [--rooms 6] [--room-0 FOLDER --weights FOLDER] [--kills 3] [--steps N]
 
 Toy rooms (48 views of 192x256; 24 of half the size with --small) go through features, fit, segment and evaluate by `run_batch`:
 with one worker, with two, and with two of which --kills are killed at random moments (SIGKILL). Each worker has one thread. The
-rooms' own teacher is looked up by the pictures, so its time is that of reading and writing maps. --room-0 adds a real scene; it
-needs a --teacher of its kind, and then all scenes take that one.
+rooms' own teacher is looked up by the pictures, so its time is that of reading and writing maps. --room-0 adds a real scene,
+whose pictures the network of benchmarks/real_teacher.py encodes; --weights is the folder that its `fetch` and `head` wrote.
 
 Start it with OMP_NUM_THREADS=1, or numpy's threads differ from those of Dask's workers in the last bits.
 """
@@ -33,15 +33,18 @@ from kfgs._files import digest_file, write_json
 from kfgs.pipeline import ColorConfig, FitConfig
 from kfgs.scale import BatchOptions, SceneEntry, open_client, run_batch
 from kfgs.scale.board import event_line, table
+from kfgs.teachers import Teacher
 from kfgs.toy.room_folder import ToyConfig, make_toy_room
 
 
 class LookedUp:
-    """The simulated teacher of toy rooms: finds a picture among those of the rooms by its values."""
+    """The simulated teacher of toy rooms finds a picture among theirs by its values; a real network encodes all others."""
 
-    def __init__(self, rooms: str) -> None:
-        self.name, self.identity = "looked-up", {"name": "looked-up"}
+    def __init__(self, rooms: str, real: str | None = None) -> None:
+        self.name, self.identity = "looked-up", {"name": "looked-up", "real": real is not None}
         self.maps: dict[str, Path] = {}
+        self.real = real
+        self.network: Teacher | None = None
         from kfgs.scenes import read_image
 
         for file in sorted(Path(rooms).glob("room_*/images/*.png")):
@@ -53,8 +56,15 @@ class LookedUp:
         return hashlib.sha256((image * 255).round().byte().numpy().tobytes()).hexdigest()
 
     def encode_image(self, image: torch.Tensor) -> torch.Tensor:
-        """The map that was made with the picture."""
-        return torch.load(self.maps[self._digest(image)], weights_only=True).float()
+        """The map that was made with the picture, or the network's."""
+        digest = self._digest(image)
+        if digest in self.maps or self.real is None:
+            return torch.load(self.maps[digest], weights_only=True).float()
+        if self.network is None:
+            from real_teacher import RealTeacher
+
+            self.network = RealTeacher(self.real)
+        return self.network.encode_image(image)
 
     def encode_text(self, prompts: list[str]) -> torch.Tensor:
         """The rooms have their texts."""
@@ -116,8 +126,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=400, help="of the geometry of each room")
     parser.add_argument("--kills", type=int, default=3)
     parser.add_argument("--room-0", type=Path)
-    parser.add_argument("--teacher")
-    parser.add_argument("--weights")
+    parser.add_argument("--weights", type=Path, help="of the network that encodes --room-0")
     given = parser.parse_args()
     size = {"train_views": 24, "test_views": 6, "size": (96, 128), "feature_size": (36, 48), "feature_dim": 64}
     rooms = [ToyConfig(seed=seed, **(size if given.small else {})) for seed in range(given.rooms)]
@@ -130,10 +139,8 @@ def main() -> None:
     os.environ["PYTHONPATH"] = os.pathsep.join(
         [str(Path(__file__).parent), *sys.path[:1], os.environ.get("PYTHONPATH", "")]
     )
-    teacher = {"teacher": given.teacher, "weights": given.weights} if given.teacher else {
-        "teacher": "batch:LookedUp",
-        "teacher_options": {"rooms": str(base)},
-    }  # fmt: skip
+    network = None if given.weights is None else str(given.weights.absolute())
+    teacher = {"teacher": "batch:LookedUp", "teacher_options": {"rooms": str(base), "real": network}}
     options = BatchOptions(fit=FitConfig.cpu(color=color, device="cpu"), pictures=1, **teacher)
     found = {}
     for name, workers, kills in (("one worker", 1, 0), ("two workers", 2, 0), ("two workers, killed", 2, given.kills)):

@@ -23,7 +23,9 @@ def test_the_changelog_has_a_section_for_the_version():
 
 
 def test_all_that_the_source_archive_names_is_there():
-    include = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]
+    include = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["sdist"][
+        "include"
+    ]
     assert not [name for name in include if not list(ROOT.glob(name))]
 
 
