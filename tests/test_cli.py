@@ -11,6 +11,7 @@ from PIL import Image
 from small_room import fit_run, make_room
 
 from kfgs.cli import main
+from kfgs.fields import SemanticField
 from kfgs.formats.ply import read_ply, write_ply
 
 
@@ -89,13 +90,14 @@ def test_label_carries_classes_to_another_cloud_and_keeps_its_columns(run, room,
     assert {"class_id", "score", "red"} <= set(read_ply(out / "gaussians.ply"))
 
 
-def test_nothing_of_the_users_is_overwritten(run, room, tmp_path, capsys):
+def test_nothing_of_the_users_is_overwritten(run, room, tmp_path, capsys, monkeypatch):
     before = (room / "labels" / "view_001.png").read_bytes()
     assert main(["segment", str(run / "field"), "--scene", str(room), "--out", str(room), "--pictures", "0"]) == 0
     assert (room / "labels" / "view_001.png").read_bytes() == before
     cloud = tmp_path / "gaussians.ply"
     write_ply(cloud, {name: np.zeros(3, np.float32) for name in "xyz"})
     before = cloud.read_bytes()
+    monkeypatch.setattr(SemanticField, "load", None)  # the work
     arguments = ["label", str(run / "field"), "--scene", str(room), "--out", str(tmp_path), "--cloud", str(cloud)]
     assert main(arguments) == 1
     assert "would be overwritten" in capsys.readouterr().err

@@ -10,7 +10,6 @@ from typing import Any
 
 from .atomic import (
     HIDDEN,
-    FullDiskError,
     atomic_folder,
     atomic_path,
     current_file,
@@ -18,6 +17,7 @@ from .atomic import (
     hidden_folder,
     open_current,
 )
+from .errors import FullDiskError
 from .locks import InUseError, locked
 from .own import check_inside, check_own
 from .paths import as_path, check_output, real_path

@@ -33,7 +33,8 @@ def check_inside(folder: Path, names: Iterable[str | Path]) -> None:
             if place.is_symlink():
                 raise ValueError(
                     f"{place}: expected a folder or nothing there, got a link to {os.readlink(place)}; kfgs follows no "
-                    "links inside an output folder: delete it, or name another output"
+                    "links inside an output folder: delete it, or name another output. To use another disk, put the whole "
+                    "output folder there; a link to it may be the output"
                 )
 
 

@@ -20,6 +20,7 @@ and a line in `MODULES`.
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -30,7 +31,7 @@ from ..gaussians import Gaussians
 from .order import morton_order
 from .sidecar import find_names, names_path, read_sidecar, write_sidecar
 from .splat_file import SplatFile, Written
-from .values import check_splats
+from .values import check_splats, known_quats
 
 MODULES = (  # tried in this order: compressed PLY before PLY, because both end in .ply
     "compressed_ply",
@@ -82,6 +83,8 @@ def find_format(path: str | Path) -> ModuleType:
 def read_splats(path: str | Path) -> SplatFile:
     """Read a splat file of any known format, with labels and class names from it or from the files next to it.
 
+    A quaternion of length 0 is read as no rotation, (1, 0, 0, 0): rasterisers do the same.
+
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is of no known format, or damaged: truncated, with counts that disagree, numbers that are not
@@ -90,6 +93,7 @@ def read_splats(path: str | Path) -> SplatFile:
     path = as_path(path)
     module = find_format(path)
     splats: SplatFile = read_sidecar(path, module.read(path))
+    splats = replace(splats, gaussians=splats.gaussians.replace(quats=known_quats(splats.gaussians.quats)))
     labels = splats.gaussians.labels
     if labels is not None and len(labels):
         low, high = int(labels.min()), int(labels.max())
@@ -119,8 +123,8 @@ def write_splats(path: str | Path, splats: SplatFile | Gaussians, *, format: str
 
     Raises:
         ValueError: if no format has this ending, or the format cannot be written or cannot store this cloud, or a value is
-            NaN or infinite, a scale not positive, an opacity outside [0, 1] (both ends are allowed), or a label has no name
-            in `classes`. Nothing is written then.
+            NaN or infinite, a quaternion 0, a scale not positive, an opacity outside [0, 1] (both ends are allowed), or a
+            label has no name in `classes`. Nothing is written then.
     """
     path = as_path(path)
     if isinstance(splats, Gaussians):
