@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from .._files import InUseError, check_own, read_json
+from .._files import InUseError, check_output, check_own, read_json, write_json
 from .files import check_alone
 from .options import Given, Positional, Teacher
 from .output import say, wrote
@@ -68,10 +68,6 @@ def search(
             check_alone(name, other, "with --like, which needs no words")
     teacher.check_weights()
     if json is not None:
-        from .._files import check_output
-
-        check_output("json", json, "a file")
-    if json is not None:
         check_output("json", json, "a file")
         check_own(json, lambda path: "query" in read_json(path), "kfgs search")
     known = _up_to_date(SearchIndex.open(folder))
@@ -91,25 +87,24 @@ def search(
     if len(found.unasked) > SHOWN:
         say(f"note: not asked: {len(found.unasked) - SHOWN} more")
     if json is not None:
-        from .._files import write_json
-
         write_json(json, {"query": what, "folder": str(folder)} | found.to_json())
         wrote([json])
 
 
 def _up_to_date(known: Any) -> Any:
-    """The index, extended if fields are new or have changed. While another process extends it, the old one answers."""
+    """The index, extended if fields are new or have changed. If that is impossible now, the old one answers."""
     if known.is_current():
         return known
     try:
         known, changes = known.update(progress=True)
-    except InUseError as error:
+    except (InUseError, OSError) as error:  # another process extends it, or the folder is read-only
         if len(known) == 0:
             raise
         say(f"note: the index is not extended now: {error}")
         return known
     gone = f", {len(changes.removed)} removed" if changes.removed else ""
-    say(f"index: {len(changes.added)} fields added{gone}; {len(known)} in {known.file}")
+    if changes.added or changes.removed or changes.failed:  # else copied files only got their new times
+        say(f"index: {len(changes.added)} fields added{gone}; {len(known)} in {known.file}")
     return known
 
 
