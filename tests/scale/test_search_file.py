@@ -54,7 +54,9 @@ def test_what_is_written_is_read_and_equal_content_gives_equal_bytes(runs, tmp_p
 
 def test_another_version_or_kind_is_named(runs, tmp_path):
     newer = rewritten(runs / NAME, tmp_path / "newer", lambda tensors: None, version=2)
-    with pytest.raises(ValueError, match=tells(newer, "version 1", "version 2", "use the kfgs that wrote it", "delete it")):
+    with pytest.raises(
+        ValueError, match=tells(newer, "version 1", "version 2", "use the kfgs that wrote it", "delete it")
+    ):
         read_index(newer)
     other = rewritten(runs / NAME, tmp_path / "other", lambda tensors: None, kind="semantic field")
     with pytest.raises(ValueError, match=tells(other, "search index", "'semantic field'", "move it away")):
