@@ -180,7 +180,7 @@ def _plan(job: Job) -> Generator[tuple[str, list[Task]], list[Any], Any]:
         if job.options.teacher is not None and "features" not in done:
             pictures, share = found["pictures"], job.options.share
             parts = [pictures[i : i + share] for i in range(0, len(pictures), share)]
-            yield "features", [Task(stages.encode_part, (job, i, part)) for i, part in enumerate(parts)]
+            yield "features", [Task(stages.encode_part, (job, part)) for part in parts]
             stems = [stem for stem, _ in pictures]
             yield "features", [Task(stages.join_parts, (job, keys["features"], stems))]
         done["fit"] = (yield "fit", [Task(stages.fit, (job, keys["fit"]))])[0]

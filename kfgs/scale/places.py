@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from .._files import atomic_path, parse_json
+from .._files import atomic_path, parse_json, real_path
 from .scene_list import is_url
 
 LOCAL_ONLY = ("digests.json",)  # a run's notes about files of this machine
@@ -27,15 +27,33 @@ class Place:
         """Where its files are, or their copies."""
 
     def listing(self) -> dict[str, list[Any]]:
-        """[bytes, version] of each file by its relative name, without hidden ones; a changed file has another version."""
+        """[bytes, version] of each file by its relative name, without hidden ones; a changed file has another version.
+
+        Links are followed, but each folder is listed once: a second link to it, or one that leads back, is left out.
+        """
         found: dict[str, list[Any]] = {}
+        seen = {real_path(self.path)}
         for here, folders, names in os.walk(self.path, followlinks=True):
-            folders[:] = [name for name in folders if not name.startswith(".")]
+            inside = sorted(Path(here) / name for name in folders if not name.startswith("."))
+            folders.clear()
+            for folder in sorted(inside, key=Path.is_symlink):  # links last: they may lead to a folder beside them, or back
+                if (real := real_path(folder)) not in seen:
+                    seen.add(real)
+                    folders.append(folder.name)
             for file in (Path(here) / name for name in names if not name.startswith(".")):
-                with suppress(FileNotFoundError):  # a broken link
-                    info = file.stat()
-                    found[file.relative_to(self.path).as_posix()] = [info.st_size, info.st_mtime_ns]
+                if (mark := _mark(file)) is not None:  # else a broken link
+                    found[file.relative_to(self.path).as_posix()] = mark
         return dict(sorted(found.items()))
+
+    def marks(self, names: Iterable[str], listing: dict[str, list[Any]] | None = None) -> list[list[Any]]:
+        """[name, bytes, version] of files, for a key; a file that does not exist has neither.
+
+        Args:
+            names: relative or absolute.
+            listing: of this place, if there is one already.
+        """
+        known = self.listing() if listing is None else listing
+        return [[name, *(known.get(name) or _mark(self.path / name) or [None])] for name in sorted(names)]
 
     def fetch(self, wanted: Callable[[str], bool]) -> None:
         """Copy the files whose relative names are wanted to `path`, if they are elsewhere."""
@@ -167,6 +185,10 @@ def inside(*places: str) -> Callable[[str], bool]:
     return lambda name: any(name == place or name.startswith(folder) for place, folder in chosen)
 
 
-def marks_of(listing: dict[str, list[Any]], names: Iterable[str]) -> list[list[Any]]:
-    """[name, bytes, version] of files, in a key; a file that is not listed has no version."""
-    return [[name, *listing.get(name, [None])] for name in sorted(names)]
+def _mark(file: Path) -> list[Any] | None:
+    """[bytes, version] of a file; None if there is none."""
+    try:
+        info = file.stat()
+    except OSError:  # none, or a link to itself
+        return None
+    return [info.st_size, info.st_mtime_ns]
