@@ -15,7 +15,16 @@ from .._files import bytes_in_words, digest_file
 from ..teachers.protocol import Teacher, check_features
 from .finder import MapFinder
 from .layouts import LAYOUTS, OWN, layout_of, map_file
-from .manifest import MANIFEST, Manifest, MapRecord, differences, latest_records, part_manifests, plain_identity, read_manifest
+from .manifest import (
+    MANIFEST,
+    Manifest,
+    MapRecord,
+    differences,
+    latest_records,
+    part_manifests,
+    plain_identity,
+    read_manifest,
+)
 from .pictures import Picture
 
 LOCK = ".features.lock"

@@ -10,10 +10,25 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from .._check import check_range
+from .._check import check_whole
 
 START = "60s"  # to wait for a scheduler
 WALLTIME = "24:00:00"  # of a Slurm job; a batch goes on after it ended
+
+
+def check_workers(scheduler: str | None, workers: int | None, slurm: str | None, threads: int) -> None:
+    """Check options of `open_client`, which starts nothing before.
+
+    Raises:
+        ValueError: if both a scheduler and workers or Slurm are given, or a number is less than 1.
+    """
+    if workers is not None:
+        check_whole("workers", workers, 1)
+    check_whole("threads", threads, 1)
+    if scheduler is not None and (workers is not None or slurm is not None):
+        raise ValueError(
+            "scheduler: expected none with workers or slurm, which start their own, got both; leave one out"
+        )
 
 
 @contextmanager
@@ -39,15 +54,10 @@ def open_client(
 
     Raises:
         ImportError: if Dask, or for Slurm dask-jobqueue, is missing.
-        ValueError: if both a scheduler and workers or Slurm are given.
+        ValueError: see `check_workers`.
         OSError: if the scheduler does not answer, or there is no Slurm.
     """
-    if scheduler is not None and (workers is not None or slurm is not None):
-        raise ValueError(
-            "scheduler: expected none with workers or slurm, which start their own, got both; leave one out"
-        )
-    if workers is not None:
-        check_range("workers", workers, 1)
+    check_workers(scheduler, workers, slurm, threads)
     try:
         from distributed import Client, LocalCluster
     except ImportError as error:

@@ -11,9 +11,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from .._files import atomic_path, parse_json, real_path
+from .._files import atomic_path, check_own, foreign, parse_json, real_path
 from .scene_list import is_url
 
+WRITER = "kfgs batch"
 LOCAL_ONLY = ("digests.json",)  # a run's notes about files of this machine
 STAMPS = ("ETag", "etag", "md5Hash", "content_md5", "mtime", "LastModified", "last_modified", "created")
 """What file systems of fsspec say about a file's version; each has some of them."""
@@ -36,7 +37,7 @@ class Place:
         for here, folders, names in os.walk(self.path, followlinks=True):
             inside = sorted(Path(here) / name for name in folders if not name.startswith("."))
             folders.clear()
-            for folder in sorted(inside, key=Path.is_symlink):  # links last: they may lead to a folder beside them, or back
+            for folder in sorted(inside, key=Path.is_symlink):  # links last: they may lead to a folder beside them
                 if (real := real_path(folder)) not in seen:
                     seen.add(real)
                     folders.append(folder.name)
@@ -81,6 +82,10 @@ class Place:
         """Delete a file, if it is there."""
         (self.path / name).unlink(missing_ok=True)
 
+    def check_own(self, name: str, ours: Callable[[str], bool]) -> None:
+        """Check that a text may be replaced: there is none, or `kfgs batch` wrote it, see `_files.check_own`."""
+        check_own(self.path / name, lambda path: ours(path.read_text(encoding="utf-8")), WRITER)
+
     def read_json(self, name: str) -> dict[str, Any]:
         """A JSON object that a batch wrote; an empty one if there is none, or it is damaged."""
         with suppress(ValueError):
@@ -109,7 +114,7 @@ class StoredPlace(Place):
                 f"{url}: expected a kind of URL that fsspec can open ({error}); pip install 'kfgs[scale]', and for s3:// s3fs, "
                 "for gs:// gcsfs, for abfs:// adlfs"
             ) from error
-        self.root = root.rstrip("/")
+        self.url, self.root = url.rstrip("/"), root.rstrip("/")
         self._before: dict[str, list[Any]] = {}
 
     def _at(self, name: str) -> str:
@@ -159,6 +164,16 @@ class StoredPlace(Place):
     def write_text(self, name: str, text: str) -> None:
         """See `Place.write_text`; an object store shows an object when it is whole."""
         self.files.pipe_file(self._at(name), text.encode("utf-8"))
+
+    def check_own(self, name: str, ours: Callable[[str], bool]) -> None:
+        """See `Place.check_own`."""
+        try:
+            text = self.read_text(name)
+            known = text is None or ours(text)
+        except (ValueError, LookupError, TypeError):
+            known = False
+        if not known:
+            raise foreign(f"{self.url}/{name}", WRITER)
 
     def remove(self, name: str) -> None:
         """See `Place.remove`."""

@@ -1,9 +1,9 @@
 """The stages of a scene, as tasks: functions of paths and plain values, which a worker imports and calls.
 
 Each stage calls the function that does it on one machine, and then writes `done/<stage>.json`: the key of its inputs, its result
-and its files. A task whose description is there, with this key and all files, returns the result at once. The description is
-deleted before the work and written last, so a killed task leaves nothing that counts as finished. Inputs are known by names,
-sizes and times; where only times differ, the stage's own cache, which goes by content, finds its work.
+and its files. A task whose description is there, with this key and all files, returns the result at once. While the stage is
+made, its description has no key, so a killed task leaves nothing that counts as finished. Inputs are known by names, sizes and
+times; where only times differ, the stage's own cache, which goes by content, finds its work.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 
 import torch
 
-from .._files import InUseError, digest_value, read_json, write_json
+from .._files import InUseError, digest_value, foreign, read_json, write_json
 from ..evaluation import LabelSet
 from ..features import FeatureFolder, Picture, discard_maps, extract_features, join_features, pictures_of
 from ..fields import SemanticField
@@ -32,7 +32,7 @@ from ..scenes import Scene, SceneError, is_scene, link_images, list_images, load
 from ..teachers.load import load_teacher
 from ..teachers.protocol import Teacher, identify
 from .options import BatchOptions, Job
-from .places import Place, inside, open_place
+from .places import WRITER, Place, inside, open_place
 
 PATIENCE = 120  # seconds to wait for a folder in which a process works that was taken for dead
 PROTOCOL = "kfgs-pooled/1"
@@ -53,6 +53,9 @@ def find_scene(job: Job, *, report: Report) -> dict[str, Any]:
         if photos := _photos(source):
             config = job.options.sfm_config
             keys["sfm"] = _key(keys["photos"], asdict(config))
+            model = "scene/sparse/0"
+            if not out.read_json(_description("sfm")) and any(map(inside(model), out.listing())):
+                raise foreign(f"{job.out}/{model}", WRITER)
 
             def make() -> dict[str, Any]:
                 made = run_sfm(source.path / photos, out.path / "scene", config=config, replace=True)
@@ -97,8 +100,10 @@ def _keys_of(
 
 
 def encode_part(job: Job, pictures: list[list[str]], *, report: Report) -> dict[str, Any]:
-    """Encode some pictures, [stem, relative name] each, by the worker's teacher. A part is called by its pictures, so that
-    one of another division never has its name."""
+    """Encode some pictures, [stem, relative name] each, by the worker's teacher.
+
+    A part is called by its pictures, so that one of another division never has its name.
+    """
     with _work(job) as (source, out):
         teacher, word = _teacher(job.options), _key([stem for stem, _ in pictures])
         key = _key(identify(teacher), source.marks(name for _, name in pictures))
@@ -187,7 +192,7 @@ def score(job: Job, key: str, *, report: Report) -> dict[str, Any]:
                 encode=_classes(job, source),
                 truth=_truth(source),
                 images=images,
-                command="kfgs batch",
+                command=WRITER,
             )
             write_json(out.path / "scores.json", found.to_json())
             report(str(found))
@@ -238,7 +243,7 @@ def _stage(
     about = _finished(out, stage, key, out.listing())
     if about is not None:
         return {**about["result"], "reused": True}
-    out.remove(_description(stage))
+    out.write_json(_description(stage), {"key": None})  # begun: from now on, its files there are ours
     out.fetch(inside(*needs))
     result = _patiently(make)
     out.store()
