@@ -69,8 +69,8 @@ def batch(
         discard_features: Delete a scene's feature maps when its field is made.
     """
     from ..scale import BatchOptions, open_client, read_scenes, run_batch
+    from ..scale.batch import check_runs
     from ..scale.clients import check_workers
-    from ..scale.scene_list import is_url
     from ..teachers.load import check_teacher_name
 
     check_workers(workers.scheduler, workers.workers, workers.slurm, workers.threads)
@@ -105,10 +105,10 @@ def batch(
         threads=workers.threads,
         discard_features=discard_features,
     )
-    screen = _Screen()
+    folder, screen = check_runs(entries, out), _Screen()
     with open_client(**dataclasses.asdict(workers)) as client:
         say(f"{len(entries)} scenes; workers: {client.cluster or client.scheduler.address}")
-        if is_url(out):
+        if folder is None:
             say(
                 f"note: {out} has no lock: start no other batch with this --out before this one ends; scenes might fail"
             )

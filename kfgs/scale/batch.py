@@ -154,9 +154,7 @@ def run_batch(
     """
     limit(at_once)
     options, entries = options or BatchOptions(), as_entries(scenes)
-    check_apart(entries, out)
-    written = [f"{entry.name}/{folder}" for entry in entries for folder in WRITTEN]
-    local = None if is_url(str(out)) else check_output("out", out, "a folder", inside=written).absolute()
+    local = check_runs(entries, out)
     root = str(out).rstrip("/") if local is None else str(local)
     jobs = {entry.name: Job(entry.source, f"{root}/{entry.name}", options) for entry in entries}
     with nullcontext() if local is None else locked(local, LOCK):
@@ -171,6 +169,15 @@ def run_batch(
         plans = {name: _plan(jobs[name]) for name, record in records.items() if record.begin(retry_failed)}
         drive(plans, client, note, at_once=at_once)
     return [SceneResult(row.name, row.value, row.failure, sum(row.seconds.values())) for row in rows]
+
+
+def check_runs(entries: Sequence[SceneEntry], out: str | Path) -> Path | None:
+    """Check before the work that runs can be written; the folder `out`, or None if it is a URL."""
+    check_apart(entries, out)
+    if is_url(str(out)):
+        return None
+    written = [f"{entry.name}/{folder}" for entry in entries for folder in WRITTEN]
+    return check_output("out", out, "a folder", inside=written).absolute()
 
 
 def _plan(job: Job) -> Generator[tuple[str, list[Task]], list[Any], Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 import signal
 import threading
 from collections.abc import Iterator
@@ -59,9 +60,14 @@ def open_client(
     """
     check_workers(scheduler, workers, slurm, threads)
     try:
+        from dask.utils import parse_bytes
         from distributed import Client, LocalCluster
     except ImportError as error:
         raise ImportError(f"batch: expected Dask, got {error}; pip install 'kfgs[scale]'") from error
+    try:
+        parse_bytes(memory)
+    except ValueError as error:
+        raise ValueError(f"memory: expected a size such as 16GB, got {memory!r}; write it so") from error
     if scheduler is not None:
         try:
             client = Client(scheduler, timeout=START, set_as_default=False)
@@ -99,6 +105,8 @@ def _slurm(partition: str, threads: int, memory: str, scheduler: dict[str, Any])
     finally:
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, before)  # the package replaces it: Ctrl-C would be an exit with code 0
+    if shutil.which("sbatch") is None:
+        raise OSError("slurm: expected Slurm's sbatch on this machine, got none; start it where jobs are submitted")
     return SLURMCluster(
         queue=partition,
         cores=1,  # Dask's threads: one task at a time

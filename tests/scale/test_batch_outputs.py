@@ -20,6 +20,10 @@ OURS = {
 }
 
 
+class Killed(BaseException):
+    """Ends a task like a kill."""
+
+
 class Idle:
     """An engine to which nothing may be submitted."""
 
@@ -103,7 +107,7 @@ def photos(tmp_path, monkeypatch):
         model.mkdir(parents=True, exist_ok=True)
         (model / "cameras.bin").write_text("found")
         calls.append("sfm")
-        raise KeyboardInterrupt
+        raise Killed
 
     monkeypatch.setattr(stages, "run_sfm", run)
     return Job(str(tmp_path / "photos"), str(tmp_path / "runs" / "photos"), BatchOptions()), calls
@@ -124,7 +128,7 @@ def test_cameras_of_somebody_else_are_not_replaced(photos):
 def test_a_killed_search_for_cameras_is_repeated(photos):
     job, calls = photos
     for _ in range(2):
-        with pytest.raises(KeyboardInterrupt):
+        with pytest.raises(Killed):
             stages.find_scene(job, report=print)
     assert calls == ["sfm", "sfm"]
 
