@@ -56,7 +56,12 @@ def check_own(path: Path, ours: Callable[[Path], bool], writer: str) -> None:
     except (OSError, ValueError, LookupError, TypeError):
         known = False
     if not known:
-        raise FileExistsError(
-            f"{path}: expected nothing there, or what an earlier `{writer}` wrote, got something else; move it away, or "
-            "choose another output"
-        )
+        raise foreign(path, writer)
+
+
+def foreign(place: Path | str, writer: str) -> FileExistsError:
+    """The error for a file that `writer` must not replace."""
+    return FileExistsError(
+        f"{place}: expected nothing there, or what an earlier `{writer}` wrote, got something else; move it away, or "
+        "choose another output"
+    )
