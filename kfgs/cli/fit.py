@@ -108,9 +108,10 @@ def fit(
 ) -> None:
     """Make a semantic field of a scene and its teacher features.
 
-    The features are averaged onto Gaussians in 3-D and then compressed. The Gaussians are those of --splat. Without it
-    they are trained on the pictures first; `kfgs color` with the same --out makes better ones, which are then used if it
-    took more steps. A color.ply that is there already is never replaced.
+    The features are averaged onto Gaussians in 3-D and then compressed. The Gaussians are those of --splat, or of the
+    newest splat in the scene's folder (an output folder of 3DGS has one). Without both they are trained on the pictures
+    first; `kfgs color` with the same --out makes better ones, which are then used if it took more steps. A
+    color.ply that is there already is never replaced.
 
     Examples:
         kfgs fit scene/ --out run/ --splat my.ply
@@ -148,6 +149,10 @@ def fit(
     else:
         training.say_idle()
     as_taken = views.load(scene)
+    if splat is None and as_taken.splat is not None and method.method != "paper":
+        check_alone(
+            "steps", training.steps, f"with a scene that has its splat ({as_taken.splat}), which needs no training"
+        )
     loaded = as_taken.undistorted()
     chosen = loaded.views(views.split)
     check_scene(loaded, chosen)  # before hours of features

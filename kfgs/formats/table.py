@@ -27,6 +27,7 @@ from types import ModuleType
 from .._check import typed
 from .._files import as_path
 from ..gaussians import Gaussians
+from .folders import PATTERNS, newest_splat
 from .order import morton_order
 from .sidecar import find_names, names_path, read_sidecar, write_sidecar
 from .splat_file import SplatFile, Written
@@ -53,11 +54,13 @@ def formats() -> dict[str, ModuleType]:
 def find_format(path: str | Path) -> ModuleType:
     """The format of a file: by its content, or by its name if the content has no mark (`.splat`).
 
+    Of the output folder of a training program it is the format of its newest splat.
+
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is none of the known formats.
     """
-    path = as_path(path)
+    path = _newest(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file; expected a splat file there")
     head = b""
@@ -76,18 +79,28 @@ def find_format(path: str | Path) -> ModuleType:
         if path.is_file() and path.name.lower().endswith(module.SUFFIXES) and not hasattr(module, "MAGIC"):
             return module
     known = ", ".join(f"{name} ({', '.join(module.SUFFIXES)})" for name, module in formats().items())
+    known += f", and folders with {' or '.join(PATTERNS)}"
     raise ValueError(f"{path}: expected a splat file of a known format, got something else; known are {known}")
+
+
+def _newest(path: str | Path) -> Path:
+    """A splat file; of the output folder of a training program, its newest one."""
+    path = as_path(path)
+    return newest_splat(path) or path if path.is_dir() else path
 
 
 def read_splats(path: str | Path) -> SplatFile:
     """Read a splat file of any known format, with labels and class names from it or from the files next to it.
+
+    Args:
+        path: the file; or the output folder of Inria's 3DGS, whose newest iteration is then read.
 
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is of no known format, or damaged: truncated, with counts that disagree, numbers that are not
             finite, or labels without a name in its classes.
     """
-    path = as_path(path)
+    path = _newest(path)
     module = find_format(path)
     splats: SplatFile = read_sidecar(path, module.read(path))
     labels = splats.gaussians.labels

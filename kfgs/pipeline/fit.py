@@ -215,9 +215,10 @@ def fit_scene(
         folder: the run folder; the finished field goes to `folder/field`. A field that other options made there before is kept as
             `folder/field@<key>`; `restore_field` brings it back.
         config: the method and its options.
-        splat: of method `fuse`, the Gaussians to fuse onto, in the scene's frame: a splat file or its content. None trains them
-            on the pictures with `config.color` and writes them to `folder/color.ply`, unless that file exists. If `fit_color`
-            trained for longer in the same folder, its Gaussians are taken instead.
+        splat: of method `fuse`, the Gaussians to fuse onto, in the scene's frame: a splat file or its content. None takes
+            `scene.splat`; if the scene has none, it trains them on the pictures with `config.color` and writes them to
+            `folder/color.ply`, unless that file exists. If `fit_color` trained for longer in the same folder, its Gaussians are
+            taken instead.
         latents: of method `fuse`, those of other fields (`fields.sample_latents`), with which this one shall agree.
         report: receives one line per stage.
         progress: True shows bars; a function receives the history rows of every trained stage as they appear.

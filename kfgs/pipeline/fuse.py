@@ -40,10 +40,11 @@ def find_geometry(
 ) -> tuple[Gaussians, dict[str, Any]]:
     """The Gaussians to fuse onto, and their origin, for `field.json`.
 
-    Without a splat they are the colour field of the run. Its stage is found again if it is there. A longer colour field of the
-    same scene, as `kfgs color` makes it in the same run folder, is taken instead. A shorter one is not, but its
-    `color.ply` stays.
+    Without a splat they are those of the scene's own splat, or else the colour field of the run. Its stage is found again
+    if it is there. A longer colour field of the same scene, as `kfgs color` makes it in the same run folder, is taken
+    instead. A shorter one is not, but its `color.ply` stays.
     """
+    splat = scene.splat if splat is None else splat
     if isinstance(splat, Gaussians):
         return splat, {"geometry": "given"}
     if isinstance(splat, SplatFile):

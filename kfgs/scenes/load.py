@@ -9,9 +9,11 @@ from typing import Literal, NamedTuple
 
 from .._check import check_choice
 from .._files import as_path, real_path
+from ..formats.folders import newest_splat
 from .colmap import load_colmap
 from .colmap_model import has_model
 from .files import SceneError, natural_key, some
+from .inria import is_inria, load_inria
 from .llff import POSES, is_llff, load_llff
 from .replica import is_nice_slam, is_semantic_nerf, load_nice_slam, load_semantic_nerf
 from .scannet import is_scannet, load_scannet
@@ -41,6 +43,7 @@ _LAYOUTS = (
     ),
     _Layout("ScanNet", "color/ and pose/", is_scannet, lambda path, _: load_scannet(path)),
     _Layout("LLFF (3D-OVS)", POSES, is_llff, load_llff),
+    _Layout("3DGS's output", "cameras.json and point_cloud/", is_inria, load_inria),
 )
 """Asked in this order, after COLMAP models and transforms.json: 3D-OVS and Mip-NeRF 360 have both a model and LLFF's poses."""
 
@@ -51,7 +54,7 @@ def load_scene(path: str | Path, *, images: str | Path | None = None, split: Spl
     The first of these is read: a COLMAP model in `sparse/0`, `sparse`, `colmap/sparse/0`, `colmap_ground_truth` or the
     folder itself (binary before text); `transforms.json`; Blender's `transforms_train.json`; Replica as NICE-SLAM
     (`results/`, `traj.txt`) or Semantic-NeRF (`rgb/`, `traj_w_c.txt`) rendered it; ScanNet (`color/`, `pose/`); LLFF and
-    3D-OVS (`poses_bounds.npy`). `docs/datasets.md` has them all.
+    3D-OVS (`poses_bounds.npy`); the output of Inria's 3DGS (`cameras.json`, `point_cloud/`). `docs/datasets.md` has them all.
 
     Args:
         path: the scene folder, a model folder, or a .json file.
@@ -77,12 +80,23 @@ def load_scene(path: str | Path, *, images: str | Path | None = None, split: Spl
         raise FileNotFoundError(f"{path}: no such folder; expected a scene there")
     root = path if path.is_dir() else path.parent
     try:
-        scene = replace(_load_views(path, _given_folder(root, images)), folder=root)
+        scene = _with_splat(replace(_load_views(path, _given_folder(root, images)), folder=root), root)
     except SceneError as error:  # of cameras that do not fit together
         if str(root) in str(error):
             raise
         raise SceneError(f"{path}: {error}") from error
     return _with_split(scene, root, split)
+
+
+def _with_splat(scene: Scene, root: Path) -> Scene:
+    """The scene with the splat that a training program left in its folder."""
+    splat = newest_splat(root)
+    if splat is None:
+        return scene
+    note = (
+        f"{splat.relative_to(root)} is a splat of this scene: a field is made on its Gaussians (--splat names others)"
+    )
+    return replace(scene, splat=splat, notes=(*scene.notes, note))
 
 
 def picture_folders(path: str | Path, images: str | Path | None = None) -> list[Path]:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from .._card import short_repr
 from ..cameras.camera import Camera
+from ..formats.ply import points_from_columns, read_ply
 from .files import MAX_NUMBER, SceneError, is_file, list_images, natural_key, open_picture, read_image, some
 from .scene import Scene
 
@@ -30,6 +31,7 @@ class PosedPicture(NamedTuple):
     path: Path
     pose: Matrix  # [4, 4] camera to world, x right, y down, z forward
     origin: str  # the file, and the line, that the pose is from; for messages
+    lens: tuple[Matrix, tuple[int, int]] | None = None  # its own K [3, 3] and (width, height); None: that of the scene
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -121,12 +123,12 @@ def numbered_pictures(folder: Path, pattern: str, poses: Path) -> tuple[list[Pos
 def scene_of_poses(
     folder: Path,
     views: Sequence[PosedPicture],
-    K: Matrix,  # [3, 3]
-    size: tuple[int, int],  # (width, height)
+    K: Matrix | None,  # [3, 3]; None if each view has its own lens
+    size: tuple[int, int] | None,  # (width, height)
     points: tuple[Tensor, Tensor] | None = None,  # [P, 3], [P, 3] uint8
     notes: Sequence[str] = (),
 ) -> Scene:
-    """A scene of pictures that one camera took; views without a pose (not finite) are left out and noted.
+    """A scene of pictures with poses; views without a pose (not finite) are left out and noted.
 
     Raises:
         SceneError: if no view has a pose, or a pose is no rigid motion.
@@ -145,7 +147,11 @@ def scene_of_poses(
         try:
             if view.pose[3].tolist() != [0, 0, 0, 1]:
                 raise ValueError(f"pose: expected 0 0 0 1 as its last row, got {view.pose[3].tolist()}")
-            cameras.append(Camera(torch.from_numpy(viewmat).float(), torch.from_numpy(K).float(), *size, view.name))
+            own_K, own_size = view.lens or (K, size)
+            assert own_K is not None
+            assert own_size is not None
+            lens = torch.from_numpy(own_K).float(), *own_size
+            cameras.append(Camera(torch.from_numpy(viewmat).float(), *lens, view.name))
         except ValueError as error:
             raise SceneError(f"{view.origin}: {error}; copy the poses again") from error
     said = [f"{len(lost)} views have no pose (not finite) and were left out: {some(lost)}"] if lost else []
@@ -154,6 +160,23 @@ def scene_of_poses(
         said.append("no points: a field needs points to start from (`kfgs sfm` finds them)")
     splits = {"train": list(range(len(cameras))), "test": []}
     return Scene(cameras, [view.path for view in posed], *points, splits, (*notes, *said)).with_near()
+
+
+def read_points(path: Path) -> tuple[Tensor, Tensor]:  # [P, 3] float32, [P, 3] uint8
+    """The vertices of a PLY and their colours; grey if it has none.
+
+    Raises:
+        ValueError: if it is damaged, or a coordinate is not finite.
+    """
+    columns = read_ply(path)
+    points = points_from_columns(columns)
+    if not torch.isfinite(points).all():
+        raise ValueError(f"{path}: expected finite coordinates, got NaN or infinity; write the point cloud again")
+    colors = torch.full((len(points), 3), 128, dtype=torch.uint8)
+    for i, name in enumerate(("red", "green", "blue")):
+        if name in columns and columns[name].dtype.kind in "iu":
+            colors[:, i] = torch.from_numpy(columns[name].clip(0, 255).astype("uint8"))
+    return points, colors
 
 
 def read_depth(path: Path) -> NDArray[Any]:  # [H, W]

@@ -20,7 +20,6 @@ from torch import Tensor
 
 from .._files import as_path
 from ..cameras.camera import Camera, Distortion
-from ..formats.ply import points_from_columns, read_ply
 from .files import (
     IMAGE_SUFFIXES,
     MAX_NUMBER,
@@ -32,6 +31,7 @@ from .files import (
     read_scene_json,
     some,
 )
+from .posed import read_points
 from .scene import Scene
 
 _PERSPECTIVE = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -303,21 +303,13 @@ def _points(reader: _Reader, top: dict[str, Any]) -> tuple[Tensor, Tensor, list[
     if file is None or not _normal(file).is_relative_to(_normal(reader.root)) or not is_file(file):
         return *nothing, [f"no points: ply_file_path {listed!r:.200} is no file inside {reader.root}"]
     try:
-        columns = read_ply(file)
-        points = points_from_columns(columns)
+        return *read_points(file), notes
     except ValueError as error:
         if notes:
             raise SceneError(f"{error}; write the points again, or remove the file to load without points") from error
         raise SceneError(
             f"{error} (named by ply_file_path in {reader.path}; remove the entry to load without points)"
         ) from error
-    if not torch.isfinite(points).all():
-        raise SceneError(f"{file}: expected finite coordinates, got NaN or infinity; write the point cloud again")
-    colors = torch.full((len(points), 3), 128, dtype=torch.uint8)
-    for i, name in enumerate(("red", "green", "blue")):
-        if name in columns and columns[name].dtype.kind in "iu":
-            colors[:, i] = torch.from_numpy(columns[name].clip(0, 255).astype("uint8"))
-    return points, colors, notes
 
 
 def _splits(views: list[tuple[Camera, Path, str]], root: Path, top: dict[str, Any]) -> dict[str, list[int]]:

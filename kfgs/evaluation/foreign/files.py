@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ...formats.folders import numbered_files
 from ...gaussians import Gaussians
 from ...teachers.torch_files import TorchFileError, check_plain, load_torch_file
 
@@ -137,12 +137,7 @@ def find_numbered(folder: Path, pattern: str, step: int | None, what: str) -> Pa
     Raises:
         FileNotFoundError: if there is none.
     """
-    before, after = pattern.split("*")
-    files: dict[int, Path] = {}
-    for file in folder.glob(pattern) if folder.is_dir() else ():
-        match = re.fullmatch(re.escape(before) + r"(\d+)" + re.escape(after), file.relative_to(folder).as_posix())
-        if match:
-            files[int(match[1])] = file
+    files = numbered_files(folder, pattern)
     if not files or (step is not None and step not in files):
         got = f"steps {sorted(files)}" if files else "none"
         raise FileNotFoundError(

@@ -1,0 +1,31 @@
+"""Find the newest splat in the output folder of a training program.
+
+From formats.md and the programs' own code: Inria's 3DGS and its descendants write `point_cloud/iteration_30000/point_cloud.ply`.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+PATTERNS = ("point_cloud/iteration_*/point_cloud.ply",)  # * is the step
+
+
+def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
+    """The files of a pattern with one `*`, by the whole number in its place."""
+    before, after = pattern.split("*")
+    found = {}
+    for file in folder.glob(pattern) if folder.is_dir() else ():
+        match = re.fullmatch(re.escape(before) + r"(\d{1,18})" + re.escape(after), file.relative_to(folder).as_posix())
+        if match and file.is_file():
+            found[int(match[1])] = file
+    return found
+
+
+def newest_splat(folder: Path) -> Path | None:
+    """The splat of the highest step in the output folder of a training program; None if this is no such folder."""
+    for pattern in PATTERNS:
+        files = numbered_files(folder, pattern)
+        if files:
+            return files[max(files)]
+    return None
