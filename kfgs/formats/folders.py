@@ -1,6 +1,7 @@
 """Find the newest splat in the output folder of a training program.
 
-From formats.md and the programs' own code: Inria's 3DGS and its descendants write `point_cloud/iteration_30000/point_cloud.ply`.
+Inria's 3DGS and its descendants write `point_cloud/iteration_30000/point_cloud.ply`, gsplat's trainer
+`ckpts/ckpt_29999_rank0.pt`, nerfstudio `nerfstudio_models/step-000029999.ckpt`.
 """
 
 from __future__ import annotations
@@ -8,7 +9,11 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-PATTERNS = ("point_cloud/iteration_*/point_cloud.ply",)  # * is the step
+PATTERNS = (  # * is the step
+    "point_cloud/iteration_*/point_cloud.ply",
+    "ckpts/ckpt_*_rank0.pt",
+    "nerfstudio_models/step-*.ckpt",
+)
 
 
 def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:

@@ -37,6 +37,7 @@ MODULES = (  # tried in this order: compressed PLY before PLY, because both end 
     "compressed_ply",
     "ply_3dgs",
     "spz",
+    "checkpoint",  # before sog, which takes every zip file
     "sog",
     "gltf",
     "ksplat",
@@ -93,7 +94,7 @@ def read_splats(path: str | Path) -> SplatFile:
     """Read a splat file of any known format, with labels and class names from it or from the files next to it.
 
     Args:
-        path: the file; or the output folder of Inria's 3DGS, whose newest iteration is then read.
+        path: the file; or the output folder of 3DGS, gsplat or nerfstudio, whose newest step is then read.
 
     Raises:
         FileNotFoundError: if there is no such file.
