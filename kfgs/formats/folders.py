@@ -9,6 +9,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from .._files import as_path
+
 PATTERNS = (  # * is the step
     "point_cloud/iteration_*/point_cloud.ply",
     "ckpts/ckpt_*_rank0.pt",
@@ -34,3 +36,9 @@ def newest_splat(folder: Path) -> Path | None:
         if files:
             return files[max(files)]
     return None
+
+
+def splat_file_of(path: str | Path) -> Path:
+    """The path itself; of the output folder of a training program, its newest splat."""
+    path = as_path(path)
+    return newest_splat(path) or path if path.is_dir() else path

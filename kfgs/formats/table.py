@@ -27,7 +27,7 @@ from types import ModuleType
 from .._check import typed
 from .._files import as_path
 from ..gaussians import Gaussians
-from .folders import PATTERNS, newest_splat
+from .folders import PATTERNS, splat_file_of
 from .order import morton_order
 from .sidecar import find_names, names_path, read_sidecar, write_sidecar
 from .splat_file import SplatFile, Written
@@ -61,7 +61,7 @@ def find_format(path: str | Path) -> ModuleType:
         FileNotFoundError: if there is no such file.
         ValueError: if it is none of the known formats.
     """
-    path = _newest(path)
+    path = splat_file_of(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file; expected a splat file there")
     head = b""
@@ -84,12 +84,6 @@ def find_format(path: str | Path) -> ModuleType:
     raise ValueError(f"{path}: expected a splat file of a known format, got something else; known are {known}")
 
 
-def _newest(path: str | Path) -> Path:
-    """A splat file; of the output folder of a training program, its newest one."""
-    path = as_path(path)
-    return newest_splat(path) or path if path.is_dir() else path
-
-
 def read_splats(path: str | Path) -> SplatFile:
     """Read a splat file of any known format, with labels and class names from it or from the files next to it.
 
@@ -101,7 +95,7 @@ def read_splats(path: str | Path) -> SplatFile:
         ValueError: if it is of no known format, or damaged: truncated, with counts that disagree, numbers that are not
             finite, or labels without a name in its classes.
     """
-    path = _newest(path)
+    path = splat_file_of(path)
     module = find_format(path)
     splats: SplatFile = read_sidecar(path, module.read(path))
     labels = splats.gaussians.labels

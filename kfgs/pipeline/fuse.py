@@ -19,6 +19,7 @@ from .._tensors import save_tensors
 from ..cameras import Camera
 from ..fields import Answers, Seen, SemanticField, UpliftConfig, fused_answers, remember, uplift_maps
 from ..formats import SplatFile, read_splats
+from ..formats.folders import splat_file_of
 from ..gaussians import Gaussians
 from ..quant import LinearLatents
 from ..scenes import Scene
@@ -50,7 +51,7 @@ def find_geometry(
     if isinstance(splat, SplatFile):
         return splat.gaussians, {"geometry": "given"}
     if splat is not None:
-        return read_splats(splat).gaussians, {"geometry": str(splat)}
+        return read_splats(splat).gaussians, {"geometry": str(splat_file_of(splat))}
     found = find_color(run, scene, config)
     if found is None:
         found = make_color(run, scene, config, device, progress, overwrite=False).gaussians, config.field.steps

@@ -20,6 +20,7 @@ from .._files import as_path, check_inside, check_output, digest_file, locked, r
 from ..features import FeatureFolder
 from ..fields import SemanticField, sample_latents, select_gaussians
 from ..formats import SplatFile, read_splats, write_splats
+from ..formats.folders import splat_file_of
 from ..pipeline import FitConfig, fit_scene
 from ..quant import LinearLatents
 from ..scenes import Scene, SceneError, load_scene
@@ -83,7 +84,7 @@ def split_scene(
         "version": 1,
         "scene": os.path.relpath(source, out),
         "features": os.path.relpath(real_path(maps_folder), real_path(out)),
-        "splat": None if splat is None else digest_file(splat),
+        "splat": None if splat is None else digest_file(splat_file_of(splat)),
         "latents": latents,
         "blocks": [b.to_json() for b in blocks],
     }

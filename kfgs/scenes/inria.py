@@ -109,7 +109,9 @@ def _settings(path: Path) -> dict[str, Any]:
         if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Namespace"):
             raise ValueError("another expression")
         values = {word.arg: word.value for word in call.keywords}
-        found = {name: ast.literal_eval(values[name]) for name in ("source_path", "images", "eval") if name in values}
+        found: dict[str, Any] = {
+            name: ast.literal_eval(values[name]) for name in ("source_path", "images", "eval") if name in values
+        }
         kinds = {"source_path": str, "images": str, "eval": bool}
         odd = [name for name, value in found.items() if not isinstance(value, kinds[name]) or "\0" in str(value)]
         if odd:
@@ -160,7 +162,7 @@ def _names(path: Path, entries: list[Any], pictures: Path) -> list[str | None]:
 
 def _camera(where: str, entry: dict[str, Any]) -> tuple[Matrix, Matrix, tuple[int, int]]:
     """Camera to world [4, 4], K [3, 3] and (width, height)."""
-    numbers = [entry.get(name) for name in ("width", "height", "fx", "fy")]
+    numbers: list[Any] = [entry.get(name) for name in ("width", "height", "fx", "fy")]
     width, height, fx, fy = (n if type(n) in (int, float) and math.isfinite(n) else -1 for n in numbers)
     if (
         min(width, height, fx, fy) <= 0

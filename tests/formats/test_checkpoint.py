@@ -12,6 +12,7 @@ import torch
 from messages import tells
 from torch import Tensor, nn
 
+from kfgs.cli import main
 from kfgs.formats import find_format, read_splats, write_splats
 from kfgs.formats.checkpoint import FRAME
 from kfgs.splat import evaluate_sh
@@ -81,7 +82,7 @@ def test_gsplat_values_are_activated(tmp_path: Path) -> None:
     torch.testing.assert_close(read_splats(tmp_path / "same.ply").gaussians.scales, cloud.scales)
 
 
-def test_all_ranks_are_joined(tmp_path: Path) -> None:
+def test_all_ranks_are_joined(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     parts = [raw_values(count) for count in (3, 5)]
     for rank, raw in enumerate(parts):
         write_gsplat(tmp_path / f"ckpts/ckpt_6999_rank{rank}.pt", raw)
@@ -89,6 +90,8 @@ def test_all_ranks_are_joined(tmp_path: Path) -> None:
     found = read_splats(tmp_path)  # the newest step of the folder
     assert torch.equal(found.gaussians.means, torch.cat([raw["means"] for raw in parts]))
     assert found.info["ranks"] == 2
+    assert main(["info", str(tmp_path)]) == 0
+    assert "program: gsplat" in capsys.readouterr().out
     (tmp_path / "ckpts/ckpt_6999_rank0.pt").unlink()
     with pytest.raises(ValueError, match=tells("ranks 0 to 1", "[1]", "copy them all")):
         read_splats(tmp_path / "ckpts/ckpt_6999_rank1.pt")
