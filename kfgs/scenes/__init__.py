@@ -4,6 +4,7 @@ from ..cameras.bounds import Bounds, robust_bounds
 from .colmap_model import ColmapModel, read_model
 from .files import SceneError, file_stem, list_images, read_image
 from .load import is_scene, load_scene
+from .pictures import convert_heic, extract_frames
 from .scene import Scene
 from .sfm import SfmConfig, link_images, run_sfm
 from .sfm_onto import extend_sfm
@@ -16,7 +17,9 @@ __all__ = [
     "Scene",
     "SceneError",
     "SfmConfig",
+    "convert_heic",
     "extend_sfm",
+    "extract_frames",
     "file_stem",
     "is_scene",
     "link_images",
