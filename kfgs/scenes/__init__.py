@@ -3,6 +3,7 @@
 from ..cameras.bounds import Bounds, robust_bounds
 from .colmap_model import ColmapModel, read_model
 from .files import SceneError, file_stem, list_images, read_image
+from .known_poses import find_points, write_known_poses
 from .load import is_scene, load_scene
 from .pictures import convert_heic, extract_frames
 from .scene import Scene
@@ -21,6 +22,7 @@ __all__ = [
     "extend_sfm",
     "extract_frames",
     "file_stem",
+    "find_points",
     "is_scene",
     "link_images",
     "list_images",
@@ -31,4 +33,5 @@ __all__ = [
     "robust_bounds",
     "run_sfm",
     "undistort_scene",
+    "write_known_poses",
 ]
