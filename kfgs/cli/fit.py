@@ -13,10 +13,10 @@ from .._ranks import once
 from .features import check_discard, choose_teacher, stored_maps
 from .files import check_alone, inputs_of, is_field, open_field, open_splats
 from .options import (
+    CameraSearch,
     FieldMethod,
     Flag,
     Given,
-    GivenMatching,
     Maps,
     MapTeacher,
     Positional,
@@ -56,13 +56,10 @@ def sfm(
     out: Path,
     onto: Given[Path] = None,
     fps: Given[float] = None,
-    matching: GivenMatching = None,
-    camera_model: str = "SIMPLE_RADIAL",
-    no_single_camera: Flag = False,
-    min_registered: float = 0.9,
     seed: int = 0,
-    ignore_poses: Flag = False,
     replace: Flag = False,
+    *,
+    search: CameraSearch,
 ) -> None:
     """Find the cameras of photographs or of a video (structure from motion, pycolmap).
 
@@ -82,12 +79,7 @@ def sfm(
         onto: A scene with a COLMAP model: place the photographs in it. Its own cameras do not move, and it is not written to;
             OUT has the pictures of both, as links.
         fps: Frames of each second of a video that are used, 2 when not given: the sharpest of each half second.
-        matching: sequential for the frames of a video, exhaustive for everything else; by default so.
-        camera_model: COLMAP's name of the lens model.
-        no_single_camera: The photographs were taken with several cameras, or with changes of zoom.
-        min_registered: Share of the images that must be placed; fewer is an error.
         seed: Every random choice follows from it.
-        ignore_poses: Estimate poses also if the folder has some.
         replace: Replace a model that is in OUT/sparse/0 already; without it that is an error.
     """
     from ..scenes import SfmConfig, extend_sfm, is_scene, link_images, load_scene, run_sfm, write_known_poses
@@ -98,10 +90,10 @@ def sfm(
     if not video:
         check_alone("fps", fps, "with photographs, which are all used")
     config = SfmConfig(
-        matching=matching or ("sequential" if video else "exhaustive"),
-        camera_model=camera_model,
-        single_camera=not no_single_camera,
-        min_registered=min_registered,
+        matching=search.matching or ("sequential" if video else "exhaustive"),
+        camera_model=search.camera_model,
+        single_camera=not search.no_single_camera,
+        min_registered=search.min_registered,
         seed=seed,
     )
     if onto is not None:
@@ -113,7 +105,11 @@ def sfm(
         say(str(extend_sfm(images, onto, out, config=config, progress=True)))
         wrote([out / "sparse" / "0", out / "images"])
         return
-    if not video and not ignore_poses and is_scene(images):
+    if not video and not search.ignore_poses and (is_scene(images) or images.suffix == ".json"):
+        for name, given in (("matching", search.matching), ("no_single_camera", search.no_single_camera)):
+            check_alone(
+                name, given, "with a folder that has poses, whose neighbours are compared (or give --ignore-poses)"
+            )
         scene = load_scene(images, split="all")
         say(
             f"{images}: has the poses of {len(scene)} pictures: they are kept, and points are found (not so: --ignore-poses)"
@@ -135,7 +131,7 @@ def sfm(
 def _plain_pictures(images: Path, out: Path, fps: float | None) -> Path:
     """A folder of pictures that pycolmap reads: of a video its frames, of HEIC photographs JPEG files, both in OUT/images."""
     from ..scenes import convert_heic, extract_frames
-    from ..scenes.pictures import has_heic, is_video
+    from ..scenes.pictures import VIDEO_SUFFIXES, has_heic, is_video
 
     if is_video(images):
         frames = extract_frames(images, out / "images", fps=2.0 if fps is None else fps, progress=True)
@@ -143,6 +139,10 @@ def _plain_pictures(images: Path, out: Path, fps: float | None) -> Path:
     elif has_heic(images):
         found = convert_heic(images, out / "images", progress=True)
         say(f"{images}: HEIC photographs are JPEG files in {out / 'images'}, {len(found)} pictures in all")
+    elif images.is_file():
+        raise ValueError(
+            f"images: expected a folder, or a video ({', '.join(VIDEO_SUFFIXES)}), got {images}; convert it to .mp4"
+        )
     else:
         return images
     return out / "images"

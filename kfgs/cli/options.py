@@ -76,6 +76,22 @@ class Views:
 
 
 @dataclass(frozen=True)
+class CameraSearch:
+    """How cameras are found."""
+
+    matching: GivenMatching = None
+    """sequential for the frames of a video, exhaustive for everything else; by default so."""
+    camera_model: str = "SIMPLE_RADIAL"
+    """COLMAP's name of the lens model."""
+    no_single_camera: Flag = False
+    """The photographs were taken with several cameras, or with changes of zoom."""
+    min_registered: float = 0.9
+    """Share of the images that must be placed; fewer is an error."""
+    ignore_poses: Flag = False
+    """Estimate poses also if the folder has some."""
+
+
+@dataclass(frozen=True)
 class Maps:
     """Feature maps that exist already."""
 

@@ -83,7 +83,10 @@ def test_sfm_keeps_poses_it_is_given(posed: Scene, tmp_path: Path, capsys: pytes
             torch.tensor(mine.distortion.coefficients), torch.tensor(given.distortion.coefficients)
         )
     assert torch.equal(scene.image(2), posed.image(2))
-    assert main(["sfm", str(posed.folder), "--out", str(tmp_path / "out")]) == 1
+    again = ["sfm", str(posed.folder / "transforms.json"), "--out", str(tmp_path / "out")]
+    assert main([*again, "--matching", "sequential"]) == 1
+    assert "--ignore-poses" in capsys.readouterr().err
+    assert main(again) == 1
     assert "--replace" in capsys.readouterr().err
 
 
