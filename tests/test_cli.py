@@ -233,7 +233,7 @@ def test_a_progress_bar_does_not_flood_a_log():
     assert done.stderr.count("it/s") <= 2  # the start and the end; a terminal gets ten a second
 
 
-def test_a_scene_without_points_is_told_before_features_are_asked_for(room, tmp_path, capsys):
+def test_a_scene_without_points_is_told_that_some_are_found(room, tmp_path, capsys):
     (tmp_path / "images").mkdir()
     frames = []
     for number, picture in enumerate(sorted((room / "images").iterdir())[:2]):
@@ -248,4 +248,5 @@ def test_a_scene_without_points_is_told_before_features_are_asked_for(room, tmp_
     assert main(["fit", str(tmp_path), "--out", str(tmp_path / "run")]) == 1
     said = capsys.readouterr()
     assert "note: no points: this transforms.json has no ply_file_path" in said.out
-    assert said.err.startswith("error: SCENE: expected sparse points to start from, got 0")
+    assert "triangulate some from the poses before they train" in said.out
+    assert said.err.startswith("error: --features: expected a folder of feature maps")

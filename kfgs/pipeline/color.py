@@ -25,6 +25,7 @@ from ..formats import write_splats
 from ..gaussians import Gaussians
 from ..scenes import Scene
 from .color_file import is_saved, may_replace, stage_gaussians, what_is
+from .points import with_points
 from .stages import Run, Stage, describe_lens, digest_scene, digest_tensors, stage_generator
 from .train import check_scene, field_stage, training_device, with_extent
 
@@ -195,7 +196,7 @@ def fit_color(
     Spherical harmonics up to `config.sh_degree`, L1 + D-SSIM, cloning, splitting and pruning as in 3DGS, on black.
 
     Args:
-        scene: posed, undistorted views with their sparse points.
+        scene: posed, undistorted views with their sparse points; without points, some are triangulated first.
         folder: the run folder; `folder/color.ply` receives the Gaussians, in place of those of an earlier fit with other
             options. Its stage stays in the folder, so the earlier call brings them back at once. Any other `color.ply`,
             and one with labels, is never replaced.
@@ -205,7 +206,7 @@ def fit_color(
         device: where to train, see `training_device`; the result lies on the CPU.
 
     Raises:
-        ValueError: if a camera has distortion, there is no such device, the scene has no points to start from, the
+        ValueError: if a camera has distortion, there is no such device, the scene's points are out of sight, the
             split has no views, `folder/color.ply` is a file that no fit in this folder wrote, or another process works in
             `folder`.
     """
@@ -213,6 +214,7 @@ def fit_color(
     check_scene(scene, scene.views(config.split))
     run, target = Run(check_output("folder", folder, "a folder"), report), training_device(device)
     with run.locked():
+        scene = with_points(run, scene, scene.views(config.split), config.seed, progress)
         return make_color(run, scene, config, target, progress, overwrite=True)
 
 

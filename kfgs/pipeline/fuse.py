@@ -19,6 +19,7 @@ from .._tensors import save_tensors
 from ..cameras import Camera
 from ..fields import Answers, Seen, SemanticField, UpliftConfig, fused_answers, remember, uplift_maps
 from ..formats import SplatFile, read_splats
+from ..formats.folders import splat_file_of
 from ..gaussians import Gaussians
 from ..quant import LinearLatents
 from ..scenes import Scene
@@ -40,16 +41,17 @@ def find_geometry(
 ) -> tuple[Gaussians, dict[str, Any]]:
     """The Gaussians to fuse onto, and their origin, for `field.json`.
 
-    Without a splat they are the colour field of the run. Its stage is found again if it is there. A longer colour field of the
-    same scene, as `kfgs color` makes it in the same run folder, is taken instead. A shorter one is not, but its
-    `color.ply` stays.
+    Without a splat they are those of the scene's own splat, or else the colour field of the run. Its stage is found again
+    if it is there. A longer colour field of the same scene, as `kfgs color` makes it in the same run folder, is taken
+    instead. A shorter one is not, but its `color.ply` stays.
     """
+    splat = scene.splat if splat is None else splat
     if isinstance(splat, Gaussians):
         return splat, {"geometry": "given"}
     if isinstance(splat, SplatFile):
         return splat.gaussians, {"geometry": "given"}
     if splat is not None:
-        return read_splats(splat).gaussians, {"geometry": str(splat)}
+        return read_splats(splat).gaussians, {"geometry": str(splat_file_of(splat))}
     found = find_color(run, scene, config)
     if found is None:
         found = make_color(run, scene, config, device, progress, overwrite=False).gaussians, config.field.steps

@@ -21,6 +21,7 @@ from .._rows import unit_rows
 from ..features import FeatureFolder
 from ..fields import SemanticField, sample_latents, select_gaussians
 from ..formats import SplatFile, read_splats, write_splats
+from ..formats.folders import splat_file_of
 from ..pipeline import FitConfig, fit_scene
 from ..pipeline.stages import digest_tensors
 from ..quant import FeatureMaps, LinearLatents
@@ -92,7 +93,7 @@ def split_scene(
         "version": 1,
         "scene": os.path.relpath(source, out),
         "features": os.path.relpath(real_path(maps_folder), real_path(out)),
-        "splat": None if splat is None else digest_file(splat),
+        "splat": None if splat is None else digest_file(splat_file_of(splat)),
         "latents": digest_tensors(latents.basis) if isinstance(latents, LinearLatents) else latents,
         "blocks": [b.to_json() for b in blocks],
     }
