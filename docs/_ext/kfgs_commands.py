@@ -40,7 +40,8 @@ def options_of(command: Any) -> Iterator[tuple[str, str, list[tuple[str, str]]]]
                 name = action.option_strings[-1] if action.option_strings else ""
                 rows.append((" ".join(filter(None, [name, str(action.metavar or "")])), str(action.help or "").strip()))
         if rows:
-            yield group.title or "", group.description or "", rows
+            title = (group.title or "").removesuffix(" options")
+            yield {"positional arguments": "what to give", "options": "options"}.get(title, title), group.description or "", rows
 
 
 def table(command: Any) -> str:

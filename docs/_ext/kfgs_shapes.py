@@ -16,6 +16,7 @@ from typing import Any
 
 from sphinx.application import Sphinx
 
+plain: dict[str, list[str]] = {}  # texts of attributes, as they are written
 
 def shapes_of(function: Any) -> dict[str, str]:
     """The comments of a function's arguments, by name; `return` is what the result's says."""
@@ -44,6 +45,8 @@ def add_shapes(app: Sphinx, what: str, name: str, thing: Any, options: Any, line
     for number, line in enumerate(lines):
         if not line.lstrip().startswith((">>>", "...")):
             lines[number] = re.sub(r"(`[^`]*`)|\|", lambda found: found[1] or r"\|", line)
+    if what == "attribute":
+        plain[name] = list(lines)
     if what not in ("function", "method"):
         return
     shapes = shapes_of(inspect.unwrap(thing))
@@ -53,7 +56,20 @@ def add_shapes(app: Sphinx, what: str, name: str, thing: Any, options: Any, line
         lines[at:at] = ["", "*Shapes:* " + "; ".join(told).replace("\\", "\\\\") + "."]
 
 
+def keep_plain(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Undo what napoleon makes of an attribute's text: it takes the words before a colon for a type."""
+    if what == "attribute":
+        lines[:] = plain.pop(name)
+
+
+def short_defaults(app: Sphinx, what: str, name: str, thing: Any, options: Any, sign: str | None, back: Any) -> Any:
+    """Write `...` for a default that is made by a function: what stands there is not Python."""
+    return (sign.replace("<factory>", "..."), back) if sign else None
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Register the hook; before napoleon's, which is given 500."""
+    """Register the hooks, before and after napoleon's, which has 500."""
     app.connect("autodoc-process-docstring", add_shapes, priority=400)
+    app.connect("autodoc-process-docstring", keep_plain, priority=600)
+    app.connect("autodoc-process-signature", short_defaults)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -33,7 +33,7 @@ class SearchIndex:
     Example, with fields of `kfgs fit` below the folder runs::
 
         index = SearchIndex.open("runs")
-        index = index.update(progress=True)
+        index, changes = index.update(progress=True)
         for scene in index.search("chair").scenes:
             print(scene.path, scene.count, scene.parts[0].center, scene.parts[0].view)
     """
