@@ -58,6 +58,7 @@ copybutton_exclude = ".linenos, .gp, .go"
 
 # MathJax in one file, from a wheel; without it the site would ask a server for it.
 _mathjax = find_spec("sphinx-mathjax-offline")
-assert _mathjax is not None and _mathjax.origin is not None, 'pip install -c constraints.txt torch==2.13.0 ".[docs]"'
-html_static_path.append(str(Path(_mathjax.origin).parent / "static" / "mathjax" / "tex-svg.js"))
+if _mathjax is None:
+    raise ImportError('the site needs MathJax; run: pip install -c constraints.txt torch==2.13.0 ".[docs]"')
+html_static_path.append(str(Path(str(_mathjax.origin)).parent / "static" / "mathjax" / "tex-svg.js"))
 mathjax_path = "tex-svg.js"

@@ -41,7 +41,11 @@ def options_of(command: Any) -> Iterator[tuple[str, str, list[tuple[str, str]]]]
                 rows.append((" ".join(filter(None, [name, str(action.metavar or "")])), str(action.help or "").strip()))
         if rows:
             title = (group.title or "").removesuffix(" options")
-            yield {"positional arguments": "what to give", "options": "options"}.get(title, title), group.description or "", rows
+            yield (
+                {"positional arguments": "what to give", "options": "options"}.get(title, title),
+                group.description or "",
+                rows,
+            )
 
 
 def table(command: Any) -> str:
@@ -49,7 +53,9 @@ def table(command: Any) -> str:
     parts = []
     for title, text, rows in options_of(command):
         head = "| option | what it does |\n|---|---|"
-        lines = [f"| `{name.replace('|', chr(92) + '|')}` | {told.replace('|', chr(92) + '|')} |" for name, told in rows]
+        lines = [
+            f"| `{name.replace('|', chr(92) + '|')}` | {told.replace('|', chr(92) + '|')} |" for name, told in rows
+        ]
         about = f"**{title}**" + (f": {text}" if text else "")
         parts.append(f"{about}\n\n{head}\n" + "\n".join(lines) + "\n")
     return "\n".join(parts)

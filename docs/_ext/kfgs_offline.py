@@ -9,7 +9,15 @@ from sphinx.application import Sphinx
 from sphinx.util import logging
 
 # What a browser loads by itself. A link (<a href>) is followed only by a click.
-LOADED = {"script": "src", "link": "href", "img": "src", "iframe": "src", "source": "src", "video": "src", "use": "href"}
+LOADED = {
+    "script": "src",
+    "link": "href",
+    "img": "src",
+    "iframe": "src",
+    "source": "src",
+    "video": "src",
+    "use": "href",
+}
 say = logging.getLogger(__name__)
 
 
@@ -21,6 +29,7 @@ class Loaded(HTMLParser):
         self.outside: list[str] = []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Look at one tag."""
         target = dict(attrs).get(LOADED.get(tag, "")) or ""
         if target.startswith(("http:", "https:", "//")):
             self.outside.append(f"<{tag}> {target}")

@@ -1,4 +1,4 @@
-"""A type of a signature leads to its page: `kfgs.gaussians.Gaussians`, where it is written, to `kfgs.Gaussians`, where it is shown."""
+"""A type in a signature leads to its page: `kfgs.gaussians.Gaussians` is shown as `kfgs.Gaussians`."""
 
 from __future__ import annotations
 

@@ -18,6 +18,7 @@ from sphinx.application import Sphinx
 
 plain: dict[str, list[str]] = {}  # texts of attributes, as they are written
 
+
 def shapes_of(function: Any) -> dict[str, str]:
     """The comments of a function's arguments, by name; `return` is what the result's says."""
     try:

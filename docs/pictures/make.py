@@ -65,10 +65,13 @@ class Demo:
         return palette(labels.numpy(), self.words.names)
 
 
-def save(name: str, pictures: list[np.ndarray], titles: list[str]) -> None:
-    """Write pictures side by side as one JPEG that is small enough."""
-    grid = viz.picture_grid([pictures], titles, width=(WIDE - 6 * len(pictures)) // len(pictures))
-    write(name, Image.fromarray(grid))
+def save(name: str, pictures: list[np.ndarray], titles: list[str], across: int = 3) -> None:
+    """Write pictures, `across` of them side by side, as one JPEG that is small enough."""
+    rows = [
+        viz.picture_grid([pictures[i : i + across]], titles[i : i + across], width=(WIDE - 6 * across) // across)
+        for i in range(0, len(pictures), across)
+    ]
+    write(name, Image.fromarray(np.concatenate(rows)))
 
 
 def write(name: str, picture: Image.Image) -> None:
@@ -87,7 +90,9 @@ def draw_field(demo: Demo) -> None:
     dots = labelled.replace(scales=labelled.scales * 0.45, opacities=torch.full_like(labelled.opacities, 0.95))
     gaussians = show_cloud(dots, color_by="label", names=demo.words.names)(demo.large)
     classes = show_classes(labelled, demo.words.names)(demo.large)
-    save("site_field.jpg", [demo.photo(), gaussians, classes], ["photo", "Gaussians of the field", "class of each pixel"])
+    save(
+        "site_field.jpg", [demo.photo(), gaussians, classes], ["photo", "Gaussians of the field", "class of each pixel"]
+    )
 
 
 def draw_uplift(demo: Demo) -> None:
@@ -109,7 +114,11 @@ def draw_codebook(demo: Demo) -> None:
     both = torch.cat([features.flatten(0, 1), words.flatten(0, 1)])
     colors = colors_of_features(both)(both)
     before, after = (part.reshape(*features.shape[:2], 3) for part in np.split(np.asarray(colors), 2))
-    save("site_codebook.jpg", [demo.photo(), before, after], ["photo", "512 numbers a pixel", f"one of {book.size} codewords"])
+    save(
+        "site_codebook.jpg",
+        [demo.photo(), before, after],
+        ["photo", "512 numbers a pixel", f"one of {book.size} codewords"],
+    )
 
 
 def draw_gamma(demo: Demo) -> None:
@@ -159,7 +168,7 @@ def draw_landing(demo: Demo) -> None:
         show_selection(demo.field.gaussians, asked, demo.colors)(demo.large),
         show_cloud(edited, color_by="rgb")(demo.large),
     ]
-    save("site_landing.jpg", pictures, ["photo", "classes", "“chair”", "chairs removed, plant red"])
+    save("site_landing.jpg", pictures, ["photo", "classes", "“chair”", "chairs removed, plant red"], across=2)
 
 
 def main() -> int:

@@ -46,7 +46,11 @@ def desk(tmp_path_factory):
 
 @pytest.mark.parametrize("name", kfgs.__all__)
 def test_every_public_name_is_on_a_page_and_in_an_example_of_that_page(name):
-    pages = [topic for topic in TOPICS if re.search(rf"^\.\. auto\w+:: kfgs\.{name}$", (PAGES / f"{topic}.md").read_text(), re.M)]
+    pages = [
+        topic
+        for topic in TOPICS
+        if re.search(rf"^\.\. auto\w+:: kfgs\.{name}$", (PAGES / f"{topic}.md").read_text(), re.M)
+    ]
     assert len(pages) == 1
     assert name in words_of(pages[0])
 
