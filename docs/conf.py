@@ -62,3 +62,4 @@ if _mathjax is None:
     raise ImportError('the site needs MathJax; run: pip install -c constraints.txt torch==2.13.0 ".[docs]"')
 html_static_path.append(str(Path(str(_mathjax.origin)).parent / "static" / "mathjax" / "tex-svg.js"))
 mathjax_path = "tex-svg.js"
+mathjax3_config = {"options": {"enableMenu": False}}  # some of the menu's entries load from a server

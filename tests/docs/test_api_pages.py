@@ -69,6 +69,31 @@ def test_the_examples_of_a_page_run(topic, desk, tmp_path, monkeypatch):
     assert result.failed == 0, "".join(said)
 
 
+WITH_CODE = ["index", "concepts/field", "howto/teacher", "howto/remove", "howto/count", "howto/export", "quickstart"]
+
+
+@pytest.mark.parametrize("page", WITH_CODE)
+def test_the_python_of_other_pages_runs(page, desk, tmp_path, monkeypatch):
+    shutil.copytree(desk, tmp_path / "desk")
+    monkeypatch.chdir(tmp_path / "desk")
+    Path("kfgs_demo").symlink_to(".")
+    kfgs.write_splats("labelled.ply", kfgs.attach(kfgs.SemanticField.load("run/field"), "my.ply").splats)
+    blocks = re.findall(r"```python\n(.*?)```", (PAGES.parent / f"{page}.md").read_text(encoding="utf-8"), re.DOTALL)
+    assert blocks
+    known = {}
+    for block in blocks:
+        exec(block, known)
+
+
+def test_no_page_has_python_that_no_test_runs():
+    pages = [*PAGES.parent.glob("*.md"), *PAGES.parent.glob("[ch]o*/*.md")]
+    others = {"recipes", "datasets", "protocols", "engines"}  # recipes: test_first_scripts; the others need data
+    have = {
+        path.relative_to(PAGES.parent).with_suffix("").as_posix() for path in pages if "```python\n" in path.read_text()
+    }
+    assert have == {*WITH_CODE, *others}
+
+
 def test_every_page_is_listed_and_asks_a_question():
     index = (PAGES / "index.md").read_text(encoding="utf-8")
     for topic in TOPICS:
