@@ -26,11 +26,14 @@ extensions = [
     "kfgs_offline",
 ]
 exclude_patterns = ["_ext", "pictures", "runs"]
-suppress_warnings = ["mystnb.unknown_mime_type"]  # the interactive viewer of a notebook; its still picture is shown
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 nb_execution_mode = "off"  # notebooks are shown with the outputs that are in the file
+nb_ipywidgets_js: dict[str, dict[str, str]] = {}  # they would come from a server: of a viewer its still picture is shown
+nb_mime_priority_overrides = [
+    ("html", kind, None) for kind in ("application/vnd.jupyter.widget-view+json", "application/javascript")
+]
 
 default_role = "py:obj"  # `Scene` in a docstring is a link if there is a page of it
 add_module_names = False
