@@ -25,12 +25,14 @@ extensions = [
     "kfgs_shapes",
     "kfgs_offline",
 ]
-exclude_patterns = ["_ext", "pictures", "runs"]
+exclude_patterns = ["_build", "_ext", "pictures", "runs"]
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 nb_execution_mode = "off"  # notebooks are shown with the outputs that are in the file
-nb_ipywidgets_js: dict[str, dict[str, str]] = {}  # they would come from a server: of a viewer its still picture is shown
+nb_ipywidgets_js: dict[
+    str, dict[str, str]
+] = {}  # they would come from a server: of a viewer its still picture is shown
 nb_mime_priority_overrides = [
     ("html", kind, None) for kind in ("application/vnd.jupyter.widget-view+json", "application/javascript")
 ]

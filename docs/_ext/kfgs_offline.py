@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -42,11 +43,17 @@ def find_outside(page: str) -> list[str]:
     return parser.outside
 
 
+def find_outside_style(sheet: str) -> list[str]:
+    """What a style sheet would load from another machine."""
+    return re.findall(r"(?:url\(\s*|@import\s+)[\"']?((?:https?:)?//[^\s\"')]+)", sheet)
+
+
 def check(app: Sphinx, exception: Exception | None) -> None:
     """Warn about each page of the site that loads something from elsewhere."""
     if exception is None and app.builder.format == "html":
-        for path in sorted(Path(app.outdir).rglob("*.html")):
-            for what in find_outside(path.read_text(encoding="utf-8")):
+        for path in sorted(path for path in Path(app.outdir).rglob("*") if path.suffix in (".html", ".css")):
+            find = find_outside if path.suffix == ".html" else find_outside_style
+            for what in find(path.read_text(encoding="utf-8")):
                 say.warning(f"{path.relative_to(app.outdir)}: expected files of the site alone, got {what}")
 
 

@@ -24,6 +24,8 @@ def resolve(app: Sphinx, env: BuildEnvironment, node: pending_xref, child: nodes
             builder = app.builder
             place = builder.get_relative_uri(node.get("refdoc", env.docname), entry.docname) + "#" + entry.node_id
             return nodes.reference("", "", child.deepcopy(), internal=True, refuri=place)
+    if target == f"kfgs.{name}":  # a page means a public name that has no page
+        return None
     return child.deepcopy() if node["reftype"] in ("class", "obj", "data", "exc") else None
 
 

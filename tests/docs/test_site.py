@@ -41,6 +41,18 @@ def test_what_a_page_would_load_from_elsewhere_is_found(page, outside):
     assert load("kfgs_offline").find_outside(page) == outside
 
 
+@pytest.mark.parametrize(
+    ("sheet", "outside"),
+    [
+        ("@import 'https://a.org/b.css';", ["https://a.org/b.css"]),
+        ("p { background: url(//a.org/b.png) }", ["//a.org/b.png"]),
+        ("/* https://a.org */ p { background: url(b.png) url('data:image/svg+xml;//') }", []),
+    ],
+)
+def test_what_a_style_sheet_would_load_from_elsewhere_is_found(sheet, outside):
+    assert load("kfgs_offline").find_outside_style(sheet) == outside
+
+
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))
 def test_every_option_of_a_command_is_in_its_table(name):
     commands = load("kfgs_commands")
