@@ -30,10 +30,10 @@ class SearchIndex:
     Every Gaussian is known by its word in a `SharedCodebook`, one for each teacher. The index holds where the words are in
     each field, and each field's answers about its own classes. `update` extends it when fields are new or have changed.
 
-    Example, with fields of `kfgs fit` below the folder runs:
+    Example, with fields of `kfgs fit` below the folder runs::
 
         index = SearchIndex.open("runs")
-        index = index.update(progress=True)
+        index, changes = index.update(progress=True)
         for scene in index.search("chair").scenes:
             print(scene.path, scene.count, scene.parts[0].center, scene.parts[0].view)
     """
