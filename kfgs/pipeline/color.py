@@ -25,7 +25,7 @@ from ..formats import write_splats
 from ..gaussians import Gaussians
 from ..scenes import Scene
 from .color_file import is_saved, may_replace, stage_gaussians, what_is
-from .stages import Run, Stage, describe_lens, digest_scene, digest_tensors, stage_generator
+from .stages import Run, Stage, describe_lens, digest_scene, digest_shape, digest_tensors, stage_generator
 from .train import check_scene, field_stage, training_device, with_extent
 
 
@@ -272,6 +272,31 @@ def find_color(run: Run, scene: Scene, config: ColorConfig) -> tuple[Gaussians, 
         return None
     run.say(f"geometry: the colours of {best[0]:,} steps that are in {run.folder}")
     return stage_gaussians(best[1]), best[0]
+
+
+def colors_before(
+    run: Run, scene: Scene, config: ColorConfig, geometries: Sequence[str]
+) -> tuple[Gaussians, int, str] | None:
+    """Gaussians that were trained on some of a scene's pictures: the colours, their steps, and the name of their stage.
+
+    Args:
+        run: its folder.
+        scene: the scene, which has more pictures now.
+        config: the options; a stage with other ones is taken if it has more steps.
+        geometries: digests of the Gaussians that may be taken (`digest_shape`), the best first.
+    """
+    wanted = json.loads(json.dumps(_inputs(run, scene, scene.views(config.split), config)))
+    if run.has("color", wanted):
+        return None
+    found = {}
+    for about in sorted((run.folder / "stages").glob("color-*/stage.json")) if geometries else ():
+        inputs = read_json(about)["inputs"]
+        steps = int(inputs["config"]["field"]["steps"])
+        same = inputs["config"] == wanted["config"] or steps > config.field.steps
+        if same and all(picture in wanted["pictures"] for picture in inputs["pictures"]):
+            cloud = stage_gaussians(about.parent)
+            found[digest_shape(cloud)] = cloud, steps, about.parent.name
+    return next((found[one] for one in geometries if one in found), None)
 
 
 def _inputs(run: Run, scene: Scene, views: Sequence[int], config: ColorConfig) -> dict[str, Any]:
