@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from .._files import real_path
 from ..features import FeatureFolder, Picture, extract_features
