@@ -277,13 +277,9 @@ def find_color(run: Run, scene: Scene, config: ColorConfig) -> tuple[Gaussians, 
 def colors_before(
     run: Run, scene: Scene, config: ColorConfig, geometries: Sequence[str]
 ) -> tuple[Gaussians, int, str] | None:
-    """Gaussians that were trained on some of a scene's pictures: the colours, their steps, and the name of their stage.
+    """Gaussians that were trained on some of a scene's pictures, with these options or more steps; their steps, and their stage.
 
-    Args:
-        run: its folder.
-        scene: the scene, which has more pictures now.
-        config: the options; a stage with other ones is taken if it has more steps.
-        geometries: digests of the Gaussians that may be taken (`digest_shape`), the best first.
+    They have the first digest in `geometries` that a stage has.
     """
     wanted = json.loads(json.dumps(_inputs(run, scene, scene.views(config.split), config)))
     if run.has("color", wanted):

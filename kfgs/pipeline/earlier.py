@@ -21,7 +21,7 @@ from .stages import STAGE_FILE, Run, describe_lens, digest_tensors, is_whole
 SUMS = "sums.safetensors"
 GROWTH = 2
 """When there are this many times the views that were fused at once, all are fused again. Latents are then chosen for all, and
-all of the fits of a growing scene together cost little more than twice the last one."""
+all fits of a growing scene together cost at most about three times the last full one."""
 
 
 @dataclass(frozen=True)
@@ -61,10 +61,9 @@ def find_earlier(run: Run, inputs: dict[str, Any], cameras: Sequence[Camera], ma
     def look() -> list[dict[str, Any]]:
         found = []
         for about in sorted((run.folder / "stages").glob(f"uplift-*/{STAGE_FILE}")):
-            inputs_then = read_json(about)["inputs"]
             if not (about.with_name(SUMS).is_file() and is_whole(about.parent)):
                 continue
-            facts = read_json(about.with_name("facts.json"))
+            inputs_then, facts = read_json(about)["inputs"], read_json(about.with_name("facts.json"))
             views = _positions(inputs_then["features"]["files"], inputs["features"]["files"])
             if (
                 {name: inputs_then.get(name) for name in wanted} == wanted
