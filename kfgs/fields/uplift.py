@@ -171,7 +171,8 @@ def uplift_maps(
                 say(f"{len(merged.gaussians)} of {len(cloud)} Gaussians left")
                 cloud, agreement = merged.gaussians, _pooled(agreement * shown, merged) / some(merged.weights)
                 shown = merged.weights
-                own, old, after = (_pooled_halves(values, merged) for values in (own, old, lacking[1]))
+                own = _pooled_halves(own, merged)
+                old, after = (None if one is None else _pooled_halves(one, merged) for one in (old, lacking[1]))
                 if config.corrections:
                     own, old, found = correct(cloud, own, old, after, views, bar)
                     passes.append(torch.where(merged.source[:, None] < 0, 0, found[:, merged.source.clamp_min(0)]))
@@ -279,8 +280,8 @@ def _pooled(values: Tensor, merged: Merged) -> Tensor:  # [N, ...] -> [M, ...]
     return sums.index_add_(0, merged.source[rows], values[rows])
 
 
-def _pooled_halves(sums: Tensor | None, merged: Merged) -> Tensor | None:  # [2, N, ...] -> [2, M, ...]
-    return None if sums is None else torch.stack([_pooled(half, merged) for half in sums])
+def _pooled_halves(sums: Tensor, merged: Merged) -> Tensor:  # [2, N, ...] -> [2, M, ...]
+    return torch.stack([_pooled(half, merged) for half in sums])
 
 
 def _capped(weights: Tensor) -> Tensor:

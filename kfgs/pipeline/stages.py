@@ -219,7 +219,7 @@ def _sizes(folder: Path) -> dict[str, int]:
 def is_whole(folder: Path) -> bool:
     """Whether a folder is a finished stage that this version made: its name follows from its inputs, no file changed its size."""
     about = read_stage(folder / STAGE_FILE)
-    return folder.name == f"{about['name']}-{_key(about['name'], about.get('inputs'))}" and about.get(
+    return folder.name == f"{about['name']}-{_key(about['name'], about.get('inputs', {}))}" and about.get(
         "files"
     ) == _sizes(folder)
 

@@ -101,6 +101,34 @@ def test_only_maps_of_new_views_are_needed(room, scene, splat, tmp_path):
     assert made.field.info["views_new"] == 1
 
 
+def test_an_interrupted_addition_leaves_whole_stages_and_goes_on(room, scene, splat, tmp_path):
+    part, stored = fewer(scene, len(scene.views("train")) - 2), maps_of(room, scene)
+    fit(room, part, tmp_path / "run", splat)
+    before = sorted(path.name for path in (tmp_path / "run" / "stages").iterdir())
+    shutil.copytree(tmp_path / "run", tmp_path / "whole")
+
+    class Stopped:
+        files, shape, read = stored.files, stored.shape, []
+
+        def __len__(self):
+            return len(stored)
+
+        def __getitem__(self, i):
+            self.read.append(i)
+            if len(self.read) == 4:  # two maps for the directions, and one for the means
+                raise KeyboardInterrupt
+            return stored[i]
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_scene(scene, Stopped(), tmp_path / "run", CONFIG, splat=splat)
+    assert sorted(path.name for path in (tmp_path / "run" / "stages").iterdir()) == before
+    assert len([*(tmp_path / "run" / "unfinished").rglob("*.npz")]) == 1
+    one, other = (fit(room, scene, tmp_path / name, splat) for name in ("run", "whole"))
+    assert one.field.info["views_new"] == 2
+    assert one.stages[-1].key == other.stages[-1].key
+    assert torch.equal(one.field.features, other.field.features)
+
+
 @pytest.mark.parametrize("change", ["seed", "options", "splat", "pose", "map", "sums", "damaged", "many"])
 def test_another_fit_is_not_gone_on_from(room, scene, splat, tmp_path, change):
     total = len(scene.views("train"))
