@@ -143,9 +143,9 @@ def fit(
         views_per_step=training.views_per_step,
         split=views.split,
     )
-    for name, given in (("refit", refit), ("discard_sums", discard_sums)):
-        if method.method == "paper":
-            check_alone(name, given, "with --method paper, which trains on all views")
+    if method.method == "paper":
+        check_alone("refit", refit, "with --method paper, which always trains on all views")
+        check_alone("discard_sums", discard_sums, "with --method paper, which keeps none")
     config = dataclasses.replace(config, undistorted_features=maps.undistorted_features, device=training.device)
     config = dataclasses.replace(config, refit=refit, discard_sums=discard_sums)
     check_output("out", out, "a folder", apart=inputs_of(scene, views.images), other=[maps.features])
