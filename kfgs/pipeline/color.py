@@ -26,7 +26,7 @@ from ..gaussians import Gaussians
 from ..scenes import Scene
 from .color_file import is_saved, may_replace, stage_gaussians, what_is
 from .points import with_points
-from .stages import Run, Stage, describe_lens, digest_scene, digest_tensors, stage_generator
+from .stages import Run, Stage, describe_lens, digest_scene, digest_shape, digest_tensors, stage_generator
 from .train import check_scene, field_stage, training_device, with_extent
 
 
@@ -274,6 +274,27 @@ def find_color(run: Run, scene: Scene, config: ColorConfig) -> tuple[Gaussians, 
         return None
     run.say(f"geometry: the colours of {best[0]:,} steps that are in {run.folder}")
     return stage_gaussians(best[1]), best[0]
+
+
+def colors_before(
+    run: Run, scene: Scene, config: ColorConfig, geometries: Sequence[str]
+) -> tuple[Gaussians, int, str] | None:
+    """Gaussians that were trained on some of a scene's pictures, with these options or more steps; their steps, and their stage.
+
+    They have the first digest in `geometries` that a stage has.
+    """
+    wanted = json.loads(json.dumps(_inputs(run, scene, scene.views(config.split), config)))
+    if run.has("color", wanted):
+        return None
+    found = {}
+    for about in sorted((run.folder / "stages").glob("color-*/stage.json")) if geometries else ():
+        inputs = read_json(about)["inputs"]
+        steps = int(inputs["config"]["field"]["steps"])
+        same = inputs["config"] == wanted["config"] or steps > config.field.steps
+        if same and all(picture in wanted["pictures"] for picture in inputs["pictures"]):
+            cloud = stage_gaussians(about.parent)
+            found[digest_shape(cloud)] = cloud, steps, about.parent.name
+    return next((found[one] for one in geometries if one in found), None)
 
 
 def _inputs(run: Run, scene: Scene, views: Sequence[int], config: ColorConfig) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from .._card import short_repr
 from .._check import typed
-from .._files import as_path, check_output, digest_value, read_json, write_json
+from .._files import as_path, check_output, read_json, write_json
 from .._progress import Progress, as_progress
 from .._ranks import once
 from ..cameras import Camera
@@ -46,11 +46,12 @@ from ..quant import (
 from ..scenes import Scene
 from .color import ColorConfig, find_color
 from .config import FitConfig
+from .earlier import digest_lenses, find_earlier
 from .fuse import answers_stage, find_geometry, uplift_stage, without_lens
-from .maps import KnownFeatures, Maps, UndistortedMaps, as_maps, check_readable, map_digests, map_shape
+from .maps import KnownFeatures, Maps, as_maps, check_readable, map_digests, map_shape
 from .points import with_points
 from .runs import check_current, keep_field, say_kept
-from .stages import Run, Stage, UnfinishedError, describe_lens, digest_scene, stage_generator
+from .stages import Run, Stage, UnfinishedError, digest_scene, digest_tensors, stage_generator
 from .train import check_scene, field_stage, training_device, with_extent
 
 
@@ -284,10 +285,15 @@ def _make_field(
     if config.method == "paper":
         about = {"method": config.method, "mode": config.mode, "steps": {"field": config.field.steps}}
         return answers_stage(job.run, _paper_stages(job), job.cameras), about
-    geometry, origin = find_geometry(job.run, job.scene, splat, _color_config(config), job.device, job.progress)
     inputs = {"features": job.features, "config": asdict(config.uplift), "seed": config.seed}
-    found = uplift_stage(job.run, geometry, job.cameras, job.maps, config.uplift, inputs, job.progress is True, latents)
-    return found, {"method": config.method, **origin}
+    if latents is not None:
+        inputs["latents"] = digest_tensors(latents.basis)
+    earlier = [] if config.refit else find_earlier(job.run, inputs, job.cameras, job.maps)
+    given = job.run, job.scene, splat, _color_config(config), job.device, job.progress
+    geometry, origin = find_geometry(*given, earlier)
+    options = config.uplift, inputs, job.progress is True, latents, earlier, not config.discard_sums
+    found = uplift_stage(job.run, geometry, job.cameras, job.maps, *options)
+    return found, {"method": config.method, **origin, **found.info}
 
 
 def _paper_stages(job: _Job) -> SemanticField:
@@ -312,9 +318,7 @@ def _paper_stages(job: _Job) -> SemanticField:
 def _job(run: Run, scene: Scene, maps: Maps, config: FitConfig, device: torch.device, progress: Progress) -> _Job:
     views = scene.views(config.split)
     straight = without_lens(scene, maps, config)
-    lenses = straight.lenses if isinstance(straight, UndistortedMaps) else None
-    removed = None if lenses is None else digest_value([describe_lens(lens) for lens in lenses])
-    features = {"files": map_digests(run, straight), "lenses": removed}
+    features = {"files": map_digests(run, straight), "lenses": digest_lenses(straight)}
     return _Job(run, scene, views, straight, features, config, device, progress)
 
 
