@@ -73,7 +73,8 @@ def test_examples_are_understood(command, capsys, monkeypatch):
     called = run_nothing(monkeypatch)
     for line in lines:
         assert cli.main(line[1:]) == 0
-    assert called == [command] * len(lines)
+    assert called == [line[1] for line in lines]
+    assert command in called
 
 
 @pytest.mark.parametrize("name", SHOWN)
