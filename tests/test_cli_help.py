@@ -32,7 +32,10 @@ def help_of(command, capsys):
 
 def command_lines(text):
     """The lines that run kfgs, without their comments."""
-    return [shlex.split(line, comments=True) for line in re.findall(r"^ *(kfgs [a-z].*)$", text, re.MULTILINE)]
+    return [
+        shlex.split(line, comments=True)
+        for line in re.findall(r"^ *(kfgs [a-z].*)$", text.replace("\\\n", " "), re.MULTILINE)
+    ]
 
 
 def run_nothing(monkeypatch):
