@@ -205,7 +205,9 @@ def _convert_by_class(source: Path, folder: Path) -> None:
     for name in parts:
         check_splat(folder / name, "written by kfgs", "kfgs convert")
         if real_path(folder / name) == real_path(source):
-            raise ValueError(f"target: expected another folder than that of {source}, got {folder}; it would be overwritten")
+            raise ValueError(
+                f"target: expected another folder than that of {source}, got {folder}; it would be overwritten"
+            )
     with atomic_folder(folder) as new:
         for name, part in parts.items():
             written = write_splats(new / name, part.replace(gaussians=part.gaussians.replace(labels=None)), plain=True)

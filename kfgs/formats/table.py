@@ -115,7 +115,9 @@ def read_splats(path: str | Path) -> SplatFile:
 
 
 @typed
-def write_splats(path: str | Path, splats: SplatFile | Gaussians, *, format: str | None = None, plain: bool = False) -> Written:
+def write_splats(
+    path: str | Path, splats: SplatFile | Gaussians, *, format: str | None = None, plain: bool = False
+) -> Written:
     """Write a cloud in the format of the file's ending.
 
     **Convention**: formats that pack neighbours together (compressed PLY, SOG) store the Gaussians in Morton order, with
