@@ -68,8 +68,9 @@ def segment(
             check_alone(name, value, "with --path, of whose pictures nothing is known")
         size = 72 if frames is None else frames, 480 if width is None else width
         return _segment_path(field, out, path, size, color, coco, rule, classes)
-    for name, value in (("frames", frames), ("width", width), ("color", color)):
-        check_alone(name, value, "without --path, which it belongs to")
+    alone: dict[str, object] = {"frames": frames, "width": width, "color": color}
+    for name, given in alone.items():
+        check_alone(name, given, "without --path, which it belongs to")
     loaded_field = open_field("field", field)
     scene = recall_scene(loaded_field.info, loaded_field.folder) if classes.scene is None else classes.scene
     classes = dataclasses.replace(classes, scene=scene)

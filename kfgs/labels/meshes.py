@@ -51,7 +51,8 @@ class LabelledMesh:
 
         A part is a set of faces that are connected by edges; corners at one position count as one. It is closed if each
         edge is passed as often in one direction as in the other: no holes, and all faces look outwards or all inwards.
-        Its class is the one with the largest area on it. A closed hollow inside another part adds to the sum.
+        Its class is the one with the largest area on it, even if most of it has none. A closed hollow inside another part
+        adds to the sum.
         """
         part, closed = self._parts()
         signed = np.zeros(len(closed))
@@ -60,6 +61,7 @@ class LabelledMesh:
         np.add.at(signed, part, np.linalg.det(corners) / 6)
         share = np.zeros((len(closed), int(self.face_labels.max(initial=-1)) + 2))
         np.add.at(share, (part, self.face_labels + 1), self.face_areas)
+        share[:, 0] = 0  # no class
         return self._by_class(share.argmax(axis=1)[closed] - 1, np.abs(signed)[closed])
 
     def _parts(self) -> tuple[Array, Array]:  # [F] int64, [P] bool

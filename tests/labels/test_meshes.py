@@ -77,6 +77,11 @@ def test_the_class_of_a_part_is_the_one_with_the_largest_area_on_it():
     found = label_mesh((CORNERS * (1, 1, 4), FACES), two, 9.0, classes=("top", "rest"))
     assert found.areas() == pytest.approx({"rest": 17.0, "top": 1.0})
     assert found.volumes() == pytest.approx({"rest": 4.0})
+    top = label_mesh((CORNERS * (1, 1, 4), FACES), two.select([0]), 1.0, classes=("top",))
+    assert top.areas() == pytest.approx({"(none)": 17.0, "top": 1.0})
+    assert top.volumes() == pytest.approx({"top": 4.0})
+    none = label_mesh((CORNERS, FACES), two, 0.01)
+    assert none.volumes() == pytest.approx({"(none)": 1.0})
 
 
 def test_meshes_of_trimesh_pyvista_and_arrays_agree():
