@@ -41,6 +41,8 @@ THIRD_PARTY = {
     "pyvista": "kfgs/viz/",
     "vtk": "kfgs/viz/",
     "vtkmodules": "kfgs/viz/",
+    "trimesh": "kfgs/viz/",
+    "open3d": "kfgs/viz/",
     "numba": "kfgs/splat/engines/",
     "llvmlite": "kfgs/splat/engines/",
     "triton": "kfgs/splat/engines/",

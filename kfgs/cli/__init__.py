@@ -31,10 +31,11 @@ from .features import features, plan
 from .fit import color, demo, fit, sfm, uplift
 from .output import called, open_streams, said_on_stderr, said_whole, say, warnings_as_notes
 from .pack import pack
-from .query import info, label, segment, select
+from .query import info, label, select
 from .render import render
 from .runs import runs
 from .search import search
+from .segment import segment
 from .splats import attach, convert, edit
 from .text import text
 from .view import view

@@ -2,6 +2,7 @@
 
 from .animation import save_animation
 from .boxes import add_boxes, add_names, add_selections
+from .bridges import to_open3d, to_trimesh
 from .camera_view import look_through
 from .clouds import CloudOptions, add_cloud, recolor_cloud, to_pyvista
 from .confusions import plot_confusion, plot_largest_confusions
@@ -68,5 +69,7 @@ __all__ = [
     "save_picture",
     "save_turntable",
     "show_cloud",
+    "to_open3d",
     "to_pyvista",
+    "to_trimesh",
 ]
