@@ -106,7 +106,11 @@ def read_examples(path: str | Path) -> dict[str, list[Example]]:
     """
     content = read_json(path)
     if not isinstance(content, dict) or not all(isinstance(shown, list) for shown in content.values()):
-        raise ValueError(f"{path}: expected an object of lists of examples by class name, got {type(content).__name__}")
+        wrong = [name for name, shown in content.items() if type(shown) is not list] if type(content) is dict else []
+        got = f"no list for {wrong[0]!r:.60}" if wrong else type(content).__name__
+        raise ValueError(
+            f'{path}: expected an object of lists of examples by class name, {{"chair": [...]}}, got {got}; correct it'
+        )
     return {
         name: [_read(f"{path}: {name!r}[{i}]", one, as_path(path).parent) for i, one in enumerate(shown)]
         for name, shown in content.items()
@@ -117,22 +121,33 @@ def _read(where: str, one: Any, folder: Path) -> Example:
     keys = set(one) if isinstance(one, dict) else set()
     try:
         if keys == {"gaussians"}:
-            return Picked([int(i) for i in one["gaussians"]])
+            return Picked(_list_of("gaussians", one["gaussians"], int))
+        if "view" in keys and not isinstance(one["view"], str):
+            raise ValueError(f"view: expected the name of a view, got {one['view']!r:.40}")
         if keys == {"view", "points"}:
-            return Clicks(str(one["view"]), [(float(x), float(y)) for x, y in one["points"]])
+            points = _list_of("points", one["points"], list)
+            return Clicks(one["view"], [_list_of("points", point, int | float, 2) for point in points])
         if keys == {"view", "box"}:
-            x0, y0, x1, y1 = map(float, one["box"])
-            return Box(str(one["view"]), (x0, y0, x1, y1))
+            return Box(one["view"], _list_of("box", one["box"], int | float, 4))
         if keys == {"view", "masks", "index"}:
-            return Mask(str(one["view"]), _mask_of_file(as_path(folder / one["masks"]), one["index"]))
+            return Mask(one["view"], _mask_of_file(as_path(folder / one["masks"]), one["index"]))
         if keys >= {"view", "segmentation"}:
-            return Mask(str(one["view"]), _decoded(one["segmentation"]))
-    except (TypeError, ValueError, OverflowError) as error:  # int(infinity)
+            return Mask(one["view"], _decoded(one["segmentation"]))
+    except (TypeError, ValueError) as error:
         raise ValueError(f"{where}: expected an example with numbers ({error}); see kfgs text --help") from error
     raise ValueError(
         f"{where}: expected 'view' with 'points', 'box', 'segmentation', or 'masks' and 'index'; or 'gaussians'; got "
         f"{sorted(keys) or type(one).__name__}; correct it"
     )
+
+
+def _list_of(name: str, values: Any, kind: Any, count: int | None = None) -> list[Any]:
+    """A list of JSON as it is, if all of it is of a kind; a bool is no number."""
+    good = isinstance(values, list) and all(isinstance(one, kind) and not isinstance(one, bool) for one in values)
+    if not good or count not in (None, len(values)):
+        what = {int: "whole numbers", list: "[x, y]"}.get(kind, f"{count} numbers")
+        raise ValueError(f"{name}: expected a list of {what}, got {values!r:.40}")
+    return list(values)
 
 
 def _mask_of_file(path: Path, index: object) -> Tensor:  # [H, W] bool
