@@ -19,6 +19,10 @@ from ..labels import LabelSet
 from ..labels.polygons import decode_rle
 from .semantic_field import SemanticField
 
+LONGEST = 4096
+"""Pixels on the longer edge of the picture that is drawn of a view: larger ones, which a file may state in a few bytes, are
+drawn at this size."""
+
 
 @dataclass(frozen=True, eq=False)
 class Clicks:
@@ -197,23 +201,27 @@ def _of_gaussians(field: SemanticField, example: Any, name: str) -> Tensor:  # [
 
 def _of_pixels(field: SemanticField, example: Any, name: str) -> Tensor:  # [n, D]
     camera = _camera(field, example.view, name)
-    mask = torch.zeros(camera.size, dtype=torch.bool)
+    drawn = camera.fitted(LONGEST)
+    down, right = drawn.height / camera.height, drawn.width / camera.width  # 1 but for huge views
+    mask = torch.zeros(drawn.size, dtype=torch.bool)
     if isinstance(example, Mask):
         check_shapes((f"{name}.mask", example.mask, camera.size))
-        mask = example.mask.bool()
+        y, x = example.mask.nonzero(as_tuple=True)
+        mask[(y * down).long(), (x * right).long()] = True
     elif isinstance(example, Clicks):
         for x, y in example.points:
             if not (0 <= x < camera.width and 0 <= y < camera.height):
                 raise ValueError(f"{name}: expected points within {camera.width} x {camera.height}, got ({x:g}, {y:g})")
-            mask[int(y), int(x)] = True
+            mask[int(y * down), int(x * right)] = True
     else:
         x0, y0, x1, y1 = example.corners
         if not (0 <= x0 < x1 <= camera.width and 0 <= y0 < y1 <= camera.height):
             raise ValueError(
                 f"{name}: expected x0 < x1 and y0 < y1 within {camera.width} x {camera.height}, got {tuple(example.corners)}"
             )
-        mask[int(y0) : max(int(y1), int(y0) + 1), int(x0) : max(int(x1), int(x0) + 1)] = True
-    rendering = field.render(camera)
+        y0, y1, x0, x1 = int(y0 * down), int(y1 * down), int(x0 * right), int(x1 * right)
+        mask[y0 : max(y1, y0 + 1), x0 : max(x1, x0 + 1)] = True
+    rendering = field.render(drawn)
     rows = mask.to(rendering.alpha.device) & (rendering.alpha > 0)
     return field.decode(rendering.map[rows])
 
