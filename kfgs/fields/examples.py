@@ -15,6 +15,7 @@ from .._check import check_shapes
 from .._files import as_path, read_json
 from .._rows import EPS, row_norms, unit_rows
 from ..cameras import Camera
+from ..gaussians import as_rows
 from ..labels import LabelSet
 from ..labels.polygons import decode_rle
 from .semantic_field import SemanticField
@@ -191,10 +192,9 @@ def _feature(field: SemanticField, example: Example, name: str) -> Tensor:  # [D
 
 
 def _of_gaussians(field: SemanticField, example: Any, name: str) -> Tensor:  # [n, D]
-    which = torch.as_tensor(example.indices)
+    which = as_rows(f"{name}.indices", example.indices, len(field))
     rows = which.nonzero()[:, 0] if which.dtype == torch.bool else which.long()
-    wrong = which.is_floating_point() or (which.dtype == torch.bool and len(which) != len(field))
-    if wrong or which.ndim != 1 or len(rows) == 0 or int(rows.min()) < 0 or int(rows.max()) >= len(field):
+    if rows.ndim != 1 or len(rows) == 0 or int(rows.min()) < 0 or int(rows.max()) >= len(field):
         raise ValueError(f"{name}: expected indices of the field's {len(field)} Gaussians, got {example.indices!r:.80}")
     return field.own_features(rows)
 
