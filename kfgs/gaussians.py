@@ -88,7 +88,9 @@ class Gaussians:
 
     def __array__(self, *args: Any, **kwargs: Any) -> Array:
         """None: without it, NumPy would look into g[0][0][0]... for numbers."""
-        raise TypeError("gaussians: expected an array, got Gaussians, which hold several; to_numpy() gives them by name")
+        raise TypeError(
+            "gaussians: expected an array, got Gaussians, which hold several; to_numpy() gives them by name"
+        )
 
     if not TYPE_CHECKING:  # so that a type checker still finds misspelt names
 

@@ -152,7 +152,7 @@ class SemanticField:
             return parts.latent_cosines(self, unit)
 
     def own_features(self, rows: Tensor) -> Tensor:  # [n] int64 -> [n, D]
-        """The features of some Gaussians by the rule, in the teacher's space; all-zero if unknown. Errors as `Gaussians.select`."""
+        """The features of some Gaussians by the rule, all-zero if unknown. Rows and errors: see `Gaussians.select`."""
         rows = as_rows("rows", rows, len(self)).to(self.features.device)
         if self.linear is not None:
             return self.linear.decode(self._own[rows])

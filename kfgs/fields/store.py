@@ -251,7 +251,9 @@ def _cameras(rows: list[Any], tensors: dict[str, Tensor]) -> tuple[Camera, ...]:
         return ()
     for _, width, height, _ in rows:
         if width * height > PIXELS:
-            raise ValueError(f"cameras: expected at most {PIXELS:,} pixels, as a picture has, got {width:,} x {height:,}")
+            raise ValueError(
+                f"cameras: expected at most {PIXELS:,} pixels, as a picture has, got {width:,} x {height:,}"
+            )
     both = zip(rows, tensors["viewmats"], tensors["Ks"], strict=True)
     return tuple(Camera(E, K, width, height, name, near=near) for (name, width, height, near), E, K in both)
 
