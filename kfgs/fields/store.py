@@ -21,6 +21,7 @@ from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels import LabelSet
 from ..quant import Autoencoder, Codebook, LinearLatents
+from ..scenes.files import PIXELS
 from .answers import Seen
 from .container import HEADER, pack_tensors, peek, unpack_tensors
 from .parts import check_parts
@@ -248,6 +249,11 @@ def _label_set(tensors: dict[str, Tensor], names: dict[str, Any]) -> LabelSet:
 def _cameras(rows: list[Any], tensors: dict[str, Tensor]) -> tuple[Camera, ...]:
     if not rows:
         return ()
+    for _, width, height, _ in rows:
+        if width * height > PIXELS:
+            raise ValueError(
+                f"cameras: expected at most {PIXELS:,} pixels, as a picture has, got {width:,} x {height:,}"
+            )
     both = zip(rows, tensors["viewmats"], tensors["Ks"], strict=True)
     return tuple(Camera(E, K, width, height, name, near=near) for (name, width, height, near), E, K in both)
 

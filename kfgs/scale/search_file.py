@@ -221,7 +221,8 @@ def _contents(tensors: dict[str, Array]) -> Contents:
         table = None if one["table"] is None else _index(one["table"], len(tables))
         space, views = _index(one["space"], len(spaces)), _texts(one["views"])
         own = {kind: kinds[kind][i] for kind in COLUMNS}
-        _check_rows(own, len(spaces[space].words), 0 if table is None else len(tables[table].names), len(views))
+        classes = 0 if table is None else len(tables[table].names)
+        _check_rows(own, len(spaces[space].words), classes, len(views), int(one["gaussians"]))
         (path,), (size, time) = _texts([one["path"]]), one["mark"]
         mark, facts = (int(size), int(time)), (int(one["gaussians"]), space, table, views, float(one["outside"]))
         entries[path] = Entry(path, mark, str(one["sha256"]), *facts, own)
@@ -241,16 +242,20 @@ def _rows(tensors: dict[str, Array], kind: str, fields: int) -> list[Rows]:
     return [{name: column[place] for name, column in columns.items()} for place in places]
 
 
-def _check_rows(rows: Mapping[str, Rows], words: int, classes: int, views: int) -> None:
+def _check_rows(rows: Mapping[str, Rows], words: int, classes: int, views: int, gaussians: int) -> None:
     atoms, parts = rows["atoms"], rows["parts"]
+    counted = int(atoms["count"].sum(dtype=np.int64))
+    if counted > gaussians:  # each is in one atom at most
+        raise ValueError(f"its atoms have {counted} of {gaussians} Gaussians")
     bounded = (
         (atoms["word"], 0, words),
         (rows["links"]["pair"], 0, len(atoms["word"])),
         (parts["label"], 0, classes),
         (atoms["views"], -1, views),
         (parts["view"], -1, views),
-        (atoms["count"], 1, 1 << 31),
-        (parts["count"], 1, 1 << 31),
+        (atoms["count"], 1, gaussians + 1),
+        (parts["count"], 1, gaussians + 1),
+        (rows["classes"]["count"], 0, gaussians + 1),
     )
     for values, low, end in bounded:
         if values.size and not low <= int(values.min()) <= int(values.max()) < end:

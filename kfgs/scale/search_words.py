@@ -181,7 +181,7 @@ def _word_answer(entry: Entry, scores: Tensor, gamma: float | None) -> SceneFoun
     atoms = entry.rows["atoms"]
     own = scores[torch.from_numpy(atoms["word"].astype(np.int64))]
     if gamma is None:
-        gamma = similarity_threshold(own.repeat_interleave(torch.from_numpy(atoms["count"].astype(np.int64))))[0]
+        gamma = similarity_threshold(own, torch.from_numpy(atoms["count"].astype(np.int64)))[0]
     mask, score = (own > gamma).numpy(), own.double().numpy()
     total = int(atoms["count"][mask].sum())
     mean = float(np.average(score[mask], weights=atoms["count"][mask])) if total else 0.0
