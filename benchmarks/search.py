@@ -2,6 +2,8 @@
 
     python benchmarks/search.py --out /tmp/search                      # 52 rooms of 20,000 Gaussians
     python benchmarks/search.py --out /tmp/search --compare RUNS       # disagreement on real fields below RUNS
+    python benchmarks/search.py --out /tmp/search --fields 3 --copies 10000             # an archive, made of copied entries
+    python benchmarks/search.py --out /tmp/search --fields 3 --copies 10000 --atoms 50  # entries as large as those of room_0
 
 The rooms are toy rooms of different seeds: Gaussians on their surfaces with the features of their classes, noise, and blends
 at borders. All share one teacher. Times are those of whole processes, with Python's start.
@@ -10,10 +12,15 @@ at borders. All share one teacher. Times are those of whole processes, with Pyth
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
+import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from functools import partial
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +31,7 @@ from kfgs import Gaussians, LabelSet
 from kfgs.fields import SemanticField
 from kfgs.quant import fit_linear_latents
 from kfgs.scale import SearchIndex
+from kfgs.scale.search_file import NAME, Contents, Entry, read_index, write_index
 from kfgs.scale.search_words import label_set
 from kfgs.toy.geometry import sample_surface
 from kfgs.toy.render import walk_cameras
@@ -31,6 +39,7 @@ from kfgs.toy.room import CLASSES, build_room
 from kfgs.toy.teacher import class_embeddings
 
 NOISE = 0.02  # of each of 512 channels of a unit feature: a cosine of 0.91 with its class
+LARGE = ("atoms", "links")  # rows of an entry that grow with its scene
 BLEND = 0.06  # metres: features are means over neighbours, as those of uplifted pixels are
 
 
@@ -117,6 +126,41 @@ def say_comparison(rows: list[dict[str, object]]) -> dict[str, object]:
     }
 
 
+def archive(source: Path, folder: Path, copies: int, atoms: int) -> dict[str, object]:
+    """Processor seconds of an index with many entries, copied from those of a small one, each with `atoms` times its atoms."""
+    few = read_index(source / NAME)
+
+    def grown(entry: Entry) -> Entry:
+        large = {
+            kind: {name: np.concatenate([rows] * atoms) for name, rows in entry.rows[kind].items()} for kind in LARGE
+        }
+        return dataclasses.replace(entry, rows={**entry.rows, **large})
+
+    entries = {}
+    for number, entry in zip(range(copies), cycle(map(grown, few.entries.values()))):
+        name = f"{number:06d}/field"
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        if not (folder / name / "field.json").exists():
+            os.link(source / entry.path / "field.json", folder / name / "field.json")  # the same size and time
+        entries[name] = dataclasses.replace(entry, path=name)
+    many = Contents(few.spaces, few.tables, entries)
+    report: dict[str, object] = {"write_s": seconds(partial(write_index, folder / NAME, many))}
+    del many, entries
+    report |= {"bytes": (folder / NAME).stat().st_size, "read_s": seconds(lambda: SearchIndex.open(folder))}
+    index = SearchIndex.open(folder)
+    report |= {"look_for_changes_s": seconds(index.is_current), "unchanged": index.is_current()}
+    report["class_s"] = seconds(lambda: index.search("chair"))
+    report["by_words_s"] = seconds(lambda: index.search("chair", threshold=0.7))
+    return report
+
+
+def seconds(work: Callable[[], object]) -> float:
+    """Processor seconds of some work."""
+    start = time.process_time()
+    work()
+    return round(time.process_time() - start, 2)
+
+
 def main() -> None:
     """Make the fields (kept in --out), and print one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -124,6 +168,10 @@ def main() -> None:
     parser.add_argument("--fields", type=int, default=52)
     parser.add_argument("--gaussians", type=int, default=20_000)
     parser.add_argument("--compare", type=Path, help="only compare answers on the fields below this folder")
+    parser.add_argument(
+        "--copies", type=int, help="time an archive of so many entries, copied from those of the fields"
+    )
+    parser.add_argument("--atoms", type=int, default=1, help="make each of these entries so many times as large")
     given = parser.parse_args()
     if given.compare is not None:
         rows = compare(given.compare)
@@ -145,6 +193,10 @@ def main() -> None:
         "index_bytes": index.file.stat().st_size,
         "words": [len(space.words) for space in index.contents.spaces],
     }
+    if given.copies is not None:
+        report |= archive(given.out, given.out.with_name(f"{given.out.name}-{given.copies}"), given.copies, given.atoms)
+        print(json.dumps(report, indent=2))
+        return
     example = given.out / "room_000" / "field"
     report["class"] = time_command("search", "chair", given.out)
     report["threshold"] = time_command("search", "chair", given.out, "--threshold", 0.7)

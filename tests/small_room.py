@@ -3,6 +3,9 @@
 import dataclasses
 from pathlib import Path
 
+from cases_color import make_splat
+
+from kfgs import FeatureFolder, UpliftConfig, fit_scene, load_scene
 from kfgs.cli import main
 from kfgs.fields import FieldConfig
 from kfgs.pipeline import FitConfig
@@ -36,6 +39,16 @@ CONFIG = FitConfig.paper(
 
 def make_room(folder: Path) -> Path:
     return make_toy_room(folder, ROOM)
+
+
+def make_desk(folder: Path) -> Path:
+    """A folder as a user has it after `kfgs fit`: scene/, run/field, and a splat of another program, my.ply."""
+    make_splat(make_room(folder / "scene"), folder / "my.ply")
+    scene = load_scene(folder / "scene")
+    maps = FeatureFolder(folder / "scene" / "features", [scene.stem(i) for i in scene.views("train")])
+    short = FitConfig(uplift=UpliftConfig.field(max_gaussians=2_000))
+    fit_scene(scene, maps, folder / "run", short, splat=folder / "my.ply")
+    return folder
 
 
 def config(**changes):

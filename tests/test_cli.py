@@ -11,6 +11,7 @@ from PIL import Image
 from small_room import fit_run, make_room
 
 from kfgs.cli import main
+from kfgs.fields import SemanticField
 from kfgs.formats.ply import read_ply, write_ply
 
 
@@ -89,13 +90,14 @@ def test_label_carries_classes_to_another_cloud_and_keeps_its_columns(run, room,
     assert {"class_id", "score", "red"} <= set(read_ply(out / "gaussians.ply"))
 
 
-def test_nothing_of_the_users_is_overwritten(run, room, tmp_path, capsys):
+def test_nothing_of_the_users_is_overwritten(run, room, tmp_path, capsys, monkeypatch):
     before = (room / "labels" / "view_001.png").read_bytes()
     assert main(["segment", str(run / "field"), "--scene", str(room), "--out", str(room), "--pictures", "0"]) == 0
     assert (room / "labels" / "view_001.png").read_bytes() == before
     cloud = tmp_path / "gaussians.ply"
     write_ply(cloud, {name: np.zeros(3, np.float32) for name in "xyz"})
     before = cloud.read_bytes()
+    monkeypatch.setattr(SemanticField, "load", None)  # the work
     arguments = ["label", str(run / "field"), "--scene", str(room), "--out", str(tmp_path), "--cloud", str(cloud)]
     assert main(arguments) == 1
     assert "would be overwritten" in capsys.readouterr().err
@@ -231,7 +233,7 @@ def test_a_progress_bar_does_not_flood_a_log():
     assert done.stderr.count("it/s") <= 2  # the start and the end; a terminal gets ten a second
 
 
-def test_a_scene_without_points_is_told_before_features_are_asked_for(room, tmp_path, capsys):
+def test_a_scene_without_points_is_told_that_some_are_found(room, tmp_path, capsys):
     (tmp_path / "images").mkdir()
     frames = []
     for number, picture in enumerate(sorted((room / "images").iterdir())[:2]):
@@ -246,4 +248,5 @@ def test_a_scene_without_points_is_told_before_features_are_asked_for(room, tmp_
     assert main(["fit", str(tmp_path), "--out", str(tmp_path / "run")]) == 1
     said = capsys.readouterr()
     assert "note: no points: this transforms.json has no ply_file_path" in said.out
-    assert said.err.startswith("error: SCENE: expected sparse points to start from, got 0")
+    assert "triangulate some from the poses before they train" in said.out
+    assert said.err.startswith("error: --features: expected a folder of feature maps")

@@ -16,6 +16,10 @@ SHOWN = [
     "docs/architecture.md",
     "docs/protocols.md",
     "notebooks/6_inspect_in_pyvista.py",
+    *sorted(str(path.relative_to(REPOSITORY)) for path in REPOSITORY.glob("docs/[ch]o*/*.md")),
+    "docs/quickstart.md",
+    "docs/faq.md",
+    "docs/compare.md",
 ]
 
 

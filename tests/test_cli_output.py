@@ -3,6 +3,7 @@
 import io
 import signal
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -75,6 +76,18 @@ def test_half_a_surrogate_pair_can_be_printed(stream, monkeypatch):
     monkeypatch.setattr(sys, stream, io.TextIOWrapper(raw, encoding="utf-8", errors="strict"))
     say("\udc80", getattr(sys, stream))
     assert raw.getvalue() == b"\\udc80\n"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's full device")
+@pytest.mark.parametrize(
+    ("stream", "name"), [("stdout", "standard output"), ("stderr", "standard error"), ("", "/dev/full")]
+)
+def test_a_stream_that_takes_nothing_is_named(stream, name, monkeypatch):
+    with Path("/dev/full").open("w") as full:
+        if stream:
+            monkeypatch.setattr(sys, stream, full)
+        with pytest.raises(OSError, match=f"^{name} cannot be written"):
+            say("hello", full)
 
 
 def test_advice_for_python_is_left_out_on_the_command_line():

@@ -120,6 +120,30 @@ def test_while_another_process_extends_the_index_the_old_one_answers(tmp_path, c
     assert "in 1 of 1 scenes" in out
 
 
+def test_a_folder_that_cannot_be_written_to_is_still_searched(tmp_path, capsys):
+    save_scenes(tmp_path, a=scene([("wall", 0.0), ("chair", 0.0)], 1))
+    assert main(["search", "chair", str(tmp_path)]) == 0
+    save_scenes(tmp_path, b=scene([("wall", 0.0), ("chair", 0.0)], 2))
+    (tmp_path / LOCK).unlink()
+    (tmp_path / LOCK).mkdir()  # an OSError, also for root
+    capsys.readouterr()
+    assert main(["search", "chair", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "note: the index is not extended now" in out
+    assert "in 1 of 1 scenes" in out
+
+
+def test_copied_fields_are_not_called_new(tmp_path, capsys):
+    save_scenes(tmp_path, a=scene([("wall", 0.0), ("chair", 0.0)], 1))
+    assert main(["search", "chair", str(tmp_path)]) == 0
+    before = (tmp_path / NAME).read_bytes()
+    (tmp_path / "a" / "field" / "field.json").touch()
+    capsys.readouterr()
+    assert main(["search", "chair", str(tmp_path)]) == 0
+    assert "index:" not in capsys.readouterr().out
+    assert (tmp_path / NAME).read_bytes() != before  # it knows the new time
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

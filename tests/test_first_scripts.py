@@ -5,12 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cases_color import make_splat
 from PIL import Image
-from small_room import make_room
+from small_room import make_desk
 
 import kfgs
-from kfgs import FeatureFolder, FitConfig, SemanticField, UpliftConfig, attach, fit_scene, load_scene, read_splats
+from kfgs import SemanticField, attach, read_splats
 from kfgs.viz import available
 
 PAGE = Path(kfgs.__file__).parents[1] / "docs" / "recipes.md"
@@ -27,14 +26,7 @@ def scripts():
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
-    """A folder as the user has it after `kfgs fit`: scene/, run/field, and a splat of another program, my.ply."""
-    folder = tmp_path_factory.mktemp("room")
-    make_splat(make_room(folder / "scene"), folder / "my.ply")
-    scene = load_scene(folder / "scene")
-    maps = FeatureFolder(folder / "scene" / "features", [scene.stem(i) for i in scene.views("train")])
-    config = FitConfig(uplift=UpliftConfig.field(max_gaussians=2_000))
-    fit_scene(scene, maps, folder / "run", config, splat=folder / "my.ply")
-    return folder
+    return make_desk(tmp_path_factory.mktemp("room"))
 
 
 @pytest.fixture(autouse=True)

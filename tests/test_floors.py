@@ -19,7 +19,7 @@ ROOT = Path(kfgs.__file__).parent
 FLOORS = (
     {"_card", "_names", "_ranks"},
     {"_check", "_compiling", "_files", "_interrupts", "_progress", "_rows", "_tensors"},
-    {"_arrays", "gaussians", "cameras", "page"},
+    {"_arrays", "_torch_files", "gaussians", "cameras", "page"},
     {"splat", "quant", "metrics"},
     {"formats"},
     {"scenes", "labels"},

@@ -6,6 +6,7 @@ import shutil
 import socket
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -217,6 +218,27 @@ def test_the_command_line_says_an_error_once_and_refuses_what_is_not_shared(room
         monkeypatch.setenv("RANK", rank)
         assert main(["info", str(room)]) == 1
         assert capsys.readouterr().err == said
+
+
+@pytest.mark.parametrize("word", ["--help", "--version", "no-such-command"])
+def test_the_first_process_alone_prints_help_and_what_is_no_command(word, monkeypatch, capsys):
+    said = []
+    for rank in ("0", "1"):
+        monkeypatch.setenv("WORLD_SIZE", "2")
+        monkeypatch.setenv("RANK", rank)
+        with suppress(SystemExit):
+            main([word])
+        said.append("".join(capsys.readouterr()))
+    assert said[0]
+    assert said[1] == ""
+
+
+@pytest.mark.parametrize(("words", "code"), [(["--help"], 0), (["--no-such-option"], 2), ([], 2)])
+def test_the_first_process_alone_prints_the_help_of_a_command_and_wrong_usage(words, code):
+    (out, error, first), other = finish(start(2, "-m", "kfgs", "fit", *words))
+    assert "kfgs fit" in out + error
+    assert other == ("", "", code)
+    assert first == code
 
 
 @pytest.mark.parametrize("size", [2, 3])

@@ -10,7 +10,6 @@ from typing import Any
 
 from .atomic import (
     HIDDEN,
-    FullDiskError,
     atomic_folder,
     atomic_path,
     current_file,
@@ -18,8 +17,9 @@ from .atomic import (
     hidden_folder,
     open_current,
 )
+from .errors import FullDiskError
 from .locks import InUseError, locked
-from .own import check_inside, check_own
+from .own import check_inside, check_own, foreign
 from .paths import as_path, check_output, real_path
 
 __all__ = [
@@ -37,6 +37,7 @@ __all__ = [
     "digest_file",
     "digest_value",
     "finish_writing",
+    "foreign",
     "hidden_folder",
     "locked",
     "open_current",

@@ -12,9 +12,7 @@ several files uses `open_current`.
 from __future__ import annotations
 
 import errno
-import math
 import os
-import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -23,6 +21,7 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
+from .errors import retold
 from .former import sweep_former
 from .locks import open_lock, try_lock
 from .own import check_inside, check_ordinary
@@ -30,16 +29,8 @@ from .paths import as_path
 
 HIDDEN, WAITING, LOCK, NEW = ".kfgs-unfinished", "waiting", ".kfgs-lock", "new-"
 ATTEMPTS = 100  # to put a folder where other processes put theirs
-FULL = (errno.ENOSPC, errno.EDQUOT)
-UNNAMED = (*FULL, errno.EIO, errno.EFBIG, errno.EROFS)  # errors of writing, which Python raises without a file
-SHORT = "requested and"  # in the message of numpy
-LEAST = 1 << 14  # bytes: a disk with less is full
 
 T = TypeVar("T")
-
-
-class FullDiskError(OSError):
-    """The disk has no space for an output; the message names the file or folder that was asked for."""
 
 
 def _read_umask() -> int:
@@ -87,6 +78,8 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
         new = place / "new"
         new.mkdir(mode=0o777 & ~UMASK)
         yield new
+        if not (place / LOCK).exists():  # deleted, and perhaps made again by who wrote into it
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(new))
         for file in new.rglob("*"):
             if file.is_file() and not file.is_symlink():
                 _make_ordinary(file)
@@ -169,11 +162,11 @@ def hidden_folder(parent: Path, target: Path | None = None) -> Iterator[Path]:
         _sweep(hidden)
         place, handle = _take(hidden)
     except OSError as error:
-        raise _retold(error, hidden, shown) or error from error
+        raise retold(error, hidden, shown) or error from error
     try:
         yield place
     except Exception as error:
-        told = _retold(error, place, shown)
+        told = retold(error, place, shown, gone=not (place / LOCK).exists())
         if told is None:
             raise
         raise told from error
@@ -318,47 +311,3 @@ def _is_used(folder: Path) -> bool:
 def _make_ordinary(file: Path) -> None:
     """Give a file the permissions of any new one: safetensors makes private files."""
     file.chmod(0o666 & ~UMASK)
-
-
-def _retold(error: Exception, place: Path, target: Path) -> OSError | None:
-    """An error of writing as one that names `target`; None if it can be raised as it is."""
-    text, told = str(error), isinstance(error, FullDiskError)
-    if isinstance(error, ValueError | TypeError | LookupError) or (told and str(place) not in text):
-        return None
-    rust = re.search(r"\(os error (\d+)\)", text)  # of safetensors
-    code = int(rust[1]) if rust else getattr(error, "errno", None)
-    if code == errno.ENOENT and place.name.startswith(NEW) and not place.exists():
-        return FileNotFoundError(
-            f"{target}: expected its folder to stay while it is written, but it was deleted or moved meanwhile; start again"
-        )
-    free = _free(place)
-    most = _largest_file()
-    if code == errno.EFBIG or (SHORT in text and LEAST < most < free):
-        return FullDiskError(
-            f"{target}: expected to write it whole, but files may have at most {most:,} bytes here; raise that limit (ulimit -f)"
-        )
-    if told or code in FULL or SHORT in text or free < LEAST:
-        return FullDiskError(
-            f"{target}: expected space on the disk to write it, got {free:,} bytes free; free some, or choose another disk"
-        )
-    unnamed = code in UNNAMED and getattr(error, "filename", None) is None
-    if code is not None and (unnamed or str(place) in text):
-        return OSError(code, os.strerror(code), str(target))
-    return None
-
-
-def _largest_file() -> float:
-    """The most bytes that the system lets this process write to a file."""
-    with suppress(ImportError):  # Windows
-        import resource
-
-        soft = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
-        return math.inf if soft == resource.RLIM_INFINITY else soft
-    return math.inf
-
-
-def _free(place: Path) -> float:
-    """Bytes that are free on the disk of a folder; infinitely many if the system does not say."""
-    with suppress(OSError):
-        return shutil.disk_usage(next(folder for folder in (place, *place.parents) if folder.is_dir())).free
-    return math.inf

@@ -17,6 +17,8 @@ KEPT = "field@"
 """Beginning of the folders in which a run keeps its earlier fields."""
 ASIDE = ("stages", "unfinished")
 """Folders of a run that hold parts of its work."""
+NOTES = (".run.lock", "digests.json")
+"""Files that a run has in its folder from its first stage on."""
 
 
 def describes_field(folder: Path) -> bool:
@@ -27,8 +29,8 @@ def describes_field(folder: Path) -> bool:
 def fields_below(folder: str | Path) -> Iterator[Path]:
     """All fields below a folder, folders and packed files, in the order of their names.
 
-    Links to folders are not followed. Hidden folders, stages of runs, and earlier fields that a run keeps
-    (`field@<key>`) are left out.
+    Links to folders are not followed. Hidden folders are left out. So are, in the folder of a run, its stages and the
+    earlier fields that it keeps (`field@<key>`); elsewhere a folder may have such a name.
 
     Raises:
         NotADirectoryError: if there is no such folder.
@@ -41,7 +43,13 @@ def fields_below(folder: str | Path) -> Iterator[Path]:
         return
     for entry in sorted(os.scandir(folder), key=lambda entry: entry.name):
         if entry.is_dir(follow_symlinks=False):
-            if not entry.name.startswith((".", KEPT)) and entry.name not in ASIDE:
+            own = entry.name.startswith(KEPT) or entry.name in ASIDE
+            if not entry.name.startswith(".") and not (own and _is_run(folder)):
                 yield from fields_below(entry.path)
         elif entry.name.endswith(SUFFIX) and not entry.name.startswith(".") and entry.is_file():
             yield Path(entry.path)
+
+
+def _is_run(folder: Path) -> bool:
+    """Whether a folder is that of a run."""
+    return describes_field(folder / "field") or any((folder / name).is_file() for name in NOTES)

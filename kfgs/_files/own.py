@@ -33,7 +33,8 @@ def check_inside(folder: Path, names: Iterable[str | Path]) -> None:
             if place.is_symlink():
                 raise ValueError(
                     f"{place}: expected a folder or nothing there, got a link to {os.readlink(place)}; kfgs follows no "
-                    "links inside an output folder: delete it, or name another output"
+                    "links inside an output folder: delete it, or name another output. To use another disk, put the whole "
+                    "output folder there; a link to it may be the output"
                 )
 
 
@@ -55,7 +56,12 @@ def check_own(path: Path, ours: Callable[[Path], bool], writer: str) -> None:
     except (OSError, ValueError, LookupError, TypeError):
         known = False
     if not known:
-        raise FileExistsError(
-            f"{path}: expected nothing there, or what an earlier `{writer}` wrote, got something else; move it away, or "
-            "choose another output"
-        )
+        raise foreign(path, writer)
+
+
+def foreign(place: Path | str, writer: str) -> FileExistsError:
+    """The error for a file that `writer` must not replace."""
+    return FileExistsError(
+        f"{place}: expected nothing there, or what an earlier `{writer}` wrote, got something else; move it away, or "
+        "choose another output"
+    )

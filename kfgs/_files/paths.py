@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
-from .own import check_inside, check_ordinary
+from .own import check_inside
 
 BLOCK = 4096  # bytes written on trial: a disk without them is full
 
@@ -62,10 +62,9 @@ def check_output(
     if path == "":
         raise ValueError(f"{name}: expected the name of {kind}, got an empty text; '.' is the current folder")
     target = as_path(path)
-    check_ordinary(target)
     check_inside(target, inside)
-    if target.exists() and target.is_dir() != (kind == "a folder"):
-        got = "a folder" if target.is_dir() else "a file"
+    got = "a folder" if target.is_dir() else "a file" if target.is_file() else "a pipe or a device"
+    if target.exists() and got != kind:
         raise ValueError(f"{name}: expected {kind} or nothing at {path}, got {got}; give another name")
     above = next(place for place in target.absolute().parents if place.exists())
     if not above.is_dir():

@@ -23,7 +23,7 @@ import tyro
 
 from .._card import error_line, short_of_memory
 from .._interrupts import interruptible
-from .._ranks import LostError, PeerError, place, together
+from .._ranks import LostError, PeerError, first, place, together
 from .batch import batch
 from .blocks import blocks, join
 from .evaluate import compare, evaluate
@@ -86,7 +86,8 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         goes_on = bool(RESUMED & {*words[:1]})
         with suppress(OSError):  # the same Ctrl-C may have ended who read it
-            say("interrupted" + ("; the same command goes on where it stopped" if goes_on else ""), sys.stderr)
+            if rank == 0:
+                say("interrupted" + ("; the same command goes on where it stopped" if goes_on else ""), sys.stderr)
         return 130
     except BrokenPipeError:
         return 141
@@ -102,25 +103,19 @@ def main(arguments: list[str] | None = None) -> int:
 def _run(words: list[str], names: dict[str, str]) -> int:
     """Run the command that the words ask for; `names` receives the command-line names of its parameters."""
     name, *given = [_expand_home(word) for word in words] or [""]
-    if name in ("-h", "--help"):
-        say(_overview())
-        return 0
-    if name == "--version":
-        from .. import __version__
-
-        say(f"kfgs {__version__}")
-        return 0
+    rank, size = place()
     if name not in COMMANDS:
-        say(_unknown(name), sys.stderr)
+        told = {"-h": _overview, "--help": _overview, "--version": _version}.get(name)
+        if rank == 0:  # one of several processes speaks for all
+            say(told() if told else _unknown(name), None if told else sys.stderr)
+        if told:
+            return 0
         raise SystemExit(2)
     _check_working_directory()
     command = COMMANDS[name]
     called[:] = ["kfgs", name, *given]
-    rank, size = place()
     if size > 1 and name not in SHARED:
-        if rank == 0:
-            say(f"error: expected one process for `kfgs {name}`, got {size} by torchrun; start it without", sys.stderr)
-        return 1
+        raise ValueError(f"expected one process for `kfgs {name}`, got {size} by torchrun; start it without")
 
     def spoken(message: str) -> str:
         return _in_options(message, names)
@@ -129,8 +124,15 @@ def _run(words: list[str], names: dict[str, str]) -> int:
     with interruptible(), warnings_as_notes(spoken), said_on_stderr(), said_whole(), together():
         names |= _shown_names(command)
         command.__doc__ = re.sub(r"\n {8,}(?!kfgs)", " ", inspect.getdoc(command) or "")  # an option's text on one line
-        tyro.cli(command, prog=f"kfgs {name}", description=_description(command), args=given, config=STYLE)
+        about = _description(command)
+        tyro.cli(command, prog=f"kfgs {name}", description=about, args=given, config=STYLE, console_outputs=first())
     return 0
+
+
+def _version() -> str:
+    from .. import __version__
+
+    return f"kfgs {__version__}"
 
 
 def _check_working_directory() -> None:

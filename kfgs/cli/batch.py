@@ -69,8 +69,11 @@ def batch(
         discard_features: Delete a scene's feature maps when its field is made.
     """
     from ..scale import BatchOptions, open_client, read_scenes, run_batch
+    from ..scale.batch import check_runs
+    from ..scale.clients import check_workers
     from ..teachers.load import check_teacher_name
 
+    check_workers(workers.scheduler, workers.workers, workers.slurm, workers.threads)
     entries = read_scenes(scenes)
     given: dict[str, Any] = {}
     if teacher.teacher is None:
@@ -102,9 +105,13 @@ def batch(
         threads=workers.threads,
         discard_features=discard_features,
     )
-    screen = _Screen()
+    folder, screen = check_runs(entries, out), _Screen()
     with open_client(**dataclasses.asdict(workers)) as client:
         say(f"{len(entries)} scenes; workers: {client.cluster or client.scheduler.address}")
+        if folder is None:
+            say(
+                f"note: {out} has no lock: start no other batch with this --out before this one ends; scenes might fail"
+            )
         results = run_batch(
             entries,
             out,

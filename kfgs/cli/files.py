@@ -75,6 +75,7 @@ def open_field(name: str, field: Path) -> Any:
     from ..fields.store import SUFFIX, find_field
 
     if find_field(field) != field:
+        check_joined(name, field)
         inside = field / "field"
         what = "a file" if field.is_file() else "a folder without one" if field.is_dir() else "no such folder"
         hint = "make one with `kfgs fit`"
@@ -95,6 +96,7 @@ def open_splats(name: str, path: Path, *, labelled: bool = False) -> Any:
     """
     from ..formats import read_splats
 
+    check_joined(name, path)
     if is_field(path):
         raise ValueError(
             f"{name}: expected a splat file, got {path}, a semantic field; pass a colour splat, for example what "
@@ -104,3 +106,17 @@ def open_splats(name: str, path: Path, *, labelled: bool = False) -> Any:
     if labelled and splats.gaussians.labels is None:
         raise ValueError(f"{name}: expected a splat with classes, got {path} without; `kfgs attach` gives it some")
     return splats
+
+
+def check_joined(name: str, path: Path) -> None:
+    """Raise a ValueError, with the command that helps, if a path is a scene in blocks: other commands read one field."""
+    if (path / "blocks.json").is_file():
+        from ..scale import FieldInBlocks
+        from ..scale.in_blocks import in_numbers
+
+        city = FieldInBlocks.open(path)
+        raise ValueError(
+            f"{name}: expected one field, got {path}, a scene in blocks ({len(city):,} Gaussians); join all of it with "
+            f"`kfgs join {path} --out FIELD`, or a part, for example {city.blocks[0].name}, with "
+            f"`kfgs join {path} --out FIELD --box={in_numbers(city.boxes[0])}`, and pass FIELD"
+        )

@@ -12,7 +12,19 @@ from .._files import check_output, check_own, read_json, real_path
 from .._ranks import once
 from .features import check_discard, choose_teacher, stored_maps
 from .files import check_alone, inputs_of, is_field, open_field, open_splats
-from .options import FieldMethod, Flag, Given, Maps, MapTeacher, Positional, SceneFolder, Training, Views, fit_config
+from .options import (
+    CameraSearch,
+    FieldMethod,
+    Flag,
+    Given,
+    Maps,
+    MapTeacher,
+    Positional,
+    SceneFolder,
+    Training,
+    Views,
+    fit_config,
+)
 from .output import called, say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -43,47 +55,69 @@ def sfm(
     images: Positional[Path],
     out: Path,
     onto: Given[Path] = None,
-    matching: Literal["exhaustive", "sequential"] = "exhaustive",
-    camera_model: str = "SIMPLE_RADIAL",
-    no_single_camera: Flag = False,
-    min_registered: float = 0.9,
+    fps: Given[float] = None,
     seed: int = 0,
     replace: Flag = False,
+    *,
+    search: CameraSearch,
 ) -> None:
-    """Find the cameras of a folder of photographs (structure from motion, pycolmap).
+    """Find the cameras of photographs or of a video (structure from motion, pycolmap).
+
+    Of a video, the sharpest frames are written to OUT/images first. HEIC photographs are written there as JPEG. A folder that
+    has poses already (transforms.json, ScanNet, Polycam, ...) keeps them: only its points are found.
 
     Examples:
         kfgs sfm photos/ --out scene/
+        kfgs sfm video.mp4 --out scene/ --fps 2
         kfgs sfm frames/ --out scene/ --matching sequential    # frames of a video
+        kfgs sfm capture/ --out scene/                         # capture/ has poses: they are kept
         kfgs sfm more/ --onto scene/ --out larger/             # new photographs of a known scene
 
     Args:
-        images: Folder of photographs.
+        images: Folder of photographs, a video, or a folder with poses.
         out: Scene folder to make; OUT/sparse/0 receives the COLMAP model.
         onto: A scene with a COLMAP model: place the photographs in it. Its own cameras do not move, and it is not written to;
             OUT has the pictures of both, as links.
-        matching: sequential for the frames of a video, exhaustive for everything else.
-        camera_model: COLMAP's name of the lens model.
-        no_single_camera: The photographs were taken with several cameras, or with changes of zoom.
-        min_registered: Share of the images that must be placed; fewer is an error.
+        fps: Frames of each second of a video that are used, 2 when not given: the sharpest of each half second.
         seed: Every random choice follows from it.
         replace: Replace a model that is in OUT/sparse/0 already; without it that is an error.
     """
-    from ..scenes import SfmConfig, extend_sfm, link_images, run_sfm
+    from ..scenes import SfmConfig, extend_sfm, is_scene, link_images, load_scene, run_sfm, write_known_poses
+    from ..scenes.pictures import is_video
 
     check_output("out", out, "a folder", apart=inputs_of(onto), other=[images], inside=["sparse/0"])
+    video = is_video(images)
+    if not video:
+        check_alone("fps", fps, "with photographs, which are all used")
     config = SfmConfig(
-        matching=matching,
-        camera_model=camera_model,
-        single_camera=not no_single_camera,
-        min_registered=min_registered,
+        matching=search.matching or ("sequential" if video else "exhaustive"),
+        camera_model=search.camera_model,
+        single_camera=not search.no_single_camera,
+        min_registered=search.min_registered,
         seed=seed,
     )
     if onto is not None:
         check_alone("replace", replace, "with --onto, which needs a new folder")
+        if video:
+            raise ValueError(
+                "images: expected photographs with --onto, got a video; write its frames with `kfgs sfm` first"
+            )
         say(str(extend_sfm(images, onto, out, config=config, progress=True)))
         wrote([out / "sparse" / "0", out / "images"])
         return
+    if not video and not search.ignore_poses and (is_scene(images) or images.suffix == ".json"):
+        for name, given in (("matching", search.matching), ("no_single_camera", search.no_single_camera)):
+            check_alone(
+                name, given, "with a folder that has poses, whose neighbours are compared (or give --ignore-poses)"
+            )
+        scene = load_scene(images, split="all")
+        say(
+            f"{images}: has the poses of {len(scene)} pictures: they are kept, and points are found (not so: --ignore-poses)"
+        )
+        say(str(write_known_poses(scene, out, config=config, replace=replace, progress=True)))
+        wrote([out / "sparse" / "0", out / "images"])
+        return
+    images = _plain_pictures(images, out, fps)
     say(str(run_sfm(images, out, config=config, replace=replace, progress=True)))
     written = [out / "sparse" / "0"]
     beside = out / "images"
@@ -94,12 +128,34 @@ def sfm(
     wrote(written)
 
 
+def _plain_pictures(images: Path, out: Path, fps: float | None) -> Path:
+    """A folder of pictures that pycolmap reads: of a video its frames, of HEIC photographs JPEG files, both in OUT/images."""
+    from ..scenes import convert_heic, extract_frames
+    from ..scenes.pictures import VIDEO_SUFFIXES, has_heic, is_video
+
+    if is_video(images):
+        frames = extract_frames(images, out / "images", fps=2.0 if fps is None else fps, progress=True)
+        say(f"{images}: the {len(frames)} sharpest frames are in {out / 'images'}")
+    elif has_heic(images):
+        found = convert_heic(images, out / "images", progress=True)
+        say(f"{images}: HEIC photographs are JPEG files in {out / 'images'}, {len(found)} pictures in all")
+    elif images.is_file():
+        raise ValueError(
+            f"images: expected a folder, or a video ({', '.join(VIDEO_SUFFIXES)}), got {images}; convert it to .mp4"
+        )
+    else:
+        return images
+    return out / "images"
+
+
 def fit(
     scene: SceneFolder,
     out: Path,
     *,
     splat: Given[Path] = None,
     discard_features: Flag = False,
+    refit: Flag = False,
+    discard_sums: Flag = False,
     method: FieldMethod,
     views: Views,
     maps: Maps,
@@ -108,9 +164,10 @@ def fit(
 ) -> None:
     """Make a semantic field of a scene and its teacher features.
 
-    The features are averaged onto Gaussians in 3-D and then compressed. The Gaussians are those of --splat. Without it
-    they are trained on the pictures first; `kfgs color` with the same --out makes better ones, which are then used if it
-    took more steps. A color.ply that is there already is never replaced.
+    The features are averaged onto Gaussians in 3-D and then compressed. The Gaussians are those of --splat, or of the
+    newest splat in the scene's folder (an output folder of 3DGS has one). Without both they are trained on the pictures
+    first; `kfgs color` with the same --out makes better ones, which are then used if it took more steps. A
+    color.ply that is there already is never replaced.
 
     Examples:
         kfgs fit scene/ --out run/ --splat my.ply
@@ -123,6 +180,9 @@ def fit(
         splat: Any splat file of the scene, in its frame: the Gaussians to average onto.
         discard_features: Delete the feature maps when the stages made of them are done. Later runs with the same options
             do not need them; runs with other options (another --splat, for example) do.
+        refit: Fuse all views again, and train all Gaussians again. Without it, views that are new since an earlier fit in OUT are
+            added to its result, and its Gaussians stay, until there are twice as many views.
+        discard_sums: Do not keep what is needed to add views later (about 240 bytes for each Gaussian of the splat).
     """
     from .._files import bytes_in_words
     from ..features import RecomputedMaps, discard_maps
@@ -138,7 +198,11 @@ def fit(
         views_per_step=training.views_per_step,
         split=views.split,
     )
+    if method.method == "paper":
+        check_alone("refit", refit, "with --method paper, which always trains on all views")
+        check_alone("discard_sums", discard_sums, "with --method paper, which keeps none")
     config = dataclasses.replace(config, undistorted_features=maps.undistorted_features, device=training.device)
+    config = dataclasses.replace(config, refit=refit, discard_sums=discard_sums)
     check_output("out", out, "a folder", apart=inputs_of(scene, views.images), other=[maps.features])
     check_report(out)
     if method.method == "paper":
@@ -148,6 +212,10 @@ def fit(
     else:
         training.say_idle()
     as_taken = views.load(scene)
+    if splat is None and as_taken.splat is not None and method.method != "paper":
+        check_alone(
+            "steps", training.steps, f"with a scene that has its splat ({as_taken.splat}), which needs no training"
+        )
     loaded = as_taken.undistorted()
     chosen = loaded.views(views.split)
     check_scene(loaded, chosen)  # before hours of features

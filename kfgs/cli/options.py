@@ -44,6 +44,8 @@ By = Literal["views", "distance"]
 LabelRule = Literal["own", "nearest"]  # of `kfgs evaluate`: who says the class of a pixel
 GivenLevel = Annotated[Level | None, _choice(Level), _quiet]
 GivenMode = Annotated[Mode | None, _choice(Mode), _quiet]
+Matching = Literal["exhaustive", "sequential"]  # of `kfgs sfm`: which pairs of pictures are compared
+GivenMatching = Annotated[Matching | None, _choice(Matching), _quiet]
 GivenBy = Annotated[By | None, _choice(By), _quiet]
 Precision = Literal["lossless", "fine", "small", "tiny"]  # `fields.precision`, without its imports
 GivenPrecision = Annotated[Precision | None, _choice(Precision), _quiet]
@@ -71,6 +73,22 @@ class Views:
         for note in loaded.notes:
             say(f"note: {note}")
         return loaded
+
+
+@dataclass(frozen=True)
+class CameraSearch:
+    """How cameras are found."""
+
+    matching: GivenMatching = None
+    """sequential for the frames of a video, exhaustive for everything else; by default so."""
+    camera_model: str = "SIMPLE_RADIAL"
+    """COLMAP's name of the lens model."""
+    no_single_camera: Flag = False
+    """The photographs were taken with several cameras, or with changes of zoom."""
+    min_registered: float = 0.9
+    """Share of the images that must be placed; fewer is an error."""
+    ignore_poses: Flag = False
+    """Estimate poses also if the folder has some."""
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,7 @@ def said_whole() -> Iterator[None]:
 
 @contextmanager
 def _writing(stream: TextIO) -> Iterator[None]:
+    """Name the stream in errors of writing, and send to nowhere what it still has to write."""
     try:
         yield
     except OSError as error:
@@ -54,9 +55,9 @@ def _writing(stream: TextIO) -> Iterator[None]:
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         if isinstance(error, BrokenPipeError):
             raise
-        raise type(error)(
-            f"standard output cannot be written ({error.strerror}); choose another place for it"
-        ) from error
+        other = "standard error" if stream is sys.stderr else getattr(stream, "name", "the output")
+        name = "standard output" if stream is sys.stdout else other
+        raise type(error)(f"{name} cannot be written ({error.strerror}); choose another place for it") from error
 
 
 def open_streams() -> None:

@@ -228,13 +228,13 @@ def label(
     check_output("out", out, "a folder", apart=inputs_of(classes.scene, classes.images))
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
-    loaded = classes.open_field("field", field)
-    label_set = classes.of_field(loaded)
-    carried = None if cloud is None else read_cloud(cloud)
     if cloud is not None and real_path(cloud) in {real_path(out / name) for name in ("gaussians.ply", "cloud.ply")}:
         raise ValueError(f"out: expected another folder than that of --cloud, got {out}; {cloud} would be overwritten")
     for name, comment in list(COMMENTS.items())[: 1 if cloud is None else 2]:
         check_splat(out / name, comment, "kfgs label")
+    loaded = classes.open_field("field", field)
+    label_set = classes.of_field(loaded)
+    carried = None if cloud is None else read_cloud(cloud)
     if query is None:
         labels, scores = loaded.classify(label_set, rule=rule)
         who = "what the views show of each Gaussian" if rule == "fused" else "each Gaussian's own latent (Sec. 3.4)"

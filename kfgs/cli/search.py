@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from .._files import InUseError, check_own, read_json
+from .._files import InUseError, check_output, check_own, read_json, write_json
 from .files import check_alone
 from .options import Given, Positional, Teacher
 from .output import say, wrote
@@ -31,9 +31,10 @@ def search(
 ) -> None:
     """Find a class, a phrase or an example in all fields below a folder: which scenes, where, how many, and the best view.
 
-    The first search makes an index, FOLDER/search.kfgs; later ones extend it when fields are new or have changed. A class
-    of a field's own table is answered exactly as `kfgs select` does. Other phrases, examples, and other thresholds are
-    answered by words that stand for many Gaussians each; --exact asks the fields themselves.
+    The first search makes an index, FOLDER/search.kfgs; later ones extend it when fields are new or have changed. It may be
+    deleted at any time. A class of a field's own table is answered exactly as `kfgs select` does. Other phrases, examples,
+    and other thresholds are answered nearly exactly, from the index alone: groups of like Gaussians stand for their members
+    (marked ~). With --exact, the fields themselves are asked.
 
     Examples:
         kfgs search chair runs/
@@ -41,14 +42,15 @@ def search(
         kfgs search runs/ --like runs/room_0/field --index 17    # what resembles Gaussian 17
 
     Args:
-        query: A class name; with --teacher any phrase, compared with its canonical words in every scene.
-        folder: Folder with run folders or fields in it, at any depth. With --like it is the only argument.
+        query: A class name; with --teacher any phrase.
+        folder: Folder with runs, fields or scenes in blocks in it, at any depth. With --like it is the only argument.
         like: A field folder, or a field in one file, that shows an example, instead of a query.
-        index: Number of the example's Gaussian, from 0, for --like.
+        index: Number of the example's Gaussian, from 0, for --like; `kfgs view` shows it when you click one.
         text: A table of `kfgs text` to look the class up, instead of each field's own classes.
-        threshold: Scores must be above it: by default 0.5 for a relevancy; 0.9 for --like, where it is a cosine.
-        exact: Ask the fields themselves for so many of the best scenes, and rank these again.
-        top: So many scenes are printed.
+        threshold: Gaussians with a higher score are found. By default 0.5, where Gaussians are as like the query as like its
+            nearest negative; with --like 0.9, a cosine.
+        exact: Number of scenes, the best first, whose fields are asked themselves; they are ranked again.
+        top: Number of scenes that are printed.
         json: File for the whole answer.
     """
     from ..scale import SearchIndex
@@ -68,10 +70,6 @@ def search(
             check_alone(name, other, "with --like, which needs no words")
     teacher.check_weights()
     if json is not None:
-        from .._files import check_output
-
-        check_output("json", json, "a file")
-    if json is not None:
         check_output("json", json, "a file")
         check_own(json, lambda path: "query" in read_json(path), "kfgs search")
     known = _up_to_date(SearchIndex.open(folder))
@@ -85,31 +83,32 @@ def search(
     if len(found.scenes) > top:
         say(f"  and {len(found.scenes) - top} more scenes; --top {len(found.scenes)} shows all")
     if any(not scene.exact for scene in found.scenes[:top]):
-        say("~: by words, not by Gaussians; --exact N asks the N best scenes themselves")
+        say(
+            "~: from the index, where groups of like Gaussians have one score; --exact N asks the N best scenes themselves"
+        )
     for name, why in list(found.unasked.items())[:SHOWN]:
         say(f"note: not asked: {name} ({why})")
     if len(found.unasked) > SHOWN:
         say(f"note: not asked: {len(found.unasked) - SHOWN} more")
     if json is not None:
-        from .._files import write_json
-
         write_json(json, {"query": what, "folder": str(folder)} | found.to_json())
         wrote([json])
 
 
 def _up_to_date(known: Any) -> Any:
-    """The index, extended if fields are new or have changed. While another process extends it, the old one answers."""
+    """The index, extended if fields are new or have changed. If that is impossible now, the old one answers."""
     if known.is_current():
         return known
     try:
         known, changes = known.update(progress=True)
-    except InUseError as error:
+    except (InUseError, OSError) as error:  # another process extends it, or the folder is read-only
         if len(known) == 0:
             raise
         say(f"note: the index is not extended now: {error}")
         return known
     gone = f", {len(changes.removed)} removed" if changes.removed else ""
-    say(f"index: {len(changes.added)} fields added{gone}; {len(known)} in {known.file}")
+    if changes.added or changes.removed or changes.failed:  # else copied files only got their new times
+        say(f"index: {len(changes.added)} fields added{gone}; {len(known)} in {known.file}")
     return known
 
 

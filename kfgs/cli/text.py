@@ -36,7 +36,9 @@ def text(
         kfgs text --examples clicks.json --field run/field    # for a teacher without text
 
     In clicks.json each class has its examples: {"chair": [{"view": "a.png", "points": [[x, y]]}, {"view": "b.png",
-    "box": [x0, y0, x1, y1]}, {"gaussians": [3, 14]}], ...}
+    "box": [x0, y0, x1, y1]}, {"gaussians": [3, 14]}], ...}. A mask of Segment Anything is {"view": "a.png", "segmentation":
+    {"size": ..., "counts": ...}}, or {"view": "a.png", "masks": "a.json", "index": 3} for one of a file. An annotations.json
+    in COCO's format will do, too: each category is a class.
 
     Args:
         names: Words between commas, a .txt file (a class a line), or a .json file (a list). Synonyms follow a semicolon:
@@ -46,7 +48,7 @@ def text(
             for the word; by default those of the teacher.
         no_negatives: Leave out LERF's canonical words (object, things, stuff, texture), which `kfgs select --negatives
             canonical` needs.
-        examples: A .json file of examples instead of words.
+        examples: A .json file of examples, or COCO's annotations, instead of words.
         field: The field folder of the examples.
     """
     from ..labels import CANONICAL
@@ -61,9 +63,9 @@ def text(
             check_alone(name, given, "with --examples, which replace words")
         if field is None:
             raise ValueError("field: expected --field with --examples, got none; pass the field of the examples")
-        from ..fields import label_set_from_examples, read_examples
+        from ..fields import label_set_from_examples
 
-        shown = label_set_from_examples(open_field("field", field), read_examples(examples))
+        shown = label_set_from_examples(open_field("field", field), _examples(examples))
         shown.save(out)
         say(f"{len(shown)} classes, {shown.dim} channels each, by examples: {', '.join(shown.names)}")
         wrote([out])
@@ -82,6 +84,17 @@ def text(
     for name, more in made.info["synonyms"].items():
         say(f"  {name}: also {', '.join(more)}")
     wrote([out])
+
+
+def _examples(path: Path) -> dict[str, Any]:
+    """The examples of a file, which may be COCO's."""
+    from .._files import read_json
+    from ..evaluation.datasets import load_coco_examples
+    from ..fields import read_examples
+
+    content = read_json(path)
+    coco = isinstance(content, dict) and {"images", "annotations", "categories"} <= set(content)
+    return load_coco_examples(path) if coco else read_examples(path)
 
 
 def read_words(names: str) -> list[str]:

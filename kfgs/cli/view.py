@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .._files import check_output, check_own, real_path
-from .files import check_alone, inputs_of, is_field, open_splats
+from .files import check_alone, check_joined, inputs_of, is_field, open_splats
 from .options import Classes, Given, Positional, Teacher
 from .output import say, wrote
 from .text import note_other_teacher, text_encoder
@@ -70,6 +70,7 @@ def view(
         out: Folder for saved pictures and selections.
     """
     place = "browser" if where == "auto" else where
+    check_joined("source", source)
     if where in ("html", "picture") or out.exists():  # the others write only when asked
         check_output("out", out, "a folder", apart=inputs_of(classes.scene, classes.images))
         _check_older(out, place)

@@ -25,7 +25,7 @@ from .._files import (
 from ..scenes import Scene
 from ..teachers.protocol import Teacher, as_teacher, identify
 from .layouts import map_file, write_npy_map
-from .manifest import MANIFEST, Manifest, MapRecord, read_manifest
+from .manifest import MANIFEST, Manifest, MapRecord, latest_records, part_manifests, read_manifest
 from .pictures import Picture, Split, as_pictures
 from .writer import LOCK, MapWriter, check_maps, encode_half
 
@@ -60,6 +60,7 @@ def extract_features(
             the remaining maps of other programs.
         part: a word of letters and digits, if several processes fill the folder at the same time, each with other pictures
             and another word. The maps are recorded in `features.part-<word>.json` until `join_features` joins all parts.
+            Maps that another part has recorded are kept, so a later call may divide the pictures in another way.
         progress: show a progress bar.
         report: receives one line about what will be done, and one per map that is made again.
 
@@ -133,25 +134,22 @@ def join_features(folder: str | Path, stems: Sequence[str]) -> Manifest:
     """
     folder = as_path(folder)
     with locked(folder, LOCK):
-        files = sorted(folder.glob("features.part-*.json"))
-        parts = [found for file in files if (found := read_manifest(folder, file.stem.partition("-")[2])) is not None]
-        whole = read_manifest(folder)
-        made = {stem: record for one in parts for stem, record in one.maps.items()}
-        known = made if whole is None else {**whole.maps, **made}
+        parts, whole = part_manifests(folder), read_manifest(folder)
+        manifests = [*([] if whole is None else [whole]), *parts.values()]
+        known, teachers = latest_records(manifests), [one.teacher for one in manifests]
         missing = [stem for stem in stems if stem not in known]
-        teachers = [one.teacher for one in (whole, *parts) if one is not None]
         if missing or any(teacher != teachers[0] for teacher in teachers):
             got = f"none of {missing[0]!r} ({len(missing)} in all)" if missing else "those of different teachers"
             raise ValueError(
                 f"stems: expected a record of one teacher for each view in {folder}, got {got}; encode it again"
             )
         order = known if whole is not None else {**{stem: known[stem] for stem in stems}, **known}
-        discarded = whole is not None and whole.discarded and not set(whole.maps) <= set(made)
+        made = {stem for one in parts.values() for stem in one.maps}
+        discarded = whole is not None and whole.discarded and not set(whole.maps) <= made
         joined = Manifest(teachers[0], order, discarded)
         joined.save(folder)
-        for file in files:
+        for file in (*parts, *folder.glob(".features.part-*.lock")):
             file.unlink()
-            (folder / f".{file.stem}.lock").unlink(missing_ok=True)
         return joined
 
 

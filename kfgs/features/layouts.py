@@ -16,8 +16,8 @@ from torch import Tensor
 from .._arrays import FileError, read_array, read_safetensors
 from .._check import check_shapes
 from .._files import as_path, atomic_path
+from .._torch_files import Placeholder, check_plain, load_torch_file
 from ..scenes.files import some
-from ..teachers.torch_files import Placeholder, check_plain, load_torch_file
 from .langsplat import INDEX, ROWS, MaskFeatures
 
 StoredMap = Tensor | NDArray[Any] | MaskFeatures

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from dataclasses import field as default
 from pathlib import Path, PurePosixPath
@@ -98,6 +98,22 @@ def read_manifest(folder: str | Path, part: str | None = None) -> Manifest | Non
             "delete it to use the maps without it, or delete it and run `kfgs features` with --overwrite, which makes them "
             "again"
         ) from error
+
+
+def part_manifests(folder: Path) -> dict[Path, Manifest]:
+    """The manifests of all parts that were not joined yet, by their files."""
+    files = sorted(folder.glob(manifest_file(folder, "*").name))
+    found = {file: read_manifest(folder, file.stem.partition("-")[2]) for file in files}
+    return {file: manifest for file, manifest in found.items() if manifest is not None}
+
+
+def latest_records(manifests: Iterable[Manifest]) -> dict[str, MapRecord]:
+    """The records of several manifests. Of a picture with several records, that of the map that was written last."""
+    found: dict[str, MapRecord] = {}
+    for stem, record in (pair for manifest in manifests for pair in manifest.maps.items()):
+        if stem not in found or found[stem].mtime_ns <= record.mtime_ns:
+            found[stem] = record
+    return found
 
 
 def _read_record(stem: str, found: Any) -> MapRecord:

@@ -15,7 +15,16 @@ from .._files import bytes_in_words, digest_file
 from ..teachers.protocol import Teacher, check_features
 from .finder import MapFinder
 from .layouts import LAYOUTS, OWN, layout_of, map_file
-from .manifest import MANIFEST, Manifest, MapRecord, differences, plain_identity, read_manifest
+from .manifest import (
+    MANIFEST,
+    Manifest,
+    MapRecord,
+    differences,
+    latest_records,
+    part_manifests,
+    plain_identity,
+    read_manifest,
+)
 from .pictures import Picture
 
 LOCK = ".features.lock"
@@ -99,13 +108,21 @@ class MapWriter:
             )
 
 
-def _known(whole: Manifest | None, begun: Manifest | None, stems: list[str]) -> Manifest | None:
-    """What is recorded of a part's pictures: in the manifest of the folder, and in the part's own."""
-    if whole is None:
-        return begun
-    own = begun.maps if begun is not None and begun.teacher == whole.teacher else {}
-    found = {stem: own.get(stem) or whole.maps.get(stem) for stem in stems}
-    return replace(whole, maps={stem: record for stem, record in found.items() if record is not None})
+def _known(folder: Path, part: str, whole: Manifest | None, identity: Any, stems: list[str]) -> Manifest | None:
+    """What is recorded of a part's pictures, in the manifest of the folder, and in those of the parts.
+
+    An earlier call may have divided the pictures in another way: if there are maps that this part did not record, all parts
+    are read. If one of these manifests is of another teacher, that one is returned.
+    """
+    manifests = [one for one in (whole, read_manifest(folder, part)) if one is not None]
+    records = latest_records(manifests)
+    if any(stem not in records and map_file(folder, stem).is_file() for stem in stems):
+        manifests = [*manifests, *part_manifests(folder).values()]
+        records = latest_records(manifests)
+    other = next((one for one in manifests if one.teacher != identity), None)
+    if other is not None or not manifests:
+        return other
+    return replace(manifests[0], maps={stem: records[stem] for stem in stems if stem in records})
 
 
 def check_maps(
@@ -116,8 +133,10 @@ def check_maps(
     Maps of others are an error; with `overwrite` they may be replaced. Nothing is written here.
     """
     finder, stems, identity = MapFinder(folder), [picture.stem for picture in pictures], plain_identity(identity)
-    found = finder.manifest if part is None else _known(finder.manifest, read_manifest(folder, part), stems)
-    hint = "use another folder, or pass overwrite=True (--overwrite)"
+    found, hint = finder.manifest, "use another folder, or pass overwrite=True (--overwrite)"
+    if part is not None:
+        found = _known(folder, part, finder.manifest, identity, stems)
+        hint = "use another folder, or delete this one"
     expected = "folder: expected one without maps of other programs, got"
     files = [map_file(folder, stem) for stem in stems]
     finder.own |= set(files)

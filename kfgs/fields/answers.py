@@ -8,7 +8,7 @@ later no camera is needed.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -35,6 +35,10 @@ class Seen(NamedTuple):
 
     def __repr__(self) -> str:
         return short_repr(self)
+
+    def to(self, *args: Any, **kwargs: Any) -> Seen:
+        """Both on another device or in another dtype, as `torch.Tensor.to`."""
+        return Seen(*(value.to(*args, **kwargs) for value in self))
 
 
 class Answers(NamedTuple):

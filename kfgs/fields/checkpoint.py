@@ -64,7 +64,17 @@ def identify_fit(
 
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint, identity: dict[str, str]) -> None:
-    """Write the file; it is whole or absent."""
+    """Write the file; it is whole or absent.
+
+    Raises:
+        FileNotFoundError: if its folder is missing. `fit_field` makes it at the start: a folder that is made again would hide
+            until the end of the training that something else deleted it.
+    """
+    if not path.parent.is_dir():
+        raise FileNotFoundError(
+            f"{path.parent}: expected this folder to stay while Gaussians are trained, but something else deleted or moved "
+            "it; start again"
+        )
     metadata = {
         "kfgs": KIND,
         "version": VERSION,

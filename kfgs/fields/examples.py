@@ -12,10 +12,11 @@ from torch import Tensor
 
 from .._card import short_repr
 from .._check import check_shapes
-from .._files import read_json
+from .._files import as_path, read_json
 from .._rows import EPS, row_norms, unit_rows
 from ..cameras import Camera
 from ..labels import LabelSet
+from ..labels.polygons import decode_rle
 from .semantic_field import SemanticField
 
 
@@ -94,6 +95,11 @@ def read_examples(path: str | Path) -> dict[str, list[Example]]:
     """Read examples from JSON: {"chair": [{"view": "a.png", "points": [[x, y], ...]}, {"view": "b.png", "box": [x0, y0, x1, y1]},
     {"gaussians": [3, 14]}], ...}.
 
+    A mask is {"view": "c.png", "segmentation": {"size": [H, W], "counts": ...}} with COCO's run lengths: an entry of Segment
+    Anything's list of masks, whose other values are not read, with the view added. {"view": "c.png", "masks": "c.json",
+    "index": 3} takes mask 3, counted from 0, of such a list in a file beside this one; the list may also be the `annotations`
+    of that file.
+
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it has another content.
@@ -102,11 +108,12 @@ def read_examples(path: str | Path) -> dict[str, list[Example]]:
     if not isinstance(content, dict) or not all(isinstance(shown, list) for shown in content.values()):
         raise ValueError(f"{path}: expected an object of lists of examples by class name, got {type(content).__name__}")
     return {
-        name: [_read(f"{path}: {name!r}[{i}]", one) for i, one in enumerate(shown)] for name, shown in content.items()
+        name: [_read(f"{path}: {name!r}[{i}]", one, as_path(path).parent) for i, one in enumerate(shown)]
+        for name, shown in content.items()
     }
 
 
-def _read(where: str, one: Any) -> Example:
+def _read(where: str, one: Any, folder: Path) -> Example:
     keys = set(one) if isinstance(one, dict) else set()
     try:
         if keys == {"gaussians"}:
@@ -116,11 +123,42 @@ def _read(where: str, one: Any) -> Example:
         if keys == {"view", "box"}:
             x0, y0, x1, y1 = map(float, one["box"])
             return Box(str(one["view"]), (x0, y0, x1, y1))
+        if keys == {"view", "masks", "index"}:
+            return Mask(str(one["view"]), _mask_of_file(as_path(folder / one["masks"]), one["index"]))
+        if keys >= {"view", "segmentation"}:
+            return Mask(str(one["view"]), _decoded(one["segmentation"]))
     except (TypeError, ValueError, OverflowError) as error:  # int(infinity)
-        raise ValueError(f"{where}: expected numbers ({error}); see kfgs text --help") from error
+        raise ValueError(f"{where}: expected an example with numbers ({error}); see kfgs text --help") from error
     raise ValueError(
-        f"{where}: expected 'view' with 'points' or 'box', or 'gaussians', got {sorted(keys) or type(one).__name__}; correct it"
+        f"{where}: expected 'view' with 'points', 'box', 'segmentation', or 'masks' and 'index'; or 'gaussians'; got "
+        f"{sorted(keys) or type(one).__name__}; correct it"
     )
+
+
+def _mask_of_file(path: Path, index: object) -> Tensor:  # [H, W] bool
+    """A mask of Segment Anything's list in a JSON file."""
+    content = read_json(path)
+    masks = content.get("annotations") if isinstance(content, dict) else content
+    count = len(masks) if isinstance(masks, list) else 0
+    if (
+        not isinstance(masks, list)
+        or type(index) is not int
+        or not 0 <= index < count
+        or not isinstance(masks[index], dict)
+    ):
+        raise ValueError(
+            f"{path}: expected a list of masks, and an index below their number ({count}), got {index!r:.20}"
+        )
+    return _decoded(masks[index].get("segmentation"))
+
+
+def _decoded(segmentation: object) -> Tensor:  # [H, W] bool
+    if not isinstance(segmentation, dict):
+        raise ValueError(
+            "segmentation: expected COCO's run lengths {'size': [H, W], 'counts': ...}, got "
+            f"{type(segmentation).__name__}; run Segment Anything with output_mode='coco_rle'"
+        )
+    return decode_rle(segmentation)
 
 
 def _feature(field: SemanticField, example: Example, name: str) -> Tensor:  # [D] unit

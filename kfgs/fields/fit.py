@@ -76,6 +76,7 @@ def fit_field(
         ValueError: if the cameras' extent is 0 or not finite, counts or shapes disagree, a camera has distortion, the
             checkpoint belongs to another fit, or no Gaussian is left.
         FloatingPointError: if the loss is no longer finite.
+        FileNotFoundError: if something else deletes the checkpoint's folder meanwhile; noticed at the next checkpoint.
     """
     config, progress = config or FieldConfig(), as_progress(progress)
     generator = generator or torch.Generator().manual_seed(0)
@@ -89,6 +90,7 @@ def fit_field(
         saved = read_checkpoint(path, identity)
         if saved is not None:
             trainer.restore_(saved)
+        path.parent.mkdir(parents=True, exist_ok=True)
     agree("the start of a fit", lambda: f"{trainer.step} {identity} {trainer.digest()}")
     if trainer.step < config.steps:
         trainer.warm_up()

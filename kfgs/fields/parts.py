@@ -1,17 +1,19 @@
-"""Helpers of `SemanticField`: check that its parts fit together."""
+"""Helpers of `SemanticField`: its parts fit together, are decoded, and are described for people."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from .._check import as_tensor, check_shapes
+from .._rows import check_directions, unit_rows
 from ..gaussians import Gaussians
 from ..labels import LabelSet
 from ..labels.questions import Classes
-from ..metrics import MIB
+from ..metrics import MIB, semantic_storage_bytes
 from ..quant import Autoencoder, Codebook, LinearLatents
 from .answers import Seen
 
@@ -95,6 +97,39 @@ def classes_to_ask(field: Any, target: str | Tensor, negatives: Any) -> LabelSet
             raise
         return None
     return found
+
+
+def decode_latents(field: Any, latents: Tensor) -> Tensor:  # [..., d] -> [..., D]
+    """See `SemanticField.decode`."""
+    if latents.shape[-1] != field.channels:
+        raise ValueError(
+            f"latents: expected [..., d] with d = {field.channels} (from gaussians), got {tuple(latents.shape)}; "
+            "pass maps or features of this field"
+        )
+    if field.method == "fused":
+        decoded: Tensor = field.linear.decode(latents)
+        return decoded
+    return latents if field.autoencoder is None else field.autoencoder.decode(latents, chunk=CHUNK)
+
+
+def latent_cosines(field: Any, unit: Tensor) -> Tensor:  # [M, D] of length 1 -> [N, M]
+    """The cosines of the Gaussians' own latents with some rows, by the rule "paper" of `SemanticField.cosines`."""
+    chunks = field.features.split(CHUNK)
+    if field.codebook is None:
+        check_directions("gaussians.features", field.features)
+        return torch.cat([unit_rows(part) @ unit.T for part in chunks])
+    per_codeword = field.codebook.unit.to(unit) @ unit.T  # [K, M]
+    index = torch.cat([field.codebook.quantize(field.decode(part)) for part in chunks])
+    cosines: Tensor = per_codeword[index] * field.features.any(dim=1)[:, None]
+    return cosines
+
+
+def storage_bytes(field: Any) -> int:
+    """See `SemanticField.storage`."""
+    decoder = 0 if field.autoencoder is None else field.autoencoder.decoder_parameters
+    codebook = 0 if field.codebook is None else field.codebook.codewords.numel()
+    basis = field.linear.basis.numel() if field.method == "fused" else 0
+    return semantic_storage_bytes(len(field), field.channels, decoder, codebook + basis)
 
 
 def card_facts(field: Any) -> dict[str, object]:

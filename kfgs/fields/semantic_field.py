@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as default
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
@@ -14,12 +14,11 @@ from torch import Tensor
 from .._card import html_card
 from .._check import as_tensor, check_choice, typed
 from .._files import as_path
-from .._rows import check_directions, unit_embeddings, unit_rows
+from .._rows import unit_embeddings
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels import Classification, CodewordLabels, LabelSet, Score, Selection, label_codewords, select_by_similarity
 from ..labels.questions import Classes, Negatives, check_rows, class_rows, make_question
-from ..metrics import semantic_storage_bytes
 from ..quant import Autoencoder, Codebook, LinearLatents
 from ..splat import Ranked, Rendering, rasterize
 from . import parts
@@ -27,9 +26,7 @@ from .answers import Answers, Seen, fused_answers
 from .precision import PrecisionName, Rounding
 from .remembered import recall_classes
 from .store import load_field, save_field
-from .views import rank_classes
-
-Rule = Literal["fused", "paper"]
+from .views import Rule, rank_classes
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,12 +108,8 @@ class SemanticField:
 
         Cameras that you pass to `segment` and `render` afterwards must be on the same device. `folder` stays.
         """
-        names = ("gaussians", "codebook", "autoencoder", "linear", "answers")
-        moved: dict[str, Any] = {
-            name: part.to(*args, **kwargs) for name in names if (part := getattr(self, name)) is not None
-        }
-        if self.seen is not None:
-            moved["seen"] = Seen(*(value.to(*args, **kwargs) for value in self.seen))
+        names = ("gaussians", "codebook", "autoencoder", "linear", "answers", "seen")
+        moved = {name: part.to(*args, **kwargs) for name in names if (part := getattr(self, name)) is not None}
         return replace(self, **moved, cameras=tuple(camera.to(*args, **kwargs) for camera in self.cameras))
 
     # Maps
@@ -129,16 +122,8 @@ class SemanticField:
 
     def decode(self, latents: Tensor) -> Tensor:  # [..., d] -> [..., D]
         """Decode latents to the teacher's space (Psi of Sec. 3.3.2, or B z); features are returned unchanged."""
-        latents = as_tensor("latents", latents, floating=True)
-        if latents.shape[-1] != self.channels:
-            raise ValueError(
-                f"latents: expected [..., d] with d = {self.channels} (from gaussians), got {tuple(latents.shape)}; "
-                "pass maps or features of this field"
-            )
         with torch.no_grad():
-            if self.linear is not None and self._is_linear:
-                return self.linear.decode(latents)
-            return latents if self.autoencoder is None else self.autoencoder.decode(latents, chunk=parts.CHUNK)
+            return parts.decode_latents(self, as_tensor("latents", latents, floating=True))
 
     def feature_map(self, camera: Camera) -> Tensor:  # [H, W, D]
         """Render the teacher's features from a viewpoint. 512 channels at 640x480 take 630 MB."""
@@ -164,12 +149,7 @@ class SemanticField:
         with torch.no_grad():
             if self.linear is not None and (rule == "fused" or self._is_linear):
                 return self.linear.cosines(self._own, unit)
-            if self.codebook is None:
-                check_directions("gaussians.features", self.features)
-                return torch.cat([unit_rows(part) @ unit.T for part in self.features.split(parts.CHUNK)])
-            per_codeword = self.codebook.unit.to(unit) @ unit.T  # [K, M]
-            index = [self.codebook.quantize(self.decode(part)) for part in self.features.split(parts.CHUNK)]
-            return per_codeword[torch.cat(index)] * self.features.any(dim=1)[:, None]
+            return parts.latent_cosines(self, unit)
 
     def own_features(self, rows: Tensor) -> Tensor:  # [n] int64 -> [n, D]
         """The features of some Gaussians by the rule, in the teacher's space; all-zero if unknown."""
@@ -188,7 +168,7 @@ class SemanticField:
             Labels [N], -1 if nothing is known about the Gaussian, and scores [N]. A tie goes to the lowest class.
         """
         scores, labels = self.cosines(self._rows(classes), rule=rule).max(dim=1)
-        nothing = ~(self.known if rule == "fused" else self.features.any(dim=1))
+        nothing = ~self._known(rule)
         return Classification(labels.masked_fill(nothing, -1), scores.masked_fill(nothing, 0))
 
     def label(self, classes: Classes | None = None, *, rule: Rule = "fused") -> Gaussians:
@@ -229,12 +209,10 @@ class SemanticField:
             negatives = "none"
         classes = parts.classes_to_ask(self, target, negatives) if classes is None else classes
         asked = make_question(target, classes, negatives, self.dim, self.info)
-        others = [] if asked.negatives is None else [asked.negatives.to(asked.row)]
-        rows = torch.cat([asked.row[None], *others])
-        cosines = self.cosines(rows, rule=rule)
-        known = self.known if rule == "fused" else self.features.any(dim=1)
+        cosines = self.cosines(asked.rows, rule=rule)
         against = None if asked.negatives is None else cosines[:, 1:]
-        return select_by_similarity(cosines[:, 0], against, threshold, known, score=score, logit_scale=logit_scale)
+        options: dict[str, Any] = {"score": score, "logit_scale": logit_scale}
+        return select_by_similarity(cosines[:, 0], against, threshold, self._known(rule), **options)
 
     @typed
     def segment(
@@ -254,7 +232,6 @@ class SemanticField:
         Raises:
             ValueError: if shapes disagree or `rule` is unknown.
         """
-        check_choice("rule", rule, get_args(Rule))
         return rank_classes(self, camera, self._rows(classes), rule, early=True).labels[..., 0]
 
     def rank(self, camera: Camera, classes: Classes | None = None, *, top: int = 1, rule: Rule = "fused") -> Ranked:
@@ -274,7 +251,6 @@ class SemanticField:
         Raises:
             ValueError: as `segment`, and if `top` is out of range.
         """
-        check_choice("rule", rule, get_args(Rule))
         return rank_classes(self, camera, self._rows(classes), rule, top)
 
     def codeword_labels(self, embeddings: Tensor) -> CodewordLabels:  # [C, D]
@@ -328,10 +304,7 @@ class SemanticField:
         Without an autoencoder, the table counts no codebook; here it counts, because labelling needs it. Fused answers do
         not count.
         """
-        decoder = 0 if self.autoencoder is None else self.autoencoder.decoder_parameters
-        codebook = 0 if self.codebook is None else self.codebook.codewords.numel()
-        basis = self.linear.basis.numel() if self._is_linear and self.linear is not None else 0
-        return semantic_storage_bytes(len(self), self.channels, decoder, codebook + basis)
+        return parts.storage_bytes(self)
 
     def summary(self) -> str:
         """A few lines of text: counts, channels, codewords, size."""
@@ -366,6 +339,9 @@ class SemanticField:
     @property
     def _own(self) -> Tensor:  # [N, e]
         return self.features if self.answers is None else self.answers
+
+    def _known(self, rule: Rule) -> Tensor:  # [N] bool
+        return self.known if rule == "fused" else self.features.any(dim=1)
 
     def _rows(self, classes: Classes | None) -> Tensor:  # [C, D]
         return class_rows(self.label_set() if classes is None else parts.checked_classes(classes), self.dim, self.info)

@@ -12,29 +12,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 from tqdm import tqdm
 
 from .._card import short_repr
 from .._check import check_range, check_whole, typed
 from .._progress import as_bar
-from .._ranks import first, in_order
+from .._ranks import first
 from .._rows import row_norms, unit_rows
-from ..cameras import Camera, resize_map
+from ..cameras import Camera
 from ..formats import SplatFile
 from ..formats.values import check_splats
 from ..gaussians import Gaussians
-from ..labels.views import sum_pixels
 from ..quant import FeatureMaps
 from ..quant.linear import LinearLatents, fit_linear_latents
-from ..splat import rasterize
 from .merge import FAINT, Merged, merge_gaussians
-from .working_maps import WorkingMaps, shrink_map, working_directions
+from .uplift_passes import average, correct, per_weight, some
+from .uplift_sums import UpliftSums, add_sums, extend_directions
+from .working_maps import WorkingMaps, working_directions
 
-NEIGHBOURS = 17  # a Gaussian and its 16 nearest, whose corrections are judged together
 SPARSE = 0.3  # share of the views' pixels: a splat of the scene fills nearly all of them
 
 
@@ -85,6 +82,8 @@ class Uplifted:
     agreement: Tensor  # [N] in [0, 1]
     """Length of the mean of the unit features at its pixels: 1 if all are equal, 0 = never shown. For merged Gaussians the mean
     over their members."""
+    sums: UpliftSums | None = None
+    """For `uplift_maps(before=...)`, which adds views later; None if there is more than one pass of corrections."""
 
     __repr__ = short_repr
 
@@ -97,6 +96,7 @@ def uplift_maps(
     config: UpliftConfig | None = None,
     *,
     latents: LinearLatents | None = None,
+    before: UpliftSums | None = None,
     generator: torch.Generator | None = None,
     scratch: Path | None = None,
     progress: bool = False,
@@ -114,6 +114,8 @@ def uplift_maps(
         maps: one per camera, covering its picture at any size; all-zero features mean "unknown".
         config: see `UpliftConfig`.
         latents: those of other fields (`sample_latents`), with which these shall agree; None: fitted to this scene.
+        before: `sums` of an earlier call with the same Gaussians, options and `latents`. The views are then new ones, which are
+            added to the earlier ones; those are not looked at again.
         generator: draws the first centres of merging; None: seed 0.
         scratch: a folder for these files, used for these maps only; files of a killed process are used again. The caller
             deletes it. None: a temporary folder.
@@ -123,61 +125,63 @@ def uplift_maps(
     Raises:
         TypeError: if `progress` is a function: there are no rows to call it with.
         ValueError: if counts or shapes disagree, `write_splats` would refuse the Gaussians, a map is not finite, no map has
-            features, or no view shows any Gaussian.
+            features, no view shows any Gaussian, or `before` is of other Gaussians or options.
 
     Note:
+        With `before`, the means are those of all views, up to rounding. Two things differ from one call with all views. The
+        earlier latents stay; others are added if the new means need them. And in the corrections, each group of views is
+        compared with its own mean instead of that of all views.
+
         To continue by training, start `fit_field` with `GaussianParams.from_gaussians(found.gaussians)` and the maps
         `found.latents.encode(unit features)`.
     """
     config, progress = config or UpliftConfig(), as_bar(progress)
     say = report if report is not None and first() else lambda text: None
-    if len(gaussians) == 0:
-        raise ValueError("gaussians: expected at least one, got none; there is nothing to carry features to")
-    if len(cameras) == 0 or len(cameras) != len(maps):
-        raise ValueError(
-            f"maps: expected one per camera ({len(cameras)}, at least one), got {len(maps)}; pass the views that have maps"
-        )
-    cloud = gaussians.replace(sh=None, features=None, labels=None).detach()
-    check_splats(SplatFile(cloud))
-    cloud = cloud.to(torch.promote_types(cloud.means.dtype, torch.float32))
+    cloud = _checked(gaussians, cameras, maps, latents, before, config)
     steps = len(cameras) * (1 + config.corrections + (config.max_gaussians is not None and config.corrections > 0))
     with torch.no_grad(), tqdm(total=steps, desc="uplift", unit="view", disable=not progress) as bar:
-        directions = (working_directions(maps) if latents is None else latents.basis).to(cloud.means)
-        with WorkingMaps(cameras, maps, directions, config.pixels, scratch) as views:
-            sums, shown = _average(cloud, views, bar)
-            if not bool((shown > 0).any()):
-                raise ValueError(
-                    "cameras: expected views that show the Gaussians, got none that does; do both share one frame?"
-                )
-            filled = float(shown.sum()) / sum(camera.width * camera.height for camera in cameras)
-            if filled < SPARSE:
-                say(f"note: the Gaussians fill {filled:.0%} of the views; are they in the cameras' frame?")
-            average = _mean(sums)
-            agreement = row_norms(average).clamp_max(1)
+        known = None if before is None else before.latents.basis
+        directions = (working_directions(maps, known=known) if latents is None else latents.basis).to(cloud.means)
+        count = 0 if before is None else before.views[0]
+        with WorkingMaps(cameras, maps, directions, config.pixels, scratch, count) as views:
+            own, shown = average(cloud, views, bar)
+            _check_shown(shown, cameras, before, say)
+            means, shown, agreement = _with_earlier(own, shown, before)
             if latents is None:
-                chosen = fit_linear_latents(
-                    unit_rows(average), _capped(shown), keep=config.keep, maximum=config.max_latents
-                )
-                views.project(chosen.basis)
-                sums = torch.cat([sums[..., :-1] @ chosen.basis, sums[..., -1:]], dim=-1)
-                latents = LinearLatents((directions.double() @ chosen.basis.double()).to(directions))
+                chosen = _directions(means, shown, before, config, say)
+                views.project(chosen)
+                own = torch.cat([own[..., :-1] @ chosen, own[..., -1:]], dim=-1)
+                latents = LinearLatents((directions.double() @ chosen.double()).to(directions))
             say(f"fused {len(cameras)} maps of {latents.dim} channels as {latents.latent} latents")
+            old = None if before is None else before.sums
+            sums, passes = add_sums(own, old), []  # of these views, and of the earlier ones
+            lacking = [None, None] if before is None else [before.lacking(k) for k in range(2)]
+            facts = {"shown": shown, "agreement": agreement}
             for _ in range(config.corrections):
-                sums = _correct(cloud, sums, views, bar)
+                own, old, found = correct(cloud, own, old, lacking[0], views, bar)
+                passes.append(found)
             if config.max_gaussians is not None:
                 merged = merge_gaussians(
-                    cloud.replace(features=_mean(sums)),
+                    cloud.replace(features=_mean(add_sums(own, old))),
                     shown,
                     config.max_gaussians,
                     faint=config.faint,
                     generator=generator,
                 )
                 say(f"{len(merged.gaussians)} of {len(cloud)} Gaussians left")
-                cloud, agreement = merged.gaussians, _pooled(agreement * shown, merged) / _some(merged.weights)
-                sums, shown = torch.stack([_pooled(half, merged) for half in sums]), merged.weights
+                cloud, agreement = merged.gaussians, _pooled(agreement * shown, merged) / some(merged.weights)
+                shown = merged.weights
+                own = _pooled_halves(own, merged)
+                old, after = (None if one is None else _pooled_halves(one, merged) for one in (old, lacking[1]))
                 if config.corrections:
-                    sums = _correct(cloud, sums, views, bar)
-    return Uplifted(cloud.replace(features=_mean(sums)), latents, shown, agreement)
+                    own, old, found = correct(cloud, own, old, after, views, bar)
+                    passes.append(torch.where(merged.source[:, None] < 0, 0, found[:, merged.source.clamp_min(0)]))
+    kept = None
+    if config.corrections < 2:
+        halves = torch.stack(passes).half() if passes else sums.new_zeros(0, *sums.shape, dtype=torch.float16)
+        total = count + len(cameras)
+        kept = UpliftSums(latents, sums, halves, **facts, views=(total, total if before is None else before.views[1]))
+    return Uplifted(cloud.replace(features=_mean(add_sums(own, old))), latents, shown, agreement, kept)
 
 
 def sample_latents(maps: FeatureMaps, *, count: int = 32, views: int = 256) -> LinearLatents:
@@ -196,81 +200,77 @@ def sample_latents(maps: FeatureMaps, *, count: int = 32, views: int = 256) -> L
     return LinearLatents(working_directions(maps, count, views))
 
 
-def _part(cloud: Gaussians, camera: Camera, signal: Tensor, scale: float) -> dict[str, Tensor]:  # signal [h, w, c]
-    """What one view adds to the rows `index` [M]: `total` [M, c + 1], the sums of the signal by rendering weight and, in the last
-    column, the weight of the known pixels. A weight of 1 stands for `scale` original pixels.
-    """
-    known = ~signal[..., :1].isnan()
-    both = torch.cat([torch.where(known, signal, 0), known.to(signal)], dim=-1)
-    both = resize_map(both, camera.size).contiguous()
-    index, total, _ = sum_pixels(cloud, camera, both)
-    return {"index": index, "total": total, "scale": torch.tensor(scale, dtype=torch.float64)}
+def _checked(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    maps: FeatureMaps,
+    latents: LinearLatents | None,
+    before: UpliftSums | None,
+    config: UpliftConfig,
+) -> Gaussians:
+    """The Gaussians without colours and features, after a check of the arguments of `uplift_maps`."""
+    if len(gaussians) == 0:
+        raise ValueError("gaussians: expected at least one, got none; there is nothing to carry features to")
+    if len(cameras) == 0 or len(cameras) != len(maps):
+        raise ValueError(
+            f"maps: expected one per camera ({len(cameras)}, at least one), got {len(maps)}; pass the views that have maps"
+        )
+    if before is not None:
+        passes = 0 if config.corrections == 0 else 1 + (config.max_gaussians is not None)
+        same = latents is None or torch.equal(latents.basis, before.latents.basis)
+        if config.corrections > 1 or tuple(before.corrections.shape[0::2]) != (passes, len(gaussians)) or not same:
+            raise ValueError(
+                f"before: expected sums of these {len(gaussians)} Gaussians, latents and options, with at most one pass of "
+                f"corrections, got those of {before.sums.shape[1]} with {len(before.corrections)}; leave it out, and "
+                "give the maps of all views"
+            )
+    cloud = gaussians.replace(sh=None, features=None, labels=None).detach()
+    check_splats(SplatFile(cloud))
+    return cloud.to(torch.promote_types(cloud.means.dtype, torch.float32))
 
 
-def _average(cloud: Gaussians, views: WorkingMaps, bar: Any) -> tuple[Tensor, Tensor]:  # [2, N, d' + 1], [N]
-    """Sums of features and weights, over the even and the odd views, and the number of pixels that each Gaussian fills."""
-    sums, shown = cloud.means.new_zeros(2, len(cloud), views.channels + 1), torch.zeros_like(cloud.opacities)
-
-    def look(i: int) -> dict[str, Tensor]:
-        camera, features, _, scale = views[i]
-        return _part(cloud, camera, features, scale)
-
-    for i, part in enumerate(in_order(range(len(views)), look)):
-        before = sums[i % 2, :, -1].clone()
-        sums[i % 2].index_add_(0, part["index"], part["total"])
-        shown += float(part["scale"]) * (sums[i % 2, :, -1] - before)
-        bar.update()
-    return sums, shown
+def _check_shown(
+    shown: Tensor, cameras: Sequence[Camera], before: UpliftSums | None, say: Callable[[str], None]
+) -> None:
+    """Refuse views that show no Gaussian, if there are no earlier views, and say if they show few."""
+    if before is None and not bool((shown > 0).any()):
+        raise ValueError(
+            "cameras: expected views that show the Gaussians, got none that does; do both share one frame?"
+        )
+    filled = float(shown.sum()) / sum(camera.width * camera.height for camera in cameras)
+    if filled < SPARSE:
+        say(f"note: the Gaussians fill {filled:.0%} of the views; are they in the cameras' frame?")
 
 
-def _correct(cloud: Gaussians, sums: Tensor, views: WorkingMaps, bar: Any) -> Tensor:  # [2, N, d + 1]
-    """One pass of SIRT: correct each Gaussian's feature by the weighted mean of the difference at its pixels, without noise.
-
-    The even and the odd views make one reconstruction each. Signal is the part of the two corrections that agrees among
-    neighbours (`_reliability`); both take the reliable share.
-    """
-    weights = sums[..., -1:]
-    halves = sums[..., :-1] / _some(weights)
-    lacking = torch.zeros_like(sums)
-
-    def look(i: int) -> dict[str, Tensor]:
-        camera, features, factor, scale = views[i]
-        rendered, alpha, _ = rasterize(cloud.replace(features=halves[i % 2]), camera)
-        covered = shrink_map(alpha[..., None], factor)  # the rest of the pixel is empty: no Gaussian can explain it
-        return _part(cloud, camera, covered * features - shrink_map(rendered, factor), scale)
-
-    for i, part in enumerate(in_order(range(len(views)), look)):
-        lacking[i % 2].index_add_(0, part["index"], part["total"])
-        bar.update()
-    corrections = lacking[..., :-1] / _some(lacking[..., -1:])
-    share = _reliability(corrections[0], corrections[1], _neighbours(cloud.means))
-    return torch.cat([(halves + share[:, None] * corrections) * weights, weights], dim=-1)
+def _with_earlier(own: Tensor, shown: Tensor, before: UpliftSums | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean features [N, d'], pixels shown [N] and agreement [N] of these views and earlier ones."""
+    if before is None:
+        means = _mean(own)
+        return means, shown, row_norms(means).clamp_max(1)
+    sums = add_sums(own, before.sums)
+    means, outside = _mean(sums), before.outside / some(sums[..., -1].sum(0))
+    return means, shown + before.shown, torch.hypot(row_norms(means), outside).clamp_max(1)
 
 
-def _reliability(one: Tensor, other: Tensor, near: Tensor) -> Tensor:  # [N, d] x 2, [N, k] -> [N] in [0, 1]
-    """The share of signal in the mean of two independent estimates: 2 r / (1 + r), the Spearman-Brown formula.
-
-    r is the common part of the estimates, sum of products over mean sum of squares, over a Gaussian and its neighbours.
-    Negative values become 0; so do those of Gaussians that one half of the views does not show.
-    """
-    products = (one * other).sum(1)[near].sum(1)
-    squares = (one.square().sum(1) + other.square().sum(1))[near].sum(1) / 2
-    r = (products / _some(squares)).clamp(0, 1)
-    return 2 * r / (1 + r)
-
-
-def _neighbours(means: Tensor) -> Tensor:  # [N, 3] -> [N, k] int64
-    """Each Gaussian and those nearest to it."""
-    places = means.detach().cpu().double().numpy()
-    count = min(NEIGHBOURS, len(places))
-    found = cKDTree(places).query(places, k=[*range(1, count + 1)], workers=-1)[1]
-    return torch.from_numpy(np.asarray(found)).to(means.device)
+def _directions(
+    means: Tensor, shown: Tensor, before: UpliftSums | None, config: UpliftConfig, say: Callable[[str], None]
+) -> Tensor:  # [d', d]
+    """The latents of the mean features, in the working directions; earlier latents stay, and others are added to them."""
+    weights = _capped(shown)
+    if before is None:
+        return fit_linear_latents(unit_rows(means), weights, keep=config.keep, maximum=config.max_latents).basis
+    known = before.latents.latent
+    chosen, outside = extend_directions(means, weights, known, config.keep, config.max_latents)
+    added = f"{chosen.shape[1] - known} added" if chosen.shape[1] > known else "none added"
+    say(
+        f"{outside:.2%} of the features' variation is outside of the {known} latents ({1 - config.keep:.2%} may be): {added}"
+    )
+    return chosen
 
 
 def _mean(sums: Tensor) -> Tensor:  # [2, N, d + 1] -> [N, d]
     """The mean feature over both halves of the views; 0 if no view shows the Gaussian."""
-    whole = sums.sum(0)
-    return whole[:, :-1] / _some(whole[:, -1:])
+    return per_weight(sums.sum(0))
 
 
 def _pooled(values: Tensor, merged: Merged) -> Tensor:  # [N, ...] -> [M, ...]
@@ -280,12 +280,12 @@ def _pooled(values: Tensor, merged: Merged) -> Tensor:  # [N, ...] -> [M, ...]
     return sums.index_add_(0, merged.source[rows], values[rows])
 
 
+def _pooled_halves(sums: Tensor, merged: Merged) -> Tensor:  # [2, N, ...] -> [2, M, ...]
+    return torch.stack([_pooled(half, merged) for half in sums])
+
+
 def _capped(weights: Tensor) -> Tensor:
     """Weights capped at their 0.99 quantile, so that a few wall-sized Gaussians do not decide all latents."""
     sample = weights[weights > 0]
     sample = sample[:: max(1, len(sample) // 100_000)]
     return weights.clamp_max(torch.quantile(sample, 0.99))
-
-
-def _some(weights: Tensor) -> Tensor:
-    return weights.clamp_min(torch.finfo(weights.dtype).tiny)

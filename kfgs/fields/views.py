@@ -7,14 +7,14 @@ votes, depend on the text alone; the last ones of each field are kept.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
 
 from .._card import short_repr
-from .._check import check_whole
+from .._check import check_choice, check_whole
 from .._rows import row_norms, unit_embeddings
 from ..cameras import Camera
 from ..gaussians import Gaussians
@@ -23,7 +23,9 @@ from ..labels.questions import Classes
 from ..splat import Ranked, rasterize_labels
 
 if TYPE_CHECKING:
-    from .semantic_field import Rule, SemanticField
+    from .semantic_field import SemanticField
+
+Rule = Literal["fused", "paper"]
 
 
 class Votes(NamedTuple):
@@ -94,8 +96,9 @@ def rank_classes(
         class plus twice the blended length of the features, which only compares the classes of one pixel.
 
     Raises:
-        ValueError: if `top` is out of range.
+        ValueError: if `rule` is unknown, or `top` is out of range.
     """
+    check_choice("rule", rule, get_args(Rule))
     check_whole("top", top, 1, len(rows))
     if field.codebook is None or field.method == "fused" or (rule == "fused" and field.autoencoder is None):
         return rank_votes(field.gaussians, camera, _votes(field, rows, rule), top, early=early)

@@ -20,6 +20,7 @@ and a line in `MODULES`.
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -27,15 +28,17 @@ from types import ModuleType
 from .._check import typed
 from .._files import as_path
 from ..gaussians import Gaussians
+from .folders import PATTERNS, splat_file_of
 from .order import morton_order
 from .sidecar import find_names, names_path, read_sidecar, write_sidecar
 from .splat_file import SplatFile, Written
-from .values import check_splats
+from .values import check_splats, known_quats
 
 MODULES = (  # tried in this order: compressed PLY before PLY, because both end in .ply
     "compressed_ply",
     "ply_3dgs",
     "spz",
+    "checkpoint",  # before sog, which takes every zip file
     "sog",
     "gltf",
     "ksplat",
@@ -53,11 +56,13 @@ def formats() -> dict[str, ModuleType]:
 def find_format(path: str | Path) -> ModuleType:
     """The format of a file: by its content, or by its name if the content has no mark (`.splat`).
 
+    Of the output folder of a training program it is the format of its newest splat.
+
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is none of the known formats.
     """
-    path = as_path(path)
+    path = splat_file_of(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file; expected a splat file there")
     head = b""
@@ -76,20 +81,27 @@ def find_format(path: str | Path) -> ModuleType:
         if path.is_file() and path.name.lower().endswith(module.SUFFIXES) and not hasattr(module, "MAGIC"):
             return module
     known = ", ".join(f"{name} ({', '.join(module.SUFFIXES)})" for name, module in formats().items())
+    known += f", and folders with {' or '.join(PATTERNS)}"
     raise ValueError(f"{path}: expected a splat file of a known format, got something else; known are {known}")
 
 
 def read_splats(path: str | Path) -> SplatFile:
     """Read a splat file of any known format, with labels and class names from it or from the files next to it.
 
+    A quaternion of length 0 is read as no rotation, (1, 0, 0, 0): rasterisers do the same.
+
+    Args:
+        path: the file; or the output folder of 3DGS, gsplat or nerfstudio, whose newest step is then read.
+
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is of no known format, or damaged: truncated, with counts that disagree, numbers that are not
             finite, or labels without a name in its classes.
     """
-    path = as_path(path)
+    path = splat_file_of(path)
     module = find_format(path)
     splats: SplatFile = read_sidecar(path, module.read(path))
+    splats = replace(splats, gaussians=splats.gaussians.replace(quats=known_quats(splats.gaussians.quats)))
     labels = splats.gaussians.labels
     if labels is not None and len(labels):
         low, high = int(labels.min()), int(labels.max())
@@ -119,8 +131,8 @@ def write_splats(path: str | Path, splats: SplatFile | Gaussians, *, format: str
 
     Raises:
         ValueError: if no format has this ending, or the format cannot be written or cannot store this cloud, or a value is
-            NaN or infinite, a scale not positive, an opacity outside [0, 1] (both ends are allowed), or a label has no name
-            in `classes`. Nothing is written then.
+            NaN or infinite, a quaternion 0, a scale not positive, an opacity outside [0, 1] (both ends are allowed), or a
+            label has no name in `classes`. Nothing is written then.
     """
     path = as_path(path)
     if isinstance(splats, Gaussians):

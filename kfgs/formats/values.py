@@ -17,10 +17,11 @@ UP_AND_BACK = (1, -1, -1)  # x right, y up, z back (RUB) against x right, y down
 # Signs of the coefficients under a flip of axes: which of x, y, z each harmonic is odd in, degrees 1 to 3.
 _ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 _TINY_SCALE = 1e-10  # world units, instead of a scale of 0
+_SHORTEST = 1e-12  # of a quaternion; kornia divides by no less
 _LABELS = 2**31 - 1  # the largest int32
 _EXPECTED = {
     "means": "finite numbers",
-    "quats": "finite numbers",
+    "quats": "finite numbers, not all 0",
     "scales": "finite numbers above 0",
     "opacities": "numbers from 0 to 1",
     "sh": "finite numbers",
@@ -68,21 +69,28 @@ def flip_axes(g: Gaussians, axes: tuple[int, int, int]) -> Gaussians:
     return g.replace(means=g.means * means + 0.0, quats=g.quats * quats + 0.0, sh=sh)  # + 0: no negative zeros
 
 
+def known_quats(quats: Tensor) -> Tensor:  # [N, 4] wxyz twice
+    """The quaternions; those of length 0, which are no rotation at all, become the identity, as in the rasteriser."""
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype)
+    known = quats.norm(dim=1, keepdim=True) > _SHORTEST
+    return quats if bool(known.all()) else torch.where(known, quats, identity)
+
+
 def unit_quats(quats: Tensor) -> Tensor:  # [N, 4] wxyz -> [N, 4] of length 1
     """Quaternions of length 1; those of length 0 become the identity."""
-    length = quats.norm(dim=1, keepdim=True)
-    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype)
-    return torch.where(length > 1e-12, quats / length.clamp(min=1e-12), identity)
+    known = known_quats(quats)
+    return known / known.norm(dim=1, keepdim=True)
 
 
 def check_splats(splats: SplatFile) -> None:
     """Check a cloud before it is written, for the values that readers refuse. They are checked as float32, as stored.
 
+    A quaternion of length 0 is refused, too: other programs divide by its length. In a file, it is read as no rotation.
     Opacities of exactly 0 and 1 are allowed: the PLY, which stores logits, keeps them within 1e-7.
 
     Raises:
-        ValueError: if a value is NaN or infinite, a scale is not positive, an opacity lies outside [0, 1], a label is below
-            -1 or none of the named classes, or a labelled Gaussian's score is not finite.
+        ValueError: if a value is NaN or infinite, a quaternion is 0, a scale is not positive, an opacity lies outside [0, 1],
+            a label is below -1 or none of the named classes, or a labelled Gaussian's score is not finite.
     """
     g = splats.gaussians.detach()
     for name, expected in _EXPECTED.items():
@@ -91,7 +99,9 @@ def check_splats(splats: SplatFile) -> None:
             continue
         values = values.float()
         good = values.isfinite()
-        if name == "scales":
+        if name == "quats":
+            good &= values.norm(dim=1, keepdim=True) > _SHORTEST
+        elif name == "scales":
             good &= values > 0
         elif name == "opacities":
             good &= (values >= 0) & (values <= 1)

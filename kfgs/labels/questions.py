@@ -30,6 +30,11 @@ class Question(NamedTuple):
     def __repr__(self) -> str:
         return short_repr(self)
 
+    @property
+    def rows(self) -> Tensor:  # [1 + M, D]
+        """The target, then its negatives."""
+        return torch.cat([self.row[None], *([] if self.negatives is None else [self.negatives.to(self.row)])])
+
 
 def class_rows(classes: Classes, dim: int, info: dict[str, Any]) -> Tensor:  # [C, D]
     """The embeddings of some classes, checked against a field's features. Warns if another teacher embedded them.

@@ -87,6 +87,7 @@ class App {
     this.tools = new Tools(this.stage, this.eye, this);
     if (Number.isInteger(this.header.default_view)) this.goTo(this.header.default_view);
     model.addEventListener("change", () => (this.refresh(), this.remember()));
+    this.hold();
     this.watch();
     await this.begin();
     await this.remembered();
@@ -105,6 +106,15 @@ class App {
     if (words && gamma !== this.model.gamma) this.model.setGamma(gamma);
     this.model.past = [];
     this.refreshPanes();
+  }
+
+  /** Take no edits until Python has checked that the scene is not outdated; without Python there is nothing to check. */
+  hold() {
+    const { link, model } = this;
+    if (!link.checked) return;
+    model.unchecked = true;
+    link.checked.then(() => (model.unchecked = false));
+    model.addEventListener("unchecked", () => this.say("Python still checks whether this scene is outdated. Edit it in a few seconds."));
   }
 
   watch() {
@@ -298,7 +308,10 @@ class App {
   }
 
   openFile(file) {
-    return file && this.attempt(async () => this.open(await new Response(file).json().catch(() => null)));
+    return file && this.attempt(async () => {
+      await this.link.checked;
+      await this.open(await new Response(file).json().catch(() => null));
+    });
   }
 
   /** Show a state that `Model.toJSON` gave; without its question, if nobody answers that any more. */

@@ -22,9 +22,9 @@ PYTHON_START = """\
     if (!loaded?.ok) throw new Error("Python does not answer; its terminal says why.");
     const [header, data] = kfgs.readMessage(await loaded.arrayBuffer());
     const link = new kfgs.PythonLink(kfgs.callPage, header);
-    const shown = loaded.headers.get("ETag"); // the scene may have been kept, and be outdated
-    const version = fetch("version").then((answer) => (answer.ok ? answer.text() : shown));
-    version.then((text) => text === shown || (sessionStorage.clear(), location.reload())).catch(() => null);
+    const shown = loaded.headers.get("ETag"); // the scene may have been kept, and be outdated: then it is replaced
+    const version = fetch("version").then((answer) => (answer.ok ? answer.text() : shown)).catch(() => shown);
+    link.checked = version.then((text) => text === shown || new Promise(() => (sessionStorage.clear(), location.reload())));
     window.viewer = await kfgs.mount(root, { header, data }, link);"""
 ROOT = '<div id="kfgs"></div>'
 """Holds the viewer, and shows that a page is one of kfgs."""

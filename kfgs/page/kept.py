@@ -38,7 +38,9 @@ def scenes_folder() -> Path:
 def scene_key(words: Iterable[object], inputs: Iterable[Path]) -> str | None:
     """What a packed scene depends on: the options, the names, sizes and dates of its files and folders, and kfgs itself.
 
-    Files beside an input count if their names begin as its own does: labels lie there. None if there are too many files.
+    Files beside an input count if their names begin as its own does: labels lie there. What lies elsewhere and is only named
+    in an input does not: the splat that a field was made on, the photos of the scene that it remembers. If these change, the
+    old scene is shown until Python has packed the new one. None if there are too many files.
     """
     with suppress(*ODD):
         code = (file for folder in (CODE / "page", CODE / "viz/explorer") for file in folder.iterdir())

@@ -133,14 +133,14 @@ def segment_scene(
     return results
 
 
-def true_labels(scene: Scene, folder: Path, split: str) -> dict[str, Tensor]:
+def true_labels(scene: Scene, folder: str | Path, split: str) -> dict[str, Tensor]:
     """The label pictures of a split's views by stem, as [H, W] with -1 = void; views without one are left out.
 
     If the scene is undistorted, the label pictures are undistorted too.
     """
     truth = {}
     for i in scene.views(split):
-        path = folder / f"{scene.stem(i)}.png"
+        path = as_path(folder) / f"{scene.stem(i)}.png"
         if path.is_file():
             labels = load_label_map(path)
             if scene.lenses is not None and scene.lenses[i].distortion is not None:

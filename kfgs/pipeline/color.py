@@ -25,7 +25,8 @@ from ..formats import write_splats
 from ..gaussians import Gaussians
 from ..scenes import Scene
 from .color_file import is_saved, may_replace, stage_gaussians, what_is
-from .stages import Run, Stage, describe_lens, digest_scene, digest_tensors, stage_generator
+from .points import with_points
+from .stages import Run, Stage, describe_lens, digest_scene, digest_shape, digest_tensors, stage_generator
 from .train import check_scene, field_stage, training_device, with_extent
 
 
@@ -195,7 +196,7 @@ def fit_color(
     Spherical harmonics up to `config.sh_degree`, L1 + D-SSIM, cloning, splitting and pruning as in 3DGS, on black.
 
     Args:
-        scene: posed, undistorted views with their sparse points.
+        scene: posed, undistorted views with their sparse points; without points, some are triangulated first.
         folder: the run folder; `folder/color.ply` receives the Gaussians, in place of those of an earlier fit with other
             options. Its stage stays in the folder, so the earlier call brings them back at once. Any other `color.ply`,
             and one with labels, is never replaced.
@@ -205,7 +206,7 @@ def fit_color(
         device: where to train, see `training_device`; the result lies on the CPU.
 
     Raises:
-        ValueError: if a camera has distortion, there is no such device, the scene has no points to start from, the
+        ValueError: if a camera has distortion, there is no such device, the scene's points are out of sight, the
             split has no views, `folder/color.ply` is a file that no fit in this folder wrote, or another process works in
             `folder`.
     """
@@ -213,6 +214,7 @@ def fit_color(
     check_scene(scene, scene.views(config.split))
     run, target = Run(check_output("folder", folder, "a folder"), report), training_device(device)
     with run.locked():
+        scene = with_points(run, scene, scene.views(config.split), config.seed, progress)
         return make_color(run, scene, config, target, progress, overwrite=True)
 
 
@@ -272,6 +274,27 @@ def find_color(run: Run, scene: Scene, config: ColorConfig) -> tuple[Gaussians, 
         return None
     run.say(f"geometry: the colours of {best[0]:,} steps that are in {run.folder}")
     return stage_gaussians(best[1]), best[0]
+
+
+def colors_before(
+    run: Run, scene: Scene, config: ColorConfig, geometries: Sequence[str]
+) -> tuple[Gaussians, int, str] | None:
+    """Gaussians that were trained on some of a scene's pictures, with these options or more steps; their steps, and their stage.
+
+    They have the first digest in `geometries` that a stage has.
+    """
+    wanted = json.loads(json.dumps(_inputs(run, scene, scene.views(config.split), config)))
+    if run.has("color", wanted):
+        return None
+    found = {}
+    for about in sorted((run.folder / "stages").glob("color-*/stage.json")) if geometries else ():
+        inputs = read_json(about)["inputs"]
+        steps = int(inputs["config"]["field"]["steps"])
+        same = inputs["config"] == wanted["config"] or steps > config.field.steps
+        if same and all(picture in wanted["pictures"] for picture in inputs["pictures"]):
+            cloud = stage_gaussians(about.parent)
+            found[digest_shape(cloud)] = cloud, steps, about.parent.name
+    return next((found[one] for one in geometries if one in found), None)
 
 
 def _inputs(run: Run, scene: Scene, views: Sequence[int], config: ColorConfig) -> dict[str, Any]:

@@ -11,13 +11,16 @@ from ..features.manifest import MANIFEST, read_manifest
 from ..fields import SemanticField
 from ..fields.store import find_field
 from ..formats import SplatFile, find_format, read_splats
+from ..formats.folders import splat_file_of
 from ..formats.ply import read_ply
-from ..scenes import SceneError, load_scene
+from ..scenes import SceneError, is_scene, load_scene
 from .stages import read_stage
 
 
 def describe(path: str | Path) -> str:
-    """Describe a field, run or scene folder, a folder of feature maps that kfgs made, a splat file, or a PLY of points.
+    """Describe a field, run or scene folder, a folder of feature maps that kfgs made, a splat, or a PLY of points.
+
+    A splat is a file, or the output folder of a training program.
 
     Raises:
         FileNotFoundError: if the path does not exist.
@@ -30,9 +33,9 @@ def describe(path: str | Path) -> str:
     if field is not None:
         size = [f"  one file of {path.stat().st_size / 2**20:.2f} MiB"] if path.is_file() else []
         return "\n".join([SemanticField.load(field).summary(), *size])
-    if path.is_file():
+    if path.is_file() or (splat_file_of(path) != path and not is_scene(path)):
         if find_format(path).NAME == "ply":
-            columns = read_ply(path)
+            columns = read_ply(splat_file_of(path))
             if "scale_0" not in columns:
                 count = len(next(iter(columns.values())))
                 return f"{path}: PLY with {count} vertices; columns {', '.join(columns)}"

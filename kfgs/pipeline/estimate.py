@@ -258,6 +258,8 @@ def _uplift(sizes: Sizes) -> StagePlan:
     _, last = gaussian_counts(sizes.config.color.field, sizes.points, full=True)
     left, latents = min(last, options.max_gaussians or last), min(options.max_latents, D)
     size = 2 * FLOAT * (left * (13 + latents) + latents * D)  # in the stage and in the finished field
+    if not sizes.config.discard_sums and options.corrections < 2:
+        size += FLOAT * (last * (4 * latents + 4) + latents * D)  # `UpliftSums`
     working = HALF * sizes.count * min(WORKING, D) * min(options.pixels, h * w)  # files of the working maps
     more = 0
     if "uplift" not in sizes.timings:

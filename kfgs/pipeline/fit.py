@@ -19,7 +19,7 @@ from torch import Tensor
 
 from .._card import short_repr
 from .._check import typed
-from .._files import as_path, check_output, digest_value, read_json, write_json
+from .._files import as_path, check_output, read_json, write_json
 from .._progress import Progress, as_progress
 from .._ranks import once
 from ..cameras import Camera
@@ -46,10 +46,12 @@ from ..quant import (
 from ..scenes import Scene
 from .color import ColorConfig, find_color
 from .config import FitConfig
+from .earlier import digest_lenses, find_earlier
 from .fuse import answers_stage, find_geometry, uplift_stage, without_lens
-from .maps import KnownFeatures, Maps, UndistortedMaps, as_maps, check_readable, map_digests, map_shape
+from .maps import KnownFeatures, Maps, as_maps, check_readable, map_digests, map_shape
+from .points import with_points
 from .runs import check_current, keep_field, say_kept
-from .stages import Run, Stage, UnfinishedError, describe_lens, digest_scene, stage_generator
+from .stages import Run, Stage, UnfinishedError, digest_scene, digest_tensors, stage_generator
 from .train import check_scene, field_stage, training_device, with_extent
 
 
@@ -208,16 +210,18 @@ def fit_scene(
     """Make a semantic field of a scene; finished stages in the run folder are reused.
 
     Args:
-        scene: posed, undistorted views with their sparse points.
+        scene: posed, undistorted views with their sparse points; if it has none and training needs them, they are
+            triangulated first.
         maps: one teacher map [h, w, D] per training view; read one at a time; a `FeatureFolder`, or a list in memory. When
             the stages that read them are finished, the maps may be deleted (`discard_maps`), except for the paper's mode
             `decouple`.
         folder: the run folder; the finished field goes to `folder/field`. A field that other options made there before is kept as
             `folder/field@<key>`; `restore_field` brings it back.
         config: the method and its options.
-        splat: of method `fuse`, the Gaussians to fuse onto, in the scene's frame: a splat file or its content. None trains them
-            on the pictures with `config.color` and writes them to `folder/color.ply`, unless that file exists. If `fit_color`
-            trained for longer in the same folder, its Gaussians are taken instead.
+        splat: of method `fuse`, the Gaussians to fuse onto, in the scene's frame: a splat file or its content. None takes
+            `scene.splat`; if the scene has none, it trains them on the pictures with `config.color` and writes them to
+            `folder/color.ply`, unless that file exists. If `fit_color` trained for longer in the same folder, its Gaussians are
+            taken instead.
         latents: of method `fuse`, those of other fields (`fields.sample_latents`), with which this one shall agree.
         report: receives one line per stage.
         progress: True shows bars; a function receives the history rows of every trained stage as they appear.
@@ -240,6 +244,8 @@ def fit_scene(
     run = Run(check_output("folder", folder, "a folder"), report)
     with run.locked():
         check_current(run.folder)
+        if config.method == "paper" or (splat is None and scene.splat is None):  # else nothing is trained
+            scene = with_points(run, scene, scene.views(config.split), config.seed, progress)
         job = _job(run, scene, maps, config, target_device, progress)
         found, about = _make_field(job, splat, latents)
         done = FitResult(found, run.folder, run.stages)
@@ -279,10 +285,15 @@ def _make_field(
     if config.method == "paper":
         about = {"method": config.method, "mode": config.mode, "steps": {"field": config.field.steps}}
         return answers_stage(job.run, _paper_stages(job), job.cameras), about
-    geometry, origin = find_geometry(job.run, job.scene, splat, _color_config(config), job.device, job.progress)
     inputs = {"features": job.features, "config": asdict(config.uplift), "seed": config.seed}
-    found = uplift_stage(job.run, geometry, job.cameras, job.maps, config.uplift, inputs, job.progress is True, latents)
-    return found, {"method": config.method, **origin}
+    if latents is not None:
+        inputs["latents"] = digest_tensors(latents.basis)
+    earlier = [] if config.refit else find_earlier(job.run, inputs, job.cameras, job.maps)
+    given = job.run, job.scene, splat, _color_config(config), job.device, job.progress
+    geometry, origin = find_geometry(*given, earlier)
+    options = config.uplift, inputs, job.progress is True, latents, earlier, not config.discard_sums
+    found = uplift_stage(job.run, geometry, job.cameras, job.maps, *options)
+    return found, {"method": config.method, **origin, **found.info}
 
 
 def _paper_stages(job: _Job) -> SemanticField:
@@ -307,9 +318,7 @@ def _paper_stages(job: _Job) -> SemanticField:
 def _job(run: Run, scene: Scene, maps: Maps, config: FitConfig, device: torch.device, progress: Progress) -> _Job:
     views = scene.views(config.split)
     straight = without_lens(scene, maps, config)
-    lenses = straight.lenses if isinstance(straight, UndistortedMaps) else None
-    removed = None if lenses is None else digest_value([describe_lens(lens) for lens in lenses])
-    features = {"files": map_digests(run, straight), "lenses": removed}
+    features = {"files": map_digests(run, straight), "lenses": digest_lenses(straight)}
     return _Job(run, scene, views, straight, features, config, device, progress)
 
 
@@ -324,6 +333,8 @@ def finished_stages(scene: Scene, maps: Maps | None, folder: str | Path, config:
     """
     run, device = Run(as_path(folder), look_only=True), torch.device("cpu")
     with suppress(UnfinishedError):
+        if config.method == "paper" or scene.splat is None:
+            scene = with_points(run, scene, scene.views(config.split), config.seed, False)
         if maps is not None:
             _make_field(_job(run, scene, maps, config, device, False), None)
         elif config.method == "fuse":

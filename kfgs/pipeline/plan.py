@@ -241,7 +241,10 @@ def notes_on(sizes: Sizes) -> list[str]:
     if any(sizes.made) and sizes.dense != "recompute":
         found.append(f"{sum(sizes.made)} of {sizes.count} maps exist and are not made again")
     if sizes.points < 2:
-        found.append(f"the scene has {sizes.points} points; training needs some: estimate them with `kfgs sfm`")
+        found.append(
+            f"the scene has {sizes.points} points; `kfgs fit` triangulates some from the poses before it trains, which is not "
+            "counted; after `kfgs sfm SCENE --out NEW` the plan of NEW is complete"
+        )
     if not sizes.missing or sizes.shape is None:
         return found
     whole = sizes.samples * sizes.count == sizes.pixels

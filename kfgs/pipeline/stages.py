@@ -36,11 +36,13 @@ from .._files import (
 from .._ranks import first, meet, once
 from ..cameras import Camera
 from ..cameras.camera import NEAR
+from ..gaussians import Gaussians
 from ..scenes import Scene
 
 STAGE_FILE, LOCK, DIGESTS = "stage.json", ".run.lock", "digests.json"
 WRITTEN = ("field", "field@*", "stages", "stages/*", "unfinished", "unfinished/*", "teacher", "teacher/*")
 """The folders in a run folder that are written to."""
+SHAPE = ("means", "quats", "scales", "opacities")
 STAGE_VERSION = 2
 """Part of every key: raised if the same inputs give another result in a new version, so that old stages are not reused."""
 
@@ -150,6 +152,10 @@ class Run:
             yield
             meet()
 
+    def has(self, name: str, inputs: dict[str, Any]) -> bool:
+        """Whether the stage of these inputs is finished."""
+        return bool(once((self.folder / "stages" / f"{name}-{_key(name, inputs)}" / STAGE_FILE).is_file))
+
     def scratch(self, name: str, inputs: dict[str, Any]) -> Path:
         """A path for the unfinished work of a stage (checkpoints), kept until the stage is done."""
         return self.folder / "unfinished" / f"{name}-{_key(name, inputs)}"
@@ -210,6 +216,14 @@ def _sizes(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_size for path in sorted(folder.iterdir()) if path.name != STAGE_FILE}
 
 
+def is_whole(folder: Path) -> bool:
+    """Whether a folder is a finished stage that this version made: its name follows from its inputs, no file changed its size."""
+    about = read_stage(folder / STAGE_FILE)
+    return folder.name == f"{about['name']}-{_key(about['name'], about.get('inputs', {}))}" and about.get(
+        "files"
+    ) == _sizes(folder)
+
+
 def stage_generator(seed: int, purpose: str) -> torch.Generator:
     """A separate generator for each stage, so that reusing a stage does not change later ones."""
     digest = hashlib.sha256(f"{purpose}:{seed}".encode()).digest()
@@ -223,6 +237,11 @@ def digest_tensors(*tensors: Tensor) -> str:
         digest.update(f"{tuple(tensor.shape)}{tensor.dtype}".encode())
         digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()
+
+
+def digest_shape(gaussians: Gaussians) -> str:
+    """SHA-256 of positions, rotations, sizes and opacities."""
+    return digest_tensors(*(getattr(gaussians, name) for name in SHAPE))
 
 
 def digest_scene(scene: Scene, views: Sequence[int]) -> str:

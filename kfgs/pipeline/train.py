@@ -45,14 +45,14 @@ def training_device(device: str | torch.device = "auto") -> torch.device:
 
 
 def check_scene(scene: Scene, views: Sequence[int]) -> None:
-    """Raise a ValueError if some views cannot be trained on: a camera has a lens, or there are no different points in sight."""
+    """Raise a ValueError if some views cannot be trained on: a camera has a lens, or no different points are in sight.
+
+    A scene without any points passes: `with_points` finds some before the training.
+    """
     if scene.distorted:
         raise ValueError("scene: expected cameras without distortion, got a lens; pass scene.undistorted()")
-    if len(scene.points) < 2:
-        raise ValueError(
-            f"scene: expected sparse points to start from, got {len(scene.points)}; a transforms.json needs a "
-            "ply_file_path, or estimate the scene with `kfgs sfm`"
-        )
+    if len(scene.points) == 0:
+        return
     if bool((scene.points == scene.points[0]).all()):
         raise ValueError(
             f"scene: expected sparse points at different positions, got {len(scene.points)} at one; estimate the scene again "

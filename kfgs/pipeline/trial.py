@@ -7,7 +7,7 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,6 +24,7 @@ from ..teachers import CallableTeacher, LSeg, LSegOptions, Teacher, as_teacher
 from .color import fit_color
 from .config import FitConfig
 from .fit import fit_scene
+from .maps import ChosenMaps
 from .stages import Stage
 
 STEPS = 20  # steps of the longer of two runs
@@ -128,7 +129,7 @@ def time_fit(scene: Scene, maps: FeatureFolder, config: FitConfig, gaussians: in
             field=_shortened(config.field, steps),
         )
         splat = GaussianParams.from_points(few.points, 1).activated().detach() if config.method == "fuse" else None
-        return fit_scene(few, _FewMaps(maps, views), folder, short, splat=splat, report=report).stages
+        return fit_scene(few, _few_maps(maps, views), folder, short, splat=splat, report=report).stages
 
     found = _time_twice(make, count, {"autoencoder", "field"})
     return {name: replace(one, each=one.each / denser) if name == "codebook" else one for name, one in found.items()}
@@ -196,27 +197,9 @@ class _Peaks:
             self.found[name] = self._memory.bytes
 
 
-class _FewMaps(Sequence[Tensor]):
+def _few_maps(maps: FeatureFolder, count: int) -> ChosenMaps:
     """The maps of a number of views, evenly spread over the stored ones; repeated if there are too few."""
-
-    def __init__(self, maps: FeatureFolder, count: int) -> None:
-        self._maps, self._chosen = maps, [i * len(maps) // count for i in range(count)]
-        self.files, self.shape = [maps.files[i] for i in self._chosen], maps.shape
-
-    def __len__(self) -> int:
-        return len(self._chosen)
-
-    def __getitem__(self, i: int) -> Tensor:  # type: ignore[override]  # [h, w, D]
-        return self._maps[self._chosen[i]]
-
-    def digests(self) -> list[list[str]]:
-        return [[str(i), ""] for i in range(len(self))]
-
-    def grid(self, i: int, step: tuple[int, int] | None, samples: int) -> Tensor:  # [n, D]
-        return self._maps.grid(self._chosen[i], step, samples)
-
-    def blocks(self, i: int) -> Iterator[Tensor]:  # each [at most 32, w, D]
-        return self._maps.blocks(self._chosen[i])
+    return ChosenMaps(maps, [i * len(maps) // count for i in range(count)], [[str(i), ""] for i in range(count)])
 
 
 class PeakMemory:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import re
 import time
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import nullcontext
@@ -11,15 +12,16 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from .._check import check_range
-from .._files import check_output, locked
-from .driver import Engine, Event, Failure, Plan, Task, drive
+from .._files import check_output, locked, parse_json
+from .driver import Engine, Event, Failure, Plan, Task, drive, limit
 from .options import BatchOptions, Job
-from .places import Place, StoredPlace
-from .scene_list import SceneEntry, as_entries, is_url
+from .places import WRITER, Place, StoredPlace
+from .scene_list import SceneEntry, as_entries, check_apart, is_url
 
 STAGES = ("scene", "features", "fit", "segment", "evaluate")
 STATE, LOG, LOCK, FORMAT = "state.json", "log.txt", ".batch.lock", "kfgs-batch/1"
+LOGGED = re.compile(rf"\d{{4}}-\d\d-\d\d \d\d:\d\d:\d\d ({'|'.join(STAGES)}): ")  # begins every log.txt
+WRITTEN = ("done", "features", "scene/sparse/0", "segmented")  # folders of a run; the fit checks its own
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ def map_scenes(
         client: a `dask.distributed.Client`, or anything with `submit(function, *arguments)` whose results have `done()` and
             `result()`: executors of concurrent.futures, submitit, Ray or MPI. Or a function that makes one: a process pool is
             of no use any more when one of its processes has died, and then another one is made.
-        at_once: calls in progress at the same time, or a function that says how many.
+        at_once: calls in progress at the same time, or a function that says how many; 0 from it means: wait.
         report: receives an event when a call begins, ends or is repeated.
 
     Returns:
@@ -108,8 +110,6 @@ def map_scenes(
     def plan(entry: SceneEntry) -> Plan:
         return (yield "call", [Task(_call, (sent, entry.source))])[0]
 
-    if not callable(at_once):
-        check_range("at_once", at_once, 1)
     drive({entry.name: plan(entry) for entry in entries}, client, note, at_once=at_once)
     return [found[entry.name] for entry in entries]
 
@@ -147,13 +147,14 @@ def run_batch(
         A result per scene, in their order.
 
     Raises:
-        ValueError: if there are no scenes, two have the same name, or another batch works in `out`.
-        OSError: if `out` cannot be written to.
+        ValueError: if there are no scenes, two have the same name, a run would be in the folder of a scene, a link is in the
+            way, or another batch works in the folder `out`. A URL has no lock: start one batch at a time.
+        OSError: if `out` cannot be written to, or a run's `state.json`, `log.txt` or `scores.json` was written by something
+            else (FileExistsError).
     """
-    if not callable(at_once):
-        check_range("at_once", at_once, 1)
+    limit(at_once)
     options, entries = options or BatchOptions(), as_entries(scenes)
-    local = None if is_url(str(out)) else check_output("out", out, "a folder").absolute()
+    local = check_runs(entries, out)
     root = str(out).rstrip("/") if local is None else str(local)
     jobs = {entry.name: Job(entry.source, f"{root}/{entry.name}", options) for entry in entries}
     with nullcontext() if local is None else locked(local, LOCK):
@@ -170,6 +171,15 @@ def run_batch(
     return [SceneResult(row.name, row.value, row.failure, sum(row.seconds.values())) for row in rows]
 
 
+def check_runs(entries: Sequence[SceneEntry], out: str | Path) -> Path | None:
+    """Check before the work that runs can be written; the folder `out`, or None if it is a URL."""
+    check_apart(entries, out)
+    if is_url(str(out)):
+        return None
+    written = [f"{entry.name}/{folder}" for entry in entries for folder in WRITTEN]
+    return check_output("out", out, "a folder", inside=written).absolute()
+
+
 def _plan(job: Job) -> Generator[tuple[str, list[Task]], list[Any], Any]:
     """The stages of a scene that are not done yet."""
     from . import stages  # torch and all, which the options of a command do not need
@@ -180,7 +190,7 @@ def _plan(job: Job) -> Generator[tuple[str, list[Task]], list[Any], Any]:
         if job.options.teacher is not None and "features" not in done:
             pictures, share = found["pictures"], job.options.share
             parts = [pictures[i : i + share] for i in range(0, len(pictures), share)]
-            yield "features", [Task(stages.encode_part, (job, i, part)) for i, part in enumerate(parts)]
+            yield "features", [Task(stages.encode_part, (job, part)) for part in parts]
             stems = [stem for stem, _ in pictures]
             yield "features", [Task(stages.join_parts, (job, keys["features"], stems))]
         done["fit"] = (yield "fit", [Task(stages.fit, (job, keys["fit"]))])[0]
@@ -203,6 +213,9 @@ class _Record:
 
     def begin(self, retry_failed: bool) -> bool:
         """Read what an earlier batch left; whether its failure is to be forgotten."""
+        self.place.check_own(STATE, lambda text: parse_json(text)["format"] == FORMAT)
+        self.place.check_own(LOG, lambda text: LOGGED.match(text) is not None)
+        self.place.check_own("scores.json", lambda text: parse_json(text)["command"] == WRITER)
         self._log = self.place.read_text(LOG) or ""
         before = self.place.read_json(STATE)
         failure = before.get("failure") if before.get("format") == FORMAT else None

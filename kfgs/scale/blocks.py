@@ -17,13 +17,16 @@ import torch
 
 from .._check import as_array, check_whole
 from .._files import as_path, check_inside, check_output, digest_file, locked, read_json, real_path, write_json
+from .._rows import unit_rows
 from ..features import FeatureFolder
 from ..fields import SemanticField, sample_latents, select_gaussians
 from ..formats import SplatFile, read_splats, write_splats
+from ..formats.folders import splat_file_of
 from ..pipeline import FitConfig, fit_scene
-from ..quant import LinearLatents
+from ..pipeline.stages import digest_tensors
+from ..quant import FeatureMaps, LinearLatents
 from ..scenes import Scene, SceneError, load_scene
-from ..scenes.blocks import Block, partition, write_part
+from ..scenes.blocks import Block, partition, write_parts
 from ..scenes.load import find_model
 from .batch import map_scenes
 from .in_blocks import BLOCKS, CORE, FACTS, FORMAT, FieldInBlocks, read_blocks
@@ -32,6 +35,7 @@ LATENTS, SPLAT = "latents.safetensors", "splat.ply"
 RUN = ".run"  # hidden: its field has the Gaussians of the reach, too, and `kfgs search` must not count them
 BESIDE = ("classes.json", "text.npy", "text.safetensors", "labels", "labels_scored")
 """Files and folders of a scene that belong to each of its blocks, too."""
+LOOKED_AT = 8  # maps, to say how well given latents fit
 REACH = 3.0  # standard deviations: farther out, a Gaussian is below 1/255 of any pixel
 
 
@@ -42,7 +46,7 @@ def split_scene(
     *,
     features: str | Path | None = None,
     splat: str | Path | None = None,
-    latents: int = 32,
+    latents: int | str | Path | LinearLatents = 32,
     report: Callable[[str], None] | None = None,
 ) -> list[Block]:
     """Cut a scene into blocks, each a scene folder of its own that `fit_block` or any command takes.
@@ -55,7 +59,8 @@ def split_scene(
         count: of blocks.
         features: folder of feature maps; None: SCENE/features.
         splat: Gaussians of the whole scene; each block gets those that it needs. None: each block trains its own.
-        latents: numbers per Gaussian, in all blocks.
+        latents: numbers per Gaussian, in all blocks; or latents that exist, or their file (`latents.safetensors` of other
+            blocks): then the fields of both scenes mean the same, and can be joined. The teacher must be the same.
         report: called with a line per block.
 
     Returns:
@@ -65,15 +70,20 @@ def split_scene(
         SceneError: as `scenes.partition`.
         FileNotFoundError: if views have no maps.
         ValueError: if OUT holds another scene's blocks, or was cut from other maps, another splat or in another way; if another
-            process cuts there; if OUT is the scene, or lies among its maps.
+            process cuts there; if OUT is the scene, or lies among its maps; if given latents do not fit to the maps.
     """
     source, say = as_path(scene), report or (lambda text: None)
     maps_folder = source / "features" if features is None else as_path(features)
     out = check_output("out", out, "a folder", apart=[maps_folder], other=[source])
-    check_whole("latents", latents, 1)
+    if isinstance(latents, str | Path):
+        latents = LinearLatents.load(latents)
+    elif not isinstance(latents, LinearLatents):
+        check_whole("latents", latents, 1)
     whole = load_scene(source)
     cloud = None if splat is None else read_splats(splat)
     maps = FeatureFolder(maps_folder).of(whole, "train")
+    if isinstance(latents, LinearLatents):
+        say(_fit_of(latents, maps))
     model = find_model(source)
     if model is None:
         raise SceneError(f"scene: expected a folder with a COLMAP model, got {source}; make one with `kfgs sfm`")
@@ -83,8 +93,8 @@ def split_scene(
         "version": 1,
         "scene": os.path.relpath(source, out),
         "features": os.path.relpath(real_path(maps_folder), real_path(out)),
-        "splat": None if splat is None else digest_file(splat),
-        "latents": latents,
+        "splat": None if splat is None else digest_file(splat_file_of(splat)),
+        "latents": digest_tensors(latents.basis) if isinstance(latents, LinearLatents) else latents,
         "blocks": [b.to_json() for b in blocks],
     }
     _check_same(out, facts)
@@ -98,19 +108,38 @@ def split_scene(
     with locked(out, ".blocks.lock"):
         _check_same(out, facts)
         write_json(out / BLOCKS, facts)  # first, so that another cut is refused even if this one is killed
-        sample_latents(maps, count=latents).save(out / LATENTS)
+        known = latents if isinstance(latents, LinearLatents) else sample_latents(maps, count=latents)
+        known.save(out / LATENTS)
+        write_parts(model, {out / block.name / "sparse/0": block.views for block in blocks})
         for block in blocks:
             _write_block(out / block.name, block, whole, maps_folder, cloud)
             say(f"{block.name}: {len(block.views)} views")
     return blocks
 
 
+def _fit_of(latents: LinearLatents, maps: FeatureMaps) -> str:
+    """A line about how well given latents fit to the features of some maps; a ValueError if they have other channels."""
+    views = range(0, len(maps), max(1, len(maps) // LOOKED_AT))
+    own = sample_latents([maps[i] for i in views], count=latents.latent)
+    if own.dim != latents.dim:
+        raise ValueError(
+            f"latents: expected those of features with {own.dim} channels, as the maps have, got {latents.dim} channels; "
+            "give latents of the same teacher"
+        )
+    given, best = (_held(one, [maps[i] for i in views]) for one in (latents, own))
+    return f"the given latents hold {given:.1%} of the features here; {latents.latent} of this scene's own would hold {best:.1%}"
+
+
+def _held(latents: LinearLatents, maps: list[torch.Tensor]) -> float:
+    """The share of unit features, by squared length, that latents hold; pixels without a feature do not count."""
+    rows = unit_rows(torch.cat([one.flatten(0, 1).float() for one in maps]))
+    known = rows[rows.any(1)]
+    return float(latents.encode(known).square().sum() / len(known))
+
+
 def _write_block(folder: Path, block: Block, whole: Scene, maps_folder: Path, cloud: SplatFile | None) -> None:
-    """Make the scene folder of a block."""
+    """Make the scene folder of a block, which has its model already."""
     assert whole.folder is not None
-    model = find_model(whole.folder)
-    assert model is not None
-    write_part(model, block.views, folder / "sparse" / "0")
     _link(folder / "images", _picture_folder(whole))
     _link(folder / "features", maps_folder)
     for name in BESIDE:

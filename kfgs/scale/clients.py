@@ -4,16 +4,32 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from .._check import check_range
+from .._check import check_whole
 
 START = "60s"  # to wait for a scheduler
 WALLTIME = "24:00:00"  # of a Slurm job; a batch goes on after it ended
+
+
+def check_workers(scheduler: str | None, workers: int | None, slurm: str | None, threads: int) -> None:
+    """Check options of `open_client`, which starts nothing before.
+
+    Raises:
+        ValueError: if both a scheduler and workers or Slurm are given, or a number is less than 1.
+    """
+    if workers is not None:
+        check_whole("workers", workers, 1)
+    check_whole("threads", threads, 1)
+    if scheduler is not None and (workers is not None or slurm is not None):
+        raise ValueError(
+            "scheduler: expected none with workers or slurm, which start their own, got both; leave one out"
+        )
 
 
 @contextmanager
@@ -39,19 +55,19 @@ def open_client(
 
     Raises:
         ImportError: if Dask, or for Slurm dask-jobqueue, is missing.
-        ValueError: if both a scheduler and workers or Slurm are given.
+        ValueError: see `check_workers`.
         OSError: if the scheduler does not answer, or there is no Slurm.
     """
-    if scheduler is not None and (workers is not None or slurm is not None):
-        raise ValueError(
-            "scheduler: expected none with workers or slurm, which start their own, got both; leave one out"
-        )
-    if workers is not None:
-        check_range("workers", workers, 1)
+    check_workers(scheduler, workers, slurm, threads)
     try:
+        from dask.utils import parse_bytes
         from distributed import Client, LocalCluster
     except ImportError as error:
         raise ImportError(f"batch: expected Dask, got {error}; pip install 'kfgs[scale]'") from error
+    try:
+        parse_bytes(memory)
+    except ValueError as error:
+        raise ValueError(f"memory: expected a size such as 16GB, got {memory!r}; write it so") from error
     if scheduler is not None:
         try:
             client = Client(scheduler, timeout=START, set_as_default=False)
@@ -89,6 +105,8 @@ def _slurm(partition: str, threads: int, memory: str, scheduler: dict[str, Any])
     finally:
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, before)  # the package replaces it: Ctrl-C would be an exit with code 0
+    if shutil.which("sbatch") is None:
+        raise OSError("slurm: expected Slurm's sbatch on this machine, got none; start it where jobs are submitted")
     return SLURMCluster(
         queue=partition,
         cores=1,  # Dask's threads: one task at a time

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from .._card import error_line
+from .._check import check_whole
 
 AGAIN = 3
 """How often a task is submitted again after its worker died."""
@@ -138,11 +139,12 @@ def drive(
         report: called for each event, in this thread.
         at_once: scenes in progress at the same time; a function is asked each time, for workers that come and go.
     """
+    most = limit(at_once)
     engine, waiting, lanes = _Submitter(client), list(plans.items())[::-1], list[_Lane]()
     try:
         while waiting or lanes:
             moved = False
-            while waiting and len(lanes) < (at_once() if callable(at_once) else at_once):
+            while waiting and len(lanes) < most():
                 lane = _Lane(*waiting.pop())
                 if _advance(lane, None, engine, report):
                     lanes.append(lane)
@@ -159,6 +161,23 @@ def drive(
             with suppress(Exception):
                 future.cancel()
         engine.close()
+
+
+def limit(at_once: int | Callable[[], int]) -> Callable[[], int]:
+    """How many scenes may be in progress, as a function.
+
+    Raises:
+        ValueError: if it is no whole number, or less than 1; a function may say 0, for instance before workers have come.
+    """
+    if not callable(at_once):
+        check_whole("at_once", at_once, 1)
+
+    def asked() -> int:
+        most = at_once() if callable(at_once) else at_once
+        check_whole("at_once", most, 0)
+        return most
+
+    return asked
 
 
 def _advance(lane: _Lane, results: list[Any] | None, engine: _Submitter, report: Callable[[Event], None]) -> bool:

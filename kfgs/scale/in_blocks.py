@@ -46,7 +46,7 @@ class FieldInBlocks:
 
         Raises:
             FileNotFoundError: if there are no blocks, or one was not fitted.
-            ValueError: if a file is damaged.
+            ValueError: if a file is damaged, or no block has a Gaussian.
         """
         folder = as_path(folder)
         blocks, counts, boxes = [], [], []
@@ -61,10 +61,18 @@ class FieldInBlocks:
                     blocks.append(block)
                     counts.append(int(facts["gaussians"]))
                     boxes.append((low, high))
+        if not blocks:
+            raise ValueError(f"{folder}: expected blocks with Gaussians, got none; was the splat one of another scene?")
         return FieldInBlocks(folder, tuple(blocks), tuple(counts), tuple(boxes))
 
     def __len__(self) -> int:
         return sum(self.counts)
+
+    @property
+    def extent(self) -> tuple[list[float], list[float]]:
+        """Low and high corner of the box around all Gaussians, world units."""
+        low, high = (np.array(corners) for corners in zip(*self.boxes, strict=True))
+        return low.min(0).tolist(), high.max(0).tolist()
 
     def field(self, name: str) -> SemanticField:
         """The core of one block, read now."""
@@ -95,21 +103,27 @@ class FieldInBlocks:
         """The Gaussians whose centres lie in a box, as one field; only blocks that touch the box are read.
 
         Args:
-            low: [3] corner, world units.
-            high: [3] corner.
+            low: [3] corner, world units; -inf: no limit on this side.
+            high: [3] corner; inf: no limit.
 
         Raises:
-            ValueError: if there is no Gaussian.
+            ValueError: if low is above high, or there is no Gaussian; a box that no block touches is refused before a field is
+                read.
         """
         corners = np.array([low, high], np.float64)
-        if corners.shape != (2, 3) or not np.isfinite(corners).all():
-            raise ValueError(f"low, high: expected three finite numbers each, got {list(low)} and {list(high)}")
+        if corners.shape != (2, 3) or np.isnan(corners).any():
+            raise ValueError(f"low, high: expected three numbers each, got {list(low)} and {list(high)}")
+        for axis, first, last in zip("xyz", *corners.tolist(), strict=True):
+            if first > last:
+                raise ValueError(
+                    f"low, high: expected a low corner and then a high one, got {axis} from {first:g} down to {last:g}; "
+                    "exchange the two numbers"
+                )
         parts = self._touching(*corners)
         if not parts:
-            around = np.min([box[0] for box in self.boxes], 0), np.max([box[1] for box in self.boxes], 0)
             raise ValueError(
-                f"low, high: expected a box with Gaussians, got none from {list(low)} to {list(high)}; they lie from "
-                f"{around[0].round(2).tolist()} to {around[1].round(2).tolist()}"
+                "low, high: expected a box with Gaussians, got one with none; all Gaussians lie in "
+                f"{in_numbers(self.extent)}; choose a part of that box"
             )
         return self._join(parts)
 
@@ -161,9 +175,18 @@ class FieldInBlocks:
         return labels
 
 
+def in_numbers(box: tuple[list[float], list[float]]) -> str:
+    """A box as `kfgs join --box` takes it."""
+    return ",".join(f"{x:.4g}" for corner in box for x in corner)
+
+
 def read_blocks(folder: Path) -> list[Block]:
     """The blocks that `split_scene` wrote to a folder; a ValueError or FileNotFoundError if there are none."""
     file = folder / BLOCKS
+    if not file.is_file():
+        raise FileNotFoundError(
+            f"{file}: no such file; expected the folder of a scene in blocks, which `kfgs blocks` made"
+        )
     found = read_json(file)
     with reading(file, "the blocks of a scene", "cut the scene again with split_scene"):
         if (found["format"], found["version"]) != (FORMAT, 1):

@@ -8,7 +8,7 @@ from dataclasses import field as default
 from pathlib import Path
 from typing import Any
 
-from .._check import check_range
+from .._check import check_whole
 from .._files import as_path
 from ..pipeline import FitConfig
 from ..scenes import SfmConfig
@@ -40,9 +40,9 @@ class BatchOptions:
     """Delete a scene's feature maps when its field is made."""
 
     def __post_init__(self) -> None:
-        check_range("share", self.share, 1)
-        check_range("threads", self.threads, 1)
-        check_range("pictures", self.pictures, 0)
+        check_whole("share", self.share, 1)
+        check_whole("threads", self.threads, 1)
+        check_whole("pictures", self.pictures, 0)
         for name in ("weights", "text"):  # workers run in other folders
             given = getattr(self, name)
             if given is not None and as_path(given).exists():

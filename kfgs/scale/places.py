@@ -11,9 +11,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from .._files import atomic_path, parse_json
+from .._files import atomic_path, check_own, foreign, parse_json, real_path
 from .scene_list import is_url
 
+WRITER = "kfgs batch"
 LOCAL_ONLY = ("digests.json",)  # a run's notes about files of this machine
 STAMPS = ("ETag", "etag", "md5Hash", "content_md5", "mtime", "LastModified", "last_modified", "created")
 """What file systems of fsspec say about a file's version; each has some of them."""
@@ -27,15 +28,33 @@ class Place:
         """Where its files are, or their copies."""
 
     def listing(self) -> dict[str, list[Any]]:
-        """[bytes, version] of each file by its relative name, without hidden ones; a changed file has another version."""
+        """[bytes, version] of each file by its relative name, without hidden ones; a changed file has another version.
+
+        Links are followed, but each folder is listed once: a second link to it, or one that leads back, is left out.
+        """
         found: dict[str, list[Any]] = {}
+        seen = {real_path(self.path)}
         for here, folders, names in os.walk(self.path, followlinks=True):
-            folders[:] = [name for name in folders if not name.startswith(".")]
+            inside = sorted(Path(here) / name for name in folders if not name.startswith("."))
+            folders.clear()
+            for folder in sorted(inside, key=Path.is_symlink):  # links last: they may lead to a folder beside them
+                if (real := real_path(folder)) not in seen:
+                    seen.add(real)
+                    folders.append(folder.name)
             for file in (Path(here) / name for name in names if not name.startswith(".")):
-                with suppress(FileNotFoundError):  # a broken link
-                    info = file.stat()
-                    found[file.relative_to(self.path).as_posix()] = [info.st_size, info.st_mtime_ns]
+                if (mark := _mark(file)) is not None:  # else a broken link
+                    found[file.relative_to(self.path).as_posix()] = mark
         return dict(sorted(found.items()))
+
+    def marks(self, names: Iterable[str], listing: dict[str, list[Any]] | None = None) -> list[list[Any]]:
+        """[name, bytes, version] of files, for a key; a file that does not exist has neither.
+
+        Args:
+            names: relative or absolute.
+            listing: of this place, if there is one already.
+        """
+        known = self.listing() if listing is None else listing
+        return [[name, *(known.get(name) or _mark(self.path / name) or [None])] for name in sorted(names)]
 
     def fetch(self, wanted: Callable[[str], bool]) -> None:
         """Copy the files whose relative names are wanted to `path`, if they are elsewhere."""
@@ -62,6 +81,10 @@ class Place:
     def remove(self, name: str) -> None:
         """Delete a file, if it is there."""
         (self.path / name).unlink(missing_ok=True)
+
+    def check_own(self, name: str, ours: Callable[[str], bool]) -> None:
+        """Check that a text may be replaced: there is none, or `kfgs batch` wrote it, see `_files.check_own`."""
+        check_own(self.path / name, lambda path: ours(path.read_text(encoding="utf-8")), WRITER)
 
     def read_json(self, name: str) -> dict[str, Any]:
         """A JSON object that a batch wrote; an empty one if there is none, or it is damaged."""
@@ -91,7 +114,7 @@ class StoredPlace(Place):
                 f"{url}: expected a kind of URL that fsspec can open ({error}); pip install 'kfgs[scale]', and for s3:// s3fs, "
                 "for gs:// gcsfs, for abfs:// adlfs"
             ) from error
-        self.root = root.rstrip("/")
+        self.url, self.root = url.rstrip("/"), root.rstrip("/")
         self._before: dict[str, list[Any]] = {}
 
     def _at(self, name: str) -> str:
@@ -142,6 +165,16 @@ class StoredPlace(Place):
         """See `Place.write_text`; an object store shows an object when it is whole."""
         self.files.pipe_file(self._at(name), text.encode("utf-8"))
 
+    def check_own(self, name: str, ours: Callable[[str], bool]) -> None:
+        """See `Place.check_own`."""
+        try:
+            text = self.read_text(name)
+            known = text is None or ours(text)
+        except (ValueError, LookupError, TypeError):
+            known = False
+        if not known:
+            raise foreign(f"{self.url}/{name}", WRITER)
+
     def remove(self, name: str) -> None:
         """See `Place.remove`."""
         with suppress(FileNotFoundError):
@@ -167,6 +200,10 @@ def inside(*places: str) -> Callable[[str], bool]:
     return lambda name: any(name == place or name.startswith(folder) for place, folder in chosen)
 
 
-def marks_of(listing: dict[str, list[Any]], names: Iterable[str]) -> list[list[Any]]:
-    """[name, bytes, version] of files, in a key; a file that is not listed has no version."""
-    return [[name, *listing.get(name, [None])] for name in sorted(names)]
+def _mark(file: Path) -> list[Any] | None:
+    """[bytes, version] of a file; None if there is none."""
+    try:
+        info = file.stat()
+    except OSError:  # none, or a link to itself
+        return None
+    return [info.st_size, info.st_mtime_ns]

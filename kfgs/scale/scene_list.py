@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from .._check import one_line
-from .._files import as_path
+from .._files import as_path, real_path
 
 SHOWN = 5  # lines named in an error
 NAME = re.compile(r"[^\s./\\][^/\\\0-\x1f]*")  # a folder of that name can be made anywhere, and is not hidden
@@ -44,10 +44,10 @@ def read_scenes(path: str | Path) -> list[SceneEntry]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected a list of scenes, a folder or an URL per line")
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()  # Windows begins it with a mark
     except UnicodeDecodeError as error:
         raise ValueError(
-            f"{path}: expected a list of scenes in UTF-8, got other bytes ({error}); save it as text"
+            f"{path}: expected a list of scenes in UTF-8, got other bytes ({error}); save it as UTF-8"
         ) from error
     numbered = [(number, re.sub(r"(^|\s)#.*", "", line).strip()) for number, line in enumerate(lines, start=1)]
     found = {number: _entry(line, path.parent) for number, line in numbered if line}
@@ -95,6 +95,28 @@ def as_entries(scenes: Iterable[str | Path | SceneEntry]) -> list[SceneEntry]:
             f"scenes: expected scenes, each with a name of its own, got {got}; pass SceneEntry(name, source)"
         )
     return entries
+
+
+def check_apart(entries: Iterable[SceneEntry], out: str | Path) -> None:
+    """Check that no run, `out/<name>`, is the folder of a scene or lies in one: a scene stays as it is.
+
+    Raises:
+        ValueError: if one does.
+    """
+    entries, root = list(entries), _spot(str(out))
+    scenes = {_spot(entry.source) for entry in entries}
+    for run in (root / entry.name for entry in entries):
+        scene = next((place for place in (run, *run.parents) if place in scenes), None)
+        if scene is not None:
+            raise ValueError(
+                f"out: expected a place apart from all scenes, got {out}, so that {run.name!r} would be written to the scene "
+                f"{scene}; give another"
+            )
+
+
+def _spot(place: str) -> PurePath:
+    """A place that can be compared; links are followed."""
+    return PurePath(place) if is_url(place) else real_path(place)
 
 
 def _entry(line: str, folder: Path) -> SceneEntry:

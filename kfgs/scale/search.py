@@ -30,10 +30,10 @@ class SearchIndex:
     Every Gaussian is known by its word in a `SharedCodebook`, one for each teacher. The index holds where the words are in
     each field, and each field's answers about its own classes. `update` extends it when fields are new or have changed.
 
-    Example, with fields of `kfgs fit` below the folder runs:
+    Example, with fields of `kfgs fit` below the folder runs::
 
         index = SearchIndex.open("runs")
-        index = index.update(progress=True)
+        index, changes = index.update(progress=True)
         for scene in index.search("chair").scenes:
             print(scene.path, scene.count, scene.parts[0].center, scene.parts[0].view)
     """
@@ -47,12 +47,12 @@ class SearchIndex:
 
         Raises:
             NotADirectoryError: if there is no such folder.
-            ValueError: if the file is damaged, or of another version.
+            ValueError: if the file is damaged, or of another version, or no file.
         """
         folder = as_path(folder)
         if not folder.is_dir():
             raise NotADirectoryError(f"folder: expected a folder with runs or fields in it, got {folder}; name another")
-        return cls(folder, read_index(folder / NAME) if (folder / NAME).is_file() else Contents())
+        return cls(folder, read_index(folder / NAME))
 
     @property
     def file(self) -> Path:
@@ -71,11 +71,13 @@ class SearchIndex:
         return f"SearchIndex({self.folder}: {len(self)} fields, {sum(len(one.words) for one in self.contents.spaces)} words)"
 
     def is_current(self) -> bool:
-        """Whether the fields below the folder are those of the index, unchanged (by size and time, then by digest)."""
-        from .search_state import compare_fields
+        """Whether the fields below the folder are those of the index, with the same sizes and times.
 
-        state = compare_fields(self.folder, self.contents)
-        return not (state.changed or state.removed)
+        If not, `update` reads what differs, by digest; a copied or touched field is the same, and gets its new time.
+        """
+        from .search_state import is_current
+
+        return is_current(self.folder, self.contents)
 
     def update(
         self, *, progress: bool = False, report: Callable[[str], None] | None = None

@@ -167,17 +167,18 @@ def write_index(path: Path, contents: Contents) -> None:
 
 
 def read_index(path: Path) -> Contents:
-    """Read what `write_index` wrote. Numbers are checked before they are used as places.
+    """Read what `write_index` wrote; nothing, if there is no file. Numbers are checked before they are used as places.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is another file, damaged, or of another version; the message says what to do.
+        ValueError: if it is something else, damaged, or of another version; the message says what to do.
     """
     from safetensors import SafetensorError, safe_open
 
     advice = "delete it, and the next search makes it again"
+    if not path.exists():
+        return Contents()
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected a kfgs {KIND} there")
+        raise ValueError(f"{path}: expected a kfgs {KIND}, or nothing there, got a folder; move it away")
     try:
         with safe_open(str(path), framework="np") as file:
             stated = parse_json((file.metadata() or {})["kfgs"])
@@ -191,8 +192,10 @@ def read_index(path: Path) -> Contents:
         raise ValueError(
             f"{path}: expected a kfgs {KIND}, but it is damaged ({ascii(why)[1:160]}); {advice}"
         ) from error
-    got = f"version {version!r:.20}" if kind == KIND else f"{kind!r:.40}"
-    raise ValueError(f"{path}: expected a kfgs {KIND}, version {VERSION}, got {got}; {advice}")
+    got, other = f"version {version!r:.20}", f"use the kfgs that wrote it, or {advice}"
+    if kind != KIND:
+        got, other = f"{kind!r:.40}", "move it away"
+    raise ValueError(f"{path}: expected a kfgs {KIND}, version {VERSION}, got {got}; {other}")
 
 
 def _contents(tensors: dict[str, Array]) -> Contents:

@@ -17,12 +17,13 @@ from ..labels import LabelSet
 from .search_entry import describe
 from .search_file import NAME, Contents, Entry, Space, Table, Unread, read_index, write_index
 from .search_found import Changes
-from .search_state import compare_fields, mark_of
+from .search_state import Marked, compare_fields
 from .search_words import find_space, teacher_of
 from .shared_codebook import TOLERANCE, SharedCodebook
 
 LOCK = ".search.lock"
-EVERY = 20.0  # seconds between two writes of a long update
+EVERY, SHARE = 20.0, 0.05
+"""A long update writes after so many seconds, but spends at most this share of its time on it: the file may be large."""
 
 
 def update_index(
@@ -31,40 +32,41 @@ def update_index(
     """See `SearchIndex.update`. The file is read again under the lock: another process may have extended it."""
     file, say = folder / NAME, report or (lambda text: None)
     with locked(folder, LOCK):
-        contents = read_index(file) if file.is_file() else Contents()
+        contents = read_index(file)
         state = compare_fields(folder, contents)
         moved = any(contents.entries[name].mark != entry.mark for name, entry in state.same.items())
         contents = Contents(list(contents.spaces), list(contents.tables), dict(state.same), dict(state.unread))
-        added, failed, written = list[str](), dict[str, str](), time.monotonic()
-        for name, path in tqdm(state.changed.items(), desc="index", unit="field", disable=not progress):
+        added, failed, due = list[str](), dict[str, str](), time.monotonic() + EVERY
+        for name, found in tqdm(state.changed.items(), desc="index", unit="field", disable=not progress):
             try:
-                contents.entries[name] = add_field(contents, name, path)
+                contents.entries[name] = add_field(contents, name, found)
                 added.append(name)
             except (OSError, ValueError, TypeError) as error:
                 failed[name] = error_line(error)
-                contents.unread[name] = Unread(mark_of(path)[1], failed[name])
-                say(f"{path} is left out: {failed[name]}")
-            if time.monotonic() - written > EVERY:
+                contents.unread[name] = Unread(found.mark, failed[name])
+                say(f"{found.path} is left out: {failed[name]}")
+            start = time.monotonic()
+            if start > due:
                 write_index(file, contents)
-                written = time.monotonic()
+                end = time.monotonic()
+                due = end + max(EVERY, (end - start) / SHARE)
         if added or failed or moved or state.removed:
             write_index(file, contents)
     return contents, Changes(tuple(added), state.removed, failed)
 
 
-def add_field(contents: Contents, name: str, path: Path) -> Entry:
+def add_field(contents: Contents, name: str, found: Marked) -> Entry:
     """Describe a field in the words of its teacher's space; the space, and the table of its classes, are added if new."""
-    file, mark = mark_of(path)
-    sha256 = digest_file(file)  # before it is read: if it changes meanwhile, the next update reads it again
-    field = SemanticField.load(path)
+    sha256 = digest_file(found.file)  # before it is read: if it changes meanwhile, the next update reads it again
+    field = SemanticField.load(found.path)
     classes = _classes_of(field)
     space = _space_of(contents, field)
     one = contents.spaces[space]
-    found = describe(field, SharedCodebook(torch.from_numpy(one.words), one.tolerance), classes)
-    contents.spaces[space] = Space(one.teacher, one.tolerance, found.book.words.cpu().float().numpy())
+    described = describe(field, SharedCodebook(torch.from_numpy(one.words), one.tolerance), classes)
+    contents.spaces[space] = Space(one.teacher, one.tolerance, described.book.words.cpu().float().numpy())
     table = None if classes is None else _table_of(contents, space, classes)
     views = tuple(camera.name for camera in field.cameras)
-    return Entry(name, mark, sha256, len(field), space, table, views, found.outside, found.rows)
+    return Entry(name, found.mark, sha256, len(field), space, table, views, described.outside, described.rows)
 
 
 def _classes_of(field: SemanticField) -> LabelSet | None:

@@ -15,10 +15,11 @@ from torch import Tensor
 from .._check import as_tensor, check_whole, one_line
 from .._rows import unit_embeddings
 from ..fields import SemanticField
-from ..labels import LabelSet, connected_parts, select_by_similarity
+from ..labels import LabelSet, Score, connected_parts, select_by_similarity
 from ..labels.label_set import teacher_difference
 from ..labels.parts import SPECK
 from ..labels.questions import make_question
+from ..labels.scores import similarity_threshold
 from .search_file import Array, Contents, Entry, Table
 from .search_found import PartFound, SceneFound, part_found, ranked, scene_found
 
@@ -32,28 +33,30 @@ def ask_words(
 ) -> tuple[list[SceneFound], dict[str, str]]:
     """What the words say about some fields, and the fields that cannot be asked. Errors are those of `SearchIndex.search`.
 
-    Fields of one space that are asked with the same classes share the words' cosines.
+    Fields of one space that are asked with the same classes share the words' scores.
     """
     if not isinstance(target, str):
         target = as_tensor("target", target, floating=True)
     found, unasked, errors = list[SceneFound](), dict[str, str](), list[ValueError]()
-    cosines: dict[tuple[int, int | None], tuple[Tensor, Tensor | None] | ValueError] = {}
+    scores: dict[tuple[int, int | None], tuple[Tensor, float | None] | ValueError] = {}
     for entry in entries:
         table = None if classes is not None else table_to_ask(contents, entry, target)
         key = (entry.space, table)
-        if key not in cosines:
+        if key not in scores:
             try:
                 asked = classes if table is None else label_set(contents.tables[table])
-                cosines[key] = _word_cosines(contents, entry.space, target, asked, options["negatives"])
+                cosines = _word_cosines(contents, entry.space, target, asked, options["negatives"])
             except ValueError as error:
-                cosines[key] = error
-        known = cosines[key]
+                scores[key] = error
+            else:
+                scores[key] = _word_scores(*cosines, options["threshold"], options["score"])
+        known = scores[key]
         if isinstance(known, ValueError):
             unknown = isinstance(target, str) and str(known).startswith("class")
             unasked[entry.path] = f"no class {target!r}" if unknown else one_line(known, 160)
             errors.append(known)
         else:
-            found.append(_word_answer(entry, *known, options))
+            found.append(_word_answer(entry, *known))
     if errors and not found and len(unasked) == len(contents.entries):
         raise errors[0]
     return found, unasked
@@ -164,17 +167,22 @@ def _word_cosines(
     return near, None if asked.negatives is None else words @ unit_embeddings(asked.negatives.to(words), "negatives").T
 
 
-def _word_answer(entry: Entry, near: Tensor, others: Tensor | None, options: dict[str, Any]) -> SceneFound:
+def _word_scores(
+    near: Tensor, others: Tensor | None, threshold: float | None, score: Score | None
+) -> tuple[Tensor, float | None]:  # [K]
+    """The score of each word, and gamma; None if gamma follows from the scores of a field's Gaussians."""
+    found = select_by_similarity(near, others, threshold, score=score)
+    relevant = others is not None and score in (None, "relevancy")
+    return found.scores, found.threshold if relevant or threshold is not None else None
+
+
+def _word_answer(entry: Entry, scores: Tensor, gamma: float | None) -> SceneFound:  # scores [K]
     """The atoms whose word is selected, joined to parts."""
     atoms = entry.rows["atoms"]
-    counts = torch.from_numpy(atoms["count"].astype(np.int64))
-    word = torch.from_numpy(atoms["word"].astype(np.int64))
-    each = torch.repeat_interleave(torch.arange(len(word)), counts)  # a threshold may follow from all Gaussians' scores
-    rows = word[each]
-    options = {"threshold": options["threshold"], "score": options["score"]}
-    selected = select_by_similarity(near[rows], None if others is None else others[rows], **options)
-    first = counts.cumsum(0) - counts
-    mask, score = selected.mask[first].numpy(), selected.scores[first].double().numpy()
+    own = scores[torch.from_numpy(atoms["word"].astype(np.int64))]
+    if gamma is None:
+        gamma = similarity_threshold(own.repeat_interleave(torch.from_numpy(atoms["count"].astype(np.int64))))[0]
+    mask, score = (own > gamma).numpy(), own.double().numpy()
     total = int(atoms["count"][mask].sum())
     mean = float(np.average(score[mask], weights=atoms["count"][mask])) if total else 0.0
     return scene_found(entry, total, mean, False, _joined(entry, mask, score))

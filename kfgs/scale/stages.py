@@ -1,9 +1,9 @@
 """The stages of a scene, as tasks: functions of paths and plain values, which a worker imports and calls.
 
 Each stage calls the function that does it on one machine, and then writes `done/<stage>.json`: the key of its inputs, its result
-and its files. A task whose description is there, with this key and all files, returns the result at once. The description is
-deleted before the work and written last, so a killed task leaves nothing that counts as finished. Inputs are known by names,
-sizes and times; where only times differ, the stage's own cache, which goes by content, finds its work.
+and its files. A task whose description is there, with this key and all files, returns the result at once. While the stage is
+made, its description has no key, so a killed task leaves nothing that counts as finished. Inputs are known by names, sizes and
+times; where only times differ, the stage's own cache, which goes by content, finds its work.
 """
 
 from __future__ import annotations
@@ -19,10 +19,9 @@ from typing import Any
 
 import torch
 
-from .._files import InUseError, digest_value, read_json, write_json
+from .._files import InUseError, digest_value, foreign, read_json, write_json
 from ..evaluation import LabelSet
 from ..features import FeatureFolder, Picture, discard_maps, extract_features, join_features, pictures_of
-from ..features.manifest import manifest_file
 from ..fields import SemanticField
 from ..fields.remembered import CLASSES
 from ..labels import load_label_set
@@ -33,7 +32,7 @@ from ..scenes import Scene, SceneError, is_scene, link_images, list_images, load
 from ..teachers.load import load_teacher
 from ..teachers.protocol import Teacher, identify
 from .options import BatchOptions, Job
-from .places import Place, inside, marks_of, open_place
+from .places import WRITER, Place, inside, open_place
 
 PATIENCE = 120  # seconds to wait for a folder in which a process works that was taken for dead
 PROTOCOL = "kfgs-pooled/1"
@@ -50,10 +49,13 @@ def find_scene(job: Job, *, report: Report) -> dict[str, Any]:
         listing = source.listing()
         maps = inside("features") if job.options.teacher is not None else inside()
         source.fetch(lambda name: not maps(name))
-        keys = {"photos": _key(marks_of(listing, (name for name in listing if not maps(name))))}
+        keys = {"photos": _key(source.marks((name for name in listing if not maps(name)), listing))}
         if photos := _photos(source):
             config = job.options.sfm_config
             keys["sfm"] = _key(keys["photos"], asdict(config))
+            model = "scene/sparse/0"
+            if not out.read_json(_description("sfm")) and any(map(inside(model), out.listing())):
+                raise foreign(f"{job.out}/{model}", WRITER)
 
             def make() -> dict[str, Any]:
                 made = run_sfm(source.path / photos, out.path / "scene", config=config, replace=True)
@@ -84,9 +86,9 @@ def _keys_of(
     """The keys of the stages, each with everything that decides its result; and which of them are finished."""
     options, names = job.options, [name for _, name in pictures]
     if options.teacher is not None:
-        keys["features"] = _key(identify(_teacher(options)), marks_of(listing, names))
+        keys["features"] = _key(identify(_teacher(options)), source.marks(names, listing))
     else:
-        keys["features"] = _key(marks_of(listing, filter(inside("features"), listing)))
+        keys["features"] = _key(source.marks(filter(inside("features"), listing), listing))
     keys["fit"] = _key(keys["photos"], keys.get("sfm"), keys["features"], asdict(options.fit), version("kfgs"))
     words = _class_files(job, source) or []
     table = [[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in words] if options.text else []
@@ -97,21 +99,24 @@ def _keys_of(
     return {"keys": keys, "done": done}
 
 
-def encode_part(job: Job, part: int, pictures: list[list[str]], *, report: Report) -> dict[str, Any]:
-    """Encode some pictures, [stem, relative name] each, by the worker's teacher."""
+def encode_part(job: Job, pictures: list[list[str]], *, report: Report) -> dict[str, Any]:
+    """Encode some pictures, [stem, relative name] each, by the worker's teacher.
+
+    A part is called by its pictures, so that one of another division never has its name.
+    """
     with _work(job) as (source, out):
-        teacher, word = _teacher(job.options), f"{part:05d}"
-        key = _key(identify(teacher), marks_of(source.listing(), [name for _, name in pictures]))
+        teacher, word = _teacher(job.options), _key([stem for stem, _ in pictures])
+        key = _key(identify(teacher), source.marks(name for _, name in pictures))
         files = tuple(f"features/{stem}.npy" for stem, _ in pictures)
-        records = [f"features/{manifest_file(Path(), one).name}" for one in (None, word)]
 
         def make() -> dict[str, Any]:
+            out.fetch(_is_manifest)
             source.fetch(inside(*(name for _, name in pictures)))
             chosen = [Picture(stem, source.path / name) for stem, name in pictures]
             extract_features(teacher, chosen, out.path / "features", part=word, report=report)
             return {"maps": len(chosen)}
 
-        return _stage(out, f"features-{word}", key, files, (*records, *files), make)
+        return _stage(out, f"features-{word}", key, files, files, make)
 
 
 def join_parts(job: Job, key: str, stems: list[str], *, report: Report) -> dict[str, Any]:
@@ -119,7 +124,7 @@ def join_parts(job: Job, key: str, stems: list[str], *, report: Report) -> dict[
     with _work(job) as (_, out):
 
         def make() -> dict[str, Any]:
-            out.fetch(lambda name: name.startswith("features/") and name.endswith(".json"))
+            out.fetch(_is_manifest)
             join_features(out.path / "features", stems)
             return {"maps": len(stems)}
 
@@ -187,7 +192,7 @@ def score(job: Job, key: str, *, report: Report) -> dict[str, Any]:
                 encode=_classes(job, source),
                 truth=_truth(source),
                 images=images,
-                command="kfgs batch",
+                command=WRITER,
             )
             write_json(out.path / "scores.json", found.to_json())
             report(str(found))
@@ -202,6 +207,11 @@ def _work(job: Job) -> Iterator[tuple[Place, Place]]:
     torch.set_num_threads(job.options.threads)
     with open_place(job.source) as source, open_place(job.out) as out:
         yield source, out
+
+
+def _is_manifest(name: str) -> bool:
+    """Whether a file of a run is a manifest of maps, of all or of a part."""
+    return name.startswith("features/features.") and name.endswith(".json")
 
 
 def _key(*parts: Any) -> str:
@@ -233,7 +243,7 @@ def _stage(
     about = _finished(out, stage, key, out.listing())
     if about is not None:
         return {**about["result"], "reused": True}
-    out.remove(_description(stage))
+    out.write_json(_description(stage), {"key": None})  # begun: from now on, its files there are ours
     out.fetch(inside(*needs))
     result = _patiently(make)
     out.store()

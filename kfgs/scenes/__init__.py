@@ -3,7 +3,9 @@
 from ..cameras.bounds import Bounds, robust_bounds
 from .colmap_model import ColmapModel, read_model
 from .files import SceneError, file_stem, list_images, read_image
+from .known_poses import find_points, write_known_poses
 from .load import is_scene, load_scene
+from .pictures import convert_heic, extract_frames
 from .scene import Scene
 from .sfm import SfmConfig, link_images, run_sfm
 from .sfm_onto import extend_sfm
@@ -16,8 +18,11 @@ __all__ = [
     "Scene",
     "SceneError",
     "SfmConfig",
+    "convert_heic",
     "extend_sfm",
+    "extract_frames",
     "file_stem",
+    "find_points",
     "is_scene",
     "link_images",
     "list_images",
@@ -28,4 +33,5 @@ __all__ = [
     "robust_bounds",
     "run_sfm",
     "undistort_scene",
+    "write_known_poses",
 ]

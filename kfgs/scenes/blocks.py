@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -135,28 +136,37 @@ def partition(
     return blocks
 
 
-def write_part(model: str | Path, names: Iterable[str], folder: str | Path) -> None:
-    """Write a COLMAP model with some of the images of another, and the points that at least two of them see.
+def write_parts(model: str | Path, parts: Mapping[Path, Iterable[str]]) -> None:
+    """Write COLMAP models with some of the images of another, and the points that at least two of them see.
 
+    The model is read once, as that of a city has gigabytes; then memory holds it, and a copy from which one part is made.
     Images of one rig that were taken together stay together.
+
+    Args:
+        model: the folder of the model.
+        parts: the folder of each new model, with the names of its images.
 
     Raises:
         SceneError: if the model is damaged, or has no image of a name.
     """
-    model, wanted = as_path(model), set(names)
+    model = as_path(model)
     with (
         quiet_pycolmap() as pycolmap,
         scene_errors(f"{model}: expected a model that pycolmap can read", "write it again with COLMAP"),
     ):
         whole = pycolmap.Reconstruction(str(model))
-        missing = wanted - {image.name for image in whole.images.values()}
-        if missing:
-            raise SceneError(f"names: expected images of {model}, got {min(missing)!r}; correct the name")
-        kept = {image.frame_id for image in whole.images.values() if image.name in wanted}
-        for frame in {image.frame_id for image in whole.images.values() if image.has_pose} - kept:
-            whole.deregister_frame(frame)
-        with atomic_folder(folder) as place:
-            whole.write(str(place))
+        frames = {image.name: image.frame_id for image in whole.images.values()}
+        posed = {image.frame_id for image in whole.images.values() if image.has_pose}
+        for names in parts.values():
+            missing = set(names) - frames.keys()
+            if missing:
+                raise SceneError(f"parts: expected images of {model}, got {min(missing)!r}; correct the name")
+        for folder, names in parts.items():
+            part = copy.deepcopy(whole)
+            for frame in posed - {frames[name] for name in names}:
+                part.deregister_frame(frame)
+            with atomic_folder(folder) as place:
+                part.write(str(place))
 
 
 def _robust(points: Array) -> NDArray[np.bool_]:

@@ -103,7 +103,7 @@ def load_colmap(path: str | Path, images: str | Path) -> Scene:
     if extra:
         notes.append(f"{len(extra)} image files in {folder} have no pose in the model: {some(extra)}")
     if len(model.points) == 0:
-        notes.append("the model has no points: give the field other points to start from")
+        notes.append("no points: `kfgs fit` and `kfgs color` triangulate some from the poses before they train")
     points, colors = torch.from_numpy(model.points).float(), torch.from_numpy(model.colors)
     splits = {"train": list(range(len(found))), "test": []}
     paths = [folder / image.name for image in found]

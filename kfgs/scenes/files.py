@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 import warnings
@@ -19,6 +20,8 @@ from .._check import one_line
 from .._files import as_path, read_json
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
+HEIC_SUFFIXES = (".heic", ".heif")
+"""Of photographs by phones. Pillow reads them with pillow-heif only, and pycolmap never: `convert_heic` makes JPEGs of them."""
 ORIENTATION = 0x0112  # EXIF's tag
 PIXELS, SMALL, COLORS, PACKED = 1 << 27, 1 << 24, 9 << 20, 200
 """Most pixels of a picture (4 GB while it is read), and most for each byte of its file, which photos have about 10 of, beyond
@@ -127,6 +130,7 @@ def open_picture(
 
     Raises:
         FileNotFoundError: if there is no such file.
+        ImportError: if it is a HEIC file, and pillow-heif is not installed.
         SceneError: if it cannot be decoded, or states more than `PIXELS` pixels, or more than `small` and than `PACKED` for each
             of its bytes.
     """
@@ -136,15 +140,30 @@ def open_picture(
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our limits come next
+            if path.suffix.lower() in HEIC_SUFFIXES:
+                _allow_heic(path)
             picture = Image.open(path)
         with picture:
             width, height = picture.size
             if width * height > min(PIXELS, max(small, PACKED * path.stat().st_size)):
                 raise ValueError(f"{width}x{height} pixels in {path.stat().st_size} bytes are too many to be one")
             yield picture
+    except ImportError:
+        raise
     except Exception as error:  # hostile bytes raise almost anything, memory may be short
         why = one_line(error, 160) or type(error).__name__
         raise SceneError(f"{path}: expected {expected}, but it cannot be decoded ({why}); {advice}") from error
+
+
+def _allow_heic(path: Path) -> None:
+    """Let Pillow read HEIC files; an ImportError if pillow-heif is not installed."""
+    try:
+        importlib.import_module("pillow_heif").register_heif_opener()
+    except ImportError as error:
+        raise ImportError(
+            f"{path}: expected pillow-heif to read HEIC photographs, but it is not installed; run: pip install pillow-heif (or "
+            "save them as JPEG)"
+        ) from error
 
 
 def read_scene_json(path: str | Path, advice: str) -> Any:

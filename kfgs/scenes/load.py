@@ -9,10 +9,13 @@ from typing import Literal, NamedTuple
 
 from .._check import check_choice
 from .._files import as_path, real_path
+from ..formats.folders import newest_splat
 from .colmap import load_colmap
 from .colmap_model import has_model
 from .files import SceneError, natural_key, some
+from .inria import is_inria, load_inria
 from .llff import POSES, is_llff, load_llff
+from .polycam import is_polycam, load_polycam
 from .replica import is_nice_slam, is_semantic_nerf, load_nice_slam, load_semantic_nerf
 from .scannet import is_scannet, load_scannet
 from .scene import Scene
@@ -41,6 +44,8 @@ _LAYOUTS = (
     ),
     _Layout("ScanNet", "color/ and pose/", is_scannet, lambda path, _: load_scannet(path)),
     _Layout("LLFF (3D-OVS)", POSES, is_llff, load_llff),
+    _Layout("Polycam", "keyframes/ with cameras/ and images/", is_polycam, lambda path, _: load_polycam(path)),
+    _Layout("3DGS's output", "cameras.json and point_cloud/", is_inria, load_inria),
 )
 """Asked in this order, after COLMAP models and transforms.json: 3D-OVS and Mip-NeRF 360 have both a model and LLFF's poses."""
 
@@ -51,13 +56,14 @@ def load_scene(path: str | Path, *, images: str | Path | None = None, split: Spl
     The first of these is read: a COLMAP model in `sparse/0`, `sparse`, `colmap/sparse/0`, `colmap_ground_truth` or the
     folder itself (binary before text); `transforms.json`; Blender's `transforms_train.json`; Replica as NICE-SLAM
     (`results/`, `traj.txt`) or Semantic-NeRF (`rgb/`, `traj_w_c.txt`) rendered it; ScanNet (`color/`, `pose/`); LLFF and
-    3D-OVS (`poses_bounds.npy`). `docs/datasets.md` has them all.
+    3D-OVS (`poses_bounds.npy`); raw captures of Polycam (`keyframes/`); the output of Inria's 3DGS (`cameras.json`,
+    `point_cloud/`). `docs/datasets.md` has them all.
 
     Args:
         path: the scene folder, a model folder, or a .json file.
         images: the image folder, also by its name in the scene folder, as in `"images_4"` of Mip-NeRF 360, whose cameras are
             then resized; None: `images/` beside the model or up to two folders above it, else the first of `images_2`,
-            `images_4`, ..., else the scene folder. Replica and ScanNet know one place only.
+            `images_4`, ..., else the scene folder. Replica, ScanNet and Polycam know one place only.
         split: `"auto"`: split.json if there is one, else the model's test.txt, else the split of the transforms.json if it
             has one, else by number of images: from 200 the paper's (which trains on every 10th image only), from 8
             `"holdout8"`, below 8 all; `"file"`: split.json; or a rule of `make_split`.
@@ -77,12 +83,23 @@ def load_scene(path: str | Path, *, images: str | Path | None = None, split: Spl
         raise FileNotFoundError(f"{path}: no such folder; expected a scene there")
     root = path if path.is_dir() else path.parent
     try:
-        scene = replace(_load_views(path, _given_folder(root, images)), folder=root)
+        scene = _with_splat(replace(_load_views(path, _given_folder(root, images)), folder=root), root)
     except SceneError as error:  # of cameras that do not fit together
         if str(root) in str(error):
             raise
         raise SceneError(f"{path}: {error}") from error
     return _with_split(scene, root, split)
+
+
+def _with_splat(scene: Scene, root: Path) -> Scene:
+    """The scene with the splat that a training program left in its folder."""
+    splat = newest_splat(root)
+    if splat is None:
+        return scene
+    note = (
+        f"{splat.relative_to(root)} is a splat of this scene: a field is made on its Gaussians (--splat names others)"
+    )
+    return replace(scene, splat=splat, notes=(*scene.notes, note))
 
 
 def picture_folders(path: str | Path, images: str | Path | None = None) -> list[Path]:

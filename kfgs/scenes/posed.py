@@ -14,9 +14,11 @@ from torch import Tensor
 
 from .._card import short_repr
 from ..cameras.camera import Camera
+from ..formats.ply import points_from_columns, read_ply
 from .files import MAX_NUMBER, SceneError, is_file, list_images, natural_key, open_picture, read_image, some
 from .scene import Scene
 
+MILLIMETRE = 1e-3  # metres: the step of most depth pictures
 DEPTH_VIEWS = 25  # depth pictures that are read for points: enough to see a room from all sides, a second to decode
 DEPTH_POINTS = 100_000  # points from all of them: what structure from motion gives for a room, and more
 
@@ -30,6 +32,7 @@ class PosedPicture(NamedTuple):
     path: Path
     pose: Matrix  # [4, 4] camera to world, x right, y down, z forward
     origin: str  # the file, and the line, that the pose is from; for messages
+    lens: tuple[Matrix, tuple[int, int]] | None = None  # its own K [3, 3] and (width, height); None: that of the scene
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -121,12 +124,12 @@ def numbered_pictures(folder: Path, pattern: str, poses: Path) -> tuple[list[Pos
 def scene_of_poses(
     folder: Path,
     views: Sequence[PosedPicture],
-    K: Matrix,  # [3, 3]
-    size: tuple[int, int],  # (width, height)
+    K: Matrix | None,  # [3, 3]; None if each view has its own lens
+    size: tuple[int, int] | None,  # (width, height)
     points: tuple[Tensor, Tensor] | None = None,  # [P, 3], [P, 3] uint8
     notes: Sequence[str] = (),
 ) -> Scene:
-    """A scene of pictures that one camera took; views without a pose (not finite) are left out and noted.
+    """A scene of pictures with poses; views without a pose (not finite) are left out and noted.
 
     Raises:
         SceneError: if no view has a pose, or a pose is no rigid motion.
@@ -145,15 +148,36 @@ def scene_of_poses(
         try:
             if view.pose[3].tolist() != [0, 0, 0, 1]:
                 raise ValueError(f"pose: expected 0 0 0 1 as its last row, got {view.pose[3].tolist()}")
-            cameras.append(Camera(torch.from_numpy(viewmat).float(), torch.from_numpy(K).float(), *size, view.name))
+            own_K, own_size = view.lens or (K, size)
+            assert own_K is not None
+            assert own_size is not None
+            lens = torch.from_numpy(own_K).float(), *own_size
+            cameras.append(Camera(torch.from_numpy(viewmat).float(), *lens, view.name))
         except ValueError as error:
             raise SceneError(f"{view.origin}: {error}; copy the poses again") from error
     said = [f"{len(lost)} views have no pose (not finite) and were left out: {some(lost)}"] if lost else []
     if points is None:
         points = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)
-        said.append("no points: a field needs points to start from (`kfgs sfm` finds them)")
+        said.append("no points: `kfgs fit` and `kfgs color` triangulate some from the poses before they train")
     splits = {"train": list(range(len(cameras))), "test": []}
     return Scene(cameras, [view.path for view in posed], *points, splits, (*notes, *said)).with_near()
+
+
+def read_points(path: Path) -> tuple[Tensor, Tensor]:  # [P, 3] float32, [P, 3] uint8
+    """The vertices of a PLY and their colours; grey if it has none.
+
+    Raises:
+        ValueError: if it is damaged, or a coordinate is not finite.
+    """
+    columns = read_ply(path)
+    points = points_from_columns(columns)
+    if not torch.isfinite(points).all():
+        raise ValueError(f"{path}: expected finite coordinates, got NaN or infinity; write the point cloud again")
+    colors = torch.full((len(points), 3), 128, dtype=torch.uint8)
+    for i, name in enumerate(("red", "green", "blue")):
+        if name in columns and columns[name].dtype.kind in "iu":
+            colors[:, i] = torch.from_numpy(columns[name].clip(0, 255).astype("uint8"))
+    return points, colors
 
 
 def read_depth(path: Path) -> NDArray[Any]:  # [H, W]
@@ -172,7 +196,7 @@ def read_depth(path: Path) -> NDArray[Any]:  # [H, W]
 def points_from_depth(
     views: Sequence[PosedPicture],
     depths: Sequence[Path],
-    K: Matrix,  # [3, 3] of the depth pictures
+    K: Matrix | None,  # [3, 3] of the depth pictures; None: that of each view, resized to its depth picture
     scale: float,
 ) -> tuple[Tensor, Tensor] | None:  # [P, 3] float32, [P, 3] uint8
     """About `DEPTH_POINTS` points of surfaces with their colours, from `DEPTH_VIEWS` evenly chosen depth pictures.
@@ -180,7 +204,8 @@ def points_from_depth(
     Args:
         views: the pictures; those without a pose are left out.
         depths: their depth pictures; a missing file is left out.
-        K: intrinsics of the depth pictures. A colour is that of the same place in the colour picture.
+        K: intrinsics of the depth pictures. None takes those of each view (`lens`), resized: pictures and depth then show
+            the same. A colour is that of the same place in the colour picture.
         scale: numbers in the file per world unit.
 
     Returns:
@@ -195,11 +220,42 @@ def points_from_depth(
         depth, image = read_depth(file).astype(np.float64) / scale, read_image(view.path).numpy()
         height, width = depth.shape
         step = max(int(np.sqrt(height * width * len(chosen) / DEPTH_POINTS)), 1)
+        own = K if K is not None else _resized(view, (width, height))
         y, x = (axis.reshape(-1) for axis in np.mgrid[step // 2 : height : step, step // 2 : width : step])
         z = depth[y, x]
         x, y, z = x[z > 0], y[z > 0], z[z > 0]
-        local = np.stack([(x + 0.5 - K[0, 2]) / K[0, 0] * z, (y + 0.5 - K[1, 2]) / K[1, 1] * z, z], 1)
+        local = np.stack([(x + 0.5 - own[0, 2]) / own[0, 0] * z, (y + 0.5 - own[1, 2]) / own[1, 1] * z, z], 1)
         points.append(local @ view.pose[:3, :3].T + view.pose[:3, 3])
         colors.append(image[y * image.shape[0] // height, x * image.shape[1] // width])
     places, shades = np.concatenate(points), np.concatenate(colors)
     return torch.from_numpy(places).float(), torch.from_numpy((shades * 255).round().astype(np.uint8))
+
+
+def points_of_cameras(
+    frames: Sequence[tuple[Camera, Path, Path]], unit: float
+) -> tuple[Tensor, Tensor, list[str]] | None:
+    """Points from the depth pictures of cameras without lens, and a note; None if there are none.
+
+    Args:
+        frames: camera, picture and depth picture.
+        unit: world units per step of the depth pictures.
+
+    Raises:
+        SceneError: if `unit` is not above 0, or a depth picture is none.
+    """
+    views = [
+        (PosedPicture(camera.name, path, torch.linalg.inv(camera.viewmat.double()).numpy(), str(depth), lens), depth)
+        for camera, path, depth in frames
+        if camera.distortion is None and (lens := (camera.K.double().numpy(), (camera.width, camera.height)))
+    ]
+    if not unit > 0:
+        raise SceneError(f"integer_depth_scale: expected a number above 0, got {unit:g}; correct it")
+    found = points_from_depth([view for view, _ in views], [depth for _, depth in views], None, 1 / unit)
+    return None if found is None else (*found, [f"points from the depth pictures of {len(views)} views"])
+
+
+def _resized(view: PosedPicture, size: tuple[int, int]) -> Matrix:  # [3, 3]
+    """The intrinsics of a view for a picture of another size (width, height)."""
+    assert view.lens is not None
+    K, (width, height) = view.lens
+    return np.diag([size[0] / width, size[1] / height, 1.0]) @ K

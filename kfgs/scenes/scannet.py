@@ -8,14 +8,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-import torch
 from torch import Tensor
 
 from .._files import as_path
-from ..formats.ply import points_from_columns, read_ply
 from .files import SceneError, file_stem, list_images, some
-from .posed import Matrix, PosedPicture, picture_size, points_from_depth, read_numbers, scene_of_poses
+from .posed import Matrix, PosedPicture, picture_size, points_from_depth, read_numbers, read_points, scene_of_poses
 from .scene import Scene
 
 _MILLIMETRES = 1000.0  # of ScanNet's depth pictures
@@ -73,15 +70,9 @@ def _points(folder: Path, views: list[PosedPicture]) -> tuple[Tensor, Tensor] | 
     meshes = sorted(folder.glob(f"*{MESH}"))
     if meshes:
         try:
-            columns = read_ply(meshes[0])
-            points = points_from_columns(columns)
+            return read_points(meshes[0])
         except ValueError as error:
             raise SceneError(f"{error}; copy the mesh again, or remove it to take points from the depth") from error
-        colors = torch.full((len(points), 3), 128, dtype=torch.uint8)
-        for i, name in enumerate(("red", "green", "blue")):
-            if name in columns and columns[name].dtype == np.uint8:
-                colors[:, i] = torch.from_numpy(columns[name])
-        return points, colors
     intrinsic = folder / "intrinsic" / "intrinsic_depth.txt"
     if not intrinsic.is_file():
         return None

@@ -48,6 +48,8 @@ class Scene:
     """Only in an undistorted scene: the cameras with the distortion that the files on disk still have."""
     folder: Path | None = None
     """The path that the scene was loaded from."""
+    splat: Path | None = None
+    """A trained splat in the frame of the cameras, found in the scene's folder. `fit_scene` averages features onto it."""
 
     def __post_init__(self) -> None:
         check_shapes(("points", self.points, "P 3"), ("colors", self.colors, "P 3"))

@@ -17,6 +17,7 @@ from .._files import as_path, atomic_folder, check_output, real_path
 from .colmap import SUPPORTED_MODELS
 from .colmap_model import has_model
 from .files import SceneError, list_images, some
+from .pictures import refuse_heic
 from .pycolmap_import import quiet_pycolmap, scene_errors
 
 OVERLAP = 10
@@ -120,6 +121,7 @@ def run_sfm(
             f"out: expected a scene folder without a model, got one in {model}; name another folder, or pass replace=True "
             "(--replace) to give up that model"
         )
+    refuse_heic(images)
     names = list_images(images)
     if len(names) < 3:
         raise SceneError(f"{images}: expected at least 3 images (PNG, JPEG, TIFF, WebP), got {len(names)}; add views")
@@ -236,11 +238,25 @@ class SfmRun:
         exhaustive = config.matching == "exhaustive"
         self.begin("matching", count * (count - 1) // 2 if exhaustive else count, "pair" if exhaustive else "image")
         match, pairing = (colmap.match_exhaustive, {}) if exhaustive else self._sequential(colmap)
+        self._match(match, pairing)
+
+    def match_pairs(self, pairs: list[tuple[str, str]]) -> None:
+        """Compare given pairs of images; no name may have a blank."""
+        self.begin("matching", len(pairs), "pair")
+        self._match(self.pycolmap.match_image_pairs, self._listed(pairs))
+
+    def _match(self, match: Callable[..., None], pairing: dict[str, Any]) -> None:
         match(
-            self.database, matching_options={"num_threads": config.num_threads}, **pairing,
-            verification_options={"ransac": {"random_seed": config.seed}}, device=colmap.Device.cpu,
+            self.database, matching_options={"num_threads": self.config.num_threads}, **pairing,
+            verification_options={"ransac": {"random_seed": self.config.seed}}, device=self.pycolmap.Device.cpu,
         )  # fmt: skip
         self.bar.update(self.bar.total)
+
+    def _listed(self, pairs: list[tuple[str, str]]) -> dict[str, Any]:
+        """The option that names the pairs."""
+        listed = self.scratch / "pairs.txt"
+        listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
+        return {"pairing_options": self.pycolmap.ImportedPairingOptions(match_list_path=str(listed))}
 
     def _sequential(self, colmap: Any) -> tuple[Callable[..., None], dict[str, Any]]:
         """The function that matches a video, and its options.
@@ -255,9 +271,7 @@ class SfmRun:
                 f"{self.images}: expected names without blanks, or padded with zeros, for matching='sequential', got "
                 f"{some(self.names, 3)}; rename the images or use matching='exhaustive'"
             )
-        listed = self.scratch / "pairs.txt"
-        listed.write_text("".join(f"{a} {b}\n" for a, b in sequential_pairs(self.names)), encoding="utf-8")
-        return colmap.match_image_pairs, {"pairing_options": colmap.ImportedPairingOptions(match_list_path=str(listed))}
+        return colmap.match_image_pairs, self._listed(sequential_pairs(self.names))
 
     def options(self) -> Any:
         """Of the mapping, with its seeds."""
@@ -276,6 +290,19 @@ class SfmRun:
             initial_image_pair_callback=lambda: self.bar.update(2), next_image_callback=lambda: self.bar.update(1),
         )  # fmt: skip
         self.models = list(found.values())
+
+
+def fill_database(pycolmap: Any, path: str, known: Any) -> None:
+    """Write the cameras and images of a model, with their ids, into a new database."""
+    with pycolmap.Database.open(path) as database:
+        for camera in known.cameras.values():
+            database.write_camera(camera, use_camera_id=True)
+        for rig in known.rigs.values():
+            database.write_rig(rig, use_rig_id=True)
+        for frame in known.frames.values():
+            database.write_frame(frame, use_frame_id=True)
+        for image in known.images.values():
+            database.write_image(image, use_image_id=True)
 
 
 def sequential_pairs(

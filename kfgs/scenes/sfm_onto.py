@@ -13,9 +13,10 @@ from .colmap import load_colmap
 from .colmap_model import ColmapModel, has_model, read_model
 from .files import SceneError, file_stem, list_images, some
 from .load import MODEL_FOLDERS, find_images
+from .pictures import refuse_heic
 from .posed import picture_size
 from .pycolmap_import import quiet_pycolmap, scene_errors
-from .sfm import SfmConfig, SfmReport, SfmRun, timed
+from .sfm import SfmConfig, SfmReport, SfmRun, fill_database, timed
 
 KEPT = ("classes.json", "text.npy", "text.safetensors")  # files of the scene that are the same for more images
 
@@ -54,6 +55,7 @@ def extend_sfm(
     for folder in (images, scene):
         if not folder.is_dir():
             raise FileNotFoundError(f"{folder}: no such folder; expected images and a scene")
+    refuse_heic(images)
     model, pictures = _old_model(scene)
     check_output("out", out, "a folder", apart=[scene], other=[images])
     if out.exists() and any(out.iterdir()):
@@ -76,7 +78,7 @@ def extend_sfm(
                 (larger / name).symlink_to(real_path(scene / name))
         run = SfmRun(pycolmap, larger / "images", [*names, *new], Path(scratch), config, bar)
         known = pycolmap.Reconstruction(str(model))
-        _fill_database(pycolmap, run.database, known)
+        fill_database(pycolmap, run.database, known)
         camera = _shared_camera(old, images / new[0]) if config.single_camera else None
         seconds = {"features": timed(lambda: run.extract(names, None, False))}
         seconds["features"] += timed(lambda: run.extract(new, camera))
@@ -148,19 +150,6 @@ def _link(folder: Path, sources: dict[str, Path]) -> None:
         place = folder / name
         place.parent.mkdir(parents=True, exist_ok=True)
         place.symlink_to(real_path(source / name))
-
-
-def _fill_database(pycolmap: Any, path: str, known: Any) -> None:
-    """The cameras and images of the model with their ids, so that they stay the same in the larger one."""
-    with pycolmap.Database.open(path) as database:
-        for camera in known.cameras.values():
-            database.write_camera(camera, use_camera_id=True)
-        for rig in known.rigs.values():
-            database.write_rig(rig, use_rig_id=True)
-        for frame in known.frames.values():
-            database.write_frame(frame, use_frame_id=True)
-        for image in known.images.values():
-            database.write_image(image, use_image_id=True)
 
 
 def _shared_camera(old: ColmapModel, picture: Path) -> int | None:

@@ -20,7 +20,6 @@ from torch import Tensor
 
 from .._files import as_path
 from ..cameras.camera import Camera, Distortion
-from ..formats.ply import points_from_columns, read_ply
 from .files import (
     IMAGE_SUFFIXES,
     MAX_NUMBER,
@@ -32,6 +31,7 @@ from .files import (
     read_scene_json,
     some,
 )
+from .posed import MILLIMETRE, points_of_cameras, read_points
 from .scene import Scene
 
 _PERSPECTIVE = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -52,6 +52,12 @@ class _Reader:
     missing: list[str] = field(default_factory=list)
     outside: list[str] = field(default_factory=list)
     masked: int = 0
+    depths: list[Path | None] = field(default_factory=list)
+
+    def with_depth(self) -> list[tuple[Camera, Path, Path]]:
+        """Camera, picture and depth picture of each view that has all three."""
+        both = zip(self.views, self.depths, strict=True)
+        return [(camera, path, depth) for (camera, path), depth in both if depth is not None]
 
 
 def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene:
@@ -64,7 +70,8 @@ def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene
     A frame whose file is missing is left out and named in `notes`. Frames outside the scene folder (an absolute path, or
     `..`) are read if they are image files, and counted in `notes`. `ply_file_path` gives the points if it is inside the
     folder, without it the `points3d.ply` of 3DGS and OpenGaussian; else the scene has no points (P = 0), and a
-    note says so. `mask_path` and `depth_file_path` are not read.
+    note says so. Without points, those of `depth_file_path` are taken (millimetres, or `integer_depth_scale`), if no lens
+    is distorted. `mask_path` is not read.
 
     Args:
         path: the file, or a folder with `transforms.json` or `transforms_train.json`.
@@ -95,6 +102,11 @@ def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene
     views.sort(key=lambda view: natural_key(view[0].name))
     first, top = next(iter(readers.values()))
     points, colors, notes = _points(first, top)
+    if len(points) == 0:
+        unit = _Frame(first.path, "top level", top).number("integer_depth_scale", MILLIMETRE)  # world units per step
+        frames = [frame for reader, _ in readers.values() for frame in reader.with_depth()]
+        found = points_of_cameras(frames, unit)
+        points, colors, notes = found or (points, colors, notes)
     if missing:
         notes.append(f"{len(missing)} of {len(missing) + len(views)} frames have no image file: {some(missing)}")
     if outside:
@@ -136,12 +148,11 @@ def _read_frames(reader: _Reader) -> dict[str, Any]:
             continue
         reader.masked += "mask_path" in values
         if "w" not in merged or "h" not in merged:
-            if (
-                "all" not in sizes
-            ):  # Blender writes no size, and pictures of one size; another size fails in Scene.image
+            if "all" not in sizes:  # Blender writes no size; pictures of other sizes fail in Scene.image
                 height, width = read_image(file).shape[:2]
                 sizes["all"] = width, height
             merged["w"], merged["h"] = sizes["all"]
+        reader.depths.append(_depth_file(reader, merged))
         reader.views.append((frame.camera(_name(reader, file)), file))
     return top
 
@@ -297,27 +308,29 @@ def _points(reader: _Reader, top: dict[str, Any]) -> tuple[Tensor, Tensor, list[
         ]
     if listed is None:
         return *nothing, [
-            "no points: this transforms.json has no ply_file_path; a field needs points to start from (`kfgs sfm` finds them)"
+            "no points: this transforms.json has no ply_file_path; `kfgs fit` and `kfgs color` triangulate some from the poses "
+            "before they train"
         ]
     file = reader.root / listed if isinstance(listed, str) and "\0" not in listed else None
     if file is None or not _normal(file).is_relative_to(_normal(reader.root)) or not is_file(file):
         return *nothing, [f"no points: ply_file_path {listed!r:.200} is no file inside {reader.root}"]
     try:
-        columns = read_ply(file)
-        points = points_from_columns(columns)
+        return *read_points(file), notes
     except ValueError as error:
         if notes:
             raise SceneError(f"{error}; write the points again, or remove the file to load without points") from error
         raise SceneError(
             f"{error} (named by ply_file_path in {reader.path}; remove the entry to load without points)"
         ) from error
-    if not torch.isfinite(points).all():
-        raise SceneError(f"{file}: expected finite coordinates, got NaN or infinity; write the point cloud again")
-    colors = torch.full((len(points), 3), 128, dtype=torch.uint8)
-    for i, name in enumerate(("red", "green", "blue")):
-        if name in columns and columns[name].dtype.kind in "iu":
-            colors[:, i] = torch.from_numpy(columns[name].clip(0, 255).astype("uint8"))
-    return points, colors, notes
+
+
+def _depth_file(reader: _Reader, values: dict[str, Any]) -> Path | None:
+    """The depth picture of a frame inside the scene folder; nerfstudio and instant-ngp name it differently."""
+    listed = values.get("depth_file_path", values.get("depth_path"))
+    if not isinstance(listed, str) or "\0" in listed:
+        return None
+    file = reader.root / listed.replace("\\", "/")
+    return file if file.suffix.lower() == ".png" and _normal(file).is_relative_to(_normal(reader.root)) else None
 
 
 def _splits(views: list[tuple[Camera, Path, str]], root: Path, top: dict[str, Any]) -> dict[str, list[int]]:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .._check import one_line
 from .._files import as_path, digest_file
-from .torch_files import Placeholder, TorchFileError, check_plain, load_torch_file
+from .._torch_files import Placeholder, TorchFileError, check_plain, load_torch_file
 
 _EXPECTED = "expected a checkpoint (.ckpt, .pt, .pth or .safetensors)"
 _STATES = ("state_dict", "model_state_dict", "model", "module", "net", "network", "params")  # usual keys

@@ -4,6 +4,7 @@ from .animation import save_animation
 from .boxes import add_boxes, add_names, add_selections
 from .camera_view import look_through
 from .clouds import CloudOptions, add_cloud, recolor_cloud, to_pyvista
+from .confusions import plot_confusion, plot_largest_confusions
 from .explorer import ExploreOptions, Explorer, explore
 from .field_colors import FeatureColors, feature_colors
 from .film_frames import show_cloud
@@ -18,9 +19,7 @@ from .palette import palette
 from .pictures import legend_strip, overlay_labels, picture_grid, save_picture
 from .plots import (
     plot_codebook_history,
-    plot_confusion,
     plot_iou,
-    plot_largest_confusions,
     plot_quality_storage,
     plot_training,
 )

@@ -6,7 +6,7 @@ import pytest
 from messages import tells
 from small_batch import timeless
 
-from kfgs._files import InUseError, locked
+from kfgs._files import InUseError, digest_file, locked
 from kfgs.features import FeatureFolder, Picture, extract_features, join_features, read_manifest
 from tests.features.test_extract import Counting, paint
 
@@ -96,3 +96,35 @@ def test_maps_of_other_programs_are_not_overwritten_by_a_part(pictures, tmp_path
     (tmp_path / "maps" / "features.json").unlink()
     with pytest.raises(ValueError, match=tells("other programs", "d.npy")):
         extract_features(Counting(), pictures[:2], tmp_path / "maps", part="0")
+
+
+def test_another_division_of_the_pictures_goes_on_without_loss(pictures, tmp_path):
+    """Two parts of two pictures, of which the second was killed after a map; then a part of three pictures, and one of one."""
+    extract_features(Counting(), pictures, tmp_path / "one")
+    extract_features(Counting(), pictures[:2], tmp_path / "maps", part="0")
+    extract_features(Counting(), pictures[2:3], tmp_path / "maps", part="1")
+    (tmp_path / "maps" / "a.npy").write_bytes(b"left by the killed process, without a record")
+    teacher = Counting()
+    extract_features(teacher, pictures[1:], tmp_path / "maps", part="other")
+    extract_features(teacher, pictures[:1], tmp_path / "maps", part="last")
+    assert len(teacher.calls) == 1
+    join_features(tmp_path / "maps", STEMS)
+    assert files(tmp_path / "maps") == files(tmp_path / "one")
+    assert sorted(path.name for path in (tmp_path / "maps").glob(".*")) == [".features.lock"]
+
+
+def test_of_two_divisions_the_map_that_was_written_last_is_joined(pictures, tmp_path):
+    extract_features(Counting(), pictures, tmp_path / "maps", part="z")
+    paint(pictures[0].path, 9)
+    teacher = Counting()
+    extract_features(teacher, pictures[:2], tmp_path / "maps", part="a")
+    assert len(teacher.calls) == 1
+    joined = join_features(tmp_path / "maps", STEMS)
+    assert joined.maps["d"].image_digest == digest_file(pictures[0].path)
+    assert joined.maps["d"].doubt(tmp_path / "maps" / "d.npy", read=False) is None
+
+
+def test_a_part_of_another_division_by_another_teacher_is_refused_at_once(pictures, tmp_path):
+    extract_features(Counting(), pictures[:2], tmp_path / "maps", part="0")
+    with pytest.raises(ValueError, match=tells("same teacher", "w2", "use another folder, or delete this one")):
+        extract_features(Counting(weights="w2"), pictures[1:], tmp_path / "maps", part="other")

@@ -1,3 +1,4 @@
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -238,6 +239,22 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
         )
     how_often = replace(short, checkpoint_every=2)  # changes no result
     assert len(fit_field(start(), cameras, targets, how_often, checkpoint=path).history) == 1
+
+
+def test_a_folder_that_is_deleted_meanwhile_is_noticed_at_the_next_checkpoint(tmp_path):
+    cameras, targets = scene()
+    path, steps = tmp_path / "run" / "unfinished" / "field", []
+
+    def watch(row):
+        steps.append(row["step"])
+        if row["step"] == 30:
+            assert path.is_file()
+            shutil.rmtree(tmp_path / "run")
+
+    with pytest.raises(FileNotFoundError, match=tells(path.parent, "something else deleted", "start again")):
+        fit_field(start(), cameras, targets, SHORT, checkpoint=path, progress=watch)
+    assert steps[-1] == 40
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_damaged_or_foreign_checkpoint_is_refused(tmp_path):

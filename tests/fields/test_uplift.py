@@ -13,7 +13,16 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from kfgs import Camera, Gaussians
 from kfgs._rows import unit_rows
 from kfgs.cameras import resize_map
-from kfgs.fields import FieldConfig, GaussianParams, UpliftConfig, fit_field, uplift, uplift_maps, working_maps
+from kfgs.fields import (
+    FieldConfig,
+    GaussianParams,
+    UpliftConfig,
+    fit_field,
+    uplift,
+    uplift_maps,
+    uplift_passes,
+    working_maps,
+)
 from kfgs.fields.working_maps import shrink_map
 from kfgs.labels import average_views
 from kfgs.splat import rasterize
@@ -62,7 +71,7 @@ def decoded(uplifted):
 
 @pytest.mark.parametrize("corrections", [0, 1, 2])
 def test_features_are_those_of_the_slow_oracle(monkeypatch, corrections):
-    monkeypatch.setattr(uplift, "NEIGHBOURS", 4)
+    monkeypatch.setattr(uplift_passes, "NEIGHBOURS", 4)
     views, gaussians = cameras(), cloud()
     maps = random_maps(views)
     smooth = torch.randn(5, generator=torch.Generator().manual_seed(1))
@@ -105,16 +114,16 @@ def test_latents_are_a_projection_of_the_same_average():
 @pytest.mark.parametrize("shares", [([1.0], [1.0], 1.0), ([1.0], [-1.0], 0.0), ([1.0], [0.0], 0.0)])
 def test_reliability_of_one_number(shares):
     one, other, expected = shares
-    found = uplift._reliability(torch.tensor([one]), torch.tensor([other]), torch.tensor([[0]]))
+    found = uplift_passes.reliability(torch.tensor([one]), torch.tensor([other]), torch.tensor([[0]]))
     assert found.tolist() == [expected]
 
 
 def test_reliability_is_the_spearman_brown_share_among_neighbours():
     one, other = torch.tensor([[1.0, 0.0], [2.0, 0.0], [0.0, 0.0]]), torch.tensor([[0.6, 0.8], [2.0, 0.0], [0.0, 0.0]])
-    alone = uplift._reliability(one, other, torch.tensor([[0], [1], [2]]))
+    alone = uplift_passes.reliability(one, other, torch.tensor([[0], [1], [2]]))
     torch.testing.assert_close(alone, torch.tensor([2 * 0.6 / 1.6, 1.0, 0.0]))
     r = (0.6 + 4) / (1 + 4)
-    together = uplift._reliability(one, other, torch.tensor([[0, 1], [1, 0], [2, 0]]))
+    together = uplift_passes.reliability(one, other, torch.tensor([[0, 1], [1, 0], [2, 0]]))
     torch.testing.assert_close(together, torch.tensor([2 * r / (1 + r), 2 * r / (1 + r), 2 * 0.6 / 1.6]))
 
 
@@ -256,7 +265,7 @@ def test_a_correction_does_not_follow_noise(monkeypatch):
     errors = [
         wrongness(uplift_maps(gaussians, views, maps, UpliftConfig(corrections=k, keep=1.0)), truth) for k in (0, 1)
     ]
-    monkeypatch.setattr(uplift, "_reliability", lambda one, other, near: torch.ones(len(one)))
+    monkeypatch.setattr(uplift_passes, "reliability", lambda one, other, near: torch.ones(len(one)))
     believed = wrongness(uplift_maps(gaussians, views, maps, UpliftConfig(corrections=1, keep=1.0)), truth)
     assert errors[1] < 1.1 * errors[0]
     assert believed > 1.5 * errors[0]

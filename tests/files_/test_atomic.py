@@ -11,7 +11,17 @@ from killed import kill_everywhere
 from messages import tells
 from safetensors.torch import save_file
 
-from kfgs._files import FullDiskError, atomic, atomic_folder, atomic_path, current_file, finish_writing, open_current
+from kfgs._files import (
+    HIDDEN,
+    FullDiskError,
+    atomic,
+    atomic_folder,
+    atomic_path,
+    current_file,
+    finish_writing,
+    open_current,
+    write_json,
+)
 
 
 def names(folder):
@@ -233,9 +243,26 @@ def test_a_folder_that_is_deleted_meanwhile_is_said(tmp_path, block):
             shutil.rmtree(tmp_path / "run")
             save_file({"a": torch.zeros(2)}, new if block is atomic_path else new / "a.safetensors")
 
-    with pytest.raises(FileNotFoundError, match=tells(tmp_path / "run" / "out", "deleted or moved", "again")) as caught:
+    parts = tmp_path / "run" / "out", "something else deleted or moved", "start again"
+    with pytest.raises(FileNotFoundError, match=tells(*parts)) as caught:
         write()
     assert "kfgs-unfinished" not in str(caught.value)
+
+
+def test_a_folder_that_is_made_again_is_not_taken_for_a_whole_one(tmp_path):
+    """The second file makes the hidden folder again, but the first one is lost."""
+
+    def write():
+        with atomic_folder(tmp_path / "out") as new:
+            write_json(new / "a.json", 1)
+            shutil.rmtree(tmp_path / HIDDEN)
+            write_json(new / "b.json", 2)
+
+    with pytest.raises(
+        FileNotFoundError, match=tells(tmp_path / "out", "something else deleted or moved", "start again")
+    ):
+        write()
+    assert not (tmp_path / "out").exists()
 
 
 def test_files_that_came_meanwhile_stay(tmp_path):

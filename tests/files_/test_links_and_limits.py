@@ -1,6 +1,7 @@
 """Links that lead to themselves, devices and pipes in the place of files, and a limit on the size of files."""
 
 import os
+import re
 import resource
 import stat
 import subprocess
@@ -9,13 +10,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from messages import tells
 
 import kfgs
 from kfgs._files import atomic_path, check_output, parse_json, read_json, real_path, write_json
 from kfgs.cli import main
+from kfgs.formats import read_splats, write_splats
 from kfgs.formats.ply import write_ply
+from kfgs.gaussians import Gaussians
 from kfgs.labels import LabelSet
+
+
+def splat(path):
+    cloud = Gaussians(torch.rand(3, 3), torch.ones(3, 4), torch.ones(3, 3), torch.rand(3), sh=torch.rand(3, 1, 3))
+    write_splats(path, cloud)
+    return path
 
 
 def test_a_link_that_leads_to_itself_is_no_traceback(tmp_path, capsys):
@@ -34,26 +44,36 @@ def test_no_file_of_kfgs_resolves_paths_in_another_way():
     assert [file.relative_to(root).as_posix() for file in found] == []
 
 
-def test_a_link_in_the_place_of_a_file_is_replaced_and_what_it_leads_to_stays(tmp_path):
-    (tmp_path / "mine.json").write_text("mine")
-    (tmp_path / "out.json").symlink_to("mine.json")
-    write_json(tmp_path / "out.json", [1])
-    assert read_json(tmp_path / "out.json") == [1]
-    assert not (tmp_path / "out.json").is_symlink()
-    assert (tmp_path / "mine.json").read_text() == "mine"
+@pytest.mark.parametrize("name", ["out.json", "out.ply"])
+def test_a_link_in_the_place_of_a_file_is_replaced_and_what_it_leads_to_stays(name, tmp_path):
+    (tmp_path / "far").mkdir()
+    (tmp_path / "far" / name).write_text("mine")
+    out = tmp_path / name
+    out.symlink_to(f"far/{name}")
+    if name == "out.json":
+        write_json(out, [1])
+        assert read_json(out) == [1]
+    else:
+        assert main(["convert", str(splat(tmp_path / "a.ply")), str(out)]) == 0
+        assert len(read_splats(out)) == 3
+    assert not out.is_symlink()
+    assert (tmp_path / "far" / name).read_text() == "mine"
 
 
-def test_a_pipe_or_a_device_is_never_replaced(tmp_path):
+def test_a_pipe_or_a_device_is_never_replaced(tmp_path, capsys):
     pipe = tmp_path / "pipe.json"
     os.mkfifo(pipe)
-    with pytest.raises(ValueError, match=tells("pipe.json", "a pipe", "another name")):
-        check_output("out", pipe, "a file")
+    for path, kind in ((pipe, "a file"), (pipe, "a folder"), ("/dev/null", "a file")):
+        with pytest.raises(ValueError, match=tells("out:", path, kind, "a pipe", "another name")):
+            check_output("out", path, kind)
     with pytest.raises(ValueError, match=tells("pipe.json", "a pipe")), atomic_path(pipe) as new:
         new.write_text("1")
     assert stat.S_ISFIFO(pipe.stat().st_mode)
     assert os.listdir(tmp_path) == ["pipe.json"]
-    with pytest.raises(ValueError, match="/dev/null"):
-        check_output("out", "/dev/null", "a file")
+    os.mkfifo(tmp_path / "b.ply")
+    assert main(["convert", str(splat(tmp_path / "a.ply")), str(tmp_path / "b.ply")]) == 1
+    assert re.search(tells("error: TARGET:", tmp_path / "b.ply", "a pipe"), capsys.readouterr().err)
+    assert stat.S_ISFIFO((tmp_path / "b.ply").stat().st_mode)
 
 
 @pytest.mark.parametrize("write", ["new.write_bytes(bytes(9_000_000))", "np.zeros(9_000_000).tofile(new)"])

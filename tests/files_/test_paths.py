@@ -104,18 +104,13 @@ def test_an_empty_path_is_not_the_current_folder():
     refused("", "a folder", "empty")
 
 
-def test_a_pipe_is_no_output(tmp_path):
-    os.mkfifo(tmp_path / "pipe.ply")
-    with pytest.raises(ValueError, match=tells(tmp_path / "pipe.ply", "pipe")):
-        check_output("out", tmp_path / "pipe.ply", "a file")
-
-
 @pytest.mark.parametrize("place", ["sparse", "sparse/0"])
 def test_links_inside_an_output_are_refused_and_the_output_itself_may_be_one(tmp_path, place):
     (tmp_path / "mine").mkdir()
     (tmp_path / "out" / place).parent.mkdir(parents=True)
     (tmp_path / "out" / place).symlink_to(tmp_path / "mine")
     (tmp_path / "link").symlink_to("mine")
-    with pytest.raises(ValueError, match=tells(tmp_path / "out" / place, "a link", tmp_path / "mine")):
+    advice = "put the whole output folder there; a link to it may be the output"
+    with pytest.raises(ValueError, match=tells(tmp_path / "out" / place, "a link", tmp_path / "mine", advice)):
         check_output("out", tmp_path / "out", "a folder", inside=["sparse/0"])
     assert check_output("out", tmp_path / "link", "a folder", inside=["sparse/0"])

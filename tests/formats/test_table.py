@@ -31,9 +31,9 @@ def test_every_format_keeps_the_contract():
         assert all(suffix.startswith(".") and suffix == suffix.lower() for suffix in module.SUFFIXES)
         assert module.matches(b"") is False
         assert callable(module.read)
-        assert hasattr(module, "write") == hasattr(module, "precision") or name == "ksplat"
+        assert hasattr(module, "write") == hasattr(module, "precision") or name in ("ksplat", "checkpoint")
         assert module.__doc__
-    assert {"ply", "compressed_ply", "spz", "sog", "gltf", "ksplat", "splat"} == set(formats())
+    assert {"ply", "compressed_ply", "spz", "sog", "gltf", "ksplat", "splat", "checkpoint"} == set(formats())
 
 
 def test_every_module_of_a_format_is_listed():

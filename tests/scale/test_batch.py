@@ -250,6 +250,8 @@ def test_two_batches_in_one_folder_are_refused(rooms, tmp_path):
 def test_options_are_checked():
     with pytest.raises(ValueError, match=tells("share", 0)):
         BatchOptions(share=0)
+    with pytest.raises(ValueError, match=tells("share", 1.5)):
+        BatchOptions(share=1.5)
     with pytest.raises(ValueError, match=tells("discard_features", "decouple")):
         BatchOptions(discard_features=True, fit=dataclasses.replace(OPTIONS.fit, method="paper", mode="decouple"))
     with (
@@ -257,7 +259,23 @@ def test_options_are_checked():
         open_client(scheduler="tcp://a:1", workers=2),
     ):
         pass
-    with pytest.raises(ValueError, match=tells("workers", 0)), open_client(workers=0):
+    for wrong in (0, -1, 1.5, "2"):
+        with pytest.raises(ValueError, match=tells("workers", wrong)), open_client(workers=wrong):
+            pass
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "parts"),
+    [
+        ({"slurm": "gpu"}, OSError, ("slurm", "sbatch")),
+        ({"slurm": "gpu", "memory": "much"}, ValueError, ("memory", "16GB", "'much'")),
+    ],
+)
+def test_slurm_that_is_not_there_and_sizes_that_are_none_are_refused(options, error, parts, tmp_path, monkeypatch):
+    if find_spec("dask_jobqueue") is None:
+        pytest.skip("needs dask-jobqueue")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(error, match=tells(*parts)), open_client(**options):
         pass
 
 
@@ -283,6 +301,10 @@ def test_the_command_takes_a_list_to_the_end_and_fails_if_a_scene_does(rooms, cl
     ("line", "parts"),
     [
         ("nothing.txt --out runs", ("no such file",)),
+        ("nothing.txt --out runs --teacher lsegg --workers 0", ("--workers", "0")),
+        ("nothing.txt --out runs --workers=-2", ("--workers", "-2")),
+        ("nothing.txt --out runs --threads 0", ("--threads", "0")),
+        ("scenes.txt --out room/runs --teacher dinov2", ("--out", "apart from all scenes", "room")),
         ("scenes.txt --out runs --teacher lsegg", ("teacher", "lseg")),
         ("scenes.txt --out runs --weights a.ckpt", ("--weights", "without --teacher")),
         ("scenes.txt --out runs --discard-features", ("--discard-features", "without --teacher")),

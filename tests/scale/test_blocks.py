@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 
@@ -170,7 +171,7 @@ def test_what_cannot_be_cut_or_opened(tmp_path, town):
     (tmp_path / "town/transforms.json").write_text(json.dumps({"frames": frames}))
     with pytest.raises(SceneError, match=tells("scene", "COLMAP")):
         split_scene(tmp_path / "town", tmp_path / "o", 2)
-    with pytest.raises(FileNotFoundError, match=tells("blocks.json", "no such")):
+    with pytest.raises(FileNotFoundError, match=tells("blocks.json", "no such", "kfgs blocks")):
         FieldInBlocks.open(tmp_path)
     split_scene(town, tmp_path / "unfitted", 2)
     with pytest.raises(FileNotFoundError, match=tells("core.json", "kfgs blocks")):
@@ -203,6 +204,10 @@ def test_the_commands(town, splat, tmp_path, capsys):
     assert main(["blocks", str(town), "--out", str(out), "--count", "2", "--splat", str(splat)]) == 0
     said = capsys.readouterr().out
     assert "block01" in said
+    assert "all lie in the box -3" in said
+    assert main(["blocks", str(town), "--out", str(tmp_path / "none"), "--count", "2", "--workers", "0"]) == 1
+    assert "--workers" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
     assert main(["join", str(out), "--out", str(tmp_path / "field")]) == 0
     assert len(SemanticField.load(tmp_path / "field")) == len(FieldInBlocks.open(out))
     box = ["--box=-4,-4,-1,4,4,4"]
@@ -210,6 +215,15 @@ def test_the_commands(town, splat, tmp_path, capsys):
     assert len(SemanticField.load(tmp_path / "part")) < len(SemanticField.load(tmp_path / "field"))
     assert main(["join", str(out), "--out", str(tmp_path / "x"), "--box", "1,2,3"]) == 1
     assert "six numbers" in capsys.readouterr().err
+    for command in (["view"], ["select", "chair"]):
+        assert main([*command, str(out), "--out", str(tmp_path / "x")]) == 1
+        said = capsys.readouterr()
+        assert (said.out, said.err.count("\n")) == ("", 1)  # no page was opened
+        assert f"kfgs join {out} --out FIELD`" in said.err
+        join = said.err.split("`")[3].replace("FIELD", str(tmp_path / command[0])).split()
+        assert main(join[1:]) == 0
+        assert len(SemanticField.load(tmp_path / command[0])) > 0
+        assert f"next: kfgs view {tmp_path / command[0]}" in capsys.readouterr().out
     assert main(["join", str(tmp_path), "--out", str(tmp_path / "x")]) == 1
     assert "blocks.json" in capsys.readouterr().err
 
@@ -274,3 +288,66 @@ def test_a_city_is_not_joined_into_itself(fitted, capsys):
         assert main(["join", str(fitted.folder), "--out", str(fitted.folder / place)]) == 1
         assert "--out" in capsys.readouterr().err
     assert sorted(fitted.folder.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("box", "words"),
+    [
+        ("", ("--box", "empty")),
+        ("all", ("--box", "six numbers", "'all'")),
+        ("1,2,3", ("--box", "six numbers", "'1,2,3'")),
+        ("nan,0,0,1,1,1", ("--box", "three numbers", "nan")),
+        ("0,4,0,1,-4,1", ("--box", "y from 4 down to -4", "exchange")),
+        ("500,0,0,501,1,1", ("--box", "none", "choose a part")),
+        ("0,0,0,0,0,0", ("--box", "none", "choose a part")),
+    ],
+)
+def test_wrong_boxes_are_one_line(fitted, tmp_path, box, words, capsys):
+    assert main(["join", str(fitted.folder), "--out", str(tmp_path / "x"), f"--box={box}"]) == 1
+    error = capsys.readouterr().err
+    assert re.search(tells(*words), error)
+    assert error.count("\n") == 1
+    assert not (tmp_path / "x").exists()
+
+
+def test_boxes_are_checked_before_a_field_is_read(fitted, monkeypatch):
+    monkeypatch.setattr(SemanticField, "load", staticmethod(lambda path: pytest.fail(f"{path} was read")))
+    for low, high in (([500, 0, 0], [501, 1, 1]), ([0, 4, 0], [1, -4, 1]), ([0, 0], [1, 1])):
+        with pytest.raises(ValueError, match="low, high"):
+            fitted.within(low, high)
+
+
+def test_a_box_may_have_no_limit(fitted):
+    inf = float("inf")
+    assert len(fitted.within([-inf] * 3, [inf] * 3)) == len(fitted)
+    first, second = fitted.within([-inf] * 3, [4, inf, inf]), fitted.within([4, -inf, -inf], [inf] * 3)
+    assert len(first) + len(second) == len(fitted)
+
+
+def test_two_cities_with_the_same_latents_join(fitted, town, splat, tmp_path, capsys):
+    said, file = [], fitted.folder / "latents.safetensors"
+    split_scene(town, tmp_path / "second", 2, splat=splat, latents=file, report=said.append)
+    assert "12 of this scene's own would hold" in said[0]
+    second = fit_blocks(tmp_path / "second", EVERY)
+    both = join_fields([fitted.joined(), second.joined()])
+    assert len(both) == len(fitted) + len(second)
+    assert split_scene(town, tmp_path / "second", 2, splat=splat, latents=LinearLatents.load(file))  # it goes on
+    with pytest.raises(ValueError, match=tells("out", "others")):
+        split_scene(town, tmp_path / "second", 2, splat=splat, latents=12)
+    LinearLatents(torch.eye(16)[:, :4]).save(tmp_path / "other.safetensors")
+    for given, words in (("other.safetensors", ("--latents", "24 channels", "16")), ("none", ("none", "no such"))):
+        arguments = [str(town), "--out", str(tmp_path / "x"), "--count", "2", "--latents", str(tmp_path / given)]
+        assert main(["blocks", *arguments]) == 1
+        assert re.search(tells(*words), capsys.readouterr().err)
+        assert not (tmp_path / "x").exists()
+
+
+def test_a_splat_of_another_scene_is_said(town, splat, tmp_path):
+    far = read_splats(splat)
+    moved = far.gaussians.replace(means=far.gaussians.means + torch.tensor([0, 0, 900.0]))
+    write_splats(tmp_path / "far.ply", dataclasses.replace(far, gaussians=moved))
+    split_scene(town, tmp_path / "city", 2, splat=tmp_path / "far.ply", latents=4)
+    for block in ("block00", "block01"):
+        (tmp_path / "city" / block / "core.json").write_text('{"gaussians": 0, "of": 0, "box": null, "seconds": 0}')
+    with pytest.raises(ValueError, match=tells("city", "none", "splat")):
+        FieldInBlocks.open(tmp_path / "city")

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from messages import tells
 
-from kfgs.scale import map_scenes
+from kfgs.scale import map_scenes, run_batch
 from kfgs.scale.driver import AGAIN, Task, drive
 
 SCENES = [f"/data/{name}" for name in ("kitchen", "hall", "attic", "cellar")]
@@ -146,7 +146,19 @@ def test_submitit_is_an_engine(tmp_path):
     assert found[0].value == 13
 
 
-@pytest.mark.parametrize("at_once", [0, -1])
-def test_a_wrong_number_of_scenes_at_once_is_refused(at_once):
-    with pytest.raises(ValueError, match=tells("at_once", at_once)):
+@pytest.mark.parametrize("at_once", [0, -1, 0.5, 2.5, float("inf"), "2", True, None, lambda: -1, lambda: "two"])
+def test_a_wrong_number_of_scenes_at_once_is_refused(at_once, tmp_path):
+    with pytest.raises(ValueError, match=tells("at_once", at_once() if callable(at_once) else at_once)):
         map_scenes(len, SCENES, client=ThreadPoolExecutor(1), at_once=at_once)
+    if not callable(at_once):
+        with pytest.raises(ValueError, match=tells("at_once", at_once)):
+            run_batch(SCENES, tmp_path / "runs", client=ThreadPoolExecutor(1), at_once=at_once)
+        assert not (tmp_path / "runs").exists()
+
+
+def test_scenes_wait_while_there_are_no_workers():
+    answers = [0, 0]
+    with ThreadPoolExecutor(1) as pool:
+        found = map_scenes(len, SCENES[:1], client=pool, at_once=lambda: answers.pop() if answers else 1)
+    assert found[0].value == 13
+    assert answers == []

@@ -44,6 +44,18 @@ def test_all_wrong_lines_are_named(listed):
     assert "line 4:" not in message
 
 
+def test_a_list_from_windows_is_read(listed, tmp_path):
+    path = listed("")
+    path.write_bytes(b"\xef\xbb\xbfkitchen\r\n\r\nup = attic/images  # two rooms\r\n# the end\r\n")
+    assert [(one.name, one.source) for one in read_scenes(path)] == [
+        ("kitchen", str(tmp_path / "kitchen")),
+        ("up", str(tmp_path / "attic" / "images")),
+    ]
+    path.write_bytes("kitchen\r\n".encode("utf-16"))
+    with pytest.raises(ValueError, match=tells("scenes.txt", "UTF-8")):
+        read_scenes(path)
+
+
 @pytest.mark.parametrize("text", ["", "# nothing\n\n"])
 def test_an_empty_list_is_refused(listed, text):
     with pytest.raises(ValueError, match=tells("expected a scene", "got none")):

@@ -8,10 +8,12 @@ import torch
 from cases_search import COUNT, NAMES, save_scenes, scene, table
 from messages import tells
 
+from kfgs._files import digest_file
 from kfgs.fields import SemanticField
 from kfgs.labels import connected_parts
-from kfgs.scale import SearchIndex
+from kfgs.scale import SearchIndex, search_state
 from kfgs.scale.search_file import NAME
+from kfgs.scale.search_found import Changes
 
 
 @pytest.fixture(scope="module")
@@ -154,8 +156,10 @@ def test_a_changed_field_is_described_again_and_a_touched_one_is_not(tmp_path):
     index, _ = SearchIndex.open(tmp_path).update()
     assert index.is_current()
     (tmp_path / "b" / "field" / "field.json").touch()
-    assert index.is_current()  # by its digest
-    assert index.update()[1].added == ()
+    assert not index.is_current()  # its time is noted
+    index, changes = index.update()
+    assert changes.added == ()  # by its digest
+    assert index.is_current()
     save_scenes(tmp_path, b=scene([("wall", 0.0), ("chair", 0.0)], 2))
     assert not index.is_current()
     index, changes = index.update()
@@ -220,3 +224,68 @@ def test_fifty_fields_are_searched_from_one_file(tmp_path):
     assert len(index.contents.spaces[0].words) < 12  # shared: three classes
     assert {one.path for one in index.search("lamp").scenes} == {f"scene_{i:02d}/field" for i in range(0, 50, 5)}
     assert (tmp_path / NAME).stat().st_size < 50 * 8_000
+
+
+def test_a_run_may_be_called_as_a_part_of_a_run(tmp_path):
+    field = scene([("wall", 0.0), ("chair", 0.0)], 1)
+    for name in ("stages", "unfinished", "field@home"):
+        field.save(tmp_path / name / "field")
+        field.save(tmp_path / "run" / name / "deep")  # in a run's own folders nothing is a result
+    (tmp_path / "run" / "digests.json").write_text("{}")
+    index, _ = SearchIndex.open(tmp_path).update()
+    assert index.fields == ("field@home/field", "stages/field", "unfinished/field")
+
+
+def test_a_copied_archive_is_digested_once_and_a_moved_one_never(tmp_path, monkeypatch):
+    save_scenes(tmp_path / "old", a=scene([("wall", 0.0), ("chair", 0.0)], 1), b=scene([("wall", 0.0)], 2))
+    SearchIndex.open(tmp_path / "old").update()
+    read = []
+    monkeypatch.setattr(search_state, "digest_file", lambda file: read.append(file) or digest_file(file))
+    (tmp_path / "old").rename(tmp_path / "moved")
+    index = SearchIndex.open(tmp_path / "moved")
+    assert index.is_current()
+    assert [one.path for one in index.search("chair", exact=2).scenes] == ["a/field"]
+    shutil.copytree(tmp_path / "moved", tmp_path / "copy", copy_function=shutil.copyfile)
+    index = SearchIndex.open(tmp_path / "copy")
+    assert not index.is_current()
+    assert read == []
+    index, changes = index.update()
+    assert (changes, len(read)) == (Changes(), 2)
+    again = SearchIndex.open(tmp_path / "copy")
+    assert again.is_current()
+    assert again.update()[1] == Changes()
+    assert len(read) == 2
+
+
+def test_scenes_in_any_order_give_the_same_answers(tmp_path):
+    scenes = {
+        "a": scene([("wall", 0.0), ("chair", 0.0)], 1),
+        "b": scene([("table", 0.0), ("chair", 0.0)], 2),
+        "c": scene([("lamp", 0.0), ("wall", 0.0), ("table", 0.0)], 3),
+    }
+    found = []
+    for order in ("abc", "cba"):
+        for name in order:
+            save_scenes(tmp_path / order, **{name: scenes[name]})
+            index, _ = SearchIndex.open(tmp_path / order).update()
+        words = index.contents.spaces[0].words
+        assert len(words) == 4
+        found.append([[(one.path, one.count) for one in index.search(name, table()).scenes] for name in NAMES[:4]])
+        assert all(one.outside < 0.05 for one in index.contents.entries.values())
+    assert [sorted(one) for one in found[0]] == [sorted(one) for one in found[1]]
+    assert sum(map(len, found[0])) == 7
+
+
+def test_a_field_that_goes_while_it_is_indexed_is_left_out(tmp_path, monkeypatch):
+    save_scenes(tmp_path, a=scene([("wall", 0.0), ("chair", 0.0)], 1), b=scene([("chair", 0.0)], 2))
+    load = SemanticField.load
+
+    def lost(path):
+        shutil.rmtree(tmp_path / "b", ignore_errors=True)
+        return load(path)
+
+    monkeypatch.setattr(SemanticField, "load", staticmethod(lost))
+    index, changes = SearchIndex.open(tmp_path).update()
+    assert index.fields == ("a/field",)
+    assert changes.failed.keys() == {"b/field"}
+    assert SearchIndex.open(tmp_path).update()[1].removed == ("b/field",)

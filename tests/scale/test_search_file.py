@@ -5,6 +5,7 @@ import os
 import struct
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 import numpy as np
@@ -53,10 +54,12 @@ def test_what_is_written_is_read_and_equal_content_gives_equal_bytes(runs, tmp_p
 
 def test_another_version_or_kind_is_named(runs, tmp_path):
     newer = rewritten(runs / NAME, tmp_path / "newer", lambda tensors: None, version=2)
-    with pytest.raises(ValueError, match=tells(newer, "version 1", "version 2", "delete it")):
+    with pytest.raises(
+        ValueError, match=tells(newer, "version 1", "version 2", "use the kfgs that wrote it", "delete it")
+    ):
         read_index(newer)
     other = rewritten(runs / NAME, tmp_path / "other", lambda tensors: None, kind="semantic field")
-    with pytest.raises(ValueError, match=tells(other, "'semantic field'", "search index")):
+    with pytest.raises(ValueError, match=tells(other, "search index", "'semantic field'", "move it away")):
         read_index(other)
 
 
@@ -146,6 +149,29 @@ for _ in range(100):
     except ValueError as error:
         assert "in use" in str(error), error
 """
+
+
+def test_a_folder_in_place_of_the_index_is_named_before_the_work(tmp_path):
+    save_scenes(tmp_path, a=scene([("wall", 0.0)], 1))
+    (tmp_path / NAME).mkdir()
+    with pytest.raises(ValueError, match=tells(tmp_path / NAME, "search index", "a folder", "move it away")):
+        SearchIndex.open(tmp_path)
+
+
+def test_searches_go_on_while_the_index_is_replaced(runs, tmp_path):
+    """Readers find one of two whole indices at any moment."""
+    both = read_index(runs / NAME)
+    one = Contents(both.spaces, both.tables, {"a/field": both.entries["a/field"]})
+    write_index(tmp_path / NAME, both)
+    found = set()
+    with ThreadPoolExecutor(1) as pool:
+        writing = pool.submit(lambda: [write_index(tmp_path / NAME, (one, both)[i % 2]) for i in range(60)])
+        while not writing.done():
+            index = SearchIndex.open(tmp_path)
+            found.add((len(index), len(index.search("chair").scenes), len(index.search("wall").scenes)))
+        writing.result()
+    assert found <= {(1, 1, 1), (2, 1, 2)}
+    assert found
 
 
 def test_two_processes_that_write_at_once_make_one_whole_index(tmp_path):

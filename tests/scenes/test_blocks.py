@@ -8,7 +8,7 @@ from messages import tells
 from small_room import make_room
 
 from kfgs.scenes import SceneError, load_scene, read_model
-from kfgs.scenes.blocks import Block, partition, write_part
+from kfgs.scenes.blocks import Block, partition, write_parts
 
 
 @pytest.fixture(scope="module")
@@ -68,16 +68,34 @@ def test_a_block_survives_json(room):
 def test_a_part_of_a_model_is_a_model(room, tmp_path):
     block = partition(room / "sparse/0", 4, share=0.5)[1]
     assert 0 < len(block.views) < 9
-    write_part(room / "sparse/0", block.views, tmp_path / "part")
+    write_parts(room / "sparse/0", {tmp_path / "part": block.views})
     whole, part = load_scene(room), read_model(tmp_path / "part")
     assert {image.name for image in part.images.values()} == set(block.views)
     poses = {image.name: image.pose for image in part.images.values()}
     for camera in whole.cameras:
         if camera.name in poses:
             np.testing.assert_allclose(poses[camera.name], camera.viewmat.numpy(), atol=1e-6)
-    with pytest.raises(SceneError, match=tells("names", "nobody.png")):
-        write_part(room / "sparse/0", ["nobody.png"], tmp_path / "other")
+    with pytest.raises(SceneError, match=tells("parts", "nobody.png")):
+        write_parts(room / "sparse/0", {tmp_path / "good": block.views, tmp_path / "other": ["nobody.png"]})
+    assert not (tmp_path / "good").exists()
     assert not (tmp_path / "other").exists()
+
+
+def test_all_parts_are_those_of_one_reading(room, tmp_path, monkeypatch):
+    import pycolmap
+
+    blocks, read, reads = partition(room / "sparse/0", 4, share=0.2), pycolmap.Reconstruction, []
+    for block in blocks:
+        write_parts(room / "sparse/0", {tmp_path / "alone" / block.name: block.views})
+    monkeypatch.setattr(pycolmap, "Reconstruction", lambda *words: reads.append(words) or read(*words))
+    write_parts(room / "sparse/0", {tmp_path / "together" / block.name: block.views for block in blocks})
+    assert len(reads) == 1
+    assert sum(len(block.views) > 1 for block in blocks) > 1
+    for block in blocks:  # no part is missing what an earlier one left out
+        one, other = (read_model(tmp_path / kind / block.name) for kind in ("alone", "together"))
+        assert {image.name for image in other.images.values()} == set(block.views)
+        assert len(other.images) == 1 or len(other.points) > 10
+        np.testing.assert_array_equal(one.points, other.points)
 
 
 def test_what_cannot_be_cut(room, tmp_path):

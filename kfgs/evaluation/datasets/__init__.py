@@ -1,12 +1,12 @@
 """Ground truth of published data sets, and of any folder of labels. Poses and pictures come from `kfgs.scenes.load_scene`."""
 
-from .coco import load_coco_labels, load_coco_masks
+from ...labels.polygons import decode_rle, fill_polygon, fill_region
+from .coco import load_coco_examples, load_coco_labels, load_coco_masks
 from .find import find_labels, find_masks, find_points
 from .label_folder import load_labels
 from .legaussians import load_legaussians
 from .lerf_ovs import load_lerf_ovs
 from .ovs3d import OVS3D_REPORTED, OVS3D_SCENES, load_3dovs
-from .polygons import decode_rle, fill_polygon, fill_region
 from .replica import load_replica_points, load_semantic_nerf_labels
 from .scannet import load_scannet_points
 from .scenesplat import load_scenesplat_points
@@ -23,6 +23,7 @@ __all__ = [
     "find_masks",
     "find_points",
     "load_3dovs",
+    "load_coco_examples",
     "load_coco_labels",
     "load_coco_masks",
     "load_labels",

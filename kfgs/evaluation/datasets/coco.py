@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 
 from ..._files import as_path, read_json
+from ...fields.examples import Mask
+from ...labels.polygons import MOST, decode_rle, fill_region, say_range, union
 from ...scenes.files import MAX_SIDE, file_stem
 from ..class_lists import VOID_NAMES, name_key
 from ..truth import LabelTruth, MaskAndBoxes, MaskTruth
 from .files import ReadWhenAsked
-from .polygons import MOST, decode_rle, fill_region, say_range, union
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,24 @@ def load_coco_masks(path: str | Path) -> MaskTruth:
     void = [category for category in names if _is_void(names[category])]
     shown = {s: p for s, p in pictures.items() if any(one.get("category_id") not in void for _, one in p.objects)}
     return MaskTruth(ReadWhenAsked({stem: partial(_masks, path, names, p) for stem, p in shown.items()}))
+
+
+def load_coco_examples(path: str | Path) -> dict[str, list[Mask]]:
+    """Read a COCO JSON as examples of classes (`fields.label_set_from_examples`): one mask per category and picture.
+
+    Pictures must be views of the field, in their size. Categories in `VOID_NAMES` are left out.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is damaged, or has no objects.
+    """
+    examples: dict[str, list[Mask]] = {}
+    for stem, masks in load_coco_masks(path).frames.items():
+        for name, found in masks.items():
+            examples.setdefault(name, []).append(Mask(stem, found.mask))
+    if not examples:
+        raise ValueError(f"{path}: expected objects as examples, got none; annotate some")
+    return examples
 
 
 def load_coco_labels(path: str | Path) -> LabelTruth:

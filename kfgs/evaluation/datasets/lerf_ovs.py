@@ -15,12 +15,12 @@ from typing import Any
 import torch
 
 from ..._files import as_path, read_json
+from ...labels.polygons import MOST, fill_polygon, say_range, union
 from ...scenes.files import natural_key, some
 from ...scenes.posed import picture_size
 from ..class_lists import load_classes
 from ..truth import MaskAndBoxes, MaskTruth
 from .files import ReadWhenAsked, find_folder
-from .polygons import MOST, fill_polygon, say_range, union
 
 
 def load_lerf_ovs(path: str | Path, scene: str | None = None) -> MaskTruth:

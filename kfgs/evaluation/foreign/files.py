@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,43 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..._torch_files import plain_tensor, read_torch
+from ...formats.folders import numbered_files
 from ...gaussians import Gaussians
-from ...teachers.torch_files import TorchFileError, check_plain, load_torch_file
-
-
-def read_torch(path: Path, expected: str) -> Any:
-    """The object in a file of `torch.save`; nothing in it is run.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is something else, or damaged.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected {expected} there")
-    try:
-        return load_torch_file(path)
-    except TorchFileError as error:
-        raise ValueError(f"{path}: expected {expected}, got {error}") from error
-
-
-def plain_tensor(path: Path, name: str, value: object) -> Tensor:
-    """A tensor of a file as float32, without its graph.
-
-    Raises:
-        ValueError: if it is no dense tensor of finite numbers.
-    """
-    if not isinstance(value, Tensor):
-        raise ValueError(
-            f"{path}: expected a tensor for {name}, got {type(value).__name__}; is this another program's file?"
-        )
-    try:
-        check_plain(value)
-    except TorchFileError as error:
-        raise ValueError(f"{path}: {name} is {error}") from error
-    found = value.detach().float()
-    if not bool(torch.isfinite(found).all()):
-        raise ValueError(f"{path}: expected finite numbers for {name}, got NaN or infinity; did the training diverge?")
-    return found
 
 
 def read_state(path: Path, expected: str) -> dict[str, Tensor]:
@@ -137,12 +102,7 @@ def find_numbered(folder: Path, pattern: str, step: int | None, what: str) -> Pa
     Raises:
         FileNotFoundError: if there is none.
     """
-    before, after = pattern.split("*")
-    files: dict[int, Path] = {}
-    for file in folder.glob(pattern) if folder.is_dir() else ():
-        match = re.fullmatch(re.escape(before) + r"(\d+)" + re.escape(after), file.relative_to(folder).as_posix())
-        if match:
-            files[int(match[1])] = file
+    files = numbered_files(folder, pattern)
     if not files or (step is not None and step not in files):
         got = f"steps {sorted(files)}" if files else "none"
         raise FileNotFoundError(

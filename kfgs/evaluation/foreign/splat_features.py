@@ -15,8 +15,8 @@ from torch import Tensor
 
 from ..._arrays import read_array
 from ..._files import as_path
+from ..._torch_files import plain_tensor, read_torch
 from ...formats import read_splats
-from .files import plain_tensor, read_torch
 from .splatted import Level, SplattedMethod
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from pickled import archive, legacy, pickled, tensor, text
 
-from kfgs.teachers.torch_files import TorchFileError, load_torch_file
+from kfgs._torch_files import TorchFileError, load_torch_file
 
 NAMES = [
     "os.system",

@@ -23,8 +23,7 @@ import torch
 from messages import tells
 from pickled import CONTAINERS, Call, archive, legacy, pickled, tensor, text, zip_of
 
-from kfgs.teachers import pickle_check
-from kfgs.teachers.torch_files import Placeholder, TorchFileError, load_torch_file
+from kfgs._torch_files import Placeholder, TorchFileError, load_torch_file, pickle_check
 
 GETATTR = b"cbuiltins\ngetattr\n"
 PARTIAL = b"cfunctools\npartial\n(cbuiltins\nlen\ntR"

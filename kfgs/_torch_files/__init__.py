@@ -126,6 +126,41 @@ def check_plain(tensor: Tensor) -> None:
         )
 
 
+def read_torch(path: Path, expected: str) -> Any:
+    """The object in a file of `torch.save`; nothing in it is run.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is something else, or damaged.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; expected {expected} there")
+    try:
+        return load_torch_file(path)
+    except TorchFileError as error:
+        raise ValueError(f"{path}: expected {expected}, got {error}") from error
+
+
+def plain_tensor(path: Path, name: str, value: object) -> Tensor:
+    """A tensor of a file as float32, without its graph.
+
+    Raises:
+        ValueError: if it is no dense tensor of finite numbers.
+    """
+    if not isinstance(value, Tensor):
+        raise ValueError(
+            f"{path}: expected a tensor for {name}, got {type(value).__name__}; is this another program's file?"
+        )
+    try:
+        check_plain(value)
+    except TorchFileError as error:
+        raise ValueError(f"{path}: {name} is {error}") from error
+    found = value.detach().float()
+    if not bool(torch.isfinite(found).all()):
+        raise ValueError(f"{path}: expected finite numbers for {name}, got NaN or infinity; did the training diverge?")
+    return found
+
+
 @contextmanager
 def _pickle_errors() -> Iterator[None]:
     """Turn errors of a pickle into a one-line TorchFileError."""

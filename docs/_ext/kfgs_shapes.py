@@ -1,0 +1,76 @@
+"""Docstrings as the reference needs them.
+
+The comments beside a function's arguments, `means: Tensor,  # [N, 3]`, become a line of its page. `|x|` is a length: in
+reStructuredText alone it would be the name of a substitution.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import io
+import re
+import textwrap
+import tokenize
+from typing import Any
+
+from sphinx.application import Sphinx
+
+plain: dict[str, list[str]] = {}  # texts of attributes, as they are written
+
+
+def shapes_of(function: Any) -> dict[str, str]:
+    """The comments of a function's arguments, by name; `return` is what the result's says."""
+    try:
+        source = textwrap.dedent(inspect.getsource(function))
+    except (OSError, TypeError):
+        return {}
+    tree = ast.parse(source).body[0]
+    if not isinstance(tree, ast.FunctionDef):
+        return {}
+    last = tree.body[0].lineno
+    lines = {}
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT and token.start[0] < last:
+            lines[token.start[0]] = token.string.lstrip("# ")
+    arguments = [*tree.args.posonlyargs, *tree.args.args, *tree.args.kwonlyargs]
+    found = {one.arg: lines[one.lineno] for one in arguments if one.lineno in lines}
+    end = tree.returns.end_lineno if tree.returns else None
+    if end in lines and end not in {one.lineno for one in arguments}:
+        found["return"] = lines[end]
+    return {name: text for name, text in found.items() if not text.startswith(("noqa", "type:"))}
+
+
+def add_shapes(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Put the shapes after the first paragraph of a docstring, and a backslash before each bar outside of code."""
+    for number, line in enumerate(lines):
+        if not line.lstrip().startswith((">>>", "...")):
+            lines[number] = re.sub(r"(`[^`]*`)|\|", lambda found: found[1] or r"\|", line)
+    if what == "attribute":
+        plain[name] = list(lines)
+    if what not in ("function", "method"):
+        return
+    shapes = shapes_of(inspect.unwrap(thing))
+    if shapes:
+        told = [f"``{key}`` {text}" if key != "return" else f"returns {text}" for key, text in shapes.items()]
+        at = lines.index("") if "" in lines else len(lines)
+        lines[at:at] = ["", "*Shapes:* " + "; ".join(told).replace("\\", "\\\\") + "."]
+
+
+def keep_plain(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Undo what napoleon makes of an attribute's text: it takes the words before a colon for a type."""
+    if what == "attribute":
+        lines[:] = plain.pop(name)
+
+
+def short_defaults(app: Sphinx, what: str, name: str, thing: Any, options: Any, sign: str | None, back: Any) -> Any:
+    """Write `...` for a default that is made by a function: what stands there is not Python."""
+    return (sign.replace("<factory>", "..."), back) if sign else None
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Register the hooks, before and after napoleon's, which has 500."""
+    app.connect("autodoc-process-docstring", add_shapes, priority=400)
+    app.connect("autodoc-process-docstring", keep_plain, priority=600)
+    app.connect("autodoc-process-signature", short_defaults)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,185 @@
+"""Draw the pictures of the site's pages with kfgs itself, on the result of `kfgs demo`.
+
+    kfgs demo --out DEMO && python docs/pictures/make.py DEMO
+
+Each `site_*.jpg` here is smaller than 100 kB. Look at every picture before you commit it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from kfgs import (
+    EditList,
+    FeatureFolder,
+    Recolor,
+    Remove,
+    SemanticField,
+    fit_codebook,
+    load_label_set,
+    load_scene,
+    read_splats,
+    transfer_labels,
+    viz,
+)
+from kfgs.pipeline import true_labels
+from kfgs.viz.field_colors import colors_of_features
+from kfgs.viz.film_frames import show_cloud
+from kfgs.viz.palette import palette
+from kfgs.viz.shows import show_classes, show_selection
+
+HERE = Path(__file__).resolve().parent
+LARGEST = 100_000  # bytes
+WIDE = 1200  # pixels
+
+
+class Demo:
+    """What the pictures are drawn from: scene, field, classes and colour splat of a demo, and the view they show."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder / "scene"
+        self.scene = load_scene(self.folder)
+        self.field = SemanticField.load(folder / "run" / "field")
+        self.words = load_label_set(self.folder / "classes.json", self.folder / "text.npy")
+        self.splat = read_splats(folder / "color.ply")
+        chair = self.words.index("chair")
+        self.truth = true_labels(self.scene, self.folder / "labels", "test")
+        stem = max(self.truth, key=lambda name: int((self.truth[name] == chair).sum()))
+        self.index = next(i for i in self.scene.views("test") if self.scene.stem(i) == stem)
+        self.stem, self.camera = stem, self.scene.cameras[self.index]
+        self.large = self.camera.resized(480, 640)
+        self.colors = show_cloud(self.splat.gaussians, color_by="rgb")
+
+    def photo(self) -> np.ndarray:
+        """The photograph of the view."""
+        return self.scene.image(self.index).numpy()
+
+    def classes(self, labels: torch.Tensor) -> np.ndarray:
+        """Labels as a picture in the colours of the classes."""
+        return palette(labels.numpy(), self.words.names)
+
+
+def save(name: str, pictures: list[np.ndarray], titles: list[str], across: int = 3) -> None:
+    """Write pictures, `across` of them side by side, as one JPEG that is small enough."""
+    rows = [
+        viz.picture_grid([pictures[i : i + across]], titles[i : i + across], width=(WIDE - 6 * across) // across)
+        for i in range(0, len(pictures), across)
+    ]
+    write(name, Image.fromarray(np.concatenate(rows)))
+
+
+def write(name: str, picture: Image.Image) -> None:
+    """Write a JPEG in the best quality that stays below the limit."""
+    path = HERE / name
+    for quality in (88, 80, 70, 60, 50):
+        picture.convert("RGB").save(path, quality=quality, optimize=True)
+        if path.stat().st_size < LARGEST:
+            break
+    print(f"{name}: {picture.size[0]} x {picture.size[1]}, {path.stat().st_size / 1000:.0f} kB")
+
+
+def draw_field(demo: Demo) -> None:
+    """A photo, the Gaussians with shrunken shapes, and the classes."""
+    labelled = demo.field.label(demo.words)
+    dots = labelled.replace(scales=labelled.scales * 0.45, opacities=torch.full_like(labelled.opacities, 0.95))
+    gaussians = show_cloud(dots, color_by="label", names=demo.words.names)(demo.large)
+    classes = show_classes(labelled, demo.words.names)(demo.large)
+    save(
+        "site_field.jpg", [demo.photo(), gaussians, classes], ["photo", "Gaussians of the field", "class of each pixel"]
+    )
+
+
+def draw_uplift(demo: Demo) -> None:
+    """The teacher's classes, the field's, and the truth."""
+    features = FeatureFolder(demo.folder / "features", [demo.stem])[0]
+    unit = torch.nn.functional.normalize(features.float(), dim=-1)
+    teacher = (unit @ demo.words.embeddings.float().T).argmax(-1)
+    found = demo.field.segment(demo.camera, demo.words)
+    pictures = [demo.classes(labels) for labels in (teacher, found, demo.truth[demo.stem])]
+    save("site_uplift.jpg", pictures, ["the teacher, one view", "the field, all views averaged", "truth"])
+
+
+def draw_codebook(demo: Demo) -> None:
+    """A feature map in colours, before and after each pixel takes its nearest codeword."""
+    maps = FeatureFolder(demo.folder / "features").of(demo.scene, "train")
+    book = fit_codebook(maps, generator=torch.Generator().manual_seed(0)).codebook
+    features = FeatureFolder(demo.folder / "features", [demo.stem])[0].float()
+    words = book.codewords[book.quantize(features)]
+    both = torch.cat([features.flatten(0, 1), words.flatten(0, 1)])
+    colors = colors_of_features(both)(both)
+    before, after = (part.reshape(*features.shape[:2], 3) for part in np.split(np.asarray(colors), 2))
+    save(
+        "site_codebook.jpg",
+        [demo.photo(), before, after],
+        ["photo", "512 numbers a pixel", f"one of {book.size} codewords"],
+    )
+
+
+def draw_gamma(demo: Demo) -> None:
+    """The chairs at three thresholds, and the histogram of their scores."""
+    found = demo.field.query("chair", demo.words)
+    shown, titles = [], []
+    high = float(found.scores[found.mask].quantile(0.6))
+    for gamma in (0.02, found.threshold, high):
+        mask = demo.field.query("chair", demo.words, gamma).mask
+        shown.append(show_selection(demo.field.gaussians, mask, demo.colors)(demo.large))
+        titles.append(f"gamma {gamma:.2f}: {int(mask.sum()):,} Gaussians")
+    save("site_gamma.jpg", shown, titles)
+    figure = viz.plot_scores(found)
+    figure.savefig(HERE / "site_scores.png", dpi=110)
+    write("site_scores.jpg", Image.open(HERE / "site_scores.png"))
+    (HERE / "site_scores.png").unlink()
+
+
+def draw_lambda(demo: Demo) -> None:
+    """Labels of a field that has never seen the plant, carried to the splat within three distances."""
+    labelled = demo.field.label(demo.words)
+    source = labelled[labelled.labels != demo.words.index("plant")]
+    target, shown, titles = demo.splat.gaussians, [], []
+    for distance in (0.02, 0.1, 0.8):
+        carried = transfer_labels(source, source.labels, target, distance).labels
+        shown.append(show_cloud(target.replace(labels=carried), color_by="label", names=demo.words.names)(demo.large))
+        titles.append(f"lambda {distance:.2f}: {(carried >= 0).float().mean():.0%} labelled")
+    save("site_lambda.jpg", shown, titles)
+
+
+def draw_errors(demo: Demo) -> None:
+    """Truth, result, and where they differ."""
+    truth, found = demo.truth[demo.stem], demo.field.segment(demo.camera, demo.words)
+    photo = demo.photo()
+    gray = np.repeat(photo.mean(-1, keepdims=True), 3, -1) * 0.5 + 0.5
+    errors = np.where((found != truth).numpy()[..., None], (0.84, 0.15, 0.1), gray)
+    save("site_scores_errors.jpg", [demo.classes(truth), demo.classes(found), errors], ["truth", "field", "errors"])
+
+
+def draw_landing(demo: Demo) -> None:
+    """Photo, classes, a query, and an edited scene."""
+    edited = EditList().then(Remove("chair")).then(Recolor("plant", "#c04040")).apply(demo.splat).gaussians
+    asked = demo.field.query("chair", demo.words).mask
+    pictures = [
+        demo.photo(),
+        show_classes(demo.field.label(demo.words), demo.words.names)(demo.large),
+        show_selection(demo.field.gaussians, asked, demo.colors)(demo.large),
+        show_cloud(edited, color_by="rgb")(demo.large),
+    ]
+    save("site_landing.jpg", pictures, ["photo", "classes", "“chair”", "chairs removed, plant red"], across=2)
+
+
+def main() -> int:
+    """Draw all pictures."""
+    parser = argparse.ArgumentParser(description="Draw the pictures of the site.")
+    parser.add_argument("demo", type=Path, help="folder that `kfgs demo --out` wrote")
+    demo = Demo(parser.parse_args().demo)
+    for draw in (draw_landing, draw_field, draw_uplift, draw_codebook, draw_gamma, draw_lambda, draw_errors):
+        draw(demo)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,121 @@
+"""The passes of the uplift over its views: sums by rendering weight, and the correction of blended Gaussians (SIRT)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from .._ranks import in_order
+from ..cameras import Camera, resize_map
+from ..gaussians import Gaussians
+from ..labels.views import sum_pixels
+from ..splat import rasterize
+from .uplift_sums import add_sums
+from .working_maps import WorkingMaps, shrink_map
+
+NEIGHBOURS = 17  # a Gaussian and its 16 nearest, whose corrections are judged together
+
+
+def average(cloud: Gaussians, views: WorkingMaps, bar: Any) -> tuple[Tensor, Tensor]:  # [2, N, d' + 1], [N]
+    """Sums of features and weights, over the even and the odd views, and the number of pixels that each Gaussian fills."""
+    sums, shown = cloud.means.new_zeros(2, len(cloud), views.channels + 1), torch.zeros_like(cloud.opacities)
+
+    def look(i: int) -> dict[str, Tensor]:
+        camera, features, _, scale = views[i]
+        return _part(cloud, camera, features, scale)
+
+    for i, part in enumerate(in_order(range(len(views)), look)):
+        half = sums[views.half(i)]
+        before = half[:, -1].clone()
+        half.index_add_(0, part["index"], part["total"])
+        shown += float(part["scale"]) * (half[:, -1] - before)
+        bar.update()
+    return sums, shown
+
+
+def correct(
+    cloud: Gaussians, sums: Tensor, old: Tensor | None, old_lacking: Tensor | None, views: WorkingMaps, bar: Any
+) -> tuple[Tensor, Tensor | None, Tensor]:  # [2, N, d + 1], [2, N, d + 1], [2, N, d]
+    """One pass of SIRT: correct each Gaussian's feature by the weighted mean of the difference at its pixels, without noise.
+
+    The even and the odd views make one reconstruction each. Signal is the part of the two corrections that agrees among
+    neighbours (`reliability`); both take the reliable share.
+
+    Args:
+        cloud: the Gaussians.
+        sums: of these views.
+        old: of earlier views, with their own sums of differences, `old_lacking`.
+        views: these views.
+        bar: counts them.
+
+    Returns:
+        Corrected sums of these and of earlier views, and the corrections before noise was taken out of them.
+    """
+    halves = per_weight(sums)
+    lacking = torch.zeros_like(sums)
+
+    def look(i: int) -> dict[str, Tensor]:
+        camera, features, factor, scale = views[i]
+        rendered, alpha, _ = rasterize(cloud.replace(features=halves[views.half(i)]), camera)
+        covered = shrink_map(alpha[..., None], factor)  # the rest of the pixel is empty: no Gaussian can explain it
+        return _part(cloud, camera, covered * features - shrink_map(rendered, factor), scale)
+
+    for i, part in enumerate(in_order(range(len(views)), look)):
+        lacking[views.half(i)].index_add_(0, part["index"], part["total"])
+        bar.update()
+    corrections = per_weight(add_sums(lacking, old_lacking))
+    share = reliability(corrections[0], corrections[1], _neighbours(cloud.means))[:, None]
+    if old is not None and old_lacking is not None:
+        old = _moved(old, share * per_weight(old_lacking))
+    return _moved(sums, share * per_weight(lacking)), old, corrections
+
+
+def _moved(sums: Tensor, change: Tensor) -> Tensor:  # [2, N, d + 1], [2, N, d] -> [2, N, d + 1]
+    """Sums whose means are changed."""
+    weights = sums[..., -1:]
+    return torch.cat([(per_weight(sums) + change) * weights, weights], dim=-1)
+
+
+def reliability(one: Tensor, other: Tensor, near: Tensor) -> Tensor:  # [N, d] x 2, [N, k] -> [N] in [0, 1]
+    """The share of signal in the mean of two independent estimates: 2 r / (1 + r), the Spearman-Brown formula.
+
+    r is the common part of the estimates, sum of products over mean sum of squares, over a Gaussian and its neighbours.
+    Negative values become 0; so do those of Gaussians that one half of the views does not show.
+    """
+    products = (one * other).sum(1)[near].sum(1)
+    squares = (one.square().sum(1) + other.square().sum(1))[near].sum(1) / 2
+    r = (products / some(squares)).clamp(0, 1)
+    return 2 * r / (1 + r)
+
+
+def _neighbours(means: Tensor) -> Tensor:  # [N, 3] -> [N, k] int64
+    """Each Gaussian and those nearest to it."""
+    places = means.detach().cpu().double().numpy()
+    count = min(NEIGHBOURS, len(places))
+    found = cKDTree(places).query(places, k=[*range(1, count + 1)], workers=-1)[1]
+    return torch.from_numpy(np.asarray(found)).to(means.device)
+
+
+def per_weight(sums: Tensor) -> Tensor:  # [..., d + 1] -> [..., d]
+    """Means of sums whose last column is the weight; 0 without weight."""
+    return sums[..., :-1] / some(sums[..., -1:])
+
+
+def some(weights: Tensor) -> Tensor:
+    """Weights to divide by: 0 becomes the smallest normal number."""
+    return weights.clamp_min(torch.finfo(weights.dtype).tiny)
+
+
+def _part(cloud: Gaussians, camera: Camera, signal: Tensor, scale: float) -> dict[str, Tensor]:  # signal [h, w, c]
+    """What one view adds to the rows `index` [M]: `total` [M, c + 1], the sums of the signal by rendering weight and, in the last
+    column, the weight of the known pixels. A weight of 1 stands for `scale` original pixels.
+    """
+    known = ~signal[..., :1].isnan()
+    both = torch.cat([torch.where(known, signal, 0), known.to(signal)], dim=-1)
+    both = resize_map(both, camera.size).contiguous()
+    index, total, _ = sum_pixels(cloud, camera, both)
+    return {"index": index, "total": total, "scale": torch.tensor(scale, dtype=torch.float64)}

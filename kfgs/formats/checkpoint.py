@@ -1,0 +1,161 @@
+"""Checkpoints of gsplat (`ckpt_29999_rank0.pt`) and of nerfstudio's splatfacto (`step-000029999.ckpt`), read only.
+
+Both hold raw values: scales are logarithms, opacities logits, quaternions (w, x, y, z). gsplat's are in `splats`: means,
+scales, quats, opacities, sh0, shN. Nerfstudio's are in `pipeline`, under names that end in `gauss_params.means` (older ones:
+`_model.means`) and so on. Its colours are features_dc and features_rest; without the latter they are logits of colours. This
+is what the programs' own code writes; no file by the programs was at hand.
+
+**Frame**: nerfstudio trains in a frame of its own, x' = scale (R x + t), and writes it to `dataparser_transforms.json` in the
+folder above the checkpoint; it is undone here. The result is the frame of the data before its `applied_transform`, if
+transforms.json has one: that of COLMAP. gsplat's trainer normalises the scene, too, and does not write the frame anywhere.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .._files import read_json
+from .._torch_files import plain_tensor, read_torch
+from ..cameras.similarity import Similarity
+from ..gaussians import Gaussians
+from ..splat.transform import transform_gaussians
+from .splat_file import SplatFile
+from .values import SH_C0, check_finite, positive_scales
+
+NAME = "checkpoint"
+SUFFIXES = (".pt", ".ckpt")
+HOLDS_LABELS = False
+FRAME = "dataparser_transforms.json"
+_EXPECTED = "a checkpoint of gsplat (with 'splats') or of nerfstudio's splatfacto (with 'pipeline')"
+_NAMES = ("means", "scales", "quats", "opacities")
+
+
+def matches(head: bytes) -> bool:
+    """A zip file whose first entry is a pickle, as torch writes them."""
+    return head.startswith(b"PK\x03\x04") and head[30 : 30 + int.from_bytes(head[26:28], "little")].endswith(
+        b"/data.pkl"
+    )
+
+
+def read(path: Path) -> SplatFile:
+    """Read the Gaussians of a checkpoint; optimisers and networks in it are skipped.
+
+    Of gsplat, the files of all ranks of the step are joined. `info` has `step`, and `frame` in words.
+
+    Raises:
+        ValueError: if it is something else, damaged, or its colours come from a network (gsplat's `app_opt`); or if
+            `dataparser_transforms.json` is damaged.
+    """
+    top = read_torch(path, _EXPECTED)
+    found = top if isinstance(top, dict) else {}
+    info: dict[str, Any] = {"format": NAME, **({"step": found["step"]} if isinstance(found.get("step"), int) else {})}
+    if isinstance(found.get("splats"), dict):
+        files = _ranks(path)
+        parts = [_gsplat(file, found if file == path else read_torch(file, _EXPECTED)) for file in files]
+        info |= {"program": "gsplat", "frame": "that of gsplat's trainer, which normalises the scene by default"}
+        return SplatFile(Gaussians.cat(parts), info=info | ({"ranks": len(files)} if len(files) > 1 else {}))
+    if isinstance(found.get("pipeline"), dict):
+        cloud, frame = _undo_frame(path, _splatfacto(path, found["pipeline"]))
+        return SplatFile(cloud, info=info | {"program": "nerfstudio", "frame": frame})
+    got = f"one with {', '.join(map(str, list(found)[:5]))}" if found else type(top).__name__
+    raise ValueError(f"{path}: expected {_EXPECTED}, got {got:.200}; name another file")
+
+
+def _ranks(path: Path) -> list[Path]:
+    """The files of all processes that trained together, in order of their numbers."""
+    match = re.fullmatch(r"(.*_rank)(\d+)(\.pt)", path.name)
+    if match is None:
+        return [path]
+    found = (re.fullmatch(re.escape(match[1]) + r"(\d+)\.pt", file.name) for file in path.parent.glob("*.pt"))
+    numbers = sorted(int(one[1]) for one in found if one)
+    if numbers != list(range(len(numbers))):
+        raise ValueError(
+            f"{path}: expected the files of ranks 0 to {numbers[-1]} beside it, got {numbers}; copy them all"
+        )
+    return [path.with_name(f"{match[1]}{number}{match[3]}") for number in numbers]
+
+
+def _gsplat(path: Path, top: Any) -> Gaussians:
+    splats = top.get("splats") if isinstance(top, dict) else None
+    if not isinstance(splats, dict):
+        raise ValueError(f"{path}: expected {_EXPECTED}, got another file; copy the checkpoints again")
+    if "sh0" not in splats and "features" in splats:
+        raise ValueError(
+            f"{path}: expected colours as spherical harmonics (sh0, shN), got features for a network (app_opt); export a PLY "
+            "with gsplat (--save_ply), or train without app_opt"
+        )
+    raw = {name: plain_tensor(path, name, splats.get(name)) for name in (*_NAMES, "sh0")}
+    rest = plain_tensor(path, "shN", splats["shN"]) if "shN" in splats else raw["sh0"][:, :0]
+    return _cloud(path, raw, raw["sh0"], rest)
+
+
+def _splatfacto(path: Path, state: dict[Any, Any]) -> Gaussians:
+    prefixes = {
+        str(name).removesuffix("means") for name in state if re.search(r"(gauss_params|_model)\.means$", str(name))
+    }
+    if len(prefixes) != 1:
+        raise ValueError(
+            f"{path}: expected the Gaussians of splatfacto (_model.gauss_params.means, ...), got {len(prefixes)} sets; "
+            "is this a checkpoint of another method?"
+        )
+    (prefix,) = prefixes
+    raw = {name: plain_tensor(path, prefix + name, state.get(prefix + name)) for name in (*_NAMES, "features_dc")}
+    dc = raw["features_dc"] if raw["features_dc"].ndim == 3 else raw["features_dc"][:, None]
+    rest = (
+        plain_tensor(path, "features_rest", state[f"{prefix}features_rest"])
+        if f"{prefix}features_rest" in state
+        else dc[:, :0]
+    )
+    if rest.ndim == 3 and rest.shape[1] == 0:  # trained without harmonics
+        dc = (dc.sigmoid() - 0.5) / SH_C0
+    return _cloud(path, raw, dc, rest)
+
+
+def _cloud(path: Path, raw: dict[str, Tensor], dc: Tensor, rest: Tensor) -> Gaussians:
+    """The Gaussians of raw values; a ValueError if shapes disagree or numbers overflow."""
+    N = len(raw["means"])
+    shapes = {"means": [N, 3], "scales": [N, 3], "quats": [N, 4]}
+    odd = [f"{name} {list(raw[name].shape)}" for name, shape in shapes.items() if list(raw[name].shape) != shape]
+    odd += [f"opacities {list(raw['opacities'].shape)}"] if raw["opacities"].numel() != N else []
+    odd += [f"colours {list(dc.shape)}"] if list(dc.shape) != [N, 1, 3] else []
+    if rest.ndim != 3 or rest.shape[1] not in (0, 3, 8, 15) or list(rest.shape[::2]) != [N, 3]:
+        odd.append(f"higher colours {list(rest.shape)}")
+    if odd:
+        raise ValueError(
+            f"{path}: expected values of {N} Gaussians (from means), got {', '.join(odd)}; is the file damaged?"
+        )
+    scales = raw["scales"].exp()
+    check_finite(path, scales=scales.numpy())
+    opacities = raw["opacities"].reshape(N).sigmoid()
+    return Gaussians(
+        raw["means"], raw["quats"], positive_scales(path, scales.numpy()), opacities, sh=torch.cat([dc, rest], 1)
+    )
+
+
+def _undo_frame(path: Path, cloud: Gaussians) -> tuple[Gaussians, str]:
+    """The Gaussians in the frame of the data, and that in words."""
+    file = next((place / FRAME for place in (path.parent.parent, path.parent) if (place / FRAME).is_file()), None)
+    if file is None:
+        warnings.warn(
+            f"{path}: no {FRAME} in the folder above, so the Gaussians stay in nerfstudio's own frame, which is not that of the "
+            "scene; copy that file from the run to its place",
+            stacklevel=4,
+        )
+        return cloud, "nerfstudio's own"
+    content = read_json(file)
+    try:
+        rows, scale = torch.tensor(content["transform"], dtype=torch.float64), float(content["scale"])
+        if rows.shape not in ((3, 4), (4, 4)) or not scale > 0:
+            raise ValueError(f"{list(rows.shape)} and {scale}")
+        data_from_run = Similarity(scale, rows[:3, :3], scale * rows[:3, 3]).inverse()
+    except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise ValueError(
+            f"{file}: expected a rigid 'transform' [3][4] and a 'scale' above 0, got something else ({error}); copy it again"
+        ) from error
+    return transform_gaussians(cloud, data_from_run), "that of the data, before applied_transform"

@@ -1,0 +1,45 @@
+"""Points for scenes that have poses and no points, as a stage of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from .._arrays import read_safetensors
+from .._progress import Progress
+from .._tensors import save_tensors
+from ..scenes import Scene, SfmConfig, find_points
+from .stages import Run, describe_lens, digest_scene
+from .train import check_scene
+
+
+def with_points(run: Run, scene: Scene, views: Sequence[int], seed: int, progress: Progress) -> Scene:
+    """The scene, with points if it had none: triangulated from the known poses of some of its views (`find_points`).
+
+    Raises:
+        SceneError: if pictures and poses do not fit together.
+        ValueError: if no view shows the points.
+    """
+    if len(scene.points):
+        return scene
+    seen = scene.select(views)
+    inputs = {
+        "pictures": run.digests(seen.image_paths),
+        "lenses": None if seen.lenses is None else [describe_lens(lens) for lens in seen.lenses],
+        "scene": digest_scene(seen, range(len(seen))),
+        "seed": seed,
+    }
+
+    def make(folder: Path) -> None:
+        run.say(
+            f"points: the scene has none, and training starts from points; they are triangulated from {len(seen)} pictures and "
+            "their poses (`kfgs sfm SCENE --out OUT` does the same once for all runs)"
+        )
+        found = find_points(seen, config=SfmConfig(seed=seed), progress=progress is True)
+        save_tensors(folder / "points.safetensors", {"points": found.points, "colors": found.colors})
+
+    tensors = read_safetensors(run.stage("points", inputs, make).folder / "points.safetensors")[0]
+    scene = replace(scene, points=tensors["points"], colors=tensors["colors"])
+    check_scene(scene, views)
+    return scene

@@ -1,0 +1,213 @@
+"""The output folder of Inria's 3DGS and its descendants: a scene and its splat at once.
+
+**Convention**: an entry of `cameras.json` has the centre of the camera (`position`) and a camera-to-world rotation
+(`rotation`, rows; x right, y down, z forward). `fx`, `fy` are in pixels of `width` x `height`. 3DGS puts the principal point
+in the middle of the picture. Test views are listed before training views. `cfg_args` is the text of a Python object: it is
+parsed for three plain values, and never run.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .._files import as_path
+from ..formats.folders import newest_splat
+from ..formats.table import read_splats
+from ..formats.values import SH_C0
+from .files import MAX_NUMBER, MAX_SIDE, SceneError, file_stem, list_images, read_scene_json, some
+from .posed import Matrix, PosedPicture, picture_size, read_points, scene_of_poses
+from .scene import Scene
+
+CAMERAS, SETTINGS, POINTS = "cameras.json", "cfg_args", "input.ply"
+_LONGEST = 1 << 16  # bytes of cfg_args, which has about 500
+_AGAIN = "copy the folder again"
+
+
+def is_inria(folder: Path) -> bool:
+    """Whether this is an output folder of 3DGS."""
+    return (folder / CAMERAS).is_file() and newest_splat(folder) is not None
+
+
+def load_inria(folder: str | Path, images: str | Path | None = None) -> Scene:
+    """Read the cameras of an output folder of 3DGS, with the pictures that it was trained on.
+
+    Points are those of `input.ply`, else the centres of the newest splat's Gaussians. If `cfg_args` says that views were
+    held out (`eval`), they are the `test` split.
+
+    Args:
+        folder: with `cameras.json` and `point_cloud/iteration_N/point_cloud.ply`; `cfg_args` may be missing.
+        images: the folder of the pictures; None: `images/` in `source_path` of `cfg_args`, also if that folder was moved
+            beside or above this one; else `images/` in this folder.
+
+    Raises:
+        FileNotFoundError: if there are no pictures.
+        SceneError: if a file is damaged, or pictures and cameras do not fit.
+    """
+    folder = as_path(folder)
+    path, settings = folder / CAMERAS, _settings(folder / SETTINGS)
+    entries = read_scene_json(path, _AGAIN)
+    if not isinstance(entries, list) or not entries:
+        raise SceneError(f"{path}: expected a list of cameras, got {type(entries).__name__}; {_AGAIN}")
+    pictures = as_path(images) if images is not None else _find_pictures(folder, settings)
+    names = _names(path, entries, pictures)
+    views, order, missing, sizes = [], [], [], dict[tuple[int, int], tuple[int, int]]()
+    for i, (entry, name) in enumerate(zip(entries, names, strict=True)):
+        if name is None:
+            missing.append(str(entry["img_name"]))
+            continue
+        pose, K, size = _camera(f"{path}, camera {i}", entry)
+        if size not in sizes:  # pictures of one size were resized to one size: only the first is looked at
+            sizes[size] = _true_size(pictures / name, size)
+        width, height = sizes[size]
+        K = np.diag([width / size[0], height / size[1], 1.0]) @ K
+        views.append(PosedPicture(name, pictures / name, pose, f"{path}, camera {i}", (K, (width, height))))
+        order.append(name)
+    if not views:
+        raise SceneError(
+            f"{pictures}: expected the pictures of {path} ({some(missing, 3)}), found none of them; name the folder that has "
+            "them (images=, or --images)"
+        )
+    notes = (
+        [f"{len(missing)} of {len(entries)} cameras have no picture in {pictures}: {some(missing)}"] if missing else []
+    )
+    notes += [
+        f"{size}: pictures are {true} pixels; cameras were resized to them"
+        for size, true in sizes.items()
+        if size != true
+    ]
+    scene = scene_of_poses(folder, views, None, None, _points(folder), notes)
+    held_out = _held_out(order) if settings.get("eval") is True else set()
+    test = [i for i, camera in enumerate(scene.cameras) if camera.name in held_out]
+    return replace(scene, splits={"train": [i for i in range(len(scene)) if i not in test], "test": test})
+
+
+def _settings(path: Path) -> dict[str, Any]:
+    """`source_path`, `images` and `eval` of `cfg_args`, as far as they are there.
+
+    Raises:
+        SceneError: if the file is something else.
+    """
+    if not path.is_file():
+        return {}
+    text = path.read_bytes()[: _LONGEST + 1]
+    expected = f"{path}: expected the text Namespace(source_path='...', ...)"
+    try:
+        if len(text) > _LONGEST:
+            raise ValueError(f"more than {_LONGEST} bytes")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of backslashes in paths
+            call = ast.parse(text.decode().strip(), mode="eval").body
+        if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Namespace"):
+            raise ValueError("another expression")
+        values = {word.arg: word.value for word in call.keywords}
+        found: dict[str, Any] = {
+            name: ast.literal_eval(values[name]) for name in ("source_path", "images", "eval") if name in values
+        }
+        kinds = {"source_path": str, "images": str, "eval": bool}
+        odd = [name for name, value in found.items() if not isinstance(value, kinds[name]) or "\0" in str(value)]
+        if odd:
+            raise ValueError(f"{odd[0]} = {found[odd[0]]!r:.60}")
+        return found
+    except (ValueError, SyntaxError, TypeError, RecursionError, MemoryError) as error:
+        raise SceneError(
+            f"{expected}, got something else ({error}); correct it, or delete it and name the pictures"
+        ) from error
+
+
+def _find_pictures(folder: Path, settings: dict[str, Any]) -> Path:
+    source, name = settings.get("source_path", ""), settings.get("images") or "images"
+    last = source.replace("\\", "/").rstrip("/").rpartition("/")[2]
+    places = [Path(source), folder / source] if source else []
+    places += [folder.parent / last, folder.parent.parent / last] if last else []
+    tried = [place / name for place in places] + [folder / name]
+    for place in [*tried, *places[:2]]:  # Blender's pictures lie in the source folder itself
+        if place.is_dir() and list_images(place):
+            return place
+    raise FileNotFoundError(
+        f"{folder}: expected the pictures of {CAMERAS} in one of {', '.join(map(str, dict.fromkeys(tried)))} ({SETTINGS} says "
+        f"source_path = {source!r}), found none; name their folder (images=, or --images)"
+    )
+
+
+def _names(path: Path, entries: list[Any], pictures: Path) -> list[str | None]:
+    """The picture of each camera, relative to the folder: 3DGS writes names with or without their folder and ending."""
+    known: dict[str, set[str]] = {}
+    for name in list_images(pictures):
+        bare = name.rpartition("/")[2]
+        for short in {name, file_stem(name), bare, file_stem(bare), bare.partition(".")[0]}:
+            known.setdefault(short, set()).add(name)
+    found: list[str | None] = []
+    for i, entry in enumerate(entries):
+        given = entry.get("img_name") if isinstance(entry, dict) else None
+        if not isinstance(given, str | int) or given == "":
+            raise SceneError(f"{path}, camera {i}: expected an object with an 'img_name', got {entry!r:.100}; {_AGAIN}")
+        fits = known.get(str(given), set())
+        if len(fits) > 1:
+            raise SceneError(
+                f"{path}, camera {i}: expected one picture {given!r} in {pictures}, got {some(sorted(fits))}; load the "
+                "folder that 3DGS was trained on, and give this one as the splat (--splat)"
+            )
+        found.append(next(iter(fits), None))
+    return found
+
+
+def _camera(where: str, entry: dict[str, Any]) -> tuple[Matrix, Matrix, tuple[int, int]]:
+    """Camera to world [4, 4], K [3, 3] and (width, height)."""
+    numbers: list[Any] = [entry.get(name) for name in ("width", "height", "fx", "fy")]
+    width, height, fx, fy = (n if type(n) in (int, float) and math.isfinite(n) else -1 for n in numbers)
+    if (
+        min(width, height, fx, fy) <= 0
+        or max(width, height) > MAX_SIDE
+        or width % 1
+        or height % 1
+        or max(fx, fy) > MAX_NUMBER
+    ):
+        raise SceneError(f"{where}: expected width, height, fx and fy above 0, got {numbers!r:.100}; {_AGAIN}")
+    pose = np.eye(4)
+    try:
+        rows, centre = np.array(entry["rotation"], np.float64), np.array(entry["position"], np.float64)
+        if rows.shape != (3, 3) or centre.shape != (3,):
+            raise ValueError(f"{rows.shape} and {centre.shape}")
+        pose[:3, :3], pose[:3, 3] = rows, centre
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise SceneError(
+            f"{where}: expected a rotation [3][3] and a position [3], got {error!r:.100}; {_AGAIN}"
+        ) from error
+    return pose, np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]]), (int(width), int(height))
+
+
+def _true_size(picture: Path, size: tuple[int, int]) -> tuple[int, int]:
+    """(width, height) of the pictures, which may be smaller or larger than the cameras say (`images_4`)."""
+    width, height = picture_size(picture)
+    if abs(size[1] / size[0] * width - height) > max(1.0, width / size[0]):
+        raise SceneError(
+            f"{picture}: expected a picture in the shape of {size[0]}x{size[1]} pixels, as {CAMERAS} says, got {width}x{height}; "
+            "name the folder of the pictures that 3DGS was trained on (images=, or --images)"
+        )
+    return width, height
+
+
+def _points(folder: Path) -> tuple[Tensor, Tensor]:
+    try:
+        if (folder / POINTS).is_file():
+            return read_points(folder / POINTS)
+        cloud = read_splats(folder).gaussians
+    except ValueError as error:
+        raise SceneError(str(error)) from error
+    shades = torch.full((len(cloud), 3), 0.5) if cloud.sh is None else 0.5 + SH_C0 * cloud.sh[:, 0]
+    return cloud.means, (shades.clamp(0, 1) * 255).round().to(torch.uint8)
+
+
+def _held_out(names: list[str]) -> set[str]:
+    """The views listed before the one place where the order of names begins again; none if there is not one such place."""
+    falls = [i for i in range(1, len(names)) if names[i] < names[i - 1]]
+    return set(names[: falls[0]]) if len(falls) == 1 else set()

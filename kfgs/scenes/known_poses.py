@@ -1,0 +1,210 @@
+"""Points for a scene whose poses are known: features and matches by pycolmap, triangulated; no pose and no lens changes."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from tqdm import tqdm
+
+from .._files import atomic_folder, check_output, real_path
+from ..cameras.camera import Camera
+from .colmap_model import has_model
+from .files import SceneError
+from .pycolmap_import import quiet_pycolmap, scene_errors
+from .scene import Scene
+from .sfm import SfmConfig, SfmReport, SfmRun, fill_database, timed
+
+MOST_VIEWS = 200
+"""Views that `find_points` looks at, evenly chosen: about 100,000 points of a room in some minutes."""
+NEIGHBOURS = 20
+"""Views that each view is compared with: the nearest ones that look the same way. It is twice what COLMAP takes of a video."""
+SAME_WAY = (
+    0.3  # cosine of the angle between two viewing directions (73 degrees): beyond it, SIFT finds nothing in common
+)
+FEWEST = 10  # points to start a field from
+AGREEING = 0.2
+"""The share of the matches that must agree with the poses. Of 6 photographs with their poses 97 % agree, with poses at random
+1 %, with inverted ones 4 %, with the axes of another convention none."""
+
+
+def find_points(
+    scene: Scene, *, config: SfmConfig | None = None, most_views: int | None = MOST_VIEWS, progress: bool = False
+) -> Scene:
+    """Give a scene points that are triangulated from its own poses; the points that it has are given up.
+
+    Args:
+        scene: posed views, with or without lens.
+        config: `max_features`, `seed` and `num_threads` are used.
+        most_views: look at so many views, evenly chosen; None: at all.
+        progress: show a bar.
+
+    Returns:
+        The same scene with points and their colours.
+
+    Raises:
+        FileNotFoundError: if a picture is missing.
+        SceneError: if there are fewer than 2 views, or pictures and poses do not fit together.
+        ImportError: if pycolmap is not installed.
+    """
+    count = len(scene) if most_views is None else min(most_views, len(scene))
+    chosen = np.unique(np.linspace(0, len(scene) - 1, count).round().astype(int)).tolist() if count else []
+    with tempfile.TemporaryDirectory(prefix="kfgs-points-") as scratch:
+        model, _ = _triangulate(scene.select(chosen), Path(scratch), config or SfmConfig(), progress)
+        points = [model.points3D[i] for i in sorted(model.points3D)]
+    places = torch.from_numpy(np.array([point.xyz for point in points])).float()
+    colors = torch.from_numpy(np.array([point.color for point in points], np.uint8))
+    return replace(scene, points=places, colors=colors)
+
+
+def write_known_poses(
+    scene: Scene, out: str | Path, *, config: SfmConfig | None = None, replace: bool = False, progress: bool = False
+) -> SfmReport:
+    """Write a scene with known poses as a COLMAP model with triangulated points: `out/sparse/0`, and links in `out/images`.
+
+    Args:
+        scene: posed views, with or without lens. All are looked at.
+        out: the scene folder.
+        config: `max_features`, `seed` and `num_threads` are used.
+        replace: replace a model that is in `out/sparse/0` already.
+        progress: show a bar.
+
+    Raises:
+        FileExistsError: if `out/sparse/0` holds a model, and `replace` is False; or if `out/images` holds other files.
+        SceneError: as for `find_points`.
+        ImportError: if pycolmap is not installed.
+    """
+    out = check_output("out", out, "a folder", inside=["sparse/0"])
+    model, images = out / "sparse" / "0", out / "images"
+    if has_model(model) and not replace:
+        raise FileExistsError(
+            f"out: expected a scene folder without a model, got one in {model}; name another folder, or pass replace=True "
+            "(--replace) to give up that model"
+        )
+    links = {
+        images / camera.name: real_path(path) for camera, path in zip(scene.cameras, scene.image_paths, strict=True)
+    }
+    taken = next((place for place, file in links.items() if place.exists() and real_path(place) != file), None)
+    if taken is not None:
+        raise FileExistsError(
+            f"{taken}: expected a link to {links[taken]}, got another file; name another folder (--out)"
+        )
+    with tempfile.TemporaryDirectory(prefix="kfgs-points-") as scratch:
+        found, seconds = _triangulate(scene, Path(scratch), config or SfmConfig(), progress)
+        for number, camera in enumerate(scene.cameras, 1):
+            found.images[number].name = camera.name
+        with atomic_folder(model) as folder:
+            found.write(str(folder))
+    for place, file in links.items():
+        if not place.exists():
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.symlink_to(file)
+    error = float(found.compute_mean_reprojection_error())
+    return SfmReport(len(scene), len(scene), len(found.points3D), error, seconds, (), (len(scene),))
+
+
+def _triangulate(scene: Scene, scratch: Path, config: SfmConfig, progress: bool) -> tuple[Any, dict[str, float]]:
+    """The reconstruction, with image i + 1 for view i, and the seconds of each part."""
+    if len(scene) < 2:
+        raise SceneError(f"scene: expected at least 2 views to triangulate points, got {len(scene)}; add pictures")
+    folder = scratch / "images"
+    folder.mkdir()
+    names = []
+    for i, path in enumerate(scene.image_paths):
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such file; expected a picture of the scene there")
+        names.append(f"{i:06d}{path.suffix.lower()}")  # pycolmap cuts names at blanks in a list of pairs
+        (folder / names[-1]).symlink_to(real_path(path))
+    advice = "check the pictures, or estimate the poses again (`kfgs sfm --ignore-poses`)"
+    with (
+        quiet_pycolmap() as pycolmap,
+        scene_errors("scene: expected pictures that fit their poses", advice),
+        tqdm(disable=not progress, unit="image") as bar,
+    ):
+        run = SfmRun(pycolmap, folder, names, scratch, config, bar)
+        known = _reconstruction(pycolmap, scene, names)
+        fill_database(pycolmap, run.database, known)
+        seconds = {"features": timed(lambda: run.extract(names, None, False))}
+        pairs = [(names[a], names[b]) for a, b in neighbours(scene.cameras)]
+        seconds["matching"] = timed(lambda: run.match_pairs(pairs))
+        run.begin("points", len(names), "image")
+        (scratch / "points").mkdir()
+        arguments = (known, run.database, str(folder), str(scratch / "points"), True, run.options())
+        seconds["points"] = timed(lambda: pycolmap.triangulate_points(*arguments))
+        bar.update(len(names))
+        _check_fit(pycolmap, run.database, known)
+        known.extract_colors_for_all_images(str(folder))
+        return known, seconds
+
+
+def _check_fit(pycolmap: Any, database: str, known: Any) -> None:
+    """Raise a SceneError if few of the matches of the pictures, which the poses have no part in, agree with the poses."""
+    with pycolmap.Database.open(database) as opened:
+        matches = sum(len(pair.inlier_matches) for pair in opened.read_two_view_geometries()[1])
+    lengths = [len(point.track.elements) for point in known.points3D.values()]
+    agree = sum(n * (n - 1) // 2 for n in lengths)
+    if len(lengths) < FEWEST or agree < AGREEING * matches:
+        raise SceneError(
+            f"scene: expected pictures that fit their poses, got {matches} matches between them of which {agree} agree with the "
+            f"poses ({len(lengths)} points); do the poses belong to these pictures, and is their axis convention right? Else "
+            "estimate them again (`kfgs sfm --ignore-poses`)"
+        )
+
+
+def neighbours(cameras: list[Camera]) -> list[tuple[int, int]]:
+    """Pairs of views to compare: each with the `NEIGHBOURS` nearest ones that look the same way, up to `SAME_WAY`.
+
+    Example:
+        >>> from kfgs.cameras import Camera
+        >>> turned = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))  # looks back
+        >>> neighbours([Camera(view, torch.eye(3), 4, 4) for view in (torch.eye(4), turned, torch.eye(4))])
+        [(0, 2)]
+    """
+    centres = torch.stack([camera.center for camera in cameras]).double().numpy()
+    axes = torch.stack([camera.viewmat[2, :3] for camera in cameras]).double().numpy()
+    near = cKDTree(centres).query(centres, k=min(4 * NEIGHBOURS, len(cameras)))[1].reshape(len(cameras), -1)
+    pairs = set()
+    for a, others in enumerate(near.tolist()):
+        fits = [b for b in others if b != a and float(axes[a] @ axes[b]) > SAME_WAY]
+        pairs |= {(min(a, b), max(a, b)) for b in fits[:NEIGHBOURS]}
+    return sorted(pairs)
+
+
+def _reconstruction(pycolmap: Any, scene: Scene, names: list[str]) -> Any:
+    """The views as pycolmap has them: one camera for each lens."""
+    known, numbers = pycolmap.Reconstruction(), dict[tuple[Any, ...], int]()
+    for i, (lens, name) in enumerate(zip(scene.lenses or scene.cameras, names, strict=True), 1):
+        model, params = _lens(lens)
+        key = (model, *params, lens.width, lens.height)
+        if key not in numbers:
+            numbers[key] = len(numbers) + 1
+            camera = pycolmap.Camera(
+                model=model, width=lens.width, height=lens.height, params=params, camera_id=numbers[key],
+                has_prior_focal_length=True,
+            )  # fmt: skip
+            known.add_camera_with_trivial_rig(camera)
+        view = lens.viewmat.double().numpy()
+        U, _, Vh = np.linalg.svd(view[:3, :3])  # float32 is not orthonormal enough
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(U @ Vh), view[:3, 3])
+        image = pycolmap.Image(name=name, camera_id=numbers[key], image_id=i)
+        known.add_image_with_trivial_frame(image, pose)
+    return known
+
+
+def _lens(camera: Camera) -> tuple[str, list[float]]:
+    """COLMAP's name and parameters of a lens."""
+    K = camera.K.double()
+    intrinsics = [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])]
+    if camera.distortion is None:
+        return "PINHOLE", intrinsics
+    lens = list(camera.distortion.coefficients)
+    if camera.distortion.model == "kannala_brandt":
+        return "OPENCV_FISHEYE", intrinsics + lens
+    if len(lens) == 4:
+        return "OPENCV", intrinsics + lens
+    return "FULL_OPENCV", intrinsics + lens + [0.0] * (8 - len(lens))

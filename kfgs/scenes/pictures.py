@@ -1,0 +1,205 @@
+"""Pictures for structure from motion that no folder of images holds yet: sharp frames of a video, and HEIC photographs."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from kornia.filters import laplacian
+from numpy.typing import NDArray
+from PIL import Image
+from tqdm import tqdm
+
+from .._check import check_range, one_line
+from .._files import as_path, atomic_folder, check_output, digest_file, read_json, real_path, write_json
+from .files import (
+    HEIC_SUFFIXES,
+    ORIENTATION,
+    PIXELS,
+    SceneError,
+    file_stem,
+    list_images,
+    natural_key,
+    open_picture,
+    some,
+)
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+SOURCE = "source.json"  # in the folder of the pictures: what they were made of
+CANDIDATES = 8  # frames of an interval that are compared: 8 of 15 find a moment between two shakes of a hand
+QUALITY = 95  # of JPEG: SIFT finds the same features as in the original
+FFMPEG = "imageio_ffmpeg"
+
+Picture = NDArray[np.uint8]  # [H, W, 3]
+
+
+def is_video(path: str | Path) -> bool:
+    """Whether a path is a file with the ending of a video."""
+    path = as_path(path)
+    return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
+
+
+def has_heic(folder: str | Path) -> bool:
+    """Whether a folder has HEIC photographs without a JPEG or PNG of the same name."""
+    return as_path(folder).is_dir() and bool(_heic_names(as_path(folder)))
+
+
+def refuse_heic(folder: Path) -> None:
+    """Raise a SceneError if a folder has photographs that pycolmap would leave out without a word."""
+    names = _heic_names(folder)
+    if names:
+        raise SceneError(
+            f"{folder}: expected pictures that pycolmap reads, got HEIC photographs ({some(names, 3)}); make JPEG files of them: "
+            "`kfgs sfm` does, and kfgs.scenes.convert_heic(images, out)"
+        )
+
+
+def extract_frames(video: str | Path, out: str | Path, *, fps: float = 2.0, progress: bool = False) -> list[Path]:
+    """Write the sharpest frame of each part of a video that is 1 / `fps` seconds long, as JPEG files.
+
+    The sharpest frame is that with the largest variance of the Laplacian of its grey values. Frames stay as they are: no
+    resizing; the rotation that a phone notes in the file is applied.
+
+    Args:
+        video: the file.
+        out: the folder of the frames `frame_00001.jpg`, .... Frames of the same video and `fps` that are there are kept.
+        fps: frames per second of the video that are written, at most those of the video.
+        progress: show a bar.
+
+    Returns:
+        The files in order of time.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        FileExistsError: if `out` holds something else.
+        ValueError: if `fps` is not above 0.
+        SceneError: if the file cannot be decoded.
+        ImportError: if imageio-ffmpeg is not installed.
+    """
+    video, out = as_path(video), as_path(out)
+    check_range("fps", fps, 0, closed=(False, False))
+    if not video.is_file():
+        raise FileNotFoundError(f"{video}: no such file; expected a video there")
+    source = {"video": video.name, "sha256": digest_file(video), "fps": fps}
+    if _made_before(out, source):
+        return [out / name for name in list_images(out)]
+    with atomic_folder(out) as folder, tqdm(disable=not progress, unit="frame", desc="frames") as bar:
+        count = 0
+        for count, frame in enumerate(_sharpest(video, fps, bar), 1):
+            Image.fromarray(frame).save(folder / f"frame_{count:05d}.jpg", quality=QUALITY, subsampling=0)
+        if not count:
+            raise SceneError(f"{video}: expected a video with frames, got none; does it play?")
+        write_json(folder / SOURCE, source)
+    return [out / name for name in list_images(out)]
+
+
+def sharpness(frame: Picture) -> float:
+    """The variance of the Laplacian of a picture's grey values: larger is sharper, if both show the same."""
+    grey = torch.from_numpy(np.array(Image.fromarray(frame).convert("L"))).float()
+    return float(laplacian(grey[None, None], kernel_size=3, normalized=False).var())
+
+
+def _sharpest(video: Path, fps: float, bar: Any) -> Iterator[Picture]:
+    """The sharpest frame of each interval, one after the other; two frames are in memory."""
+    best: tuple[int, float, Picture] | None = None
+    for number, (frame, rate) in enumerate(_decode(video)):
+        bar.update()
+        interval = math.floor(number * fps / rate)
+        if number % max(1, round(rate / fps / CANDIDATES)) and (best is None or best[0] == interval):
+            continue
+        found = sharpness(frame)
+        if best is not None and best[0] != interval:
+            yield best[2]
+            best = None
+        if best is None or found > best[1]:
+            best = interval, found, frame
+    if best is not None:
+        yield best[2]
+
+
+def _decode(video: Path) -> Iterator[tuple[Picture, float]]:
+    """Each frame of a video, and the frames per second."""
+    try:
+        ffmpeg = importlib.import_module(FFMPEG)
+    except ImportError as error:
+        raise ImportError(
+            "video: expected imageio-ffmpeg to decode it, but it is not installed; run: pip install imageio-ffmpeg"
+        ) from error
+    # A playlist that is named .mp4 could make ffmpeg fetch pages: files only.
+    safe = ["-protocol_whitelist", "file"]
+    try:
+        with closing(ffmpeg.read_frames(str(real_path(video)), pix_fmt="rgb24", input_params=safe)) as frames:
+            about = next(frames)
+            (width, height), rate = about["size"], float(about["fps"])
+            if not (0 < width * height <= PIXELS and 0 < rate < 10_000):
+                raise ValueError(f"{width}x{height} pixels, {rate:g} frames per second")
+            for data in frames:
+                yield np.frombuffer(data, np.uint8).reshape(height, width, 3), rate
+    except (OSError, RuntimeError, ValueError, KeyError, IndexError, StopIteration) as error:
+        raise SceneError(
+            f"{video}: expected a video that ffmpeg can decode, got an error ({one_line(error, 160)}); convert it to MP4 (H.264)"
+        ) from error
+
+
+def _heic_names(folder: Path) -> list[str]:
+    """The HEIC files of a folder that no other picture has the name of, in natural order."""
+    others = {file_stem(name) for name in list_images(folder)}
+    found = (file for file in folder.rglob("*") if file.suffix.lower() in HEIC_SUFFIXES and file.is_file())
+    names = [file.relative_to(folder).as_posix() for file in found if not file.name.startswith(".")]
+    return sorted((name for name in names if file_stem(name) not in others), key=natural_key)
+
+
+def convert_heic(images: str | Path, out: str | Path, *, progress: bool = False) -> list[Path]:
+    """Write the HEIC photographs of a folder as JPEG files, and links to its other pictures.
+
+    Args:
+        images: the folder, with subfolders.
+        out: the folder to write. What an earlier call made of the same photographs is kept.
+        progress: show a bar.
+
+    Returns:
+        All pictures in `out`.
+
+    Raises:
+        FileExistsError: if `out` holds something else.
+        SceneError: if a photograph cannot be decoded.
+        ImportError: if pillow-heif is not installed.
+    """
+    images, out = as_path(images), as_path(out)
+    names, others = _heic_names(images), list_images(images)
+    sizes = [[name, (images / name).stat().st_size] for name in [*names, *others]]
+    source = {"images": sizes}
+    if _made_before(out, source):
+        return [out / name for name in list_images(out)]
+    with atomic_folder(out) as folder:
+        for name in tqdm(names, disable=not progress, unit="image", desc="HEIC"):
+            target = folder / f"{file_stem(name)}.jpg"
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with open_picture(images / name, "a HEIC photograph") as picture:
+                exif = picture.getexif()  # with the focal length, from which COLMAP starts
+                exif.pop(ORIENTATION, None)  # pillow-heif has turned the picture
+                picture.convert("RGB").save(target, quality=QUALITY, subsampling=0, exif=exif)
+        for name in others:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).symlink_to(real_path(images / name))
+        write_json(folder / SOURCE, source)
+    return [out / name for name in list_images(out)]
+
+
+def _made_before(out: Path, source: dict[str, Any]) -> bool:
+    """Whether `out` holds the pictures of this source; a FileExistsError if it holds anything else."""
+    check_output("out", out, "a folder")
+    if not out.exists() or not any(out.iterdir()):
+        return False
+    if (out / SOURCE).is_file() and read_json(out / SOURCE) == source:
+        return True
+    held = some(sorted(file.name for file in out.iterdir()), 3)
+    raise FileExistsError(
+        f"{out}: expected a new or empty folder for the pictures, got one with {held}; name another scene folder (--out)"
+    )

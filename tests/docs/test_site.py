@@ -1,0 +1,99 @@
+"""What the site adds to Sphinx (docs/_ext): commands, shapes, notebooks, and the check that nothing is loaded from elsewhere."""
+
+import importlib
+import inspect
+import sys
+from pathlib import Path
+
+import pytest
+
+import kfgs
+from kfgs import cli
+
+EXTENSIONS = Path(kfgs.__file__).parents[1] / "docs" / "_ext"
+if not EXTENSIONS.is_dir():
+    pytest.skip(f"no folder {EXTENSIONS}", allow_module_level=True)
+pytest.importorskip("sphinx", reason='the site needs: pip install "kfgs[docs]"')
+
+
+@pytest.fixture(autouse=True)
+def extensions(monkeypatch):
+    monkeypatch.syspath_prepend(str(EXTENSIONS))
+    yield
+    for name in [name for name in sys.modules if name.startswith("kfgs_")]:
+        del sys.modules[name]
+
+
+def load(name):
+    return importlib.import_module(name)
+
+
+@pytest.mark.parametrize(
+    ("page", "outside"),
+    [
+        ('<script src="https://a.org/b.js"></script>', ["<script> https://a.org/b.js"]),
+        ('<link href="//a.org/b.css">', ["<link> //a.org/b.css"]),
+        ('<img src="http://a.org/b.png">', ["<img> http://a.org/b.png"]),
+        ('<a href="https://a.org">a link is followed by a click</a><img src="_images/b.png">', []),
+    ],
+)
+def test_what_a_page_would_load_from_elsewhere_is_found(page, outside):
+    assert load("kfgs_offline").find_outside(page) == outside
+
+
+@pytest.mark.parametrize(
+    ("sheet", "outside"),
+    [
+        ("@import 'https://a.org/b.css';", ["https://a.org/b.css"]),
+        ("p { background: url(//a.org/b.png) }", ["//a.org/b.png"]),
+        ("/* https://a.org */ p { background: url(b.png) url('data:image/svg+xml;//') }", []),
+    ],
+)
+def test_what_a_style_sheet_would_load_from_elsewhere_is_found(sheet, outside):
+    assert load("kfgs_offline").find_outside_style(sheet) == outside
+
+
+@pytest.mark.parametrize("name", sorted(cli.COMMANDS))
+def test_every_option_of_a_command_is_in_its_table(name):
+    commands = load("kfgs_commands")
+    command = cli.COMMANDS[name]
+    written = commands.described(command) + commands.table(command)
+    options = set(cli._shown_names(command).values())
+    for option in (option for option in options if option.startswith("--")):
+        assert f"`{option}" in written, option
+    assert written.count("\n| `") == len(options)
+    assert f"kfgs {name}" in written
+    assert "None" not in written
+
+
+def test_shapes_beside_arguments_are_read_and_other_comments_are_not():
+    shapes = load("kfgs_shapes").shapes_of
+
+    def scored(
+        means,  # [N, 3]
+        names=(),
+        *,
+        mask=None,  # [N] bool
+    ) -> object:  # [N]
+        # a comment of the body
+        return means
+
+    assert shapes(scored) == {"means": "[N, 3]", "mask": "[N] bool", "return": "[N]"}
+    assert shapes(kfgs.transfer_labels)["src_labels"].startswith("[S] int64")
+    assert shapes(inspect.signature) == {}
+
+
+def test_notebooks_come_into_the_gallery_and_go_with_their_file(tmp_path):
+    bring = load("kfgs_gallery").bring
+    notebooks, pages = tmp_path / "notebooks", tmp_path / "gallery"
+    notebooks.mkdir()
+    pages.mkdir()
+    assert bring(notebooks, pages) == []
+    assert "{note}" in (pages / "list.inc").read_text()
+    (notebooks / "2_b.ipynb").write_text("{}")
+    (notebooks / "1_a.ipynb").write_text("[]")
+    assert bring(notebooks, pages) == ["1_a", "2_b"]
+    assert (pages / "list.inc").read_text().splitlines()[3:5] == ["1_a", "2_b"]
+    (notebooks / "1_a.ipynb").unlink()
+    assert bring(notebooks, pages) == ["2_b"]
+    assert sorted(path.name for path in pages.glob("*.ipynb")) == ["2_b.ipynb"]

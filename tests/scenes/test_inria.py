@@ -1,0 +1,197 @@
+"""The output folder of 3DGS, written here from its description: a scene and a splat at once."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from cases_color import make_field, make_splat
+from messages import tells
+from PIL import Image
+from small_room import make_room
+
+from kfgs import load_scene, read_splats
+from kfgs.cli import main
+from kfgs.fields import SemanticField
+from kfgs.formats import write_splats
+from kfgs.formats.ply import write_ply
+from kfgs.scenes import SceneError, is_scene
+from kfgs.scenes.scene import Scene
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_room(tmp_path_factory.mktemp("inria") / "room")
+
+
+def write_inria(folder: Path, scene: Scene, source: Path, *, tests: int = 0, ending: bool = False) -> Path:
+    """What 3DGS writes beside its splat: test views first, names with or without their ending."""
+    names = sorted(camera.name for camera in scene.cameras)
+    listed = [*names[::4][:tests], *(name for name in names if name not in names[::4][:tests])]
+    entries = []
+    for number, name in enumerate(listed):
+        camera = next(camera for camera in scene.cameras if camera.name == name)
+        world = np.linalg.inv(camera.viewmat.double().numpy())
+        entries.append(
+            {
+                "id": number,
+                "img_name": name if ending else Path(name).stem,
+                "width": camera.width,
+                "height": camera.height,
+                "position": world[:3, 3].tolist(),
+                "rotation": world[:3, :3].tolist(),
+                "fy": float(camera.K[1, 1]),
+                "fx": float(camera.K[0, 0]),
+            }
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "cameras.json").write_text(json.dumps(entries))
+    values = f"data_device='cuda', eval={tests > 0}, images='images', model_path='./out', resolution=-1, sh_degree=3"
+    (folder / "cfg_args").write_text(f"Namespace({values}, source_path={str(source)!r}, white_background=False)")
+    points = {axis: np.array([0.0, 1.0, i], np.float32) for i, axis in enumerate("xyz")}
+    points |= {name: np.array([10 * i, 20, 30], np.uint8) for i, name in enumerate(("red", "green", "blue"))}
+    write_ply(folder / "input.ply", points)
+    return folder
+
+
+def write_iterations(folder: Path, splat: Path) -> None:
+    """The splat as iteration 30000, and its first five Gaussians as iteration 7000, which has the later name."""
+    cloud = read_splats(splat).gaussians
+    for step, kept in ((7000, cloud[:5]), (30000, cloud)):
+        place = folder / f"point_cloud/iteration_{step}/point_cloud.ply"
+        place.parent.mkdir(parents=True)
+        write_splats(place, kept)
+
+
+@pytest.fixture(scope="module")
+def output(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = write_inria(tmp_path_factory.mktemp("output") / "out", load_scene(room), room, tests=2)
+    write_iterations(folder, make_splat(room, folder / "labelled.ply"))
+    return folder
+
+
+def test_an_output_folder_is_a_scene(room: Path, output: Path) -> None:
+    truth, scene = load_scene(room), load_scene(output)
+    assert is_scene(output)
+    assert [camera.name for camera in scene.cameras] == [camera.name for camera in truth.cameras]
+    for found, true in zip(scene.cameras, truth.cameras, strict=True):
+        torch.testing.assert_close(found.viewmat, true.viewmat, atol=1e-5, rtol=0)
+        torch.testing.assert_close(found.K[:2, :2], true.K[:2, :2])
+        assert found.K[:2, 2].tolist() == [true.width / 2, true.height / 2]
+    assert torch.equal(scene.image(3), truth.image(3))
+    assert scene.points.tolist() == [[0, 0, 0], [1, 1, 1], [0, 1, 2]]
+    assert scene.colors.tolist() == [[0, 10, 20], [20, 20, 20], [30, 30, 30]]
+    assert [scene.cameras[i].name for i in scene.splits["test"]] == sorted(c.name for c in truth.cameras)[::4][:2]
+    assert scene.splat == output / "point_cloud/iteration_30000/point_cloud.ply"
+    assert any("iteration_30000" in note for note in scene.notes)
+
+
+def test_it_is_a_splat_too(output: Path) -> None:
+    newest = read_splats(output / "point_cloud/iteration_30000/point_cloud.ply").gaussians
+    assert torch.equal(read_splats(output).gaussians.means, newest.means)
+    assert len(newest) > 5
+    with pytest.raises(ValueError, match=tells("known format", "point_cloud/iteration_*")):
+        read_splats(output / "point_cloud")
+
+
+def test_fit_averages_onto_its_gaussians(room: Path, output: Path, tmp_path: Path, capsys) -> None:
+    run = tmp_path / "run"
+    maps = ["--features", str(room / "features")]
+    assert main(["fit", str(output), *maps, "--out", str(run)]) == 0
+    said = capsys.readouterr().out
+    assert "iteration_30000" in said
+    field = SemanticField.load(run / "field")
+    assert field.info["geometry"].endswith("iteration_30000/point_cloud.ply")
+    assert not (run / "color.ply").exists()
+    assert main(["fit", str(output), *maps, "--out", str(run), "--steps", "5"]) == 1
+    assert "which needs no training" in capsys.readouterr().err
+
+
+def test_attach_takes_the_folder(room: Path, output: Path, tmp_path: Path) -> None:
+    field = make_field(room, tmp_path / "field")
+    out = tmp_path / "labelled.ply"
+    assert main(["attach", str(field), str(output), "--scene", str(room), "--by", "distance", "--out", str(out)]) == 0
+    assert (read_splats(out).gaussians.labels >= 0).float().mean() > 0.9
+    assert main(["info", str(output)]) == 0
+
+
+@pytest.mark.parametrize("ending", [False, True])
+def test_pictures_beside_the_output_or_named(room: Path, output: Path, tmp_path: Path, ending: bool) -> None:
+    folder = write_inria(tmp_path / "out", load_scene(room), Path("/gone") / "room", ending=ending)
+    (folder / "point_cloud").symlink_to(output / "point_cloud")
+    with pytest.raises(FileNotFoundError, match=tells("/gone/room", "--images")):
+        load_scene(folder)
+    assert len(load_scene(folder, images=room / "images")) == len(load_scene(room))
+    (tmp_path / "room").symlink_to(room)  # source_path moved with the output
+    scene = load_scene(folder, split="all")
+    assert scene.image_paths[0].is_relative_to(tmp_path / "room")
+    assert (folder / "input.ply").is_file()
+    (folder / "input.ply").unlink()
+    scene = load_scene(folder)
+    cloud = read_splats(output).gaussians
+    assert torch.equal(scene.points, cloud.means)
+    expected = ((0.5 + 0.28209479177387814 * cloud.sh[:, 0]).clamp(0, 1) * 255).round().to(torch.uint8)
+    assert torch.equal(scene.colors, expected)
+
+
+def test_smaller_pictures_resize_the_cameras(room: Path, output: Path, tmp_path: Path) -> None:
+    truth, small = load_scene(room), tmp_path / "small"
+    small.mkdir()
+    for i, path in enumerate(truth.image_paths):
+        with Image.open(path) as picture:
+            picture.resize((truth.cameras[i].width // 2, truth.cameras[i].height // 2)).save(small / path.name)
+    scene = load_scene(output, images=small)
+    half, full = scene.cameras[0], truth.cameras[0]
+    assert half.size == (full.height // 2, full.width // 2)
+    torch.testing.assert_close(half.K[:2, :2], full.K[:2, :2] / 2)
+    assert any("resized" in note for note in scene.notes)
+    with Image.open(truth.image_paths[0]) as picture:
+        for path in truth.image_paths:
+            picture.resize((30, 60)).save(small / path.name)
+    with pytest.raises(SceneError, match=tells("30x60", "--images")):
+        load_scene(output, images=small)
+
+
+def test_settings_are_data(room: Path, output: Path, tmp_path: Path) -> None:
+    folder = write_inria(tmp_path / "out", load_scene(room), room)
+    (folder / "point_cloud").symlink_to(output / "point_cloud")
+    for text in (
+        "__import__('pathlib').Path('ran').touch()",
+        f"Namespace(source_path=__import__('pathlib').Path({str(tmp_path / 'ran')!r}).touch())",
+        "Namespace(source_path=3)",
+        "Namespace(",
+        "(" * 5000,
+        "Namespace(source_path='" + "a" * 70000 + "')",
+    ):
+        (folder / "cfg_args").write_text(text)
+        with pytest.raises(SceneError, match=tells("cfg_args", "Namespace(source_path=", "name the pictures")):
+            load_scene(folder)
+    assert not (tmp_path / "ran").exists()
+    (folder / "cfg_args").write_text(f"Namespace(device=device(type='cuda'), source_path={str(room)!r})")
+    assert len(load_scene(folder)) == len(load_scene(room))  # what is not asked for may be anything
+
+
+def test_damaged_cameras(room: Path, output: Path, tmp_path: Path) -> None:
+    folder = write_inria(tmp_path / "out", load_scene(room), room)
+    (folder / "point_cloud").symlink_to(output / "point_cloud")
+    entries = json.loads((folder / "cameras.json").read_text())
+    for change, part in (
+        ({"fx": 0}, "fx and fy above 0"),
+        ({"width": 1.5}, "width, height"),
+        ({"rotation": [[1, 0], [0, 1]]}, "rotation [3][3]"),
+        ({"rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}, "rotation"),
+        ({"img_name": None}, "img_name"),
+    ):
+        (folder / "cameras.json").write_text(json.dumps([entries[0] | change, *entries[1:]]))
+        with pytest.raises(SceneError, match=tells("cameras.json, camera 0", part)):
+            load_scene(folder)
+    (folder / "cameras.json").write_text(json.dumps([*entries, entries[0] | {"img_name": "other"}]))
+    assert any("other" in note for note in load_scene(folder).notes)
+    two = tmp_path / "two"
+    for name in ("a", "b"):
+        (two / name).mkdir(parents=True)
+        for path in load_scene(room).image_paths:
+            (two / name / path.name).symlink_to(path)
+    with pytest.raises(SceneError, match=tells("one picture", "a/", "b/", "--splat")):
+        load_scene(folder, images=two)

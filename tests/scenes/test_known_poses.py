@@ -1,0 +1,254 @@
+"""Points for scenes that have poses and no points: by triangulation, or from depth."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from cases_sfm import downsized
+from messages import tells
+from PIL import Image
+from tqdm import tqdm
+
+from kfgs.cameras import Camera, Distortion
+from kfgs.cli import main
+from kfgs.scenes import Scene, SceneError, SfmConfig, find_points, load_scene, write_known_poses
+from kfgs.scenes.known_poses import neighbours
+from kfgs.scenes.pycolmap_import import import_pycolmap
+from kfgs.scenes.sfm import SfmRun
+
+FEW = SfmConfig(max_features=1500, num_threads=1)
+
+
+@pytest.fixture(scope="module")
+def posed(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    """Six small photographs with true poses, as a transforms.json without points has them."""
+    folder = tmp_path_factory.mktemp("posed")
+    truth = load_scene(shared_data / "lund_door", split="all").select(range(6))
+    files = sorted(downsized(shared_data / "lund_door/images", folder / "images", 6).iterdir())
+    with Image.open(files[0]) as picture:
+        width, height = picture.size
+    frames = []
+    for camera, file in zip(truth.cameras, files, strict=True):
+        small = camera.resized(height, width)
+        pose = np.linalg.inv(small.viewmat.double().numpy()) @ np.diag([1.0, -1, -1, 1])
+        fx, fy, cx, cy = (float(small.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        lens = {
+            "fl_x": fx,
+            "fl_y": fy,
+            "cx": cx,
+            "cy": cy,
+            "k1": small.distortion.coefficients[0],
+            "w": width,
+            "h": height,
+        }
+        frames.append({"file_path": f"images/{file.name}", "transform_matrix": pose.tolist(), **lens})
+    (folder / "transforms.json").write_text(json.dumps({"frames": frames}))
+    return load_scene(folder, split="all")
+
+
+def reprojection(scene: Scene, truth: Scene) -> float:
+    """The median distance of points to the nearest points of the true model, as a share of their depth."""
+    nearest = torch.cdist(scene.points.double(), truth.points.double()).min(dim=1).values
+    return float((nearest / scene.points[:, 2].double().abs()).median())
+
+
+def test_points_are_triangulated_from_the_given_poses(posed: Scene, shared_data: Path) -> None:
+    assert len(posed.points) == 0
+    assert any("triangulate" in note for note in posed.notes)
+    found = find_points(posed, config=FEW)
+    assert len(found.points) > 300
+    assert found.colors.shape == found.points.shape
+    assert 20 < float(found.colors.float().mean()) < 235
+    truth = load_scene(shared_data / "lund_door", split="all")
+    assert reprojection(found, truth) < 0.02  # the frame and the scale are those of the poses
+    assert found.cameras == posed.cameras
+    straight = find_points(posed.undistorted(), config=FEW)  # the files on disk still have the lens
+    assert torch.equal(straight.points, found.points)
+
+
+def test_sfm_keeps_poses_it_is_given(posed: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sfm", str(posed.folder), "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().out
+    assert "has the poses of 6 pictures: they are kept" in said
+    scene = load_scene(tmp_path / "out", split="all")
+    assert len(scene.points) > 300
+    assert [camera.name for camera in scene.cameras] == [camera.name for camera in posed.cameras]
+    for mine, given in zip(scene.cameras, posed.cameras, strict=True):
+        torch.testing.assert_close(mine.viewmat, given.viewmat, atol=1e-5, rtol=0)
+        torch.testing.assert_close(mine.K, given.K)
+        torch.testing.assert_close(
+            torch.tensor(mine.distortion.coefficients), torch.tensor(given.distortion.coefficients)
+        )
+    assert torch.equal(scene.image(2), posed.image(2))
+    again = ["sfm", str(posed.folder / "transforms.json"), "--out", str(tmp_path / "out")]
+    assert main([*again, "--matching", "sequential"]) == 1
+    assert "--ignore-poses" in capsys.readouterr().err
+    assert main(again) == 1
+    assert "--replace" in capsys.readouterr().err
+
+
+def test_a_field_of_a_scene_without_points_trains(posed: Scene, tmp_path: Path, capsys) -> None:
+    arguments = ["color", str(posed.folder), "--out", str(tmp_path / "run"), "--steps", "2", "--preset", "quick"]
+    assert main(arguments) == 0
+    said = capsys.readouterr().out
+    assert "points: the scene has none" in said
+    assert "triangulated from" in said
+    assert (tmp_path / "run/color.ply").is_file()
+    assert main(arguments) == 0
+    assert "points: found in points-" in capsys.readouterr().out
+
+
+def test_poses_that_do_not_fit_are_refused(posed: Scene) -> None:
+    turned = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))  # OpenGL axes taken for COLMAP's
+    g = torch.Generator().manual_seed(0)
+    wrong = []
+    for camera in posed.cameras:
+        view = turned @ camera.viewmat
+        view[:3, 3] += 10 * torch.randn(3, generator=g)
+        wrong.append(dataclasses.replace(camera, viewmat=view))
+    with pytest.raises(SceneError, match=tells("poses", "--ignore-poses", "axis")):
+        find_points(dataclasses.replace(posed, cameras=wrong), config=FEW)
+    with pytest.raises(SceneError, match=tells("at least 2 views", "got 1")):
+        find_points(posed.select([0]), config=FEW)
+    gone = dataclasses.replace(posed, image_paths=[*posed.image_paths[:-1], Path("gone.png")])
+    with pytest.raises(FileNotFoundError, match=tells("gone.png")):
+        find_points(gone, config=FEW)
+
+
+def test_images_of_other_files_are_not_replaced(posed: Scene, tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / posed.cameras[0].name).write_bytes(b"mine")
+    with pytest.raises(FileExistsError, match=tells(posed.cameras[0].name, "--out")):
+        write_known_poses(posed, tmp_path, config=FEW)
+    assert not (tmp_path / "sparse").exists()
+
+
+def test_each_lens_reaches_pycolmap(posed: Scene) -> None:
+    from kfgs.cameras.distortion import plane_to_pixel
+    from kfgs.scenes.known_poses import _lens
+
+    pycolmap = import_pycolmap()
+    rays = np.array([[0.1, -0.2, 1.0], [-0.3, 0.15, 1.0]])
+    for model, coefficients in ((None, ()), ("brown_conrady", (0.1, -0.02, 0.01, 0.005)),
+                                ("brown_conrady", (0.1, -0.02, 0.01, 0.005, 0.003)),
+                                ("brown_conrady", (0.1, -0.02, 0.01, 0.005, 0.003, 0.02, 0.01, 0.004)),
+                                ("kannala_brandt", (0.1, -0.02, 0.01, 0.005))):  # fmt: skip
+        lens = None if model is None else Distortion(model, coefficients)
+        K = torch.tensor([[50.0, 0, 31], [0, 55, 25], [0, 0, 1]])
+        name, params = _lens(Camera(torch.eye(4), K, 64, 48, "a.png", lens))
+        theirs = pycolmap.Camera(model=name, width=64, height=48, params=params).img_from_cam(rays)
+        ours = plane_to_pixel(torch.from_numpy(rays[:, :2]), K.double(), lens)
+        np.testing.assert_allclose(np.asarray(theirs), ours.numpy(), atol=1e-6)
+
+
+def test_neighbours_are_near_and_look_the_same_way() -> None:
+    K = torch.eye(3)
+    views = []
+    for i in range(30):
+        view = torch.eye(4)
+        view[0, 3] = float(i)
+        views.append(Camera(view, K, 4, 4, f"{i}.png"))
+    pairs = neighbours(views)
+    assert all(a < b for a, b in pairs)
+    assert (0, 1) in pairs
+    assert (0, 29) not in pairs
+    assert {b for a, b in pairs if a == 0} >= set(range(1, 21))
+
+
+def test_pairs_are_compared_as_given(posed: Scene, tmp_path: Path) -> None:
+    pycolmap, names = import_pycolmap(), [camera.name for camera in posed.cameras]
+    with tqdm(disable=True) as bar:
+        run = SfmRun(pycolmap, posed.image_paths[0].parent, names, tmp_path, FEW, bar)
+        run.extract()
+        run.match_pairs([(names[0], names[1]), (names[2], names[4])])
+    with pycolmap.Database.open(run.database) as database:
+        pairs, _ = database.read_two_view_geometries()
+        read = {image.image_id: image.name for image in database.read_all_images()}
+        found = {tuple(sorted(read[i] for i in pycolmap.pair_id_to_image_pair(pair))) for pair in pairs}
+    assert found == {(names[0], names[1]), (names[2], names[4])}
+
+
+# Depth: a wall at z = 4 in front of a camera at (1, 2, 0) that looks along world +z.
+OPENGL = [[1.0, 0, 0, 1], [0, -1, 0, 2], [0, 0, -1, 0], [0, 0, 0, 1]]
+
+
+def _wall(folder: Path, name: str, size: tuple[int, int] = (24, 32)) -> None:
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    (folder / "depth").mkdir(exist_ok=True)
+    Image.new("RGB", (64, 48), (200, 100, 50)).save(folder / f"images/{name}.png")
+    Image.fromarray(np.full(size, 4000, np.uint16)).save(folder / f"depth/{name}.png")
+
+
+def _at_the_wall(scene: Scene) -> None:
+    assert len(scene.points) == 24 * 32
+    torch.testing.assert_close(scene.points[:, 2], torch.full((768,), 4.0))
+    # columns reach from (0.5 - 16) / 25 * 4 to (31.5 - 16) / 25 * 4 around x = 1; rows the same way around y = 2
+    torch.testing.assert_close(scene.points[:, 0].aminmax(), (torch.tensor(1 - 2.48), torch.tensor(1 + 2.48)))
+    torch.testing.assert_close(scene.points[:, 1].aminmax(), (torch.tensor(2 - 1.84), torch.tensor(2 + 1.84)))
+    assert scene.colors[0].tolist() == [200, 100, 50]
+
+
+@pytest.mark.parametrize("key", ["depth_file_path", "depth_path"])
+def test_points_from_the_depth_of_a_transforms_json(tmp_path: Path, key: str) -> None:
+    _wall(tmp_path, "a")
+    frame = {"file_path": "images/a.png", key: "depth/a.png", "transform_matrix": OPENGL}
+    lens = {"fl_x": 50, "fl_y": 50, "cx": 32, "cy": 24, "w": 64, "h": 48}
+    (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": [frame]}))
+    scene = load_scene(tmp_path)
+    _at_the_wall(scene)
+    assert any("depth pictures of 1 views" in note for note in scene.notes)
+    (tmp_path / "transforms.json").write_text(json.dumps({**lens, "integer_depth_scale": 2e-3, "frames": [frame]}))
+    assert float(load_scene(tmp_path).points[0, 2]) == 8
+    (tmp_path / "transforms.json").write_text(json.dumps({**lens, "integer_depth_scale": 0, "frames": [frame]}))
+    with pytest.raises(SceneError, match=tells("integer_depth_scale", "above 0")):
+        load_scene(tmp_path)
+    for other in ("../depth/a.png", 7, "depth/gone.png", "a\0.png"):
+        (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": [frame | {key: other}]}))
+        assert len(load_scene(tmp_path).points) == 0
+
+
+def _polycam(folder: Path, kind: str = "corrected_") -> Path:
+    keyframes = folder / "keyframes"
+    for name in ("1001", "1002"):
+        _wall(keyframes, name)
+        values = {f"t_{i}{j}": OPENGL[i][j] for i in range(3) for j in range(4)}
+        values |= {"fx": 50, "fy": 50.0, "cx": 32, "cy": 24, "width": 64, "height": 48, "blur_score": 90.5}
+        (keyframes / f"{kind}cameras").mkdir(exist_ok=True)
+        (keyframes / f"{kind}cameras/{name}.json").write_text(json.dumps(values))
+    if kind:
+        (keyframes / "images").rename(keyframes / f"{kind}images")
+    return folder
+
+
+@pytest.mark.parametrize("kind", ["corrected_", ""])
+def test_a_raw_capture_of_polycam(tmp_path: Path, kind: str) -> None:
+    scene = load_scene(_polycam(tmp_path, kind), split="all")
+    assert [camera.name for camera in scene.cameras] == ["1001.png", "1002.png"]
+    assert scene.cameras[0].center.tolist() == [1, 2, 0]
+    assert scene.cameras[0].viewmat[2, :3].tolist() == [0, 0, 1]  # looks along +z
+    assert scene.cameras[0].viewmat[1, :3].tolist() == [0, 1, 0]  # down is +y
+    assert scene.image(0).shape == (48, 64, 3)
+    assert len(scene.points) == 2 * 768
+    _at_the_wall(dataclasses.replace(scene, points=scene.points[:768], colors=scene.colors[:768]))
+    assert any("ARKit's own" in note for note in scene.notes) == (kind == "")
+    assert len(load_scene(tmp_path / "keyframes", split="all")) == 2
+
+
+def test_a_capture_that_is_damaged(tmp_path: Path) -> None:
+    folder = _polycam(tmp_path) / "keyframes"
+    file = folder / "corrected_cameras/1001.json"
+    values = json.loads(file.read_text())
+    for change, part in (
+        ({"t_12": None}, "t_12 = None"),
+        ({"fx": -1}, "fx"),
+        ({"width": 0.5}, "width"),
+        ({"t_00": 3}, "1001.json"),
+    ):
+        file.write_text(json.dumps(values | change))
+        with pytest.raises(SceneError, match=tells("1001.json", part)):
+            load_scene(tmp_path)
+    file.unlink()
+    assert any("1 pictures have no file in corrected_cameras" in note for note in load_scene(tmp_path).notes)

@@ -1,0 +1,173 @@
+"""Pictures that structure from motion takes from a video or from HEIC photographs."""
+
+import importlib.util
+import os
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import torch
+from cases_sfm import downsized
+from messages import tells
+from PIL import Image, ImageFilter
+
+import kfgs.scenes.pictures as pictures
+from kfgs.cli import main
+from kfgs.scenes import SceneError, SfmConfig, convert_heic, extract_frames, load_scene, read_image, run_sfm
+from kfgs.scenes.pictures import SOURCE, has_heic, is_video, sharpness
+
+# imageio-ffmpeg leaves the pipes of a finished ffmpeg to the garbage collector, which warns.
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
+SIZE = (96, 64)  # width, height
+
+
+def texture(seed: int) -> Image.Image:
+    g = np.random.default_rng(seed)
+    return Image.fromarray(g.integers(0, 255, (8, 12, 3), dtype=np.uint8)).resize(SIZE, Image.Resampling.NEAREST)
+
+
+def write_video(path: Path, frames: list[Image.Image], fps: float = 10) -> Path:
+    writer = imageio_ffmpeg.write_frames(
+        str(path), frames[0].size, fps=fps, codec="libx264", quality=9, macro_block_size=2
+    )
+    writer.send(None)
+    for frame in frames:
+        writer.send(np.ascontiguousarray(np.asarray(frame.convert("RGB"))))
+    writer.close()
+    return path
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three seconds at 10 frames a second; frame 2, 8, 11, 17, ... of each half second alone is sharp, all others blurred."""
+    frames = []
+    for number in range(30):
+        frame = texture(number // 5)
+        frames.append(
+            frame if number % 5 == (2 if number // 5 % 2 == 0 else 3) else frame.filter(ImageFilter.GaussianBlur(4))
+        )
+    return write_video(tmp_path_factory.mktemp("video") / "walk.mp4", frames)
+
+
+def test_the_sharpest_frame_of_each_half_second_is_taken(video: Path, tmp_path: Path) -> None:
+    assert is_video(video)
+    assert not is_video(video.parent)
+    files = extract_frames(video, tmp_path / "images", fps=2)
+    assert [file.name for file in files] == [f"frame_{i:05d}.jpg" for i in range(1, 7)]
+    for i, file in enumerate(files):
+        with Image.open(file) as frame:
+            sharp = np.asarray(frame, dtype=np.float64)
+        assert sharp.shape == (64, 96, 3)
+        assert np.abs(sharp - np.asarray(texture(i), dtype=np.float64)).mean() < 12  # H.264 and JPEG
+        assert sharpness(sharp.astype(np.uint8)) > 5 * sharpness(
+            np.asarray(texture(i).filter(ImageFilter.GaussianBlur(4)))
+        )
+
+
+def test_sharpness_is_the_variance_of_the_laplacian() -> None:
+    g = np.random.default_rng(1)
+    grey = g.integers(0, 255, (9, 11), dtype=np.uint8)
+    frame = np.repeat(grey[..., None], 3, 2)
+    padded = np.pad(grey.astype(np.float64), 1, mode="reflect")
+    values = np.zeros(grey.shape)
+    for y in range(9):
+        for x in range(11):
+            values[y, x] = padded[y : y + 3, x : x + 3].sum() - 9 * padded[y + 1, x + 1]
+    assert sharpness(frame) == pytest.approx(values.var(ddof=1), rel=1e-4)
+    assert sharpness(np.full((9, 11, 3), 7, np.uint8)) == 0
+
+
+@pytest.mark.parametrize(("fps", "count"), [(1, 3), (0.4, 2), (10, 30), (100, 30)])
+def test_how_many_frames(video: Path, tmp_path: Path, fps: float, count: int) -> None:
+    assert len(extract_frames(video, tmp_path / "images", fps=fps)) == count
+
+
+def test_frames_that_are_there_are_kept_and_others_are_not_mixed(video: Path, tmp_path: Path) -> None:
+    first = extract_frames(video, tmp_path / "images", fps=1)
+    times = [file.stat().st_mtime_ns for file in first]
+    assert [file.stat().st_mtime_ns for file in extract_frames(video, tmp_path / "images", fps=1)] == times
+    with pytest.raises(FileExistsError, match=tells("images", "new or empty", "--out")):
+        extract_frames(video, tmp_path / "images", fps=2)
+    assert (tmp_path / "images" / SOURCE).is_file()
+
+
+def test_what_is_no_video(tmp_path: Path, video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(FileNotFoundError, match=tells("none.mp4", "no such file")):
+        extract_frames(tmp_path / "none.mp4", tmp_path / "out")
+    (tmp_path / "bad.mp4").write_bytes(b"not a video" * 100)
+    with pytest.raises(SceneError, match=tells("bad.mp4", "ffmpeg can decode", "H.264")):
+        extract_frames(tmp_path / "bad.mp4", tmp_path / "out")
+    with pytest.raises(ValueError, match=tells("fps")):
+        extract_frames(video, tmp_path / "out", fps=0)
+    # a playlist that is named .mp4: ffmpeg must not open what it names
+    (tmp_path / "list.mp4").write_text(
+        "#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nhttp://127.0.0.1:9/a.ts\n#EXT-X-ENDLIST\n"
+    )
+    with pytest.raises(SceneError, match=tells("list.mp4")):
+        extract_frames(tmp_path / "list.mp4", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    monkeypatch.setattr(pictures, "FFMPEG", "no_such_module")
+    with pytest.raises(ImportError, match=tells("imageio-ffmpeg", "pip install imageio-ffmpeg")):
+        extract_frames(video, tmp_path / "out")
+
+
+def test_sfm_of_a_video(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    photos = downsized(shared_data / "lund_door/images", tmp_path / "photos", 6)
+    frames = []
+    for file in sorted(photos.iterdir()):
+        with Image.open(file) as picture:
+            whole = picture.convert("RGB")
+            frames += [whole.filter(ImageFilter.GaussianBlur(3)), whole]
+    video = write_video(tmp_path / "door.mp4", frames, fps=4)
+    arguments = ["sfm", str(video), "--out", str(tmp_path / "scene"), "--min-registered", "0.8"]
+    assert main(arguments) == 0
+    said = capsys.readouterr().out
+    assert "the 6 sharpest frames" in said
+    scene = load_scene(tmp_path / "scene", split="all")
+    assert 5 <= len(scene) <= 6
+    assert scene.image(0).shape == (frames[0].height, frames[0].width, 3)
+    assert len(scene.points) > 100
+    assert main([*arguments, "--onto", str(tmp_path / "scene")]) == 1
+    for file, message in (("a.gif", ".mp4, .mov"), ("gone.mp4", "no such folder")):
+        (tmp_path / "a.gif").write_bytes(b"GIF89a")
+        assert main(["sfm", str(tmp_path / file), "--out", str(tmp_path / "other")]) == 1
+        assert message in capsys.readouterr().err
+    assert main(["sfm", str(photos), "--out", str(tmp_path / "other"), "--fps", "2"]) == 1
+    assert "fps: expected none with photographs" in capsys.readouterr().err.replace("--fps", "fps")
+
+
+def test_heic_without_its_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.HEIC").write_bytes(b"\0\0\0\x18ftypheic")
+    assert has_heic(tmp_path)
+    monkeypatch.setitem(__import__("sys").modules, "pillow_heif", None)
+    with pytest.raises(ImportError, match=tells("a.HEIC", "pip install pillow-heif", "JPEG")):
+        read_image(tmp_path / "a.HEIC")
+    with pytest.raises(ImportError, match=tells("pillow-heif")):
+        convert_heic(tmp_path, tmp_path / "out")
+    with pytest.raises(SceneError, match=tells("HEIC", "convert_heic")):
+        run_sfm(tmp_path, tmp_path / "scene", config=SfmConfig(num_threads=1))
+
+
+@pytest.mark.skipif(importlib.util.find_spec("pillow_heif") is None, reason="pillow-heif is not installed")
+def test_heic_photographs_become_jpeg(tmp_path: Path) -> None:
+    import pillow_heif
+
+    photos = tmp_path / "photos"
+    (photos / "more").mkdir(parents=True)
+    made = pillow_heif.from_pillow(texture(0))
+    made.save(photos / "IMG_1.HEIC", quality=95)
+    made.save(photos / "more/IMG_2.heic", quality=95)
+    made.save(photos / "IMG_3.heic", quality=95)
+    texture(3).save(photos / "IMG_3.jpg")  # the phone's own copy: not converted again
+    read = read_image(photos / "IMG_1.HEIC")
+    assert float((read * 255 - torch.from_numpy(np.array(texture(0)))).abs().mean()) < 12
+    files = convert_heic(photos, tmp_path / "out")
+    assert sorted(file.relative_to(tmp_path / "out").as_posix() for file in files) == [
+        "IMG_1.jpg",
+        "IMG_3.jpg",
+        "more/IMG_2.jpg",
+    ]
+    assert os.path.samefile(tmp_path / "out/IMG_3.jpg", photos / "IMG_3.jpg")
+    assert float((read_image(tmp_path / "out/IMG_1.jpg") - read).abs().mean()) < 0.05
+    assert convert_heic(photos, tmp_path / "out") == files
