@@ -26,6 +26,7 @@ def test_it_fits_scores_and_draws(tmp_path, monkeypatch, capsys):
         "2",
     ]
     monkeypatch.setattr("sys.argv", arguments)
+    monkeypatch.syspath_prepend(str(SCRIPT.parent))
     runpy.run_path(str(SCRIPT), run_name="__main__")
     facts = json.loads((tmp_path / "out" / "scores.json").read_text())
     assert (facts["steps"], facts["preset"]) == (20, "quick")

@@ -32,7 +32,10 @@ def help_of(command, capsys):
 
 def command_lines(text):
     """The lines that run kfgs, without their comments."""
-    return [shlex.split(line, comments=True) for line in re.findall(r"^ *(kfgs [a-z].*)$", text, re.MULTILINE)]
+    return [
+        shlex.split(line, comments=True)
+        for line in re.findall(r"^ *(kfgs [a-z].*)$", text.replace("\\\n", " "), re.MULTILINE)
+    ]
 
 
 def run_nothing(monkeypatch):
@@ -73,7 +76,8 @@ def test_examples_are_understood(command, capsys, monkeypatch):
     called = run_nothing(monkeypatch)
     for line in lines:
         assert cli.main(line[1:]) == 0
-    assert called == [command] * len(lines)
+    assert called == [line[1] for line in lines]
+    assert command in called
 
 
 @pytest.mark.parametrize("name", SHOWN)

@@ -58,6 +58,7 @@ def make_fixture(folder: Path) -> None:
         command("uplift", "room", "labelled.ply", "--out", "run/field"),
         command("uplift", "room", "other.ply", "--out", "older"),
         command("pack", "run/field", "packed.kfgs.safetensors"),
+        command("label", "run/field", "--out", "labelled", "--query", "chair", "--scene", "room"),
         command("fit", "room", "--splat", "other.ply", "--out", "two"),
         command("fit", "room", "--splat", "labelled.ply", "--out", "two"),
     ]
@@ -160,7 +161,7 @@ def all_jobs() -> list[Job]:
         Job(
             "label",
             command("label", field, "--out", "work/labelled", "--cloud", "in/labelled.ply", "--distance", "1", *room),
-            _with(files={"labelled/gaussians.ply": "other.ply"}, notes=("labelled/notes.txt",)),
+            _with(files={"labelled": "labelled"}, notes=("labelled/notes.txt",)),
         ),
         Job(
             "pack",

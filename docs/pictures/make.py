@@ -11,6 +11,7 @@ import argparse
 import sys
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from PIL import Image
@@ -91,7 +92,9 @@ def draw_field(demo: Demo) -> None:
     gaussians = show_cloud(dots, color_by="label", names=demo.words.names)(demo.large)
     classes = show_classes(labelled, demo.words.names)(demo.large)
     save(
-        "site_field.jpg", [demo.photo(), gaussians, classes], ["photo", "Gaussians of the field", "class of each pixel"]
+        "site_field.jpg",
+        [demo.photo(), gaussians, classes],
+        ["photo", f"the {len(dots):,} Gaussians of the field", "class of each pixel"],
     )
 
 
@@ -137,6 +140,38 @@ def draw_gamma(demo: Demo) -> None:
     (HERE / "site_scores.png").unlink()
 
 
+def draw_votes(demo: Demo) -> None:
+    """Three pixels across an edge of the sofa, and how the Gaussians that each of them shows divide their votes."""
+    found = demo.field.rank(demo.camera, demo.words, top=len(demo.words))
+    sofa, wall = (demo.words.index(name) for name in ("sofa", "wall"))
+    votes = torch.zeros(*found.labels.shape[:2], len(demo.words))
+    votes.scatter_add_(2, found.labels.clamp_min(0), found.scores * (found.labels >= 0))
+    edge = torch.minimum(votes[..., sofa], votes[..., wall])
+    y, x = divmod(int(edge.argmax()), edge.shape[1])
+    places = [(y - 12, x), (y, x), (y + 12, x)]
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3), width_ratios=(1, 1.4), layout="constrained")
+    left.imshow(demo.photo())
+    left.set_axis_off()
+    start = np.zeros(len(places))
+    for name in range(len(demo.words)):
+        shares = np.array([float(votes[place][name] / votes[place].sum()) for place in places])
+        if shares.max() > 0.02:
+            color = palette(np.array([name]), demo.words.names)[0] / 255
+            right.barh(
+                ["A", "B", "C"], shares, left=start, color=color, edgecolor="black", label=demo.words.names[name]
+            )
+        start += shares
+    for letter, (row, column) in zip("ABC", places, strict=True):
+        left.plot(column, row, "o", color="white", markeredgecolor="black", markersize=6)
+        left.annotate(letter, (column, row), (8, -4), textcoords="offset points", color="white", weight="bold")
+    right.invert_yaxis()
+    right.set(xlim=(0, 1), xlabel="share of the votes")
+    right.legend(loc="upper center", bbox_to_anchor=(0.5, 1.2), ncols=5, frameon=False)
+    figure.savefig(HERE / "site_votes.png", dpi=110)
+    write("site_votes.jpg", Image.open(HERE / "site_votes.png"))
+    (HERE / "site_votes.png").unlink()
+
+
 def draw_lambda(demo: Demo) -> None:
     """Labels of a field that has never seen the plant, carried to the splat within three distances."""
     labelled = demo.field.label(demo.words)
@@ -176,7 +211,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Draw the pictures of the site.")
     parser.add_argument("demo", type=Path, help="folder that `kfgs demo --out` wrote")
     demo = Demo(parser.parse_args().demo)
-    for draw in (draw_landing, draw_field, draw_uplift, draw_codebook, draw_gamma, draw_lambda, draw_errors):
+    for draw in (
+        draw_votes,
+        draw_landing,
+        draw_field,
+        draw_uplift,
+        draw_codebook,
+        draw_gamma,
+        draw_lambda,
+        draw_errors,
+    ):
         draw(demo)
     return 0
 

@@ -77,7 +77,6 @@ def join(
     Examples:
         kfgs join city/ --out field/
         kfgs join city/ --out street/ --box=-5,0,-2,40,10,8
-        kfgs view street/
 
     Args:
         city: The folder that `kfgs blocks` made.

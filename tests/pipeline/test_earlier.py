@@ -9,8 +9,10 @@ import pytest
 import torch
 from small_room import make_room
 
+from kfgs.cli import main
 from kfgs.features import FeatureFolder
 from kfgs.fields import UpliftConfig
+from kfgs.formats import write_splats
 from kfgs.gaussians import Gaussians
 from kfgs.pipeline import FitConfig, fit_scene
 from kfgs.pipeline.color import ColorConfig
@@ -161,6 +163,21 @@ def test_another_fit_is_not_gone_on_from(room, scene, splat, tmp_path, change):
         with (made / "sums.safetensors").open("ab") as opened:
             opened.write(b"0")
     assert "goes_on" not in fit(folder, now, tmp_path / "run", cloud, config).field.info
+
+
+def test_the_command_keeps_no_sums_if_told_and_refuses_options_without_effect(room, splat, tmp_path, capsys):
+    write_splats(tmp_path / "splat.ply", splat)
+    out = tmp_path / "run"
+    arguments = ["fit", str(room), "--out", str(out), "--splat", str(tmp_path / "splat.ply")]
+    assert main([*arguments, "--discard-sums"]) == 0
+    assert list(out.glob("stages/uplift-*/uplift.safetensors"))
+    assert not list(out.glob("stages/uplift-*/sums.safetensors"))
+    capsys.readouterr()
+    for option in ("--refit", "--discard-sums"):
+        assert main(["fit", str(room), "--out", str(out), "--method", "paper", option]) != 0
+        told = "".join(capsys.readouterr())
+        assert option in told
+        assert "--method paper" in told
 
 
 def test_trained_gaussians_stay_until_a_refit(room, scene, tmp_path):

@@ -295,7 +295,6 @@ def test_a_city_is_not_joined_into_itself(fitted, capsys):
     [
         ("", ("--box", "empty")),
         ("all", ("--box", "six numbers", "'all'")),
-        ("1,2,3", ("--box", "six numbers", "'1,2,3'")),
         ("nan,0,0,1,1,1", ("--box", "three numbers", "nan")),
         ("0,4,0,1,-4,1", ("--box", "y from 4 down to -4", "exchange")),
         ("500,0,0,501,1,1", ("--box", "none", "choose a part")),
@@ -312,7 +311,7 @@ def test_wrong_boxes_are_one_line(fitted, tmp_path, box, words, capsys):
 
 def test_boxes_are_checked_before_a_field_is_read(fitted, monkeypatch):
     monkeypatch.setattr(SemanticField, "load", staticmethod(lambda path: pytest.fail(f"{path} was read")))
-    for low, high in (([500, 0, 0], [501, 1, 1]), ([0, 4, 0], [1, -4, 1]), ([0, 0], [1, 1])):
+    for low, high in (([500, 0, 0], [501, 1, 1]), ([0, 1, 0], [1, -1, 1]), ([0, 0], [1, 1])):
         with pytest.raises(ValueError, match="low, high"):
             fitted.within(low, high)
 
@@ -329,8 +328,7 @@ def test_two_cities_with_the_same_latents_join(fitted, town, splat, tmp_path, ca
     split_scene(town, tmp_path / "second", 2, splat=splat, latents=file, report=said.append)
     assert "12 of this scene's own would hold" in said[0]
     second = fit_blocks(tmp_path / "second", EVERY)
-    both = join_fields([fitted.joined(), second.joined()])
-    assert len(both) == len(fitted) + len(second)
+    assert len(join_fields([fitted.joined(), second.joined()])) == len(fitted) + len(second)
     assert split_scene(town, tmp_path / "second", 2, splat=splat, latents=LinearLatents.load(file))  # it goes on
     with pytest.raises(ValueError, match=tells("out", "others")):
         split_scene(town, tmp_path / "second", 2, splat=splat, latents=12)
@@ -343,11 +341,10 @@ def test_two_cities_with_the_same_latents_join(fitted, town, splat, tmp_path, ca
 
 
 def test_a_splat_of_another_scene_is_said(town, splat, tmp_path):
-    far = read_splats(splat)
-    moved = far.gaussians.replace(means=far.gaussians.means + torch.tensor([0, 0, 900.0]))
-    write_splats(tmp_path / "far.ply", dataclasses.replace(far, gaussians=moved))
+    cloud = read_splats(splat).gaussians
+    write_splats(tmp_path / "far.ply", SplatFile(cloud.replace(means=cloud.means + 900)))
     split_scene(town, tmp_path / "city", 2, splat=tmp_path / "far.ply", latents=4)
-    for block in ("block00", "block01"):
-        (tmp_path / "city" / block / "core.json").write_text('{"gaussians": 0, "of": 0, "box": null, "seconds": 0}')
+    for block in (tmp_path / "city").glob("block0*"):
+        (block / "core.json").write_text('{"gaussians": 0, "box": null}')
     with pytest.raises(ValueError, match=tells("city", "none", "splat")):
         FieldInBlocks.open(tmp_path / "city")
