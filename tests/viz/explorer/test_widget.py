@@ -35,6 +35,12 @@ def answers(widget, *messages):
     return sent
 
 
+def still_of(state):
+    bundle = make_widget(state)._repr_mimebundle_()
+    file = base64.b64decode((bundle[0] if isinstance(bundle, tuple) else bundle)["image/jpeg"])
+    return np.asarray(Image.open(io.BytesIO(file))).astype(int)
+
+
 def test_the_scene_is_sent_once(tmp_path):
     state = exploration()
     state.ask("chair")
@@ -79,15 +85,31 @@ def test_explore_in_a_notebook_gives_a_viewer():
 def test_a_picture_stands_in_where_widgets_cannot_run(show):
     state = exploration()
     state.set_show(show)
-    bundle = make_widget(state)._repr_mimebundle_()
-    file = base64.b64decode((bundle[0] if isinstance(bundle, tuple) else bundle)["image/jpeg"])
-    picture = np.asarray(Image.open(io.BytesIO(file)))
+    picture = still_of(state)
     assert picture.shape[:2] == (state.cameras[0].height, state.cameras[0].width)
     cloud = state.cloud("color")
     if show == "labels":
         cloud = cloud.replace(features=torch.from_numpy(state.colors("color")) / 255, sh=None)
     truth = rasterize(cloud, state.cameras[0], background=torch.ones(3)).map.clamp(0, 1)
     assert np.abs(picture / 255 - truth.numpy()).mean() < 0.03
+
+
+def test_after_a_question_the_picture_shows_the_answer():
+    """What was not selected is grey, so that colour is where selected Gaussians are."""
+    state = exploration()
+    state.set_show("rgb")
+    plain = still_of(state)
+    state.ask("chair")
+    asked = still_of(state)
+    selected = torch.from_numpy(state.selected("color"))
+    assert 0 < int(selected.sum()) < len(selected)
+    cloud = state.cloud("color").replace(features=selected[:, None].float(), sh=None)
+    chosen = rasterize(cloud, state.cameras[0]).map[..., 0].numpy()
+    drawn = rasterize(state.cloud("color"), state.cameras[0]).alpha.numpy() > 0.5
+    rest, answer = drawn & (chosen < 0.01), chosen > 0.5
+    before, after = (picture.max(-1) - picture.min(-1) for picture in (plain, asked))  # 0 = grey
+    assert before[rest].mean() > 5 * after[rest].mean()  # some is left: JPEG blurs colours
+    assert after[answer].mean() > 4 * after[rest].mean()
 
 
 def test_without_anywidget_the_install_line_is_told():
