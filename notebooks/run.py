@@ -2,15 +2,18 @@
 
     python notebooks/run.py [N ...] [--out notebooks/built] [--pictures DIR]
 
-Each `N_name.py` becomes a notebook (jupytext) and runs from its first cell to its last (nbclient) in a fresh kernel of
-this Python, in the sources' own folder. It is refused if a cell fails, if anything is written to stderr (warnings are),
-if the executed file is larger than 1 MB, or if it shows no picture. What failed leaves no file behind.
+`N_name.py` is what is written and reviewed, `N_name.ipynb` is what people open: the same cells with their outputs. Both are
+committed, and tests/test_notebooks.py holds them in step. Each source runs from its first cell to its last (nbclient) in a
+fresh kernel of this Python, in the sources' own folder. It is refused if a cell fails, if anything is written to stderr
+(warnings are), if the executed file is larger than 1 MB, or if it shows no picture. What failed leaves no file behind.
+Pictures are kept as JPEG where that is smaller. `--out notebooks` renews the committed ones.
 """
 
 from __future__ import annotations
 
 import argparse
 import base64
+import io
 import os
 import re
 import sys
@@ -27,11 +30,13 @@ from jupyter_client.kernelspec import KernelSpecManager
 from jupyter_client.manager import AsyncKernelManager
 from nbclient import NotebookClient
 from nbclient.exceptions import CellControlSignal, CellExecutionError, DeadKernelError
+from PIL import Image
 
 HERE = Path(__file__).resolve().parent
 LARGEST = 1_000_000  # bytes of an executed notebook: what a repository's web page still shows
 SECONDS = 600  # for one cell: six times what a whole notebook may take on two idle cores
 SUFFIXES = {"image/png": ".png", "image/jpeg": ".jpg", "image/gif": ".gif"}
+QUALITY = 85  # of JPEG
 COLORS = re.compile(r"\x1b\[[0-9;]*m")  # of a terminal, in tracebacks
 
 
@@ -65,14 +70,19 @@ def run_notebook(source: Path, out: Path, *, largest: int = LARGEST, seconds: in
     outcome, target = Outcome(source), out / f"{source.stem}.ipynb"
     target.unlink(missing_ok=True)  # else an older run's would pass for this one's
     notebook = jupytext.read(source, fmt="py:percent")
-    notebook.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
+    notebook.metadata = {
+        "kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"},
+        "language_info": {"name": "python", "file_extension": ".py", "mimetype": "text/x-python"},
+    }
+    for number, cell in enumerate(notebook.cells):
+        cell.id = f"cell-{number:02d}"  # the same in every run, so that a change shows only what changed
     start = time.perf_counter()
     failure, below = _execute(notebook, source.parent, seconds)
     outcome.seconds = time.perf_counter() - start
     outcome.problems = [failure] if failure else []
     outcome.problems += list(_noise(notebook))
     outcome.problems += [f"the kernel writes to stderr: {below}"] if below else []
-    _drop_copies(notebook)
+    _shrink(notebook)
     outcome.pictures = _pictures(notebook, source.stem)
     if not failure:
         text = nbformat.writes(notebook)
@@ -146,14 +156,27 @@ def _noise(notebook: Any) -> Iterator[str]:
             yield f"cell {_number(notebook, index)} writes to stderr: {COLORS.sub('', text)}"
 
 
-def _drop_copies(notebook: Any) -> None:
-    """Keep the smallest where a picture comes in several formats, as Pillow's do (PNG and JPEG)."""
+def _shrink(notebook: Any) -> None:
+    """Keep the smallest where a picture comes in several formats, and JPEG if that is smaller still; no times of cells."""
     for cell in notebook.cells:
+        cell.metadata.pop("execution", None)
         for output in cell.get("outputs", []):
             data = output.get("data", {})
+            if "image/png" in data and "image/jpeg" not in data:
+                data["image/jpeg"] = _as_jpeg(data["image/png"])
             kinds = sorted((kind for kind in SUFFIXES if kind in data), key=lambda kind: len(data[kind]))
             for kind in kinds[1:]:
                 del data[kind]
+
+
+def _as_jpeg(picture: str) -> str:
+    """A picture in base64 as JPEG; what is transparent becomes white."""
+    shown = Image.open(io.BytesIO(base64.b64decode(picture))).convert("RGBA")
+    flat = Image.new("RGB", shown.size, "white")
+    flat.paste(shown, mask=shown.getchannel("A"))
+    kept = io.BytesIO()
+    flat.save(kept, "JPEG", quality=QUALITY, optimize=True, subsampling=0)
+    return base64.b64encode(kept.getvalue()).decode()
 
 
 def _pictures(notebook: Any, stem: str) -> dict[str, bytes]:

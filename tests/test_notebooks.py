@@ -43,6 +43,32 @@ def code_cells(source):
     return [cell.source for cell in jupytext.read(source, fmt="py:percent").cells if cell.cell_type == "code"]
 
 
+def test_the_committed_notebook_has_the_cells_of_its_source_and_their_outputs(source, runner):
+    """If this fails: `python notebooks/run.py N --out notebooks`."""
+    committed = source.with_suffix(".ipynb")
+    assert committed.stat().st_size < runner.LARGEST
+    text = committed.read_text(encoding="utf-8")
+    assert not re.search(r"/(tmp|home|root|Users|var|work)/", text), "no path of the machine that ran it"
+    cells = json.loads(text)["cells"]
+    written = jupytext.read(source, fmt="py:percent").cells
+    assert [(cell["cell_type"], "".join(cell["source"])) for cell in cells] == [
+        (cell.cell_type, cell.source) for cell in written
+    ]
+    code = [cell for cell in cells if cell["cell_type"] == "code"]
+    assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
+    kinds = {kind for cell in code for output in cell["outputs"] for kind in output.get("data", {})}
+    assert kinds & {"image/jpeg", "image/png", "image/gif"}
+
+
+def test_a_notebook_has_at_most_90_lines_of_code(source):
+    lines = [line for cell in code_cells(source) for line in cell.splitlines() if line.strip() and line.strip()[0] != "#"]
+    assert len(lines) <= 90
+
+
+def test_there_is_no_notebook_without_its_source():
+    assert sorted(path.stem for path in NOTEBOOKS.glob("*.ipynb")) == [path.stem for path in SOURCES]
+
+
 def test_they_are_numbered_from_1():
     assert [int(path.name.split("_")[0]) for path in SOURCES] == list(range(1, len(SOURCES) + 1))
 

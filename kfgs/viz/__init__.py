@@ -3,7 +3,7 @@
 from .animation import save_animation
 from .boxes import add_boxes, add_names, add_selections
 from .bridges import to_open3d, to_trimesh
-from .camera_view import look_through
+from .camera_view import draw_view, look_through
 from .clouds import CloudOptions, add_cloud, recolor_cloud, to_pyvista
 from .confusions import plot_confusion, plot_largest_confusions
 from .explorer import ExploreOptions, Explorer, explore
@@ -43,6 +43,7 @@ __all__ = [
     "add_selections",
     "add_transfer",
     "available",
+    "draw_view",
     "explore",
     "feature_colors",
     "legend_strip",

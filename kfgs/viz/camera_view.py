@@ -1,15 +1,17 @@
-"""Set a plotter's view from a posed camera, and make a posed camera from a view."""
+"""Set a plotter's view from a posed camera, draw what a camera sees, and make a posed camera from a view."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import atan, degrees, radians, tan
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from ..cameras import Camera
 from ..cameras.camera import NEAR
+from .headless import make_plotter
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -39,6 +41,38 @@ def look_through(plotter: pv.Plotter, camera: Camera) -> None:
     view.SetUseExplicitAspectRatio(True)
     plotter.camera_set = True  # otherwise the first render moves the camera to see everything
     plotter.renderer.ResetCameraClippingRange()
+
+
+def draw_view(
+    camera: Camera,
+    draw: Callable[[pv.Plotter], object],
+    *,
+    background: str = "white",
+) -> np.ndarray[Any, Any]:  # [H, W, 3] uint8
+    """Draw with pyvista what a camera sees, and return the picture. No window opens, and the plotter is closed.
+
+    For a window that can be turned, make a plotter with `make_plotter` and call `look_through` and `show` yourself.
+
+    Args:
+        camera: where to look from; the picture has its size.
+        draw: called with the plotter; adds to it what is to be seen. What it returns is not used.
+        background: a colour that pyvista knows.
+
+    Raises:
+        RuntimeError: if nothing can be drawn here; the message names the packages to install.
+        ValueError: if the camera's lens distorts.
+
+    Example:
+        >>> from kfgs.viz import add_cloud
+        >>> picture = draw_view(camera, lambda plotter: add_cloud(plotter, cloud))  # doctest: +SKIP
+    """
+    plotter = make_plotter(*camera.size, off_screen=True, background=background)
+    try:
+        draw(plotter)
+        look_through(plotter, camera)
+        return np.asarray(plotter.screenshot(return_img=True))
+    finally:
+        plotter.close()
 
 
 def camera_of(plotter: pv.Plotter, subplot: tuple[int, int] = (0, 0), *, near: float = NEAR) -> Camera:

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 import torch
-from cases_viz import some_camera, some_plotter
+from cases_viz import some_camera, some_gaussians, some_plotter
 from messages import tells
 
-from kfgs.viz import look_through, make_plotter
+from kfgs.viz import add_cloud, draw_view, look_through, make_plotter
 from kfgs.viz.camera_view import camera_of
 
 
@@ -49,3 +49,29 @@ def test_parallel_rays_are_of_no_pinhole_camera():
         plotter.enable_parallel_projection()
         with pytest.raises(ValueError, match=tells("plotter:", "perspective")):
             camera_of(plotter)
+
+
+def test_draw_view_is_a_plotter_that_looks_through_the_camera_and_is_closed():
+    camera, cloud, used = some_camera(), some_gaussians(), []
+    with some_plotter() as plotter:
+        add_cloud(plotter, cloud)
+        look_through(plotter, camera)
+        expected = plotter.screenshot(return_img=True)
+
+    def draw(plotter):
+        used.append(plotter)
+        add_cloud(plotter, cloud)
+
+    picture = draw_view(camera, draw, background="black")
+    assert picture.shape == (*camera.size, 3)
+    assert np.array_equal(picture, expected)
+    assert picture.any()
+    assert (draw_view(camera, lambda plotter: None) == 255).all()
+
+    def fail(plotter):
+        used.append(plotter)
+        raise KeyError("draw")
+
+    with pytest.raises(KeyError):
+        draw_view(camera, fail)
+    assert [plotter.render_window for plotter in used] == [None, None]

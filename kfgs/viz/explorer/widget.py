@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 HEIGHT = 640  # CSS pixels
 STILL = 800  # pixels: the longer edge of the picture where widgets cannot run
+PALE = 0.6  # share of white in the grey of what a question did not select
 START = """
 export default {
   async render({ model, el }) {
@@ -128,12 +129,18 @@ def make_widget(
 
 
 def still(exploration: Exploration) -> str:
-    """What the first camera sees, in the colours that the viewer opens with: a JPEG file in base64, as notebooks hold it."""
+    """What the first camera sees, in the colours that the viewer opens with: a JPEG file in base64, as notebooks hold it.
+
+    After a question, what it did not select is pale.
+    """
     side = exploration.sides[-1]
     camera = exploration.cameras[0].fitted(STILL)
     cloud = exploration.cloud(side)
-    if exploration.show != "rgb" or cloud.sh is None:
+    if exploration.asked is not None or exploration.show != "rgb" or cloud.sh is None:
         colors = torch.from_numpy(exploration.colors(side)).to(cloud.means) / 255
+        if exploration.asked is not None:
+            rest = ~torch.from_numpy(exploration.selected(side)).to(colors.device)
+            colors[rest] = PALE + (1 - PALE) * colors[rest].mean(dim=1, keepdim=True)
         cloud = cloud.replace(features=colors, sh=None)
     with torch.no_grad():
         picture = as_bytes(rasterize(cloud.replace(labels=None), camera, background=cloud.means.new_ones(3)).map)

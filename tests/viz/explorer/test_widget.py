@@ -35,6 +35,12 @@ def answers(widget, *messages):
     return sent
 
 
+def still_of(state):
+    bundle = make_widget(state)._repr_mimebundle_()
+    file = base64.b64decode((bundle[0] if isinstance(bundle, tuple) else bundle)["image/jpeg"])
+    return np.asarray(Image.open(io.BytesIO(file))).astype(int)
+
+
 def test_the_scene_is_sent_once(tmp_path):
     state = exploration()
     state.ask("chair")
@@ -79,15 +85,29 @@ def test_explore_in_a_notebook_gives_a_viewer():
 def test_a_picture_stands_in_where_widgets_cannot_run(show):
     state = exploration()
     state.set_show(show)
-    bundle = make_widget(state)._repr_mimebundle_()
-    file = base64.b64decode((bundle[0] if isinstance(bundle, tuple) else bundle)["image/jpeg"])
-    picture = np.asarray(Image.open(io.BytesIO(file)))
+    picture = still_of(state)
     assert picture.shape[:2] == (state.cameras[0].height, state.cameras[0].width)
     cloud = state.cloud("color")
     if show == "labels":
         cloud = cloud.replace(features=torch.from_numpy(state.colors("color")) / 255, sh=None)
     truth = rasterize(cloud, state.cameras[0], background=torch.ones(3)).map.clamp(0, 1)
     assert np.abs(picture / 255 - truth.numpy()).mean() < 0.03
+
+
+def test_after_a_question_the_picture_shows_the_answer():
+    state = exploration()
+    state.set_show("rgb")
+    plain = still_of(state)
+    state.ask("chair")
+    asked = still_of(state)
+    selected = state.selected("color")
+    assert 0 < selected.sum() < len(selected)
+    colors = state.colors("color") / 255
+    colors[~selected] = 0.6 + 0.4 * colors[~selected].mean(axis=1, keepdims=True)  # three fifths white, no hue
+    cloud = state.cloud("color").replace(features=torch.from_numpy(colors).float(), sh=None)
+    expected = rasterize(cloud, state.cameras[0], background=torch.ones(3)).map.numpy()
+    error, change = (np.abs(asked - other).mean() for other in (255 * expected, plain))
+    assert 2 * error < change
 
 
 def test_without_anywidget_the_install_line_is_told():
