@@ -91,7 +91,7 @@ def split_scene(
     facts = {
         "format": FORMAT,
         "version": 1,
-        "scene": os.path.relpath(source, out),
+        "scene": os.path.relpath(real_path(source), real_path(out)),
         "features": os.path.relpath(real_path(maps_folder), real_path(out)),
         "splat": None if splat is None else digest_file(splat_file_of(splat)),
         "latents": digest_tensors(latents.basis) if isinstance(latents, LinearLatents) else latents,

@@ -351,3 +351,12 @@ def test_a_splat_of_another_scene_is_said(town, splat, tmp_path):
         (tmp_path / "city" / block / "core.json").write_text('{"gaussians": 0, "of": 0, "box": null, "seconds": 0}')
     with pytest.raises(ValueError, match=tells("city", "none", "splat")):
         FieldInBlocks.open(tmp_path / "city")
+
+
+def test_a_city_behind_a_link_remembers_its_scene(town, splat, tmp_path):
+    (tmp_path / "deep/er/city").mkdir(parents=True)
+    (tmp_path / "city").symlink_to("deep/er/city")
+    split_scene(town, tmp_path / "city", 2, splat=splat, latents=4)
+    field = fit_blocks(tmp_path / "city", EVERY).joined()
+    assert recall_scene(field.info, field.folder).samefile(town)
+    assert field.has_classes
