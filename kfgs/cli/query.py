@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .._files import atomic_folder, check_output, check_own, read_json, real_path
-from .files import check_alone, check_splat, inputs_of, is_field, open_splats
-from .options import Classes, Given, Positional, Rule, Teacher, remembered_scene
+from .files import check_alone, check_splat, is_field, open_splats
+from .options import Classes, Given, Positional, Rule, Teacher
 from .output import say, say_counts, wrote
 from .text import ask
 
@@ -59,7 +59,7 @@ def select(
     if not source.exists() and Path(query).exists():
         raise ValueError(f"query, source: expected a class, then a file, got {query!r}, {str(source)!r}; swap them")
     if out is not None:
-        check_output("out", out, "a folder", apart=inputs_of(classes.scene, classes.images))
+        check_output("out", out, "a folder")
         _check_older(out)
     if threshold is not None:
         check_range("threshold", threshold, 0, 1)
@@ -68,8 +68,6 @@ def select(
     counted = not asked_by_text and threshold is None  # parts are numbered as `kfgs edit` does
     if asked_by_text:
         field = classes.open_field("source", source)
-        if out is not None and classes.scene is None:
-            check_output("out", out, "a folder", apart=inputs_of(remembered_scene(field)))
         label_set, target = ask(query, classes, teacher, field)
         query = target if isinstance(target, str) else query
         how = None if score == "auto" else score
@@ -141,7 +139,7 @@ def label(
     ):
         if value is not None and needed is None:
             raise ValueError(f"{name}: expected --{other} with it, got none; it would have no effect")
-    check_output("out", out, "a folder", apart=inputs_of(classes.scene, classes.images))
+    check_output("out", out, "a folder")
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
     if cloud is not None and real_path(cloud) in {real_path(out / name) for name in ("gaussians.ply", "cloud.ply")}:

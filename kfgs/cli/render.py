@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from .._files import check_output
-from .files import inputs_of
 from .options import Classes, Given, Positional, Teacher, Walk
 from .output import say, wrote
 from .view import open_colors, open_meaning
@@ -56,7 +55,7 @@ def render(
     from ..viz import save_animation
     from ..viz.animation import SUFFIXES, check_target
 
-    check_output("out", out, "a file", apart=inputs_of(classes.scene, classes.images))
+    check_output("out", out, "a file")
     if out.suffix.lower() not in SUFFIXES:
         raise ValueError(f"out: expected a name that ends in .gif or .mp4, got {out.name!r}; rename it")
     check_target(out, fps)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .._files import check_output, check_own, read_json
-from .files import check_alone, inputs_of, open_field
+from .files import check_alone, open_field
 from .options import Classes, Flag, Given, GivenWalk, Positional, Rule, Walk
 from .output import say, wrote
 from .render import walk_of
@@ -96,7 +96,7 @@ def segment(
         check_own(out / "scores.json", lambda path: bool(read_json(path)["segmentation"]), "kfgs segment")
         check_pictures(out, ("confusion", "iou"), "kfgs segment")
     if coco:
-        check_coco(out, (loaded.stem(i) for i in loaded.views(split)), inputs_of(scene, classes.images))
+        check_coco(out, (loaded.stem(i) for i in loaded.views(split)))
     found = segment_scene(
         loaded_field,
         loaded,

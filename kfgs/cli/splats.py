@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from .._files import check_output, check_own, read_json, real_path
 from .edit_syntax import Edits, check_parts, inserted_files, parse_edits
-from .files import check_alone, check_splat, check_target, inputs_of, open_splats
+from .files import check_alone, check_splat, check_target, open_splats
 from .options import Classes, Flag, Given, GivenBy, Positional, SceneOption, Several
 from .output import say, say_counts, say_lost, wrote
 
@@ -61,7 +61,7 @@ def attach(
     from ..pipeline.attach import attach as attach_field
     from ..scenes import SceneError, load_scene
 
-    check_target("out", out, splats, apart=inputs_of(classes.scene, classes.images))
+    check_target("out", out)
     classes.check_images()
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
@@ -124,7 +124,7 @@ def edit(
     from ..pipeline.compare import views_of_edits, write_comparison
     from ..viz.pictures import check_pictures
 
-    check_target("out", out, splats, apart=inputs_of(scene.scene, scene.images))
+    check_target("out", out)
     saved = _edits_beside(out, replay)
     check_whole("pictures", pictures, 0)
     if scene.scene is not None and pictures:
@@ -181,7 +181,7 @@ def convert(source: Positional[Path], target: Positional[Path], *, plain: Flag =
     if by_class:
         check_alone("plain", plain, "with --by-class, whose files are plain")
         return _convert_by_class(source, target)
-    check_target("target", target, source)
+    check_target("target", target)
     splats = open_splats("source", source)
     say(repr(splats))
     written = write_splats(target, splats, plain=plain)

@@ -64,9 +64,9 @@ def segment_cameras(
     return found
 
 
-def check_coco(out: Path, names: Iterable[str], apart: Iterable[Path] = ()) -> None:
-    """Check before the work that `write_coco` may write there; `apart` is that of `check_output`."""
-    check_output("out", out / COCO, "a folder", apart=apart)
+def check_coco(out: Path, names: Iterable[str]) -> None:
+    """Check before the work that `write_coco` may write there."""
+    check_output("out", out / COCO, "a folder")
     check_pictures(out, (f"{COCO}/images/{name}" for name in names), "kfgs segment")
     check_own(out / COCO / "annotations.json", is_ours, "kfgs segment")
 

@@ -370,3 +370,25 @@ def test_a_splat_of_another_scene_is_said(town, splat, tmp_path):
         (block / "core.json").write_text('{"gaussians": 0, "box": null}')
     with pytest.raises(ValueError, match=tells("city", "none", "splat")):
         FieldInBlocks.open(tmp_path / "city")
+
+
+def test_a_city_behind_a_link_remembers_its_scene(town, splat, tmp_path):
+    (tmp_path / "deep/er/city").mkdir(parents=True)
+    (tmp_path / "city").symlink_to("deep/er/city")
+    split_scene(town, tmp_path / "city", 2, splat=splat, latents=4)
+    field = fit_blocks(tmp_path / "city", EVERY).joined()
+    assert recall_scene(field.info, field.folder).samefile(town)
+    assert field.has_classes
+
+
+@pytest.mark.parametrize("name", ["latents.safetensors", "block00/splat.ply", "block00/mine.txt", "block01"])
+def test_files_of_somebody_else_are_not_replaced(town, splat, tmp_path, name, capsys):
+    file = tmp_path / "city" / name
+    file.parent.mkdir(parents=True)
+    file.write_text("mine")
+    before = sorted(tmp_path.rglob("*"))
+    line = ["blocks", str(town), "--out", str(tmp_path / "city"), "--count", "2", "--splat", str(splat)]
+    assert main(line) == 1
+    place = tmp_path / "city" / name.split("/")[0]
+    assert re.search(tells(place, "kfgs blocks", "move it away"), capsys.readouterr().err)
+    assert (file.read_text(), sorted(tmp_path.rglob("*"))) == ("mine", before)
