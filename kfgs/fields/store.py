@@ -14,6 +14,7 @@ from .._arrays import read_safetensors
 from .._check import check_choice
 from .._files import as_path, atomic_folder, atomic_path, current_file, digest_file, open_current, read_json, write_json
 from .._files.fields import DESCRIPTION as DESCRIPTION
+from .._files.fields import NUMBERS as TENSORS
 from .._files.fields import SUFFIX as SUFFIX
 from .._files.fields import describes_field as describes_field
 from .._tensors import save_tensors
@@ -30,7 +31,6 @@ from .remembered import check_notes, rebased, recall_classes
 
 FORMAT, VERSIONS = "kfgs.semantic_field", (1, 2, 3)
 """Version 2 may hold linear latents, fused answers and cameras; version 3 the classes."""
-TENSORS = "field.safetensors"
 
 
 def find_field(path: str | Path) -> Path | None:

@@ -7,13 +7,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .._card import short_repr
 from .._files import atomic_path, parse_json
+from .._files.paths import utf8
 
 Array = NDArray[Any]
 Rows = Mapping[str, Array]
@@ -53,16 +54,30 @@ COLUMNS: dict[str, dict[str, tuple[str, tuple[int, ...]]]] = {
 """Type and further axes of each column, for each kind of row of a field."""
 
 
+class FileMark(NamedTuple):
+    """A file from which a field's answers follow. If size and time are the same, so is its content."""
+
+    name: str
+    """Relative to the folder of the field; empty: the field itself, which is one file."""
+    size: int
+    """Bytes; -1: there is none."""
+    time: int
+    """Of its last change, in nanoseconds."""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+
 @dataclass(frozen=True, eq=False)
 class Entry:
     """What the index knows of one field. Positions are in its scene's frame and units."""
 
     path: str
     """Of the field, relative to the index's folder, with slashes."""
-    mark: tuple[int, int]
-    """Size in bytes and time in nanoseconds of `field.json`, or of the packed file."""
-    sha256: str
-    """Of that file."""
+    marks: tuple[FileMark, ...]
+    """Of the field's files, and of those of the classes that it remembers."""
+    digests: tuple[str, ...]
+    """SHA-256 of each of these files."""
     gaussians: int
     space: int
     """Index of its teacher's words."""
@@ -108,9 +123,9 @@ class Table:
 
 @dataclass(frozen=True)
 class Unread:
-    """A field that could not be read. It is tried again when its file changes."""
+    """A field that could not be read. It is tried again when its files change."""
 
-    mark: tuple[int, int]
+    marks: tuple[FileMark, ...]
     reason: str
 
 
@@ -139,7 +154,7 @@ def write_index(path: Path, contents: Contents) -> None:
     from safetensors.numpy import save_file
 
     entries = [contents.entries[name] for name in sorted(contents.entries)]
-    names = ("path", "mark", "sha256", "gaussians", "space", "table", "views", "outside")
+    names = ("path", "marks", "digests", "gaussians", "space", "table", "views", "outside")
     about = {
         "fields": [{name: getattr(entry, name) for name in names} for entry in entries],
         "spaces": [{"teacher": one.teacher, "tolerance": one.tolerance} for one in contents.spaces],
@@ -147,7 +162,7 @@ def write_index(path: Path, contents: Contents) -> None:
             {"space": one.space, "names": one.names, "negative_names": one.negative_names, "info": one.info}
             for one in contents.tables
         ],
-        "unread": {name: [*one.mark, one.reason] for name, one in sorted(contents.unread.items())},
+        "unread": {name: [one.marks, utf8(one.reason)] for name, one in sorted(contents.unread.items())},
     }
     text = json.dumps(about, allow_nan=False).encode()
     if len(text) > WORDS:
@@ -223,10 +238,12 @@ def _contents(tensors: dict[str, Array]) -> Contents:
         own = {kind: kinds[kind][i] for kind in COLUMNS}
         classes = 0 if table is None else len(tables[table].names)
         _check_rows(own, len(spaces[space].words), classes, len(views), int(one["gaussians"]))
-        (path,), (size, time) = _texts([one["path"]]), one["mark"]
-        mark, facts = (int(size), int(time)), (int(one["gaussians"]), space, table, views, float(one["outside"]))
-        entries[path] = Entry(path, mark, str(one["sha256"]), *facts, own)
-    unread = {name: Unread((int(size), int(time)), str(why)) for name, (size, time, why) in about["unread"].items()}
+        (path,), marks, digests = _texts([one["path"]]), _marks(one["marks"]), _texts(one["digests"])
+        if len(digests) != len(marks):
+            raise ValueError(f"it holds {len(digests)} digests of {len(marks)} files")
+        facts = int(one["gaussians"]), space, table, views, float(one["outside"])
+        entries[path] = Entry(path, marks, digests, *facts, own)
+    unread = {name: Unread(_marks(marks), str(why)) for name, (marks, why) in about["unread"].items()}
     return Contents(spaces, tables, entries, unread)
 
 
@@ -278,6 +295,11 @@ def _matrix(tensors: dict[str, Array], name: str) -> Array:
     if found.ndim != 2:
         raise ValueError(f"{name} has shape {found.shape}")
     return _column(tensors, name, "<f4", found.shape[1:])
+
+
+def _marks(rows: Any) -> tuple[FileMark, ...]:
+    names = _texts([name for name, _, _ in rows])
+    return tuple(FileMark(name, int(size), int(time)) for name, (_, size, time) in zip(names, rows, strict=True))
 
 
 def _texts(values: Any) -> tuple[str, ...]:
