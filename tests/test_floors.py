@@ -43,6 +43,7 @@ THIRD_PARTY = {
     "vtkmodules": "kfgs/viz/",
     "trimesh": "kfgs/viz/",
     "open3d": "kfgs/viz/",
+    "pxr": "kfgs/viz/",
     "numba": "kfgs/splat/engines/",
     "llvmlite": "kfgs/splat/engines/",
     "triton": "kfgs/splat/engines/",

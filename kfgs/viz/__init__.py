@@ -25,6 +25,7 @@ from .plots import (
     plot_training,
 )
 from .reports import plot_codebook_growth, plot_codebook_report
+from .usd import save_usd
 
 __all__ = [
     "CloudOptions",
@@ -69,6 +70,7 @@ __all__ = [
     "save_flythrough",
     "save_picture",
     "save_turntable",
+    "save_usd",
     "show_cloud",
     "to_open3d",
     "to_pyvista",

@@ -74,6 +74,8 @@ WITH_CODE = ["index", "concepts/field", "howto/teacher", "howto/remove", "howto/
 
 @pytest.mark.parametrize("page", WITH_CODE)
 def test_the_python_of_other_pages_runs(page, desk, tmp_path, monkeypatch):
+    if page == "howto/export":
+        pytest.importorskip("trimesh")
     shutil.copytree(desk, tmp_path / "desk")
     monkeypatch.chdir(tmp_path / "desk")
     Path("kfgs_demo").symlink_to(".")
