@@ -34,7 +34,7 @@ camera = scene.cameras[0]
 print(scene)
 print(f"{camera.name}: {camera.width} x {camera.height} pixels, at {[round(x, 2) for x in camera.center.tolist()]}")
 train = scene.views("train")
-shown = [scene.image(train[k * len(train) // 8]) for k in range(8)]
+shown = [scene.image(train[k * len(train) // 9]) for k in range(8)]
 Image.fromarray(viz.picture_grid([shown[:4], shown[4:]], width=256))
 
 # %% [markdown]

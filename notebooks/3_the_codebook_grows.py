@@ -50,7 +50,7 @@ from kfgs.viz import plot_codebook_growth
 
 fits = {}
 for alpha in (0.9, 0.7):
-    config = CodebookConfig.paper(epochs=5, step_every=2, joins_per_image=1, expand_below=alpha)
+    config = CodebookConfig.paper(epochs=4, step_every=2, joins_per_image=1, expand_below=alpha)
     fits[f"alpha = {alpha}"] = fit_codebook(maps, config)
 plot_codebook_growth({name: fit.history for name, fit in fits.items()}, pictures / "growth.png")
 Shown(pictures / "growth.png", width=900)
@@ -58,14 +58,13 @@ Shown(pictures / "growth.png", width=900)
 # %% [markdown]
 # *Coverage* is the share of features whose similarity to their codeword is at least $\alpha$. With $\alpha = 0.9$, the
 # paper's value, this book grows to the limit of 100 and still covers little: this teacher is so noisy that new codewords
-# only copy its noise. The mean similarity hardly differs between the two books. By default, kfgs needs no $\alpha$: it
-# splits the features of a codeword in two while both halves come clearly nearer to their codewords.
+# only copy its noise. The mean similarity hardly differs between the two books. By default
+# (`fit_codebook(maps)`), kfgs needs no $\alpha$: it splits the features of a codeword in two while both halves come clearly
+# nearer to their codewords.
 
 # %%
 for name, fit in fits.items():
     print(f"{name}: K = {fit.codebook.size:3d}, coverage {fit.coverage:.3f}, mean similarity {fit.mean_similarity:.3f}")
-by_default = fit_codebook(maps)
-print(f"by default:  K = {by_default.codebook.size:3d}, mean similarity {by_default.mean_similarity:.3f}")
 fit = fits["alpha = 0.7"]
 codebook = fit.codebook
 
@@ -104,7 +103,14 @@ classes = label_codewords(codebook.codewords, words.embeddings).labels
 rows = []
 for i in (0, 2 * len(maps) // 3):
     index = torch.from_numpy(index_maps[i]).long().clamp_max(codebook.size - 1)  # K where the teacher says nothing
-    rows.append([scene.image(train[i]), colors(maps[i]), colors(codebook.codewords)[index], palette(classes)[index]])
+    rows.append(
+        [
+            scene.image(train[i]),
+            colors(maps[i]),
+            colors(codebook.codewords)[index],
+            palette(classes, words.names)[index],
+        ]
+    )
 titles = ["photograph", "the teacher", "its codewords", "their classes"]
 Image.fromarray(picture_grid(rows, titles, width=min(scene.cameras[0].width, 320)))
 

@@ -31,24 +31,26 @@ run, pictures = data / "run", data / "pictures"
 
 # %%
 from dataclasses import replace
+from functools import partial
 
 import torch
 from IPython.display import Image as Shown
 from PIL import Image
 
-from kfgs import ColorConfig, FeatureFolder, FitConfig, SemanticField, fit_scene, load_label_set, load_scene, viz
-from kfgs import read_splats, score_scene, score_views, segment_scene
+import kfgs
+from kfgs import viz
 from kfgs.pipeline import score_teacher, true_labels
 
-scene = load_scene(folder).undistorted()
-classes = load_label_set(names, text)
+scene = kfgs.load_scene(folder).undistorted()
+classes = kfgs.load_label_set(names, text)
 train, test = scene.views("train"), scene.views("test")
-maps = FeatureFolder(features).of(scene, "train")
+maps = kfgs.FeatureFolder(features).of(scene, "train")
 print(scene)
 print(f"{len(maps)} maps of {tuple(maps[0].shape)}; {len(classes)} classes: {', '.join(classes.names)}")
-colors = viz.FeatureColors.fit(torch.cat([maps[i][::4, ::4].flatten(0, 1) for i in range(len(maps))]))
-chosen = [k * len(maps) // 4 for k in range(4)]
-rows = [[scene.image(train[k]) for k in chosen], [colors(maps[k]) for k in chosen]]
+unit = partial(torch.nn.functional.normalize, dim=-1)  # only the direction of a feature has a meaning
+colors = viz.FeatureColors.fit(unit(torch.cat([maps[i][::4, ::4].flatten(0, 1) for i in range(len(maps))])))
+chosen = [k * len(maps) // 5 for k in range(4)]
+rows = [[scene.image(train[k]) for k in chosen], [colors(unit(maps[k])) for k in chosen]]
 Image.fromarray(viz.picture_grid(rows, width=256))
 
 # %% [markdown]
@@ -66,9 +68,9 @@ Image.fromarray(viz.picture_grid(rows, width=256))
 # trains the features too; notebook 8 compares.) If you have a splat of your scene already, add `splat="my.ply"`.
 
 # %%
-quick = ColorConfig.quick()
+quick = kfgs.ColorConfig.quick()
 quick = replace(quick, field=replace(quick.field.with_steps(800), max_gaussians=60_000))
-fitted = fit_scene(scene, maps, run, FitConfig.cpu(color=quick), report=print)
+fitted = kfgs.fit_scene(scene, maps, run, kfgs.FitConfig.cpu(color=quick), report=print)
 field = fitted.field
 print(field.summary())
 
@@ -81,11 +83,11 @@ print(field.summary())
 # %%
 k = 2
 camera, image = scene.cameras[test[k]], scene.image(test[k])
-test_maps = FeatureFolder(features).of(scene, "test")
-colored = read_splats(run / "color.ply").gaussians
-print(f"{len(colored):,} Gaussians, PSNR on unseen views: {score_views(colored, scene).psnr.value:.1f} dB")
+test_maps = kfgs.FeatureFolder(features).of(scene, "test")
+colored = kfgs.read_splats(run / "color.ply").gaussians
+print(f"{len(colored):,} Gaussians, PSNR on unseen views: {kfgs.score_views(colored, scene).psnr.value:.1f} dB")
 drawn = viz.show_cloud(colored, background="black", color_by="rgb")(camera)
-row = [image, drawn, colors(field.feature_map(camera)), colors(test_maps[k])]
+row = [image, drawn, colors(unit(field.feature_map(camera))), colors(unit(test_maps[k]))]
 Image.fromarray(viz.picture_grid([row], ("photograph", "colour field", "field's features", "teacher's"), width=256))
 
 # %% [markdown]
@@ -97,7 +99,7 @@ Image.fromarray(viz.picture_grid([row], ("photograph", "colour field", "field's 
 
 # %%
 truth = true_labels(scene, labels, "test")
-found = segment_scene(field, scene, classes, run / "segmentation", truth=truth, maps=features)
+found = kfgs.segment_scene(field, scene, classes, run / "segmentation", truth=truth, maps=features)
 sheet = Image.open(run / "segmentation" / "sheets" / f"{scene.stem(test[-1])}.png").convert("RGB")
 sheet.resize((1024, round(sheet.height * 1024 / sheet.width)))
 
@@ -110,7 +112,7 @@ sheet.resize((1024, round(sheet.height * 1024 / sheet.width)))
 
 # %%
 stems = list(truth)
-scores = score_scene(found, truth, classes)
+scores = kfgs.score_scene(found, truth, classes)
 teacher = score_teacher(lambda stem: test_maps[stems.index(stem)], truth, classes, camera.size)
 print(f"mIoU on unseen views: field {scores.miou.value:.3f}, teacher {teacher.miou.value:.3f}")
 viz.plot_iou(scores.iou, classes.names, pictures / "iou.png", reference=teacher.iou, reference_name="teacher")
@@ -123,7 +125,7 @@ Shown(pictures / "iou.png", width=700)
 # cameras, and how they came about. What is loaded answers exactly as before.
 
 # %%
-again = SemanticField.load(run / "field")
+again = kfgs.SemanticField.load(run / "field")
 assert torch.equal(again.segment(camera, classes), found[scene.stem(test[k])])
 size = sum(path.stat().st_size for path in (run / "field").iterdir()) / 2**20
 maps_size = len(maps) * maps[0].numel() * 2 / 2**20

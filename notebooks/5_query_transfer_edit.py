@@ -89,7 +89,7 @@ semantic = field.label(classes)
 hidden = torch.tensor([-1, *(classes.index(name) for name in shell if classes.knows(name))])
 inside = semantic.select(~torch.isin(semantic.labels, hidden))
 up = estimate_up(scene.cameras)
-orbit = Orbit(frames=1, size=(450, 640), elevation_degrees=50, start_degrees=120, zoom=1.8)
+orbit = Orbit(frames=1, size=(450, 640), elevation_degrees=50, start_degrees=120, zoom=1.6)
 
 
 def draw_things(plotter):

@@ -29,19 +29,19 @@ from dataclasses import replace
 import torch
 from PIL import Image
 
-from kfgs import ColorConfig, FeatureFolder, FitConfig, connected_parts, fit_scene, load_label_set, load_scene
-from kfgs import read_splats, transfer_labels, viz
+import kfgs
+from kfgs import viz
 from kfgs.cameras import Orbit, estimate_up, orbit_cameras
 from kfgs.labels import Selection
 
-scene = load_scene(folder).undistorted()
-classes = load_label_set(names, text)
+scene = kfgs.load_scene(folder).undistorted()
+classes = kfgs.load_label_set(names, text)
 cameras = [scene.cameras[i] for i in scene.views("train")]
-maps = FeatureFolder(features).of(scene, "train")
-quick = ColorConfig.quick()
+maps = kfgs.FeatureFolder(features).of(scene, "train")
+quick = kfgs.ColorConfig.quick()
 quick = replace(quick, field=replace(quick.field.with_steps(800), max_gaussians=60_000))
-field = fit_scene(scene, maps, run, FitConfig.cpu(color=quick)).field  # notebook 4 explains it
-color = read_splats(run / "color.ply").gaussians
+field = kfgs.fit_scene(scene, maps, run, kfgs.FitConfig.cpu(color=quick)).field  # notebook 4 explains it
+color = kfgs.read_splats(run / "color.ply").gaussians
 semantic = field.label(classes)
 print(f"{len(semantic):,} semantic Gaussians, {len(color):,} of colour")
 
@@ -119,15 +119,13 @@ Image.fromarray(viz.draw_view(outside, draw_outside))
 
 # %%
 owner = torch.full((len(semantic),), -1)
-for number, part in enumerate(connected_parts(semantic, found, cameras, distance=0.15)):
+for number, part in enumerate(kfgs.connected_parts(semantic, found, cameras, distance=0.15)):
     owner[part.indices] = number
     print(part)
-carried = transfer_labels(semantic, owner, color, 0.1).labels
+carried = kfgs.transfer_labels(semantic, owner, color, 0.1).labels
 selections = {f"{word} {k + 1}": Selection.of(carried == k) for k in range(int(owner.max()) + 1)}
 view = camera.resized(2 * camera.height, 2 * camera.width)
-Image.fromarray(
-    viz.draw_view(view, lambda plotter: viz.add_selections(plotter, color, selections, style="gaussians"))
-)
+Image.fromarray(viz.draw_view(view, lambda plotter: viz.add_selections(plotter, color, selections, style="gaussians")))
 
 # %% [markdown]
 # ## The explorer, driven from cells
@@ -152,7 +150,8 @@ Image.fromarray(picture)
 # Where widgets cannot run, for instance on a web page, you see a still picture: what was asked keeps its colours.
 
 # %%
-viewer = viz.explore(field, color, classes=classes, cameras=[camera, *cameras], where="notebook")
+first = camera.resized(2 * camera.height, 2 * camera.width)
+viewer = viz.explore(field, color, classes=classes, cameras=[first, *cameras], where="notebook")
 viewer.ask(word)
 viewer
 

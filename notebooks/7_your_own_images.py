@@ -20,7 +20,15 @@ from kfgs import ToyConfig, make_toy_room
 data = Path(os.environ.get("KFGS_NOTEBOOK_DATA", "data"))
 photos = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6)) / "images"  # yours: Path("my/photos")
 out = data / "own"
-phrases = ["forest green", "dark grey blue", "reddish brown", "greyish brown", "dark brown", "pinkish grey", "cloudy blue"]
+phrases = [
+    "forest green",
+    "dark grey blue",
+    "reddish brown",
+    "greyish brown",
+    "dark brown",
+    "pinkish grey",
+    "cloudy blue",
+]
 phrases += ["greenish grey", "medium grey", "dusty red", "cocoa"]
 question = "forest green"
 
@@ -34,12 +42,12 @@ import numpy as np
 import torch
 from PIL import Image
 
-from kfgs import ColorConfig, FeatureFolder, FitConfig, connected_parts, extract_features, fit_scene, load_scene
-from kfgs import make_label_set, plan_scene, resize_map, run_sfm, viz
+import kfgs
+from kfgs import viz
 from kfgs.scenes import list_images, read_image
 
 names = list_images(photos)
-shown = [read_image(photos / names[k * len(names) // 8]) for k in range(8)]
+shown = [read_image(photos / names[k * len(names) // 9]) for k in range(8)]
 Image.fromarray(viz.picture_grid([shown[:4], shown[4:]], width=256))
 
 # %% [markdown]
@@ -51,8 +59,8 @@ Image.fromarray(viz.picture_grid([shown[:4], shown[4:]], width=256))
 
 # %%
 if not (out / "sparse" / "0").is_dir():
-    print(run_sfm(photos, out))
-scene = load_scene(out, images=photos).undistorted()
+    print(kfgs.run_sfm(photos, out))
+scene = kfgs.load_scene(out, images=photos).undistorted()
 train, test = scene.views("train"), scene.views("test")
 print(scene)
 
@@ -74,8 +82,9 @@ def draw_cameras(plotter):
     viz.add_camera_images(plotter, scene.cameras, scene.image, size=0.25 * scene.extent, most=10)
 
 
-orbit = Orbit(frames=8, size=(420, 640), elevation_degrees=40, zoom=1.25)
-outside = orbit_cameras(torch.cat([points, *(one.center[None].to(points) for one in scene.cameras)]), orbit, up=estimate_up(scene.cameras))
+orbit = Orbit(frames=8, size=(420, 640), elevation_degrees=40, zoom=1.0)
+everything = torch.cat([points, torch.stack([one.center for one in scene.cameras]).to(points)])
+outside = orbit_cameras(everything, orbit, up=estimate_up(scene.cameras))
 Image.fromarray(viz.draw_view(outside[1], draw_cameras))
 
 # %% [markdown]
@@ -120,7 +129,7 @@ def hear(names):  # n names of colours -> [n, 216]
 
 teacher = CallableTeacher(see, hear, name="colour words")
 photo = scene.image(test[0])
-seen = resize_map(teacher.encode_image(photo.movedim(-1, 0)).movedim(0, -1), photo.shape[:2])  # [H, W, 216]
+seen = kfgs.resize_map(teacher.encode_image(photo.movedim(-1, 0)).movedim(0, -1), photo.shape[:2])  # [H, W, 216]
 likeness = normalize(seen, dim=-1) @ teacher.encode_text([question])[0]
 row = [photo, viz.FeatureColors.fit(seen.flatten(0, 1)[::7])(seen), colormaps["cividis"](likeness.numpy())[..., :3]]
 Image.fromarray(viz.picture_grid([row], ["photo", "features", question], width=320))
@@ -133,13 +142,13 @@ Image.fromarray(viz.picture_grid([row], ["photo", "features", question], width=3
 # on where it stopped: run this notebook twice, and the second time takes seconds.
 
 # %%
-quick = ColorConfig.quick()
-config = FitConfig.cpu(color=replace(quick, field=replace(quick.field.with_steps(600), max_gaussians=60_000)))
-print(plan_scene(scene, teacher=teacher, config=config, features=out / "features", run=out))
+quick = kfgs.ColorConfig.quick()
+config = kfgs.FitConfig.cpu(color=replace(quick, field=replace(quick.field.with_steps(600), max_gaussians=60_000)))
+print(kfgs.plan_scene(scene, teacher=teacher, config=config, features=out / "features", run=out))
 
 # %%
-extract_features(teacher, scene, out / "features", split="train")
-field = fit_scene(scene, FeatureFolder(out / "features").of(scene, "train"), out / "run", config).field
+kfgs.extract_features(teacher, scene, out / "features", split="train")
+field = kfgs.fit_scene(scene, kfgs.FeatureFolder(out / "features").of(scene, "train"), out / "run", config).field
 print(field.summary())
 
 # %% [markdown]
@@ -150,9 +159,9 @@ print(field.summary())
 # question. This teacher hears only colours: a brown square of a rug is brown like a chair.
 
 # %%
-classes = make_label_set(teacher, phrases, templates=None, negatives=None)
+classes = kfgs.make_label_set(teacher, phrases, templates=None, negatives=None)
 found = field.query(question, classes)
-for thing in connected_parts(field.gaussians, found, [scene.cameras[i] for i in train]):
+for thing in kfgs.connected_parts(field.gaussians, found, [scene.cameras[i] for i in train]):
     print(thing)
 scored = field.gaussians.replace(features=found.scores[:, None], sh=None)
 rows = []
