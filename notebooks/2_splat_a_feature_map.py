@@ -1,9 +1,9 @@
 # %% [markdown]
 # # 2. Splat a feature map
 #
-# What splatting does, one step at a time: four Gaussians are projected, listed by tile, and composited front to back.
-# Then 20,000 of them carry a teacher's 512 channels and are drawn from a view they have not seen. At the end: how much
-# faster the engines are than the plain equations, and that pyvista shows the same picture as the rasteriser.
+# **How does a cloud of Gaussians become a picture, and how can that picture show features instead of colours?** You will
+# see four Gaussians projected, listed by tile, and blended from front to back. Then 20,000 of them carry the 512 numbers
+# of a teacher, and are drawn from a view that they have not seen. At the end the engines are timed.
 #
 # About 10 seconds on two CPU cores (20 more to make the toy room the first time). Needs the extra
 # `notebook`, no data.
@@ -25,17 +25,19 @@ maps = FeatureFolder(folder / "features").of(scene, "train")
 # %% [markdown]
 # ## Four Gaussians and a camera
 #
-# A Gaussian has a mean, a rotation (w, x, y, z), three standard deviations and an opacity; here it also carries three
-# channels, which are shown as a colour. The surfaces are drawn at one standard deviation.
+# A Gaussian has a position $p$, a scale $s$ (three standard deviations), a rotation $q$ (a quaternion w, x, y, z) and an
+# opacity $o$. It carries any number of channels $f'$. Drawing is a function $R$ of these and of the camera (Eq. 3):
+#
+# $$\mathbf{F}_r = R(p^2, s^2, q^2, o^2, f'; p_{cam})$$
+#
+# The upper index 2 says that these Gaussians are not those of the colours (index 1): the two fields are *decoupled*.
+# Here $f'$ has three channels, which we show as a colour. The surfaces are drawn at one standard deviation.
 
 # %%
-import pyvista as pv
 import torch
+from PIL import Image
 
-from kfgs import Camera, Gaussians
-from kfgs.viz import add_cameras, add_cloud, make_plotter
-
-pv.set_jupyter_backend("static")  # "server" lets you turn the scene: pip install "pyvista[jupyter]"
+from kfgs import Camera, Gaussians, viz
 
 four = Gaussians(
     means=torch.tensor([[-0.55, 0.1, 2.4], [0.1, -0.1, 3.0], [0.65, 0.25, 3.6], [0.2, 0.5, 2.2]]),
@@ -46,18 +48,23 @@ four = Gaussians(
 )
 pinhole = Camera(torch.eye(4), torch.tensor([[200.0, 0, 120], [0, 200.0, 80], [0, 0, 1]]), width=240, height=160)
 
-plotter = make_plotter(320, 560)
-add_cloud(plotter, four, color_by=four.features, style="ellipsoids")
-add_cameras(plotter, [pinhole], size=0.8, line_width=2)
+plotter = viz.make_plotter(320, 560, off_screen=True)
+viz.add_cloud(plotter, four, color_by=four.features, style="ellipsoids")
+viz.add_cameras(plotter, [pinhole], size=0.8, line_width=2)
 plotter.camera_position = [(3.4, -1.6, -0.5), (0.05, 0.1, 1.75), (0, -1, 0)]
-plotter.show()
+Image.fromarray(plotter.screenshot(return_img=True))
 
 # %% [markdown]
 # ## Project, then list by tile
 #
-# `project` gives each Gaussian's centre and shape on the image (EWA splatting); a Gaussian ends where its alpha falls
-# to 1/255, the outer line; the inner one is one standard deviation. `bin_tiles` lists for each square of 16 pixels
-# which Gaussians touch it, front to back; the numbers count them. Empty tiles cost nothing.
+# `project` finds where each Gaussian lies in the picture: a centre $\mu$ and an ellipse with the matrix $\Sigma$ (EWA
+# splatting). At a pixel $x$ it covers a share
+#
+# $$\alpha(x) = o \, \exp\left(-\tfrac{1}{2} (x - \mu)^\top \Sigma^{-1} (x - \mu)\right)$$
+#
+# The inner line is one standard deviation. The outer line is where $\alpha$ falls to 1/255; a Gaussian ends there.
+# `bin_tiles` lists the Gaussians that touch each square of 16 pixels, the nearest first. The numbers count them: where
+# there is none, nothing has to be computed.
 
 # %%
 import matplotlib.pyplot as plt
@@ -79,56 +86,52 @@ for tile, count in enumerate(tiles.offsets.diff().tolist()):
     row, column = divmod(tile, tiles.grid[1])
     axes.text(16 * column + 8, 16 * row + 8, str(count or ""), ha="center", va="center", fontsize=8)
 axes.set(xticks=range(0, 241, 16), yticks=range(0, 161, 16), xlim=(0, 240), ylim=(160, 0), aspect="equal")
-axes.tick_params(labelsize=7)
 axes.grid(alpha=0.5)
 plt.show()
 
 # %% [markdown]
 # ## Composite front to back
 #
-# Each Gaussian adds its channels, weighted by its alpha and by what those before it let through (Eq. 3). The nearest
-# comes first; the last picture is the opacity of all four. `rasterize` is the three steps in one call.
+# Each Gaussian adds its channels, weighted by its own $\alpha$ and by what the Gaussians in front of it let through:
+#
+# $$\mathbf{F}_r(x) = \sum_i f'_i \, \alpha_i(x) \prod_{j < i} (1 - \alpha_j(x))$$
+#
+# The nearest one comes first. The last picture is the opacity of all four. `rasterize` does the three steps in one call.
 
 # %%
-from PIL import Image
-
 from kfgs import rasterize
 from kfgs.splat import composite
-from kfgs.viz import picture_grid
 
 nearest_first = four.means[:, 2].argsort()
 steps = [rasterize(four.select(nearest_first[:count]), pinhole).map for count in range(1, 5)]
 maps4, alpha4 = composite(*projected[:2], projected.opacities, four.features[projected.index], tiles)
-print(f"project, bin, composite against rasterize: largest difference {float((maps4 - steps[-1]).abs().max()):.0e}")
+print(f"the three steps differ from rasterize by at most {float((maps4 - steps[-1]).abs().max()):.0e}")
 opacity = alpha4[..., None].expand(-1, -1, 3)
-Image.fromarray(picture_grid([[*steps, opacity]], ["the nearest", "two", "three", "all four", "opacity"]))
+Image.fromarray(viz.picture_grid([[*steps, opacity]], ["the nearest", "two", "three", "all four", "opacity"]))
 
 # %% [markdown]
 # ## A teacher's map
 #
-# A teacher gives each pixel a feature of many channels. `FeatureColors` shows them as colours: one linear projection
-# for the whole scene, so that equal features have equal colours in every view. Edges are blurred, surfaces are noisy,
-# and some patches are simply wrong (the picture on the wall).
+# A *teacher* is a network that gives each pixel of a photograph a feature: many numbers that say what is there. We show
+# them as colours, with one projection for the whole scene: equal features have equal colours in every view. The edges
+# are blurred, surfaces are noisy, and some patches are wrong. It is a simulated teacher, with the faults of real ones.
 
 # %%
 from kfgs.quant import sample_grid
-from kfgs.viz import FeatureColors
 
-colors = FeatureColors.fit(torch.cat([sample_grid(maps[i], samples=500) for i in range(len(maps))]))
-print(
-    f"{len(maps)} maps of {maps.shape}, {len(maps) * 2 * torch.tensor(maps.shape).prod() / 1e6:.0f} MB in half precision"
-)
+colors = viz.FeatureColors.fit(torch.cat([sample_grid(maps[i], samples=500) for i in range(len(maps))]))
+print(f"{len(maps)} maps of {maps.shape}")
 chosen = [0, len(train) // 3, 2 * len(train) // 3]
 rows = [[scene.image(train[i]) for i in chosen], [colors(maps[i]) for i in chosen]]
-Image.fromarray(picture_grid(rows, width=min(scene.cameras[0].width, 320)))
+Image.fromarray(viz.picture_grid(rows, width=min(scene.cameras[0].width, 320)))
 
 # %% [markdown]
 # ## Features on Gaussians
 #
-# Round Gaussians stand on the points of the cloud. Their features need no training to be looked at: each takes the mean
-# of the pixels that it shows in, weighted by how much it shows (`accumulate_pixels`); hence blurred edges.
-# [Notebook 4](4_a_semantic_field_from_start_to_end.py) does so with sharp Gaussians and corrects for blending. One training
-# view is kept apart.
+# We put a round Gaussian on each point of the scene. Then each takes the mean of the teacher's features at the pixels that
+# show it, weighted by how much it shows there. No training is needed. The Gaussians are round and large, so the edges are
+# blurred; [notebook 4](4_a_semantic_field_from_start_to_end.ipynb) does it with sharp ones. One training view is kept
+# apart, to see how well the others predict it.
 
 # %%
 from kfgs import GaussianParams
@@ -139,9 +142,7 @@ apart = len(maps) // 4
 cloud = GaussianParams.from_points(scene.points, colors=scene.colors, sh_degree=0, initial_opacity=0.8).activated()
 cloud = cloud.replace(scales=0.8 * cloud.scales)  # a little narrower: less blur, a few holes
 sums, weights = torch.zeros(len(cloud), D), torch.zeros(len(cloud))
-for i in range(len(maps)):
-    if i == apart:
-        continue
+for i in set(range(len(maps))) - {apart}:
     view = scene.cameras[train[i]].resized(h, w)
     seen = project(cloud, view)
     shown = accumulate_pixels(seen.means2d, seen.conics, seen.opacities, maps[i], bin_tiles(seen, w, h))
@@ -158,21 +159,15 @@ held = scene.cameras[train[apart]]
 rendering = rasterize(semantic, held)
 cosine = feature_cosine(resize_map(rendering.map, (h, w)), maps[apart])
 print(f"{tuple(rendering.map.shape)} rendered; cosine with the teacher on the view kept apart {float(cosine):.3f}")
-pictures = [
-    scene.image(train[apart]),
-    colors(maps[apart]),
-    colors(rendering.map),
-    rendering.alpha[..., None].expand(-1, -1, 3),
-]
-titles = ["photograph", "the teacher", "rendered features", "opacity"]
-Image.fromarray(picture_grid([pictures], titles, width=min(held.width, 320)))
+pictures = [scene.image(train[apart]), colors(maps[apart]), colors(rendering.map)]
+Image.fromarray(viz.picture_grid([pictures], ["photograph", "the teacher", "rendered features"], width=256))
 
 # %% [markdown]
 # ## Engines
 #
-# The same equations are written once plainly in torch (`reference`) and once compiled. `engine="auto"` takes the
-# fastest for the tensors' device, Triton where there is a GPU. Times are of 9 channels, the paper's latents, as a
-# ratio.
+# The equations above are written plainly in torch (`reference`), and again as compiled code that gives the same numbers
+# faster. `engine="auto"` takes the fastest one for the device of the tensors; on a GPU that is Triton. The times are for 9
+# channels, as many as the paper trains.
 
 # %%
 import time
@@ -180,40 +175,13 @@ import time
 from kfgs import available_engines
 
 latents = semantic.replace(features=semantic.features[:, :9].contiguous())
-seconds, drawn = {}, {}
+seconds = {}
 for engine in available_engines("cpu"):
     rasterize(latents, held, engine=engine)  # compiles
-    times = []
-    for _ in range(3):
-        start = time.perf_counter()
-        drawn[engine] = rasterize(latents, held, engine=engine).map
-        times.append(time.perf_counter() - start)
-    seconds[engine] = min(times)
-for engine, value in seconds.items():
-    difference = float((drawn[engine] - drawn["reference"]).abs().max() / drawn["reference"].abs().max())
-    print(
-        f"{engine:10s} {seconds['reference'] / value:6.0f} times the reference's speed, relative difference {difference:.0e}"
-    )
+    start = time.perf_counter()
+    rasterize(latents, held, engine=engine)
+    seconds[engine] = time.perf_counter() - start
+print({engine: f"{seconds['reference'] / value:.0f} times as fast" for engine, value in seconds.items()})
 
 # %% [markdown]
-# ## pyvista shows the same
-#
-# `add_cloud(style="gaussians")` draws the Gaussians themselves, so what is inspected is what is rendered. From the same
-# camera the two pictures differ by the rounding of 8 bits per blended Gaussian.
-
-# %%
-from kfgs.metrics import psnr
-from kfgs.viz import look_through, show_cloud
-
-plotter = make_plotter(held.height, held.width, off_screen=True)
-add_cloud(plotter, cloud, color_by="rgb", style="gaussians")
-look_through(plotter, held)
-viewer = torch.from_numpy(plotter.screenshot(return_img=True).copy()) / 255
-plotter.close()
-ours = torch.from_numpy(show_cloud(cloud)(held)) / 255
-print(f"viewer against rasteriser: {psnr(viewer, ours):.1f} dB")
-difference = (10 * (viewer - ours).abs()).clamp(0, 1)
-Image.fromarray(picture_grid([[viewer, ours, difference]], ["pyvista", "rasterize", "10 x difference"]))
-
-# %% [markdown]
-# Next: [3_the_codebook_grows](3_the_codebook_grows.py) makes 512 channels small enough to train.
+# Next: [3_the_codebook_grows](3_the_codebook_grows.ipynb) makes 512 channels small enough to train.
