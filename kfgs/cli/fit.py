@@ -5,6 +5,9 @@ from __future__ import annotations
 import dataclasses
 import os
 import shlex
+import subprocess
+import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,9 +34,10 @@ from .output import called, say, wrote
 
 
 def demo(out: Path = Path("kfgs_demo"), seed: int = 0) -> None:
-    """See all of kfgs at work on a toy room that it makes itself (about five minutes).
+    """See all of kfgs at work on a small room that it makes itself (about two minutes).
 
-    It fits a semantic field, segments unseen views, labels points, edits colours, and scores each against the exact truth.
+    It trains colours, makes a semantic field, segments unseen views, labels points, edits colours, and scores each against the
+    exact truth. It says at each step what it does. In a terminal with a display, it ends by opening `kfgs view`.
 
     Examples:
         kfgs demo
@@ -43,12 +47,18 @@ def demo(out: Path = Path("kfgs_demo"), seed: int = 0) -> None:
         out: Folder for the scene, the run and its results; running again continues where it stopped.
         seed: Every random choice follows from it.
     """
+    from ..page.serving import has_display
     from ..pipeline import demo as run_demo
     from ..toy.room_folder import ToyConfig
 
     check_output("out", out, "a folder")
-    wrote(run_demo.run(out, fit_config(FieldMethod(), seed=seed), room=ToyConfig(seed=seed), report=say, progress=True))
-    say(f"next: kfgs view {out / 'run' / 'field'} --scene {out / 'scene'} --color {out / 'color.ply'}")
+    room = ToyConfig(train_views=36, test_views=9, seed=seed)
+    wrote(run_demo.run(out, fit_config(FieldMethod(), seed=seed), room=room, report=say, progress=True))
+    look = ["view", str(out / "run" / "field"), "--scene", str(out / "scene"), "--color", str(out / "color.ply")]
+    say(f'6. Look. Type "chair" there, select, edit: kfgs {shlex.join(look)}')
+    if has_display() and sys.stdin.isatty() and sys.stdout.isatty():
+        with suppress(KeyboardInterrupt):  # the viewer ends by it
+            subprocess.run([sys.executable, "-m", "kfgs", *look], check=False)
 
 
 def sfm(

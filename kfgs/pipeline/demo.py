@@ -64,19 +64,34 @@ def run(
     if not (out / "scene" / "toy.json").is_file():  # then no demo was here
         for name in FILES:
             check_own(out / name, lambda _: False, "kfgs demo")
-    say("making the toy room")
+    say(
+        "1. A room. The demo makes a small furnished room, so that the truth is known exactly: photos, cameras, and for each "
+        "photo what a 2-D network would say about its pixels, with the errors of such networks."
+    )
     folder = make_toy_room(out / "scene", room or ToyConfig())
     scene = load_scene(folder)
     classes = load_label_set(folder / "classes.json", folder / "text.npy")
 
+    say(
+        "2. Colours. An ordinary Gaussian splat is trained on the photos. It knows nothing of chairs. If you have a splat of "
+        "your own, kfgs takes that."
+    )
     maps = FeatureFolder(folder / "features").of(scene, "train")
     colors = replace(ColorConfig.quick(), seed=config.seed)
     colored = fit_color(scene, out / "run", colors, report=say, progress=progress)
     quality = score_views(colored.gaussians, scene)
     say(f"colours of unseen views: {quality}")
+    say(
+        "3. Meaning. Each Gaussian gets the mean of what the network says about the pixels that show it; errors of single photos "
+        "cancel. Then the features are compressed: a few numbers instead of 512, and neighbours that mean the same become one."
+    )
     fitted = fit_scene(scene, maps, out / "run", config, splat=colored.gaussians, report=say, progress=progress)
     say(fitted.field.summary())
 
+    say(
+        "4. Segmentation. Views that no photo shows are drawn from the field, a class for each pixel, and compared with the truth. "
+        "mIoU is the mean over classes of overlap divided by union; 1 is perfect."
+    )
     truth = true_labels(scene, folder / "labels", "test")
     found = segment_scene(
         fitted.field,
@@ -92,13 +107,17 @@ def run(
     size = scene.cameras[scene.views("test")[0]].size
     teacher = score_teacher(lambda stem: test_maps[list(found).index(stem)], truth, classes, size)
     say(f"unseen views: {scores}")
-    say(f"the teacher on the same views: {teacher.miou}")
+    say(f"the 2-D network alone, on the same views: {teacher.miou}")
 
     labels, cosines = fitted.field.classify(classes)
     gaussians = fitted.field.gaussians.replace(labels=labels)
     written = save_labelled(out / "gaussians.ply", gaussians, cosines, classes, rule="fused features; score = cosine")
     surface = _label_surface(gaussians, folder, out / "surface.ply", classes)
     say(f"surface points: {surface}")
+    say(
+        f'5. Edits. The classes are carried over to the splat with the colours, and then "{REMOVED}" is a name for Gaussians: '
+        f"the {REMOVED}s are removed, and the {PAINTED}s are painted red. Both are compared with what the room would look like."
+    )
     edited, edit_scores = _edit_colors(out, scene, folder, fitted, colored.gaussians, classes, say)
     write_report(
         out / "scores.json",
