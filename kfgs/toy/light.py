@@ -94,16 +94,18 @@ def _clearance(solid: Solid, origin: Array, ways: Array) -> tuple[Array, Array]:
         at = np.clip(-_dot(o, d) / np.maximum(_dot(d, d), 1e-12), 0.0, 1.0)
         nearest = o + at[:, None] * d
         return (np.sqrt(_dot(nearest, nearest)) - 1.0) * float(half.mean()), at
-    # The largest of |o + t d| - half over the axes is convex in t: halve the interval by its slope.
+    # A step aside of length 1 changes the distance to a face by at most the sine between the way and the face's axis.
+    aside = 1.0 / np.sqrt(np.maximum(1.0 - d * d / np.maximum(_dot(d, d), 1e-12)[:, None], 0.01))
+    # The largest of (|o + t d| - half) * aside over the axes is convex in t: halve the interval by its slope.
     low, high = np.zeros(len(o)), np.ones(len(o))
     rows = np.arange(len(o))
     for _ in range(7):
         at = 0.5 * (low + high)
         place = o + at[:, None] * d
-        axis = np.argmax(np.abs(place) - half, axis=-1)
+        axis = np.argmax((np.abs(place) - half) * aside, axis=-1)
         falling = place[rows, axis] * d[rows, axis] < 0
         low, high = np.where(falling, at, low), np.where(falling, high, at)
-    return (np.abs(o + at[:, None] * d) - half).max(-1), at
+    return ((np.abs(o + at[:, None] * d) - half) * aside).max(-1), at
 
 
 def lamps_seen(
@@ -120,8 +122,10 @@ def lamps_seen(
             if solid.label in FLAT:
                 continue
             to_center = np.array(solid.center) - lamp.place
-            reach = float(np.linalg.norm(solid.half))
-            near = -(rays @ to_center) > np.sqrt(max(float(to_center @ to_center) - (reach + lamp.radius) ** 2, 0.0))
+            # A shadow's edge is as wide as the lamp times the blocker's share of the way, at most its share of the height.
+            top = (solid.center[2] + solid.half[2]) / lamp.place[2]
+            reach = float(np.linalg.norm(solid.half)) + lamp.radius * top
+            near = -(rays @ to_center) > np.sqrt(max(float(to_center @ to_center) - reach**2, 0.0))
             rows = facing[near]
             rows = rows[(which[rows] != i) & (seen[rows, k] > 0.01)]
             clear, at = _clearance(solid, points[rows], ways[rows])

@@ -66,9 +66,9 @@ def _sprigs(texture: Texture, noise: Noise, spots: Spots) -> Array:
     return _mix(_plaster(texture, noise, spots), shade, inside)
 
 
-def _threads(noise: Noise, spots: Spots, wavelength: float) -> Array:  # [N]
+def _threads(texture: Texture, noise: Noise, spots: Spots, wavelength: float) -> Array:  # [N]
     """Woven threads: noise drawn out along one direction, and along the other."""
-    third = spots.axis * 0.7 + spots.place[0, 0] if len(spots.place) else spots.axis * 0.7
+    third = spots.axis * 0.7 + texture.seed % 997 * 0.03  # other threads on each face of each object
     total = np.zeros(len(spots.plane))
     for stretch in ((0.12, 1.0), (1.0, 0.12)):
         at = np.column_stack([spots.plane * stretch, third + stretch[0]])
@@ -77,7 +77,7 @@ def _threads(noise: Noise, spots: Spots, wavelength: float) -> Array:  # [N]
 
 
 def _weave(texture: Texture, noise: Noise, spots: Spots) -> Array:
-    return _ramp(texture.colors, np.clip(0.5 + 0.3 * _threads(noise, spots, texture.scale), 0.0, 1.0))
+    return _ramp(texture.colors, np.clip(0.5 + 0.3 * _threads(texture, noise, spots, texture.scale), 0.0, 1.0))
 
 
 def _stripes(texture: Texture, noise: Noise, spots: Spots) -> Array:
@@ -88,7 +88,7 @@ def _stripes(texture: Texture, noise: Noise, spots: Spots) -> Array:
     for k, (middle, reach) in enumerate(((0.3, 0.13), (0.62, 0.05), (0.86, 0.03))):
         share = _cover((phase - middle) * texture.scale, reach * texture.scale, spots.footprint)
         color = _mix(color, texture.colors[1 + k % (len(texture.colors) - 1)], share)
-    return color * (1.0 + 0.06 * _threads(noise, spots, 0.05))[:, None]
+    return color * (1.0 + 0.06 * _threads(texture, noise, spots, 0.05))[:, None]
 
 
 def _fibre_tone(texture: Texture, noise: Noise, spots: Spots) -> Array:  # [N] in [0, 1]
@@ -155,7 +155,7 @@ def _rug(texture: Texture, noise: Noise, spots: Spots) -> Array:
     pile = noise.fractal(spots.place, 0.09, spots.footprint, octaves=3)
     u, v = (spots.plane + 0.006 * pile[:, None]).T
     s = texture.scale
-    color = _ramp(texture.colors[:2], np.clip(0.5 + 0.35 * _threads(noise, spots, 0.06), 0.0, 1.0))
+    color = _ramp(texture.colors[:2], np.clip(0.5 + 0.35 * _threads(texture, noise, spots, 0.06), 0.0, 1.0))
     one, two = u / s + 0.62 * v / s, u / s - 0.62 * v / s
     cell = np.stack([np.floor(one).astype(np.int64), np.floor(two).astype(np.int64)], -1)
     lines = np.maximum(*(_cover((k - np.round(k)) * s * 0.85, 0.011, spots.footprint) for k in (one, two)))
@@ -209,7 +209,7 @@ def _hills(texture: Texture, noise: Noise, spots: Spots) -> Array:
     disc = np.hypot(u - 0.2 * spots.edge[:, 0], v - 0.22 * h) - 0.055
     color = _mix(color, sun, np.clip(0.5 - disc / spots.footprint, 0.0, 1.0))
     for k, tone in enumerate(ranges):
-        at = np.stack([u + 3.0 * k, np.full_like(u, 0.4 + k), np.zeros_like(u)], -1) + spots.place[:1] * 0
+        at = np.stack([u + 3.0 * k, np.full_like(u, 0.4 + k), np.zeros_like(u)], -1)
         ridge = h * (0.18 - 0.3 * k) + 0.07 * noise.fractal(at, 0.7, np.full(len(u), 1e-3), octaves=4, gain=0.45)
         share = np.clip((ridge - v) / spots.footprint + 0.5, 0.0, 1.0)
         color = _mix(

@@ -76,8 +76,8 @@ def _shell(b: _Builder) -> None:
     X, Y, Z = ROOM[0] / 2, ROOM[1] / 2, ROOM[2]
     t = _THICK / 2
     oak = {"kind": "planks", "colors": ((0.60, 0.47, 0.34), (0.72, 0.58, 0.43), (0.80, 0.67, 0.52)), "scale": 0.16}
-    b.place("floor", [("box", (0, 0, -t), (X, Y, t))], (0, 0, 0), {**oak, "contrast": 0.16})
-    white = {"kind": "plaster", "colors": ((0.90, 0.89, 0.87), (0.95, 0.94, 0.92)), "contrast": 0.08}
+    b.place("floor", [("box", (0, 0, -t), (X, Y, t))], (0, 0, 0), {**oak, "contrast": 0.21})
+    white = {"kind": "plaster", "colors": ((0.90, 0.89, 0.87), (0.95, 0.94, 0.92)), "contrast": 0.13}
     b.place("ceiling", [("box", (0, 0, Z + t), (X, Y, t))], (0, 0, 0), white)
     papers: list[dict[str, Any]] = [
         {"kind": "sprigs", "colors": ((0.66, 0.71, 0.66), (0.73, 0.77, 0.71), (0.50, 0.58, 0.52)), "scale": 0.24},
@@ -85,18 +85,18 @@ def _shell(b: _Builder) -> None:
         {"kind": "sprigs", "colors": ((0.83, 0.79, 0.73), (0.89, 0.86, 0.80), (0.70, 0.66, 0.60)), "scale": 0.26},
         {"kind": "sprigs", "colors": ((0.84, 0.81, 0.76), (0.90, 0.87, 0.82), (0.66, 0.65, 0.60)), "scale": 0.25},
     ]
-    papers = [{**paper, "contrast": 0.085} for paper in papers]
+    papers = [{**paper, "contrast": 0.16} for paper in papers]
     b.place("wall", [("box", (-X - t, 0, Z / 2), (t, Y, Z / 2))], (0, 0, 0), papers[0])
     b.place("wall", [("box", (X + t, 0, Z / 2), (t, Y, Z / 2))], (0, 0, 0), papers[1])
     b.place("wall", [("box", (0, -Y - t, Z / 2), (X, t, Z / 2))], (0, 0, 0), papers[2])
     b.place("wall", [("box", (0, Y + t, Z / 2), (X, t, Z / 2))], (0, 0, 0), papers[3])
     door = {"kind": "panel", "colors": ((0.80, 0.79, 0.76), (0.86, 0.85, 0.82), (0.45, 0.38, 0.28)), "scale": 0.11}
-    b.place("door", [("box", (0, 0, 1.03), (0.46, 0.03, 1.03))], (-1.2, -Y + 0.03, 0), {**door, "contrast": 0.08})
+    b.place("door", [("box", (0, 0, 1.03), (0.46, 0.03, 1.03))], (-1.2, -Y + 0.03, 0), {**door, "contrast": 0.1})
 
 
 def _seating(b: _Builder) -> None:
     """Sofa with cushions, five chairs."""
-    cloth = {"kind": "weave", "colors": ((0.34, 0.42, 0.48), (0.50, 0.58, 0.63)), "scale": 0.04, "contrast": 0.12}
+    cloth = {"kind": "weave", "colors": ((0.34, 0.42, 0.48), (0.50, 0.58, 0.63)), "scale": 0.04, "contrast": 0.16}
     sofa: list[_Part] = [
         ("box", (0, 0, 0.21), (1.05, 0.45, 0.21)),
         ("box", (0, 0.36, 0.62), (1.05, 0.11, 0.22)),
@@ -110,9 +110,9 @@ def _seating(b: _Builder) -> None:
         ("weave", ((0.68, 0.42, 0.32), (0.80, 0.55, 0.43))),
     ]
     for x, (kind, colors), turn in zip((-0.33, 0.40, 1.22), covers, (12, -6, -18), strict=True):
-        skin = {"kind": kind, "colors": colors, "scale": 0.08, "contrast": 0.10}
+        skin = {"kind": kind, "colors": colors, "scale": 0.08, "contrast": 0.13}
         b.place("cushion", [("ellipsoid", (0, 0, 0), (0.31, 0.14, 0.25))], (x, 2.04, 0.66), skin, yaw=turn)
-    beech = {"kind": "wood", "colors": ((0.66, 0.47, 0.31), (0.80, 0.62, 0.45)), "scale": 0.05, "contrast": 0.16}
+    beech = {"kind": "wood", "colors": ((0.66, 0.47, 0.31), (0.80, 0.62, 0.45)), "scale": 0.05, "contrast": 0.21}
     chair: list[_Part] = [
         ("box", (0, 0, 0.44), (0.24, 0.24, 0.045)),
         ("box", (0, 0.21, 0.72), (0.24, 0.04, 0.24)),
@@ -131,14 +131,14 @@ def _storage(b: _Builder) -> None:
         "kind": "rug",
         "colors": ((0.84, 0.80, 0.72), (0.91, 0.88, 0.81), (0.45, 0.47, 0.48), (0.72, 0.50, 0.40)),
         "scale": 0.34,
-        "contrast": 0.10,
+        "contrast": 0.13,
     }
     b.place("rug", [("box", (0, 0, 0.008), (1.5, 1.15, 0.008))], (0.05, -0.05, 0), wool, yaw=3)
-    ash = {"kind": "wood", "colors": ((0.72, 0.58, 0.42), (0.86, 0.74, 0.57)), "scale": 0.07, "contrast": 0.15}
+    ash = {"kind": "wood", "colors": ((0.72, 0.58, 0.42), (0.86, 0.74, 0.57)), "scale": 0.07, "contrast": 0.2}
     table: list[_Part] = [("box", (0, 0, 0.735), (0.68, 0.42, 0.035))]
     table += [("box", (x, y, 0.35), (0.055, 0.055, 0.35)) for x in (-0.58, 0.58) for y in (-0.32, 0.32)]
     b.place("table", table, (0.0, -0.3, 0), ash, yaw=-4)
-    walnut: dict[str, Any] = {"colors": ((0.36, 0.25, 0.18), (0.50, 0.36, 0.26)), "scale": 0.06, "contrast": 0.12}
+    walnut: dict[str, Any] = {"colors": ((0.36, 0.25, 0.18), (0.50, 0.36, 0.26)), "scale": 0.06, "contrast": 0.16}
     fronts = {**walnut, "kind": "panel", "colors": (*walnut["colors"], (0.74, 0.66, 0.48))}
     spines = ((0.55, 0.34, 0.28), (0.34, 0.42, 0.46), (0.80, 0.74, 0.62), (0.44, 0.48, 0.38), (0.72, 0.58, 0.36))
     low: list[_Part] = [("box", (0, 0, 0.04), (0.17, 0.76, 0.04))]
@@ -154,9 +154,9 @@ def _decoration(b: _Builder) -> None:
         "kind": "leaves",
         "colors": ((0.13, 0.22, 0.13), (0.30, 0.43, 0.24), (0.52, 0.62, 0.38)),
         "scale": 0.07,
-        "contrast": 0.15,
+        "contrast": 0.2,
     }
-    pot = {"kind": "plaster", "colors": ((0.68, 0.47, 0.37), (0.78, 0.58, 0.47)), "contrast": 0.10}
+    pot = {"kind": "plaster", "colors": ((0.68, 0.47, 0.37), (0.78, 0.58, 0.47)), "contrast": 0.13}
     b.place("plant", [("box", (0, 0, 0.2), (0.19, 0.19, 0.2))], (-2.45, 1.95, 0), pot, yaw=20)
     crown: list[_Part] = [("ellipsoid", (0, 0, 0.62), (0.22, 0.20, 0.30))]
     for k in range(6):
@@ -175,7 +175,7 @@ def _decoration(b: _Builder) -> None:
         "kind": "weave",
         "colors": ((0.86, 0.78, 0.64), (0.94, 0.88, 0.76)),
         "scale": 0.06,
-        "contrast": 0.08,
+        "contrast": 0.1,
         "glow": 0.3,
     }
     floor_lamp: list[_Part] = [
@@ -202,7 +202,7 @@ def _decoration(b: _Builder) -> None:
     X, Y = ROOM[0] / 2, ROOM[1] / 2
     walls = [(-0.35, Y, 0, 0.45), (1.10, Y, 0, 0.40), (-X, -0.15, 90, 0.48), (X, 0.45, 90, 0.62)]
     for (x, y, turn, width), (kind, colors) in zip(walls, prints, strict=True):
-        skin = {"kind": kind, "colors": colors, "contrast": 0.06}
+        skin = {"kind": kind, "colors": colors, "contrast": 0.078}
         at = (x - 0.025 * np.sign(x) * (turn == 90), y - 0.025 * np.sign(y) * (turn == 0), 1.62)
         b.place("picture", [("box", (0, 0, 0), (width, 0.025, 0.36))], at, skin, yaw=turn)
 

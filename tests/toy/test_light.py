@@ -1,0 +1,73 @@
+import numpy as np
+import pytest
+
+from kfgs.toy.geometry import Solid
+from kfgs.toy.light import LAMPS, lamps_seen, openness
+from kfgs.toy.texture import Texture
+
+SKIN = Texture("plaster", ((0.5, 0.5, 0.5), (0.6, 0.6, 0.6)))
+LAMP = LAMPS[0]
+ROOM = (6.0, 5.0, 2.9)
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def piece(shape, z=1.0, half=(0.3, 0.3, 0.1), yaw=0.4):
+    """A piece of furniture straight under the first lamp."""
+    return Solid(shape, (LAMP.place[0], LAMP.place[1], z), half, yaw, "table", SKIN)
+
+
+def on_floor(distances):
+    """Places on the floor, so far to the side of the lamp."""
+    return np.array([[LAMP.place[0] + x, LAMP.place[1], 0.0] for x in distances])
+
+
+def share_by_rays(solid, point):
+    """The share of the lamp's disc, square to the ray, that the place sees: many rays, each stepped along."""
+    way = np.array(LAMP.place) - point
+    way /= np.linalg.norm(way)
+    side = np.cross(way, [0.3, 0.9, 0.1])
+    side /= np.linalg.norm(side)
+    seen = total = 0
+    for u in np.linspace(-1, 1, 21):
+        for v in np.linspace(-1, 1, 21):
+            if u * u + v * v > 1:
+                continue
+            end = np.array(LAMP.place) + LAMP.radius * (u * side + v * np.cross(way, side))
+            local = solid.to_local(point + np.linspace(0, 1, 200)[:, None] * (end - point))
+            size = np.abs(local / solid.half)
+            inside = (size.max(1) if solid.shape == "box" else np.linalg.norm(size, axis=1)) < 1
+            seen, total = seen + (not inside.any()), total + 1
+    return seen / total
+
+
+@pytest.mark.parametrize("shape", ["box", "ellipsoid"])
+def test_a_shadow_is_dark_in_its_middle_soft_at_its_edge_and_ends(shape):
+    solid = piece(shape, half=(0.45, 0.45, 0.1))
+    points = on_floor([0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 2.0])
+    seen = lamps_seen([solid], points, np.broadcast_to(UP, points.shape), np.full(len(points), -1))[:, 0]
+    assert seen[0] < 0.02
+    assert seen[-1] == 1.0
+    assert (np.diff(seen) >= -1e-9).all()
+    true = np.array([share_by_rays(solid, point) for point in points])
+    assert np.abs(seen - true).max() < 0.3  # it is closed form, not exact
+    assert ((seen > 0.05) & (seen < 0.95)).any()
+
+
+def test_no_solid_shades_itself_and_walls_cast_no_shadow():
+    table = piece("box")
+    top = np.array([[LAMP.place[0], LAMP.place[1], 1.1]])
+    assert lamps_seen([table], top, UP[None], np.array([0]))[0, 0] == 1.0
+    assert lamps_seen([table], top - [0, 0, 1.0], UP[None], np.array([-1]))[0, 0] < 0.02
+    wall = Solid("box", table.center, table.half, table.yaw, "wall", SKIN)
+    assert lamps_seen([wall], top - [0, 0, 1.0], UP[None], np.array([-1]))[0, 0] == 1.0
+
+
+@pytest.mark.parametrize("shape", ["box", "ellipsoid"])
+def test_corners_and_places_beside_furniture_are_less_open(shape):
+    solid = piece(shape, z=0.3, half=(0.3, 0.3, 0.3))
+    points = on_floor([0.31, 0.5, 2.0])
+    opened = openness([solid], points, np.broadcast_to(UP, points.shape), np.full(3, -1), ROOM)
+    assert opened[0] < opened[1] < opened[2]
+    corner = np.array([[-2.9, -2.4, 0.0], [0.0, 0.0, 0.0]])
+    dark, light = openness([], corner, np.broadcast_to(UP, corner.shape), np.full(2, -1), ROOM)
+    assert dark < 0.8 < light <= 1.0
