@@ -131,6 +131,17 @@ def test_an_input_or_a_file_of_the_scene_is_not_replaced(file, line, desk, capsy
     refused(f"{line} {file}", desk, capsys, "give another")
 
 
+@pytest.mark.parametrize(
+    "option", ["segment {run}/field --labels", "plan {scene} --features", "evaluate {run} --truth"]
+)
+def test_nothing_is_written_into_folders_that_an_option_names(option, desk, capsys):
+    """Of maps and true labels, wherever they are."""
+    (desk["tmp"] / "given").mkdir(exist_ok=True)
+    (desk["tmp"] / "given" / "view_000.png").write_text("mine")
+    for place in ("given", "given/new"):
+        refused(f"{option} {{tmp}}/given --out {{tmp}}/{place}", desk, capsys, "--out", "apart", desk["tmp"] / "given")
+
+
 def test_pictures_elsewhere_are_known_from_what_the_field_remembers(desk, tmp_path, capsys):
     """A transforms.json may name pictures far from it, so that nothing above the output is a scene."""
     scene, photos = tmp_path / "scene", tmp_path / "photos"

@@ -61,7 +61,9 @@ def test_the_committed_notebook_has_the_cells_of_its_source_and_their_outputs(so
 
 
 def test_a_notebook_has_at_most_90_lines_of_code(source):
-    lines = [line for cell in code_cells(source) for line in cell.splitlines() if line.strip() and line.strip()[0] != "#"]
+    lines = [
+        line for cell in code_cells(source) for line in cell.splitlines() if line.strip() and line.strip()[0] != "#"
+    ]
     assert len(lines) <= 90
 
 

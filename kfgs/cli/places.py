@@ -97,8 +97,9 @@ def _kept(command: str, named: Mapping[str, Any], above: list[Path]) -> Iterator
         if path.is_file():
             yield Kept(path, "which is read")
         if name in READ_WHOLE and path.is_dir():
-            inside = {real_path(other) for _, other in inputs} - {real_path(path)}
-            if not is_scene(path) and not any(other.is_relative_to(real_path(path)) for other in inside):
+            others = {real_path(other) for _, other in inputs} - {real_path(path)}
+            around = is_scene(path) or any(other.is_relative_to(real_path(path)) for other in others)
+            if not around and any(one.is_file() for one in path.iterdir()):  # else it is a folder around such folders
                 yield Kept(path, "what is read", whole=True)
         if is_scene(path) or name == "scene":
             yield from _parts(command, path, images)

@@ -89,8 +89,8 @@ def run(
     say(fitted.field.summary())
 
     say(
-        "4. Segmentation. Views that no photo shows are drawn from the field, a class for each pixel, and compared with the truth. "
-        "mIoU is the mean over classes of overlap divided by union; 1 is perfect."
+        "4. Segmentation. Views that no photo shows are drawn from the field, a class for each pixel, and compared with the "
+        "truth. mIoU is the mean over classes of overlap divided by union; 1 is perfect."
     )
     truth = true_labels(scene, folder / "labels", "test")
     found = segment_scene(

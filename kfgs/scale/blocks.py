@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import torch
 from .._check import as_array, check_whole
 from .._files import (
     as_path,
+    atomic_folder,
     check_inside,
     check_output,
     check_own,
@@ -30,6 +32,8 @@ from .._files import (
 from .._rows import unit_rows
 from ..features import FeatureFolder
 from ..fields import SemanticField, sample_latents, select_gaussians
+from ..fields.remembered import rebased
+from ..fields.store import DESCRIPTION, TENSORS
 from ..formats import SplatFile, read_splats, write_splats
 from ..formats.folders import splat_file_of
 from ..pipeline import FitConfig, fit_scene
@@ -172,6 +176,8 @@ def fit_block(
 ) -> dict[str, Any]:
     """Fit the field of one block, and keep its core in `folder/core`. Finished stages in `folder/.run` are reused.
 
+    An older core stays until the new one, with the facts about it in `core.json`, replaces it in one step.
+
     Args:
         folder: what `split_scene` made.
         config: of method `fuse`.
@@ -187,11 +193,11 @@ def fit_block(
     folder, config = as_path(folder), config or FitConfig()
     block = Block.from_json(read_json(folder / "block.json"))
     check_inside(folder, [RUN, CORE])
-    (folder / FACTS).unlink(missing_ok=True)  # until the new core is there, the block counts as not fitted
     as_taken = load_scene(folder)
     maps = FeatureFolder(folder / "features").of(as_taken, config.split)
     splat = read_splats(folder / SPLAT) if (folder / SPLAT).is_file() else None
     facts: dict[str, Any] = {"gaussians": 0, "of": 0, "box": None, "seconds": 0.0}
+    core = None
     if splat is None or block.holds(as_array(splat.gaussians.means)).any():
         latents = LinearLatents.load(folder.parent / LATENTS)
         result = fit_scene(
@@ -208,10 +214,20 @@ def fit_block(
         facts |= {"gaussians": int(own.sum()), "of": len(own), "seconds": round(result.seconds, 1)}
         if bool(own.any()):
             core = select_gaussians(result.field, own)
-            core.save(folder / CORE)
             facts["box"] = _box(core)
-    write_json(folder / FACTS, facts)
+    _put(folder / CORE, core, facts)
     return facts
+
+
+def _put(place: Path, core: SemanticField | None, facts: dict[str, Any]) -> None:
+    """Write the core of a block, if it has Gaussians, and the facts about it, in one step."""
+    with atomic_folder(place) as new:
+        if core is not None:  # its notes are relative to where it is going to be
+            replace(core, info=rebased(core.info, core.folder, place), folder=None).save(new)
+        write_json(new / FACTS, facts)
+    if core is None:  # what is left of an older one
+        for name in (DESCRIPTION, TENSORS):
+            (place / name).unlink(missing_ok=True)
 
 
 def fit_blocks(

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from .._arrays import reading
 from .._check import as_array, check_range
-from .._files import as_path, read_json, real_path
+from .._files import as_path, current_file, read_json, real_path
 from ..cameras import Camera
 from ..fields import SemanticField, join_fields, remember, select_gaussians
 from ..gaussians import Gaussians
@@ -51,7 +51,7 @@ class FieldInBlocks:
         folder = as_path(folder)
         blocks, counts, boxes = [], [], []
         for block in read_blocks(folder):
-            file = folder / block.name / FACTS
+            file = current_file(folder / block.name / CORE, FACTS)
             if not file.is_file():
                 raise FileNotFoundError(f"{file}: no such file; fit the block first, with fit_blocks or `kfgs blocks`")
             facts = read_json(file)

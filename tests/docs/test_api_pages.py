@@ -89,7 +89,13 @@ def test_the_python_of_other_pages_runs(page, desk, tmp_path, monkeypatch):
 
 def test_no_page_has_python_that_no_test_runs():
     pages = [*PAGES.parent.glob("*.md"), *PAGES.parent.glob("[ch]o*/*.md")]
-    others = {"recipes", "guide", "datasets", "protocols", "engines"}  # test_first_scripts, test_readme; others need data
+    others = {
+        "recipes",
+        "guide",
+        "datasets",
+        "protocols",
+        "engines",
+    }  # test_first_scripts, test_readme; others need data
     have = {
         path.relative_to(PAGES.parent).with_suffix("").as_posix() for path in pages if "```python\n" in path.read_text()
     }

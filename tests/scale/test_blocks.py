@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
+from killed import kill_everywhere
 from messages import tells
 
 from kfgs.cli import main
@@ -29,6 +30,7 @@ from kfgs.labels import transfer_labels
 from kfgs.pipeline import FitConfig
 from kfgs.quant import LinearLatents
 from kfgs.scale import FieldInBlocks, fit_block, fit_blocks, split_scene
+from kfgs.scale.blocks import _put
 from kfgs.scale.in_blocks import _in_view
 from kfgs.scenes import SceneError, load_scene
 from kfgs.toy.room_folder import ToyConfig
@@ -366,8 +368,11 @@ def test_a_splat_of_another_scene_is_said(town, splat, tmp_path):
     cloud = read_splats(splat).gaussians
     write_splats(tmp_path / "far.ply", SplatFile(cloud.replace(means=cloud.means + 900)))
     split_scene(town, tmp_path / "city", 2, splat=tmp_path / "far.ply", latents=4)
-    for block in (tmp_path / "city").glob("block0*"):
-        (block / "core.json").write_text('{"gaussians": 0, "box": null}')
+    for block in ("block00", "block01"):
+        (tmp_path / "city" / block / "core").mkdir()
+        (tmp_path / "city" / block / "core" / "core.json").write_text(
+            '{"gaussians": 0, "of": 0, "box": null, "seconds": 0}'
+        )
     with pytest.raises(ValueError, match=tells("city", "none", "splat")):
         FieldInBlocks.open(tmp_path / "city")
 
@@ -392,3 +397,56 @@ def test_files_of_somebody_else_are_not_replaced(town, splat, tmp_path, name, ca
     place = tmp_path / "city" / name.split("/")[0]
     assert re.search(tells(place, "kfgs blocks", "move it away"), capsys.readouterr().err)
     assert (file.read_text(), sorted(tmp_path.rglob("*"))) == ("mine", before)
+
+
+def test_a_fit_that_ends_early_leaves_the_old_core(fitted, monkeypatch):
+    before = fitted.joined().gaussians.means
+    monkeypatch.setattr("kfgs.scale.blocks.fit_scene", lambda *_, **__: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        fit_block(fitted.folder / "block00", EVERY)
+    city = FieldInBlocks.open(fitted.folder)
+    assert city == fitted
+    assert torch.equal(city.joined().gaussians.means, before)
+
+
+PUT = """
+import json, os, shutil, torch
+from kfgs.fields import SemanticField, select_gaussians
+from kfgs.scale.blocks import _put
+from pathlib import Path
+city = Path({city!r})
+new = SemanticField.load(city / "block00/core")
+new = select_gaussians(new, torch.arange(len(new)) < {count})
+facts = json.loads((city / "block00/core/core.json").read_text()) | {{"gaussians": {count}}}
+def prepare(folder):
+    shutil.copytree(city / "block00/core", folder / "block00/core")
+    cut = json.loads((city / "blocks.json").read_text())
+    (folder / "blocks.json").write_text(json.dumps(cut | {{"blocks": cut["blocks"][:1]}}))
+def work(folder):
+    _put(folder / "block00/core", new, facts)
+"""
+
+
+def test_at_every_kill_a_core_and_its_facts_are_both_old_or_both_new(fitted, tmp_path):
+    found = []
+    for folder in kill_everywhere(PUT.format(city=str(fitted.folder), count=17), tmp_path / "cities"):
+        city = FieldInBlocks.open(folder)
+        assert len(city) == len(city.field("block00")), folder
+        found.append(len(city))
+    old = fitted.counts[0]
+    switch = found.index(17)
+    assert found == [old] * switch + [17] * (len(found) - switch)
+    assert 0 < switch < len(found) - 1
+
+
+def test_a_block_that_becomes_empty_leaves_no_core(fitted, tmp_path):
+    place = tmp_path / "core"
+    facts = {"gaussians": 1, "options": "a"}
+    _put(place, fitted.field("block00"), facts)
+    moved = SemanticField.load(place)
+    assert recall_scene(moved.info, moved.folder).samefile(fitted.folder / "block00")
+    _put(place, None, {"gaussians": 0})
+    assert [path.name for path in place.iterdir()] == ["core.json"]
+    _put(place, fitted.field("block00"), facts)
+    assert json.loads((place / "core.json").read_text()) == facts
+    assert len(SemanticField.load(place)) == len(moved)
