@@ -8,14 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import functools
-import inspect
 import math
 import numbers
-from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,17 +19,6 @@ from torch import Tensor
 
 from ._card import error_line, short_of_memory
 
-P = ParamSpec("P")
-R = TypeVar("R")
-MADE = {
-    "Scene": "load_scene(path) reads one",
-    "SemanticField": "SemanticField.load(path) reads one",
-    "LabelSet": "load_label_set(path) reads one",
-    "Gaussians": "read_splats(path).gaussians are some",
-    "SplatFile": "read_splats(path) reads one",
-    "Camera": "a Scene has .cameras",
-}
-"""How to make what `typed` misses."""
 PARTS = ("embeddings", "codewords", "map", "means", "gaussians")  # where our objects keep what is mostly meant
 
 
@@ -214,60 +199,10 @@ def _instead(value: object) -> str:
     return f"pass its .{part}" if part else "convert it with torch.as_tensor"
 
 
-def typed(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorator of public functions: check arguments that are to be objects of kfgs, or functions.
-
-    An argument is checked if its type is one or more of classes of kfgs, paths, functions and None. Those with lists, tensors
-    or numbers are left to the checks of the function. Raises a TypeError that names the argument and how to make the object.
-    """
-    signature = inspect.signature(function)
-    kinds: dict[str, tuple[type, ...]] = {}
-
-    @functools.wraps(function)
-    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
-        if torch.compiler.is_compiling():  # it cannot trace this
-            return function(*args, **kwargs)
-        if not kinds:  # not before all modules are there
-            kinds.update({name: _kinds(hint) for name, hint in get_type_hints(function).items()})
-        given = signature.bind(*args, **kwargs).arguments
-        for name, value in given.items():
-            expected = kinds.get(name, ())
-            if expected and not isinstance(value, expected):
-                raise TypeError(
-                    f"{name}: expected {_in_words(expected)}, got {type(value).__name__}; {_made(expected)}"
-                )
-        return function(*args, **kwargs)
-
-    return checked
-
-
-def _kinds(hint: Any) -> tuple[type, ...]:
-    """The classes of a type hint that `typed` checks; empty if it checks none."""
-    members = get_args(hint) if isinstance(hint, UnionType) or get_origin(hint) is Union else (hint,)
-    found = tuple(Callable if get_origin(one) is Callable else one for one in members)
-    ours = [one for one in found if one is Callable or getattr(one, "__module__", "").startswith("kfgs.")]
-    plain = all(one in (*ours, str, Path, NoneType) and not getattr(one, "_is_protocol", False) for one in found)
-    return found if ours and plain and all(isinstance(one, type) for one in found) else ()
-
-
-def _in_words(kinds: tuple[type, ...]) -> str:
-    words = {str: "a path", Path: "a path", NoneType: "None", Callable: "a function"}
-    return " or ".join(dict.fromkeys(words.get(kind, f"a {kind.__name__}") for kind in kinds))
-
-
-def _made(kinds: tuple[type, ...]) -> str:
-    kind = next(kind for kind in kinds if kind not in (str, Path, NoneType))
-    return (
-        MADE.get(kind.__name__, f"pass {kind.__name__}(...)")
-        if kind is not Callable
-        else "pass one, for instance print"
-    )
-
-
 def check_choice(name: str, value: object, choices: Iterable[object]) -> None:
     """Raise a ValueError unless `value` is one of `choices`."""
     options = list(choices)
-    if value not in options:
+    if isinstance(value, Tensor | np.ndarray) or value not in options:
         near = difflib.get_close_matches(str(value).lower(), map(str, options), n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
         raise ValueError(f"{name}: expected one of {', '.join(map(repr, options))}, got {value!r}{hint}")

@@ -39,6 +39,8 @@ def class_indices(name: str, names: Sequence[str]) -> tuple[int, ...]:
         >>> class_indices("chair", ["chair", "wall", "chair"]), class_indices("Wall", ["chair", "wall"])
         ((0, 2), (1,))
     """
+    if not isinstance(name, str):
+        raise TypeError(f"class: expected a name, got {type(name).__name__}; pass one of the class names")
     folded = {one for one in names if one.casefold() == name.casefold()}
     spelled = name if name in names else folded.pop() if len(folded) == 1 else None
     if spelled is not None:

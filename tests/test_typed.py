@@ -8,7 +8,8 @@ import torch
 from messages import tells
 
 from kfgs import Gaussians
-from kfgs._check import check_range, typed
+from kfgs._check import check_range
+from kfgs._typed import typed
 from kfgs.cameras import Camera
 from kfgs.fields import SemanticField
 from kfgs.formats import write_splats
@@ -50,7 +51,7 @@ def test_what_is_not_of_kfgs_is_left_to_the_function():
         """Return a word."""
         return "done"
 
-    assert probe(CLOUD, 5, "no list") == "done"
+    assert probe(CLOUD, 5, ["no number"]) == "done"
     assert probe.__name__ == "probe"
     with pytest.raises(TypeError, match="missing a required argument: 'place'"):
         probe(CLOUD)

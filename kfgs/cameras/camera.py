@@ -145,7 +145,7 @@ class Camera:
         """
         check_range("fov_degrees", fov_degrees, 0, 180, closed=(False, False))
         like = eye if isinstance(eye, Tensor) and eye.is_floating_point() else torch.zeros(())
-        place, aim = (torch.as_tensor(value).detach().double().cpu() for value in (eye, target))
+        place, aim = (as_tensor(name, one).detach().double().cpu() for name, one in (("eye", eye), ("target", target)))
         check_shapes(("eye", place, "3"), ("target", aim, "3"))
         forward, zenith = unit_vector("target - eye", aim - place), unit_vector("up", up)
         right = torch.linalg.cross(forward, zenith)
@@ -208,7 +208,7 @@ class Camera:
 
 def unit_vector(name: str, vector: Tensor | Sequence[float]) -> Tensor:  # [3] float64
     """The direction of a vector; errors name the argument `name`."""
-    values = torch.as_tensor(vector).detach().double().cpu()
+    values = as_tensor(name, vector).detach().double().cpu()
     check_shapes((name, values, "3"))
     length = float(values.norm())
     if not 0 < length < math.inf:

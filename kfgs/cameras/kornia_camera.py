@@ -9,9 +9,11 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 
 from .._check import check_shapes
+from .._typed import typed
 from .camera import NEAR, Camera
 
 
+@typed
 def to_kornia(cameras: Sequence[Camera], *, integer_centers: bool = False) -> PinholeCamera:
     """Stack cameras into one kornia `PinholeCamera` of batch B = len(cameras).
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_range, check_shapes, check_size, check_whole
+from .._typed import typed
 from .bounds import robust_bounds
 from .camera import UP, Camera, unit_vector
 
@@ -46,6 +47,7 @@ class Orbit:
         check_range("cut", self.cut, 0, 1)
 
 
+@typed
 def estimate_up(cameras: Sequence[Camera]) -> Tensor:  # [3] float64, unit
     """Estimate the up direction of the world from the cameras.
 
@@ -72,6 +74,7 @@ def estimate_up(cameras: Sequence[Camera]) -> Tensor:  # [3] float64, unit
     return up * torch.sign(up @ mean)
 
 
+@typed
 def orbit_cameras(
     points: Tensor,  # [N, 3]
     orbit: Orbit | None = None,

@@ -9,10 +9,12 @@ from kornia.geometry.depth import depth_to_3d_v2
 from torch import Tensor
 
 from .._check import check_range, check_shapes
+from .._typed import typed
 from .camera import Camera
 from .distortion import fold_radius, plane_to_pixel
 
 
+@typed
 def world_to_camera(camera: Camera, points: Tensor) -> Tensor:  # points: [N, 3] -> [N, 3]
     """Express world points in the camera's frame: R X + t.
 
@@ -37,6 +39,7 @@ def world_to_camera(camera: Camera, points: Tensor) -> Tensor:  # points: [N, 3]
     return points @ viewmat[:3, :3].T + viewmat[:3, 3]
 
 
+@typed
 def camera_to_pixel(camera: Camera, points_cam: Tensor) -> Tensor:  # points_cam: [N, 3] -> [N, 2]
     """Project points of the camera's frame to pixels (x, y), through the lens if the camera has one.
 
@@ -59,6 +62,7 @@ def camera_to_pixel(camera: Camera, points_cam: Tensor) -> Tensor:  # points_cam
     return plane_to_pixel(plane, camera.K.to(points_cam), camera.distortion)
 
 
+@typed
 def projection_jacobian(camera: Camera, points_cam: Tensor) -> Tensor:  # points_cam: [N, 3] -> [N, 2, 3]
     """Derivative of the pinhole projection, d(u, v) / d(x, y, z), in pixels per world unit (EWA, Zwicker 2001).
 
@@ -74,6 +78,7 @@ def projection_jacobian(camera: Camera, points_cam: Tensor) -> Tensor:  # points
     return dx_project_points_z1(points_cam) * focal[:, None]
 
 
+@typed
 def project_points(
     camera: Camera,
     points: Tensor,  # [N, 3] world
@@ -119,6 +124,7 @@ def project_points(
     return xy, depth, visible
 
 
+@typed
 def unproject_depth(camera: Camera, depth: Tensor) -> Tensor:  # depth: [H, W] -> [H, W, 3] world
     """Lift a depth map to one world point per pixel centre.
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_range, check_shapes
+from .._typed import typed
 from .camera import Camera
 
 ROTATION_TOLERANCE = 1e-3  # as for Camera.viewmat: matrices from text files have few digits
@@ -104,6 +105,7 @@ class Similarity:
     def __matmul__(self, first: Similarity) -> Similarity:
         return self.compose(first)
 
+    @typed
     def apply_to_camera(self, camera: Camera) -> Camera:
         """The camera that takes the same picture of the moved scene.
 

@@ -7,10 +7,12 @@ from math import atan, cos, degrees, pi, sin
 from torch import Tensor
 
 from .._check import check_range, check_shapes, check_size, check_whole
+from .._typed import typed
 from .camera import Camera
 from .projection import project_points
 
 
+@typed
 def spiral_cameras(
     camera: Camera,
     points: Tensor,  # [N, 3]

@@ -10,11 +10,13 @@ from kornia.geometry.conversions import normalize_points_with_intrinsics
 from torch import Tensor
 
 from .._check import check_shapes
+from .._typed import typed
 from .camera import Camera
 from .distortion import fold_radius, plane_to_pixel
 from .resample import from_bchw, to_bchw
 
 
+@typed
 def undistort(
     image: Tensor,  # [H, W, C]
     camera: Camera,
@@ -52,6 +54,7 @@ def undistort(
     return result, replace(camera, distortion=None), recorded
 
 
+@typed
 def undistort_labels(
     labels: Tensor,  # [H, W] integer
     camera: Camera,

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .._typed import typed
 from ..gaussians import Gaussians
 from ..metrics import Score, psnr, ssim
 from ..scenes import Scene
@@ -65,6 +66,7 @@ class ColorReport:
 
 
 @torch.no_grad()
+@typed
 def score_views(
     gaussians: Gaussians,
     scene: Scene,

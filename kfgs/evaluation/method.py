@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from .._rows import EPS, row_norms, unit_embeddings, unit_rows
+from .._typed import typed
 from ..cameras import Camera
 from ..features import FeatureFolder
 from ..fields import SemanticField
@@ -58,6 +59,7 @@ class Labeller(Protocol):
         """The class of each pixel, -1 where nothing is known."""
 
 
+@typed
 def best_labels(cosines: Tensor) -> Tensor:  # [..., K] -> [...] int64
     """The text with the largest cosine; -1 where the cosines are NaN. A tie goes to the lowest.
 
@@ -65,6 +67,8 @@ def best_labels(cosines: Tensor) -> Tensor:  # [..., K] -> [...] int64
         >>> best_labels(torch.tensor([[0.1, 0.3], [0.2, 0.2], [float("nan")] * 2])).tolist()
         [1, 0, -1]
     """
+    if cosines.ndim == 0 or cosines.shape[-1] == 0:
+        raise ValueError(f"cosines: expected [..., C] with at least one class, got {tuple(cosines.shape)}")
     unknown = cosines.isnan()
     return cosines.masked_fill(unknown, -torch.inf).argmax(-1).masked_fill(unknown.all(-1), -1)
 
@@ -77,6 +81,7 @@ def check_level(method: Method, level: int | str) -> None:
         )
 
 
+@typed
 def label_view(method: Method, view: View, text: Tensor, level: int = 0) -> Tensor:  # [H, W] int64
     """The class of each pixel: the method's own answer if it has a rule (`Labeller`), else the largest cosine.
 
@@ -112,6 +117,7 @@ def annotated(views: Sequence[View], stems: Iterable[str]) -> list[View]:
     return found
 
 
+@typed
 class FieldMethod:
     """A `SemanticField` as a method: one level.
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from .._check import check_choice, check_range, check_whole
 from .._rows import unit_embeddings
+from .._typed import typed
 
 Encode = Callable[[Sequence[str]], Tensor]
 """From texts to their embeddings [K, D] in the teacher's space; their length does not matter."""
@@ -48,6 +49,7 @@ def encode_unit(encode: Encode, texts: Sequence[str]) -> Tensor:  # [K, D]
     return unit_embeddings(rows, "encode(texts)")
 
 
+@typed
 def lerf_relevancy(
     positive: Tensor,  # [..., K] cosines with K texts
     negatives: Tensor,  # [..., M] cosines with M negatives
@@ -61,6 +63,8 @@ def lerf_relevancy(
         >>> lerf_relevancy(torch.tensor([0.30]), torch.tensor([0.25, 0.20, 0.10, 0.28]))  # sigmoid(0.2)
         tensor([0.5498])
     """
+    if negatives.ndim == 0 or negatives.shape[-1] == 0:
+        raise ValueError(f"negatives: expected [..., M] with at least one, got {tuple(negatives.shape)}")
     return torch.sigmoid(scale * (positive - negatives.amax(-1, keepdim=True)))
 
 

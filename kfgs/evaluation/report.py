@@ -8,12 +8,15 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from .._typed import typed
+
 SHOWN = 4
 """An option with more values is only counted in the short form."""
 Row = Mapping[str, Any]
 """One line of a report's table: "view", "text" or "class", and numbers."""
 
 
+@typed
 @dataclass(frozen=True, eq=False)
 class Report:
     """Scores under a named protocol.
@@ -157,6 +160,7 @@ def make_report(
     )
 
 
+@typed
 def average(reports: Sequence[Report]) -> Report:
     """The plain mean of a protocol's scores over several scenes, as published tables have it; one row for each scene.
 

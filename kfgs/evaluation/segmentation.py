@@ -12,7 +12,9 @@ import torch
 from torch import Tensor
 
 from .._card import short_repr
+from .._check import as_tensor
 from .._files import as_path
+from .._typed import typed
 from ..cameras import resize_labels
 from ..metrics import ConfusionMatrix, Score
 from ..scenes.files import open_picture
@@ -87,6 +89,7 @@ def check_truth(target: Tensor, classes: int, name: str) -> None:  # target: [H,
         )
 
 
+@typed
 def evaluate_segmentation(
     predict: Callable[[str], Tensor],  # stem -> labels [h, w]
     truth: Mapping[str, Path | Tensor],  # stem -> label picture, or its labels [H, W] with -1 = void
@@ -109,7 +112,7 @@ def evaluate_segmentation(
     for stem, given in truth.items():
         target = given if isinstance(given, Tensor) else load_label_map(given)
         check_truth(target, len(names), f"truth[{stem!r}]" if isinstance(given, Tensor) else str(given))
-        labels = predict(stem)
+        labels = as_tensor(f"predict({stem!r})", predict(stem))
         if labels.shape != target.shape:
             labels = resize_labels(labels, (int(target.shape[0]), int(target.shape[1])))
         pooled.update(labels, target)

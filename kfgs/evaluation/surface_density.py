@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from .._check import check_shapes
+from .._typed import typed
 from ..gaussians import Gaussians
 from ..splat.engines import ALPHA_MIN
 
@@ -16,6 +17,7 @@ _PAIRS = 2_000_000  # of Gaussian and point at a time, about 200 MB
 _QUERY = 4_096  # Gaussians whose points are looked up at a time
 
 
+@typed
 def surface_density(
     gaussians: Gaussians,
     points: Tensor,  # [P, 3] world units

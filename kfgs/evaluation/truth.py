@@ -11,8 +11,10 @@ from torch import Tensor
 
 from .._card import short_repr
 from .._check import check_shapes
+from .._typed import typed
 
 
+@typed
 @dataclass(frozen=True, eq=False)
 class LabelTruth:
     """A closed set of classes, and the class of each pixel."""
@@ -42,6 +44,7 @@ class MaskAndBoxes(NamedTuple):
         return short_repr(self)
 
 
+@typed
 @dataclass(frozen=True, eq=False)
 class MaskTruth:
     """Masks of texts in some pictures; those of one picture may overlap, and leave pixels without any."""
@@ -70,6 +73,7 @@ class MaskTruth:
         return tuple(dict.fromkeys(text for texts in self.frames.values() for text in texts))
 
 
+@typed
 @dataclass(frozen=True, eq=False)
 class PointTruth:
     """Labelled points of a scene's surfaces."""

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from .._check import check_whole
 from .._files import digest_file
+from .._typed import typed
 from ..quant import grid_slices
 from ..scenes import Scene
 from .check import FeatureReport, check_maps
@@ -91,6 +92,7 @@ class FeatureFolder(Sequence[Tensor]):
         if stems is not None:
             _ = self.files  # views without a map are an error here, not hours later
 
+    @typed
     def of(self, scene: Scene, split: Split = "train") -> FeatureFolder:
         """The maps of some views of a scene.
 

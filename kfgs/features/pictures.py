@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 
 from torch import Tensor
 
+from .._typed import typed
 from ..scenes import Scene, read_image
 from ..scenes.files import some
 
@@ -30,6 +31,7 @@ class Picture:
         return read_image(self.path)
 
 
+@typed
 def pictures_of(scene: Scene, split: Split = "all") -> list[Picture]:
     """The pictures of some views of a scene, as they are on disk.
 

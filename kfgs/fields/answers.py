@@ -15,6 +15,7 @@ from torch import Tensor
 
 from .._card import short_repr
 from .._rows import EPS, row_norms, unit_rows
+from .._typed import typed
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels import nearest_codeword
@@ -52,6 +53,7 @@ class Answers(NamedTuple):
         return short_repr(self)
 
 
+@typed
 def fused_answers(
     gaussians: Gaussians, codebook: Codebook | None, autoencoder: Autoencoder | None, cameras: Sequence[Camera]
 ) -> Answers:

@@ -14,6 +14,7 @@ from .._card import short_repr
 from .._check import check_shapes
 from .._files import as_path, read_json
 from .._rows import EPS, row_norms, unit_rows
+from .._typed import typed
 from ..cameras import Camera
 from ..gaussians import as_rows
 from ..labels import LabelSet
@@ -67,6 +68,7 @@ class Picked:
 Example = Clicks | Box | Mask | Picked
 
 
+@typed
 def label_set_from_examples(field: SemanticField, examples: Mapping[str, Example | Sequence[Example]]) -> LabelSet:
     """Make classes from examples, for a teacher without text (DINOv2, SAM) or for words that it does not know.
 
@@ -206,8 +208,8 @@ def _of_pixels(field: SemanticField, example: Any, name: str) -> Tensor:  # [n, 
     mask = torch.zeros(drawn.size, dtype=torch.bool)
     if isinstance(example, Mask):
         check_shapes((f"{name}.mask", example.mask, camera.size))
-        y, x = example.mask.nonzero(as_tuple=True)
-        mask[(y * down).long(), (x * right).long()] = True
+        rows, columns = example.mask.nonzero(as_tuple=True)
+        mask[(rows * down).long(), (columns * right).long()] = True
     elif isinstance(example, Clicks):
         for x, y in example.points:
             if not (0 <= x < camera.width and 0 <= y < camera.height):

@@ -8,11 +8,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from .._typed import typed
 from ..gaussians import Gaussians
 from .answers import Seen
 from .semantic_field import SemanticField
 
 
+@typed
 def select_gaussians(field: SemanticField, which: Tensor) -> SemanticField:  # which: [N] bool or [n] int64
     """A field of some of its Gaussians, with all that is known about them."""
     answers = None if field.answers is None else field.answers[which]
@@ -20,6 +22,7 @@ def select_gaussians(field: SemanticField, which: Tensor) -> SemanticField:  # w
     return replace(field, gaussians=field.gaussians.select(which), answers=answers, seen=seen)
 
 
+@typed
 def join_fields(fields: Sequence[SemanticField]) -> SemanticField:
     """Fused fields with the same linear latents as one field; views that several fields have are kept once.
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from .._check import check_range
+from .._typed import typed
 from ..cameras import resize_map
 from ..cameras.resample import from_bchw, to_bchw
 from ..splat.engines.table import choose, load, offers
@@ -25,6 +26,7 @@ SSIM_CONSTANTS = 0.01**2, 0.03**2
 """(K1 peak)^2 and (K2 peak)^2 of SSIM, for colours in [0, 1]."""
 
 
+@typed
 def l1_loss(
     rendered: Tensor,  # [H, W, D]
     alpha: Tensor,  # [H, W], not used

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from .._card import short_repr
 from .._check import check_range, check_shapes, check_whole
+from .._typed import typed
 from ..gaussians import Gaussians
 from ..quant import spherical_kmeans
 from ..splat import covariance_3d
@@ -36,6 +37,7 @@ class Merged(NamedTuple):
         return short_repr(self)
 
 
+@typed
 def merge_gaussians(
     gaussians: Gaussians,
     weights: Tensor,  # [N] >= 0

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from .._typed import typed
 from ..labels import LabelSet
 from .precision import PrecisionName, Rounding
 from .semantic_field import SemanticField
 from .store import pack_parts, unpack_parts
 
 
+@typed
 def pack_field(field: SemanticField, precision: PrecisionName | Rounding = "small") -> bytes:
     """The bytes of one file with the field, and its classes if they can be read.
 

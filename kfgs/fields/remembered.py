@@ -8,6 +8,7 @@ from typing import Any
 
 from .._files import digest_file, real_path
 from .._files.paths import noted_path
+from .._typed import typed
 from ..labels import LabelSet, load_label_set
 
 CLASSES = ("classes.json", "text.npy"), ("classes.json", "text.safetensors"), ("text.safetensors",)
@@ -55,6 +56,7 @@ def rebased(info: dict[str, Any], old: Path | None, new: Path) -> dict[str, Any]
     return moved
 
 
+@typed
 def recall_scene(info: dict[str, Any], folder: Path | None) -> Path:
     """The scene folder in a field's notes; a ValueError if there is no note, a FileNotFoundError if no folder."""
     noted = info.get("scene")

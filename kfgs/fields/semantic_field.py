@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from .._card import html_card
-from .._check import as_tensor, check_choice, typed
+from .._check import as_tensor, check_choice
 from .._files import as_path
 from .._rows import unit_embeddings
+from .._typed import typed
 from ..cameras import Camera
 from ..gaussians import Gaussians, as_rows
 from ..labels import Classification, CodewordLabels, LabelSet, Score, Selection, label_codewords, select_by_similarity
@@ -29,6 +30,7 @@ from .store import load_field, save_field
 from .views import Rule, rank_classes
 
 
+@typed
 @dataclass(frozen=True, eq=False)
 class SemanticField:
     """A scene's semantics in 3-D, with everything needed to classify, query and segment.

@@ -17,10 +17,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._card import short_repr
-from .._check import check_range, check_whole, typed
+from .._check import check_range, check_whole
 from .._progress import as_bar
 from .._ranks import first
 from .._rows import row_norms, unit_rows
+from .._typed import typed
 from ..cameras import Camera
 from ..formats import SplatFile
 from ..formats.values import check_splats
@@ -184,6 +185,7 @@ def uplift_maps(
     return Uplifted(cloud.replace(features=_mean(add_sums(own, old))), latents, shown, agreement, kept)
 
 
+@typed
 def sample_latents(maps: FeatureMaps, *, count: int = 32, views: int = 256) -> LinearLatents:
     """Latents for several fields of one teacher: the main directions of features that are sampled from their maps.
 

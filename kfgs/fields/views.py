@@ -16,6 +16,7 @@ from torch import Tensor
 from .._card import short_repr
 from .._check import check_choice, check_whole
 from .._rows import row_norms, unit_embeddings
+from .._typed import typed
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels import LOGIT_SCALES, label_pixels
@@ -118,6 +119,7 @@ def rank_classes(
     return Ranked(*found, rendering.alpha)
 
 
+@typed
 def score_pixels(
     field: SemanticField, camera: Camera, target: str | Tensor, classes: Classes | None = None, **options: Any
 ) -> Ranked:

@@ -170,6 +170,8 @@ def working_directions(
         rows = unit_rows(rows) * (row_norms(rows) > EPS)[:, None]
         return {"moment": rows.T @ rows}
 
+    if len(views) == 0:
+        raise ValueError("maps: expected at least one, got none; pass the maps of the training views")
     for part in in_order(views, look):
         moment = moment + part["moment"]
     assert isinstance(moment, Tensor)

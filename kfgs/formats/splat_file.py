@@ -11,12 +11,14 @@ import numpy as np
 from torch import Tensor
 
 from .._card import LINE, cut, html_card, short_repr, short_value
+from .._typed import typed
 from ..gaussians import Gaussians
 from .ply import Columns
 
 SCORE = "score"  # the extra column with the confidence of a Gaussian's label
 
 
+@typed
 @dataclass(frozen=True, eq=False)
 class SplatFile:
     """A cloud with the other content of a splat file.

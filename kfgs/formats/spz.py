@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from .._check import check_choice, check_whole
 from .._files import as_path, parse_json
+from .._typed import typed
 from ..gaussians import Gaussians
 from .render_mode import ANTIALIASED as ANTIALIASED_MODE
 from .render_mode import describe_lost_mode
@@ -99,6 +100,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
     return write_spz(path, splats)
 
 
+@typed
 def write_spz(
     path: str | Path,
     splats: SplatFile,

@@ -26,8 +26,8 @@ from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
-from .._check import typed
 from .._files import as_path
+from .._typed import typed
 from ..gaussians import Gaussians
 from .folders import PATTERNS, splat_file_of
 from .order import morton_order

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from .._card import short_repr
 from .._check import as_tensor, check_choice, check_shapes
+from .._typed import typed
 from ..gaussians import Gaussians
 from ..splat.sh import rgb_to_sh0, sh0_to_rgb
 
@@ -53,6 +54,7 @@ def parse_color(color: str | Sequence[float] | Tensor, name: str = "rgb") -> tup
     return float(plain[0]), float(plain[1]), float(plain[2])
 
 
+@typed
 def recolor(
     gaussians: Gaussians,
     mask: Tensor,  # [N] bool

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from .._check import check_range, check_shapes
+from .._typed import typed
 from .nearest import Array, positions
 
 NEIGHBOURS = 8  # nearest neighbours of each point that are joined first
@@ -41,6 +42,7 @@ def component_distance(
     return chosen if chosen > 0 else 1.0  # all at one position: any distance joins them
 
 
+@typed
 def component_numbers(
     means: Tensor,  # [N, 3]
     mask: Tensor,  # [N] bool

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from .._check import check_shapes, check_whole
 from .._rows import check_finite
+from .._typed import typed
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from .boxes import OrientedBox
@@ -92,6 +93,7 @@ class Part:
         } | ({"indices": self.indices.tolist()} if indices else {})
 
 
+@typed
 def describe_selection(
     gaussians: Gaussians,
     selection: Selection,
@@ -119,6 +121,7 @@ def describe_selection(
     return _described(gaussians, selection, [selection.indices], [selection.how], cameras, engine)[0]
 
 
+@typed
 def connected_parts(
     gaussians: Gaussians,
     selection: Selection,

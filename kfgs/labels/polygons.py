@@ -10,6 +10,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from .._typed import typed
+
 Mask = NDArray[np.bool_]
 MOST = 1 << 28  # pixels of a mask: more than any picture has, so a larger number is damage
 
@@ -49,6 +51,7 @@ def fill_region(points: ArrayLike, size: tuple[int, int]) -> Tensor:  # [V, 2] -
     return torch.from_numpy(_inside(np.asarray(points, dtype=np.float64).reshape(-1, 2), size, 0.5))
 
 
+@typed
 def decode_rle(segmentation: dict[str, Any]) -> Tensor:  # [H, W] bool
     """A mask from COCO's run lengths: `{"size": [H, W], "counts": ...}`, zeros first, column by column.
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from .._check import check_choice, check_range, check_shapes
 from .._rows import check_finite
+from .._typed import typed
 from .selection import Selection
 
 TEMPERATURE = 10.0  # factor of the cosines in LERF (Kerr 2023)
@@ -37,6 +38,7 @@ to three quarters may lie above it (the walls of a room), if it is 5 times spars
 TOP, WAY = 0.999, 0.7  # if no gap is clear: 70 % of the way from the median to the 99.9 % quantile
 
 
+@typed
 def relevancy(
     similarity: Tensor,  # [N]
     negatives: Tensor,  # [N, M]

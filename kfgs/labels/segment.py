@@ -9,6 +9,7 @@ from torch import Tensor
 
 from .._check import check_choice, check_range, check_shapes
 from .._rows import EPS, row_norms
+from .._typed import typed
 from ..quant.codebook import Codebook
 from ..splat.engines.table import choose, load, offers
 from .classify import CodewordLabels, classify
@@ -25,6 +26,7 @@ LEAD = 1e-4
 codewords of two classes are nearer to each other, the plain computation decides."""
 
 
+@typed
 def label_pixels(
     latent_map: Tensor,  # [..., d], usually [H, W, d]
     codebook: Codebook | None,
@@ -133,6 +135,7 @@ def _engine(rows: Tensor) -> str:
     return choose("auto", rows.device.type, rows.dtype)
 
 
+@typed
 def nearest_codeword(
     latents: Tensor,  # [N, d]
     centres: Tensor,  # [K, d]
@@ -141,6 +144,7 @@ def nearest_codeword(
 
     One matrix product of [N, d] by [d, K]: the sum without |x|^2 loses no accuracy that d <= 16 latents in [0, 1] need.
     """
+    check_shapes(("latents", latents, "N d"), ("centres", centres, "K d"))
     return torch.addmm((centres * centres).sum(dim=-1), latents, centres.T, alpha=-2).argmin(dim=-1)
 
 

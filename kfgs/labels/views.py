@@ -16,6 +16,7 @@ from torch import Tensor
 from .._card import short_repr
 from .._check import check_range
 from .._ranks import in_order
+from .._typed import typed
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..splat import accumulate_pixels, bin_tiles, project
@@ -61,6 +62,7 @@ def sum_pixels(
     return projected.index, *accumulate_pixels(*shape, signal, tiles, engine=engine)
 
 
+@typed
 def average_views(
     gaussians: Gaussians,
     views: Iterable[tuple[Camera, Tensor]],  # maps [H, W, C] of the cameras' sizes

@@ -12,8 +12,9 @@ from PIL import Image
 from torch import Tensor
 from tqdm import tqdm
 
-from .._check import check_range, typed
+from .._check import check_range
 from .._files import as_path, check_output, write_json
+from .._typed import typed
 from ..cameras import resize_labels, undistort_labels
 from ..evaluation import SegmentationReport, evaluate_segmentation, load_label_map
 from ..evaluation.segmentation import VOID, check_truth
@@ -138,6 +139,7 @@ def segment_scene(
     return results
 
 
+@typed
 def true_labels(scene: Scene, folder: str | Path, split: str) -> dict[str, Tensor]:
     """The label pictures of a split's views by stem, as [H, W] with -1 = void; views without one are left out.
 
@@ -162,6 +164,7 @@ def score_scene(labels: dict[str, Tensor], truth: dict[str, Tensor], classes: La
     return evaluate_segmentation(labels.__getitem__, known, classes.names)
 
 
+@typed
 def score_teacher(
     maps: Callable[[str], Tensor], truth: dict[str, Tensor], classes: LabelSet, size: tuple[int, int]
 ) -> SegmentationReport:
@@ -182,6 +185,7 @@ def score_teacher(
     return evaluate_segmentation(predict, truth, classes.names)
 
 
+@typed
 def select_labelled(splats: SplatFile, name: str, threshold: float | None = None) -> Selection:
     """The Gaussians of a labelled splat that have one class.
 
@@ -204,6 +208,7 @@ def select_labelled(splats: SplatFile, name: str, threshold: float | None = None
     return Selection(mask, scores, threshold, found.how)
 
 
+@typed
 def save_labelled(
     path: str | Path, gaussians: Gaussians, scores: Tensor, classes: LabelSet, *, rule: str
 ) -> list[Path]:
@@ -257,6 +262,7 @@ def read_cloud(path: str | Path) -> Columns:
     return columns
 
 
+@typed
 def label_cloud(
     gaussians: Gaussians, cloud: Columns, out: str | Path, classes: LabelSet, *, distance: float | None = None
 ) -> tuple[Transfer, list[Path]]:
@@ -288,6 +294,7 @@ def write_report(path: Path, **parts: Any) -> None:
     write_json(path, {name: part.to_json() if hasattr(part, "to_json") else part for name, part in parts.items()})
 
 
+@typed
 def write_training_pictures(result: FitResult) -> list[Path]:
     """Plot the histories of a run's codebook and field into its folder; return the pictures written."""
     draw = {"codebook": plot_codebook_history, "field": plot_training}

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from .._card import LINE, cut
-from .._check import check_choice, check_range, typed
+from .._check import check_choice, check_range
+from .._typed import typed
 from ..align.by_cameras import Alignment, align_by_cameras
 from ..align.by_shape import align_clouds
 from ..align.frames import frames_agree

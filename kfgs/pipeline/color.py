@@ -15,10 +15,11 @@ import torch
 from torch import Tensor
 
 from .._card import short_repr
-from .._check import check_range, check_whole, typed
+from .._check import check_range, check_whole
 from .._files import check_output, read_json
 from .._progress import Progress, as_progress
 from .._ranks import once
+from .._typed import typed
 from ..cameras import Camera, resize_map
 from ..fields import ColorLoss, FieldConfig, FieldFit, GaussianParams, fit_field
 from ..formats import write_splats

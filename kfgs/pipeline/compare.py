@@ -11,6 +11,7 @@ from torch import Tensor
 
 from .._check import check_whole
 from .._files import as_path
+from .._typed import typed
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..splat import rasterize
@@ -30,6 +31,7 @@ def render_color(gaussians: Gaussians, camera: Camera) -> Tensor:  # [H, W, 3] i
         return rasterize(gaussians.replace(features=None), camera).map.clamp(0, 1)
 
 
+@typed
 def views_of_change(before: Gaussians, after: Gaussians, cameras: Sequence[Camera], count: int = 2) -> list[int]:
     """The viewpoints that show an edit best. Each looks in a different direction than those before it, if possible.
 
@@ -99,6 +101,7 @@ def _share(before: Tensor, after: Tensor) -> float:  # [H, W, 3] each
     return float(((before - after).abs().amax(-1) > VISIBLE).float().mean())
 
 
+@typed
 def write_comparison(
     path: str | Path, before: Gaussians, after: Gaussians, cameras: Sequence[Camera], *, titles: tuple[str, str]
 ) -> Path:

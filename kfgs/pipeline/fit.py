@@ -18,10 +18,10 @@ import torch
 from torch import Tensor
 
 from .._card import short_repr
-from .._check import typed
 from .._files import as_path, check_output, read_json, write_json
 from .._progress import Progress, as_progress
 from .._ranks import once
+from .._typed import typed
 from ..cameras import Camera
 from ..fields import (
     FieldFit,

@@ -11,11 +11,11 @@ from typing import Any
 import torch
 
 from .._arrays import read_safetensors
-from .._check import typed
 from .._files import as_path, bytes_in_words, write_json
 from .._progress import Progress
 from .._ranks import once
 from .._tensors import save_tensors
+from .._typed import typed
 from ..cameras import Camera
 from ..fields import Answers, Seen, SemanticField, UpliftConfig, fused_answers, remember, uplift_maps
 from ..formats import SplatFile, read_splats

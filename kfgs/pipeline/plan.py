@@ -13,6 +13,7 @@ from torch import Tensor
 
 from .._check import check_choice
 from .._files import as_path, bytes_in_words, seconds_in_words
+from .._typed import typed
 from ..features import FeatureFolder
 from ..scenes import Scene
 from ..teachers import Teacher
@@ -124,6 +125,7 @@ class Plan:
         return "\n".join([self.title, "", *lines, "", *(f"note: {note}" for note in self.notes), self.verdict])
 
 
+@typed
 def plan_scene(
     scene: Scene,
     *,

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from .._files import as_path
+from .._typed import typed
 from ..features import FeatureFolder, pictures_of, read_manifest, write_npy_map
 from ..scenes import Scene
 from ..teachers import TRANSFORMERS, LSeg, LSegConfig, LSegOptions, Teacher, as_teacher, load_teacher, teacher_names
@@ -22,6 +23,7 @@ MOST_SIZES = 3  # sizes of pictures that the teacher is run on
 RANK = 8  # directions of the noise that replaces the maps of a network with random weights
 
 
+@typed
 @dataclass(frozen=True)
 class NamedTeacher:
     """A teacher by its name, loaded only if the plan must run it. Nothing is downloaded.

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from .._files import atomic_path, bytes_in_words, check_own, current_file, real_path, seconds_in_words
+from .._typed import typed
 from ..fields import SemanticField
 from ..fields.store import DESCRIPTION, TENSORS
 from ..labels import LabelSet
@@ -81,6 +82,7 @@ def check_report(folder: Path) -> None:
     check_own(folder / REPORT, lambda path: TITLE in path.read_text(encoding="utf-8"), "kfgs fit")
 
 
+@typed
 def write_run_report(
     result: FitResult,
     scene: Scene,

@@ -21,6 +21,7 @@ from typing import Any
 from .._check import one_line
 from .._files import as_path, atomic_folder, atomic_path, current_file, digest_value
 from .._files.fields import KEPT
+from .._typed import typed
 from ..fields.store import DESCRIPTION, TENSORS, check_place, describes_field, load_field, read_description
 from .stages import Run
 
@@ -162,6 +163,7 @@ def restore_field(folder: str | Path, key: str) -> RunField:
     return _read(folder / FIELD, current=True)
 
 
+@typed
 def compare_fields(one: RunField, other: RunField) -> list[tuple[str, str, str]]:
     """What differs between two fields: (fact, value of the first, value of the second)."""
     facts = [_facts(field) for field in (one, other)]

@@ -15,6 +15,7 @@ from .._check import as_tensor, check_range, check_shapes, check_whole
 from .._progress import Progress, as_progress
 from .._ranks import in_order
 from .._rows import ENCODE, EPS, check_directions, row_norms, unit_rows
+from .._typed import typed
 from .codebook import Codebook
 from .evolve import EvolvingCodebook, Tally, prune
 from .grow import ROUNDS, grow, kmeans
@@ -25,6 +26,7 @@ POOL = 32_768  # features that codewords grow on: 67 MB of 512 channels in float
 CODEWORD_RMS = 0.5  # of a codeword's channels: in mode adc the field learns them at absolute rates made for [0, 1]
 
 
+@typed
 @dataclass(frozen=True)
 class CodebookConfig:
     """Options of `fit_codebook`. By default the data decide; `CodebookConfig.paper()` follows the paper."""

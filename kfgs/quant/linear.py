@@ -14,11 +14,13 @@ from .._arrays import reading
 from .._card import short_repr
 from .._check import as_tensor, check_range, check_shapes, check_whole, moved_to
 from .._rows import unit_rows
+from .._typed import typed
 from ._store import read_tensors, write_tensors
 
 NOISE = 1e-10  # of the first eigenvalue: rounding in float32 gives so much to directions that are not in the data
 
 
+@typed
 @dataclass(frozen=True, eq=False)
 class LinearLatents:
     """Features f of D channels as d numbers z, with f = B z and orthonormal columns of B.

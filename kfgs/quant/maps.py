@@ -18,6 +18,7 @@ from .._files import atomic_path
 from .._progress import as_bar
 from .._ranks import in_order
 from .._rows import ENCODE, EPS, check_directions
+from .._typed import typed
 from ._store import read_tensors, write_tensors
 from .codebook import Codebook, compare
 
@@ -37,6 +38,7 @@ def read_blocks(maps: FeatureMaps, i: int) -> Iterator[Tensor]:  # each [at most
     yield from as_tensor(f"maps[{i}]", maps[i]).split(32) if blocks is None else blocks(i)
 
 
+@typed
 class IndexMaps(Sequence[NDArray[Any]]):
     """The index maps M of Eq. 5: one [h, w] array of codeword numbers per image, one or two bytes per pixel.
 
@@ -109,6 +111,7 @@ class IndexMaps(Sequence[NDArray[Any]]):
             return IndexMaps([tensors[f"map.{i}"].numpy() for i in range(len(tensors) - 1)], int(tensors["size"]))
 
 
+@typed
 class LatentMaps(Sequence[Tensor]):
     """The maps F_l = S'[M] that the field learns (Sec. 3.3.2), each made when it is read; holes are NaN.
 
@@ -148,6 +151,7 @@ class LatentMaps(Sequence[Tensor]):
         return (self[i] for i in range(len(self)))
 
 
+@typed
 def quantize_maps(
     maps: FeatureMaps,  # each [h, w, D]
     codebook: Codebook,

@@ -5,12 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._check import check_range, check_shapes
+from .._check import check_range, check_shapes, check_size
 from .._rows import EPS, row_norms, unit_rows
+from .._typed import typed
 
 SAMPLES = 28_800  # rows 1::2 and columns 1::3 of a 360 x 480 map, as in the paper's experiments
 
 
+@typed
 def choose_grid_step(height: int, width: int, samples: int = SAMPLES) -> tuple[int, int]:
     """The finest grid (row step, column step) that leaves at most `samples` pixels of a map.
 
@@ -20,6 +22,7 @@ def choose_grid_step(height: int, width: int, samples: int = SAMPLES) -> tuple[i
         >>> choose_grid_step(360, 480), choose_grid_step(90, 120)
         ((2, 3), (1, 1))
     """
+    check_size((height, width), low=0)
     check_range("samples", samples, 1)
     rows, columns = 1, 1
     while len(_grid(height, rows)) * len(_grid(width, columns)) > samples:
@@ -27,6 +30,7 @@ def choose_grid_step(height: int, width: int, samples: int = SAMPLES) -> tuple[i
     return rows, columns
 
 
+@typed
 def grid_slices(
     height: int, width: int, step: tuple[int, int] | None = None, *, samples: int = SAMPLES
 ) -> tuple[slice, slice]:
@@ -46,6 +50,7 @@ def grid_slices(
     return slice(i.start, height, rows), slice(j.start, width, columns)
 
 
+@typed
 def sample_grid(
     feature_map: Tensor,  # [h, w, D]
     step: tuple[int, int] | None = None,

@@ -10,6 +10,7 @@ from torch import Tensor
 from .._card import short_repr
 from .._check import as_tensor, check_range, check_shapes
 from .._rows import EPS, check_directions, row_norms, unit_rows
+from .._typed import typed
 from ..quant import LinearLatents
 from ..quant.codebook import Nearest
 from ..quant.grow import grow, nearest_cells
@@ -70,6 +71,7 @@ class SharedCodebook:
         check_shapes(("features", features, "n D"))
         return cls(features.new_zeros(0, features.shape[1]), tolerance).extended(features)
 
+    @typed
     def nearest(
         self,
         features: Tensor,  # [n, D], or latents [n, d]
@@ -90,6 +92,7 @@ class SharedCodebook:
         cells = nearest_cells(unit, words)
         return Nearest(cells.index, cells.similarity)
 
+    @typed
     def extended(
         self,
         features: Tensor,  # [n, D], or latents [n, d]

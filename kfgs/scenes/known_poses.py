@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 from .._files import atomic_folder, check_output, real_path
+from .._typed import typed
 from ..cameras.camera import Camera
 from .colmap_model import has_model
 from .files import SceneError
@@ -33,6 +34,7 @@ AGREEING = 0.2
 1 %, with inverted ones 4 %, with the axes of another convention none."""
 
 
+@typed
 def find_points(
     scene: Scene, *, config: SfmConfig | None = None, most_views: int | None = MOST_VIEWS, progress: bool = False
 ) -> Scene:
@@ -62,6 +64,7 @@ def find_points(
     return replace(scene, points=places, colors=colors)
 
 
+@typed
 def write_known_poses(
     scene: Scene, out: str | Path, *, config: SfmConfig | None = None, replace: bool = False, progress: bool = False
 ) -> SfmReport:

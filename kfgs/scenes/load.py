@@ -155,8 +155,9 @@ def find_model(path: Path) -> Path | None:
     return next((path / name for name in MODEL_FOLDERS if path.is_dir() and has_model(path / name)), None)
 
 
-def is_scene(path: Path) -> bool:
+def is_scene(path: str | Path) -> bool:
     """Whether a folder has poses: a COLMAP model, a transforms.json, or the layout of a data set."""
+    path = as_path(path)
     return (
         find_model(path) is not None
         or any((path / name).is_file() for name in _TRANSFORMS)

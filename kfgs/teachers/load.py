@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from .._card import error_line
+from .._typed import typed
 from .identity import code_identity, plain_options, weights_identity
 from .protocol import Teacher, as_teacher
 from .transformers_table import TRANSFORMERS
@@ -41,6 +42,7 @@ def teacher_names() -> list[str]:
     return ["lseg", *TRANSFORMERS, "sam"]
 
 
+@typed
 def load_teacher(name: str, weights: str | Path | None = None, **options: Any) -> Teacher:
     """Load a teacher.
 
@@ -57,9 +59,9 @@ def load_teacher(name: str, weights: str | Path | None = None, **options: Any) -
         FileNotFoundError: if the weights do not exist.
         ImportError: if a package is missing or broken.
     """
+    check_teacher_name(name)
     if ":" in name:
         return _imported(name, weights, options)
-    check_teacher_name(name)
     if weights is None:
         what = "a checkpoint file" if name in ("lseg", "sam") else "a folder of save_pretrained, or a hub id"
         raise ValueError(f"weights: expected {what} for teacher {name!r}, got none; kfgs downloads nothing by itself")
@@ -70,6 +72,8 @@ def load_teacher(name: str, weights: str | Path | None = None, **options: Any) -
 
 def check_teacher_name(name: str) -> None:
     """Raise a ValueError unless it is one of `teacher_names()`, or `package.module:name`, which is not imported here."""
+    if not isinstance(name, str):
+        raise TypeError(f"teacher: expected a name, got {type(name).__name__}; teacher_names() lists them")
     names = teacher_names()
     if ":" not in name and name not in names:
         near = difflib.get_close_matches(name.lower(), names, n=1)

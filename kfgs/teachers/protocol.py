@@ -149,7 +149,11 @@ def as_teacher(source: Teacher | Callable[[Tensor], Tensor]) -> Teacher:
 def identify(teacher: Teacher) -> dict[str, Any]:
     """JSON of what a teacher's features depend on: its `identity`, or its name if it has none."""
     found = getattr(teacher, "identity", None)
-    return dict(found) if isinstance(found, dict) else {"name": teacher.name}
+    if isinstance(found, dict):
+        return dict(found)
+    if not hasattr(teacher, "name"):
+        raise TypeError(f"teacher: expected a teacher, got {type(teacher).__name__}; load_teacher(name) loads one")
+    return {"name": teacher.name}
 
 
 def check_features(name: str, features: Any) -> Tensor:  # -> [D, h, w]

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from .._check import check_range
 from .._files import as_path, atomic_path
+from .._typed import typed
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from .film_frames import Show, as_shows, draw_frame, legend_under
@@ -29,6 +30,7 @@ FFMPEG = "imageio_ffmpeg"
 SUFFIXES = (".gif", ".mp4")
 
 
+@typed
 def save_animation(
     path: str | Path,
     shows: Gaussians | Show | Mapping[str, Gaussians | Show],

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from .._check import check_range, check_shapes
+from .._typed import typed
 from ..gaussians import Gaussians
 from ..labels import OrientedBox, Selection
 from ..labels.color import LUMINANCE
@@ -36,6 +37,7 @@ class Selections(NamedTuple):
     names: Any
 
 
+@typed
 def add_boxes(
     plotter: pv.Plotter,
     boxes: Sequence[OrientedBox],
@@ -73,6 +75,7 @@ def add_boxes(
     return draw_mesh(plotter, mesh, scalars="rgb", rgb=True, line_width=line_width, lighting=False)
 
 
+@typed
 def add_names(
     plotter: pv.Plotter,
     boxes: Sequence[OrientedBox],
@@ -108,6 +111,7 @@ def add_names(
     return actor
 
 
+@typed
 def add_selections(
     plotter: pv.Plotter,
     gaussians: Gaussians,

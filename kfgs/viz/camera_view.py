@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from .._typed import typed
 from ..cameras import Camera
 from ..cameras.camera import NEAR
 from .headless import make_plotter
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     import pyvista as pv
 
 
+@typed
 def look_through(plotter: pv.Plotter, camera: Camera) -> None:
     """Set the active subplot's view to a camera, including its principal point and both focal lengths.
 

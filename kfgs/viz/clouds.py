@@ -14,6 +14,7 @@ import numpy as np
 from torch import Tensor
 
 from .._check import as_array, check_choice, check_range, check_shapes
+from .._typed import typed
 from ..cameras.camera import NEAR
 from ..gaussians import Gaussians
 from .cloud_colors import CloudColors, ColorBy, cloud_colors, seen_from
@@ -154,6 +155,14 @@ def to_pyvista(
     return cloud
 
 
+def cloud_of(name: str, actor: Any) -> Any:
+    """The mesh that an actor draws; a TypeError that names the argument if it is no actor."""
+    if not hasattr(actor, "mapper"):
+        raise TypeError(f"{name}: expected the actor of a cloud, got {type(actor).__name__}; add_cloud returns one")
+    return actor.mapper.dataset
+
+
+@typed
 def recolor_cloud(
     actor: pv.Actor,
     colors: Array,  # [N, 3] uint8
@@ -169,7 +178,7 @@ def recolor_cloud(
     Raises:
         ValueError: if numbers differ from the Gaussians, colours are not uint8, or opacities are out of [0, 1].
     """
-    cloud: Any = actor.mapper.dataset
+    cloud = cloud_of("actor", actor)
     count = int(cloud.field_data["count"][0])
     check_shapes(("colors", colors, ("N", 3)))
     if len(colors) != count or colors.dtype != np.uint8:

@@ -10,6 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from .._check import as_array, check_range, check_shapes
+from .._typed import typed
 from ..labels import Selection
 from .figures import INK, LINES, Array, axes_for, finish
 from .palette import palette
@@ -26,6 +27,7 @@ WIDE = 88  # letters per line of the title
 CLOSEST = 100  # the axis begins at the median distance divided by this, or later
 
 
+@typed
 def plot_scores(
     selection: Selection,
     path: str | Path | None = None,

@@ -10,7 +10,9 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from .._check import as_array, check_range
+from .._typed import typed
 from .cloud_colors import COLORMAP
+from .clouds import cloud_of
 from .pictures import LEGEND_INK, LEGEND_PAPER, check_names, legend_column
 
 if TYPE_CHECKING:
@@ -59,6 +61,7 @@ def add_legend(
     return pin_picture(plotter, draw)
 
 
+@typed
 def add_scalar_bar(plotter: pv.Plotter, cloud: pv.Actor | tuple[float, float], title: str = "score") -> Any:
     """Draw a colour bar with numbers in the lower right corner of the active subplot.
 
@@ -71,7 +74,7 @@ def add_scalar_bar(plotter: pv.Plotter, cloud: pv.Actor | tuple[float, float], t
     Raises:
         ValueError: if the cloud is not coloured by numbers, or two numbers do not ascend.
     """
-    clim = cloud if isinstance(cloud, tuple | list) else cloud.mapper.dataset.field_data.get("clim")
+    clim = cloud if isinstance(cloud, tuple | list) else cloud_of("cloud", cloud).field_data.get("clim")
     if clim is None:
         raise ValueError(
             "cloud: expected one coloured by scores or opacity, got one without a scale; use add_legend for labels"

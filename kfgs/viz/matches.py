@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from .._check import as_array, check_choice, check_shapes, check_whole
+from .._typed import typed
 from ..gaussians import Gaussians
 from ..labels import Transfer
 from .frusta import evenly
@@ -33,12 +34,14 @@ class Matches(NamedTuple):
     legend: Any
 
 
+@typed
 def match_states(transfer: Transfer) -> Array:  # [N] int64
     """The state of each destination: 0 matched, 1 ambiguous (labelled, but its sources disagree), 2 orphaned (no label)."""
     labelled = as_array(transfer.labels) >= 0
     return np.where(labelled, np.where(as_array(transfer.disagree), AMBIGUOUS, MATCHED), ORPHANED)
 
 
+@typed
 def add_matches(
     plotter: pv.Plotter,
     src: Gaussians,
@@ -88,6 +91,7 @@ def add_matches(
     return Matches(dots, lines, legend)
 
 
+@typed
 def add_transfer(
     plotter: pv.Plotter,
     src: Gaussians,

@@ -16,6 +16,7 @@ from torch.nn.functional import interpolate
 
 from .._check import as_array, check_range, check_shapes
 from .._files import as_path, atomic_path, check_inside, check_own
+from .._typed import typed
 from .palette import palette
 
 Array = np.ndarray[Any, Any]
@@ -193,6 +194,7 @@ def check_pictures(folder: Path, names: Iterable[str], writer: str) -> None:
         check_own(picture, is_drawn, writer)
 
 
+@typed
 def picture_grid(
     rows: Sequence[Sequence[Tensor | Array]],  # each [H, W, 3] in [0, 1] or uint8
     titles: Sequence[str] = (),

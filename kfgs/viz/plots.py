@@ -13,6 +13,7 @@ import numpy as np
 from torch import Tensor
 
 from .._check import as_array, check_shapes
+from .._typed import typed
 from .figures import (
     INK,
     LINES,
@@ -38,6 +39,7 @@ CLOCK = ("seconds",)  # not drawn by default: a nearly straight line
 COUNTS = {"size", "added", "pruned", "count", "gaussians"}  # whole numbers, drawn from zero
 
 
+@typed
 def plot_codebook_history(
     history: Sequence[Row], path: str | Path | None = None, *, ax: Sequence[Axes] | Array | None = None
 ) -> Figure:
@@ -54,6 +56,7 @@ def plot_codebook_history(
     return _plot_rows(history, path, ax, first="size", title="Codebook")
 
 
+@typed
 def plot_training(
     history: Sequence[Row],
     path: str | Path | None = None,
@@ -134,6 +137,7 @@ def plot_iou(
     return finish(axes, path)
 
 
+@typed
 def plot_quality_storage(
     points: Mapping[str, tuple[float, float]],
     path: str | Path | None = None,

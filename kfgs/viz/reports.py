@@ -13,6 +13,7 @@ from torch import Tensor
 from .._card import short_repr
 from .._check import check_shapes, check_whole
 from .._rows import unit_rows
+from .._typed import typed
 from ..labels import label_codewords
 from ..quant.fit_codebook import CodebookFit
 from .figures import (
@@ -139,6 +140,7 @@ def plot_codebook_report(
     return finish(first, path)
 
 
+@typed
 def plot_codebook_growth(
     histories: Mapping[str, Sequence[Row] | CodebookFit] | Sequence[Row] | CodebookFit,
     path: str | Path | None = None,

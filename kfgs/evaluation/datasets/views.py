@@ -9,6 +9,7 @@ from typing import Literal
 from torch import Tensor
 
 from ..._check import check_choice
+from ..._typed import typed
 from ...scenes.files import some
 from ...scenes.scene import Scene
 from ..method import View
@@ -16,6 +17,7 @@ from ..segmentation import load_label_map
 from ..truth import LabelTruth, MaskTruth
 
 
+@typed
 def truth_views(scene: Scene, truth: LabelTruth | MaskTruth, size: Literal["truth", "scene"] = "truth") -> list[View]:
     """The views of a scene that have ground truth, in the order of the truth, as protocols take them.
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..._check import check_shapes
 from ..._rows import EPS, row_norms, unit_embeddings, unit_rows
+from ..._typed import typed
 from ...gaussians import Gaussians
 from ...splat import rasterize
 from ..method import CHUNK, View
@@ -39,6 +40,7 @@ class Level:
         return self.gaussians.features
 
 
+@typed
 class SplattedMethod:
     """A field of another program as a `Method`: its values are splatted by kfgs's own engine, its decoder is applied.
 

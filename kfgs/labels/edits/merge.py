@@ -6,12 +6,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..._typed import typed
 from ...formats.splat_file import SplatFile
 from ...gaussians import Gaussians
 
 _ALWAYS = ("means", "quats", "scales", "opacities")
 
 
+@typed
 def join(first: SplatFile, second: SplatFile) -> SplatFile:
     """The Gaussians of two clouds, the first before the second; dtype, device and `info` are those of the first.
 

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from ..._check import check_shapes, check_whole
+from ..._typed import typed
 from . import ops
 from .contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Ranked, Splats, Tiles
 from .cpu.memory import free_memory
@@ -24,6 +25,7 @@ __all__ = [
 ]
 
 
+@typed
 def composite(
     means2d: Tensor,  # [M, 2] pixels (x, y)
     conics: Tensor,  # [M, 3] (a, b, c)
@@ -73,6 +75,7 @@ def composite(
     return maps, alphas
 
 
+@typed
 def rank_channels(
     means2d: Tensor,  # [M, 2]
     conics: Tensor,  # [M, 3]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 from torch import Tensor
 
 from ..._check import check_choice
+from ..._typed import typed
 from ...cameras import Camera
 from ...formats import SplatFile
 from ...gaussians import Gaussians
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 Where = Literal["auto", "window", "browser", "notebook", "picture"]
 
 
+@typed
 def explore(
     source: SemanticField | SplatFile,
     color: Gaussians | SplatFile | None = None,
@@ -67,6 +69,8 @@ def explore(
     check_choice("where", where, get_args(Where))
     place = find_place() if where == "auto" else where
     check_place(place)
+    if not isinstance(source, SplatFile) and not hasattr(source, "cosines"):
+        raise TypeError(f"source: expected a SemanticField or a SplatFile, got {type(source).__name__}; pass one")
     if not cameras and not isinstance(source, SplatFile):
         cameras = source.cameras
     meaning = meaning_of(source, classes, cameras=cameras, embed=embed)

@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image
 
 from ..._check import check_choice
+from ..._typed import typed
 from ...cameras import Camera
 from ...cameras.camera import NEAR
 from ..camera_view import camera_of, letterboxed, look_through
@@ -40,6 +41,7 @@ MANY = 150_000  # Gaussians: a frame of them takes half a second in software
 HIGHLIGHT = np.array((255, 120, 0))  # tints a selection shown in its own colours: a white sofa is hard to see on white
 
 
+@typed
 class Explorer:
     """Both clouds side by side, with methods that change the question, the colours and the picked Gaussian.
 

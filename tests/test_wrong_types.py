@@ -1,0 +1,120 @@
+"""Every public function and class refuses arguments of wrong kinds by TypeError, ValueError or OSError, by no other error."""
+
+import importlib
+import inspect
+import warnings
+from contextlib import suppress
+
+import pytest
+import torch
+from cases_search import scene
+from messages import tells
+from test_public import PACKAGES
+
+import kfgs
+from kfgs import Camera, CodebookConfig, SharedCodebook, SplatFile
+from kfgs.features import FeatureFolder
+
+FIELD = scene([("chair", 0.0)])
+GOOD = {
+    "Gaussians": FIELD.gaussians,
+    "SemanticField": FIELD,
+    "Camera": Camera.look_at((0, -4, 0), (0, 0, 0)),
+    "LabelSet": FIELD.words,
+    "SplatFile": SplatFile(FIELD.gaussians),
+}
+"""What is passed for a first parameter of this type, so that the second one is looked at, too."""
+WRONG = (None, "x", 1.5, [], torch.zeros(0), object())
+RIGHT = {("make_toy_room", "x")}  # a name for a folder: it makes a room there
+
+
+def public():
+    """All callables of kfgs and its packages, each once; without errors, protocols and aliases of types."""
+    found = {}
+    for package in ("kfgs", *PACKAGES):
+        module = importlib.import_module(package)
+        for name in module.__all__:
+            value = getattr(module, name)
+            odd = inspect.isclass(value) and (issubclass(value, BaseException) or getattr(value, "_is_protocol", False))
+            if (inspect.isfunction(value) or inspect.isclass(value)) and not odd:
+                found.setdefault(id(value), pytest.param(value, id=f"{package}.{name}"))
+    return list(found.values())
+
+
+def calls(function, wrong):
+    """Arguments that are all wrong, and those after a right first one."""
+    parameters = inspect.signature(function).parameters.values()
+    plain = [one for one in parameters if one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD)]
+    needed = sum(one.default is one.empty for one in plain)
+    named = {one.name: wrong for one in parameters if one.kind is one.KEYWORD_ONLY and one.default is one.empty}
+    if plain:
+        yield [wrong] * max(1, needed), named
+        kinds = str(plain[0].annotation).split(" | ")
+        for good in (value for kind, value in GOOD.items() if kind in kinds and len(plain) > 1):
+            yield [good, *[wrong] * max(1, needed - 1)], named
+
+
+@pytest.mark.parametrize("function", public())
+def test_wrong_kinds_are_refused_in_words(function, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for wrong in WRONG:
+        if isinstance(wrong, str) and (function.__name__, wrong) in RIGHT:
+            continue
+        for arguments, named in calls(function, wrong):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                with suppress(TypeError, ValueError, OSError):
+                    function(*arguments, **named)
+
+
+def test_every_public_name_is_called():
+    called = {one.values[0] for one in public()}
+    left = [name for name in kfgs.__all__ if getattr(kfgs, name) not in called]
+    assert left == ["SceneError", "Teacher"]
+    assert len(called) > 300
+
+
+@pytest.mark.parametrize(
+    ("call", "parts"),
+    [
+        (lambda: SplatFile(FIELD.gaussians, extra=None), ("extra: expected", "dict")),
+        (lambda: FeatureFolder(".", level=torch.zeros(2)), ("level",)),
+        (lambda: kfgs.label_set_from_examples(FIELD, [1]), ("examples: expected", "dict", "list")),
+        (lambda: kfgs.evaluate_segmentation(len, [1], "ab"), ("truth: expected", "dict", "list")),
+        (lambda: kfgs.evaluate_segmentation(len, torch.zeros(2), ["a"]), ("truth: expected", "dict", "Tensor")),
+        (
+            lambda: kfgs.evaluate_segmentation(lambda stem: None, {"a": torch.zeros(2, 2).long()}, ["a"]),
+            ("predict", "'a'", "NoneType"),
+        ),
+        (lambda: Camera.look_at(None, (0, 0, 0)), ("eye: expected", "NoneType")),
+        (lambda: kfgs.load_teacher([]), ("teacher: expected a name", "list")),
+        (lambda: kfgs.plan_scene(None), ("scene: expected a Scene", "NoneType", "load_scene")),
+        (lambda: kfgs.score_views(None, None), ("gaussians: expected", "NoneType")),
+        (lambda: SharedCodebook(torch.eye(3)).nearest(torch.eye(3), linear=True), ("linear: expected", "bool")),
+        (lambda: SharedCodebook(torch.eye(3)).extended(torch.eye(3), linear=True), ("linear: expected", "bool")),
+        (
+            lambda: kfgs.attach(FIELD, GOOD["SplatFile"], FIELD.words, cameras="x"),
+            ("cameras: expected", "Sequence", "str"),
+        ),
+        (
+            lambda: kfgs.attach(FIELD, GOOD["SplatFile"], FIELD.words, cameras=torch.zeros(3)),
+            ("cameras: expected", "Tensor"),
+        ),
+        (
+            lambda: kfgs.attach(FIELD, GOOD["SplatFile"], FIELD.words, cameras=["a"]),
+            ("cameras[0]: expected a Camera", "str"),
+        ),
+        (lambda: CodebookConfig(grid_step=torch.zeros(0)), ("grid_step: expected", "Tensor")),
+        (lambda: CodebookConfig(adaptive=torch.zeros(0)), ("adaptive: expected True or False", "Tensor")),
+    ],
+)
+def test_the_argument_is_named(call, parts):
+    with pytest.raises((TypeError, ValueError), match=tells(*parts)):
+        call()
+
+
+def test_the_maps_of_no_scene(tmp_path):
+    with pytest.raises((TypeError, ValueError), match=tells("scene: expected a Scene", "NoneType")):
+        FeatureFolder(tmp_path).of(None)
+    with pytest.raises(TypeError, match=tells("scene: expected a Scene", "str", "load_scene")):
+        kfgs.pictures_of("S")
