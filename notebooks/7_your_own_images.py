@@ -74,10 +74,12 @@ def draw_cameras(plotter):
     viz.add_camera_images(plotter, scene.cameras, scene.image, size=0.25 * scene.extent, most=10)
 
 
-orbit = Orbit(frames=8, size=(420, 640), elevation_degrees=40, zoom=1.4)
+orbit = Orbit(frames=8, size=(420, 640), elevation_degrees=40, zoom=1.1)
 everything = torch.cat([points, torch.stack([one.center for one in scene.cameras]).to(points)])
-outside = orbit_cameras(everything, orbit, up=estimate_up(scene.cameras))
-Image.fromarray(viz.draw_view(outside[1], draw_cameras))
+around = orbit_cameras(everything, orbit, up=estimate_up(scene.cameras))
+ahead = scene.cameras[0].viewmat[2, :3]  # where the first camera looks
+outside = max(around, key=lambda one: float(one.viewmat[2, :3] @ ahead.to(one.viewmat)))
+Image.fromarray(viz.draw_view(outside, draw_cameras))
 
 # %% [markdown]
 # ## A teacher
