@@ -86,6 +86,12 @@ class Gaussians:
     def __getitem__(self, which: Any) -> Gaussians:
         return self.select(which)
 
+    def __array__(self, *args: Any, **kwargs: Any) -> Array:
+        """None: without it, NumPy would look into g[0][0][0]... for numbers."""
+        raise TypeError(
+            "gaussians: expected an array, got Gaussians, which hold several; to_numpy() gives them by name"
+        )
+
     if not TYPE_CHECKING:  # so that a type checker still finds misspelt names
 
         def __getattr__(self, name: str) -> Any:
@@ -112,19 +118,7 @@ class Gaussians:
             TypeError: if it is neither a mask nor whole numbers.
             IndexError: if there is no such Gaussian.
         """
-        if isinstance(which, int | np.integer) and not isinstance(which, bool) and not -len(self) <= which < len(self):
-            raise IndexError(f"which: expected an index below {len(self)} (the number of Gaussians), got {which}")
-        if isinstance(which, slice):
-            which = torch.from_numpy(np.arange(*which.indices(len(self))))
-        elif not isinstance(which, Tensor):
-            which = torch.as_tensor(np.asarray(getattr(which, "mask", which)))
-            which = which.long() if which.numel() == 0 and which.dtype != torch.bool else which
-        if which.dtype == torch.bool and which.shape != self.opacities.shape:
-            raise ValueError(f"which: expected a mask [N] with N = {len(self)}, got {tuple(which.shape)}")
-        if which.is_floating_point():
-            raise TypeError(f"which: expected a mask or whole numbers, got {which.dtype}; compare first, as in x > 0.5")
-        index = which.to(self.means.device)
-        index = index.reshape(-1) if index.ndim == 0 else index
+        index = as_rows("which", which, len(self)).to(self.means.device)
         return Gaussians(**{name: value[index] for name, value in self._tensors().items()})
 
     def to(self, *args: Any, **kwargs: Any) -> Gaussians:
@@ -159,6 +153,38 @@ class Gaussians:
                     "add or drop them with replace()"
                 )
         return Gaussians(**{name: torch.cat([part._tensors()[name] for part in parts]) for name in names})
+
+
+def as_rows(name: str, which: Any, count: int) -> Tensor:  # [count] bool, or [n] whole numbers
+    """Which of `count` Gaussians, in any form that `Gaussians.select` takes, as a tensor to index with.
+
+    It is looked at before anything walks through it: a cloud can be indexed for ever, g[0][0][0]...
+
+    Raises:
+        ValueError: if a mask is not [count].
+        TypeError: if it is neither a mask nor whole numbers.
+        IndexError: if there is no such Gaussian.
+    """
+    which = getattr(which, "mask", which)
+    if isinstance(which, slice):
+        return torch.from_numpy(np.arange(*which.indices(count)))
+    rows = which
+    if not isinstance(which, Tensor):
+        numbers = isinstance(which, int | np.integer | list | tuple | range) or hasattr(which, "__array__")
+        if isinstance(which, Gaussians) or not numbers:
+            got = type(which).__name__
+            raise TypeError(f"{name}: expected a mask or whole numbers, got {got}; pass a Selection, a mask or indices")
+        rows = as_tensor(name, which)
+        rows = rows.long() if rows.numel() == 0 and rows.dtype != torch.bool else rows
+    if rows.dtype == torch.bool and rows.shape != (count,):
+        raise ValueError(f"{name}: expected a mask [N] with N = {count}, got {tuple(rows.shape)}")
+    if rows.is_floating_point() or rows.is_complex():
+        raise TypeError(f"{name}: expected a mask or whole numbers, got {rows.dtype}; compare first, as in x > 0.5")
+    if rows.ndim == 0:
+        rows = rows.reshape(-1)
+        if not -count <= int(rows) < count:
+            raise IndexError(f"{name}: expected an index below {count} (the number of Gaussians), got {int(rows)}")
+    return rows
 
 
 def check_gaussians(value: object, name: str = "gaussians") -> None:

@@ -13,9 +13,11 @@ from small_room import make_room
 
 import kfgs.pipeline.color as color_module
 from kfgs.cli import main
+from kfgs.cli.splats import _file_name
 from kfgs.evaluation import load_label_set
 from kfgs.fields import SemanticField
 from kfgs.formats import read_splats, write_splats
+from kfgs.formats.ply import read_ply
 from kfgs.formats.sidecar import names_path
 from kfgs.labels.edits import EditList
 from kfgs.pipeline.color import Photos
@@ -377,3 +379,45 @@ def test_convert_keeps_classes(labelled, tmp_path, name, capsys):
     assert counts[0] == counts[1]
     for path in (tmp_path / "new").iterdir():
         assert str(path) in said
+
+
+def test_convert_writes_a_plain_ply_with_the_classes_beside_it(labelled, tmp_path, capsys):
+    out = tmp_path / "plain.ply"
+    assert main(["convert", str(labelled), str(out), "--plain"]) == 0
+    assert f"{out}.labels.npz" in capsys.readouterr().out
+    assert "class_id" not in read_ply(out)
+    before, after = read_splats(labelled), read_splats(out)
+    assert after.classes == before.classes
+    assert torch.equal(after.gaussians.labels, before.gaussians.labels)
+
+
+def test_convert_by_class_writes_a_plain_file_for_each_class(labelled, tmp_path, capsys):
+    cloud, out = read_splats(labelled), tmp_path / "objects"
+    words = ["convert", str(labelled), str(out), "--by-class"]
+    assert main(words) == 0
+    assert main(words) == 0  # its own files may be replaced
+    said = capsys.readouterr().out
+    counts = {path.name: len(read_splats(path)) for path in out.iterdir()}
+    labels = cloud.gaussians.labels
+    assert counts.pop("unlabelled.ply", 0) == int((labels < 0).sum())
+    assert counts[f"05_{cloud.classes[5]}.ply"] == int((labels == 5).sum())
+    assert sum(counts.values()) == int((labels >= 0).sum())
+    for name in counts:
+        assert {"class_id", "score"}.isdisjoint(read_ply(out / name))
+        assert name in said
+    assert "note:" not in said
+
+
+def test_convert_by_class_replaces_no_file_of_others(labelled, tmp_path, capsys):
+    theirs = tmp_path / "05_chair.ply"
+    theirs.write_bytes(b"mine")
+    assert main(["convert", str(labelled), str(tmp_path), "--by-class"]) == 1
+    assert str(theirs) in capsys.readouterr().err
+    assert theirs.read_bytes() == b"mine"
+    assert [path.name for path in tmp_path.iterdir()] == [theirs.name]
+
+
+def test_names_of_files_by_class():
+    assert [_file_name(i, ["a/b", "a b", "..", "été"]) for i in range(-1, 5)] == [
+        "unlabelled.ply", "00_a_b.ply", "01_a_b.ply", "02.ply", "03_été.ply", "04.ply",
+    ]  # fmt: skip

@@ -18,6 +18,7 @@ SHOWN = [
     "notebooks/6_inspect_in_pyvista.py",
     *sorted(str(path.relative_to(REPOSITORY)) for path in REPOSITORY.glob("docs/[ch]o*/*.md")),
     "docs/quickstart.md",
+    "docs/guide.md",
     "docs/faq.md",
     "docs/compare.md",
 ]

@@ -177,7 +177,7 @@ def test_each_output_of_edit_has_its_own_edits(splat, tmp_path):
 def test_a_comparison_puts_no_picture_over_one_of_the_scene(room, run, other, capsys):
     before = files(room)
     words = ["compare", run / "field", other, "--scene", room, "--out", room / "images"]
-    refused(words, capsys, room / "images", "move it away")
+    refused(words, capsys, room / "images", "pictures and feature maps")
     assert files(room) == before
 
 

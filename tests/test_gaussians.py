@@ -8,6 +8,7 @@ import pytest
 import torch
 from messages import tells
 
+from kfgs._check import as_tensor
 from kfgs.cameras import Camera, Similarity
 from kfgs.formats import read_splats, write_splats
 from kfgs.gaussians import Gaussians
@@ -268,3 +269,18 @@ def test_gaussians_of_mixed_types_give_the_same_or_name_what_differs(dtype, chos
         else:
             assert (set(NUMBERS) - set(unused)) & set(chosen), f"{name}: {refused}"
             assert re.search(tells("gaussians.", "expected torch.", "got torch.", "convert"), refused), name
+
+
+def test_a_cloud_is_no_index_and_no_array():
+    """Each of them would walk into g[0][0][0]... for ever; one ended Python."""
+    g = cloud(4)
+    for wrong in (g, "ab", {"a": 1}, None):
+        with pytest.raises(TypeError, match=tells("which: expected a mask or whole numbers", "Selection")):
+            g.select(wrong)
+    with pytest.raises(TypeError, match=tells("which", "list")):
+        g[[g]]
+    for made in (g, [g], [[g]]):
+        with pytest.raises(TypeError, match=tells("to_numpy")):
+            np.asarray(made)
+        with pytest.raises(TypeError, match=tells("means: expected", type(made).__name__)):
+            as_tensor("means", made)

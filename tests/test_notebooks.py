@@ -19,7 +19,7 @@ pytest.importorskip("ipykernel", reason='the notebooks need: pip install "kfgs[n
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
 if not (NOTEBOOKS / "run.py").is_file():  # a source distribution comes without them
     pytest.skip(f"no folder {NOTEBOOKS}", allow_module_level=True)
-SOURCES = sorted(NOTEBOOKS.glob("[0-9]*_*.py"))
+SOURCES = sorted(NOTEBOOKS.glob("[0-9]*_*.py"), key=lambda path: int(path.name.split("_")[0]))
 OWN_DATA = "# your own data"
 IMPORTS = (ast.Import, ast.ImportFrom)
 

@@ -1,4 +1,4 @@
-"""The Python examples of the README run as they are written, on a small room; only the schedule is shortened."""
+"""The Python of the README and of the guide runs as it is written, on a small room; only the schedule is shortened."""
 
 import re
 from dataclasses import replace
@@ -15,14 +15,19 @@ from kfgs import FitConfig, SemanticField, UpliftConfig, load_label_set, load_sc
 from kfgs.fields import remember
 
 SHORT = FitConfig(uplift=UpliftConfig.field(max_gaussians=2_000))
-README = Path(kfgs.__file__).parents[1] / "README.md"
+ROOT = Path(kfgs.__file__).parents[1]
+README, GUIDE = ROOT / "README.md", ROOT / "docs" / "guide.md"
+
+
+def python_of(page):
+    return re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
 
 
 @pytest.fixture(scope="module")
 def examples():
     if not README.is_file():
         pytest.skip("kfgs is installed without its repository: no README.md beside it")
-    return re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    return python_of(GUIDE)
 
 
 @pytest.fixture(scope="module")
@@ -75,3 +80,16 @@ def test_the_example_of_a_teacher_runs_with_a_tiny_lseg(examples, tmp_path, monk
     words = load_label_set("scene/text.safetensors")
     assert words.names == ("wall", "floor", "chair")
     assert words.info["teacher"]["name"] == "lseg"
+
+
+def test_the_ten_lines_of_the_readme_run(examples, desk, tmp_path, monkeypatch):
+    [code] = python_of(README)
+    assert len([line for line in code.splitlines() if line.strip()]) <= 10
+    for name in ("scene", "features", "my.spz"):
+        (tmp_path / name).symlink_to(desk / name)
+    monkeypatch.chdir(tmp_path)
+    known = {"SHORT": SHORT}
+    exec(code.replace("kfgs.FitConfig.cpu()", "SHORT"), known)
+    assert known["labels"].shape == known["scene"].cameras[0].size
+    assert len(known["chair"]) > 0
+    assert len(read_splats("edited.ply")) < len(known["splat"])

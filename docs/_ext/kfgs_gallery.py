@@ -16,7 +16,8 @@ No executed notebook lies in `notebooks/` of this checkout. `python notebooks/ru
 
 def bring(notebooks: Path, pages: Path) -> list[str]:
     """Copy the notebooks to where Sphinx reads, write the list of them, and return their names."""
-    found = {path.name: path.read_bytes() for path in sorted(notebooks.glob("[0-9]*.ipynb"))}
+    paths = sorted(notebooks.glob("[0-9]*_*.ipynb"), key=lambda path: int(path.name.split("_")[0]))
+    found = {path.name: path.read_bytes() for path in paths}
     for old in pages.glob("*.ipynb"):
         if old.name not in found:
             old.unlink()

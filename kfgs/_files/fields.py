@@ -11,6 +11,8 @@ from .paths import as_path
 
 DESCRIPTION = "field.json"
 """In the folder of a field; it holds the digest of the numbers."""
+NUMBERS = "field.safetensors"
+"""Beside it."""
 SUFFIX = ".kfgs.safetensors"
 """Of a field in one file."""
 KEPT = "field@"

@@ -32,6 +32,16 @@ def real_path(path: str | Path) -> Path:
     return Path(os.path.realpath(as_path(path)))
 
 
+def noted_path(place: Path, noted: str) -> Path:
+    """The absolute form of a path that is relative to a folder. Links are resolved first: it is noted of the real folder."""
+    return Path(os.path.normpath(real_path(place) / noted))
+
+
+def utf8(name: str) -> str:
+    """A name of a file as text that can be saved: bytes that are no UTF-8 are written as backslashes and digits."""
+    return name.encode(errors="backslashreplace").decode()
+
+
 def check_output(
     name: str,
     path: str | Path,

@@ -31,10 +31,12 @@ from .features import features, plan
 from .fit import color, demo, fit, sfm, uplift
 from .output import called, open_streams, said_on_stderr, said_whole, say, warnings_as_notes
 from .pack import pack
-from .query import info, label, segment, select
+from .places import checked
+from .query import info, label, select
 from .render import render
 from .runs import runs
 from .search import search
+from .segment import segment
 from .splats import attach, convert, edit
 from .text import text
 from .view import view
@@ -125,7 +127,9 @@ def _run(words: list[str], names: dict[str, str]) -> int:
         names |= _shown_names(command)
         command.__doc__ = re.sub(r"\n {8,}(?!kfgs)", " ", inspect.getdoc(command) or "")  # an option's text on one line
         about = _description(command)
-        tyro.cli(command, prog=f"kfgs {name}", description=about, args=given, config=STYLE, console_outputs=first())
+        tyro.cli(
+            checked(command), prog=f"kfgs {name}", description=about, args=given, config=STYLE, console_outputs=first()
+        )
     return 0
 
 

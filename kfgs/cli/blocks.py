@@ -10,7 +10,6 @@ from typing import Annotated
 import tyro
 
 from .._files import check_output, real_path
-from .files import inputs_of
 from .options import FieldMethod, Given, Maps, Positional, SceneFolder, Training, fit_config
 from .output import say, wrote
 
@@ -52,7 +51,7 @@ def blocks(
     from ..scale import fit_blocks, open_client, split_scene
     from ..scale.in_blocks import in_numbers
 
-    check_output("out", out, "a folder", apart=inputs_of(scene), other=[maps.features])
+    check_output("out", out, "a folder")
     config = fit_config(
         FieldMethod(),
         seed=training.seed,

@@ -45,7 +45,6 @@ def features(
         device: Where the teacher runs: auto (a GPU if there is one), cpu or cuda.
     """
     from ..features import FeatureFolder, extract_features
-    from ..scenes.load import picture_folders
 
     if check is not None:
         for name, given in (("teacher", teacher.teacher), ("weights", teacher.weights), ("out", out)):
@@ -54,7 +53,7 @@ def features(
         check_alone("level", level, "without --check; it is of LangSplat's maps")
     target = out if out is not None else scene_folder(scene) / "features"
     if check is None:
-        check_output("out", target, "a folder", apart=picture_folders(scene, views.images))
+        check_output("out", target, "a folder")
     loaded = views.load(scene)
     if check is not None:
         found = FeatureFolder(check, level=level or "default").check(loaded, views.split)

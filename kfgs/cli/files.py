@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,19 +10,7 @@ from .._files import check_output, check_own, read_json, real_path
 # Heavy imports happen inside the functions, so that `kfgs --help` answers at once.
 
 
-def inputs_of(scene: Path | None, images: Path | None = None) -> Iterator[Path]:
-    """The folders of a scene (a folder, or its transforms.json) from which pictures and feature maps are read.
-
-    For the `apart` of `check_output`, which asks for them after its other checks.
-    """
-    from ..scenes.load import picture_folders
-
-    if scene is not None:
-        yield (scene if scene.is_dir() else scene.parent) / "features"
-        yield from picture_folders(scene, images)
-
-
-def check_target(name: str, target: Path, *sources: Path, apart: Iterable[Path] = ()) -> None:
+def check_target(name: str, target: Path, *sources: Path) -> None:
     """Raise a ValueError unless `target` can become a splat file that overwrites none of the sources; see `check_output`."""
     from ..formats import formats
 
@@ -33,7 +20,7 @@ def check_target(name: str, target: Path, *sources: Path, apart: Iterable[Path] 
             f"{name}: expected a file whose name ends in one of {', '.join(endings)}, got {target}; "
             "the ending chooses the format"
         )
-    check_output(name, target, "a file", apart=apart)
+    check_output(name, target, "a file")
     for source in sources:
         if real_path(target) == real_path(source):
             raise ValueError(f"{name}: expected another file than {source}, got the same; give another name")

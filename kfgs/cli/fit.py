@@ -11,7 +11,7 @@ from typing import Any, Literal
 from .._files import check_output, check_own, read_json, real_path
 from .._ranks import once
 from .features import check_discard, choose_teacher, stored_maps
-from .files import check_alone, inputs_of, is_field, open_field, open_splats
+from .files import check_alone, is_field, open_field, open_splats
 from .options import (
     CameraSearch,
     FieldMethod,
@@ -85,7 +85,7 @@ def sfm(
     from ..scenes import SfmConfig, extend_sfm, is_scene, link_images, load_scene, run_sfm, write_known_poses
     from ..scenes.pictures import is_video
 
-    check_output("out", out, "a folder", apart=inputs_of(onto), other=[images], inside=["sparse/0"])
+    check_output("out", out, "a folder", other=[images], inside=["sparse/0"])
     video = is_video(images)
     if not video:
         check_alone("fps", fps, "with photographs, which are all used")
@@ -203,7 +203,7 @@ def fit(
         check_alone("discard_sums", discard_sums, "with --method paper, which keeps none")
     config = dataclasses.replace(config, undistorted_features=maps.undistorted_features, device=training.device)
     config = dataclasses.replace(config, refit=refit, discard_sums=discard_sums)
-    check_output("out", out, "a folder", apart=inputs_of(scene, views.images), other=[maps.features])
+    check_output("out", out, "a folder")
     check_report(out)
     if method.method == "paper":
         check_alone("splat", splat, "with --method paper, which trains its own Gaussians")
@@ -276,7 +276,7 @@ def uplift(
     from ..pipeline import FitConfig
     from ..pipeline.fuse import uplift as uplift_scene
 
-    check_output("out", out, "a folder", apart=inputs_of(scene, views.images), other=[maps.features])
+    check_output("out", out, "a folder")
     check_place(out)
     as_taken = views.load(scene)
     loaded = as_taken.undistorted()
@@ -318,7 +318,7 @@ def color(
     from ..pipeline.compare import PhotoPictures
 
     check_whole("pictures", pictures, 0)
-    check_output("out", out, "a folder", apart=inputs_of(scene, views.images))
+    check_output("out", out, "a folder")
     config = {"quick": ColorConfig.quick, "cpu": ColorConfig.cpu, "paper": ColorConfig.paper}[preset]()
     training.say_idle()
     fields = config.field if training.steps is None else config.field.with_steps(training.steps)

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from .._files import check_output, real_path
+from .._files import check_output
 from .files import check_alone, open_field
 from .options import Classes, GivenPrecision, Positional
 from .output import say, wrote
@@ -57,8 +57,6 @@ def pack(
     classes.check_images()
     single = out.name.endswith(SUFFIX)
     check_output("out", out, "a file" if single else "a folder")
-    if real_path(out) == real_path(field):
-        raise ValueError(f"out: expected another place than {field}, got the same; give another name")
     check_place(out)
     if not single:
         check_alone("precision", precision, f"for a folder, which keeps every bit; a file ends in {SUFFIX}")

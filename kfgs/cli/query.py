@@ -1,4 +1,4 @@
-"""Commands that query a field or a labelled splat: select, segment, label, info."""
+"""Commands that query a field or a labelled splat: select, label, info."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .._files import atomic_folder, check_output, check_own, read_json, real_path
-from .files import check_alone, check_splat, inputs_of, is_field, open_field, open_splats
-from .options import Classes, Given, Positional, Teacher, remembered_scene
+from .files import check_alone, check_splat, is_field, open_splats
+from .options import Classes, Given, Positional, Rule, Teacher
 from .output import say, say_counts, wrote
 from .text import ask
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
-Rule = Literal["fused", "paper"]
 Negatives = Literal["auto", "classes", "canonical", "none"]
 Score = Literal["auto", "cosine", "softmax", "relevancy"]
 
@@ -60,7 +59,7 @@ def select(
     if not source.exists() and Path(query).exists():
         raise ValueError(f"query, source: expected a class, then a file, got {query!r}, {str(source)!r}; swap them")
     if out is not None:
-        check_output("out", out, "a folder", apart=inputs_of(classes.scene, classes.images))
+        check_output("out", out, "a folder")
         _check_older(out)
     if threshold is not None:
         check_range("threshold", threshold, 0, 1)
@@ -69,8 +68,6 @@ def select(
     counted = not asked_by_text and threshold is None  # parts are numbered as `kfgs edit` does
     if asked_by_text:
         field = classes.open_field("source", source)
-        if out is not None and classes.scene is None:
-            check_output("out", out, "a folder", apart=inputs_of(remembered_scene(field)))
         label_set, target = ask(query, classes, teacher, field)
         query = target if isinstance(target, str) else query
         how = None if score == "auto" else score
@@ -101,89 +98,6 @@ def select(
         for name in {"parts.png", "selection.ply.classes.json"} - set(written):
             (out / name).unlink(missing_ok=True)  # of an older selection
         wrote([out / name for name in written])
-
-
-def segment(
-    field: Positional[Path],
-    out: Path,
-    *,
-    split: str = "test",
-    labels: Given[Path] = None,
-    features: Given[Path] = None,
-    rule: Rule = "fused",
-    pictures: int = 4,
-    classes: Classes,
-) -> None:
-    """Segment the views of a scene with a field; score them if there are label pictures.
-
-    Examples:
-        kfgs segment run/field --out segmented/
-        kfgs segment run/field --out segmented/ --scene scene/ --text words.safetensors --split train
-
-    Args:
-        field: The folder that `kfgs fit` wrote (RUN/field).
-        out: Folder for label maps (predicted/ has class numbers, colored/ shows them in colours), pictures and scores.json.
-        split: Which views: train, test, or another split that SCENE/split.json names.
-        labels: Folder of true label pictures; SCENE/labels_scored or SCENE/labels when not given.
-        features: Folder of the teacher's maps, for the sheets; SCENE/features when not given, if it exists.
-        rule: fused: the classes of the field's Gaussians; paper: decode every pixel (Sec. 3.4), seconds a view.
-        pictures: How many views get pictures: a sheet (photo, truth, teacher, field, errors), an overlay and features.
-    """
-    from ..fields import recall_scene
-    from ..pipeline import score_scene, segment_scene, true_labels, write_report
-    from ..pipeline.apply import SEGMENTED
-    from ..viz import plot_iou, plot_largest_confusions
-    from ..viz.pictures import check_pictures
-
-    check_output("out", out, "a folder")
-    loaded_field = open_field("field", field)
-    scene = recall_scene(loaded_field.info, loaded_field.folder) if classes.scene is None else classes.scene
-    classes = dataclasses.replace(classes, scene=scene)
-    loaded, label_set = classes.load_scene().undistorted(), classes.load_classes()
-    folder = labels or next((scene / name for name in ("labels_scored", "labels") if (scene / name).is_dir()), None)
-    listed = scene / "classes.json"
-    if labels is None and folder is not None and listed.is_file() and tuple(read_json(listed)) != label_set.names:
-        say(f"note: not scored: {folder} counts the classes of {listed}, which are others; pass --classes {listed}")
-        folder = None
-    truth = {} if folder is None else true_labels(loaded, folder, split)
-    if labels is not None and not truth:
-        raise ValueError(
-            f"labels: expected pictures <stem>.png of the views of split {split!r} in {labels}, found none; "
-            "name the folder that holds them"
-        )
-    seen = set(loaded_field.info.get("views", ())) & {loaded.cameras[i].name for i in loaded.views(split)}
-    if seen:
-        say(f"note: the field was trained on {len(seen)} of these views")
-    if features is not None and not features.is_dir():
-        raise ValueError(f"features: expected a folder of feature maps, got {features}, which is none; name another")
-    maps = features or (scene / "features" if (scene / "features").is_dir() else None)
-    if truth:
-        check_own(out / "scores.json", lambda path: bool(read_json(path)["segmentation"]), "kfgs segment")
-        check_pictures(out, ("confusion", "iou"), "kfgs segment")
-    found = segment_scene(
-        loaded_field,
-        loaded,
-        label_set,
-        out,
-        split=split,
-        rule=rule,
-        pictures=pictures,
-        truth=truth,
-        maps=maps,
-        progress=True,
-    )
-    written = [out / name for name in SEGMENTED if (out / name).is_dir()]
-    if truth:
-        scores = score_scene(found, truth, label_set)
-        say(str(scores))
-        write_report(out / "scores.json", segmentation=scores, truth=str(folder), field=str(field), rule=rule)
-        picture = out / "confusion.png"
-        plot_largest_confusions(scores.confusion, list(label_set.names), picture, misses=scores.misses)
-        plot_iou(scores.iou, list(label_set.names), out / "iou.png")
-        written += [out / name for name in ("scores.json", "confusion.png", "iou.png")]
-    else:
-        say(f"note: no label pictures of split {split!r} to score against")
-    wrote(written)
 
 
 def label(
@@ -225,7 +139,7 @@ def label(
     ):
         if value is not None and needed is None:
             raise ValueError(f"{name}: expected --{other} with it, got none; it would have no effect")
-    check_output("out", out, "a folder", apart=inputs_of(classes.scene, classes.images))
+    check_output("out", out, "a folder")
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
     if cloud is not None and real_path(cloud) in {real_path(out / name) for name in ("gaussians.ply", "cloud.ply")}:

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from .._files import check_output
-from .files import inputs_of
-from .options import Classes, Given, Positional, Teacher
+from .options import Classes, Given, Positional, Teacher, Walk
 from .output import say, wrote
 from .view import open_colors, open_meaning
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
-Walk = Literal["orbit", "spiral", "cameras"]
 WORDS = "photo, labels, features or query=TEXT"
 OVERHEAD = "ceiling"  # left out of an orbit, which looks in from above
 
@@ -57,7 +55,7 @@ def render(
     from ..viz import save_animation
     from ..viz.animation import SUFFIXES, check_target
 
-    check_output("out", out, "a file", apart=inputs_of(classes.scene, classes.images))
+    check_output("out", out, "a file")
     if out.suffix.lower() not in SUFFIXES:
         raise ValueError(f"out: expected a name that ends in .gif or .mp4, got {out.name!r}; rename it")
     check_target(out, fps)
@@ -74,7 +72,7 @@ def render(
         semantic, colors = _opened(meaning.names, semantic, colors)
     words = [word.strip() for word in (show or ("labels" if colors is None else "photo,labels")).split(",")]
     shows = {_title(word): _show(word, meaning, semantic, colors) for word in words}
-    walk = _walk(path, (semantic if colors is None else colors).means, cameras, frames, width)
+    walk = walk_of(path, (semantic if colors is None else colors).means, cameras, frames, width)
     listed = semantic.labels.unique() if "labels" in words else None
     with tqdm(total=frames, desc="render", unit="frame") as bar:
         save_animation(
@@ -109,8 +107,8 @@ def _opened(names: Any, semantic: Any, colors: Any) -> tuple[Any, Any]:
     return shown, None if colors is None else shown if colors is semantic else kept(colors)
 
 
-def _walk(path: Walk, points: Any, cameras: list[Any], frames: int, width: int) -> list[Any]:
-    """The cameras of the film."""
+def walk_of(path: Walk, points: Any, cameras: list[Any], frames: int, width: int) -> list[Any]:
+    """The cameras of a path; those of the scene are needed for all but an orbit."""
     from ..cameras import Orbit, orbit_cameras, path_cameras, spiral_cameras
     from ..viz.films import KEYS
     from ..viz.linked import upwards

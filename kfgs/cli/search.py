@@ -100,7 +100,7 @@ def _up_to_date(known: Any) -> Any:
     if known.is_current():
         return known
     try:
-        known, changes = known.update(progress=True)
+        known, changes = known.update(progress=True, report=lambda line: say(f"note: {line}"))
     except (InUseError, OSError) as error:  # another process extends it, or the folder is read-only
         if len(known) == 0:
             raise

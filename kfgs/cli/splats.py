@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Sequence
 from itertools import accumulate
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any, Literal
 
 from .._files import check_output, check_own, read_json, real_path
 from .edit_syntax import Edits, check_parts, inserted_files, parse_edits
-from .files import check_alone, check_target, inputs_of, open_splats
+from .files import check_alone, check_splat, check_target, open_splats
 from .options import Classes, Flag, Given, GivenBy, Positional, SceneOption, Several
 from .output import say, say_counts, say_lost, wrote
 
@@ -60,7 +61,7 @@ def attach(
     from ..pipeline.attach import attach as attach_field
     from ..scenes import SceneError, load_scene
 
-    check_target("out", out, splats, apart=inputs_of(classes.scene, classes.images))
+    check_target("out", out)
     classes.check_images()
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
@@ -123,7 +124,7 @@ def edit(
     from ..pipeline.compare import views_of_edits, write_comparison
     from ..viz.pictures import check_pictures
 
-    check_target("out", out, splats, apart=inputs_of(scene.scene, scene.images))
+    check_target("out", out)
     saved = _edits_beside(out, replay)
     check_whole("pictures", pictures, 0)
     if scene.scene is not None and pictures:
@@ -159,26 +160,68 @@ def edit(
     wrote(paths)
 
 
-def convert(source: Positional[Path], target: Positional[Path]) -> None:
+def convert(source: Positional[Path], target: Positional[Path], *, plain: Flag = False, by_class: Flag = False) -> None:
     """Convert a splat file to another format. Classes are kept; losses of the new format are reported.
 
     Examples:
         kfgs convert edited.ply edited.spz
         kfgs convert scene.ksplat scene.ply
+        kfgs convert labelled.ply for_unity.ply --plain
+        kfgs convert labelled.ply objects/ --by-class
 
     Args:
         source: A .ply (3DGS, or SuperSplat's compressed), .splat, .ksplat, .spz, .sog, .glb or .gltf file.
         target: The file to write; its ending chooses the format (.ply, .compressed.ply, .splat, .spz, .sog, .glb, .gltf).
+        plain: Write a .ply with exactly the properties of Inria's 3DGS, for importers that fail on others. The classes go to
+            a file beside it, which kfgs finds again.
+        by_class: TARGET is a folder that receives one plain .ply for each class, 05_chair.ply for class 5.
     """
     from ..formats import write_splats
 
-    check_target("target", target, source)
+    if by_class:
+        check_alone("plain", plain, "with --by-class, whose files are plain")
+        return _convert_by_class(source, target)
+    check_target("target", target)
     splats = open_splats("source", source)
     say(repr(splats))
-    written = write_splats(target, splats)
+    written = write_splats(target, splats, plain=plain)
     say_lost(written)
     say(f"{_bytes_of(source) / 2**10:,.1f} KiB -> {_bytes_of(target) / 2**10:,.1f} KiB")
     wrote(written.paths)
+
+
+def _convert_by_class(source: Path, folder: Path) -> None:
+    """One plain PLY for each class of a splat. The class is in the name of its file, so there is nothing beside it."""
+    from .._files import atomic_folder
+    from ..formats import write_splats
+    from ..formats.splat_file import SCORE
+
+    check_output("target", folder, "a folder")
+    splats = open_splats("source", source, labelled=True)
+    if len(splats) == 0:
+        raise ValueError(f"source: expected Gaussians to divide by class, got none in {source}; name another splat")
+    extra = {name: values for name, values in splats.extra.items() if name != SCORE}
+    parts = {_file_name(label, splats.classes): part for label, part in splats.replace(extra=extra).by_class().items()}
+    for name in parts:
+        check_splat(folder / name, "written by kfgs", "kfgs convert")
+        if real_path(folder / name) == real_path(source):
+            raise ValueError(
+                f"target: expected another folder than that of {source}, got {folder}; it would be overwritten"
+            )
+    with atomic_folder(folder) as new:
+        for name, part in parts.items():
+            written = write_splats(new / name, part.replace(gaussians=part.gaussians.replace(labels=None)), plain=True)
+            say(f"{name}: {len(part)} Gaussians")
+    say_lost(written)
+    wrote([folder / name for name in parts])
+
+
+def _file_name(label: int, classes: Sequence[str]) -> str:
+    """`05_chair.ply` for class 5; the number keeps names apart that differ only in what a file's name cannot hold."""
+    if label < 0:
+        return "unlabelled.ply"
+    word = re.sub(r"[^\w-]+", "_", classes[label]).strip("_")[:80] if label < len(classes) else ""
+    return f"{label:02d}_{word}.ply" if word else f"{label:02d}.ply"
 
 
 def _apply(edits: Any, splats: Any, asked: list[str]) -> Any:

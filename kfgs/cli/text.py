@@ -38,7 +38,7 @@ def text(
     In clicks.json each class has its examples: {"chair": [{"view": "a.png", "points": [[x, y]]}, {"view": "b.png",
     "box": [x0, y0, x1, y1]}, {"gaussians": [3, 14]}], ...}. A mask of Segment Anything is {"view": "a.png", "segmentation":
     {"size": ..., "counts": ...}}, or {"view": "a.png", "masks": "a.json", "index": 3} for one of a file. An annotations.json
-    in COCO's format will do, too: each category is a class.
+    in the format of COCO will do, too: each category is a class.
 
     Args:
         names: Words between commas, a .txt file (a class a line), or a .json file (a list). Synonyms follow a semicolon:

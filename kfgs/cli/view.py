@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .._files import check_output, check_own, real_path
-from .files import check_alone, check_joined, inputs_of, is_field, open_splats
+from .files import check_alone, check_joined, is_field, open_splats
 from .options import Classes, Given, Positional, Teacher
 from .output import say, wrote
+from .places import check_apart
 from .text import note_other_teacher, text_encoder
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -72,9 +73,9 @@ def view(
     place = "browser" if where == "auto" else where
     check_joined("source", source)
     if where in ("html", "picture") or out.exists():  # the others write only when asked
-        check_output("out", out, "a folder", apart=inputs_of(classes.scene, classes.images))
+        check_output("out", out, "a folder")
         _check_older(out, place)
-    read = functools.partial(_read, source, color, ask, distance, classes, teacher)
+    read = functools.partial(_read, source, color, ask, distance, out, classes, teacher)
     if place == "browser":
         key = functools.partial(_key, source, color, ask, distance, classes, teacher, display.show)
         _serve(read, key, source, out, classes, display)
@@ -138,15 +139,22 @@ def _check_drawing(place: Where) -> None:
 
 
 def _read(
-    source: Path, color: Path | None, ask: str | None, distance: float | None, classes: Classes, teacher: Teacher
+    source: Path,
+    color: Path | None,
+    ask: str | None,
+    distance: float | None,
+    out: Path,
+    classes: Classes,
+    teacher: Teacher,
 ) -> Any:
-    """The exploration."""
+    """The exploration, whose pictures and selections go to `out`."""
     from .._check import check_range
     from ..fields.store import find_field
     from ..viz.explorer import Exploration
 
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
+    check_apart("view", {"source": source, "color": color, "out": out, "classes": classes})
     classes.check_images()
     say("reading")
     found = find_field(source)

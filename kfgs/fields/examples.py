@@ -15,9 +15,14 @@ from .._check import check_shapes
 from .._files import as_path, read_json
 from .._rows import EPS, row_norms, unit_rows
 from ..cameras import Camera
+from ..gaussians import as_rows
 from ..labels import LabelSet
 from ..labels.polygons import decode_rle
 from .semantic_field import SemanticField
+
+LONGEST = 4096
+"""Pixels on the longer edge of the picture that is drawn of a view: larger ones, which a file may state in a few bytes, are
+drawn at this size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +111,11 @@ def read_examples(path: str | Path) -> dict[str, list[Example]]:
     """
     content = read_json(path)
     if not isinstance(content, dict) or not all(isinstance(shown, list) for shown in content.values()):
-        raise ValueError(f"{path}: expected an object of lists of examples by class name, got {type(content).__name__}")
+        wrong = [name for name, shown in content.items() if type(shown) is not list] if type(content) is dict else []
+        got = f"no list for {wrong[0]!r:.60}" if wrong else type(content).__name__
+        raise ValueError(
+            f'{path}: expected an object of lists of examples by class name, {{"chair": [...]}}, got {got}; correct it'
+        )
     return {
         name: [_read(f"{path}: {name!r}[{i}]", one, as_path(path).parent) for i, one in enumerate(shown)]
         for name, shown in content.items()
@@ -117,22 +126,33 @@ def _read(where: str, one: Any, folder: Path) -> Example:
     keys = set(one) if isinstance(one, dict) else set()
     try:
         if keys == {"gaussians"}:
-            return Picked([int(i) for i in one["gaussians"]])
+            return Picked(_list_of("gaussians", one["gaussians"], int))
+        if "view" in keys and not isinstance(one["view"], str):
+            raise ValueError(f"view: expected the name of a view, got {one['view']!r:.40}")
         if keys == {"view", "points"}:
-            return Clicks(str(one["view"]), [(float(x), float(y)) for x, y in one["points"]])
+            points = _list_of("points", one["points"], list)
+            return Clicks(one["view"], [_list_of("points", point, int | float, 2) for point in points])
         if keys == {"view", "box"}:
-            x0, y0, x1, y1 = map(float, one["box"])
-            return Box(str(one["view"]), (x0, y0, x1, y1))
+            return Box(one["view"], _list_of("box", one["box"], int | float, 4))
         if keys == {"view", "masks", "index"}:
-            return Mask(str(one["view"]), _mask_of_file(as_path(folder / one["masks"]), one["index"]))
+            return Mask(one["view"], _mask_of_file(as_path(folder / one["masks"]), one["index"]))
         if keys >= {"view", "segmentation"}:
-            return Mask(str(one["view"]), _decoded(one["segmentation"]))
-    except (TypeError, ValueError, OverflowError) as error:  # int(infinity)
+            return Mask(one["view"], _decoded(one["segmentation"]))
+    except (TypeError, ValueError) as error:
         raise ValueError(f"{where}: expected an example with numbers ({error}); see kfgs text --help") from error
     raise ValueError(
         f"{where}: expected 'view' with 'points', 'box', 'segmentation', or 'masks' and 'index'; or 'gaussians'; got "
         f"{sorted(keys) or type(one).__name__}; correct it"
     )
+
+
+def _list_of(name: str, values: Any, kind: Any, count: int | None = None) -> list[Any]:
+    """A list of JSON as it is, if all of it is of a kind; a bool is no number."""
+    good = isinstance(values, list) and all(isinstance(one, kind) and not isinstance(one, bool) for one in values)
+    if not good or count not in (None, len(values)):
+        what = {int: "whole numbers", list: "[x, y]"}.get(kind, f"{count} numbers")
+        raise ValueError(f"{name}: expected a list of {what}, got {values!r:.40}")
+    return list(values)
 
 
 def _mask_of_file(path: Path, index: object) -> Tensor:  # [H, W] bool
@@ -172,33 +192,36 @@ def _feature(field: SemanticField, example: Example, name: str) -> Tensor:  # [D
 
 
 def _of_gaussians(field: SemanticField, example: Any, name: str) -> Tensor:  # [n, D]
-    which = torch.as_tensor(example.indices)
+    which = as_rows(f"{name}.indices", example.indices, len(field))
     rows = which.nonzero()[:, 0] if which.dtype == torch.bool else which.long()
-    wrong = which.is_floating_point() or (which.dtype == torch.bool and len(which) != len(field))
-    if wrong or which.ndim != 1 or len(rows) == 0 or int(rows.min()) < 0 or int(rows.max()) >= len(field):
+    if rows.ndim != 1 or len(rows) == 0 or int(rows.min()) < 0 or int(rows.max()) >= len(field):
         raise ValueError(f"{name}: expected indices of the field's {len(field)} Gaussians, got {example.indices!r:.80}")
     return field.own_features(rows)
 
 
 def _of_pixels(field: SemanticField, example: Any, name: str) -> Tensor:  # [n, D]
     camera = _camera(field, example.view, name)
-    mask = torch.zeros(camera.size, dtype=torch.bool)
+    drawn = camera.fitted(LONGEST)
+    down, right = drawn.height / camera.height, drawn.width / camera.width  # 1 but for huge views
+    mask = torch.zeros(drawn.size, dtype=torch.bool)
     if isinstance(example, Mask):
         check_shapes((f"{name}.mask", example.mask, camera.size))
-        mask = example.mask.bool()
+        y, x = example.mask.nonzero(as_tuple=True)
+        mask[(y * down).long(), (x * right).long()] = True
     elif isinstance(example, Clicks):
         for x, y in example.points:
             if not (0 <= x < camera.width and 0 <= y < camera.height):
                 raise ValueError(f"{name}: expected points within {camera.width} x {camera.height}, got ({x:g}, {y:g})")
-            mask[int(y), int(x)] = True
+            mask[int(y * down), int(x * right)] = True
     else:
         x0, y0, x1, y1 = example.corners
         if not (0 <= x0 < x1 <= camera.width and 0 <= y0 < y1 <= camera.height):
             raise ValueError(
                 f"{name}: expected x0 < x1 and y0 < y1 within {camera.width} x {camera.height}, got {tuple(example.corners)}"
             )
-        mask[int(y0) : max(int(y1), int(y0) + 1), int(x0) : max(int(x1), int(x0) + 1)] = True
-    rendering = field.render(camera)
+        y0, y1, x0, x1 = int(y0 * down), int(y1 * down), int(x0 * right), int(x1 * right)
+        mask[y0 : max(y1, y0 + 1), x0 : max(x1, x0 + 1)] = True
+    rendering = field.render(drawn)
     rows = mask.to(rendering.alpha.device) & (rendering.alpha > 0)
     return field.decode(rendering.map[rows])
 

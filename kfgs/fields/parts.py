@@ -101,7 +101,7 @@ def classes_to_ask(field: Any, target: str | Tensor, negatives: Any) -> LabelSet
 
 def decode_latents(field: Any, latents: Tensor) -> Tensor:  # [..., d] -> [..., D]
     """See `SemanticField.decode`."""
-    if latents.shape[-1] != field.channels:
+    if latents.ndim == 0 or latents.shape[-1] != field.channels:
         raise ValueError(
             f"latents: expected [..., d] with d = {field.channels} (from gaussians), got {tuple(latents.shape)}; "
             "pass maps or features of this field"

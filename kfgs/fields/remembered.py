@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .._files import digest_file, real_path
+from .._files.paths import noted_path
 from ..labels import LabelSet, load_label_set
 
 CLASSES = ("classes.json", "text.npy"), ("classes.json", "text.safetensors"), ("text.safetensors",)
@@ -59,7 +60,7 @@ def recall_scene(info: dict[str, Any], folder: Path | None) -> Path:
     noted = info.get("scene")
     if not isinstance(noted, str) or folder is None:
         raise ValueError("scene: expected a field that remembers its scene, got one that does not; pass the scene")
-    path = _absolute(folder, noted)
+    path = noted_path(folder, noted)
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: no such folder, where this field's scene was; pass the scene")
     return path
@@ -78,7 +79,7 @@ def recall_classes(info: dict[str, Any], folder: Path | None) -> LabelSet:
             "classes: expected a label set, or a field that remembers the classes of its scene, got neither; pass "
             "the classes (in Python: load_label_set(names, embeddings))"
         )
-    files = [_absolute(folder, str(one["path"])) for one in noted]
+    files = [noted_path(folder, str(one["path"])) for one in noted]
     for file, one in zip(files, noted, strict=True):
         if not file.is_file():
             raise FileNotFoundError(f"{file}: no such file, where this field's classes were; pass the classes")
@@ -98,8 +99,3 @@ def _is_of(files: list[Path], channels: int) -> bool:
 
 def _relative(path: Path, field: Path) -> str:
     return Path(os.path.relpath(real_path(path), real_path(field))).as_posix()
-
-
-def _absolute(field: Path, noted: str) -> Path:
-    """The absolute form of a noted path. Links are resolved first: notes are relative to the field's real folder."""
-    return Path(os.path.normpath(real_path(field) / noted))

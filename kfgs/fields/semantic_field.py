@@ -16,7 +16,7 @@ from .._check import as_tensor, check_choice, typed
 from .._files import as_path
 from .._rows import unit_embeddings
 from ..cameras import Camera
-from ..gaussians import Gaussians
+from ..gaussians import Gaussians, as_rows
 from ..labels import Classification, CodewordLabels, LabelSet, Score, Selection, label_codewords, select_by_similarity
 from ..labels.questions import Classes, Negatives, check_rows, class_rows, make_question
 from ..quant import Autoencoder, Codebook, LinearLatents
@@ -152,7 +152,8 @@ class SemanticField:
             return parts.latent_cosines(self, unit)
 
     def own_features(self, rows: Tensor) -> Tensor:  # [n] int64 -> [n, D]
-        """The features of some Gaussians by the rule, in the teacher's space; all-zero if unknown."""
+        """The features of some Gaussians by the rule, all-zero if unknown. Rows and errors: see `Gaussians.select`."""
+        rows = as_rows("rows", rows, len(self)).to(self.features.device)
         if self.linear is not None:
             return self.linear.decode(self._own[rows])
         return self.decode(self.features[rows]) * self.known[rows, None]

@@ -14,6 +14,7 @@ from .._arrays import read_safetensors
 from .._check import check_choice
 from .._files import as_path, atomic_folder, atomic_path, current_file, digest_file, open_current, read_json, write_json
 from .._files.fields import DESCRIPTION as DESCRIPTION
+from .._files.fields import NUMBERS as TENSORS
 from .._files.fields import SUFFIX as SUFFIX
 from .._files.fields import describes_field as describes_field
 from .._tensors import save_tensors
@@ -21,6 +22,7 @@ from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels import LabelSet
 from ..quant import Autoencoder, Codebook, LinearLatents
+from ..scenes.files import PIXELS
 from .answers import Seen
 from .container import HEADER, pack_tensors, peek, unpack_tensors
 from .parts import check_parts
@@ -29,7 +31,6 @@ from .remembered import check_notes, rebased, recall_classes
 
 FORMAT, VERSIONS = "kfgs.semantic_field", (1, 2, 3)
 """Version 2 may hold linear latents, fused answers and cameras; version 3 the classes."""
-TENSORS = "field.safetensors"
 
 
 def find_field(path: str | Path) -> Path | None:
@@ -248,6 +249,11 @@ def _label_set(tensors: dict[str, Tensor], names: dict[str, Any]) -> LabelSet:
 def _cameras(rows: list[Any], tensors: dict[str, Tensor]) -> tuple[Camera, ...]:
     if not rows:
         return ()
+    for _, width, height, _ in rows:
+        if width * height > PIXELS:
+            raise ValueError(
+                f"cameras: expected at most {PIXELS:,} pixels, as a picture has, got {width:,} x {height:,}"
+            )
     both = zip(rows, tensors["viewmats"], tensors["Ks"], strict=True)
     return tuple(Camera(E, K, width, height, name, near=near) for (name, width, height, near), E, K in both)
 

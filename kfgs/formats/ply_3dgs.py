@@ -18,13 +18,14 @@ from ..gaussians import Gaussians
 from .ply import points_from_columns, read_comments, read_ply, stack_columns, write_ply
 from .render_mode import comments_of_mode, mode_from_comments
 from .splat_file import Columns, Precision, SplatFile
-from .values import check_finite, positive_scales
+from .values import check_finite, colours_to_write, describe_loss, positive_scales
 
 NAME = "ply"
 SUFFIXES = (".ply",)
 MAGIC = b"ply"
 HOLDS_LABELS = True
 NORMALS = ("nx", "ny", "nz")  # always zero in 3DGS files; written, not kept
+COEFFICIENTS = 16  # of harmonics of degree 3, which Inria's script always writes
 
 
 def matches(head: bytes) -> bool:
@@ -57,6 +58,19 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
     comments = ("written by kfgs", *comments_of_mode(splats.info))
     write_ply(path, columns_from_gaussians(splats.gaussians) | splats.extra, comments=comments)
     return ()
+
+
+def write_plain(path: Path, splats: SplatFile) -> tuple[str, ...]:
+    """Write the 62 properties of the files of Inria's script, no more and no fewer: harmonics up to degree 3, zero if unknown.
+
+    Some importers count properties, or cannot skip those that they do not know.
+    """
+    what = "a plain PLY"
+    g = colours_to_write(splats.gaussians, what)
+    assert g.sh is not None
+    whole = torch.nn.functional.pad(g.sh, (0, 0, 0, COEFFICIENTS - g.sh.shape[1]))
+    write(path, SplatFile(g.replace(sh=whole, features=None, labels=None), info=splats.info))
+    return describe_loss(splats, what, 3)
 
 
 def precision(gaussians: Gaussians) -> Precision:

@@ -64,15 +64,26 @@ class SplatFile:
         """A copy with some parts exchanged."""
         return replace(self, **changes)
 
-    def save(self, path: str | Path, *, format: str | None = None) -> Written:
+    def save(self, path: str | Path, *, format: str | None = None, plain: bool = False) -> Written:
         """Write the cloud in the format that the ending of `path` names; see `write_splats`, which this calls."""
-        return SplatFile._writer(path, self, format=format)
+        return SplatFile._writer(path, self, format=format, plain=plain)
 
     def select(self, which: Tensor) -> SplatFile:  # which: [N] bool or [n] int64
         """The Gaussians under a mask or an index, with their extra columns."""
         index = which.detach().cpu().numpy()
         extra = {name: np.ascontiguousarray(values[index]) for name, values in self.extra.items()}
         return replace(self, gaussians=self.gaussians.select(which), extra=extra)
+
+    def by_class(self) -> dict[int, SplatFile]:
+        """One cloud for each label that some Gaussian has, ascending; -1 is the cloud without a class.
+
+        Raises:
+            ValueError: if there are no labels.
+        """
+        labels = self.gaussians.labels
+        if labels is None:
+            raise ValueError("gaussians: expected labels, got none; `kfgs.attach` or `label_splats` gives them some")
+        return {label: self.select(labels == label) for label in labels.unique().tolist()}
 
 
 class Written(NamedTuple):

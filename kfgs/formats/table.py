@@ -11,6 +11,7 @@ A format is one module of this package with
 - `precision(gaussians) -> Precision`: the largest errors of a written cloud;
 - `HOLDS_LABELS`: whether the file stores `class_id` and `score`. If not, they go to a separate file (see `sidecar`, which
   also writes the class names of every labelled file);
+- `write_plain`, if files can be written without labels and other columns (PLY);
 - `SORTS = True`, if the format packs neighbours together: `write` keeps the given order, and `write_splats` passes Morton
   order;
 
@@ -114,7 +115,9 @@ def read_splats(path: str | Path) -> SplatFile:
 
 
 @typed
-def write_splats(path: str | Path, splats: SplatFile | Gaussians, *, format: str | None = None) -> Written:
+def write_splats(
+    path: str | Path, splats: SplatFile | Gaussians, *, format: str | None = None, plain: bool = False
+) -> Written:
     """Write a cloud in the format of the file's ending.
 
     **Convention**: formats that pack neighbours together (compressed PLY, SOG) store the Gaussians in Morton order, with
@@ -125,6 +128,8 @@ def write_splats(path: str | Path, splats: SplatFile | Gaussians, *, format: str
         path: the file; it is whole or absent. Its ending chooses the format.
         splats: a cloud with colours; its `labels`, `score` and class names are written too.
         format: a format's name, if the ending does not say it.
+        plain: write a PLY with exactly the 62 properties of Inria's 3DGS, for importers that fail on others. Classes and
+            `score` go to a file beside it, which `read_splats` finds; other columns and features are lost.
 
     Returns:
         The files written, what the format could not store, and the order.
@@ -132,18 +137,21 @@ def write_splats(path: str | Path, splats: SplatFile | Gaussians, *, format: str
     Raises:
         ValueError: if no format has this ending, or the format cannot be written or cannot store this cloud, or a value is
             NaN or infinite, a quaternion 0, a scale not positive, an opacity outside [0, 1] (both ends are allowed), or a
-            label has no name in `classes`. Nothing is written then.
+            label has no name in `classes`; or if `plain` is asked of another format, or of a cloud without colours. Nothing
+            is written then.
     """
     path = as_path(path)
     if isinstance(splats, Gaussians):
         splats = SplatFile(splats)
     module = _format_to_write(path, format)
+    if plain and not hasattr(module, "write_plain"):
+        raise ValueError(f"plain: expected it for a file that ends in .ply, got {path}; leave it out")
     check_splats(splats)
     order = morton_order(splats.gaussians.means) if getattr(module, "SORTS", False) else None
     if order is not None:
         splats = splats.select(order)
-    lost = module.write(path, splats)
-    beside = write_sidecar(path, splats, holds_labels=module.HOLDS_LABELS)
+    lost = module.write_plain(path, splats) if plain else module.write(path, splats)
+    beside = write_sidecar(path, splats, holds_labels=module.HOLDS_LABELS and not plain)
     return Written([path, *beside], tuple(lost), order)
 
 

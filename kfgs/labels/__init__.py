@@ -15,6 +15,7 @@ from .color import parse_color, recolor
 from .components import component_numbers
 from .edits import Duplicate, Edit, EditList, Extract, Insert, Move, Opacity, Recolor, Remove, Turn, join
 from .label_set import LabelSet, load_label_set
+from .meshes import LabelledMesh, label_mesh
 from .names import class_index, class_indices
 from .nearest import default_distance
 from .parts import Part, connected_parts, describe_selection
@@ -43,6 +44,7 @@ __all__ = [
     "InSphere",
     "Insert",
     "LabelSet",
+    "LabelledMesh",
     "Move",
     "Not",
     "OfClass",
@@ -67,6 +69,7 @@ __all__ = [
     "describe_selection",
     "join",
     "label_codewords",
+    "label_mesh",
     "label_pixels",
     "label_splats",
     "load_label_set",

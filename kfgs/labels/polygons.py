@@ -75,6 +75,19 @@ def decode_rle(segmentation: dict[str, Any]) -> Tensor:  # [H, W] bool
     return torch.from_numpy(np.ascontiguousarray(values.reshape(size[1], size[0]).T))
 
 
+def encode_rle(mask: Tensor) -> dict[str, Any]:  # [H, W] bool
+    """COCO's run lengths of a mask, as a list, which every program reads; `decode_rle` is the way back.
+
+    Example:
+        >>> encode_rle(torch.tensor([[False, True], [True, False]]))
+        {'size': [2, 2], 'counts': [1, 2, 1]}
+    """
+    flat = mask.detach().cpu().numpy().T.reshape(-1)
+    changes = np.flatnonzero(np.diff(flat.astype(np.int8), prepend=0))  # zeros come first
+    counts = np.diff(changes, prepend=0, append=len(flat))
+    return {"size": list(mask.shape), "counts": counts.tolist()}
+
+
 def _uncompressed(text: str) -> list[int]:
     """The numbers in COCO's text.
 

@@ -24,6 +24,7 @@ LOGIT_SCALES = {
     "lseg": 1 / 0.07,  # 14.2857, of LSeg's training
     "clip": 100.0,  # at the end of CLIP's training
 }
+Array = np.ndarray[Any, Any]
 Score = Literal["cosine", "softmax", "relevancy"]
 
 BINS = 128
@@ -161,7 +162,9 @@ def select_by_similarity(
     return Selection((scores > gamma) & known, scores, gamma, how)
 
 
-def similarity_threshold(scores: Tensor) -> tuple[float, str]:  # scores: [N]
+def similarity_threshold(
+    scores: Tensor, times: Tensor | None = None
+) -> tuple[float, str]:  # scores: [N], times: [N] int64
     """Choose gamma, a threshold between the highest mode of the scores and the rest, and say how it was found.
 
     A target is often a hundredth of the scene, and the rest has several modes. Otsu's threshold then cuts the rest in two
@@ -174,6 +177,10 @@ def similarity_threshold(scores: Tensor) -> tuple[float, str]:  # scores: [N]
     true label: room_0 (18 classes) 0.88, and 0.90 with the best threshold in hindsight; without a bound on the share and
     with Otsu's threshold if no gap is clear, 0.79. On the toy room (13 classes) 0.98.
 
+    Args:
+        scores: of the Gaussians.
+        times: how many Gaussians have each of the scores, all at least 1; None: one each.
+
     Returns:
         The threshold and one line that says how it was found. No scores give 1.0, all-equal scores their value. Selection
         is strict, so nothing is selected then.
@@ -181,24 +188,26 @@ def similarity_threshold(scores: Tensor) -> tuple[float, str]:  # scores: [N]
     values = scores.detach().double().cpu().numpy()
     if values.size == 0:
         return 1.0, "no scores: nothing to select"
+    weights = None if times is None else times.cpu().numpy()
+    count = values.size if weights is None else int(weights.sum())
     low, high = float(values.min()), float(values.max())
     if high - low < 1e-6:  # float32 cosines differ by this much through rounding alone
-        return high, f"all {values.size} scores are equal ({high:.3f}): nothing stands out"
-    counts, edges = np.histogram(values, bins=BINS, range=(low, high))
+        return high, f"all {count} scores are equal ({high:.3f}): nothing stands out"
+    counts, edges = np.histogram(values, bins=BINS, range=(low, high), weights=weights)
     centres = (edges[1:] + edges[:-1]) / 2
-    density = np.log10(1 + gaussian_filter1d(counts * (PER / values.size), SMOOTHING, mode="constant"))
+    density = np.log10(1 + gaussian_filter1d(counts * (PER / count), SMOOTHING, mode="constant"))
     highest_below = np.maximum.accumulate(density)
     highest_above = np.maximum.accumulate(density[::-1])[::-1]
     depth = np.minimum(highest_below, highest_above) - density
-    above = 1 - np.cumsum(counts) / values.size
+    above = 1 - np.cumsum(counts) / count
     parts = ((np.arange(BINS) >= _past_flank(density, above, share), clear) for share, clear in SHARES)
     candidates = [depth * part for part, clear in parts if (depth * part).max() >= clear]
     if not candidates:
-        median, top = np.quantile(values, (0.5, TOP))
+        median, top = _quantiles(values, weights, (0.5, TOP))
         threshold = float(median + WAY * (top - median))
         return threshold, (
             f"{WAY:.0%} of the way from the median {median:.3f} to the top {top:.3f}: no clear gap between modes of "
-            f"{values.size} scores; check the scores"
+            f"{count} scores; check the scores"
         )
     depth = candidates[0]
     deep = np.flatnonzero(depth >= depth.max() / 2)
@@ -207,10 +216,23 @@ def similarity_threshold(scores: Tensor) -> tuple[float, str]:  # scores: [N]
     floor = gap[density[gap] <= density[gap].min() + 1e-9]
     threshold = float(centres[floor].mean())
     sparser = 10 ** depth[gap].max()
-    return threshold, f"gap at {threshold:.3f}: {sparser:.0f} x sparser than the modes beside it ({values.size} scores)"
+    return threshold, f"gap at {threshold:.3f}: {sparser:.0f} x sparser than the modes beside it ({count} scores)"
 
 
-def _past_flank(density: np.ndarray[Any, Any], above: np.ndarray[Any, Any], share: float) -> int:
+def _quantiles(values: Array, times: Array | None, shares: tuple[float, ...]) -> Array:
+    """`np.quantile`, where each value counts several times."""
+    if times is None:
+        return np.asarray(np.quantile(values, shares))
+    order = np.argsort(values)
+    end = np.cumsum(times[order])  # of the run of equal values, if each were repeated
+    place = np.array(shares) * (end[-1] - 1)
+    below, above = (
+        values[order][np.searchsorted(end, rounded, side="right")] for rounded in (np.floor(place), np.ceil(place))
+    )
+    return np.asarray(below + (place - np.floor(place)) * (above - below))
+
+
+def _past_flank(density: Array, above: Array, share: float) -> int:
     """The first bin with at most `share` of the scores above it; if a mode rises there, the bin after its flank."""
     start = int(np.argmax(above <= share))
     while 0 < start < BINS and density[start] > density[start - 1]:

@@ -22,6 +22,7 @@ from .describe import describe
 from .evaluate import evaluate
 from .fit import fit_scene
 from .fuse import uplift
+from .label_pictures import segment_cameras, write_coco
 from .plan import Plan, plan_scene
 from .plan_maps import NamedTeacher
 from .question import Question, open_question
@@ -53,12 +54,14 @@ __all__ = [
     "save_labelled",
     "score_scene",
     "score_teacher",
+    "segment_cameras",
     "segment_scene",
     "select_labelled",
     "together",
     "true_labels",
     "uplift",
     "views_of_change",
+    "write_coco",
     "write_comparison",
     "write_report",
     "write_run_report",

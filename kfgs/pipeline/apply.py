@@ -52,6 +52,16 @@ def save_colored_labels(path: Path, labels: Tensor, names: Sequence[str]) -> Non
     _save_bytes(path, labels, colors.astype(np.uint8))
 
 
+def check_classes(field: SemanticField, classes: LabelSet) -> None:
+    """Check before any file is written that label pictures can hold the classes, and that the field knows their space."""
+    if len(classes) > VOID:
+        raise ValueError(
+            f"classes: expected at most {VOID} (label pictures hold a byte per pixel, {VOID} = none), got {len(classes)}; "
+            "segment with fewer classes, or call SemanticField.segment, which has no such limit"
+        )
+    class_rows(classes, field.dim, field.info)
+
+
 def _save_bytes(path: Path, labels: Tensor, colors: Array | None = None) -> None:
     picture = Image.fromarray(torch.where(labels < 0, VOID, labels).to(torch.uint8).cpu().numpy())
     if colors is not None:
@@ -99,12 +109,7 @@ def segment_scene(
     for name in SEGMENTED if pictures else SEGMENTED[:2]:
         check_output("out", out / name, "a folder", apart=apart, other=inputs)
         check_pictures(out, (f"{name}/{scene.stem(i)}" for i in scene.views(split)), "kfgs segment")
-    if len(classes) > VOID:
-        raise ValueError(
-            f"classes: expected at most {VOID} (label pictures hold a byte per pixel, {VOID} = none), got {len(classes)}; "
-            "segment with fewer classes, or call SemanticField.segment, which has no such limit"
-        )
-    class_rows(classes, field.dim, field.info)  # checks the classes before any file is written
+    check_classes(field, classes)
     for stem, known in (truth or {}).items():
         check_truth(known, len(classes), f"truth[{stem!r}]")
     views = scene.views(split)

@@ -168,6 +168,10 @@ def plan_scene(
     stored = find_stored(scene, config.split, folder, teacher)
     views, straight = scene.views(config.split), scene.undistorted()
     done = set() if run is None else finished_stages(straight, stored.maps, run, config)
+    notes = [] if stored.note is None else [stored.note]
+    if config.method == "fuse" and scene.splat is not None:
+        done = done | {"color"}
+        notes.append(f"the scene has its splat ({scene.splat}), so no colours are trained")
     sizes = Sizes(
         config=config,
         dense=dense,
@@ -177,7 +181,6 @@ def plan_scene(
         made=stored.there,
         done=frozenset(done),
     )
-    notes = [] if stored.note is None else [stored.note]
     if run is not None and not as_path(run).is_dir():
         notes.append(f"there is no folder {run} yet, so no stage is finished")
     if isinstance(teacher, NamedTeacher) and teacher.weights is not None and not sizes.missing:
@@ -240,7 +243,7 @@ def notes_on(sizes: Sizes) -> list[str]:
     ]
     if any(sizes.made) and sizes.dense != "recompute":
         found.append(f"{sum(sizes.made)} of {sizes.count} maps exist and are not made again")
-    if sizes.points < 2:
+    if sizes.points < 2 and "color" not in sizes.done:
         found.append(
             f"the scene has {sizes.points} points; `kfgs fit` triangulates some from the poses before it trains, which is not "
             "counted; after `kfgs sfm SCENE --out NEW` the plan of NEW is complete"

@@ -16,7 +16,17 @@ from typing import Any
 import torch
 
 from .._check import as_array, check_whole
-from .._files import as_path, check_inside, check_output, digest_file, locked, read_json, real_path, write_json
+from .._files import (
+    as_path,
+    check_inside,
+    check_output,
+    check_own,
+    digest_file,
+    locked,
+    read_json,
+    real_path,
+    write_json,
+)
 from .._rows import unit_rows
 from ..features import FeatureFolder
 from ..fields import SemanticField, sample_latents, select_gaussians
@@ -71,6 +81,7 @@ def split_scene(
         FileNotFoundError: if views have no maps.
         ValueError: if OUT holds another scene's blocks, or was cut from other maps, another splat or in another way; if another
             process cuts there; if OUT is the scene, or lies among its maps; if given latents do not fit to the maps.
+        FileExistsError: if OUT has files of these names, but no blocks: somebody else made them.
     """
     source, say = as_path(scene), report or (lambda text: None)
     maps_folder = source / "features" if features is None else as_path(features)
@@ -91,7 +102,7 @@ def split_scene(
     facts = {
         "format": FORMAT,
         "version": 1,
-        "scene": os.path.relpath(source, out),
+        "scene": os.path.relpath(real_path(source), real_path(out)),
         "features": os.path.relpath(real_path(maps_folder), real_path(out)),
         "splat": None if splat is None else digest_file(splat_file_of(splat)),
         "latents": digest_tensors(latents.basis) if isinstance(latents, LinearLatents) else latents,
@@ -245,8 +256,11 @@ def fit_blocks(
 
 
 def _check_same(out: Path, facts: dict[str, Any]) -> None:
-    """Raise a ValueError if the folder holds other blocks."""
-    if (out / BLOCKS).is_file() and read_json(out / BLOCKS) != facts:
+    """Raise a ValueError if the folder holds other blocks, or a FileExistsError if it holds files of somebody else."""
+    if not (out / BLOCKS).is_file():  # it is written first: what is there without it is not of kfgs
+        for name in (BLOCKS, LATENTS, *(block["name"] for block in facts["blocks"])):
+            check_own(out / name, lambda _: False, "kfgs blocks")
+    elif read_json(out / BLOCKS) != facts:
         raise ValueError(
             f"out: expected a new folder, or one with these blocks, got {out} with others (of another scene, splat, maps, ...); "
             "choose another, or delete it"

@@ -187,6 +187,10 @@ def _advance(lane: _Lane, results: list[Any] | None, engine: _Submitter, report:
     except StopIteration as end:
         report(Event(lane.name, "finished", results=(end.value,)))
         return False
+    except Exception as error:  # of the plan: results that it cannot use end this scene only
+        why = Failure(lane.stage, error_line(error), traceback.format_exc())
+        report(Event(lane.name, "failed", lane.stage, failure=why))
+        return False
     report(Event(lane.name, "started", lane.stage))
     lane.deaths, lane.done = {}, {}
     lane.futures = {i: engine.submit(task, f"{lane.name}/{lane.stage}/{i}") for i, task in enumerate(lane.tasks)}

@@ -57,7 +57,7 @@ class FieldInBlocks:
             facts = read_json(file)
             with reading(file, "the facts of a block", "fit the block again"):
                 if facts["gaussians"]:  # else nothing lies in this part of space
-                    low, high = (list(map(float, corner)) for corner in facts["box"])
+                    low, high = np.array(facts["box"], np.float64).reshape(2, 3).tolist()
                     blocks.append(block)
                     counts.append(int(facts["gaussians"]))
                     boxes.append((low, high))
@@ -93,7 +93,7 @@ class FieldInBlocks:
     def _join(self, parts: list[SemanticField]) -> SemanticField:
         """Parts as one field, which remembers the scene of all blocks."""
         field = join_fields(parts)
-        scene = real_path(self.folder / str(read_json(self.folder / BLOCKS)["scene"]))
+        scene = real_path(self.folder / _described(self.folder)[0])
         info = {
             name: value for name, value in field.info.items() if name not in ("geometry", "seconds", "scene", "classes")
         }
@@ -187,11 +187,19 @@ def read_blocks(folder: Path) -> list[Block]:
         raise FileNotFoundError(
             f"{file}: no such file; expected the folder of a scene in blocks, which `kfgs blocks` made"
         )
+    return _described(folder)[1]
+
+
+def _described(folder: Path) -> tuple[str, list[Block]]:
+    """The scene that `blocks.json` names, relative to its folder, and the blocks."""
+    file = folder / BLOCKS
     found = read_json(file)
     with reading(file, "the blocks of a scene", "cut the scene again with split_scene"):
         if (found["format"], found["version"]) != (FORMAT, 1):
             raise ValueError(f"format {found['format']!r}, version {found['version']!r}")
-        return [Block.from_json(block) for block in found["blocks"]]
+        if not isinstance(found["scene"], str):
+            raise ValueError(f"scene {found['scene']!r:.40} is no path")
+        return found["scene"], [Block.from_json(block) for block in found["blocks"]]
 
 
 def _in_view(camera: Camera, low: list[float], high: list[float]) -> bool:

@@ -146,7 +146,8 @@ class SearchIndex:
             more, refused = ask_words(self.contents, others, target, classes, options)
             found, unasked = found + more, unasked | refused
             if exact:
-                found = ask_fields(self.folder, self.contents, ranked(found), exact, target, classes, options)
+                found, lost = ask_fields(self.folder, self.contents, ranked(found), exact, target, classes, options)
+                return Found(ranked(found), len(self) + len(self.contents.unread) - len(unasked), unasked | lost)
         return Found(ranked(found), len(self) + len(self.contents.unread) - len(unasked), unasked)
 
     def like(self, source: str | Path, index: int, threshold: float | None = None, *, exact: int = 0) -> Found:

@@ -7,13 +7,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .._card import short_repr
 from .._files import atomic_path, parse_json
+from .._files.paths import utf8
 
 Array = NDArray[Any]
 Rows = Mapping[str, Array]
@@ -53,16 +54,30 @@ COLUMNS: dict[str, dict[str, tuple[str, tuple[int, ...]]]] = {
 """Type and further axes of each column, for each kind of row of a field."""
 
 
+class FileMark(NamedTuple):
+    """A file from which a field's answers follow. If size and time are the same, so is its content."""
+
+    name: str
+    """Relative to the folder of the field; empty: the field itself, which is one file."""
+    size: int
+    """Bytes; -1: there is none."""
+    time: int
+    """Of its last change, in nanoseconds."""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+
 @dataclass(frozen=True, eq=False)
 class Entry:
     """What the index knows of one field. Positions are in its scene's frame and units."""
 
     path: str
     """Of the field, relative to the index's folder, with slashes."""
-    mark: tuple[int, int]
-    """Size in bytes and time in nanoseconds of `field.json`, or of the packed file."""
-    sha256: str
-    """Of that file."""
+    marks: tuple[FileMark, ...]
+    """Of the field's files, and of those of the classes that it remembers."""
+    digests: tuple[str, ...]
+    """SHA-256 of each of these files."""
     gaussians: int
     space: int
     """Index of its teacher's words."""
@@ -108,9 +123,9 @@ class Table:
 
 @dataclass(frozen=True)
 class Unread:
-    """A field that could not be read. It is tried again when its file changes."""
+    """A field that could not be read. It is tried again when its files change."""
 
-    mark: tuple[int, int]
+    marks: tuple[FileMark, ...]
     reason: str
 
 
@@ -139,7 +154,7 @@ def write_index(path: Path, contents: Contents) -> None:
     from safetensors.numpy import save_file
 
     entries = [contents.entries[name] for name in sorted(contents.entries)]
-    names = ("path", "mark", "sha256", "gaussians", "space", "table", "views", "outside")
+    names = ("path", "marks", "digests", "gaussians", "space", "table", "views", "outside")
     about = {
         "fields": [{name: getattr(entry, name) for name in names} for entry in entries],
         "spaces": [{"teacher": one.teacher, "tolerance": one.tolerance} for one in contents.spaces],
@@ -147,7 +162,7 @@ def write_index(path: Path, contents: Contents) -> None:
             {"space": one.space, "names": one.names, "negative_names": one.negative_names, "info": one.info}
             for one in contents.tables
         ],
-        "unread": {name: [*one.mark, one.reason] for name, one in sorted(contents.unread.items())},
+        "unread": {name: [one.marks, utf8(one.reason)] for name, one in sorted(contents.unread.items())},
     }
     text = json.dumps(about, allow_nan=False).encode()
     if len(text) > WORDS:
@@ -221,11 +236,14 @@ def _contents(tensors: dict[str, Array]) -> Contents:
         table = None if one["table"] is None else _index(one["table"], len(tables))
         space, views = _index(one["space"], len(spaces)), _texts(one["views"])
         own = {kind: kinds[kind][i] for kind in COLUMNS}
-        _check_rows(own, len(spaces[space].words), 0 if table is None else len(tables[table].names), len(views))
-        (path,), (size, time) = _texts([one["path"]]), one["mark"]
-        mark, facts = (int(size), int(time)), (int(one["gaussians"]), space, table, views, float(one["outside"]))
-        entries[path] = Entry(path, mark, str(one["sha256"]), *facts, own)
-    unread = {name: Unread((int(size), int(time)), str(why)) for name, (size, time, why) in about["unread"].items()}
+        classes = 0 if table is None else len(tables[table].names)
+        _check_rows(own, len(spaces[space].words), classes, len(views), int(one["gaussians"]))
+        (path,), marks, digests = _texts([one["path"]]), _marks(one["marks"]), _texts(one["digests"])
+        if len(digests) != len(marks):
+            raise ValueError(f"it holds {len(digests)} digests of {len(marks)} files")
+        facts = int(one["gaussians"]), space, table, views, float(one["outside"])
+        entries[path] = Entry(path, marks, digests, *facts, own)
+    unread = {name: Unread(_marks(marks), str(why)) for name, (marks, why) in about["unread"].items()}
     return Contents(spaces, tables, entries, unread)
 
 
@@ -241,16 +259,20 @@ def _rows(tensors: dict[str, Array], kind: str, fields: int) -> list[Rows]:
     return [{name: column[place] for name, column in columns.items()} for place in places]
 
 
-def _check_rows(rows: Mapping[str, Rows], words: int, classes: int, views: int) -> None:
+def _check_rows(rows: Mapping[str, Rows], words: int, classes: int, views: int, gaussians: int) -> None:
     atoms, parts = rows["atoms"], rows["parts"]
+    counted = int(atoms["count"].sum(dtype=np.int64))
+    if counted > gaussians:  # each is in one atom at most
+        raise ValueError(f"its atoms have {counted} of {gaussians} Gaussians")
     bounded = (
         (atoms["word"], 0, words),
         (rows["links"]["pair"], 0, len(atoms["word"])),
         (parts["label"], 0, classes),
         (atoms["views"], -1, views),
         (parts["view"], -1, views),
-        (atoms["count"], 1, 1 << 31),
-        (parts["count"], 1, 1 << 31),
+        (atoms["count"], 1, gaussians + 1),
+        (parts["count"], 1, gaussians + 1),
+        (rows["classes"]["count"], 0, gaussians + 1),
     )
     for values, low, end in bounded:
         if values.size and not low <= int(values.min()) <= int(values.max()) < end:
@@ -273,6 +295,11 @@ def _matrix(tensors: dict[str, Array], name: str) -> Array:
     if found.ndim != 2:
         raise ValueError(f"{name} has shape {found.shape}")
     return _column(tensors, name, "<f4", found.shape[1:])
+
+
+def _marks(rows: Any) -> tuple[FileMark, ...]:
+    names = _texts([name for name, _, _ in rows])
+    return tuple(FileMark(name, int(size), int(time)) for name, (_, size, time) in zip(names, rows, strict=True))
 
 
 def _texts(values: Any) -> tuple[str, ...]:

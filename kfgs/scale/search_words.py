@@ -12,6 +12,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from .._card import error_line
 from .._check import as_tensor, check_whole, one_line
 from .._rows import unit_embeddings
 from ..fields import SemanticField
@@ -70,17 +71,26 @@ def ask_fields(
     target: str | Tensor,
     classes: LabelSet | None,
     options: dict[str, Any],
-) -> list[SceneFound]:
-    """Put the question to the fields themselves, for the first `count` scenes; those that are exact already stay."""
+) -> tuple[list[SceneFound], dict[str, str]]:
+    """Put the question to the fields themselves, for the first `count` scenes; those that are exact already stay.
+
+    Returns:
+        All scenes, and the fields that could not be read, with the reason: they keep the answer by words.
+    """
     check_whole("exact", count, 1)
-    result = list(found[count:])
+    result, refused = list(found[count:]), dict[str, str]()
     for one in found[:count]:
         if one.exact:
             result.append(one)
             continue
         entry = contents.entries[one.path]
         table = None if classes is not None else table_to_ask(contents, entry, target)
-        field = SemanticField.load(folder / one.path)
+        try:
+            field = SemanticField.load(folder / one.path)
+        except (OSError, ValueError) as error:
+            refused[one.path] = f"itself: {error_line(error)}"
+            result.append(one)
+            continue
         asked = classes if table is None else label_set(contents.tables[table])
         selection = field.query(target, asked, **options)
         parts = connected_parts(field.gaussians, selection, field.cameras or None)
@@ -99,7 +109,7 @@ def ask_fields(
         )
         mean = float(selection.scores[selection.mask].double().mean()) if len(selection) else 0.0
         result.append(scene_found(entry, len(selection), mean, True, shown))
-    return list(ranked(result))
+    return list(ranked(result)), refused
 
 
 def example_of(contents: Contents, path: Path, index: int) -> tuple[Tensor, dict[str, Entry], float]:
@@ -161,6 +171,8 @@ def _word_cosines(
     other = None if classes is None else teacher_difference(info, classes.info)
     if other is not None:
         raise ValueError(f"another teacher: {other[0]} {other[1]!r:.40} instead of {other[2]!r:.40}")
+    if classes is None and isinstance(target, str):
+        raise ValueError(f"class: expected one that a field knows, got {target!r:.60}, and no classes could be read")
     asked = make_question(target, classes, negatives, one.words.shape[1], info)
     words = torch.from_numpy(one.words)
     near = words @ unit_embeddings(asked.row[None].to(words), "target")[0]
@@ -181,7 +193,7 @@ def _word_answer(entry: Entry, scores: Tensor, gamma: float | None) -> SceneFoun
     atoms = entry.rows["atoms"]
     own = scores[torch.from_numpy(atoms["word"].astype(np.int64))]
     if gamma is None:
-        gamma = similarity_threshold(own.repeat_interleave(torch.from_numpy(atoms["count"].astype(np.int64))))[0]
+        gamma = similarity_threshold(own, torch.from_numpy(atoms["count"].astype(np.int64)))[0]
     mask, score = (own > gamma).numpy(), own.double().numpy()
     total = int(atoms["count"][mask].sum())
     mean = float(np.average(score[mask], weights=atoms["count"][mask])) if total else 0.0

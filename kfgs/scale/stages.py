@@ -37,6 +37,8 @@ from .places import WRITER, Place, inside, open_place
 PATIENCE = 120  # seconds to wait for a folder in which a process works that was taken for dead
 PROTOCOL = "kfgs-pooled/1"
 TRUTH = ("labels_scored", "labels")
+RESULTS = {"sfm": ("report",), "fit": ("gaussians", "latents"), "evaluate": ("miou",)}
+"""What others read of the results of stages."""
 Report = Callable[[str], None]
 
 _loaded: dict[str, Teacher] = {}
@@ -223,12 +225,13 @@ def _description(stage: str) -> str:
 
 
 def _finished(out: Place, stage: str, key: str, files: dict[str, Any]) -> dict[str, Any] | None:
-    """The description of a stage with this key whose files are all there, in their sizes."""
+    """The description of a stage with this key whose files are all there, in their sizes. A damaged one does not count."""
     about = out.read_json(_description(stage))
-    whole = about.get("key") == key and all(
-        name in files and files[name][0] == size for name, size in about["files"].items()
-    )
-    return about if whole else None
+    result, made = about.get("result"), about.get("files")
+    if about.get("key") != key or not isinstance(result, dict) or not isinstance(made, dict):
+        return None
+    whole = all(name in files and files[name][0] == size for name, size in made.items())
+    return about if whole and set(RESULTS.get(stage, ())) <= set(result) else None
 
 
 def _stage(

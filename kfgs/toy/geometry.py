@@ -51,21 +51,24 @@ class Solid:
 def intersect(solid: Solid, origin: Array, directions: Array) -> Array:  # [3], [..., 3] -> [...]
     """The parameter t at which `origin + t * directions` enters the solid; infinity if it misses."""
     o = solid.to_local(origin)
-    d = directions @ solid.rotation()
+    d = directions @ solid.rotation() if solid.yaw else directions
     if solid.shape == "ellipsoid":
         o, d = o / np.array(solid.half), d / np.array(solid.half)
-        a, b, c = (d * d).sum(-1), d @ o, float(o @ o) - 1.0
+        a, b, c = np.einsum("...i,...i", d, d), d @ o, float(o @ o) - 1.0
         root = b * b - a * c
         t = (-b - np.sqrt(np.maximum(root, 0.0))) / a
         return np.where((root > 0) & (t > NEAR), t, np.inf)
     enter = np.full(d.shape[:-1], -np.inf)
     leave = np.full(d.shape[:-1], np.inf)
     for axis in range(3):
-        slope = d[..., axis]
-        inverse = 1.0 / np.where(np.abs(slope) < 1e-12, 1e-12, slope)
-        low, high = (-solid.half[axis] - o[axis]) * inverse, (solid.half[axis] - o[axis]) * inverse
-        enter = np.maximum(enter, np.minimum(low, high))
-        leave = np.minimum(leave, np.maximum(low, high))
+        inverse = np.array(d[..., axis])
+        np.copyto(inverse, 1e-12, where=np.abs(inverse) < 1e-12)
+        np.divide(1.0, inverse, out=inverse)
+        middle = inverse * -o[axis]
+        reach = np.abs(inverse, out=inverse)
+        reach *= solid.half[axis]
+        np.maximum(enter, middle - reach, out=enter)
+        np.minimum(leave, np.add(middle, reach, out=middle), out=leave)
     return np.where((enter <= leave) & (enter > NEAR), enter, np.inf)
 
 

@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 from .._card import short_repr
 from ..cameras.camera import Camera
-from .geometry import Array, Solid, cast, normals, occluded, pixel_rays
+from .geometry import Array, Solid, cast, normals, pixel_rays
+from .light import lamps_seen, light, openness
+from .noise import Noise
 from .room import CLASSES, ROOM
-from .texture import Noise, evaluate
+from .texture import evaluate
 
-_LIGHTS = (((-0.4, 0.3, 2.75), 0.42), ((2.2, -1.6, 2.6), 0.26))  # position (metres), strength
-_AMBIENT = 0.42
 _SPLIT = 2  # colour samples per pixel and axis
+_EXPOSURE = 1.4
 
 
 class View(NamedTuple):
@@ -83,30 +84,31 @@ def surface_color(
     points: Array,  # [N, 3]
     which: NDArray[np.int64],  # [N]
     footprint: Array,  # [N] metres a pixel covers
-    lit: Array,  # [N, L] 1 if lit, 0 in shadow
+    lit: Array,  # [N, L + 1] from `light_reaches`
 ) -> Array:  # [N, 3] in [0, 1]
-    """Texture times a matte shading by the lights of the room; it does not depend on the camera."""
+    """Material times the light on it, as a matte surface shows it; it does not depend on the camera."""
     color = np.zeros((len(points), 3))
     for i in np.unique(which):
         rows = np.flatnonzero(which == i)
         solid, p = solids[i], points[rows]
         n = normals(solid, p)
         axis = np.argmax(np.abs(n @ solid.rotation()), axis=-1)
-        light = np.full(len(rows), _AMBIENT)
-        for k, (position, strength) in enumerate(_LIGHTS):
-            way = np.array(position) - p
-            cosine = (way * n).sum(-1) / np.linalg.norm(way, axis=-1)
-            light += strength * (0.35 + 0.65 * np.maximum(cosine, 0.0)) * (0.35 + 0.65 * lit[rows, k])
-        corner = np.clip(p[:, 2] / 0.25, 0.0, 1.0)  # a little darker towards the floor
-        light *= np.where(np.abs(n[:, 2]) < 0.9, 0.8 + 0.2 * corner, 1.0)
-        color[rows] = evaluate(solid.texture, noise, solid.to_local(p), axis, footprint[rows]) * light[:, None]
-    return np.clip(color, 0.0, 1.0)
+        skin, half, is_round = solid.texture, np.array(solid.half), solid.shape == "ellipsoid"
+        own = evaluate(skin, noise, solid.to_local(p), axis, half, footprint[rows], is_round=is_round)
+        bright = light(p, n, lit[rows, :-1], lit[rows, -1]) + skin.glow
+        color[rows] = np.square(np.clip(own, 0.0, 1.0)) * bright  # light multiplies linear values, about squares
+    return np.sqrt(-np.expm1(-_EXPOSURE * color))  # bright places turn white slowly, as on film
 
 
-def light_reaches(solids: Sequence[Solid], points: Array) -> Array:  # [N, 3] -> [N, L]
-    """1 if nothing is between a point and a light, else 0; walls, floor and ceiling cast no shadow."""
-    casters = [s for s in solids if s.label not in ("wall", "floor", "ceiling", "rug", "picture")]
-    return np.stack([~occluded(casters, np.array(p), points) for p, _ in _LIGHTS], axis=-1).astype(float)
+def light_reaches(
+    solids: Sequence[Solid], points: Array, which: NDArray[np.int64]
+) -> Array:  # [N, 3], [N] -> [N, L + 1]
+    """The share of each lamp that each point sees, and how open its surroundings are."""
+    outward = np.zeros_like(points)
+    for i in np.unique(which):
+        outward[which == i] = normals(solids[i], points[which == i])
+    opened = openness(solids, points, outward, which, ROOM)
+    return np.column_stack([lamps_seen(solids, points, outward, which), opened])
 
 
 def render(solids: Sequence[Solid], noise: Noise, camera: Camera) -> View:
@@ -117,7 +119,8 @@ def render(solids: Sequence[Solid], noise: Noise, camera: Camera) -> View:
             f"{camera.name}: a ray leaves the room {ROOM}"
         )  # the room is closed, so this is a bug of kfgs
     origin, rays = pixel_rays(camera)
-    lit = light_reaches(solids, (origin + rays * depth[..., None]).reshape(-1, 3)).reshape(*camera.size, -1)
+    lit = light_reaches(solids, (origin + rays * depth[..., None]).reshape(-1, 3), index.ravel())
+    lit = lit.reshape(*camera.size, -1)
     lit = lit.repeat(_SPLIT, axis=0).repeat(_SPLIT, axis=1)
 
     fine = camera.resized(camera.height * _SPLIT, camera.width * _SPLIT)

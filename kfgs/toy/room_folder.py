@@ -23,12 +23,12 @@ from .._files import as_path, atomic_folder, check_output, read_json, write_json
 from ..cameras.camera import Camera
 from .colmap import write_model
 from .geometry import Array, Solid, normals, sample_surface, visible
+from .noise import Noise
 from .render import View, light_reaches, render, surface_color, walk_cameras
 from .room import CLASSES, build_room
 from .teacher import class_embeddings, teacher_features
-from .texture import Noise
 
-VERSION = 4  # of the generator: a folder written by another version is not reused
+VERSION = 5  # of the generator: a folder written by another version is not reused
 POINT_NOISE = 0.01  # metres, standard deviation of the sparse points around the surface
 PIXEL_NOISE = 0.4  # pixels, standard deviation of their observations
 
@@ -212,7 +212,7 @@ def _write_geometry(
     chance = np.minimum(seen.sum(-1), 8.0) + 1e-3  # SfM finds what many views share
     rows = rng.choice(len(points), config.sparse_points, replace=False, p=chance / chance.sum())
     near, sides, owner = points[rows], outward[rows], which[rows]
-    color = surface_color(solids, noise, near, owner, np.full(len(rows), 0.01), light_reaches(solids, near))
+    color = surface_color(solids, noise, near, owner, np.full(len(rows), 0.01), light_reaches(solids, near, owner))
     observed = np.stack([visible(solids, camera, near, sides) for camera in cameras], axis=-1)
     placed = near + POINT_NOISE * rng.standard_normal(near.shape)
     outliers = max(1, len(rows) // 200)

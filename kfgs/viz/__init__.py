@@ -2,6 +2,7 @@
 
 from .animation import save_animation
 from .boxes import add_boxes, add_names, add_selections
+from .bridges import to_open3d, to_trimesh
 from .camera_view import draw_view, look_through
 from .clouds import CloudOptions, add_cloud, recolor_cloud, to_pyvista
 from .confusions import plot_confusion, plot_largest_confusions
@@ -24,6 +25,7 @@ from .plots import (
     plot_training,
 )
 from .reports import plot_codebook_growth, plot_codebook_report
+from .usd import save_usd
 
 __all__ = [
     "CloudOptions",
@@ -68,6 +70,9 @@ __all__ = [
     "save_flythrough",
     "save_picture",
     "save_turntable",
+    "save_usd",
     "show_cloud",
+    "to_open3d",
     "to_pyvista",
+    "to_trimesh",
 ]

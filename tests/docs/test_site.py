@@ -94,6 +94,9 @@ def test_notebooks_come_into_the_gallery_and_go_with_their_file(tmp_path):
     (notebooks / "1_a.ipynb").write_text("[]")
     assert bring(notebooks, pages) == ["1_a", "2_b"]
     assert (pages / "list.inc").read_text().splitlines()[3:5] == ["1_a", "2_b"]
+    (notebooks / "10_c.ipynb").write_text("{}")
+    assert bring(notebooks, pages) == ["1_a", "2_b", "10_c"]
+    (notebooks / "10_c.ipynb").unlink()
     (notebooks / "1_a.ipynb").unlink()
     assert bring(notebooks, pages) == ["2_b"]
     assert sorted(path.name for path in pages.glob("*.ipynb")) == ["2_b.ipynb"]

@@ -10,7 +10,7 @@ from messages import tells
 from PIL import Image
 
 from kfgs.evaluation import load_label_map
-from kfgs.evaluation.datasets import load_coco_labels, load_coco_masks, load_labels
+from kfgs.evaluation.datasets import load_coco_labels, load_coco_masks, load_labels, save_coco
 
 RED, GREEN, BLACK = (255, 0, 0), (0, 255, 0), (0, 0, 0)
 
@@ -206,3 +206,28 @@ def test_the_real_room(shared_data: Path) -> None:
     stem = sorted(truth.maps)[0]
     assert (len(truth.names), truth.names[:3]) == (18, ("wall", "ceiling", "floor"))
     assert torch.equal(truth.maps[stem], load_label_map(folder / f"{stem}.png"))
+
+
+def test_label_maps_come_back_from_coco(tmp_path: Path) -> None:
+    maps = {
+        "left/a.png": torch.tensor([[-1, 2, 2], [0, 2, -1], [0, 0, -1], [2, -1, -1]]),
+        "b.png": torch.tensor([[1, 1]]),
+        "c.png": torch.full((2, 2), -1),
+    }
+    names = ("wall", "dog", "cat")
+    save_coco(tmp_path / "coco.json", maps, names)
+    truth = load_coco_labels(tmp_path / "coco.json")
+    assert truth.names == names
+    assert {f"{stem}.png": labels.tolist() for stem, labels in truth.maps.items()} == {
+        name: labels.tolist() for name, labels in maps.items()
+    }
+    written = json.loads((tmp_path / "coco.json").read_text())
+    cat = next(one for one in written["annotations"] if one["category_id"] == 3)
+    assert (cat["area"], cat["bbox"], cat["iscrowd"], cat["image_id"]) == (4, [0, 0, 3, 4], 0, 1)
+    assert [one["id"] for one in written["annotations"]] == [1, 2, 3]
+    assert written["images"][1] == {"id": 2, "file_name": "b.png", "height": 1, "width": 2}
+    boxes = load_coco_masks(tmp_path / "coco.json").frames["left/a"]["wall"].boxes
+    assert boxes is not None
+    assert boxes.tolist() == [[0, 1, 2, 3]]
+    with pytest.raises(ValueError, match=tells("labels:", "below 2", "got 2 in left/a.png")):
+        save_coco(tmp_path / "coco.json", maps, names[:2])

@@ -583,3 +583,16 @@ def test_a_description_that_nests_too_deep_is_named(tmp_path):
     (tmp_path / "field" / "field.json").write_text('{"info": ' + "[" * 100_000 + "]" * 100_000 + "}")
     with pytest.raises(ValueError, match=tells("field.json:", "nest more than 200 deep")):
         SemanticField.load(tmp_path / "field")
+
+
+def test_rows_of_features_are_checked_before_they_are_looked_up():
+    """An index that was no index ended Python, or was an IndexError of torch."""
+    one = field("fused")
+    for wrong in (one.gaussians, 1.5, torch.zeros(0), None, "a", [one.gaussians]):
+        with pytest.raises(TypeError, match=tells("rows: expected")):
+            one.own_features(wrong)
+    with pytest.raises(ValueError, match=tells("rows: expected a mask [N]", len(one))):
+        one.own_features(torch.ones(len(one) + 1, dtype=torch.bool))
+    assert torch.equal(one.own_features([1, 0]), one.own_features(torch.tensor([1, 0])))
+    with pytest.raises(ValueError, match=tells("latents: expected [..., d]", one.channels, "got ()")):
+        one.decode(-1)

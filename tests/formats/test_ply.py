@@ -3,7 +3,7 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.formats import read_splats, write_splats
+from kfgs.formats import SplatFile, read_splats, write_splats
 from kfgs.formats.ply import (
     other_elements,
     points_from_columns,
@@ -268,3 +268,44 @@ def test_scales_far_below_the_smallest_that_is_needed_come_back(tmp_path):
     cloud = _cloud()[:2].replace(scales=scales, labels=None)
     write_splats(tmp_path / "a.ply", cloud)
     assert torch.allclose(read_splats(tmp_path / "a.ply").gaussians.scales, scales, rtol=1e-4, atol=0)
+
+
+STANDARD = [
+    "x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(45)), "opacity",
+    *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_a_plain_file_has_the_62_properties_of_inrias_files_and_its_classes_are_found_again(tmp_path, degree):
+    cloud, path = _cloud(degree=degree), tmp_path / "a.ply"
+    classes, extra = ("a", "b", "c", "d", "e", "f"), {"score": np.linspace(0, 1, 7), "id": np.arange(7)}
+    written = write_splats(path, SplatFile(cloud, extra, classes), plain=True)
+    columns = read_ply(path)
+    assert list(columns) == STANDARD
+    assert {values.dtype.str for values in columns.values()} == {"<f4"}
+    assert [one.name for one in written.paths] == ["a.ply", "a.ply.labels.npz", "a.ply.classes.json"]
+    assert [word.split(":")[0] for word in written.lost] == ["9 features per Gaussian", "the columns id"]
+    back = read_splats(path)
+    assert back.classes == classes
+    assert torch.equal(back.gaussians.labels, cloud.labels)
+    np.testing.assert_allclose(back.extra["score"], extra["score"], rtol=1e-6)
+    K = cloud.sh.shape[1]
+    assert torch.equal(back.gaussians.sh[:, :K], cloud.sh)
+    assert not back.gaussians.sh[:, K:].any()
+
+
+def test_a_full_file_at_the_place_of_a_plain_one_leaves_nothing_beside_it(tmp_path):
+    path = tmp_path / "a.ply"
+    write_splats(path, _cloud(), plain=True)
+    write_splats(path, _cloud())
+    assert [one.name for one in tmp_path.iterdir()] == ["a.ply"]
+    assert torch.equal(read_splats(path).gaussians.labels, _cloud().labels)
+
+
+def test_plain_is_for_ply_files_with_colours(tmp_path):
+    with pytest.raises(ValueError, match=tells("plain:", "ends in .ply", "a.spz")):
+        write_splats(tmp_path / "a.spz", _cloud(), plain=True)
+    with pytest.raises(ValueError, match=tells("splats:", "colours", "a plain PLY")):
+        write_splats(tmp_path / "a.ply", _cloud().replace(sh=None), plain=True)
+    assert list(tmp_path.iterdir()) == []

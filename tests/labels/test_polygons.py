@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from kfgs.evaluation.datasets import decode_rle, fill_polygon, fill_region
+from kfgs.evaluation.datasets import decode_rle, encode_rle, fill_polygon, fill_region
 
 
 def _picture(rows: str) -> list[list[bool]]:
@@ -95,3 +95,19 @@ def test_run_lengths() -> None:
 def test_bad_run_lengths(segmentation: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         decode_rle(segmentation)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 5), (7, 2), (40, 30)])
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_run_lengths_come_back(size: tuple[int, int], share: float) -> None:
+    mask = torch.rand(size, generator=torch.Generator().manual_seed(size[0])) < share
+    encoded = encode_rle(mask)
+    assert encoded["size"] == list(size)
+    assert sum(encoded["counts"]) == mask.numel()
+    assert sum(encoded["counts"][1::2]) == int(mask.sum())
+    assert all(count > 0 for count in encoded["counts"][1:])
+    assert torch.equal(decode_rle(encoded), mask)
+
+
+def test_run_lengths_begin_with_zeros_and_go_down_the_columns() -> None:
+    assert encode_rle(torch.tensor([[1, 0, 0], [1, 1, 0]]).bool()) == {"size": [2, 3], "counts": [0, 2, 1, 1, 2]}

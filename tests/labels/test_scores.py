@@ -267,3 +267,13 @@ def test_equal_or_no_scores_select_nothing():
     assert not (equal > threshold).any()
     assert "nothing stands out" in how
     assert similarity_threshold(torch.empty(0)) == (1.0, "no scores: nothing to select")
+
+
+@pytest.mark.parametrize("parts", [[(0.3, 0.05, 60), (0.85, 0.02, 9)], [(0.6, 0.05, 40)], [(0.6, 0.0, 5)]])
+def test_a_score_that_counts_several_times_is_that_many_scores(parts):
+    scores = mixture(parts)
+    times = torch.randint(1, 30, (len(scores),), generator=torch.Generator().manual_seed(1))
+    threshold, how = similarity_threshold(scores.repeat_interleave(times))
+    found, same = similarity_threshold(scores, times)
+    assert found == pytest.approx(threshold, abs=1e-12)
+    assert same == how

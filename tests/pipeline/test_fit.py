@@ -164,7 +164,14 @@ def test_unseen_views_are_segmented_scored_and_drawn(fitted, scene, room, tmp_pa
     assert json.dumps(scores.to_json())
 
 
-def test_bad_input_is_refused_before_any_work(scene, maps, room, tmp_path):
+def test_pictures_that_give_no_points_are_refused(scene, maps, tmp_path):
+    nothing = dataclasses.replace(scene, points=scene.points[:0], colors=scene.colors[:0])
+    with pytest.raises(ValueError, match=tells("scene:", "agree with the poses", "--ignore-poses")):
+        fit_scene(nothing, maps, tmp_path, CONFIG)
+    assert not (tmp_path / "field").exists()
+
+
+def test_bad_input_is_refused_before_any_work(scene, room, tmp_path):
     two = FeatureFolder(room / "features", [scene.stem(0), scene.stem(1)])
     with pytest.raises(ValueError, match=tells("maps:", "'train'", "(6)", "got 2")):
         fit_scene(scene, two, tmp_path, CONFIG)
@@ -173,9 +180,6 @@ def test_bad_input_is_refused_before_any_work(scene, maps, room, tmp_path):
     backwards = FeatureFolder(room / "features", [scene.stem(i) for i in reversed(scene.splits["train"])])
     with pytest.raises(ValueError, match=tells("maps:", "order (view_")):
         fit_scene(scene, backwards, tmp_path, CONFIG)
-    nothing = dataclasses.replace(scene, points=scene.points[:0], colors=scene.colors[:0])
-    with pytest.raises(ValueError, match=tells("scene:", "sparse points", "got 0")):
-        fit_scene(nothing, maps, tmp_path, CONFIG)
     with pytest.raises(ValueError, match=tells("split:", "train, test", "got 'val'")):
         fit_scene(scene, two, tmp_path, config(split="val"))
     assert list(tmp_path.iterdir()) == []

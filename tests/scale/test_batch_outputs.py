@@ -204,3 +204,32 @@ def test_a_url_has_no_lock_and_the_command_says_so(scene, tmp_path, capsys, monk
         assert main(["batch", str(tmp_path / "scenes.txt"), "--out", out]) == 1  # the failure of before
         assert ("has no lock" in capsys.readouterr().out) is noted
     shutil.rmtree(tmp_path / "runs")
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"result": None}, {"result": {}}, {"result": {"gaussians": 1}}, {"result": [1]}, {"files": None},
+        {"files": ["field"]}, {"files": {"field": [1]}}, {"key": None},
+    ],
+)  # fmt: skip
+def test_a_damaged_note_of_a_finished_stage_counts_as_not_done(tmp_path, damage):
+    place, made = Place(tmp_path), []
+
+    def make():
+        (tmp_path / "field").write_text("numbers")
+        made.append(len(made))
+        return {"gaussians": 7, "latents": 3}
+
+    def stage():
+        return stages._stage(place, "fit", "key", ("field",), (), make)
+
+    first, again = stage(), stage()
+    assert (first["reused"], again, made) == (False, first | {"reused": True}, [0])
+    file = tmp_path / "done" / "fit.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | damage))
+    assert stage() == first
+    assert stage() == again  # it was repaired
+    assert made == [0, 1]
+    file.write_text(json.dumps({name: one for name, one in json.loads(file.read_text()).items() if name not in damage}))
+    assert stage() == first

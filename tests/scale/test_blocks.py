@@ -243,6 +243,28 @@ def test_a_joined_field_remembers_the_whole_scene(fitted, town, tmp_path):
     assert field.label_set().names == fitted.field("block00").label_set().names
 
 
+@pytest.mark.parametrize(
+    ("file", "change", "parts"),
+    [
+        ("blocks.json", {"scene": None}, ("blocks.json", "scene None is no path", "cut the scene again")),
+        ("blocks.json", {"scene": 5}, ("blocks.json", "scene 5 is no path")),
+        ("block00/core.json", {"box": [[0, 0], [1, 1]]}, ("core.json", "the facts of a block", "fit the block again")),
+    ],
+)
+def test_a_damaged_description_is_named_when_a_city_is_opened(fitted, tmp_path, file, change, parts):
+    for name in ("blocks.json", *(f"{block.name}/core.json" for block in fitted.blocks)):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        shutil.copy(fitted.folder / name, tmp_path / name)
+    assert len(FieldInBlocks.open(tmp_path)) == len(fitted)
+    (tmp_path / file).write_text(json.dumps(json.loads((tmp_path / file).read_text()) | change))
+    with pytest.raises(ValueError, match=tells(*parts)):
+        FieldInBlocks.open(tmp_path)
+    if file == "blocks.json":
+        (tmp_path / file).write_text('{"format": "kfgs.blocks", "version": 1, "blocks": []}')
+        with pytest.raises(ValueError, match=tells(file, "KeyError: 'scene'", "cut the scene again")):
+            FieldInBlocks.open(tmp_path)
+
+
 def test_other_inputs_are_refused_also_after_a_kill(town, splat, tmp_path):
     split_scene(town, tmp_path / "city", 2, splat=splat, latents=4)
     for path in (tmp_path / "city").glob("block*"):
@@ -348,3 +370,25 @@ def test_a_splat_of_another_scene_is_said(town, splat, tmp_path):
         (block / "core.json").write_text('{"gaussians": 0, "box": null}')
     with pytest.raises(ValueError, match=tells("city", "none", "splat")):
         FieldInBlocks.open(tmp_path / "city")
+
+
+def test_a_city_behind_a_link_remembers_its_scene(town, splat, tmp_path):
+    (tmp_path / "deep/er/city").mkdir(parents=True)
+    (tmp_path / "city").symlink_to("deep/er/city")
+    split_scene(town, tmp_path / "city", 2, splat=splat, latents=4)
+    field = fit_blocks(tmp_path / "city", EVERY).joined()
+    assert recall_scene(field.info, field.folder).samefile(town)
+    assert field.has_classes
+
+
+@pytest.mark.parametrize("name", ["latents.safetensors", "block00/splat.ply", "block00/mine.txt", "block01"])
+def test_files_of_somebody_else_are_not_replaced(town, splat, tmp_path, name, capsys):
+    file = tmp_path / "city" / name
+    file.parent.mkdir(parents=True)
+    file.write_text("mine")
+    before = sorted(tmp_path.rglob("*"))
+    line = ["blocks", str(town), "--out", str(tmp_path / "city"), "--count", "2", "--splat", str(splat)]
+    assert main(line) == 1
+    place = tmp_path / "city" / name.split("/")[0]
+    assert re.search(tells(place, "kfgs blocks", "move it away"), capsys.readouterr().err)
+    assert (file.read_text(), sorted(tmp_path.rglob("*"))) == ("mine", before)

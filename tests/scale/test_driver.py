@@ -49,6 +49,20 @@ def test_a_failure_is_kept_and_the_others_go_on():
     assert "in letters" in found[2].failure.traceback
 
 
+def test_a_plan_that_cannot_use_a_result_fails_alone():
+    def plan(name, key):
+        found = (yield "look", [Task(_double, (2,))])[0]
+        return {"value": found}[key]
+
+    events = []
+    with ThreadPoolExecutor(1) as pool:
+        drive({name: plan(name, key) for name, key in (("a", "odd"), ("b", "value"))}, pool, events.append)
+    (failed,) = (event for event in events if event.kind == "failed")
+    assert (failed.name, failed.stage, failed.failure.stage) == ("a", "look", "look")
+    assert "odd" in failed.failure.message
+    assert [event.results for event in events if event.kind == "finished"] == [(4,)]
+
+
 @pytest.mark.parametrize("deaths", [1, AGAIN])
 def test_a_task_whose_worker_died_is_submitted_again(deaths):
     engine, events = Dying(deaths), []

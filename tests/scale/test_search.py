@@ -1,8 +1,13 @@
 """Search over many fields: exact answers about classes, answers by words, and what keeps the index right."""
 
 import dataclasses
+import json
+import os
 import shutil
+import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from cases_search import COUNT, NAMES, save_scenes, scene, table
@@ -10,6 +15,7 @@ from messages import tells
 
 from kfgs._files import digest_file
 from kfgs.fields import SemanticField
+from kfgs.fields.remembered import remember
 from kfgs.labels import connected_parts
 from kfgs.scale import SearchIndex, search_state
 from kfgs.scale.search_file import NAME
@@ -250,11 +256,14 @@ def test_a_copied_archive_is_digested_once_and_a_moved_one_never(tmp_path, monke
     assert not index.is_current()
     assert read == []
     index, changes = index.update()
-    assert (changes, len(read)) == (Changes(), 2)
+    assert (changes, len(read)) == (Changes(), 4)  # two files each
     again = SearchIndex.open(tmp_path / "copy")
     assert again.is_current()
     assert again.update()[1] == Changes()
-    assert len(read) == 2
+    assert len(read) == 4
+    (tmp_path / "copy" / "a" / "field" / "field.json").touch()
+    assert again.update()[1] == Changes()
+    assert [file.name for file in read[4:]] == ["field.json"]
 
 
 def test_scenes_in_any_order_give_the_same_answers(tmp_path):
@@ -289,3 +298,86 @@ def test_a_field_that_goes_while_it_is_indexed_is_left_out(tmp_path, monkeypatch
     assert index.fields == ("a/field",)
     assert changes.failed.keys() == {"b/field"}
     assert SearchIndex.open(tmp_path).update()[1].removed == ("b/field",)
+
+
+@pytest.fixture
+def shared(tmp_path):
+    """A field that remembers the classes of its scene, and the file of their embeddings."""
+    (tmp_path / "scene").mkdir()
+    words = table()
+    (tmp_path / "scene" / "classes.json").write_text(json.dumps(words.names))
+    np.save(tmp_path / "scene" / "text.npy", words.embeddings.numpy())
+    field = dataclasses.replace(scene([("wall", 0.0), ("chair", 0.0)], 1), words=None)
+    notes = remember(tmp_path / "scene", tmp_path / "runs" / "field")
+    dataclasses.replace(field, info=field.info | notes).save(tmp_path / "runs" / "field")
+    return tmp_path / "scene" / "text.npy"
+
+
+def test_classes_that_changed_are_not_answered_from_the_index(shared, tmp_path):
+    """As `kfgs select`, which refuses them."""
+    index, said = SearchIndex.open(tmp_path / "runs").update()[0], []
+    assert index.search("chair").scenes[0].exact
+    whole = shared.read_bytes()
+    shared.touch()
+    assert not index.is_current()
+    index, changes = index.update(report=said.append)
+    assert (changes, said, index.is_current()) == (Changes(), [], True)
+    np.save(shared, np.load(shared)[::-1].copy())  # as large as before
+    with pytest.raises(ValueError, match=tells("as it was when the field was fitted")):
+        SemanticField.load(tmp_path / "runs" / "field").query("chair")
+    assert not index.is_current()
+    index, changes = index.update(report=said.append)
+    assert len(changes.added) == 1
+    assert "classes are left out" in said[0]
+    assert "as it was when the field was fitted" in said[0]
+    with pytest.raises(ValueError, match=tells("class: expected one that a field knows", "'chair'")):
+        index.search("chair")
+    shared.unlink()
+    assert not index.is_current()
+    index, _ = index.update()
+    assert index.is_current()
+    shared.write_bytes(whole)
+    assert not index.is_current()
+    assert index.update()[0].search("chair").scenes[0].exact
+
+
+def test_a_field_that_is_cut_short_later_is_not_answered_from_the_index(tmp_path):
+    save_scenes(tmp_path, a=scene([("wall", 0.0), ("chair", 0.0)], 1))
+    index, _ = SearchIndex.open(tmp_path).update()
+    numbers = tmp_path / "a" / "field" / "field.safetensors"
+    whole = numbers.read_bytes()
+    numbers.write_bytes(whole[:-4])
+    assert not index.is_current()
+    index, changes = index.update()
+    assert changes.failed.keys() == index.search("chair").unasked.keys() == {"a/field"}
+    numbers.write_bytes(whole)
+    assert not index.is_current()
+    assert len(index.update()[0].search("chair").scenes) == 1
+
+
+def test_a_field_that_cannot_be_asked_itself_keeps_the_answer_by_words(tmp_path):
+    save_scenes(tmp_path, **{name: scene([("wall", 0.0), ("chair", 0.0)], i) for i, name in enumerate("ab")})
+    index, _ = SearchIndex.open(tmp_path).update()
+    (tmp_path / "a" / "field" / "field.safetensors").write_bytes(b"")
+    found = index.search("chair", threshold=0.6, exact=2)
+    assert {one.path: one.exact for one in found.scenes} == {"a/field": False, "b/field": True}
+    assert found.unasked.keys() == {"a/field"}
+    assert "itself: " in found.unasked["a/field"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems refuse such names")
+def test_a_name_that_is_no_text_is_left_out_by_name_and_the_index_stays_readable(tmp_path):
+    field = scene([("wall", 0.0), ("chair", 0.0)], 1)
+    save_scenes(tmp_path, ok=field)
+    shutil.copytree(tmp_path / "ok", os.fsdecode(bytes(tmp_path) + b"/caf\xe9"))
+    changes = SearchIndex.open(tmp_path).update()[1]
+    assert changes.added == ("ok/field",)
+    again = SearchIndex.open(tmp_path)
+    assert again.is_current()
+    assert [one.path for one in again.search("chair").scenes] == ["ok/field"]
+    assert list(again.search("chair").unasked) == [r"caf\udce9/field"]
+    assert "rename the folder" in again.search("chair").unasked[r"caf\udce9/field"]
+    deep = os.fsdecode(bytes(tmp_path) + b"/caf\xe9")  # a folder that is searched may have any name
+    (Path(deep) / "field" / "field.safetensors").write_bytes(b"")
+    assert SearchIndex.open(deep).update()[1].failed.keys() == {"field"}
+    assert SearchIndex.open(deep).is_current()

@@ -5,6 +5,7 @@ import os
 import struct
 import subprocess
 import sys
+import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
@@ -70,6 +71,11 @@ def test_another_version_or_kind_is_named(runs, tmp_path):
         ("atoms.word", -1),
         ("atoms.views", 99),
         ("atoms.count", 0),
+        ("atoms.count", 121),  # of 120
+        ("atoms.count", -(1 << 31)),
+        ("parts.count", 121),
+        ("classes.count", 121),
+        ("classes.count", -1),
         ("links.pair", 1 << 20),
         ("parts.label", 77),
         ("parts.view", -2),
@@ -86,6 +92,27 @@ def test_numbers_that_point_elsewhere_are_refused(runs, tmp_path, name, value):
     bad = rewritten(runs / NAME, tmp_path / "bad", change)
     with pytest.raises(ValueError, match=tells(bad, "damaged", "delete it")):
         read_index(bad)
+
+
+def test_a_few_bytes_that_claim_many_gaussians_take_no_memory_for_each(runs, tmp_path):
+    """Gamma of a cosine follows from the scores of all Gaussians: it is found without a row for each."""
+    honest = SearchIndex.open(runs).search("chair", score="cosine", negatives="none")
+
+    def change(tensors):
+        about = json.loads(tensors["description"].tobytes())
+        for one in about["fields"]:
+            one["gaussians"] *= 10**7
+        tensors["description"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
+        tensors["atoms.count"] *= 10**7
+
+    (tmp_path / "runs").mkdir()
+    rewritten(runs / NAME, tmp_path / "runs" / NAME, change)
+    tracemalloc.start()
+    found = SearchIndex.open(tmp_path / "runs").search("chair", score="cosine", negatives="none")
+    assert [one.count for one in found.scenes] == [one.count * 10**7 for one in honest.scenes]
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 50e6
 
 
 @pytest.mark.parametrize("name", ["description", "atoms.word", "atoms.start", "classes.0", "words.0"])

@@ -1,5 +1,6 @@
 """The output folder of 3DGS, written here from its description: a scene and a splat at once."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -13,9 +14,11 @@ from small_room import make_room
 
 from kfgs import load_scene, read_splats
 from kfgs.cli import main
+from kfgs.features import FeatureFolder
 from kfgs.fields import SemanticField
 from kfgs.formats import write_splats
 from kfgs.formats.ply import write_ply
+from kfgs.pipeline import fit_scene, plan_scene
 from kfgs.scenes import SceneError, is_scene
 from kfgs.scenes.scene import Scene
 
@@ -106,6 +109,17 @@ def test_fit_averages_onto_its_gaussians(room: Path, output: Path, tmp_path: Pat
     assert not (run / "color.ply").exists()
     assert main(["fit", str(output), *maps, "--out", str(run), "--steps", "5"]) == 1
     assert "which needs no training" in capsys.readouterr().err
+
+
+def test_a_splat_needs_no_points(room: Path, output: Path, tmp_path: Path) -> None:
+    scene = load_scene(output)
+    bare = dataclasses.replace(scene, points=torch.zeros(0, 3), colors=torch.zeros(0, 3, dtype=torch.uint8))
+    maps = FeatureFolder(room / "features").of(bare, "train")
+    assert [stage.name for stage in fit_scene(bare, maps, tmp_path / "run").stages] == ["uplift"]
+    planned = plan_scene(bare, features=room / "features")
+    assert "no colours are trained" in str(planned)
+    assert [stage.what for stage in planned.stages if "color" in stage.name] == ["done already"]
+    assert "has 0 points" not in str(planned)
 
 
 def test_attach_takes_the_folder(room: Path, output: Path, tmp_path: Path) -> None:

@@ -224,9 +224,9 @@ def test_pictures_are_rich_enough_for_structure_from_motion(tmp_path):
     """Every one of six neighbouring views of the default size registers."""
     from skimage.io import imsave
 
+    from kfgs.toy.noise import Noise
     from kfgs.toy.render import render
     from kfgs.toy.room import build_room
-    from kfgs.toy.texture import Noise
 
     (tmp_path / "images").mkdir()
     (tmp_path / "sparse").mkdir()

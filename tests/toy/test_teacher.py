@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 import torch
 
+from kfgs.toy.noise import Noise
 from kfgs.toy.render import render, walk_cameras
 from kfgs.toy.room import CLASSES, GROUPS, build_room
 from kfgs.toy.teacher import class_embeddings, teacher_features
-from kfgs.toy.texture import Noise
 
 
 def test_embeddings_are_unit_and_related_classes_are_closer():

@@ -1,7 +1,7 @@
 """Ground truth of published data sets, and of any folder of labels. Poses and pictures come from `kfgs.scenes.load_scene`."""
 
-from ...labels.polygons import decode_rle, fill_polygon, fill_region
-from .coco import load_coco_examples, load_coco_labels, load_coco_masks
+from ...labels.polygons import decode_rle, encode_rle, fill_polygon, fill_region
+from .coco import load_coco_examples, load_coco_labels, load_coco_masks, save_coco
 from .find import find_labels, find_masks, find_points
 from .label_folder import load_labels
 from .legaussians import load_legaussians
@@ -17,6 +17,7 @@ __all__ = [
     "OVS3D_REPORTED",
     "OVS3D_SCENES",
     "decode_rle",
+    "encode_rle",
     "fill_polygon",
     "fill_region",
     "find_labels",
@@ -34,5 +35,6 @@ __all__ = [
     "load_scenesplat_points",
     "load_semantic_nerf_labels",
     "load_surface_points",
+    "save_coco",
     "truth_views",
 ]

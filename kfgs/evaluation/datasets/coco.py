@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,13 +12,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..._files import as_path, read_json
+from ..._files import as_path, read_json, write_json
 from ...fields.examples import Mask
-from ...labels.polygons import MOST, decode_rle, fill_region, say_range, union
+from ...labels.polygons import MOST, decode_rle, encode_rle, fill_region, say_range, union
 from ...scenes.files import MAX_SIDE, file_stem
 from ..class_lists import VOID_NAMES, name_key
 from ..truth import LabelTruth, MaskAndBoxes, MaskTruth
 from .files import ReadWhenAsked
+
+WRITER = "label maps by kfgs"  # in the files that kfgs writes
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,50 @@ def load_coco_labels(path: str | Path) -> LabelTruth:
     index = {category: asked.index(category) if category in asked else -1 for category in names}
     readers = {stem: partial(_labels, path, index, p) for stem, p in pictures.items()}
     return LabelTruth(tuple(names[category] for category in asked), ReadWhenAsked(readers))
+
+
+def save_coco(
+    path: str | Path,
+    labels: Mapping[str, Tensor],  # each [H, W] int64, -1 = none
+    names: Sequence[str],
+) -> None:
+    """Write label maps as a COCO JSON: one annotation for each class of each picture, with run lengths, area and box.
+
+    Two chairs in a picture are one annotation. Category ids are the labels plus 1, because 0 means background in many
+    programs. `load_coco_labels` reads the same labels again.
+
+    Args:
+        path: the file.
+        labels: the label map of each picture, by the name of its file.
+        names: the name of each class.
+
+    Raises:
+        ValueError: if a label has no name.
+    """
+    annotations: list[dict[str, Any]] = []
+    for number, (file, found) in enumerate(labels.items(), start=1):
+        for label in found.unique().tolist():
+            if label >= len(names):
+                raise ValueError(f"labels: expected classes below {len(names)} (the names), got {label} in {file}")
+            if label < 0:
+                continue
+            mask = found == label
+            rows, columns = mask.any(dim=1).nonzero()[:, 0].tolist(), mask.any(dim=0).nonzero()[:, 0].tolist()
+            box = [columns[0], rows[0], columns[-1] - columns[0] + 1, rows[-1] - rows[0] + 1]  # x, y, width, height
+            one = {"id": len(annotations) + 1, "image_id": number, "category_id": label + 1, "iscrowd": 0}
+            annotations.append(one | {"segmentation": encode_rle(mask), "area": int(mask.sum()), "bbox": box})
+    images = [
+        {"id": number, "file_name": file, "height": found.shape[0], "width": found.shape[1]}
+        for number, (file, found) in enumerate(labels.items(), start=1)
+    ]
+    categories = [{"id": label + 1, "name": name} for label, name in enumerate(names)]
+    info = {"description": WRITER}
+    write_json(path, {"info": info, "images": images, "annotations": annotations, "categories": categories})
+
+
+def is_ours(path: Path) -> bool:
+    """Whether `save_coco` wrote a file."""
+    return bool(read_json(path)["info"]["description"] == WRITER)
 
 
 def _read(path: Path) -> tuple[dict[int, str], dict[str, _Picture]]:

@@ -1,0 +1,169 @@
+"""The command segment: label pictures of a field, for views of a scene or a camera path."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from .._files import check_output, check_own, read_json
+from .files import check_alone, open_field
+from .options import Classes, Flag, Given, GivenWalk, Positional, Rule, Walk
+from .output import say, wrote
+from .render import walk_of
+from .view import open_colors
+
+# Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
+
+
+def segment(
+    field: Positional[Path],
+    out: Path,
+    *,
+    split: str = "test",
+    path: GivenWalk = None,
+    frames: Given[int] = None,
+    width: Given[int] = None,
+    color: Given[Path] = None,
+    coco: Flag = False,
+    labels: Given[Path] = None,
+    features: Given[Path] = None,
+    rule: Rule = "fused",
+    pictures: int = 4,
+    classes: Classes,
+) -> None:
+    """Segment the views of a scene with a field; score them if there are label pictures. Or segment a camera path.
+
+    Examples:
+        kfgs segment run/field --out segmented/
+        kfgs segment run/field --out segmented/ --scene scene/ --text words.safetensors --split train
+        kfgs segment run/field --out segmented/ --split train --coco
+        kfgs segment run/field --out masks/ --path spiral --frames 40 --coco
+
+    Args:
+        field: The folder that `kfgs fit` wrote (RUN/field).
+        out: Folder for label maps (predicted/ has class numbers, colored/ shows them in colours), pictures and scores.json.
+        split: Which views: train, test, or another split that SCENE/split.json names.
+        path: Segment the cameras of a path, as `kfgs render` has it, instead of the views of a split: orbit, spiral or cameras.
+        frames: Number of cameras of the path; by default 72.
+        width: Width of its pictures in pixels; by default 480.
+        color: Colour splat for the pictures of the path (with --coco); by default that of the run.
+        coco: Write coco/annotations.json (COCO's run lengths, areas and boxes; one annotation for each class of each picture)
+            and its pictures to coco/images: undistorted photographs, or with --path rendered colours.
+        labels: Folder of true label pictures; SCENE/labels_scored or SCENE/labels when not given.
+        features: Folder of the teacher's maps, for the sheets; SCENE/features when not given, if it exists.
+        rule: fused: the classes of the field's Gaussians; paper: decode every pixel (Sec. 3.4), seconds a view.
+        pictures: How many views get pictures: a sheet (photo, truth, teacher, field, errors), an overlay and features.
+    """
+    from ..fields import recall_scene
+    from ..pipeline import score_scene, segment_scene, true_labels, write_coco, write_report
+    from ..pipeline.apply import SEGMENTED
+    from ..pipeline.label_pictures import check_coco
+    from ..viz import plot_iou, plot_largest_confusions
+    from ..viz.pictures import check_pictures
+
+    check_output("out", out, "a folder")
+    if path is not None:
+        for name, value in (("labels", labels), ("features", features)):
+            check_alone(name, value, "with --path, of whose pictures nothing is known")
+        size = 72 if frames is None else frames, 480 if width is None else width
+        return _segment_path(field, out, path, size, color, coco, rule, classes)
+    alone: dict[str, object] = {"frames": frames, "width": width, "color": color}
+    for name, given in alone.items():
+        check_alone(name, given, "without --path, which it belongs to")
+    loaded_field = open_field("field", field)
+    scene = recall_scene(loaded_field.info, loaded_field.folder) if classes.scene is None else classes.scene
+    classes = dataclasses.replace(classes, scene=scene)
+    loaded, label_set = classes.load_scene().undistorted(), classes.load_classes()
+    folder = labels or next((scene / name for name in ("labels_scored", "labels") if (scene / name).is_dir()), None)
+    listed = scene / "classes.json"
+    if labels is None and folder is not None and listed.is_file() and tuple(read_json(listed)) != label_set.names:
+        say(f"note: not scored: {folder} counts the classes of {listed}, which are others; pass --classes {listed}")
+        folder = None
+    truth = {} if folder is None else true_labels(loaded, folder, split)
+    if labels is not None and not truth:
+        raise ValueError(
+            f"labels: expected pictures <stem>.png of the views of split {split!r} in {labels}, found none; "
+            "name the folder that holds them"
+        )
+    seen = set(loaded_field.info.get("views", ())) & {loaded.cameras[i].name for i in loaded.views(split)}
+    if seen:
+        say(f"note: the field was trained on {len(seen)} of these views")
+    if features is not None and not features.is_dir():
+        raise ValueError(f"features: expected a folder of feature maps, got {features}, which is none; name another")
+    maps = features or (scene / "features" if (scene / "features").is_dir() else None)
+    if truth:
+        check_own(out / "scores.json", lambda path: bool(read_json(path)["segmentation"]), "kfgs segment")
+        check_pictures(out, ("confusion", "iou"), "kfgs segment")
+    if coco:
+        check_coco(out, (loaded.stem(i) for i in loaded.views(split)))
+    found = segment_scene(
+        loaded_field,
+        loaded,
+        label_set,
+        out,
+        split=split,
+        rule=rule,
+        pictures=pictures,
+        truth=truth,
+        maps=maps,
+        progress=True,
+    )
+    written = [out / name for name in SEGMENTED if (out / name).is_dir()]
+    if coco:
+        views = {loaded.stem(i): i for i in loaded.views(split)}
+        written.append(write_coco(out, found, label_set.names, lambda stem: loaded.image(views[stem])))
+    if truth:
+        scores = score_scene(found, truth, label_set)
+        say(str(scores))
+        write_report(out / "scores.json", segmentation=scores, truth=str(folder), field=str(field), rule=rule)
+        picture = out / "confusion.png"
+        plot_largest_confusions(scores.confusion, list(label_set.names), picture, misses=scores.misses)
+        plot_iou(scores.iou, list(label_set.names), out / "iou.png")
+        written += [out / name for name in ("scores.json", "confusion.png", "iou.png")]
+    else:
+        say(f"note: no label pictures of split {split!r} to score against")
+    wrote(written)
+
+
+def _segment_path(
+    field: Path,
+    out: Path,
+    path: Walk,
+    size: tuple[int, int],
+    color: Path | None,
+    coco: bool,
+    rule: Rule,
+    classes: Classes,
+) -> None:
+    """Segment the cameras of a path, and with --coco render the colours that they see."""
+    from .._check import check_whole
+    from ..cameras import Camera
+    from ..pipeline import segment_cameras, write_coco
+    from ..pipeline.label_pictures import check_coco
+    from ..viz import show_cloud
+
+    frames, width = size
+    check_whole("frames", frames, 2)
+    check_whole("width", width, 16)
+    classes.check_images()
+    if not coco:
+        check_alone("color", color, "without --coco, whose pictures it colours")
+    loaded = classes.open_field("field", field)
+    label_set = classes.of_field(loaded)
+    cameras = list(loaded.cameras) if classes.scene is None else classes.load_scene().undistorted().cameras
+    colors = open_colors(field, color, loaded) if coco else None
+    walk: dict[str, Camera] = {
+        str(camera.name): camera for camera in walk_of(path, loaded.gaussians.means, cameras, frames, width)
+    }
+    if coco:
+        check_coco(out, walk)
+    found = segment_cameras(loaded, list(walk.values()), label_set, out, rule=rule, progress=True)
+    written = [out / "predicted", out / "colored"]
+    if coco:
+        show = None if colors is None else show_cloud(colors, color_by="rgb")
+        if show is None:
+            say("note: no colour splat is known, so there are no pictures beside the annotations; --color names one")
+        picture: Any = None if show is None else lambda name: show(walk[name])
+        written.append(write_coco(out, found, label_set.names, picture))
+    wrote(written)

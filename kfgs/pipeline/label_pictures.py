@@ -1,0 +1,100 @@
+"""Label pictures for other programs: masks of any cameras, and COCO's JSON with the pictures that it speaks of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+
+from torch import Tensor
+from tqdm import tqdm
+
+from .._check import typed
+from .._files import as_path, check_output, check_own
+from ..cameras import Camera
+from ..evaluation.datasets.coco import is_ours, save_coco
+from ..fields import Rule, SemanticField
+from ..labels import LabelSet
+from ..scenes.files import file_stem
+from ..viz import save_picture
+from ..viz.pictures import Array, check_pictures
+from .apply import SEGMENTED, check_classes, save_colored_labels, save_label_map
+
+COCO = "coco"  # the folder with annotations.json and images/
+
+
+@typed
+def segment_cameras(
+    field: SemanticField,
+    cameras: Sequence[Camera],
+    classes: LabelSet,
+    out: str | Path,
+    *,
+    rule: Rule = "fused",
+    progress: bool = False,
+) -> dict[str, Tensor]:
+    """Segment what any cameras see, and write label pictures. For views of a scene, `segment_scene` adds photographs.
+
+    Args:
+        field: a finished field.
+        cameras: viewpoints without distortion in its frame, each with a name of its own: `path_cameras`, `orbit_cameras`,
+            `spiral_cameras`, or your own.
+        classes: names and embeddings in the teacher's space.
+        out: receives `predicted/<name>.png` (class numbers, 255 = none) and `colored/<name>.png` (in the classes' colours).
+        rule: as in `SemanticField.segment`.
+        progress: show a progress bar.
+
+    Returns:
+        The label map [H, W] of each camera by its name, without a suffix such as .png.
+
+    Raises:
+        ValueError: if names are missing or repeated, or there are more classes than a byte can hold.
+    """
+    out, names = as_path(out), [file_stem(camera.name or "") for camera in cameras]
+    if "" in names or len(set(names)) != len(names):
+        raise ValueError(f"cameras: expected a name of its own for each, got {names!r:.120}; name them with replace()")
+    for folder in SEGMENTED[:2]:
+        check_output("out", out / folder, "a folder")
+        check_pictures(out, (f"{folder}/{name}" for name in names), "kfgs segment")
+    check_classes(field, classes)
+    found: dict[str, Tensor] = {}
+    for name, camera in zip(names, tqdm(cameras, desc="segment", unit="view", disable=not progress), strict=True):
+        found[name] = field.segment(camera, classes, rule=rule)
+        save_label_map(out / "predicted" / f"{name}.png", found[name])
+        save_colored_labels(out / "colored" / f"{name}.png", found[name], classes.names)
+    return found
+
+
+def check_coco(out: Path, names: Iterable[str]) -> None:
+    """Check before the work that `write_coco` may write there."""
+    check_output("out", out / COCO, "a folder")
+    check_pictures(out, (f"{COCO}/images/{name}" for name in names), "kfgs segment")
+    check_own(out / COCO / "annotations.json", is_ours, "kfgs segment")
+
+
+def write_coco(
+    out: str | Path,
+    labels: Mapping[str, Tensor],  # each [H, W] int64, -1 = none
+    names: Sequence[str],
+    picture: Callable[[str], Tensor | Array] | None = None,
+) -> Path:
+    """Write `coco/annotations.json`, and the pictures that it speaks of to `coco/images/`.
+
+    The pictures are of the same camera as the labels. A photograph by a lens with distortion is not: it must be undistorted,
+    as `Scene.image` of an undistorted scene is.
+
+    Args:
+        out: receives the folder `coco`.
+        labels: the label map of each view by its name, for instance from `segment_scene` or `segment_cameras`.
+        names: the name of each class.
+        picture: gives the picture [H, W, 3] of a view by its name; None: write no pictures.
+
+    Returns:
+        The folder `coco`.
+    """
+    folder = as_path(out) / COCO
+    check_coco(as_path(out), labels)
+    for name in labels:
+        if picture is not None:
+            save_picture(folder / "images" / f"{name}.png", picture(name))
+    save_coco(folder / "annotations.json", {f"{name}.png": found for name, found in labels.items()}, names)
+    return folder

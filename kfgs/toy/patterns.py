@@ -1,0 +1,258 @@
+"""The patterns of the toy room's materials: wood, cloth, wallpaper, a rug, books, pictures on the wall.
+
+Each is a function of the material, the noise and the places that are asked for, and gives a colour for each place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .noise import Array, Noise, hashed
+
+if TYPE_CHECKING:
+    from .texture import Texture
+
+
+class Spots(NamedTuple):
+    """Places on the surface of one object."""
+
+    local: Array  # [N, 3] metres, in the object's axes
+    plane: Array  # [N, 2] metres on the face, from its centre; on an upright face, the second is the height
+    edge: Array  # [N, 2] half sizes of the face
+    axis: NDArray[np.int64]  # [N] the face's normal axis
+    grain: Array  # [N] fine noise
+    footprint: Array  # [N] metres a pixel covers
+    fibres: Array  # [N, 3] where to read noise that is drawn out along the longest edge
+    place: Array  # [N, 3] where to read other noise
+
+
+def _ramp(colors: tuple[tuple[float, float, float], ...], value: Array) -> Array:  # [N] in [0, 1] -> [N, 3]
+    """Piecewise linear colours over [0, 1]."""
+    stops = np.linspace(0.0, 1.0, len(colors))
+    return np.stack([np.interp(value, stops, [c[i] for c in colors]) for i in range(3)], axis=-1)
+
+
+def _cover(distance: Array, reach: float, footprint: Array) -> Array:  # [N] -> [N] in [0, 1]
+    """How much of a pixel lies within `reach` of a line from which its centre is `distance` away."""
+    return np.clip((reach - np.abs(distance)) / footprint + 0.5, 0.0, 1.0) * np.clip(2 * reach / footprint, 0.0, 1.0)
+
+
+def _mix(below: Array, above: Array | tuple[float, ...], share: Array) -> Array:  # [N, 3], [N, 3], [N] -> [N, 3]
+    return below + (np.asarray(above) - below) * share[:, None]
+
+
+def _plaster(texture: Texture, noise: Noise, spots: Spots) -> Array:
+    cloud = noise.fractal(spots.place, 0.9, spots.footprint, octaves=2)
+    return _ramp(texture.colors[:2], np.clip(0.5 + 0.4 * cloud, 0.0, 1.0))
+
+
+def _sprigs(texture: Texture, noise: Noise, spots: Spots) -> Array:
+    """Wallpaper: scattered leaves; each has its own place, turn, size and tint, so that SfM can tell them apart."""
+    s, (u, v) = texture.scale, spots.plane.T / texture.scale
+    cell = np.stack([np.floor(u), np.floor(v)], -1).astype(np.int64)
+    turn, tone, length, right, up = (hashed(cell, texture.seed + k) for k in range(5))
+    x, y = (u - cell[:, 0] - 0.3 - 0.4 * right) * s, (v - cell[:, 1] - 0.3 - 0.4 * up) * s
+    angle = np.pi * turn
+    along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+    reach = s * (0.10 + 0.20 * length)
+    leaf = (0.25 + 0.35 * tone) * reach * (1.0 - (along / reach) ** 2)
+    inside = np.clip((leaf - np.abs(across)) / spots.footprint + 0.5, 0.0, 1.0)
+    vein = _cover(across, 0.0025, spots.footprint) * (np.abs(along) < reach)
+    shade = _ramp(texture.colors, np.clip(0.25 + 0.75 * tone, 0, 1) * (1.0 - 0.7 * vein))
+    return _mix(_plaster(texture, noise, spots), shade, inside)
+
+
+def _threads(noise: Noise, spots: Spots, wavelength: float) -> Array:  # [N]
+    """Woven threads: noise drawn out along one direction, and along the other."""
+    third = spots.axis * 0.7 + spots.place[0, 0] if len(spots.place) else spots.axis * 0.7
+    total = np.zeros(len(spots.plane))
+    for stretch in ((0.12, 1.0), (1.0, 0.12)):
+        at = np.column_stack([spots.plane * stretch, third + stretch[0]])
+        total += noise.fractal(at, wavelength, spots.footprint, octaves=3)
+    return total
+
+
+def _weave(texture: Texture, noise: Noise, spots: Spots) -> Array:
+    return _ramp(texture.colors, np.clip(0.5 + 0.3 * _threads(noise, spots, texture.scale), 0.0, 1.0))
+
+
+def _stripes(texture: Texture, noise: Noise, spots: Spots) -> Array:
+    """Woven stripes of unequal widths, in the colours' order."""
+    at = spots.plane[:, 0] / texture.scale
+    phase = at - np.floor(at)
+    color = np.broadcast_to(np.array(texture.colors[0]), (len(at), 3))
+    for k, (middle, reach) in enumerate(((0.3, 0.13), (0.62, 0.05), (0.86, 0.03))):
+        share = _cover((phase - middle) * texture.scale, reach * texture.scale, spots.footprint)
+        color = _mix(color, texture.colors[1 + k % (len(texture.colors) - 1)], share)
+    return color * (1.0 + 0.06 * _threads(noise, spots, 0.05))[:, None]
+
+
+def _fibre_tone(texture: Texture, noise: Noise, spots: Spots) -> Array:  # [N] in [0, 1]
+    """Growth rings that were cut along, under fine grain."""
+    wave = noise.fractal(spots.fibres, 0.5, spots.footprint, octaves=2)
+    rings = np.sin(2 * np.pi * ((spots.fibres @ np.ones(3)) / texture.scale + 1.6 * wave))
+    return 0.5 + 0.22 * rings + 0.3 * spots.grain
+
+
+def _wood(texture: Texture, noise: Noise, spots: Spots) -> Array:
+    return _ramp(texture.colors, np.clip(_fibre_tone(texture, noise, spots), 0.0, 1.0))
+
+
+def _planks(texture: Texture, noise: Noise, spots: Spots) -> Array:
+    """Floor boards of equal width, each with a tone of its own, and thin dark joints."""
+    s, (u, v) = texture.scale, spots.plane.T
+    row = np.floor(v / s).astype(np.int64)
+    along = u / (9.0 * s) + hashed(row[:, None], texture.seed)
+    tone = hashed(np.stack([row, np.floor(along).astype(np.int64)], -1), texture.seed)
+    color = _ramp(texture.colors, np.clip(0.1 + 0.65 * tone + 0.25 * spots.grain, 0.0, 1.0))
+    joint = np.maximum(
+        _cover((v / s - np.round(v / s)) * s, 0.003, spots.footprint),
+        _cover((along - np.round(along)) * 9.0 * s, 0.002, spots.footprint),
+    )
+    return color * (1.0 - 0.65 * joint)[:, None]
+
+
+def _panel(texture: Texture, noise: Noise, spots: Spots) -> Array:
+    """A door or a drawer's front: a frame around a sunken panel, and a knob of the last colour."""
+    tone = np.clip(_fibre_tone(texture, noise, spots), 0.0, 1.0)
+    color = _ramp(texture.colors[:-1], tone)
+    inset = (spots.edge - np.abs(spots.plane)).min(-1)  # metres from the nearest edge of the face
+    broad = spots.edge.min(-1) > 0.15  # the narrow sides have no panel
+    color = color * (1.0 - broad * 0.4 * _cover(inset - texture.scale, 0.006, spots.footprint))[:, None]
+    color = color * (1.0 + broad * 0.2 * _cover(inset - texture.scale - 0.012, 0.006, spots.footprint))[:, None]
+    knob = np.hypot(spots.plane[:, 0] - 0.82 * spots.edge[:, 0], spots.plane[:, 1]) - 0.012
+    return _mix(color, texture.colors[-1], broad * np.clip(0.5 - knob / spots.footprint, 0.0, 1.0))
+
+
+def _books(texture: Texture, noise: Noise, spots: Spots) -> Array:
+    """A bookcase: wood, and on the front a shelf of books whose spines have the later colours."""
+    color = _ramp(texture.colors[:2], np.clip(_fibre_tone(texture, noise, spots), 0.0, 1.0))
+    inset = (spots.edge - np.abs(spots.plane)).min(-1)
+    front = (spots.axis == 0) * np.clip((inset - 0.025) / spots.footprint + 0.5, 0.0, 1.0)
+    u, v = spots.plane.T
+    s = texture.scale
+    at = u / s + 0.3 * np.sin(2.1 * u / s) + 31.0  # spines of unequal width
+    book = np.floor(at).astype(np.int64)[:, None]
+    tone, height = hashed(book, texture.seed), hashed(book, texture.seed + 1)
+    spines = np.array(texture.colors[2:])
+    spine = spines[(tone * len(spines)).astype(int)] * (0.85 + 0.3 * height)[:, None]
+    rounding = 1.0 - 1.6 * (at - np.floor(at) - 0.5) ** 2
+    label = _cover(
+        v - (0.1 + 0.1 * tone), 0.012 + 0.02 * float(hashed(np.array([[3]]), texture.seed)[0]), spots.footprint
+    )
+    spine = _mix(spine * rounding[:, None], (0.82, 0.78, 0.68), 0.7 * label)
+    top = spots.edge[:, 1] * (0.35 + 0.5 * height) - v
+    shadow = _mix(0.25 * color, spine, np.clip(top / spots.footprint + 0.5, 0.0, 1.0))
+    return color + (shadow - color) * front[:, None]
+
+
+def _rug(texture: Texture, noise: Noise, spots: Spots) -> Array:
+    """Diamonds in fine lines on a light ground, with a border; the pile makes them a little uneven."""
+    pile = noise.fractal(spots.place, 0.09, spots.footprint, octaves=3)
+    u, v = (spots.plane + 0.006 * pile[:, None]).T
+    s = texture.scale
+    color = _ramp(texture.colors[:2], np.clip(0.5 + 0.35 * _threads(noise, spots, 0.06), 0.0, 1.0))
+    one, two = u / s + 0.62 * v / s, u / s - 0.62 * v / s
+    cell = np.stack([np.floor(one).astype(np.int64), np.floor(two).astype(np.int64)], -1)
+    lines = np.maximum(*(_cover((k - np.round(k)) * s * 0.85, 0.011, spots.footprint) for k in (one, two)))
+    heart = np.abs(one - cell[:, 0] - 0.5) + np.abs(two - cell[:, 1] - 0.5)
+    filled = hashed(cell, texture.seed) < 0.55
+    color = _mix(color, texture.colors[3], filled * np.clip((0.22 - heart) * s / spots.footprint + 0.5, 0.0, 1.0))
+    color = _mix(color, texture.colors[2], 0.85 * lines)
+    inset = (spots.edge - np.abs(spots.plane)).min(-1)
+    color = _mix(color, texture.colors[0], np.clip((0.15 - inset) / spots.footprint + 0.5, 0.0, 1.0))
+    for middle, reach, which in ((0.15, 0.012, 2), (0.085, 0.028, 3), (0.03, 0.008, 2)):
+        color = _mix(color, texture.colors[which], _cover(inset - middle, reach, spots.footprint))
+    return color * (1.0 + 0.07 * pile)[:, None]
+
+
+def _leaves(texture: Texture, noise: Noise, spots: Spots) -> Array:
+    """Foliage: each place belongs to the nearest of scattered leaves, bright in its middle and dark at its rim."""
+    at = spots.place / texture.scale * (1.0, 1.0, 0.6)
+    cell = np.floor(at).astype(np.int64)
+    nearest, second = np.full(len(at), 9.0), np.full(len(at), 9.0)
+    tone = np.zeros(len(at))
+    for step in np.ndindex(3, 3, 3):
+        other = cell + np.array(step) - 1
+        middle = other + np.stack([hashed(other, texture.seed + k) for k in range(3)], -1)
+        away = middle - at
+        distance = np.sqrt(np.einsum("ij,ij->i", away, away))
+        closer = distance < nearest
+        second = np.where(closer, nearest, np.minimum(second, distance))
+        tone = np.where(closer, hashed(other, texture.seed + 3), tone)
+        nearest = np.minimum(nearest, distance)
+    body = np.clip((second - nearest) / 0.45, 0.0, 1.0)
+    return _ramp(texture.colors, np.clip(body * (0.45 + 0.55 * tone), 0.0, 1.0))
+
+
+def _framed(inside: Callable[[Texture, Noise, Spots], Array]) -> Callable[[Texture, Noise, Spots], Array]:
+    """A picture within a white mount and a frame of the first colour."""
+
+    def draw(texture: Texture, noise: Noise, spots: Spots) -> Array:
+        inset = (spots.edge - np.abs(spots.plane)).min(-1)
+        color = _mix(inside(texture, noise, spots), (0.90, 0.89, 0.85), _cover(inset, 0.085, spots.footprint))
+        frame = np.array(texture.colors[0]) * (1.0 + 0.25 * spots.grain)[:, None]
+        return color + (frame - color) * _cover(inset, 0.028, spots.footprint)[:, None]
+
+    return draw
+
+
+def _hills(texture: Texture, noise: Noise, spots: Spots) -> Array:
+    """A landscape: a sky, a low sun, and ranges of hills, the nearest darkest."""
+    (u, v), h = spots.plane.T, spots.edge[:, 1]
+    sky, sun, *ranges = texture.colors[1:]
+    color = _mix(np.broadcast_to(np.array(sky), (len(u), 3)), (0.97, 0.93, 0.86), np.clip(0.5 - v / h, 0.0, 1.0))
+    disc = np.hypot(u - 0.2 * spots.edge[:, 0], v - 0.22 * h) - 0.055
+    color = _mix(color, sun, np.clip(0.5 - disc / spots.footprint, 0.0, 1.0))
+    for k, tone in enumerate(ranges):
+        at = np.stack([u + 3.0 * k, np.full_like(u, 0.4 + k), np.zeros_like(u)], -1) + spots.place[:1] * 0
+        ridge = h * (0.18 - 0.3 * k) + 0.07 * noise.fractal(at, 0.7, np.full(len(u), 1e-3), octaves=4, gain=0.45)
+        share = np.clip((ridge - v) / spots.footprint + 0.5, 0.0, 1.0)
+        color = _mix(
+            color,
+            _mix(
+                np.broadcast_to(np.array(tone), color.shape),
+                (0.93, 0.92, 0.88),
+                0.35 * np.clip((ridge - v) / (0.5 * h), 0.0, 1.0),
+            ),
+            share,
+        )
+    return color
+
+
+def _shapes(texture: Texture, noise: Noise, spots: Spots) -> Array:
+    """An abstract print: discs and arches of flat colours."""
+    (u, v), (w, h) = spots.plane.T, spots.edge.T
+    color = np.broadcast_to(np.array(texture.colors[1]), (len(u), 3))
+    rng = np.random.default_rng([texture.seed, 7])
+    for k, tone in enumerate(texture.colors[2:] * 2):
+        x, y = rng.uniform(-0.62, 0.62), rng.uniform(-0.4, 0.4)
+        reach = rng.uniform(0.07, 0.15) / (1 + k // 3 * 0.6)
+        away = np.hypot(u - x * w, v - y * h)
+        inside = np.clip((reach - away) / spots.footprint + 0.5, 0.0, 1.0)
+        if k % 3 == 1:
+            inside = _cover(away - reach, 0.018, spots.footprint)
+        elif k % 3 == 2:
+            inside *= v > y * h
+        color = _mix(color, tone, inside)
+    return color
+
+
+PATTERNS: dict[str, Callable[[Texture, Noise, Spots], Array]] = {
+    "plaster": _plaster,
+    "sprigs": _sprigs,
+    "weave": _weave,
+    "stripes": _stripes,
+    "planks": _planks,
+    "wood": _wood,
+    "panel": _panel,
+    "books": _books,
+    "rug": _rug,
+    "leaves": _leaves,
+    "hills": _framed(_hills),
+    "shapes": _framed(_shapes),
+}

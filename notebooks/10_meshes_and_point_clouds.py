@@ -1,0 +1,158 @@
+# %% [markdown]
+# # 10. Meshes and point clouds
+#
+# How do I use the classes of a field outside of kfgs: in trimesh, Open3D or pyvista, and on a mesh of the same room? You will
+# see the chairs as a point cloud of trimesh, the classes carried to a mesh, the area and the volume of each class beside
+# the true ones, and files for Blender.
+#
+# About a minute on two CPU cores if no notebook was run before this one, 15 seconds if
+# `5_query_transfer_edit` was. Needs the extra `notebook`, no data. Open3D (400 MB) is used if it is there.
+
+# %%
+# Your own data: a scene, its teacher's maps, the classes with their text embeddings, a run folder; a mesh of the scene in the
+# same frame; what to look for, the classes to measure, and what hides the rest from outside.
+import os
+from pathlib import Path
+
+from kfgs import ToyConfig, make_toy_room
+
+data = Path(os.environ.get("KFGS_NOTEBOOK_DATA", "data"))
+folder = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6))  # yours: folder = Path("my/scene")
+features, names, text = folder / "features", folder / "classes.json", folder / "text.npy"
+run, out = data / "run", data / "meshes"
+mesh_file = None  # yours: Path("scan.ply"); None: the boxes and ellipsoids that the toy room is made of
+thing, measured = "chair", ("chair", "table", "sofa", "cabinet", "plant")
+shell = ("ceiling", "wall", "door", "picture")
+finest, reach = 0.1, 0.1  # scene units: longer edges of the mesh are divided first; lambda, None: the spacings decide
+
+# %%
+from dataclasses import replace
+from importlib.util import find_spec
+
+import numpy as np
+import pyvista as pv
+import trimesh
+from PIL import Image
+
+import kfgs
+from kfgs import viz
+from kfgs.cameras import Orbit, estimate_up, orbit_cameras
+from kfgs.labels import label_mesh
+from kfgs.toy.room import build_room
+
+scene = kfgs.load_scene(folder).undistorted()
+classes = kfgs.load_label_set(names, text)
+maps = kfgs.FeatureFolder(features).of(scene, "train")
+quick = kfgs.ColorConfig.quick()
+quick = replace(quick, field=replace(quick.field.with_steps(800), max_gaussians=60_000))
+color = kfgs.fit_color(scene, run, quick).gaussians  # the same fields as in notebooks 4 to 6
+field = kfgs.fit_scene(scene, maps, run, kfgs.FitConfig.cpu(), splat=color).field
+splat = kfgs.attach(field, kfgs.SplatFile(color), classes).splats  # the colour splat with a class for each Gaussian
+print(splat)
+
+# %% [markdown]
+# ## A point cloud of trimesh
+#
+# One point per Gaussian, in the colours of the classes; what else is known of a Gaussian is in `metadata`. `color_by="rgb"`
+# takes the colours of the splat.
+
+# %%
+found = kfgs.OfClass(thing).select(splat)
+points = viz.to_trimesh(splat.select(found.mask), "rgb")
+print(points, {name: np.shape(values) for name, values in points.metadata.items()})
+box = points.bounding_box_oriented
+print(
+    f"the {thing}s lie in a box of {np.round(box.primitive.extents, 2)}, their hull has {points.convex_hull.volume:.2f}"
+)
+
+# %% [markdown]
+# The same for Open3D: its point cloud takes every array along, and selections keep them.
+
+# %%
+if find_spec("open3d"):
+    cloud = viz.to_open3d(splat)
+    print(cloud)
+    print(cloud.select_by_index(np.flatnonzero(found.mask)))
+else:
+    print("not installed: pip install open3d")
+
+# %% [markdown]
+# ## Classes on a mesh
+#
+# The other direction: every vertex, and the centre of every face, takes the label of the nearest Gaussian that is closer than
+# lambda (Sec. 3.4 of the paper). Large faces are divided first: a wall of two triangles has two centres. This mesh has sides
+# that no picture shows, for example the undersides and the backs of the cabinets. A small lambda leaves them without a class;
+# without a lambda of yours, 99.5 % of the mesh get one.
+
+# %%
+if mesh_file is None:
+    parts, solids = [], build_room(ToyConfig().seed)
+    for solid in solids:
+        is_box = solid.shape == "box"
+        part = trimesh.creation.box((2, 2, 2)) if is_box else trimesh.creation.icosphere(subdivisions=3)
+        turn = np.eye(4)
+        turn[:3, :3], turn[:3, 3] = solid.rotation(), solid.center
+        parts.append(part.apply_scale(solid.half).apply_transform(turn))
+    mesh = trimesh.util.concatenate(parts)
+else:
+    mesh = trimesh.load_mesh(mesh_file)
+fine = mesh.subdivide_to_size(finest, max_iter=20)
+labelled = label_mesh(fine, splat, reach)
+print(labelled)
+print(labelled.transfer)
+
+# %% [markdown]
+# The result holds arrays; they can be hung on a mesh of any library. Here pyvista draws it, without the walls and the ceiling.
+
+# %%
+surface = pv.wrap(fine)
+surface.cell_data["rgb"] = viz.palette(labelled.face_labels, classes.names)
+hidden = [-1, *(classes.index(name) for name in shell if classes.knows(name))]
+inside = surface.extract_cells(~np.isin(labelled.face_labels, hidden))
+up = estimate_up(scene.cameras)
+orbit = Orbit(frames=1, size=(450, 640), elevation_degrees=50, start_degrees=120, zoom=1.8)
+furniture = splat.gaussians[~np.isin(splat.gaussians.labels, hidden)]
+outside = orbit_cameras(furniture.means, orbit, up=up)[0]
+plotter = viz.make_plotter(*outside.size, off_screen=True)
+plotter.add_mesh(inside, scalars="rgb", rgb=True, ambient=0.4, diffuse=0.7)
+viz.look_through(plotter, outside)
+picture = plotter.screenshot()
+plotter.close()
+shown = viz.show_cloud(furniture, color_by="rgb")(outside)
+Image.fromarray(viz.picture_grid([[shown, picture]], ("the splat", "the mesh with its classes"), width=512))
+
+# %% [markdown]
+# ## Areas and volumes
+#
+# The area of a class is the sum of its faces. A part of the mesh without holes has a volume as well; its class is the one with
+# the largest area on it. The toy room knows the truth: the solids that each class is made of. Found areas are smaller where
+# sides are hidden (sofa, cabinet), and larger where the class spills over to what is near (the chairs to floor and rug below
+# them, of which the splat has few Gaussians). Volumes are exact: they only ask for the class of a part. A scan of a real
+# room is one open surface, with areas and without volumes.
+
+# %%
+areas, volumes = labelled.areas(), labelled.volumes()
+for name in measured:
+    line = f"{name:<10} area {areas.get(name, 0.0):6.2f}   volume {volumes.get(name, 0.0):6.3f}"
+    if mesh_file is None:
+        true = [part for part, solid in zip(parts, solids, strict=True) if solid.label == name]
+        line += f"   true: {sum(one.area for one in true):6.2f} {sum(one.volume for one in true):6.3f}"
+    print(line)
+
+# %% [markdown]
+# ## Files
+#
+# A mesh in the colours of its classes, for any program, and one plain PLY for each class of the splat, for programs that show
+# splats as separate objects. On the command line: `kfgs convert labelled.ply objects/ --by-class`.
+
+# %%
+out.mkdir(exist_ok=True)
+fine.visual.face_colors = viz.palette(labelled.face_labels, classes.names)
+fine.export(out / "classes.glb")
+for label, part in splat.by_class().items():
+    name = "unlabelled" if label < 0 else classes.names[label].replace(" ", "_")
+    part.save(out / f"{name}.ply", plain=True)
+print(*sorted(path.name for path in out.glob("*.[gp]l[by]")), sep=", ")
+
+# %% [markdown]
+# [5_query_transfer_edit](5_query_transfer_edit.py) has edits, [6_inspect_in_pyvista](6_inspect_in_pyvista.py) the viewer.

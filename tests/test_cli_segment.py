@@ -1,0 +1,118 @@
+"""`kfgs segment` for other programs: COCO's JSON with its pictures, and the label pictures of a camera path."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from messages import tells
+from PIL import Image
+from small_room import make_desk
+
+from kfgs.cameras import orbit_cameras
+from kfgs.cli import main
+from kfgs.evaluation.datasets import load_coco_labels
+from kfgs.fields import SemanticField
+from kfgs.pipeline import segment_cameras, write_coco
+from kfgs.scenes import load_scene
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory):
+    return make_desk(tmp_path_factory.mktemp("desk"))
+
+
+def segment(desk, out, *words):
+    return main(["segment", str(desk / "run" / "field"), "--out", str(out), *map(str, words)])
+
+
+def read(path):
+    with Image.open(path) as picture:
+        return np.asarray(picture)
+
+
+def as_predicted(labels):
+    return torch.where(labels < 0, 255, labels).numpy()
+
+
+def test_coco_of_the_views_of_a_split_has_their_photographs(desk, tmp_path, capsys):
+    assert segment(desk, tmp_path, "--coco", "--pictures", "0") == 0
+    assert segment(desk, tmp_path, "--coco", "--pictures", "0") == 0  # its own files may be replaced
+    assert str(tmp_path / "coco") in capsys.readouterr().out
+    scene = load_scene(desk / "scene")
+    truth = load_coco_labels(tmp_path / "coco" / "annotations.json")
+    assert truth.names == SemanticField.load(desk / "run" / "field").label_set().names
+    assert set(truth.maps) == {scene.stem(i) for i in scene.views("test")}
+    for i in scene.views("test"):
+        stem = scene.stem(i)
+        assert np.array_equal(as_predicted(truth.maps[stem]), read(tmp_path / "predicted" / f"{stem}.png"))
+        assert np.array_equal(read(tmp_path / "coco" / "images" / f"{stem}.png"), read(scene.image_paths[i])[..., :3])
+
+
+@pytest.mark.parametrize("path", ["orbit", "spiral", "cameras"])
+def test_a_path_is_segmented_with_the_colours_that_it_sees(desk, tmp_path, path, capsys):
+    words = ["--path", path, "--frames", 3, "--width", 64, "--coco", "--color", desk / "my.ply"]
+    assert segment(desk, tmp_path, *words) == 0
+    said = capsys.readouterr().out
+    for name in ("predicted", "colored", "coco"):
+        assert str(tmp_path / name) in said
+    written = json.loads((tmp_path / "coco" / "annotations.json").read_text())
+    assert len(written["images"]) == 3
+    truth = load_coco_labels(tmp_path / "coco" / "annotations.json")
+    for one in written["images"]:
+        seen = read(tmp_path / "predicted" / one["file_name"])
+        assert seen.shape == (one["height"], one["width"])
+        assert seen.shape[1] == 64
+        assert np.array_equal(as_predicted(truth.maps[one["file_name"].removesuffix(".png")]), seen)
+        assert len(np.unique(read(tmp_path / "coco" / "images" / one["file_name"]).reshape(-1, 3), axis=0)) > 50
+    assert len(np.unique(read(tmp_path / "predicted" / "{}".format(written["images"][0]["file_name"])))) > 2
+
+
+def test_a_path_alone_gives_label_pictures(desk, tmp_path):
+    assert segment(desk, tmp_path, "--path", "cameras", "--frames", 2, "--width", 32) == 0
+    assert {one.name for one in tmp_path.iterdir()} == {"predicted", "colored"}
+
+
+def test_cameras_of_your_own(desk, tmp_path):
+    field = SemanticField.load(desk / "run" / "field")
+    orbit = orbit_cameras(field.gaussians.means)[:2]
+    cameras = [camera.resized(30, 40) for camera in orbit]
+    found = segment_cameras(field, cameras, field.label_set(), tmp_path)
+    assert list(found) == [camera.name for camera in cameras]
+    expected = field.segment(cameras[0], field.label_set())
+    assert torch.equal(found[cameras[0].name], expected)
+    assert np.array_equal(read(tmp_path / "predicted" / f"{cameras[0].name}.png"), as_predicted(expected))
+    folder = write_coco(tmp_path, found, field.label_set().names)
+    assert [path.name for path in folder.iterdir()] == ["annotations.json"]
+    with pytest.raises(ValueError, match=tells("cameras:", "a name of its own")):
+        segment_cameras(field, [cameras[0], cameras[0]], field.label_set(), tmp_path)
+
+
+@pytest.mark.parametrize("name", ["annotations.json", "images/view_{}.png"])
+def test_files_of_others_are_not_replaced(desk, tmp_path, name, capsys):
+    scene = load_scene(desk / "scene")
+    name = name.replace("view_{}", scene.stem(scene.views("test")[0]))
+    place = tmp_path / "coco" / name
+    place.parent.mkdir(parents=True)
+    place.write_text("{}")
+    assert segment(desk, tmp_path, "--coco") == 1
+    assert str(place) in capsys.readouterr().err
+    assert place.read_text() == "{}"
+    assert not (tmp_path / "predicted").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (["--frames", "3"], ("--frames:", "without --path")),
+        (["--path", "orbit", "--labels", "x"], ("--labels:", "with --path")),
+        (["--path", "orbit", "--color", "x.ply"], ("--color:", "without --coco")),
+        (["--path", "orbit", "--frames", "0"], ("--frames:", "got 0")),
+    ],
+)
+def test_options_that_would_have_no_effect_are_named(desk, tmp_path, words, parts, capsys):
+    assert segment(desk, tmp_path / "o", *words) == 1
+    error = capsys.readouterr().err
+    for part in parts:
+        assert part in error
+    assert not (tmp_path / "o").exists()

@@ -1,0 +1,69 @@
+"""USD scenes, read back by OpenUSD itself: an object per class, with every value of its Gaussians."""
+
+import sys
+
+import numpy as np
+import pytest
+from cases_viz import some_gaussians
+from messages import tells
+
+from kfgs.formats import SplatFile
+from kfgs.viz import save_usd
+
+NAMES = ("wall", "office chair", "b", "c", "d")
+
+
+def opened(path):
+    Usd = pytest.importorskip("pxr.Usd")
+    stage = Usd.Stage.Open(str(path))
+    return stage, {prim.GetName(): prim for prim in stage.GetDefaultPrim().GetChildren()}
+
+
+@pytest.mark.parametrize("ending", ["usda", "usdc", "usd"])
+def test_each_class_is_an_object_with_its_gaussians(tmp_path, ending):
+    pytest.importorskip("pxr")
+    cloud, path = some_gaussians(K=4), tmp_path / f"a.{ending}"
+    save_usd(path, SplatFile(cloud, classes=NAMES))
+    _, prims = opened(path)
+    assert set(prims) == {"no_class", *(f"class_{i}" for i in range(5))}
+    chairs, prim = cloud[cloud.labels == 1], prims["class_1"]
+    assert prim.GetTypeName() == "ParticleField3DGaussianSplat"
+    assert prim.GetAttribute("kfgs:class").Get() == "office chair"
+    assert set(prim.GetAttribute("primvars:class_id").Get()) == {1}
+
+    def read(name):
+        return np.array(prim.GetAttribute(name).Get())
+
+    np.testing.assert_allclose(read("positions"), chairs.means, rtol=1e-6)
+    np.testing.assert_allclose(read("scales"), chairs.scales, rtol=1e-6)
+    np.testing.assert_allclose(read("opacities"), chairs.opacities, rtol=1e-6)
+    assert prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get() == 1
+    np.testing.assert_allclose(read("radiance:sphericalHarmonicsCoefficients").reshape(-1, 4, 3), chairs.sh, rtol=1e-6)
+    first, expected = prim.GetAttribute("orientations").Get()[0], chairs.quats[0] / chairs.quats[0].norm()
+    np.testing.assert_allclose([first.GetReal(), *first.GetImaginary()], expected, rtol=1e-5)
+
+
+def test_points_for_programs_without_gaussians(tmp_path):
+    pytest.importorskip("pxr")
+    cloud = some_gaussians()
+    save_usd(tmp_path / "a.usdc", cloud.replace(labels=None), points=True)
+    _, prims = opened(tmp_path / "a.usdc")
+    (prim,) = prims.values()
+    assert prim.GetTypeName() == "Points"
+    np.testing.assert_allclose(np.array(prim.GetAttribute("points").Get()), cloud.means, rtol=1e-6)
+    np.testing.assert_allclose(np.array(prim.GetAttribute("widths").Get()), 2 * cloud.scales.mean(dim=1), rtol=1e-6)
+    colors = np.array(prim.GetAttribute("primvars:displayColor").Get())
+    np.testing.assert_allclose(colors, (0.28209479 * cloud.sh[:, 0] + 0.5).clip(0, 1), atol=1e-5)
+    assert set(prim.GetAttribute("primvars:class_id").Get()) == {-1}
+
+
+def test_bad_requests_and_a_missing_library_are_named(tmp_path, monkeypatch):
+    pytest.importorskip("pxr")
+    with pytest.raises(ValueError, match=tells("path:", ".usdc", "a.ply")):
+        save_usd(tmp_path / "a.ply", some_gaussians())
+    with pytest.raises(ValueError, match=tells("cloud:", "colours")):
+        save_usd(tmp_path / "a.usdc", some_gaussians().replace(sh=None))
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    with pytest.raises(ImportError, match=tells("save_usd:", "usd-core")):
+        save_usd(tmp_path / "a.usdc", some_gaussians())
+    assert list(tmp_path.iterdir()) == []
