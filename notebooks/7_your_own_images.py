@@ -20,16 +20,8 @@ from kfgs import ToyConfig, make_toy_room
 data = Path(os.environ.get("KFGS_NOTEBOOK_DATA", "data"))
 photos = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6)) / "images"  # yours: Path("my/photos")
 out = data / "own"
-phrases = [
-    "forest green",
-    "dark grey blue",
-    "reddish brown",
-    "greyish brown",
-    "dark brown",
-    "pinkish grey",
-    "cloudy blue",
-]
-phrases += ["greenish grey", "medium grey", "dusty red", "cocoa"]
+phrases = ["forest green", "dark grey blue", "cloudy blue", "reddish brown", "dark brown", "dusty red", "mustard"]
+phrases += ["greyish brown", "cocoa", "pinkish grey", "greenish grey", "medium grey", "charcoal", "off white"]
 question = "forest green"
 
 # %% [markdown]
@@ -82,10 +74,12 @@ def draw_cameras(plotter):
     viz.add_camera_images(plotter, scene.cameras, scene.image, size=0.25 * scene.extent, most=10)
 
 
-orbit = Orbit(frames=8, size=(420, 640), elevation_degrees=40, zoom=1.0)
+orbit = Orbit(frames=8, size=(420, 640), elevation_degrees=40, zoom=1.1)
 everything = torch.cat([points, torch.stack([one.center for one in scene.cameras]).to(points)])
-outside = orbit_cameras(everything, orbit, up=estimate_up(scene.cameras))
-Image.fromarray(viz.draw_view(outside[1], draw_cameras))
+around = orbit_cameras(everything, orbit, up=estimate_up(scene.cameras))
+ahead = scene.cameras[0].viewmat[2, :3]  # where the first camera looks
+outside = max(around, key=lambda one: float(one.viewmat[2, :3] @ ahead.to(one.viewmat)))
+Image.fromarray(viz.draw_view(outside, draw_cameras))
 
 # %% [markdown]
 # ## A teacher
@@ -137,13 +131,15 @@ Image.fromarray(viz.picture_grid([row], ["photo", "features", question], width=3
 # %% [markdown]
 # ## The plan, then the field
 #
-# Before anything long starts, `plan_scene` tries the teacher and a few steps on this machine, and says what each stage
-# will take. Then the teacher sees every training picture, and `fit_scene` makes the field (notebook 4). A killed run goes
-# on where it stopped: run this notebook twice, and the second time takes seconds.
+# Before anything long starts, `plan_scene` tries the teacher and a few steps on this machine, and says what each stage will
+# take. Then the teacher sees every training picture, and `fit_scene` makes the field (notebook 4). Its Gaussians are trained
+# on pictures made 320 pixels wide, which is quick. A killed run goes on where it stopped: run this notebook twice, and the
+# second time takes seconds.
 
 # %%
 quick = kfgs.ColorConfig.quick()
-config = kfgs.FitConfig.cpu(color=replace(quick, field=replace(quick.field.with_steps(600), max_gaussians=60_000)))
+quick = replace(quick, field=replace(quick.field.with_steps(600), max_gaussians=60_000))
+config = kfgs.FitConfig.cpu(color=replace(quick, picture_scale=min(1.0, 320 / scene.cameras[0].width)))
 print(kfgs.plan_scene(scene, teacher=teacher, config=config, features=out / "features", run=out))
 
 # %%
@@ -163,13 +159,13 @@ classes = kfgs.make_label_set(teacher, phrases, templates=None, negatives=None)
 found = field.query(question, classes)
 for thing in kfgs.connected_parts(field.gaussians, found, [scene.cameras[i] for i in train]):
     print(thing)
-scored = field.gaussians.replace(features=found.scores[:, None], sh=None)
-rows = []
+cloud, rows = field.gaussians, []
 for i in test[:2]:
-    photo, camera = scene.image(i), scene.cameras[i]
+    camera = scene.cameras[i].resized(round(480 * scene.cameras[i].height / scene.cameras[i].width), 480)
+    photo = kfgs.resize_map(scene.image(i), camera.size)
     labels = viz.overlay_labels(photo, field.segment(camera, classes), phrases, alpha=0.8, legend=False)
     scores = viz.draw_view(
-        camera, lambda plotter: viz.add_cloud(plotter, scored, color_by=found.scores, style="gaussians", clim=(0, 1))
+        camera, lambda plotter: viz.add_cloud(plotter, cloud, color_by=found.scores, style="gaussians", clim=(0, 1))
     )
     rows.append([photo, labels, scores])
 sheet = viz.picture_grid(rows, ["unseen picture", "segmented", question], width=320)

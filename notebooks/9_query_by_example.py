@@ -94,8 +94,8 @@ sheet = viz.picture_grid([rows], ["unseen picture", "classes by example"] * 2, w
 Image.fromarray(np.concatenate([sheet, viz.legend_strip(torch.arange(len(classes)), classes.names, sheet.shape[1])]))
 
 # %% [markdown]
-# Things that were not shown are counted to the nearest class that was. To leave them out, show them too, as one class
-# "other", or ask for one class as below.
+# A thing that was not shown, like the cabinet or the door, is given the class of what is most like it.
+# To leave such things out, show them as a class of their own, or ask for one class as below.
 #
 # ## One click
 #

@@ -125,7 +125,7 @@ def test_only_public_names_of_kfgs_are_used(source):
 def test_the_readme_lists_them_all():
     text = (NOTEBOOKS / "README.md").read_text(encoding="utf-8")
     for path in SOURCES:
-        assert f"]({path.name})" in text
+        assert f"]({path.stem}.ipynb)" in text
 
 
 def test_links_between_notebooks_lead_somewhere(source):
