@@ -8,8 +8,8 @@ from pathlib import Path
 from torch import Tensor
 from tqdm import tqdm
 
-from .._check import typed
 from .._files import as_path, check_output, check_own
+from .._typed import typed
 from ..cameras import Camera
 from ..evaluation.datasets.coco import is_ours, save_coco
 from ..fields import Rule, SemanticField
