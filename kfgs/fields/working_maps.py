@@ -187,4 +187,4 @@ def working_directions(
         raise ValueError(
             f"maps: expected nonzero features (longer than {EPS:g}), got {len(maps)} maps without; check the teacher"
         )
-    return directions[:, :count].float()
+    return directions[:, : count if known is None else max(count, known.shape[1])].float()

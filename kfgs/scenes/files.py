@@ -76,17 +76,21 @@ def is_file(path: Path) -> bool:
         return False
 
 
-def list_images(folder: str | Path) -> list[str]:
+def list_images(folder: str | Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[str]:
     """Names of the image files in a folder and its subfolders, relative to it, in natural order.
 
     Hidden files and folders are left out; links to folders are not followed.
+
+    Args:
+        folder: the folder.
+        suffixes: the endings of the files to list, in lower case.
     """
     root = as_path(folder)
     names: list[str] = []
     for here, folders, files in os.walk(root):
         folders[:] = [name for name in folders if not name.startswith(".")]
         for name in files:
-            if not name.startswith(".") and name.lower().endswith(IMAGE_SUFFIXES):
+            if not name.startswith(".") and name.lower().endswith(suffixes):
                 names.append((Path(here) / name).relative_to(root).as_posix())
     return sorted(names, key=natural_key)
 

@@ -28,6 +28,7 @@ from .posed import Matrix, PosedPicture, picture_size, read_points, scene_of_pos
 from .scene import Scene
 
 CAMERAS, SETTINGS, POINTS = "cameras.json", "cfg_args", "input.ply"
+BLENDER = "transforms_train.json"  # in a folder of Blender's pictures
 _LONGEST = 1 << 16  # bytes of cfg_args, which has about 500
 _AGAIN = "copy the folder again"
 
@@ -46,7 +47,7 @@ def load_inria(folder: str | Path, images: str | Path | None = None) -> Scene:
     Args:
         folder: with `cameras.json` and `point_cloud/iteration_N/point_cloud.ply`; `cfg_args` may be missing.
         images: the folder of the pictures; None: `images/` in `source_path` of `cfg_args`, also if that folder was moved
-            beside or above this one; else `images/` in this folder.
+            beside or above this one; else `images/` in this folder; else `source_path` itself, if it is a scene of Blender.
 
     Raises:
         FileNotFoundError: if there are no pictures.
@@ -98,7 +99,8 @@ def _settings(path: Path) -> dict[str, Any]:
     """
     if not path.is_file():
         return {}
-    text = path.read_bytes()[: _LONGEST + 1]
+    with path.open("rb") as file:
+        text = file.read(_LONGEST + 1)
     expected = f"{path}: expected the text Namespace(source_path='...', ...)"
     try:
         if len(text) > _LONGEST:
@@ -129,7 +131,8 @@ def _find_pictures(folder: Path, settings: dict[str, Any]) -> Path:
     places = [Path(source), folder / source] if source else []
     places += [folder.parent / last, folder.parent.parent / last] if last else []
     tried = [place / name for place in places] + [folder / name]
-    for place in [*tried, *places[:2]]:  # Blender's pictures lie in the source folder itself
+    # Only Blender's pictures lie in the source folder itself; a stranger's source folder may be the whole disk
+    for place in [*tried, *(place for place in places[:2] if (place / BLENDER).is_file())]:
         if place.is_dir() and list_images(place):
             return place
     raise FileNotFoundError(

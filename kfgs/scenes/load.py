@@ -92,14 +92,19 @@ def load_scene(path: str | Path, *, images: str | Path | None = None, split: Spl
 
 
 def _with_splat(scene: Scene, root: Path) -> Scene:
-    """The scene with the splat that a training program left in its folder."""
+    """The scene with the splat that 3DGS left in its folder. Other programs train in a frame of their own: only a note."""
     splat = newest_splat(root)
     if splat is None:
         return scene
+    name = splat.relative_to(root).as_posix()
+    if name.startswith("point_cloud/"):
+        note = f"{name} is a splat of this scene: a field is made on its Gaussians (--splat names others)"
+        return replace(scene, splat=splat, notes=(*scene.notes, note))
     note = (
-        f"{splat.relative_to(root)} is a splat of this scene: a field is made on its Gaussians (--splat names others)"
+        f"{name} is not used by itself, because its program may train in another frame than that of the cameras; if they "
+        f"agree, name it: --splat {splat}"
     )
-    return replace(scene, splat=splat, notes=(*scene.notes, note))
+    return replace(scene, notes=(*scene.notes, note))
 
 
 def picture_folders(path: str | Path, images: str | Path | None = None) -> list[Path]:

@@ -25,7 +25,6 @@ from .files import (
     SceneError,
     file_stem,
     list_images,
-    natural_key,
     open_picture,
     some,
 )
@@ -150,9 +149,7 @@ def _decode(video: Path) -> Iterator[tuple[Picture, float]]:
 def _heic_names(folder: Path) -> list[str]:
     """The HEIC files of a folder that no other picture has the name of, in natural order."""
     others = {file_stem(name) for name in list_images(folder)}
-    found = (file for file in folder.rglob("*") if file.suffix.lower() in HEIC_SUFFIXES and file.is_file())
-    names = [file.relative_to(folder).as_posix() for file in found if not file.name.startswith(".")]
-    return sorted((name for name in names if file_stem(name) not in others), key=natural_key)
+    return [name for name in list_images(folder, HEIC_SUFFIXES) if file_stem(name) not in others]
 
 
 def convert_heic(images: str | Path, out: str | Path, *, progress: bool = False) -> list[Path]:
@@ -168,13 +165,18 @@ def convert_heic(images: str | Path, out: str | Path, *, progress: bool = False)
 
     Raises:
         FileExistsError: if `out` holds something else.
-        SceneError: if a photograph cannot be decoded.
+        SceneError: if a photograph cannot be decoded, or two have the same name before the suffix.
         ImportError: if pillow-heif is not installed.
     """
     images, out = as_path(images), as_path(out)
     names, others = _heic_names(images), list_images(images)
-    sizes = [[name, (images / name).stat().st_size] for name in [*names, *others]]
-    source = {"images": sizes}
+    stems = [file_stem(name) for name in names]
+    if len(set(stems)) < len(stems):  # both would be the same JPEG file
+        twice = [name for name, stem in zip(names, stems, strict=True) if stems.count(stem) > 1]
+        raise SceneError(
+            f"{images}: expected HEIC photographs with names that differ before the suffix, got {some(twice)}; rename them"
+        )
+    source = {"images": [[name, digest_file(images / name)] for name in names], "others": others}
     if _made_before(out, source):
         return [out / name for name in list_images(out)]
     with atomic_folder(out) as folder:

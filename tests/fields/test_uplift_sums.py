@@ -9,6 +9,7 @@ from messages import tells
 
 from kfgs import Camera, Gaussians
 from kfgs.fields import UpliftConfig, UpliftSums, uplift_maps
+from kfgs.quant import LinearLatents
 from kfgs.splat import rasterize
 
 PLAIN = UpliftConfig(corrections=0, keep=1.0)
@@ -137,3 +138,13 @@ def test_new_views_that_show_nothing_change_nothing():
     more = uplift_maps(gaussians, [looking(50.0)], [maps[2]], before=old.sums, report=told.append)
     assert told[0].startswith("note: the Gaussians fill 0% of the views")
     torch.testing.assert_close(decoded(more), decoded(old), atol=1e-3, rtol=0)
+
+
+def test_earlier_latents_may_be_more_than_the_working_directions():
+    views, maps, gaussians = cameras(), random_maps(cameras(), channels=80), cloud()
+    basis = torch.linalg.qr(torch.randn(80, 70, generator=torch.Generator().manual_seed(1)))[0]
+    old = uplift_maps(gaussians, views[:4], maps[:4], PLAIN, latents=LinearLatents(basis))
+    both = uplift_maps(gaussians, views[4:], maps[4:], PLAIN, before=old.sums)  # its latents are in the sums
+    assert torch.equal(both.latents.basis, basis)
+    whole = uplift_maps(gaussians, views, maps, PLAIN, latents=LinearLatents(basis))
+    torch.testing.assert_close(decoded(both), decoded(whole), atol=2e-5, rtol=0)

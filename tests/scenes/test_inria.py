@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -209,3 +210,26 @@ def test_damaged_cameras(room: Path, output: Path, tmp_path: Path) -> None:
             (two / name / path.name).symlink_to(path)
     with pytest.raises(SceneError, match=tells("one picture", "a/", "b/", "--splat")):
         load_scene(folder, images=two)
+
+
+def test_a_source_path_makes_nobody_search_the_whole_disk(room: Path, output: Path, tmp_path: Path) -> None:
+    disk = tmp_path / "disk"
+    shutil.copytree(room / "images", disk / "home/me/photos")
+    folder = write_inria(tmp_path / "somewhere/out", load_scene(room), disk)
+    (folder / "point_cloud").symlink_to(output / "point_cloud")
+    with pytest.raises(FileNotFoundError, match=tells("disk", "--images")):
+        load_scene(folder)
+    (disk / "transforms_train.json").write_text("{}")  # a scene of Blender: its pictures lie in the folder itself
+    assert len(load_scene(folder)) == len(load_scene(room))
+
+
+def test_a_checkpoint_in_a_scene_is_not_used_by_itself(room: Path, output: Path, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    shutil.copytree(room, scene)
+    (scene / "ckpts").mkdir()
+    (scene / "ckpts/ckpt_29999_rank0.pt").write_bytes(b"its frame is gsplat's own")
+    loaded = load_scene(scene)
+    assert loaded.splat is None
+    assert any("ckpt_29999_rank0.pt is not used" in note and "--splat" in note for note in loaded.notes)
+    (scene / "point_cloud").symlink_to(output / "point_cloud")
+    assert load_scene(scene).splat == scene / "point_cloud/iteration_30000/point_cloud.ply"

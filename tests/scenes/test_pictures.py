@@ -171,3 +171,25 @@ def test_heic_photographs_become_jpeg(tmp_path: Path) -> None:
     assert os.path.samefile(tmp_path / "out/IMG_3.jpg", photos / "IMG_3.jpg")
     assert float((read_image(tmp_path / "out/IMG_1.jpg") - read).abs().mean()) < 0.05
     assert convert_heic(photos, tmp_path / "out") == files
+
+
+@pytest.mark.skipif(importlib.util.find_spec("pillow_heif") is None, reason="pillow-heif is not installed")
+def test_no_heic_photograph_is_lost_or_mistaken_for_another(tmp_path: Path) -> None:
+    import pillow_heif
+
+    photos = tmp_path / "photos"
+    (photos / ".trash").mkdir(parents=True)
+    texture(0).save(photos / "a.png")
+    pillow_heif.from_pillow(texture(1)).save(photos / ".trash/old.heic")
+    assert not has_heic(photos)  # hidden, as everywhere
+    for name in ("b.HEIC", "b.heif"):
+        pillow_heif.from_pillow(texture(2)).save(photos / name)
+    with pytest.raises(SceneError, match=tells("b.HEIC", "b.heif", "rename")):
+        convert_heic(photos, tmp_path / "out")
+    (photos / "b.heif").unlink()
+    assert len(convert_heic(photos, tmp_path / "out")) == 2
+    data = bytearray((photos / "b.HEIC").read_bytes())
+    data[-1] ^= 1
+    (photos / "b.HEIC").write_bytes(data)  # another photograph of the same size
+    with pytest.raises(FileExistsError, match=tells("out", "new or empty")):
+        convert_heic(photos, tmp_path / "out")
