@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from .._files import (
     check_output,
     check_own,
     digest_file,
+    digest_value,
     locked,
     read_json,
     real_path,
@@ -49,6 +50,8 @@ LATENTS, SPLAT = "latents.safetensors", "splat.ply"
 RUN = ".run"  # hidden: its field has the Gaussians of the reach, too, and `kfgs search` must not count them
 BESIDE = ("classes.json", "text.npy", "text.safetensors", "labels", "labels_scored")
 """Files and folders of a scene that belong to each of its blocks, too."""
+IDLE = ("device", "discard_sums")
+"""Options of a fit that do not change what its field means."""
 LOOKED_AT = 8  # maps, to say how well given latents fit
 REACH = 3.0  # standard deviations: farther out, a Gaussian is below 1/255 of any pixel
 
@@ -185,7 +188,7 @@ def fit_block(
         progress: show bars.
 
     Returns:
-        Counts, the box of the core's Gaussians (None if there is none) and seconds, as JSON.
+        Counts, the box of the core's Gaussians (None if there is none), seconds, and a digest of the options, as JSON.
 
     Raises:
         ValueError: as `fit_scene`.
@@ -196,7 +199,8 @@ def fit_block(
     as_taken = load_scene(folder)
     maps = FeatureFolder(folder / "features").of(as_taken, config.split)
     splat = read_splats(folder / SPLAT) if (folder / SPLAT).is_file() else None
-    facts: dict[str, Any] = {"gaussians": 0, "of": 0, "box": None, "seconds": 0.0}
+    options = {name: value for name, value in asdict(config).items() if name not in IDLE}
+    facts: dict[str, Any] = {"gaussians": 0, "of": 0, "box": None, "seconds": 0.0, "options": digest_value(options)}
     core = None
     if splat is None or block.holds(as_array(splat.gaussians.means)).any():
         latents = LinearLatents.load(folder.parent / LATENTS)

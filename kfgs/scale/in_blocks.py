@@ -46,21 +46,29 @@ class FieldInBlocks:
 
         Raises:
             FileNotFoundError: if there are no blocks, or one was not fitted.
-            ValueError: if a file is damaged, or no block has a Gaussian.
+            ValueError: if a file is damaged, no block has a Gaussian, or the blocks were fitted with different options.
         """
         folder = as_path(folder)
         blocks, counts, boxes = [], [], []
+        options = dict[Any, str]()
         for block in read_blocks(folder):
             file = current_file(folder / block.name / CORE, FACTS)
             if not file.is_file():
                 raise FileNotFoundError(f"{file}: no such file; fit the block first, with fit_blocks or `kfgs blocks`")
             facts = read_json(file)
             with reading(file, "the facts of a block", "fit the block again"):
+                options.setdefault(facts.get("options"), block.name)
                 if facts["gaussians"]:  # else nothing lies in this part of space
                     low, high = np.array(facts["box"], np.float64).reshape(2, 3).tolist()
                     blocks.append(block)
                     counts.append(int(facts["gaussians"]))
                     boxes.append((low, high))
+        if len(options) > 1:
+            one, other, *_ = options.values()
+            raise ValueError(
+                f"{folder}: expected blocks that were fitted with the same options, got {one} and {other} with different "
+                "ones; run the last `kfgs blocks` again, which fits the rest"
+            )
         if not blocks:
             raise ValueError(f"{folder}: expected blocks with Gaussians, got none; was the splat one of another scene?")
         return FieldInBlocks(folder, tuple(blocks), tuple(counts), tuple(boxes))

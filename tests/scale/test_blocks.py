@@ -450,3 +450,19 @@ def test_a_block_that_becomes_empty_leaves_no_core(fitted, tmp_path):
     _put(place, fitted.field("block00"), facts)
     assert json.loads((place / "core.json").read_text()) == facts
     assert len(SemanticField.load(place)) == len(moved)
+
+
+def test_blocks_of_different_options_are_not_joined(town, splat, tmp_path, capsys):
+    """As after a second fit that was interrupted between two blocks."""
+    city = tmp_path / "city"
+    split_scene(town, city, 2, splat=splat, latents=4)
+    fit_blocks(city, EVERY)
+    fit_block(city / "block00", dataclasses.replace(EVERY, device="cpu"))  # makes no difference
+    assert len(FieldInBlocks.open(city).blocks) == 2
+    other = dataclasses.replace(EVERY, seed=7)
+    fit_block(city / "block00", other)
+    capsys.readouterr()
+    assert main(["join", str(city), "--out", str(tmp_path / "field")]) == 1
+    assert re.search(tells(city, "same options", "block00", "block01", "again"), capsys.readouterr().err)
+    assert not (tmp_path / "field").exists()
+    assert len(fit_blocks(city, other).joined()) > 0
