@@ -99,7 +99,7 @@ def _clearance(solid: Solid, origin: Array, ways: Array) -> tuple[Array, Array]:
     # The largest of (|o + t d| - half) * aside over the axes is convex in t: halve the interval by its slope.
     low, high = np.zeros(len(o)), np.ones(len(o))
     rows = np.arange(len(o))
-    for _ in range(7):
+    for _ in range(11):
         at = 0.5 * (low + high)
         place = o + at[:, None] * d
         axis = np.argmax((np.abs(place) - half) * aside, axis=-1)

@@ -85,7 +85,7 @@ def _shell(b: _Builder) -> None:
         {"kind": "sprigs", "colors": ((0.83, 0.79, 0.73), (0.89, 0.86, 0.80), (0.70, 0.66, 0.60)), "scale": 0.26},
         {"kind": "sprigs", "colors": ((0.84, 0.81, 0.76), (0.90, 0.87, 0.82), (0.66, 0.65, 0.60)), "scale": 0.25},
     ]
-    papers = [{**paper, "contrast": 0.16} for paper in papers]
+    papers = [{**paper, "contrast": 0.15} for paper in papers]
     b.place("wall", [("box", (-X - t, 0, Z / 2), (t, Y, Z / 2))], (0, 0, 0), papers[0])
     b.place("wall", [("box", (X + t, 0, Z / 2), (t, Y, Z / 2))], (0, 0, 0), papers[1])
     b.place("wall", [("box", (0, -Y - t, Z / 2), (X, t, Z / 2))], (0, 0, 0), papers[2])

@@ -54,7 +54,7 @@ def evaluate(
     shift = np.random.default_rng([texture.seed, 5]).uniform(-9.0, 9.0, 3)
     fibre = np.where(np.arange(3) == np.argmax(half), 0.08, 1.0)  # grain runs along the longest edge
     streaks = fibre if texture.kind in ("wood", "planks", "panel", "books") else np.ones(3)
-    grain = noise.fractal(local * streaks + shift, 0.14, footprint, octaves=5, gain=0.85)
+    grain = noise.fractal(local * streaks + shift, 0.12, footprint, octaves=5, gain=0.85)
     spots = Spots(local, plane, edge, np.asarray(axis), grain, footprint, local * fibre + shift, local + shift)
     color = PATTERNS[texture.kind](texture, noise, spots)
     return color * (1.0 + texture.contrast * grain[:, None])
