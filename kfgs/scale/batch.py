@@ -149,8 +149,8 @@ def run_batch(
     Raises:
         ValueError: if there are no scenes, two have the same name, a run would be in the folder of a scene, a link is in the
             way, or another batch works in the folder `out`. A URL has no lock: start one batch at a time.
-        OSError: if `out` cannot be written to, or a run's `state.json`, `log.txt` or `scores.json` was written by something
-            else (FileExistsError).
+        OSError: if `out` cannot be written to, or a run's `state.json`, `log.txt`, `scores.json` or `done/*.json` was written by
+            something else (FileExistsError).
     """
     limit(at_once)
     options, entries = options or BatchOptions(), as_entries(scenes)
@@ -216,6 +216,8 @@ class _Record:
         self.place.check_own(STATE, lambda text: parse_json(text)["format"] == FORMAT)
         self.place.check_own(LOG, lambda text: LOGGED.match(text) is not None)
         self.place.check_own("scores.json", lambda text: parse_json(text)["command"] == WRITER)
+        for stage in ("sfm", *STAGES[1:]):
+            self.place.check_own(f"done/{stage}.json", lambda text: "key" in parse_json(text))
         self._log = self.place.read_text(LOG) or ""
         before = self.place.read_json(STATE)
         failure = before.get("failure") if before.get("format") == FORMAT else None

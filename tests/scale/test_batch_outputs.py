@@ -17,6 +17,8 @@ OURS = {
     "state.json": json.dumps({"format": "kfgs-batch/1", "failure": {"stage": "fit", "message": "no space"}}),
     "log.txt": "2026-11-23 10:00:00 scene: done in 1.0 s\n",
     "scores.json": json.dumps({"command": "kfgs batch"}),
+    "done/sfm.json": json.dumps({"key": None}),
+    "done/fit.json": json.dumps({"key": "0123", "result": {}, "files": {}}),
 }
 
 
