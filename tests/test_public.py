@@ -66,4 +66,4 @@ def test_the_package_stays_small():
     packed = {
         path: len(zlib.compress(path.read_bytes())) + 2 * len(str(path.relative_to(root))) + 130 for path in files
     }
-    assert sum(packed.values()) + 11_000 < 1_350_000, sorted(packed, key=packed.__getitem__)[-5:]
+    assert sum(packed.values()) + 11_000 < 1_380_000, sorted(packed, key=packed.__getitem__)[-5:]

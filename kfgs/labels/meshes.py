@@ -11,6 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from .._check import as_array, check_shapes
+from .._typed import typed
 from ..formats.splat_file import SplatFile
 from ..gaussians import Gaussians
 from .nearest import Array
@@ -86,6 +87,7 @@ class LabelledMesh:
         return NONE if label < 0 else self.classes[label] if label < len(self.classes) else f"class {label}"
 
 
+@typed
 def label_mesh(
     mesh: Any,
     labelled: SplatFile | Gaussians,

@@ -78,6 +78,7 @@ def decode_rle(segmentation: dict[str, Any]) -> Tensor:  # [H, W] bool
     return torch.from_numpy(np.ascontiguousarray(values.reshape(size[1], size[0]).T))
 
 
+@typed
 def encode_rle(mask: Tensor) -> dict[str, Any]:  # [H, W] bool
     """COCO's run lengths of a mask, as a list, which every program reads; `decode_rle` is the way back.
 

@@ -71,6 +71,7 @@ def check_coco(out: Path, names: Iterable[str]) -> None:
     check_own(out / COCO / "annotations.json", is_ours, "kfgs segment")
 
 
+@typed
 def write_coco(
     out: str | Path,
     labels: Mapping[str, Tensor],  # each [H, W] int64, -1 = none

@@ -26,6 +26,10 @@ class Spots(NamedTuple):
     axis: NDArray[np.int64]  # [N] the face's normal axis
     grain: Array  # [N] fine noise
     footprint: Array  # [N] metres a pixel covers
+
+    def __repr__(self) -> str:
+        return f"Spots({len(self.grain)} places)"
+
     fibres: Array  # [N, 3] where to read noise that is drawn out along the longest edge
     place: Array  # [N, 3] where to read other noise
 

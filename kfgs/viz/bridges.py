@@ -8,6 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from .._check import as_array
+from .._typed import typed
 from ..formats.splat_file import SplatFile
 from ..gaussians import Gaussians
 from .cloud_colors import Array, ColorBy
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     import trimesh
 
 
+@typed
 def to_trimesh(
     cloud: Gaussians | SplatFile,
     color_by: ColorBy | Tensor | Array | None = None,
@@ -48,6 +50,7 @@ def to_trimesh(
     return trimesh.PointCloud(positions, colors=rgb, metadata=arrays | {"classes": list(classes)})
 
 
+@typed
 def to_open3d(
     cloud: Gaussians | SplatFile,
     color_by: ColorBy | Tensor | Array | None = None,

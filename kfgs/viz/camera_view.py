@@ -45,6 +45,7 @@ def look_through(plotter: pv.Plotter, camera: Camera) -> None:
     plotter.renderer.ResetCameraClippingRange()
 
 
+@typed
 def draw_view(
     camera: Camera,
     draw: Callable[[pv.Plotter], object],

@@ -9,6 +9,7 @@ import numpy as np
 
 from .._check import as_array
 from .._files import as_path, atomic_path
+from .._typed import typed
 from ..formats.splat_file import SplatFile
 from ..gaussians import Gaussians
 from ..splat.sh import sh0_to_rgb
@@ -16,6 +17,7 @@ from ..splat.sh import sh0_to_rgb
 SUFFIXES = (".usdc", ".usda", ".usd")
 
 
+@typed
 def save_usd(path: str | Path, cloud: Gaussians | SplatFile, *, points: bool = False) -> None:
     """Write a cloud as a USD scene: below `/splat` one object for each class, so that classes can be hidden or moved.
 

@@ -395,7 +395,7 @@ def test_a_real_run_stays_within_its_plan(room, tmp_path, method):
     assert [stage.name for stage in made.stages] == [stage.name.replace(" ", "_") for stage in planned.stages]
     written = sum(path.stat().st_size for path in folder.rglob("*") if path.suffix in (".safetensors", ".ply"))
     assert (
-        0.25 * planned.kept_bytes < written <= planned.kept_bytes * 1.05
+        0.25 * planned.kept_bytes < written <= planned.kept_bytes * 1.1
     )  # headers; Gaussians and codewords are bounds
     if memory.bytes is not None:
         assert memory.bytes < planned.peak_bytes + 10**8

@@ -250,12 +250,16 @@ def test_a_joined_field_remembers_the_whole_scene(fitted, town, tmp_path):
     [
         ("blocks.json", {"scene": None}, ("blocks.json", "scene None is no path", "cut the scene again")),
         ("blocks.json", {"scene": 5}, ("blocks.json", "scene 5 is no path")),
-        ("block00/core.json", {"box": [[0, 0], [1, 1]]}, ("core.json", "the facts of a block", "fit the block again")),
+        (
+            "block00/core/core.json",
+            {"box": [[0, 0], [1, 1]]},
+            ("core.json", "the facts of a block", "fit the block again"),
+        ),
     ],
 )
 def test_a_damaged_description_is_named_when_a_city_is_opened(fitted, tmp_path, file, change, parts):
-    for name in ("blocks.json", *(f"{block.name}/core.json" for block in fitted.blocks)):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
+    for name in ("blocks.json", *(f"{block.name}/core/core.json" for block in fitted.blocks)):
+        (tmp_path / name).parent.mkdir(exist_ok=True, parents=True)
         shutil.copy(fitted.folder / name, tmp_path / name)
     assert len(FieldInBlocks.open(tmp_path)) == len(fitted)
     (tmp_path / file).write_text(json.dumps(json.loads((tmp_path / file).read_text()) | change))

@@ -73,5 +73,5 @@ def test_a_missing_library_is_named_with_the_line_that_installs_it(convert, name
 @pytest.mark.parametrize(("convert", "name"), [(to_trimesh, "trimesh"), (to_open3d, "open3d")])
 def test_what_is_no_cloud_is_named(convert, name):
     pytest.importorskip(name)
-    with pytest.raises(TypeError, match=tells("gaussians:", "got Tensor")):
+    with pytest.raises(TypeError, match=tells("cloud:", "got Tensor")):
         convert(torch.zeros(3, 3))

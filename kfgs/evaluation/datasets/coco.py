@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from ..._files import as_path, read_json, write_json
+from ..._typed import typed
 from ...fields.examples import Mask
 from ...labels.polygons import MOST, decode_rle, encode_rle, fill_region, say_range, union
 from ...scenes.files import MAX_SIDE, file_stem
@@ -81,6 +82,7 @@ def load_coco_labels(path: str | Path) -> LabelTruth:
     return LabelTruth(tuple(names[category] for category in asked), ReadWhenAsked(readers))
 
 
+@typed
 def save_coco(
     path: str | Path,
     labels: Mapping[str, Tensor],  # each [H, W] int64, -1 = none

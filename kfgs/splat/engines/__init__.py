@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from ..._check import check_shapes, check_whole
-from ..._typed import typed
 from . import ops
 from .contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Ranked, Splats, Tiles
 from .cpu.memory import free_memory
@@ -25,7 +24,6 @@ __all__ = [
 ]
 
 
-@typed
 def composite(
     means2d: Tensor,  # [M, 2] pixels (x, y)
     conics: Tensor,  # [M, 3] (a, b, c)
@@ -75,7 +73,6 @@ def composite(
     return maps, alphas
 
 
-@typed
 def rank_channels(
     means2d: Tensor,  # [M, 2]
     conics: Tensor,  # [M, 3]
@@ -212,7 +209,7 @@ def _contiguous(tiles: Tiles) -> Tiles:
 
 def _check_kinds(others: dict[str, Tensor | None], means2d: Tensor) -> None:
     for name, value in ({"means2d": means2d} | others).items():
-        if not isinstance(value, Tensor | None):
+        if not isinstance(value, Tensor) and (value is not None or name != "background"):
             raise TypeError(f"{name}: expected a tensor, got {type(value).__name__}; convert it with torch.as_tensor")
     if means2d.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"means2d: expected float32 or float64, got {means2d.dtype}; convert the Gaussians with .to()")
