@@ -2,7 +2,7 @@
 # # 7. Your own images
 #
 # **I have a folder of photographs. What can I ask them?** From pictures alone to answers: cameras by structure from motion, a
-# teacher, a semantic field, and *where is the green plant?* You will see what each step makes, and how to check it before
+# teacher, a semantic field, and *where is something green?* You will see what each step makes, and how to check it before
 # the next one.
 #
 # About a minute on two CPU cores with the pictures of the toy room (20 seconds more to make it the first time). Needs the
@@ -20,9 +20,9 @@ from kfgs import ToyConfig, make_toy_room
 data = Path(os.environ.get("KFGS_NOTEBOOK_DATA", "data"))
 photos = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6)) / "images"  # yours: Path("my/photos")
 out = data / "own"
-phrases = ["forest green", "dark grey blue", "cloudy blue", "reddish brown", "dark brown", "dusty red", "mustard"]
-phrases += ["greyish brown", "cocoa", "pinkish grey", "greenish grey", "medium grey", "charcoal", "off white"]
-question = "forest green"
+phrases = ["dark sage", "slate grey", "blue grey", "dark brown", "light brown", "pale brown", "camel", "clay"]
+phrases += ["light grey", "greyish", "charcoal", "off white"]
+question = "dark sage"  # the green of leaves
 
 # %% [markdown]
 # ## Pictures
@@ -152,7 +152,8 @@ print(field.summary())
 #
 # A question is compared with the other classes, and `connected_parts` lists the things that were found. Below, pictures that
 # took no part in the fit: the classes of their pixels, in colours of the palette, and how well each pixel answers the
-# question. This teacher hears only colours: a brown square of a rug is brown like a chair.
+# question. This teacher knows only colours: a
+# wooden floor is brown like a chair.
 
 # %%
 classes = kfgs.make_label_set(teacher, phrases, templates=None, negatives=None)
