@@ -87,6 +87,11 @@ def test_every_public_name_is_called():
             ("predict", "'a'", "NoneType"),
         ),
         (lambda: Camera.look_at(None, (0, 0, 0)), ("eye: expected", "NoneType")),
+        (lambda: Camera(torch.eye(4), torch.eye(3), True, 4), ("width: expected", "whole number", "True")),
+        (
+            lambda: Camera(torch.eye(4), torch.eye(3), 4, 4, distortion=True),
+            ("distortion: expected a Distortion or None", "bool"),
+        ),
         (lambda: kfgs.load_teacher([]), ("teacher: expected a name", "list")),
         (lambda: kfgs.plan_scene(None), ("scene: expected a Scene", "NoneType", "load_scene")),
         (lambda: kfgs.score_views(None, None), ("gaussians: expected", "NoneType")),

@@ -73,8 +73,14 @@ class Camera:
                 object.__setattr__(self, name, as_tensor(name, matrix, floating=True))
             as_tensor(name, getattr(self, name), floating=True)
         check_shapes(("viewmat", self.viewmat, "4 4"), ("K", self.K, "3 3"))
+        if not isinstance(self.distortion, Distortion | None):
+            got = type(self.distortion).__name__
+            raise TypeError(
+                f"distortion: expected a Distortion or None, got {got}; pass Distortion(model, coefficients)"
+            )
         for name, size in (("width", self.width), ("height", self.height)):
-            if not (isinstance(size, numbers.Real) and math.isfinite(size) and size >= 1 and int(size) == size):
+            whole = isinstance(size, numbers.Real) and math.isfinite(size) and size >= 1 and int(size) == size
+            if isinstance(size, bool) or not whole:
                 raise ValueError(f"{name}: expected a positive whole number of pixels, got {size!r}; pass an integer")
             object.__setattr__(self, name, int(size))
         if self.width * self.height > PIXELS:

@@ -48,7 +48,7 @@ def save_animation(
         shows: Gaussians (coloured by their labels, else by their harmonics), a function camera -> [H, W, 3] (for instance
             from `show_cloud`), or several of these by title, shown side by side.
         cameras: one per frame, all of one size (`kfgs.cameras.orbit_cameras`, `path_cameras`).
-        fps: frames per second, at most 50 in a GIF, which counts hundredths of a second.
+        fps: frames per second, at least 0.01, and at most 50 in a GIF, which counts hundredths of a second.
         names: class names, for a legend of the labelled Gaussians below every frame, and their colours. Gaussians inside
             functions are not listed.
         listed: the labels in the legend; None: those of the labelled Gaussians.
@@ -118,7 +118,7 @@ def check_target(path: str | Path, fps: float) -> Path:
     suffix = target.suffix.lower()
     if suffix not in SUFFIXES:
         raise ValueError(f"path: expected a name that ends in .gif or .mp4, got {target.name!r}; rename it")
-    check_range("fps", fps, 0, GIF_FPS if suffix == ".gif" else 240, closed=(False, True))
+    check_range("fps", fps, 0.01, GIF_FPS if suffix == ".gif" else 240)  # a GIF counts to 655 seconds
     if suffix == ".mp4":
         _ffmpeg()
     return target

@@ -148,7 +148,8 @@ def test_video_without_ffmpeg_says_what_to_install_before_anything_is_drawn(tmp_
         ("a.gif", [], 10, ("frames:", "got none")),
         ("a.gif", [np.zeros((2, 2))], 10, ("frames[0]:", "[H, W, 3]", "got (2, 2)")),
         ("a.gif", [np.zeros((2, 2, 3)), np.zeros((2, 4, 3))], 10, ("frames[1]:", "[2, 2, 3]", "got (2, 4, 3)")),
-        ("a.gif", [np.zeros((2, 2, 3))], 60, ("fps:", "(0, 50]", "got 60")),
+        ("a.gif", [np.zeros((2, 2, 3))], 60, ("fps:", "[0.01, 50]", "got 60")),
+        ("a.gif", [np.zeros((2, 2, 3))], 1e-9, ("fps:", "[0.01, 50]", "got 1e-09")),
         ("a.gif", [np.zeros((2, 2, 3))], 0, ("fps:", "got 0")),
     ],
 )
