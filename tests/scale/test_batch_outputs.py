@@ -1,4 +1,4 @@
-"""What a batch may write to: nothing of a scene, no file of somebody else, nothing behind a link; and what it takes as its own."""
+"""What a batch may write to: nothing of a scene, no file of somebody else, nothing behind a link; what it takes as its own."""
 
 import json
 import shutil
@@ -63,7 +63,9 @@ def test_bytes_that_are_no_text_are_not_replaced(scene, tmp_path):
         batch([scene], tmp_path / "runs")
 
 
-@pytest.mark.parametrize("name", ["", "done", "features", "scene", "scene/sparse/0", "segmented", "state.json", "log.txt"])
+@pytest.mark.parametrize(
+    "name", ["", "done", "features", "scene", "scene/sparse/0", "segmented", "state.json", "log.txt"]
+)
 def test_links_in_the_output_are_not_followed(scene, tmp_path, name):
     link, elsewhere = tmp_path / "runs" / "kitchen" / name, tmp_path / "elsewhere"
     elsewhere.mkdir()
