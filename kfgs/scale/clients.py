@@ -91,9 +91,18 @@ def open_client(
             dashboard_address="127.0.0.1:0",
             scheduler_kwargs=once,
             silence_logs=logging.CRITICAL,
+            preload=[__name__],  # each worker calls dask_setup
         )
     with cluster, Client(cluster, set_as_default=False) as client:
         yield client
+
+
+def dask_setup(_: Any) -> None:
+    """Called in each worker of this machine: Ctrl-C ends the driver, which ends its workers.
+
+    In a terminal, it reaches all processes, and workers would print tracebacks.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _slurm(partition: str, threads: int, memory: str, scheduler: dict[str, Any]) -> Any:

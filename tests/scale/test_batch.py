@@ -363,3 +363,11 @@ def test_jobs_of_slurm(tmp_path, monkeypatch):
         "--nthreads 1",
     ):
         assert part in script.read_text()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+def test_ctrl_c_in_a_terminal_does_not_reach_the_workers(client):
+    def ignored():
+        return signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+
+    assert client.submit(ignored).result(timeout=100)
