@@ -155,4 +155,4 @@ for label, part in splat.by_class().items():
 print(*sorted(path.name for path in out.glob("*.[gp]l[by]")), sep=", ")
 
 # %% [markdown]
-# [5_query_transfer_edit](5_query_transfer_edit.py) has edits, [6_inspect_in_pyvista](6_inspect_in_pyvista.py) the viewer.
+# [5_query_transfer_edit](5_query_transfer_edit.ipynb) has edits, [6_inspect_in_pyvista](6_inspect_in_pyvista.ipynb) the viewer.

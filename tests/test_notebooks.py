@@ -68,7 +68,7 @@ def test_a_notebook_has_at_most_90_lines_of_code(source):
 
 
 def test_there_is_no_notebook_without_its_source():
-    assert sorted(path.stem for path in NOTEBOOKS.glob("*.ipynb")) == [path.stem for path in SOURCES]
+    assert {path.stem for path in NOTEBOOKS.glob("*.ipynb")} == {path.stem for path in SOURCES}
 
 
 def test_they_are_numbered_from_1():
