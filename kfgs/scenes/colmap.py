@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from ..cameras.camera import Camera, Distortion
 from .colmap_files import CAMERA_MODELS
 from .colmap_model import ColmapImage, ColmapModel, read_model
 from .files import SceneError, is_file, list_images, natural_key, some
-from .posed import picture_size
+from .posed import as_large_as_pictures
 from .scene import Scene
 
 # COLMAP's model: (our lens, its number of coefficients). COLMAP's own order after the intrinsics is ours in each case:
@@ -68,8 +67,8 @@ def load_colmap(path: str | Path, images: str | Path) -> Scene:
 
     Args:
         path: the model's folder (cameras, images, points3D; binary or text; with or without rigs and frames).
-        images: the folder that the model's image names are relative to. In a folder `images_2`, `images_4` or the like,
-            as in Mip-NeRF 360, pictures are smaller than the model says: the cameras are resized to them.
+        images: the folder that the model's image names are relative to. Its pictures may be smaller than the model says,
+            as in `images_2`, `images_4` of Mip-NeRF 360: the cameras are resized to them.
 
     Returns:
         The scene in natural order of names, points in order of their COLMAP ids, every view in the `train` split.
@@ -86,7 +85,8 @@ def load_colmap(path: str | Path, images: str | Path) -> Scene:
     views = sorted(model.images.values(), key=lambda image: natural_key(image.name))
     posed = [image for image in views if image.pose is not None]
     found = [image for image in posed if is_file(folder / image.name)]
-    cameras, shrunk = _resized(_cameras(path, model, found), folder)
+    paths = [folder / image.name for image in found]
+    cameras, shrunk = as_large_as_pictures(_cameras(path, model, found), paths, folder)
     lost = [image.name for image in views if image.pose is None]
     missing = [image.name for image in posed if not is_file(folder / image.name)]
     if not found:
@@ -106,31 +106,7 @@ def load_colmap(path: str | Path, images: str | Path) -> Scene:
         notes.append("no points: `kfgs fit` and `kfgs color` triangulate some from the poses before they train")
     points, colors = torch.from_numpy(model.points).float(), torch.from_numpy(model.colors)
     splits = {"train": list(range(len(found))), "test": []}
-    paths = [folder / image.name for image in found]
     return Scene(cameras, paths, points, colors, splits, tuple(notes)).with_near()
-
-
-def _resized(cameras: list[Camera], folder: Path) -> tuple[list[Camera], list[str]]:
-    """Cameras for the pictures of a folder `images_N`, which are N times smaller; and a note that says so."""
-    match = re.fullmatch(r"images_(\d+)", folder.name)
-    if match is None or not cameras:
-        return cameras, []
-    factor, sizes = int(match[1]), {}
-    for camera in cameras:  # pictures of one size are resized to one size: only the first is looked at
-        if camera.size in sizes:
-            continue
-        width, height = picture_size(folder / camera.name)
-        odd = max(abs(camera.width - factor * width), abs(camera.height - factor * height)) > factor
-        if odd and (height, width) != camera.size:
-            raise SceneError(
-                f"{folder / camera.name}: expected a picture of 1/{factor} of {camera.width}x{camera.height} pixels, as "
-                f"the name of its folder says, got {width}x{height}; rename the folder, or resize the pictures"
-            )
-        sizes[camera.size] = (height, width)
-    if all(size == small for size, small in sizes.items()):
-        return cameras, []  # the model was made from these pictures
-    note = f"{folder.name}: pictures are {factor} times smaller than the model says; cameras were resized to them"
-    return [camera.resized(*sizes[camera.size]) for camera in cameras], [note]
 
 
 def _cameras(path: Path, model: ColmapModel, images: list[ColmapImage]) -> list[Camera]:

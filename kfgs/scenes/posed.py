@@ -48,6 +48,43 @@ def picture_size(path: Path) -> tuple[int, int]:
         return picture.size
 
 
+def as_large_as_pictures(
+    cameras: list[Camera], paths: Sequence[Path], folder: Path | None
+) -> tuple[list[Camera], list[str]]:
+    """Cameras for pictures that may be smaller than the cameras say, as in `images_4`, and a note if they are.
+
+    Args:
+        cameras: as the model says. Pictures of one camera size must all have one size: only the first is looked at.
+        paths: their pictures.
+        folder: of the pictures. One called `images_N` must hold pictures that are N times smaller.
+
+    Raises:
+        SceneError: if a picture is larger than its camera, or of another shape.
+    """
+    where = folder if folder is not None and paths and paths[0].is_relative_to(folder) else Path("images")
+    named = re.fullmatch(r"images_(\d+)", where.name)
+    sizes: dict[tuple[int, int], tuple[int, int]] = {}
+    for camera, path in zip(cameras, paths, strict=True):
+        if camera.size in sizes:
+            continue
+        width, height = picture_size(path)
+        factor = int(named[1]) if named else max(1.0, camera.width / width)
+        odd = max(abs(camera.width - factor * width), abs(camera.height - factor * height)) > factor
+        if odd and (height, width) != camera.size:
+            shape, reason = (f"1/{factor}", "the name of its folder") if named else ("the shape", "its camera")
+            raise SceneError(
+                f"{path}: expected a picture of {shape} of {camera.width}x{camera.height} pixels, as {reason} says, "
+                f"got {width}x{height}; give the pictures that the cameras were made for, or smaller copies of them"
+            )
+        sizes[camera.size] = (height, width)
+    changed = [(size, small) for size, small in sizes.items() if size != small]
+    if not changed:
+        return cameras, []
+    (_, width), (_, small) = changed[0]
+    note = f"{where.name}: pictures are {width / small:.3g} times smaller than the model says; cameras were resized to them"
+    return [camera.resized(*sizes[camera.size]) for camera in cameras], [note]
+
+
 def read_numbers(path: Path, expected: str) -> Matrix:  # [rows, columns]
     """The numbers of a text file, row by row.
 

@@ -31,7 +31,7 @@ from .files import (
     read_scene_json,
     some,
 )
-from .posed import MILLIMETRE, points_of_cameras, read_points
+from .posed import MILLIMETRE, as_large_as_pictures, points_of_cameras, read_points
 from .scene import Scene
 
 _PERSPECTIVE = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -75,16 +75,15 @@ def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene
 
     Args:
         path: the file, or a folder with `transforms.json` or `transforms_train.json`.
-        images: where to look for image files before the scene folder.
+        images: where to look for image files before the scene folder. Smaller ones than the file says resize the cameras.
 
     Returns:
         The scene in natural order of names. Splits come from the file (`train_filenames`, `test_filenames`) or from Blender's
-        two files; else all views are in `train`.
+        two files; else all views train.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        SceneError: if it is damaged, a number is missing or implausible, a lens has no exact form in kfgs, or no frame
-            has a file.
+        SceneError: if it is damaged, a number is missing or implausible, a lens is unknown to kfgs, or no frame has a file.
     """
     files = _files(as_path(path))
     readers = {}
@@ -113,8 +112,9 @@ def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene
         notes.append(f"{len(outside)} image files lie outside {first.root}: {some(outside, 3)}")
     if any(reader.masked for reader, _ in readers.values()):
         notes.append(f"{sum(reader.masked for reader, _ in readers.values())} frames have a mask_path; it is not used")
-    cameras, paths = [view[0] for view in views], [view[1] for view in views]
-    return Scene(cameras, paths, points, colors, _splits(views, first.root, top), tuple(notes)).with_near()
+    paths = [view[1] for view in views]
+    cameras, shrunk = as_large_as_pictures([view[0] for view in views], paths, first.images)
+    return Scene(cameras, paths, points, colors, _splits(views, first.root, top), (*notes, *shrunk)).with_near()
 
 
 def _files(path: Path) -> dict[str, Path]:

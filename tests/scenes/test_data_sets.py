@@ -263,6 +263,21 @@ def test_mip_nerf_360_with_smaller_pictures(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
+def test_smaller_pictures_in_a_folder_of_any_name(tmp_path: Path) -> None:
+    write_model(tmp_path / "sparse/0", ["a.png", "b.png"])  # 64x48
+    for name in ("a.png", "b.png"):
+        write_picture(tmp_path / "small" / name, 18, 24)
+        write_picture(tmp_path / "cropped" / name, 18, 20)
+        write_picture(tmp_path / "large" / name, 96, 128)
+    scene = load_scene(tmp_path, images="small")
+    assert scene.image(0).shape == (18, 24, 3)
+    torch.testing.assert_close(scene.cameras[0].K[0, 0], torch.tensor(50 * 24 / 64))
+    assert any("small: pictures are 2.67 times smaller" in note for note in scene.notes)
+    for name, size in (("cropped", "20x18"), ("large", "128x96")):
+        with pytest.raises(SceneError, match=tells(name, "shape of 64x48", size, "smaller copies")):
+            load_scene(tmp_path, images=name)
+
+
 def test_feature_3dgs_and_lists_of_test_views(tmp_path: Path) -> None:
     names = [f"rgb_{i}.png" for i in range(12)]
     write_model(tmp_path / "sparse/0", names)

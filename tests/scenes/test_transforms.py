@@ -130,6 +130,20 @@ def test_images_are_looked_up_in_the_given_folder_first(tmp_path: Path) -> None:
     assert load_transforms(file, tmp_path / "empty").image_paths[0].parent.name == "images"
 
 
+def test_smaller_pictures_resize_the_cameras(tmp_path: Path) -> None:
+    file = _write(tmp_path)
+    write_picture(tmp_path / "images_4/a.png", 12, 16)
+    write_picture(tmp_path / "small/a.png", 24, 32)
+    for images, f in (("images_4", 12.5), ("small", 25.0)):
+        scene = load_transforms(file, tmp_path / images)
+        assert scene.cameras[0].K[0, 0] == f
+        assert scene.image(0).shape[:2] == scene.cameras[0].size
+        assert any(note.startswith(f"{images}: pictures are {50 / f:g} times smaller") for note in scene.notes)
+    (tmp_path / "images_4").rename(tmp_path / "images_8")
+    with pytest.raises(SceneError, match=tells("images_8/a.png", "1/8 of 64x48", "16x12")):
+        load_transforms(file, tmp_path / "images_8")
+
+
 def test_paths_out_of_the_folder_must_be_images_and_are_noted(tmp_path: Path) -> None:
     write_picture(tmp_path / "elsewhere/b.png")
     (tmp_path / "secret.txt").write_text("secret")
