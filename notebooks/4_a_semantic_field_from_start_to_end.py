@@ -2,7 +2,7 @@
 # # 4. A semantic field from start to end
 #
 # **Can a field be better than the teacher it learns from?** A teacher says, with many mistakes, what is where in each
-# photograph. Here its maps become some 20,000 Gaussians that answer from any viewpoint, and you will see that they are
+# photograph. Here its maps become some 35,000 Gaussians that answer from any viewpoint, and you will see that they are
 # right more often than the teacher. It takes three steps: Gaussians with colours, the teacher's maps carried onto them,
 # and classes for pictures that no step has seen.
 #

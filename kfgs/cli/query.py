@@ -171,14 +171,14 @@ def label(
 
 
 def info(path: Positional[Path]) -> None:
-    """Describe a field, a run, a scene, a folder of feature maps or a PLY file.
+    """Describe a field, a run, a scene, a folder of feature maps, a splat or a PLY of points.
 
     Examples:
         kfgs info run/field
         kfgs info scene/
 
     Args:
-        path: A field folder, run folder, scene folder, folder of feature maps, or .ply file.
+        path: A field folder, run folder, scene folder, folder of feature maps, splat file, or .ply of points.
     """
     from ..pipeline import describe
 

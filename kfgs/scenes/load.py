@@ -65,8 +65,8 @@ def load_scene(path: str | Path, *, images: str | Path | None = None, split: Spl
             then resized; None: `images/` beside the model or up to two folders above it, else the first of `images_2`,
             `images_4`, ..., else the scene folder. Replica, ScanNet and Polycam know one place only.
         split: `"auto"`: split.json if there is one, else the model's test.txt, else the split of the transforms.json if it
-            has one, else by number of images: from 200 the paper's (which trains on every 10th image only), from 8
-            `"holdout8"`, below 8 all; `"file"`: split.json; or a rule of `make_split`.
+            has one, else `"df3dgs"` for the videos of Replica, `"holdout8"` from 8 images, below 8 `"all"`; `"file"`:
+            split.json; or a rule of `make_split`.
 
     Returns:
         The scene, with views in natural order of names, and cameras with a `near` for the size of the scene
@@ -206,12 +206,11 @@ def _with_split(scene: Scene, root: Path, split: SplitChoice) -> Scene:
         return replace(scene, splits=read_test_list(listed[0], [scene.stem(i) for i in range(len(scene))]))
     if split == "auto" and scene.splits.get("test"):
         return scene
-    rule = choose_split(len(scene)) if split == "auto" else split
+    replica = find_model(root) is None and (is_nice_slam(root) or is_semantic_nerf(root))
+    rule = choose_split(len(scene), replica) if split == "auto" else split
     assert rule != "file"
     splits = make_split(len(scene), rule)
     note = f"split {rule}: {len(splits['train'])} of {len(scene)} views train, {len(splits['test'])} test"
-    if split == "auto" and rule == "df3dgs":
-        note += ' (the paper\'s, for 900 frames of video); split="holdout8" trains on 7 of 8 views'
     if not splits["train"]:
         raise SceneError(
             f'{root}: expected at least 6 views for the split {rule!r}, got {len(scene)}; use split="all" or "holdout8"'

@@ -11,8 +11,7 @@ from .files import SceneError, file_stem, read_scene_json
 
 SplitRule = Literal["df3dgs", "feature3dgs", "holdout8", "all"]
 RULES: tuple[SplitRule, ...] = ("df3dgs", "feature3dgs", "holdout8", "all")
-
-DF3DGS_FEWEST = 200  # the paper's rule leaves out 4 of 5 views: fine for a video, too many of a few dozen photos
+LONG_VIDEO = 200  # frames of Replica: neighbours show the same, so that every tenth is enough
 
 
 def split_every(count: int, *, step: int, test_start: int = 0, train_start: int | None = None) -> dict[str, list[int]]:
@@ -70,9 +69,9 @@ def make_split(count: int, rule: SplitRule) -> dict[str, list[int]]:
     return {"train": list(range(count)), "test": []}
 
 
-def choose_split(count: int) -> SplitRule:
-    """The rule for a scene without a split: the paper's from 200 images, `"holdout8"` from 8, else `"all"`."""
-    if count >= DF3DGS_FEWEST:
+def choose_split(count: int, video: bool = False) -> SplitRule:
+    """The rule for a scene without a split: `"holdout8"` from 8 images, else `"all"`; of a long video the paper's."""
+    if video and count >= LONG_VIDEO:
         return "df3dgs"
     return "holdout8" if count >= 8 else "all"
 

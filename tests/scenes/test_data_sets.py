@@ -60,6 +60,17 @@ def test_replica_of_nice_slam(tmp_path: Path) -> None:
     assert scene.colors.shape == (3 * 48 * 64, 3)
 
 
+def test_a_long_video_of_replica_is_split_as_in_the_paper_and_many_photos_are_not(tmp_path: Path) -> None:
+    scene = load_scene(_nice_slam(tmp_path / "replica", 200))
+    assert (scene.splits["train"][:2], scene.splits["test"][:2], len(scene.splits["train"])) == ([5, 15], [0, 10], 20)
+    assert any(note.startswith("split df3dgs: 20 of 200 views train") for note in scene.notes)
+    names = [f"{i}.png" for i in range(200)]
+    write_model(tmp_path / "photos/sparse/0", names)
+    for name in names:
+        write_picture(tmp_path / "photos/images" / name)
+    assert len(load_scene(tmp_path / "photos").splits["train"]) == 175
+
+
 def test_a_real_room_in_the_layout_of_nice_slam(tmp_path: Path, shared_data: Path) -> None:
     room = load_scene(shared_data / "room_0")
     chosen = list(range(0, 180, 45))

@@ -23,10 +23,18 @@ def test_holdout8_and_all() -> None:
 
 
 @pytest.mark.parametrize(
-    ("count", "rule"), [(0, "all"), (7, "all"), (8, "holdout8"), (199, "holdout8"), (200, "df3dgs")]
+    ("count", "video", "rule"),
+    [
+        (0, False, "all"),
+        (7, True, "all"),
+        (8, False, "holdout8"),
+        (500, False, "holdout8"),
+        (199, True, "holdout8"),
+        (200, True, "df3dgs"),
+    ],
 )
-def test_the_rule_without_a_split_file(count: int, rule: str) -> None:
-    assert choose_split(count) == rule
+def test_the_rule_without_a_split_file(count: int, video: bool, rule: str) -> None:
+    assert choose_split(count, video) == rule
 
 
 def test_split_every_checks_its_numbers() -> None:
