@@ -24,7 +24,7 @@ ELSEWHERE = {
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N 3-D Gaussians. All values are **activated**; raw (log, logit) values live only in `fields.GaussianParams`.
+    """N 3-D Gaussians. Values are **activated** (opacities from 0 to 1, scales as lengths); `fields.GaussianParams` has raw ones.
 
     **Convention**: quaternions are (w, x, y, z) and need not be unit (they are normalised where used); scales are
     standard deviations in world units; labels are class indices with -1 = none, and become int64. A semantic field carries

@@ -52,7 +52,7 @@ def batch(
     """Take many scenes through sfm, features, fit, segment and evaluate, on many machines.
 
     SCENES is a text file with a scene in each line: a folder with a COLMAP model or a transforms.json, a folder of photos whose
-    cameras are found first, or an URL (s3://bucket/scene). `name = scene` gives a run another name than its folder. Running
+    cameras are found first, or a URL (s3://bucket/scene). `name = scene` gives a run another name than its folder. Running
     again repeats nothing that is done. Needs pip install 'kfgs[scale]'. The project's docs/scale has files for clusters.
 
     Examples:

@@ -132,7 +132,7 @@ class FieldConfig:
 
     @classmethod
     def paper(cls, **changes: Any) -> FieldConfig:
-        """The published values (the same as `FieldConfig()`), with changes."""
+        """The published values (the same as `FieldConfig()`), with the given changes."""
         return cls(**changes)
 
     @classmethod

@@ -33,16 +33,17 @@ from .views import Rule, rank_classes
 @typed
 @dataclass(frozen=True, eq=False)
 class SemanticField:
-    """A scene's semantics in 3-D, with everything needed to classify, query and segment.
+    """The result of a fit: find things (`query`), give each Gaussian a class (`classify`) or each pixel (`segment`).
 
-    Latents are linear in the teacher's features (`linear`, made by `uplift`), or one of the three rows of Table 1: with
-    codebook and autoencoder, d latents ("decouple+ADC+SC"); with the codebook only, features near codewords
-    ("decouple+ADC"); with neither, the teacher's features ("just decouple").
+    `field.gaussians[field.query("chair")]` are the Gaussians of the chair.
+
+    **Latents.** A Gaussian holds d numbers. They are linear in the teacher's features (`linear`, made by `uplift`), or as in
+    one of the three rows of Table 1: with codebook and autoencoder, d latents ("decouple+ADC+SC"); with the codebook
+    only, features near codewords ("decouple+ADC"); with neither, the teacher's features ("just decouple").
 
     **The rule.** The class or score of a Gaussian is that of its *fused* feature: the mean over the pixels of the training
     views that show it. Selections, labels of other clouds, and the views of a fused field follow from it. `rule="paper"` is
     Sec. 3.4 as printed: decode and quantise a Gaussian's own latent, or a pixel's rendered one.
-    `field.gaussians[field.query("chair")]` are the Gaussians of the chair.
     """
 
     gaussians: Gaussians

@@ -49,7 +49,7 @@ _HEAD_BYTES = 1 << 16
 
 
 def formats() -> dict[str, ModuleType]:
-    """Every format by name, in the order of trial."""
+    """All formats by name, in the order in which `read_splats` tries them."""
     modules = [import_module(f".{name}", __package__) for name in MODULES]
     return {module.NAME: module for module in modules}
 

@@ -97,7 +97,7 @@ class LabelSet:
         return int(self.embeddings.shape[1])
 
     def index(self, name: str) -> int:
-        """The label of a class; a ValueError offers names that are like an unknown one."""
+        """The label of a class; for an unknown name, a ValueError lists similar names."""
         return class_index(name, self.names)
 
     def knows(self, name: str) -> bool:

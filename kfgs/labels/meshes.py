@@ -22,7 +22,7 @@ NONE = "(none)"  # the key of what has no class
 
 @dataclass(frozen=True, eq=False)
 class LabelledMesh:
-    """A mesh of V vertices and F triangles with labels. It holds arrays only; hang them on your mesh as you like."""
+    """A mesh of V vertices and F triangles with labels. It holds arrays only; attach them to your mesh as you like."""
 
     vertices: Array  # [V, 3] float64
     faces: Array  # [F, 3] int64

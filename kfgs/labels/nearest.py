@@ -109,8 +109,8 @@ def default_distance(
     spacing is the distance to the nearest other source) and at most 10 times the 90 % quantile of the spacings. With the
     lower bound a destination between two sources reaches both. The upper bound keeps floaters and background, which only
     the colour field has, from taking labels across the room; it uses a quantile because a few large Gaussians fill a wall.
-    With a single source position only the 99.5 % count. Measured on an evenly strided sample of at most 20,000 Gaussians
-    of each cloud.
+    With a single source position there are no spacings, and only the 99.5 % count. Measured on an evenly strided sample
+    of at most 20,000 Gaussians of each cloud.
 
     Raises:
         ValueError: if a cloud is empty or a position is not finite.

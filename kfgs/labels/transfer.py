@@ -129,10 +129,8 @@ def transfer_labels(
         TypeError: if the labels are not integers.
 
     Note:
-        Measured on the colour Gaussians of the toy room (true classes of its surface) and of Replica's room_0 (classes of
-        the labelled pixels that they fill), mIoU in per cent for nearest / vote / mahalanobis of Gaussians: 88.6 / 89.6 /
-        90.9 and 74.7 / 75.4 / 78.7 with votes of segmented views; 50.1 / 70.1 / 74.4 and 30.7 / 51.1 / 48.9 with
-        `SemanticField.classify`, whose labels are noisy. Times: benchmarks/transfer.py.
+        With noisy source labels "vote" and "mahalanobis" are much better than "nearest", with clean ones a little
+        (`docs/results.md`, "Labels for a colour field").
     """
     check_choice("method", method, get_args(Method))
     check_whole("neighbours", neighbours, 1)

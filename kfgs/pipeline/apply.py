@@ -159,7 +159,13 @@ def true_labels(scene: Scene, folder: str | Path, split: str) -> dict[str, Tenso
 
 @typed
 def score_scene(labels: dict[str, Tensor], truth: dict[str, Tensor], classes: LabelSet) -> SegmentationReport:
-    """Score segmented views against the truth of those that have one (`true_labels`)."""
+    """Score segmented views against their true labels (protocol `kfgs-pooled/1`). Views without truth are left out.
+
+    Args:
+        labels: the label map of each view by its stem, from `segment_scene`.
+        truth: true labels by stem, from `true_labels`.
+        classes: what the labels mean.
+    """
     known = {stem: target for stem, target in truth.items() if stem in labels}
     return evaluate_segmentation(labels.__getitem__, known, classes.names)
 

@@ -95,7 +95,9 @@ def fit_autoencoder(
     generator: torch.Generator | None = None,
     progress: Progress = False,
 ) -> AutoencoderFit:
-    """Fit the scene's autoencoder to its codewords (Eq. 10): the mean over codewords of |Psi(E(f)) - f|_2.
+    """Fit the scene's autoencoder, which compresses codewords from D to d numbers (Eq. 10).
+
+    The loss is the mean over codewords of |Psi(E(f)) - f|_2.
 
     With blends, the mean also goes over rows |Psi(sum_j w_j E(f_j)) - f|_2, f the direction of sum_j w_j f_j: `BLENDED`
     codewords drawn at random with weights from the flat Dirichlet distribution, other ones in every step.

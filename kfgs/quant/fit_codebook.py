@@ -135,7 +135,7 @@ def fit_codebook(
     generator: torch.Generator | None = None,
     progress: Progress = False,
 ) -> CodebookFit:
-    """Fit a codebook to the feature maps of a scene (Sec. 3.3.1).
+    """Fit a codebook to the feature maps of a scene: K features that stand for all others (Sec. 3.3.1).
 
     By default: take a pool of features evenly from the maps, grow codewords on it by splitting cells (`grow`), and drop
     those that are too similar (Eq. 9). A codeword is the mean direction of its cell, scaled to channels of root mean

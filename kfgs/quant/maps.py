@@ -159,7 +159,7 @@ def quantize_maps(
     progress: bool = False,
     scratch: Path | None = None,
 ) -> IndexMaps:
-    """Quantise every pixel of every map (Eq. 5), with one map in memory at a time.
+    """Replace every pixel's feature by the number of its most similar codeword (Eq. 5), with one map in memory at a time.
 
     An all-zero feature (not longer than `EPS`, as in `fit_codebook`) says nothing about its pixel and becomes a hole,
     index K.

@@ -68,7 +68,7 @@ def map_scenes(
     go on.
 
     Args:
-        function: receives a scene's place, an absolute path or an URL; returns something small. It is sent by cloudpickle, so
+        function: receives a scene's place, an absolute path or a URL; returns something small. It is sent by cloudpickle, so
             it may be a lambda, or defined in a notebook.
         scenes: folders, URLs, or entries; see `read_scenes` for a file.
         client: a `dask.distributed.Client`, or anything with `submit(function, *arguments)` whose results have `done()` and

@@ -84,7 +84,7 @@ def split_scene(
         The blocks.
 
     Raises:
-        SceneError: as `scenes.partition`.
+        SceneError: if the model has no tracks, or fewer points than blocks, or no image sees a block.
         FileNotFoundError: if views have no maps.
         ValueError: if OUT holds another scene's blocks, or was cut from other maps, another splat or in another way; if another
             process cuts there; if OUT is the scene, or lies among its maps; if given latents do not fit to the maps.

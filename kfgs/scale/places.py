@@ -1,4 +1,4 @@
-"""Where scenes and runs lie: a folder, used in place, or an URL of fsspec, of which a task has a copy in a scratch folder."""
+"""Where scenes and runs lie: a folder, used in place, or a URL of fsspec, of which a task has a copy in a scratch folder."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ class StoredPlace(Place):
 
 @contextmanager
 def open_place(place: str) -> Iterator[Place]:
-    """A folder or URL; the scratch folder of an URL is deleted at the end."""
+    """A folder or URL; the scratch folder of a URL is deleted at the end."""
     if not is_url(place):
         yield Place(Path(place))
         return

@@ -22,18 +22,18 @@ class SceneEntry:
     name: str
     """Of its run: RUNS/<name>."""
     source: str
-    """An absolute path, or an URL of fsspec."""
+    """An absolute path, or a URL of fsspec."""
 
 
 def is_url(place: str) -> bool:
-    """Whether a place is an URL such as `s3://bucket/scene`; else it is a path."""
+    """Whether a place is a URL such as `s3://bucket/scene`; else it is a path."""
     return URL.match(place) is not None
 
 
 def read_scenes(path: str | Path) -> list[SceneEntry]:
     """Read a list of scenes: one per line, `#` before a comment, blank lines ignored.
 
-    A line is a folder (relative to that of the list) or an URL of fsspec. Its last part is the name of the run;
+    A line is a folder (relative to that of the list) or a URL of fsspec. Its last part is the name of the run;
     `name = folder` gives another one.
 
     Raises:

@@ -12,7 +12,7 @@ from .sh import rotate_sh
 
 
 def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussians:
-    """The cloud after x' = s R x + t: seen from cameras moved along, it looks the same.
+    """Move, turn and resize a cloud: x' = s R x + t. Cameras that move along see the same picture.
 
     Means move, quaternions are turned (q' = q_R q, keeping their length), scales grow by s, spherical harmonics turn with
     R (`rotate_sh`). Opacities, features and labels stay as they are. dtype and device are kept; differentiable.

@@ -81,14 +81,14 @@ def make_label_set(
     synonyms: Mapping[str, Sequence[str]] | None = None,
     negatives: Sequence[str] | None = CANONICAL,
 ) -> LabelSet:
-    """Class names with their embeddings (`embed_labels`), on the CPU; `info` records teacher and templates.
+    """Make classes from words: each name with its embedding by the teacher's text encoder, on the CPU.
 
-    Arguments and errors are those of `embed_labels`; a class is named by its first word.
+    Errors are those of `embed_labels`; `info` of the result records teacher and templates.
 
     Args:
         teacher: a teacher with a text encoder.
-        names: C class names.
-        templates: also used for the negatives.
+        names: C class names. A name may contain synonyms, "chair;armchair"; the first word names the class.
+        templates: texts such as "a photo of a {}.", or the name of a set of `TEMPLATES`; None: the teacher's, else bare words.
         synonyms: further words of a class, by its name.
         negatives: words that a query is compared with if there is no other class (LERF's canonical words), or None.
     """
