@@ -97,7 +97,7 @@ plt.show()
 # ## Which views are held out
 #
 # Scores count only on pictures that training has not seen. Here the test views are orange. If the folder has a
-# `split.json`, it decides. Otherwise every eighth view is for testing (from 200 photos on, the paper's rule holds).
+# `split.json`, it decides. Otherwise every eighth view is for testing.
 
 # %%
 split_colors = {"train": "#0072b2", "test": "#d55e00"}
