@@ -39,7 +39,8 @@ def features(
 
     Args:
         out: Folder for the maps; by default SCENE/features.
-        overwrite: Replace maps of another teacher, other weights or other options; without it they are an error.
+        overwrite: Replace maps that kfgs made with another teacher, other weights or other options; without it they are an
+            error. Maps of other programs always are.
         check: Check this folder of maps instead, and report every file that does not fit.
         level: For --check: which masks of LangSplat's maps, default, subparts (s), parts (m) or wholes (l).
         device: Where the teacher runs: auto (a GPU if there is one), cpu or cuda.
