@@ -59,7 +59,13 @@ def features(
     if check is not None:
         found = FeatureFolder(check, level=level or "default").check(loaded, views.split)
         say(str(found))
-        found.raise_if_bad()
+        if not found.ok:
+            raise ValueError(
+                f"check: expected a map that fits for each of the {found.views} views of split {views.split!r}, got "
+                f"{len(found.problems)} that are missing or do not fit (named above); make these maps again, or name the "
+                "photos to use in SCENE/split.json"
+            )
+        say(f"next: kfgs fit {scene} --out run --features {check}")
         return
     network = choose_teacher(teacher.teacher, teacher.weights, teacher.fast, teacher.size, device)
     made = extract_features(network, loaded, target, views.split, overwrite=overwrite, report=say, progress=True)

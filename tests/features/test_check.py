@@ -50,7 +50,7 @@ def test_maps_that_fit_are_one_line(folder, values):
     assert report.ok
     assert (report.views, report.shape, report.dtype, report.notes) == (3, (6, 8, 16), "float16", {})
     assert report.bytes == sum((folder / f"{stem}.npy").stat().st_size for stem in "abc")
-    assert str(report) == f"{folder}: 3 of 3 views have a map that fits; 6 x 8 x 16 float16, 0.0 MB"
+    assert str(report) == f"{folder}: 3 of 3 views have a map that fits; 6 x 8 cells, 16 channels, float16, 0.0 MB"
     report.raise_if_bad()
 
 
@@ -79,7 +79,7 @@ def test_all_that_does_not_fit_is_reported_at_once_by_file(folder):
     assert "cannot be read" in report.problems["junk_fmap_CxHxW.pt"][0]
     assert report.problems["gone.npy"] == ["missing"]
     lines = str(report).splitlines()
-    assert lines[0].startswith(f"{folder}: 3 of 11 views have a map that fits; 6 x 8 x 16 float16")
+    assert lines[0].startswith(f"{folder}: 3 of 11 views have a map that fits; 6 x 8 cells, 16 channels, float16")
     assert len(lines) == 9
     assert sum(line.startswith("turned.npy: ") and "; expected the aspect" in line for line in lines) == 1
     with pytest.raises(ValueError, match=tells("11 views", "got 8", "3 more")):
@@ -159,8 +159,8 @@ def test_notes_are_no_problems(folder):
     assert report.ok
     zeros = "50 % of the features are all-zero: nothing is known there"
     assert report.notes["a.npy"] == ["double precision, which is read as single", zeros]
-    assert report.notes[""] == ["maps of none of these views: 5 (c, x0, x1 and 2 more)"]
-    assert str(report).splitlines()[1] == "note: maps of none of these views: 5 (c, x0, x1 and 2 more)"
+    assert report.notes[""] == ["maps of other views, which are not used: 5 (c, x0, x1 and 2 more)"]
+    assert str(report).splitlines()[1] == "note: maps of other views, which are not used: 5 (c, x0, x1 and 2 more)"
 
 
 def test_langsplat_with_masks_of_another_run(tmp_path):
