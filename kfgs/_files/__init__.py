@@ -19,7 +19,7 @@ from .atomic import (
 )
 from .errors import FullDiskError
 from .locks import InUseError, locked
-from .own import check_inside, check_own, foreign
+from .own import check_inside, check_own, foreign, is_own
 from .paths import as_path, check_output, real_path
 
 __all__ = [
@@ -39,6 +39,7 @@ __all__ = [
     "finish_writing",
     "foreign",
     "hidden_folder",
+    "is_own",
     "locked",
     "open_current",
     "parse_json",

@@ -145,7 +145,9 @@ def check_maps(
         if layout_of(file, finder.own) in LAYOUTS[: LAYOUTS.index(OWN)]:
             raise ValueError(f"{expected}, which would be read instead of ours; use another folder")
         if found is None and file in files:
-            raise ValueError(f"{expected} and no {MANIFEST}; use another folder, or move the maps away, which kfgs did not make")
+            raise ValueError(
+                f"{expected} and no {MANIFEST}; use another folder, or move the maps away, which kfgs did not make"
+            )
     if found is not None and found.teacher != identity and not overwrite:
         raise ValueError(
             f"{folder}: expected maps of the same teacher as now, got others ({differences(found.teacher, identity)}); "

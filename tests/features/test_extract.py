@@ -145,7 +145,9 @@ def test_maps_of_other_programs_are_left_alone(pictures, tmp_path):
     folder.mkdir()
     np.save(folder / "a.npy", np.ones((3, 4, 5)))
     for overwrite in (False, True):
-        with pytest.raises(ValueError, match=tells(f"{folder}: ", "a.npy", "features.json", "another folder")) as caught:
+        with pytest.raises(
+            ValueError, match=tells(f"{folder}: ", "a.npy", "features.json", "another folder")
+        ) as caught:
             extract_features(Counting(), pictures, folder, overwrite=overwrite)
         assert "overwrite" not in str(caught.value)
         assert list(folder.iterdir()) == [folder / "a.npy"]

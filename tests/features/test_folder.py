@@ -282,7 +282,9 @@ def test_last_parts_of_names_are_looked_for_when_nothing_else_fits(tmp_path):
     np.save(tmp_path / "a.npy", features(0).numpy())
     maps = FeatureFolder(tmp_path, ["train/a", "train/b"])
     assert [file.relative_to(tmp_path).as_posix() for file in maps.files] == ["a.npy", "feat/b.npy"]
-    with pytest.raises(FileNotFoundError, match=tells("2 views", "1 missing: b.npy", "the program that made the others")):
+    with pytest.raises(
+        FileNotFoundError, match=tells("2 views", "1 missing: b.npy", "the program that made the others")
+    ):
         FeatureFolder(tmp_path, ["a", "b"])  # a fits as it is: then so must b
     with pytest.raises(FileNotFoundError, match=tells("2 views", "2 missing", "left/a.npy")):
         FeatureFolder(tmp_path, ["left/a", "right/a"])  # which of them?
