@@ -59,7 +59,9 @@ def test_a_folder_holds_the_results_of_one_run_and_files_of_others(desk, tmp_pat
     assert segment(desk, tmp_path, "--path", "cameras", "--frames", 2, "--width", 32) == 0
     said = capsys.readouterr().out
     left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
-    drawn = {f"{folder}/{path.name}" for folder in ("predicted", "colored") for path in (tmp_path / "colored").iterdir()}
+    drawn = {
+        f"{folder}/{path.name}" for folder in ("predicted", "colored") for path in (tmp_path / "colored").iterdir()
+    }
     assert len(drawn) == 4
     assert left == drawn | {"predicted/mine.png", "coco/images/mine.png", "sheets/notes.txt"}
     assert not (tmp_path / "overlay").exists()
