@@ -34,7 +34,7 @@ FORMAT, VERSIONS = "kfgs.semantic_field", (1, 2, 3)
 
 
 def find_field(path: str | Path) -> Path | None:
-    """The field at a path: a field folder (or one of its files), a packed field, or that of a run folder; None if there is none."""
+    """The field at a path: a field folder, also by one of its two files; a packed field; that of a run folder; or None."""
     path = as_path(path)
     if path.name in (DESCRIPTION, TENSORS) and path.is_file() and describes_field(path.parent):
         return path.parent
