@@ -15,8 +15,9 @@ import torch
 from messages import tells
 from PIL import Image
 
+from kfgs._files import LARGEST
 from kfgs.scenes import SceneError, file_stem, read_image
-from kfgs.scenes.files import open_picture
+from kfgs.scenes.files import open_picture, read_scene_json
 from kfgs.scenes.posed import picture_size, read_depth
 
 RNG = np.random.default_rng(0)
