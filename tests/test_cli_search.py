@@ -44,7 +44,7 @@ def test_the_first_search_makes_the_index_and_says_so(tmp_path, capsys):
     save_scenes(tmp_path, a=scene([("wall", 0.0), ("chair", 0.0)], 1))
     assert main(["search", "chair", str(tmp_path)]) == 0
     first = capsys.readouterr().out
-    assert f"index: 1 fields added; 1 in {tmp_path / NAME}" in first
+    assert f"index: 1 field added; 1 in {tmp_path / NAME}" in first
     assert main(["search", "chair", str(tmp_path)]) == 0
     second = capsys.readouterr().out
     assert "index:" not in second

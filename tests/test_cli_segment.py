@@ -49,6 +49,37 @@ def test_coco_of_the_views_of_a_split_has_their_photographs(desk, tmp_path, caps
         assert np.array_equal(read(tmp_path / "coco" / "images" / f"{stem}.png"), read(scene.image_paths[i])[..., :3])
 
 
+def test_a_folder_holds_the_results_of_one_run_and_files_of_others(desk, tmp_path, capsys):
+    assert segment(desk, tmp_path, "--split", "train", "--coco", "--pictures", "2") == 0
+    for name in ("predicted/mine.png", "coco/images/mine.png"):
+        Image.new("RGB", (4, 3)).save(tmp_path / name)  # kfgs did not draw these
+    (tmp_path / "sheets" / "notes.txt").write_text("mine")
+    assert (tmp_path / "scores.json").is_file()
+    capsys.readouterr()
+    assert segment(desk, tmp_path, "--path", "cameras", "--frames", 2, "--width", 32) == 0
+    said = capsys.readouterr().out
+    left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
+    drawn = {
+        f"{folder}/{path.name}" for folder in ("predicted", "colored") for path in (tmp_path / "colored").iterdir()
+    }
+    assert len(drawn) == 4
+    assert left == drawn | {"predicted/mine.png", "coco/images/mine.png", "sheets/notes.txt"}
+    assert not (tmp_path / "overlay").exists()
+    # of 6 views: predicted, colored and coco/images, 2 views x (sheets, overlay, features); annotations, scores, 2 plots
+    assert f"note: deleted {6 * 3 + 2 * 3 + 4} files of an earlier `kfgs segment` in {tmp_path}" in said
+    assert f"{tmp_path / 'colored'}  (2 files)" in said
+
+
+def test_a_run_that_fails_deletes_nothing_of_an_earlier_one(desk, tmp_path, capsys):
+    assert segment(desk, tmp_path, "--pictures", "1") == 0
+    before = {path for path in tmp_path.rglob("*") if path.is_file()}
+    stem = load_scene(desk / "scene").stem(load_scene(desk / "scene").views("train")[0])
+    Image.new("RGB", (4, 3)).save(tmp_path / "colored" / f"{stem}.png")
+    assert segment(desk, tmp_path, "--split", "train") == 1
+    assert stem in capsys.readouterr().err
+    assert before < {path for path in tmp_path.rglob("*") if path.is_file()}
+
+
 @pytest.mark.parametrize("path", ["orbit", "spiral", "cameras"])
 def test_a_path_is_segmented_with_the_colours_that_it_sees(desk, tmp_path, path, capsys):
     words = ["--path", path, "--frames", 3, "--width", 64, "--coco", "--color", desk / "my.ply"]

@@ -226,6 +226,7 @@ def test_other_weights_are_refused_unless_the_maps_are_given_up(scene, pictures,
 
 def test_check_reports_maps_that_do_not_fit(scene, pictures, maps, tmp_path, capsys):
     assert main(["features", str(scene), "--check", str(maps)]) == 0
+    assert f"next: kfgs fit {scene} --out run --features {maps}" in capsys.readouterr().out
     out = tmp_path / "maps"
     shutil.copytree(maps, out)
     gone, broken, turned, *good = pictures
@@ -235,10 +236,11 @@ def test_check_reports_maps_that_do_not_fit(scene, pictures, maps, tmp_path, cap
     capsys.readouterr()
     assert main(["features", str(scene), "--check", str(out)]) == 1
     said, error = capsys.readouterr()
-    assert error.startswith("error: ")
+    assert error.startswith(f"error: --check: expected a map that fits for each of the {len(pictures)} views of split")
     assert error.count("\n") == 1
     for name in (gone, broken, turned):
         assert name in said
+        assert name not in error  # said once
     assert not any(name in said for name in good)
 
 

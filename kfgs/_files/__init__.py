@@ -19,7 +19,7 @@ from .atomic import (
 )
 from .errors import FullDiskError
 from .locks import InUseError, locked
-from .own import check_inside, check_own, foreign
+from .own import check_inside, check_own, foreign, is_own
 from .paths import as_path, check_output, real_path
 
 __all__ = [
@@ -39,6 +39,7 @@ __all__ = [
     "finish_writing",
     "foreign",
     "hidden_folder",
+    "is_own",
     "locked",
     "open_current",
     "parse_json",
@@ -49,6 +50,7 @@ __all__ = [
 ]
 
 NESTED = 200  # most levels of lists and objects in JSON: neither people nor kfgs write half as many
+LARGEST = 1 << 29  # most bytes of a JSON file: COCO's own annotations have 470 MB
 DIGITS = 300  # most digits of a whole number in JSON: it fits into a float, so that nobody has to ask
 
 
@@ -64,11 +66,15 @@ def read_json(path: str | Path) -> Any:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is not UTF-8 JSON.
+        ValueError: if it is not UTF-8 JSON, or larger than `LARGEST`.
     """
     path = as_path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected a JSON file there")
+    if (size := path.stat().st_size) > LARGEST:  # in memory it would take some ten times as much
+        raise ValueError(
+            f"{path}: expected a JSON file of at most {bytes_in_words(LARGEST)}, got {bytes_in_words(size)}; split it"
+        )
     try:
         return parse_json(path.read_text(encoding="utf-8"))
     except ValueError as error:

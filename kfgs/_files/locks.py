@@ -78,15 +78,15 @@ def locked(folder: Path, name: str) -> Iterator[None]:
         handle = open_lock(folder / name)
     except OSError as error:
         raise type(error)(
-            f"folder: expected a folder that can be written to, got {folder} ({error.strerror}); choose another"
+            f"{folder}: expected a folder that can be written to, got one that cannot ({error.strerror}); choose another"
         ) from error
     try:
         there = os.read(handle, LONGEST)
         if try_lock(handle) is False:
             holder = ascii(there.decode(errors="replace").strip())[1:-1] or "another process"
             raise InUseError(
-                f"folder: expected one that no other process writes to, got {folder}, which is in use by {holder}; wait "
-                "until that process has ended, or name another folder"
+                f"{folder}: expected a folder that no other process writes to, got one in use by {holder}; wait until that "
+                "process has ended, or name another folder"
             )
         if there and not there.startswith(MARK):  # somebody else's file, perhaps linked from elsewhere
             raise _no_lock(folder / name, "another file")

@@ -43,20 +43,22 @@ def check_own(path: Path, ours: Callable[[Path], bool], writer: str) -> None:
 
     Args:
         path: the file.
-        ours: whether an existing file is what `writer` wrote; if it cannot be read, or has no such part, it is not.
+        ours: whether an existing file is what `writer` wrote, see `is_own`.
         writer: for the message: "kfgs edit".
 
     Raises:
         FileExistsError: if something else is there.
     """
-    if not os.path.lexists(path):
-        return
-    try:
-        known = path.is_file() and not path.is_symlink() and ours(path)
-    except (OSError, ValueError, LookupError, TypeError):
-        known = False
-    if not known:
+    if os.path.lexists(path) and not is_own(path, ours):
         raise foreign(path, writer)
+
+
+def is_own(path: Path, ours: Callable[[Path], bool]) -> bool:
+    """Whether a file is there, is no link, and `ours` says so; if it cannot be read, or has no such part, it is not."""
+    try:
+        return path.is_file() and not path.is_symlink() and ours(path)
+    except (OSError, ValueError, LookupError, TypeError):
+        return False
 
 
 def foreign(place: Path | str, writer: str) -> FileExistsError:

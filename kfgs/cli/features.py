@@ -39,7 +39,8 @@ def features(
 
     Args:
         out: Folder for the maps; by default SCENE/features.
-        overwrite: Replace maps of another teacher, other weights or other options; without it they are an error.
+        overwrite: Replace maps that kfgs made with another teacher, other weights or other options; without it they are an
+            error. Maps of other programs always are.
         check: Check this folder of maps instead, and report every file that does not fit.
         level: For --check: which masks of LangSplat's maps, default, subparts (s), parts (m) or wholes (l).
         device: Where the teacher runs: auto (a GPU if there is one), cpu or cuda.
@@ -58,7 +59,13 @@ def features(
     if check is not None:
         found = FeatureFolder(check, level=level or "default").check(loaded, views.split)
         say(str(found))
-        found.raise_if_bad()
+        if not found.ok:
+            raise ValueError(
+                f"check: expected a map that fits for each of the {found.views} views of split {views.split!r}, got "
+                f"{len(found.problems)} that are missing or do not fit (named above); make these maps again, or name the "
+                "photos to use in SCENE/split.json"
+            )
+        say(f"next: kfgs fit {scene} --out run --features {check}")
         return
     network = choose_teacher(teacher.teacher, teacher.weights, teacher.fast, teacher.size, device)
     made = extract_features(network, loaded, target, views.split, overwrite=overwrite, report=say, progress=True)

@@ -61,13 +61,13 @@ def open_field(name: str, field: Path) -> Any:
     from ..fields import SemanticField
     from ..fields.store import SUFFIX, find_field
 
-    if find_field(field) != field:
+    found = find_field(field)
+    if found != field:
         check_joined(name, field)
-        inside = field / "field"
         what = "a file" if field.is_file() else "a folder without one" if field.is_dir() else "no such folder"
         hint = "make one with `kfgs fit`"
-        if is_field(inside):
-            what, hint = "a run folder", f"pass {inside}"
+        if found is not None:
+            what, hint = "a file in a field's folder" if field.is_file() else "a run folder", f"pass {found}"
         raise ValueError(
             f"{name}: expected the folder that `kfgs fit` wrote (RUN/field, with field.json), or a field in one file "
             f"(*{SUFFIX}), got {field}, {what}; {hint}"

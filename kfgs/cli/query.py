@@ -24,6 +24,8 @@ def select(
     *,
     out: Given[Path] = None,
     threshold: Given[float] = None,
+    smallest: Given[int] = None,
+    distance: Given[float] = None,
     negatives: Negatives = "auto",
     score: Score = "auto",
     teacher: Teacher,
@@ -46,6 +48,8 @@ def select(
             view, if the cameras are known).
         threshold: Scores must be above it. For a field it is the paper's gamma; by default 0.5 for a relevancy, else derived
             from the scores. For a splat the default takes every Gaussian of the class.
+        smallest: List parts from this number of Gaussians on; by default from 5 % of the largest part. At most 100 are listed.
+        distance: Gaussians at most this far apart are one part, in world units; by default from the spacing of the scene.
         negatives: Compare the query with all other classes, LERF's canonical words (object, things, stuff, texture), or
             nothing (field only). auto: the other classes for a class, the canonical words for another phrase.
         score: relevancy (against the most similar negative), softmax (over query and negatives) or cosine (field only).
@@ -65,7 +69,7 @@ def select(
         check_range("threshold", threshold, 0, 1)
     classes.check_images()
     asked_by_text = is_field(source)
-    counted = not asked_by_text and threshold is None  # parts are numbered as `kfgs edit` does
+    counted = not asked_by_text and threshold is None and distance is None  # parts are numbered as `kfgs edit` does
     if asked_by_text:
         field = classes.open_field("source", source)
         label_set, target = ask(query, classes, teacher, field)
@@ -83,9 +87,13 @@ def select(
         scene = None if classes.scene is None else classes.load_scene().undistorted()
         cameras = None if scene is None else scene.cameras
     say(f"{query}: {len(found)} of {len(cloud)} Gaussians, {found.summary}")
-    things = connected_parts(cloud.gaussians, found, cameras)
+    things = connected_parts(cloud.gaussians, found, cameras, distance=distance, smallest=smallest)
     for number, thing in enumerate(things, start=1):
         say(f"  {query}/{number}: {thing!r}" if counted else f"  {thing!r}")
+    if things and (left := things[0].total - len(things)):
+        say(f"  {left} smaller part{'s are' if left > 1 else ' is'} not listed; --smallest 1 lists the 100 largest")
+    elif not things and len(found) > 0:
+        say(f"  no part has {smallest} Gaussians; give a smaller --smallest")
     if out is not None:
         if len(found) == 0:
             raise ValueError(

@@ -108,7 +108,8 @@ def _up_to_date(known: Any) -> Any:
         return known
     gone = f", {len(changes.removed)} removed" if changes.removed else ""
     if changes.added or changes.removed or changes.failed:  # else copied files only got their new times
-        say(f"index: {len(changes.added)} fields added{gone}; {len(known)} in {known.file}")
+        added = "1 field" if len(changes.added) == 1 else f"{len(changes.added)} fields"
+        say(f"index: {added} added{gone}; {len(known)} in {known.file}")
     return known
 
 

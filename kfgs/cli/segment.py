@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from .._files import check_output, check_own, read_json
+from .._files import check_output, check_own, is_own, read_json
 from .files import check_alone, open_field
 from .options import Classes, Flag, Given, GivenWalk, Positional, Rule, Walk
 from .output import say, wrote
@@ -42,7 +44,8 @@ def segment(
 
     Args:
         field: The folder that `kfgs fit` wrote (RUN/field).
-        out: Folder for label maps (predicted/ has class numbers, colored/ shows them in colours), pictures and scores.json.
+        out: Folder for label maps (predicted/ has class numbers, colored/ shows them in colours), pictures and scores.json. It
+            holds the results of one run: those of an earlier run are replaced or deleted, files of other programs stay.
         split: Which views: train, test, or another split that SCENE/split.json names.
         path: Segment the cameras of a path, as `kfgs render` has it, instead of the views of a split: orbit, spiral or cameras.
         frames: Number of cameras of the path; by default 72.
@@ -67,7 +70,9 @@ def segment(
         for name, value in (("labels", labels), ("features", features)):
             check_alone(name, value, "with --path, of whose pictures nothing is known")
         size = 72 if frames is None else frames, 480 if width is None else width
-        return _segment_path(field, out, path, size, color, coco, rule, classes)
+        with _one_run(out) as written:
+            written += _segment_path(field, out, path, size, color, coco, rule, classes)
+        return
     alone: dict[str, object] = {"frames": frames, "width": width, "color": color}
     for name, given in alone.items():
         check_alone(name, given, "without --path, which it belongs to")
@@ -93,37 +98,74 @@ def segment(
         raise ValueError(f"features: expected a folder of feature maps, got {features}, which is none; name another")
     maps = features or (scene / "features" if (scene / "features").is_dir() else None)
     if truth:
-        check_own(out / "scores.json", lambda path: bool(read_json(path)["segmentation"]), "kfgs segment")
+        check_own(out / "scores.json", _is_result, "kfgs segment")
         check_pictures(out, ("confusion", "iou"), "kfgs segment")
     if coco:
         check_coco(out, (loaded.stem(i) for i in loaded.views(split)))
-    found = segment_scene(
-        loaded_field,
-        loaded,
-        label_set,
-        out,
-        split=split,
-        rule=rule,
-        pictures=pictures,
-        truth=truth,
-        maps=maps,
-        progress=True,
-    )
-    written = [out / name for name in SEGMENTED if (out / name).is_dir()]
-    if coco:
-        views = {loaded.stem(i): i for i in loaded.views(split)}
-        written.append(write_coco(out, found, label_set.names, lambda stem: loaded.image(views[stem])))
-    if truth:
-        scores = score_scene(found, truth, label_set)
-        say(str(scores))
-        write_report(out / "scores.json", segmentation=scores, truth=str(folder), field=str(field), rule=rule)
-        picture = out / "confusion.png"
-        plot_largest_confusions(scores.confusion, list(label_set.names), picture, misses=scores.misses)
-        plot_iou(scores.iou, list(label_set.names), out / "iou.png")
-        written += [out / name for name in ("scores.json", "confusion.png", "iou.png")]
-    else:
-        say(f"note: no label pictures of split {split!r} to score against")
-    wrote(written)
+    with _one_run(out) as written:
+        found = segment_scene(
+            loaded_field,
+            loaded,
+            label_set,
+            out,
+            split=split,
+            rule=rule,
+            pictures=pictures,
+            truth=truth,
+            maps=maps,
+            progress=True,
+        )
+        written += [out / name for name in SEGMENTED]
+        if coco:
+            views = {loaded.stem(i): i for i in loaded.views(split)}
+            written.append(write_coco(out, found, label_set.names, lambda stem: loaded.image(views[stem])))
+        if truth:
+            scores = score_scene(found, truth, label_set)
+            say(str(scores))
+            write_report(out / "scores.json", segmentation=scores, truth=str(folder), field=str(field), rule=rule)
+            picture = out / "confusion.png"
+            plot_largest_confusions(scores.confusion, list(label_set.names), picture, misses=scores.misses)
+            plot_iou(scores.iou, list(label_set.names), out / "iou.png")
+            written += [out / name for name in ("scores.json", "confusion.png", "iou.png")]
+        else:
+            say(f"note: no label pictures of split {split!r} to score against")
+
+
+@contextmanager
+def _one_run(out: Path) -> Iterator[list[Path]]:
+    """Name what a run writes to a folder (the list that it fills), and delete what an earlier run left there.
+
+    If the block fails, nothing is deleted.
+    """
+    from ..pipeline.apply import SEGMENTED
+    from ..pipeline.label_pictures import COCO
+
+    folders = [folder for folder in (out / name for name in (*SEGMENTED, COCO)) if not folder.is_symlink()]
+    places = [place for folder in folders for place in folder.rglob("*")]
+    places += [out / name for name in ("scores.json", "confusion.png", "iou.png")]
+    numbers = {place: place.stat().st_ino for place in places if is_own(place, _is_result)}
+    written: list[Path] = []
+    yield written
+    # a file that was replaced has another number
+    older = [file for file, number in numbers.items() if file.stat().st_ino == number]
+    for file in older:
+        file.unlink()
+    for folder in sorted({file.parent for file in older}, reverse=True):
+        with suppress(OSError):  # it is not empty
+            folder.rmdir()
+    if older:
+        say(f"note: deleted {len(older)} files of an earlier `kfgs segment` in {out}")
+    wrote([path for path in written if path.exists()])
+
+
+def _is_result(file: Path) -> bool:
+    """Whether `kfgs segment` wrote a file."""
+    from ..evaluation.datasets.coco import is_ours
+    from ..viz.pictures import is_drawn
+
+    if file.name == "annotations.json":
+        return is_ours(file)
+    return bool(read_json(file)["segmentation"]) if file.name == "scores.json" else is_drawn(file)
 
 
 def _segment_path(
@@ -135,8 +177,8 @@ def _segment_path(
     coco: bool,
     rule: Rule,
     classes: Classes,
-) -> None:
-    """Segment the cameras of a path, and with --coco render the colours that they see."""
+) -> list[Path]:
+    """Segment the cameras of a path, and with --coco render the colours that they see; name what was written."""
     from .._check import check_whole
     from ..cameras import Camera
     from ..pipeline import segment_cameras, write_coco
@@ -166,4 +208,4 @@ def _segment_path(
             say("note: no colour splat is known, so there are no pictures beside the annotations; --color names one")
         picture: Any = None if show is None else lambda name: show(walk[name])
         written.append(write_coco(out, found, label_set.names, picture))
-    wrote(written)
+    return written

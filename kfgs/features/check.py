@@ -41,7 +41,10 @@ class FeatureReport:
 
     def __str__(self) -> str:
         """One line for the folder, and one for each file with a problem or a note."""
-        size = "no map could be opened" if self.shape is None else f"{' x '.join(map(str, self.shape))} {self.dtype}"
+        size = "no map could be opened"
+        if self.shape is not None:
+            h, w, D = self.shape
+            size = f"{h} x {w} cells, {D} channels, {self.dtype}"
         fit, disk = self.views - len(self.problems), self.bytes / 1e6
         lines = [f"{self.folder}: {fit} of {self.views} views have a map that fits; {size}, {disk:,.1f} MB"]
         lines += [f"{name}: {'; '.join(texts)}" for name, texts in self.problems.items()]
@@ -137,7 +140,7 @@ def _find(finder: MapFinder, stems: list[str], report: FeatureReport) -> dict[st
     chosen = {stem: files[0] for stem, files in found.items() if len(files) == 1 and stem not in discarded}
     others = sorted(set(finder.listed()) - set(stems)) if chosen else []
     if others:
-        report.notes[""].append(f"maps of none of these views: {len(others)} ({some(others, 3)})")
+        report.notes[""].append(f"maps of other views, which are not used: {len(others)} ({some(others, 3)})")
     return chosen
 
 

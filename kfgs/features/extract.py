@@ -55,9 +55,8 @@ def extract_features(
         pictures: a scene, whose pictures are taken as they are on disk, or a list, see `pictures_of`.
         folder: for the maps; made if it does not exist.
         split: of a scene: the name of a split, `all`, or a list of view names or indices.
-        overwrite: replace maps that were made by another teacher (or with other weights or options), and maps with these
-            names from other programs. Maps of the same teacher are kept. If the call is killed, `FeatureFolder` refuses
-            the remaining maps of other programs.
+        overwrite: replace maps that kfgs made by another teacher (or with other weights or options). Maps of the same
+            teacher are kept, and maps of other programs are an error.
         part: a word of letters and digits, if several processes fill the folder at the same time, each with other pictures
             and another word. The maps are recorded in `features.part-<word>.json` until `join_features` joins all parts.
             Maps that another part has recorded are kept, so a later call may divide the pictures in another way.
@@ -71,7 +70,7 @@ def extract_features(
         TypeError: if `teacher` is no teacher, it returns no tensor, or JSON cannot hold its identity.
         ValueError: if `part` is no such word, or given with `overwrite`; if there are no pictures, two have the same stem, a
             map is not finite in float16, maps differ in channels, or in size for pictures of equal size; if the folder
-            holds maps of another teacher, or another process is writing to it.
+            holds maps of another teacher (without `overwrite`) or of another program, or another process is writing to it.
         OSError: if the folder cannot be written to, or the disk has no space for the maps.
     """
     folder, teacher, chosen = as_path(folder), as_teacher(teacher), as_pictures(pictures, split, exist=True)
@@ -176,8 +175,8 @@ def discard_maps(folder: str | Path, stems: Sequence[str] | None = None, *, dry_
     manifest = read_manifest(folder)
     if manifest is None:  # an error before there is a lock file in a folder of another program
         raise ValueError(
-            f"folder: expected maps that kfgs made (with {MANIFEST}), got none in {folder}; kfgs cannot make the maps of "
-            "other programs again: delete them by hand"
+            f"{folder}: expected maps that kfgs made (with {MANIFEST}), got none; kfgs cannot make the maps of other "
+            "programs again: delete them by hand"
         )
     with nullcontext() if dry_run else locked(folder, LOCK):
         manifest = read_manifest(folder) or manifest
@@ -204,7 +203,7 @@ def _discardable(folder: Path, manifest: Manifest, stems: Sequence[str] | None) 
     records = {folder / manifest.maps[stem].file: (stem, manifest.maps[stem]) for stem in wanted}
     for file, (stem, record) in records.items():
         if file != map_file(folder, stem) or (file.is_file() and record.doubt(file) is not None):
-            raise ValueError(f"folder: expected maps as they were written, got another file in {file}; move it away")
+            raise ValueError(f"{file}: expected the map that kfgs wrote, got another file; move it away")
     return [file for file in records if file.is_file()]
 
 

@@ -6,11 +6,12 @@ import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 
 from .._files import as_path
 from ..scenes.files import IMAGE_SUFFIXES, some
-from .layouts import FEATURE_3DGS, LAYOUTS, OWN, Reading, StoredMap, layout_of, open_map
+from .layouts import LAYOUTS, OWN, Reading, StoredMap, layout_of, open_map
 from .manifest import MANIFEST, MapRecord, read_manifest
 
 
@@ -25,7 +26,8 @@ class MapFinder:
     def __init__(self, path: str | Path) -> None:
         self.path = as_path(path)
         if not self.path.is_dir():
-            raise NotADirectoryError(f"path: expected a folder of feature maps, got {self.path}; check its name")
+            got = "a file" if self.path.exists() else "nothing there"
+            raise NotADirectoryError(f"{self.path}: expected a folder of feature maps, got {got}; check its name")
         self.manifest = read_manifest(self.path)
         self.records: dict[str, MapRecord] = self.manifest.maps if self.manifest else {}
         self.own = frozenset(self.path / record.file for record in self.records.values())
@@ -110,7 +112,7 @@ class MapFinder:
         faults = {}
         for stem, files in found.items():
             names = [file.relative_to(self.path).as_posix() for file in files]
-            expected = stem + (OWN if self.manifest else FEATURE_3DGS).suffix
+            expected = stem + self._suffix
             if len(files) > 1:
                 text = (
                     f"expected one map for view {stem!r}, got {len(files)}: {some(names, 3)}; name the subfolder itself"
@@ -119,7 +121,7 @@ class MapFinder:
             elif not files and self.manifest:
                 faults[expected] = "missing; `kfgs features` with the --split of this view makes it"
             elif not files:
-                faults[expected] = "missing, and no other layout of this view either; encode it"
+                faults[expected] = "missing"
             elif self.manifest and files[0] not in self.own:
                 faults[names[0]] = (
                     f"expected a map that {MANIFEST} lists, as kfgs filled this folder, got one without a record; move it "
@@ -129,17 +131,24 @@ class MapFinder:
 
     def explain_missing(self, stems: Sequence[str], missing: Sequence[str]) -> str:
         """The message for views without a map: which views, and the names of the maps that exist."""
-        suffix = OWN.suffix if self.manifest else FEATURE_3DGS.suffix
-        named = some([stem + suffix for stem in missing])
+        named = some([stem + self._suffix for stem in missing])
         text = f"expected a feature map for each of {len(stems)} views, {len(missing)} missing: {named}"
-        others = sorted(set(self.listed(deep=True)) - set(stems))
+        there = self.listed(deep=True)
+        others = sorted(set(there) - set(stems))
         if self.manifest:  # its maps have the names of the pictures, so views are missing, and no name is wrong
             hint = f"make them with `kfgs features ... --split all --out {self.path}` (or the split of these views)"
         elif len(missing) == len(stems) and others:
             return (
-                f"{text} (or {missing[0]}{OWN.suffix}); the maps there ({len(others)}) are called {some(others, 3)}, but the "
-                f"pictures {some(list(stems), 3)}: rename the maps to the names of the pictures"
+                f"{text}; the maps there ({len(others)}) are called {some(others, 3)}, but the pictures "
+                f"{some(list(stems), 3)}: rename the maps to the names of the pictures"
             )
         else:
-            text, hint = f"{text} (or {missing[0]}{OWN.suffix})", "encode these views"
+            hint = "make them with the program that made the others" if there else "make them with `kfgs features`"
         return f"{text}; {hint}, or leave these views out"
+
+    @cached_property
+    def _suffix(self) -> str:
+        """The ending of a map that is missing: that of most maps in the folder; if there are none, that of kfgs's maps."""
+        kinds = Counter(layout_of(files[0], self.own) for files in self.listed(deep=True).values())
+        common = None if self.manifest else next((kind for kind, _ in kinds.most_common(1)), None)
+        return (common or OWN).suffix

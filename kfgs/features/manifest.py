@@ -95,8 +95,7 @@ def read_manifest(folder: str | Path, part: str | None = None) -> Manifest | Non
         raise ValueError(
             f"{path}: expected a manifest of kfgs, but it is damaged "
             f"({str(error).removeprefix(f'{path}: ')}); "
-            "delete it to use the maps without it, or delete it and run `kfgs features` with --overwrite, which makes them "
-            "again"
+            "delete it to use the maps without it, or delete it and the maps and run `kfgs features`, which makes them again"
         ) from error
 
 

@@ -38,7 +38,7 @@ class MapWriter:
         folder: the folder of maps.
         identity: of the teacher, see `identify`.
         pictures: the pictures whose maps will be written, or exist.
-        overwrite: replace maps that another teacher or another program made.
+        overwrite: replace maps that kfgs made by another teacher.
         part: record the maps in the manifest of this part.
 
     Raises:
@@ -103,8 +103,8 @@ class MapWriter:
         needed, free = maps * map_bytes, shutil.disk_usage(self.folder).free
         if needed > free:
             raise OSError(
-                f"folder: expected {bytes_in_words(needed)} free for {maps} maps, got {bytes_in_words(free)} where "
-                f"{self.folder} is; free some, take another disk, or store no maps (RecomputedMaps)"
+                f"{self.folder}: expected {bytes_in_words(needed)} free there for {maps} maps, got {bytes_in_words(free)}; "
+                "free some, take another disk, or store no maps (RecomputedMaps)"
             )
 
 
@@ -130,25 +130,28 @@ def check_maps(
 ) -> Manifest | None:
     """The manifest of a folder that a teacher may write maps to; arguments and errors are those of `MapWriter`.
 
-    Maps of others are an error; with `overwrite` they may be replaced. Nothing is written here.
+    Maps of another teacher are an error; with `overwrite` they may be replaced. Maps of other programs never are. Nothing is
+    written here.
     """
     finder, stems, identity = MapFinder(folder), [picture.stem for picture in pictures], plain_identity(identity)
     found, hint = finder.manifest, "use another folder, or pass overwrite=True (--overwrite)"
     if part is not None:
         found = _known(folder, part, finder.manifest, identity, stems)
         hint = "use another folder, or delete this one"
-    expected = "folder: expected one without maps of other programs, got"
     files = [map_file(folder, stem) for stem in stems]
     finder.own |= set(files)
     for file in (file for stem in stems for file in finder.named(stem)):
+        expected = f"{folder}: expected a folder without maps of other programs, got {file.relative_to(folder)}"
         if layout_of(file, finder.own) in LAYOUTS[: LAYOUTS.index(OWN)]:
-            raise ValueError(f"{expected} {file}, which would be read instead of ours; use another folder")
-        if found is None and not overwrite and file in files:
-            raise ValueError(f"{expected} {file} and no {MANIFEST}; {hint}")
+            raise ValueError(f"{expected}, which would be read instead of ours; use another folder")
+        if found is None and file in files:
+            raise ValueError(
+                f"{expected} and no {MANIFEST}; use another folder, or move the maps away, which kfgs did not make"
+            )
     if found is not None and found.teacher != identity and not overwrite:
         raise ValueError(
-            f"folder: expected maps of the same teacher as now, got others in {folder} "
-            f"({differences(found.teacher, identity)}); {hint} to give up its {len(found.maps)} maps"
+            f"{folder}: expected maps of the same teacher as now, got others ({differences(found.teacher, identity)}); "
+            f"{hint} to give up its {len(found.maps)} maps"
         )
     return found
 

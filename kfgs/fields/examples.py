@@ -85,14 +85,22 @@ def label_set_from_examples(field: SemanticField, examples: Mapping[str, Example
     """
     if not examples:
         raise ValueError("examples: expected at least one class, got none; name one and show it")
-    rows, counts = [], {}
-    for name, given in examples.items():
-        shown = [given] if isinstance(given, Example) else list(given)
-        if not shown:
+    shown = {
+        name: {
+            f"examples[{name!r}][{i}]": one for i, one in enumerate([given] if isinstance(given, Example) else given)
+        }
+        for name, given in examples.items()
+    }
+    for name, given in shown.items():
+        if not given:
             raise ValueError(f"examples[{name!r}]: expected at least one example, got none; show one")
-        features = torch.stack([_feature(field, one, f"examples[{name!r}][{i}]") for i, one in enumerate(shown)])
-        rows.append(unit_rows(features.mean(dim=0)))
-        counts[name] = len(shown)
+        for where, one in given.items():  # all of them before the first view is rendered
+            _chosen(field, one, where)
+    rows = [
+        unit_rows(torch.stack([_feature(field, one, where) for where, one in given.items()]).mean(dim=0))
+        for given in shown.values()
+    ]
+    counts = {name: len(given) for name, given in shown.items()}
     teacher = field.info.get("teacher")
     info: dict[str, Any] = {"examples": counts, **({"teacher": teacher} if teacher else {})}
     return LabelSet(tuple(examples), torch.stack(rows), info=info)
@@ -185,25 +193,40 @@ def _decoded(segmentation: object) -> Tensor:  # [H, W] bool
 
 def _feature(field: SemanticField, example: Example, name: str) -> Tensor:  # [D] unit
     """The mean direction of the features of one example."""
-    where = _of_gaussians if isinstance(example, Picked) else _of_pixels
-    features = where(field, example, name)
+    camera, chosen = _chosen(field, example, name)
+    if camera is None:
+        features = field.own_features(chosen)
+    else:
+        rendering = field.render(camera)
+        features = field.decode(rendering.map[chosen.to(rendering.alpha.device) & (rendering.alpha > 0)])
     known = features[row_norms(features) > EPS]
     if len(known) == 0:
         raise ValueError(f"{name}: expected a place where the field shows something, got none; choose another")
     return unit_rows(unit_rows(known).mean(dim=0))
 
 
-def _of_gaussians(field: SemanticField, example: Any, name: str) -> Tensor:  # [n, D]
+def _chosen(field: SemanticField, example: Any, name: str) -> tuple[Camera | None, Tensor]:
+    """The camera of an example and its pixels [H, W] bool; or None and its Gaussians [n]. Nothing is rendered.
+
+    Raises:
+        ValueError: if the field has no such view, pixels or Gaussians.
+    """
+    if isinstance(example, Picked):
+        return None, _gaussians(field, example, name)
+    camera = _camera(field, example.view, name)
+    drawn = camera.fitted(LONGEST)
+    return drawn, _pixels(camera, drawn, example, name)
+
+
+def _gaussians(field: SemanticField, example: Picked, name: str) -> Tensor:  # [n] int64
     which = as_rows(f"{name}.indices", example.indices, len(field))
     rows = which.nonzero()[:, 0] if which.dtype == torch.bool else which.long()
     if rows.ndim != 1 or len(rows) == 0 or int(rows.min()) < 0 or int(rows.max()) >= len(field):
         raise ValueError(f"{name}: expected indices of the field's {len(field)} Gaussians, got {example.indices!r:.80}")
-    return field.own_features(rows)
+    return rows
 
 
-def _of_pixels(field: SemanticField, example: Any, name: str) -> Tensor:  # [n, D]
-    camera = _camera(field, example.view, name)
-    drawn = camera.fitted(LONGEST)
+def _pixels(camera: Camera, drawn: Camera, example: Any, name: str) -> Tensor:  # [H, W] bool, of `drawn`
     down, right = drawn.height / camera.height, drawn.width / camera.width  # 1 but for huge views
     mask = torch.zeros(drawn.size, dtype=torch.bool)
     if isinstance(example, Mask):
@@ -223,9 +246,7 @@ def _of_pixels(field: SemanticField, example: Any, name: str) -> Tensor:  # [n, 
             )
         y0, y1, x0, x1 = int(y0 * down), int(y1 * down), int(x0 * right), int(x1 * right)
         mask[y0 : max(y1, y0 + 1), x0 : max(x1, x0 + 1)] = True
-    rendering = field.render(drawn)
-    rows = mask.to(rendering.alpha.device) & (rendering.alpha > 0)
-    return field.decode(rendering.map[rows])
+    return mask
 
 
 def _camera(field: SemanticField, view: str | Camera, name: str) -> Camera:

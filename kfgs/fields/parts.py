@@ -16,6 +16,7 @@ from ..labels.questions import Classes
 from ..metrics import MIB, semantic_storage_bytes
 from ..quant import Autoencoder, Codebook, LinearLatents
 from .answers import Seen
+from .remembered import scene_in_words
 
 CHUNK = 8192  # latents decoded at once: the decoder's widest layer then holds 32 MB
 
@@ -153,7 +154,7 @@ def summary_text(field: Any) -> str:
     lines = [
         f"semantic field ({field.method}): {len(field)} Gaussians, {channels}, {codewords}",
         f"  size as Table 1 counts it: {field.storage() / MIB:.2f} MiB",
-        *info_lines(field.info),
+        *info_lines(field.info | scene_in_words(field.info, field.folder)),
     ]
     if field.words is not None:
         lines.append(f"  classes: {len(field.words)}, with their text table")

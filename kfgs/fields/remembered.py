@@ -68,6 +68,17 @@ def recall_scene(info: dict[str, Any], folder: Path | None) -> Path:
     return path
 
 
+def scene_in_words(info: dict[str, Any], folder: Path | None) -> dict[str, str]:
+    """The scene of a field's notes as a user can name it: below the current folder if it lies there, else absolute."""
+    noted = info.get("scene")
+    if not isinstance(noted, str) or folder is None:
+        return {}
+    path = noted_path(folder, noted)
+    here = real_path(Path.cwd())
+    shown = path.relative_to(here) if path.is_relative_to(here) else path
+    return {"scene": f"{shown}" if path.is_dir() else f"{shown} (not there any more)"}
+
+
 def recall_classes(info: dict[str, Any], folder: Path | None) -> LabelSet:
     """The label set that a field remembers.
 

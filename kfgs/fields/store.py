@@ -34,8 +34,10 @@ FORMAT, VERSIONS = "kfgs.semantic_field", (1, 2, 3)
 
 
 def find_field(path: str | Path) -> Path | None:
-    """The field at a path: a field folder, a packed field, or the field of a run folder; None if there is none."""
+    """The field at a path: a field folder, also by one of its two files; a packed field; that of a run folder; or None."""
     path = as_path(path)
+    if path.name in (DESCRIPTION, TENSORS) and path.is_file() and describes_field(path.parent):
+        return path.parent
     found = (one for one in (path, path / "field") if describes_field(one))
     return next(found, path if _peek(path) is not None else None)
 

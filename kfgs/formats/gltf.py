@@ -38,6 +38,7 @@ from .ply import Columns
 from .render_mode import describe_lost_mode
 from .splat_file import SCORE, Precision, SplatFile
 from .values import (
+    EXACT,
     SH_C0,
     UP_AND_BACK,
     check_finite,
@@ -55,7 +56,6 @@ EXTENSION = "KHR_gaussian_splatting"
 KERNEL, COLOR_SPACE, PROJECTION, SORTING = "ellipse", "srgb_rec709_display", "perspective", "cameraDistance"
 _UNDERSTOOD = (EXTENSION, "KHR_mesh_quantization")
 _POINTS = 0
-_EXACT = 1 << 24  # whole numbers that float32 holds
 _LEAST_BYTES = 8  # bytes per Gaussian: with fewer, the file shows one buffer many times
 
 
@@ -259,7 +259,7 @@ def _read_columns(
         extra[name] = read_accessor(document, index, 1, len(gaussians))[:, 0].copy()
     labels = extra.pop("class_id", None)
     if labels is not None:
-        if not (labels == np.trunc(labels)).all() or (labels < -1).any() or (labels > _EXACT).any():
+        if not (labels == np.trunc(labels)).all() or (labels < -1).any() or (labels > EXACT).any():
             raise document.wrong(f"{where}._CLASS_ID", "whole numbers of -1 or more", labels[:4].tolist())
         gaussians = gaussians.replace(labels=torch.from_numpy(labels.astype(np.int64)))
     if labels is None or not isinstance(classes, list) or not all(isinstance(name, str) for name in classes):
@@ -303,8 +303,8 @@ def _write_columns(
     labels = splats.gaussians.labels
     if labels is not None:
         columns["class_id"] = labels.detach().cpu().numpy()
-        if (high := int(columns["class_id"].max())) > _EXACT:
-            raise ValueError(f"labels: expected -1 to {_EXACT} for glTF, got {high}; number the classes from 0")
+        if (high := int(columns["class_id"].max())) > EXACT:
+            raise ValueError(f"labels: expected -1 to {EXACT} for glTF, got {high}; number the classes from 0")
     for name, values in splats.extra.items():
         as_written = values.astype(np.float32)
         if name == SCORE or np.array_equal(as_written.astype(values.dtype), values):  # float32 holds them

@@ -18,7 +18,7 @@ from ..gaussians import Gaussians
 from .ply import points_from_columns, read_comments, read_ply, stack_columns, write_ply
 from .render_mode import comments_of_mode, mode_from_comments
 from .splat_file import Columns, Precision, SplatFile
-from .values import check_finite, colours_to_write, describe_loss, positive_scales
+from .values import EXACT, check_finite, colours_to_write, describe_loss, positive_scales
 
 NAME = "ply"
 SUFFIXES = (".ply",)
@@ -166,5 +166,14 @@ def columns_from_gaussians(gaussians: Gaussians) -> Columns:
         for i in range(values.shape[1]):
             columns[group if group == "opacity" else f"{group}_{i}"] = values[:, i].contiguous().numpy()
     if g.labels is not None:
-        columns["class_id"] = g.labels.to(torch.int32).numpy()
+        columns["class_id"] = label_column(g.labels)
     return columns
+
+
+def label_column(labels: Tensor) -> NDArray[Any]:  # [N] -> [N]
+    """The column `class_id`, as `float` like all others: some importers know no `int`, and misread the whole file.
+
+    It is `int` if a label is too large for `float` to hold exactly.
+    """
+    exact = not bool((labels > EXACT).any())
+    return labels.detach().cpu().to(torch.float32 if exact else torch.int32).numpy()

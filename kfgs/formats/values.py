@@ -18,6 +18,7 @@ UP_AND_BACK = (1, -1, -1)  # x right, y up, z back (RUB) against x right, y down
 _ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 _TINY_SCALE = 1e-10  # world units, instead of a scale of 0
 _SHORTEST = 1e-12  # of a quaternion; kornia divides by no less
+EXACT = 1 << 24  # float32 holds all whole numbers up to this one
 _LABELS = 2**31 - 1  # the largest int32
 _EXPECTED = {
     "means": "finite numbers",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -43,6 +43,7 @@ class Part:
     extent: tuple[Tensor, Tensor]  # lowest and highest corner [3] along the world's axes
     best_view: BestView | None  # None without cameras, or if no camera shows any of it
     how: str  # how it was selected
+    total: int = 1  # how many connected parts the selection has, with those that are left out
 
     @property
     def count(self) -> int:
@@ -159,7 +160,7 @@ def connected_parts(
     order = torch.argsort(numbers, stable=True)[int((numbers < 0).sum()) :]  # part by part, ascending in each
     parts = list(order.split(sizes.tolist())[:kept])
     how = [f"{selection.how}; part {i + 1} of {len(sizes)}" for i in range(kept)]
-    return _described(gaussians, selection, parts, how, cameras, engine)
+    return [replace(part, total=len(sizes)) for part in _described(gaussians, selection, parts, how, cameras, engine)]
 
 
 def view_shares(

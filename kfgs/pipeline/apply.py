@@ -20,7 +20,7 @@ from ..evaluation import SegmentationReport, evaluate_segmentation, load_label_m
 from ..evaluation.segmentation import VOID, check_truth
 from ..fields import Rule, SemanticField
 from ..formats.ply import Columns, other_elements, points_from_columns, read_ply, write_ply
-from ..formats.ply_3dgs import columns_from_gaussians
+from ..formats.ply_3dgs import columns_from_gaussians, label_column
 from ..formats.sidecar import write_names
 from ..formats.splat_file import SCORE, SplatFile
 from ..gaussians import Gaussians
@@ -239,9 +239,9 @@ def label_columns(
     names: Sequence[str],
     scores: Tensor | None = None,  # [N]
 ) -> Columns:
-    """PLY columns of labels: class_id (int, -1 = none), label colours, and scores if given."""
+    """PLY columns of labels: class_id (-1 = none), label colours, and scores if given."""
     rgb = palette(labels, names)
-    columns: Columns = {"class_id": labels.to(torch.int32).numpy()}
+    columns: Columns = {"class_id": label_column(labels)}
     columns |= {name: np.ascontiguousarray(rgb[:, i]) for i, name in enumerate(("red", "green", "blue"))}
     if scores is not None:
         columns["score"] = scores.to(torch.float32).numpy()

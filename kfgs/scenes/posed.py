@@ -221,12 +221,15 @@ def read_depth(path: Path) -> NDArray[Any]:  # [H, W]
     """The whole numbers of a depth PNG; 0 is unknown.
 
     Raises:
-        SceneError: if it is no picture with one channel.
+        SceneError: if it is no picture with one channel, or its numbers are indices of a palette.
     """
     with open_picture(path, "a depth PNG", "copy it again") as picture:
-        depth = np.asarray(picture)
-    if depth.ndim != 2:
-        raise SceneError(f"{path}: expected a depth PNG with one channel, got {depth.shape}; is this a colour picture?")
+        depth, mode = np.asarray(picture), picture.mode
+    if depth.ndim != 2 or mode == "P":
+        got = "colours of a palette" if mode == "P" else str(depth.shape)
+        raise SceneError(
+            f"{path}: expected a depth PNG with one channel of numbers, got {got}; is this a picture for people?"
+        )
     return depth
 
 

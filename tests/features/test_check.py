@@ -50,7 +50,7 @@ def test_maps_that_fit_are_one_line(folder, values):
     assert report.ok
     assert (report.views, report.shape, report.dtype, report.notes) == (3, (6, 8, 16), "float16", {})
     assert report.bytes == sum((folder / f"{stem}.npy").stat().st_size for stem in "abc")
-    assert str(report) == f"{folder}: 3 of 3 views have a map that fits; 6 x 8 x 16 float16, 0.0 MB"
+    assert str(report) == f"{folder}: 3 of 3 views have a map that fits; 6 x 8 cells, 16 channels, float16, 0.0 MB"
     report.raise_if_bad()
 
 
@@ -77,9 +77,9 @@ def test_all_that_does_not_fit_is_reported_at_once_by_file(folder):
     ]
     assert report.problems["whole.npy"] == ["expected floating-point features, got int32; encode it again"]
     assert "cannot be read" in report.problems["junk_fmap_CxHxW.pt"][0]
-    assert report.problems["gone_fmap_CxHxW.pt"] == ["missing, and no other layout of this view either; encode it"]
+    assert report.problems["gone.npy"] == ["missing"]
     lines = str(report).splitlines()
-    assert lines[0].startswith(f"{folder}: 3 of 11 views have a map that fits; 6 x 8 x 16 float16")
+    assert lines[0].startswith(f"{folder}: 3 of 11 views have a map that fits; 6 x 8 cells, 16 channels, float16")
     assert len(lines) == 9
     assert sum(line.startswith("turned.npy: ") and "; expected the aspect" in line for line in lines) == 1
     with pytest.raises(ValueError, match=tells("11 views", "got 8", "3 more")):
@@ -159,8 +159,8 @@ def test_notes_are_no_problems(folder):
     assert report.ok
     zeros = "50 % of the features are all-zero: nothing is known there"
     assert report.notes["a.npy"] == ["double precision, which is read as single", zeros]
-    assert report.notes[""] == ["maps of none of these views: 5 (c, x0, x1 and 2 more)"]
-    assert str(report).splitlines()[1] == "note: maps of none of these views: 5 (c, x0, x1 and 2 more)"
+    assert report.notes[""] == ["maps of other views, which are not used: 5 (c, x0, x1 and 2 more)"]
+    assert str(report).splitlines()[1] == "note: maps of other views, which are not used: 5 (c, x0, x1 and 2 more)"
 
 
 def test_langsplat_with_masks_of_another_run(tmp_path):
@@ -177,7 +177,7 @@ def test_langsplat_with_masks_of_another_run(tmp_path):
 def test_names_that_fit_no_picture_are_shown(folder):
     report = check(folder, pictures("rgb_a", "rgb_b"))
     assert report.shape is None
-    assert list(report.problems) == ["rgb_a_fmap_CxHxW.pt", "rgb_b_fmap_CxHxW.pt"]
+    assert list(report.problems) == ["rgb_a.npy", "rgb_b.npy"]
     assert "the maps there (3) are called a, b, c, but the pictures rgb_a, rgb_b" in report.notes[""][0]
     assert "0 of 2 views have a map that fits; no map could be opened" in str(report)
 
@@ -187,7 +187,7 @@ def test_several_files_of_one_view(folder):
         (folder / name).mkdir()
         np.save(folder / name / "0001.npy", features(0).numpy())
     report = check(folder, pictures("0001"))
-    problem = report.problems["0001_fmap_CxHxW.pt"]
+    problem = report.problems["0001.npy"]
     assert problem == [
         "expected one map for view '0001', got 2: left/0001.npy, right/0001.npy; name the subfolder itself"
     ]
@@ -252,7 +252,7 @@ def test_a_map_without_a_record_among_kfgss_own_is_a_problem(tmp_path):
 
 
 def test_bad_arguments(tmp_path):
-    with pytest.raises(NotADirectoryError, match=tells("path", "a folder of feature maps", "nowhere")):
+    with pytest.raises(NotADirectoryError, match=tells("nowhere: ", "a folder of feature maps")):
         check(tmp_path / "nowhere", pictures("a"))
     with pytest.raises(ValueError, match=tells("pictures", "at least one view", "none")):
         check(tmp_path, [])
@@ -266,7 +266,7 @@ def test_the_views_to_check_are_a_scenes_a_list_or_those_of_the_folder(folder):
     maps = FeatureFolder(folder)
     assert maps.check(scene).ok
     assert list(maps.check(scene, "test").problems) == ["b.npy"]
-    assert sorted(maps.check(scene, "all").problems) == ["b.npy", "d_fmap_CxHxW.pt"]
+    assert sorted(maps.check(scene, "all").problems) == ["b.npy", "d.npy"]
     assert list(maps.check().problems) == ["b.npy"]  # without pictures, nothing is known of their sizes
     assert maps.of(scene, ["c", "a"]).check().ok
     assert "transposed?" in str(FeatureFolder(folder, ["a"], sizes=[(80, 60)]).check())

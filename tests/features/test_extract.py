@@ -131,7 +131,7 @@ def test_another_teachers_maps_are_neither_mixed_nor_lost(other, pictures, tmp_p
     extract_features(Counting(), pictures, folder)
     whole = contents(folder)
     what = "weights: w1 there, w2 now" if other.identity["weights"] == "w2" else "cell: 2 there, 1 now"
-    with pytest.raises(ValueError, match=tells("folder:", "same teacher", f"maps ({what})")):
+    with pytest.raises(ValueError, match=tells(f"{folder}: ", "same teacher", f"others ({what})")):
         extract_features(other, pictures[:1], folder)
     assert contents(folder) == whole
     manifest = extract_features(other, pictures[:1], folder, overwrite=True)
@@ -144,18 +144,24 @@ def test_maps_of_other_programs_are_left_alone(pictures, tmp_path):
     folder = tmp_path / "maps"
     folder.mkdir()
     np.save(folder / "a.npy", np.ones((3, 4, 5)))
-    with pytest.raises(ValueError, match=tells("folder:", "a.npy", "features.json", "overwrite=True")):
-        extract_features(Counting(), pictures, folder)
-    assert np.load(folder / "a.npy").sum() == 60
-    extract_features(Counting(), pictures, folder, overwrite=True)
+    for overwrite in (False, True):
+        with pytest.raises(
+            ValueError, match=tells(f"{folder}: ", "a.npy", "features.json", "another folder")
+        ) as caught:
+            extract_features(Counting(), pictures, folder, overwrite=overwrite)
+        assert "overwrite" not in str(caught.value)
+        assert list(folder.iterdir()) == [folder / "a.npy"]
+        assert np.load(folder / "a.npy").sum() == 60
+    (folder / "a.npy").unlink()
+    extract_features(Counting(), pictures, folder)
     (folder / "a_s.npy").touch()
     extract_features(Counting(), pictures, folder)  # half of what LangSplat writes is nothing
     (folder / "a_f.npy").touch()
-    with pytest.raises(ValueError, match=tells("folder:", "a_s.npy")):
+    with pytest.raises(ValueError, match=tells(f"{folder}: ", "a_s.npy")):
         extract_features(Counting(), pictures, folder)
     (folder / "a_s.npy").unlink()
     (folder / "b_fmap_CxHxW.pt").touch()
-    with pytest.raises(ValueError, match=tells("folder:", "b_fmap_CxHxW.pt")):
+    with pytest.raises(ValueError, match=tells(f"{folder}: ", "b_fmap_CxHxW.pt")):
         extract_features(Counting(), pictures, folder, overwrite=True)
 
 
@@ -247,7 +253,7 @@ def test_only_what_kfgs_wrote_is_discarded(pictures, tmp_path):
     folder = tmp_path / "maps"
     extract_features(Counting(), pictures, folder)
     np.save(folder / "b.npy", np.ones(1000))
-    with pytest.raises(ValueError, match=tells("folder:", "another file", "b.npy")):
+    with pytest.raises(ValueError, match=tells("b.npy: ", "another file")):
         discard_maps(folder)
     assert len(contents(folder)) == 3
     (tmp_path / "outside.npy").write_bytes(b"mine")
@@ -261,7 +267,7 @@ def test_only_what_kfgs_wrote_is_discarded(pictures, tmp_path):
     assert (tmp_path / "outside.npy").exists()
     assert len(contents(folder)) == 3
     (tmp_path / "other").mkdir()
-    with pytest.raises(ValueError, match=tells("folder:", "features.json", "got none")):
+    with pytest.raises(ValueError, match=tells("other: ", "features.json", "got none")):
         discard_maps(tmp_path / "other")
     assert list((tmp_path / "other").iterdir()) == []  # no lock either
 
@@ -272,7 +278,7 @@ def test_a_map_of_the_same_length_that_changed_stops_the_deletion_and_a_copied_o
     whole = contents(folder)
     (folder / "b.npy").write_bytes(whole["b.npy"][:-1] + b"\x01")
     for dry_run in (False, True):
-        with pytest.raises(ValueError, match=tells("folder:", "another file", "b.npy")):
+        with pytest.raises(ValueError, match=tells("b.npy: ", "another file")):
             discard_maps(folder, dry_run=dry_run)
     assert len(contents(folder)) == 3
     (folder / "b.npy").write_bytes(whole["b.npy"])
@@ -314,16 +320,16 @@ def test_views_without_a_record_are_named_before_any_is_deleted(pictures, tmp_pa
             discard_maps(folder, ["a", "x"], dry_run=dry_run)
         with pytest.raises(TypeError, match=tells("stems", "list", "'ab'")):
             discard_maps(folder, "ab", dry_run=dry_run)
-        with pytest.raises(ValueError, match=tells("folder:", "features.json", "got none")):
+        with pytest.raises(ValueError, match=tells(f"{tmp_path / 'images'}: ", "features.json", "got none")):
             discard_maps(tmp_path / "images", ["a"], dry_run=dry_run)
     assert len(contents(folder)) == 3
     assert discard_maps(folder, []) == 0
     assert len(contents(folder)) == 3
 
 
-def test_foreign_maps_that_were_given_up_do_not_pass_for_ours_when_the_call_dies(pictures, tmp_path):
+def test_foreign_maps_in_our_folder_do_not_pass_for_ours_when_the_call_dies(pictures, tmp_path):
     folder = tmp_path / "maps"
-    folder.mkdir()
+    Manifest(Counting().identity).save(folder)
     for stem in ("a", "b"):
         np.save(folder / f"{stem}.npy", np.full((3, 4, 5), 7, np.float16))
 
@@ -344,7 +350,7 @@ def test_what_a_manifest_says_of_its_teacher_is_shown_in_one_line(pictures, tmp_
     evil = {"name": "a\n\x1b[31mOK", "k\ney": {"deep": ["b\n\x07"]}, "weights": "\r" + "x" * 100}
     folder.mkdir()
     Manifest(evil).save(folder)
-    with pytest.raises(ValueError, match=tells("folder:", "same teacher")) as caught:
+    with pytest.raises(ValueError, match=tells(f"{folder}: ", "same teacher")) as caught:
         extract_features(Counting(), pictures, folder)
     text = str(caught.value)
     assert text.isprintable()
@@ -443,7 +449,7 @@ def test_a_full_disk_is_refused_before_the_first_map_with_numbers(pictures, tmp_
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(10**9, 10**9, 300))
     needed = 3 * 3 * 4 * 5 * 2  # maps, cells, channels, bytes
     assert needed > 300
-    with pytest.raises(OSError, match=tells("folder:", "MB", "3 maps", "RecomputedMaps")):
+    with pytest.raises(OSError, match=tells("maps: ", "MB", "3 maps", "RecomputedMaps")):
         extract_features(Counting(), pictures, tmp_path / "maps")
     assert contents(tmp_path / "maps") == {}
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(10**9, 10**9, needed))
@@ -452,7 +458,7 @@ def test_a_full_disk_is_refused_before_the_first_map_with_numbers(pictures, tmp_
     extract_features(Counting(), pictures, tmp_path / "maps")  # nothing to do needs nothing
     (tmp_path / "maps" / "a.npy").unlink()
     known = Counting()
-    with pytest.raises(OSError, match=tells("folder:", "1 maps")):
+    with pytest.raises(OSError, match=tells("maps: ", "1 maps")):
         extract_features(known, pictures, tmp_path / "maps")
     assert known.calls == []  # the size was known from the records
 
@@ -462,16 +468,16 @@ def test_two_processes_on_one_folder_are_refused(pictures, tmp_path):
     folder.mkdir()
     with (folder / LOCK).open("a") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
-        with pytest.raises(ValueError, match=tells("folder:", "process", "maps", "in use")):
+        with pytest.raises(ValueError, match=tells(f"{folder}: ", "process", "in use")):
             extract_features(Counting(), pictures, folder)
     extract_features(Counting(), pictures, folder)
 
 
 def test_a_folder_that_cannot_be_written_to_is_named(pictures, tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(OSError, match=tells("folder:", "written", "file (File exists)")):
+    with pytest.raises(OSError, match=tells("file: ", "written", "(File exists)")):
         extract_features(Counting(), pictures, tmp_path / "file")
-    with pytest.raises(OSError, match=tells("folder:", "written", "got /sys/maps (")):
+    with pytest.raises(OSError, match=tells("/sys/maps: ", "written", "(")):
         extract_features(Counting(), pictures, "/sys/maps")  # where even root may make nothing
 
 
@@ -576,7 +582,7 @@ def test_a_folder_that_is_refused_stays_as_it_is(pictures, tmp_path):
     folder.mkdir()
     np.save(folder / "a.npy", np.zeros((2, 2, 2), np.float16))
     before = contents(folder)
-    with pytest.raises(ValueError, match=tells("folder:", folder / "a.npy")):
+    with pytest.raises(ValueError, match=tells(f"{folder}: ", "a.npy")):
         extract_features(Counting(), pictures, folder)
     assert [path.name for path in folder.iterdir()] == ["a.npy"]
     assert contents(folder) == before

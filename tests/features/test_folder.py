@@ -90,7 +90,7 @@ def test_missing_views_are_named(tmp_path):
 
 
 def test_bad_arguments(tmp_path):
-    with pytest.raises(NotADirectoryError, match=tells("path:", "folder", "nowhere")):
+    with pytest.raises(NotADirectoryError, match=tells("nowhere: ", "folder")):
         FeatureFolder(tmp_path / "nowhere", ["a"])
     with pytest.raises(ValueError, match=tells("stems", tmp_path, "at least one view", "none")):
         len(FeatureFolder(tmp_path))
@@ -282,9 +282,11 @@ def test_last_parts_of_names_are_looked_for_when_nothing_else_fits(tmp_path):
     np.save(tmp_path / "a.npy", features(0).numpy())
     maps = FeatureFolder(tmp_path, ["train/a", "train/b"])
     assert [file.relative_to(tmp_path).as_posix() for file in maps.files] == ["a.npy", "feat/b.npy"]
-    with pytest.raises(FileNotFoundError, match=tells("2 views", "1 missing", "b_fmap")):
+    with pytest.raises(
+        FileNotFoundError, match=tells("2 views", "1 missing: b.npy", "the program that made the others")
+    ):
         FeatureFolder(tmp_path, ["a", "b"])  # a fits as it is: then so must b
-    with pytest.raises(FileNotFoundError, match=tells("2 views", "2 missing", "left/a_fmap")):
+    with pytest.raises(FileNotFoundError, match=tells("2 views", "2 missing", "left/a.npy")):
         FeatureFolder(tmp_path, ["left/a", "right/a"])  # which of them?
 
 

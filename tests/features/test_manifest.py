@@ -15,7 +15,9 @@ def folder(tmp_path):
     return tmp_path
 
 
-WAY_OUT = "delete it to use the maps without it, or delete it and run `kfgs features` with --overwrite, which makes them again"
+WAY_OUT = (
+    "delete it to use the maps without it, or delete it and the maps and run `kfgs features`, which makes them again"
+)
 
 
 def nested(levels: int) -> dict:

@@ -7,7 +7,7 @@ import torch
 from cases_search import COUNT, scene
 
 from kfgs import Camera, SemanticField, label_set_from_examples
-from kfgs.fields import Box, Clicks
+from kfgs.fields import Box, Clicks, Picked
 from kfgs.fields.examples import LONGEST, Mask
 
 FIELD = scene([("chair", 0.0), ("lamp", 0.0)])
@@ -41,3 +41,19 @@ def test_a_stored_camera_of_more_pixels_than_any_picture_is_refused(tmp_path):
         SemanticField.load(tmp_path / "field")
     assert isinstance(huge, Camera)
     assert len(FIELD) == 2 * COUNT
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        Clicks("no such view", [[1, 1]]),
+        Clicks(VIEW, [[1, 1000]]),
+        Box(VIEW, [5, 5, 4, 4]),
+        Mask(VIEW, torch.ones(3, 3, dtype=torch.bool)),
+        Picked([10**6]),
+    ],
+)
+def test_all_examples_are_checked_before_the_first_view_is_rendered(wrong, monkeypatch):
+    monkeypatch.setattr(SemanticField, "render", lambda self, camera: pytest.fail("rendered"))
+    with pytest.raises(ValueError, match=r"examples\['z'\]\[1\]"):
+        label_set_from_examples(FIELD, {**shown(1), "z": [Clicks(VIEW, [[20, 15]]), wrong]})

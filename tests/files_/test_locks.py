@@ -21,7 +21,7 @@ def test_the_second_is_told_who_holds_it_and_a_kill_frees_it(tmp_path):
     with subprocess.Popen([sys.executable, "-c", HOLD, tmp_path / "run"], stdout=subprocess.PIPE) as first:
         assert first.stdout.readline() == b"held\n"
         with (
-            pytest.raises(ValueError, match=tells("folder:", tmp_path / "run", f"process {first.pid} of", "wait")),
+            pytest.raises(ValueError, match=tells(f"{tmp_path / 'run'}: ", f"process {first.pid} of", "wait")),
             locked(tmp_path / "run", "lock"),
         ):
             pass
@@ -53,7 +53,7 @@ def test_what_a_lock_file_says_is_shown_harmless_and_short(tmp_path):
 def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").touch()
     with (
-        pytest.raises(OSError, match=tells("folder:", tmp_path / "file" / "run")),
+        pytest.raises(OSError, match=tells(f"{tmp_path / 'file' / 'run'}: ")),
         locked(tmp_path / "file" / "run", "lock"),
     ):
         pass

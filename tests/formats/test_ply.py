@@ -309,3 +309,21 @@ def test_plain_is_for_ply_files_with_colours(tmp_path):
     with pytest.raises(ValueError, match=tells("splats:", "colours", "a plain PLY")):
         write_splats(tmp_path / "a.ply", _cloud().replace(sh=None), plain=True)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("high", "kind"), [(2**24, "float"), (2**24 + 1, "int"), (2**31 - 1, "int")])
+def test_labels_are_float_where_float_holds_them_and_files_with_int_are_read(tmp_path, high, kind):
+    """An importer that knows the size of `float` alone finds every property of a labelled splat."""
+    cloud = _cloud()
+    labels = torch.arange(len(cloud)) - 1
+    labels[-1] = high
+    score = np.linspace(0, 1, len(cloud), dtype=np.float32)
+    write_splats(tmp_path / "a.ply", SplatFile(cloud.replace(labels=labels), {"score": score}))
+    header = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0].decode()
+    kinds = dict(reversed(line.split()[1:]) for line in header.splitlines() if line.startswith("property"))
+    assert kinds.pop("class_id") == kind
+    assert kinds.pop("score") == "float"
+    assert set(kinds.values()) == {"float"}
+    assert torch.equal(read_splats(tmp_path / "a.ply").gaussians.labels, labels)
+    write_ply(tmp_path / "old.ply", columns_from_gaussians(cloud) | {"class_id": labels.numpy().astype(np.int32)})
+    assert torch.equal(read_splats(tmp_path / "old.ply").gaussians.labels, labels)

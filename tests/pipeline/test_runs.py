@@ -371,7 +371,7 @@ def test_a_second_fit_in_the_folder_is_refused_and_destroys_nothing(fuse, tmp_pa
         def __getitem__(self, i):
             if not seen:
                 with pytest.raises(
-                    ValueError, match=tells("folder:", tmp_path, f"process {os.getpid()}", "wait")
+                    ValueError, match=tells(f"{tmp_path}: ", f"process {os.getpid()}", "wait")
                 ) as caught:
                     fit_scene(scene, maps, tmp_path, config, splat=splat)
                 seen.append(caught.value)

@@ -15,8 +15,9 @@ import torch
 from messages import tells
 from PIL import Image
 
+from kfgs._files import LARGEST
 from kfgs.scenes import SceneError, file_stem, read_image
-from kfgs.scenes.files import open_picture
+from kfgs.scenes.files import open_picture, read_scene_json
 from kfgs.scenes.posed import picture_size, read_depth
 
 RNG = np.random.default_rng(0)
@@ -200,3 +201,23 @@ def test_where_memory_is_short_a_picture_is_refused_and_nothing_panics(suffix, o
     assert codes[:3] == [3, 3, 3]
     assert codes[-1] == 0
     assert "panicked" not in done.stderr
+
+
+def test_depth_of_a_palette_is_refused_as_its_numbers_are_colours(tmp_path):
+    numbers = Image.fromarray(np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000)
+    numbers.save(tmp_path / "depth.png")
+    assert read_depth(tmp_path / "depth.png").tolist() == (np.arange(12).reshape(3, 4) * 1000).tolist()
+    indexed = Image.fromarray(np.arange(12, dtype=np.uint8).reshape(3, 4))
+    indexed.putpalette(bytes(range(255, -1, -1)) * 3)
+    indexed.save(tmp_path / "shown.png")
+    with pytest.raises(SceneError, match=tells("shown.png: expected a depth PNG", "palette")) as caught:
+        read_depth(tmp_path / "shown.png")
+    assert "decoded" not in str(caught.value)
+
+
+def test_a_json_file_that_would_fill_the_memory_is_refused_unread(tmp_path):
+    path = tmp_path / "cameras.json"
+    with path.open("wb") as file:
+        file.truncate(LARGEST + 1)
+    with pytest.raises(SceneError, match=tells("cameras.json: ", "at most 536.9 MB", "split it; copy it again")):
+        read_scene_json(path, "copy it again")

@@ -1,0 +1,69 @@
+"""`kfgs select`: which parts are listed, and the paths of a field that it takes; `kfgs info` of the same field."""
+
+import re
+
+import pytest
+from messages import tells
+from small_room import make_desk
+
+from kfgs import SemanticField, connected_parts
+from kfgs.cli import main
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory):
+    return make_desk(tmp_path_factory.mktemp("desk"))
+
+
+def said_of(desk, capsys, *words):
+    assert main(["select", "chair", str(desk / "run" / "field"), *words]) == 0
+    return capsys.readouterr().out.splitlines()[1:]
+
+
+def test_parts_that_are_not_listed_are_counted(desk, capsys):
+    field = SemanticField.load(desk / "run" / "field")
+    every = connected_parts(field.gaussians, field.query("chair"), smallest=1)
+    listed = connected_parts(field.gaussians, field.query("chair"))
+    assert {part.total for part in (*every, *listed)} == {len(every)}
+    assert 1 <= len(listed) < len(every) < 100
+    *parts, note = said_of(desk, capsys)
+    assert len(parts) == len(listed)
+    left = len(every) - len(listed)
+    assert note.startswith(f"  {left} smaller part{'s are' if left > 1 else ' is'} not listed; --smallest 1 ")
+    parts = said_of(desk, capsys, "--smallest", "1")
+    assert [int(re.search(r"Part\((\d+) ", line)[1]) for line in parts] == [part.count for part in every]
+    assert said_of(desk, capsys, "--smallest", "1000000") == [
+        "  no part has 1000000 Gaussians; give a smaller --smallest"
+    ]
+    assert main(["select", "chair", str(desk / "run" / "field"), "--smallest", "0"]) == 1
+    assert "--smallest: expected" in capsys.readouterr().err
+
+
+def test_the_distance_within_which_gaussians_are_one_part_can_be_given(desk, capsys):
+    (whole,) = said_of(desk, capsys, "--smallest", "1", "--distance", "100")
+    field = SemanticField.load(desk / "run" / "field")
+    assert whole.startswith(f"  Part({len(field.query('chair'))} Gaussians")
+
+
+@pytest.mark.parametrize("name", ["field/field.json", "field/field.safetensors", ""])
+def test_a_path_beside_the_fields_folder_is_answered_with_that_folder(desk, name, capsys):
+    assert main(["select", "chair", str(desk / "run" / name)]) == 1
+    assert re.search(tells("SOURCE: ", f"pass {desk / 'run' / 'field'}\n"), capsys.readouterr().err)
+
+
+def test_info_names_the_scene_as_it_can_be_typed(desk, monkeypatch, capsys):
+    monkeypatch.chdir(desk)
+    for path in ("run", "run/field", "run/field/field.json"):
+        assert main(["info", path]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        assert "  scene: scene" in lines
+        assert not any("one file" in line for line in lines)
+    monkeypatch.chdir(desk / "run")
+    assert main(["info", "field"]) == 0
+    assert f"  scene: {desk.resolve() / 'scene'}\n" in capsys.readouterr().out
+    (desk / "scene").rename(desk / "moved")
+    try:
+        assert main(["info", "field"]) == 0
+    finally:
+        (desk / "moved").rename(desk / "scene")
+    assert f"  scene: {desk.resolve() / 'scene'} (not there any more)\n" in capsys.readouterr().out
