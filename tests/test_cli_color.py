@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -421,3 +422,19 @@ def test_names_of_files_by_class():
     assert [_file_name(i, ["a/b", "a b", "..", "été"]) for i in range(-1, 5)] == [
         "unlabelled.ply", "00_a_b.ply", "01_a_b.ply", "02.ply", "03_été.ply", "04.ply",
     ]  # fmt: skip
+
+
+def test_all_photographs_can_be_used_and_none_is_left_to_score(room, splat, tmp_path, capsys):
+    every = sorted(path.stem for path in (room / "images").iterdir())
+    assert main(["fit", str(room), "--out", str(tmp_path / "run"), "--splat", str(splat), "--split", "all"]) == 0
+    field = SemanticField.load(tmp_path / "run" / "field")
+    assert [Path(name).stem for name in field.info["views"]] == every
+    out = tmp_path / "segmented"
+    assert (
+        main(["segment", str(tmp_path / "run" / "field"), "--out", str(out), "--split", "all", "--pictures", "0"]) == 0
+    )
+    assert sorted(path.stem for path in (out / "predicted").iterdir()) == every
+    capsys.readouterr()
+    assert main(["color", str(room), "--out", str(tmp_path / "color"), *COLOR, "--split", "all"]) == 0
+    assert "nothing to score against" in capsys.readouterr().out
+    assert not (tmp_path / "color" / "scores.json").exists()

@@ -337,7 +337,8 @@ def color(
         fields = dataclasses.replace(fields, max_gaussians=training.max_gaussians)
     config = dataclasses.replace(config, seed=training.seed, split=views.split, field=fields)
     loaded = views.load(scene).undistorted()
-    tested = [loaded.stem(i) for i in loaded.views("test")] if loaded.splits.get("test") else []
+    held_out = loaded.splits.get("test", [])
+    tested = [] if set(held_out) & set(loaded.views(views.split)) else [loaded.stem(i) for i in held_out]
     if tested:
         check_own(out / "scores.json", lambda path: bool(read_json(path)["color"]), "kfgs color")
         beside = PhotoPictures(out / "views", tested, pictures)
@@ -353,7 +354,7 @@ def color(
             write_report(out / "scores.json", color=scores)
             written += [*beside.written, out / "scores.json"]
         else:
-            say("note: no views are held out (split 'test'): nothing to score against")
+            say("note: no views are held out (split 'test', not trained on): nothing to score against")
         wrote(written)
 
     once(finish)

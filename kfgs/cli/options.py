@@ -66,7 +66,7 @@ class Views:
     images: Given[Path] = None
     """Folder of the pictures, if it is not SCENE/images."""
     split: Annotated[str, tyro.conf.arg(metavar="NAME")] = "train"
-    """Which views: train, test, or another split that SCENE/split.json names; `kfgs features` also takes all."""
+    """Which views: train, test, all, or another split that SCENE/split.json names."""
 
     def load(self, scene: Path) -> Any:
         """Load the scene (not undistorted), and print its notes."""

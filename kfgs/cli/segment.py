@@ -46,7 +46,7 @@ def segment(
         field: The folder that `kfgs fit` wrote (RUN/field).
         out: Folder for label maps (predicted/ has class numbers, colored/ shows them in colours), pictures and scores.json. It
             holds the results of one run: those of an earlier run are replaced or deleted, files of other programs stay.
-        split: Which views: train, test, or another split that SCENE/split.json names.
+        split: Which views: train, test, all, or another split that SCENE/split.json names.
         path: Segment the cameras of a path, as `kfgs render` has it, instead of the views of a split: orbit, spiral or cameras.
         frames: Number of cameras of the path; by default 72.
         width: Width of its pictures in pixels; by default 480.

@@ -46,7 +46,7 @@ def pictures_of(scene: Scene, split: Split = "all") -> list[Picture]:
         ValueError: if the scene has no such split or view, or the split is empty.
     """
     if isinstance(split, str):
-        split = range(len(scene)) if split == "all" and "all" not in scene.splits else scene.views(split)
+        split = scene.views(split)
     chosen = scene.select(split)
     return [Picture(chosen.stem(i), chosen.image_paths[i], chosen.cameras[i].size) for i in range(len(chosen))]
 

@@ -103,7 +103,7 @@ class MapWriter:
         needed, free = maps * map_bytes, shutil.disk_usage(self.folder).free
         if needed > free:
             raise OSError(
-                f"{self.folder}: expected {bytes_in_words(needed)} free there for {maps} maps, got {bytes_in_words(free)}; "
+                f"{self.folder}: expected {bytes_in_words(needed)} free for {maps} maps, got {bytes_in_words(free)}; "
                 "free some, take another disk, or store no maps (RecomputedMaps)"
             )
 

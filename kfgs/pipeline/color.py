@@ -38,7 +38,7 @@ class ColorConfig:
     seed: int = 0
     """Every random choice follows from it."""
     split: str = "train"
-    """The split of training views."""
+    """The split of training views; "all" trains on all views."""
     sh_degree: int = 3
     """Highest degree of the spherical harmonics, 0 to 3: how colour changes with the direction of sight."""
     picture_scale: float = 1.0

@@ -30,7 +30,7 @@ class FitConfig:
     seed: int = 0
     """Every random choice of the run follows from it."""
     split: str = "train"
-    """The split of training views."""
+    """The split of training views; "all" trains on all views."""
     device: str = "auto"
     """Where to train a field, see `training_device`; the other stages and the result stay on the CPU."""
     refit: bool = False

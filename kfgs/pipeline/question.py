@@ -241,8 +241,7 @@ def read_teacher(folder: Path, scene: Scene, views: Sequence[View], align_corner
 
 
 def _views(scene: Scene, split: str) -> list[View]:
-    indices = range(len(scene)) if split == "all" and "all" not in scene.splits else scene.views(split)
-    return [View(scene.stem(i), scene.cameras[i]) for i in indices]
+    return [View(scene.stem(i), scene.cameras[i]) for i in scene.views(split)]
 
 
 def _of_split(truth: Any, scene: Scene, split: str | None) -> Any:

@@ -97,14 +97,16 @@ class Scene:
         return file_stem(self.cameras[i].name)
 
     def views(self, split: str) -> list[int]:
-        """The views of a split.
+        """The views of a split; "all" are all views, if no split has that name.
 
         Raises:
             ValueError: if the scene has no such split, or it is empty.
         """
+        if split == "all" and "all" not in self.splits:
+            return list(range(len(self)))
         if not self.splits.get(split):
-            named = ", ".join(name for name, views in self.splits.items() if views)
-            raise ValueError(f"split: expected one of {named or 'none (no split holds a view)'}, got {split!r}")
+            named = "".join(f"{name}, " for name, views in self.splits.items() if views and name != "all")
+            raise ValueError(f"split: expected one of {named}all, got {split!r}")
         return self.splits[split]
 
     def image(self, i: int) -> Tensor:  # [H, W, 3] in [0, 1]

@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from .._check import check_choice, check_range
 from .._files import as_path, atomic_folder, check_output, real_path
+from ..formats.folders import newest_splat
 from .colmap import SUPPORTED_MODELS
 from .colmap_model import has_model
 from .files import SceneError, list_images, some
@@ -102,7 +103,8 @@ def run_sfm(
 
     Raises:
         FileNotFoundError: if there is no such folder.
-        FileExistsError: if `out/sparse/0` holds a model, and `replace` is False.
+        FileExistsError: if `out/sparse/0` holds a model, and `replace` is False; or if `out/point_cloud` holds a splat, which was
+            trained with other poses.
         ValueError: if `out` is a file, or the folder of the images.
         SceneError: if there are fewer than 3 images, pycolmap fails, or the largest model places fewer than
             `min_registered` of the images (the rest is lost, or COLMAP split the scene into unconnected models).
@@ -120,6 +122,14 @@ def run_sfm(
         raise FileExistsError(
             f"out: expected a scene folder without a model, got one in {model}; name another folder, or pass replace=True "
             "(--replace) to give up that model"
+        )
+    splat = newest_splat(out)
+    if splat is not None and splat.is_relative_to(
+        out / "point_cloud"
+    ):  # `load_scene` would take it for one of these poses
+        raise FileExistsError(
+            f"out: expected a scene folder without a splat of other poses, got {splat}, which will not fit the new ones; move "
+            f"{out / 'point_cloud'} away, or name another folder"
         )
     refuse_heic(images)
     names = list_images(images)

@@ -152,3 +152,11 @@ def test_a_scene_shows_its_facts_in_a_notebook(tmp_path: Path) -> None:
         assert fact in card
     assert "pinhole" in scene.undistorted()._repr_html_()
     assert "extent" not in scene.select([])._repr_html_()
+
+
+def test_all_are_all_views_unless_a_split_has_that_name(tmp_path: Path) -> None:
+    scene = replace(_scene(tmp_path), splits={"train": [1], "test": [], "night": [0]})
+    assert scene.views("all") == list(range(len(scene)))
+    assert replace(scene, splits={"all": [1]}).views("all") == [1]
+    with pytest.raises(ValueError, match="split: expected one of train, night, all, got 'test'"):
+        scene.views("test")
