@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -436,5 +437,7 @@ def test_all_photographs_can_be_used_and_none_is_left_to_score(room, splat, tmp_
     assert sorted(path.stem for path in (out / "predicted").iterdir()) == every
     capsys.readouterr()
     assert main(["color", str(room), "--out", str(tmp_path / "color"), *COLOR, "--split", "all"]) == 0
-    assert "nothing to score against" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "nothing to score against" in printed
+    assert re.findall("^note: split .*", printed, re.MULTILINE) in ([], [f"note: split all: all {len(every)} views"])
     assert not (tmp_path / "color" / "scores.json").exists()

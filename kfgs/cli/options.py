@@ -73,7 +73,11 @@ class Views:
         from ..scenes import load_scene
 
         loaded = load_scene(scene, images=self.images)
-        for note in loaded.notes:
+        notes = loaded.notes
+        if self.split == "all" and "all" not in loaded.splits:
+            rule = f"split all: all {len(loaded)} views"
+            notes = [rule if note.startswith("split ") else note for note in notes]
+        for note in notes:
             say(f"note: {note}")
         return loaded
 
