@@ -451,6 +451,7 @@ def test_discarding_spares_the_maps_of_other_views(scene, weights, tmp_path, cap
     folder = tmp_path / "maps"
     everything = ["features", str(scene), *TEACHER, str(weights), "--out", str(folder), "--split", "all"]
     assert main(everything) == 0
+    assert f"next: kfgs fit {scene} --out run --features {folder} --split all\n" in capsys.readouterr().out
     loaded = load_scene(scene)
     arguments = ["fit", str(scene), "--features", str(folder), "--out", str(tmp_path / "run"), *QUICK]
     assert main([*arguments, "--discard-features"]) == 0

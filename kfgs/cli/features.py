@@ -56,6 +56,7 @@ def features(
     if check is None:
         check_output("out", target, "a folder")
     loaded = views.load(scene)
+    chosen = "" if views.split == "train" else f" --split {views.split}"
     if check is not None:
         found = FeatureFolder(check, level=level or "default").check(loaded, views.split)
         say(str(found))
@@ -65,13 +66,13 @@ def features(
                 f"{len(found.problems)} that are missing or do not fit (named above); make these maps again, or name the "
                 "photos to use in SCENE/split.json"
             )
-        say(f"next: kfgs fit {scene} --out run --features {check}")
+        say(f"next: kfgs fit {scene} --out run --features {check}{chosen}")
         return
     network = choose_teacher(teacher.teacher, teacher.weights, teacher.fast, teacher.size, device)
     made = extract_features(network, loaded, target, views.split, overwrite=overwrite, report=say, progress=True)
     shapes = sorted({" x ".join(map(str, record.shape)) for record in made.maps.values()})
     say(f"{len(made.maps)} maps of {', '.join(shapes)} by {teacher_words(made.teacher)}")
-    say(f"next: kfgs fit {scene} --out run" + ("" if out is None else f" --features {out}"))
+    say(f"next: kfgs fit {scene} --out run" + ("" if out is None else f" --features {out}") + chosen)
     wrote([target])
 
 
