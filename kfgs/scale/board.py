@@ -13,10 +13,13 @@ LONGEST = 24  # characters of a name
 
 
 def event_line(event: Event, rows: Sequence[Row]) -> str | None:
-    """A line for an event; None for the start of a stage."""
+    """A line for an event, and one for each note of its tasks; None for a scene that is finished."""
     row = next(row for row in rows if row.name == event.name)
+    if event.kind == "started":
+        return f"{event.name}: {event.stage} started"
     if event.kind == "done":
-        return f"{event.name}: {event.stage} {row.stages[event.stage]} in {seconds_in_words(event.seconds)}"
+        done = f"{event.name}: {event.stage} {row.stages[event.stage]} in {seconds_in_words(event.seconds)}"
+        return "\n".join([done, *(f"{event.name}: {line}" for line in event.lines if line.startswith("note: "))])
     if event.kind == "lost":
         return f"{event.name}: {event.stage}: {event.lines[0]}"
     if event.failure is not None:

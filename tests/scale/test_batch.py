@@ -225,10 +225,25 @@ def test_photos_get_their_cameras_first(rooms, tmp_path, monkeypatch):
             assert result.failure is None, result.failure.traceback
     assert calls == [("photos", 1, True)]
     run = tmp_path / "runs" / "photos"
+    assert f"note: no poses in {photos}: " in (run / "log.txt").read_text()
     assert (run / "scene" / "images").resolve() == photos
     assert (run / "field" / "field.json").is_file()
     assert not (run / "segmented").exists()  # no classes are known
     assert not table_.exists()
+
+
+def test_an_error_of_sfm_says_where_its_options_are(rooms, tmp_path, monkeypatch):
+    from kfgs.scale import stages
+    from kfgs.scenes import SceneError
+
+    def fails(*_, **__):
+        raise SceneError("expected 6 images, got 2; pass single_camera=False (--no-single-camera)")
+
+    monkeypatch.setattr(stages, "run_sfm", fails)
+    shutil.copytree(rooms[0] / "images", tmp_path / "photos")
+    with ThreadPoolExecutor(1) as pool:
+        failure = run_batch([tmp_path / "photos"], tmp_path / "runs", OPTIONS, client=pool)[0].failure
+    assert f"`kfgs sfm {tmp_path / 'photos'} --out SCENE`" in failure.message
 
 
 def test_a_scene_without_maps_or_teacher_says_what_to_name(rooms, tmp_path):
@@ -287,6 +302,17 @@ def test_the_command_takes_a_list_to_the_end_and_fails_if_a_scene_does(rooms, cl
     assert main(line) == 1
     said = capsys.readouterr()
     assert "kitchen: fit done in " in said.out
+    for stage in ("scene", "features", "fit", "segment", "evaluate"):
+        assert said.out.count(f"kitchen: {stage} started\n") == 1
+    log = (tmp_path / "runs" / "kitchen" / "log.txt").read_text().splitlines()
+    assert [line[20:] for line in log].count("fit: started") == 1
+    times = [line[:19] for line in log if line[20:].startswith("fit: ")]
+    assert times == sorted(times)
+    assert log.index(next(one for one in log if "fit: started" in one)) < log.index(
+        next(one for one in log if "color:" in one)
+    )
+    assert read_json(tmp_path / "runs" / "kitchen" / "scores.json")["scene"] == "kitchen"
+    spent = read_json(tmp_path / "runs" / "kitchen" / "state.json")["seconds"]
     assert "garden: scene failed: " in said.out
     assert "2 scenes: 1 finished, 1 failed, mean mIoU" in said.out
     assert re.search(tells("SCENES", "1 failed (garden)", "log.txt", "--retry-failed"), said.err)
@@ -295,6 +321,11 @@ def test_the_command_takes_a_list_to_the_end_and_fails_if_a_scene_does(rooms, cl
     said = capsys.readouterr().out
     assert "kitchen: fit" not in said
     assert re.search(r"kitchen +done +found +found +found +found", said)
+    kept = read_json(tmp_path / "runs" / "kitchen" / "state.json")["seconds"]
+    assert {name: kept[name] for name in kept if name != "scene"} == {
+        name: spent[name] for name in spent if name != "scene"
+    }
+    assert kept["fit"] > 0
 
 
 @pytest.mark.parametrize(
@@ -336,7 +367,8 @@ def test_the_table_keeps_to_its_height_and_shows_failures_first():
     assert "1 finished, 1 failed, 1 at work, mean mIoU 0.500 of 1" in text
     assert re.search(r"room3 .* 4\.5 0\.500", table(rows))
     assert event_line(Event("room7", "failed", "fit", failure=failure), rows).startswith("room7: fit failed: no space")
-    assert event_line(Event("room5", "started", "scene"), rows) is None
+    assert event_line(Event("room5", "started", "scene"), rows) == "room5: scene started"
+    assert event_line(Event("room5", "finished"), rows) is None
 
 
 def test_jobs_of_slurm(tmp_path, monkeypatch):
