@@ -171,18 +171,19 @@ def label(
 
 
 def info(path: Positional[Path]) -> None:
-    """Describe a field, a run, a scene, a folder of feature maps or a PLY file.
+    """Describe a field, a run, the runs of a batch, a scene, a folder of feature maps or a PLY file.
 
     Examples:
         kfgs info run/field
         kfgs info scene/
 
     Args:
-        path: A field folder, run folder, scene folder, folder of feature maps, or .ply file.
+        path: A field folder, run folder, --out folder of a batch, scene folder, folder of feature maps, or .ply file.
     """
     from ..pipeline import describe
+    from ..scale.board import describe_batch
 
-    say(describe(path))
+    say(describe_batch(path) or describe(path))
 
 
 def _check_older(out: Path) -> None:

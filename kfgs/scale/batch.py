@@ -7,7 +7,7 @@ import pickle
 import re
 import time
 from collections.abc import Callable, Generator, Iterable, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -259,6 +259,23 @@ class _Record:
             self.place.write_text(LOG, self._log)
         if event.kind != "lost":
             self.place.write_json(STATE, json.loads(json.dumps({"format": FORMAT, **asdict(row)})))
+
+
+def read_rows(folder: Path) -> list[Row]:
+    """The scenes of the batch that wrote to a folder, by their `state.json`; those that are damaged or not ours are left out."""
+    rows = []
+    for file in sorted(folder.glob(f"*/{STATE}")):
+        about = Place(file.parent).read_json(STATE)
+        if about.pop("format", None) != FORMAT:
+            continue
+        failure = about.get("failure")
+        with suppress(TypeError, AttributeError):
+            about["seconds"] = _seconds(about.get("seconds"))
+            about["failure"] = None if failure is None else Failure(**failure)
+            about["stages"] = {str(name): str(word) for name, word in about.get("stages", {}).items()}
+            if about.get("value") is None or isinstance(about["value"], dict):
+                rows.append(Row(**about))
+    return rows
 
 
 def _clock(when: float) -> str:

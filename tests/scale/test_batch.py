@@ -316,6 +316,11 @@ def test_the_command_takes_a_list_to_the_end_and_fails_if_a_scene_does(rooms, cl
     assert "garden: scene failed: " in said.out
     assert "2 scenes: 1 finished, 1 failed, mean mIoU" in said.out
     assert re.search(tells("SCENES", "1 failed (garden)", "log.txt", "--retry-failed"), said.err)
+    assert main(["info", str(tmp_path / "runs")]) == 0
+    told = capsys.readouterr().out
+    assert f"{tmp_path / 'runs'}: a batch" in told
+    assert re.search(r"kitchen +done +done +done +done +done", told)
+    assert re.search(tells("2 scenes: 1 finished, 1 failed", "next: ", "--retry-failed"), told)
     (tmp_path / "scenes.txt").write_text(f"kitchen = {rooms[0]}\n")
     assert main(line) == 0
     said = capsys.readouterr().out
