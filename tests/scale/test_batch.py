@@ -408,3 +408,15 @@ def test_ctrl_c_in_a_terminal_does_not_reach_the_workers(client):
         return signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
     assert client.submit(ignored).result(timeout=100)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc")
+def test_workers_say_nothing_when_they_are_asked_to_end(client):
+    def caught():  # in a thread of the worker, as tasks are
+        from kfgs.scenes.pycolmap_import import import_pycolmap
+
+        import_pycolmap()
+        status = Path("/proc/self/status").read_text()
+        return int(status.partition("SigCgt:")[2].split()[0], 16) >> (signal.SIGTERM - 1) & 1
+
+    assert client.submit(caught).result(timeout=100) == 0
