@@ -153,7 +153,7 @@ def test_another_share_goes_on_where_a_killed_batch_stopped(tmp_path, kind):
         "features: 3 maps found, 0 to make",
         "features: 1 maps found, 1 to make",
     ]
-    assert stages.join_parts(job, "key", list(names), report=print)["maps"] == 5
+    assert stages.join_parts(job, "key", list(names), 0.0, report=print)["maps"] == 5
     with open_place(out) as place:
         assert sorted(name for name in place.listing() if name.startswith("features/")) == [
             *(f"features/{name}.npy" for name in names),
