@@ -43,6 +43,10 @@ HEAD = (
     "machine",
     "command",
 )
+UNITS = (
+    "MiB: every number of the result in float32, with decoder and codebook. Labels, FPS: views a second that get a class for "
+    "each pixel (rendering included), on the machine of the row."
+)
 INTRO = f"""# Leaderboard
 
 Every row was run with kfgs's own implementation of the method (`benchmarks/baselines/`), on the same scene and teacher, by the
@@ -185,7 +189,7 @@ def section(name: str, runs: dict[str, Any]) -> str:
         of_row.setdefault(row["row"], []).append(row)
     ranked = sorted(of_row.items(), key=lambda one: -mean(row["miou"] for row in one[1]))
     lines += [f"| {' | '.join(cells(place, key, rows))} |" for place, (key, rows) in enumerate(ranked, 1)]
-    return "\n".join([*lines, "", f"Source: [runs/{name}.json](runs/{name}.json).", ""])
+    return "\n".join([*lines, "", UNITS, "", f"Source: [runs/{name}.json](runs/{name}.json).", ""])
 
 
 def cells(place: int, key: str, rows: list[dict[str, Any]]) -> list[str]:

@@ -11,6 +11,8 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any
 
+from ._ranks import place
+
 CODE = 130  # as shells count it: 128 + SIGINT
 IMPORTS = ("<frozen importlib._bootstrap>", "_find_and_load")
 
@@ -24,7 +26,7 @@ def end_at_once(*_: Any) -> None:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Make Ctrl-C a KeyboardInterrupt in the block, except where one would be lost or become another error.
+    """Make Ctrl-C and SIGTERM a KeyboardInterrupt in the block, except where one would be lost or become another error.
 
     A C++ module that loads (torch, numpy, pycolmap) ends the process with SIGABRT, or with an ImportError, when Python raises
     in it. Python itself prints and forgets an exception in `__del__`. There the process ends at once.
@@ -49,6 +51,10 @@ def interruptible() -> Iterator[None]:
         told(error)
 
     signal.signal(signal.SIGINT, interrupt)
+    ended = signal.getsignal(signal.SIGTERM)
+    asked = ended is signal.SIG_DFL and place()[1] == 1  # torchrun ends its processes itself
+    if asked:
+        signal.signal(signal.SIGTERM, interrupt)
     sys.unraisablehook = forgotten
     try:
         yield
@@ -59,6 +65,8 @@ def interruptible() -> Iterator[None]:
     finally:
         sys.unraisablehook = told
         signal.signal(signal.SIGINT, before)
+        if asked:
+            signal.signal(signal.SIGTERM, ended)
 
 
 def _imports(frame: FrameType | None) -> bool:

@@ -40,7 +40,7 @@ def one_process(room: Path, out: Path) -> Path:
     truth = true_labels(scene, room / "labels", "test")
     segment_scene(SemanticField.load(out / "field"), scene, classes, out / "segmented", pictures=0, truth=truth)
     report = evaluate(out / "field", room, encode=classes, truth=room / "labels")
-    (out / "scores.json").write_text(json.dumps(report.to_json(), indent=2) + "\n")
+    (out / "scores.json").write_text(json.dumps({"scene": room.name, **report.to_json()}, indent=2) + "\n")
     return out
 
 

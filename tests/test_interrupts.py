@@ -1,6 +1,8 @@
 import subprocess
 import sys
 
+import pytest
+
 RUN = "import sys; from kfgs.__main__ import run; sys.argv = ['kfgs', *sys.argv[1:]]; sys.exit(run())"
 BEFORE = "import atexit, os, signal; ctrl_c = lambda: os.kill(os.getpid(), signal.SIGINT)\n"
 
@@ -68,3 +70,21 @@ def test_a_shell_that_ignores_ctrl_c_for_its_jobs_is_obeyed():
     end = "\nassert signal.getsignal(signal.SIGINT) is signal.SIG_IGN"
     code = code.replace("sys.exit(run())", "run()") + end
     assert subprocess.run([sys.executable, "-c", code, "--version"], capture_output=True).returncode == 0
+
+
+ASKED = """
+import os, signal
+from kfgs import cli
+def probe() -> None:
+    "Load pycolmap, and be asked to end."
+    from kfgs.scenes.pycolmap_import import import_pycolmap
+    import_pycolmap()
+    os.kill(os.getpid(), signal.SIGTERM)
+    print("went on")
+cli.COMMANDS["probe"] = probe
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="SIGTERM")
+def test_a_process_that_is_asked_to_end_says_one_line(tmp_path):
+    assert run(tmp_path, "probe", code=ASKED + RUN) == (130, "interrupted\n")

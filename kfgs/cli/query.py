@@ -179,18 +179,20 @@ def label(
 
 
 def info(path: Positional[Path]) -> None:
-    """Describe a field, a run, a scene, a folder of feature maps, a splat or a PLY of points.
+    """Describe a field, a run, the runs of a batch, a scene, a folder of feature maps, a splat or a PLY of points.
 
     Examples:
         kfgs info run/field
         kfgs info scene/
 
     Args:
-        path: A field folder, run folder, scene folder, folder of feature maps, splat file, or .ply of points.
+        path: A field folder, run folder, --out folder of a batch, scene folder, folder of feature maps, splat file, or .ply of
+            points.
     """
     from ..pipeline import describe
+    from ..scale.board import describe_batch
 
-    say(describe(path))
+    say(describe_batch(path) or describe(path))
 
 
 def _check_older(out: Path) -> None:

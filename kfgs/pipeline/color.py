@@ -27,7 +27,7 @@ from ..gaussians import Gaussians
 from ..scenes import Scene
 from .color_file import is_saved, may_replace, stage_gaussians, what_is
 from .points import with_points
-from .stages import Run, Stage, describe_lens, digest_scene, digest_shape, digest_tensors, stage_generator
+from .stages import Run, Stage, describe_lens, digest_scene, digest_shape, digest_tensors, is_whole, stage_generator
 from .train import check_scene, field_stage, training_device, with_extent
 
 
@@ -264,7 +264,7 @@ def find_color(run: Run, scene: Scene, config: ColorConfig) -> tuple[Gaussians, 
     views = scene.views(config.split)
     wanted = json.loads(json.dumps(_inputs(run, scene, views, config) | {"config": None}))
     best: tuple[int, Path] | None = None
-    for about in sorted((run.folder / "stages").glob("color-*/stage.json")):
+    for about in _whole_stages(run):
         inputs = read_json(about)["inputs"]
         if inputs | {"config": None} != wanted:  # another scene, split or pictures
             continue
@@ -275,6 +275,12 @@ def find_color(run: Run, scene: Scene, config: ColorConfig) -> tuple[Gaussians, 
         return None
     run.say(f"geometry: the colours of {best[0]:,} steps that are in {run.folder}")
     return stage_gaussians(best[1]), best[0]
+
+
+def _whole_stages(run: Run) -> list[Path]:
+    """The descriptions of the colour stages in the run that are not damaged."""
+    found = sorted((run.folder / "stages").glob("color-*/stage.json"))
+    return [about for about in found if is_whole(about.parent)]
 
 
 def colors_before(
@@ -288,7 +294,7 @@ def colors_before(
     if run.has("color", wanted):
         return None
     found = {}
-    for about in sorted((run.folder / "stages").glob("color-*/stage.json")) if geometries else ():
+    for about in _whole_stages(run) if geometries else ():
         inputs = read_json(about)["inputs"]
         steps = int(inputs["config"]["field"]["steps"])
         same = inputs["config"] == wanted["config"] or steps > config.field.steps

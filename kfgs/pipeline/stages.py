@@ -217,8 +217,14 @@ def _sizes(folder: Path) -> dict[str, int]:
 
 
 def is_whole(folder: Path) -> bool:
-    """Whether a folder is a finished stage that this version made: its name follows from its inputs, no file changed its size."""
-    about = read_stage(folder / STAGE_FILE)
+    """Whether a folder is a finished stage that this version made: its name follows from its inputs, no file changed its size.
+
+    A damaged description is that of no stage.
+    """
+    try:
+        about = read_stage(folder / STAGE_FILE)
+    except (OSError, ValueError):
+        return False
     return folder.name == f"{about['name']}-{_key(about['name'], about.get('inputs', {}))}" and about.get(
         "files"
     ) == _sizes(folder)

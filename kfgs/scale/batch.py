@@ -7,7 +7,7 @@ import pickle
 import re
 import time
 from collections.abc import Callable, Generator, Iterable, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ class SceneResult:
     """What the function returned; of a batch, `gaussians`, `latents` and `miou`, as far as they exist. None if it failed."""
     failure: Failure | None
     seconds: float
-    """Of all its tasks, together."""
+    """Of all its tasks, together. Of a batch, what was found counts with the seconds of the start that made it."""
 
 
 @dataclass
@@ -45,6 +45,7 @@ class Row:
     stages: dict[str, str] = field(default_factory=dict)
     """running, done, found (made earlier) or failed, by stage; a stage that is not there waits, or is not needed."""
     seconds: dict[str, float] = field(default_factory=dict)
+    """Of the work that made each stage, by whichever start of the batch."""
     value: dict[str, Any] | None = None
     failure: Failure | None = None
 
@@ -190,9 +191,9 @@ def _plan(job: Job) -> Generator[tuple[str, list[Task]], list[Any], Any]:
         if job.options.teacher is not None and "features" not in done:
             pictures, share = found["pictures"], job.options.share
             parts = [pictures[i : i + share] for i in range(0, len(pictures), share)]
-            yield "features", [Task(stages.encode_part, (job, part)) for part in parts]
-            stems = [stem for stem, _ in pictures]
-            yield "features", [Task(stages.join_parts, (job, keys["features"], stems))]
+            made = yield "features", [Task(stages.encode_part, (job, part)) for part in parts]
+            stems, seconds = [stem for stem, _ in pictures], sum(one["seconds"] for one in made)
+            yield "features", [Task(stages.join_parts, (job, keys["features"], stems, seconds))]
         done["fit"] = (yield "fit", [Task(stages.fit, (job, keys["fit"]))])[0]
     if found["classes"] and "segment" not in done:
         yield "segment", [Task(stages.segment, (job, keys["segment"], found["split"]))]
@@ -224,32 +225,64 @@ class _Record:
         if isinstance(failure, dict) and {"stage", "message"} <= set(failure) and not retry_failed:
             self.row.failure = Failure(*(str(failure.get(name, "")) for name in ("stage", "message", "traceback")))
             self.row.stages = {self.row.failure.stage: "failed"}
+            self.row.seconds = _seconds(before.get("seconds"))
             return False
         return True
 
     def add(self, event: Event) -> None:
         """Note an event."""
         row, stage = self.row, event.stage
-        if event.seconds:
-            row.seconds[stage] = round(row.seconds.get(stage, 0.0) + event.seconds, 3)
         if event.kind == "started":
             row.stages[stage] = "running"
         elif event.kind == "done":
             row.stages[stage] = "found" if all(one.get("reused") for one in event.results) else "done"
+            row.seconds[stage] = round(sum(one["seconds"] for one in event.results), 3)
             if stage == "scene":
-                row.stages |= {name: "found" for name in STAGES if name in event.results[0]["done"]}
+                found = {name: one for name, one in event.results[0]["done"].items() if name in STAGES}
+                row.stages |= dict.fromkeys(found, "found")
+                row.seconds |= {name: round(one["seconds"], 3) for name, one in found.items()}
         elif event.kind == "failed":
             row.stages[stage], row.failure = "failed", event.failure
+            row.seconds[stage] = round(row.seconds.get(stage, 0.0) + event.seconds, 3)
         elif event.kind == "finished":
             row.value = event.results[0]
-        lines = [f"{stage}: {line.removeprefix(f'{stage}: ')}" for line in event.lines]
+        now = time.time()
+        lines = [(when, line.removeprefix(f"{stage}: ")) for when, line in zip(event.times, event.lines, strict=True)]
+        if event.kind == "started":
+            lines.append((now, "started"))
         if event.kind in ("done", "failed"):
-            lines.append(f"{stage}: {row.stages[stage]} in {event.seconds:.1f} s")
+            lines.append((now, f"{row.stages[stage]} in {event.seconds:.1f} s"))
         if event.failure is not None:
-            lines += [f"{stage}: {event.failure.message}", event.failure.traceback]
+            lines += [(now, event.failure.message), (now, event.failure.traceback)]
         if lines:
-            now = time.strftime("%Y-%m-%d %H:%M:%S")
-            self._log += "".join(f"{now} {line}\n" for line in lines)
+            self._log += "".join(f"{_clock(when)} {stage}: {line}\n" for when, line in lines)
             self.place.write_text(LOG, self._log)
         if event.kind != "lost":
             self.place.write_json(STATE, json.loads(json.dumps({"format": FORMAT, **asdict(row)})))
+
+
+def read_rows(folder: Path) -> list[Row]:
+    """The scenes of the batch that wrote to a folder, by their `state.json`; those that are damaged or not ours are left out."""
+    rows = []
+    for file in sorted(folder.glob(f"*/{STATE}")):
+        about = Place(file.parent).read_json(STATE)
+        if about.pop("format", None) != FORMAT:
+            continue
+        failure = about.get("failure")
+        with suppress(TypeError, AttributeError):
+            about["seconds"] = _seconds(about.get("seconds"))
+            about["failure"] = None if failure is None else Failure(**failure)
+            about["stages"] = {str(name): str(word) for name, word in about.get("stages", {}).items()}
+            if about.get("value") is None or isinstance(about["value"], dict):
+                rows.append(Row(**about))
+    return rows
+
+
+def _clock(when: float) -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(when))
+
+
+def _seconds(noted: Any) -> dict[str, float]:
+    """The seconds of stages in a `state.json`; none if they are damaged."""
+    whole = isinstance(noted, dict) and all(isinstance(one, int | float) for one in noted.values())
+    return dict(noted) if whole else {}

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 from .._card import cut
 from .._files import seconds_in_words
-from .batch import STAGES, Row
+from .batch import LOCK, STAGES, Row, read_rows
 from .driver import Event
 
 LONGEST = 24  # characters of a name
 
 
 def event_line(event: Event, rows: Sequence[Row]) -> str | None:
-    """A line for an event; None for the start of a stage."""
+    """A line for an event, and one for each note of its tasks; None for a scene that is finished."""
     row = next(row for row in rows if row.name == event.name)
+    if event.kind == "started":
+        return f"{event.name}: {event.stage} started"
     if event.kind == "done":
-        return f"{event.name}: {event.stage} {row.stages[event.stage]} in {seconds_in_words(event.seconds)}"
+        done = f"{event.name}: {event.stage} {row.stages[event.stage]} in {seconds_in_words(event.seconds)}"
+        return "\n".join([done, *(f"{event.name}: {line}" for line in event.lines if line.startswith("note: "))])
     if event.kind == "lost":
         return f"{event.name}: {event.stage}: {event.lines[0]}"
     if event.failure is not None:
@@ -54,3 +58,15 @@ def table(rows: Sequence[Row], most: int | None = None) -> str:
     words = [f"{count} {what}" for what, count in counts.items() if count]
     words += [f"mean mIoU {sum(scores) / len(scores):.3f} of {len(scores)}"] if scores else []
     return "\n".join([*lines, f"{len(rows)} scenes: {', '.join(words) or 'all wait'}"])
+
+
+def describe_batch(folder: Path) -> str | None:
+    """What the --out folder of a batch has, as its table; None if it is none."""
+    rows = read_rows(folder) if (folder / LOCK).is_file() else []
+    if not rows:
+        return None
+    advice = ["the same `kfgs batch` again goes on with scenes that are not done"]
+    advice += ["with --retry-failed also with failed ones"] if any(row.failure for row in rows) else []
+    advice = [f"kfgs search WORD {folder}"] if all(row.value is not None for row in rows) else advice
+    head = f"{folder}: a batch; scenes that have not begun are not listed"
+    return "\n".join([head, table(rows), f"next: {', '.join(advice)}"])

@@ -8,7 +8,7 @@ import shutil
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from .._check import check_whole
@@ -100,9 +100,14 @@ def open_client(
 def dask_setup(_: Any) -> None:
     """Called in each worker of this machine: Ctrl-C ends the driver, which ends its workers.
 
-    In a terminal, it reaches all processes, and workers would print tracebacks.
+    In a terminal, it reaches all processes, and workers would print tracebacks. pycolmap is imported here, in the main thread:
+    only there can the import undo that its log library prints a stack at SIGTERM.
     """
+    from ..scenes.pycolmap_import import import_pycolmap
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with suppress(ImportError):
+        import_pycolmap()
 
 
 def _slurm(partition: str, threads: int, memory: str, scheduler: dict[str, Any]) -> Any:

@@ -66,6 +66,8 @@ class Event:
     """Of the tasks of a stage, together."""
     lines: tuple[str, ...] = ()
     """What the tasks reported."""
+    times: tuple[float, ...] = ()
+    """When each line was reported: seconds since 1970, by the clock of the worker."""
     results: tuple[Any, ...] = ()
     """Of the tasks of a stage; of a finished scene, what its plan returned."""
     failure: Failure | None = None
@@ -76,11 +78,11 @@ def attempt(task: Task, ticket: str) -> dict[str, Any]:
 
     `ticket` makes two calls differ, for engines that keep the results of equal calls.
     """
-    lines: list[str] = []
+    lines: list[tuple[float, str]] = []
     start = time.perf_counter()
     about: dict[str, Any] = {"value": None, "error": None}
     try:
-        about["value"] = task.function(*task.arguments, report=lines.append)
+        about["value"] = task.function(*task.arguments, report=lambda line: lines.append((time.time(), line)))
     except Exception as error:
         about["error"] = (str(error) or error_line(error), traceback.format_exc())
     return {**about, "lines": lines, "seconds": time.perf_counter() - start}
@@ -181,7 +183,8 @@ def limit(at_once: int | Callable[[], int]) -> Callable[[], int]:
 
 
 def _advance(lane: _Lane, results: list[Any] | None, engine: _Submitter, report: Callable[[Event], None]) -> bool:
-    """Submit the next stage of a plan; False if it has none."""
+    """Submit the next stage of a plan; False if it has none. A stage that goes on with more tasks is reported once."""
+    before = lane.stage
     try:
         lane.stage, lane.tasks = next(lane.plan) if results is None else lane.plan.send(results)
     except StopIteration as end:
@@ -191,7 +194,8 @@ def _advance(lane: _Lane, results: list[Any] | None, engine: _Submitter, report:
         why = Failure(lane.stage, error_line(error), traceback.format_exc())
         report(Event(lane.name, "failed", lane.stage, failure=why))
         return False
-    report(Event(lane.name, "started", lane.stage))
+    if lane.stage != before:
+        report(Event(lane.name, "started", lane.stage))
     lane.deaths, lane.done = {}, {}
     lane.futures = {i: engine.submit(task, f"{lane.name}/{lane.stage}/{i}") for i, task in enumerate(lane.tasks)}
     return True
@@ -213,7 +217,7 @@ def _look(lane: _Lane, engine: _Submitter, report: Callable[[Event], None]) -> b
             lane.done[i] = {"value": None, "error": (message, ""), "lines": [], "seconds": 0.0}
         else:
             line = f"a worker died ({error_line(died)}); the task is submitted again ({lane.deaths[i]} of {AGAIN})"
-            report(Event(lane.name, "lost", lane.stage, lines=(line,)))
+            report(Event(lane.name, "lost", lane.stage, lines=(line,), times=(time.time(),)))
             lane.futures[i] = engine.submit(lane.tasks[i], f"{lane.name}/{lane.stage}/{i}")
     return bool(finished)
 
@@ -221,13 +225,14 @@ def _look(lane: _Lane, engine: _Submitter, report: Callable[[Event], None]) -> b
 def _end_stage(lane: _Lane, engine: _Submitter, report: Callable[[Event], None]) -> bool:
     """All tasks of a stage have ended: go on with the next; False if the scene has ended."""
     done = [lane.done[i] for i in range(len(lane.tasks))]
-    lines = tuple(line for one in done for line in one["lines"])
+    said = [line for one in done for line in one["lines"]]
+    times, lines = tuple(when for when, _ in said), tuple(line for _, line in said)
     seconds = sum(one["seconds"] for one in done)
     error = next((one["error"] for one in done if one["error"] is not None), None)
     if error is not None:
         lane.plan.close()
-        report(Event(lane.name, "failed", lane.stage, seconds, lines, failure=Failure(lane.stage, *error)))
+        report(Event(lane.name, "failed", lane.stage, seconds, lines, times, failure=Failure(lane.stage, *error)))
         return False
     values = [one["value"] for one in done]
-    report(Event(lane.name, "done", lane.stage, seconds, lines, tuple(values)))
+    report(Event(lane.name, "done", lane.stage, seconds, lines, times, tuple(values)))
     return _advance(lane, values, engine, report)

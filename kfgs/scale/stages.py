@@ -19,26 +19,23 @@ from typing import Any
 
 import torch
 
-from .._files import InUseError, digest_value, foreign, read_json, write_json
-from ..evaluation import LabelSet
+from .._files import InUseError, digest_value, foreign, write_json
 from ..features import FeatureFolder, Picture, discard_maps, extract_features, join_features, pictures_of
 from ..fields import SemanticField
-from ..fields.remembered import CLASSES
-from ..labels import load_label_set
 from ..pipeline import fit_scene, segment_scene, true_labels
 from ..pipeline.evaluate import evaluate
 from ..pipeline.train import training_device
-from ..scenes import Scene, SceneError, is_scene, link_images, list_images, load_scene, run_sfm
+from ..scenes import SceneError, link_images, run_sfm
 from ..teachers.load import load_teacher
 from ..teachers.protocol import Teacher, identify
 from .options import BatchOptions, Job
 from .places import WRITER, Place, inside, open_place
+from .scene_parts import class_files, classes_of, counts_alike, load, photos_of, relative, truth_of
 
 PATIENCE = 120  # seconds to wait for a folder in which a process works that was taken for dead
 PROTOCOL = "kfgs-pooled/1"
-TRUTH = ("labels_scored", "labels")
 RESULTS = {"sfm": ("report",), "fit": ("gaussians", "latents"), "evaluate": ("miou",)}
-"""What others read of the results of stages."""
+"""What others read of the results of stages; in addition each has `seconds`, of the work that made it."""
 Report = Callable[[str], None]
 
 _loaded: dict[str, Teacher] = {}
@@ -47,12 +44,17 @@ _loading = threading.Lock()
 
 def find_scene(job: Job, *, report: Report) -> dict[str, Any]:
     """Find the cameras of photos (sfm), and list what is left to do: pictures, keys of the stages, finished stages."""
+    start, earlier = time.perf_counter(), 0.0
     with _work(job) as (source, out):
         listing = source.listing()
         maps = inside("features") if job.options.teacher is not None else inside()
         source.fetch(lambda name: not maps(name))
         keys = {"photos": _key(source.marks((name for name in listing if not maps(name)), listing))}
-        if photos := _photos(source):
+        if photos := photos_of(source):
+            report(
+                f"note: no poses in {job.source}: no COLMAP model and no transforms.json; its cameras are found from the photos "
+                "(sfm). If it had poses before, put them back and start again"
+            )
             config = job.options.sfm_config
             keys["sfm"] = _key(keys["photos"], asdict(config))
             model = "scene/sparse/0"
@@ -60,26 +62,41 @@ def find_scene(job: Job, *, report: Report) -> dict[str, Any]:
                 raise foreign(f"{job.out}/{model}", WRITER)
 
             def make() -> dict[str, Any]:
-                made = run_sfm(source.path / photos, out.path / "scene", config=config, replace=True)
+                with _advice(f"{job.source}/{photos}".removesuffix("/.")):
+                    made = run_sfm(source.path / photos, out.path / "scene", config=config, replace=True)
                 if type(out) is Place:
                     link_images(source.path / photos, out.path / "scene")
                 return {"registered": made.registered, "images": made.total, "report": str(made)}
 
-            report(_stage(out, "sfm", keys["sfm"], ("scene/sparse",), (), make)["report"])
+            cameras = _stage(out, "sfm", keys["sfm"], ("scene/sparse",), (), make)
+            earlier = cameras["seconds"] if cameras["reused"] else 0.0
+            report(cameras["report"])
         out.fetch(inside("scene"))
-        scene = _load(source, out)
+        scene = load(source, out)
         for note in scene.notes:
             report(f"note: {note}")
         views = {name: len(scene.views(name)) for name in ("train", "test") if scene.splits.get(name)}
-        pictures = [[one.stem, _relative(one.path, source)] for one in pictures_of(scene, job.options.fit.split)]
+        pictures = [[one.stem, relative(one.path, source)] for one in pictures_of(scene, job.options.fit.split)]
         return {
             "views": views,
             "pictures": pictures,
             "split": "test" if views.get("test") else job.options.fit.split,
-            "classes": _class_files(job, source) is not None,
-            "labels": _truth(source) is not None and _counts_alike(job, source, report),
+            "classes": class_files(job, source) is not None,
+            "labels": truth_of(source) is not None and counts_alike(job, source, report),
             **_keys_of(job, keys, listing, pictures, source, out),
+            "seconds": earlier + time.perf_counter() - start,
         }
+
+
+@contextmanager
+def _advice(photos: str) -> Iterator[None]:
+    """Say where the options are that sfm's errors name: a batch has none of them."""
+    try:
+        yield
+    except SceneError as error:
+        raise SceneError(
+            f"{error}. Or find the cameras with other options of `kfgs sfm {photos} --out SCENE`, and write SCENE into the list"
+        ) from error
 
 
 def _keys_of(
@@ -92,7 +109,7 @@ def _keys_of(
     else:
         keys["features"] = _key(source.marks(filter(inside("features"), listing), listing))
     keys["fit"] = _key(keys["photos"], keys.get("sfm"), keys["features"], asdict(options.fit), version("kfgs"))
-    words = _class_files(job, source) or []
+    words = class_files(job, source) or []
     table = [[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in words] if options.text else []
     keys["segment"] = _key(keys["fit"], table, options.pictures)
     keys["evaluate"] = _key(keys["fit"], table, PROTOCOL)
@@ -121,14 +138,14 @@ def encode_part(job: Job, pictures: list[list[str]], *, report: Report) -> dict[
         return _stage(out, f"features-{word}", key, files, files, make)
 
 
-def join_parts(job: Job, key: str, stems: list[str], *, report: Report) -> dict[str, Any]:
-    """Join the manifests of all parts."""
+def join_parts(job: Job, key: str, stems: list[str], seconds: float, *, report: Report) -> dict[str, Any]:
+    """Join the manifests of all parts, which took some seconds."""
     with _work(job) as (_, out):
 
         def make() -> dict[str, Any]:
             out.fetch(_is_manifest)
             join_features(out.path / "features", stems)
-            return {"maps": len(stems)}
+            return {"maps": len(stems), "seconds": seconds}
 
         return _stage(out, "features", key, ("features",), (), make)
 
@@ -140,15 +157,16 @@ def fit(job: Job, key: str, *, report: Report) -> dict[str, Any]:
 
         def make() -> dict[str, Any]:
             source.fetch(lambda name: options.teacher is None or not inside("features")(name))
-            scene = _load(source, out)
+            scene = load(source, out)
             folder = (source if options.teacher is None else out).path / "features"
             if not folder.is_dir():
                 raise SceneError(
                     f"{job.source}: expected feature maps in features/, got none; name a teacher (--teacher)"
                 )
             maps = FeatureFolder(folder).of(scene, options.fit.split)
-            found = fit_scene(scene.undistorted(), maps, out.path, options.fit, report=report).field
-            return {"gaussians": len(found), "latents": found.features.shape[1]}
+            made = fit_scene(scene.undistorted(), maps, out.path, options.fit, report=report)
+            earlier = sum(stage.seconds for stage in made.stages if stage.reused)
+            return {"gaussians": len(made.field), "latents": made.field.features.shape[1], "seconds": earlier}
 
         result = _stage(out, "fit", key, ("field",), ("features", "scene", "stages", "field", "color.ply"), make)
         if options.discard_features and options.teacher is not None and (out.path / "features").is_dir():
@@ -163,12 +181,12 @@ def segment(job: Job, key: str, split: str, *, report: Report) -> dict[str, Any]
 
         def make() -> dict[str, Any]:
             source.fetch(lambda name: not inside("features")(name))
-            scene, truth = _load(source, out).undistorted(), _truth(source)
+            scene, truth = load(source, out).undistorted(), truth_of(source)
             known = {} if truth is None else true_labels(scene, truth, split)
             made = segment_scene(
                 SemanticField.load(out.path / "field"),
                 scene,
-                _classes(job, source),
+                classes_of(job, source),
                 out.path / "segmented",
                 split=split,
                 pictures=job.options.pictures,
@@ -185,18 +203,18 @@ def score(job: Job, key: str, *, report: Report) -> dict[str, Any]:
 
         def make() -> dict[str, Any]:
             source.fetch(lambda name: not inside("features")(name))
-            photos = _photos(source)
+            photos = photos_of(source)
             folder, images = (source.path, None) if not photos else (out.path / "scene", source.path / photos)
             found = evaluate(
                 out.path / "field",
                 folder,
                 PROTOCOL,
-                encode=_classes(job, source),
-                truth=_truth(source),
+                encode=classes_of(job, source),
+                truth=truth_of(source),
                 images=images,
                 command=WRITER,
             )
-            write_json(out.path / "scores.json", found.to_json())
+            write_json(out.path / "scores.json", {"scene": job.out.rpartition("/")[2], **found.to_json()})
             report(str(found))
             return {"miou": found.to_json()["scores"]["mIoU"]}
 
@@ -230,6 +248,8 @@ def _finished(out: Place, stage: str, key: str, files: dict[str, Any]) -> dict[s
     result, made = about.get("result"), about.get("files")
     if about.get("key") != key or not isinstance(result, dict) or not isinstance(made, dict):
         return None
+    if not isinstance(result.setdefault("seconds", 0.0), int | float):  # older ones do not say it
+        return None
     whole = all(name in files and files[name][0] == size for name, size in made.items())
     return about if whole and set(RESULTS.get(stage, ())) <= set(result) else None
 
@@ -242,14 +262,19 @@ def _stage(
     needs: Sequence[str],
     make: Callable[[], dict[str, Any]],
 ) -> dict[str, Any]:
-    """A stage's result, found or made; `makes` are its files and folders in the run, `needs` those that it reads."""
+    """A stage's result, found or made; `makes` are its files and folders in the run, `needs` those that it reads.
+
+    `make` returns `seconds` if earlier work is in what it makes.
+    """
     about = _finished(out, stage, key, out.listing())
     if about is not None:
         return {**about["result"], "reused": True}
     out.write_json(_description(stage), {"key": None})  # begun: from now on, its files there are ours
+    start = time.perf_counter()
     out.fetch(inside(*needs))
     result = _patiently(make)
     out.store()
+    result["seconds"] = result.get("seconds", 0.0) + time.perf_counter() - start
     made = inside(*makes)
     files = {name: mark[0] for name, mark in out.listing().items() if made(name)}
     out.write_json(_description(stage), {"key": key, "result": result, "files": files})
@@ -284,62 +309,3 @@ def _teacher(options: BatchOptions) -> Teacher:
 
 def _stamp(path: Path) -> list[int]:
     return [path.stat().st_size, path.stat().st_mtime_ns] if path.is_file() else []
-
-
-def _photos(source: Place) -> str | None:
-    """The folder of photos of a place without poses, as a relative name; None if it has poses."""
-    if not source.path.is_dir():
-        raise FileNotFoundError(f"{source.path}: no such folder; expected a scene or photos there")
-    if is_scene(source.path):
-        return None
-    found = next(
-        (name for name in ("images", ".") if (source.path / name).is_dir() and list_images(source.path / name)), None
-    )
-    if found is None:
-        raise SceneError(
-            f"{source.path}: expected a COLMAP model, a transforms.json, or photos to find their cameras, got none of them; name "
-            "the folder of a scene"
-        )
-    return found
-
-
-def _load(source: Place, out: Place) -> Scene:
-    """The scene, with the cameras that sfm found if it has none of its own."""
-    photos = _photos(source)
-    return load_scene(source.path) if photos is None else load_scene(out.path / "scene", images=source.path / photos)
-
-
-def _relative(path: Path, source: Place) -> str:
-    try:
-        return path.relative_to(source.path).as_posix()
-    except ValueError:  # a transforms.json may name pictures elsewhere on this machine
-        return str(path.absolute())
-
-
-def _truth(source: Place) -> Path | None:
-    return next((source.path / name for name in TRUTH if (source.path / name).is_dir()), None)
-
-
-def _counts_alike(job: Job, source: Place, report: Report) -> bool:
-    """Whether the numbers in true labels mean the classes of the table for all scenes, if there is one."""
-    listed = source.path / "classes.json"
-    if job.text_file is None or (listed.is_file() and tuple(read_json(listed)) == load_label_set(job.text_file).names):
-        return True
-    report(
-        f"note: not scored: the scene's labels count the classes of its classes.json, and {job.text_file} has others"
-    )
-    return False
-
-
-def _class_files(job: Job, source: Place) -> list[Path] | None:
-    """The files of the label set: the table for all scenes, or the scene's own; None if there is none."""
-    if job.text_file is not None:
-        return [job.text_file]
-    choices = ([source.path / name for name in names] for names in CLASSES)
-    return next((files for files in choices if all(file.is_file() for file in files)), None)
-
-
-def _classes(job: Job, source: Place) -> LabelSet:
-    files = _class_files(job, source)
-    assert files is not None
-    return load_label_set(*files)

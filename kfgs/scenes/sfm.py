@@ -278,8 +278,8 @@ class SfmRun:
             if sorted(self.names) == self.names:
                 return colmap.match_sequential, {}
             raise SceneError(
-                f"{self.images}: expected names without blanks, or padded with zeros, for matching='sequential', got "
-                f"{some(self.names, 3)}; rename the images or use matching='exhaustive'"
+                f"{self.images}: expected names without blanks, or padded with zeros, for sequential matching, got "
+                f"{some(self.names, 3)}; rename the images or use --matching exhaustive (in Python: matching='exhaustive')"
             )
         return colmap.match_image_pairs, self._listed(sequential_pairs(self.names))
 
@@ -332,10 +332,14 @@ def _require_one_model(images: Path, sizes: tuple[int, ...], names: list[str], c
         got = f"a scene split into {len(sizes)} unconnected models of {', '.join(map(str, sizes))} images"
     else:
         got = f"{sizes[0] if sizes else 0}"
-    advice = ["use matching='exhaustive'"] if config.matching == "sequential" else []
+    advice = ["use --matching exhaustive (in Python: matching='exhaustive')"] if config.matching == "sequential" else []
     advice += ["take overlapping photos between the parts"]
-    advice += ["pass single_camera=False if sizes or zoom differ"] if config.single_camera else []
+    advice += (
+        ["give --no-single-camera (in Python: single_camera=False) if sizes or zoom differ"]
+        if config.single_camera
+        else []
+    )
     raise SceneError(
         f"{images}: expected at least {needed:.0f} of {len(names)} images registered in one model (min_registered = "
-        f"{config.min_registered:g}), got {got}; {', or '.join(advice)}, or lower min_registered"
+        f"{config.min_registered:g}), got {got}; {', or '.join(advice)}, or lower --min-registered (in Python: min_registered)"
     )

@@ -131,7 +131,9 @@ def test_an_interrupted_addition_leaves_whole_stages_and_goes_on(room, scene, sp
     assert torch.equal(one.field.features, other.field.features)
 
 
-@pytest.mark.parametrize("change", ["seed", "options", "splat", "pose", "map", "sums", "damaged", "many"])
+@pytest.mark.parametrize(
+    "change", ["seed", "options", "splat", "pose", "map", "sums", "damaged", "description", "many"]
+)
 def test_another_fit_is_not_gone_on_from(room, scene, splat, tmp_path, change):
     total = len(scene.views("train"))
     part = fewer(scene, total // 2 - 1 if change == "many" else total - 1)
@@ -162,6 +164,11 @@ def test_another_fit_is_not_gone_on_from(room, scene, splat, tmp_path, change):
     elif change == "damaged":
         with (made / "sums.safetensors").open("ab") as opened:
             opened.write(b"0")
+    elif change == "description":
+        (made / "stage.json").write_text("{")
+        color = tmp_path / "run" / "stages" / "color-0" / "stage.json"
+        color.parent.mkdir()
+        color.write_text("{")
     assert "goes_on" not in fit(folder, now, tmp_path / "run", cloud, config).field.info
 
 

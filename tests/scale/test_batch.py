@@ -225,10 +225,25 @@ def test_photos_get_their_cameras_first(rooms, tmp_path, monkeypatch):
             assert result.failure is None, result.failure.traceback
     assert calls == [("photos", 1, True)]
     run = tmp_path / "runs" / "photos"
+    assert f"note: no poses in {photos}: " in (run / "log.txt").read_text()
     assert (run / "scene" / "images").resolve() == photos
     assert (run / "field" / "field.json").is_file()
     assert not (run / "segmented").exists()  # no classes are known
     assert not table_.exists()
+
+
+def test_an_error_of_sfm_says_where_its_options_are(rooms, tmp_path, monkeypatch):
+    from kfgs.scale import stages
+    from kfgs.scenes import SceneError
+
+    def fails(*_, **__):
+        raise SceneError("expected 6 images, got 2; pass single_camera=False (--no-single-camera)")
+
+    monkeypatch.setattr(stages, "run_sfm", fails)
+    shutil.copytree(rooms[0] / "images", tmp_path / "photos")
+    with ThreadPoolExecutor(1) as pool:
+        failure = run_batch([tmp_path / "photos"], tmp_path / "runs", OPTIONS, client=pool)[0].failure
+    assert f"`kfgs sfm {tmp_path / 'photos'} --out SCENE`" in failure.message
 
 
 def test_a_scene_without_maps_or_teacher_says_what_to_name(rooms, tmp_path):
@@ -287,14 +302,35 @@ def test_the_command_takes_a_list_to_the_end_and_fails_if_a_scene_does(rooms, cl
     assert main(line) == 1
     said = capsys.readouterr()
     assert "kitchen: fit done in " in said.out
+    for stage in ("scene", "features", "fit", "segment", "evaluate"):
+        assert said.out.count(f"kitchen: {stage} started\n") == 1
+    log = (tmp_path / "runs" / "kitchen" / "log.txt").read_text().splitlines()
+    assert [line[20:] for line in log].count("fit: started") == 1
+    times = [line[:19] for line in log if line[20:].startswith("fit: ")]
+    assert times == sorted(times)
+    assert log.index(next(one for one in log if "fit: started" in one)) < log.index(
+        next(one for one in log if "color:" in one)
+    )
+    assert read_json(tmp_path / "runs" / "kitchen" / "scores.json")["scene"] == "kitchen"
+    spent = read_json(tmp_path / "runs" / "kitchen" / "state.json")["seconds"]
     assert "garden: scene failed: " in said.out
     assert "2 scenes: 1 finished, 1 failed, mean mIoU" in said.out
     assert re.search(tells("SCENES", "1 failed (garden)", "log.txt", "--retry-failed"), said.err)
+    assert main(["info", str(tmp_path / "runs")]) == 0
+    told = capsys.readouterr().out
+    assert f"{tmp_path / 'runs'}: a batch" in told
+    assert re.search(r"kitchen +done +done +done +done +done", told)
+    assert re.search(tells("2 scenes: 1 finished, 1 failed", "next: ", "--retry-failed"), told)
     (tmp_path / "scenes.txt").write_text(f"kitchen = {rooms[0]}\n")
     assert main(line) == 0
     said = capsys.readouterr().out
     assert "kitchen: fit" not in said
     assert re.search(r"kitchen +done +found +found +found +found", said)
+    kept = read_json(tmp_path / "runs" / "kitchen" / "state.json")["seconds"]
+    assert {name: kept[name] for name in kept if name != "scene"} == {
+        name: spent[name] for name in spent if name != "scene"
+    }
+    assert kept["fit"] > 0
 
 
 @pytest.mark.parametrize(
@@ -336,7 +372,8 @@ def test_the_table_keeps_to_its_height_and_shows_failures_first():
     assert "1 finished, 1 failed, 1 at work, mean mIoU 0.500 of 1" in text
     assert re.search(r"room3 .* 4\.5 0\.500", table(rows))
     assert event_line(Event("room7", "failed", "fit", failure=failure), rows).startswith("room7: fit failed: no space")
-    assert event_line(Event("room5", "started", "scene"), rows) is None
+    assert event_line(Event("room5", "started", "scene"), rows) == "room5: scene started"
+    assert event_line(Event("room5", "finished"), rows) is None
 
 
 def test_jobs_of_slurm(tmp_path, monkeypatch):
@@ -371,3 +408,15 @@ def test_ctrl_c_in_a_terminal_does_not_reach_the_workers(client):
         return signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
     assert client.submit(ignored).result(timeout=100)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc")
+def test_workers_say_nothing_when_they_are_asked_to_end(client):
+    def caught():  # in a thread of the worker, as tasks are
+        from kfgs.scenes.pycolmap_import import import_pycolmap
+
+        import_pycolmap()
+        status = Path("/proc/self/status").read_text()
+        return int(status.partition("SigCgt:")[2].split()[0], 16) >> (signal.SIGTERM - 1) & 1
+
+    assert client.submit(caught).result(timeout=100) == 0

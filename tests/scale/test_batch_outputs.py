@@ -153,7 +153,7 @@ def test_another_share_goes_on_where_a_killed_batch_stopped(tmp_path, kind):
         "features: 3 maps found, 0 to make",
         "features: 1 maps found, 1 to make",
     ]
-    assert stages.join_parts(job, "key", list(names), report=print)["maps"] == 5
+    assert stages.join_parts(job, "key", list(names), 0.0, report=print)["maps"] == 5
     with open_place(out) as place:
         assert sorted(name for name in place.listing() if name.startswith("features/")) == [
             *(f"features/{name}.npy" for name in names),
@@ -224,7 +224,9 @@ def test_a_damaged_note_of_a_finished_stage_counts_as_not_done(tmp_path, damage)
         return {"gaussians": 7, "latents": 3}
 
     def stage():
-        return stages._stage(place, "fit", "key", ("field",), (), make)
+        found = stages._stage(place, "fit", "key", ("field",), (), make)
+        assert found.pop("seconds") > 0
+        return found
 
     first, again = stage(), stage()
     assert (first["reused"], again, made) == (False, first | {"reused": True}, [0])
