@@ -76,7 +76,7 @@ class Views:
         notes = loaded.notes
         if self.split == "all" and "all" not in loaded.splits:
             rule = f"split all: all {len(loaded)} views"
-            notes = [rule if note.startswith("split ") else note for note in notes]
+            notes = tuple(rule if note.startswith("split ") else note for note in notes)
         for note in notes:
             say(f"note: {note}")
         return loaded
