@@ -19,26 +19,38 @@ from sphinx.application import Sphinx
 plain: dict[str, list[str]] = {}  # texts of attributes, as they are written
 
 
-def shapes_of(function: Any) -> dict[str, str]:
-    """The comments of a function's arguments, by name; `return` is what the result's says."""
+def shapes_of(function: Any) -> list[str]:
+    """What the comments of a function's arguments and of its result say, in the order of its lines."""
     try:
         source = textwrap.dedent(inspect.getsource(function))
     except (OSError, TypeError):
-        return {}
+        return []
     tree = ast.parse(source).body[0]
     if not isinstance(tree, ast.FunctionDef):
-        return {}
+        return []
     last = tree.body[0].lineno
     lines = {}
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT and token.start[0] < last:
             lines[token.start[0]] = token.string.lstrip("# ")
     arguments = [*tree.args.posonlyargs, *tree.args.args, *tree.args.kwonlyargs]
-    found = {one.arg: lines[one.lineno] for one in arguments if one.lineno in lines}
     end = tree.returns.end_lineno if tree.returns else None
-    if end in lines and end not in {one.lineno for one in arguments}:
-        found["return"] = lines[end]
-    return {name: text for name, text in found.items() if not text.startswith(("noqa", "type:"))}
+    gives = ast.unparse(tree.returns) if tree.returns else ""
+    told = []
+    for number, text in lines.items():
+        names = [one.arg for one in arguments if one.lineno == number and one.arg not in ("self", "cls")]
+        named = re.match(r"(\w+): (.*)", text)
+        if text.startswith(("noqa", "type:")):
+            continue
+        if named:  # "points: [N, 3]"
+            told.append(f"``{named[1]}`` {named[2]}")
+        elif number == end and "->" in text:  # "[N, 3] -> [N] bool", of all that is on the line
+            told.append(re.sub(r"^->", "returns", text))
+        elif number == end and (not names or re.search("Tensor|Array|ndarray", gives)):
+            told.append(f"returns {text}")
+        elif len(names) == 1:
+            told.append(f"``{names[0]}`` {text}")
+    return told
 
 
 def add_shapes(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
@@ -52,9 +64,8 @@ def add_shapes(app: Sphinx, what: str, name: str, thing: Any, options: Any, line
         return
     shapes = shapes_of(inspect.unwrap(thing))
     if shapes:
-        told = [f"``{key}`` {text}" if key != "return" else f"returns {text}" for key, text in shapes.items()]
         at = lines.index("") if "" in lines else len(lines)
-        lines[at:at] = ["", "*Shapes:* " + "; ".join(told).replace("\\", "\\\\") + "."]
+        lines[at:at] = ["", "*Shapes:* " + "; ".join(shapes).replace("\\", "\\\\") + "."]
 
 
 def keep_plain(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
