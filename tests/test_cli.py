@@ -133,7 +133,7 @@ def test_a_single_query_reports_its_threshold(run, room, tmp_path, capsys):
     assert "above gamma = " in capsys.readouterr().out
     labels = read_ply(tmp_path / "gaussians.ply")["class_id"]
     names = json.loads((tmp_path / "gaussians.ply.classes.json").read_text())["class_id"]
-    assert {names[str(label)] for label in labels if label >= 0} == {"chair"}
+    assert {names[str(int(label))] for label in labels if label >= 0} == {"chair"}
     assert (labels == -1).any()
 
 
@@ -149,7 +149,7 @@ def test_a_single_query_reports_its_threshold(run, room, tmp_path, capsys):
             ["fit", "{room}", "--features", "{tmp}/nothing", "--out", "{tmp}/o"],
             ("--features:", "got {tmp}/nothing", "`kfgs features`"),
         ),
-        (["fit", "{room}", "--features", "{tmp}", "--out", "{tmp}/o"], ("{tmp}:", "6 missing: view_000_fmap_CxHxW.pt")),
+        (["fit", "{room}", "--features", "{tmp}", "--out", "{tmp}/o"], ("{tmp}:", "6 missing: view_000.npy")),
         (["fit", "{tmp}", "--features", "{room}/features", "--out", "{tmp}/o"], ("{tmp}:", "COLMAP", "`kfgs sfm")),
         (
             ["fit", "{room}", "--features", "{room}/features", "--out", "{tmp}/o", "--split", "val"],

@@ -147,11 +147,11 @@ def test_pictures_elsewhere_are_known_from_what_the_field_remembers(desk, tmp_pa
     scene, photos = tmp_path / "scene", tmp_path / "photos"
     scene.mkdir()
     shutil.copytree(desk["scene"] / "images", photos)
-    rows = ["w", "h", "fl_x"]
+    size = {"w": 80, "h": 60, "fl_x": 80}
     frames = [
         {"file_path": f"../photos/{path.name}", "transform_matrix": np.eye(4).tolist()} for path in photos.iterdir()
     ]
-    (scene / "transforms.json").write_text(json.dumps({**dict.fromkeys(rows, 80), "frames": frames}))
+    (scene / "transforms.json").write_text(json.dumps({**size, "frames": frames}))
     field = dataclasses.replace(SemanticField.load(desk["run"] / "field"), words=None)
     for place in (tmp_path / "run" / "field", tmp_path / "a.kfgs.safetensors"):
         about = {name: value for name, value in field.info.items() if name not in ("scene", "classes")}
