@@ -340,7 +340,7 @@ def _color_stage(
             max_points=config.max_points,
             generator=generator,
         )
-        cameras = [_training_camera(scene.cameras[i], config.picture_scale) for i in views]
+        cameras = training_cameras(scene, views, config.picture_scale)
         return fit_field(
             start.map(lambda value: value.to(device)),
             cameras,
@@ -355,5 +355,9 @@ def _color_stage(
     return field_stage(run, "color", inputs, train)[0]
 
 
-def _training_camera(camera: Camera, scale: float) -> Camera:
-    return camera.resized(*(max(1, round(n * scale)) for n in camera.size)) if scale != 1 else camera
+def training_cameras(scene: Scene, views: Sequence[int], scale: float) -> list[Camera]:
+    """The cameras of these views, with pictures made smaller by `scale`."""
+    cameras = [scene.cameras[i] for i in views]
+    if scale == 1:
+        return cameras
+    return [camera.resized(*(max(1, round(n * scale)) for n in camera.size)) for camera in cameras]

@@ -21,7 +21,7 @@ from ..features import FeatureFolder, Picture, extract_features
 from ..fields import FieldConfig, GaussianParams
 from ..scenes import Scene
 from ..teachers import CallableTeacher, LSeg, LSegOptions, Teacher, as_teacher
-from .color import fit_color
+from .color import Photos, fit_color, training_cameras
 from .config import FitConfig
 from .fit import fit_scene
 from .maps import ChosenMaps
@@ -96,14 +96,30 @@ def _one_run(teacher: Teacher, picture: Picture) -> tuple[Teacher, int]:
 
 
 def time_color(scene: Scene, config: FitConfig, gaussians: int) -> dict[str, Timing]:
-    """Time the stage `color`, with this number of Gaussians from the start."""
+    """Time the stage `color`, with this number of Gaussians from the start.
+
+    Each picture is read once, at its first step. A trial of few steps would count that for every step, so it is timed alone.
+    """
+    chosen = scene.views(config.split)
+    read = _time_reading(scene, chosen[:1], config)
 
     def make(views: int, steps: int, folder: Path, report: Callable[[str], None]) -> list[Stage]:
         few = few_views(scene, config.split, views, gaussians)
         color = replace(config.color, split=config.split, max_points=None, field=_shortened(config.color.field, steps))
-        return fit_color(few, folder, color, device=config.device, report=report).stages
+        [stage] = fit_color(few, folder, color, device=config.device, report=report).stages
+        return [replace(stage, seconds=max(stage.seconds - read * min(views, steps), NOISE * stage.seconds))]
 
-    return _time_twice(make, len(scene.views(config.split)), {"color"})
+    found = _time_twice(make, len(chosen), {"color"})
+    return {name: replace(one, fixed=one.fixed + read * len(chosen)) for name, one in found.items()}
+
+
+def _time_reading(scene: Scene, views: list[int], config: FitConfig) -> float:
+    """Seconds to read the first of these pictures at its training size, when the code has run before."""
+    cameras = training_cameras(scene, views, config.color.picture_scale)
+    for _ in range(2):
+        start = time.perf_counter()
+        Photos(scene, views, cameras)[0]
+    return time.perf_counter() - start
 
 
 def time_fit(scene: Scene, maps: FeatureFolder, config: FitConfig, gaussians: int) -> dict[str, Timing]:

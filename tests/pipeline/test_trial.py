@@ -9,8 +9,9 @@ import torch
 from small_room import make_room
 
 from kfgs.features import FeatureFolder, pictures_of
+from kfgs.pipeline import FitConfig
 from kfgs.pipeline.stages import Stage
-from kfgs.pipeline.trial import Timing, _time_twice, disk_free, few_views, memory_free, time_picture
+from kfgs.pipeline.trial import Timing, _time_twice, disk_free, few_views, memory_free, time_color, time_picture
 from kfgs.scenes import load_scene
 from kfgs.teachers import LSeg, LSegConfig, LSegOptions
 from kfgs.teachers.lseg.network import LSegNetwork
@@ -38,6 +39,22 @@ def test_two_runs_give_a_line():
     only = _time_twice(make, 1, {"field"})
     assert only["index_maps"].seconds(1) == pytest.approx(3.5)
     assert Timing(1, 2).seconds(3) == 7
+
+
+def test_reading_a_picture_is_counted_once_per_view_not_per_step(scene, monkeypatch):
+    """Large photos took 1.3 s to read and 0.06 s a step: a plan of 13 minutes for a fit of 50 s."""
+
+    class Colors:
+        def __init__(self, few, folder, config, *, device, report):
+            steps = config.field.steps
+            seconds = 2 + 1.3 * min(len(few), steps) + 0.06 * steps
+            self.stages = [Stage("color", "", folder, seconds, False)]
+
+    monkeypatch.setattr("kfgs.pipeline.trial.fit_color", Colors)
+    monkeypatch.setattr("kfgs.pipeline.trial._time_reading", lambda *_: 1.3)
+    found = time_color(scene, FitConfig(), 100)["color"]
+    assert found.each == pytest.approx(0.06)
+    assert found.seconds(600) == pytest.approx(2 + 6 * 1.3 + 0.06 * 600)
 
 
 def test_few_views_have_as_many_points_as_asked_for(scene):
