@@ -1,7 +1,7 @@
 # %% [markdown]
 # # 10. Meshes and point clouds
 #
-# How do I use the classes of a field outside of kfgs: in trimesh, Open3D or pyvista, and on a mesh of the same room? You will
+# **How do I use the classes of a field outside of kfgs: in trimesh, Open3D or pyvista, and on a mesh of the same room?** You will
 # see the chairs as a point cloud of trimesh, the classes carried to a mesh, the area and the volume of each class beside
 # the true ones, and files for Blender.
 #
@@ -104,7 +104,7 @@ print(labelled.transfer)
 # %% [markdown]
 # The result holds arrays; they can be hung on a mesh of any library. Here pyvista draws it, without the walls and the ceiling.
 
-# %%
+# %% tags=["thumbnail"]
 surface = pv.wrap(fine)
 surface.cell_data["rgb"] = viz.palette(labelled.face_labels, classes.names)
 hidden = [-1, *(classes.index(name) for name in shell if classes.knows(name))]

@@ -46,7 +46,7 @@ Image.fromarray(viz.picture_grid([shown[:4], shown[4:]], width=256))
 # Structure from motion leaves some points far outside of the scene. `robust_bounds` finds the bulk of them. The highest
 # fifth is left out too, to look into the room.
 
-# %%
+# %% tags=["thumbnail"]
 from kfgs.cameras import Orbit, estimate_up, orbit_cameras
 from kfgs.scenes import robust_bounds
 

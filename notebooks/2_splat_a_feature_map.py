@@ -116,7 +116,7 @@ Image.fromarray(viz.picture_grid([[*steps, opacity]], ["the nearest", "two", "th
 # them as colours, with one projection for the whole scene: equal features have equal colours in every view. The edges
 # are blurred, surfaces are noisy, and some patches are wrong. It is a simulated teacher, with the faults of real ones.
 
-# %%
+# %% tags=["thumbnail"]
 from kfgs.quant import sample_grid
 
 colors = viz.FeatureColors.fit(torch.cat([sample_grid(maps[i], samples=500) for i in range(len(maps))]))

@@ -88,7 +88,7 @@ Shown(pictures / "codebook.png", width=900)
 # codewords that stand for it in the same colours, then the class of each codeword. The noise is gone and the borders are
 # kept. Patches where the teacher is wrong are kept as well, because no view was compared with another one yet.
 
-# %%
+# %% tags=["thumbnail"]
 import torch
 from PIL import Image
 

@@ -97,7 +97,7 @@ Image.fromarray(viz.picture_grid([row], ("photograph", "colour field", "field's 
 # texts $t_c$ its feature is similar to, $\cos(f_i, t_c)$. A pixel blends the votes of its Gaussians like colours, and the
 # largest sum wins. `segment_scene` does so for all unseen views, and draws sheets that compare truth, teacher and field.
 
-# %%
+# %% tags=["thumbnail"]
 truth = true_labels(scene, labels, "test")
 found = kfgs.segment_scene(field, scene, classes, run / "segmentation", truth=truth, maps=features)
 sheet = Image.open(run / "segmentation" / "sheets" / f"{scene.stem(test[-1])}.png").convert("RGB")

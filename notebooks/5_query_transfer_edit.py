@@ -80,7 +80,7 @@ Shown(out / "scores.png", width=560)
 # `connected_parts` takes a selection apart into things: each has a box, a size, and the view that shows it best. Parts that
 # are nearer than `distance` (0.15 m here) are one thing. Walls and ceiling are left out, to look into the room.
 
-# %%
+# %% tags=["thumbnail"]
 cameras = [scene.cameras[i] for i in scene.views("train")]
 things = kfgs.connected_parts(field.gaussians, found["relevancy"], cameras, distance=0.15)
 for number, one in enumerate(things, start=1):

@@ -95,7 +95,7 @@ Image.fromarray(viz.picture_grid([row], ["latents", f"score of {word}", "colours
 #
 # Any camera will do. Here it flies around the room, whose walls and ceiling are left out.
 
-# %%
+# %% tags=["thumbnail"]
 hidden = torch.tensor([-1, *(classes.index(name) for name in shell if classes.knows(name))])
 inside = semantic.select(~torch.isin(semantic.labels, hidden))
 orbit = Orbit(frames=8, size=(420, 640), elevation_degrees=40, zoom=1.3)

@@ -155,7 +155,7 @@ print(field.summary())
 # question. This teacher knows only colours: a
 # wooden floor is brown like a chair.
 
-# %%
+# %% tags=["thumbnail"]
 classes = kfgs.make_label_set(teacher, phrases, templates=None, negatives=None)
 found = field.query(question, classes)
 for thing in kfgs.connected_parts(field.gaussians, found, [scene.cameras[i] for i in train]):

@@ -94,7 +94,7 @@ print(report.about)
 # Mistakes are orange, and their share is written above them. The teacher's are whole patches, in other places in every view.
 # A method that compresses each map, before views are compared, keeps some of them. The fused field has outvoted most.
 
-# %%
+# %% tags=["thumbnail"]
 compared.write(out, question, classes, count=2)
 view = question.scored[-1].stem
 Shown(out / f"{view}.png", width=1000)

@@ -55,7 +55,7 @@ print(field)
 #
 # The examples in their pictures. A few are enough: the field has seen each thing from many sides already.
 
-# %%
+# %% tags=["thumbnail"]
 index = {scene.cameras[i].name: i for i in scene.views("train")}
 marked = {}
 for number, shown in enumerate(examples.values()):

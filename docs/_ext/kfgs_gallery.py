@@ -1,13 +1,21 @@
-"""The gallery: shows every .ipynb of `notebooks/`, with the outputs that are in the file; without any, it says so."""
+"""The gallery: every .ipynb of `notebooks/` as a page with the outputs that are in the file, and a card with a picture for each.
+
+The picture is that of the cell with the tag `thumbnail`, or else the last one. The text is the first bold sentence.
+"""
 
 from __future__ import annotations
 
+import base64
+import json
+import re
 from pathlib import Path
+from typing import Any
 
 from sphinx.application import Sphinx
 
 PAGES = Path(__file__).resolve().parents[1] / "gallery"
 NOTEBOOKS = PAGES.parents[1] / "notebooks"
+SUFFIXES = {"image/jpeg": ".jpg", "image/png": ".png"}
 NONE = """```{note}
 No executed notebook lies in `notebooks/` of this checkout. `python notebooks/run.py` runs them all.
 ```
@@ -18,18 +26,40 @@ def bring(notebooks: Path, pages: Path) -> list[str]:
     """Copy the notebooks to where Sphinx reads, write the list of them, and return their names."""
     paths = sorted(notebooks.glob("[0-9]*_*.ipynb"), key=lambda path: int(path.name.split("_")[0]))
     found = {path.name: path.read_bytes() for path in paths}
-    for old in pages.glob("*.ipynb"):
+    cards = []
+    for path in paths:
+        card, picture = _card(path.stem, json.loads(found[path.name]))
+        cards.append(card)
+        found |= picture
+    for old in [*pages.glob("*.ipynb"), *pages.glob("card_*")]:
         if old.name not in found:
             old.unlink()
-    for name, content in found.items():
+    names = [path.stem for path in paths]
+    hidden = "```{toctree}\n:hidden:\n\n" + "\n".join(names) + "\n```\n"
+    listed = "::::{grid} 1 2 2 3\n:gutter: 3\n\n" + "\n".join(cards) + "::::\n\n" + hidden if names else NONE
+    for name, content in {**found, "list.inc": listed.encode()}.items():
         if not (pages / name).is_file() or (pages / name).read_bytes() != content:  # else Sphinx reads it again
             (pages / name).write_bytes(content)
-    names = [name.removesuffix(".ipynb") for name in found]
-    listed = "```{toctree}\n:maxdepth: 1\n\n" + "\n".join(names) + "\n```\n" if names else NONE
-    place = pages / "list.inc"
-    if not place.is_file() or place.read_text(encoding="utf-8") != listed:
-        place.write_text(listed, encoding="utf-8")
     return names
+
+
+def _card(name: str, notebook: dict[str, Any]) -> tuple[str, dict[str, bytes]]:
+    """A card as Markdown, and its picture as a file; no file if the notebook shows no picture."""
+    texts = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "markdown"]
+    title = next((line[2:] for text in texts for line in text.splitlines() if line.startswith("# ")), name)
+    question = next((found[1] for text in texts if (found := re.search(r"\*\*(.+?)\*\*", text, re.DOTALL))), "")
+    shown = [
+        (cell["metadata"].get("tags", []), f"card_{name}{SUFFIXES[kind]}", data[kind])
+        for cell in notebook["cells"]
+        for data in (output.get("data", {}) for output in cell.get("outputs", []))
+        for kind in SUFFIXES
+        if kind in data
+    ]
+    chosen = [one for one in shown if "thumbnail" in one[0]] or shown
+    lines = [f":::{{grid-item-card}} {title}", f":link: {name}", ":link-type: doc"]
+    picture = {chosen[-1][1]: base64.b64decode("".join(chosen[-1][2]))} if chosen else {}
+    lines += [f":img-top: {file}" for file in picture]
+    return "\n".join([*lines, "", " ".join(question.split()), ":::", ""]), picture
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

@@ -1,7 +1,9 @@
 """What the site adds to Sphinx (docs/_ext): commands, shapes, notebooks, and the check that nothing is loaded from elsewhere."""
 
+import base64
 import importlib
 import inspect
+import json
 import sys
 from pathlib import Path
 
@@ -91,6 +93,15 @@ def test_a_comment_beside_a_whole_signature_is_not_given_to_each_argument():
     assert shapes(kfgs.labels.OrientedBox.around) == ["``points`` [N, 3]"]
 
 
+def notebook_of(title, *pictures, tagged=None):
+    cells = [{"cell_type": "markdown", "metadata": {}, "source": [f"# {title}\n", "\n", "**What is\n", "it?** More."]}]
+    for picture in pictures:
+        tags = {"tags": ["thumbnail"]} if picture == tagged else {}
+        data = {"image/png": base64.b64encode(picture).decode(), "text/plain": "<Image>"}
+        cells.append({"cell_type": "code", "metadata": tags, "source": "x", "outputs": [{"data": data}]})
+    return json.dumps({"cells": cells})
+
+
 def test_notebooks_come_into_the_gallery_and_go_with_their_file(tmp_path):
     bring = load("kfgs_gallery").bring
     notebooks, pages = tmp_path / "notebooks", tmp_path / "gallery"
@@ -98,13 +109,17 @@ def test_notebooks_come_into_the_gallery_and_go_with_their_file(tmp_path):
     pages.mkdir()
     assert bring(notebooks, pages) == []
     assert "{note}" in (pages / "list.inc").read_text()
-    (notebooks / "2_b.ipynb").write_text("{}")
-    (notebooks / "1_a.ipynb").write_text("[]")
+    (notebooks / "2_b.ipynb").write_text(notebook_of("2. B", b"one", b"two", b"three", tagged=b"two"))
+    (notebooks / "1_a.ipynb").write_text(notebook_of("1. A", b"one", b"two"))
     assert bring(notebooks, pages) == ["1_a", "2_b"]
-    assert (pages / "list.inc").read_text().splitlines()[3:5] == ["1_a", "2_b"]
-    (notebooks / "10_c.ipynb").write_text("{}")
+    listed = (pages / "list.inc").read_text()
+    assert listed.index(":::{grid-item-card} 1. A\n") < listed.index(":::{grid-item-card} 2. B\n")
+    assert ":link: 2_b\n:link-type: doc\n:img-top: card_2_b.png\n\nWhat is it?\n:::" in listed
+    assert "\n1_a\n2_b\n```" in listed
+    assert (pages / "card_1_a.png").read_bytes() == (pages / "card_2_b.png").read_bytes() == b"two"
+    (notebooks / "10_c.ipynb").write_text(notebook_of("10. C"))
     assert bring(notebooks, pages) == ["1_a", "2_b", "10_c"]
     (notebooks / "10_c.ipynb").unlink()
     (notebooks / "1_a.ipynb").unlink()
     assert bring(notebooks, pages) == ["2_b"]
-    assert sorted(path.name for path in pages.glob("*.ipynb")) == ["2_b.ipynb"]
+    assert sorted(path.name for path in pages.iterdir()) == ["2_b.ipynb", "card_2_b.png", "list.inc"]
