@@ -102,7 +102,7 @@ print(labelled)
 print(labelled.transfer)
 
 # %% [markdown]
-# The result holds arrays; they can be hung on a mesh of any library. Here pyvista draws it, without the walls and the ceiling.
+# The result holds arrays; they can be attached to a mesh of any library. Here pyvista draws it, without walls and ceiling.
 
 # %% tags=["thumbnail"]
 surface = pv.wrap(fine)

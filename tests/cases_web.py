@@ -102,11 +102,12 @@ class Viewer:
 
 
 @contextmanager
-def software_chromium():
+def software_chromium(*more):
+    """A browser that draws without a GPU; `more` are further options of its command line."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
+        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=[*SOFTWARE, *more])
         yield opened
         opened.close()
 

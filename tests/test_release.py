@@ -4,6 +4,8 @@ import re
 import tomllib
 from pathlib import Path
 
+import pytest
+
 import kfgs
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -13,9 +15,14 @@ def test_the_version_stands_in_one_place():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     assert "version" not in project["project"]
     assert project["tool"]["hatch"]["version"]["path"] == "kfgs/__init__.py"
-    cited = re.search(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.M)
-    assert cited is not None
-    assert cited[1] == kfgs.__version__
+
+
+@pytest.mark.parametrize(
+    ("file", "line"),
+    [("CITATION.cff", r"^version: (.+)$"), ("docs/citing.md", r"^  version = \{(.+)\},$")],
+)
+def test_files_that_repeat_the_version_have_the_same(file, line):
+    assert re.findall(line, (ROOT / file).read_text(encoding="utf-8"), re.M) == [kfgs.__version__]
 
 
 def test_the_changelog_has_a_section_for_the_version():

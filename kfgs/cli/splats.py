@@ -166,11 +166,13 @@ def convert(source: Positional[Path], target: Positional[Path], *, plain: Flag =
     Examples:
         kfgs convert edited.ply edited.spz
         kfgs convert scene.ksplat scene.ply
+        kfgs convert output/ scene.ply    # the newest splat of 3DGS, gsplat or nerfstudio
         kfgs convert labelled.ply for_unity.ply --plain
         kfgs convert labelled.ply objects/ --by-class
 
     Args:
-        source: A .ply (3DGS, or SuperSplat's compressed), .splat, .ksplat, .spz, .sog, .glb or .gltf file.
+        source: A .ply (3DGS, or SuperSplat's compressed), .splat, .ksplat, .spz, .sog, .glb or .gltf file; a checkpoint of
+            gsplat (.pt) or nerfstudio (.ckpt); or the output folder of 3DGS, gsplat or nerfstudio, whose newest splat is read.
         target: The file to write; its ending chooses the format (.ply, .compressed.ply, .splat, .spz, .sog, .glb, .gltf).
         plain: Write a .ply with exactly the properties of Inria's 3DGS, for importers that fail on others. The classes go to
             a file beside it, which kfgs finds again.
