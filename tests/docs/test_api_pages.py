@@ -2,12 +2,17 @@
 
 import ast
 import doctest
+import importlib
+import inspect
 import re
 import shutil
+from functools import cache
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from small_room import make_desk
+from test_public import PACKAGES
 
 import kfgs
 from kfgs.viz import available
@@ -44,15 +49,107 @@ def desk(tmp_path_factory):
     return make_desk(tmp_path_factory.mktemp("desk"))
 
 
+@cache
+def entries():
+    """The entries of all pages: full name to page."""
+    found = {}
+    for topic in TOPICS:
+        text = (PAGES / f"{topic}.md").read_text(encoding="utf-8")
+        for name in re.findall(r"^\.\. (?:auto\w+|py:data):: (kfgs\.[\w.]+)$", text, re.M):
+            assert name not in found, f"{name} is on two pages: {topic} and {found[name]}"
+            found[name] = topic
+    return found
+
+
+def value_of(name):
+    """The object of a full name; of two things with one name, a module and what the package exports, the latter."""
+    module, _, last = name.rpartition(".")
+    return getattr(importlib.import_module(module), last)
+
+
+def entry_of(name):
+    """The entry of a public name, which may be that of the same object in another package: `kfgs.labels.Remove`."""
+    if name in entries():
+        return name
+    value, last = value_of(name), name.rpartition(".")[2]
+    same = [one for one in entries() if one.endswith(f".{last}") and value_of(one) is value]
+    return same[0] if same else None
+
+
+def has_example(entry):
+    """Whether the page uses a name in its examples, or its docstring has one."""
+    return entry.rpartition(".")[2] in words_of(entries()[entry]) or ">>>" in (inspect.getdoc(value_of(entry)) or "")
+
+
 @pytest.mark.parametrize("name", kfgs.__all__)
-def test_every_public_name_is_on_a_page_and_in_an_example_of_that_page(name):
-    pages = [
-        topic
-        for topic in TOPICS
-        if re.search(rf"^\.\. auto\w+:: kfgs\.{name}$", (PAGES / f"{topic}.md").read_text(), re.M)
-    ]
-    assert len(pages) == 1
-    assert name in words_of(pages[0])
+def test_every_name_of_kfgs_is_on_a_page_and_in_an_example_of_that_page(name):
+    assert f"kfgs.{name}" in entries()
+    assert name in words_of(entries()[f"kfgs.{name}"])
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_name_of_a_public_package_is_on_a_page(package):
+    names = importlib.import_module(package).__all__
+    assert [name for name in names if entry_of(f"{package}.{name}") is None] == []
+
+
+def test_an_entry_is_public_and_the_index_lists_its_package():
+    index = (PAGES / "index.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"`(kfgs\.[\w.]+)`", index.split("Everything else")[0])) == set(PACKAGES)
+    for name in entries():
+        package, _, last = name.rpartition(".")
+        assert package in ("kfgs", *PACKAGES), name
+        assert last in importlib.import_module(package).__all__, name
+
+
+def read_code(path):
+    """The Python of a script, or of the blocks of a page."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".py":
+        return [text]
+    blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    sessions = re.findall(r"```pycon\n(.*?)```", text, re.DOTALL)
+    return blocks + ["".join(one.source for one in doctest.DocTestParser().get_examples(code)) for code in sessions]
+
+
+def names_of_kfgs(tree):
+    """What some code takes from kfgs, by full name: by imports, and as an attribute of what it imported."""
+    known = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            known |= {one.asname or one.name: one.name for one in node.names if re.match(r"kfgs\b", one.name)}
+        elif isinstance(node, ast.ImportFrom) and re.match(r"kfgs\b", node.module or ""):
+            known |= {one.asname or one.name: f"{node.module}.{one.name}" for one in node.names}
+    used = {
+        f"{known[node.value.id]}.{node.attr}"
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in known
+    }
+    modules = {name for name in known.values() if name == "kfgs" or isinstance(value_of(name), ModuleType)}
+    return (set(known.values()) - modules) | {name for name in used if name.rpartition(".")[0] in modules}
+
+
+ROOT = PAGES.parents[1]
+READ = [ROOT / "README.md", *sorted(PAGES.parent.rglob("*.md")), *sorted((ROOT / "notebooks").glob("*_*.py"))]
+READ = [path for path in READ if path.is_file() and any("kfgs" in code for code in read_code(path))]
+
+
+@pytest.mark.parametrize("path", READ, ids=lambda path: str(path.relative_to(ROOT)))
+def test_what_users_are_shown_to_import_is_on_a_page_with_an_example(path):
+    names = set().union(*(names_of_kfgs(ast.parse(code)) for code in read_code(path)))
+    assert names
+    for name in sorted(names):
+        assert name.rpartition(".")[0] in ("kfgs", *PACKAGES), f"{name}: import it from its package"
+        entry = entry_of(name)
+        assert entry is not None, f"{name}: no entry on an API page"
+        assert has_example(entry), f"{name}: no example"
+
+
+def test_names_are_read_from_imports_and_attributes():
+    code = (
+        "import kfgs\nfrom kfgs import viz, attach\nfrom kfgs.labels import InBox as Box\nviz.palette()\nkfgs.uplift.x"
+    )
+    assert names_of_kfgs(ast.parse(code)) == {"kfgs.attach", "kfgs.labels.InBox", "kfgs.viz.palette", "kfgs.uplift"}
 
 
 @pytest.mark.parametrize("topic", TOPICS)
