@@ -106,7 +106,9 @@ def keep_plain(app: Sphinx, what: str, name: str, thing: Any, options: Any, line
 
 
 def short_defaults(app: Sphinx, what: str, name: str, thing: Any, options: Any, sign: str | None, back: Any) -> Any:
-    """Write `...` for a default that is made by a function: what stands there is not Python."""
+    """Write `...` for a default that is made by a function: what stands there is not Python. A protocol has no arguments."""
+    if what == "class" and getattr(thing, "_is_protocol", False):
+        return ("", back)
     return (sign.replace("<factory>", "..."), back) if sign else None
 
 

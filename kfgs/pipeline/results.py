@@ -80,7 +80,7 @@ class Results:
     """The second files of results of other programs."""
 
     @staticmethod
-    def read(paths: Sequence[Path], with_file: Sequence[str] = ()) -> Results:
+    def read(paths: Sequence[str | Path], with_file: Sequence[str] = ()) -> Results:
         """Read the JSON files among some results, and find which result each second file belongs to.
 
         Args:
@@ -91,7 +91,7 @@ class Results:
             FileNotFoundError: if a JSON file is missing.
             ValueError: if one has another content, or it is unclear which result a file belongs to.
         """
-        each = tuple(dict.fromkeys(paths))
+        each = tuple(dict.fromkeys(as_path(path) for path in paths))
         kept = {path: _read_kept(path) for path in each if path.suffix == ".json"}
         return Results(each, kept, _second_files([path for path in each if path not in kept], with_file))
 
