@@ -89,7 +89,7 @@ def add_shapes(app: Sphinx, what: str, name: str, thing: Any, options: Any, line
         if not line.lstrip().startswith((">>>", "...")):
             line = re.sub(r"(?<!`)`(~[^`]*)`(?!`)", r"``\1``", line)
             lines[number] = re.sub(r"(`[^`]*`)|\|", lambda found: found[1] or r"\|", line)
-    if what == "attribute":
+    if what == "attribute" or (what == "property" and "" not in lines[:-1]):  # a property may have sections
         plain[name] = list(lines)
     if what not in ("function", "method"):
         return
@@ -101,7 +101,7 @@ def add_shapes(app: Sphinx, what: str, name: str, thing: Any, options: Any, line
 
 def keep_plain(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
     """Undo what napoleon makes of an attribute's text: it takes the words before a colon for a type."""
-    if what == "attribute":
+    if what in ("attribute", "property"):
         lines[:] = plain.pop(name, lines)
 
 
