@@ -61,7 +61,7 @@ To run a row again, make what all rows share, once; then type the command beside
 
 ```bash
 pip install -c constraints.txt torch==2.13.0 -e ".[test]" onnx                    # in a clone of this repository
-python -c "from kfgs.toy.room_folder import make_toy_room; make_toy_room('TOY')"  # the toy room
+python -c "from kfgs import make_toy_room; make_toy_room('TOY')"  # the toy room
 kfgs color TOY --out COLOR
 
 python benchmarks/real_teacher.py fetch WEIGHTS                                   # room_0, if you have it

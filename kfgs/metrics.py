@@ -18,6 +18,17 @@ from ._check import as_tensor, check_range, check_shapes
 from ._rows import unit_rows
 from .cameras.resample import to_bchw
 
+__all__ = [
+    "MIB",
+    "ConfusionMatrix",
+    "Score",
+    "confusion_matrix",
+    "feature_cosine",
+    "psnr",
+    "semantic_storage_bytes",
+    "ssim",
+]
+
 MIB = 2**20
 """Bytes in the "MB" of Table 1."""
 
@@ -52,7 +63,7 @@ class Score:
 
     def __post_init__(self) -> None:
         for field, text in (("name", self.name), ("protocol", self.protocol)):
-            if not text.strip():
+            if not isinstance(text, str) or not text.strip():
                 raise ValueError(f"{field}: expected a text, got {text!r}; say what was measured and how")
 
     def __str__(self) -> str:

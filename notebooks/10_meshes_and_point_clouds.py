@@ -38,7 +38,7 @@ import kfgs
 from kfgs import viz
 from kfgs.cameras import Orbit, estimate_up, orbit_cameras
 from kfgs.labels import label_mesh
-from kfgs.toy.room import build_room
+from kfgs.toy import build_room
 
 scene = kfgs.load_scene(folder).undistorted()
 classes = kfgs.load_label_set(names, text)

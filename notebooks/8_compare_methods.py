@@ -27,9 +27,7 @@ from IPython.display import Image as Shown
 
 import kfgs
 from kfgs import viz
-from kfgs.pipeline import evaluate, open_question
-from kfgs.pipeline.results import Results
-from kfgs.pipeline.side_by_side import table_text
+from kfgs.pipeline import Results, evaluate, open_question
 
 scene = kfgs.load_scene(folder).undistorted()
 classes = kfgs.load_label_set(names, text)
@@ -77,7 +75,7 @@ for name, config in configs.items():
 # %%
 question = open_question(folder, "kfgs-pooled/1")
 compared = Results.read([*runs.values(), features]).score(question, classes)
-print(table_text(compared.reports))
+print(compared)
 
 # %% [markdown]
 # These two lines are what `kfgs compare` does in a shell. To score one result, `evaluate` (`kfgs evaluate`) gives a report.

@@ -11,16 +11,11 @@ from kfgs import cli
 
 REPOSITORY = Path(kfgs.__file__).parents[1]
 SHOWN = [
-    "README.md",
-    "docs/results.md",
-    "docs/architecture.md",
-    "docs/protocols.md",
-    "notebooks/6_inspect_in_pyvista.py",
-    *sorted(str(path.relative_to(REPOSITORY)) for path in REPOSITORY.glob("docs/[ch]o*/*.md")),
-    "docs/quickstart.md",
-    "docs/guide.md",
-    "docs/faq.md",
-    "docs/compare.md",
+    *sorted(path.name for path in REPOSITORY.glob("*.md")),
+    *sorted(
+        str(path.relative_to(REPOSITORY)) for path in REPOSITORY.glob("docs/**/*.md") if "_build" not in path.parts
+    ),
+    *sorted(str(path.relative_to(REPOSITORY)) for path in REPOSITORY.glob("notebooks/*_*.py")),
 ]
 
 
@@ -32,10 +27,10 @@ def help_of(command, capsys):
 
 
 def command_lines(text):
-    """The lines that run kfgs, without their comments."""
+    """The lines that run kfgs, also as `-m kfgs`, without their comments and without what follows `&&`."""
     return [
         shlex.split(line, comments=True)
-        for line in re.findall(r"^ *(kfgs [a-z].*)$", text.replace("\\\n", " "), re.MULTILINE)
+        for line in re.findall(r"(?:^ *|-m )(kfgs [a-z].*?)(?: *&& .*)?$", text.replace("\\\n", " "), re.MULTILINE)
     ]
 
 
@@ -97,6 +92,24 @@ def test_command_lines_in_the_docs_are_understood(name, monkeypatch):
     for line in (line for line in map(str.split, quoted)):
         known = cli._shown_names(cli.COMMANDS[line[1]]).values()
         assert {word for word in line if word.startswith("--")} <= {*known, "--help"}, line
+
+
+OF_OTHERS = {"--spz-version", "--nthreads"}  # options of SplatTransform and of Dask
+OF_BENCHMARKS = {"--kinds", "--quick", "--room-0", "--whole", "--atoms", "--copies"}
+
+
+@pytest.mark.parametrize("name", SHOWN)
+def test_an_option_that_the_docs_name_exists(name):
+    known = {"--help", "--version", *OF_OTHERS, *OF_BENCHMARKS}
+    for command in cli.COMMANDS.values():
+        known |= {word for word in cli._shown_names(command).values() if word.startswith("--")}
+    text = (REPOSITORY / name).read_text(encoding="utf-8")
+    named = {
+        word
+        for code in re.findall(r"`((?:--|kfgs )[^`\n]+)`", text)
+        for word in re.findall(r"(?<!\S)--[a-z][\w-]*", code)
+    }
+    assert {word for word in named if word not in known and word.replace("--no-", "--", 1) not in known} == set()
 
 
 def test_a_home_folder_is_understood_everywhere(monkeypatch, tmp_path, capsys):

@@ -1,7 +1,8 @@
 """Docstrings as the reference needs them.
 
-The comments beside a function's arguments, `means: Tensor,  # [N, 3]`, become a line of its page. `|x|` is a length: in
-reStructuredText alone it would be the name of a substitution.
+The comments beside a function's arguments, `means: Tensor,  # [N, 3]`, become a line of its page, and those beside the fields
+of a class their descriptions. `|x|` is a length: in reStructuredText alone it would be the name of a substitution. `~a` is an
+operation: the default role would take the `~` for a sign of its own.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import tokenize
 from typing import Any
 
 from sphinx.application import Sphinx
+from sphinx.pycode import ModuleAnalyzer
 
 plain: dict[str, list[str]] = {}  # texts of attributes, as they are written
 
@@ -53,12 +55,41 @@ def shapes_of(function: Any) -> list[str]:
     return told
 
 
+def comments_of(source: str) -> dict[tuple[str, str], str]:
+    """The comments beside the fields of classes, `mask: Tensor  # [N] bool`, by the names of class and field."""
+    fields = {
+        field.end_lineno: (kind.name, field.target.id)
+        for kind in ast.walk(ast.parse(source))
+        if isinstance(kind, ast.ClassDef)
+        for field in kind.body
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
+    }
+    found = {}
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT and token.start[0] in fields:
+            text = re.sub(r"^(type: ignore\S*|noqa\S*( \S+)?) *#? *", "", token.string.lstrip("# "))
+            if text:
+                found[fields[token.start[0]]] = text
+    return found
+
+
+read_source = ModuleAnalyzer.analyze
+
+
+def analyze(module: ModuleAnalyzer) -> None:
+    """Read a module for autodoc; a comment beside a field is its description, if it has no other."""
+    read_source(module)
+    for key, text in comments_of(module.code).items():
+        module.attr_docs.setdefault(key, [text, ""])
+
+
 def add_shapes(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
     """Put the shapes after the first paragraph of a docstring, and a backslash before each bar outside of code."""
     for number, line in enumerate(lines):
         if not line.lstrip().startswith((">>>", "...")):
+            line = re.sub(r"(?<!`)`(~[^`]*)`(?!`)", r"``\1``", line)
             lines[number] = re.sub(r"(`[^`]*`)|\|", lambda found: found[1] or r"\|", line)
-    if what == "attribute":
+    if what == "attribute" or (what == "property" and "" not in lines[:-1]):  # a property may have sections
         plain[name] = list(lines)
     if what not in ("function", "method"):
         return
@@ -70,17 +101,20 @@ def add_shapes(app: Sphinx, what: str, name: str, thing: Any, options: Any, line
 
 def keep_plain(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
     """Undo what napoleon makes of an attribute's text: it takes the words before a colon for a type."""
-    if what == "attribute":
-        lines[:] = plain.pop(name)
+    if what in ("attribute", "property"):
+        lines[:] = plain.pop(name, lines)
 
 
 def short_defaults(app: Sphinx, what: str, name: str, thing: Any, options: Any, sign: str | None, back: Any) -> Any:
-    """Write `...` for a default that is made by a function: what stands there is not Python."""
+    """Write `...` for a default that is made by a function: what stands there is not Python. A protocol has no arguments."""
+    if what == "class" and getattr(thing, "_is_protocol", False):
+        return ("", back)
     return (sign.replace("<factory>", "..."), back) if sign else None
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Register the hooks, before and after napoleon's, which has 500."""
+    ModuleAnalyzer.analyze = analyze  # type: ignore[method-assign]
     app.connect("autodoc-process-docstring", add_shapes, priority=400)
     app.connect("autodoc-process-docstring", keep_plain, priority=600)
     app.connect("autodoc-process-signature", short_defaults)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from .._typed import typed
 from ..cameras import Camera
 from ..cameras.similarity import Similarity, fit_similarity
 from ..scenes.files import SceneError, file_stem, some
@@ -69,6 +70,7 @@ class Alignment:
         }
 
 
+@typed
 def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
     """The similarity between two reconstructions of the same pictures, from the cameras that have the same names.
 

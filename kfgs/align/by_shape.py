@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_shapes
+from .._typed import typed
 from ..cameras.similarity import Similarity
 from ..scenes.files import SceneError
 from .by_cameras import Alignment
@@ -27,6 +28,7 @@ MIN_FIT = 0.6  # of the points, both ways (harmonic mean)
 MARGIN = 0.6  # the second best fit must leave more than 1 / MARGIN times as many points unfit as the best
 
 
+@typed
 def align_clouds(
     src: Tensor,  # [N, 3]
     dst: Tensor,  # [M, 3]

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from .._check import check_shapes
+from .._typed import typed
 from ..cameras.similarity import Similarity
 from .close_fit import Cloud, fit_closely
 from .clouds import Array, bulk, median_spacing, nearest
@@ -47,6 +48,7 @@ class FrameCheck(NamedTuple):
     drift: float  # how far the best fit nearby moves the surface of src, along its normals, world units
 
 
+@typed
 def frames_agree(
     src: Tensor,  # [N, 3]
     dst: Tensor,  # [M, 3]

@@ -125,7 +125,6 @@ def compare(
     """
     from .._check import check_range
     from ..pipeline.results import Results
-    from ..pipeline.side_by_side import table_text
     from ..viz.pictures import check_pictures
 
     check_range("pictures", pictures, 0)
@@ -150,7 +149,7 @@ def compare(
     if out is not None and draw and question is not None:
         check_pictures(out, (view.stem for view in question.scored), "kfgs compare")
     compared = results.score(question, encode, draw=draw)
-    say("\n".join([table_text(compared.reports), *(f"note: {note}" for note in (*missing, *compared.notes))]))
+    say("\n".join([str(compared), *(f"note: {note}" for note in (*missing, *compared.notes))]))
     if out is None:
         return
     written = compared.write(out, question, encode, pictures)

@@ -63,7 +63,7 @@ class LEGaussiansMasks:
     """LEGaussians' `render_mask.py` and `eval.py`: relevancy maps, cut at 0.5, against masks of texts.
 
     Means are taken over the texts of a picture, then over the pictures. Masks are brought to the size of the view by nearest
-    neighbour. Pixels of which a method knows nothing count as the least relevant ones of their map.
+    neighbour. Pixels without an answer count as the least relevant ones of their map.
     """
 
     name: ClassVar[str] = "legaussians-mip360/1"

@@ -76,7 +76,7 @@ class LerfOvs2D:
     """LangSplat's `eval/evaluate_iou_loc.py`: each text that is annotated in a frame is looked for in that frame.
 
     The evaluated frames are training views in LangSplat, LangSplatV2 and GAGS; Occam's LGS and VALA hold them out. Say which.
-    Pixels of which a method knows nothing count as the least relevant ones of their map; a map of such pixels alone hits no box.
+    Pixels without an answer count as the least relevant ones of their map; a map without any answer hits no box.
     """
 
     name: ClassVar[str] = "lerf-ovs-2d/1"

@@ -53,7 +53,7 @@ class Method(Protocol):
 
 @runtime_checkable
 class Labeller(Protocol):
-    """A method with a rule of its own for the classes of pixels; of the others, the class with the largest cosine wins."""
+    """A method that decides the classes of pixels itself. Without `labels`, a pixel takes the class with the largest cosine."""
 
     def labels(self, view: View, text: Tensor) -> Tensor:  # [K, D] unit rows -> [H, W] int64
         """The class of each pixel, -1 where nothing is known."""
@@ -83,7 +83,7 @@ def check_level(method: Method, level: int | str) -> None:
 
 @typed
 def label_view(method: Method, view: View, text: Tensor, level: int = 0) -> Tensor:  # [H, W] int64
-    """The class of each pixel: the method's own answer if it has a rule (`Labeller`), else the largest cosine.
+    """The class of each pixel: the method's own answer if it has one (`Labeller`), else the class with the largest cosine.
 
     Args:
         method: what is scored.

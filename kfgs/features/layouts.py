@@ -17,6 +17,7 @@ from .._arrays import FileError, read_array, read_safetensors
 from .._check import check_shapes
 from .._files import as_path, atomic_path
 from .._torch_files import Placeholder, check_plain, load_torch_file
+from .._typed import typed
 from ..scenes.files import some
 from .langsplat import INDEX, ROWS, MaskFeatures
 
@@ -247,6 +248,7 @@ def write_npy_map(
     return target
 
 
+@typed
 def save_feature_map(path: str | Path, stem: str, features: Tensor) -> Path:  # features: [h, w, D]
     """Write one view's map in the layout of Feature 3DGS: `<stem>_fmap_CxHxW.pt`, float16 [D, h, w], atomically.
 

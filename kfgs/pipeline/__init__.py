@@ -26,16 +26,19 @@ from .label_pictures import segment_cameras, write_coco
 from .plan import Plan, plan_scene
 from .plan_maps import NamedTeacher
 from .question import Question, open_question
+from .results import Compared, Results
 from .run_report import write_run_report
 from .runs import RunField, compare_fields, list_fields, restore_field
 from .stages import Run
 
 __all__ = [
     "ColorConfig",
+    "Compared",
     "FitConfig",
     "NamedTeacher",
     "Plan",
     "Question",
+    "Results",
     "Run",
     "RunField",
     "attach",

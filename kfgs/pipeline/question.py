@@ -142,15 +142,15 @@ def open_question(
     Args:
         scene: its folder.
         protocol: a name of `kfgs.evaluation.PROTOCOLS`.
-        truth: where the ground truth is, if not in the scene's folder (`find_labels`, `find_masks`, `find_points`); of
-            `feature3dgs-teacher/1`, the teacher's maps (`features/` in the scene).
-        split: which views. None: of label pictures the test views, or all if none of those has one; of masks all pictures that
-            have some; of a teacher all views.
+        truth: where the ground truth is, if not in the scene's folder (`find_labels`, `find_masks`, `find_points`). For
+            `feature3dgs-teacher/1` it is the folder of the teacher's maps; None: `features/` in the scene.
+        split: which views. None depends on the truth. Label pictures: the test views, or all views if no test view has one.
+            Masks: all pictures that have some. A teacher's maps: all views.
         images: folder of the pictures.
-        options: of the protocol, as published where left out; and the inputs of an edit's protocol: `before` (a splat file),
-            `removed` or `painted` (a class), `rgb`.
-        labels: who says the class of a pixel, of a field of kfgs: `own`, the field (`SemanticField.segment`), or `nearest`,
-            the text with the largest cosine, as of other methods. None: as the protocol has it (`Question.rule`).
+        options: of the protocol; those left out are as published. An edit's protocol also needs its inputs here: `before` (a
+            splat file), `removed` or `painted` (a class), `rgb`.
+        labels: how a field of kfgs decides the class of a pixel: `own` is `SemanticField.segment`; `nearest` is the text with
+            the largest cosine, as for other methods. None: the protocol's choice (`Question.rule`).
 
     Raises:
         FileNotFoundError: if the scene or its truth is missing.

@@ -26,21 +26,34 @@ class Kept(NamedTuple):
 
 
 class Compared(NamedTuple):
-    """Results by title: the name of the method, with its file or folder where several have one name."""
+    """Several results under one protocol, by title; `print` shows a table of scores, the best first.
+
+    A title is the name of the method, followed by its file or folder if several have the same name.
+    """
 
     reports: dict[str, Report]
+    """The scores."""
     methods: dict[str, Any]
-    """Those that can be drawn."""
+    """The results that can be drawn."""
     notes: tuple[str, ...]
-    """Which could not be opened to be drawn, and what the protocol decided by the data."""
+    """Which results could not be opened to be drawn, and what the protocol decided by the data."""
 
     def __repr__(self) -> str:
         return short_repr(self)
 
+    def __str__(self) -> str:
+        return table_text(self.reports)
+
     def write(
         self, folder: Path, question: Question | None, encode: Encode | LabelSet | None, count: int
     ) -> list[Path]:
-        """Write `compare.txt`, `compare.json` and pictures of `count` views; without a question none.
+        """Write `compare.txt`, `compare.json`, and pictures of some views.
+
+        Args:
+            folder: where to write.
+            question: what was asked; None: no pictures.
+            encode: as in `Results.score`.
+            count: number of views to draw.
 
         Returns:
             What was written.
@@ -57,17 +70,18 @@ class Compared(NamedTuple):
 
 @dataclass(frozen=True)
 class Results:
-    """What is compared, before it is scored."""
+    """Results to compare: `Results.read` finds them, `score` asks all of them the same question."""
 
     paths: tuple[Path, ...]
-    """Each once."""
+    """All results, each once."""
     kept: Mapping[Path, Kept]
+    """Those that were scored before: JSON files of `kfgs evaluate --out`."""
     files: Mapping[Path, Path]
     """The second files of results of other programs."""
 
     @staticmethod
-    def read(paths: Sequence[Path], with_file: Sequence[str] = ()) -> Results:
-        """Read the JSON files among some results, and see to whom second files belong.
+    def read(paths: Sequence[str | Path], with_file: Sequence[str] = ()) -> Results:
+        """Read the JSON files among some results, and find which result each second file belongs to.
 
         Args:
             paths: whatever `evaluate` takes, or JSON files of `kfgs evaluate --out`.
@@ -75,24 +89,24 @@ class Results:
 
         Raises:
             FileNotFoundError: if a JSON file is missing.
-            ValueError: if one is something else, or it is open which result a file belongs to.
+            ValueError: if one has another content, or it is unclear which result a file belongs to.
         """
-        each = tuple(dict.fromkeys(paths))
+        each = tuple(dict.fromkeys(as_path(path) for path in paths))
         kept = {path: _read_kept(path) for path in each if path.suffix == ".json"}
         return Results(each, kept, _second_files([path for path in each if path not in kept], with_file))
 
     @property
     def new(self) -> list[Path]:
-        """Those that are scored now."""
+        """The results that must be scored now."""
         return [path for path in self.paths if path not in self.kept]
 
     @property
     def first(self) -> Kept | None:
-        """The first that was scored before: it says how the others are."""
+        """The first result that was scored before: new ones are scored the same way."""
         return next(iter(self.kept.values()), None)
 
     def check(self, protocol: str) -> None:
-        """What can be known before anything is computed.
+        """Check what can be checked before anything is computed.
 
         Raises:
             TypeError: if a protocol of Gaussians is asked about a teacher's maps.
@@ -114,12 +128,12 @@ class Results:
     def score(
         self, question: Question | None, encode: Encode | LabelSet | None = None, *, draw: bool = False
     ) -> Compared:
-        """Score the new ones, and open the others again to draw them.
+        """Score the new results; with `draw`, also open those that were scored before.
 
         Args:
-            question: what new ones are asked; None if there are none and nothing is drawn.
+            question: what new results are asked; None if there are none and nothing is drawn.
             encode: a label set, or the teacher's text encoder.
-            draw: whether kept ones are opened.
+            draw: open results that were scored before, so that `Compared.write` can draw them.
 
         Raises:
             FileNotFoundError: if a result is missing.

@@ -26,7 +26,7 @@ WRITTEN = ("done", "features", "scene/sparse/0", "segmented")  # folders of a ru
 
 @dataclass(frozen=True)
 class SceneResult:
-    """What became of a scene."""
+    """The result of one scene, or why there is none."""
 
     name: str
     value: Any

@@ -38,12 +38,12 @@ AGREEING = 0.2
 def find_points(
     scene: Scene, *, config: SfmConfig | None = None, most_views: int | None = MOST_VIEWS, progress: bool = False
 ) -> Scene:
-    """Give a scene points that are triangulated from its own poses; the points that it has are given up.
+    """Triangulate points from a scene's own poses. They replace the points that it has.
 
     Args:
         scene: posed views, with or without lens.
         config: `max_features`, `seed` and `num_threads` are used.
-        most_views: look at so many views, evenly chosen; None: at all.
+        most_views: use at most this many views, evenly chosen; None: all.
         progress: show a bar.
 
     Returns:
@@ -71,7 +71,7 @@ def write_known_poses(
     """Write a scene with known poses as a COLMAP model with triangulated points: `out/sparse/0`, and links in `out/images`.
 
     Args:
-        scene: posed views, with or without lens. All are looked at.
+        scene: posed views, with or without lens. All are used.
         out: the scene folder.
         config: `max_features`, `seed` and `num_threads` are used.
         replace: replace a model that is in `out/sparse/0` already.

@@ -6,7 +6,7 @@ from .bridges import to_open3d, to_trimesh
 from .camera_view import draw_view, look_through
 from .clouds import CloudOptions, add_cloud, recolor_cloud, to_pyvista
 from .confusions import plot_confusion, plot_largest_confusions
-from .explorer import ExploreOptions, Explorer, explore
+from .explorer import Exploration, ExploreOptions, Explorer, Viewer, explore
 from .field_colors import FeatureColors, feature_colors
 from .film_frames import show_cloud
 from .films import save_flythrough, save_turntable
@@ -29,10 +29,12 @@ from .usd import save_usd
 
 __all__ = [
     "CloudOptions",
+    "Exploration",
     "ExploreOptions",
     "Explorer",
     "FeatureColors",
     "Matches",
+    "Viewer",
     "add_boxes",
     "add_camera_images",
     "add_cameras",

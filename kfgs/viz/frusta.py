@@ -39,7 +39,7 @@ def add_cameras(
         size: depth of the pyramids, world units; None: a twentieth of the extent of the cameras' positions.
         color: one that pyvista knows.
         line_width: in pixels.
-        most: draw at most so many, evenly chosen; None: all.
+        most: draw at most this many, evenly chosen; None: all.
 
     Returns:
         The actor; its mesh's cells carry `camera`, the index.
@@ -76,7 +76,7 @@ def add_camera_images(
             cameras drawn. Any size; the picture is stretched to its camera's.
         size: distance of the pictures from their cameras, world units; None: as in `add_cameras`.
         opacity: of the pictures, in (0, 1].
-        most: draw at most so many, evenly chosen; None: all.
+        most: draw at most this many, evenly chosen; None: all.
 
     Returns:
         The actor; its mesh's cells carry `camera`, the index.

@@ -93,6 +93,29 @@ def test_a_comment_beside_a_whole_signature_is_not_given_to_each_argument():
     assert shapes(kfgs.labels.OrientedBox.around) == ["``points`` [N, 3]"]
 
 
+def test_comments_beside_the_fields_of_a_class_are_read():
+    source = (
+        "class Seen(NamedTuple):\n"
+        "    pixels: Tensor  # [N] of all views\n"
+        "    index: Tensor  # type: ignore[assignment]  # [M] int64\n"
+        "    bare: int\n"
+        "    def read(self):\n"
+        "        inside: int = 1  # a comment of the body\n"
+        "other: int = 2  # of the module\n"
+    )
+    found = load("kfgs_shapes").comments_of(source)
+    assert found == {("Seen", "pixels"): "[N] of all views", ("Seen", "index"): "[M] int64"}
+    analyzer = importlib.import_module("sphinx.pycode").ModuleAnalyzer.for_string(source, "seen")
+    load("kfgs_shapes").analyze(analyzer)
+    assert analyzer.attr_docs["Seen", "pixels"] == ["[N] of all views", ""]
+
+
+def test_a_tilde_in_code_is_kept():
+    lines = ["`~a` and `a | b`"]
+    load("kfgs_shapes").add_shapes(None, "class", "kfgs.A", None, None, lines)
+    assert lines == ["``~a`` and `a | b`"]
+
+
 def notebook_of(title, *pictures, tagged=None):
     cells = [{"cell_type": "markdown", "metadata": {}, "source": [f"# {title}\n", "\n", "**What is\n", "it?** More."]}]
     for picture in pictures:

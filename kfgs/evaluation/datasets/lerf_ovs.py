@@ -39,6 +39,16 @@ def load_lerf_ovs(path: str | Path, scene: str | None = None) -> MaskTruth:
     Raises:
         FileNotFoundError: if there are no labels, or a published picture of one of the four scenes has none.
         ValueError: if a file is damaged; the message names the file and the object.
+
+    Example:
+        >>> import json, tempfile
+        >>> folder = Path(tempfile.mkdtemp()) / "label" / "desk"
+        >>> folder.mkdir(parents=True)
+        >>> cup = {"category": "cup", "segmentation": [[1, 0], [3, 0], [3, 1], [1, 1]], "bbox": [1, 0, 3, 1]}
+        >>> top = {"info": {"name": "frame_1.jpg", "width": 5, "height": 3}, "objects": [cup]}
+        >>> _ = (folder / "frame_1.json").write_text(json.dumps(top))
+        >>> load_lerf_ovs(folder).frames["frame_1"]["cup"].mask.int().tolist()
+        [[0, 1, 1, 1, 0], [0, 1, 1, 1, 0], [0, 0, 0, 0, 0]]
     """
     path = as_path(path)
     root = path / scene if scene else path

@@ -24,8 +24,8 @@ AUTOENCODER = re.compile(r"decoder\.(\d+)")  # a layer of DF-3DGS's
 def load_feature3dgs(run: str | Path, step: int | None = None, *, decoder: str | Path | None = None) -> SplattedMethod:
     """Read a run of Feature 3DGS, or of DF-3DGS, whose PLY has the same columns, without colours.
 
-    `RUN/point_cloud/iteration_30000/point_cloud.ply`, and `RUN/decoder_chkpnt30000.pth` if there is one. A PLY alone will
-    do, too. The convolution has a bias, so a Gaussian's feature is that of its value alone, decoded. Of DF-3DGS with 9
+    `RUN/point_cloud/iteration_30000/point_cloud.ply`, and `RUN/decoder_chkpnt30000.pth` if there is one. A PLY alone is
+    enough. The convolution has a bias, so a Gaussian's feature is that of its value alone, decoded. Of DF-3DGS with 9
     channels, `decoder` is the scene's autoencoder; features are decoded, and not quantised afterwards.
 
     Args:

@@ -38,7 +38,7 @@ def load_langsplat(runs: Runs, autoencoder: str | Path, step: int | None = None)
 
     Args:
         runs: the folders of the runs in the order s, m, l (`figurines_1`, `figurines_2`, `figurines_3`), or what they have in
-            common (`output/figurines`); checkpoints themselves will do.
+            common (`output/figurines`); checkpoints are accepted, too.
         autoencoder: `best_ckpt.pth`, whose layers are named `decoder.0`, `decoder.2`, ...
         step: which iteration; None: the last.
 

@@ -51,6 +51,10 @@ class Exploration:
         cameras: Sequence[Camera] = (),
         distance: float | None = None,
     ) -> None:
+        if not isinstance(getattr(meaning, "gaussians", None), Gaussians):
+            raise TypeError(
+                f"meaning: expected a FieldMeaning or a SplatMeaning, got {type(meaning).__name__}; `explore` makes one"
+            )
         if meaning.gaussians.labels is None:
             raise ValueError(
                 "meaning.gaussians.labels: expected labels [N], got None; use FieldMeaning or SplatMeaning"

@@ -23,8 +23,8 @@ class Viewer:
     """The WebGL viewer of an exploration. As the last value of a notebook's cell it is a widget.
 
     The browser draws, and keeps what a person changes; Python answers texts and writes files. It opens with the state's question,
-    gamma, lambda, colours and hidden classes. Then both go separate ways, except that `ask` in Python also asks in an open
-    widget.
+    gamma, lambda, colours and hidden classes. After that, page and state are independent, except that `ask` in Python also
+    asks in an open widget.
 
     Args:
         exploration: the state.

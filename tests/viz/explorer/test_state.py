@@ -154,6 +154,8 @@ def test_numbers_out_of_range():
 
 
 def test_clouds_that_cannot_be_explored():
+    with pytest.raises(TypeError, match=tells("meaning: expected", "got NoneType")):
+        Exploration(None)
     with pytest.raises(ValueError, match=tells("color:", "got none")):
         Exploration(SplatMeaning(splat_file(cloud(LINE, [0] * 4))), cloud(torch.zeros(0, 3)))
     bent = replace(cameras()[0], distortion=Distortion("kannala_brandt", (0.1, 0, 0, 0)))
