@@ -10,6 +10,7 @@ import pytest
 from small_room import make_desk
 
 import kfgs
+from kfgs.scenes import load_cameras
 from kfgs.viz import available
 
 PAGES = Path(kfgs.__file__).parents[1] / "docs" / "api"
@@ -86,6 +87,17 @@ def test_the_python_of_other_pages_runs(page, desk, tmp_path, monkeypatch):
     known = {}
     for block in blocks:
         exec(block, known)
+
+
+def test_the_file_of_cameras_on_the_page_of_export_can_be_read(tmp_path):
+    (text,) = re.findall(
+        r"```json\n(.*?)```", (PAGES.parent / "howto/export.md").read_text(encoding="utf-8"), re.DOTALL
+    )
+    (tmp_path / "my_cameras.json").write_text(text)
+    first, second = load_cameras(tmp_path / "my_cameras.json")
+    assert first.size == (480, 640)
+    assert second.center.tolist() == pytest.approx([1.0, -2.0, 1.2])
+    assert second.viewmat[1:3, :3].tolist() == [[0, 0, -1], [0, 1, 0]]  # down is -z, it looks along y
 
 
 def test_no_page_has_python_that_no_test_runs():
