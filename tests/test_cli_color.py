@@ -393,6 +393,25 @@ def test_convert_writes_a_plain_ply_with_the_classes_beside_it(labelled, tmp_pat
     assert torch.equal(after.gaussians.labels, before.gaussians.labels)
 
 
+@pytest.mark.parametrize(("words", "kind"), [([], "ParticleField3DGaussianSplat"), (["--points"], "Points")])
+def test_convert_writes_usd_with_an_object_for_each_class(labelled, tmp_path, words, kind, capsys):
+    pytest.importorskip("pxr")
+    from pxr import Usd
+
+    out = tmp_path / "room.usdc"
+    assert main(["convert", str(labelled), str(out), *words]) == 0
+    said = capsys.readouterr().out
+    assert "KiB -> " in said
+    assert f"wrote:\n  {out}\n" in said
+    assert ("note: shapes" in said) == bool(words)
+    stage, cloud = Usd.Stage.Open(str(out)), read_splats(labelled)
+    prims = {one.GetAttribute("kfgs:class").Get(): one for one in stage.GetDefaultPrim().GetChildren()}
+    assert {one.GetTypeName() for one in prims.values()} == {kind}
+    counts = {name: len(one.GetAttribute("primvars:class_id").Get()) for name, one in prims.items()}
+    names = ["", *cloud.classes]
+    assert counts == {names[label + 1]: len(part) for label, part in cloud.by_class().items()}
+
+
 def test_convert_by_class_writes_a_plain_file_for_each_class(labelled, tmp_path, capsys):
     cloud, out = read_splats(labelled), tmp_path / "objects"
     words = ["convert", str(labelled), str(out), "--by-class"]

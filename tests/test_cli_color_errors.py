@@ -166,8 +166,12 @@ ERRORS = {
         (["{splat}", "{splat}"], ("TARGET:", "{splat}", "got the same")),
         (
             ["{splat}", "{o}.ksplat"],
-            ("TARGET:", ".compressed.ply, .ply", "got {o}.ksplat"),
+            ("TARGET:", ".compressed.ply, .ply", "got {o}.ksplat", "`kfgs convert` writes USD, too"),
         ),
+        (["{splat}", "{o}.usdx"], ("TARGET:", ".usdc, .usda, .usd, .usdz", "got {o}.usdx")),
+        (["{labelled}", "{o}.usdc", "--plain"], ("--plain:", "for USD", "leave it out")),
+        (["{labelled}", "{o}.usdc", "--by-class"], ("--by-class:", "for USD, which has an object for each class")),
+        (["{labelled}", "{o}.spz", "--points"], ("--points:", "without a TARGET in USD")),
         (["{field}", "{o}.ply"], ("SOURCE:", "got {field}", "a colour splat")),
         (["{splat}", "{o}.spz", "--plain"], ("--plain:", ".ply", "{o}.spz")),
         (["{labelled}", "{o}", "--by-class", "--plain"], ("--plain:", "--by-class")),

@@ -1,6 +1,8 @@
 """`kfgs render`: films of a run, of a field and of a labelled splat."""
 
 import dataclasses
+import json
+import shutil
 
 import numpy as np
 import pytest
@@ -68,6 +70,27 @@ def test_a_labelled_splat(run, tmp_path):
     assert film(tmp_path / "l.ply", "--out", tmp_path / "b.gif", "--path", "spiral", "--scene", scene.folder) == 0
 
 
+def test_cameras_of_your_own_are_the_frames(run, tmp_path, capsys):
+    model = tmp_path / "model"
+    shutil.copytree(run.parent / "scene" / "sparse" / "0", model)  # no pictures here
+    words = ["render", str(run), "--show", "photo", "--path", str(model), "--out"]
+    assert main([*words, str(tmp_path / "a.gif")]) == 0
+    scene, made = load_scene(run.parent / "scene"), frames(tmp_path / "a.gif")
+    assert len(made) == len(scene)
+    assert main([*words, str(tmp_path / "b.gif"), "--frames", "4", "--width", "40"]) == 0
+    assert len(frames(tmp_path / "b.gif")) == 4
+    margin = made[0].shape[1] - scene.cameras[0].width
+    assert frames(tmp_path / "b.gif")[0].shape[1] == 40 + margin
+    listed = {"w": 40, "h": 30, "fl_x": 30, "frames": [{"transform_matrix": np.eye(4).tolist()}] * 2}
+    listed["frames"][1] = listed["frames"][1] | {"h": 20}
+    (tmp_path / "two.json").write_text(json.dumps(listed))
+    capsys.readouterr()
+    assert main([*words[:-2], str(tmp_path / "two.json"), "--out", str(tmp_path / "c.gif")]) == 1
+    said = capsys.readouterr().err
+    assert all(part in said for part in ("--path:", "one size", "got 40x20 and 40x30", "give --frames"))
+    assert not (tmp_path / "c.gif").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -75,6 +98,10 @@ def test_a_labelled_splat(run, tmp_path):
         (["{run}", "--out", "{tmp}/a.gif", "--show", "labels,colour"], ("--show:", "'colour'", "query=TEXT")),
         (["{run}", "--out", "{tmp}/a.gif", "--show", "query=unicorn"], ("unicorn",)),
         (["{run}", "--out", "{tmp}/a.gif", "--frames", "1"], ("--frames:",)),
+        (
+            ["{run}", "--out", "{tmp}/a.gif", "--path", "{tmp}/x.json"],
+            ("--path:", "got {tmp}/x.json", "does not exist"),
+        ),
         (["{run}/color.ply", "--out", "{tmp}/a.gif"], ("expected a splat with classes",)),
     ],
 )
@@ -82,5 +109,5 @@ def test_bad_input_is_named_and_writes_nothing(run, tmp_path, capsys, arguments,
     fill = {"run": str(run), "tmp": str(tmp_path)}
     assert main(["render", *(word.format(**fill) for word in arguments)]) == 1
     said = capsys.readouterr().err
-    assert all(part in said for part in message), said
+    assert all(part.format(**fill) in said for part in message), said
     assert not list(tmp_path.iterdir())

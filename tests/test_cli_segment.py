@@ -1,6 +1,8 @@
 """`kfgs segment` for other programs: COCO's JSON with its pictures, and the label pictures of a camera path."""
 
+import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -11,10 +13,11 @@ from small_room import make_desk
 
 from kfgs.cameras import orbit_cameras
 from kfgs.cli import main
+from kfgs.cli.render import walk_of
 from kfgs.evaluation.datasets import load_coco_labels
 from kfgs.fields import SemanticField
 from kfgs.pipeline import segment_cameras, write_coco
-from kfgs.scenes import load_scene
+from kfgs.scenes import load_cameras, load_scene
 
 
 @pytest.fixture(scope="module")
@@ -119,6 +122,54 @@ def test_cameras_of_your_own(desk, tmp_path):
         segment_cameras(field, [cameras[0], cameras[0]], field.label_set(), tmp_path)
 
 
+def own_cameras(folder, cameras, name="{}"):
+    """A transforms.json without pictures, as another program writes one."""
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+    frames = []
+    for i, camera in enumerate(cameras):
+        fx, fy, cx, cy = (float(camera.K[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        pose = (torch.linalg.inv(camera.viewmat) @ flip).tolist()
+        lens = {"w": camera.width, "h": camera.height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+        frames.append({"file_path": name.format(i), "transform_matrix": pose, **lens})
+    folder.mkdir()
+    (folder / "path.json").write_text(json.dumps({"frames": frames}))
+    return folder / "path.json"
+
+
+def test_exactly_the_cameras_of_a_file_are_segmented(desk, tmp_path, capsys):
+    field = SemanticField.load(desk / "run" / "field")
+    cameras = [camera.resized(30 + i, 40) for i, camera in enumerate(field.cameras[:3])]
+    file = own_cameras(tmp_path / "in", cameras, "views/v_{}.jpg")
+    assert segment(desk, tmp_path / "out", "--path", file, "--coco", "--color", desk / "my.ply") == 0
+    capsys.readouterr()
+    for i, camera in enumerate(cameras):
+        expected = as_predicted(field.segment(camera, field.label_set()))
+        found = read(tmp_path / "out" / "predicted" / "views" / f"v_{i}.png")
+        assert found.shape == camera.size
+        assert (found != expected).mean() < 2e-3  # the inverse of a pose is rounded: a pixel or two at an edge
+        assert read(tmp_path / "out" / "coco" / "images" / "views" / f"v_{i}.png").shape[:2] == camera.size
+
+
+def test_own_cameras_draw_from_the_depth_from_which_those_of_the_scene_do(desk, tmp_path):
+    cameras = SemanticField.load(desk / "run" / "field").cameras
+    moved = dataclasses.replace(
+        cameras[0], viewmat=cameras[0].viewmat + torch.eye(4)[3] * 1e-3 * torch.tensor([[1], [0], [0], [0]])
+    )
+    file = own_cameras(tmp_path / "in", [cameras[0], moved])  # a millimetre apart: as a scene, it is a tiny one
+    assert load_cameras(file)[0].near < 1e-3
+    assert {camera.near for camera in walk_of(file, None, cameras, None, None)} == {cameras[0].near}
+
+
+def test_a_path_through_the_cameras_of_a_scene_without_pictures(desk, tmp_path):
+    (tmp_path / "scene").mkdir()
+    shutil.copytree(desk / "scene" / "sparse", tmp_path / "scene" / "sparse")
+    assert segment(desk, tmp_path / "out", "--path", tmp_path / "scene", "--frames", 4, "--width", 32) == 0
+    assert sorted(one.name for one in (tmp_path / "out" / "predicted").iterdir()) == [
+        f"path_{i:04d}.png" for i in range(4)
+    ]
+    assert read(tmp_path / "out" / "predicted" / "path_0000.png").shape == (24, 32)
+
+
 @pytest.mark.parametrize("name", ["annotations.json", "images/view_{}.png"])
 def test_files_of_others_are_not_replaced(desk, tmp_path, name, capsys):
     scene = load_scene(desk / "scene")
@@ -139,11 +190,23 @@ def test_files_of_others_are_not_replaced(desk, tmp_path, name, capsys):
         (["--path", "orbit", "--labels", "x"], ("--labels:", "with --path")),
         (["--path", "orbit", "--color", "x.ply"], ("--color:", "without --coco")),
         (["--path", "orbit", "--frames", "0"], ("--frames:", "got 0")),
+        (["--path", "orbitt"], ("--path:", "orbit, spiral, cameras, or a file", "got orbitt", "correct it")),
+        (
+            ["--path", "{scene}/classes.json"],
+            ("{scene}/classes.json, top level:", "'frames'", "is this a transforms.json"),
+        ),
+        (["--path", "{scene}/labels"], ("{scene}/labels:", "expected a COLMAP model")),
+        (
+            ["--path", "{one}", "--frames", "3"],
+            ("--frames:", "two different cameras", "got 1 in {one}", "leave it out"),
+        ),
+        (["--path", "{one}", "--width", "3"], ("--width:", "got 3")),
     ],
 )
 def test_options_that_would_have_no_effect_are_named(desk, tmp_path, words, parts, capsys):
-    assert segment(desk, tmp_path / "o", *words) == 1
+    known = {"scene": desk / "scene", "one": own_cameras(tmp_path / "in", load_scene(desk / "scene").cameras[:1])}
+    assert segment(desk, tmp_path / "o", *(word.format(**known) for word in words)) == 1
     error = capsys.readouterr().err
     for part in parts:
-        assert part in error
+        assert part.format(**known) in error
     assert not (tmp_path / "o").exists()

@@ -10,15 +10,23 @@ from .._files import check_output, check_own, read_json, real_path
 # Heavy imports happen inside the functions, so that `kfgs --help` answers at once.
 
 
-def check_target(name: str, target: Path, *sources: Path) -> None:
-    """Raise a ValueError unless `target` can become a splat file that overwrites none of the sources; see `check_output`."""
+def check_target(name: str, target: Path, *sources: Path, endings: tuple[str, ...] = ()) -> None:
+    """Raise a ValueError unless `target` can become a file that overwrites none of the sources; see `check_output`.
+
+    Args:
+        name: the parameter.
+        target: its file.
+        sources: files that are read.
+        endings: those of the file; by default those of splat files.
+    """
     from ..formats import formats
 
-    endings = tuple(ending for one in formats().values() if hasattr(one, "write") for ending in one.SUFFIXES)
-    if not target.name.lower().endswith(endings):
+    splats = tuple(ending for one in formats().values() if hasattr(one, "write") for ending in one.SUFFIXES)
+    if not target.name.lower().endswith(endings or splats):
+        more = "" if endings else " (`kfgs convert` writes USD, too, for example .usdc)"
         raise ValueError(
-            f"{name}: expected a file whose name ends in one of {', '.join(endings)}, got {target}; "
-            "the ending chooses the format"
+            f"{name}: expected a file whose name ends in one of {', '.join(endings or splats)}, got {target}; "
+            f"the ending chooses the format{more}"
         )
     check_output(name, target, "a file")
     for source in sources:

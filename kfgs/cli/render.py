@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from .view import open_colors, open_meaning
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
 WORDS = "photo, labels, features or query=TEXT"
+FRAMES, WIDTH = 72, 480  # of a path without cameras of your own
 OVERHEAD = "ceiling"  # left out of an orbit, which looks in from above
 
 
@@ -23,9 +25,9 @@ def render(
     path: Walk = "orbit",
     show: Given[str] = None,
     color: Given[Path] = None,
-    frames: int = 72,
+    frames: Given[int] = None,
     fps: float = 15.0,
-    width: int = 480,
+    width: Given[int] = None,
     teacher: Teacher,
     classes: Classes,
 ) -> None:
@@ -35,22 +37,24 @@ def render(
         kfgs render run/ --out tour.gif
         kfgs render run/ --path cameras --show photo,labels,query=chair --out tour.mp4
         kfgs render labelled.ply --path spiral --scene scene/ --out spiral.gif
+        kfgs render run/ --path my_cameras.json --out mine.mp4
 
     Args:
         source: A run folder, a field (RUN/field), or a splat with classes.
         out: The film, .gif or .mp4 (which needs imageio-ffmpeg).
         path: orbit goes around the scene and looks in from above: what is in front is cut away, and a class "ceiling" is left
-            out. spiral sways at the camera in the middle. cameras flies along the scene's cameras.
+            out. spiral sways at the camera in the middle. cameras flies along the scene's cameras. A file or folder
+            (transforms.json, COLMAP model, scene; without pictures, too) gives cameras of your own: exactly these, in the order
+            of their names; or with --frames a smooth path through them.
         show: What stands side by side, with commas between: photo (the colours), labels, features, query=TEXT. By default
             photo,labels, or labels if there are no colours.
         color: Colour splat in the same frame; by default that of the run, or that which the field was made on.
-        frames: Number of pictures.
+        frames: Number of pictures; by default 72, or one for each camera of your own.
         fps: Pictures a second.
-        width: Width of each picture in pixels.
+        width: Width of each picture in pixels; by default 480, or that of your own cameras.
     """
     from tqdm import tqdm
 
-    from .._check import check_whole
     from ..fields.store import find_field
     from ..viz import save_animation
     from ..viz.animation import SUFFIXES, check_target
@@ -59,8 +63,7 @@ def render(
     if out.suffix.lower() not in SUFFIXES:
         raise ValueError(f"out: expected a name that ends in .gif or .mp4, got {out.name!r}; rename it")
     check_target(out, fps)
-    check_whole("frames", frames, 2)
-    check_whole("width", width, 16)
+    check_walk(path, frames, width)
     classes.check_images()
     found = find_field(source)
     meaning, cameras = open_meaning(source if found is None else found, classes, teacher)
@@ -73,8 +76,14 @@ def render(
     words = [word.strip() for word in (show or ("labels" if colors is None else "photo,labels")).split(",")]
     shows = {_title(word): _show(word, meaning, semantic, colors) for word in words}
     walk = walk_of(path, (semantic if colors is None else colors).means, cameras, frames, width)
+    sizes = sorted({f"{camera.width}x{camera.height}" for camera in walk})
+    if len(sizes) > 1:
+        raise ValueError(
+            f"path: expected cameras of one size for a film, got {' and '.join(sizes[:3])} in {path}; give --frames, which takes "
+            "the size of the first"
+        )
     listed = semantic.labels.unique() if "labels" in words else None
-    with tqdm(total=frames, desc="render", unit="frame") as bar:
+    with tqdm(total=len(walk), desc="render", unit="frame") as bar:
         save_animation(
             out,
             shows,
@@ -107,12 +116,29 @@ def _opened(names: Any, semantic: Any, colors: Any) -> tuple[Any, Any]:
     return shown, None if colors is None else shown if colors is semantic else kept(colors)
 
 
-def walk_of(path: Walk, points: Any, cameras: list[Any], frames: int, width: int) -> list[Any]:
-    """The cameras of a path; those of the scene are needed for all but an orbit."""
+def check_walk(path: Walk, frames: int | None, width: int | None) -> None:
+    """Check what `walk_of` is asked for, before anything is read."""
+    from .._check import check_whole
+
+    if isinstance(path, Path) and not path.exists():
+        raise ValueError(
+            f"path: expected orbit, spiral, cameras, or a file or folder with cameras of your own, got {path}, which does not "
+            "exist; correct it"
+        )
+    for name, value, least in (("frames", frames, 2), ("width", width, 16)):
+        if value is not None:
+            check_whole(name, value, least)
+
+
+def walk_of(path: Walk, points: Any, cameras: list[Any], frames: int | None, width: int | None) -> list[Any]:
+    """The cameras of a path. Those of the scene are needed for a spiral and a flight along them."""
     from ..cameras import Orbit, orbit_cameras, path_cameras, spiral_cameras
     from ..viz.films import KEYS
     from ..viz.linked import upwards
 
+    if isinstance(path, Path):
+        return _own_walk(path, cameras, frames, width)
+    frames, width = frames or FRAMES, width or WIDTH
     if path == "orbit":
         size = (round(width * 3 / 4), width)
         orbit = Orbit(frames=frames, size=size, elevation_degrees=45, zoom=1.5, cut=0.6)
@@ -129,6 +155,27 @@ def walk_of(path: Walk, points: Any, cameras: list[Any], frames: int, width: int
     centers = torch.stack([camera.center for camera in cameras]).double()
     middle = int((centers - centers.mean(dim=0)).norm(dim=1).argmin())
     return spiral_cameras(cameras[middle], points, frames, size=size)
+
+
+def _own_walk(path: Path, cameras: list[Any], frames: int | None, width: int | None) -> list[Any]:
+    """The cameras of a file or folder; with `frames`, those of a smooth path through them."""
+    from ..cameras import path_cameras
+    from ..scenes import load_cameras
+
+    own = load_cameras(path)
+    if cameras:  # the size of the scene, not that of the path, says what is too near to be drawn
+        near = min(camera.near for camera in cameras)
+        own = [replace(camera, near=near) for camera in own]
+    if width is not None:
+        own = [camera.resized(max(1, round(width * camera.height / camera.width)), width) for camera in own]
+    if frames is None:
+        return own
+    try:
+        return path_cameras(own, frames)
+    except ValueError as error:
+        raise ValueError(
+            f"frames: expected two different cameras or more to go through, got {len(own)} in {path}; leave it out"
+        ) from error
 
 
 def _title(word: str) -> str:

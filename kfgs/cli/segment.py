@@ -12,7 +12,7 @@ from .._files import check_output, check_own, is_own, read_json
 from .files import check_alone, open_field
 from .options import Classes, Flag, Given, GivenWalk, Positional, Rule, Walk
 from .output import say, wrote
-from .render import walk_of
+from .render import check_walk, walk_of
 from .view import open_colors
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -41,15 +41,18 @@ def segment(
         kfgs segment run/field --out segmented/ --scene scene/ --text words.safetensors --split train
         kfgs segment run/field --out segmented/ --split train --coco
         kfgs segment run/field --out masks/ --path spiral --frames 40 --coco
+        kfgs segment run/field --out masks/ --path my_cameras.json --coco
 
     Args:
         field: The folder that `kfgs fit` wrote (RUN/field).
         out: Folder for label maps (predicted/ has class numbers, colored/ shows them in colours), pictures and scores.json. It
             holds the results of one run: those of an earlier run are replaced or deleted, files of other programs stay.
         split: Which views: train, test, all, or another split that SCENE/split.json names.
-        path: Segment the cameras of a path, as `kfgs render` has it, instead of the views of a split: orbit, spiral or cameras.
-        frames: Number of cameras of the path; by default 72.
-        width: Width of its pictures in pixels; by default 480.
+        path: Segment the cameras of a path instead of the views of a split: orbit, spiral or cameras, as in `kfgs render`; or a
+            file or folder with cameras of your own (transforms.json, COLMAP model, scene; without pictures, too): exactly
+            these, or with --frames a smooth path through them.
+        frames: Number of cameras of the path; by default 72, or your own cameras.
+        width: Width of its pictures in pixels; by default 480, or that of your own cameras.
         color: Colour splat for the pictures of the path (with --coco); by default that of the run.
         coco: Write coco/annotations.json (COCO's run lengths, areas and boxes; one annotation for each class of each picture)
             and its pictures to coco/images: undistorted photographs, or with --path rendered colours.
@@ -69,9 +72,9 @@ def segment(
     if path is not None:
         for name, value in (("labels", labels), ("features", features)):
             check_alone(name, value, "with --path, of whose pictures nothing is known")
-        size = 72 if frames is None else frames, 480 if width is None else width
+        check_walk(path, frames, width)
         with _one_run(out) as written:
-            written += _segment_path(field, out, path, size, color, coco, rule, classes)
+            written += _segment_path(field, out, path, frames, width, color, coco, rule, classes)
         return
     alone: dict[str, object] = {"frames": frames, "width": width, "color": color}
     for name, given in alone.items():
@@ -172,22 +175,20 @@ def _segment_path(
     field: Path,
     out: Path,
     path: Walk,
-    size: tuple[int, int],
+    frames: int | None,
+    width: int | None,
     color: Path | None,
     coco: bool,
     rule: Rule,
     classes: Classes,
 ) -> list[Path]:
     """Segment the cameras of a path, and with --coco render the colours that they see; name what was written."""
-    from .._check import check_whole
     from ..cameras import Camera
     from ..pipeline import segment_cameras, write_coco
     from ..pipeline.label_pictures import check_coco
+    from ..scenes import file_stem
     from ..viz import show_cloud
 
-    frames, width = size
-    check_whole("frames", frames, 2)
-    check_whole("width", width, 16)
     classes.check_images()
     if not coco:
         check_alone("color", color, "without --coco, whose pictures it colours")
@@ -196,7 +197,7 @@ def _segment_path(
     cameras = list(loaded.cameras) if classes.scene is None else classes.load_scene().undistorted().cameras
     colors = open_colors(field, color, loaded) if coco else None
     walk: dict[str, Camera] = {
-        str(camera.name): camera for camera in walk_of(path, loaded.gaussians.means, cameras, frames, width)
+        file_stem(camera.name): camera for camera in walk_of(path, loaded.gaussians.means, cameras, frames, width)
     }
     if coco:
         check_coco(out, walk)

@@ -4,7 +4,7 @@ from ..cameras.bounds import Bounds, robust_bounds
 from .colmap_model import ColmapModel, read_model
 from .files import SceneError, file_stem, list_images, read_image
 from .known_poses import find_points, write_known_poses
-from .load import is_scene, load_scene
+from .load import is_scene, load_cameras, load_scene
 from .pictures import convert_heic, extract_frames
 from .scene import Scene
 from .sfm import SfmConfig, link_images, run_sfm
@@ -26,6 +26,7 @@ __all__ = [
     "is_scene",
     "link_images",
     "list_images",
+    "load_cameras",
     "load_scene",
     "make_split",
     "read_image",

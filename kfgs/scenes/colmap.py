@@ -109,6 +109,17 @@ def load_colmap(path: str | Path, images: str | Path) -> Scene:
     return Scene(cameras, paths, points, colors, splits, tuple(notes)).with_near()
 
 
+def colmap_cameras(path: Path) -> list[Camera]:
+    """The cameras of a model's images with a pose, in natural order of names; the image files need not be there.
+
+    Raises:
+        SceneError: if the model is damaged, or a lens has no exact form in kfgs.
+    """
+    model = read_model(path)
+    views = sorted(model.images.values(), key=lambda image: natural_key(image.name))
+    return _cameras(path, model, [image for image in views if image.pose is not None])
+
+
 def _cameras(path: Path, model: ColmapModel, images: list[ColmapImage]) -> list[Camera]:
     lenses = {}
     for camera_id, camera in model.cameras.items():

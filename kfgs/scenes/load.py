@@ -7,10 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+import torch
+
 from .._check import check_choice
 from .._files import as_path, real_path
+from ..cameras.camera import Camera
 from ..formats.folders import newest_splat
-from .colmap import load_colmap
+from .colmap import colmap_cameras, load_colmap
 from .colmap_model import has_model
 from .files import SceneError, natural_key, some
 from .inria import is_inria, load_inria
@@ -20,7 +23,7 @@ from .replica import is_nice_slam, is_semantic_nerf, load_nice_slam, load_semant
 from .scannet import is_scannet, load_scannet
 from .scene import Scene
 from .splits import RULES, choose_split, make_split, read_split, read_test_list
-from .transforms import load_transforms
+from .transforms import load_transforms, transforms_cameras
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap_ground_truth", ".")
 _TRANSFORMS = ("transforms.json", "transforms_train.json")
@@ -91,6 +94,40 @@ def load_scene(path: str | Path, *, images: str | Path | None = None, split: Spl
     return _with_split(scene, root, split)
 
 
+def load_cameras(path: str | Path) -> list[Camera]:
+    """The cameras of a scene, or of a camera path of your own, for what needs no pictures. They are without lens distortion.
+
+    `near` is chosen as by `load_scene`, from these cameras alone.
+
+    Args:
+        path: what `load_scene` reads. The pictures of a COLMAP model or a transforms.json are not needed: the cameras have the
+            sizes that it says. A frame of a transforms.json needs no `file_path` either; its number is then its name.
+
+    Returns:
+        The cameras in natural order of their names.
+
+    Raises:
+        FileNotFoundError: if there is no such file or folder.
+        SceneError: if there are no cameras, or they cannot be used.
+    """
+    path = as_path(path)
+    model = find_model(path)
+    if model is not None:
+        cameras = colmap_cameras(model)
+    elif path.exists() and _is_transforms(path):
+        cameras = transforms_cameras(path)
+    else:
+        return load_scene(path).undistorted().cameras
+    if not cameras:
+        raise SceneError(f"{path}: expected cameras with poses, got none; run COLMAP again (`kfgs sfm`)")
+    nothing = torch.zeros(0, 3)
+    try:
+        scene = Scene(cameras, [Path(camera.name) for camera in cameras], nothing, nothing.byte())
+    except SceneError as error:  # of two names that are the same
+        raise SceneError(f"{path}: {error}") from error
+    return scene.with_near().undistorted().cameras
+
+
 def _with_splat(scene: Scene, root: Path) -> Scene:
     """The scene with the splat that 3DGS left in its folder. Other programs train in a frame of their own: only a note."""
     splat = newest_splat(root)
@@ -140,7 +177,7 @@ def _load_views(path: Path, images: str | Path | None) -> Scene:
             note = f"{model.parent} holds other models too ({some(others)}): COLMAP split the images; 0 is used"
             scene = replace(scene, notes=(*scene.notes, note))
         return scene
-    if path.suffix == ".json" or any((path / name).is_file() for name in _TRANSFORMS):
+    if _is_transforms(path):
         return load_transforms(path, images)
     for layout in _LAYOUTS:
         if path.is_dir() and layout.matches(path):
@@ -153,6 +190,10 @@ def _load_views(path: Path, images: str | Path | None) -> Scene:
         f"{path}: expected a COLMAP model (in {', '.join(MODEL_FOLDERS)}) or a transforms.json, found neither; nor "
         f"{'; '.join(f'{layout.files} of {layout.name}' for layout in _LAYOUTS)}{half}; {_advice(path)}"
     )
+
+
+def _is_transforms(path: Path) -> bool:
+    return path.suffix == ".json" or any((path / name).is_file() for name in _TRANSFORMS)
 
 
 def find_model(path: Path) -> Path | None:

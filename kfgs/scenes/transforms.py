@@ -1,15 +1,7 @@
-"""Read scenes from transforms.json (nerfstudio, instant-ngp, Blender).
-
-**Convention**: `transform_matrix` is camera to world with OpenGL axes (x right, y up, z backward). kfgs wants world to
-camera with y down and z forward, so the y and z columns change sign and the pose is inverted. World coordinates are those of
-the file: `applied_transform`, which was applied to poses and points, is not undone.
-`cx, cy` are read as in COLMAP (the centre of the first pixel is (0.5, 0.5)), because the converters of nerfstudio and
-instant-ngp copy COLMAP's numbers and both programs sample pixels at +0.5.
-"""
+"""Read scenes from transforms.json (nerfstudio, instant-ngp, Blender). `transforms_frame` has the conventions."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -19,26 +11,13 @@ import torch
 from torch import Tensor
 
 from .._files import as_path
-from ..cameras.camera import Camera, Distortion
-from .files import (
-    IMAGE_SUFFIXES,
-    MAX_NUMBER,
-    MAX_SIDE,
-    SceneError,
-    is_file,
-    natural_key,
-    read_image,
-    read_scene_json,
-    some,
-)
-from .posed import MILLIMETRE, as_large_as_pictures, points_of_cameras, read_points
+from ..cameras.camera import Camera
+from .files import IMAGE_SUFFIXES, SceneError, is_file, natural_key, read_image, read_scene_json, some
+from .posed import MILLIMETRE, as_large_as_pictures, picture_size, points_of_cameras, read_points
 from .scene import Scene
+from .transforms_frame import Frame
 
-_PERSPECTIVE = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-_FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
-_COEFFICIENTS = {"PINHOLE": (), "SIMPLE_PINHOLE": (), **dict.fromkeys(_FISHEYE, ("k1", "k2", "k3", "k4"))}
 _UNNAMED_POINTS = "points3d.ply"
-_FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  # OpenGL axes to COLMAP's
 
 
 @dataclass
@@ -102,7 +81,7 @@ def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene
     first, top = next(iter(readers.values()))
     points, colors, notes = _points(first, top)
     if len(points) == 0:
-        unit = _Frame(first.path, "top level", top).number("integer_depth_scale", MILLIMETRE)  # world units per step
+        unit = Frame(first.path, "top level", top).number("integer_depth_scale", MILLIMETRE)  # world units per step
         frames = [frame for reader, _ in readers.values() for frame in reader.with_depth()]
         found = points_of_cameras(frames, unit)
         points, colors, notes = found or (points, colors, notes)
@@ -115,6 +94,31 @@ def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene
     paths = [view[1] for view in views]
     cameras, shrunk = as_large_as_pictures([view[0] for view in views], paths, first.images)
     return Scene(cameras, paths, points, colors, _splits(views, first.root, top), (*notes, *shrunk)).with_near()
+
+
+def transforms_cameras(path: Path) -> list[Camera]:
+    """The cameras of the files that `load_transforms` reads, in natural order of names, also of frames without an image file.
+
+    A frame without `file_path` is named by its number, `0007.png`. A picture is opened only if its frame has no `w, h`.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        SceneError: if it is damaged, a number is missing or implausible, or a lens is unknown to kfgs.
+    """
+    cameras = []
+    for file in _files(path).values():
+        reader = _Reader(file, file.parent, None)
+        for i, (frame, _) in enumerate(_frames(reader, _read_top(reader))):
+            listed = frame.values.get("file_path") or f"{i:04d}"
+            if not isinstance(listed, str) or "\0" in listed or not Path(listed).name:
+                raise frame.fail("file_path", "a file's name", listed, "correct it, or leave it out")
+            named, found = reader.root / listed.replace("\\", "/"), _find_image(reader, listed)
+            if named.suffix.lower() not in IMAGE_SUFFIXES:  # of Blender
+                named = named.with_name(f"{named.name}.png")
+            if found is not None and not {"w", "h"} <= set(frame.values):
+                frame.values["w"], frame.values["h"] = picture_size(found)
+            cameras.append(frame.camera(_name(reader, found or named)))
+    return sorted(cameras, key=lambda camera: natural_key(camera.name))
 
 
 def _files(path: Path) -> dict[str, Path]:
@@ -130,16 +134,26 @@ def _files(path: Path) -> dict[str, Path]:
     return {"all": path}
 
 
-def _read_frames(reader: _Reader) -> dict[str, Any]:
-    """Fill `reader.views`; return the top level of the file."""
+def _read_top(reader: _Reader) -> dict[str, Any]:
     top = read_scene_json(reader.path, "write the file again")
     if not isinstance(top, dict) or not isinstance(top.get("frames"), list) or not top["frames"]:
-        place = _Frame(reader.path, "top level", {})
+        place = Frame(reader.path, "top level", {})
         raise place.fail("", "an object with a list of 'frames'", top, "is this a transforms.json?")
-    sizes: dict[str, tuple[int, int]] = {}
+    return top
+
+
+def _frames(reader: _Reader, top: dict[str, Any]) -> Iterator[tuple[Frame, Any]]:
+    """Each frame with what the top says for all, and as it is in the file."""
     for i, values in enumerate(top["frames"]):
-        merged = {**top, **values} if isinstance(values, dict) else {}
-        frame, listed = _Frame(reader.path, f"frame {i}", merged), merged.get("file_path")
+        yield Frame(reader.path, f"frame {i}", {**top, **values} if isinstance(values, dict) else {}), values
+
+
+def _read_frames(reader: _Reader) -> dict[str, Any]:
+    """Fill `reader.views`; return the top level of the file."""
+    top = _read_top(reader)
+    sizes: dict[str, tuple[int, int]] = {}
+    for frame, values in _frames(reader, top):
+        merged, listed = frame.values, frame.values.get("file_path")
         if not isinstance(listed, str) or not listed:
             raise frame.fail("", "an object with a 'file_path'", values, "write the file again")
         file = _find_image(reader, listed)
@@ -198,103 +212,6 @@ def _normal(path: Path) -> Path:
         else:
             parts.append(part)
     return Path(*parts)
-
-
-@dataclass(frozen=True)
-class _Frame:
-    """The values of one frame; if the frame lacks one, that at the top of the file."""
-
-    path: Path
-    where: str
-    values: dict[str, Any]
-
-    def fail(self, where: str, expected: str, got: object, advice: str) -> SceneError:
-        place = f"{self.where}, {where}" if where else self.where
-        return SceneError(f"{self.path}, {place}: expected {expected}, got {got!r:.200}; {advice}")
-
-    def number(self, name: str, default: float | None = None) -> float:
-        value = self.values.get(name, default)
-        if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) < MAX_NUMBER:
-            raise self.fail(name, "a finite number", value, "add it at the top or in each frame")
-        return float(value)
-
-    def camera(self, name: str) -> Camera:
-        width, height = self.number("w"), self.number("h")
-        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE and width % 1 == 0 and height % 1 == 0):
-            raise self.fail("", f"w and h of 1 to {MAX_SIDE} whole pixels", (width, height), "correct the size")
-        fx = self.focal_length("x", width)
-        fy = self.focal_length("y", height)
-        if fx is None:
-            expected = "'fl_x' or 'camera_angle_x'"
-            raise self.fail("", expected, sorted(self.values), "add one at the top or in each frame")
-        cx, cy = self.number("cx", width / 2), self.number("cy", height / 2)
-        K = torch.tensor([[fx, 0, cx], [0, fx if fy is None else fy, cy], [0, 0, 1]], dtype=torch.float32)
-        viewmat, lens = self.viewmat(), self.distortion()
-        try:
-            return Camera(viewmat.float(), K, int(width), int(height), name, lens)
-        except ValueError as error:
-            raise SceneError(f"{self.path}, {self.where} ({name}): {error}") from error
-
-    def focal_length(self, axis: str, side: float) -> float | None:
-        if f"fl_{axis}" in self.values:
-            return self.number(f"fl_{axis}")
-        name = f"camera_angle_{axis}"
-        if name not in self.values:
-            return None
-        angle = self.number(name)
-        if not 0 < angle < math.pi:
-            raise self.fail(name, "an angle in (0, pi) radians", angle, "correct it")
-        return side / 2 / math.tan(angle / 2)
-
-    def distortion(self) -> Distortion | None:
-        """The lens; a perspective lens whose coefficients are all zero is None.
-
-        The k4 of nerfstudio's perspective camera is the fourth radial term; OpenCV's k4 is the first of the denominator. So
-        k4 is accepted only with FULL_OPENCV, where it can only mean OpenCV's.
-        """
-        model = "OPENCV_FISHEYE" if self.values.get("is_fisheye") is True else self.values.get("camera_model", "OPENCV")
-        if model not in _PERSPECTIVE + _FISHEYE:
-            expected = f"one of {', '.join(_PERSPECTIVE + _FISHEYE)}"
-            raise self.fail("camera_model", expected, model, "undistort the images first")
-        k = [self.number(f"k{i}", 0.0) for i in range(1, 7)]
-        p = [self.number(f"p{i}", 0.0) for i in (1, 2)]
-        coefficients = {**{f"k{i}": value for i, value in enumerate(k, 1)}, "p1": p[0], "p2": p[1]}
-        known = _COEFFICIENTS.get(model, tuple(coefficients))
-        dropped = {name: value for name, value in coefficients.items() if value and name not in known}
-        if dropped:
-            expected = f"only {' '.join(known) or 'zeros'} with camera_model {model}"
-            raise self.fail("", expected, dropped, "correct camera_model or remove them")
-        if model in _FISHEYE:
-            return Distortion("kannala_brandt", tuple(k[:4]))
-        if not any(k + p):
-            return None
-        if not any(k[3:]):
-            return Distortion("brown_conrady", (k[0], k[1], *p, k[2]) if k[2] else (k[0], k[1], *p))
-        if model != "FULL_OPENCV":
-            raise self.fail(
-                "", "at most k1 k2 k3 p1 p2", {"k4": k[3], "k5": k[4], "k6": k[5]},
-                'undistort the images first, or set "camera_model": "FULL_OPENCV" if these are OpenCV\'s k4 k5 k6',
-            )  # fmt: skip
-        return Distortion("brown_conrady", (k[0], k[1], *p, *k[2:]))
-
-    def viewmat(self) -> Tensor:  # [4, 4] float64
-        """World to camera from a camera-to-world matrix with OpenGL axes."""
-        name, rows = "transform_matrix", self.values.get("transform_matrix")
-        try:
-            pose = torch.tensor(rows, dtype=torch.float64)
-        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-            raise self.fail(name, "4 rows of 4 numbers", rows, "write the file again") from error
-        if pose.shape == (3, 4):
-            pose = torch.cat([pose, pose.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
-        if pose.shape != (4, 4) or not torch.isfinite(pose).all() or float(pose.abs().max()) > MAX_NUMBER:
-            raise self.fail(name, "4 rows of 4 finite numbers", rows, "write the file again")
-        if pose[3].tolist() != [0, 0, 0, 1]:
-            raise self.fail(name, "0 0 0 1 as the last row", pose[3].tolist(), "is it transposed?")
-        pose = pose @ _FLIP
-        viewmat = torch.eye(4, dtype=torch.float64)
-        viewmat[:3, :3] = pose[:3, :3].T  # Camera refuses what is not a rotation
-        viewmat[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-        return viewmat
 
 
 def _points(reader: _Reader, top: dict[str, Any]) -> tuple[Tensor, Tensor, list[str]]:

@@ -120,7 +120,7 @@ def check_target(path: str | Path, fps: float) -> Path:
         raise ValueError(f"path: expected a name that ends in .gif or .mp4, got {target.name!r}; rename it")
     check_range("fps", fps, 0.01, GIF_FPS if suffix == ".gif" else 240)  # a GIF counts to 655 seconds
     if suffix == ".mp4":
-        _ffmpeg()
+        _ffmpeg(target)
     return target
 
 
@@ -181,7 +181,7 @@ def _indexed(frame: Array, legend: tuple[Array, Array] | None) -> Image.Image:
 def _write_mp4(path: Path, frames: Iterator[Array], fps: float) -> None:
     first = next(frames)
     height, width = (first.shape[0] + 1) // 2 * 2, (first.shape[1] + 1) // 2 * 2  # H.264 needs even sizes
-    writer = _ffmpeg().write_frames(
+    writer = _ffmpeg(path).write_frames(
         str(path), (width, height), fps=fps, codec="libx264", quality=8, macro_block_size=2, ffmpeg_log_level="error"
     )
     writer.send(None)
@@ -194,11 +194,11 @@ def _write_mp4(path: Path, frames: Iterator[Array], fps: float) -> None:
         writer.close()
 
 
-def _ffmpeg() -> Any:
+def _ffmpeg(path: Path) -> Any:
     try:
         return importlib.import_module(FFMPEG)
     except ImportError as error:
         raise ImportError(
-            "path: expected imageio-ffmpeg to write .mp4, but it is not installed; run: pip install imageio-ffmpeg "
+            f"{path}: expected imageio-ffmpeg to write .mp4, but it is not installed; run: pip install imageio-ffmpeg "
             "(or write a .gif, which needs nothing)"
         ) from error

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 from typing import Any
 
@@ -9,40 +11,51 @@ import numpy as np
 
 from .._check import as_array
 from .._files import as_path, atomic_path
+from .._files.errors import UNNAMED
 from .._typed import typed
-from ..formats.splat_file import SplatFile
+from ..formats.render_mode import describe_lost_mode
+from ..formats.splat_file import SCORE, SplatFile, Written
+from ..formats.values import check_splats, describe_loss
 from ..gaussians import Gaussians
 from ..splat.sh import sh0_to_rgb
 
-SUFFIXES = (".usdc", ".usda", ".usd")
+SUFFIXES = (".usdc", ".usda", ".usd", ".usdz")
 
 
 @typed
-def save_usd(path: str | Path, cloud: Gaussians | SplatFile, *, points: bool = False) -> None:
+def save_usd(path: str | Path, cloud: Gaussians | SplatFile, *, points: bool = False) -> Written:
     """Write a cloud as a USD scene: below `/splat` one object for each class, so that classes can be hidden or moved.
 
     The objects are `ParticleField3DGaussianSplat`, which OpenUSD knows since 26.03; or, for programs that do not know it,
-    `Points` in their base colour, as wide as two mean standard deviations. Each object has the primvar `class_id` (a number
-    per Gaussian) and the attribute `kfgs:class`, the name of its class. Axes and units stay those of the scene.
+    `Points` in their base colour, as wide as two mean standard deviations. Each object has the primvars `class_id` and, if
+    known, `score` (a number per Gaussian), and the attribute `kfgs:class`, the name of its class. Axes and units stay those of
+    the scene.
 
     Args:
-        path: the file: .usdc (binary), .usda (text) or .usd (binary).
+        path: the file: .usdc (binary), .usda (text), .usd (binary) or .usdz (a .usdc in an uncompressed zip file).
         cloud: Gaussians or a splat with colours.
         points: write points instead of Gaussians.
 
+    Returns:
+        The file, and what it could not store.
+
     Raises:
         ImportError: if usd-core is not installed.
-        ValueError: if the name has another ending, or the cloud has no colours.
+        ValueError: if the name has another ending, the cloud has no colours, or a value cannot be stored (see
+            `write_splats`). Nothing is written then.
     """
-    try:
-        from pxr import Sdf, Usd, UsdGeom
-    except ImportError as error:
-        raise ImportError(f"save_usd: expected usd-core ({error}); run: pip install 'usd-core>=26.3'") from error
     path, splats = as_path(path), SplatFile(cloud) if isinstance(cloud, Gaussians) else cloud
+    try:
+        from pxr import Sdf, Usd, UsdGeom, UsdUtils
+    except ImportError as error:
+        raise ImportError(
+            f"{path}: expected usd-core to write USD ({error}); run: pip install 'usd-core>=26.3'"
+        ) from error
     if path.suffix.lower() not in SUFFIXES:
         raise ValueError(f"path: expected a name that ends in {', '.join(SUFFIXES)}, got {path.name!r}; rename it")
     if splats.gaussians.sh is None:
         raise ValueError(f"cloud: expected colours (sh [N, K, 3]), got {splats!r}; pass a colour splat")
+    check_splats(splats)
     stage = Usd.Stage.CreateInMemory()
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/splat").GetPrim())
     for label, part in ({-1: splats} if splats.gaussians.labels is None else splats.by_class()).items():
@@ -50,12 +63,24 @@ def save_usd(path: str | Path, cloud: Gaussians | SplatFile, *, points: bool = F
         shape = (_add_points if points else _add_gaussians)(stage, place, part.gaussians.detach())
         name = splats.classes[label] if 0 <= label < len(splats.classes) else ""
         shape.GetPrim().CreateAttribute("kfgs:class", Sdf.ValueTypeNames.String).Set(name)
-        primvar = UsdGeom.PrimvarsAPI(shape).CreatePrimvar(
-            "class_id", Sdf.ValueTypeNames.IntArray, UsdGeom.Tokens.vertex
-        )
-        primvar.Set(np.full(len(part), label, np.int32))
+        numbers = {"class_id": (Sdf.ValueTypeNames.IntArray, np.full(len(part), label, np.int32))}
+        if SCORE in part.extra:
+            numbers[SCORE] = (Sdf.ValueTypeNames.FloatArray, _floats(part.extra[SCORE]))
+        for key, (kind, values) in numbers.items():
+            UsdGeom.PrimvarsAPI(shape).CreatePrimvar(key, kind, UsdGeom.Tokens.vertex).Set(values)
     with atomic_path(path) as temporary:
-        stage.GetRootLayer().Export(str(temporary))
+        packed = path.suffix.lower() == ".usdz"
+        layer = temporary.with_suffix(".usdc") if packed else temporary
+        try:
+            stage.GetRootLayer().Export(str(layer))
+            if packed:
+                UsdUtils.CreateNewUsdzPackage(str(layer), str(temporary))
+        except RuntimeError as error:  # of USD: the system's words are somewhere in several lines
+            code = next((code for code in UNNAMED if os.strerror(code) in str(error)), errno.EIO)
+            raise OSError(code, os.strerror(code)) from error
+    lost = describe_loss(splats, path.suffix, 3) + describe_lost_mode(splats.info, path.suffix)
+    flat = ("shapes, opacities and harmonics of the Gaussians: points are round and opaque",) if points else ()
+    return Written([path], lost + flat, None)
 
 
 def _add_points(stage: Any, place: str, g: Gaussians) -> Any:

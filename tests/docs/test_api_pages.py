@@ -21,6 +21,7 @@ import kfgs
 from kfgs import scale
 from kfgs.evaluation import FieldMethod
 from kfgs.pipeline import true_labels
+from kfgs.scenes import load_cameras
 from kfgs.viz import available
 
 RUN_BATCH = scale.run_batch
@@ -173,7 +174,8 @@ def test_names_are_read_from_imports_and_attributes():
 @pytest.mark.parametrize("topic", TOPICS)
 def test_the_examples_of_a_page_run(topic, request):
     if topic == "view":
-        pytest.importorskip("anywidget")
+        for name in ("anywidget", "trimesh", "pxr"):
+            pytest.importorskip(name)
         if not available():
             pytest.skip("nothing can be drawn here")
     request.getfixturevalue("inside")
@@ -301,6 +303,17 @@ def test_the_python_of_many_scenes_runs(inside, monkeypatch):
     exec(table, {})
     rows = Path("scores.csv").read_text().splitlines()
     assert rows == ["scene,mIoU,accuracy,failure", "attic,,,no pictures", "kitchen,0.5,0.75,"]
+
+
+def test_the_file_of_cameras_on_the_page_of_export_can_be_read(tmp_path):
+    (text,) = re.findall(
+        r"```json\n(.*?)```", (PAGES.parent / "howto/export.md").read_text(encoding="utf-8"), re.DOTALL
+    )
+    (tmp_path / "my_cameras.json").write_text(text)
+    first, second = load_cameras(tmp_path / "my_cameras.json")
+    assert first.size == (480, 640)
+    assert second.center.tolist() == pytest.approx([1.0, -2.0, 1.2])
+    assert second.viewmat[1:3, :3].tolist() == [[0, 0, -1], [0, 1, 0]]  # down is -z, it looks along y
 
 
 def test_no_page_has_python_that_no_test_runs():

@@ -1,12 +1,13 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from colmap_models import write_model, write_picture
 from messages import tells
 
-from kfgs.scenes import SceneError, list_images, load_scene
+from kfgs.scenes import SceneError, list_images, load_cameras, load_scene
 from kfgs.scenes.load import picture_folders
 
 
@@ -142,3 +143,89 @@ def test_picture_folders_are_those_that_are_read(
     (root / "sparse/0/images.bin").write_bytes(b"")  # the model is not read for it
     assert picture_folders(root, given) == ([] if found is None else [root / found])
     assert picture_folders(tmp_path) == []  # no scene
+
+
+def _same(some: list[Any], others: list[Any]) -> bool:
+    return [(c.name, c.size, c.near, c.distortion, c.viewmat.tolist(), c.K.tolist()) for c in some] == [
+        (c.name, c.size, c.near, c.distortion, c.viewmat.tolist(), c.K.tolist()) for c in others
+    ]
+
+
+def test_cameras_of_a_model_without_its_pictures_are_those_with_them(tmp_path: Path) -> None:
+    names = ["a.png", "b_10.png", "b_9.png"]
+    write_model(tmp_path / "sparse/0", names)
+    _pictures(tmp_path / "images", names)
+    expected = load_scene(tmp_path).undistorted().cameras
+    shutil.rmtree(tmp_path / "images")
+    assert [camera.name for camera in expected] == ["a.png", "b_9.png", "b_10.png"]
+    for path in (tmp_path, tmp_path / "sparse/0"):
+        assert _same(load_cameras(path), expected)
+
+
+POSES = [[[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 2 * x], [0, 0, 0, 1]] for x in range(3)]
+LENS = {"w": 16, "h": 12, "fl_x": 20.0, "k1": 0.01}
+
+
+def _frames(names: list[Any]) -> list[dict[str, Any]]:
+    named = [{} if name is None else {"file_path": name} for name in names]
+    return [one | {"transform_matrix": pose} for one, pose in zip(named, POSES, strict=False)]
+
+
+def _write_transforms(file: Path, names: list[Any]) -> Path:
+    file.write_text(json.dumps({**LENS, "frames": _frames(names)}))
+    return file
+
+
+def test_cameras_of_a_transforms_json_without_its_pictures_are_those_with_them(tmp_path: Path) -> None:
+    names = ["images/b.png", "images/a.png", "./train/r_0.5"]
+    file = _write_transforms(tmp_path / "transforms.json", names)
+    for name in [*names[:2], "train/r_0.5.png"]:
+        write_picture(tmp_path / name, 12, 16)
+    expected = load_scene(tmp_path).undistorted().cameras
+    for name in ("images", "train"):
+        shutil.rmtree(tmp_path / name)
+    assert [camera.name for camera in expected] == ["a.png", "b.png", "train/r_0.5.png"]
+    for path in (tmp_path, file):
+        assert _same(load_cameras(path), expected)
+
+
+def test_cameras_need_no_names_and_keep_their_order(tmp_path: Path) -> None:
+    file = _write_transforms(tmp_path / "path.json", [None, None, ""])
+    cameras = load_cameras(file)
+    assert [camera.name for camera in cameras] == ["0000.png", "0001.png", "0002.png"]
+    assert [camera.center[0] for camera in cameras] == [0, 1, 2]
+    outside = _write_transforms(file, ["../../secret.png", "/etc/b.png", "C:\\c.png"])
+    assert [camera.name for camera in load_cameras(outside)] == ["C:/c.png", "b.png", "secret.png"]
+
+
+def test_without_a_size_cameras_are_as_large_as_their_pictures(tmp_path: Path) -> None:
+    file = _write_transforms(tmp_path / "transforms_test.json", ["r_0"])
+    values = json.loads(file.read_text())
+    file.write_text(json.dumps({key: value for key, value in values.items() if key not in "wh"}))
+    with pytest.raises(SceneError, match=tells(file, "frame 0, w:", "a finite number", "got None")):
+        load_cameras(file)
+    write_picture(tmp_path / "r_0.png", 12, 16)
+    assert load_cameras(file)[0].size == (12, 16)
+
+
+@pytest.mark.parametrize(
+    ("names", "parts"),
+    [
+        (["a.png", "a.jpg"], ("path.json:", "names that differ", "'a' twice")),
+        (["a\0.png"], ("path.json, frame 0, file_path:", "a file's name")),
+        (["/"], ("path.json, frame 0, file_path:", "a file's name")),
+        ([3], ("path.json, frame 0, file_path:", "a file's name", "got 3")),
+        ([], ("path.json, top level:", "'frames'", "is this a transforms.json")),
+    ],
+)
+def test_cameras_that_cannot_be_used_are_named(tmp_path: Path, names: list[Any], parts: tuple[str, ...]) -> None:
+    file = _write_transforms(tmp_path / "path.json", names)
+    with pytest.raises(SceneError, match=tells(*parts)):
+        load_cameras(file)
+
+
+def test_where_there_are_no_cameras_the_error_is_that_of_a_scene(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=tells(tmp_path / "none", "no such")):
+        load_cameras(tmp_path / "none")
+    with pytest.raises(SceneError, match=tells(tmp_path, "COLMAP model", "transforms.json")):
+        load_cameras(tmp_path)

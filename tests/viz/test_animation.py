@@ -137,7 +137,7 @@ def test_video_without_ffmpeg_says_what_to_install_before_anything_is_drawn(tmp_
     def never(camera):
         raise AssertionError
 
-    with pytest.raises(ImportError, match=tells("path:", ".mp4", "pip install imageio-ffmpeg")):
+    with pytest.raises(ImportError, match=tells(".mp4: expected imageio-ffmpeg", "pip install imageio-ffmpeg")):
         save_animation(tmp_path / "a.mp4", never, cameras())
 
 

@@ -4,26 +4,36 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 from cases_viz import some_gaussians
 from messages import tells
 
 from kfgs.formats import SplatFile
 from kfgs.viz import save_usd
 
+pxr = pytest.importorskip("pxr")
+
 NAMES = ("wall", "office chair", "b", "c", "d")
 
 
 def opened(path):
-    Usd = pytest.importorskip("pxr.Usd")
+    from pxr import Usd
+
     stage = Usd.Stage.Open(str(path))
     return stage, {prim.GetName(): prim for prim in stage.GetDefaultPrim().GetChildren()}
 
 
-@pytest.mark.parametrize("ending", ["usda", "usdc", "usd"])
+@pytest.mark.parametrize("ending", ["usda", "usdc", "usd", "usdz"])
 def test_each_class_is_an_object_with_its_gaussians(tmp_path, ending):
-    pytest.importorskip("pxr")
     cloud, path = some_gaussians(K=4), tmp_path / f"a.{ending}"
-    save_usd(path, SplatFile(cloud, classes=NAMES))
+    score = np.linspace(0, 1, len(cloud), dtype=np.float32)
+    written = save_usd(path, SplatFile(cloud, {"score": score, "other": score}, NAMES))
+    assert written.paths == [path]
+    assert written.lost == (
+        f"4 features per Gaussian: .{ending} has no place for them",
+        f"the columns other: .{ending} has no place for them",
+    )
+    assert [one.name for one in tmp_path.iterdir()] == [path.name]
     _, prims = opened(path)
     assert set(prims) == {"no_class", *(f"class_{i}" for i in range(5))}
     chairs, prim = cloud[cloud.labels == 1], prims["class_1"]
@@ -34,6 +44,7 @@ def test_each_class_is_an_object_with_its_gaussians(tmp_path, ending):
     def read(name):
         return np.array(prim.GetAttribute(name).Get())
 
+    np.testing.assert_array_equal(read("primvars:score"), score[cloud.labels == 1])
     np.testing.assert_allclose(read("positions"), chairs.means, rtol=1e-6)
     np.testing.assert_allclose(read("scales"), chairs.scales, rtol=1e-6)
     np.testing.assert_allclose(read("opacities"), chairs.opacities, rtol=1e-6)
@@ -44,9 +55,9 @@ def test_each_class_is_an_object_with_its_gaussians(tmp_path, ending):
 
 
 def test_points_for_programs_without_gaussians(tmp_path):
-    pytest.importorskip("pxr")
     cloud = some_gaussians()
-    save_usd(tmp_path / "a.usdc", cloud.replace(labels=None), points=True)
+    written = save_usd(tmp_path / "a.usdc", cloud.replace(labels=None, features=None), points=True)
+    assert written.lost == ("shapes, opacities and harmonics of the Gaussians: points are round and opaque",)
     _, prims = opened(tmp_path / "a.usdc")
     (prim,) = prims.values()
     assert prim.GetTypeName() == "Points"
@@ -58,12 +69,13 @@ def test_points_for_programs_without_gaussians(tmp_path):
 
 
 def test_bad_requests_and_a_missing_library_are_named(tmp_path, monkeypatch):
-    pytest.importorskip("pxr")
     with pytest.raises(ValueError, match=tells("path:", ".usdc", "a.ply")):
         save_usd(tmp_path / "a.ply", some_gaussians())
     with pytest.raises(ValueError, match=tells("cloud:", "colours")):
         save_usd(tmp_path / "a.usdc", some_gaussians().replace(sh=None))
+    with pytest.raises(ValueError, match=tells("scales:", "above 0")):
+        save_usd(tmp_path / "a.usdc", some_gaussians().replace(scales=torch.zeros(60, 3)))
     monkeypatch.setitem(sys.modules, "pxr", None)
-    with pytest.raises(ImportError, match=tells("save_usd:", "usd-core")):
+    with pytest.raises(ImportError, match=tells("a.usdc:", "usd-core", "pip install 'usd-core>=26.3'")):
         save_usd(tmp_path / "a.usdc", some_gaussians())
     assert list(tmp_path.iterdir()) == []
