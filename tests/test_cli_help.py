@@ -94,7 +94,8 @@ def test_command_lines_in_the_docs_are_understood(name, monkeypatch):
         assert {word for word in line if word.startswith("--")} <= {*known, "--help"}, line
 
 
-OF_OTHERS = {"--spz-version", "--nthreads", "--no-normalize-world-space"}  # of SplatTransform, Dask, gsplat
+# of SplatTransform, Dask, gsplat, torchrun
+OF_OTHERS = {"--spz-version", "--nthreads", "--no-normalize-world-space", "--rdzv-endpoint"}
 OF_BENCHMARKS = {"--kinds", "--quick", "--room-0", "--whole", "--atoms", "--copies"}
 
 
