@@ -77,7 +77,8 @@ class Part:
         place = ", ".join(f"{x:.3g}" for x in self.centroid.tolist())
         size = " x ".join(f"{2 * x:.3g}" for x in self.box.half.tolist())
         view = "" if self.best_view is None else f", {self.best_view.share:.1%} of {self.best_view.camera!r}"
-        return f"Part({self.count} Gaussian{"s" * (self.count != 1)} at ({place}), {size}, score {self.score:.3f}{view})"
+        what = "Gaussian" if self.count == 1 else "Gaussians"
+        return f"Part({self.count} {what} at ({place}), {size}, score {self.score:.3f}{view})"
 
     def to_json(self, indices: bool = True) -> dict[str, Any]:
         """Plain numbers, lists and strings; `indices=False` leaves out the list of Gaussians, which may be long."""
