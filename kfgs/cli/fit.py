@@ -132,6 +132,7 @@ def sfm(
     written = [out / "sparse" / "0"]
     beside = out / "images"
     if link_images(images, out):
+        say(f"{beside} is a link to {real_path(images)}: keep the photos there")
         written.append(beside)
     elif real_path(beside) != real_path(images):
         say(f"note: {beside} is another folder; pass --images {images} to the other commands")
