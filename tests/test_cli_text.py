@@ -246,9 +246,7 @@ def test_words_of_another_teacher_are_noted(field, names, tmp_path, capsys):
     made.save(table)
     assert main(["select", "lamp", str(field), "--text", str(table)]) == 0
     said = capsys.readouterr().out
-    assert (
-        "note: --classes: expected text of the field's teacher (name 'letters'), got text of another ('clip')" in said
-    )
+    assert "note: --text: expected text of the field's teacher (name 'letters'), got text of another ('clip')" in said
     assert main(["select", "palm", str(field), "--text", str(table), *LETTERS]) == 0
     said = capsys.readouterr().out
     assert "note: --text: expected a table by the query's teacher (name 'letters'" in said
@@ -274,11 +272,13 @@ def test_words_of_another_teacher_are_noted(field, names, tmp_path, capsys):
             ("--negatives:", "classes or canonical", "--score softmax", "got none"),
         ),
         (["lamp", "--teacher", "cases_text:MUTE"], ("teacher 'mute':", "text encoder")),
-        (["palm", "--text", "{other}", *LETTERS], ("--classes:", "[C, 16]", "teacher")),
+        (["lamp"], ("--classes, --text:", "got none", "`kfgs text --examples clicks.json --field {field} --out")),
+        (["palm", "--text", "{other}", *LETTERS], ("--text:", "[C, 16]", "teacher")),
         (
             ["lamp", "--text", "{other}"],
-            ("--classes:", "[C, 16]", "got ({count}, 5)"),
+            ("--text:", "[C, 16]", "got ({count}, 5)"),
         ),
+        (["lamp", "--text", "{shown}"], ("--text:", "[C, 16]", "another field", "`kfgs text --examples")),
         (
             ["lamp", "--text", "{bare}", "--negatives", "canonical"],
             ("--negatives:", "canonical", "got none", "`kfgs text`"),
@@ -288,14 +288,17 @@ def test_words_of_another_teacher_are_noted(field, names, tmp_path, capsys):
 )
 def test_wrong_queries_are_named(field, names, tmp_path, capsys, arguments, message):
     made = make_label_set(TEACHER, names)
-    paths = {name: tmp_path / f"{name}.safetensors" for name in ("table", "bare", "other")}
+    paths = {name: tmp_path / f"{name}.safetensors" for name in ("table", "bare", "other", "shown")}
     made.save(paths["table"])
     make_label_set(TEACHER, names, negatives=None).save(paths["bare"])
     type(made)(made.names, torch.eye(len(names), 5) + 1).save(paths["other"])
+    type(made)(made.names, torch.eye(len(names), 5) + 1, info={"examples": {"lamp": 1}}).save(paths["shown"])
     given = [argument.format(tmp=tmp_path, **paths) for argument in arguments]
     assert main(["select", given[0], str(field), *given[1:]]) == 1
     error = capsys.readouterr().err
-    assert re.search(tells(*(part.replace("{count}", str(len(names))) for part in message)), error)
+    assert re.search(
+        tells(*(part.replace("{count}", str(len(names))).replace("{field}", str(field)) for part in message)), error
+    )
     assert error.count("\n") == 1
 
 
