@@ -11,7 +11,7 @@ from cases_color import surface
 from cases_text import DIM, TEACHER, letters
 from messages import tells
 from PIL import Image
-from small_room import make_room
+from small_room import make_desk, make_room
 
 from kfgs.cli import main
 from kfgs.cli.options import Classes, Teacher
@@ -382,3 +382,22 @@ def test_annotations_of_coco_are_classes_by_example(room, truth, names, tmp_path
     for name, row in zip(learnt.names, learnt.embeddings, strict=True):
         assert names[int((words @ row).argmax())] == name
     assert len(learnt) >= 3
+
+
+def test_examples_are_drawn_in_the_photographs_of_the_field(tmp_path, capsys):
+    folder = make_desk(tmp_path)
+    clicks, out = tmp_path / "clicks.json", tmp_path / "shown.safetensors"
+    view = SemanticField.load(folder / "run/field").cameras[0].name
+    clicks.write_text(json.dumps({"chair": [{"view": view, "points": [[20, 30]]}], "wall": [{"gaussians": [3]}]}))
+    words = ["text", "--examples", str(clicks), "--field", str(folder / "run/field"), "--out", str(out)]
+    assert main(words) == 0
+    picture = tmp_path / "shown.safetensors.png"
+    assert f"wrote:\n  {out}\n  {picture}\n" in capsys.readouterr().out
+    with Image.open(picture) as opened:
+        assert opened.size[0] > 480
+    picture.write_bytes(b"mine")
+    assert main(words) == 1
+    assert re.search(tells(picture, "kfgs text"), capsys.readouterr().err)
+    shutil.move(folder / "scene", folder / "elsewhere")
+    assert main(words) == 0  # without photographs there is no picture
+    assert picture.read_bytes() == b"mine"
