@@ -78,6 +78,8 @@ def search(
     found = _ask(known, query, like, index, text, threshold, exact, teacher)
     what = f"like {like}:{index}" if like is not None else query
     count = sum(scene.count for scene in found.scenes)
+    if json is not None:
+        write_json(json, {"query": what, "folder": str(folder)} | found.to_json())
     say(f"{what}: in {len(found.scenes)} of {found.searched} scenes, {count} Gaussians")
     _say_table(found.scenes[:top])
     if len(found.scenes) > top:
@@ -91,7 +93,6 @@ def search(
     if len(found.unasked) > SHOWN:
         say(f"note: not asked: {len(found.unasked) - SHOWN} more")
     if json is not None:
-        write_json(json, {"query": what, "folder": str(folder)} | found.to_json())
         wrote([json])
 
 

@@ -124,12 +124,12 @@ def segment(
             written.append(write_coco(out, found, label_set.names, lambda stem: loaded.image(views[stem])))
         if truth:
             scores = score_scene(found, truth, label_set)
-            say(str(scores))
             write_report(out / "scores.json", segmentation=scores, truth=str(folder), field=str(field), rule=rule)
             picture = out / "confusion.png"
             plot_largest_confusions(scores.confusion, list(label_set.names), picture, misses=scores.misses)
             plot_iou(scores.iou, list(label_set.names), out / "iou.png")
             written += [out / name for name in ("scores.json", "confusion.png", "iou.png")]
+            say(str(scores))
         else:
             say(f"note: no label pictures of split {split!r} to score against")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -185,10 +186,11 @@ def _load_views(path: Path, images: str | Path | None) -> Scene:
     others = [
         name for name in ("results", "color", "pose", "rgb", "traj.txt", "traj_w_c.txt") if (path / name).exists()
     ]
-    half = f" (there is {' and '.join(others)}, but not what belongs to it)" if others else ""
+    whole = [f"{one.files} of {one.name}" for one in _LAYOUTS if set(one.files.replace("/", "").split()) & set(others)]
+    half = f" (there is {' and '.join(others)}, but not what belongs to it: {'; '.join(whole)})" if others else ""
     raise SceneError(
-        f"{path}: expected a COLMAP model (in {', '.join(MODEL_FOLDERS)}) or a transforms.json, found neither; nor "
-        f"{'; '.join(f'{layout.files} of {layout.name}' for layout in _LAYOUTS)}{half}; {_advice(path)}"
+        f"{path}: expected a COLMAP model, a transforms.json or the layout of a data set (docs/datasets.md), found "
+        f"none{half}; {_advice(path)}"
     )
 
 
@@ -220,7 +222,7 @@ def _advice(path: Path) -> str:
         return f"it holds scenes ({some(inside)}): give one of them, as in {path / inside[0]}"
     if is_scene(real_path(path).parent):
         return f"the folder above is a scene: give {real_path(path).parent}"
-    return "estimate the cameras first: `kfgs sfm <images> <scene>` or kfgs.scenes.run_sfm"
+    return f"estimate the cameras first: `kfgs sfm {shlex.quote(str(path))} --out scene/` (in Python: run_sfm)"
 
 
 def find_images(root: Path, model: Path) -> Path:

@@ -88,8 +88,11 @@ def test_the_split_file_wins(tmp_path: Path) -> None:
 def test_what_cannot_be_loaded_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=tells("nothing:", "no such folder", "scene")):
         load_scene(tmp_path / "nothing")
-    with pytest.raises(SceneError, match=tells("COLMAP", "transforms.json", "neither", "`kfgs sfm")):
-        load_scene(tmp_path)
+    photos = tmp_path / "my photos"
+    photos.mkdir()
+    advice = f"`kfgs sfm '{photos}' --out scene/` (in Python: run_sfm)"
+    with pytest.raises(SceneError, match=tells("COLMAP", "transforms.json", "docs/datasets.md", "none", advice)):
+        load_scene(photos)
     with pytest.raises(ValueError, match=tells("split:", "'auto'", "got 'random'")):
         load_scene(tmp_path, split="random")  # type: ignore[arg-type]
     write_model(tmp_path / "sparse/0", ["a.png"])
