@@ -28,8 +28,10 @@ def save_usd(path: str | Path, cloud: Gaussians | SplatFile, *, points: bool = F
 
     The objects are `ParticleField3DGaussianSplat`, which OpenUSD knows since 26.03; or, for programs that do not know it,
     `Points` in their base colour, as wide as two mean standard deviations. Each object has the primvars `class_id` and, if
-    known, `score` (a number per Gaussian), and the attribute `kfgs:class`, the name of its class. Axes and units stay those of
-    the scene.
+    known, `score` (a number per Gaussian), and the attribute `kfgs:class`, the name of its class.
+
+    **Convention**: coordinates stay as they are. The file says that a unit is a metre (`metersPerUnit` 1) and that z is up
+    (`upAxis`), as kfgs assumes if no cameras tell; without these, USD means centimetres and y.
 
     Args:
         path: the file: .usdc (binary), .usda (text), .usd (binary) or .usdz (a .usdc in an uncompressed zip file).
@@ -57,6 +59,8 @@ def save_usd(path: str | Path, cloud: Gaussians | SplatFile, *, points: bool = F
         raise ValueError(f"cloud: expected colours (sh [N, K, 3]), got {splats!r}; pass a colour splat")
     check_splats(splats)
     stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/splat").GetPrim())
     for label, part in ({-1: splats} if splats.gaussians.labels is None else splats.by_class()).items():
         place = f"/splat/class_{label}" if label >= 0 else "/splat/no_class"
