@@ -412,6 +412,14 @@ def test_convert_writes_usd_with_an_object_for_each_class(labelled, tmp_path, wo
     assert counts == {names[label + 1]: len(part) for label, part in cloud.by_class().items()}
 
 
+def test_info_of_a_usd_file_says_that_kfgs_only_writes_it(labelled, tmp_path, capsys):
+    pytest.importorskip("pxr")
+    assert main(["convert", str(labelled), str(tmp_path / "a.usdz")]) == 0
+    capsys.readouterr()
+    assert main(["info", str(tmp_path / "a.usdz")]) == 1
+    assert "a.usdz: expected a splat file, got USD, which kfgs writes but does not read" in capsys.readouterr().err
+
+
 def test_convert_by_class_writes_a_plain_file_for_each_class(labelled, tmp_path, capsys):
     cloud, out = read_splats(labelled), tmp_path / "objects"
     words = ["convert", str(labelled), str(out), "--by-class"]

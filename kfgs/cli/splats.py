@@ -200,9 +200,10 @@ def convert(
         check_alone("plain", plain, "with --by-class, whose files are plain")
         return _convert_by_class(source, target)
     if usd:  # pyvista takes a second to import
-        from ..viz.usd import SUFFIXES, save_usd
+        from ..formats.table import USD
+        from ..viz.usd import save_usd
 
-        check_target("target", target, endings=SUFFIXES)
+        check_target("target", target, endings=USD)
     else:
         check_target("target", target)
     splats = open_splats("source", source)

@@ -15,11 +15,10 @@ from .._files.errors import UNNAMED
 from .._typed import typed
 from ..formats.render_mode import describe_lost_mode
 from ..formats.splat_file import SCORE, SplatFile, Written
+from ..formats.table import USD
 from ..formats.values import check_splats, describe_loss
 from ..gaussians import Gaussians
 from ..splat.sh import sh0_to_rgb
-
-SUFFIXES = (".usdc", ".usda", ".usd", ".usdz")
 
 
 @typed
@@ -53,8 +52,8 @@ def save_usd(path: str | Path, cloud: Gaussians | SplatFile, *, points: bool = F
         raise ImportError(
             f"{path}: expected usd-core to write USD ({error}); run: pip install 'usd-core>=26.3'"
         ) from error
-    if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"path: expected a name that ends in {', '.join(SUFFIXES)}, got {path.name!r}; rename it")
+    if path.suffix.lower() not in USD:
+        raise ValueError(f"path: expected a name that ends in {', '.join(USD)}, got {path.name!r}; rename it")
     if splats.gaussians.sh is None:
         raise ValueError(f"cloud: expected colours (sh [N, K, 3]), got {splats!r}; pass a colour splat")
     check_splats(splats)
