@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from .._files import check_output, check_own, is_own, read_json
 from .files import check_alone, open_field
@@ -14,6 +14,9 @@ from .options import Classes, Flag, Given, GivenWalk, Positional, Rule, Walk
 from .output import say, wrote
 from .render import check_walk, walk_of
 from .view import open_colors
+
+if TYPE_CHECKING:
+    from ..cameras import Camera
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
@@ -72,9 +75,9 @@ def segment(
     if path is not None:
         for name, value in (("labels", labels), ("features", features)):
             check_alone(name, value, "with --path, of whose pictures nothing is known")
-        check_walk(path, frames, width)
+        walk = check_walk(path, frames, width)
         with _one_run(out) as written:
-            written += _segment_path(field, out, path, frames, width, color, coco, rule, classes)
+            written += _segment_path(field, out, walk, frames, width, color, coco, rule, classes)
         return
     alone: dict[str, object] = {"frames": frames, "width": width, "color": color}
     for name, given in alone.items():
@@ -174,7 +177,7 @@ def _is_result(file: Path) -> bool:
 def _segment_path(
     field: Path,
     out: Path,
-    path: Walk,
+    path: Walk | list[Camera],
     frames: int | None,
     width: int | None,
     color: Path | None,
@@ -183,7 +186,6 @@ def _segment_path(
     classes: Classes,
 ) -> list[Path]:
     """Segment the cameras of a path, and with --coco render the colours that they see; name what was written."""
-    from ..cameras import Camera
     from ..pipeline import segment_cameras, write_coco
     from ..pipeline.label_pictures import check_coco
     from ..scenes import file_stem
