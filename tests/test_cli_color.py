@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -410,6 +411,12 @@ def test_convert_writes_usd_with_an_object_for_each_class(labelled, tmp_path, wo
     counts = {name: len(one.GetAttribute("primvars:class_id").Get()) for name, one in prims.items()}
     names = ["", *cloud.classes]
     assert counts == {names[label + 1]: len(part) for label, part in cloud.by_class().items()}
+
+
+def test_convert_misses_usd_core_before_it_reads(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    assert main(["convert", str(tmp_path / "absent.ply"), str(tmp_path / "a.usdc")]) == 1
+    assert "a.usdc: expected usd-core to write USD" in capsys.readouterr().err
 
 
 def test_info_of_a_usd_file_says_that_kfgs_only_writes_it(labelled, tmp_path, capsys):

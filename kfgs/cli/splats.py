@@ -201,9 +201,10 @@ def convert(
         return _convert_by_class(source, target)
     if usd:  # pyvista takes a second to import
         from ..formats.table import USD
-        from ..viz.usd import save_usd
+        from ..viz.usd import check_usd_core, save_usd
 
         check_target("target", target, endings=USD)
+        check_usd_core(target)
     else:
         check_target("target", target)
     splats = open_splats("source", source)

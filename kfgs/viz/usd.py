@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,16 @@ from ..formats.table import USD
 from ..formats.values import check_splats, describe_loss
 from ..gaussians import Gaussians
 from ..splat.sh import sh0_to_rgb
+
+
+def check_usd_core(path: Path) -> None:
+    """Raise an ImportError, which names the file to write, unless usd-core is installed."""
+    try:
+        import_module("pxr")
+    except ImportError as error:
+        raise ImportError(
+            f"{path}: expected usd-core to write USD ({error}); run: pip install 'usd-core>=26.3'"
+        ) from error
 
 
 @typed
@@ -46,12 +57,9 @@ def save_usd(path: str | Path, cloud: Gaussians | SplatFile, *, points: bool = F
             `write_splats`). Nothing is written then.
     """
     path, splats = as_path(path), SplatFile(cloud) if isinstance(cloud, Gaussians) else cloud
-    try:
-        from pxr import Sdf, Usd, UsdGeom, UsdUtils
-    except ImportError as error:
-        raise ImportError(
-            f"{path}: expected usd-core to write USD ({error}); run: pip install 'usd-core>=26.3'"
-        ) from error
+    check_usd_core(path)
+    from pxr import Sdf, Usd, UsdGeom, UsdUtils
+
     if path.suffix.lower() not in USD:
         raise ValueError(f"path: expected a name that ends in {', '.join(USD)}, got {path.name!r}; rename it")
     if splats.gaussians.sh is None:
