@@ -145,7 +145,11 @@ def _read_top(reader: _Reader) -> dict[str, Any]:
 def _frames(reader: _Reader, top: dict[str, Any]) -> Iterator[tuple[Frame, Any]]:
     """Each frame with what the top says for all, and as it is in the file."""
     for i, values in enumerate(top["frames"]):
-        yield Frame(reader.path, f"frame {i}", {**top, **values} if isinstance(values, dict) else {}), values
+        frame = Frame(reader.path, f"frame {i}", {})
+        if not isinstance(values, dict):
+            raise frame.fail("", "an object with a 'transform_matrix'", values, "write the file again")
+        frame.values.update({**top, **values})
+        yield frame, values
 
 
 def _read_frames(reader: _Reader) -> dict[str, Any]:

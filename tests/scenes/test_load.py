@@ -208,6 +208,13 @@ def test_without_a_size_cameras_are_as_large_as_their_pictures(tmp_path: Path) -
     assert load_cameras(file)[0].size == (12, 16)
 
 
+def test_a_frame_that_is_no_object_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "path.json"
+    file.write_text(json.dumps({**LENS, "frames": [3]}))
+    with pytest.raises(SceneError, match=tells("path.json, frame 0: expected an object", "got 3")):
+        load_cameras(file)
+
+
 @pytest.mark.parametrize(
     ("names", "parts"),
     [
