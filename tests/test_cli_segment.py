@@ -17,6 +17,7 @@ from kfgs.cli.render import check_walk, walk_of
 from kfgs.evaluation.datasets import load_coco_labels
 from kfgs.fields import SemanticField
 from kfgs.pipeline import segment_cameras, write_coco
+from kfgs.pipeline.label_pictures import picture_names
 from kfgs.scenes import load_cameras, load_scene
 
 
@@ -122,6 +123,30 @@ def test_cameras_of_your_own(desk, tmp_path):
         segment_cameras(field, [cameras[0], cameras[0]], field.label_set(), tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("names", "bad"),
+    [
+        ([".kfgs-unfinished/waiting/x.png", "b"], ".kfgs-unfinished/waiting/x"),
+        (["a.png", "a.png/b.png"], "a"),
+        (["../a.png", "b"], "../a"),
+        (["/a.png", "b"], "/a"),
+        (["a\n.png", "b"], r"a\n"),
+        (["x" * 252 + ".png", "b"], "xxx"),
+    ],
+)
+def test_names_that_cannot_be_those_of_pictures_are_refused(tmp_path, names, bad):
+    camera = orbit_cameras(torch.rand(50, 3))[0]
+    cameras = [dataclasses.replace(camera, name=name) for name in names]
+    with pytest.raises(ValueError, match=tells("path:", "names can be those of pictures", f"got '{bad}", "rename it")):
+        picture_names(cameras, "path")
+
+
+def test_the_longest_name_of_a_picture(tmp_path):
+    camera = dataclasses.replace(orbit_cameras(torch.rand(50, 3))[0], name="x" * 251 + ".png")
+    (name,) = picture_names([camera])
+    (tmp_path / f"{name}.png").touch()
+
+
 def own_cameras(folder, cameras, name="{}"):
     """A transforms.json without pictures, as another program writes one."""
     flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
@@ -223,6 +248,7 @@ def test_cameras_of_your_own_are_checked_before_the_field_is_opened(tmp_path, ca
         (["--path", "{one}", "--width", "3"], ("--width:", "got 3")),
         (["--path", "orbit", "--width", "10000000"], ("--width:", "[16, 16384]", "got 10000000")),
         (["--path", "orbit", "--frames", "99999999999"], ("--frames:", "[2, 100000]", "got 99999999999")),
+        (["--path", "{folder}"], ("--path:", "names can be those of pictures", "got 'a'; rename it")),
         (["--path", "{large}"], ("--path:", "16384 x 16384", "got 60000 x 2 in {large}", "give a smaller --width")),
         (["--path", "{high}", "--width", "100"], ("--width:", "16384 x 16384", "got 100 x 3000000 in {high}")),
         (["--path", "{huge}"], ("{huge}, frame 0", "got 60,000 x 60,000; give a smaller size")),
@@ -232,6 +258,9 @@ def test_options_that_would_have_no_effect_are_named(desk, tmp_path, words, part
     cameras = load_scene(desk / "scene").cameras[:1]
     known = {"scene": desk / "scene", "one": own_cameras(tmp_path / "in", cameras)}
     known |= {"same": own_cameras(tmp_path / "same", cameras * 3)}
+    listed = own_cameras(tmp_path / "folder", load_scene(desk / "scene").cameras[:2], "a.png{}")
+    listed.write_text(listed.read_text().replace("a.png0", "a.png").replace("a.png1", "a.png/b.png"))
+    known["folder"] = listed
     for name, width, height in (("large", 60_000, 2), ("high", 2, 60_000), ("huge", 60_000, 60_000)):
         known[name] = own_cameras(tmp_path / name, cameras)
         frames = json.loads(known[name].read_text())["frames"]

@@ -67,7 +67,7 @@ def segment(
     from ..fields import recall_scene
     from ..pipeline import score_scene, segment_scene, true_labels, write_coco, write_report
     from ..pipeline.apply import SEGMENTED
-    from ..pipeline.label_pictures import check_coco
+    from ..pipeline.label_pictures import check_coco, picture_names
     from ..viz import plot_iou, plot_largest_confusions
     from ..viz.pictures import check_pictures
 
@@ -76,6 +76,8 @@ def segment(
         for name, value in (("labels", labels), ("features", features)):
             check_alone(name, value, "with --path, of whose pictures nothing is known")
         walk = check_walk(path, frames, width)
+        if isinstance(walk, list):
+            picture_names(walk, "path")
         with _one_run(out) as written:
             written += _segment_path(field, out, walk, frames, width, color, coco, rule, classes)
         return

@@ -220,6 +220,8 @@ def test_a_frame_that_is_no_object_is_named(tmp_path: Path) -> None:
     [
         (["a.png", "a.jpg"], ("path.json:", "names that differ", "'a' twice")),
         (["a\0.png"], ("path.json, frame 0, file_path:", "a file's name")),
+        (["a.png", "b\n.png"], ("path.json, frame 1, file_path:", "control characters", r"got 'b\n.png'")),
+        (["\x1b[2J.png"], ("path.json, frame 0, file_path:", "control characters", "leave it out")),
         (["/"], ("path.json, frame 0, file_path:", "a file's name")),
         ([3], ("path.json, frame 0, file_path:", "a file's name", "got 3")),
         ([], ("path.json, top level:", "'frames'", "is this a transforms.json")),
