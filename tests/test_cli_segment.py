@@ -229,6 +229,8 @@ def test_cameras_of_your_own_are_checked_before_the_field_is_opened(tmp_path, ca
     [
         (["--frames", "3"], ("--frames:", "without --path")),
         (["--path", "orbit", "--labels", "x"], ("--labels:", "with --path")),
+        (["--path", "orbit", "--split", "test"], ("--split:", "with --path", "got test; leave it out")),
+        (["--path", "orbit", "--pictures", "0"], ("--pictures:", "with --path", "got 0; leave it out")),
         (["--path", "orbit", "--color", "x.ply"], ("--color:", "without --coco")),
         (["--path", "orbit", "--frames", "0"], ("--frames:", "got 0")),
         (["--path", "orbitt"], ("--path:", *PLACES, "got orbitt, which does not exist; correct it")),
