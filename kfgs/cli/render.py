@@ -36,7 +36,7 @@ def render(
     teacher: Teacher,
     classes: Classes,
 ) -> None:
-    """Make a film of a field or a labelled splat: an orbit around it, a spiral at one view, or a flight along its cameras.
+    """Make a film of a field or a labelled splat: an orbit, a spiral at one view, or a flight along its cameras or your own.
 
     Examples:
         kfgs render run/ --out tour.gif
@@ -162,9 +162,11 @@ def _own_walk(path: Path, frames: int | None, width: int | None, film: bool) -> 
     """The cameras of a file or folder; with `frames`, those of a smooth path through them."""
     from ..cameras import path_cameras
     from ..cameras.paths import TooFewViewsError
-    from ..scenes import load_cameras
+    from ..scenes.load import cameras_and_notes
 
-    own = load_cameras(path)
+    own, notes = cameras_and_notes(path)
+    for note in notes:
+        say(f"note: {note}")
     sizes = [(camera.width, camera.height) for camera in own]
     if width is not None:
         sizes = [(width, max(1, round(width * h / w))) for w, h in sizes]
