@@ -444,6 +444,13 @@ def test_convert_by_class_writes_a_plain_file_for_each_class(labelled, tmp_path,
     assert "note:" not in said
 
 
+def test_convert_by_class_into_a_folder_named_like_usd(labelled, tmp_path):
+    out = tmp_path / "objs.usd"
+    out.mkdir()
+    assert main(["convert", str(labelled), str(out), "--by-class"]) == 0
+    assert {path.suffix for path in out.iterdir()} == {".ply"}
+
+
 def test_convert_by_class_replaces_no_file_of_others(labelled, tmp_path, capsys):
     theirs = tmp_path / "05_chair.ply"
     theirs.write_bytes(b"mine")

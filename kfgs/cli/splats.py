@@ -189,8 +189,9 @@ def convert(
         points: For USD: write points in their base colour, for programs that do not know Gaussians.
     """
     from ..formats import write_splats
+    from ..formats.table import USD
 
-    usd = target.suffix.lower().startswith(".usd")
+    usd = target.suffix.lower() in USD and not (by_class and target.is_dir())  # a folder may have any name
     if usd:
         for name, given in (("plain", plain), ("by_class", by_class)):
             check_alone(name, given, "for USD, which has an object for each class")
@@ -200,7 +201,6 @@ def convert(
         check_alone("plain", plain, "with --by-class, whose files are plain")
         return _convert_by_class(source, target)
     if usd:  # pyvista takes a second to import
-        from ..formats.table import USD
         from ..viz.usd import check_usd_core, save_usd
 
         check_target("target", target, endings=USD)
