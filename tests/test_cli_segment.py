@@ -238,7 +238,7 @@ def test_cameras_of_your_own_are_checked_before_the_field_is_opened(tmp_path, ca
             ["--path", "{scene}/classes.json"],
             ("{scene}/classes.json, top level:", "'frames'", "is this a transforms.json"),
         ),
-        (["--path", "{scene}/labels"], ("--path:", *PLACES, "got {scene}/labels, a folder without")),
+        (["--path", "{scene}/labels"], ("--path:", *PLACES, "got {scene}/labels, a folder without cameras")),
         (["--path", "{scene}/../run"], ("--path:", *PLACES, "got {scene}/../run, a field; `--path cameras`")),
         (["--path", "{scene}/../my.ply"], ("--path:", *PLACES, "my.ply, another file")),
         (["--path", "/dev/null"], ("--path:", *PLACES, "got /dev/null, another file")),

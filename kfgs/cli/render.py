@@ -145,7 +145,7 @@ def _check_place(path: Path) -> None:
 
     if (path.suffix == ".json" and path.exists()) or (path.is_dir() and is_scene(path)):
         return
-    got, advice = "a folder without them", "correct it"
+    got, advice = "a folder without cameras", "correct it"
     if not path.exists():
         got = "which does not exist"
     elif find_field(path) is not None:
