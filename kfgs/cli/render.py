@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 WORDS = "photo, labels, features or query=TEXT"
 FRAMES, WIDTH = 72, 480  # of a path without cameras of your own
-MOST_FRAMES = 100_000  # an hour of film at 25 a second
-LARGEST = 1 << 14  # pixels on a side; GIF and H.264 end near there, and a picture of that size takes gigabytes
+MOST_FRAMES = 100_000  # more than an hour of film at 25 a second
+LARGEST = 1 << 14  # pixels on a side: a square picture in floats takes 3 GB
 OVERHEAD = "ceiling"  # left out of an orbit, which looks in from above
 
 
