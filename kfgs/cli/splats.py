@@ -190,8 +190,9 @@ def convert(
         points: For USD: write points in their base colour, for programs that do not know Gaussians.
     """
     from ..formats import write_splats
+    from ..formats.table import USD
 
-    usd = target.suffix.lower().startswith(".usd")
+    usd = target.suffix.lower() in USD and not (by_class and target.is_dir())  # a folder may have any name
     if usd:
         for name, given in (("plain", plain), ("by_class", by_class)):
             check_alone(name, given, "for USD, which has an object for each class")
@@ -201,9 +202,10 @@ def convert(
         check_alone("plain", plain, "with --by-class, whose files are plain")
         return _convert_by_class(source, target)
     if usd:  # pyvista takes a second to import
-        from ..viz.usd import SUFFIXES, save_usd
+        from ..viz.usd import check_usd_core, save_usd
 
-        check_target("target", target, endings=SUFFIXES)
+        check_target("target", target, endings=USD)
+        check_usd_core(target)
     else:
         check_target("target", target)
     splats = open_splats("source", source)

@@ -96,9 +96,9 @@ def load_scene(path: str | Path, *, images: str | Path | None = None, split: Spl
 
 
 def load_cameras(path: str | Path) -> list[Camera]:
-    """The cameras of a scene, or of a camera path of your own, for what needs no pictures. They are without lens distortion.
+    """The cameras of a scene, or of a camera path of your own. Use it where no pictures are needed. Lens distortion is removed.
 
-    `near` is chosen as by `load_scene`, from these cameras alone.
+    `near` is chosen as by `load_scene`, from these cameras alone. Images of a COLMAP model without a pose are left out.
 
     Args:
         path: what `load_scene` reads. The pictures of a COLMAP model or a transforms.json are not needed: the cameras have the
@@ -110,15 +110,32 @@ def load_cameras(path: str | Path) -> list[Camera]:
     Raises:
         FileNotFoundError: if there is no such file or folder.
         SceneError: if there are no cameras, or they cannot be used.
+
+    Example:
+        >>> import json, tempfile
+        >>> pose = [[1, 0, 0, 0.5], [0, 0, -1, -2], [0, 1, 0, 1.2], [0, 0, 0, 1]]  # camera to world; it looks along y
+        >>> values = {"w": 640, "h": 480, "camera_angle_x": 1.0, "frames": [{"transform_matrix": pose}]}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = Path(folder, "my_cameras.json")
+        ...     _ = file.write_text(json.dumps(values))
+        ...     (camera,) = load_cameras(file)
+        >>> camera.name, camera.size, camera.center
+        ('0000.png', (480, 640), tensor([ 0.5000, -2.0000,  1.2000]))
     """
+    return cameras_and_notes(path)[0]
+
+
+def cameras_and_notes(path: str | Path) -> tuple[list[Camera], list[str]]:
+    """The cameras of `load_cameras`, and a note if the file has more than these."""
     path = as_path(path)
+    notes: list[str] = []
     model = find_model(path)
     if model is not None:
-        cameras = colmap_cameras(model)
+        cameras, notes = colmap_cameras(model)
     elif path.exists() and _is_transforms(path):
         cameras = transforms_cameras(path)
     else:
-        return load_scene(path).undistorted().cameras
+        return load_scene(path).undistorted().cameras, notes
     if not cameras:
         raise SceneError(f"{path}: expected cameras with poses, got none; run COLMAP again (`kfgs sfm`)")
     nothing = torch.zeros(0, 3)
@@ -126,7 +143,7 @@ def load_cameras(path: str | Path) -> list[Camera]:
         scene = Scene(cameras, [Path(camera.name) for camera in cameras], nothing, nothing.byte())
     except SceneError as error:  # of two names that are the same
         raise SceneError(f"{path}: {error}") from error
-    return scene.with_near().undistorted().cameras
+    return scene.with_near().undistorted().cameras, notes
 
 
 def _with_splat(scene: Scene, root: Path) -> Scene:
