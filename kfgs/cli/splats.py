@@ -133,7 +133,7 @@ def edit(
         check_alone("views", ", ".join(views) or None, "without --scene, whose views they are")
         scene.check_images()
     replayed = EditList() if replay is None else EditList.load(replay, anywhere=True)  # the user's own file
-    asked, listed = tuple(parse_edits(edits)), replayed
+    asked, listed = parse_edits(edits), replayed
     for _, one in asked:
         listed = listed.then(one)
     if len(listed) == 0:
