@@ -120,6 +120,24 @@ def inserted_files(edits: Iterable[Any]) -> list[Path]:
     return [Path(edit.source) for edit in edits if isinstance(edit, Insert) and isinstance(edit.source, str | Path)]
 
 
+def classes_of(edits: Iterable[Any]) -> Iterator[str | int]:
+    """The classes, by name or index, that edits need in the first splat: those before an inserted one, which may bring some."""
+    for edit in edits:
+        if edit.op == "insert":
+            return
+        yield from _classes(edit.where)
+
+
+def _classes(where: Any) -> Iterator[str | int]:
+    from ..labels.where import OfClass
+
+    if isinstance(where, OfClass):
+        yield where.name
+    for one in (*getattr(where, "parts", ()), getattr(where, "where", None)):
+        if one is not None:
+            yield from _classes(one)
+
+
 def check_parts(splats: Any, edits: Iterable[Any]) -> None:
     """Raise a ValueError if an edit names a part of a class (`chair/6`) that `kfgs select` does not list.
 

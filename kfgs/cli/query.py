@@ -82,7 +82,7 @@ def select(
         given = {"classes": classes.classes, "text": classes.text, "negatives": negatives, "score": score}
         for name, value in (given | dataclasses.asdict(teacher)).items():
             check_alone(name, None if value == "auto" else value, "with a splat, which has its own classes")
-        cloud = open_splats("source", source, labelled=True)
+        cloud = open_splats("source", source, labelled=True, named=True)
         found = select_labelled(cloud, query, threshold)
         scene = None if classes.scene is None else classes.load_scene().undistorted()
         cameras = None if scene is None else scene.cameras
