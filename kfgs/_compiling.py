@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-COMPILING = "compiling the CPU engine's kernels: a minute or two in all, once on this machine"
+COMPILING = "compiling kernels of the CPU engine (seconds each, a minute or two in all; each only once on this machine)"
 _listeners: list[Callable[[str], None]] = []
 _said: list[str] = []  # the line above, once it was said
 

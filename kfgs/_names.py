@@ -6,10 +6,11 @@ import difflib
 from collections.abc import Sequence
 
 SHOWN = 20  # names listed in a message
+TAKE = "take one of these classes"
 
 
-def class_index(name: str, names: Sequence[str]) -> int:
-    """The label of a class: its place in `names`, found as `class_indices` does.
+def class_index(name: str, names: Sequence[str], otherwise: str = TAKE) -> int:
+    """The label of a class: its place in `names`, found as `class_indices` does; `otherwise` is its advice.
 
     Raises:
         ValueError: if the name is unknown (the message offers the nearest names), or several labels have it.
@@ -18,7 +19,7 @@ def class_index(name: str, names: Sequence[str]) -> int:
         >>> class_index("chair", ["wall", "chair"])
         1
     """
-    found = class_indices(name, names)
+    found = class_indices(name, names, otherwise)
     if len(found) > 1:
         raise ValueError(
             f"class: expected one class called {name!r}, got {len(found)} (labels {', '.join(map(str, found))}); "
@@ -27,10 +28,11 @@ def class_index(name: str, names: Sequence[str]) -> int:
     return found[0]
 
 
-def class_indices(name: str, names: Sequence[str]) -> tuple[int, ...]:
+def class_indices(name: str, names: Sequence[str], otherwise: str = TAKE) -> tuple[int, ...]:
     """The labels of a class, ascending. There are several if several classes have the same name.
 
-    A name is looked up exactly, then without regard to case, if only one spelling fits.
+    A name is looked up exactly, then without regard to case, if only one spelling fits. `otherwise` is the advice about a name
+    that is like none.
 
     Raises:
         ValueError: if the name is unknown; the message offers the nearest names.
@@ -54,5 +56,5 @@ def class_indices(name: str, names: Sequence[str]) -> tuple[int, ...]:
     near += [lower[m] for m in difflib.get_close_matches(name.lower(), lower, 3) if lower[m] not in near]
     near += [one for one in dict.fromkeys(names) if name and name.lower() in one.lower() and one not in near][:3]
     listed = ", ".join(names[:SHOWN]) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
-    hint = f"did you mean {' or '.join(map(repr, near))}?" if near else "add its embedding to the classes"
+    hint = f"did you mean {' or '.join(map(repr, near))}?" if near else otherwise
     raise ValueError(f"class: expected one of {listed}, got {name!r}; {hint}")

@@ -282,6 +282,17 @@ def test_edit_takes_the_parts_that_select_lists(labelled, tmp_path, capsys):
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "e.ply").read_bytes()
 
 
+def test_parts_within_a_distance_keep_their_names(labelled, tmp_path, capsys):
+    assert main(["select", "chair", str(labelled), "--out", str(tmp_path), "--distance", "100"]) == 0
+    said = capsys.readouterr().out
+    (part,) = json.loads((tmp_path / "selection.json").read_text())["parts"]
+    assert f"  chair/1: Part({part['count']} Gaussians" in said
+    assert "with `kfgs edit`, add --distance 100.0\n" in said
+    arguments = ["edit", str(labelled), "--out", str(tmp_path / "e.ply"), "--extract", "chair/1", "--distance", "100"]
+    assert main(arguments) == 0
+    assert len(read_splats(tmp_path / "e.ply")) == part["count"]
+
+
 @pytest.mark.parametrize("option", ["--remove", "--extract"])
 def test_a_part_beyond_the_last_is_refused_even_beside_one_that_is_there(labelled, tmp_path, capsys, option):
     assert main(["select", "chair", str(labelled), "--out", str(tmp_path)]) == 0

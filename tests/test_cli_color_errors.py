@@ -68,8 +68,9 @@ ERRORS = {
         (["chiar", "{labelled}", "--out", "{o}"], ("class:", "got 'chiar'", "'chair'?")),
         (
             ["chair", "{splat}"],
-            ("SOURCE:", "classes", "got {splat}", "`kfgs attach`"),
+            ("SOURCE:", "classes", "got {splat}", "`kfgs attach FIELD"),
         ),
+        (["chair", "{alone}"], ("SOURCE:", "beside {alone}", "got no file {alone}.classes.json", "copy it")),
         (["chair", "{tmp}/no.ply"], ("{tmp}/no.ply:", "no such file")),
         (["chair", "{field}"], ("--classes, --text:", "got none", "--scene", "`kfgs text`")),
         (["chair", "{run}"], ("got {run}", "pass {field}")),
@@ -108,7 +109,10 @@ ERRORS = {
             ("--out:", ".compressed.ply, .ply", "got {o}.ksplat"),
         ),
         (["{labelled}", "--out", "{o}", "--remove", "chair"], ("--out:", ".compressed.ply, .ply", "got {o}")),
-        (["{splat}", "--out", "{o}.ply", "--remove", "chair"], ("SPLATS:", "classes", "got {splat}", "`kfgs attach`")),
+        (
+            ["{splat}", "--out", "{o}.ply", "--remove", "chair"],
+            ("SPLATS:", "classes", "got {splat}", "`kfgs attach FIELD"),
+        ),
         (
             ["{field}", "--out", "{o}.ply", "--remove", "chair"],
             ("SPLATS:", "got {field}", "a colour splat"),
@@ -147,6 +151,20 @@ ERRORS = {
         ),
         (["{labelled}", "--out", "{o}.ply", "--replay", "{tmp}/no.json"], ("{tmp}/no.json:", "no such file")),
         (
+            ["{splat}", "--out", "{o}.ply", "--replay", "{saved}"],
+            ("SPLATS:", "expected a splat with classes, got {splat}", "`kfgs attach FIELD {splat} --out labelled.ply`"),
+        ),
+        (["{alone}", "--out", "{o}.ply", "--replay", "{saved}"], ("SPLATS:", "{alone}.classes.json", "copy it")),
+        (["{alone}", "--out", "{o}.ply", "--remove", "chair/2"], ("SPLATS:", "{alone}.classes.json", "copy it")),
+        (
+            ["{labelled}", "--out", "{o}.ply", "--remove", "chair", "--distance", "0.1"],
+            ("--distance:", "chair/2", "got 0.1"),
+        ),
+        (
+            ["{labelled}", "--out", "{o}.ply", "--remove", "chair/2", "--distance", "-1"],
+            ("--distance:", "(0, inf)", "got -1.0"),
+        ),
+        (
             ["{labelled}", "--out", "{o}.ply", "--replay", "{room}/classes.json"],
             ("{room}/classes.json:", "'kfgs.edits'"),
         ),
@@ -175,6 +193,8 @@ ERRORS = {
         (["{field}", "{o}.ply"], ("SOURCE:", "got {field}", "a colour splat")),
         (["{splat}", "{o}.spz", "--plain"], ("--plain:", ".ply", "{o}.spz")),
         (["{labelled}", "{o}", "--by-class", "--plain"], ("--plain:", "--by-class")),
+        (["{labelled}", "{o}.zip", "--by-class"], ("TARGET:", "expected a folder", "got {o}.zip")),
+        (["{labelled}", "{o}.SPZ", "--by-class"], ("TARGET:", "expected a folder", "got {o}.SPZ")),
         (["{splat}", "{o}", "--by-class"], ("SOURCE:", "expected a splat with classes")),
         (["{room}/text.npy", "{o}.ply"], ("{room}/text.npy:", "known", "compressed_ply")),
         (["{tmp}", "{o}.ply"], ("{tmp}:", "known", "compressed_ply")),
@@ -186,7 +206,8 @@ ERRORS = {
 def places(tmp_path_factory):
     """What the errors speak of.
 
-    `plain` has classes but no colours, `four` has four Gaussians far away; edits lie beside `same`, a folder beside `taken`.
+    `plain` has classes but no colours, `alone` no names beside it, `four` has four Gaussians far away; edits lie beside
+    `same`, a folder beside `taken`.
     """
     folder = tmp_path_factory.mktemp("errors")
     room = make_room(folder / "scene")
@@ -196,13 +217,14 @@ def places(tmp_path_factory):
     assert main([*arguments, "--out", str(labelled)]) == 0
     cloud = read_splats(labelled)
     write_splats(folder / "plain.ply", SplatFile(cloud.gaussians.replace(sh=None), {}, cloud.classes))
+    (folder / "alone.ply").write_bytes(labelled.read_bytes())
     four = read_splats(splat).gaussians.select(torch.arange(4))
     write_splats(folder / "four.ply", four.replace(means=four.means + 100))
     same = EditList((Remove("rug"),)).save(folder / "same.ply.edits.json")
     (folder / "taken.ply.edits.json").mkdir()
     paths = {"room": room, "field": field, "run": field.parent, "splat": splat, "labelled": labelled, "saved": same}
     paths |= {"same": folder / "same", "taken": folder / "taken"}
-    paths |= {name: folder / f"{name}.ply" for name in ("plain", "four")}
+    paths |= {name: folder / f"{name}.ply" for name in ("plain", "alone", "four")}
     return {name: str(path) for name, path in paths.items()}
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.cli.edit_syntax import Edits, inserted_files, parse_edits
+from kfgs.cli.edit_syntax import Edits, check_parts, inserted_files, parse_edits
 from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
 from kfgs.labels import connected_parts
@@ -104,6 +104,28 @@ def test_parts_that_are_removed_are_counted_together():
     )
     (edit,) = read(remove=["chair/1", "chair"])
     assert edit.apply(cloud).gaussians.labels.unique().tolist() == [0]
+
+
+def test_parts_are_those_within_a_distance():
+    cloud = rows(20, 60, 40)
+    shifted = cloud.gaussians.means.clone()
+    shifted[50:80, 0] += 0.15  # a gap in the row of 60: 30 and 30
+    cloud = cloud.replace(gaussians=cloud.gaussians.replace(means=shifted))
+    things = connected_parts(cloud.gaussians, OfClass("chair").select(cloud), distance=0.12)
+    assert [thing.count for thing in things] == [40, 30, 30, 20]
+    (edit,) = read(remove=["chair/3"], distance=0.12)
+    assert edit == Remove(Component(OfClass("chair"), 0.12, 2))
+    assert torch.equal(edit.where.mask(cloud).nonzero()[:, 0], things[2].indices)
+    check_parts(cloud, [edit])
+    with pytest.raises(
+        ValueError, match=tells("chair/5:", "chair/1 to chair/4", "`kfgs select chair SPLAT --distance 0.12`")
+    ):
+        check_parts(cloud, read(remove=["chair/5"], distance=0.12))
+
+
+def test_a_distance_without_a_part_is_refused():
+    with pytest.raises(ValueError, match=tells("distance:", "chair/2", "got 0.12")):
+        read(remove=["chair"], move=["rug:1,0,0"], distance=0.12)
 
 
 def test_a_class_name_may_hold_a_colon():

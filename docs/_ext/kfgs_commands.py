@@ -38,7 +38,7 @@ def options_of(command: Any) -> Iterator[tuple[str, str, list[tuple[str, str]]]]
         for action in group._group_actions:
             if action.dest != "help":
                 name = action.option_strings[-1] if action.option_strings else ""
-                rows.append((" ".join(filter(None, [name, str(action.metavar or "")])), str(action.help or "").strip()))
+                rows.append((" ".join(filter(None, [name, str(action.metavar or "")])), _help_of(action)))
         if rows:
             title = (group.title or "").removesuffix(" options")
             yield (
@@ -46,6 +46,11 @@ def options_of(command: Any) -> Iterator[tuple[str, str, list[tuple[str, str]]]]
                 group.description or "",
                 rows,
             )
+
+
+def _help_of(action: Any) -> str:
+    """What an option does; argparse writes a percent sign twice."""
+    return str(action.help or "").strip().replace("%%", "%")
 
 
 def table(command: Any) -> str:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from .options import Several
+from .options import Given, Several
 
 _THREE = "3 numbers between commas"
 
@@ -41,17 +42,30 @@ class Edits:
     """Keep only these classes, or parts of them."""
     insert: Several = ()
     """A splat file to add, "lamp.ply"; with a translation, "lamp.ply:1,0,0". No other edit touches it."""
+    distance: Given[float] = None
+    """For parts as in "chair/2": Gaussians at most this far apart are one part, in world units, as in `kfgs select`."""
 
 
-def parse_edits(asked: Edits) -> Iterator[tuple[str, Any]]:
+def parse_edits(asked: Edits) -> list[tuple[str, Any]]:
     """The edits of the options, each after its words ("--scale lamp:2"), in the order of `Edits`: recolour before remove.
 
     Parts of a class (`chair/1`) are counted after the earlier edits; removed parts of one class are counted together. A class
     with a name that ends in `/1` can only be edited in Python.
 
     Raises:
-        ValueError: if an option lacks its value, or the value is of another kind; the message quotes the option's text.
+        ValueError: if an option lacks its value, or the value is of another kind (the message quotes the option's text), or
+            there is a distance but no part.
     """
+    edits = list(_parse(asked, partial(_where, asked.distance)))
+    if asked.distance is not None and not any(_parts(getattr(edit, "where", None)) for _, edit in edits):
+        raise ValueError(
+            f"distance: expected an edit of a part with it (--remove chair/2), got {asked.distance} and none; name a part, or "
+            "leave it out"
+        )
+    return edits
+
+
+def _parse(asked: Edits, where_of: Callable[[str, str], Any]) -> Iterator[tuple[str, Any]]:
     from ..labels.color import parse_color
     from ..labels.edits import Duplicate, Extract, Move, Opacity, Recolor, Remove, Turn
     from ..labels.edits.motion import AXES
@@ -59,19 +73,19 @@ def parse_edits(asked: Edits) -> Iterator[tuple[str, Any]]:
 
     for words in asked.recolor:
         name, value = _split("recolor", words, "plant:#c04040")
-        yield f"--recolor {words}", Recolor(_where("recolor", name), parse_color(value, "recolor"), asked.mode)
+        yield f"--recolor {words}", Recolor(where_of("recolor", name), parse_color(value, "recolor"), asked.mode)
     for words in asked.opacity:
         name, value = _split("opacity", words, "lamp:0.3")
         (factor,) = _numbers("opacity", words, value, "a factor from 0 to 1", 1)
         if not 0 <= factor <= 1:
             raise ValueError(f"opacity: expected a factor from 0 to 1 after the colon, got {words!r}; 0 hides, 1 keeps")
-        yield f"--opacity {words}", Opacity(_where("opacity", name), factor)
+        yield f"--opacity {words}", Opacity(where_of("opacity", name), factor)
     for words in asked.scale:
         name, value = _split("scale", words, "lamp:1.5")
         (factor,) = _numbers("scale", words, value, "a factor above 0", 1)
         if factor <= 0:
             raise ValueError(f"scale: expected a factor above 0 after the colon, got {words!r}; 0.5 halves, 2 doubles")
-        yield f"--scale {words}", Move(_where("scale", name), scale=factor)
+        yield f"--scale {words}", Move(where_of("scale", name), scale=factor)
     for words in asked.rotate:
         name, value = _split("rotate", words, "table:z,90")
         axis, _, degrees = value.partition(",")
@@ -80,20 +94,20 @@ def parse_edits(asked: Edits) -> Iterator[tuple[str, Any]]:
                 f"rotate: expected an axis (x, y or z) and degrees, got {words!r}; write it as 'table:z,90'"
             )
         (angle,) = _numbers("rotate", words, degrees, "an axis (x, y or z) and degrees", 1)
-        yield f"--rotate {words}", Move(_where("rotate", name), rotation=Turn(AXES[axis], angle))
+        yield f"--rotate {words}", Move(where_of("rotate", name), rotation=Turn(AXES[axis], angle))
     for words in asked.move:
         name, value = _split("move", words, "table:0.5,0,0")
-        yield f"--move {words}", Move(_where("move", name), _numbers("move", words, value, _THREE, 3))
+        yield f"--move {words}", Move(where_of("move", name), _numbers("move", words, value, _THREE, 3))
     for words in asked.duplicate:
         name, value = _split("duplicate", words, "chair:1,0,0")
         yield (
             f"--duplicate {words}",
-            Duplicate(_where("duplicate", name), _numbers("duplicate", words, value, _THREE, 3)),
+            Duplicate(where_of("duplicate", name), _numbers("duplicate", words, value, _THREE, 3)),
         )
-    for removed, parts in _together(asked.remove):
+    for removed, parts in _together(asked.remove, where_of):
         yield f"--remove {' '.join(removed)}", Remove(parts[0] if len(parts) == 1 else Either(tuple(parts)))
     if asked.extract:
-        where = Either(tuple(_where("extract", words) for words in asked.extract))
+        where = Either(tuple(where_of("extract", words) for words in asked.extract))
         yield f"--extract {' '.join(asked.extract)}", Extract(where)
     for words in asked.insert:
         yield f"--insert {words}", _insertion(words)
@@ -104,6 +118,24 @@ def inserted_files(edits: Iterable[Any]) -> list[Path]:
     from ..labels.edits import Insert
 
     return [Path(edit.source) for edit in edits if isinstance(edit, Insert) and isinstance(edit.source, str | Path)]
+
+
+def classes_of(edits: Iterable[Any]) -> Iterator[str | int]:
+    """The classes, by name or index, that edits need in the first splat: those before an inserted one, which may bring some."""
+    for edit in edits:
+        if edit.op == "insert":
+            return
+        yield from _classes(edit.where)
+
+
+def _classes(where: Any) -> Iterator[str | int]:
+    from ..labels.where import OfClass
+
+    if isinstance(where, OfClass):
+        yield where.name
+    for one in (*getattr(where, "parts", ()), getattr(where, "where", None)):
+        if one is not None:
+            yield from _classes(one)
 
 
 def check_parts(splats: Any, edits: Iterable[Any]) -> None:
@@ -124,10 +156,11 @@ def check_parts(splats: Any, edits: Iterable[Any]) -> None:
         numbers = component_numbers(splats.gaussians.means, mask, part.distance)
         sizes = torch.bincount(numbers[mask])
         count = int((sizes >= SPECK * sizes[0]).sum()) if len(sizes) else 0
+        far = "" if part.distance is None else f" --distance {part.distance}"
         if part.rank >= count:
             raise ValueError(
                 f"{name}/{part.rank + 1}: expected a part from {name}/1 to {name}/{count}, got no part of that number; "
-                f"`kfgs select {name} SPLAT` lists them"
+                f"`kfgs select {name} SPLAT{far}` lists them"
                 if count
                 else f"{name}/{part.rank + 1}: expected Gaussians of class {name!r}, got none in this splat; "
                 "`kfgs info SPLAT` lists what it holds"
@@ -143,7 +176,7 @@ def _parts(where: Any) -> list[Any]:
     return [where] if isinstance(where, Component) else []
 
 
-def _where(option: str, words: str) -> Any:
+def _where(distance: float | None, option: str, words: str) -> Any:
     """A class, or one of its connected parts, as in `chair/2`."""
     from ..labels.where import Component, OfClass
 
@@ -152,14 +185,14 @@ def _where(option: str, words: str) -> Any:
         return OfClass(words)
     if int(part) == 0:
         raise ValueError(f"{option}: expected parts counted from 1, got {words!r}; '{name}/1' is the largest")
-    return Component(OfClass(name), rank=int(part) - 1)
+    return Component(OfClass(name), distance, int(part) - 1)
 
 
-def _together(remove: Sequence[str]) -> list[tuple[list[str], list[Any]]]:
+def _together(remove: Sequence[str], where_of: Callable[[str, str], Any]) -> list[tuple[list[str], list[Any]]]:
     """The removed parts by class (ignoring case), because removing one part changes the numbers of the others."""
     found: dict[str, tuple[list[str], list[Any]]] = {}
     for words in dict.fromkeys(remove):
-        where = _where("remove", words)
+        where = where_of("remove", words)
         of_class = getattr(where, "where", where)
         said, parts = found.setdefault(of_class.name.casefold(), ([], []))
         said.append(words)

@@ -85,13 +85,15 @@ def open_field(name: str, field: Path) -> Any:
     return SemanticField.load(field)
 
 
-def open_splats(name: str, path: Path, *, labelled: bool = False) -> Any:
+def open_splats(name: str, path: Path, *, labelled: bool = False, named: bool = False) -> Any:
     """Read a splat file.
 
     Raises:
-        ValueError: if the path is a semantic field, or the splat has no classes and `labelled` asks for them.
+        ValueError: if the path is a semantic field, or the splat has no classes and `labelled` asks for them, or no names of
+            its classes and `named` asks for them.
     """
     from ..formats import read_splats
+    from ..formats.sidecar import names_path
 
     check_joined(name, path)
     if is_field(path):
@@ -101,7 +103,14 @@ def open_splats(name: str, path: Path, *, labelled: bool = False) -> Any:
         )
     splats = read_splats(path)
     if labelled and splats.gaussians.labels is None:
-        raise ValueError(f"{name}: expected a splat with classes, got {path} without; `kfgs attach` gives it some")
+        raise ValueError(
+            f"{name}: expected a splat with classes, got {path} without; run `kfgs attach FIELD {path} --out labelled.ply`"
+        )
+    if named and splats.gaussians.labels is not None and not splats.classes:
+        raise ValueError(
+            f"{name}: expected the names of its classes beside {path}, got no file {names_path(path)}; copy it, too, from "
+            "where the splat was, or run `kfgs attach` again"
+        )
     return splats
 
 

@@ -69,7 +69,7 @@ def select(
         check_range("threshold", threshold, 0, 1)
     classes.check_images()
     asked_by_text = is_field(source)
-    counted = not asked_by_text and threshold is None and distance is None  # parts are numbered as `kfgs edit` does
+    counted = not asked_by_text and threshold is None  # parts are numbered as `kfgs edit` does
     if asked_by_text:
         field = classes.open_field("source", source)
         label_set, target = ask(query, classes, teacher, field)
@@ -82,7 +82,7 @@ def select(
         given = {"classes": classes.classes, "text": classes.text, "negatives": negatives, "score": score}
         for name, value in (given | dataclasses.asdict(teacher)).items():
             check_alone(name, None if value == "auto" else value, "with a splat, which has its own classes")
-        cloud = open_splats("source", source, labelled=True)
+        cloud = open_splats("source", source, labelled=True, named=True)
         found = select_labelled(cloud, query, threshold)
         scene = None if classes.scene is None else classes.load_scene().undistorted()
         cameras = None if scene is None else scene.cameras
@@ -106,6 +106,8 @@ def select(
         say(f"  {left} smaller part{'s are' if left > 1 else ' is'} not listed; --smallest 1 lists the 100 largest")
     elif not things and len(found) > 0:
         say(f"  no part has {smallest} Gaussians; give a smaller --smallest")
+    if counted and things and distance is not None:
+        say(f"with `kfgs edit`, add --distance {distance}")
     if out is not None:
         wrote([out / name for name in written])
 

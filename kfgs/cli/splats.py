@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .._files import check_output, check_own, read_json, real_path
-from .edit_syntax import Edits, check_parts, inserted_files, parse_edits
+from .edit_syntax import Edits, check_parts, classes_of, inserted_files, parse_edits
 from .files import check_alone, check_splat, check_target, open_splats
 from .options import Classes, Flag, Given, GivenBy, Positional, SceneOption, Several
 from .output import say, say_counts, say_lost, wrote
@@ -133,13 +133,15 @@ def edit(
         check_alone("views", ", ".join(views) or None, "without --scene, whose views they are")
         scene.check_images()
     replayed = EditList() if replay is None else EditList.load(replay, anywhere=True)  # the user's own file
-    asked, listed = tuple(parse_edits(edits)), replayed
+    asked, listed = parse_edits(edits), replayed
     for _, one in asked:
         listed = listed.then(one)
     if len(listed) == 0:
         raise ValueError("edits: expected at least one, got none; give --remove, --recolor, --move or another")
     check_target("out", out, *inserted_files(listed))
-    before = open_splats("splats", splats, labelled=any(edit.op != "insert" for _, edit in asked))
+    by_class = [*classes_of(replayed), *classes_of(edit for _, edit in asked)]
+    named = any(isinstance(one, str) for one in by_class)
+    before = open_splats("splats", splats, labelled=bool(by_class), named=named)
     check_parts(replayed.apply(before), [one for _, one in asked])
     cameras = [] if scene.scene is None else _cameras_to_show(before, scene, views)
     after = _apply(listed, before, [words for words, _ in asked])
@@ -220,9 +222,14 @@ def convert(
 def _convert_by_class(source: Path, folder: Path) -> None:
     """One plain PLY for each class of a splat. The class is in the name of its file, so there is nothing beside it."""
     from .._files import atomic_folder
-    from ..formats import write_splats
+    from ..formats import formats, write_splats
     from ..formats.splat_file import SCORE
 
+    endings = *(ending for one in formats().values() for ending in one.SUFFIXES), ".zip"
+    if folder.name.lower().endswith(endings) and not folder.is_dir():
+        raise ValueError(
+            f"target: expected a folder for the files of the classes, got {folder}, the name of a file; leave its ending out"
+        )
     check_output("target", folder, "a folder")
     splats = open_splats("source", source, labelled=True)
     if len(splats) == 0:

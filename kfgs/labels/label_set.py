@@ -102,7 +102,7 @@ class LabelSet:
 
     def index(self, name: str) -> int:
         """The label of a class; for an unknown name, a ValueError lists similar names."""
-        return class_index(name, self.names)
+        return class_index(name, self.names, "add its embedding to the classes")
 
     def knows(self, name: str) -> bool:
         """Whether `index` finds a class of that name."""

@@ -26,6 +26,7 @@ Progress = Callable[[int, int], object]
 
 GIF_FPS = 50.0  # browsers slow down films with shorter frames than 0.02 s
 LEGEND_COLORS = 64  # of a GIF frame's 256 colours: 18 classes, ink, paper, and the greys between
+MOST_LEGEND_COLORS = 192  # of more classes; the picture keeps 64 of its own, four steps per channel
 FFMPEG = "imageio_ffmpeg"
 SUFFIXES = (".gif", ".mp4")
 
@@ -153,18 +154,23 @@ def _write_gif(path: Path, frames: Iterator[Array], fps: float, strip: Array | N
 
 
 def _few_colors(strip: Array) -> tuple[Array, Array]:  # [h, w, 3] -> [h, w] int64, [n, 3]
-    """Reduce the legend to its 64 commonest colours. They include the classes, perhaps not all edges of letters."""
+    """Reduce the legend to 64 colours, or more if its areas have more: those of areas, then the commonest edges of letters."""
     colors, inverse, counts = np.unique(strip.reshape(-1, 3), axis=0, return_inverse=True, return_counts=True)
-    kept = np.argsort(-counts, kind="stable")[:LEGEND_COLORS]
+    places = inverse.reshape(strip.shape[:2])
+    windows = np.lib.stride_tricks.sliding_window_view(places, (3, 3))
+    inside = (windows == places[1:-1, 1:-1, None, None]).all(axis=(2, 3))  # all neighbours have its colour: no edge
+    areas = np.bincount(places[1:-1, 1:-1][inside], minlength=len(colors))
+    kept = np.lexsort((-counts, -areas))[: np.clip(np.count_nonzero(areas), LEGEND_COLORS, MOST_LEGEND_COLORS)]
     distances = np.abs(colors[:, None].astype(np.int64) - colors[kept][None].astype(np.int64)).sum(-1)
-    return distances.argmin(1)[inverse.reshape(strip.shape[:2])], colors[kept]
+    return distances.argmin(1)[places], colors[kept]
 
 
 def _indexed(frame: Array, legend: tuple[Array, Array] | None) -> Image.Image:
     """A frame in 256 colours of its own, including the legend's. No dithering: its dots would flicker.
 
     An octree keeps the hue of small areas; a median cut, whose mean error is a little lower, paints them like their
-    neighbours.
+    neighbours. With a legend, each pixel takes the nearest of all colours (Pillow looks that up in steps of 4 levels of 255),
+    so that a small area has its colour in the legend.
     """
     index, colors = legend if legend is not None else (np.zeros((0, frame.shape[1]), np.int64), frame[:0, 0])
     picture = Image.fromarray(np.ascontiguousarray(frame[: len(frame) - len(index)]))
@@ -172,9 +178,13 @@ def _indexed(frame: Array, legend: tuple[Array, Array] | None) -> Image.Image:
     reduced = picture.quantize(free, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
     if legend is None:
         return reduced
-    whole = Image.fromarray(np.concatenate([np.asarray(reduced), index + free]).astype(np.uint8))
     table = [*(reduced.getpalette() or [])[: 3 * free]]
-    whole.putpalette([*table, *[0] * (3 * free - len(table)), *colors.ravel().tolist()])
+    table = [*table, *[0] * (3 * free - len(table)), *colors.ravel().tolist()]
+    all_colors = Image.new("P", (1, 1))
+    all_colors.putpalette(table)
+    nearest = picture.quantize(palette=all_colors, dither=Image.Dither.NONE)
+    whole = Image.fromarray(np.concatenate([np.asarray(nearest), index + free]).astype(np.uint8))
+    whole.putpalette(table)
     return whole
 
 

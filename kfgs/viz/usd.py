@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 from importlib import import_module
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,8 @@ def save_usd(path: str | Path, cloud: Gaussians | SplatFile, *, points: bool = F
 
     The objects are `ParticleField3DGaussianSplat`, which OpenUSD knows since 26.03; or, for programs that do not know it,
     `Points` in their base colour, as wide as two mean standard deviations. Each object has the primvars `class_id` and, if
-    known, `score` (a number per Gaussian), and the attribute `kfgs:class`, the name of its class.
+    known, `score` (a number per Gaussian), and the attribute `kfgs:class`, the name of its class; it is called after that, with
+    `_` for what USD does not allow (`office_chair`), or `unlabelled`.
 
     **Convention**: coordinates stay as they are. The file says that a unit is a metre (`metersPerUnit` 1) and that z is up
     (`upAxis`), as kfgs assumes if no cameras tell; without these, USD means centimetres and y.
@@ -70,9 +72,9 @@ def save_usd(path: str | Path, cloud: Gaussians | SplatFile, *, points: bool = F
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/splat").GetPrim())
     for label, part in ({-1: splats} if splats.gaussians.labels is None else splats.by_class()).items():
-        place = f"/splat/class_{label}" if label >= 0 else "/splat/no_class"
-        shape = (_add_points if points else _add_gaussians)(stage, place, part.gaussians.detach())
         name = splats.classes[label] if 0 <= label < len(splats.classes) else ""
+        place = _place(stage, label, name)
+        shape = (_add_points if points else _add_gaussians)(stage, place, part.gaussians.detach())
         shape.GetPrim().CreateAttribute("kfgs:class", Sdf.ValueTypeNames.String).Set(name)
         numbers = {"class_id": (Sdf.ValueTypeNames.IntArray, np.full(len(part), label, np.int32))}
         if SCORE in part.extra:
@@ -92,6 +94,17 @@ def save_usd(path: str | Path, cloud: Gaussians | SplatFile, *, points: bool = F
     lost = describe_loss(splats, path.suffix, 3) + describe_lost_mode(splats.info, path.suffix)
     flat = ("shapes, opacities and harmonics of the Gaussians: points are round and opaque",) if points else ()
     return Written([path], lost + flat, None)
+
+
+def _place(stage: Any, label: int, name: str) -> str:
+    """A free path with the name of a class (`office_chair`); its number follows if the path is taken or no letter is left."""
+    from pxr import Tf
+
+    word = Tf.MakeValidIdentifier(name) if label >= 0 else "unlabelled"
+    nameless = not word.strip("_")
+    word = "class" if nameless else word
+    endings = (f"_{label}" * times for times in count(int(nameless)))
+    return next(place for ending in endings if not stage.GetPrimAtPath(place := f"/splat/{word}{ending}"))
 
 
 def _add_points(stage: Any, place: str, g: Gaussians) -> Any:

@@ -66,6 +66,7 @@ def test_every_option_of_a_command_is_in_its_table(name):
     assert written.count("\n| `") == len(options)
     assert f"kfgs {name}" in written
     assert "None" not in written
+    assert "%%" not in written
 
 
 def test_shapes_beside_arguments_are_read_and_other_comments_are_not():

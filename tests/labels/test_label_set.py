@@ -46,7 +46,7 @@ def test_bad_input_is_named(tmp_path):
         load_label_set(tmp_path / "classes.json", tmp_path / "none.npy")
     with pytest.raises(ValueError, match=tells("names:", "got ['a', 'a']")):
         LabelSet(("a", "a"), torch.zeros(2, 3))
-    with pytest.raises(ValueError, match=tells("class:", "wall", "got 'chair'")):
+    with pytest.raises(ValueError, match=tells("class:", "wall", "got 'chair'", "add its embedding to the classes")):
         LabelSet(("wall",), torch.zeros(1, 3)).index("chair")
 
 

@@ -64,6 +64,29 @@ def test_legend_colours_stay_exact_where_a_frame_has_thousands_of_others():
     assert plain.shape == strip.shape
 
 
+@pytest.mark.parametrize("width", [160, 320, 960])
+def test_a_legend_of_a_hundred_classes_keeps_all_their_colours(width):
+    names = [f"a long name of class {i}" for i in range(100)]  # letters have more pixels than patches
+    strip = legend_strip(torch.arange(100), names, width)
+    index, colors = _few_colors(strip)
+    for color in palette(torch.arange(100), names):
+        there = (strip == color).all(-1)
+        assert there.sum() > 20
+        assert (colors[index[there]] == color).all()
+
+
+def test_a_small_area_has_its_colour_in_the_legend():
+    names = [f"class {i}" for i in range(18)]
+    strip = legend_strip(torch.arange(18), names, 300)
+    picture = np.random.default_rng(0).integers(0, 256, (60, 300, 3)).astype(np.uint8)
+    for i, color in enumerate(palette(torch.arange(18), names)):
+        picture[20:23, 10 * i : 10 * i + 3] = color
+    seen = np.asarray(_indexed(np.concatenate([picture, strip]), _few_colors(strip)).convert("RGB"))
+    for i in range(18):
+        area = np.s_[20:23, 10 * i : 10 * i + 3]
+        assert np.abs(seen[area].astype(int) - picture[area]).max() <= 8  # Pillow looks colours up in steps of 4
+
+
 NAMES = ["a", "b", "c", "chair"]
 
 

@@ -35,8 +35,8 @@ def test_each_class_is_an_object_with_its_gaussians(tmp_path, ending):
     )
     assert [one.name for one in tmp_path.iterdir()] == [path.name]
     _, prims = opened(path)
-    assert set(prims) == {"no_class", *(f"class_{i}" for i in range(5))}
-    chairs, prim = cloud[cloud.labels == 1], prims["class_1"]
+    assert set(prims) == {"unlabelled", "wall", "office_chair", "b", "c", "d"}
+    chairs, prim = cloud[cloud.labels == 1], prims["office_chair"]
     assert prim.GetTypeName() == "ParticleField3DGaussianSplat"
     assert prim.GetAttribute("kfgs:class").Get() == "office chair"
     assert set(prim.GetAttribute("primvars:class_id").Get()) == {1}
@@ -52,6 +52,15 @@ def test_each_class_is_an_object_with_its_gaussians(tmp_path, ending):
     np.testing.assert_allclose(read("radiance:sphericalHarmonicsCoefficients").reshape(-1, 4, 3), chairs.sh, rtol=1e-6)
     first, expected = prim.GetAttribute("orientations").Get()[0], chairs.quats[0] / chairs.quats[0].norm()
     np.testing.assert_allclose([first.GetReal(), *first.GetImaginary()], expected, rtol=1e-5)
+
+
+def test_names_that_collide_or_say_nothing_get_the_number_of_their_class(tmp_path):
+    cloud = some_gaussians()
+    names = ("tv set", "tv-set", "unlabelled", "\u6905\u5b50", "")
+    save_usd(tmp_path / "a.usda", SplatFile(cloud, {}, names))
+    _, prims = opened(tmp_path / "a.usda")
+    expected = {"unlabelled": -1, "tv_set": 0, "tv_set_1": 1, "unlabelled_2": 2, "class_3": 3, "class_4": 4}
+    assert {name: prim.GetAttribute("primvars:class_id").Get()[0] for name, prim in prims.items()} == expected
 
 
 def test_points_for_programs_without_gaussians(tmp_path):

@@ -161,7 +161,7 @@ class FieldMeaning:
     def _phrase(self, words: str) -> Tensor:  # [D]
         if self._embed is None or not words:
             try:
-                class_indices(words, self.names)
+                self._classes.index(words)
             except ValueError as error:  # its message lists the classes and similar names
                 more = "" if self.phrases else "; other words need the teacher's text encoder (embed)"
                 raise ValueError(f"{error}{more}") from None

@@ -302,6 +302,8 @@ def test_cosines_below_zero_and_missing_scores_still_select_the_whole_class():
 def test_splats_without_labels_or_names():
     with pytest.raises(ValueError, match=tells("splats.gaussians.labels:", "[N]", "got None", "`kfgs attach`")):
         SplatMeaning(splat_file(cloud(LINE)))
+    with pytest.raises(ValueError, match=tells("class:", "got 'zebra'; take one of these classes")):
+        SplatMeaning(splat_file(cloud(LINE, LABELS))).ask("zebra")
     made = SplatMeaning(splat_file(cloud(LINE, LABELS)).replace(classes=("wall",)))
     assert made.names == ("wall", "class 1", "class 2", "class 3")
     assert made.ask("class 3").selection.indices.tolist() == [2]
