@@ -11,6 +11,7 @@ from .batch import LOCK, STAGES, Row, read_rows
 from .driver import Event
 
 LONGEST = 24  # characters of a name
+MESSAGE = 600  # characters of a failure: what sfm says is long, and its end is advice
 
 
 def event_line(event: Event, rows: Sequence[Row]) -> str | None:
@@ -24,7 +25,7 @@ def event_line(event: Event, rows: Sequence[Row]) -> str | None:
     if event.kind == "lost":
         return f"{event.name}: {event.stage}: {event.lines[0]}"
     if event.failure is not None:
-        return f"{event.name}: {event.stage} failed: {cut(event.failure.message, 300)}"
+        return f"{event.name}: {event.stage} failed: {cut(event.failure.message, MESSAGE)}"
     return None
 
 
@@ -48,7 +49,7 @@ def table(rows: Sequence[Row], most: int | None = None) -> str:
         cells = [cut(row.name, LONGEST).ljust(width), *(row.stages.get(stage, "-").ljust(8) for stage in STAGES)]
         lines.append(" ".join([*cells, f"{sum(row.seconds.values()):7.1f}", score]))
         if row.failure is not None:
-            lines.append(f"  {row.failure.stage}: {cut(row.failure.message, 300 if most is None else 90)}")
+            lines.append(f"  {row.failure.stage}: {cut(row.failure.message, MESSAGE if most is None else 90)}")
     counts = {
         "finished": sum(row.value is not None for row in rows),
         "failed": sum(row.failure is not None for row in rows),

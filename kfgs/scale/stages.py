@@ -62,7 +62,7 @@ def find_scene(job: Job, *, report: Report) -> dict[str, Any]:
                 raise foreign(f"{job.out}/{model}", WRITER)
 
             def make() -> dict[str, Any]:
-                with _advice(f"{job.source}/{photos}".removesuffix("/.")):
+                with _advice(job.source, photos):
                     made = run_sfm(source.path / photos, out.path / "scene", config=config, replace=True)
                 if type(out) is Place:
                     link_images(source.path / photos, out.path / "scene")
@@ -89,13 +89,17 @@ def find_scene(job: Job, *, report: Report) -> dict[str, Any]:
 
 
 @contextmanager
-def _advice(photos: str) -> Iterator[None]:
-    """Say where the options are that sfm's errors name: a batch has none of them."""
+def _advice(source: str, photos: str) -> Iterator[None]:
+    """Say where the options are that sfm's errors name: a batch has none of them. That comes first: tables cut messages."""
     try:
         yield
     except SceneError as error:
+        apart = photos == "."  # no model is written among the photos themselves
+        place = source if apart else f"{source}/{photos}"
+        todo = "SCENE`, and write SCENE into the list" if apart else f"{source}`, then this again with --retry-failed"
+        said = str(error).removeprefix(f"{place}: ")
         raise SceneError(
-            f"{error}. Or find the cameras with other options of `kfgs sfm {photos} --out SCENE`, and write SCENE into the list"
+            f"no cameras found; try other options or photos: `kfgs sfm {place} --out {todo}. sfm says: {said}"
         ) from error
 
 

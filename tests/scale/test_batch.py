@@ -236,14 +236,19 @@ def test_an_error_of_sfm_says_where_its_options_are(rooms, tmp_path, monkeypatch
     from kfgs.scale import stages
     from kfgs.scenes import SceneError
 
-    def fails(*_, **__):
-        raise SceneError("expected 6 images, got 2; pass single_camera=False (--no-single-camera)")
+    def fails(images, *_, **__):
+        raise SceneError(f"{images}: expected 6 images, got 2; pass single_camera=False (--no-single-camera)")
 
     monkeypatch.setattr(stages, "run_sfm", fails)
-    shutil.copytree(rooms[0] / "images", tmp_path / "photos")
+    photos, capture = tmp_path / "photos", tmp_path / "capture"
+    shutil.copytree(rooms[0] / "images", photos)
+    shutil.copytree(rooms[0] / "images", capture / "images")
     with ThreadPoolExecutor(1) as pool:
-        failure = run_batch([tmp_path / "photos"], tmp_path / "runs", OPTIONS, client=pool)[0].failure
-    assert f"`kfgs sfm {tmp_path / 'photos'} --out SCENE`" in failure.message
+        found = run_batch([photos, capture], tmp_path / "runs", OPTIONS, client=pool)
+    told = [one.failure.message.split(". sfm says: ") for one in found]
+    assert f"`kfgs sfm {photos} --out SCENE`, and write SCENE into the list" in told[0][0]
+    assert f"`kfgs sfm {capture}/images --out {capture}`, then this again with --retry-failed" in told[1][0]
+    assert all(said.startswith("expected 6 images, got 2; pass ") for _, said in told)
 
 
 def test_a_scene_without_maps_or_teacher_says_what_to_name(rooms, tmp_path):
