@@ -8,10 +8,12 @@ times; where only times differ, the stage's own cache, which goes by content, fi
 
 from __future__ import annotations
 
+import os
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -29,7 +31,7 @@ from ..scenes import SceneError, link_images, run_sfm
 from ..teachers.load import load_teacher
 from ..teachers.protocol import Teacher, identify
 from .options import BatchOptions, Job
-from .places import WRITER, Place, inside, open_place
+from .places import AT_WORK, WRITER, Place, inside, open_place
 from .scene_parts import class_files, classes_of, counts_alike, load, photos_of, relative, truth_of
 
 PATIENCE = 120  # seconds to wait for a folder in which a process works that was taken for dead
@@ -230,6 +232,9 @@ def _work(job: Job) -> Iterator[tuple[Place, Place]]:
     """The places of a scene and its run, with the threads of a task."""
     torch.set_num_threads(job.options.threads)
     with open_place(job.source) as source, open_place(job.out) as out:
+        if type(out) is Place:
+            with suppress(OSError):  # only shown to people
+                out.write_text(AT_WORK, f"process {os.getpid()} of {socket.gethostname()}\n")
         yield source, out
 
 
