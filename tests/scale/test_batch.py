@@ -467,6 +467,17 @@ def test_ctrl_c_in_a_terminal_does_not_reach_the_workers(client):
     assert client.submit(ignored).result(timeout=100)
 
 
+def test_workers_hold_no_semaphore_that_a_kill_would_leave(client):
+    """The driver's Python warned of them after Ctrl-C."""
+
+    def lock():
+        from tqdm import tqdm
+
+        return type(tqdm(disable=True).get_lock()).__name__
+
+    assert client.submit(lock).result(timeout=100) == "RLock"
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc")
 def test_workers_say_nothing_when_they_are_asked_to_end(client):
     def caught():  # in a thread of the worker, as tasks are
