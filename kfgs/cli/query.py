@@ -9,7 +9,7 @@ from typing import Any, Literal
 from .._files import atomic_folder, check_output, check_own, read_json, real_path
 from .files import check_alone, check_splat, is_field, open_splats
 from .options import Classes, Given, Positional, Rule, Teacher
-from .output import say, say_counts, wrote
+from .output import lengths_odd, say, say_counts, wrote
 from .text import ask
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -58,6 +58,7 @@ def select(
     from .._check import check_range
     from ..formats import SplatFile
     from ..labels import connected_parts
+    from ..labels.components import component_distance
     from ..pipeline.apply import select_labelled
 
     if not source.exists() and Path(query).exists():
@@ -87,9 +88,13 @@ def select(
         scene = None if classes.scene is None else classes.load_scene().undistorted()
         cameras = None if scene is None else scene.cameras
     say(f"{query}: {len(found)} of {len(cloud)} Gaussians, {found.summary}")
+    if distance is None and len(found):
+        distance = component_distance(cloud.gaussians.means, found.mask)
     things = connected_parts(cloud.gaussians, found, cameras, distance=distance, smallest=smallest)
-    for number, thing in enumerate(things, start=1):
-        say(f"  {query}/{number}: {thing!r}" if counted else f"  {thing!r}")
+    for number, (thing, times) in enumerate(zip(things, _times_as_long(things), strict=True), start=1):
+        say((f"  {query}/{number}: {thing!r}" if counted else f"  {thing!r}") + times)
+    if things:
+        say(f"  parts are joined within {distance:.3g}; --distance changes it")
     if things and (left := things[0].total - len(things)):
         say(f"  {left} smaller part{'s are' if left > 1 else ' is'} not listed; --smallest 1 lists the 100 largest")
     elif not things and len(found) > 0:
@@ -193,6 +198,12 @@ def info(path: Positional[Path]) -> None:
     from ..scale.board import describe_batch
 
     say(describe_batch(path) or describe(path))
+
+
+def _times_as_long(things: list[Any]) -> list[str]:
+    """What is said of parts that may be two things in one."""
+    odd = lengths_odd([2 * float(thing.box.half.max()) for thing in things])
+    return ["" if one is None else f" ? ({one:.1f} times as long as the median: two in one?)" for one in odd]
 
 
 def _check_older(out: Path) -> None:
