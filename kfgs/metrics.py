@@ -63,7 +63,9 @@ class Score:
 
     def __post_init__(self) -> None:
         for field, text in (("name", self.name), ("protocol", self.protocol)):
-            if not isinstance(text, str) or not text.strip():
+            if not isinstance(text, str):
+                raise TypeError(f"{field}: expected a text, got {type(text).__name__}; say what was measured and how")
+            if not text.strip():
                 raise ValueError(f"{field}: expected a text, got {text!r}; say what was measured and how")
 
     def __str__(self) -> str:

@@ -38,7 +38,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw
+from PIL import Image
 
 import kfgs
 from kfgs import viz
@@ -57,20 +57,8 @@ print(field)
 
 # %% tags=["thumbnail"]
 index = {scene.cameras[i].name: i for i in scene.views("train")}
-marked = {}
-for number, shown in enumerate(examples.values()):
-    for one in shown:
-        pixels = (scene.image(index[one.view]) * 255).byte().numpy()
-        picture = marked.setdefault(one.view, Image.fromarray(pixels))
-        pen, color = ImageDraw.Draw(picture), tuple(viz.palette(np.array([number]), list(examples))[0].tolist())
-        for x, y in one.points if isinstance(one, Clicks) else ():
-            pen.ellipse((x - 4, y - 4, x + 4, y + 4), fill=color, outline="white")
-        if isinstance(one, Box):
-            pen.rectangle(one.corners, outline="white", width=4)
-            pen.rectangle(one.corners, outline=color, width=2)
-sheet = viz.picture_grid([[np.asarray(picture) for picture in marked.values()]], list(marked), width=384)
-legend = viz.legend_strip(torch.arange(len(examples)), list(examples), sheet.shape[1])
-Image.fromarray(np.concatenate([sheet, legend]))
+shown = viz.draw_examples(field.cameras, examples, lambda camera: scene.image(index[camera.name]), width=384)
+Image.fromarray(shown)
 
 # %% [markdown]
 # ## Examples become classes

@@ -10,6 +10,7 @@ from messages import tells
 from PIL import Image
 from small_room import fit_run, make_room
 
+from kfgs import scenes
 from kfgs.cli import main
 from kfgs.fields import SemanticField
 from kfgs.formats.ply import read_ply, write_ply
@@ -250,3 +251,16 @@ def test_a_scene_without_points_is_told_that_some_are_found(room, tmp_path, caps
     assert "note: no points: this transforms.json has no ply_file_path" in said.out
     assert "triangulate some from the poses before they train" in said.out
     assert said.err.startswith("error: --features: expected a folder of feature maps")
+
+
+def test_sfm_says_that_the_images_of_the_scene_are_a_link(tmp_path, monkeypatch, capsys):
+    def placed(images, out, **_):
+        (out / "sparse" / "0").mkdir(parents=True)
+        return "2 of 2 images registered"
+
+    monkeypatch.setattr(scenes, "run_sfm", placed)
+    photos, scene = tmp_path / "photos", tmp_path / "scene"
+    photos.mkdir()
+    assert main(["sfm", str(photos), "--out", str(scene)]) == 0
+    assert (scene / "images").is_symlink()
+    assert f"{scene / 'images'} is a link to {photos}: keep the photos there\n" in capsys.readouterr().out

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -145,7 +146,7 @@ def test_attach_by_views_is_what_a_scene_does(field, splat, truth, room, tmp_pat
     said = capsys.readouterr().out
     assert "the frames agree" in said
     assert "votes of 6 segmented views" in said
-    assert "that no view shows" in said
+    assert "got a class by the views" in said
     found = read_splats(out).gaussians.labels
     counts = [
         f"  {name:<16s} {int((found == i).sum()):8d} Gaussians" for i, name in enumerate(read_splats(out).classes)
@@ -412,6 +413,20 @@ def test_convert_writes_usd_with_an_object_for_each_class(labelled, tmp_path, wo
     assert counts == {names[label + 1]: len(part) for label, part in cloud.by_class().items()}
 
 
+def test_convert_misses_usd_core_before_it_reads(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    assert main(["convert", str(tmp_path / "absent.ply"), str(tmp_path / "a.usdc")]) == 1
+    assert "a.usdc: expected usd-core to write USD" in capsys.readouterr().err
+
+
+def test_info_of_a_usd_file_says_that_kfgs_only_writes_it(labelled, tmp_path, capsys):
+    pytest.importorskip("pxr")
+    assert main(["convert", str(labelled), str(tmp_path / "a.usdz")]) == 0
+    capsys.readouterr()
+    assert main(["info", str(tmp_path / "a.usdz")]) == 1
+    assert "a.usdz: expected a splat file, got USD, which kfgs writes but does not read" in capsys.readouterr().err
+
+
 def test_convert_by_class_writes_a_plain_file_for_each_class(labelled, tmp_path, capsys):
     cloud, out = read_splats(labelled), tmp_path / "objects"
     words = ["convert", str(labelled), str(out), "--by-class"]
@@ -427,6 +442,13 @@ def test_convert_by_class_writes_a_plain_file_for_each_class(labelled, tmp_path,
         assert {"class_id", "score"}.isdisjoint(read_ply(out / name))
         assert name in said
     assert "note:" not in said
+
+
+def test_convert_by_class_into_a_folder_named_like_usd(labelled, tmp_path):
+    out = tmp_path / "objs.usd"
+    out.mkdir()
+    assert main(["convert", str(labelled), str(out), "--by-class"]) == 0
+    assert {path.suffix for path in out.iterdir()} == {".ply"}
 
 
 def test_convert_by_class_replaces_no_file_of_others(labelled, tmp_path, capsys):

@@ -13,10 +13,11 @@ from small_room import make_desk
 
 from kfgs.cameras import orbit_cameras
 from kfgs.cli import main
-from kfgs.cli.render import walk_of
+from kfgs.cli.render import check_walk, walk_of
 from kfgs.evaluation.datasets import load_coco_labels
 from kfgs.fields import SemanticField
 from kfgs.pipeline import segment_cameras, write_coco
+from kfgs.pipeline.label_pictures import picture_names
 from kfgs.scenes import load_cameras, load_scene
 
 
@@ -122,6 +123,30 @@ def test_cameras_of_your_own(desk, tmp_path):
         segment_cameras(field, [cameras[0], cameras[0]], field.label_set(), tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("names", "bad"),
+    [
+        ([".kfgs-unfinished/waiting/x.png", "b"], ".kfgs-unfinished/waiting/x"),
+        (["a.png", "a.png/b.png"], "a"),
+        (["../a.png", "b"], "../a"),
+        (["/a.png", "b"], "/a"),
+        (["a\n.png", "b"], r"a\n"),
+        (["x" * 252 + ".png", "b"], "xxx"),
+    ],
+)
+def test_names_that_cannot_be_those_of_pictures_are_refused(tmp_path, names, bad):
+    camera = orbit_cameras(torch.rand(50, 3))[0]
+    cameras = [dataclasses.replace(camera, name=name) for name in names]
+    with pytest.raises(ValueError, match=tells("path:", "names can be those of pictures", f"got '{bad}", "rename it")):
+        picture_names(cameras, "path")
+
+
+def test_the_longest_name_of_a_picture(tmp_path):
+    camera = dataclasses.replace(orbit_cameras(torch.rand(50, 3))[0], name="x" * 251 + ".png")
+    (name,) = picture_names([camera])
+    (tmp_path / f"{name}.png").touch()
+
+
 def own_cameras(folder, cameras, name="{}"):
     """A transforms.json without pictures, as another program writes one."""
     flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
@@ -157,7 +182,9 @@ def test_own_cameras_draw_from_the_depth_from_which_those_of_the_scene_do(desk, 
     )
     file = own_cameras(tmp_path / "in", [cameras[0], moved])  # a millimetre apart: as a scene, it is a tiny one
     assert load_cameras(file)[0].near < 1e-3
-    assert {camera.near for camera in walk_of(file, None, cameras, None, None)} == {cameras[0].near}
+    assert {camera.near for camera in walk_of(check_walk(file, None, None), None, cameras, None, None)} == {
+        cameras[0].near
+    }
 
 
 def test_a_path_through_the_cameras_of_a_scene_without_pictures(desk, tmp_path):
@@ -183,28 +210,63 @@ def test_files_of_others_are_not_replaced(desk, tmp_path, name, capsys):
     assert not (tmp_path / "predicted").exists()
 
 
+PLACES = (
+    "expected orbit, spiral, cameras, a transforms.json (a name that ends in .json), or a folder with a COLMAP model,",
+)
+
+
+def test_cameras_of_your_own_are_checked_before_the_field_is_opened(tmp_path, capsys):
+    (tmp_path / "broken.json").write_text("{")
+    words = ["--path", str(tmp_path / "broken.json"), "--out", str(tmp_path / "o")]
+    assert main(["segment", str(tmp_path / "no_field"), *words]) == 1
+    assert "broken.json:" in capsys.readouterr().err
+    assert main(["render", str(tmp_path / "no_field"), *words[:-1], str(tmp_path / "a.gif")]) == 1
+    assert "broken.json:" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "parts"),
     [
         (["--frames", "3"], ("--frames:", "without --path")),
         (["--path", "orbit", "--labels", "x"], ("--labels:", "with --path")),
+        (["--path", "orbit", "--split", "test"], ("--split:", "with --path", "got test; leave it out")),
+        (["--path", "orbit", "--pictures", "0"], ("--pictures:", "with --path", "got 0; leave it out")),
         (["--path", "orbit", "--color", "x.ply"], ("--color:", "without --coco")),
         (["--path", "orbit", "--frames", "0"], ("--frames:", "got 0")),
-        (["--path", "orbitt"], ("--path:", "orbit, spiral, cameras, or a file", "got orbitt", "correct it")),
+        (["--path", "orbitt"], ("--path:", *PLACES, "got orbitt, which does not exist; correct it")),
         (
             ["--path", "{scene}/classes.json"],
             ("{scene}/classes.json, top level:", "'frames'", "is this a transforms.json"),
         ),
-        (["--path", "{scene}/labels"], ("{scene}/labels:", "expected a COLMAP model")),
+        (["--path", "{scene}/labels"], ("--path:", *PLACES, "got {scene}/labels, a folder without cameras")),
+        (["--path", "{scene}/../run"], ("--path:", *PLACES, "got {scene}/../run, a field; `--path cameras`")),
+        (["--path", "{scene}/../my.ply"], ("--path:", *PLACES, "my.ply, another file")),
+        (["--path", "/dev/null"], ("--path:", *PLACES, "got /dev/null, another file")),
         (
             ["--path", "{one}", "--frames", "3"],
             ("--frames:", "two different cameras", "got 1 in {one}", "leave it out"),
         ),
+        (["--path", "{same}", "--frames", "3"], ("--frames:", "got 3 that are all at one place and angle in {same}")),
         (["--path", "{one}", "--width", "3"], ("--width:", "got 3")),
+        (["--path", "orbit", "--width", "10000000"], ("--width:", "[16, 16384]", "got 10000000")),
+        (["--path", "orbit", "--frames", "99999999999"], ("--frames:", "[2, 100000]", "got 99999999999")),
+        (["--path", "{folder}"], ("--path:", "names can be those of pictures", "got 'a'; rename it")),
+        (["--path", "{large}"], ("--path:", "16384 x 16384", "got 60000 x 2 in {large}", "give a smaller --width")),
+        (["--path", "{high}", "--width", "100"], ("--width:", "16384 x 16384", "got 100 x 3000000 in {high}")),
+        (["--path", "{huge}"], ("{huge}, frame 0", "got 60,000 x 60,000; give a smaller size")),
     ],
 )
 def test_options_that_would_have_no_effect_are_named(desk, tmp_path, words, parts, capsys):
-    known = {"scene": desk / "scene", "one": own_cameras(tmp_path / "in", load_scene(desk / "scene").cameras[:1])}
+    cameras = load_scene(desk / "scene").cameras[:1]
+    known = {"scene": desk / "scene", "one": own_cameras(tmp_path / "in", cameras)}
+    known |= {"same": own_cameras(tmp_path / "same", cameras * 3)}
+    listed = own_cameras(tmp_path / "folder", load_scene(desk / "scene").cameras[:2], "a.png{}")
+    listed.write_text(listed.read_text().replace("a.png0", "a.png").replace("a.png1", "a.png/b.png"))
+    known["folder"] = listed
+    for name, width, height in (("large", 60_000, 2), ("high", 2, 60_000), ("huge", 60_000, 60_000)):
+        known[name] = own_cameras(tmp_path / name, cameras)
+        frames = json.loads(known[name].read_text())["frames"]
+        known[name].write_text(json.dumps({"frames": [frames[0] | {"w": width, "h": height}]}))
     assert segment(desk, tmp_path / "o", *(word.format(**known) for word in words)) == 1
     error = capsys.readouterr().err
     for part in parts:

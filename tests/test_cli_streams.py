@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from messages import tells
+from small_room import make_desk
 
 from kfgs import _check, cli
 from kfgs.formats.ply import write_ply
@@ -33,6 +34,43 @@ def cloud(tmp_path):
 def test_a_reader_that_ends_is_no_error(words, tmp_path):
     line = f"{{ sleep 0.1; {KFGS} {words}; echo $? >&2; }} | true"
     assert shell(line, tmp_path) == (0, "", "141\n")
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory):
+    folder = make_desk(tmp_path_factory.mktemp("desk"))
+    for words in (
+        "attach {0}/run/field {0}/my.ply --out {0}/labelled.ply",
+        "pack {0}/run/field {0}/p.kfgs.safetensors",
+        "search floor {0}/run",  # which says that it makes the index
+    ):
+        assert cli.main(words.format(folder).split()) == 0
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("words", "written"),
+    [
+        ("attach {0}/run/field {0}/my.ply --out {1}/a.ply", "a.ply"),
+        ("label {0}/run/field --out {1}/a", "a/gaussians.ply"),
+        ("label {0}/run/field --out {1}/a --cloud {0}/my.ply", "a/cloud.ply"),
+        ("select floor {0}/run/field --out {1}/a", "a/selection.json"),
+        ("edit {0}/labelled.ply --remove floor --out {1}/a.ply", "a.ply.edits.json"),
+        ("convert {0}/labelled.ply {1}/a.splat", "a.splat"),
+        ("convert {0}/labelled.ply {1}/a --by-class", "a"),
+        ("plan {0}/scene --out {1}/a.json", "a.json"),
+        ("search floor {0}/run --json {1}/a.json", "a.json"),
+        ("compare {0}/run {0}/p.kfgs.safetensors --out {1}/a --pictures 0", "a/compare.json"),
+        ("evaluate {0}/run --out {1}/a.json", "a.json"),
+    ],
+)
+def test_what_is_asked_for_is_written_though_nobody_reads_what_is_said(words, written, desk, tmp_path, monkeypatch):
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "w") as unread:
+        monkeypatch.setattr(sys, "stdout", unread)
+        assert cli.main(words.format(desk, tmp_path).split()) == 141
+    assert (tmp_path / written).exists()
 
 
 @pytest.mark.parametrize("words", ["--help", "--version", "info a.ply"])

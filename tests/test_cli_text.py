@@ -11,7 +11,7 @@ from cases_color import surface
 from cases_text import DIM, TEACHER, letters
 from messages import tells
 from PIL import Image
-from small_room import make_room
+from small_room import make_desk, make_room
 
 from kfgs.cli import main
 from kfgs.cli.options import Classes, Teacher
@@ -246,9 +246,7 @@ def test_words_of_another_teacher_are_noted(field, names, tmp_path, capsys):
     made.save(table)
     assert main(["select", "lamp", str(field), "--text", str(table)]) == 0
     said = capsys.readouterr().out
-    assert (
-        "note: --classes: expected text of the field's teacher (name 'letters'), got text of another ('clip')" in said
-    )
+    assert "note: --text: expected text of the field's teacher (name 'letters'), got text of another ('clip')" in said
     assert main(["select", "palm", str(field), "--text", str(table), *LETTERS]) == 0
     said = capsys.readouterr().out
     assert "note: --text: expected a table by the query's teacher (name 'letters'" in said
@@ -274,11 +272,13 @@ def test_words_of_another_teacher_are_noted(field, names, tmp_path, capsys):
             ("--negatives:", "classes or canonical", "--score softmax", "got none"),
         ),
         (["lamp", "--teacher", "cases_text:MUTE"], ("teacher 'mute':", "text encoder")),
-        (["palm", "--text", "{other}", *LETTERS], ("--classes:", "[C, 16]", "teacher")),
+        (["lamp"], ("--classes, --text:", "got none", "`kfgs text --examples clicks.json --field {field} --out")),
+        (["palm", "--text", "{other}", *LETTERS], ("--text:", "[C, 16]", "teacher")),
         (
             ["lamp", "--text", "{other}"],
-            ("--classes:", "[C, 16]", "got ({count}, 5)"),
+            ("--text:", "[C, 16]", "got ({count}, 5)"),
         ),
+        (["lamp", "--text", "{shown}"], ("--text:", "[C, 16]", "another field", "`kfgs text --examples")),
         (
             ["lamp", "--text", "{bare}", "--negatives", "canonical"],
             ("--negatives:", "canonical", "got none", "`kfgs text`"),
@@ -288,14 +288,17 @@ def test_words_of_another_teacher_are_noted(field, names, tmp_path, capsys):
 )
 def test_wrong_queries_are_named(field, names, tmp_path, capsys, arguments, message):
     made = make_label_set(TEACHER, names)
-    paths = {name: tmp_path / f"{name}.safetensors" for name in ("table", "bare", "other")}
+    paths = {name: tmp_path / f"{name}.safetensors" for name in ("table", "bare", "other", "shown")}
     made.save(paths["table"])
     make_label_set(TEACHER, names, negatives=None).save(paths["bare"])
     type(made)(made.names, torch.eye(len(names), 5) + 1).save(paths["other"])
+    type(made)(made.names, torch.eye(len(names), 5) + 1, info={"examples": {"lamp": 1}}).save(paths["shown"])
     given = [argument.format(tmp=tmp_path, **paths) for argument in arguments]
     assert main(["select", given[0], str(field), *given[1:]]) == 1
     error = capsys.readouterr().err
-    assert re.search(tells(*(part.replace("{count}", str(len(names))) for part in message)), error)
+    assert re.search(
+        tells(*(part.replace("{count}", str(len(names))).replace("{field}", str(field)) for part in message)), error
+    )
     assert error.count("\n") == 1
 
 
@@ -379,3 +382,22 @@ def test_annotations_of_coco_are_classes_by_example(room, truth, names, tmp_path
     for name, row in zip(learnt.names, learnt.embeddings, strict=True):
         assert names[int((words @ row).argmax())] == name
     assert len(learnt) >= 3
+
+
+def test_examples_are_drawn_in_the_photographs_of_the_field(tmp_path, capsys):
+    folder = make_desk(tmp_path)
+    clicks, out = tmp_path / "clicks.json", tmp_path / "shown.safetensors"
+    view = SemanticField.load(folder / "run/field").cameras[0].name
+    clicks.write_text(json.dumps({"chair": [{"view": view, "points": [[20, 30]]}], "wall": [{"gaussians": [3]}]}))
+    words = ["text", "--examples", str(clicks), "--field", str(folder / "run/field"), "--out", str(out)]
+    assert main(words) == 0
+    picture = tmp_path / "shown.safetensors.png"
+    assert f"wrote:\n  {out}\n  {picture}\n" in capsys.readouterr().out
+    with Image.open(picture) as opened:
+        assert opened.size[0] > 480
+    picture.write_bytes(b"mine")
+    assert main(words) == 1
+    assert re.search(tells(picture, "kfgs text"), capsys.readouterr().err)
+    shutil.move(folder / "scene", folder / "elsewhere")
+    assert main(words) == 0  # without photographs there is no picture
+    assert picture.read_bytes() == b"mine"

@@ -178,6 +178,8 @@ def test_score_prints_its_protocol():
 def test_score_refuses_to_be_anonymous(field):
     with pytest.raises(ValueError, match=tells(f"{field}:", "got ' '")):
         Score(**{"name": "mIoU", "value": 1.0, "protocol": "p"} | {field: " "})
+    with pytest.raises(TypeError, match=tells(f"{field}:", "expected a text", "got int")):
+        Score(**{"name": "mIoU", "value": 1.0, "protocol": "p"} | {field: 3})
 
 
 # features

@@ -58,7 +58,7 @@ def _card(name: str, notebook: dict[str, Any]) -> tuple[str, dict[str, bytes]]:
     chosen = [one for one in shown if "thumbnail" in one[0]] or shown
     lines = [f":::{{grid-item-card}} {title}", f":link: {name}", ":link-type: doc"]
     picture = {chosen[-1][1]: base64.b64decode("".join(chosen[-1][2]))} if chosen else {}
-    lines += [f":img-top: {file}" for file in picture]
+    lines += [f":img-top: {file}\n:img-alt: {title}" for file in picture]
     return "\n".join([*lines, "", " ".join(question.split()), ":::", ""]), picture
 
 

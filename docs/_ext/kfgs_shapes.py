@@ -8,6 +8,7 @@ operation: the default role would take the `~` for a sign of its own.
 from __future__ import annotations
 
 import ast
+import functools
 import inspect
 import io
 import re
@@ -55,6 +56,7 @@ def shapes_of(function: Any) -> list[str]:
     return told
 
 
+@functools.cache  # autodoc asks for a module's comments thousands of times
 def comments_of(source: str) -> dict[tuple[str, str], str]:
     """The comments beside the fields of classes, `mask: Tensor  # [N] bool`, by the names of class and field."""
     fields = {

@@ -85,8 +85,8 @@ class Camera:
             object.__setattr__(self, name, int(size))
         if self.width * self.height > PIXELS:
             raise ValueError(
-                f"width, height: expected at most {PIXELS:,} pixels, got {self.width:,} x {self.height:,}; make the camera "
-                "smaller with .resized(height, width)"
+                f"width, height: expected at most {PIXELS:,} pixels, got {self.width:,} x {self.height:,}; give a smaller "
+                "size"
             )
         if not torch.compiler.is_compiling():  # a traced matrix has no values yet
             self._check_values()

@@ -19,6 +19,10 @@ STANDING = 1e-6  # of the coordinates: cameras on one tripod differ by the round
 AROUND = 3  # a closed path is continued by this many keys at both ends: keys farther away hardly change a spline
 
 
+class TooFewViewsError(ValueError):
+    """There are no two different views to go through."""
+
+
 def path_cameras(
     cameras: Sequence[Camera],
     frames: int = 150,
@@ -87,7 +91,7 @@ def _keys(cameras: Sequence[Camera], every: int, closed: bool) -> list[Camera]:
     if closed and len(keys) > 1 and _steps(*_poses([keys[-1], keys[0]]))[0] <= SAME:
         keys.pop()
     if len(keys) < 2:
-        raise ValueError(
+        raise TooFewViewsError(
             f"cameras: expected at least two different views, got {len(keys)} (of {len(cameras)}, every {every}); pass the "
             "cameras of the scene in the order of the path"
         )

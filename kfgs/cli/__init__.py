@@ -125,6 +125,9 @@ def _run(words: list[str], names: dict[str, str]) -> int:
     _check_words(given)
     with interruptible(), warnings_as_notes(spoken), said_on_stderr(), said_whole(), together():
         names |= _shown_names(command)
+        options = {word.partition("=")[0] for word in given}
+        if "text" in names and "--text" in options and "--classes" not in options:
+            names["classes"] = "--text"  # the table of classes came from there
         command.__doc__ = re.sub(r"\n {8,}(?!kfgs)", " ", inspect.getdoc(command) or "")  # an option's text on one line
         about = _description(command)
         tyro.cli(
@@ -224,7 +227,7 @@ def _in_options(message: str, names: dict[str, str]) -> str:
     about, colon, rest = message.partition(": ")
     arguments = about.replace("-", "_").split(", ")
     if colon and all(argument in names for argument in arguments):
-        about = ", ".join(names[argument] for argument in arguments)
+        about = ", ".join(dict.fromkeys(names[argument] for argument in arguments))
     for name in (name for name in names if "_" in name):  # in the text, replace only names that are no English words
         rest = re.sub(rf"\b{name}(=\w+)?\b", names[name], rest)
     return about + colon + rest

@@ -77,12 +77,13 @@ def evaluate(
     question = open_question(classes.scene, protocol, **asked)
     command = shlex.join(["kfgs", *getattr(sys, "argv", [])[1:]])
     found = evaluate_result(field, question, encode=encode, with_file=with_file, command=command)
-    say(found.text if long else "\n".join([str(found), *(f"note: {note}" for note in found.notes)]))
     if out is not None:
         inputs = {"field": field, "with_file": with_file, "truth": truth, **dataclasses.asdict(classes)}
         places = {name: None if place is None else str(real_path(place)) for name, place in inputs.items()}
         words = {"split": split, "labels": labels, "set": list(set), **dataclasses.asdict(teacher)}
         write_json(out, {**found.to_json(), "inputs": {**places, **words}})
+    say(found.text if long else "\n".join([str(found), *(f"note: {note}" for note in found.notes)]))
+    if out is not None:
         wrote([out])
 
 
@@ -149,10 +150,10 @@ def compare(
     if out is not None and draw and question is not None:
         check_pictures(out, (view.stem for view in question.scored), "kfgs compare")
     compared = results.score(question, encode, draw=draw)
+    written = [] if out is None else compared.write(out, question, encode, pictures)
     say("\n".join([str(compared), *(f"note: {note}" for note in (*missing, *compared.notes))]))
     if out is None:
         return
-    written = compared.write(out, question, encode, pictures)
     if draw and question is not None and not any(path.suffix == ".png" for path in written):
         say(f"note: no pictures: {question.protocol.name} scores no pictures of its own")
     wrote(written)

@@ -133,9 +133,10 @@ def plan(
         features=scene_folder(scene) / "features" if features is None else features,
         run=run,
     )
-    say(str(found))
     if out is not None:
         write_json(out, found.to_json())
+    say(str(found))
+    if out is not None:
         wrote([out])
 
 

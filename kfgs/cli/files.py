@@ -20,12 +20,14 @@ def check_target(name: str, target: Path, *sources: Path, endings: tuple[str, ..
         endings: those of the file; by default those of splat files.
     """
     from ..formats import formats
+    from ..formats.table import USD
 
-    splats = tuple(ending for one in formats().values() if hasattr(one, "write") for ending in one.SUFFIXES)
-    if not target.name.lower().endswith(endings or splats):
-        more = "" if endings else " (`kfgs convert` writes USD, too, for example .usdc)"
+    more = "" if endings else f" (`kfgs convert` writes USD, too: {', '.join(USD)})"
+    if not endings:
+        endings = tuple(ending for one in formats().values() if hasattr(one, "write") for ending in one.SUFFIXES)
+    if not target.name.lower().endswith(endings):
         raise ValueError(
-            f"{name}: expected a file whose name ends in one of {', '.join(endings or splats)}, got {target}; "
+            f"{name}: expected a file whose name ends in one of {', '.join(endings)}, got {target}; "
             f"the ending chooses the format{more}"
         )
     check_output(name, target, "a file")

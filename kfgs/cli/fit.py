@@ -132,6 +132,7 @@ def sfm(
     written = [out / "sparse" / "0"]
     beside = out / "images"
     if link_images(images, out):
+        say(f"{beside} is a link to {real_path(images)}: keep the photos there")
         written.append(beside)
     elif real_path(beside) != real_path(images):
         say(f"note: other commands read the pictures of these names in {beside}; --images {images} names these")
@@ -250,9 +251,9 @@ def fit(
     def finish() -> None:
         if teacher.teacher is not None:
             found.clear()  # the samples; the stages made of them are found without
-        say(result.field.summary())
         command = f"cd {shlex.quote(os.getcwd())}\n{shlex.join(called)}"
         written = [result.field_path, *write_run_report(result, loaded, config, command=command)]
+        say(result.field.summary())
         if discard_features:
             freed = bytes_in_words(discard_maps(found.path, found.stems))
             say(f"{found.path}: {freed} of {len(found)} dense maps deleted; what was made of them is in {out}")
@@ -350,8 +351,8 @@ def color(
         written = [result.path]
         if tested:
             scores = score_views(result.gaussians, loaded, "test", show=beside)
-            say(str(scores))
             write_report(out / "scores.json", color=scores)
+            say(str(scores))
             written += [*beside.written, out / "scores.json"]
         else:
             say("note: no views are held out (split 'test', not trained on): nothing to score against")

@@ -231,8 +231,8 @@ class Classes(SceneOption):
             classes = listed if classes is None else classes
         return None if classes is None or text is None else (classes, text)
 
-    def load_classes(self) -> Any:
-        """The label set of these files.
+    def load_classes(self, field: Any | None = None) -> Any:
+        """The label set of these files; an error names the `field` that they are for.
 
         Label pictures hold indices into the scene's `classes.json`. If there is one, only its classes are taken from the
         scene's table, in its order. A table that is named by --text is used whole, unless --classes is given too.
@@ -241,9 +241,11 @@ class Classes(SceneOption):
 
         found = self.files()
         if found is None:
+            place = getattr(field, "folder", None) or "RUN/field"
             raise ValueError(
                 "classes, text: expected class names (.json) and embeddings (.npy), or a table (.safetensors), got none; "
-                "pass --classes and --text, or --scene, or --text alone with what `kfgs text` made"
+                "pass --classes and --text, or --scene, or --text alone with a table of `kfgs text`. Without words, show "
+                f"examples: `kfgs text --examples clicks.json --field {place} --out shown.safetensors`"
             )
         label_set = load_label_set(*found)
         listed = None if self.scene is None else self.scene / "classes.json"
@@ -260,7 +262,7 @@ class Classes(SceneOption):
     def of_field(self, field: Any) -> Any:
         """The label set of these options; without options, that of the field."""
         given = any(path is not None for path in (self.scene, self.classes, self.text))
-        return self.load_classes() if given or not field.has_classes else field.label_set()
+        return self.load_classes(field) if given or not field.has_classes else field.label_set()
 
     def scene_of(self, field: Any | None) -> Any:
         """The scene of --scene or of the field, for its photographs; None if there is none, or it is gone."""

@@ -87,10 +87,22 @@ def select(
         found = select_labelled(cloud, query, threshold)
         scene = None if classes.scene is None else classes.load_scene().undistorted()
         cameras = None if scene is None else scene.cameras
-    say(f"{query}: {len(found)} of {len(cloud)} Gaussians, {found.summary}")
+    headline = f"{query}: {len(found)} of {len(cloud)} Gaussians, {found.summary}"
+    if out is not None and len(found) == 0:
+        say(headline)
+        raise ValueError(f"query: expected Gaussians to save, got none of {query!r}; lower the threshold or drop --out")
     if distance is None and len(found):
         distance = component_distance(cloud.gaussians.means, found.mask)
     things = connected_parts(cloud.gaussians, found, cameras, distance=distance, smallest=smallest)
+    written: list[str] = []
+    if out is not None:  # before anything is printed, whose reader may have ended
+        with atomic_folder(out) as new:
+            _save(new, query, cloud, found, things)
+            _draw(new / "parts.png", query, cloud.gaussians, things, cameras, scene)
+            written += sorted(path.name for path in new.iterdir())
+        for name in {"parts.png", "selection.ply.classes.json"} - set(written):
+            (out / name).unlink(missing_ok=True)  # of an older selection
+    say(headline)
     for number, (thing, times) in enumerate(zip(things, _times_as_long(things), strict=True), start=1):
         say((f"  {query}/{number}: {thing!r}" if counted else f"  {thing!r}") + times)
     if things:
@@ -100,16 +112,6 @@ def select(
     elif not things and len(found) > 0:
         say(f"  no part has {smallest} Gaussians; give a smaller --smallest")
     if out is not None:
-        if len(found) == 0:
-            raise ValueError(
-                f"query: expected Gaussians to save, got none of {query!r}; lower the threshold or drop --out"
-            )
-        with atomic_folder(out) as new:
-            _save(new, query, cloud, found, things)
-            _draw(new / "parts.png", query, cloud.gaussians, things, cameras, scene)
-            written = sorted(path.name for path in new.iterdir())
-        for name in {"parts.png", "selection.ply.classes.json"} - set(written):
-            (out / name).unlink(missing_ok=True)  # of an older selection
         wrote([out / name for name in written])
 
 
@@ -171,15 +173,17 @@ def label(
         labels, scores = torch.where(found.mask, label_set.index(query), -1), found.scores
         how = f"{query}: {len(found)} Gaussians above gamma = {found.threshold:.4f} ({found.how})"
     gaussians = loaded.gaussians.replace(labels=labels)
-    say(f"labelled by {how}")
-    if query is None:
-        say_counts(labels, label_set.names)
+    moved = None
     with atomic_folder(out) as new:
         save_labelled(new / "gaussians.ply", gaussians, scores, label_set, rule=how)
         if carried is not None:
             moved, _ = label_cloud(gaussians, carried, new / "cloud.ply", label_set, distance=distance)
-            say(str(moved))
         written = sorted(path.name for path in new.iterdir())
+    say(f"labelled by {how}")
+    if query is None:
+        say_counts(labels, label_set.names)
+    if moved is not None:
+        say(str(moved))
     wrote([out / name for name in written])
 
 

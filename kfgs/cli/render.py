@@ -4,17 +4,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from .._files import check_output
 from .options import Classes, Given, Positional, Teacher, Walk
 from .output import say, wrote
 from .view import open_colors, open_meaning
 
+if TYPE_CHECKING:
+    from ..cameras import Camera
+
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
 WORDS = "photo, labels, features or query=TEXT"
 FRAMES, WIDTH = 72, 480  # of a path without cameras of your own
+MOST_FRAMES = 100_000  # more than an hour of film at 25 a second
+LARGEST = 1 << 14  # pixels on a side: a square picture in floats takes 3 GB
 OVERHEAD = "ceiling"  # left out of an orbit, which looks in from above
 
 
@@ -31,7 +36,7 @@ def render(
     teacher: Teacher,
     classes: Classes,
 ) -> None:
-    """Make a film of a field or a labelled splat: an orbit around it, a spiral at one view, or a flight along its cameras.
+    """Make a film of a field or a labelled splat: an orbit, a spiral at one view, or a flight along its cameras or your own.
 
     Examples:
         kfgs render run/ --out tour.gif
@@ -63,7 +68,7 @@ def render(
     if out.suffix.lower() not in SUFFIXES:
         raise ValueError(f"out: expected a name that ends in .gif or .mp4, got {out.name!r}; rename it")
     check_target(out, fps)
-    check_walk(path, frames, width)
+    walked = check_walk(path, frames, width, film=True)
     classes.check_images()
     found = find_field(source)
     meaning, cameras = open_meaning(source if found is None else found, classes, teacher)
@@ -75,13 +80,7 @@ def render(
         semantic, colors = _opened(meaning.names, semantic, colors)
     words = [word.strip() for word in (show or ("labels" if colors is None else "photo,labels")).split(",")]
     shows = {_title(word): _show(word, meaning, semantic, colors) for word in words}
-    walk = walk_of(path, (semantic if colors is None else colors).means, cameras, frames, width)
-    sizes = sorted({f"{camera.width}x{camera.height}" for camera in walk})
-    if len(sizes) > 1:
-        raise ValueError(
-            f"path: expected cameras of one size for a film, got {' and '.join(sizes[:3])} in {path}; give --frames, which takes "
-            "the size of the first"
-        )
+    walk = walk_of(walked, (semantic if colors is None else colors).means, cameras, frames, width)
     listed = semantic.labels.unique() if "labels" in words else None
     with tqdm(total=len(walk), desc="render", unit="frame") as bar:
         save_animation(
@@ -116,28 +115,99 @@ def _opened(names: Any, semantic: Any, colors: Any) -> tuple[Any, Any]:
     return shown, None if colors is None else shown if colors is semantic else kept(colors)
 
 
-def check_walk(path: Walk, frames: int | None, width: int | None) -> None:
-    """Check what `walk_of` is asked for, before anything is read."""
+def check_walk(path: Walk, frames: int | None, width: int | None, *, film: bool = False) -> Walk | list[Camera]:
+    """Check what `walk_of` is asked for, before anything else is read; cameras of your own are read here.
+
+    Args:
+        path: the name of a path, or a file or folder with cameras of your own.
+        frames: how many cameras; None: as many as there are.
+        width: of the pictures.
+        film: the cameras must be of one size.
+
+    Returns:
+        The name of the path, or the cameras.
+    """
     from .._check import check_whole
 
-    if isinstance(path, Path) and not path.exists():
-        raise ValueError(
-            f"path: expected orbit, spiral, cameras, or a file or folder with cameras of your own, got {path}, which does not "
-            "exist; correct it"
-        )
-    for name, value, least in (("frames", frames, 2), ("width", width, 16)):
+    for name, value, least, most in (("frames", frames, 2, MOST_FRAMES), ("width", width, 16, LARGEST)):
         if value is not None:
-            check_whole(name, value, least)
+            check_whole(name, value, least, most)
+    if not isinstance(path, Path):
+        return path
+    _check_place(path)
+    return _own_walk(path, frames, width, film)
 
 
-def walk_of(path: Walk, points: Any, cameras: list[Any], frames: int | None, width: int | None) -> list[Any]:
-    """The cameras of a path. Those of the scene are needed for a spiral and a flight along them."""
+def _check_place(path: Path) -> None:
+    """Raise a ValueError unless a path can have cameras of your own."""
+    from ..fields.store import find_field
+    from ..scenes import is_scene
+
+    if (path.suffix == ".json" and path.exists()) or (path.is_dir() and is_scene(path)):
+        return
+    got, advice = "a folder without cameras", "correct it"
+    if not path.exists():
+        got = "which does not exist"
+    elif find_field(path) is not None:
+        got, advice = "a field", "`--path cameras` flies along the cameras of its scene"
+    elif not path.is_dir():
+        got, advice = "another file", "name the file or folder with the cameras"
+    raise ValueError(
+        "path: expected orbit, spiral, cameras, a transforms.json (a name that ends in .json), or a folder with a COLMAP model, "
+        f"got {path}, {got}; {advice}"
+    )
+
+
+def _own_walk(path: Path, frames: int | None, width: int | None, film: bool) -> list[Camera]:
+    """The cameras of a file or folder; with `frames`, those of a smooth path through them."""
+    from ..cameras import path_cameras
+    from ..cameras.paths import TooFewViewsError
+    from ..scenes.load import cameras_and_notes
+
+    own, notes = cameras_and_notes(path)
+    for note in notes:
+        say(f"note: {note}")
+    sizes = [(camera.width, camera.height) for camera in own]
+    if width is not None:
+        sizes = [(width, max(1, round(width * h / w))) for w, h in sizes]
+    if frames is not None:
+        sizes = sizes[:1] * len(own)
+    for w, h in sizes:
+        if max(w, h) > LARGEST:
+            raise ValueError(
+                f"{'path' if width is None else 'width'}: expected cameras of at most {LARGEST} x {LARGEST} pixels, got "
+                f"{w} x {h} in {path}; give a smaller --width"
+            )
+    if film and len(set(sizes)) > 1:
+        listed = " and ".join(f"{w}x{h}" for w, h in sorted(set(sizes))[:3])
+        raise ValueError(
+            f"path: expected cameras of one size for a film, got {listed} in {path}; give --frames, which takes the size of the "
+            "first"
+        )
+    own = [camera.resized(h, w) for camera, (w, h) in zip(own, sizes, strict=True)]
+    if frames is None:
+        return own
+    try:
+        return path_cameras(own, frames)
+    except TooFewViewsError as error:
+        got = "1" if len(own) == 1 else f"{len(own)} that are all at one place and angle"
+        raise ValueError(
+            f"frames: expected two different cameras or more to go through, got {got} in {path}; leave it out"
+        ) from error
+
+
+def walk_of(
+    path: Walk | list[Camera], points: Any, cameras: list[Camera], frames: int | None, width: int | None
+) -> list[Camera]:
+    """The cameras of a path that `check_walk` gave. Those of the scene are needed for a spiral and a flight along them."""
     from ..cameras import Orbit, orbit_cameras, path_cameras, spiral_cameras
     from ..viz.films import KEYS
     from ..viz.linked import upwards
 
-    if isinstance(path, Path):
-        return _own_walk(path, cameras, frames, width)
+    if isinstance(path, list):
+        # the size of the scene, not that of the path, says what is too near to be drawn
+        near = min((camera.near for camera in cameras), default=path[0].near)
+        return [replace(camera, near=near) for camera in path]
     frames, width = frames or FRAMES, width or WIDTH
     if path == "orbit":
         size = (round(width * 3 / 4), width)
@@ -155,27 +225,6 @@ def walk_of(path: Walk, points: Any, cameras: list[Any], frames: int | None, wid
     centers = torch.stack([camera.center for camera in cameras]).double()
     middle = int((centers - centers.mean(dim=0)).norm(dim=1).argmin())
     return spiral_cameras(cameras[middle], points, frames, size=size)
-
-
-def _own_walk(path: Path, cameras: list[Any], frames: int | None, width: int | None) -> list[Any]:
-    """The cameras of a file or folder; with `frames`, those of a smooth path through them."""
-    from ..cameras import path_cameras
-    from ..scenes import load_cameras
-
-    own = load_cameras(path)
-    if cameras:  # the size of the scene, not that of the path, says what is too near to be drawn
-        near = min(camera.near for camera in cameras)
-        own = [replace(camera, near=near) for camera in own]
-    if width is not None:
-        own = [camera.resized(max(1, round(width * camera.height / camera.width)), width) for camera in own]
-    if frames is None:
-        return own
-    try:
-        return path_cameras(own, frames)
-    except ValueError as error:
-        raise ValueError(
-            f"frames: expected two different cameras or more to go through, got {len(own)} in {path}; leave it out"
-        ) from error
 
 
 def _title(word: str) -> str:

@@ -88,6 +88,10 @@ def search(
     what = f"like {like}:{index}" if like is not None else query
     count = sum(scene.count for scene in found.scenes)
     parts = sum(len(scene.parts) for scene in found.scenes)
+    if json is not None:
+        write_json(json, {"query": what, "folder": str(folder)} | found.to_json())
+    if csv is not None:
+        _write_table(csv, what, found.scenes)
     said = f"{count} Gaussians in {parts} part{'s' if parts != 1 else ''}"
     say(f"{what}: in {len(found.scenes)} of {found.searched} scenes, {said}")
     _say_table(found.scenes[:top])
@@ -102,10 +106,8 @@ def search(
     if len(found.unasked) > SHOWN:
         say(f"note: not asked: {len(found.unasked) - SHOWN} more")
     if json is not None:
-        write_json(json, {"query": what, "folder": str(folder)} | found.to_json())
         wrote([json])
     if csv is not None:
-        _write_table(csv, what, found.scenes)
         wrote([csv])
 
 

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from .._files import check_output, check_own, is_own, read_json
 from .files import check_alone, open_field
@@ -15,14 +15,19 @@ from .output import say, wrote
 from .render import check_walk, walk_of
 from .view import open_colors
 
+if TYPE_CHECKING:
+    from ..cameras import Camera
+
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
+
+PICTURES = 4  # views with a sheet, an overlay and features
 
 
 def segment(
     field: Positional[Path],
     out: Path,
     *,
-    split: str = "test",
+    split: Given[str] = None,
     path: GivenWalk = None,
     frames: Given[int] = None,
     width: Given[int] = None,
@@ -31,7 +36,7 @@ def segment(
     labels: Given[Path] = None,
     features: Given[Path] = None,
     rule: Rule = "fused",
-    pictures: int = 4,
+    pictures: Given[int] = None,
     classes: Classes,
 ) -> None:
     """Segment the views of a scene with a field; score them if there are label pictures. Or segment a camera path.
@@ -47,7 +52,7 @@ def segment(
         field: The folder that `kfgs fit` wrote (RUN/field).
         out: Folder for label maps (predicted/ has class numbers, colored/ shows them in colours), pictures and scores.json. It
             holds the results of one run: those of an earlier run are replaced or deleted, files of other programs stay.
-        split: Which views: train, test, all, or another split that SCENE/split.json names.
+        split: Which views: train, test, all, or another split that SCENE/split.json names; by default test.
         path: Segment the cameras of a path instead of the views of a split: orbit, spiral or cameras, as in `kfgs render`; or a
             file or folder with cameras of your own (transforms.json, COLMAP model, scene; without pictures, too): exactly
             these, or with --frames a smooth path through them.
@@ -59,12 +64,13 @@ def segment(
         labels: Folder of true label pictures; SCENE/labels_scored or SCENE/labels when not given.
         features: Folder of the teacher's maps, for the sheets; SCENE/features when not given, if it exists.
         rule: fused: the classes of the field's Gaussians; paper: decode every pixel (Sec. 3.4), seconds a view.
-        pictures: How many views get pictures: a sheet (photo, truth, teacher, field, errors), an overlay and features.
+        pictures: How many views get pictures: a sheet (photo, truth, teacher, field, errors), an overlay and features; by default
+            4.
     """
     from ..fields import recall_scene
     from ..pipeline import score_scene, segment_scene, true_labels, write_coco, write_report
     from ..pipeline.apply import SEGMENTED
-    from ..pipeline.label_pictures import check_coco
+    from ..pipeline.label_pictures import check_coco, picture_names
     from ..viz import plot_iou, plot_largest_confusions
     from ..viz.pictures import check_pictures
 
@@ -72,10 +78,15 @@ def segment(
     if path is not None:
         for name, value in (("labels", labels), ("features", features)):
             check_alone(name, value, "with --path, of whose pictures nothing is known")
-        check_walk(path, frames, width)
+        for name, asked in (("split", split), ("pictures", pictures)):
+            check_alone(name, asked, "with --path, which segments no views of the scene")
+        walk = check_walk(path, frames, width)
+        if isinstance(walk, list):
+            picture_names(walk, "path")
         with _one_run(out) as written:
-            written += _segment_path(field, out, path, frames, width, color, coco, rule, classes)
+            written += _segment_path(field, out, walk, frames, width, color, coco, rule, classes)
         return
+    split, pictures = "test" if split is None else split, PICTURES if pictures is None else pictures
     alone: dict[str, object] = {"frames": frames, "width": width, "color": color}
     for name, given in alone.items():
         check_alone(name, given, "without --path, which it belongs to")
@@ -124,12 +135,12 @@ def segment(
             written.append(write_coco(out, found, label_set.names, lambda stem: loaded.image(views[stem])))
         if truth:
             scores = score_scene(found, truth, label_set)
-            say(str(scores))
             write_report(out / "scores.json", segmentation=scores, truth=str(folder), field=str(field), rule=rule)
             picture = out / "confusion.png"
             plot_largest_confusions(scores.confusion, list(label_set.names), picture, misses=scores.misses)
             plot_iou(scores.iou, list(label_set.names), out / "iou.png")
             written += [out / name for name in ("scores.json", "confusion.png", "iou.png")]
+            say(str(scores))
         else:
             say(f"note: no label pictures of split {split!r} to score against")
 
@@ -174,7 +185,7 @@ def _is_result(file: Path) -> bool:
 def _segment_path(
     field: Path,
     out: Path,
-    path: Walk,
+    path: Walk | list[Camera],
     frames: int | None,
     width: int | None,
     color: Path | None,
@@ -183,7 +194,6 @@ def _segment_path(
     classes: Classes,
 ) -> list[Path]:
     """Segment the cameras of a path, and with --coco render the colours that they see; name what was written."""
-    from ..cameras import Camera
     from ..pipeline import segment_cameras, write_coco
     from ..pipeline.label_pictures import check_coco
     from ..scenes import file_stem

@@ -83,10 +83,10 @@ def attach(
             f"splats: no frame found in which field and splat agree: {error} (--splat-scene gives the splat's cameras, "
             "--same-frame says that there is nothing to find)"
         ) from error
+    written = write_splats(out, found.splats)
     for note in found.notes:
         say(note)
     say_counts(found.labels, label_set.names)
-    written = write_splats(out, found.splats)
     say_lost(written)
     wrote(written.paths)
 
@@ -143,19 +143,20 @@ def edit(
     check_parts(replayed.apply(before), [one for _, one in asked])
     cameras = [] if scene.scene is None else _cameras_to_show(before, scene, views)
     after = _apply(listed, before, [words for words, _ in asked])
-    say(f"{len(before)} Gaussians before, {len(after)} after {len(listed)} edit(s)")
-    if len(after) == 0:
-        say("note: nothing is left")
     states = (cloud.gaussians for cloud in accumulate(listed, lambda cloud, one: one.apply(cloud), initial=before))
     shown = cameras if views or not cameras else [cameras[i] for i in views_of_edits(states, cameras, pictures)]
     written = write_splats(out, after)
-    say_lost(written)
     paths = [*written.paths, listed.save(saved)]
-    if cameras and pictures and not shown:
-        say("note: no view of the scene shows a change")
     if shown:
         picture = out.with_name(f"{out.name}.png")
         paths.append(write_comparison(picture, before.gaussians, after.gaussians, shown, titles=TITLES))
+    say(f"{len(before)} Gaussians before, {len(after)} after {len(listed)} edit(s)")
+    if len(after) == 0:
+        say("note: nothing is left")
+    say_lost(written)
+    if cameras and pictures and not shown:
+        say("note: no view of the scene shows a change")
+    if shown:
         say("before and after from " + ", ".join(camera.name for camera in shown))
     wrote(paths)
 
@@ -189,8 +190,9 @@ def convert(
         points: For USD: write points in their base colour, for programs that do not know Gaussians.
     """
     from ..formats import write_splats
+    from ..formats.table import USD
 
-    usd = target.suffix.lower().startswith(".usd")
+    usd = target.suffix.lower() in USD and not (by_class and target.is_dir())  # a folder may have any name
     if usd:
         for name, given in (("plain", plain), ("by_class", by_class)):
             check_alone(name, given, "for USD, which has an object for each class")
@@ -200,14 +202,16 @@ def convert(
         check_alone("plain", plain, "with --by-class, whose files are plain")
         return _convert_by_class(source, target)
     if usd:  # pyvista takes a second to import
-        from ..viz.usd import SUFFIXES, save_usd
+        from ..viz.usd import check_usd_core, save_usd
 
-        check_target("target", target, endings=SUFFIXES)
+        check_target("target", target, endings=USD)
+        check_usd_core(target)
     else:
         check_target("target", target)
     splats = open_splats("source", source)
-    say(repr(splats))
+    shown = repr(splats)
     written = save_usd(target, splats, points=points) if usd else write_splats(target, splats, plain=plain)
+    say(shown)
     say_lost(written)
     say(f"{_bytes_of(source) / 2**10:,.1f} KiB -> {_bytes_of(target) / 2**10:,.1f} KiB")
     wrote(written.paths)
@@ -234,7 +238,8 @@ def _convert_by_class(source: Path, folder: Path) -> None:
     with atomic_folder(folder) as new:
         for name, part in parts.items():
             written = write_splats(new / name, part.replace(gaussians=part.gaussians.replace(labels=None)), plain=True)
-            say(f"{name}: {len(part)} Gaussians")
+    for name, part in parts.items():
+        say(f"{name}: {len(part)} Gaussians")
     say_lost(written)
     wrote([folder / name for name in parts])
 

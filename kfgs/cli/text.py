@@ -43,7 +43,8 @@ def text(
     Args:
         names: Words between commas, a .txt file (a class a line), or a .json file (a list). Synonyms follow a semicolon:
             "chair;armchair;seat" is called chair.
-        out: The table to write (.safetensors).
+        out: The table to write (.safetensors). With --examples, if the field's scene is at hand, a picture of them is
+            written beside it (OUT.png): see there whether the clicks hit what you mean.
         templates: Sentences around each word: bare (none, as LSeg and the paper), clip7, tcl9, siglip, or your own with {}
             for the word; by default those of the teacher.
         no_negatives: Leave out LERF's canonical words (object, things, stuff, texture), which `kfgs select --negatives
@@ -63,12 +64,7 @@ def text(
             check_alone(name, given, "with --examples, which replace words")
         if field is None:
             raise ValueError("field: expected --field with --examples, got none; pass the field of the examples")
-        from ..fields import label_set_from_examples
-
-        shown = label_set_from_examples(open_field("field", field), _examples(examples))
-        shown.save(out)
-        say(f"{len(shown)} classes, {shown.dim} channels each, by examples: {', '.join(shown.names)}")
-        wrote([out])
+        _text_of_examples(out, open_field("field", field), _examples(examples))
         return
     check_alone("field", field, "without --examples, which are shown in it")
     if names is None or teacher.teacher is None:
@@ -84,6 +80,27 @@ def text(
     for name, more in made.info["synonyms"].items():
         say(f"  {name}: also {', '.join(more)}")
     wrote([out])
+
+
+def _text_of_examples(out: Path, field: Any, examples: dict[str, Any]) -> None:
+    """Write a table of examples and, if the photographs of their views are at hand, a picture of what was shown."""
+    from ..fields import label_set_from_examples
+    from ..viz import draw_examples, save_picture
+    from ..viz.pictures import check_pictures
+    from ..viz.shows import Photos
+
+    scene = Classes().scene_of(field)
+    drawn = scene is not None and any(hasattr(one, "view") for shown in examples.values() for one in shown)
+    if drawn:
+        check_pictures(out.parent, [out.name], "kfgs text")
+    made = label_set_from_examples(field, examples)
+    made.save(out)
+    written = [out]
+    if drawn:
+        written.append(out.with_name(f"{out.name}.png"))
+        save_picture(written[-1], draw_examples(field.cameras, examples, Photos(scene)))
+    say(f"{len(made)} classes, {made.dim} channels each, by examples: {', '.join(made.names)}")
+    wrote(written)
 
 
 def _examples(path: Path) -> dict[str, Any]:

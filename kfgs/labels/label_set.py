@@ -22,6 +22,10 @@ from .names import class_index, class_indices
 
 KIND, VERSION = "label set", "1"  # of the metadata's "kfgs" and "version"
 SUFFIX = ".safetensors"
+SHOW_AGAIN = (
+    "Make it again with this field: `kfgs text --examples FILE --field FIELD` (in Python: label_set_from_examples)"
+)
+"""The advice for classes by examples that do not fit a field."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +45,7 @@ class LabelSet:
     """LERF's canonical words: a query is compared with them if no other classes are known."""
     negative_names: tuple[str, ...] = ()
     info: dict[str, Any] = default(default_factory=dict)
-    """The origin of the rows, as JSON: `teacher` (`teachers.identify`), `templates`, `synonyms`."""
+    """The origin of the rows, as JSON: `teacher` (`teachers.identify`), `templates`, `synonyms`, `examples`."""
 
     def __post_init__(self) -> None:
         if isinstance(self.names, str):
@@ -205,6 +209,11 @@ def teacher_mismatch(field: dict[str, Any], words: dict[str, Any]) -> str | None
     if found is None:
         return None
     key, ours, theirs = found
+    if "examples" in words:
+        return (
+            f"classes: expected examples in a field of this teacher ({key} {ours!r:.40}), got examples in a field of another "
+            f"({theirs!r:.40}); their spaces do not mix. {SHOW_AGAIN}"
+        )
     return (
         f"classes: expected text of the field's teacher ({key} {ours!r:.40}), got text of another ({theirs!r:.40}); "
         "their spaces do not mix: embed the words with the field's teacher"

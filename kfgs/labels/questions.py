@@ -12,7 +12,7 @@ from torch import Tensor
 from .._card import short_repr
 from .._check import as_tensor, check_choice, check_shapes
 from .._rows import unit_rows
-from .label_set import LabelSet, teacher_difference, teacher_mismatch
+from .label_set import SHOW_AGAIN, LabelSet, teacher_difference, teacher_mismatch
 
 SAME = 1 - 1e-4  # cosine of one text embedded twice: half precision stays well above, other words below
 Negatives = Literal["auto", "classes", "canonical", "none"]
@@ -140,11 +140,14 @@ def _unlike(rows: Tensor, row: Tensor) -> Tensor:  # [M, D], [D] -> [M] bool
 
 def _check_words(classes: LabelSet, dim: int, info: dict[str, Any]) -> None:
     if classes.dim != dim:
+        wanted = f"classes: expected embeddings [C, {dim}] (from the field), got {tuple(classes.embeddings.shape)}"
+        if "examples" in classes.info:
+            raise ValueError(f"{wanted}: the examples of this table belong to another field. {SHOW_AGAIN}")
         words = teacher_difference(info, classes.info)
         difference = "" if words is None else f" ({words[0]} {words[2]!r:.40} instead of {words[1]!r:.40})"
         raise ValueError(
-            f"classes: expected embeddings [C, {dim}] (from the field), got {tuple(classes.embeddings.shape)}: text of "
-            f"another teacher?{difference} Embed the words with the teacher whose features this field was fitted to"
+            f"{wanted}: text of another teacher?{difference} Embed the words with the teacher whose features this field was "
+            "fitted to"
         )
     mismatch = teacher_mismatch(info, classes.info)
     if mismatch is not None:

@@ -155,7 +155,7 @@ def attach(
         info=splats.info | {"labels": details},
     )
     labelled_by = f"{details['labelled by']}: {len(splats) - counts[0]} of {len(splats)} Gaussians have a class"
-    notes = frame_note, labelled_by, _about(transfer, by)
+    notes = frame_note, labelled_by, _about(transfer, len(splats), by)
     return Attached(labelled, transfer, similarity, alignment, notes)
 
 
@@ -257,9 +257,12 @@ def _by_views(
     return labels, scores, carried, details
 
 
-def _about(transfer: Transfer, by: By) -> str:
-    """A sentence about the labels decided by distance."""
+def _about(transfer: Transfer, total: int, by: By) -> str:
+    """How many of all Gaussians got their class from the views, how many by distance, and how many got none."""
+    shown, lambda_ = total - len(transfer.labels), f"(lambda {transfer.distance:.3g})"
     if by == "distance":
-        return repr(transfer)
-    count = len(transfer.labels)
-    return f"of {count} that no view shows: {transfer!r}" if count else "there is none that no view shows"
+        ways = [f"{transfer.labelled:,} got a class by distance {lambda_}"]
+    else:
+        ways = [f"{shown:,} got a class by the views"]
+        ways += [f"{transfer.labelled:,} that no view shows by distance {lambda_}"] if transfer.labelled else []
+    return f"{total:,} Gaussians: {', '.join(ways)}, {transfer.orphaned:,} got none"

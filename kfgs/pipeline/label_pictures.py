@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from unicodedata import category
 
 from torch import Tensor
 from tqdm import tqdm
 
-from .._files import as_path, check_output, check_own
+from .._files import HIDDEN, as_path, check_output, check_own
 from .._typed import typed
 from ..cameras import Camera
 from ..evaluation.datasets.coco import is_ours, save_coco
@@ -20,6 +22,8 @@ from ..viz.pictures import Array, check_pictures
 from .apply import SEGMENTED, check_classes, save_colored_labels, save_label_map
 
 COCO = "coco"  # the folder with annotations.json and images/
+CONTROL = ("Cc", "Cs")  # Unicode's categories of control characters and of halves of a character
+LONGEST = 255  # bytes of a file's name on most disks
 
 
 @typed
@@ -47,11 +51,10 @@ def segment_cameras(
         The label map [H, W] of each camera by its name, without a suffix such as .png.
 
     Raises:
-        ValueError: if names are missing or repeated, or there are more classes than a byte can hold.
+        ValueError: if names are missing, repeated, or cannot be those of pictures; or if there are more classes
+            than a byte can hold.
     """
-    out, names = as_path(out), [file_stem(camera.name or "") for camera in cameras]
-    if "" in names or len(set(names)) != len(names):
-        raise ValueError(f"cameras: expected a name of its own for each, got {names!r:.120}; name them with replace()")
+    out, names = as_path(out), picture_names(cameras)
     for folder in SEGMENTED[:2]:
         check_output("out", out / folder, "a folder")
         check_pictures(out, (f"{folder}/{name}" for name in names), "kfgs segment")
@@ -62,6 +65,30 @@ def segment_cameras(
         save_label_map(out / "predicted" / f"{name}.png", found[name])
         save_colored_labels(out / "colored" / f"{name}.png", found[name], classes.names)
     return found
+
+
+def picture_names(cameras: Sequence[Camera], argument: str = "cameras") -> list[str]:
+    """The names of the cameras without suffixes, as those of pictures in an output folder.
+
+    Raises:
+        ValueError: if one is missing, repeated, or cannot be a picture's name: absolute, with "..", in kfgs's hidden folder,
+            with control characters, too long, or that of a folder that another one needs. It names `argument`.
+    """
+    names = [file_stem(camera.name or "") for camera in cameras]
+    if "" in names or len(set(names)) != len(names):
+        raise ValueError(
+            f"{argument}: expected a name of its own for each, got {names!r:.120}; name them with replace()"
+        )
+    folders = {str(folder) for name in names for folder in PurePosixPath(name).parents}
+    for name in names:
+        parts = PurePosixPath(f"{name}.png").parts
+        odd = name.startswith("/") or {"..", HIDDEN} & {*parts} or any(category(one) in CONTROL for one in name)
+        if odd or f"{name}.png" in folders or max(len(os.fsencode(part)) for part in parts) > LONGEST:
+            raise ValueError(
+                f"{argument}: expected cameras whose names can be those of pictures, got {name!r:.120}; rename it (no folder of "
+                f"this name with .png, no '..', no {HIDDEN}, no control characters, at most {LONGEST} bytes)"
+            )
+    return names
 
 
 def check_coco(out: Path, names: Iterable[str]) -> None:

@@ -87,15 +87,13 @@ def load_colmap(path: str | Path, images: str | Path) -> Scene:
     found = [image for image in posed if is_file(folder / image.name)]
     paths = [folder / image.name for image in found]
     cameras, shrunk = as_large_as_pictures(_cameras(path, model, found), paths, folder)
-    lost = [image.name for image in views if image.pose is None]
     missing = [image.name for image in posed if not is_file(folder / image.name)]
     if not found:
         raise SceneError(
             f"{folder}: expected the images of {path}, none of its {len(posed)} posed images ({some(missing, 3)}) "
             "is there; give the right image folder"
         )
-    notes = [f"{len(lost)} images of the model have no pose and were left out: {some(lost)}"] if lost else []
-    notes += shrunk
+    notes = _unposed(views) + shrunk
     if missing:
         notes.append(f"{len(missing)} of {len(posed)} posed images have no file in {folder}: {some(missing)}")
     names = {image.name for image in views}
@@ -109,15 +107,21 @@ def load_colmap(path: str | Path, images: str | Path) -> Scene:
     return Scene(cameras, paths, points, colors, splits, tuple(notes)).with_near()
 
 
-def colmap_cameras(path: Path) -> list[Camera]:
-    """The cameras of a model's images with a pose, in natural order of names; the image files need not be there.
+def colmap_cameras(path: Path) -> tuple[list[Camera], list[str]]:
+    """The cameras of a model's images with a pose, in natural order of names, and notes; the image files need not be there.
 
     Raises:
         SceneError: if the model is damaged, or a lens has no exact form in kfgs.
     """
     model = read_model(path)
     views = sorted(model.images.values(), key=lambda image: natural_key(image.name))
-    return _cameras(path, model, [image for image in views if image.pose is not None])
+    return _cameras(path, model, [image for image in views if image.pose is not None]), _unposed(views)
+
+
+def _unposed(views: list[ColmapImage]) -> list[str]:
+    """A note if images have no pose."""
+    lost = [image.name for image in views if image.pose is None]
+    return [f"{len(lost)} images of the model have no pose and were left out: {some(lost)}"] if lost else []
 
 
 def _cameras(path: Path, model: ColmapModel, images: list[ColmapImage]) -> list[Camera]:

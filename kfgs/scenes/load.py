@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -95,9 +96,9 @@ def load_scene(path: str | Path, *, images: str | Path | None = None, split: Spl
 
 
 def load_cameras(path: str | Path) -> list[Camera]:
-    """The cameras of a scene, or of a camera path of your own, for what needs no pictures. They are without lens distortion.
+    """The cameras of a scene, or of a camera path of your own. Use it where no pictures are needed. Lens distortion is removed.
 
-    `near` is chosen as by `load_scene`, from these cameras alone.
+    `near` is chosen as by `load_scene`, from these cameras alone. Images of a COLMAP model without a pose are left out.
 
     Args:
         path: what `load_scene` reads. The pictures of a COLMAP model or a transforms.json are not needed: the cameras have the
@@ -109,15 +110,32 @@ def load_cameras(path: str | Path) -> list[Camera]:
     Raises:
         FileNotFoundError: if there is no such file or folder.
         SceneError: if there are no cameras, or they cannot be used.
+
+    Example:
+        >>> import json, tempfile
+        >>> pose = [[1, 0, 0, 0.5], [0, 0, -1, -2], [0, 1, 0, 1.2], [0, 0, 0, 1]]  # camera to world; it looks along y
+        >>> values = {"w": 640, "h": 480, "camera_angle_x": 1.0, "frames": [{"transform_matrix": pose}]}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = Path(folder, "my_cameras.json")
+        ...     _ = file.write_text(json.dumps(values))
+        ...     (camera,) = load_cameras(file)
+        >>> camera.name, camera.size, camera.center
+        ('0000.png', (480, 640), tensor([ 0.5000, -2.0000,  1.2000]))
     """
+    return cameras_and_notes(path)[0]
+
+
+def cameras_and_notes(path: str | Path) -> tuple[list[Camera], list[str]]:
+    """The cameras of `load_cameras`, and a note if the file has more than these."""
     path = as_path(path)
+    notes: list[str] = []
     model = find_model(path)
     if model is not None:
-        cameras = colmap_cameras(model)
+        cameras, notes = colmap_cameras(model)
     elif path.exists() and _is_transforms(path):
         cameras = transforms_cameras(path)
     else:
-        return load_scene(path).undistorted().cameras
+        return load_scene(path).undistorted().cameras, notes
     if not cameras:
         raise SceneError(f"{path}: expected cameras with poses, got none; run COLMAP again (`kfgs sfm`)")
     nothing = torch.zeros(0, 3)
@@ -125,7 +143,7 @@ def load_cameras(path: str | Path) -> list[Camera]:
         scene = Scene(cameras, [Path(camera.name) for camera in cameras], nothing, nothing.byte())
     except SceneError as error:  # of two names that are the same
         raise SceneError(f"{path}: {error}") from error
-    return scene.with_near().undistorted().cameras
+    return scene.with_near().undistorted().cameras, notes
 
 
 def _with_splat(scene: Scene, root: Path) -> Scene:
@@ -185,10 +203,11 @@ def _load_views(path: Path, images: str | Path | None) -> Scene:
     others = [
         name for name in ("results", "color", "pose", "rgb", "traj.txt", "traj_w_c.txt") if (path / name).exists()
     ]
-    half = f" (there is {' and '.join(others)}, but not what belongs to it)" if others else ""
+    whole = [f"{one.files} of {one.name}" for one in _LAYOUTS if set(one.files.replace("/", "").split()) & set(others)]
+    half = f" (there is {' and '.join(others)}, but not what belongs to it: {'; '.join(whole)})" if others else ""
     raise SceneError(
-        f"{path}: expected a COLMAP model (in {', '.join(MODEL_FOLDERS)}) or a transforms.json, found neither; nor "
-        f"{'; '.join(f'{layout.files} of {layout.name}' for layout in _LAYOUTS)}{half}; {_advice(path)}"
+        f"{path}: expected a COLMAP model, a transforms.json or the layout of a data set (docs/datasets.md), found "
+        f"none{half}; {_advice(path)}"
     )
 
 
@@ -220,7 +239,7 @@ def _advice(path: Path) -> str:
         return f"it holds scenes ({some(inside)}): give one of them, as in {path / inside[0]}"
     if is_scene(real_path(path).parent):
         return f"the folder above is a scene: give {real_path(path).parent}"
-    return "estimate the cameras first: `kfgs sfm <images> <scene>` or kfgs.scenes.run_sfm"
+    return f"estimate the cameras first: `kfgs sfm {shlex.quote(str(path))} --out scene/` (in Python: run_sfm)"
 
 
 def find_images(root: Path, model: Path) -> Path:

@@ -247,7 +247,7 @@ class SfmRun:
         return {"existing_camera_id": int(found[0].camera_id)} if found else {}
 
     def match(self) -> None:
-        """Compare pairs; pycolmap reports no progress meanwhile."""
+        """Compare pairs."""
         colmap, config, count = self.pycolmap, self.config, len(self.names)
         exhaustive = config.matching == "exhaustive"
         self.begin("matching", count * (count - 1) // 2 if exhaustive else count, "pair" if exhaustive else "image")
@@ -260,10 +260,13 @@ class SfmRun:
         self._match(self.pycolmap.match_image_pairs, self._listed(pairs))
 
     def _match(self, match: Callable[..., None], pairing: dict[str, Any]) -> None:
+        """Compare pairs. pycolmap does not report progress meanwhile, and the bar says so."""
+        self.bar.set_postfix_str("no count until all are done")
         match(
             self.database, matching_options={"num_threads": self.config.num_threads}, **pairing,
             verification_options={"ransac": {"random_seed": self.config.seed}}, device=self.pycolmap.Device.cpu,
         )  # fmt: skip
+        self.bar.set_postfix_str("")
         self.bar.update(self.bar.total)
 
     def _listed(self, pairs: list[tuple[str, str]]) -> dict[str, Any]:

@@ -110,8 +110,9 @@ def transforms_cameras(path: Path) -> list[Camera]:
         reader = _Reader(file, file.parent, None)
         for i, (frame, _) in enumerate(_frames(reader, _read_top(reader))):
             listed = frame.values.get("file_path") or f"{i:04d}"
-            if not isinstance(listed, str) or "\0" in listed or not Path(listed).name:
-                raise frame.fail("file_path", "a file's name", listed, "correct it, or leave it out")
+            if not isinstance(listed, str) or not listed.isprintable() or not Path(listed).name:
+                expected = "a file's name without control characters"  # as in COLMAP's models
+                raise frame.fail("file_path", expected, listed, "correct it, or leave it out")
             named, found = reader.root / listed.replace("\\", "/"), _find_image(reader, listed)
             if named.suffix.lower() not in IMAGE_SUFFIXES:  # of Blender
                 named = named.with_name(f"{named.name}.png")
@@ -145,7 +146,11 @@ def _read_top(reader: _Reader) -> dict[str, Any]:
 def _frames(reader: _Reader, top: dict[str, Any]) -> Iterator[tuple[Frame, Any]]:
     """Each frame with what the top says for all, and as it is in the file."""
     for i, values in enumerate(top["frames"]):
-        yield Frame(reader.path, f"frame {i}", {**top, **values} if isinstance(values, dict) else {}), values
+        frame = Frame(reader.path, f"frame {i}", {})
+        if not isinstance(values, dict):
+            raise frame.fail("", "an object with a 'transform_matrix'", values, "write the file again")
+        frame.values.update({**top, **values})
+        yield frame, values
 
 
 def _read_frames(reader: _Reader) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from .bridges import to_open3d, to_trimesh
 from .camera_view import draw_view, look_through
 from .clouds import CloudOptions, add_cloud, recolor_cloud, to_pyvista
 from .confusions import plot_confusion, plot_largest_confusions
+from .examples import draw_examples
 from .explorer import Exploration, ExploreOptions, Explorer, Viewer, explore
 from .field_colors import FeatureColors, feature_colors
 from .film_frames import show_cloud
@@ -46,6 +47,7 @@ __all__ = [
     "add_selections",
     "add_transfer",
     "available",
+    "draw_examples",
     "draw_view",
     "explore",
     "feature_colors",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,20 @@ from .._files.errors import UNNAMED
 from .._typed import typed
 from ..formats.render_mode import describe_lost_mode
 from ..formats.splat_file import SCORE, SplatFile, Written
+from ..formats.table import USD
 from ..formats.values import check_splats, describe_loss
 from ..gaussians import Gaussians
 from ..splat.sh import sh0_to_rgb
 
-SUFFIXES = (".usdc", ".usda", ".usd", ".usdz")
+
+def check_usd_core(path: Path) -> None:
+    """Raise an ImportError, which names the file to write, unless usd-core is installed."""
+    try:
+        import_module("pxr")
+    except ImportError as error:
+        raise ImportError(
+            f"{path}: expected usd-core to write USD ({error}); run: pip install 'usd-core>=26.3'"
+        ) from error
 
 
 @typed
@@ -28,8 +38,10 @@ def save_usd(path: str | Path, cloud: Gaussians | SplatFile, *, points: bool = F
 
     The objects are `ParticleField3DGaussianSplat`, which OpenUSD knows since 26.03; or, for programs that do not know it,
     `Points` in their base colour, as wide as two mean standard deviations. Each object has the primvars `class_id` and, if
-    known, `score` (a number per Gaussian), and the attribute `kfgs:class`, the name of its class. Axes and units stay those of
-    the scene.
+    known, `score` (a number per Gaussian), and the attribute `kfgs:class`, the name of its class.
+
+    **Convention**: coordinates stay as they are. The file says that a unit is a metre (`metersPerUnit` 1) and that z is up
+    (`upAxis`), as kfgs assumes if no cameras tell; without these, USD means centimetres and y.
 
     Args:
         path: the file: .usdc (binary), .usda (text), .usd (binary) or .usdz (a .usdc in an uncompressed zip file).
@@ -45,18 +57,17 @@ def save_usd(path: str | Path, cloud: Gaussians | SplatFile, *, points: bool = F
             `write_splats`). Nothing is written then.
     """
     path, splats = as_path(path), SplatFile(cloud) if isinstance(cloud, Gaussians) else cloud
-    try:
-        from pxr import Sdf, Usd, UsdGeom, UsdUtils
-    except ImportError as error:
-        raise ImportError(
-            f"{path}: expected usd-core to write USD ({error}); run: pip install 'usd-core>=26.3'"
-        ) from error
-    if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"path: expected a name that ends in {', '.join(SUFFIXES)}, got {path.name!r}; rename it")
+    check_usd_core(path)
+    from pxr import Sdf, Usd, UsdGeom, UsdUtils
+
+    if path.suffix.lower() not in USD:
+        raise ValueError(f"path: expected a name that ends in {', '.join(USD)}, got {path.name!r}; rename it")
     if splats.gaussians.sh is None:
         raise ValueError(f"cloud: expected colours (sh [N, K, 3]), got {splats!r}; pass a colour splat")
     check_splats(splats)
     stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/splat").GetPrim())
     for label, part in ({-1: splats} if splats.gaussians.labels is None else splats.by_class()).items():
         place = f"/splat/class_{label}" if label >= 0 else "/splat/no_class"

@@ -329,3 +329,15 @@ def test_every_page_is_listed_and_asks_a_question():
     for topic in TOPICS:
         question = re.search(r"^\*\*(.+\?)\*\*$", (PAGES / f"{topic}.md").read_text(encoding="utf-8"), re.M)[1]
         assert f"]({topic}.md) | {question} |" in index
+
+
+def test_values_on_the_pages_are_those_of_the_code():
+    named = [
+        found
+        for page in PAGES.glob("*.md")
+        for found in re.findall(r"py:data:: (\S+)\n +:value: ([\d({].*)", page.read_text())
+    ]
+    assert len(named) >= 4
+    for name, value in named:
+        module, _, constant = name.rpartition(".")
+        assert eval(value) == getattr(importlib.import_module(module), constant), name

@@ -137,7 +137,7 @@ def test_notebooks_come_into_the_gallery_and_go_with_their_file(tmp_path):
     assert bring(notebooks, pages) == ["1_a", "2_b"]
     listed = (pages / "list.inc").read_text()
     assert listed.index(":::{grid-item-card} 1. A\n") < listed.index(":::{grid-item-card} 2. B\n")
-    assert ":link: 2_b\n:link-type: doc\n:img-top: card_2_b.png\n\nWhat is it?\n:::" in listed
+    assert ":link: 2_b\n:link-type: doc\n:img-top: card_2_b.png\n:img-alt: 2. B\n\nWhat is it?\n:::" in listed
     assert "\n1_a\n2_b\n```" in listed
     assert (pages / "card_1_a.png").read_bytes() == (pages / "card_2_b.png").read_bytes() == b"two"
     (notebooks / "10_c.ipynb").write_text(notebook_of("10. C"))

@@ -175,6 +175,9 @@ def test_another_teacher_is_noticed_by_name_or_weights_alone():
     assert "expected text of the field's teacher (name 'lseg'), got text of another ('letters')" in found
     other = teacher_mismatch({"teacher": {"name": "letters", "weights": "xyz"}}, words)
     assert "(weights 'xyz'), got text of another ('abc')" in other
+    shown = teacher_mismatch({"teacher": {"name": "lseg"}}, words | {"examples": {"chair": 2}})
+    assert "(name 'lseg'), got examples in a field of another ('letters')" in shown
+    assert "it again with this field: `kfgs text --examples" in shown
 
 
 def test_the_text_spaces_of_two_clips_do_not_mix(shared_data):

@@ -163,6 +163,11 @@ def test_words_of_other_channels_are_refused_before_any_view_is_drawn(monkeypatc
             match=tells("classes:", "[C, 5]", "got (2, 7)", "'clip'", "'lseg'"),
         ):
             ask()
+    shown = dataclasses.replace(other, info={"examples": {"wall": 1, "chair": 1}})
+    with pytest.raises(
+        ValueError, match=tells("classes:", "[C, 5]", "got (2, 7)", "another field", "kfgs text --examples")
+    ):
+        field().label(shown)
 
 
 def test_arrays_are_taken_as_tensors_are():

@@ -248,7 +248,7 @@ def test_where_the_views_show_everything_distance_has_no_lambda():
     assert facts["not shown"] == 0
     assert facts["lambda"] is None
     assert facts["lambda from"] is None
-    assert attached.notes[2] == "there is none that no view shows"
+    assert attached.notes[2] == "3 Gaussians: 3 got a class by the views, 0 got none"
 
 
 def test_a_given_similarity_is_taken_as_it_is():
@@ -263,11 +263,18 @@ def test_a_given_distance_is_lambda():
     assert attached.transfer.distance == 0.02
     assert attached.splats.info["labels"]["lambda"] == 0.02
     assert 0 < attached.transfer.orphaned == int((attached.labels == -1).sum())
+    labelled, none = attached.transfer.labelled, attached.transfer.orphaned
+    assert (
+        attached.notes[2] == f"1,500 Gaussians: {labelled:,} got a class by distance (lambda 0.02), {none:,} got none"
+    )
 
 
 def test_the_facts_survive_a_file(tmp_path):
     attached = attach(a_field(1_500), a_splat(1_500), CLASSES, cameras=CAMERAS, by="views")
     facts = json.loads(json.dumps(attached.splats.info["labels"], allow_nan=False))
+    by_distance = f"{attached.transfer.labelled} that no view shows by distance (lambda {facts['lambda']:.3g})"
+    counts = f"{facts['shown']:,} got a class by the views, {by_distance}, {facts['counts']['none']} got none"
+    assert attached.notes[2] == f"1,500 Gaussians: {counts}"
     assert sum(facts["counts"].values()) == len(attached.splats)
     write_splats(tmp_path / "a.ply", attached.splats)
     back = read_splats(tmp_path / "a.ply")

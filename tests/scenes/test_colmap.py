@@ -16,8 +16,10 @@ from colmap_models import (
 from messages import tells
 
 from kfgs.cameras.projection import camera_to_pixel
+from kfgs.cli.render import check_walk
 from kfgs.scenes import SceneError
 from kfgs.scenes.colmap import SUPPORTED_MODELS, convert_intrinsics, load_colmap
+from kfgs.scenes.load import cameras_and_notes
 
 INTRINSICS = {
     "SIMPLE_PINHOLE": [50.0, 31, 25],
@@ -79,7 +81,7 @@ def test_poses_points_and_names(tmp_path: Path, text: bool, rigs: bool) -> None:
     assert scene.notes == ()
 
 
-def test_a_rig_places_its_second_camera(tmp_path: Path) -> None:
+def test_a_rig_places_its_second_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cameras = "1 PINHOLE 64 48 50 50 32 24\n2 PINHOLE 64 48 50 50 32 24\n"
     images = "1 1 0 0 0 5 0 0 1 a.png\n\n2 1 0 0 0 5 1 0 2 b.png\n\n"
     rigs = "1 2 CAMERA 1 CAMERA 2 1 1 0 0 0 0 1 0\n"
@@ -97,6 +99,11 @@ def test_a_rig_places_its_second_camera(tmp_path: Path) -> None:
     unplaced = load_colmap(model, tmp_path / "images")
     assert [camera.name for camera in unplaced.cameras] == ["a.png"]
     assert any("1 images of the model have no pose and were left out: b.png" in note for note in unplaced.notes)
+    cameras, notes = cameras_and_notes(model)
+    assert [camera.name for camera in cameras] == ["a.png"]
+    assert notes == ["1 images of the model have no pose and were left out: b.png"]
+    check_walk(model, None, None)
+    assert f"note: {notes[0]}" in capsys.readouterr().out
 
 
 def test_missing_files_and_unposed_files_are_noted(tmp_path: Path) -> None:

@@ -88,8 +88,11 @@ def test_the_split_file_wins(tmp_path: Path) -> None:
 def test_what_cannot_be_loaded_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=tells("nothing:", "no such folder", "scene")):
         load_scene(tmp_path / "nothing")
-    with pytest.raises(SceneError, match=tells("COLMAP", "transforms.json", "neither", "`kfgs sfm")):
-        load_scene(tmp_path)
+    photos = tmp_path / "my photos"
+    photos.mkdir()
+    advice = f"`kfgs sfm '{photos}' --out scene/` (in Python: run_sfm)"
+    with pytest.raises(SceneError, match=tells("COLMAP", "transforms.json", "docs/datasets.md", "none", advice)):
+        load_scene(photos)
     with pytest.raises(ValueError, match=tells("split:", "'auto'", "got 'random'")):
         load_scene(tmp_path, split="random")  # type: ignore[arg-type]
     write_model(tmp_path / "sparse/0", ["a.png"])
@@ -208,11 +211,20 @@ def test_without_a_size_cameras_are_as_large_as_their_pictures(tmp_path: Path) -
     assert load_cameras(file)[0].size == (12, 16)
 
 
+def test_a_frame_that_is_no_object_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "path.json"
+    file.write_text(json.dumps({**LENS, "frames": [3]}))
+    with pytest.raises(SceneError, match=tells("path.json, frame 0: expected an object", "got 3")):
+        load_cameras(file)
+
+
 @pytest.mark.parametrize(
     ("names", "parts"),
     [
         (["a.png", "a.jpg"], ("path.json:", "names that differ", "'a' twice")),
         (["a\0.png"], ("path.json, frame 0, file_path:", "a file's name")),
+        (["a.png", "b\n.png"], ("path.json, frame 1, file_path:", "control characters", r"got 'b\n.png'")),
+        (["\x1b[2J.png"], ("path.json, frame 0, file_path:", "control characters", "leave it out")),
         (["/"], ("path.json, frame 0, file_path:", "a file's name")),
         ([3], ("path.json, frame 0, file_path:", "a file's name", "got 3")),
         ([], ("path.json, top level:", "'frames'", "is this a transforms.json")),

@@ -28,7 +28,7 @@ def test_sfm_finds_the_true_poses(shared_data: Path, tmp_path: Path, capfd: pyte
     assert "8 of 8 images registered" in str(report)
     assert set(report.seconds) == {"features", "matching", "mapping"}
     shown = capfd.readouterr().err
-    assert all(stage in shown for stage in ("features", "matching", "mapping", "8/8"))
+    assert all(stage in shown for stage in ("features", "matching", "mapping", "no count until all are done", "8/8"))
 
     found, truth = (
         load_scene(tmp_path, split="all"),

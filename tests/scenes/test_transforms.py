@@ -198,7 +198,7 @@ def _frame(**changes: Any) -> list[dict[str, Any]]:
 
 BAD = [
     ([], {}, ("'frames'", "transforms.json")),
-    ([3], {}, ("frame 0:", "'file_path'", "got 3")),
+    ([3], {}, ("frame 0:", "'transform_matrix'", "got 3")),
     (_frame(transform_matrix=None), {}, ("transform_matrix:", "expected 4", "got None")),
     (_frame(transform_matrix=[[1, 2], [3]]), {}, ("transform_matrix:", "expected 4", "got [[")),
     (_frame(transform_matrix=[[1.0, 2.0]]), {}, ("transform_matrix:", "expected 4", "got [[1.0, 2.0]]")),

@@ -68,6 +68,18 @@ def test_points_for_programs_without_gaussians(tmp_path):
     assert set(prim.GetAttribute("primvars:class_id").Get()) == {-1}
 
 
+@pytest.mark.parametrize("ending", ["usda", "usdz"])
+def test_a_unit_is_a_metre_and_z_is_up(tmp_path, ending):
+    from pxr import UsdGeom
+
+    path = tmp_path / f"a.{ending}"
+    save_usd(path, some_gaussians())
+    stage, _ = opened(path)
+    assert stage.HasAuthoredMetadata("metersPerUnit")
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    assert UsdGeom.GetStageUpAxis(stage) == "Z"
+
+
 def test_bad_requests_and_a_missing_library_are_named(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=tells("path:", ".usdc", "a.ply")):
         save_usd(tmp_path / "a.ply", some_gaussians())

@@ -1,0 +1,114 @@
+"""A picture of examples: what was clicked, boxed or masked in the views, to see whether the clicks hit what was meant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFilter
+from PIL.Image import Resampling
+from torch import Tensor
+
+from .._check import as_array, check_shapes, check_whole
+from .._typed import typed
+from ..cameras import Camera
+from .palette import palette
+from .pictures import LEGEND_INK, LEGEND_PAPER, Array, as_bytes, legend_strip, picture_grid
+
+COLUMNS = 3
+MOST = 48  # views in one picture: of a data set with thousands, nobody looks at all
+DOT, LINE = 4, 2  # pixels: radius of a point and width of a line; each has a rim
+BRIGHT = 160  # mean of the channels; brighter colours have a dark rim, the others a white one
+Color = tuple[int, ...]
+
+
+@typed
+def draw_examples(
+    cameras: Sequence[Camera],
+    examples: Mapping[str, Any],
+    photo: Callable[[Camera], Tensor | Array],  # [H, W, 3] in [0, 1] or uint8
+    *,
+    width: int = 480,
+) -> Array:  # [h, w, 3] uint8
+    """Draw examples of classes in their views: points, boxes and outlines of masks in the class's colour, with a legend.
+
+    Args:
+        cameras: the views of the field (`field.cameras`). Pixels of examples are counted in their sizes.
+        examples: as for `label_set_from_examples`. Those that are Gaussians (`Picked`) lie in no view and are left out.
+        photo: the picture of a view, in any size, for instance `lambda camera: scene.image(index[camera.name])`.
+        width: width of a view in the picture, pixels.
+
+    Returns:
+        The views in the order of their first examples, at most 48, three in a row.
+
+    Raises:
+        ValueError: if no example lies in a view, or a view is unknown.
+        TypeError: if something is no example.
+    """
+    check_whole("width", width, 16)
+    shown: dict[int, tuple[Camera, list[tuple[Any, Color]]]] = {}
+    for label, (name, given) in enumerate(examples.items()):
+        color = tuple(palette(np.array([label]), list(examples))[0].tolist())
+        for i, one in enumerate(given if isinstance(given, Sequence) else [given]):
+            if not hasattr(one, "indices"):
+                camera = _camera(cameras, one, f"examples[{name!r}][{i}]")
+                shown.setdefault(id(camera), (camera, []))[1].append((one, color))
+    if not shown:
+        raise ValueError("examples: expected at least one in a view, got none; pass Clicks, a Box or a Mask")
+    views = list(shown.values())[:MOST]
+    pictures = [_marked(camera, photo(camera), marks, width) for camera, marks in views]
+    columns, height = min(COLUMNS, len(pictures)), max(len(picture) for picture in pictures)
+    titles = [camera.name for camera, _ in views] + [""] * (-len(pictures) % columns)
+    paper = np.full((height, width, 3), 255, np.uint8)
+    pictures = [np.concatenate([one, paper[len(one) :]]) for one in pictures] + [paper] * (-len(pictures) % columns)
+    rows = [
+        picture_grid([pictures[i : i + columns]], titles[i : i + columns]) for i in range(0, len(pictures), columns)
+    ]
+    return np.concatenate([*rows, legend_strip(np.arange(len(examples)), list(examples), rows[0].shape[1])])
+
+
+def _camera(cameras: Sequence[Camera], example: Any, name: str) -> Camera:
+    view = getattr(example, "view", None)
+    if isinstance(view, Camera):
+        return view
+    if not isinstance(view, str):
+        raise TypeError(f"{name}: expected Clicks, a Box or a Mask, got {type(example).__name__}; kfgs.fields has them")
+    for camera in cameras:
+        if view in (camera.name, Path(camera.name).stem):
+            return camera
+    some = ", ".join(camera.name for camera in cameras[:3]) or "none"
+    raise ValueError(f"{name}: expected the name of a view ({some}, ...), got {view!r}; correct it")
+
+
+def _marked(camera: Camera, photo: Tensor | Array, marks: list[tuple[Any, Color]], width: int) -> Array:
+    """The photo at a width, with its marks."""
+    check_shapes(("photo", photo, "H W 3"))
+    size = width, max(1, round(camera.height * width / camera.width))  # Pillow's order
+    picture = Image.fromarray(np.ascontiguousarray(as_bytes(photo))).resize(size, Resampling.BOX)
+    pen, across, down = ImageDraw.Draw(picture), size[0] / camera.width, size[1] / camera.height
+    for one, color in marks:
+        rim = LEGEND_INK if sum(color) > 3 * BRIGHT else LEGEND_PAPER
+        if hasattr(one, "mask"):
+            check_shapes(("mask", one.mask, camera.size))
+            _outline(picture, as_array(one.mask, "mask").astype(bool), color, rim)
+        elif hasattr(one, "corners"):
+            x0, y0, x1, y1 = one.corners
+            box = x0 * across, y0 * down, x1 * across, y1 * down
+            pen.rectangle(box, outline=rim, width=2 * LINE)
+            pen.rectangle(box, outline=color, width=LINE)
+        else:
+            for x, y in ((x * across, y * down) for x, y in one.points):
+                pen.ellipse((x - DOT, y - DOT, x + DOT, y + DOT), fill=color, outline=rim, width=LINE // 2)
+    return np.asarray(picture)
+
+
+def _outline(picture: Image.Image, mask: Array, color: Color, rim: Color) -> None:
+    """Draw the border of a mask into a picture of any size."""
+    from skimage.segmentation import find_boundaries
+
+    scaled = np.asarray(Image.fromarray(mask).resize(picture.size, Resampling.NEAREST))
+    border = Image.fromarray(find_boundaries(np.pad(scaled, 1), mode="inner")[1:-1, 1:-1]).convert("L")
+    picture.paste(rim, mask=border.filter(ImageFilter.MaxFilter(2 * LINE + 1)))
+    picture.paste(color, mask=border.filter(ImageFilter.MaxFilter(LINE + 1)))
