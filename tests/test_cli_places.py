@@ -34,7 +34,7 @@ LINES = {  # a command with its output {}; and one of its inputs that could be n
     "pack": ("pack {packed} {}", "{packed}"),
     "plan": ("plan {scene} --out {}", "{scene}/split.json"),
     "render": ("render {run} --out {}.gif", None),
-    "search": ("search chair {run} --json {}", None),
+    "search": ("search chair {run} --csv {}", None),
     "segment": ("segment {run}/field --out {}", None),
     "select": ("select chair {run}/field --out {}", None),
     "sfm": ("sfm {tmp}/photos --out {}", None),

@@ -69,6 +69,14 @@ def test_what_cannot_end_well_is_refused_before_planning(room, given, message, t
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
+def test_a_list_of_scenes_is_answered_with_what_to_do(tmp_path, capsys):
+    file = tmp_path / "scenes.txt"
+    file.write_text("room\n")
+    assert main(["plan", str(file)]) == 1
+    told = tells("SCENE: expected the folder of one scene", f"got the file {file}", "multiply", "slurm.md")
+    assert re.search(told, capsys.readouterr().err)
+
+
 def test_a_typo_is_not_hidden_by_maps_that_exist(room, tmp_path, capsys):
     assert main(["plan", str(room), "--teacher", "nix"]) == 1
     assert re.search(tells("teacher:", "got 'nix'", "name one of them"), capsys.readouterr().err)

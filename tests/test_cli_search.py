@@ -1,5 +1,6 @@
 """The command search."""
 
+import csv
 import json
 import shutil
 
@@ -65,10 +66,10 @@ def test_an_empty_folder_gets_no_index(tmp_path, capsys):
 def test_the_table_names_scene_place_size_and_view(runs, capsys):
     assert main(["search", "chair", str(runs)]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith(f"chair: in 1 of 3 scenes, {2 * COUNT - 3} Gaussians")
-    assert lines[1].split() == ["scene", "score", "Gaussians", "center", "size", "best", "view"]
-    assert lines[2].split()[0] == "a/field"
-    assert lines[2].split()[2] == str(COUNT)
+    assert lines[0].startswith(f"chair: in 1 of 3 scenes, {2 * COUNT - 3} Gaussians in 2 parts")
+    assert lines[1].split() == ["scene", "parts", "score", "Gaussians", "center", "size", "best", "view"]
+    assert lines[2].split()[:2] == ["a/field", "2"]
+    assert lines[2].split()[3] == str(COUNT)
     assert "at the" in lines[2]
     assert lines[3].split()[1] == str(COUNT - 3)
 
@@ -82,6 +83,39 @@ def test_json_holds_every_part(runs, tmp_path, capsys):
     assert (one["path"], one["count"], one["exact"], len(one["parts"])) == ("a/field", 2 * COUNT - 3, True, 2)
     assert set(one["parts"][0]) == {"count", "score", "center", "low", "high", "view", "share"}
     assert str(out) in capsys.readouterr().out
+
+
+def test_csv_has_a_row_for_each_part(runs, tmp_path, capsys):
+    out, whole = tmp_path / "found.csv", tmp_path / "found.json"
+    for _ in range(2):  # its own file is replaced
+        assert main(["search", "chair", str(runs), "--csv", str(out), "--json", str(whole)]) == 0
+    assert str(out) in capsys.readouterr().out
+    with out.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    parts = json.loads(whole.read_text())["scenes"][0]["parts"]
+    assert [row["number"] for row in rows] == ["1", "2"]
+    for row, part in zip(rows, parts, strict=True):
+        assert (row["scene"], row["class"], row["photo"]) == ("a/field", "chair", part["view"] or "")
+        assert [float(row[axis]) for axis in "xyz"] == part["center"]
+        size = [high - low for low, high in zip(part["low"], part["high"], strict=True)]
+        assert [float(row[f"size_{axis}"]) for axis in "xyz"] == size
+        assert (float(row["score"]), int(row["Gaussians"])) == (part["score"], part["count"])
+    assert main(["search", "chair", str(runs), "--csv", str(out), "--json", str(out)]) == 1
+    assert "--csv: expected another file" in capsys.readouterr().err
+    out.write_text("my,own\n1,2\n")
+    assert main(["search", "chair", str(runs), "--csv", str(out)]) == 1
+    assert "found.csv" in capsys.readouterr().err
+    assert out.read_text() == "my,own\n1,2\n"
+
+
+def test_a_part_that_may_be_two_things_is_marked(tmp_path, capsys):
+    chairs = [("chair", 0.0), ("chair", 4.0), ("chair", 8.0), ("chair", 12.0), ("chair", 12.15), ("chair", 12.3)]
+    save_scenes(tmp_path, a=scene([("wall", 30.0), *chairs], 1))
+    assert main(["search", "chair", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert "in 4 parts" in said, said
+    assert [" ?" in line for line in said.splitlines()[3:7]] == [True, False, False, False], said
+    assert "?: more than 1.6 times as long as the median" in said
 
 
 def test_words_are_marked_and_exact_asks_the_fields(runs, capsys):

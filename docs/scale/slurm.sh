@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # The driver of a batch as a small job; it submits the workers as jobs of their own, one GPU each (see jobqueue.yaml).
 # Usage: sbatch slurm.sh scenes.txt /shared/runs PARTITION WORKERS --teacher lseg --weights /shared/demo_e200.ckpt
+# Without GPUs, end it with: --threads 2 --memory 8GB (the last ones count), and see jobqueue.yaml.
 # If the driver's time is over, submit it again: it goes on.
 #SBATCH --job-name=kfgs-batch
 #SBATCH --cpus-per-task=1

@@ -18,7 +18,7 @@ from .atomic import (
     open_current,
 )
 from .errors import FullDiskError
-from .locks import InUseError, locked
+from .locks import InUseError, is_locked, locked
 from .own import check_inside, check_own, foreign, is_own
 from .paths import as_path, check_output, real_path
 
@@ -39,6 +39,7 @@ __all__ = [
     "finish_writing",
     "foreign",
     "hidden_folder",
+    "is_locked",
     "is_own",
     "locked",
     "open_current",

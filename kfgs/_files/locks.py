@@ -59,6 +59,25 @@ def try_lock(handle: int) -> bool | None:
     return True
 
 
+def is_locked(file: Path) -> bool | None:
+    """Whether a process holds a lock; None if that is unknown: the file is missing or cannot be read, or there are no locks."""
+    if fcntl is None or file.is_symlink():
+        return None
+    try:
+        handle = os.open(file, os.O_RDONLY | os.O_NONBLOCK)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return None
+    finally:
+        os.close(handle)
+    return False
+
+
 @contextmanager
 def locked(folder: Path, name: str) -> Iterator[None]:
     """Keep other processes from working in a folder; it is made if it does not exist.

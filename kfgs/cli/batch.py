@@ -110,7 +110,9 @@ def batch(
     )
     folder, screen = check_runs(entries, out), _Screen()
     with open_client(**dataclasses.asdict(workers)) as client:
-        say(f"{len(entries)} scenes; workers: {client.cluster or client.scheduler.address}")
+        say(
+            f"{len(entries)} scene{'s' if len(entries) != 1 else ''}; workers: {client.cluster or client.scheduler.address}"
+        )
         if folder is None:
             say(
                 f"note: {out} has no lock: start no other batch with this --out before this one ends; scenes might fail"

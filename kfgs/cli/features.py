@@ -116,6 +116,11 @@ def plan(
         check_output("out", out, "a file")
     if features is not None and not features.is_dir():
         raise ValueError(f"features: expected a folder of maps, got {features}, which is none; leave --features out")
+    if scene.is_file() and scene.suffix != ".json":
+        raise ValueError(
+            f"scene: expected the folder of one scene, got the file {scene}; of a list for `kfgs batch`, plan one typical scene, "
+            "and multiply by their number (docs/howto/slurm.md)"
+        )
     config = fit_config(method, steps=steps, split=views.split)
     name, weights = teacher.teacher, teacher.weights
     named = teacher_options(name or "lseg", teacher.fast, teacher.size)

@@ -135,7 +135,7 @@ def sfm(
         say(f"{beside} is a link to {real_path(images)}: keep the photos there")
         written.append(beside)
     elif real_path(beside) != real_path(images):
-        say(f"note: {beside} is another folder; pass --images {images} to the other commands")
+        say(f"note: other commands read the pictures of these names in {beside}; --images {images} names these")
     wrote(written)
 
 

@@ -13,7 +13,7 @@ from .._files import as_path, real_path
 
 # Heavy imports happen inside the functions, so that `kfgs --help` answers at once.
 
-OUTPUTS = ("out", "target", "json")
+OUTPUTS = ("out", "target", "json", "csv")
 """Parameters that name what a command writes."""
 WORDS = ("weights", "with_file", "set")
 """Parameters whose words may name files: `demo_e200.ckpt`, `before=labelled.ply`."""

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from .._files import atomic_folder, check_output, check_own, read_json, real_path
 from .files import check_alone, check_splat, is_field, open_splats
 from .options import Classes, Given, Positional, Rule, Teacher
-from .output import say, say_counts, wrote
+from .output import lengths_odd, say, say_counts, wrote
 from .text import ask
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -58,6 +58,7 @@ def select(
     from .._check import check_range
     from ..formats import SplatFile
     from ..labels import connected_parts
+    from ..labels.components import component_distance
     from ..pipeline.apply import select_labelled
 
     if not source.exists() and Path(query).exists():
@@ -90,6 +91,8 @@ def select(
     if out is not None and len(found) == 0:
         say(headline)
         raise ValueError(f"query: expected Gaussians to save, got none of {query!r}; lower the threshold or drop --out")
+    if distance is None and len(found):
+        distance = component_distance(cloud.gaussians.means, found.mask)
     things = connected_parts(cloud.gaussians, found, cameras, distance=distance, smallest=smallest)
     written: list[str] = []
     if out is not None:  # before anything is printed, whose reader may have ended
@@ -100,8 +103,10 @@ def select(
         for name in {"parts.png", "selection.ply.classes.json"} - set(written):
             (out / name).unlink(missing_ok=True)  # of an older selection
     say(headline)
-    for number, thing in enumerate(things, start=1):
-        say(f"  {query}/{number}: {thing!r}" if counted else f"  {thing!r}")
+    for number, (thing, times) in enumerate(zip(things, _times_as_long(things), strict=True), start=1):
+        say((f"  {query}/{number}: {thing!r}" if counted else f"  {thing!r}") + times)
+    if things:
+        say(f"  parts are joined within {distance:.3g}; --distance changes it")
     if things and (left := things[0].total - len(things)):
         say(f"  {left} smaller part{'s are' if left > 1 else ' is'} not listed; --smallest 1 lists the 100 largest")
     elif not things and len(found) > 0:
@@ -199,6 +204,12 @@ def info(path: Positional[Path]) -> None:
     from ..scale.board import describe_batch
 
     say(describe_batch(path) or describe(path))
+
+
+def _times_as_long(things: list[Any]) -> list[str]:
+    """What is said of parts that may be two things in one."""
+    odd = lengths_odd([2 * float(thing.box.half.max()) for thing in things])
+    return ["" if one is None else f" ? ({one:.1f} times as long as the median: two in one?)" for one in odd]
 
 
 def _check_older(out: Path) -> None:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import csv as tables
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from .._files import InUseError, check_output, check_own, read_json, write_json
+from .._files import InUseError, atomic_path, check_output, check_own, read_json, real_path, write_json
 from .files import check_alone
 from .options import Given, Positional, Teacher
-from .output import say, wrote
+from .output import LONG, lengths_odd, say, wrote
 
 # Heavy imports happen inside the functions; a class that the fields know is found without torch.
 
-SHOWN = 5  # parts of a scene in the table; all are in the JSON file
+SHOWN = 5  # parts of a scene in the table; all are in the files
+COLUMNS = ["scene", "class", "number", "x", "y", "z", "size_x", "size_y", "size_z", "score", "photo", "Gaussians"]
 
 
 def search(
@@ -27,6 +29,7 @@ def search(
     exact: int = 0,
     top: int = 20,
     json: Given[Path] = None,
+    csv: Given[Path] = None,
     teacher: Teacher,
 ) -> None:
     """Find a class, a phrase or an example in all fields below a folder: which scenes, where, how many, and the best view.
@@ -52,6 +55,7 @@ def search(
         exact: Number of scenes, the best first, whose fields are asked themselves; they are ranked again.
         top: Number of scenes that are printed.
         json: File for the whole answer.
+        csv: File for a table with a row for each part: centre, size along x, y, z, score, best photo, Gaussians.
     """
     from ..scale import SearchIndex
 
@@ -69,18 +73,27 @@ def search(
         for name, other in (("text", text), ("teacher", teacher.teacher)):
             check_alone(name, other, "with --like, which needs no words")
     teacher.check_weights()
+    if json is not None and csv is not None and real_path(json) == real_path(csv):
+        raise ValueError(f"csv: expected another file than that of --json, got {csv} for both; give another name")
     if json is not None:
         check_output("json", json, "a file")
         check_own(json, lambda path: "query" in read_json(path), "kfgs search")
+    if csv is not None:
+        check_output("csv", csv, "a file")
+        check_own(csv, lambda path: path.read_text(encoding="utf-8").startswith(",".join(COLUMNS)), "kfgs search")
     known = _up_to_date(SearchIndex.open(folder))
     if len(known) == 0:
         raise ValueError(f"folder: expected fields below {folder}, got none that can be read; make one with `kfgs fit`")
     found = _ask(known, query, like, index, text, threshold, exact, teacher)
     what = f"like {like}:{index}" if like is not None else query
     count = sum(scene.count for scene in found.scenes)
+    parts = sum(len(scene.parts) for scene in found.scenes)
     if json is not None:
         write_json(json, {"query": what, "folder": str(folder)} | found.to_json())
-    say(f"{what}: in {len(found.scenes)} of {found.searched} scenes, {count} Gaussians")
+    if csv is not None:
+        _write_table(csv, what, found.scenes)
+    said = f"{count} Gaussians in {parts} part{'s' if parts != 1 else ''}"
+    say(f"{what}: in {len(found.scenes)} of {found.searched} scenes, {said}")
     _say_table(found.scenes[:top])
     if len(found.scenes) > top:
         say(f"  and {len(found.scenes) - top} more scenes; --top {len(found.scenes)} shows all")
@@ -94,6 +107,8 @@ def search(
         say(f"note: not asked: {len(found.unasked) - SHOWN} more")
     if json is not None:
         wrote([json])
+    if csv is not None:
+        wrote([csv])
 
 
 def _up_to_date(known: Any) -> Any:
@@ -146,23 +161,39 @@ def _ask(
         raise ValueError(f"{error}; for any other phrase pass --teacher and --weights") from error
 
 
+def _write_table(file: Path, what: str, scenes: Iterable[Any]) -> None:
+    """A row for each part of each scene."""
+    with atomic_path(file) as temporary, temporary.open("w", newline="", encoding="utf-8") as out:
+        rows = tables.writer(out)
+        rows.writerow(COLUMNS)
+        for scene in scenes:
+            for number, part in enumerate(scene.parts, start=1):
+                size = [high - low for low, high in zip(part.low, part.high, strict=True)]
+                rows.writerow([scene.path, what, number, *part.center, *size, part.score, part.view or "", part.count])
+
+
 def _say_table(scenes: Iterable[Any]) -> None:
     """A line for each part of each scene, the largest first."""
-    rows = [("scene", "score", "Gaussians", "center", "size", "best view")]
+    rows, long = [("scene", "parts", "score", "Gaussians", "center", "size", "best view")], False
     for scene in scenes:
         mark = "" if scene.exact else "~"
         if not scene.parts:
-            rows.append((scene.path, f"{mark}{scene.score:.3f}", f"{mark}{scene.count}", "scattered", "", ""))
+            rows.append((scene.path, "0", f"{mark}{scene.score:.3f}", f"{mark}{scene.count}", "scattered", "", ""))
+        sides = [[high - low for low, high in zip(part.low, part.high, strict=True)] for part in scene.parts]
+        odd = [times is not None for times in lengths_odd([max(one) for one in sides])]
         for i, part in enumerate(scene.parts[:SHOWN]):
-            size = " x ".join(f"{high - low:.3g}" for low, high in zip(part.low, part.high, strict=True))
+            size = " x ".join(f"{side:.3g}" for side in sides[i]) + (" ?" if odd[i] else "")
+            long = long or odd[i]
             center = ", ".join(f"{x:.3g}" for x in part.center)
             view = "" if part.view is None else f"{part.share:.1%} of {part.view}"
-            name = scene.path if i == 0 else ""
-            rows.append((name, f"{mark}{part.score:.3f}", f"{mark}{part.count}", f"({center})", size, view))
-        if len(scene.parts) > SHOWN:
-            rows.append(("", "", "", f"and {len(scene.parts) - SHOWN} more parts", "", ""))
+            name, parts = (scene.path, str(len(scene.parts))) if i == 0 else ("", "")
+            rows.append((name, parts, f"{mark}{part.score:.3f}", f"{mark}{part.count}", f"({center})", size, view))
+        if (left := len(scene.parts) - SHOWN) > 0:
+            rows.append(("", "", "", "", f"and {left} more part{'s' if left > 1 else ''}", "", ""))
     if len(rows) == 1:
         return
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     for row in rows:
         say("  " + "  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)).rstrip())
+    if long:
+        say(f"?: more than {LONG} times as long as the median of the parts of its scene: two in one?")

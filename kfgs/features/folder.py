@@ -19,7 +19,7 @@ from ..scenes import Scene
 from .check import FeatureReport, check_maps
 from .finder import MapFinder
 from .langsplat import parse_level, rows_file
-from .layouts import LANGSPLAT, Reading, StoredMap, count_bad, layout_of, read_rows
+from .layouts import AGAIN, LANGSPLAT, Reading, StoredMap, count_bad, layout_of, read_rows
 from .pictures import Picture, Split, as_pictures, check_stems, pictures_of
 
 
@@ -209,6 +209,25 @@ class FeatureFolder(Sequence[Tensor]):
             self._refuse_bad(i, count_bad(block))
             yield block
 
+    def check_files(self) -> None:
+        """Open the file of every map without reading its values: a file that is cut short is found before a long run.
+
+        Maps that are not there (discarded) are left out.
+
+        Raises:
+            ValueError, TypeError: as when a map is read; with several damaged ones, the first is named, and the others counted.
+        """
+        bad: list[ValueError | TypeError] = []
+        for i, file in enumerate(self.files):
+            try:
+                if file.is_file():
+                    self._checked(i)
+            except (ValueError, TypeError) as error:
+                bad.append(error)
+        if bad:
+            more = f" ({len(bad) - 1} more do not fit; `kfgs features SCENE --check {self.path}` names them)"
+            raise type(bad[0])(str(bad[0]) + (more if len(bad) > 1 else "")) from bad[0]
+
     def digests(self) -> list[list[str]] | None:
         """[file name, SHA-256] of each view's map, or None if the caller should compute them from the files.
 
@@ -257,9 +276,7 @@ class FeatureFolder(Sequence[Tensor]):
 
     def _refuse_bad(self, i: int, bad: int) -> None:
         if bad:
-            raise ValueError(
-                f"{self.files[i]}: expected finite features, got {bad} NaN or infinite values; encode it again"
-            )
+            raise ValueError(f"{self.files[i]}: expected finite features, got {bad} NaN or infinite values; {AGAIN}")
 
     def _read(self, i: int, rows: slice = slice(None), columns: slice = slice(None)) -> Tensor:  # [h, w, D]
         """Some rows and columns of view i's map, if it has the size of the first and they are finite."""

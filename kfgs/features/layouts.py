@@ -27,7 +27,7 @@ Axes = Literal["h w D", "D h w"]
 
 WIDTHS = frozenset((128, 256, 384, 512, 768, 1024, 1152, 1280, 1536))
 """Numbers of channels of known encoders. A first axis of one of these sizes, and a last axis of none, hints at [D, h, w]."""
-AGAIN = "encode it again"
+AGAIN = "encode it again, or leave the photo out (split.json)"
 ROW_BLOCK = 32  # rows of a map converted at a time: 30 MB in single precision at 480 x 512 channels
 
 
@@ -137,7 +137,7 @@ def open_map(file: Path, reading: Reading = Reading(), own: Container[Path] = ()
         kind = f"{found.layout} tensor" if isinstance(found, Tensor) else type(found).__name__
         raise TypeError(f"{file}: expected one dense tensor {axes}, got a {kind}; save the tensor alone")
     if not (found.is_floating_point() if isinstance(found, Tensor) else found.dtype.kind == "f"):
-        raise ValueError(f"{file}: expected floating-point features, got {found.dtype}; encode it again")
+        raise ValueError(f"{file}: expected floating-point features, got {found.dtype}; {AGAIN}")
     if found.ndim != 3 or 0 in found.shape:
         raise ValueError(f"{file}: expected a map {axes}, got {tuple(found.shape)}; save one view per file")
     order = layout.axes if layout.certain else find_axes(str(file), tuple(map(int, found.shape)), reading)

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 from .._check import one_line
 from .._files import as_path, bytes_in_words
 from ..features import FeatureFolder
+from ..features.finder import MapFinder
 from ..features.manifest import MANIFEST, read_manifest
 from ..fields import SemanticField
 from ..fields.store import find_field
 from ..formats import SplatFile, find_format, read_splats
 from ..formats.folders import splat_file_of
 from ..formats.ply import read_ply
-from ..scenes import SceneError, is_scene, load_scene
+from ..scenes import SceneError, is_scene, list_images, load_scene
+from ..scenes.files import IMAGE_SUFFIXES, natural_key, some
 from .stages import read_stage
+
+MOST = 1000  # folders that are looked into
 
 
 def describe(path: str | Path) -> str:
@@ -48,12 +53,10 @@ def describe(path: str | Path) -> str:
         return "\n".join([f"{path}: unfinished run; start `kfgs fit` again to go on", *lines])
     try:
         scene = load_scene(path)
-    except SceneError:
-        maps = FeatureFolder(path)
-        if not maps.files:
+    except SceneError as error:
+        if is_scene(path):
             raise
-        h, w, D = maps.shape
-        return f"{path}: {len(maps)} feature maps of another program\n  {h} x {w} cells, {D} channels"
+        return _describe_others(path, error)
     sizes = sorted({camera.size for camera in scene.cameras})
     splits = ", ".join(f"{name} {len(views)}" for name, views in scene.splits.items())
     lines = [
@@ -65,6 +68,46 @@ def describe(path: str | Path) -> str:
         *(f"  note: {note}" for note in scene.notes),
     ]
     return "\n".join(lines)
+
+
+def _describe_others(path: Path, error: SceneError) -> str:
+    """A folder that is no scene: photos without poses, a folder of scenes, photos or runs, or maps of another program."""
+    photos = _photos_in(path)
+    if photos == path:
+        with suppress(TypeError, ValueError):  # there may be pictures among maps
+            return _describe_other_maps(path, error)
+    if photos is not None:
+        out = "SCENE" if photos == path else path
+        count = len(list_images(photos))
+        return (
+            f"{path}: {count} photos without camera poses\nnext: kfgs sfm {photos} --out {out}, which finds the cameras"
+        )
+    folders = sorted((one for one in path.iterdir() if one.is_dir()), key=lambda one: natural_key(one.name))[:MOST]
+    scenes = [one for one in folders if is_scene(one)]
+    photos_only = [one for one in folders if one not in scenes and _photos_in(one) is not None]
+    fields = [one for one in folders if one not in scenes and find_field(one) is not None]
+    kinds = {"scenes": scenes, "photos without camera poses": photos_only, "runs or fields": fields}
+    found = {kind: inside for kind, inside in kinds.items() if inside}
+    if not found:
+        return _describe_other_maps(path, error)
+    lines = [f"  {len(inside)} {kind}: {some([one.name for one in inside])}" for kind, inside in found.items()]
+    first = next(iter(found.values()))[0]
+    return "\n".join([f"{path}: a folder of folders", *lines, f"next: give one of them: kfgs info {first}"])
+
+
+def _describe_other_maps(path: Path, error: SceneError) -> str:
+    if not MapFinder(path).listed(deep=True):
+        raise error
+    maps = FeatureFolder(path)
+    h, w, D = maps.shape
+    return f"{path}: {len(maps)} feature maps of another program\n  {h} x {w} cells, {D} channels"
+
+
+def _photos_in(path: Path) -> Path | None:
+    """The folder with the photos: images/ in a folder, or the folder itself; None if there are none."""
+    if (path / "images").is_dir() and list_images(path / "images"):
+        return path / "images"
+    return path if any(one.suffix.lower() in IMAGE_SUFFIXES for one in path.iterdir()) else None
 
 
 def _describe_maps(path: Path) -> str:

@@ -193,6 +193,8 @@ def _check_inputs(scene: Scene, views: Sequence[int], maps: Maps, config: FitCon
             f"maps: expected the maps of the views of split {split!r} in their order ({scene.stem(views[0])}, "
             f"...), got {stems[0]}, ...; read them with FeatureFolder(path).of(scene, {split!r})"
         )
+    if hasattr(maps, "check_files"):
+        maps.check_files()
 
 
 @typed
@@ -229,8 +231,8 @@ def fit_scene(
     Raises:
         TypeError: if `maps` is neither, or `progress` neither a bool nor a function.
         ValueError: if the counts of views and maps differ, a camera has distortion, there is no such device, a splat is given
-            to the paper's method, or its mode `decouple` gets `RecomputedMaps`; if `folder` is a file, another process
-            works in it, or its field is damaged.
+            to the paper's method, or its mode `decouple` gets `RecomputedMaps`; if a map's file is damaged; if `folder` is a
+            file, another process works in it, or its field is damaged.
         FileExistsError: if `folder/field` is no field.
         FileNotFoundError: if a stage needs maps that were discarded, or a picture is missing.
     """

@@ -23,9 +23,10 @@ from .stages import Run, describe_lens, digest_tensors
 class Maps(Protocol):
     """Teacher maps, one per view, read at each access; an all-zero feature means "unknown".
 
-    Five more members are used if they exist: `identity`, JSON of the teacher; `digests() -> list[list[str]] | None`, a digest
-    of each map if known without reading the files; `shape`, (h, w, D) without reading values; `grid(i, step, samples)`, see
-    `fit_codebook`; and `blocks(i)`, the map a few rows at a time.
+    Six more members are used if they exist: `identity`, JSON of the teacher; `digests() -> list[list[str]] | None`, a digest
+    of each map if known without reading the files; `shape`, (h, w, D) without reading values; `check_files()`, which raises
+    before the work if a file is damaged; `grid(i, step, samples)`, see `fit_codebook`; and `blocks(i)`, the map a few rows
+    at a time.
     """
 
     @property

@@ -15,10 +15,11 @@ from typing import Any
 from .._files import check_output, locked, parse_json
 from .driver import Engine, Event, Failure, Plan, Task, drive, limit
 from .options import BatchOptions, Job
-from .places import WRITER, Place, StoredPlace
+from .places import WRITER, Place, StoredPlace, has_begun
 from .scene_list import SceneEntry, as_entries, check_apart, is_url
 
 STAGES = ("scene", "features", "fit", "segment", "evaluate")
+LOOK = 1.0  # seconds between two looks at what workers have begun
 STATE, LOG, LOCK, FORMAT = "state.json", "log.txt", ".batch.lock", "kfgs-batch/1"
 LOGGED = re.compile(rf"\d{{4}}-\d\d-\d\d \d\d:\d\d:\d\d ({'|'.join(STAGES)}): ")  # begins every log.txt
 WRITTEN = ("done", "features", "scene/sparse/0", "segmented")  # folders of a run; the fit checks its own
@@ -43,7 +44,8 @@ class Row:
     name: str
     source: str
     stages: dict[str, str] = field(default_factory=dict)
-    """running, done, found (made earlier) or failed, by stage; a stage that is not there waits, or is not needed."""
+    """waits (for a worker), running, done, found (made earlier), failed or stopped, by stage; one that is not there comes later,
+    or is not needed."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Of the work that made each stage, by whichever start of the batch."""
     value: dict[str, Any] | None = None
@@ -167,8 +169,17 @@ def run_batch(
             if report is not None:
                 report(event, rows)
 
+        looked = time.monotonic()
+
+        def look() -> None:
+            nonlocal looked
+            if time.monotonic() - looked > LOOK:
+                for event in filter(None, [record.look() for record in records.values()]):
+                    note(event)
+                looked = time.monotonic()
+
         plans = {name: _plan(jobs[name]) for name, record in records.items() if record.begin(retry_failed)}
-        drive(plans, client, note, at_once=at_once)
+        drive(plans, client, note, at_once=at_once, idle=look)
     return [SceneResult(row.name, row.value, row.failure, sum(row.seconds.values())) for row in rows]
 
 
@@ -229,11 +240,17 @@ class _Record:
             return False
         return True
 
+    def look(self) -> Event | None:
+        """An event if a worker has begun the stage that waits; in an object store this is not known."""
+        stage = next((name for name, word in self.row.stages.items() if word == "waits"), None)
+        begun = stage is not None and type(self.place) is Place and has_begun(self.place.path, STATE)
+        return Event(self.row.name, "started", stage or "") if begun else None
+
     def add(self, event: Event) -> None:
         """Note an event."""
         row, stage = self.row, event.stage
-        if event.kind == "started":
-            row.stages[stage] = "running"
+        if event.kind in ("submitted", "started"):
+            row.stages[stage] = "waits" if event.kind == "submitted" else "running"
         elif event.kind == "done":
             row.stages[stage] = "found" if all(one.get("reused") for one in event.results) else "done"
             row.seconds[stage] = round(sum(one["seconds"] for one in event.results), 3)
@@ -248,8 +265,8 @@ class _Record:
             row.value = event.results[0]
         now = time.time()
         lines = [(when, line.removeprefix(f"{stage}: ")) for when, line in zip(event.times, event.lines, strict=True)]
-        if event.kind == "started":
-            lines.append((now, "started"))
+        if event.kind in ("submitted", "started"):
+            lines.append((now, event.kind))
         if event.kind in ("done", "failed"):
             lines.append((now, f"{row.stages[stage]} in {event.seconds:.1f} s"))
         if event.failure is not None:
@@ -273,6 +290,10 @@ def read_rows(folder: Path) -> list[Row]:
             about["seconds"] = _seconds(about.get("seconds"))
             about["failure"] = None if failure is None else Failure(**failure)
             about["stages"] = {str(name): str(word) for name, word in about.get("stages", {}).items()}
+            if has_begun(file.parent, STATE):
+                about["stages"] = {
+                    name: "running" if word == "waits" else word for name, word in about["stages"].items()
+                }
             if about.get("value") is None or isinstance(about["value"], dict):
                 rows.append(Row(**about))
     return rows

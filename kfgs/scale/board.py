@@ -6,11 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from .._card import cut
-from .._files import seconds_in_words
+from .._check import one_line
+from .._files import is_locked, seconds_in_words
 from .batch import LOCK, STAGES, Row, read_rows
 from .driver import Event
 
+STOPPED = dict.fromkeys(("waits", "running"), "stopped")
 LONGEST = 24  # characters of a name
+MESSAGE = 600  # characters of a failure: what sfm says is long, and its end is advice
 
 
 def event_line(event: Event, rows: Sequence[Row]) -> str | None:
@@ -24,7 +27,7 @@ def event_line(event: Event, rows: Sequence[Row]) -> str | None:
     if event.kind == "lost":
         return f"{event.name}: {event.stage}: {event.lines[0]}"
     if event.failure is not None:
-        return f"{event.name}: {event.stage} failed: {cut(event.failure.message, 300)}"
+        return f"{event.name}: {event.stage} failed: {cut(event.failure.message, MESSAGE)}"
     return None
 
 
@@ -33,11 +36,14 @@ def table(rows: Sequence[Row], most: int | None = None) -> str:
 
     Args:
         rows: of a batch.
-        most: show at most this many scenes: those that failed first, then those at work, then the others.
+        most: show at most this many scenes: those that failed first, then those at work, then those that wait for a worker, then
+            the others.
     """
     shown = list(rows)
     if most is not None and len(shown) > most:
-        order = sorted(rows, key=lambda row: 0 if row.failure else 1 if row.stages and not row.ended else 2)
+        order = sorted(
+            rows, key=lambda row: 0 if row.failure else 3 if row.ended or not row.stages else 2 - _at_work(row)
+        )
         chosen = {id(row) for row in order[: max(most, 0)]}
         shown = [row for row in rows if id(row) in chosen]
     width = max([5, *(min(len(row.name), LONGEST) for row in shown)])
@@ -48,16 +54,22 @@ def table(rows: Sequence[Row], most: int | None = None) -> str:
         cells = [cut(row.name, LONGEST).ljust(width), *(row.stages.get(stage, "-").ljust(8) for stage in STAGES)]
         lines.append(" ".join([*cells, f"{sum(row.seconds.values()):7.1f}", score]))
         if row.failure is not None:
-            lines.append(f"  {row.failure.stage}: {cut(row.failure.message, 300 if most is None else 90)}")
+            lines.append(f"  {row.failure.stage}: {cut(row.failure.message, MESSAGE if most is None else 90)}")
     counts = {
         "finished": sum(row.value is not None for row in rows),
         "failed": sum(row.failure is not None for row in rows),
-        "at work": sum(bool(row.stages) and not row.ended for row in rows),
+        "at work": sum(_at_work(row) for row in rows),
+        "stopped": sum("stopped" in row.stages.values() for row in rows),
     }
+    counts["waiting"] = len(rows) - sum(counts.values())
     scores = [row.value["miou"] for row in rows if row.value is not None and row.value.get("miou") is not None]
     words = [f"{count} {what}" for what, count in counts.items() if count]
     words += [f"mean mIoU {sum(scores) / len(scores):.3f} of {len(scores)}"] if scores else []
-    return "\n".join([*lines, f"{len(rows)} scenes: {', '.join(words) or 'all wait'}"])
+    return "\n".join([*lines, f"{len(rows)} scene{'s' if len(rows) != 1 else ''}: {', '.join(words)}"])
+
+
+def _at_work(row: Row) -> bool:
+    return "running" in row.stages.values()
 
 
 def describe_batch(folder: Path) -> str | None:
@@ -65,8 +77,16 @@ def describe_batch(folder: Path) -> str | None:
     rows = read_rows(folder) if (folder / LOCK).is_file() else []
     if not rows:
         return None
+    file = folder / LOCK
+    works = is_locked(file)
+    head = f"{folder}: a batch"
+    if works:
+        head += f" at work, {one_line(file.read_text(errors='replace'), 200)}"
+    elif works is False and not all(row.ended for row in rows):
+        head += " that was stopped"
+        for row in rows:
+            row.stages = {stage: STOPPED.get(word, word) for stage, word in row.stages.items()}
     advice = ["the same `kfgs batch` again goes on with scenes that are not done"]
     advice += ["with --retry-failed also with failed ones"] if any(row.failure for row in rows) else []
     advice = [f"kfgs search WORD {folder}"] if all(row.value is not None for row in rows) else advice
-    head = f"{folder}: a batch; scenes that have not begun are not listed"
-    return "\n".join([head, table(rows), f"next: {', '.join(advice)}"])
+    return "\n".join([f"{head}; scenes that have not begun are not listed", table(rows), f"next: {', '.join(advice)}"])

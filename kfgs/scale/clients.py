@@ -101,11 +101,15 @@ def dask_setup(_: Any) -> None:
     """Called in each worker of this machine: Ctrl-C ends the driver, which ends its workers.
 
     In a terminal, it reaches all processes, and workers would print tracebacks. pycolmap is imported here, in the main thread:
-    only there can the import undo that its log library prints a stack at SIGTERM.
+    only there can the import undo that its log library prints a stack at SIGTERM. tqdm's own lock is a semaphore of the system,
+    which a killed worker leaves behind: Python then warns in the driver.
     """
+    from tqdm import tqdm
+
     from ..scenes.pycolmap_import import import_pycolmap
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    tqdm.set_lock(threading.RLock())
     with suppress(ImportError):
         import_pycolmap()
 

@@ -60,7 +60,8 @@ class Event:
 
     name: str
     kind: str
-    """started or done (a stage); lost (a task, which is submitted again); failed or finished (the scene)."""
+    """submitted, started (by a worker, where that can be seen) or done (a stage); lost (a task, which is submitted again);
+    failed or finished (the scene)."""
     stage: str = ""
     seconds: float = 0.0
     """Of the tasks of a stage, together."""
@@ -131,6 +132,7 @@ def drive(
     report: Callable[[Event], None],
     *,
     at_once: int | Callable[[], int] = 64,
+    idle: Callable[[], None] | None = None,
 ) -> None:
     """Take all plans to their ends; a failed one does not hold up the others.
 
@@ -140,6 +142,7 @@ def drive(
             one of its processes dies.
         report: called for each event, in this thread.
         at_once: scenes in progress at the same time; a function is asked each time, for workers that come and go.
+        idle: called while nothing happens, some times a second.
     """
     most = limit(at_once)
     engine, waiting, lanes = _Submitter(client), list(plans.items())[::-1], list[_Lane]()
@@ -157,6 +160,8 @@ def drive(
                     if not _end_stage(lane, engine, report):
                         lanes.remove(lane)
             if not moved:
+                if idle is not None:
+                    idle()
                 time.sleep(PAUSE)
     finally:
         for future in (future for lane in lanes for future in lane.futures.values()):
@@ -195,7 +200,7 @@ def _advance(lane: _Lane, results: list[Any] | None, engine: _Submitter, report:
         report(Event(lane.name, "failed", lane.stage, failure=why))
         return False
     if lane.stage != before:
-        report(Event(lane.name, "started", lane.stage))
+        report(Event(lane.name, "submitted", lane.stage))
     lane.deaths, lane.done = {}, {}
     lane.futures = {i: engine.submit(task, f"{lane.name}/{lane.stage}/{i}") for i, task in enumerate(lane.tasks)}
     return True

@@ -15,6 +15,8 @@ from .._files import atomic_path, check_own, foreign, parse_json, real_path
 from .scene_list import is_url
 
 WRITER = "kfgs batch"
+AT_WORK = ".at_work"
+"""In the folder of a run: a worker writes it when it begins a task. So a task whose `state.json` is newer waits for a worker."""
 LOCAL_ONLY = ("digests.json",)  # a run's notes about files of this machine
 STAMPS = ("ETag", "etag", "md5Hash", "content_md5", "mtime", "LastModified", "last_modified", "created")
 """What file systems of fsspec say about a file's version; each has some of them."""
@@ -179,6 +181,12 @@ class StoredPlace(Place):
         """See `Place.remove`."""
         with suppress(FileNotFoundError):
             self.files.rm_file(self._at(name))
+
+
+def has_begun(folder: Path, since: str) -> bool:
+    """Whether a worker began a task of a run after a file there was written."""
+    note, earlier = _mark(folder / AT_WORK), _mark(folder / since)
+    return note is not None and earlier is not None and note[1] >= earlier[1]
 
 
 @contextmanager

@@ -8,10 +8,12 @@ times; where only times differ, the stage's own cache, which goes by content, fi
 
 from __future__ import annotations
 
+import os
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -29,7 +31,7 @@ from ..scenes import SceneError, link_images, run_sfm
 from ..teachers.load import load_teacher
 from ..teachers.protocol import Teacher, identify
 from .options import BatchOptions, Job
-from .places import WRITER, Place, inside, open_place
+from .places import AT_WORK, WRITER, Place, inside, open_place
 from .scene_parts import class_files, classes_of, counts_alike, load, photos_of, relative, truth_of
 
 PATIENCE = 120  # seconds to wait for a folder in which a process works that was taken for dead
@@ -62,7 +64,7 @@ def find_scene(job: Job, *, report: Report) -> dict[str, Any]:
                 raise foreign(f"{job.out}/{model}", WRITER)
 
             def make() -> dict[str, Any]:
-                with _advice(f"{job.source}/{photos}".removesuffix("/.")):
+                with _advice(job.source, photos):
                     made = run_sfm(source.path / photos, out.path / "scene", config=config, replace=True)
                 if type(out) is Place:
                     link_images(source.path / photos, out.path / "scene")
@@ -89,13 +91,17 @@ def find_scene(job: Job, *, report: Report) -> dict[str, Any]:
 
 
 @contextmanager
-def _advice(photos: str) -> Iterator[None]:
-    """Say where the options are that sfm's errors name: a batch has none of them."""
+def _advice(source: str, photos: str) -> Iterator[None]:
+    """Say where the options are that sfm's errors name: a batch has none of them. That comes first: tables cut messages."""
     try:
         yield
     except SceneError as error:
+        apart = photos == "."  # no model is written among the photos themselves
+        place = source if apart else f"{source}/{photos}"
+        todo = "SCENE`, and write SCENE into the list" if apart else f"{source}`, then this again with --retry-failed"
+        said = str(error).removeprefix(f"{place}: ")
         raise SceneError(
-            f"{error}. Or find the cameras with other options of `kfgs sfm {photos} --out SCENE`, and write SCENE into the list"
+            f"no cameras found; try other options or photos: `kfgs sfm {place} --out {todo}. sfm says: {said}"
         ) from error
 
 
@@ -226,6 +232,9 @@ def _work(job: Job) -> Iterator[tuple[Place, Place]]:
     """The places of a scene and its run, with the threads of a task."""
     torch.set_num_threads(job.options.threads)
     with open_place(job.source) as source, open_place(job.out) as out:
+        if type(out) is Place:
+            with suppress(OSError):  # only shown to people
+                out.write_text(AT_WORK, f"process {os.getpid()} of {socket.gethostname()}\n")
         yield source, out
 
 

@@ -75,7 +75,9 @@ def test_all_that_does_not_fit_is_reported_at_once_by_file(folder):
         "expected 6 x 8 cells as most maps have, got 8 x 6",
         "expected the aspect of a picture of 60 x 80 pixels, got 8 x 6 cells (transposed?)",
     ]
-    assert report.problems["whole.npy"] == ["expected floating-point features, got int32; encode it again"]
+    assert report.problems["whole.npy"] == [
+        "expected floating-point features, got int32; encode it again, or leave the photo out (split.json)"
+    ]
     assert "cannot be read" in report.problems["junk_fmap_CxHxW.pt"][0]
     assert report.problems["gone.npy"] == ["missing"]
     lines = str(report).splitlines()

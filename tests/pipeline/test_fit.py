@@ -1,9 +1,11 @@
 import dataclasses
 import json
 
+import numpy as np
 import pytest
 import torch
 from messages import tells
+from safetensors.torch import save_file
 from small_room import CONFIG, config, make_room
 
 from kfgs.cameras import Distortion
@@ -183,6 +185,27 @@ def test_bad_input_is_refused_before_any_work(scene, room, tmp_path):
     with pytest.raises(ValueError, match=tells("split:", "train, test", "got 'val'")):
         fit_scene(scene, two, tmp_path, config(split="val"))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["npy", "pt", "safetensors"])
+def test_a_map_that_is_cut_short_is_found_before_any_work(kind, scene, maps, tmp_path):
+    (tmp_path / "maps").mkdir()
+    stems = [scene.stem(i) for i in scene.splits["train"]]
+    for stem, features in zip(stems, maps, strict=True):
+        if kind == "pt":
+            save_feature_map(tmp_path / "maps", stem, features)
+        elif kind == "npy":
+            np.save(tmp_path / "maps" / f"{stem}.npy", features.half().numpy())
+        else:
+            save_file({"map": features.half()}, tmp_path / "maps" / f"{stem}.safetensors")
+    damaged = sorted((tmp_path / "maps").iterdir())[2:4]
+    for file in damaged:
+        file.write_bytes(file.read_bytes()[:-1000])
+    whole = FeatureFolder(tmp_path / "maps").of(scene, "train")
+    told = tells(damaged[0].name, "encode it again, or leave the photo out (split.json)", "1 more", "--check")
+    with pytest.raises(ValueError, match=told):
+        fit_scene(scene, whole, tmp_path / "run", CONFIG)
+    assert not (tmp_path / "run").exists()
 
 
 def test_truth_is_undistorted_as_the_views_are(scene, room):

@@ -67,7 +67,7 @@ def test_a_plan_that_cannot_use_a_result_fails_alone():
 def test_a_task_whose_worker_died_is_submitted_again(deaths):
     engine, events = Dying(deaths), []
     assert map_scenes(len, ["/data/hall"], client=engine, report=events.append)[0].value == 10
-    assert [event.kind for event in events] == ["started", *["lost"] * deaths, "done", "finished"]
+    assert [event.kind for event in events] == ["submitted", *["lost"] * deaths, "done", "finished"]
     assert len({arguments[-1] for arguments in engine.submitted}) == deaths + 1  # no two calls are equal
 
 
@@ -91,9 +91,9 @@ def test_stages_follow_each_other_and_tasks_of_one_stage_are_joined_in_order():
     with ThreadPoolExecutor(3) as pool:
         drive({"scene": plan()}, pool, events.append)
     assert [(event.kind, event.stage, event.results) for event in events] == [
-        ("started", "one", ()),
+        ("submitted", "one", ()),
         ("done", "one", (0, 2, 4)),
-        ("started", "two", ()),
+        ("submitted", "two", ()),
         ("done", "two", (12,)),
         ("finished", "", (12,)),
     ]
@@ -111,7 +111,7 @@ def test_no_more_scenes_than_asked_are_in_progress(at_once):
     inside, most = set(), []
 
     def note(event):
-        (inside.add if event.kind == "started" else inside.discard)(event.name)
+        (inside.add if event.kind == "submitted" else inside.discard)(event.name)
         most.append(len(inside))
 
     with ThreadPoolExecutor(4) as pool:

@@ -217,5 +217,5 @@ def test_a_class_is_found_without_torch(runs):
     )
     command = [sys.executable, "-c", code, "search", "chair", str(runs)]
     lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
-    assert lines[0] == "chair: in 1 of 2 scenes, 57 Gaussians"
+    assert lines[0] == "chair: in 1 of 2 scenes, 57 Gaussians in 1 part"
     assert lines[-1] == "[]"

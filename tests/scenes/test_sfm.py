@@ -1,3 +1,4 @@
+import shutil
 from itertools import combinations
 from pathlib import Path
 
@@ -8,8 +9,10 @@ from cases_sfm import WIDTH, downsized
 from kornia.io import write_image
 from messages import tells
 from oracles_cameras import align_similarity
+from small_room import make_room
 from tqdm import tqdm
 
+from kfgs.cli import main
 from kfgs.scenes import SceneError, SfmConfig, load_scene, run_sfm
 from kfgs.scenes.pycolmap_import import import_pycolmap
 from kfgs.scenes.sfm import SfmReport, SfmRun, _require_one_model, sequential_pairs
@@ -51,7 +54,12 @@ def test_images_that_share_nothing_are_refused(tmp_path: Path) -> None:
     images.mkdir()
     for i in range(3):
         write_image(str(images / f"{i}.png"), torch.randint(0, 255, (3, 60, 80), generator=g, dtype=torch.uint8))
-    with pytest.raises(SceneError, match=tells("images:", "3 of 3", "min_registered = 0.9", "got 0")):
+    with pytest.raises(
+        SceneError,
+        match=tells(
+            "images:", "3 of 3", "min_registered = 0.9", "got 0", "original photos", "enlarge", "(80x60 pixels)"
+        ),
+    ):
         run_sfm(images, tmp_path / "out", config=SfmConfig(num_threads=1))
     assert not (tmp_path / "out").exists()
 
@@ -65,6 +73,27 @@ def test_a_split_scene_is_refused_with_counts_and_advice() -> None:
     _require_one_model(Path("images"), (72, 19), names, SfmConfig(min_registered=0.8))
     with pytest.raises(SceneError, match=tells("images:", "got 80", "single_camera=False")):
         _require_one_model(Path("images"), (80,), names, SfmConfig())
+
+
+def test_a_capture_that_lost_its_poses_gets_them_in_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capture = make_room(tmp_path / "capture")
+    before = {path: path.read_bytes() for path in capture.rglob("*") if path.is_file()}
+    shutil.move(capture / "sparse", tmp_path / "found")
+
+    def found(images: Path, out: Path, **_: object) -> SfmReport:  # what sfm itself does is tested elsewhere
+        shutil.copytree(tmp_path / "found", out / "sparse")
+        return SfmReport(9, 9, 1500, 0.5)
+
+    monkeypatch.setattr("kfgs.scenes.run_sfm", found)
+    assert main(["sfm", str(capture / "images"), "--out", str(capture)]) == 0
+    assert "note:" not in capsys.readouterr().out
+    assert {path: path.read_bytes() for path in capture.rglob("*") if path.is_file()} == before
+    assert len(load_scene(capture).views("train")) == 6
+    monkeypatch.undo()
+    assert main(["sfm", str(capture / "images"), "--out", str(capture)]) == 1  # poses are never replaced unasked
+    assert "--replace" in capsys.readouterr().err
 
 
 def test_folders_without_enough_images(tmp_path: Path) -> None:

@@ -1,0 +1,58 @@
+"""What `kfgs info` says of folders that are no scene."""
+
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from messages import tells
+from small_room import make_room
+
+from kfgs.pipeline import describe
+from kfgs.scenes import SceneError
+
+
+@pytest.fixture
+def captures(tmp_path):
+    """Two scenes, a capture that lost its poses, and photos alone."""
+    folder = tmp_path / "captures"
+    make_room(folder / "flat2")
+    shutil.copytree(folder / "flat2", folder / "flat10")
+    shutil.copytree(folder / "flat2", folder / "lost", ignore=shutil.ignore_patterns("sparse"))
+    shutil.copytree(folder / "flat2" / "images", folder / "photos")
+    return folder
+
+
+def test_photos_without_poses_are_told_how_to_get_them(captures):
+    lost, photos = captures / "lost", captures / "photos"
+    told = f"{lost}: 9 photos without camera poses\nnext: kfgs sfm {lost}/images --out {lost}, which finds the cameras"
+    assert (lost / "text.npy").is_file()  # no feature map
+    assert describe(lost) == told
+    assert describe(photos).endswith(f"next: kfgs sfm {photos} --out SCENE, which finds the cameras")
+
+
+def test_a_folder_of_folders_is_counted(captures):
+    assert describe(captures).splitlines() == [
+        f"{captures}: a folder of folders",
+        "  2 scenes: flat2, flat10",
+        "  2 photos without camera poses: lost, photos",
+        f"next: give one of them: kfgs info {captures / 'flat2'}",
+    ]
+
+
+def test_a_scene_that_cannot_be_read_says_why(captures):
+    (captures / "flat2" / "sparse" / "0" / "cameras.bin").write_bytes(b"junk")
+    with pytest.raises(SceneError, match=tells("cameras.bin")):
+        describe(captures / "flat2")
+
+
+def test_maps_with_a_picture_among_them_are_maps(captures, tmp_path):
+    shutil.copy(next((captures / "photos").iterdir()), tmp_path / "preview.png")
+    np.save(tmp_path / "a.npy", torch.ones(6, 9, 8).numpy())
+    shutil.rmtree(captures)
+    assert "1 feature maps of another program" in describe(tmp_path)
+
+
+def test_a_folder_with_nothing_that_is_known(tmp_path):
+    with pytest.raises(SceneError, match=tells("expected a COLMAP model")):
+        describe(tmp_path)
