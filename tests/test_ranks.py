@@ -54,10 +54,13 @@ def finish(processes):
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
-    """A toy room, with a second folder of maps of which one is broken."""
+    """A toy room, with a second folder of maps of which one is broken: it has a NaN, which is noticed when it is read."""
     made = small_room.make_room(tmp_path_factory.mktemp("ranks") / "room")
     shutil.copytree(made / "features", made / "broken")
-    FeatureFolder(made / "broken").of(load_scene(made), "train").files[1].write_bytes(b"broken")
+    file = FeatureFolder(made / "broken").of(load_scene(made), "train").files[1]
+    values = torch.load(file)
+    values[0, 0, 0] = torch.nan
+    torch.save(values, file)
     return made
 
 
@@ -249,7 +252,7 @@ def test_a_command_by_several_processes_prints_one_error(runs, size):
     assert "color: done" in head["output"]
     (error,) = (line for line in head["errors"].splitlines() if line.startswith("error: "))
     assert error.startswith(f"error: process 1 of {size} failed: ValueError: ")
-    assert "broken" in error
+    assert "expected finite features, got 1 NaN" in error
     assert "note: a training step has 1 view(s), so only as many of the" in head["output"]
     for one in others:
         assert (one["errors"], one["output"]) == ("", "")

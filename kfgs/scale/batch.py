@@ -15,7 +15,7 @@ from typing import Any
 from .._files import check_output, locked, parse_json
 from .driver import Engine, Event, Failure, Plan, Task, drive, limit
 from .options import BatchOptions, Job
-from .places import WRITER, Place, StoredPlace, has_begun
+from .places import WRITER, Place, StoredPlace, begun_at
 from .scene_list import SceneEntry, as_entries, check_apart, is_url
 
 STAGES = ("scene", "features", "fit", "segment", "evaluate")
@@ -243,8 +243,8 @@ class _Record:
     def look(self) -> Event | None:
         """An event if a worker has begun the stage that waits; in an object store this is not known."""
         stage = next((name for name, word in self.row.stages.items() if word == "waits"), None)
-        begun = stage is not None and type(self.place) is Place and has_begun(self.place.path, STATE)
-        return Event(self.row.name, "started", stage or "") if begun else None
+        when = begun_at(self.place.path, STATE) if stage is not None and type(self.place) is Place else None
+        return None if when is None else Event(self.row.name, "started", stage or "", lines=("started",), times=(when,))
 
     def add(self, event: Event) -> None:
         """Note an event."""
@@ -265,7 +265,7 @@ class _Record:
             row.value = event.results[0]
         now = time.time()
         lines = [(when, line.removeprefix(f"{stage}: ")) for when, line in zip(event.times, event.lines, strict=True)]
-        if event.kind in ("submitted", "started"):
+        if event.kind == "submitted":
             lines.append((now, event.kind))
         if event.kind in ("done", "failed"):
             lines.append((now, f"{row.stages[stage]} in {event.seconds:.1f} s"))
@@ -290,7 +290,7 @@ def read_rows(folder: Path) -> list[Row]:
             about["seconds"] = _seconds(about.get("seconds"))
             about["failure"] = None if failure is None else Failure(**failure)
             about["stages"] = {str(name): str(word) for name, word in about.get("stages", {}).items()}
-            if has_begun(file.parent, STATE):
+            if begun_at(file.parent, STATE) is not None:
                 about["stages"] = {
                     name: "running" if word == "waits" else word for name, word in about["stages"].items()
                 }

@@ -183,10 +183,10 @@ class StoredPlace(Place):
             self.files.rm_file(self._at(name))
 
 
-def has_begun(folder: Path, since: str) -> bool:
-    """Whether a worker began a task of a run after a file there was written."""
+def begun_at(folder: Path, since: str) -> float | None:
+    """When a worker began a task of a run, in seconds of the clock; None if none did after a file there was written."""
     note, earlier = _mark(folder / AT_WORK), _mark(folder / since)
-    return note is not None and earlier is not None and note[1] >= earlier[1]
+    return None if note is None or earlier is None or note[1] < earlier[1] else note[1] / 1e9
 
 
 @contextmanager
