@@ -263,6 +263,7 @@ def test_edit_takes_the_parts_that_select_lists(labelled, tmp_path, capsys):
     assert len(parts) > 1
     for number, part in enumerate(parts, start=1):
         assert f"  chair/{number}: Part({part['count']} Gaussians" in said
+    assert "with `kfgs edit`" not in said  # which joins as far without an option
     assert main(["edit", str(labelled), "--out", str(tmp_path / "e.ply"), "--extract", "chair/2"]) == 0
     found, cloud = read_splats(tmp_path / "e.ply"), read_splats(labelled)
     assert torch.equal(found.gaussians.means, cloud.gaussians.means[parts[1]["indices"]])

@@ -91,9 +91,10 @@ def select(
     if out is not None and len(found) == 0:
         say(headline)
         raise ValueError(f"query: expected Gaussians to save, got none of {query!r}; lower the threshold or drop --out")
-    if distance is None and len(found):
-        distance = component_distance(cloud.gaussians.means, found.mask)
-    things = connected_parts(cloud.gaussians, found, cameras, distance=distance, smallest=smallest)
+    joined = distance
+    if joined is None and len(found):
+        joined = component_distance(cloud.gaussians.means, found.mask)
+    things = connected_parts(cloud.gaussians, found, cameras, distance=joined, smallest=smallest)
     written: list[str] = []
     if out is not None:  # before anything is printed, whose reader may have ended
         with atomic_folder(out) as new:
@@ -106,7 +107,7 @@ def select(
     for number, (thing, times) in enumerate(zip(things, _times_as_long(things), strict=True), start=1):
         say((f"  {query}/{number}: {thing!r}" if counted else f"  {thing!r}") + times)
     if things:
-        say(f"  parts are joined within {distance:.3g}; --distance changes it")
+        say(f"  parts are joined within {joined:.3g}; --distance changes it")
     if things and (left := things[0].total - len(things)):
         say(f"  {left} smaller part{'s are' if left > 1 else ' is'} not listed; --smallest 1 lists the 100 largest")
     elif not things and len(found) > 0:
