@@ -145,6 +145,7 @@ def test_the_longest_name_of_a_picture(tmp_path):
     camera = dataclasses.replace(orbit_cameras(torch.rand(50, 3))[0], name="x" * 251 + ".png")
     (name,) = picture_names([camera])
     (tmp_path / f"{name}.png").touch()
+    assert [path.name for path in tmp_path.iterdir()] == ["x" * 251 + ".png"]
 
 
 def own_cameras(folder, cameras, name="{}"):

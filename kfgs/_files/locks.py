@@ -46,12 +46,12 @@ def _no_lock(file: Path, got: str) -> ValueError:
     return ValueError(f"{file}: expected a lock file of kfgs or nothing there, got {got}; delete it")
 
 
-def try_lock(handle: int) -> bool | None:
+def try_lock(handle: int, *, shared: bool = False) -> bool | None:
     """Lock an open file until it is closed. False if another process or call holds it; None if there are no locks here."""
     if fcntl is None:
         return None
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(handle, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError:  # a file system without locks
@@ -68,14 +68,10 @@ def is_locked(file: Path) -> bool | None:
     except OSError:
         return None
     try:
-        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return None
+        free = try_lock(handle, shared=True)
     finally:
         os.close(handle)
-    return False
+    return None if free is None else not free
 
 
 @contextmanager

@@ -6,6 +6,7 @@ import math
 import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -220,3 +221,18 @@ def unit_vector(name: str, vector: Tensor | Sequence[float]) -> Tensor:  # [3] f
     if not 0 < length < math.inf:
         raise ValueError(f"{name}: expected a vector with a direction, got {values.tolist()}; for instance (0, 0, 1)")
     return values / length
+
+
+def view_named(cameras: Sequence[Camera], view: str | Camera, where: str) -> Camera:
+    """The one camera of a name, with or without its ending; a camera is itself.
+
+    Raises:
+        ValueError: if no camera or several have the name; the message begins with `where`.
+    """
+    if isinstance(view, Camera):
+        return view
+    found = [camera for camera in cameras if view in (camera.name, Path(camera.name).stem)]
+    if len(found) != 1:
+        some = ", ".join(camera.name for camera in cameras[:3]) or "none"
+        raise ValueError(f"{where}: expected the name of a training view ({some}, ...), got {view!r}; correct it")
+    return found[0]

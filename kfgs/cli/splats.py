@@ -203,13 +203,11 @@ def convert(
     if by_class:
         check_alone("plain", plain, "with --by-class, whose files are plain")
         return _convert_by_class(source, target)
+    check_target("target", target, endings=USD if usd else ())
     if usd:  # pyvista takes a second to import
         from ..viz.usd import check_usd_core, save_usd
 
-        check_target("target", target, endings=USD)
         check_usd_core(target)
-    else:
-        check_target("target", target)
     splats = open_splats("source", source)
     shown = repr(splats)
     written = save_usd(target, splats, points=points) if usd else write_splats(target, splats, plain=plain)

@@ -16,6 +16,7 @@ from .._files import as_path, read_json
 from .._rows import EPS, row_norms, unit_rows
 from .._typed import typed
 from ..cameras import Camera
+from ..cameras.camera import view_named
 from ..gaussians import as_rows
 from ..labels import LabelSet
 from ..labels.polygons import decode_rle
@@ -213,7 +214,7 @@ def _chosen(field: SemanticField, example: Any, name: str) -> tuple[Camera | Non
     """
     if isinstance(example, Picked):
         return None, _gaussians(field, example, name)
-    camera = _camera(field, example.view, name)
+    camera = view_named(field.cameras, example.view, name)
     drawn = camera.fitted(LONGEST)
     return drawn, _pixels(camera, drawn, example, name)
 
@@ -247,13 +248,3 @@ def _pixels(camera: Camera, drawn: Camera, example: Any, name: str) -> Tensor:  
         y0, y1, x0, x1 = int(y0 * down), int(y1 * down), int(x0 * right), int(x1 * right)
         mask[y0 : max(y1, y0 + 1), x0 : max(x1, x0 + 1)] = True
     return mask
-
-
-def _camera(field: SemanticField, view: str | Camera, name: str) -> Camera:
-    if isinstance(view, Camera):
-        return view
-    found = [camera for camera in field.cameras if view in (camera.name, Path(camera.name).stem)]
-    if len(found) != 1:
-        some = ", ".join(camera.name for camera in field.cameras[:3]) or "none"
-        raise ValueError(f"{name}: expected the name of a training view ({some}, ...), got {view!r}; correct it")
-    return found[0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from torch import Tensor
 from .._check import as_array, check_shapes, check_whole
 from .._typed import typed
 from ..cameras import Camera
+from ..cameras.camera import view_named
 from .palette import palette
 from .pictures import LEGEND_INK, LEGEND_PAPER, Array, as_bytes, legend_strip, picture_grid
 
@@ -71,15 +71,9 @@ def draw_examples(
 
 def _camera(cameras: Sequence[Camera], example: Any, name: str) -> Camera:
     view = getattr(example, "view", None)
-    if isinstance(view, Camera):
-        return view
-    if not isinstance(view, str):
+    if not isinstance(view, str | Camera):
         raise TypeError(f"{name}: expected Clicks, a Box or a Mask, got {type(example).__name__}; kfgs.fields has them")
-    for camera in cameras:
-        if view in (camera.name, Path(camera.name).stem):
-            return camera
-    some = ", ".join(camera.name for camera in cameras[:3]) or "none"
-    raise ValueError(f"{name}: expected the name of a view ({some}, ...), got {view!r}; correct it")
+    return view_named(cameras, view, name)
 
 
 def _marked(camera: Camera, photo: Tensor | Array, marks: list[tuple[Any, Color]], width: int) -> Array:
