@@ -22,6 +22,22 @@ from ._card import error_line, short_of_memory
 PARTS = ("embeddings", "codewords", "map", "means", "gaussians")  # where our objects keep what is mostly meant
 
 
+ORIGIN = (0.0, 0.0, 0.0)
+"""The origin of a scene whose coordinates are counted from the world's own zero."""
+
+
+def as_origin(value: Any) -> tuple[float, float, float]:
+    """Three finite numbers as Python floats (float64): a place in the world.
+
+    Raises:
+        ValueError: if there are not three, or one is not finite.
+    """
+    numbers_of = tuple(float(one) for one in value)
+    if len(numbers_of) != 3 or not all(math.isfinite(one) for one in numbers_of):
+        raise ValueError(f"origin: expected three finite numbers, got {numbers_of}; for instance (0, 0, 0)")
+    return numbers_of
+
+
 def check_shapes(*arguments: tuple[str, Any, str | tuple[str | int, ...]]) -> dict[str, int]:
     """Bind the axes of several tensors to one set of names and return their sizes.
 

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ._check import as_array, as_tensor, check_shapes, moved_to
+from ._check import ORIGIN, as_array, as_origin, as_tensor, check_shapes, moved_to
 
 Array = np.ndarray[Any, Any]
+TENSORS = ("means", "quats", "scales", "opacities", "features", "sh", "labels")
+FACTS = {"origin": "with_origin()", "antialiased": "replace()"}
+"""What a cloud knows besides its tensors, and how to change it."""
 ELSEWHERE = {
     "save": "write_splats(path, gaussians) writes every splat format",
     "load": "read_splats(path).gaussians reads every splat format",
@@ -29,6 +32,7 @@ class Gaussians:
     **Convention**: quaternions are (w, x, y, z) and need not be unit (they are normalised where used); scales are
     standard deviations in world units; labels are class indices with -1 = none, and become int64. A semantic field carries
     `features`, a colour field `sh`. NumPy arrays are accepted and become tensors that share their memory.
+    A scene far from zero (UTM, ECEF) has an `origin`: float32 has about 7 digits, so `means` are counted from there.
 
     `gaussians[mask]` (or an index, a slice, a `Selection`) is a new, smaller cloud; `len` counts the Gaussians.
 
@@ -47,9 +51,13 @@ class Gaussians:
     features: Tensor | None = None  # [N, D]
     sh: Tensor | None = None  # [N, K, 3], K = (degree + 1)^2
     labels: Tensor | None = None  # [N] int64, -1 = none
+    origin: tuple[float, float, float] = ORIGIN  # where the cloud's (0, 0, 0) lies in the world; means + origin in float64
+    antialiased: bool = False  # trained with Mip-Splatting's filter: drawn with opacity compensation
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
+        object.__setattr__(self, "origin", as_origin(self.origin))
+        for name in TENSORS:
+            value = getattr(self, name)
             if not isinstance(value, Tensor | None):
                 object.__setattr__(self, name, as_tensor(name, value, floating=name != "labels"))
         for name, value in self._tensors().items():
@@ -99,12 +107,17 @@ class Gaussians:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}{hint}")
 
     def _tensors(self) -> dict[str, Tensor]:
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        values = {name: getattr(self, name) for name in TENSORS}
         return {name: value for name, value in values.items() if value is not None}
 
     def replace(self, **changes: Any) -> Gaussians:
         """A copy with some tensors exchanged."""
         return replace(self, **changes)
+
+    def with_origin(self, origin: Sequence[float]) -> Gaussians:  # [3]
+        """The same places in the world, with `means` counted from another origin."""
+        shift = self.means.new_tensor([a - b for a, b in zip(self.origin, as_origin(origin), strict=True)])
+        return self if not shift.any() else self.replace(means=self.means + shift, origin=origin)
 
     def select(self, which: Any) -> Gaussians:
         """Some of the Gaussians as a new cloud; `gaussians[which]` is the same.
@@ -119,18 +132,18 @@ class Gaussians:
             IndexError: if there is no such Gaussian.
         """
         index = as_rows("which", which, len(self)).to(self.means.device)
-        return Gaussians(**{name: value[index] for name, value in self._tensors().items()})
+        return replace(self, **{name: value[index] for name, value in self._tensors().items()})
 
     def to(self, *args: Any, **kwargs: Any) -> Gaussians:
         """Move or convert the floating tensors as `Tensor.to` does; labels keep their integer type."""
         moved = {name: moved_to(value, *args, **kwargs) for name, value in self._tensors().items() if name != "labels"}
         if self.labels is not None:
             moved["labels"] = self.labels.to(moved["means"].device)
-        return Gaussians(**moved)
+        return replace(self, **moved)
 
     def detach(self) -> Gaussians:
         """The same values without their autograd history."""
-        return Gaussians(**{name: value.detach() for name, value in self._tensors().items()})
+        return replace(self, **{name: value.detach() for name, value in self._tensors().items()})
 
     def to_numpy(self) -> dict[str, Array]:
         """The tensors that there are as NumPy arrays, by name: `means` [N, 3], ..., for trimesh, Open3D or pandas."""
@@ -152,7 +165,14 @@ class Gaussians:
                     f"parts[{i}]: expected the tensors {sorted(names)} as in parts[0], got {sorted(part._tensors())}; "
                     "add or drop them with replace()"
                 )
-        return Gaussians(**{name: torch.cat([part._tensors()[name] for part in parts]) for name in names})
+        for name in ("origin", "antialiased"):
+            for i, part in enumerate(parts):
+                if getattr(part, name) != getattr(parts[0], name):
+                    raise ValueError(
+                        f"parts[{i}]: expected the {name} {getattr(parts[0], name)} as in parts[0], got "
+                        f"{getattr(part, name)}; bring them to one with {FACTS[name]}"
+                    )
+        return replace(parts[0], **{name: torch.cat([part._tensors()[name] for part in parts]) for name in names})
 
 
 def as_rows(name: str, which: Any, count: int) -> Tensor:  # [count] bool, or [n] whole numbers

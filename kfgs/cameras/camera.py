@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from .._card import cut
-from .._check import as_tensor, check_choice, check_range, check_shapes, moved_to
+from .._check import ORIGIN, as_origin, as_tensor, check_choice, check_range, check_shapes, moved_to
 
 DistortionModel = Literal["brown_conrady", "kannala_brandt"]
 COEFFICIENTS = {"brown_conrady": (4, 5, 8), "kannala_brandt": (4,)}
@@ -67,6 +67,7 @@ class Camera:
     name: str = ""
     distortion: Distortion | None = None
     near: float = NEAR  # > 0, world units: the smallest depth that is drawn
+    origin: tuple[float, float, float] = ORIGIN  # the world's place of the (0, 0, 0) that viewmat maps from; float64
 
     def __post_init__(self) -> None:
         for name, matrix in (("viewmat", self.viewmat), ("K", self.K)):  # integers would truncate the points
@@ -74,6 +75,7 @@ class Camera:
                 object.__setattr__(self, name, as_tensor(name, matrix, floating=True))
             as_tensor(name, getattr(self, name), floating=True)
         check_shapes(("viewmat", self.viewmat, "4 4"), ("K", self.K, "3 3"))
+        object.__setattr__(self, "origin", as_origin(self.origin))
         if not isinstance(self.distortion, Distortion | None):
             got = type(self.distortion).__name__
             raise TypeError(
@@ -207,6 +209,15 @@ class Camera:
         """The same view with at most so many pixels on its longer edge."""
         scale = min(1.0, longest / max(self.size))
         return self.resized(max(1, round(scale * self.height)), max(1, round(scale * self.width)))
+
+    def with_origin(self, origin: Sequence[float]) -> Camera:  # [3]
+        """The same view of the world, with `viewmat` mapping from coordinates counted from another origin."""
+        shift = self.viewmat.new_tensor([b - a for a, b in zip(self.origin, as_origin(origin), strict=True)])
+        if not shift.any():
+            return self
+        viewmat = self.viewmat.clone()
+        viewmat[:3, 3] += viewmat[:3, :3] @ shift
+        return replace(self, viewmat=viewmat, origin=origin)
 
     def to(self, *args: Any, **kwargs: Any) -> Camera:
         """Move or convert the matrices as `Tensor.to` does."""
