@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import hashlib
 import json
 from collections.abc import Iterable
@@ -19,6 +20,7 @@ from .atomic import (
 )
 from .errors import FullDiskError
 from .locks import InUseError, is_locked, locked
+from .names import Names, file_stem, folded_name
 from .own import check_inside, check_own, foreign, is_own
 from .paths import as_path, check_output, real_path
 
@@ -26,6 +28,7 @@ __all__ = [
     "HIDDEN",
     "FullDiskError",
     "InUseError",
+    "Names",
     "as_path",
     "atomic_folder",
     "atomic_path",
@@ -36,7 +39,9 @@ __all__ = [
     "current_file",
     "digest_file",
     "digest_value",
+    "file_stem",
     "finish_writing",
+    "folded_name",
     "foreign",
     "hidden_folder",
     "is_locked",
@@ -45,8 +50,10 @@ __all__ = [
     "open_current",
     "parse_json",
     "read_json",
+    "read_text",
     "real_path",
     "seconds_in_words",
+    "text_encoding",
     "write_json",
 ]
 
@@ -77,9 +84,33 @@ def read_json(path: str | Path) -> Any:
             f"{path}: expected a JSON file of at most {bytes_in_words(LARGEST)}, got {bytes_in_words(size)}; split it"
         )
     try:
-        return parse_json(path.read_text(encoding="utf-8"))
+        return parse_json(read_text(path, "a JSON file"))
     except ValueError as error:
         raise ValueError(f"{path}: expected a JSON file, but it cannot be parsed ({error})") from error
+
+
+def read_text(path: str | Path, expected: str = "a text file") -> str:
+    """Read a text that somebody else wrote, in UTF-8 or UTF-16, with or without a byte-order mark. Lines end with a newline.
+
+    Raises:
+        FileNotFoundError: if there is no such file; the message says what was `expected`.
+        ValueError: if it is in another encoding.
+    """
+    path = as_path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; expected {expected} there")
+    try:
+        return path.read_text(encoding=text_encoding(path))
+    except UnicodeDecodeError as error:
+        raise ValueError(
+            f"{path}: expected {expected} in UTF-8, got other bytes ({error}); save it as UTF-8"
+        ) from error
+
+
+def text_encoding(path: Path) -> str:
+    """The encoding that a text's first bytes tell. UTF-8 may begin with a mark; UTF-16, which PowerShell writes, must."""
+    with path.open("rb") as file:
+        return "utf-16" if file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig"
 
 
 def parse_json(text: str | bytes, **options: Any) -> Any:

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from .._files import file_stem
 from .._typed import typed
 from ..cameras import Camera
 from ..cameras.similarity import Similarity, fit_similarity
-from ..scenes.files import SceneError, file_stem, some
+from ..scenes.files import SceneError, some
 from ..scenes.pycolmap_import import quiet_pycolmap
 from .clouds import Array, nearest_rotation, to_similarity
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from .._check import one_line
+from .._files import file_stem
 from ..evaluation import Encode, FieldMethod, LabelSet
 from ..fields.parts import teacher_name
-from ..scenes.files import file_stem
 from .question import LABELLED, Question
 
 

@@ -10,13 +10,12 @@ from unicodedata import category
 from torch import Tensor
 from tqdm import tqdm
 
-from .._files import HIDDEN, as_path, check_output, check_own
+from .._files import HIDDEN, as_path, check_output, check_own, file_stem
 from .._typed import typed
 from ..cameras import Camera
 from ..evaluation.datasets.coco import is_ours, save_coco
 from ..fields import Rule, SemanticField
 from ..labels import LabelSet
-from ..scenes.files import file_stem
 from ..viz import save_picture
 from ..viz.pictures import Array, check_pictures
 from .apply import SEGMENTED, check_classes, save_colored_labels, save_label_map

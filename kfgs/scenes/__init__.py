@@ -1,8 +1,9 @@
 """Scenes: posed images and points, read from files of COLMAP, nerfstudio, instant-ngp, Blender and data sets, or estimated."""
 
+from .._files import file_stem
 from ..cameras.bounds import Bounds, robust_bounds
 from .colmap_model import ColmapModel, read_model
-from .files import SceneError, file_stem, list_images, read_image
+from .files import SceneError, list_images, read_image
 from .known_poses import find_points, write_known_poses
 from .load import is_scene, load_cameras, load_scene
 from .pictures import convert_heic, extract_frames

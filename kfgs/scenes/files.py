@@ -8,7 +8,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -50,17 +50,6 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
     """
     parts = re.split(r"([0-9]+)", name)
     return [(0, int(part[:LONGEST]), part) if i % 2 else (1, 0, part) for i, part in enumerate(parts)]
-
-
-def file_stem(name: str) -> str:
-    """A view's name without its suffix, folders kept. Feature and label files of the view carry this name.
-
-    Example:
-        >>> file_stem("rgb_5.png"), file_stem("train/r_0.png")
-        ('rgb_5', 'train/r_0')
-    """
-    path = PurePosixPath(name)
-    return str(path.with_suffix("")) if path.name else name  # "/" and "." have no suffix to take
 
 
 def some(names: list[str], count: int = 5) -> str:

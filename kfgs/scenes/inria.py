@@ -19,11 +19,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._files import as_path
+from .._files import as_path, file_stem
 from ..formats.folders import newest_splat
 from ..formats.table import read_splats
 from ..formats.values import SH_C0
-from .files import MAX_NUMBER, MAX_SIDE, SceneError, file_stem, list_images, read_scene_json, some
+from .files import MAX_NUMBER, MAX_SIDE, SceneError, list_images, read_scene_json, some
 from .posed import Matrix, PosedPicture, picture_size, read_points, scene_of_poses
 from .scene import Scene
 

@@ -17,13 +17,12 @@ from PIL import Image
 from tqdm import tqdm
 
 from .._check import check_range, one_line
-from .._files import as_path, atomic_folder, check_output, digest_file, read_json, real_path, write_json
+from .._files import as_path, atomic_folder, check_output, digest_file, file_stem, read_json, real_path, write_json
 from .files import (
     HEIC_SUFFIXES,
     ORIENTATION,
     PIXELS,
     SceneError,
-    file_stem,
     list_images,
     open_picture,
     some,

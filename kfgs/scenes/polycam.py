@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from .._files import as_path
-from .files import MAX_NUMBER, MAX_SIDE, SceneError, file_stem, list_images, read_scene_json, some
+from .._files import as_path, file_stem
+from .files import MAX_NUMBER, MAX_SIDE, SceneError, list_images, read_scene_json, some
 from .posed import MILLIMETRE, PosedPicture, points_from_depth, scene_of_poses
 from .scene import Scene
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from torch import Tensor
 
-from .._files import as_path
-from .files import SceneError, file_stem, list_images, some
+from .._files import as_path, file_stem
+from .files import SceneError, list_images, some
 from .posed import Matrix, PosedPicture, picture_size, points_from_depth, read_numbers, read_points, scene_of_poses
 from .scene import Scene
 

@@ -12,10 +12,11 @@ from torch import Tensor
 
 from .._card import html_card
 from .._check import check_shapes
+from .._files import file_stem
 from ..cameras.bounds import camera_extent
 from ..cameras.camera import NEAR, Camera
 from ..cameras.undistort import undistort
-from .files import SceneError, file_stem, read_image
+from .files import SceneError, read_image
 
 NEAR_SHARE = (
     0.1  # of the extent: 3DGS's near plane of 0.2 suits cameras 2 m apart; in smaller scenes it must be smaller

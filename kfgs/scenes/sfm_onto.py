@@ -8,10 +8,10 @@ from typing import Any
 
 from tqdm import tqdm
 
-from .._files import as_path, atomic_folder, check_output, real_path
+from .._files import as_path, atomic_folder, check_output, file_stem, real_path
 from .colmap import load_colmap
 from .colmap_model import ColmapModel, has_model, read_model
-from .files import SceneError, file_stem, list_images, some
+from .files import SceneError, list_images, some
 from .load import MODEL_FOLDERS, find_images
 from .pictures import refuse_heic
 from .posed import picture_size

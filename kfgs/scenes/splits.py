@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .._check import check_choice
-from .files import SceneError, file_stem, read_scene_json
+from .._files import file_stem
+from .files import SceneError, read_scene_json
 
 SplitRule = Literal["df3dgs", "feature3dgs", "holdout8", "all"]
 RULES: tuple[SplitRule, ...] = ("df3dgs", "feature3dgs", "holdout8", "all")

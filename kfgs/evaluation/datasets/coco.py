@@ -12,11 +12,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..._files import as_path, read_json, write_json
+from ..._files import as_path, file_stem, read_json, write_json
 from ..._typed import typed
 from ...fields.examples import Mask
 from ...labels.polygons import MOST, decode_rle, encode_rle, fill_region, say_range, union
-from ...scenes.files import MAX_SIDE, file_stem
+from ...scenes.files import MAX_SIDE
 from ..class_lists import VOID_NAMES, name_key
 from ..truth import LabelTruth, MaskAndBoxes, MaskTruth
 from .files import ReadWhenAsked

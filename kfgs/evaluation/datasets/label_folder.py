@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from ..._files import as_path, read_json, real_path
-from ...scenes.files import file_stem, list_images, some
+from ..._files import as_path, file_stem, read_json, real_path
+from ...scenes.files import list_images, some
 from ..class_lists import VOID_NAMES, name_key
 from ..truth import LabelTruth
 from .coco import load_coco_labels

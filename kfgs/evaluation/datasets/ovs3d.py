@@ -6,8 +6,8 @@ from functools import partial
 from pathlib import Path
 
 from ..._arrays import reading
-from ..._files import as_path
-from ...scenes.files import file_stem, list_images, natural_key, some
+from ..._files import as_path, file_stem
+from ...scenes.files import list_images, natural_key, some
 from ..truth import MaskAndBoxes, MaskTruth
 from .files import ReadWhenAsked, check_names, read_mask
 

@@ -1,0 +1,72 @@
+"""One rule for names of pictures, and one reader of texts."""
+
+import codecs
+
+import pytest
+
+from kfgs._files import Names, read_json, read_text
+
+
+@pytest.mark.parametrize(
+    ("asked", "there", "meant"),
+    [
+        ("A.JPG", ["A.jpg", "B.jpg"], "A.jpg"),
+        ("a.jpg", ["A.jpg", "B.jpg"], "A.jpg"),
+        ("A.JPG", ["A.png"], "A.png"),
+        ("A.heic", ["A.jpg", "B.jpg"], "A.jpg"),
+        ("A", ["A.jpg", "AB.jpg"], "A.jpg"),
+        ("A.jpg", ["A.jpg.png"], "A.jpg.png"),  # a mask of COLMAP
+        ("left\\a.png", ["left/a.png", "right/a.png"], "left/a.png"),
+        ("K\u00fcche/1.png", ["Ku\u0308che/1.png"], "Ku\u0308che/1.png"),
+        ("Ku\u0308che.png", ["k\u00fcche.PNG"], "k\u00fcche.PNG"),
+        ("./images/a.png", ["a.png"], "a.png"),
+        ("C:\\me\\images\\a.png", ["images/a.png", "b/a.png"], "images/a.png"),
+        ("shot.5", ["shot.5.png", "shot.6.png"], "shot.5.png"),
+        ("a.png", ["A.png", "A.PNG"], None),  # not clear which
+        ("A.jpg", ["A.png", "A.tif"], None),
+        ("shot.5", ["shot.png"], None),  # .5 is no ending
+        ("a.png", ["masks/a.png"], None),  # of another folder
+        ("left/a.png", ["right/a.png"], None),
+        ("", ["a.png"], None),
+    ],
+)
+def test_a_name_is_found_as_it_was_respelled(asked: str, there: list[str], meant: str | None) -> None:
+    assert Names(there).find(asked) == meant
+
+
+def test_the_exact_name_wins_over_one_that_differs_in_case() -> None:
+    names = Names(["a.png", "A.png", "a.jpg"])
+    assert [names.find(name) for name in ("a.png", "A.png", "a.jpg", "A.jpg")] == ["a.png", "A.png", "a.jpg", "a.jpg"]
+
+
+def test_names_of_views_may_lack_their_folder_where_only_one_fits() -> None:
+    names = Names(["left/a.png", "right/a.png", "left/b.png"], bare=True)
+    assert [names.find(name) for name in ("b.png", "b", "a.png", "left/a")] == [
+        "left/b.png",
+        "left/b.png",
+        None,
+        "left/a.png",
+    ]
+
+
+def test_the_nearest_name_is_the_advice() -> None:
+    assert Names(["rgb_1.png", "rgb_12.png", "depth.png"]).advice("DETH") == "did you mean 'depth.png'?"
+    assert Names([]).advice("a") == "there are no names to choose from"
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_texts_and_json_are_read_with_any_mark(encoding: str, tmp_path) -> None:
+    (tmp_path / "a.txt").write_bytes("K\u00fcche\r\nFlur\r\n".encode(encoding))
+    (tmp_path / "a.json").write_bytes('{"K\u00fcche": 1}'.encode(encoding))
+    assert read_text(tmp_path / "a.txt") == "K\u00fcche\nFlur\n"
+    assert read_json(tmp_path / "a.json") == {"K\u00fcche": 1}
+
+
+def test_another_encoding_is_refused_in_words(tmp_path) -> None:
+    file = tmp_path / "a.txt"
+    file.write_bytes("K\u00fcche".encode("latin-1"))
+    with pytest.raises(ValueError, match=r"a\.txt: expected a list in UTF-8, got other bytes \(.*\); save it as UTF-8"):
+        read_text(file, "a list")
+    file.write_bytes(codecs.BOM_UTF16_LE + b"a")
+    with pytest.raises(ValueError, match="save it as UTF-8"):
+        read_text(file, "a list")
