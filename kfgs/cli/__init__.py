@@ -53,6 +53,7 @@ GROUPS: dict[str, tuple[Any, ...]] = {
 COMMANDS = {command.__name__: command for group in GROUPS.values() for command in group}
 RESUMED = {"demo", "features", "fit", "color", "batch", "blocks", "search"}  # commands that reuse their earlier work
 SHARED = {"fit", "uplift", "color"}  # commands that several processes (torchrun) do together
+STRICT = "--strict"  # of every command that reads files
 NARROW = 40  # columns: in a few, tyro never ends
 STYLE = (
     tyro.conf.DisallowNone,
@@ -105,6 +106,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _run(words: list[str], names: dict[str, str]) -> int:
     """Run the command that the words ask for; `names` receives the command-line names of its parameters."""
     name, *given = [_expand_home(word) for word in words] or [""]
+    given, strict = [word for word in given if word != STRICT], STRICT in given
     rank, size = place()
     if name not in COMMANDS:
         told = {"-h": _overview, "--help": _overview, "--version": _version}.get(name)
@@ -115,7 +117,7 @@ def _run(words: list[str], names: dict[str, str]) -> int:
         raise SystemExit(2)
     _check_working_directory()
     command = COMMANDS[name]
-    called[:] = ["kfgs", name, *given]
+    called[:] = ["kfgs", name, *given, *[STRICT][:strict]]
     if size > 1 and name not in SHARED:
         raise ValueError(f"expected one process for `kfgs {name}`, got {size} by torchrun; start it without")
 
@@ -123,7 +125,7 @@ def _run(words: list[str], names: dict[str, str]) -> int:
         return _in_options(message, names)
 
     _check_words(given)
-    with interruptible(), warnings_as_notes(spoken), said_on_stderr(), said_whole(), together():
+    with interruptible(), warnings_as_notes(spoken, strict=strict), said_on_stderr(), said_whole(), together():
         names |= _shown_names(command)
         options = {word.partition("=")[0] for word in given}
         if "text" in names and "--text" in options and "--classes" not in options:
@@ -182,7 +184,12 @@ def _overview() -> str:
             summary = (inspect.getdoc(command) or "").split("\n\n")[0]
             lines.append(_wrap(f"  {command.__name__:<10s}{' '.join(summary.split())}", " " * 12))
     return "\n".join(
-        [*lines, "", "`kfgs COMMAND --help` has the options and examples; `kfgs --version` says which kfgs this is."]
+        [
+            *lines,
+            "",
+            "`kfgs COMMAND --help` has the options and examples; `kfgs --version` says which kfgs this is.",
+            f"{STRICT}, with any command, refuses files of which broken parts are otherwise left out with a note.",
+        ]
     )
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, TextIO
 
+from .._notes import hear
 from .._ranks import first
 
 LINE, END = 2000, 600
@@ -119,9 +120,12 @@ def say_lost(written: Any) -> None:
 
 
 @contextmanager
-def warnings_as_notes(spoken: Callable[[str], str]) -> Iterator[None]:
-    """Print the warnings of kfgs about classes and teachers as notes of one line each, in the words of `spoken`."""
-    with warnings.catch_warnings():
+def warnings_as_notes(spoken: Callable[[str], str], *, strict: bool = False) -> Iterator[None]:
+    """Print warnings about classes and teachers, in the words of `spoken`, and notes of readers, as notes of one line each.
+
+    With `strict`, readers refuse what they would leave out.
+    """
+    with warnings.catch_warnings(), hear(lambda words: say(f"note: {words}"), strict=strict):
         warnings.filterwarnings("always", message="classes: ")
 
         def note(message: Warning | str, *_: Any, **__: Any) -> None:

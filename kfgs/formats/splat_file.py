@@ -37,6 +37,9 @@ class SplatFile:
     """Details of the file, as JSON: `format`, and values of the header. `antialiased` and `surfels` are the kind of rendering
     that the cloud was trained for (`render_mode`). A format that cannot store them reports them as lost."""
 
+    notes: tuple[str, ...] = ()
+    """What the reader left out or changed, in words. Commands print it."""
+
     _writer: ClassVar[Callable[..., Written]]
     """What `save` calls: `table.write_splats`, which sets it. The formats import this file, and the table knows the formats."""
 

@@ -27,6 +27,7 @@ from pathlib import Path
 from types import ModuleType
 
 from .._files import as_path
+from .._notes import tell
 from .._typed import typed
 from ..gaussians import Gaussians
 from .folders import PATTERNS, splat_file_of
@@ -118,6 +119,8 @@ def read_splats(path: str | Path) -> SplatFile:
                 f"{path}: expected labels from -1 to {len(splats.classes) - 1} (the named classes), got {low} to {high}; "
                 f"correct the labels, or the names in {(find_names(path) or names_path(path)).name}"
             )
+    for note in splats.notes:
+        tell(f"{path.name}: {note}")
     return splats
 
 

@@ -1,0 +1,42 @@
+"""What a reader did about content that it could not use as it is: it leaves it out and notes it, or it refuses the file.
+
+Readers call `tell`. The command line listens with `hear`: it prints notes, and its `--strict` makes them errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+_listeners: list[Callable[[str], None]] = []
+_strict: list[bool] = []
+
+
+@contextmanager
+def hear(say: Callable[[str], None], *, strict: bool = False) -> Iterator[None]:
+    """Call `say` with each different note until the block ends; with `strict` readers refuse what they would leave out."""
+    told: set[str] = set()
+
+    def once(note: str) -> None:
+        if note not in told:
+            told.add(note)
+            say(note)
+
+    _listeners.append(once)
+    _strict.append(strict)
+    try:
+        yield
+    finally:
+        _listeners.remove(once)
+        _strict.pop()
+
+
+def tell(note: str) -> None:
+    """Pass a note to the command that listens, if there is one."""
+    if _listeners:
+        _listeners[-1](note)
+
+
+def is_strict() -> bool:
+    """Whether readers refuse a file with broken parts (`--strict`)."""
+    return any(_strict)
