@@ -53,7 +53,6 @@ _WHERE = {
     "make_label_set": ".teachers",
     "Teacher": ".teachers",
     "RecomputedMaps": ".features",
-    "plan_scene": ".pipeline",
     "uplift": ".pipeline",
     "UpliftConfig": ".fields",
     "FieldConfig": ".fields",
@@ -111,7 +110,6 @@ if TYPE_CHECKING:
     from .pipeline import attach as attach
     from .pipeline import fit_color as fit_color
     from .pipeline import fit_scene as fit_scene
-    from .pipeline import plan_scene as plan_scene
     from .pipeline import score_scene as score_scene
     from .pipeline import segment_scene as segment_scene
     from .pipeline import uplift as uplift

@@ -51,7 +51,9 @@ class Gaussians:
     features: Tensor | None = None  # [N, D]
     sh: Tensor | None = None  # [N, K, 3], K = (degree + 1)^2
     labels: Tensor | None = None  # [N] int64, -1 = none
-    origin: tuple[float, float, float] = ORIGIN  # where the cloud's (0, 0, 0) lies in the world; means + origin in float64
+    origin: tuple[float, float, float] = (
+        ORIGIN  # where the cloud's (0, 0, 0) lies in the world; means + origin in float64
+    )
     antialiased: bool = False  # trained with Mip-Splatting's filter: drawn with opacity compensation
 
     def __post_init__(self) -> None:

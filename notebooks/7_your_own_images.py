@@ -129,20 +129,16 @@ row = [photo, viz.FeatureColors.fit(seen.flatten(0, 1)[::7])(seen), colormaps["c
 Image.fromarray(viz.picture_grid([row], ["photo", "features", question], width=320))
 
 # %% [markdown]
-# ## The plan, then the field
+# ## The field
 #
-# Before anything long starts, `plan_scene` tries the teacher and a few steps on this machine, and says what each stage will
-# take. Then the teacher sees every training picture, and `fit_scene` makes the field (notebook 4). Its Gaussians are trained
-# on pictures made 320 pixels wide, which is quick. A killed run goes on where it stopped: run this notebook twice, and the
-# second time takes seconds.
+# The teacher sees every training picture, and `fit_scene` makes the field (notebook 4). Its Gaussians are trained on pictures
+# made 320 pixels wide, which is quick. A killed run goes on where it stopped: run this notebook twice, and the second time
+# takes seconds.
 
 # %%
 quick = kfgs.ColorConfig.quick()
 quick = replace(quick, field=replace(quick.field.with_steps(600), max_gaussians=60_000))
 config = kfgs.FitConfig.cpu(color=replace(quick, picture_scale=min(1.0, 320 / scene.cameras[0].width)))
-print(kfgs.plan_scene(scene, teacher=teacher, config=config, features=out / "features", run=out))
-
-# %%
 kfgs.extract_features(teacher, scene, out / "features", split="train")
 field = kfgs.fit_scene(scene, kfgs.FeatureFolder(out / "features").of(scene, "train"), out / "run", config).field
 print(field.summary())
@@ -178,6 +174,6 @@ Image.fromarray(np.concatenate([sheet, viz.legend_strip(torch.arange(len(phrases
 # - `viz.explore(field, classes=classes, embed=lambda phrase: teacher.encode_text([phrase])[0])` opens the viewer; with
 #   `embed`, you can type any text that the teacher understands.
 # - The field is saved in `run/field`. `kfgs view`, `kfgs select` and `kfgs render` take it from a shell.
-# - `kfgs sfm`, `kfgs plan`, `kfgs features` and `kfgs fit` are these cells as commands.
+# - `kfgs sfm`, `kfgs features` and `kfgs fit` are these cells as commands.
 #
 # Next: [8_compare_methods](8_compare_methods.ipynb) asks which method to take.

@@ -77,7 +77,6 @@ def refused(arguments, capsys, *parts):
         "render {run} --out {file}/deep/a.gif",
         "pack {run}/field {file}/deep/a.kfgs.safetensors",
         "evaluate {run}/field --out {file}/deep/a.json",
-        "plan {room} --out {file}/deep/a.json",
     ],
 )
 def test_an_output_that_cannot_be_is_refused_before_the_work(words, room, run, splat, capsys, monkeypatch):

@@ -32,7 +32,6 @@ LINES = {  # a command with its output {}; and one of its inputs that could be n
     "join": ("join {scene} --out {}", None),
     "label": ("label {run}/field --out {}", None),
     "pack": ("pack {packed} {}", "{packed}"),
-    "plan": ("plan {scene} --out {}", "{scene}/split.json"),
     "render": ("render {run} --out {}.gif", None),
     "search": ("search chair {run} --csv {}", None),
     "segment": ("segment {run}/field --out {}", None),
@@ -111,15 +110,15 @@ def test_no_command_replaces_what_it_reads(command, desk, tmp_path, capsys):
 
 
 FILES = {  # an existing file of the scene, the run or the user, and commands that would have replaced it
-    "{scene}/images/view_000.png": ["evaluate {run} --out", "plan {scene} --out", "search chair {run} --json"],
+    "{scene}/images/view_000.png": ["evaluate {run} --out", "search chair {run} --json"],
     "{scene}/features/view_000_fmap_CxHxW.pt": ["evaluate {run} --out"],
     "{scene}/sparse/0/images.bin": ["evaluate {run} --out"],
     "{scene}/split.json": ["evaluate {run} --out", "search chair {run} --json"],
     "{scene}/text.npy": ["evaluate {run} --out"],
-    "{scene}/classes.json": ["evaluate {run}/field --out", "plan {scene} --out"],
+    "{scene}/classes.json": ["evaluate {run}/field --out"],
     "{run}/field/field.safetensors": ["evaluate {run} --out", "evaluate {run}/field --out"],
     "{run}/color.ply": ["convert {run}/color.ply", "evaluate {run} --out"],
-    "{packed}": ["evaluate {packed} --out", "plan {scene} --run {packed} --out"],
+    "{packed}": ["evaluate {packed} --out"],
     "{labelled}": ["evaluate {labelled} --scene {scene} --protocol kfgs-removal --set before={labelled} --out"],
     "{table}": ["evaluate {run} --with-file {table} --out", "evaluate {run} --teacher lseg --weights {table} --out"],
     "{list}": ["evaluate {run} --truth {list} --out"],
@@ -131,9 +130,7 @@ def test_an_input_or_a_file_of_the_scene_is_not_replaced(file, line, desk, capsy
     refused(f"{line} {file}", desk, capsys, "give another")
 
 
-@pytest.mark.parametrize(
-    "option", ["segment {run}/field --labels", "plan {scene} --features", "evaluate {run} --truth"]
-)
+@pytest.mark.parametrize("option", ["segment {run}/field --labels", "evaluate {run} --truth"])
 def test_nothing_is_written_into_folders_that_an_option_names(option, desk, capsys):
     """Of maps and true labels, wherever they are."""
     (desk["tmp"] / "given").mkdir(exist_ok=True)
@@ -176,7 +173,6 @@ def test_what_a_command_makes_for_a_scene_or_beside_it_is_written(desk, capsys):
     for line, written in (
         (f"text --examples {examples} --field {run}/field --out {scene}/text.safetensors", scene / "text.safetensors"),
         (f"evaluate {run} --out {run}/scores.json", run / "scores.json"),
-        (f"plan {scene} --steps 10 --out {scene}/plan.json", scene / "plan.json"),
         (f"select chair {run}/field --out {scene}/chairs", scene / "chairs"),
     ):
         for _ in range(2):

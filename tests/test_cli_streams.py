@@ -58,7 +58,6 @@ def desk(tmp_path_factory):
         ("edit {0}/labelled.ply --remove floor --out {1}/a.ply", "a.ply.edits.json"),
         ("convert {0}/labelled.ply {1}/a.splat", "a.splat"),
         ("convert {0}/labelled.ply {1}/a --by-class", "a"),
-        ("plan {0}/scene --out {1}/a.json", "a.json"),
         ("search floor {0}/run --json {1}/a.json", "a.json"),
         ("compare {0}/run {0}/p.kfgs.safetensors --out {1}/a --pictures 0", "a/compare.json"),
         ("evaluate {0}/run --out {1}/a.json", "a.json"),

@@ -93,7 +93,6 @@ def test_every_public_name_is_called():
             ("distortion: expected a Distortion or None", "bool"),
         ),
         (lambda: kfgs.load_teacher([]), ("teacher: expected a name", "list")),
-        (lambda: kfgs.plan_scene(None), ("scene: expected a Scene", "NoneType", "load_scene")),
         (lambda: kfgs.score_views(None, None), ("gaussians: expected", "NoneType")),
         (lambda: SharedCodebook(torch.eye(3)).nearest(torch.eye(3), linear=True), ("linear: expected", "bool")),
         (lambda: SharedCodebook(torch.eye(3)).extended(torch.eye(3), linear=True), ("linear: expected", "bool")),

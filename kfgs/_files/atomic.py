@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import TypeVar
 
 from .errors import retold
-from .former import sweep_former
 from .locks import open_lock, try_lock
 from .own import check_inside, check_ordinary
 from .paths import as_path
@@ -59,7 +58,6 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         new = place / target.name
         yield new
         _make_ordinary(new)
-        sweep_former(target, new)
         os.replace(new, target)
 
 
@@ -83,7 +81,6 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
         for file in new.rglob("*"):
             if file.is_file() and not file.is_symlink():
                 _make_ordinary(file)
-        sweep_former(target, new)
         _put(new, target)
 
 

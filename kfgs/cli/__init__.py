@@ -27,7 +27,7 @@ from .._ranks import LostError, PeerError, first, place, together
 from .batch import batch
 from .blocks import blocks, join
 from .evaluate import compare, evaluate
-from .features import features, plan
+from .features import features
 from .fit import color, demo, fit, sfm, uplift
 from .output import called, open_streams, said_on_stderr, said_whole, say, warnings_as_notes
 from .pack import pack
@@ -43,7 +43,7 @@ from .view import view
 
 GROUPS: dict[str, tuple[Any, ...]] = {
     "Start here": (demo, info),
-    "Make a semantic field": (sfm, plan, features, text, fit, uplift),
+    "Make a semantic field": (sfm, features, text, fit, uplift),
     "More than one machine": (batch, blocks, join),
     "Ask it": (select, search, segment, label, view, render),
     "Store it": (pack, runs),

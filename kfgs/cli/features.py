@@ -1,15 +1,14 @@
-"""The commands plan (predict costs) and features (make or check feature maps)."""
+"""The command features: make feature maps, or check them."""
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from .._files import check_output
 from .files import check_alone
-from .options import Device, FieldMethod, Flag, Given, GivenLevel, Level, MapTeacher, SceneFolder, Views, fit_config
+from .options import Device, Flag, Given, GivenLevel, Level, MapTeacher, SceneFolder, Views
 from .output import say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -74,70 +73,6 @@ def features(
     say(f"{len(made.maps)} maps of {', '.join(shapes)} by {teacher_words(made.teacher)}")
     say(f"next: kfgs fit {scene} --out run" + ("" if out is None else f" --features {out}") + chosen)
     wrote([target])
-
-
-def plan(
-    scene: SceneFolder,
-    *,
-    features: Given[Path] = None,
-    run: Given[Path] = None,
-    store: Literal["keep", "discard", "recompute"] = "keep",
-    steps: Given[int] = None,
-    device: Device = "auto",
-    out: Given[Path] = None,
-    method: FieldMethod,
-    teacher: MapTeacher,
-    views: Views,
-) -> None:
-    """Predict disk, memory and minutes of `kfgs features` and `kfgs fit`.
-
-    Times are measured: the teacher sees one picture, and a few views and steps are tried. Existing maps and finished stages
-    take no time. Nothing is downloaded. The default teacher is lseg, which needs no weights here.
-
-    Examples:
-        kfgs plan scene/
-        kfgs plan scene/ --teacher clip --weights openai/clip-vit-base-patch16 --store discard
-
-    Args:
-        features: Folder of existing maps, in any layout that `kfgs fit` reads; by default SCENE/features.
-        run: Run folder of `kfgs fit` (its --out), to find finished stages.
-        store: keep the feature maps; discard them when the field is made (kfgs fit --discard-features); or recompute them
-            instead of storing (kfgs fit --teacher).
-        steps: Training steps; by default the preset's.
-        device: auto (a GPU if there is one), cpu or cuda.
-        out: Also write the plan to this .json file.
-    """
-    from .._files import write_json
-    from ..pipeline.plan import plan_scene
-    from ..pipeline.plan_maps import NamedTeacher
-    from ..scenes import load_scene
-
-    if out is not None:
-        check_output("out", out, "a file")
-    if features is not None and not features.is_dir():
-        raise ValueError(f"features: expected a folder of maps, got {features}, which is none; leave --features out")
-    if scene.is_file() and scene.suffix != ".json":
-        raise ValueError(
-            f"scene: expected the folder of one scene, got the file {scene}; of a list for `kfgs batch`, plan one typical scene, "
-            "and multiply by their number (docs/howto/slurm.md)"
-        )
-    config = fit_config(method, steps=steps, split=views.split)
-    name, weights = teacher.teacher, teacher.weights
-    named = teacher_options(name or "lseg", teacher.fast, teacher.size)
-    asked = name is not None or weights is not None or bool(named)
-    found = plan_scene(
-        load_scene(scene, images=views.images),
-        teacher=NamedTeacher(name or "lseg", weights, named) if asked else None,
-        config=dataclasses.replace(config, device=device),
-        dense=store,
-        features=scene_folder(scene) / "features" if features is None else features,
-        run=run,
-    )
-    if out is not None:
-        write_json(out, found.to_json())
-    say(str(found))
-    if out is not None:
-        wrote([out])
 
 
 def choose_teacher(name: str | None, weights: str | None, fast: bool, size: tuple[int, ...], device: str) -> Any:

@@ -23,8 +23,6 @@ from .evaluate import evaluate
 from .fit import fit_scene
 from .fuse import uplift
 from .label_pictures import segment_cameras, write_coco
-from .plan import Plan, plan_scene
-from .plan_maps import NamedTeacher
 from .question import Question, open_question
 from .results import Compared, Results
 from .run_report import write_run_report
@@ -35,8 +33,6 @@ __all__ = [
     "ColorConfig",
     "Compared",
     "FitConfig",
-    "NamedTeacher",
-    "Plan",
     "Question",
     "Results",
     "Run",
@@ -51,7 +47,6 @@ __all__ = [
     "label_cloud",
     "list_fields",
     "open_question",
-    "plan_scene",
     "read_cloud",
     "restore_field",
     "save_labelled",

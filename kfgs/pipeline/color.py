@@ -241,7 +241,7 @@ def make_color(
     result = ColorResult(params.activated().detach(), path, run.stages)
 
     def write() -> None:
-        if run.look_only or is_saved(path, result.gaussians):
+        if is_saved(path, result.gaussians):
             return
         if os.path.lexists(path):
             if not overwrite:

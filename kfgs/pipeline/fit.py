@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -18,7 +17,7 @@ import torch
 from torch import Tensor
 
 from .._card import short_repr
-from .._files import as_path, check_output, read_json, write_json
+from .._files import check_output, read_json, write_json
 from .._progress import Progress, as_progress
 from .._ranks import once
 from .._typed import typed
@@ -44,14 +43,14 @@ from ..quant import (
     quantize_maps,
 )
 from ..scenes import Scene
-from .color import ColorConfig, find_color
+from .color import ColorConfig
 from .config import FitConfig
 from .earlier import digest_lenses, find_earlier
 from .fuse import answers_stage, find_geometry, uplift_stage, without_lens
 from .maps import KnownFeatures, Maps, as_maps, check_readable, map_digests, map_shape
 from .points import with_points
 from .runs import check_current, keep_field, say_kept
-from .stages import Run, Stage, UnfinishedError, digest_scene, digest_tensors, stage_generator
+from .stages import Run, Stage, digest_scene, digest_tensors, stage_generator
 from .train import check_scene, field_stage, training_device, with_extent
 
 
@@ -322,28 +321,6 @@ def _job(run: Run, scene: Scene, maps: Maps, config: FitConfig, device: torch.de
     straight = without_lens(scene, maps, config)
     features = {"files": map_digests(run, straight), "lenses": digest_lenses(straight)}
     return _Job(run, scene, views, straight, features, config, device, progress)
-
-
-def finished_stages(scene: Scene, maps: Maps | None, folder: str | Path, config: FitConfig) -> set[str]:
-    """The names of the stages in a run folder that `fit_scene` would reuse; nothing is written.
-
-    Args:
-        scene: as for `fit_scene`.
-        maps: as for `fit_scene`; None if there are none yet: then only stages without maps are found.
-        folder: the run folder; it may be missing.
-        config: as for `fit_scene`.
-    """
-    run, device = Run(as_path(folder), look_only=True), torch.device("cpu")
-    with suppress(UnfinishedError):
-        if config.method == "paper" or scene.splat is None:
-            scene = with_points(run, scene, scene.views(config.split), config.seed, False)
-        if maps is not None:
-            _make_field(_job(run, scene, maps, config, device, False), None)
-        elif config.method == "fuse":
-            find_geometry(run, scene, None, _color_config(config), device, False)
-    names = {stage.name for stage in run.stages}
-    longer = config.method == "fuse" and find_color(run, scene, _color_config(config)) is not None
-    return names | {"color"} if longer else names
 
 
 def _color_config(config: FitConfig) -> ColorConfig:

@@ -65,10 +65,6 @@ def read_stage(file: Path) -> dict[str, Any]:
         return {**about, "name": str(about["name"]), "seconds": float(about["seconds"])}
 
 
-class UnfinishedError(Exception):
-    """A stage is not in the run folder, and `Run.look_only` forbids to make it."""
-
-
 @dataclass
 class Run:
     """The stages of one run folder, in the order of use.
@@ -85,8 +81,6 @@ class Run:
     folder: Path
     report: Callable[[str], None] | None = None
     stages: list[Stage] = field(default_factory=list)
-    look_only: bool = False
-    """Make and write nothing: a stage that is not finished raises `UnfinishedError`, and files are not digested."""
 
     def stage(self, name: str, inputs: dict[str, Any], make: Callable[[Path], float | None]) -> Stage:
         """Return the finished stage of these inputs; make it if it does not exist.
@@ -100,7 +94,6 @@ class Run:
 
         Raises:
             ValueError: if a folder of that key is damaged.
-            UnfinishedError: if the stage does not exist, and `look_only` is True.
         """
         key = _key(name, inputs)
         target = self.folder / "stages" / f"{name}-{key}"
@@ -117,8 +110,6 @@ class Run:
                 )
             done = Stage(name, key, target, about["seconds"], True)
             self.say(f"{name}: found in {target.name} (made in {done.seconds:.1f} s)")
-        elif self.look_only:
-            raise UnfinishedError(name)
         else:
             self.say(f"{name}: working")
             start = time.perf_counter()
@@ -161,10 +152,7 @@ class Run:
         return self.folder / "unfinished" / f"{name}-{_key(name, inputs)}"
 
     def digests(self, paths: Sequence[Path]) -> list[list[str]]:
-        """[file name, SHA-256] of each file; unchanged files are not read again.
-
-        With `look_only`, a file that would have to be read gets "unknown", which matches no finished stage.
-        """
+        """[file name, SHA-256] of each file; unchanged files are not read again."""
         return once(lambda: self._digests(paths))  # type: ignore[no-any-return]
 
     def _digests(self, paths: Sequence[Path]) -> list[list[str]]:
@@ -175,9 +163,6 @@ class Run:
             mark = [info.st_size, info.st_mtime_ns, info.st_ctime_ns]
             known = cache.get(str(real_path(path)))
             if not (isinstance(known, list) and known[:-1] == mark and isinstance(known[-1], str)):
-                if self.look_only:
-                    result.append([path.name, "unknown"])
-                    continue
                 known = [*mark, digest_file(path)]
                 cache[str(real_path(path))] = known
                 changed = True

@@ -8,7 +8,7 @@ from messages import tells
 
 from kfgs._files import HIDDEN
 from kfgs.cameras import Camera
-from kfgs.pipeline.stages import Run, UnfinishedError, digest_scene, digest_tensors
+from kfgs.pipeline.stages import Run, digest_scene, digest_tensors
 from kfgs.scenes import Scene
 
 
@@ -119,23 +119,6 @@ def test_reports_say_what_was_made_and_what_was_found(tmp_path):
     Run(tmp_path, lines.append).stage("a", {}, lambda folder: None)
     Run(tmp_path, lines.append).stage("a", {}, lambda folder: None)
     assert [line.split(" in ")[0] for line in lines] == ["a: working", "a: done", "a: found"]
-
-
-def test_looking_makes_and_writes_nothing(tmp_path):
-    picture = tmp_path / "a.png"
-    picture.write_text("picture")
-    calls: list[str] = []
-    made = Run(tmp_path / "run").stage("a", {"x": 1}, _maker(calls, "one"))
-    before = sorted((tmp_path / "run").rglob("*"))
-    run = Run(tmp_path / "run", look_only=True)
-    assert run.stage("a", {"x": 1}, _maker(calls, "two")).key == made.key
-    assert run.digests([picture]) == [["a.png", "unknown"]]
-    with pytest.raises(UnfinishedError):
-        run.stage("a", {"x": 2}, _maker(calls, "three"))
-    assert sorted((tmp_path / "run").rglob("*")) == before
-    assert calls == ["one"]
-    known = Run(tmp_path / "run").digests([picture])
-    assert run.digests([picture]) == known
 
 
 def a_scene() -> Scene:

@@ -19,7 +19,7 @@ from kfgs.features import FeatureFolder
 from kfgs.fields import SemanticField
 from kfgs.formats import write_splats
 from kfgs.formats.ply import write_ply
-from kfgs.pipeline import fit_scene, plan_scene
+from kfgs.pipeline import fit_scene
 from kfgs.scenes import SceneError, is_scene
 from kfgs.scenes.scene import Scene
 
@@ -117,10 +117,6 @@ def test_a_splat_needs_no_points(room: Path, output: Path, tmp_path: Path) -> No
     bare = dataclasses.replace(scene, points=torch.zeros(0, 3), colors=torch.zeros(0, 3, dtype=torch.uint8))
     maps = FeatureFolder(room / "features").of(bare, "train")
     assert [stage.name for stage in fit_scene(bare, maps, tmp_path / "run").stages] == ["uplift"]
-    planned = plan_scene(bare, features=room / "features")
-    assert "no colours are trained" in str(planned)
-    assert [stage.what for stage in planned.stages if "color" in stage.name] == ["done already"]
-    assert "has 0 points" not in str(planned)
 
 
 def test_attach_takes_the_folder(room: Path, output: Path, tmp_path: Path) -> None:
