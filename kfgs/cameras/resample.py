@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from kornia.geometry.transform import resize
 from torch import Tensor
@@ -91,6 +93,17 @@ def resize_labels(
         for new, old in zip(_check_size(size), labels.shape, strict=True)
     )
     return labels[rows[:, None], columns]
+
+
+def fits_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two (height, width) have the same aspect, up to one pixel (or cell) of rounding in the smaller one.
+
+    Example:
+        >>> fits_aspect((90, 120), (360, 480)), fits_aspect((48, 64), (479, 640)), fits_aspect((120, 90), (360, 480))
+        (True, True, False)
+    """
+    (h, w), (H, W) = sorted((size, other), key=math.prod)
+    return abs(h - H * w / W) <= 1 or abs(w - W * h / H) <= 1
 
 
 def _check_size(size: tuple[int, int]) -> tuple[int, int]:

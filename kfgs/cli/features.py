@@ -13,8 +13,6 @@ from .output import say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
-MISFITS = 3  # maps named in notes
-
 
 def features(
     scene: SceneFolder,
@@ -113,18 +111,12 @@ def teacher_options(name: str, fast: bool, size: tuple[int, ...]) -> dict[str, A
 
 
 def stored_maps(scene: Any, views: list[int], folder: Path, level: Level | None) -> Any:
-    """The maps of some views of a scene, with a note for each whose shape does not fit its picture."""
+    """The maps of some views of a scene."""
     from ..features import FeatureFolder
 
     maps = FeatureFolder(folder, level=level or "default").of(scene, views)
     if not maps.has_masks:
         check_alone("level", level, f"with {folder}, whose maps are not LangSplat's")
-    problems = maps.check(values=False).problems
-    for name, texts in list(problems.items())[:MISFITS]:
-        say(f"note: {name}: {'; '.join(texts)}")
-    if len(problems) > MISFITS:
-        option = "" if level is None else f" --level {level}"
-        say(f"note: and {len(problems) - MISFITS} more; `kfgs features SCENE --check {folder}{option}` lists them")
     return maps
 
 

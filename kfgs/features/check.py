@@ -7,9 +7,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from .._rows import EPS, row_norms
+from ..cameras.resample import fits_aspect
 from ..scenes.files import some
 from .finder import MapFinder
-from .layouts import Reading, StoredMap, count_bad, fits_aspect, read_rows
+from .layouts import Reading, StoredMap, count_bad, read_rows
 
 HOLES = 0.5  # share of all-zero features from which a map gets a note
 Shape = tuple[int, int, int]  # (h, w, D)
@@ -76,13 +77,16 @@ def check_maps(finder: MapFinder, sizes: dict[str, Size], reading: Reading, *, v
     files = _find(finder, list(sizes), report)
     names = {stem: file.relative_to(finder.path).as_posix() for stem, file in files.items()}
     shapes: dict[str, Shape] = {}
+    own: set[str] = set()  # views whose maps are those that kfgs made
     kinds: Counter[str] = Counter()
     for stem, file in files.items():
         record = finder.records.get(stem)
-        if record and file == finder.path / record.file and (doubt := record.doubt(file, read=values)):
-            report.notes[names[stem]].append(
-                f"{doubt} since kfgs wrote it; `kfgs features` makes it again if it differs"
-            )
+        if record and file == finder.path / record.file:
+            if doubt := record.doubt(file, read=values):
+                text = f"{doubt} since kfgs wrote it; `kfgs features` makes it again if it differs"
+                report.notes[names[stem]].append(text)
+            else:
+                own.add(stem)
         try:
             stored = finder.open(stem, file, replace(reading, size=sizes[stem]))
         except (ValueError, TypeError) as error:
@@ -98,29 +102,33 @@ def check_maps(finder: MapFinder, sizes: dict[str, Size], reading: Reading, *, v
     report.bytes = sum(file.stat().st_size for file in files.values())
     if not shapes:
         return report
-    common = Counter(shapes.values()).most_common(1)[0][0]
-    report.shape, report.dtype = common, kinds.most_common(1)[0][0]
-    channels, stretched = reading.channels or common[2], []
-    for stem, (h, w, D) in shapes.items():
-        size, same = sizes[stem], (h, w) == common[:2]
+    report.shape, report.dtype = Counter(shapes.values()).most_common(1)[0][0], kinds.most_common(1)[0][0]
+    channels = reading.channels or report.shape[2]
+    for stem, (_, _, D) in shapes.items():
         if channels != D:
             report.problems[names[stem]].append(f"expected {channels} channels, got {D}")
-        if not same:
-            report.problems[names[stem]].append(
-                f"expected {common[0]} x {common[1]} cells as most maps have, got {h} x {w}"
-            )
-        if size is None or fits_aspect((h, w), size):
-            continue
-        turned = _turned((h, w, D), size)
-        if same and not turned:
-            stretched.append(stem)
+    cells = Counter((h, w) for h, w, _ in shapes.values()).most_common()
+    if len(cells) > 1:
+        listed = [f"{h} x {w} ({count})" for (h, w), count in cells]
+        report.notes[""].append(f"maps of {len(cells)} sizes: {some(listed)}")
+    known = {stem: size for stem, size in sizes.items() if size is not None and stem in shapes}
+    misfits = [stem for stem, size in known.items() if not fits_aspect(shapes[stem][:2], size)]
+    stretched = []
+    for stem in misfits:
+        (h, w, D), (H, W) = shapes[stem], known[stem]
+        fixed = len(cells) == 1 and (
+            stem in own or len(misfits) < len(known)
+        )  # the encoder has one grid for all pictures
+        turned = "" if fixed else _turned((h, w, D), (H, W))
+        if turned or ((h, w) != cells[0][0] and stem not in own):
+            text = f"expected the aspect of a picture of {H} x {W} pixels, got {h} x {w} cells{turned}"
+            report.problems[names[stem]].append(text)
         else:
-            text = f"expected the aspect of a picture of {size[0]} x {size[1]} pixels, got {h} x {w} cells"
-            report.problems[names[stem]].append(text + turned)
+            stretched.append(stem)
     if stretched:
         text = f"maps of another aspect than their pictures: {len(stretched)} of {len(shapes)} ({some(stretched, 3)})"
-        cells = f"{common[0]} x {common[1]} cells"
-        report.notes[""].append(f"{text}, all of {cells}; each is taken to cover its whole picture")
+        which = f", all of {cells[0][0][0]} x {cells[0][0][1]} cells" if len(cells) == 1 else ""
+        report.notes[""].append(f"{text}{which}; each is taken to cover its whole picture")
     return report
 
 
@@ -149,9 +157,8 @@ def _turned(shape: Shape, size: tuple[int, int]) -> str:
     h, w, D = shape
     if fits_aspect((w, h), size):
         return " (transposed?)"
-    other = fits_aspect((D, h), size) or fits_aspect(
-        (w, D), size
-    )  # [h, w, D] read as [D, h, w], or the other way round
+    # [h, w, D] read as [D, h, w], or the other way round
+    other = max(h / w, w / h) > 3 and (fits_aspect((D, h), size) or fits_aspect((w, D), size))
     return f" (axes of {D} channels in another order?)" if other else ""
 
 

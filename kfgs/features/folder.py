@@ -35,8 +35,8 @@ class FeatureFolder(Sequence[Tensor]):
     subfolder of the same name; if no view has a map there, all subfolders are searched for the last part of its name. If
     kfgs filled the folder (it holds `features.json`), maps of other programs or of a killed process are refused.
 
-    No map is kept in memory. Every map must have the same size; an all-zero feature means "unknown". Maps that kfgs wrote
-    and later discarded (`features.json` says so) may be missing until one is read.
+    No map is kept in memory. Maps may differ in size (pictures of several sizes), not in channels; an all-zero feature means
+    "unknown". Maps that kfgs wrote and later discarded (`features.json` says so) may be missing until one is read.
 
     Args:
         path: the folder.
@@ -53,7 +53,7 @@ class FeatureFolder(Sequence[Tensor]):
         FileNotFoundError: if views have no map; the message names them. When a map is read: if it was discarded.
         ValueError: if `stems` is empty or repeats one, several files may be meant, or `features.json` is damaged or has no
             record of a view's file. Without `stems` this is checked at first use. When a map is read: if it cannot be read,
-            is not finite, or is of another size than the first; the message names the file.
+            is not finite, or has other channels than the first; the message names the file.
         TypeError: when a map is read: if the file holds anything but one tensor.
 
     Example:
@@ -111,11 +111,11 @@ class FeatureFolder(Sequence[Tensor]):
     ) -> FeatureReport:
         """Check the map of every view, and report everything that does not fit.
 
-        Problems: no map, or several; a file that cannot be read or holds no map of floats; unexpected channels; a size
-        that most maps do not have, or that looks transposed; NaN or infinite values; a map of zeros only; a map without a
-        record in a folder that kfgs filled. Notes: maps of one size with another aspect than the pictures by more than one
-        cell (from encoders with a fixed grid); double precision; many all-zero features; maps of no view; discarded maps;
-        maps that changed since kfgs wrote them.
+        Problems: no map, or several; a file that cannot be read or holds no map of floats; unexpected channels; a map that
+        looks transposed, or has another aspect than its picture by more than one cell; NaN or infinite values; a map of
+        zeros only; a map without a record in a folder that kfgs filled. Notes: maps of several sizes; maps of one size with
+        another aspect than the pictures (from encoders with a fixed grid); double precision; many all-zero features; maps of
+        no view; discarded maps; maps that changed since kfgs wrote them.
 
         Memory holds a few rows of one map at a time.
 
@@ -162,7 +162,7 @@ class FeatureFolder(Sequence[Tensor]):
 
     @cached_property
     def shape(self) -> tuple[int, int, int]:
-        """(h, w, D) of every map; opens the first file, without reading its values."""
+        """(h, w, D) of the first map; opens its file, without reading its values."""
         record = self._finder.record(self.stems[0], self.files[0])
         h, w, D = map(int, record.shape if record else self._open(0).shape)
         if self.channels is not None and self.channels != D:
@@ -187,7 +187,7 @@ class FeatureFolder(Sequence[Tensor]):
         if isinstance(index, slice):
             sizes = None if self.sizes is None else self.sizes[index]
             return self._with(self.stems[index], sizes)
-        return self._read(index)
+        return self._read(index, self._checked(index))
 
     def grid(self, i: int, step: tuple[int, int] | None, samples: int) -> Tensor:  # [n, D] float32
         """`quant.sample_grid(maps[i], step, samples=samples)`, reading no more of the file than these pixels.
@@ -195,8 +195,9 @@ class FeatureFolder(Sequence[Tensor]):
         Raises:
             ValueError: as when the whole map is read, but only the values that are read are checked.
         """
-        rows, columns = grid_slices(*self.shape[:2], step, samples=samples)
-        return self._read(i, rows, columns).reshape(-1, self.shape[2])
+        stored = self._checked(i)
+        rows, columns = grid_slices(int(stored.shape[0]), int(stored.shape[1]), step, samples=samples)
+        return self._read(i, stored, rows, columns).flatten(0, 1)
 
     def blocks(self, i: int) -> Iterator[Tensor]:  # each [at most 32, w, D] float32
         """Read a map a few rows at a time, which takes less memory than `maps[i]`.
@@ -210,23 +211,16 @@ class FeatureFolder(Sequence[Tensor]):
             yield block
 
     def check_files(self) -> None:
-        """Open the file of every map without reading its values: a file that is cut short is found before a long run.
-
-        Maps that are not there (discarded) are left out.
+        """`check` every map without reading its values, before a long run. Discarded maps are left out.
 
         Raises:
-            ValueError, TypeError: as when a map is read; with several damaged ones, the first is named, and the others counted.
+            ValueError: if one does not fit; the first is named, and the others counted.
         """
-        bad: list[ValueError | TypeError] = []
-        for i, file in enumerate(self.files):
-            try:
-                if file.is_file():
-                    self._checked(i)
-            except (ValueError, TypeError) as error:
-                bad.append(error)
-        if bad:
+        bad = self.check(values=False).problems
+        for name, texts in bad.items():
+            advice = "" if "; " in texts[0] else f"; {AGAIN}"
             more = f" ({len(bad) - 1} more do not fit; `kfgs features SCENE --check {self.path}` names them)"
-            raise type(bad[0])(str(bad[0]) + (more if len(bad) > 1 else "")) from bad[0]
+            raise ValueError(f"{self.path / name}: {texts[0]}{advice}{more if len(bad) > 1 else ''}")
 
     def digests(self) -> list[list[str]] | None:
         """[file name, SHA-256] of each view's map, or None if the caller should compute them from the files.
@@ -265,12 +259,11 @@ class FeatureFolder(Sequence[Tensor]):
         return self._finder.open(stem, file, replace(self.reading, size=size))
 
     def _checked(self, i: int) -> StoredMap:  # [h, w, D]
-        """View i's map on disk, if it has the size of the first."""
+        """View i's map on disk, if it has the channels of the first."""
         stored = self._open(i)
-        if tuple(stored.shape) != self.shape:
+        if stored.shape[2] != self.shape[2]:
             raise ValueError(
-                f"{self.files[i]}: expected a map of (h, w, D) = {self.shape} as in {self.files[0].name}, got "
-                f"{tuple(stored.shape)}; encode all views with the same settings"
+                f"{self.files[i]}: expected {self.shape[2]} channels as in {self.files[0].name}, got {stored.shape[2]}; {AGAIN}"
             )
         return stored
 
@@ -278,9 +271,11 @@ class FeatureFolder(Sequence[Tensor]):
         if bad:
             raise ValueError(f"{self.files[i]}: expected finite features, got {bad} NaN or infinite values; {AGAIN}")
 
-    def _read(self, i: int, rows: slice = slice(None), columns: slice = slice(None)) -> Tensor:  # [h, w, D]
-        """Some rows and columns of view i's map, if it has the size of the first and they are finite."""
-        stored, (h, w, D) = self._checked(i), self.shape
+    def _read(
+        self, i: int, stored: StoredMap, rows: slice = slice(None), columns: slice = slice(None)
+    ) -> Tensor:  # [rows, columns, D]
+        """Some rows and columns of view i's map, if they are finite."""
+        h, w, D = map(int, stored.shape)
         values = torch.empty(len(range(h)[rows]), len(range(w)[columns]), D, dtype=torch.float32)
         self._refuse_bad(i, sum(count_bad(block) for block in read_rows(stored, rows, columns, out=values)))
         return values

@@ -18,6 +18,7 @@ from .._check import check_shapes
 from .._files import as_path, atomic_path
 from .._torch_files import Placeholder, check_plain, load_torch_file
 from .._typed import typed
+from ..cameras.resample import fits_aspect
 from ..scenes.files import some
 from .langsplat import INDEX, ROWS, MaskFeatures
 
@@ -207,17 +208,6 @@ def find_axes(name: str, shape: tuple[int, ...], reading: Reading = Reading()) -
             "or the size of the picture, or save it as [h, w, D]"
         )
     return "h w D"
-
-
-def fits_aspect(cells: tuple[int, int], size: tuple[int, int]) -> bool:
-    """Whether a grid of (h, w) cells has the aspect of a picture of (H, W) pixels, up to one cell of rounding.
-
-    Example:
-        >>> fits_aspect((90, 120), (360, 480)), fits_aspect((48, 64), (479, 640)), fits_aspect((120, 90), (360, 480))
-        (True, True, False)
-    """
-    (h, w), (H, W) = cells, size
-    return abs(h - H * w / W) <= 1 or abs(w - W * h / H) <= 1
 
 
 def write_npy_map(

@@ -100,7 +100,8 @@ def _describe_other_maps(path: Path, error: SceneError) -> str:
         raise error
     maps = FeatureFolder(path)
     h, w, D = maps.shape
-    return f"{path}: {len(maps)} feature maps of another program\n  {h} x {w} cells, {D} channels"
+    notes = "".join(f"\n  {note}" for note in maps.check(values=False).notes[""])
+    return f"{path}: {len(maps)} feature maps of another program\n  {h} x {w} cells, {D} channels{notes}"
 
 
 def _photos_in(path: Path) -> Path | None:

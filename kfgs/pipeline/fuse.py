@@ -166,8 +166,10 @@ def uplift(
         report: called with a line per step.
 
     Raises:
-        ValueError: if counts disagree, a camera has distortion, or no view shows any Gaussian.
+        ValueError: if counts disagree, a camera has distortion, a map's file does not fit, or no view shows any Gaussian.
     """
+    if hasattr(maps, "check_files"):
+        maps.check_files()
     config = config or FitConfig(uplift=UpliftConfig())
     cameras = tuple(scene.cameras[i] for i in scene.views(config.split))
     if scene.distorted:

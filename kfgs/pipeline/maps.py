@@ -24,9 +24,9 @@ class Maps(Protocol):
     """Teacher maps, one per view, read at each access; an all-zero feature means "unknown".
 
     Six more members are used if they exist: `identity`, JSON of the teacher; `digests() -> list[list[str]] | None`, a digest
-    of each map if known without reading the files; `shape`, (h, w, D) without reading values; `check_files()`, which raises
-    before the work if a file is damaged; `grid(i, step, samples)`, see `fit_codebook`; and `blocks(i)`, the map a few rows
-    at a time.
+    of each map if known without reading the files; `shape`, (h, w, D) of the first map without reading it; `check_files()`,
+    which raises before the work if a map does not fit; `grid(i, step, samples)`, see `fit_codebook`; and `blocks(i)`, the map
+    a few rows at a time. Maps may differ in size, as pictures do, but not in channels.
     """
 
     @property
@@ -70,7 +70,7 @@ class UndistortedMaps:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(h, w, D) of every map; undistorting does not change it."""
+        """(h, w, D) of the first map; undistorting does not change it."""
         return map_shape(self.maps)
 
     def digests(self) -> list[list[str]] | None:
@@ -124,7 +124,7 @@ class ChosenMaps(Sequence[Tensor]):
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(h, w, D) of every map."""
+        """(h, w, D) of the first of all maps."""
         return map_shape(self._maps)
 
     def digests(self) -> list[list[str]] | None:

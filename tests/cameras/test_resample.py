@@ -4,7 +4,7 @@ import torch
 from messages import tells
 
 from kfgs.cameras import resize_labels, resize_map
-from kfgs.cameras.resample import from_bchw, to_bchw
+from kfgs.cameras.resample import fits_aspect, from_bchw, to_bchw
 
 
 def ramp(height, width, dtype=torch.float64):
@@ -127,3 +127,21 @@ def test_arrays_are_resized_as_tensors_are():
     assert resize_labels(np.array([[0, 1, 2, -1]]), (1, 2)).tolist() == [[1, -1]]
     with pytest.raises(TypeError, match=tells("map", "str")):
         resize_map("a.png", (2, 3))
+
+
+@pytest.mark.parametrize(
+    ("cells", "size", "fits"),
+    [
+        ((90, 120), (360, 480), True),
+        ((24, 32), (360, 480), True),
+        ((26, 64), (430, 1036), True),  # 26.6 rows, cut
+        ((27, 64), (430, 1036), True),  # and rounded
+        ((48, 64), (479, 640), True),
+        ((120, 90), (360, 480), False),
+        ((90, 90), (360, 480), False),
+        ((92, 120), (360, 480), False),
+    ],
+)
+def test_aspect_up_to_one_cell(cells, size, fits):
+    assert fits_aspect(cells, size) is fits
+    assert fits_aspect(size, cells) is fits

@@ -70,21 +70,21 @@ def test_all_that_does_not_fit_is_reported_at_once_by_file(folder):
     assert report.problems["nan.npy"] == ["2 NaN or infinite values"]
     assert report.problems["zero.npy"] == ["every feature is all-zero"]
     assert report.problems["wide.npy"] == ["expected 16 channels, got 17"]
-    assert report.problems["small.npy"] == ["expected 6 x 8 cells as most maps have, got 3 x 4"]
+    assert "small.npy" not in report.problems  # in the aspect of its picture
     assert report.problems["turned.npy"] == [
-        "expected 6 x 8 cells as most maps have, got 8 x 6",
         "expected the aspect of a picture of 60 x 80 pixels, got 8 x 6 cells (transposed?)",
     ]
+    assert report.notes[""] == ["maps of 3 sizes: 6 x 8 (6), 3 x 4 (1), 8 x 6 (1)"]
     assert report.problems["whole.npy"] == [
         "expected floating-point features, got int32; encode it again, or leave the photo out (split.json)"
     ]
     assert "cannot be read" in report.problems["junk_fmap_CxHxW.pt"][0]
     assert report.problems["gone.npy"] == ["missing"]
     lines = str(report).splitlines()
-    assert lines[0].startswith(f"{folder}: 3 of 11 views have a map that fits; 6 x 8 cells, 16 channels, float16")
+    assert lines[0].startswith(f"{folder}: 4 of 11 views have a map that fits; 6 x 8 cells, 16 channels, float16")
     assert len(lines) == 9
-    assert sum(line.startswith("turned.npy: ") and "; expected the aspect" in line for line in lines) == 1
-    with pytest.raises(ValueError, match=tells("11 views", "got 8", "3 more")):
+    assert sum(line.startswith("turned.npy: expected the aspect") for line in lines) == 1
+    with pytest.raises(ValueError, match=tells("11 views", "got 7", "2 more")):
         report.raise_if_bad()
 
 
@@ -120,11 +120,18 @@ def test_a_square_grid_over_pictures_of_any_aspect_is_a_note(tmp_path):
     assert "2 of 3 (a, b), all of 8 x 8 cells" in report.notes[""][0]
     np.save(tmp_path / "b.npy", features(1, (9, 9, 16)).numpy())  # one that differs is a problem
     assert check(tmp_path, views).problems == {
-        "b.npy": [
-            "expected 8 x 8 cells as most maps have, got 9 x 9",
-            "expected the aspect of a picture of 80 x 60 pixels, got 9 x 9 cells",
-        ]
+        "b.npy": ["expected the aspect of a picture of 80 x 60 pixels, got 9 x 9 cells"]
     }
+
+
+def test_one_grid_of_kfgs_for_pictures_of_another_aspect_is_no_problem(folder):
+    Manifest({"name": "t"}, {stem: record_of(folder, stem) for stem in "abc"}).save(folder)
+    report = check(folder, pictures("a", "b", "c", size=(80, 60)))  # a part of the views: all portraits
+    assert report.ok
+    assert "another aspect" in report.notes[""][0]
+    os.utime(folder / "b.npy", ns=(1, 1))
+    report = check(folder, pictures("a", "b", "c", size=(80, 60)), values=False)
+    assert list(report.problems) == ["b.npy"]  # perhaps another file
 
 
 def test_maps_that_are_all_transposed_are_a_problem(folder):

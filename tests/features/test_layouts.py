@@ -11,7 +11,6 @@ from kfgs.features.layouts import (
     LANGSPLAT,
     Reading,
     find_axes,
-    fits_aspect,
     layout_of,
     open_map,
     read_rows,
@@ -115,23 +114,6 @@ def test_channels_first_comes_back_channels_last(tmp_path, suffix):
 def test_double_precision_beyond_single_is_infinite(tmp_path):
     np.save(tmp_path / "a.npy", np.array([[[1e300, 1.5]]]))
     assert whole(open_map(tmp_path / "a.npy")).tolist() == [[[float("inf"), 1.5]]]
-
-
-@pytest.mark.parametrize(
-    ("cells", "size", "fits"),
-    [
-        ((90, 120), (360, 480), True),
-        ((24, 32), (360, 480), True),
-        ((26, 64), (430, 1036), True),  # 26.6 rows, cut
-        ((27, 64), (430, 1036), True),  # and rounded
-        ((48, 64), (479, 640), True),
-        ((120, 90), (360, 480), False),
-        ((90, 90), (360, 480), False),
-        ((92, 120), (360, 480), False),
-    ],
-)
-def test_aspect_up_to_one_cell(cells, size, fits):
-    assert fits_aspect(cells, size) is fits
 
 
 def test_a_view_of_both_layouts_is_told_by_the_partner(tmp_path):
