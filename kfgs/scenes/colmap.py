@@ -67,8 +67,8 @@ def load_colmap(path: str | Path, images: str | Path) -> Scene:
 
     Args:
         path: the model's folder (cameras, images, points3D; binary or text; with or without rigs and frames).
-        images: the folder that the model's image names are relative to. Its pictures may be smaller than the model says,
-            as in `images_2`, `images_4` of Mip-NeRF 360: the cameras are resized to them.
+        images: the folder that the model's image names are relative to. Its pictures may have another size than the model
+            says, as in `images_2`, `images_4` of Mip-NeRF 360: the cameras are resized to them.
 
     Returns:
         The scene in natural order of names, points in order of their COLMAP ids, every view in the `train` split.

@@ -24,7 +24,7 @@ from ..formats.folders import newest_splat
 from ..formats.table import read_splats
 from ..formats.values import SH_C0
 from .files import MAX_NUMBER, MAX_SIDE, SceneError, list_images, read_scene_json, some
-from .posed import Matrix, PosedPicture, picture_size, read_points, scene_of_poses
+from .posed import Matrix, PosedPicture, read_points, scene_of_poses
 from .scene import Scene
 
 CAMERAS, SETTINGS, POINTS = "cameras.json", "cfg_args", "input.ply"
@@ -60,17 +60,13 @@ def load_inria(folder: str | Path, images: str | Path | None = None) -> Scene:
         raise SceneError(f"{path}: expected a list of cameras, got {type(entries).__name__}; {_AGAIN}")
     pictures = as_path(images) if images is not None else _find_pictures(folder, settings)
     names = _names(path, entries, pictures)
-    views, order, missing, sizes = [], [], [], dict[tuple[int, int], tuple[int, int]]()
+    views, order, missing = [], [], []
     for i, (entry, name) in enumerate(zip(entries, names, strict=True)):
         if name is None:
             missing.append(str(entry["img_name"]))
             continue
         pose, K, size = _camera(f"{path}, camera {i}", entry)
-        if size not in sizes:  # pictures of one size were resized to one size: only the first is looked at
-            sizes[size] = _true_size(pictures / name, size)
-        width, height = sizes[size]
-        K = np.diag([width / size[0], height / size[1], 1.0]) @ K
-        views.append(PosedPicture(name, pictures / name, pose, f"{path}, camera {i}", (K, (width, height))))
+        views.append(PosedPicture(name, pictures / name, pose, f"{path}, camera {i}", (K, size)))
         order.append(name)
     if not views:
         raise SceneError(
@@ -80,11 +76,6 @@ def load_inria(folder: str | Path, images: str | Path | None = None) -> Scene:
     notes = (
         [f"{len(missing)} of {len(entries)} cameras have no picture in {pictures}: {some(missing)}"] if missing else []
     )
-    notes += [
-        f"{size}: pictures are {true} pixels; cameras were resized to them"
-        for size, true in sizes.items()
-        if size != true
-    ]
     scene = scene_of_poses(folder, views, None, None, _points(folder), notes)
     held_out = _held_out(order) if settings.get("eval") is True else set()
     test = [i for i, camera in enumerate(scene.cameras) if camera.name in held_out]
@@ -186,17 +177,6 @@ def _camera(where: str, entry: dict[str, Any]) -> tuple[Matrix, Matrix, tuple[in
             f"{where}: expected a rotation [3][3] and a position [3], got {error!r:.100}; {_AGAIN}"
         ) from error
     return pose, np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]]), (int(width), int(height))
-
-
-def _true_size(picture: Path, size: tuple[int, int]) -> tuple[int, int]:
-    """(width, height) of the pictures, which may be smaller or larger than the cameras say (`images_4`)."""
-    width, height = picture_size(picture)
-    if abs(size[1] / size[0] * width - height) > max(1.0, width / size[0]):
-        raise SceneError(
-            f"{picture}: expected a picture in the shape of {size[0]}x{size[1]} pixels, as {CAMERAS} says, got {width}x{height}; "
-            "name the folder of the pictures that 3DGS was trained on (images=, or --images)"
-        )
-    return width, height
 
 
 def _points(folder: Path) -> tuple[Tensor, Tensor]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from .._arrays import read_array
 from .._files import as_path
+from ..cameras.resample import fits_aspect
 from .files import SceneError, list_images, natural_key
 from .posed import PosedPicture, picture_size, scene_of_poses
 from .scene import Scene
@@ -28,8 +29,8 @@ def is_llff(folder: Path) -> bool:
 def load_llff(folder: str | Path, images: str | Path | None = None) -> Scene:
     """Read `poses_bounds.npy` and as many pictures: `images/`, or `images_4/` and the like.
 
-    Pictures smaller than the poses say are fine if they have the same shape: the focal length is scaled. The principal
-    point is the middle of the picture. There are no points.
+    A picture smaller than its row says is fine if it has the same shape: the focal length is scaled. The principal point is
+    the middle of the picture. There are no points.
 
     Args:
         folder: the scene.
@@ -53,17 +54,16 @@ def load_llff(folder: str | Path, images: str | Path | None = None) -> Scene:
     for i, (name, row) in enumerate(zip(sorted(names, key=natural_key), rows, strict=True)):
         pose = np.eye(4)
         pose[:3] = np.stack([row[:, 1], row[:, 0], -row[:, 2], row[:, 3]], 1)
-        views.append(PosedPicture(name, source / name, pose, f"{path}, row {i}"))
-    height, width, focal = rows[0, :, 4]
-    size = picture_size(views[0].path)
-    factor = size[0] / width
-    if not (focal > 0 and abs(size[1] - height * factor) <= 1.5):
-        raise SceneError(
-            f"{views[0].path}: expected the shape {width:g}x{height:g} that {path} says, or a smaller picture of that shape, "
-            f"got {size[0]}x{size[1]}; were the pictures cropped or turned?"
-        )
-    K = np.array([[focal * factor, 0, size[0] / 2], [0, focal * size[1] / height, size[1] / 2], [0, 0, 1]])
-    return scene_of_poses(folder, views, K, size)
+        (height, width, focal), size = row[:, 4], picture_size(source / name)
+        if not fits_aspect((size[1], size[0]), (height, width)):
+            raise SceneError(
+                f"{source / name}: expected the shape {width:g}x{height:g} that {path}, row {i}, says, got "
+                f"{size[0]}x{size[1]}; was the picture cropped or turned? give the one that the poses were made for"
+            )
+        K = np.diag([focal * (size[0] / width), focal * size[1] / height, 1.0])
+        K[:2, 2] = size[0] / 2, size[1] / 2
+        views.append(PosedPicture(name, source / name, pose, f"{path}, row {i}", (K, size)))
+    return scene_of_poses(folder, views, None, None)
 
 
 def _read(path: Path) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:  # [V, 3, 5]
@@ -75,10 +75,10 @@ def _read(path: Path) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:  # [
         got = f"{values.dtype} {values.shape}"
         raise SceneError(f"{path}: expected floats [V, 17] as LLFF writes them, got {got}; copy it again")
     matrices = values[:, :15].astype(np.float64).reshape(-1, 3, 5)
-    if not (matrices[0, :, 4] > 0).all():
+    if not (matrices[..., 4] > 0).all():
         raise SceneError(
-            f"{path}: expected height, width and focal length above 0 in the fifth column, got {matrices[0, :, 4].tolist()}; "
-            "copy it again"
+            f"{path}: expected height, width and focal length above 0 in the fifth column, got "
+            f"{matrices[..., 4].min(0).tolist()}; copy it again"
         )
     return matrices
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from .._card import short_repr
 from ..cameras.camera import Camera
+from ..cameras.resample import fits_aspect
 from ..formats.ply import points_from_columns, read_ply
 from .files import MAX_NUMBER, SceneError, is_file, list_images, natural_key, open_picture, read_image, some
 from .scene import Scene
@@ -49,40 +51,31 @@ def picture_size(path: Path) -> tuple[int, int]:
 
 
 def as_large_as_pictures(
-    cameras: list[Camera], paths: Sequence[Path], folder: Path | None
+    cameras: Sequence[Camera], paths: Sequence[Path], folder: Path | None = None
 ) -> tuple[list[Camera], list[str]]:
-    """Cameras for pictures that may be smaller than the cameras say, as in `images_4`, and a note if they are.
-
-    Args:
-        cameras: as the model says. Pictures of one camera size must all have one size: only the first is looked at.
-        paths: their pictures.
-        folder: of the pictures. One called `images_N` must hold pictures that are N times smaller.
+    """Each camera in the size of its own picture, which may be a resized copy (`images_4`), and a note if some are.
 
     Raises:
-        SceneError: if a picture is larger than its camera, or of another shape.
+        SceneError: if a picture has another shape than its camera.
     """
-    where = folder if folder is not None and paths and paths[0].is_relative_to(folder) else Path("images")
-    named = re.fullmatch(r"images_(\d+)", where.name)
-    sizes: dict[tuple[int, int], tuple[int, int]] = {}
+    fitting, factors = [], Counter[str]()
     for camera, path in zip(cameras, paths, strict=True):
-        if camera.size in sizes:
-            continue
         width, height = picture_size(path)
-        factor = int(named[1]) if named else max(1.0, camera.width / width)
-        odd = max(abs(camera.width - factor * width), abs(camera.height - factor * height)) > factor
-        if odd and (height, width) != camera.size:
-            shape, reason = (f"1/{factor}", "the name of its folder") if named else ("the shape", "its camera")
+        if not fits_aspect((height, width), camera.size):
             raise SceneError(
-                f"{path}: expected a picture of {shape} of {camera.width}x{camera.height} pixels, as {reason} says, "
-                f"got {width}x{height}; give the pictures that the cameras were made for, or smaller copies of them"
+                f"{path}: expected a picture in the shape of {camera.width}x{camera.height} pixels, as its camera says, got "
+                f"{width}x{height}; replace it by the picture that the camera was made for, or by a copy at another size"
             )
-        sizes[camera.size] = (height, width)
-    changed = [(size, small) for size, small in sizes.items() if size != small]
-    if not changed:
-        return cameras, []
-    (_, width), (_, small) = changed[0]
-    note = f"{where.name}: pictures are {width / small:.3g} times smaller than the model says; cameras were resized to them"
-    return [camera.resized(*sizes[camera.size]) for camera in cameras], [note]
+        if (height, width) != camera.size:
+            small = camera.width / width
+            factors[f"{small:.3g} times smaller" if small >= 1 else f"{1 / small:.3g} times larger"] += 1
+        fitting.append(camera if (height, width) == camera.size else camera.resized(height, width))
+    if not factors:
+        return fitting, []
+    where = folder.name if folder is not None and paths[0].is_relative_to(folder) else "images"
+    count = "" if factors.total() == len(paths) else f"{factors.total()} of {len(paths)} "
+    said = some([factor for factor, _ in factors.most_common()], 3)
+    return fitting, [f"{where}: {count}pictures are {said} than the model says; cameras were resized to them"]
 
 
 def read_numbers(path: Path, expected: str) -> Matrix:  # [rows, columns]
@@ -168,8 +161,10 @@ def scene_of_poses(
 ) -> Scene:
     """A scene of pictures with poses; views without a pose (not finite) are left out and noted.
 
+    Cameras are resized to their pictures (`as_large_as_pictures`).
+
     Raises:
-        SceneError: if no view has a pose, or a pose is no rigid motion.
+        SceneError: if no view has a pose, a pose is no rigid motion, or a picture has another shape than its camera.
     """
     views = sorted(views, key=lambda view: natural_key(view.name))
     known = [bool(np.isfinite(view.pose).all() and np.abs(view.pose).max() < MAX_NUMBER) for view in views]
@@ -192,12 +187,14 @@ def scene_of_poses(
             cameras.append(Camera(torch.from_numpy(viewmat).float(), *lens, view.name))
         except ValueError as error:
             raise SceneError(f"{view.origin}: {error}; copy the poses again") from error
+    paths = [view.path for view in posed]
+    cameras, resized = as_large_as_pictures(cameras, paths)
     said = [f"{len(lost)} views have no pose (not finite) and were left out: {some(lost)}"] if lost else []
     if points is None:
         points = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)
         said.append("no points: `kfgs fit` and `kfgs color` triangulate some from the poses before they train")
     splits = {"train": list(range(len(cameras))), "test": []}
-    return Scene(cameras, [view.path for view in posed], *points, splits, (*notes, *said)).with_near()
+    return Scene(cameras, paths, *points, splits, (*notes, *resized, *said)).with_near()
 
 
 def read_points(path: Path) -> tuple[Tensor, Tensor]:  # [P, 3] float32, [P, 3] uint8

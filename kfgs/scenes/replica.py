@@ -38,7 +38,6 @@ def load_nice_slam(folder: str | Path) -> Scene:
     folder = as_path(folder)
     K, size, scale = _cam_params(folder)
     views, notes = numbered_pictures(folder / "results", r"frame(\d+)\.(?:jpg|jpeg|png)", folder / "traj.txt")
-    _check_size(views[0].path, size, "cam_params.json says")
     depths = [view.path.with_name(Path(view.name).stem.replace("frame", "depth") + ".png") for view in views]
     return scene_of_poses(folder, views, K, size, points_from_depth(views, depths, K, scale), notes)
 
@@ -60,14 +59,20 @@ def load_semantic_nerf(folder: str | Path) -> Scene:
     """
     folder = as_path(folder)
     views, notes = numbered_pictures(folder / "rgb", r"rgb_(\d+)\.(?:png|jpg)", folder / "traj_w_c.txt")
-    size = width, height = picture_size(views[0].path)
-    focal = width / 2 / math.tan(_FIELD_OF_VIEW / 2)
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    views = [view._replace(lens=_centred(picture_size(view.path))) for view in views]
     depths = [folder / "depth" / (Path(view.name).stem.replace("rgb", "depth") + ".png") for view in views]
     note = (
         "no file has the intrinsics of Semantic-NeRF's renders: 90 degrees across and a centred principal point assumed"
     )
-    return scene_of_poses(folder, views, K, size, points_from_depth(views, depths, K, _MILLIMETRES), [*notes, note])
+    points = points_from_depth(views, depths, None, _MILLIMETRES)
+    return scene_of_poses(folder, views, None, None, points, [*notes, note])
+
+
+def _centred(size: tuple[int, int]) -> tuple[Matrix, tuple[int, int]]:
+    """K and the size of a render of Semantic-NeRF."""
+    width, height = size
+    focal = width / 2 / math.tan(_FIELD_OF_VIEW / 2)
+    return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), size
 
 
 def _cam_params(folder: Path) -> tuple[Matrix, tuple[int, int], float]:
@@ -91,12 +96,3 @@ def _cam_params(folder: Path) -> tuple[Matrix, tuple[int, int], float]:
         )
     K = np.array([[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1]], dtype=np.float64)  # also of large whole numbers
     return K, (int(w), int(h)), float(scale)
-
-
-def _check_size(path: Path, size: tuple[int, int], says: str) -> None:
-    got = picture_size(path)
-    if got != size:
-        raise SceneError(
-            f"{path}: expected {size[0]}x{size[1]} pixels as {says}, got {got[0]}x{got[1]}; correct the file, or copy the "
-            "pictures again"
-        )

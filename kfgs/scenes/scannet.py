@@ -46,10 +46,11 @@ def load_scannet(folder: str | Path) -> Scene:
     for name in with_pose:
         file = folder / "pose" / f"{file_stem(name)}.txt"
         views.append(PosedPicture(name, folder / "color" / name, _matrix(file), str(file)))
-    K, size = _matrix(folder / "intrinsic" / "intrinsic_color.txt")[:3, :3], picture_size(views[0].path)
+    K = _matrix(folder / "intrinsic" / "intrinsic_color.txt")[:3, :3]
+    size, largest = max((picture_size(view.path), view.path) for view in views)  # others may be smaller copies
     if not (0 < K[0, 2] < size[0] and 0 < K[1, 2] < size[1]):
         raise SceneError(
-            f"{folder / 'intrinsic/intrinsic_color.txt'}: expected a principal point inside {views[0].path} "
+            f"{folder / 'intrinsic/intrinsic_color.txt'}: expected a principal point inside {largest} "
             f"({size[0]}x{size[1]} pixels), got ({K[0, 2]:g}, {K[1, 2]:g}); give pictures of the size that was exported"
         )
     notes = []

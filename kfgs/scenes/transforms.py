@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .._files import as_path
 from ..cameras.camera import Camera
-from .files import IMAGE_SUFFIXES, SceneError, is_file, natural_key, read_image, read_scene_json, some
+from .files import IMAGE_SUFFIXES, SceneError, is_file, natural_key, read_scene_json, some
 from .posed import MILLIMETRE, as_large_as_pictures, picture_size, points_of_cameras, read_points
 from .scene import Scene
 from .transforms_frame import Frame
@@ -44,7 +44,7 @@ def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene
 
     Intrinsics may be at the top or in each frame (the frame wins): `w, h, fl_x, fl_y, cx, cy`, `camera_angle_x`
     and `camera_angle_y` (radians) if focal lengths are missing, `k1 k2 p1 p2 [k3]` or, with a fisheye, `k1 k2 k3 k4`.
-    Without `w, h` the size of the picture is taken, without `cx, cy` its centre.
+    Without `w, h` each frame has the size of its own picture, without `cx, cy` its centre.
 
     A frame whose file is missing is left out and named in `notes`. Frames outside the scene folder (an absolute path, or
     `..`) are read if they are image files, and counted in `notes`. `ply_file_path` gives the points if it is inside the
@@ -54,7 +54,7 @@ def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene
 
     Args:
         path: the file, or a folder with `transforms.json` or `transforms_train.json`.
-        images: where to look for image files before the scene folder. Smaller ones than the file says resize the cameras.
+        images: where to look for image files before the scene folder. Other sizes than the file says resize the cameras.
 
     Returns:
         The scene in natural order of names. Splits come from the file (`train_filenames`, `test_filenames`) or from Blender's
@@ -156,7 +156,6 @@ def _frames(reader: _Reader, top: dict[str, Any]) -> Iterator[tuple[Frame, Any]]
 def _read_frames(reader: _Reader) -> dict[str, Any]:
     """Fill `reader.views`; return the top level of the file."""
     top = _read_top(reader)
-    sizes: dict[str, tuple[int, int]] = {}
     for frame, values in _frames(reader, top):
         merged, listed = frame.values, frame.values.get("file_path")
         if not isinstance(listed, str) or not listed:
@@ -166,11 +165,10 @@ def _read_frames(reader: _Reader) -> dict[str, Any]:
             reader.missing.append(listed)
             continue
         reader.masked += "mask_path" in values
-        if "w" not in merged or "h" not in merged:
-            if "all" not in sizes:  # Blender writes no size; pictures of other sizes fail in Scene.image
-                height, width = read_image(file).shape[:2]
-                sizes["all"] = width, height
-            merged["w"], merged["h"] = sizes["all"]
+        if not {"w", "h"} <= set(
+            merged
+        ):  # Blender writes no size; a smaller copy in `images` is not what the file is about
+            merged["w"], merged["h"] = picture_size(_find_image(replace(reader, images=None), listed) or file)
         reader.depths.append(_depth_file(reader, merged))
         reader.views.append((frame.camera(_name(reader, file)), file))
     return top

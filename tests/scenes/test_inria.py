@@ -160,7 +160,7 @@ def test_smaller_pictures_resize_the_cameras(room: Path, output: Path, tmp_path:
     with Image.open(truth.image_paths[0]) as picture:
         for path in truth.image_paths:
             picture.resize((30, 60)).save(small / path.name)
-    with pytest.raises(SceneError, match=tells("30x60", "--images")):
+    with pytest.raises(SceneError, match=tells("30x60", "a copy at another size")):
         load_scene(output, images=small)
 
 

@@ -139,9 +139,30 @@ def test_smaller_pictures_resize_the_cameras(tmp_path: Path) -> None:
         assert scene.cameras[0].K[0, 0] == f
         assert scene.image(0).shape[:2] == scene.cameras[0].size
         assert any(note.startswith(f"{images}: pictures are {50 / f:g} times smaller") for note in scene.notes)
-    (tmp_path / "images_4").rename(tmp_path / "images_8")
-    with pytest.raises(SceneError, match=tells("images_8/a.png", "1/8 of 64x48", "16x12")):
-        load_transforms(file, tmp_path / "images_8")
+
+
+def test_without_a_size_every_frame_has_that_of_its_own_picture(tmp_path: Path) -> None:
+    """camera_angle_x is across each picture: f = width / 2 / tan(angle / 2)."""
+    sizes = [(64, 48), (48, 64), (96, 72)]
+    frames = [{"file_path": f"images/{i}.png", "transform_matrix": LOOK_X} for i in range(3)]
+    nothing = dict.fromkeys(("w", "h", "fl_x", "fl_y", "cx", "cy"))
+    file = _write(tmp_path, frames, camera_angle_x=0.9, **nothing)
+    for i, (width, height) in enumerate(sizes):
+        write_picture(tmp_path / f"images/{i}.png", height, width)
+    for camera, (width, height) in zip(load_transforms(file).cameras, sizes, strict=True):
+        f = width / 2 / math.tan(0.45)
+        assert camera.size == (height, width)
+        torch.testing.assert_close(camera.K, torch.tensor([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]]))
+    frames[1]["w"], frames[1]["h"] = 96, 128  # twice as large as its picture
+    file = _write(tmp_path / "stated", frames, fl_x=50, **{k: None for k in nothing if k != "fl_x"})
+    for i, (width, height) in enumerate(sizes):
+        write_picture(tmp_path / f"stated/images/{i}.png", height, width)
+        write_picture(tmp_path / f"half/{i}.png", height // 2, width // 2)
+    assert [float(camera.K[0, 0]) for camera in load_transforms(file).cameras] == [50, 25, 50]
+    halved = load_transforms(file, tmp_path / "half")  # fl_x is about the pictures that the file names
+    assert [float(camera.K[0, 0]) for camera in halved.cameras] == [25, 12.5, 25]
+    (tmp_path / "stated/images/2.png").unlink()
+    assert any("1 of 3 frames have no image file" in note for note in load_transforms(file).notes)
 
 
 def test_paths_out_of_the_folder_must_be_images_and_are_noted(tmp_path: Path) -> None:
