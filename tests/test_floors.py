@@ -19,7 +19,7 @@ ROOT = Path(kfgs.__file__).parent
 FLOORS = (
     {"_card", "_names", "_ranks"},
     {"_check", "_compiling", "_files", "_interrupts", "_notes", "_progress", "_rows", "_tensors"},
-    {"_typed"},
+    {"_typed", "_origin"},
     {"_arrays", "_torch_files", "gaussians", "cameras", "page"},
     {"splat", "quant", "metrics"},
     {"formats"},

@@ -141,8 +141,8 @@ def read_torch(path: Path, expected: str) -> Any:
         raise ValueError(f"{path}: expected {expected}, got {error}") from error
 
 
-def plain_tensor(path: Path, name: str, value: object) -> Tensor:
-    """A tensor of a file as float32, without its graph.
+def plain_tensor(path: Path, name: str, value: object, dtype: torch.dtype = torch.float32) -> Tensor:
+    """A tensor of a file as floats, without its graph.
 
     Raises:
         ValueError: if it is no dense tensor of finite numbers.
@@ -155,7 +155,7 @@ def plain_tensor(path: Path, name: str, value: object) -> Tensor:
         check_plain(value)
     except TorchFileError as error:
         raise ValueError(f"{path}: {name} is {error}") from error
-    found = value.detach().float()
+    found = value.detach().to(dtype)
     if not bool(torch.isfinite(found).all()):
         raise ValueError(f"{path}: expected finite numbers for {name}, got NaN or infinity; did the training diverge?")
     return found

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from .._card import cut
 from .._check import ORIGIN, as_origin, as_tensor, check_choice, check_range, check_shapes, moved_to
+from .._origin import to_world
 
 DistortionModel = Literal["brown_conrady", "kannala_brandt"]
 COEFFICIENTS = {"brown_conrady": (4, 5, 8), "kannala_brandt": (4,)}
@@ -172,10 +173,11 @@ class Camera:
         return Camera(viewmat.to(like), K.to(like), width, height, name, near=near)
 
     def __repr__(self) -> str:
-        x, y, z = self.center.tolist()
+        center = to_world(self.center, self.origin)
         fov = 2 * math.degrees(math.atan(self.height / 2 / float(self.K[1, 1])))
         lens = "" if self.distortion is None else f", {self.distortion.model}"
-        return f"Camera({cut(self.name, 80)!r}, {self.width}x{self.height}, fov {fov:.1f}, at ({x:.4g}, {y:.4g}, {z:.4g}){lens})"
+        place = ", ".join(f"{value:.{4 if self.origin == ORIGIN else 10}g}" for value in center.tolist())
+        return f"Camera({cut(self.name, 80)!r}, {self.width}x{self.height}, fov {fov:.1f}, at ({place}){lens})"
 
     @property
     def size(self) -> tuple[int, int]:
@@ -184,7 +186,7 @@ class Camera:
 
     @property
     def center(self) -> Tensor:  # [3]
-        """The camera's position in the world."""
+        """The camera's position, counted from `origin`."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     @property

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from .._check import check_range, check_shapes
+from .._check import ORIGIN, check_range, check_shapes
+from .._origin import FAR_UNITS, Origin
 from .._typed import typed
 from .camera import Camera
 
@@ -105,18 +106,31 @@ class Similarity:
     def __matmul__(self, first: Similarity) -> Similarity:
         return self.compose(first)
 
+    def between_worlds(self, src: Origin, dst: Origin) -> Similarity:
+        """The same motion in the world, of a similarity of coordinates that are counted from an origin on each side."""
+        far, near = (torch.tensor(origin, dtype=torch.float64) for origin in (src, dst))
+        return replace(self, translation=self.translation + near - self.scale * (self.rotation @ far))
+
     @typed
     def apply_to_camera(self, camera: Camera) -> Camera:
         """The camera that takes the same picture of the moved scene.
 
         Its viewmat stays a rigid motion, [R_c R^T, s t_c - R_c R^T t], so depths and `near` become `scale` times as large; K,
-        the size and the lens stay.
+        the size and the lens stay. The camera's `origin` moves with it.
         """
         view = camera.viewmat.detach().double().cpu()
         moved = torch.eye(4, dtype=torch.float64)
+        local, origin = self.between_origins(camera.origin)
         moved[:3, :3] = view[:3, :3] @ self.rotation.T
-        moved[:3, 3] = self.scale * view[:3, 3] - moved[:3, :3] @ self.translation
-        return replace(camera, viewmat=moved.to(camera.viewmat), near=self.scale * camera.near)
+        moved[:3, 3] = self.scale * view[:3, 3] - moved[:3, :3] @ local.translation
+        return replace(camera, viewmat=moved.to(camera.viewmat), near=self.scale * camera.near, origin=origin)
+
+    def between_origins(self, origin: Origin) -> tuple[Similarity, Origin]:
+        """The same motion of coordinates counted from an origin, and the origin that the moved ones are counted from."""
+        x, y, z = (self.scale * (self.rotation @ torch.tensor(origin, dtype=torch.float64)) + self.translation).tolist()
+        if origin == ORIGIN and max(abs(x), abs(y), abs(z)) <= FAR_UNITS:
+            return self, ORIGIN
+        return replace(self, translation=torch.zeros(3)), (x, y, z)
 
 
 def fit_similarity(

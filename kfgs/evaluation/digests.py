@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from ..gaussians import FACTS
+
 
 def digest_data(value: Any) -> str:
     """SHA-256 of tensors, arrays, numbers, texts, and of lists, mappings, dataclasses and plain objects of them.
@@ -50,7 +52,9 @@ def _add(state: Any, value: Any) -> None:
         for one in value:
             _add(state, one)
     elif is_dataclass(value) and not isinstance(value, type):
-        _add(state, {entry.name: getattr(value, entry.name) for entry in fields(value)})
+        entries = {entry.name: (getattr(value, entry.name), entry.default) for entry in fields(value)}
+        # facts of a cloud came later than its tensors: where there are none, old digests stay valid
+        _add(state, {name: now for name, (now, usual) in entries.items() if name not in FACTS or now != usual})
     elif hasattr(value, "__dict__") and not isinstance(value, type):
         _add(state, vars(value))
     else:

@@ -11,14 +11,16 @@ import torch
 from torch import Tensor
 
 from .._arrays import read_safetensors
-from .._check import check_choice
+from .._check import ORIGIN, as_origin, check_choice
 from .._files import as_path, atomic_folder, atomic_path, current_file, digest_file, open_current, read_json, write_json
 from .._files.fields import DESCRIPTION as DESCRIPTION
 from .._files.fields import NUMBERS as TENSORS
 from .._files.fields import SUFFIX as SUFFIX
 from .._files.fields import describes_field as describes_field
+from .._origin import Origin
 from .._tensors import save_tensors
 from ..cameras import Camera
+from ..gaussians import TENSORS as CLOUD
 from ..gaussians import Gaussians
 from ..labels import LabelSet
 from ..quant import Autoencoder, Codebook, LinearLatents
@@ -188,7 +190,8 @@ def _to_tensors(parts: Mapping[str, Any]) -> tuple[dict[str, Tensor], dict[str, 
         json.dumps(parts["info"], allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ValueError(f"info: expected what JSON can hold, got {error}; use strings and finite numbers") from error
-    tensors = {f"gaussians.{name}": value for name, value in vars(gaussians).items() if value is not None}
+    values = ((name, getattr(gaussians, name)) for name in CLOUD)
+    tensors = {f"gaussians.{name}": value for name, value in values if value is not None}
     for part in ("codebook", "autoencoder", "linear"):
         if parts[part] is not None:
             tensors |= {f"{part}.{name}": value for name, value in parts[part].to_tensors().items()}
@@ -197,12 +200,15 @@ def _to_tensors(parts: Mapping[str, Any]) -> tuple[dict[str, Tensor], dict[str, 
     if parts["seen"] is not None:
         tensors |= {f"seen.{name}": value for name, value in parts["seen"]._asdict().items()}
     if cameras:
+        cameras = [camera.with_origin(gaussians.origin) for camera in cameras]
         tensors["cameras.viewmats"] = torch.stack([camera.viewmat for camera in cameras])
         tensors["cameras.Ks"] = torch.stack([camera.K for camera in cameras])
     description = {
         "gaussians": len(gaussians),
         "cameras": [[camera.name, camera.width, camera.height, camera.near] for camera in cameras],
         "info": parts["info"],
+        **({"origin": gaussians.origin} if any(gaussians.origin) else {}),
+        **({"antialiased": True} if gaussians.antialiased else {}),
     }
     if words is not None:
         tensors["words.embeddings"] = words.embeddings
@@ -218,16 +224,17 @@ def _from_tensors(name: str, tensors: dict[str, Tensor], description: dict[str, 
     """The parts of a field, which fit together; a ValueError that begins with `name` if they do not."""
     try:
         linear, seen, answers = (_part(tensors, part) for part in ("linear", "seen", "answers"))
+        origin, antialiased = as_origin(description.get("origin", ORIGIN)), bool(description.get("antialiased", False))
         codebook, autoencoder, words = (_part(tensors, part) for part in ("codebook", "autoencoder", "words"))
         found: dict[str, Any] = {
-            "gaussians": Gaussians(**_part(tensors, "gaussians")),
+            "gaussians": Gaussians(**_part(tensors, "gaussians"), origin=origin, antialiased=antialiased),
             "codebook": Codebook.from_tensors(codebook) if codebook else None,
             "autoencoder": Autoencoder.from_tensors(autoencoder) if autoencoder else None,
             "info": check_notes(description["info"]),
             "linear": LinearLatents.from_tensors(linear) if linear else None,
             "answers": answers.get("latents"),
             "seen": Seen(**seen) if seen else None,
-            "cameras": _cameras(description.get("cameras", []), _part(tensors, "cameras")),
+            "cameras": _cameras(description.get("cameras", []), _part(tensors, "cameras"), origin),
             "words": _label_set(words, description["words"]) if words else None,
         }
         check_parts(*(found[one] for one in ("gaussians", "codebook", "autoencoder", "linear", "answers", "seen")))
@@ -248,7 +255,7 @@ def _label_set(tensors: dict[str, Tensor], names: dict[str, Any]) -> LabelSet:
     )
 
 
-def _cameras(rows: list[Any], tensors: dict[str, Tensor]) -> tuple[Camera, ...]:
+def _cameras(rows: list[Any], tensors: dict[str, Tensor], origin: Origin) -> tuple[Camera, ...]:
     if not rows:
         return ()
     for _, width, height, _ in rows:
@@ -257,7 +264,9 @@ def _cameras(rows: list[Any], tensors: dict[str, Tensor]) -> tuple[Camera, ...]:
                 f"cameras: expected at most {PIXELS:,} pixels, as a picture has, got {width:,} x {height:,}"
             )
     both = zip(rows, tensors["viewmats"], tensors["Ks"], strict=True)
-    return tuple(Camera(E, K, width, height, name, near=near) for (name, width, height, near), E, K in both)
+    return tuple(
+        Camera(E, K, width, height, name, near=near, origin=origin) for (name, width, height, near), E, K in both
+    )
 
 
 def _part(tensors: dict[str, Tensor], kind: str) -> dict[str, Tensor]:

@@ -90,7 +90,7 @@ def _gsplat(path: Path, top: Any) -> Gaussians:
             f"{path}: expected colours as spherical harmonics (sh0, shN), got features for a network (app_opt); export a PLY "
             "with gsplat (--save_ply), or train without app_opt"
         )
-    raw = {name: plain_tensor(path, name, splats.get(name)) for name in (*_NAMES, "sh0")}
+    raw = {name: plain_tensor(path, name, splats.get(name), _dtype(name)) for name in (*_NAMES, "sh0")}
     rest = plain_tensor(path, "shN", splats["shN"]) if "shN" in splats else raw["sh0"][:, :0]
     return _cloud(path, raw, raw["sh0"], rest)
 
@@ -105,7 +105,10 @@ def _splatfacto(path: Path, state: dict[Any, Any]) -> Gaussians:
             "is this a checkpoint of another method?"
         )
     (prefix,) = prefixes
-    raw = {name: plain_tensor(path, prefix + name, state.get(prefix + name)) for name in (*_NAMES, "features_dc")}
+    raw = {
+        name: plain_tensor(path, prefix + name, state.get(prefix + name), _dtype(name))
+        for name in (*_NAMES, "features_dc")
+    }
     dc = raw["features_dc"] if raw["features_dc"].ndim == 3 else raw["features_dc"][:, None]
     rest = (
         plain_tensor(path, "features_rest", state[f"{prefix}features_rest"])
@@ -115,6 +118,10 @@ def _splatfacto(path: Path, state: dict[Any, Any]) -> Gaussians:
     if rest.ndim == 3 and rest.shape[1] == 0:  # trained without harmonics
         dc = (dc.sigmoid() - 0.5) / SH_C0
     return _cloud(path, raw, dc, rest)
+
+
+def _dtype(name: str) -> torch.dtype:
+    return torch.float64 if name == "means" else torch.float32  # places may be far from zero
 
 
 def _cloud(path: Path, raw: dict[str, Tensor], dc: Tensor, rest: Tensor) -> Gaussians:

@@ -52,6 +52,7 @@ from .values import (
 NAME = "gltf"
 SUFFIXES = (".glb", ".gltf")
 HOLDS_LABELS = True
+HOLDS_ORIGIN = True
 EXTENSION = "KHR_gaussian_splatting"
 KERNEL, COLOR_SPACE, PROJECTION, SORTING = "ellipse", "srgb_rec709_display", "perspective", "cameraDistance"
 _UNDERSTOOD = (EXTENSION, "KHR_mesh_quantization")
@@ -151,7 +152,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "nodes": [{"mesh": 0, **({"translation": list(g.origin)} if any(g.origin) else {})}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": writer.accessors,
         "bufferViews": writer.views,
@@ -271,7 +272,7 @@ def _join(parts: list[_Part]) -> _Part:
     """Join primitives to one cloud: harmonics are padded to the highest degree; columns stay if all have them."""
     if len(parts) == 1:
         return parts[0]
-    clouds = [part.gaussians for part in parts]
+    clouds = [part.gaussians.with_origin(parts[0].gaussians.origin) for part in parts]
     most = max(cloud.sh.shape[1] for cloud in clouds if cloud.sh is not None)
     same_names = len({part.classes for part in parts if part.gaussians.labels is not None}) <= 1
     labelled = same_names and any(cloud.labels is not None for cloud in clouds)

@@ -134,7 +134,7 @@ def _read_section(
         quantum = s.quantum or 32767
         with np.errstate(over="ignore", invalid="ignore"):  # overflow is refused below
             offsets = (means - quantum) * np.float32(s.block_size / 2 / quantum)
-            means = offsets + centres[_buckets(path, s, lengths)]
+            means = offsets.astype(np.float64) + centres[_buckets(path, s, lengths)]
     scales, quats = rows["scales"].astype(np.float32), rows["quats"].astype(np.float32)
     sh = rows["sh"].astype(np.float32)
     if level == 2:

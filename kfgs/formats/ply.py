@@ -257,9 +257,9 @@ def stack_columns(columns: Columns, names: list[str]) -> Tensor:  # [N, len(name
     return torch.from_numpy(np.stack([columns[name] for name in names], -1).astype(np.float32))
 
 
-def points_from_columns(columns: Columns) -> Tensor:  # [N, 3]
+def points_from_columns(columns: Columns) -> Tensor:  # [N, 3] float64
     """The x, y, z columns as one tensor; a ValueError says which is missing."""
     missing = [name for name in "xyz" if name not in columns]
     if missing:
         raise ValueError(f"columns: expected x, y and z, {', '.join(missing)} missing; got {sorted(columns)[:12]}")
-    return stack_columns(columns, ["x", "y", "z"])
+    return torch.from_numpy(np.stack([columns[name] for name in "xyz"], -1).astype(np.float64))

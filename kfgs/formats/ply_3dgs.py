@@ -14,16 +14,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from .._check import ORIGIN
+from .._origin import to_world
 from ..gaussians import Gaussians
 from .ply import points_from_columns, read_comments, read_ply, stack_columns, write_ply
 from .render_mode import comments_of_mode, mode_from_comments
 from .splat_file import Columns, Precision, SplatFile
-from .values import EXACT, check_finite, colours_to_write, describe_loss, positive_scales
+from .values import EXACT, check_finite, colours_to_write, describe_loss, near_zero, positive_scales
 
 NAME = "ply"
 SUFFIXES = (".ply",)
 MAGIC = b"ply"
 HOLDS_LABELS = True
+HOLDS_ORIGIN = True
 NORMALS = ("nx", "ny", "nz")  # always zero in 3DGS files; written, not kept
 COEFFICIENTS = 16  # of harmonics of degree 3, which Inria's script always writes
 
@@ -54,9 +57,13 @@ def read(path: Path) -> SplatFile:
 
 
 def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
-    """Write the 3DGS layout, labels and extra columns included; nothing is lost."""
+    """Write the 3DGS layout, labels and extra columns included; x, y, z are double if it has an origin. Nothing is lost."""
     comments = ("written by kfgs", *comments_of_mode(splats.info))
-    write_ply(path, columns_from_gaussians(splats.gaussians) | splats.extra, comments=comments)
+    columns = columns_from_gaussians(splats.gaussians)
+    if any(splats.gaussians.origin):
+        places = to_world(splats.gaussians.means.detach().cpu(), splats.gaussians.origin)
+        columns |= {name: places[:, i].numpy() for i, name in enumerate("xyz")}
+    write_ply(path, columns | splats.extra, comments=comments)
     return ()
 
 
@@ -69,7 +76,7 @@ def write_plain(path: Path, splats: SplatFile) -> tuple[str, ...]:
     g = colours_to_write(splats.gaussians, what)
     assert g.sh is not None
     whole = torch.nn.functional.pad(g.sh, (0, 0, 0, COEFFICIENTS - g.sh.shape[1]))
-    write(path, SplatFile(g.replace(sh=whole, features=None, labels=None), info=splats.info))
+    write(path, SplatFile(g.replace(sh=whole, features=None, labels=None, origin=ORIGIN), info=splats.info))
     return describe_loss(splats, what, 3)
 
 
@@ -128,7 +135,7 @@ def gaussians_from_columns(columns: Columns) -> Gaussians:
         if rest:  # stored channel-major
             higher = stack_columns(columns, rest).view(len(dc), 3, len(rest) // 3).transpose(1, 2)
         sh = torch.cat([dc, higher], 1)
-    return Gaussians(
+    cloud = Gaussians(
         means=points_from_columns(columns),
         quats=stack_columns(columns, [f"rot_{i}" for i in range(4)]),
         scales=stack_columns(columns, [f"scale_{i}" for i in range(3)]).exp(),
@@ -137,6 +144,7 @@ def gaussians_from_columns(columns: Columns) -> Gaussians:
         sh=sh,
         labels=_labels(columns["class_id"]) if "class_id" in columns else None,
     )
+    return near_zero(cloud)
 
 
 def _labels(values: NDArray[Any]) -> Tensor:  # [N] -> [N] int64

@@ -11,7 +11,9 @@ import torch
 from numpy.typing import NDArray
 
 from .._arrays import read_arrays
+from .._check import ORIGIN, as_origin
 from .._files import as_path, atomic_path, digest_file, read_json, real_path, write_json
+from .._origin import Origin
 from .splat_file import SCORE, SplatFile
 
 _NPZ_HEADERS = 1 << 16  # bytes of headers in an .npz file of three arrays
@@ -37,6 +39,12 @@ def labels_path(path: str | Path) -> Path:
     return path.with_name(path.name + ".labels.npz")
 
 
+def origin_path(path: str | Path) -> Path:
+    """`scene.splat` -> `scene.splat.origin.json`: where in the world the (0, 0, 0) of a file lies that holds float32 only."""
+    path = as_path(path)
+    return path.with_name(path.name + ".origin.json")
+
+
 def write_names(path: str | Path, classes: tuple[str, ...], **facts: Any) -> Path:
     """Write the class names of a splat file next to it, with details about how its labels were made."""
     target = names_path(path)
@@ -44,8 +52,8 @@ def write_names(path: str | Path, classes: tuple[str, ...], **facts: Any) -> Pat
     return target
 
 
-def write_sidecar(path: Path, splats: SplatFile, *, holds_labels: bool) -> list[Path]:
-    """Write the labels and names that the format cannot store, and delete those of an older `path`.
+def write_sidecar(path: Path, splats: SplatFile, *, holds_labels: bool, holds_origin: bool) -> list[Path]:
+    """Write the labels, names and origin that the format cannot store, and delete those of an older `path`.
 
     Names are written for every labelled file, even if the format stores them, so that people can read them.
     """
@@ -60,6 +68,11 @@ def write_sidecar(path: Path, splats: SplatFile, *, holds_labels: bool) -> list[
         written.append(beside)
     else:
         beside.unlink(missing_ok=True)
+    if splats.gaussians.origin != ORIGIN and not holds_origin:
+        write_json(origin_path(path), {"origin": splats.gaussians.origin, "of": _digest(path)})
+        written.append(origin_path(path))
+    else:
+        origin_path(path).unlink(missing_ok=True)
     # an empty file of names prevents the shared one from being read
     if labels is not None and (splats.classes or shared_names_path(path).is_file()):
         facts = splats.info.get("labels", {})
@@ -70,7 +83,7 @@ def write_sidecar(path: Path, splats: SplatFile, *, holds_labels: bool) -> list[
 
 
 def read_sidecar(path: Path, splats: SplatFile) -> SplatFile:
-    """Add labels and names from the files next to a splat file; those in the splat file have priority.
+    """Add labels, names and the origin from the files next to a splat file; those in the splat file have priority.
 
     If `path` is a link, files next to the link come first, then those next to the file that it leads to.
 
@@ -80,6 +93,9 @@ def read_sidecar(path: Path, splats: SplatFile) -> SplatFile:
     beside = _first(labels_path(place) for place in _places(path))
     if splats.gaussians.labels is None and beside is not None:
         splats = _with_labels(beside, path, splats)
+    far = _first(origin_path(place) for place in _places(path))
+    if far is not None:
+        splats = splats.replace(gaussians=splats.gaussians.replace(origin=_read_origin(far, path)))
     names = find_names(path)
     if splats.gaussians.labels is not None and not splats.classes and names is not None:
         splats = splats.replace(classes=read_names(names))
@@ -131,6 +147,20 @@ def _with_labels(beside: Path, path: Path, splats: SplatFile) -> SplatFile:
     extra = splats.extra if score is None else splats.extra | {SCORE: score}
     gaussians = splats.gaussians.replace(labels=torch.from_numpy(labels.astype(np.int64)))
     return splats.replace(gaussians=gaussians, extra=extra)
+
+
+def _read_origin(far: Path, path: Path) -> Origin:
+    content = read_json(far)
+    try:
+        origin, of = as_origin(content["origin"]), content["of"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{far}: expected an origin of three numbers, got {content!r:.80}; delete it") from error
+    if of != _digest(path):
+        raise ValueError(
+            f"{far}: expected the origin of this version of {path.name}, got that of another version; delete it if the file "
+            "has coordinates of the world, or write both again"
+        )
+    return origin
 
 
 def _load_labels(beside: Path, path: Path, count: int) -> tuple[NDArray[Any], NDArray[Any] | None, str]:

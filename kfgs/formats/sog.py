@@ -84,7 +84,7 @@ def _read(path: Path, find: Callable[[str], Path]) -> SplatFile:
     bounds = np.array(meta.bounds)  # [2, 3]
     logs = bounds[0] + (bounds[1] - bounds[0]) * ((low + 256 * high) / _LEVELS)
     with np.errstate(over="ignore", invalid="ignore"):  # refused below
-        means = (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32)
+        means = np.sign(logs) * np.expm1(np.abs(logs))
         linear = np.exp(_look_up(meta.tables["scales"], scales[:, :3]))
     check_finite(path, means=means, scales=linear, sh=sh)
     gaussians = Gaussians(

@@ -9,6 +9,8 @@ A format is one module of this package with
 - `write(path, splats) -> tuple[str, ...]`: write the file, whole or not at all, and describe what it could not store
   (formats that are only read have no `write`);
 - `precision(gaussians) -> Precision`: the largest errors of a written cloud;
+- `HOLDS_ORIGIN = True`, if the file holds coordinates in double; `write` then puts the cloud's origin back. Other files hold
+  coordinates counted from it, and a file next to them has the origin;
 - `HOLDS_LABELS`: whether the file stores `class_id` and `score`. If not, they go to a separate file (see `sidecar`, which
   also writes the class names of every labelled file);
 - `write_plain`, if files can be written without labels and other columns (PLY);
@@ -28,13 +30,14 @@ from types import ModuleType
 
 from .._files import as_path
 from .._notes import tell
+from .._origin import describe_origin
 from .._typed import typed
 from ..gaussians import Gaussians
 from .folders import PATTERNS, splat_file_of
 from .order import morton_order
 from .sidecar import find_names, names_path, read_sidecar, write_sidecar
 from .splat_file import SplatFile, Written
-from .values import check_splats, known_quats
+from .values import check_splats, known_quats, near_zero
 
 MODULES = (  # tried in this order: compressed PLY before PLY, because both end in .ply
     "compressed_ply",
@@ -110,7 +113,7 @@ def read_splats(path: str | Path) -> SplatFile:
     path = splat_file_of(path)
     module = find_format(path)
     splats: SplatFile = read_sidecar(path, module.read(path))
-    splats = replace(splats, gaussians=splats.gaussians.replace(quats=known_quats(splats.gaussians.quats)))
+    splats = replace(splats, gaussians=near_zero(splats.gaussians.replace(quats=known_quats(splats.gaussians.quats))))
     labels = splats.gaussians.labels
     if labels is not None and len(labels):
         low, high = int(labels.min()), int(labels.max())
@@ -161,7 +164,10 @@ def write_splats(
     if order is not None:
         splats = splats.select(order)
     lost = module.write_plain(path, splats) if plain else module.write(path, splats)
-    beside = write_sidecar(path, splats, holds_labels=module.HOLDS_LABELS and not plain)
+    holds_origin = getattr(module, "HOLDS_ORIGIN", False) and not plain
+    beside = write_sidecar(path, splats, holds_labels=module.HOLDS_LABELS and not plain, holds_origin=holds_origin)
+    if not holds_origin:
+        lost = (*lost, *describe_origin(splats.gaussians.origin, f"{path.name}"))
     return Written([path, *beside], tuple(lost), order)
 
 

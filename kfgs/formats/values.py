@@ -9,6 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from .._check import ORIGIN
+from .._origin import choose_origin, to_local
 from ..gaussians import Gaussians
 from .splat_file import SCORE, SplatFile
 
@@ -58,16 +60,25 @@ def positive_scales(path: Path, scales: NDArray[np.float32]) -> Tensor:  # [N, 3
     return torch.from_numpy(np.where(scales == 0, np.float32(_TINY_SCALE), scales))
 
 
+def near_zero(g: Gaussians) -> Gaussians:
+    """A cloud as read, with its means in float32, counted from an origin if they are far from zero."""
+    if g.origin != ORIGIN:  # the file has its own
+        return g.replace(means=g.means.float())
+    origin = choose_origin(g.means)
+    return g.replace(means=to_local(g.means, origin), origin=origin)
+
+
 def flip_axes(g: Gaussians, axes: tuple[int, int, int]) -> Gaussians:
     """Flip the axes with sign -1: means change sign, rotations become S R S, harmonics change sign by their parity."""
-    sign = dict(zip("xyz", axes, strict=True))
+    signs = dict(zip("xyz", axes, strict=True))
     x, y, z = axes
     means, quats = g.means.new_tensor([x, y, z]), g.quats.new_tensor([1, y * z, x * z, x * y])
     sh = None
     if g.sh is not None:
-        parity = [float(np.prod([sign[axis] for axis in odd])) for odd in ("", *_ODD)]
+        parity = [float(np.prod([signs[axis] for axis in odd])) for odd in ("", *_ODD)]
         sh = g.sh * g.sh.new_tensor(parity[: g.sh.shape[1]])[:, None]
-    return g.replace(means=g.means * means + 0.0, quats=g.quats * quats + 0.0, sh=sh)  # + 0: no negative zeros
+    x, y, z = (place * sign + 0.0 for place, sign in zip(g.origin, axes, strict=True))  # + 0: no negative zeros
+    return g.replace(means=g.means * means + 0.0, quats=g.quats * quats + 0.0, sh=sh, origin=(x, y, z))
 
 
 def known_quats(quats: Tensor) -> Tensor:  # [N, 4] wxyz twice

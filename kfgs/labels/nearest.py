@@ -10,6 +10,7 @@ from torch import Tensor
 
 from .._card import short_repr
 from .._check import as_tensor, check_shapes
+from .._origin import recounted, to_world
 from .._rows import check_finite
 from ..formats.splat_file import SplatFile
 from ..gaussians import Gaussians
@@ -22,7 +23,7 @@ WIDE = 0.9  # which are this quantile of the spacings
 
 Array = np.ndarray[Any, Any]
 Cloud = Tensor | Array | Gaussians | SplatFile
-"""Positions [N, 3], Gaussians, or a splat."""
+"""Positions [N, 3], Gaussians, or a splat. Positions are counted from the origin of the Gaussians that they meet."""
 
 
 class Near(NamedTuple):
@@ -115,7 +116,7 @@ def default_distance(
     Raises:
         ValueError: if a cloud is empty or a position is not finite.
     """
-    src_means, dst_means = means_of("src", src), means_of("dst", dst)
+    src_means, dst_means = means_of("src", src), means_of("dst", dst, src)
     check_shapes(("src_means", src_means, "S 3"), ("dst_means", dst_means, "N 3"))
     places, targets = positions("src_means", src_means), positions("dst_means", dst_means)
     for name, points in (("src_means", places), ("dst_means", targets)):
@@ -150,10 +151,20 @@ def _sample(points: Array) -> Array:
     return points[:: max(1, -(-len(points) // SAMPLE))]
 
 
-def means_of(name: str, cloud: Cloud) -> Tensor:  # [N, 3]
-    """The positions of a splat or of Gaussians, or positions as they are given."""
+def places_of(name: str, cloud: Cloud) -> Tensor:  # [N, 3] in the world
+    """The positions of a splat or of Gaussians in the world, or positions as given."""
     gaussians = cloud.gaussians if isinstance(cloud, SplatFile) else cloud
-    return as_tensor(name, gaussians.means if isinstance(gaussians, Gaussians) else gaussians)
+    means = means_of(name, gaussians)
+    return to_world(means, gaussians.origin) if isinstance(gaussians, Gaussians) else means
+
+
+def means_of(name: str, cloud: Cloud, like: Cloud | None = None) -> Tensor:  # [N, 3]
+    """The positions of a splat or of Gaussians, counted from the origin of `like` if both have one; or positions as given."""
+    gaussians, other = (one.gaussians if isinstance(one, SplatFile) else one for one in (cloud, like))
+    if not isinstance(gaussians, Gaussians):
+        return as_tensor(name, gaussians)
+    origin = other.origin if isinstance(other, Gaussians) else gaussians.origin
+    return recounted(gaussians.means, gaussians.origin, origin)
 
 
 def positions(name: str, means: Tensor) -> Array:  # [N, 3] float64

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_shapes, check_whole
+from .._origin import FAR_UNITS, to_world
 from .._rows import check_finite
 from .._typed import typed
 from ..cameras import Camera
@@ -74,7 +75,7 @@ class Part:
         return Selection.of(mask, self.how)
 
     def __repr__(self) -> str:
-        place = ", ".join(f"{x:.3g}" for x in self.centroid.tolist())
+        place = ", ".join(f"{x:.3g}" if abs(x) < FAR_UNITS else f"{x:.2f}" for x in self.centroid.tolist())
         size = " x ".join(f"{2 * x:.3g}" for x in self.box.half.tolist())
         view = "" if self.best_view is None else f", {self.best_view.share:.1%} of {self.best_view.camera!r}"
         what = "Gaussian" if self.count == 1 else "Gaussians"
@@ -215,7 +216,7 @@ def _described(
     found = []
     for i, (indices, why) in enumerate(zip(parts, how, strict=True)):
         check_finite("gaussians.means", gaussians.means[indices])
-        points = gaussians.means[indices].detach().double()
+        points = to_world(gaussians.means[indices].detach().double(), gaussians.origin)
         best = int(shares[:, i].argmax()) if cameras else 0
         view = BestView(cameras[best].name, best, float(shares[best, i])) if cameras and shares[best, i] > 0 else None
         found.append(

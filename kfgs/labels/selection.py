@@ -11,7 +11,7 @@ from .._card import cut, html_card
 from .._check import as_tensor, check_shapes
 from .._rows import check_finite
 from .boxes import OrientedBox
-from .nearest import Array, Cloud, means_of
+from .nearest import Array, Cloud, places_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ class Selection:
         Raises:
             ValueError: if the cloud has another number of Gaussians.
         """
-        means = means_of("cloud", cloud)
+        means = places_of("cloud", cloud)
         check_shapes(("selection.mask", self.mask, "N"), ("cloud", means, "N 3"))
         points: Array = means[self.mask].detach().cpu().double().numpy()
         return points

@@ -136,7 +136,7 @@ def transfer_labels(
     check_whole("neighbours", neighbours, 1)
     check_range("deviations", deviations, 0, closed=(False, False))
     src, dst = (one.gaussians if isinstance(one, SplatFile) else one for one in (src, dst))
-    src_means, dst_means = means_of("src", src), means_of("dst", dst)
+    src_means, dst_means = means_of("src", src), means_of("dst", dst, src)
     src_labels = as_tensor("src_labels", src_labels)
     check_shapes(("src_means", src_means, "S 3"), ("src_labels", src_labels, "S"), ("dst_means", dst_means, "N 3"))
     if distance is not None:

@@ -51,7 +51,7 @@ def make_rule(
 
         return vote
     src_shapes, dst_shapes = _covariances("src", src)[:, kept], _covariances("dst", dst)
-    targets = positions("dst_means", means_of("dst", dst))
+    targets = positions("dst_means", means_of("dst", dst, src))
 
     def overlap(rows: Array, near: Near) -> Verdict:
         hit = near.hit

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_range, check_whole
+from .._origin import to_world
 from .._rows import check_finite
 from ..formats.splat_file import SplatFile
 from ..gaussians import Gaussians
@@ -322,9 +323,9 @@ def _parts(kind: type[Both] | type[Either], where: Where) -> tuple[Where, ...]:
     return where.parts if isinstance(where, kind) else (where,)  # a & b & c is one Both of three
 
 
-def _points(cloud: SplatFile) -> Tensor:  # [N, 3] float64
+def _points(cloud: SplatFile) -> Tensor:  # [N, 3] float64, in the world
     check_finite("gaussians.means", cloud.gaussians.means)
-    return cloud.gaussians.means.detach().double()
+    return to_world(cloud.gaussians.means.detach().double(), cloud.gaussians.origin)
 
 
 def _read(value: Any, name: str, depth: int) -> Where:

@@ -289,7 +289,8 @@ def _labels(found: Tensor | Path) -> Tensor:
 
 
 def _digest_views(views: Sequence[View]) -> str:
-    return digest_data([[view.stem, view.camera.viewmat, view.camera.K, *view.camera.size] for view in views])
+    cameras = [(view.stem, view.camera) for view in views]
+    return digest_data([[stem, c.viewmat, c.K, *c.size, *(c.origin if any(c.origin) else ())] for stem, c in cameras])
 
 
 def _digest_truth(truth: LabelTruth | MaskTruth) -> str:

@@ -12,7 +12,7 @@ from ..cameras.camera import Camera, Distortion
 from .colmap_files import CAMERA_MODELS
 from .colmap_model import ColmapImage, ColmapModel, read_model
 from .files import SceneError, is_file, list_images, natural_key, some
-from .posed import as_large_as_pictures
+from .posed import as_large_as_pictures, near_zero
 from .scene import Scene
 
 # COLMAP's model: (our lens, its number of coefficients). COLMAP's own order after the intrinsics is ours in each case:
@@ -102,13 +102,13 @@ def load_colmap(path: str | Path, images: str | Path) -> Scene:
         notes.append(f"{len(extra)} image files in {folder} have no pose in the model: {some(extra)}")
     if len(model.points) == 0:
         notes.append("no points: `kfgs fit` and `kfgs color` triangulate some from the poses before they train")
-    points, colors = torch.from_numpy(model.points).float(), torch.from_numpy(model.colors)
+    cameras, points, far = near_zero(cameras, torch.from_numpy(model.points))
     splits = {"train": list(range(len(found))), "test": []}
-    return Scene(cameras, paths, points, colors, splits, tuple(notes)).with_near()
+    return Scene(cameras, paths, points, torch.from_numpy(model.colors), splits, (*notes, *far)).with_near()
 
 
 def colmap_cameras(path: Path) -> tuple[list[Camera], list[str]]:
-    """The cameras of a model's images with a pose, in natural order of names, and notes; the image files need not be there.
+    """The cameras (in float64) of a model's images with a pose, by names, and notes; the image files need not be there.
 
     Raises:
         SceneError: if the model is damaged, or a lens has no exact form in kfgs.
@@ -134,9 +134,10 @@ def _cameras(path: Path, model: ColmapModel, images: list[ColmapImage]) -> list[
     cameras = []
     for image in images:
         camera, (K, distortion) = model.cameras[image.camera_id], lenses[image.camera_id]
-        viewmat = torch.from_numpy(image.pose).float()
         try:
-            cameras.append(Camera(viewmat, K.float(), camera.width, camera.height, image.name, distortion))
+            cameras.append(
+                Camera(torch.from_numpy(image.pose), K.float(), camera.width, camera.height, image.name, distortion)
+            )
         except ValueError as error:
             raise SceneError(f"{path}, image {image.name}: {error}; write the model again with COLMAP") from error
     return cameras

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from .._files import as_path, file_stem
+from .._origin import to_world
 from ..formats.folders import newest_splat
 from ..formats.table import read_splats
 from ..formats.values import SH_C0
@@ -187,7 +188,7 @@ def _points(folder: Path) -> tuple[Tensor, Tensor]:
     except ValueError as error:
         raise SceneError(str(error)) from error
     shades = torch.full((len(cloud), 3), 0.5) if cloud.sh is None else 0.5 + SH_C0 * cloud.sh[:, 0]
-    return cloud.means, (shades.clamp(0, 1) * 255).round().to(torch.uint8)
+    return to_world(cloud.means, cloud.origin), (shades.clamp(0, 1) * 255).round().to(torch.uint8)
 
 
 def _held_out(names: list[str]) -> set[str]:

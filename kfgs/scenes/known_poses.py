@@ -101,6 +101,8 @@ def write_known_poses(
         found, seconds = _triangulate(scene, Path(scratch), config or SfmConfig(), progress)
         for number, camera in enumerate(scene.cameras, 1):
             found.images[number].name = camera.name
+        with quiet_pycolmap() as pycolmap:
+            found.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array(scene.origin)))
         with atomic_folder(model) as folder:
             found.write(str(folder))
     for place, file in links.items():

@@ -20,6 +20,7 @@ from .files import SceneError, natural_key, some
 from .inria import is_inria, load_inria
 from .llff import POSES, is_llff, load_llff
 from .polycam import is_polycam, load_polycam
+from .posed import near_zero
 from .replica import is_nice_slam, is_semantic_nerf, load_nice_slam, load_semantic_nerf
 from .scannet import is_scannet, load_scannet
 from .scene import Scene
@@ -138,7 +139,7 @@ def cameras_and_notes(path: str | Path) -> tuple[list[Camera], list[str]]:
         return load_scene(path).undistorted().cameras, notes
     if not cameras:
         raise SceneError(f"{path}: expected cameras with poses, got none; run COLMAP again (`kfgs sfm`)")
-    nothing = torch.zeros(0, 3)
+    cameras, nothing, _ = near_zero(cameras, torch.zeros(0, 3))
     try:
         scene = Scene(cameras, [Path(camera.name) for camera in cameras], nothing, nothing.byte())
     except SceneError as error:  # of two names that are the same

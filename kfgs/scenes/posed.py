@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .._card import short_repr
+from .._check import ORIGIN
+from .._origin import choose_origin, describe_origin, to_local
 from ..cameras.camera import Camera
 from ..cameras.resample import fits_aspect
 from ..formats.ply import points_from_columns, read_ply
@@ -156,7 +158,7 @@ def scene_of_poses(
     views: Sequence[PosedPicture],
     K: Matrix | None,  # [3, 3]; None if each view has its own lens
     size: tuple[int, int] | None,  # (width, height)
-    points: tuple[Tensor, Tensor] | None = None,  # [P, 3], [P, 3] uint8
+    points: tuple[Tensor, Tensor] | None = None,  # [P, 3] of the world, [P, 3] uint8
     notes: Sequence[str] = (),
 ) -> Scene:
     """A scene of pictures with poses; views without a pose (not finite) are left out and noted.
@@ -184,7 +186,7 @@ def scene_of_poses(
             assert own_K is not None
             assert own_size is not None
             lens = torch.from_numpy(own_K).float(), *own_size
-            cameras.append(Camera(torch.from_numpy(viewmat).float(), *lens, view.name))
+            cameras.append(Camera(torch.from_numpy(viewmat), *lens, view.name))
         except ValueError as error:
             raise SceneError(f"{view.origin}: {error}; copy the poses again") from error
     paths = [view.path for view in posed]
@@ -193,11 +195,19 @@ def scene_of_poses(
     if points is None:
         points = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)
         said.append("no points: `kfgs fit` and `kfgs color` triangulate some from the poses before they train")
+    cameras, places, far = near_zero(cameras, points[0])
     splits = {"train": list(range(len(cameras))), "test": []}
-    return Scene(cameras, paths, *points, splits, (*notes, *resized, *said)).with_near()
+    return Scene(cameras, paths, places, points[1], splits, (*notes, *resized, *said, *far)).with_near()
 
 
-def read_points(path: Path) -> tuple[Tensor, Tensor]:  # [P, 3] float32, [P, 3] uint8
+def near_zero(cameras: list[Camera], points: Tensor) -> tuple[list[Camera], Tensor, list[str]]:
+    """Cameras and points [P, 3], read in float64, as a scene has them: float32 from one origin; and a note if it is far."""
+    origin = choose_origin(torch.stack([camera.center for camera in cameras]), points) if cameras else ORIGIN
+    local = [camera.with_origin(origin).to(torch.float32) for camera in cameras]
+    return local, to_local(points, origin), describe_origin(origin, "cameras and points")
+
+
+def read_points(path: Path) -> tuple[Tensor, Tensor]:  # [P, 3] float64, [P, 3] uint8
     """The vertices of a PLY and their colours; grey if it has none.
 
     Raises:
@@ -235,7 +245,7 @@ def points_from_depth(
     depths: Sequence[Path],
     K: Matrix | None,  # [3, 3] of the depth pictures; None: that of each view, resized to its depth picture
     scale: float,
-) -> tuple[Tensor, Tensor] | None:  # [P, 3] float32, [P, 3] uint8
+) -> tuple[Tensor, Tensor] | None:  # [P, 3] float64, [P, 3] uint8
     """About `DEPTH_POINTS` points of surfaces with their colours, from `DEPTH_VIEWS` evenly chosen depth pictures.
 
     Args:
@@ -265,7 +275,7 @@ def points_from_depth(
         points.append(local @ view.pose[:3, :3].T + view.pose[:3, 3])
         colors.append(image[y * image.shape[0] // height, x * image.shape[1] // width])
     places, shades = np.concatenate(points), np.concatenate(colors)
-    return torch.from_numpy(places).float(), torch.from_numpy((shades * 255).round().astype(np.uint8))
+    return torch.from_numpy(places), torch.from_numpy((shades * 255).round().astype(np.uint8))
 
 
 def points_of_cameras(

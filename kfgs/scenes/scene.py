@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from .._card import html_card
-from .._check import check_shapes
+from .._check import ORIGIN, check_shapes
 from .._files import file_stem
 from ..cameras.bounds import camera_extent
 from ..cameras.camera import NEAR, Camera
@@ -38,7 +38,7 @@ class Scene:
     image_paths: list[Path]
     """V files."""
     points: Tensor  # [P, 3] float32
-    """The sparse cloud with its outliers (see `robust_bounds`); it may be empty (P = 0)."""
+    """The sparse cloud with its outliers (see `robust_bounds`), counted from `origin`; it may be empty (P = 0)."""
     colors: Tensor  # [P, 3] uint8
     """The colours of the cloud."""
     splits: dict[str, list[int]] = field(default_factory=dict)
@@ -72,8 +72,19 @@ class Scene:
                     f"splits[{name!r}]: expected whole numbers in [0, {views}), got {wrong[0]!r:.80}; correct the split"
                 )
 
+        origins = {camera.origin for camera in [*self.cameras, *(self.lenses or [])]}
+        if len(origins) > 1:
+            raise ValueError(
+                f"cameras: expected one origin, got {sorted(origins)[:2]}; bring them to one with camera.with_origin()"
+            )
+
     def __len__(self) -> int:
         return len(self.cameras)
+
+    @property
+    def origin(self) -> tuple[float, float, float]:
+        """The place in the world that cameras and points are counted from, in float64; (0, 0, 0) unless they are far from it."""
+        return self.cameras[0].origin if self.cameras else ORIGIN
 
     def __repr__(self) -> str:
         splits = ", ".join(f"{name} {len(views)}" for name, views in self.splits.items())
@@ -89,6 +100,7 @@ class Scene:
             "lens": "distorted: use scene.undistorted()" if self.distorted else "pinhole",
             "points": len(self.points),
             "extent": f"{self.extent:.4g} world units" if len(self) else None,
+            "origin": ", ".join(f"{value:.15g}" for value in self.origin) if any(self.origin) else None,
             **{f"note {i}": note for i, note in enumerate(self.notes, 1)},
         }
         return html_card("Scene", facts)

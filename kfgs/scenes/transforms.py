@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from .._files import as_path
+from .._origin import Origin
 from ..cameras.camera import Camera
 from .files import IMAGE_SUFFIXES, SceneError, is_file, natural_key, read_scene_json, some
-from .posed import MILLIMETRE, as_large_as_pictures, picture_size, points_of_cameras, read_points
+from .posed import MILLIMETRE, as_large_as_pictures, near_zero, picture_size, points_of_cameras, read_points
 from .scene import Scene
 from .transforms_frame import Frame
 
@@ -33,10 +34,11 @@ class _Reader:
     masked: int = 0
     depths: list[Path | None] = field(default_factory=list)
 
-    def with_depth(self) -> list[tuple[Camera, Path, Path]]:
+    def with_depth(self, origin: Origin) -> list[tuple[Camera, Path, Path]]:
         """Camera, picture and depth picture of each view that has all three."""
         both = zip(self.views, self.depths, strict=True)
-        return [(camera, path, depth) for (camera, path), depth in both if depth is not None]
+        kept = [(camera, path, depth) for (camera, path), depth in both if depth is not None]
+        return [(camera.with_origin(origin).to(torch.float32), path, depth) for camera, path, depth in kept]
 
 
 def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene:
@@ -80,9 +82,11 @@ def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene
     views.sort(key=lambda view: natural_key(view[0].name))
     first, top = next(iter(readers.values()))
     points, colors, notes = _points(first, top)
+    paths = [view[1] for view in views]
+    cameras, points, far = near_zero([view[0] for view in views], points)
     if len(points) == 0:
         unit = Frame(first.path, "top level", top).number("integer_depth_scale", MILLIMETRE)  # world units per step
-        frames = [frame for reader, _ in readers.values() for frame in reader.with_depth()]
+        frames = [frame for reader, _ in readers.values() for frame in reader.with_depth(cameras[0].origin)]
         found = points_of_cameras(frames, unit)
         points, colors, notes = found or (points, colors, notes)
     if missing:
@@ -91,13 +95,12 @@ def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene
         notes.append(f"{len(outside)} image files lie outside {first.root}: {some(outside, 3)}")
     if any(reader.masked for reader, _ in readers.values()):
         notes.append(f"{sum(reader.masked for reader, _ in readers.values())} frames have a mask_path; it is not used")
-    paths = [view[1] for view in views]
-    cameras, shrunk = as_large_as_pictures([view[0] for view in views], paths, first.images)
-    return Scene(cameras, paths, points, colors, _splits(views, first.root, top), (*notes, *shrunk)).with_near()
+    cameras, shrunk = as_large_as_pictures(cameras, paths, first.images)
+    return Scene(cameras, paths, points, colors, _splits(views, first.root, top), (*notes, *shrunk, *far)).with_near()
 
 
 def transforms_cameras(path: Path) -> list[Camera]:
-    """The cameras of the files that `load_transforms` reads, in natural order of names, also of frames without an image file.
+    """The cameras (float64) of the files that `load_transforms` reads, by names, also of frames without an image file.
 
     A frame without `file_path` is named by its number, `0007.png`. A picture is opened only if its frame has no `w, h`.
 

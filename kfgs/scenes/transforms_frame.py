@@ -60,7 +60,7 @@ class Frame:
         K = torch.tensor([[fx, 0, cx], [0, fx if fy is None else fy, cy], [0, 0, 1]], dtype=torch.float32)
         viewmat, lens = self.viewmat(), self.distortion()
         try:
-            return Camera(viewmat.float(), K, int(width), int(height), name, lens)
+            return Camera(viewmat, K, int(width), int(height), name, lens)
         except ValueError as error:
             raise SceneError(f"{self.path}, {self.where} ({name}): {error}") from error
 

@@ -33,8 +33,10 @@ def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussia
             f"similarity: expected a Similarity, got {type(similarity).__name__}; make one from a 4 x 4 matrix with "
             "Similarity.from_matrix"
         )
+    local, origin = similarity.between_origins(gaussians.origin)
     return gaussians.replace(
-        means=similarity.apply(gaussians.means),
+        means=local.apply(gaussians.means),
+        origin=origin,
         quats=_turn(gaussians.quats, similarity.rotation),
         scales=gaussians.scales * similarity.scale,
         sh=None if gaussians.sh is None else rotate_sh(gaussians.sh, similarity.rotation),

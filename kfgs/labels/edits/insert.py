@@ -61,7 +61,7 @@ class Insert(Edit):
         """See `Edit.apply`; reads the file if it is one."""
         part = self.source if isinstance(self.source, SplatFile) else read_splats(self.source)
         if self.similarity is not None:
-            part = part.replace(gaussians=transformed(part.gaussians, self.similarity))
+            part = part.replace(gaussians=transformed(part.gaussians, self.similarity, splats.gaussians.origin))
         return join(splats, part)
 
     def to_json(self) -> dict[str, Any]:

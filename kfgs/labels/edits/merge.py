@@ -26,7 +26,7 @@ def join(first: SplatFile, second: SplatFile) -> SplatFile:
     Raises:
         ValueError: if one has colours and the other has none, or their features have different channels.
     """
-    a, b = first.gaussians, second.gaussians
+    a, b = first.gaussians, second.gaussians.with_origin(first.gaussians.origin)
     sh = _joined_sh(a.sh, b.sh)
     features = _joined_features(a, b)
     labels, classes = _joined_labels(first, second)
@@ -40,7 +40,7 @@ def join(first: SplatFile, second: SplatFile) -> SplatFile:
             for splats, column in zip((first, second), columns, strict=True)
         ]
         extra[name] = np.concatenate(filled)
-    gaussians = Gaussians(**rows, sh=sh, features=features, labels=labels)
+    gaussians = a.replace(**rows, sh=sh, features=features, labels=labels)
     return SplatFile(gaussians, extra, classes, first.info)
 
 

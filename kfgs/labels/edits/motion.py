@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ..._check import check_range
+from ..._origin import Origin, to_world
 from ...cameras.similarity import Similarity
 from ...formats.splat_file import SplatFile
-from ...gaussians import Gaussians
+from ...gaussians import TENSORS, Gaussians
 from ...splat.transform import transform_gaussians
 from .._json import number_of, numbers_of, set_fields
 from ..boxes import quaternion_of, rotation_matrix, unit
@@ -79,7 +80,8 @@ class _Motion(OnSelection):
         if isinstance(self.pivot, str):
             weights = gaussians.opacities.detach().double().cpu()
             weights = weights / weights.max() if bool(weights.any()) else torch.ones_like(weights)
-            pivot = weights @ gaussians.means.detach().double().cpu() / weights.sum()
+            middle = weights @ gaussians.means.detach().double().cpu() / weights.sum()
+            pivot = to_world(middle, gaussians.origin)
         else:
             pivot = torch.tensor(self.pivot, dtype=torch.float64)
         shift = torch.tensor(self.translation, dtype=torch.float64)
@@ -98,11 +100,12 @@ class Move(_Motion):
         if not bool(mask.any()):
             return splats
         part = splats.gaussians.select(mask)
-        moved = transformed(part, self.similarity(part))
-        rows = {name: values.clone() for name, values in vars(splats.gaussians).items() if values is not None}
+        moved = transformed(part, self.similarity(part), part.origin)
+        rows = {name: getattr(splats.gaussians, name) for name in TENSORS}
+        rows = {name: values.clone() for name, values in rows.items() if values is not None}
         for name, values in rows.items():
             values[mask] = getattr(moved, name)
-        return splats.replace(gaussians=Gaussians(**rows))
+        return splats.replace(gaussians=splats.gaussians.replace(**rows))
 
 
 @dataclass(frozen=True)
@@ -117,13 +120,13 @@ class Duplicate(_Motion):
         if not bool(mask.any()):
             return splats
         copy = splats.select(mask)
-        moved = transformed(copy.gaussians, self.similarity(copy.gaussians))
+        moved = transformed(copy.gaussians, self.similarity(copy.gaussians), copy.gaussians.origin)
         return join(splats, copy.replace(gaussians=moved))
 
 
-def transformed(gaussians: Gaussians, similarity: Similarity) -> Gaussians:
-    """`transform_gaussians`; a ValueError if a number overflows, or a scale becomes 0."""
-    moved = transform_gaussians(gaussians, similarity)
+def transformed(gaussians: Gaussians, similarity: Similarity, origin: Origin) -> Gaussians:
+    """`transform_gaussians`, counted from an origin; a ValueError if a number overflows, or a scale becomes 0."""
+    moved = transform_gaussians(gaussians, similarity).with_origin(origin)
     for name, old, new in (("positions", gaussians.means, moved.means), ("scales", gaussians.scales, moved.scales)):
         good = new.isfinite() & ((new > 0) if name == "scales" else True)
         if not bool((good | ~old.isfinite()).all()):

@@ -1,0 +1,71 @@
+"""Coordinates far from zero (UTM, ECEF, site grids): in memory they are float32, counted from an origin in float64.
+
+Readers parse in float64 and call `choose_origin` and `to_local`; answers and files for people pass through `to_world`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from ._check import ORIGIN
+
+Origin = tuple[float, float, float]
+FAR = 1000
+"""Sizes of a scene between it and zero. float32 has 2^23 steps: beyond, a scene is fewer than 8,000 of them wide, and a pixel
+of a picture of 1,000 moves by a tenth."""
+FAR_UNITS = 10_000
+"""World units. From here on a step of float32 is a millimetre, if the unit is a metre. A scene that is itself larger than a
+tenth of the distance stays: there is little to gain."""
+ONE_PLACE = 1e-6
+"""Of the distance to zero: what spreads less stands in one place up to rounding, and says nothing about a scale."""
+
+
+def choose_origin(*places: Tensor) -> Origin:  # each [N, 3]
+    """(0, 0, 0), or a round place in the middle if float32 would lose something there. Values that are not finite are ignored.
+
+    Example:
+        >>> room = torch.rand(100, 3, dtype=torch.float64)
+        >>> choose_origin(room), choose_origin(room + torch.tensor([448262.0, 5411932.0, 200.0]))
+        ((0.0, 0.0, 0.0), (448263.0, 5411933.0, 200.0))
+    """
+    points = torch.cat([place.detach().double().cpu() for place in places]) if places else torch.zeros(0, 3)
+    points = points[points.isfinite().all(1)]
+    if len(points) == 0:
+        return ORIGIN
+    middle = points.median(0).values
+    size, distance = float((points - middle).abs().amax(1).median()), float(middle.abs().max())
+    scaled = size > ONE_PLACE * distance and distance > FAR * size
+    if not (scaled or (distance > FAR_UNITS and distance > 10 * size)):
+        return ORIGIN
+    step = 10.0 ** math.ceil(math.log10(size)) if size > ONE_PLACE * distance else 1.0
+    x, y, z = (middle / step).round().mul(step).tolist()
+    return x, y, z
+
+
+def recounted(points: Tensor, origin: Origin, other: Origin) -> Tensor:  # [..., 3]
+    """Places counted from another origin: in float64, or as they are if it is the same."""
+    shift = [a - b for a, b in zip(origin, other, strict=True)]
+    return points.double() + points.new_tensor(shift, dtype=torch.float64) if any(shift) else points
+
+
+def to_local(points: Tensor, origin: Origin) -> Tensor:  # [N, 3] of the world -> [N, 3] float32
+    """Places counted from an origin, in float32."""
+    return recounted(points, ORIGIN, origin).float()
+
+
+def to_world(points: Tensor, origin: Origin) -> Tensor:  # [..., 3]
+    """Places in the world: in float64, or as they are if they are counted from zero."""
+    return recounted(points, origin, ORIGIN)
+
+
+def describe_origin(origin: Origin, what: str) -> list[str]:
+    """A note for people; none if coordinates are counted from zero."""
+    if origin == ORIGIN:
+        return []
+    numbers = ", ".join(f"{value:.15g}" for value in origin)
+    return [
+        f"coordinates of {what} are counted from the origin ({numbers}), because float32 has 7 digits; answers are in the world"
+    ]

@@ -1,0 +1,200 @@
+"""Scenes and splats in UTM: in memory float32 from an origin, in answers and files the coordinates of the world."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from kfgs import Camera, Gaussians, SplatFile, rasterize, read_splats, transfer_labels, write_splats
+from kfgs._origin import choose_origin, to_world
+from kfgs.cameras.similarity import Similarity
+from kfgs.formats.ply import read_ply, write_ply
+from kfgs.labels import InBox, InSphere, Move, OfClass, Selection, connected_parts, join
+from kfgs.splat.transform import transform_gaussians
+
+UTM = np.array([448262.25, 5411932.5, 200.0])
+
+
+def cloud(count=60, seed=0):
+    """Gaussians in a cube of side 2, and their float64 places in it."""
+    g = torch.Generator().manual_seed(seed)
+    places = torch.rand(count, 3, generator=g, dtype=torch.float64) * 2 - 1
+    quats, scales = torch.randn(count, 4, generator=g), torch.rand(count, 3, generator=g) * 0.05 + 0.02
+    labels, sh = torch.arange(count) % 3, torch.rand(count, 4, 3, generator=g)
+    opacities = torch.rand(count, generator=g) * 0.8 + 0.1
+    return Gaussians(places.float(), quats, scales, opacities, sh=sh, labels=labels), places
+
+
+def far_file(path, offset=UTM, count=60, seed=0):
+    """A PLY in double, moved by an offset, without help of the reader's code; and the places in it."""
+    near, places = cloud(count, seed)
+    write_splats(path, near)
+    table = read_ply(path)
+    world = places.numpy() + offset
+    write_ply(path, table | {name: world[:, i].copy() for i, name in enumerate("xyz")})
+    return world
+
+
+def world_of(gaussians):
+    return gaussians.means.double().numpy() + np.array(gaussians.origin)
+
+
+def test_origin_is_zero_near_zero_and_for_a_large_scene():
+    room = torch.rand(1000, 3, dtype=torch.float64) * 5
+    assert choose_origin(room) == choose_origin(room + 100) == (0, 0, 0)
+    assert choose_origin(room[:1] + 3) == choose_origin(room[:1].repeat(9, 1) + 3) == (0, 0, 0)  # one place has no size
+    assert choose_origin(room * 1e5) == (0, 0, 0)
+    assert choose_origin(torch.zeros(0, 3)) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("size", [1e-4, 1.0, 800.0])
+def test_origin_lies_near_what_is_far(size):
+    places = torch.rand(1000, 3, dtype=torch.float64) * size + torch.from_numpy(UTM)
+    places[0] = torch.nan
+    origin = torch.tensor(choose_origin(places), dtype=torch.float64)
+    assert float((places[1:] - origin).abs().max()) < 20 * max(size, 1e-6 * float(UTM.max()))
+
+
+def test_ply_in_double_is_read_and_written_to_the_millimetre(tmp_path):
+    world = far_file(tmp_path / "far.ply")
+    splats = read_splats(tmp_path / "far.ply")
+    assert splats.gaussians.means.dtype == torch.float32
+    assert np.abs(world_of(splats.gaussians) - world).max() < 1e-5
+    splats.save(tmp_path / "again.ply")
+    assert {read_ply(tmp_path / "again.ply")[name].dtype.str for name in "xyz"} == {"<f8"}
+    again = read_splats(tmp_path / "again.ply").gaussians
+    assert again.origin == splats.gaussians.origin
+    assert torch.equal(again.means, splats.gaussians.means)
+
+
+def test_a_near_cloud_is_written_as_before(tmp_path):
+    near, _ = cloud()
+    write_splats(tmp_path / "near.ply", near)
+    assert read_ply(tmp_path / "near.ply")["x"].dtype == np.float32
+    assert torch.equal(read_splats(tmp_path / "near.ply").gaussians.means, near.means)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["near.ply"]
+
+
+@pytest.mark.parametrize("ending", ["glb", "splat", "spz", "sog", "compressed.ply"])
+def test_other_formats_keep_the_place(tmp_path, ending):
+    world = far_file(tmp_path / "far.ply")
+    written = read_splats(tmp_path / "far.ply").save(tmp_path / f"far.{ending}")
+    back = read_splats(tmp_path / f"far.{ending}").gaussians
+    order = np.arange(len(world)) if written.order is None else written.order.numpy()
+    assert np.abs(world_of(back) - world[order]).max() < 2e-3
+    assert any("origin" in lost for lost in written.lost) == (ending != "glb")
+    if ending == "glb":  # a translation of the node, y up and z back
+        text = (tmp_path / "far.glb").read_bytes()[20:].split(b"BIN")[0].decode("utf-8", "replace")
+        assert json.JSONDecoder().raw_decode(text)[0]["nodes"][0]["translation"][0] == back.origin[0]
+    else:
+        assert tmp_path / f"far.{ending}.origin.json" in written.paths
+
+
+def test_plain_ply_keeps_its_62_floats_and_the_place(tmp_path):
+    world = far_file(tmp_path / "far.ply")
+    written = read_splats(tmp_path / "far.ply").save(tmp_path / "plain.ply", plain=True)
+    table = read_ply(tmp_path / "plain.ply")
+    assert len(table) == 62
+    assert {column.dtype for column in table.values()} == {np.dtype(np.float32)}
+    assert any("origin" in lost for lost in written.lost)
+    assert np.abs(world_of(read_splats(tmp_path / "plain.ply").gaussians) - world).max() < 1e-5
+
+
+def test_origin_of_another_version_is_refused_and_its_advice_works(tmp_path):
+    far_file(tmp_path / "far.ply")
+    splats = read_splats(tmp_path / "far.ply")
+    write_splats(tmp_path / "far.splat", splats.gaussians.replace(labels=None))
+    with (tmp_path / "far.splat").open("r+b") as file:
+        file.truncate(32)
+    with pytest.raises(ValueError, match=r"far.splat.origin.json: expected the origin of this version .*; delete it"):
+        read_splats(tmp_path / "far.splat")
+    (tmp_path / "far.splat.origin.json").unlink()
+    assert len(read_splats(tmp_path / "far.splat")) == 1
+
+
+def test_a_written_near_cloud_removes_an_old_origin(tmp_path):
+    far_file(tmp_path / "far.ply")
+    read_splats(tmp_path / "far.ply").save(tmp_path / "a.splat")
+    write_splats(tmp_path / "a.splat", cloud()[0])
+    assert not (tmp_path / "a.splat.origin.json").exists()
+    assert read_splats(tmp_path / "a.splat").gaussians.origin == (0, 0, 0)
+
+
+def test_a_camera_with_another_origin_draws_the_same_picture(tmp_path):
+    near, _ = cloud()
+    camera = Camera.look_at((0, -4, 1), (0, 0, 0), width=32, height=24)
+    far = near.replace(origin=tuple(UTM))
+    seen = rasterize(near, camera).map
+    elsewhere = Camera(camera.viewmat, camera.K, 32, 24, origin=tuple(UTM)).with_origin(
+        tuple(UTM + np.array([30, -20, 4]))
+    )
+    torch.testing.assert_close(rasterize(far, elsewhere).map, seen, rtol=0, atol=1e-4)
+
+
+def test_places_of_a_rule_are_those_of_the_world(tmp_path):
+    world = far_file(tmp_path / "far.ply")
+    splats = read_splats(tmp_path / "far.ply")
+    low, high = UTM - 0.4, UTM + 0.7
+    inside = ((world >= low) & (world <= high)).all(1)
+    assert InBox(tuple(low), tuple(high)).mask(splats).tolist() == inside.tolist()
+    ball = np.linalg.norm(world - UTM, axis=1) <= 0.8
+    assert 0 < ball.sum() < len(ball)
+    assert InSphere(tuple(UTM), 0.8).mask(splats).tolist() == ball.tolist()
+
+
+def test_parts_and_selections_answer_in_the_world(tmp_path):
+    world = far_file(tmp_path / "far.ply")
+    gaussians = read_splats(tmp_path / "far.ply").gaussians
+    chosen = Selection.of(torch.ones(len(gaussians), dtype=torch.bool))
+    (part,) = connected_parts(gaussians, chosen, distance=5.0)
+    np.testing.assert_allclose(part.centroid.numpy(), world.mean(0), atol=1e-4, rtol=0)
+    np.testing.assert_allclose(part.extent[0].numpy(), world.min(0), atol=1e-4, rtol=0)
+    np.testing.assert_allclose(chosen.points(gaussians), world, atol=1e-4, rtol=0)
+    assert bool(chosen.box(gaussians).contains(torch.from_numpy(chosen.points(gaussians))).all())
+    assert f"{world.mean(0)[1]:.2f}" in repr(part)
+
+
+def test_labels_pass_between_clouds_of_different_origins():
+    source, _ = cloud(seed=1)
+    target, _ = cloud(seed=2)
+    near = transfer_labels(source, source.labels, target)
+    a, b = tuple(UTM), tuple(UTM + np.array([12, -8, 3]))
+    far = transfer_labels(source.replace(origin=a), source.labels, target.replace(origin=a).with_origin(b))
+    assert torch.equal(near.labels, far.labels)
+    assert far.distance == pytest.approx(near.distance, rel=1e-4)
+
+
+def test_edits_and_joins_stay_in_the_world(tmp_path):
+    world = far_file(tmp_path / "far.ply")
+    splats = read_splats(tmp_path / "far.ply").replace(classes=("a", "b", "c"))
+    moved = Move(OfClass("b"), translation=(0.5, 0, 0), rotation=("z", 90), pivot=tuple(UTM)).apply(splats)
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    want = np.where((np.arange(60) % 3 == 1)[:, None], (world - UTM) @ quarter.T + UTM + [0.5, 0, 0], world)
+    assert np.abs(world_of(moved.gaussians) - want).max() < 1e-4
+    other = splats.replace(gaussians=splats.gaussians.with_origin(tuple(UTM + 40)))
+    both = join(splats, other).gaussians
+    assert np.abs(world_of(both) - np.concatenate([world, world])).max() < 1e-4
+
+
+def test_a_similarity_from_a_local_frame_to_utm_loses_nothing():
+    near, places = cloud()
+    turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    to_utm = Similarity(2.0, turn, torch.from_numpy(UTM))
+    far = transform_gaussians(near, to_utm)
+    assert np.abs(world_of(far) - (2 * places.numpy() @ turn.double().numpy().T + UTM)).max() < 1e-5
+    back = transform_gaussians(far, to_utm.inverse())
+    assert np.abs(world_of(back) - places.numpy()).max() < 1e-5
+    camera = Camera.look_at((0, -4, 1), (0, 0, 0), width=32, height=24)
+    moved = to_utm.apply_to_camera(camera)
+    want = to_utm.apply(camera.center.double()[None])[0]
+    assert float((to_world(moved.center, moved.origin) - want).abs().max()) < 1e-5
+    assert "5411932.5" in repr(moved)
+
+
+def test_a_splat_file_says_its_origin_and_keeps_it(tmp_path):
+    far_file(tmp_path / "far.ply")
+    splats = read_splats(tmp_path / "far.ply")
+    part = splats.select(torch.arange(5))
+    assert part.gaussians.origin == splats.gaussians.origin != (0, 0, 0)
+    assert SplatFile(part.gaussians).gaussians.detach().to(torch.float64).origin == splats.gaussians.origin
