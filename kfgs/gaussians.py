@@ -118,8 +118,8 @@ class Gaussians:
 
     def with_origin(self, origin: Sequence[float]) -> Gaussians:  # [3]
         """The same places in the world, with `means` counted from another origin."""
-        shift = self.means.new_tensor([a - b for a, b in zip(self.origin, as_origin(origin), strict=True)])
-        return self if not shift.any() else self.replace(means=self.means + shift, origin=origin)
+        shift = [a - b for a, b in zip(self.origin, as_origin(origin), strict=True)]
+        return self.replace(means=self.means + self.means.new_tensor(shift), origin=origin) if any(shift) else self
 
     def select(self, which: Any) -> Gaussians:
         """Some of the Gaussians as a new cloud; `gaussians[which]` is the same.
@@ -134,18 +134,18 @@ class Gaussians:
             IndexError: if there is no such Gaussian.
         """
         index = as_rows("which", which, len(self)).to(self.means.device)
-        return replace(self, **{name: value[index] for name, value in self._tensors().items()})
+        return self.replace(**{name: value[index] for name, value in self._tensors().items()})
 
     def to(self, *args: Any, **kwargs: Any) -> Gaussians:
         """Move or convert the floating tensors as `Tensor.to` does; labels keep their integer type."""
         moved = {name: moved_to(value, *args, **kwargs) for name, value in self._tensors().items() if name != "labels"}
         if self.labels is not None:
             moved["labels"] = self.labels.to(moved["means"].device)
-        return replace(self, **moved)
+        return self.replace(**moved)
 
     def detach(self) -> Gaussians:
         """The same values without their autograd history."""
-        return replace(self, **{name: value.detach() for name, value in self._tensors().items()})
+        return self.replace(**{name: value.detach() for name, value in self._tensors().items()})
 
     def to_numpy(self) -> dict[str, Array]:
         """The tensors that there are as NumPy arrays, by name: `means` [N, 3], ..., for trimesh, Open3D or pandas."""
@@ -174,7 +174,7 @@ class Gaussians:
                         f"parts[{i}]: expected the {name} {getattr(parts[0], name)} as in parts[0], got "
                         f"{getattr(part, name)}; bring them to one with {FACTS[name]}"
                     )
-        return replace(parts[0], **{name: torch.cat([part._tensors()[name] for part in parts]) for name in names})
+        return parts[0].replace(**{name: torch.cat([part._tensors()[name] for part in parts]) for name in names})
 
 
 def as_rows(name: str, which: Any, count: int) -> Tensor:  # [count] bool, or [n] whole numbers

@@ -214,12 +214,12 @@ class Camera:
 
     def with_origin(self, origin: Sequence[float]) -> Camera:  # [3]
         """The same view of the world, with `viewmat` mapping from coordinates counted from another origin."""
-        shift = self.viewmat.new_tensor([b - a for a, b in zip(self.origin, as_origin(origin), strict=True)])
-        if not shift.any():
+        shift = [b - a for a, b in zip(self.origin, as_origin(origin), strict=True)]
+        if not any(shift):
             return self
         viewmat = self.viewmat.clone()
-        viewmat[:3, 3] += viewmat[:3, :3] @ shift
-        return replace(self, viewmat=viewmat, origin=origin)
+        viewmat[:3, 3] += (viewmat[:3, :3].double() @ viewmat.new_tensor(shift, dtype=torch.float64)).to(viewmat)
+        return replace(self, viewmat=viewmat, origin=as_origin(origin))
 
     def to(self, *args: Any, **kwargs: Any) -> Camera:
         """Move or convert the matrices as `Tensor.to` does."""

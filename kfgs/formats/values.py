@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .._check import ORIGIN
+from .._check import ORIGIN, as_origin
 from .._origin import choose_origin, to_local
 from ..gaussians import Gaussians
 from .splat_file import SCORE, SplatFile
@@ -77,8 +77,8 @@ def flip_axes(g: Gaussians, axes: tuple[int, int, int]) -> Gaussians:
     if g.sh is not None:
         parity = [float(np.prod([signs[axis] for axis in odd])) for odd in ("", *_ODD)]
         sh = g.sh * g.sh.new_tensor(parity[: g.sh.shape[1]])[:, None]
-    x, y, z = (place * sign + 0.0 for place, sign in zip(g.origin, axes, strict=True))  # + 0: no negative zeros
-    return g.replace(means=g.means * means + 0.0, quats=g.quats * quats + 0.0, sh=sh, origin=(x, y, z))
+    place = [value * axis + 0.0 for value, axis in zip(g.origin, axes, strict=True)]  # + 0: no negative zeros
+    return g.replace(means=g.means * means + 0.0, quats=g.quats * quats + 0.0, sh=sh, origin=as_origin(place))
 
 
 def known_quats(quats: Tensor) -> Tensor:  # [N, 4] wxyz twice

@@ -83,6 +83,7 @@ def project(
             f"camera: expected a camera without distortion, got {camera.distortion.model} (camera {camera.name!r}); "
             "undistort the images first with kfgs.cameras.undistort, which returns the camera to use"
         )
+    camera = camera.with_origin(gaussians.origin)
     if any(m.dtype != gaussians.means.dtype or m.device != gaussians.means.device for m in (camera.viewmat, camera.K)):
         camera = camera.to(gaussians.means)
     values = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities

@@ -90,7 +90,7 @@ def rasterize(
         >>> rendering.map.shape, rendering.alpha[1, 1] > rendering.alpha[0, 0]
         (torch.Size([4, 4, 2]), tensor(True))
     """
-    camera = _check_arguments(gaussians, camera)
+    _check_arguments(gaussians, camera)
     if gaussians.features is None and gaussians.sh is None:
         raise ValueError("gaussians: expected features or sh to render, got neither; add them with gaussians.replace()")
     projected = project(gaussians, camera, near=near, engine=engine)
@@ -146,7 +146,7 @@ def rasterize_labels(
         >>> rasterize_labels(ball, camera, engine="reference").labels[..., 0].tolist()
         [[-1, 1, 1, -1], [1, 1, 1, 1], [1, 1, 1, 1], [-1, 1, 1, -1]]
     """
-    camera = _check_arguments(gaussians, camera)
+    _check_arguments(gaussians, camera)
     if gaussians.features is None:
         raise ValueError(
             "gaussians: expected scores of classes as features, got None; add them with gaussians.replace()"
@@ -160,8 +160,7 @@ def rasterize_labels(
         )
 
 
-def _check_arguments(gaussians: Gaussians, camera: Camera) -> Camera:
-    """The camera, with its coordinates counted from the origin of the Gaussians."""
+def _check_arguments(gaussians: Gaussians, camera: Camera) -> None:
     check_gaussians(gaussians)
     if not isinstance(camera, Camera):
         raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}; take one of scene.cameras")
@@ -174,7 +173,6 @@ def _check_arguments(gaussians: Gaussians, camera: Camera) -> Camera:
                 f"gaussians.{name}: expected {means.dtype} on {means.device} (from gaussians.means), got {value.dtype} on "
                 f"{value.device}; convert all of them with gaussians.to({means.device.type!r}, torch.float32)"
             )
-    return camera.with_origin(gaussians.origin)
 
 
 def _seen(gaussians: Gaussians, camera: Camera, projected: Projected, engine: str) -> tuple[Tensor, Tensor | None]:
@@ -182,7 +180,7 @@ def _seen(gaussians: Gaussians, camera: Camera, projected: Projected, engine: st
     if gaussians.features is not None:
         return gaussians.features, projected.index
     assert gaussians.sh is not None
-    center = camera.center.to(gaussians.means)
+    center = camera.with_origin(gaussians.origin).center.to(gaussians.means)
     compiled = choose_compiled(engine, "shade", "gaussians", gaussians.sh, gaussians.means)
     if compiled and not center.requires_grad:
         tensors = gaussians.sh.contiguous(), gaussians.means.contiguous(), center.contiguous(), projected.index
