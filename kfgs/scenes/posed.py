@@ -298,7 +298,7 @@ def points_of_cameras(
     if not unit > 0:
         raise SceneError(f"integer_depth_scale: expected a number above 0, got {unit:g}; correct it")
     found = points_from_depth([view for view, _ in views], [depth for _, depth in views], None, 1 / unit)
-    return None if found is None else (*found, [f"points from the depth pictures of {len(views)} views"])
+    return found and (found[0].float(), found[1], [f"points from the depth pictures of {len(views)} views"])
 
 
 def _resized(view: PosedPicture, size: tuple[int, int]) -> Matrix:  # [3, 3]
