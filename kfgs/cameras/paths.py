@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from .._check import check_size, check_whole
 from .camera import Camera
+from .resample import fits_aspect
 
 Array = np.ndarray[Any, Any]
 SAME = 1e-9  # successive views closer than this, in position and direction, are one
@@ -42,7 +44,8 @@ def path_cameras(
         frames: how many cameras to return. The first and last stand at the first and last key; a closed path ends one step
             before its start.
         every: take only every N-th camera as a key, and the last one. A hand-held video of 200 pictures trembles less with 10.
-        size: (height, width) in pixels of the new cameras; None: that of the first camera.
+        size: (height, width) in pixels of the new cameras; None: that of the first camera. A key of another shape than the
+            first stays complete, in the middle of the picture.
         closed: come back to the first camera, for a film that repeats.
 
     Returns:
@@ -60,7 +63,7 @@ def path_cameras(
         check_size(size)
     keys = _keys(cameras, every, closed)
     height, width = size or cameras[0].size
-    keys = [key.resized(height, width) for key in keys]
+    keys = [_in_frame(key, *cameras[0].size).resized(height, width) for key in keys]
     places, turns = _poses(keys)
     times = np.concatenate([[0.0], np.cumsum(_steps(places, turns))])
     start, end = (times[AROUND], times[-AROUND - 1]) if closed else (times[0], times[-1])
@@ -98,6 +101,16 @@ def _keys(cameras: Sequence[Camera], every: int, closed: bool) -> list[Camera]:
     if closed:
         keys = [keys[i % len(keys)] for i in range(-AROUND, len(keys) + AROUND + 1)]
     return keys
+
+
+def _in_frame(key: Camera, height: int, width: int) -> Camera:
+    """The view of a portrait in the middle of a landscape, with its pixels as high as wide; others stay as they are."""
+    if fits_aspect(key.size, (height, width)):
+        return key
+    scale = min(height / key.height, width / key.width)
+    K = key.K * key.K.new_tensor([scale, scale, 1.0])[:, None]
+    K[:2, 2] += key.K.new_tensor([width - scale * key.width, height - scale * key.height]) / 2
+    return replace(key, K=K, width=width, height=height)
 
 
 def _poses(keys: Sequence[Camera]) -> tuple[Array, Rotation]:  # [k, 3], k rotations from world to camera

@@ -171,7 +171,7 @@ def _own_walk(path: Path, frames: int | None, width: int | None, film: bool) -> 
     if width is not None:
         sizes = [(width, max(1, round(width * h / w))) for w, h in sizes]
     if frames is not None:
-        sizes = sizes[:1] * len(own)
+        sizes = sizes[:1]
     for w, h in sizes:
         if max(w, h) > LARGEST:
             raise ValueError(
@@ -184,11 +184,10 @@ def _own_walk(path: Path, frames: int | None, width: int | None, film: bool) -> 
             f"path: expected cameras of one size for a film, got {listed} in {path}; give --frames, which takes the size of the "
             "first"
         )
-    own = [camera.resized(h, w) for camera, (w, h) in zip(own, sizes, strict=True)]
     if frames is None:
-        return own
+        return [camera.resized(h, w) for camera, (w, h) in zip(own, sizes, strict=True)]
     try:
-        return path_cameras(own, frames)
+        return path_cameras(own, frames, size=sizes[0][::-1])
     except TooFewViewsError as error:
         got = "1" if len(own) == 1 else f"{len(own)} that are all at one place and angle"
         raise ValueError(
@@ -217,14 +216,15 @@ def walk_of(
         raise ValueError(
             f"scene: expected --scene for --path {path}, whose cameras it needs, got none; or take an orbit"
         )
-    size = (max(1, round(width * cameras[0].height / cameras[0].width)), width)
-    if path == "cameras":
-        return path_cameras(cameras, frames, every=max(1, round(len(cameras) / KEYS)), size=size)
     import torch
 
     centers = torch.stack([camera.center for camera in cameras]).double()
     middle = int((centers - centers.mean(dim=0)).norm(dim=1).argmin())
-    return spiral_cameras(cameras[middle], points, frames, size=size)
+    view = cameras[0 if path == "cameras" else middle]
+    size = (max(1, round(width * view.height / view.width)), width)
+    if path == "cameras":
+        return path_cameras(cameras, frames, every=max(1, round(len(cameras) / KEYS)), size=size)
+    return spiral_cameras(view, points, frames, size=size)
 
 
 def _title(word: str) -> str:

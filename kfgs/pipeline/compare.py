@@ -107,20 +107,12 @@ def write_comparison(
 ) -> Path:
     """Draw the scene before and after from each viewpoint, one row each, into one PNG file.
 
-    Pictures smaller than the largest get a white border.
+    Pictures less wide than the others get a white border.
     """
-    height, width = (max(camera.size[i] for camera in cameras) for i in (0, 1))
-    rows = [[_padded(render_color(cloud, camera), height, width) for cloud in (before, after)] for camera in cameras]
+    rows = [[render_color(cloud, camera) for cloud in (before, after)] for camera in cameras]
     path = as_path(path)
     save_picture(path, picture_grid(rows, titles))
     return path
-
-
-def _padded(picture: Tensor, height: int, width: int) -> Tensor:  # [h, w, 3] -> [H, W, 3]
-    top, left = (height - picture.shape[0]) // 2, (width - picture.shape[1]) // 2
-    sheet = picture.new_ones(height, width, 3)
-    sheet[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
-    return sheet
 
 
 class PhotoPictures:

@@ -45,10 +45,9 @@ def write_parts(
         return None
     columns = min(3, len(pictures))
     titles += [""] * (-len(pictures) % columns)
-    pictures += [np.full_like(pictures[0], 255)] * (-len(pictures) % columns)
+    pictures += [np.full((1, WIDTH, 3), 255, np.uint8)] * (-len(pictures) % columns)
     rows = [
-        picture_grid([pictures[i : i + columns]], titles[i : i + columns], width=WIDTH)
-        for i in range(0, len(pictures), columns)
+        picture_grid([pictures[i : i + columns]], titles[i : i + columns]) for i in range(0, len(pictures), columns)
     ]
     save_picture(path, np.concatenate(rows))
     return path

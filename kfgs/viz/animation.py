@@ -66,7 +66,7 @@ def save_animation(
         raise ValueError("cameras: expected at least one camera, got none; make some with kfgs.cameras.orbit_cameras")
     sizes = sorted({camera.size for camera in cameras})
     if len(sizes) > 1:
-        raise ValueError(f"cameras: expected one size for all frames, got {sizes}; make them equal with resized()")
+        raise ValueError(f"cameras: expected one size for all frames, got {sizes}; pass path_cameras(cameras, frames)")
     check_target(path, fps)
     drawn = as_shows(shows, names)
     strip = None

@@ -59,10 +59,9 @@ def draw_examples(
         raise ValueError("examples: expected at least one in a view, got none; pass Clicks, a Box or a Mask")
     views = list(shown.values())[:MOST]
     pictures = [_marked(camera, photo(camera), marks, width) for camera, marks in views]
-    columns, height = min(COLUMNS, len(pictures)), max(len(picture) for picture in pictures)
+    columns = min(COLUMNS, len(pictures))
     titles = [camera.name for camera, _ in views] + [""] * (-len(pictures) % columns)
-    paper = np.full((height, width, 3), 255, np.uint8)
-    pictures = [np.concatenate([one, paper[len(one) :]]) for one in pictures] + [paper] * (-len(pictures) % columns)
+    pictures += [np.full((1, width, 3), 255, np.uint8)] * (-len(pictures) % columns)
     rows = [
         picture_grid([pictures[i : i + columns]], titles[i : i + columns]) for i in range(0, len(pictures), columns)
     ]

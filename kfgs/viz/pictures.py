@@ -204,15 +204,14 @@ def picture_grid(
     """Lay pictures out in rows, with a title over each column.
 
     Args:
-        rows: R rows of C pictures, of one size unless a `width` is given.
+        rows: R rows of C pictures. Smaller ones stand in the middle of their row and column.
         titles: C titles, or none.
-        width: width of each picture in pixels; all pictures are resized to it and to the proportions of the first, for
-            instance a feature map beside its photograph. Shrinking averages pixels. Enlarging repeats them, so that a
-            coarse map looks coarse.
+        width: width of each picture in pixels; all pictures are resized to it and to the proportions of the first in their
+            row, for instance a feature map beside its photograph. Shrinking averages pixels. Enlarging repeats them, so
+            that a coarse map looks coarse.
 
     Raises:
-        ValueError: if there is no picture, rows or titles differ in number, pictures differ in size without a `width`, or
-            `width` is no positive whole number.
+        ValueError: if there is no picture, rows or titles differ in number, or `width` is no positive whole number.
 
     Example:
         >>> photo, coarse = np.zeros((60, 80, 3)), np.ones((6, 8, 3))
@@ -225,27 +224,22 @@ def picture_grid(
         )
     if titles and len(titles) != len(rows[0]):
         raise ValueError(f"titles: expected {len(rows[0])} (one per column), got {len(titles)}; give one for each")
-    named = [(f"rows[{i}][{j}]", picture, "H W 3") for i, row in enumerate(rows) for j, picture in enumerate(row)]
-    for one in named:
-        check_shapes(one)
+    for i, j in np.ndindex(len(rows), len(rows[0])):
+        check_shapes((f"rows[{i}][{j}]", rows[i][j], "H W 3"))
     pictures = [[as_bytes(picture) for picture in row] for row in rows]
     if width is not None:
-        pictures = _resize_alike(pictures, width)
-    height, width = pictures[0][0].shape[:2]
-    for (name, picture, _), shown in zip(named, (picture for row in pictures for picture in row), strict=True):
-        if shown.shape[:2] != (height, width):
-            raise ValueError(
-                f"{name}: expected [H, W, 3] with H = {height}, W = {width} (from rows[0][0]), got {tuple(picture.shape)}; "
-                f"call picture_grid(..., width={width}) to resize"
-            )
+        pictures = [_resize_alike(row, width) for row in pictures]
+    heights = [max(picture.shape[0] for picture in row) for row in pictures]
+    width = max(picture.shape[1] for row in pictures for picture in row)
     letters = max(12, width // 28)  # pixels
     head = (letters * 3 // 2 if titles else 0) + GAP
     columns = len(rows[0])
-    sheet = np.full((head + len(rows) * (height + GAP), GAP + columns * (width + GAP), 3), 255, np.uint8)
-    for i, row in enumerate(pictures):
-        for j, picture in enumerate(row):
-            top, left = head + i * (height + GAP), GAP + j * (width + GAP)
-            sheet[top : top + height, left : left + width] = picture
+    sheet = np.full((head + sum(heights) + len(rows) * GAP, GAP + columns * (width + GAP), 3), 255, np.uint8)
+    for i, j in np.ndindex(len(rows), columns):
+        picture = pictures[i][j]
+        top = head + sum(heights[:i]) + i * GAP + (heights[i] - picture.shape[0]) // 2
+        left = GAP + j * (width + GAP) + (width - picture.shape[1]) // 2
+        sheet[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
     canvas = Image.fromarray(sheet)
     draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(size=letters)
     for j, title in enumerate(titles):
@@ -280,18 +274,15 @@ def _to_bytes(unit: Array) -> Array:
     return np.asarray(np.round(np.clip(np.nan_to_num(unit, nan=0.0), 0, 1) * 255), dtype=np.uint8)
 
 
-def _resize_alike(pictures: list[list[Array]], width: int) -> list[list[Array]]:
-    """All pictures `width` pixels wide and in the proportions of the first."""
+def _resize_alike(pictures: list[Array], width: int) -> list[Array]:
+    """All pictures of a row `width` pixels wide and in the proportions of the first."""
     if not isinstance(width, numbers.Integral) or width < 1:
         raise ValueError(
             f"width: expected a positive whole number of pixels, got {width!r}; pass an integer, for instance 320"
         )
-    if not all(picture.size for row in pictures for picture in row):
+    if not all(picture.size for picture in pictures):
         raise ValueError("rows: expected pictures of at least one pixel, got an empty one; leave it out")
-    high, wide = pictures[0][0].shape[:2]
+    high, wide = pictures[0].shape[:2]
     size = int(width), max(1, round(high * int(width) / wide))  # Pillow's order
     # a box filter takes the mean of the pixels covered; when enlarging, the pixel itself
-    return [
-        [np.asarray(Image.fromarray(np.ascontiguousarray(p)).resize(size, Resampling.BOX)) for p in row]
-        for row in pictures
-    ]
+    return [np.asarray(Image.fromarray(np.ascontiguousarray(p)).resize(size, Resampling.BOX)) for p in pictures]

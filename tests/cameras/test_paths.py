@@ -96,6 +96,15 @@ def test_lenses_run_linearly_and_sizes_are_the_askers():
         assert view.distortion is None
 
 
+def test_a_portrait_among_landscapes_is_not_stretched():
+    """60 x 40 (width x height) in a frame of 60 x 40 from 40 x 60: two thirds as large, in the middle."""
+    high = Camera(torch.eye(4), torch.tensor([[60.0, 0, 21], [0, 60, 33], [0, 0, 1]]), 40, 60)
+    path = path_cameras([camera((-1, 0, 0)), high], 2)
+    expected = [[40, 0, 30 + 2 / 3], [0, 40, 20 + 2], [0, 0, 1]]
+    np.testing.assert_allclose(path[-1].K, expected, atol=1e-5)
+    assert path[-1].size == (40, 60)
+
+
 @pytest.mark.parametrize(
     ("keys", "options", "message"),
     [

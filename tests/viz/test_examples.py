@@ -55,10 +55,8 @@ def test_pictures_of_any_size_are_laid_out_three_in_a_row():
     examples = {"chair": [Clicks(view, [(5, 5)]) for view in views]}
     large = draw_examples(views, examples, lambda camera: torch.full((640, 640, 3), 0.5), width=WIDTH)
     assert large.shape[1] == GAP + 3 * (WIDTH + GAP)
-    rows = 2 * (HEAD + WIDTH + GAP)
+    rows = 2 * (HEAD + GAP) + WIDTH + round(WIDTH * ONE.height / ONE.width)  # each as high as its highest view
     assert large.shape[0] == rows + len(legend_strip(np.arange(1), ["chair"], large.shape[1]))
-    below = large[HEAD + WIDTH + GAP + HEAD :, GAP : GAP + WIDTH]
-    assert (below[240:WIDTH] == 255).all()  # paper, because this view is lower
 
 
 @pytest.mark.parametrize(
