@@ -89,8 +89,7 @@ class Gaussians:
             parts.append(f"{self.features.shape[1]} features")
         if self.sh is not None:
             parts.append(f"SH degree {int(self.sh.shape[1] ** 0.5) - 1}")
-        if self.labels is not None:
-            parts.append("labelled")
+        parts += ["labelled"] * (self.labels is not None) + ["antialiased"] * self.antialiased
         return f"Gaussians({', '.join(parts)}, {self.means.dtype}, {self.means.device})"
 
     def __getitem__(self, which: Any) -> Gaussians:

@@ -44,12 +44,29 @@ def project(mean, quat, scale, viewmat, K, width, height, low_pass=0.3, margin=1
     return np.array([fx * x / z + cx, fy * y / z + cy]), cov, z
 
 
+def compensation(*gaussian_and_camera):
+    """Mip-Splatting's factor of the opacity, sqrt(det S / det(S + 0.3 I)); the arguments of `project`."""
+    plain, widened = (project(*gaussian_and_camera, low_pass=width)[1] for width in (0.0, 0.3))
+    return sqrt(np.linalg.det(plain) / np.linalg.det(widened))
+
+
 def alpha_at(x, y, mean, conic, opacity):
     """min(0.99, opacity * density) at a point, 0 where that is below 1/255."""
     dx, dy = x - mean[0], y - mean[1]
     a, b, c = conic
     alpha = min(0.99, opacity * exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy)))
     return alpha if alpha >= 1 / 255 else 0.0
+
+
+def surfel_alpha(x, y, mean, quat, sides, opacity, viewmat, K):
+    """Alpha of a 2-D Gaussian at a point of the picture: where the ray meets its plane, but at least a blob (2DGS, eq. 11)."""
+    R, W = rotation(quat), np.asarray(viewmat, float)[:3, :3]
+    center = W @ np.asarray(mean, float) + np.asarray(viewmat, float)[:3, 3]
+    (u, v, normal), ray = (W @ R).T, np.linalg.inv(K) @ [x, y, 1.0]
+    at = ray * (center @ normal) / (ray @ normal) - center
+    middle = K @ center / center[2]
+    form = min((at @ u / sides[0]) ** 2 + (at @ v / sides[1]) ** 2, 2 * (x - middle[0]) ** 2 + 2 * (y - middle[1]) ** 2)
+    return opacity * exp(-0.5 * form)
 
 
 def composite(means2d, conics, depths, opacities, features, width, height, background=None):

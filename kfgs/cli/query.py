@@ -148,6 +148,7 @@ def label(
     import torch
 
     from .._check import check_range
+    from ..formats.ply import read_comments
     from ..pipeline import label_cloud, read_cloud, save_labelled
     from ..pipeline.apply import COMMENTS
 
@@ -167,6 +168,7 @@ def label(
     loaded = classes.open_field("field", field)
     label_set = classes.of_field(loaded)
     carried = None if cloud is None else read_cloud(cloud)
+    said = () if cloud is None else tuple(read_comments(cloud))
     if query is None:
         labels, scores = loaded.classify(label_set, rule=rule)
         who = "what the views show of each Gaussian" if rule == "fused" else "each Gaussian's own latent (Sec. 3.4)"
@@ -180,7 +182,7 @@ def label(
     with atomic_folder(out) as new:
         save_labelled(new / "gaussians.ply", gaussians, scores, label_set, rule=how)
         if carried is not None:
-            moved, _ = label_cloud(gaussians, carried, new / "cloud.ply", label_set, distance=distance)
+            moved, _ = label_cloud(gaussians, carried, new / "cloud.ply", label_set, distance=distance, comments=said)
         written = sorted(path.name for path in new.iterdir())
     say(f"labelled by {how}")
     if query is None:

@@ -47,14 +47,14 @@ def identify_fit(
     """A digest of each input of a fit. Of the targets, only their number and the first map count.
 
     The extent of the config may be None, so the caller puts the one in use into `others`. Near planes count where one is not
-    at 0.2: checkpoints from before cameras had one stay valid.
+    at 0.2, and `antialiased` if it is set: checkpoints from before stay valid.
     """
     options = {name: value for name, value in config.identity().items() if name not in ("checkpoint_every", "extent")}
     views = [tensor for camera in cameras for tensor in (camera.viewmat, camera.K, torch.tensor(camera.size))]
     near = torch.tensor([camera.near for camera in cameras], dtype=torch.float64)
     views += [near] if (near != NEAR).any() else []
     return {
-        "params": digest_tensors(list(params.to_tensors().values())),
+        "params": digest_tensors([*params.to_tensors().values(), *[torch.tensor(True)] * params.antialiased]),
         "cameras": digest_tensors(views),
         "targets": digest_tensors([torch.tensor(len(targets)), as_tensor("targets[0]", targets[0], floating=True)]),
         "config": digest_value(options),

@@ -161,12 +161,14 @@ def _match_moments(cloud: Gaussians, worth: Tensor, group: Tensor, count: int) -
     axes = axes * torch.linalg.det(axes).sign()[:, None, None]  # a rotation, not a reflection
     covered = _sum(cloud.opacities.double() * _area(cloud.scales.double()), group, count)
     opacities = (covered / _area(scales)).clamp(*OPACITY)
-    return Gaussians(
-        means.to(cloud.means),
-        rotation_matrix_to_quaternion(axes.contiguous()).to(cloud.means),
-        scales.to(cloud.means),
-        opacities.to(cloud.means),
+    return cloud.replace(
+        means=means.to(cloud.means),
+        quats=rotation_matrix_to_quaternion(axes.contiguous()).to(cloud.means),
+        scales=scales.to(cloud.means),
+        opacities=opacities.to(cloud.means),
         features=_sum(share.to(cloud.features) * cloud.features, group, count),
+        labels=None,
+        sh=None,
     )
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from math import isqrt
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from ..splat.sh import rgb_to_sh0
 # Bounds of a point's spacing: near-duplicates would give specks, and a lonely point a giant Gaussian.
 SMALLEST_SPACING = 0.01  # times the median spacing
 LARGEST_SPACING_QUANTILE = 0.99
+_NAMES = ("means", "quats", "log_scales", "logit_opacities", "features", "sh0", "sh_rest")
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +39,11 @@ class GaussianParams:
     features: Tensor | None = None  # [N, D]
     sh0: Tensor | None = None  # [N, 3], the coefficient of degree 0
     sh_rest: Tensor | None = None  # [N, K - 1, 3], K = (degree + 1)^2; None at degree 0
+    antialiased: bool = False  # as in `Gaussians`
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
+        for name in _NAMES:
+            value = getattr(self, name)
             if not isinstance(value, Tensor | None):
                 object.__setattr__(self, name, as_tensor(name, value, floating=True))
         check_shapes(
@@ -86,25 +90,26 @@ class GaussianParams:
 
     def to_tensors(self) -> dict[str, Tensor]:
         """The raw tensors (without None) by name, in a fixed order."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        values = {name: getattr(self, name) for name in _NAMES}
         return {name: value for name, value in values.items() if value is not None}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> GaussianParams:
         """The inverse of `to_tensors`; other names are ignored, and a missing one is a ValueError."""
-        names = [field.name for field in fields(cls)]
-        needed = [*names[:4], "sh0" if "features" not in tensors and "sh0" in tensors else "features"]
+        needed = [*_NAMES[:4], "sh0" if "features" not in tensors and "sh0" in tensors else "features"]
         missing = [name for name in needed if name not in tensors]
         if missing:
             raise ValueError(
                 f"tensors: expected the names {needed}, got {sorted(tensors)} without {missing}; "
                 "pass what GaussianParams.to_tensors gave"
             )
-        return cls(**{name: tensors[name] for name in names if name in tensors})
+        known: dict[str, Any] = {name: tensors[name] for name in _NAMES if name in tensors}
+        return cls(**known)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> GaussianParams:
         """Apply one function to every raw tensor."""
-        return GaussianParams(**{name: function(value) for name, value in self.to_tensors().items()})
+        mapped: dict[str, Any] = {name: function(value) for name, value in self.to_tensors().items()}
+        return replace(self, **mapped)
 
     def activated(self, sh_degree: int | None = None) -> Gaussians:
         """The Gaussians with these values; differentiable.
@@ -118,7 +123,8 @@ class GaussianParams:
             rest = [] if degree == 0 or self.sh_rest is None else [self.sh_rest[:, : (degree + 1) ** 2 - 1]]
             sh = torch.cat([self.sh0[:, None], *rest], dim=1)
         scales, opacities = self.log_scales.exp(), self.logit_opacities.sigmoid()
-        return Gaussians(self.means, self.quats, scales, opacities, features=self.features, sh=sh)
+        shape = self.means, self.quats, scales, opacities
+        return Gaussians(*shape, features=self.features, sh=sh, antialiased=self.antialiased)
 
     @classmethod
     def from_gaussians(cls, gaussians: Gaussians) -> GaussianParams:
@@ -146,6 +152,7 @@ class GaussianParams:
             features=None if gaussians.features is None else gaussians.features.detach().clone(),
             sh0=None if sh is None else sh[:, 0].detach().clone(),
             sh_rest=sh[:, 1:].detach().clone() if sh is not None and higher else None,
+            antialiased=gaussians.antialiased,
         )
 
     @classmethod

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -212,7 +213,7 @@ class Trainer:
             if name != "generator":
                 kind, rest = name.split(".", 1)
                 parts[kind][rest] = value.to(device)
-        params = GaussianParams.from_tensors(parts["params"])
+        params = replace(GaussianParams.from_tensors(parts["params"]), antialiased=self.optimizer.params.antialiased)
         self.optimizer = FieldOptimizer(params, self._config, extent=self._extent)
         self.optimizer.load_state_(parts["adam"])
         self.statistics = GradientStatistics(**parts["statistics"])

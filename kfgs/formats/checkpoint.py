@@ -25,6 +25,7 @@ from .._torch_files import plain_tensor, read_torch
 from ..cameras.similarity import Similarity
 from ..gaussians import Gaussians
 from ..splat.transform import transform_gaussians
+from .render_mode import Mode, with_mode
 from .splat_file import SplatFile
 from .values import SH_C0, check_finite, positive_scales
 
@@ -32,6 +33,7 @@ NAME = "checkpoint"
 SUFFIXES = (".pt", ".ckpt")
 HOLDS_LABELS = False
 FRAME = "dataparser_transforms.json"
+SETTINGS = ("config.yml", "cfg.yml")
 _EXPECTED = "a checkpoint of gsplat (with 'splats') or of nerfstudio's splatfacto (with 'pipeline')"
 _NAMES = ("means", "scales", "quats", "opacities")
 
@@ -59,12 +61,24 @@ def read(path: Path) -> SplatFile:
         files = _ranks(path)
         parts = [_gsplat(file, found if file == path else read_torch(file, _EXPECTED)) for file in files]
         info |= {"program": "gsplat", "frame": "that of gsplat's trainer, which normalises the scene by default"}
-        return SplatFile(Gaussians.cat(parts), info=info | ({"ranks": len(files)} if len(files) > 1 else {}))
+        info |= {"ranks": len(files)} if len(files) > 1 else {}
+        return with_mode(SplatFile(Gaussians.cat(parts), info=info), _mode(path))
     if isinstance(found.get("pipeline"), dict):
         cloud, frame = _undo_frame(path, _splatfacto(path, found["pipeline"]))
-        return SplatFile(cloud, info=info | {"program": "nerfstudio", "frame": frame})
+        return with_mode(SplatFile(cloud, info=info | {"program": "nerfstudio", "frame": frame}), _mode(path))
     got = f"one with {', '.join(map(str, list(found)[:5]))}" if found else type(top).__name__
     raise ValueError(f"{path}: expected {_EXPECTED}, got {got:.200}; name another file")
+
+
+def _mode(path: Path) -> Mode:
+    """What the settings of the training say, which nerfstudio (config.yml) and gsplat (cfg.yml) keep above the checkpoints."""
+    places = [path.parent.parent / name for name in SETTINGS] + [path.parent / name for name in SETTINGS]
+    text = next((file.read_text("utf-8", "replace") for file in places if file.is_file()), "").lower()
+    keys = "rasterize_mode|antialiased|model_type|with_ut|with_eval3d"
+    said = dict(re.findall(rf"^ *({keys}): *'?([\w-]+)", text, re.MULTILINE))
+    unknown = tuple(f"{key}: true" for key in ("with_ut", "with_eval3d") if said.get(key) == "true")  # 3DGUT
+    antialiased = said.get("rasterize_mode") == "antialiased" or said.get("antialiased") == "true"
+    return Mode(antialiased, said.get("model_type", "").startswith("2dgs"), unknown)
 
 
 def _ranks(path: Path) -> list[Path]:

@@ -25,7 +25,7 @@ from torch import Tensor
 from ..gaussians import Gaussians
 from .order import morton_order
 from .ply import Columns, read_comments, read_ply_elements, write_ply_elements
-from .render_mode import comments_of_mode, mode_from_comments
+from .render_mode import comments_of_mode, mode_from_comments, with_mode
 from .smallest_three import pack_smallest_three, rotation_error, unpack_smallest_three
 from .splat_file import Precision, SplatFile
 from .values import SH_C0, check_finite, colours_to_write, describe_loss, positive_scales
@@ -93,7 +93,7 @@ def read(path: Path) -> SplatFile:
         sh=torch.from_numpy(sh),
     )
     comments = read_comments(path)
-    return SplatFile(gaussians, info={"format": NAME, "comments": comments, **mode_from_comments(comments)})
+    return with_mode(SplatFile(gaussians, info={"format": NAME, "comments": comments}), mode_from_comments(comments))
 
 
 def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
@@ -130,7 +130,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
         rest = g.sh[:, 1:].transpose(1, 2).flatten(1).numpy()  # channel by channel
         steps_of_rest = np.clip(np.floor((rest / (2 * SH_LIMIT) + 0.5) * 256), 0, 255).astype(np.uint8)
         elements["sh"] = {f"f_rest_{i}": np.ascontiguousarray(column) for i, column in enumerate(steps_of_rest.T)}
-    write_ply_elements(path, elements, comments=("written by kfgs", *comments_of_mode(splats.info)))
+    write_ply_elements(path, elements, comments=("written by kfgs", *comments_of_mode(splats)))
     return describe_loss(splats, ".compressed.ply", 3) + _words_of_clipping(g)
 
 

@@ -94,7 +94,7 @@ def read(path: Path) -> SplatFile:
             "write it again without compression"
         )
     parts: list[_Part] = []
-    ignored, total, spaces = 0, 0, set()
+    ignored, total, spaces, notes = 0, 0, set(), set()
     for where, mesh, matrix in placed_meshes(document):
         for primitive in document.list_of(document.item("meshes", mesh), "primitives", f"meshes[{mesh}].primitives"):
             extension = _extension(document, primitive, mesh)
@@ -109,13 +109,16 @@ def read(path: Path) -> SplatFile:
                 )
             parts.append(part._replace(gaussians=place(document, where, part.gaussians, matrix)))
             spaces.add(str(extension.get("colorSpace", COLOR_SPACE)))
+            for key, drawn in (("colorSpace", COLOR_SPACE), ("projection", PROJECTION)):
+                if extension.get(key, drawn) != drawn:
+                    notes.add(f"the file says {key} {extension[key]!r:.80}: drawn as if it were {drawn!r}")
     if not parts:
         raise ValueError(
             f"{path}: expected a primitive with {EXTENSION}, got {ignored} primitives without; it holds no splats"
         )
     info = {"format": NAME, "color_space": ", ".join(sorted(spaces)), "primitives": len(parts), "ignored": ignored}
     gaussians, extra, classes = _join(parts)
-    return SplatFile(flip_axes(gaussians, UP_AND_BACK), extra, classes, info)
+    return SplatFile(flip_axes(gaussians, UP_AND_BACK), extra, classes, info, tuple(sorted(notes)))
 
 
 def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
@@ -159,7 +162,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
     }
     write_document(path, root, writer.binary())
     left = {name: values for name, values in splats.extra.items() if name not in kept}
-    return describe_loss(splats.replace(extra=left), path.suffix, 3) + describe_lost_mode(splats.info, path.suffix)
+    return describe_loss(splats.replace(extra=left), path.suffix, 3) + describe_lost_mode(splats, path.suffix)
 
 
 def precision(gaussians: Gaussians) -> Precision:

@@ -18,7 +18,7 @@ from .._check import ORIGIN
 from .._origin import to_world
 from ..gaussians import Gaussians
 from .ply import points_from_columns, read_comments, read_ply, stack_columns, write_ply
-from .render_mode import comments_of_mode, mode_from_comments
+from .render_mode import comments_of_mode, mode_from_comments, with_mode
 from .splat_file import Columns, Precision, SplatFile
 from .values import EXACT, check_finite, colours_to_write, describe_loss, near_zero, positive_scales
 
@@ -27,6 +27,7 @@ SUFFIXES = (".ply",)
 MAGIC = b"ply"
 HOLDS_LABELS = True
 HOLDS_ORIGIN = True
+FILTER = "filter_3D"  # Mip-Splatting's own files: the 3-D filter's deviation, not yet part of scales and opacities
 NORMALS = ("nx", "ny", "nz")  # always zero in 3DGS files; written, not kept
 COEFFICIENTS = 16  # of harmonics of degree 3, which Inria's script always writes
 
@@ -39,7 +40,7 @@ def matches(head: bytes) -> bool:
 def read(path: Path) -> SplatFile:
     """Read a 3DGS PLY with any degree of spherical harmonics; unknown columns go to `extra`.
 
-    `info` has `antialiased` or `surfels` if a comment says so (`render_mode`).
+    The comments, or columns, say whether it is antialiased or has surfels (`render_mode`).
 
     Raises:
         ValueError: if it is damaged, no 3DGS file, or a value is not a finite number; opacities of 0 and 1, whose logits
@@ -53,12 +54,16 @@ def read(path: Path) -> SplatFile:
     _check_values(path, gaussians)
     gaussians = gaussians.replace(scales=positive_scales(path, gaussians.scales.numpy()))
     extra = {name: values for name, values in columns.items() if not _is_ours(name)}
-    return SplatFile(gaussians, extra, info={"format": NAME, **mode_from_comments(read_comments(path))})
+    mode = mode_from_comments(read_comments(path))
+    mode = mode._replace(
+        surfels=mode.surfels or "scale_2" not in columns, antialiased=mode.antialiased or FILTER in columns
+    )
+    return with_mode(SplatFile(gaussians, extra, info={"format": NAME}), mode)
 
 
 def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
     """Write the 3DGS layout, labels and extra columns included; x, y, z are double if it has an origin. Nothing is lost."""
-    comments = ("written by kfgs", *comments_of_mode(splats.info))
+    comments = ("written by kfgs", *comments_of_mode(splats))
     columns = columns_from_gaussians(splats.gaussians)
     if any(splats.gaussians.origin):
         places = to_world(splats.gaussians.means.detach().cpu(), splats.gaussians.origin)
@@ -92,7 +97,7 @@ def _check_values(path: Path, g: Gaussians) -> None:
 
 
 def _is_ours(name: str) -> bool:
-    known = {"x", "y", "z", "opacity", "class_id", *NORMALS}
+    known = {"x", "y", "z", "opacity", "class_id", FILTER, *NORMALS}
     return name in known or name.startswith(("f_dc_", "f_rest_", "scale_", "rot_", "semantic_"))
 
 
@@ -115,6 +120,8 @@ def gaussians_from_columns(columns: Columns) -> Gaussians:
     Raises:
         ValueError: if a column of the 3DGS layout is missing, or numbered columns have gaps or an odd count.
     """
+    if {"scale_0", "scale_1"} <= columns.keys():  # 2DGS has no third; `render_mode.flattened` makes it thin
+        columns = {"scale_2": np.minimum(columns["scale_0"], columns["scale_1"]), **columns}
     needed = ["x", "y", "z", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     missing = [name for name in needed if name not in columns]
     if missing:
@@ -135,11 +142,17 @@ def gaussians_from_columns(columns: Columns) -> Gaussians:
         if rest:  # stored channel-major
             higher = stack_columns(columns, rest).view(len(dc), 3, len(rest) // 3).transpose(1, 2)
         sh = torch.cat([dc, higher], 1)
+    scales = stack_columns(columns, [f"scale_{i}" for i in range(3)]).exp()
+    opacities = stack_columns(columns, ["opacity"])[:, 0].sigmoid()
+    if FILTER in columns:  # Yu et al. 2024, eq. 7: a Gaussian that is widened becomes fainter
+        narrow = scales.double()
+        wide = (narrow**2 + stack_columns(columns, [FILTER]).double() ** 2).sqrt()
+        scales, opacities = wide.float(), (opacities * (narrow / wide.clamp_min(1e-300)).prod(dim=1)).float()
     cloud = Gaussians(
         means=points_from_columns(columns),
         quats=stack_columns(columns, [f"rot_{i}" for i in range(4)]),
-        scales=stack_columns(columns, [f"scale_{i}" for i in range(3)]).exp(),
-        opacities=stack_columns(columns, ["opacity"])[:, 0].sigmoid(),
+        scales=scales,
+        opacities=opacities,
         features=stack_columns(columns, features) if features else None,
         sh=sh,
         labels=_labels(columns["class_id"]) if "class_id" in columns else None,

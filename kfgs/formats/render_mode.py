@@ -1,13 +1,13 @@
-"""The kind of rendering that a cloud was trained for: antialiased, or as flat surfels. The Gaussians do not show it.
+"""The kind of rendering that a cloud was trained for, as its file says: antialiased, as flat surfels, or unknown to kfgs.
 
-`info["antialiased"]` (true or false): trained with the filter of Mip-Splatting, so a renderer that widens a Gaussian on the
-screen must lower its opacity in proportion; otherwise small Gaussians are too opaque. `info["surfels"]` (true): trained as
-2D Gaussians. If the file does not say, `info` has neither.
+`Gaussians.antialiased`: trained with the filter of Mip-Splatting, so what a renderer widens on the screen must become fainter;
+kfgs draws it so. `info["surfels"]` (true): trained as 2-D Gaussians, which kfgs draws as flat 3-D ones, and says so.
 
 - PLY and compressed PLY, in comments: `SplatRenderMode: default`, `mip` or `2dgs` (Brush), `antialiased 1` or `0` and
-  `postshot.anti_aliasing=1` or `0` (Postshot);
+  `postshot.anti_aliasing=1` or `0` (Postshot). A PLY without `scale_2` has surfels, one with `filter_3D` is Mip-Splatting's;
 - SOG, in `meta.json`: `"antialias": true` (the specification), `"model": "antialiased"` or `"2dgs"` (splat-transform);
-- SPZ: a flag for antialiased, no place for surfels.
+- SPZ: a flag for antialiased, no place for surfels;
+- checkpoints, in the settings next to them: `rasterize_mode` (nerfstudio), `antialiased` (gsplat).
 
 Other formats store neither.
 """
@@ -15,68 +15,108 @@ Other formats store neither.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
-ANTIALIASED, SURFELS = "antialiased", "surfels"
-_MODES: dict[str, dict[str, bool]] = {
-    "default": {ANTIALIASED: False},
-    "mip": {ANTIALIASED: True},
-    "2dgs": {SURFELS: True},
+import torch
+
+from ..gaussians import Gaussians
+from .splat_file import SplatFile
+
+SURFELS = "surfels"
+FLAT = 1e-3  # a surfel's thickness, times its shorter side: far below a pixel where the side is one
+AS_FLAT = (
+    "2-D Gaussians (2DGS): drawn as flat 3-D ones, which differ if seen nearly from their edge, or from nearer than ten times "
+    "their size"
+)
+"""Against the intersection of rays with them (a standard deviation of 17 pixels, 1/30 of the depth): alpha differs by at most
+0.02 at 30 degrees, 0.04 at 75, 0.5 at 89; with 1/6 of the depth by 0.1 at 30 degrees and 0.18 at 75."""
+_ANTIALIASED = "antialiased rendering"
+
+
+class Mode(NamedTuple):
+    """What a file says."""
+
+    antialiased: bool = False
+    surfels: bool = False
+    unknown: tuple[str, ...] = ()  # what kfgs does not know, as the file writes it
+
+
+_MODES = {
+    "default": Mode(),
+    "0": Mode(),
+    "1": Mode(antialiased=True),
+    "mip": Mode(antialiased=True),
+    "antialiased": Mode(antialiased=True),
+    "2dgs": Mode(surfels=True),
 }
-_FLAGS = {"0": "default", "1": "mip"}
-_MODELS = {"default": "default", "antialiased": "mip", "2dgs": "2dgs"}
-_WORDS = {ANTIALIASED: "antialiased rendering", SURFELS: "rendering as surfels (2DGS)"}
+_VALUES = {
+    "splatrendermode:": ("default", "mip", "2dgs"),
+    "antialiased": ("0", "1"),
+    "postshot.anti_aliasing": ("0", "1"),
+    "model": ("default", "antialiased", "2dgs"),
+}
+"""What a file may say, by the word that announces it."""
 
 
-def mode_from_comments(comments: Iterable[str]) -> dict[str, bool]:
-    """Read the mode from the comments of a PLY header, for `info`. The last one counts, as in Brush."""
-    said: dict[str, bool] = {}
+def mode_from_comments(comments: Iterable[str]) -> Mode:
+    """Read the mode from the comments of a PLY header. The last one that kfgs knows counts, as in Brush."""
+    mode, unknown = Mode(), []
     for comment in comments:
-        words = comment.lower().replace("=", " ").split()
-        if len(words) != 2:
+        key, *values = comment.lower().replace("=", " ").split() or [""]
+        if key not in _VALUES or len(values) != 1:
             continue
-        key, value = words
-        if key in ("antialiased", "postshot.anti_aliasing"):
-            value = _FLAGS.get(value, "")
-        elif key != "splatrendermode:":
-            continue
-        said = _MODES.get(value, said)
-    return dict(said)
+        if values[0] in _VALUES[key]:
+            mode = _MODES[values[0]]
+        else:
+            unknown.append(comment.strip())
+    return mode._replace(unknown=tuple(unknown))
 
 
-def comments_of_mode(info: Mapping[str, Any]) -> tuple[str, ...]:
-    """Comments for a PLY header, in the words of Brush and of Postshot; none if `info` does not say."""
-    if info.get(SURFELS):
+def mode_from_meta(meta: Mapping[str, Any]) -> Mode:
+    """Read the mode from the `meta.json` of a SOG scene; `model` has priority over `antialias`."""
+    model, antialias = meta.get("model"), meta.get("antialias")
+    if model in _VALUES["model"]:
+        return _MODES[model]
+    said = {"model": model, "antialias": None if isinstance(antialias, bool) else antialias}
+    unknown = tuple(f"{key}: {value!r:.40}" for key, value in said.items() if value is not None)
+    return Mode(antialias is True, unknown=unknown)
+
+
+def with_mode(splats: SplatFile, mode: Mode) -> SplatFile:
+    """A cloud that is drawn as its file says, with notes where that is not quite possible."""
+    notes = tuple(
+        f"the file says {words!r}, which kfgs does not know: drawn as 3-D Gaussians" for words in mode.unknown
+    )
+    gaussians = splats.gaussians.replace(antialiased=mode.antialiased)
+    if not mode.surfels:
+        return splats.replace(gaussians=gaussians, notes=splats.notes + notes)
+    info = splats.info | {SURFELS: True}
+    return splats.replace(gaussians=flattened(gaussians), info=info, notes=(*splats.notes, AS_FLAT, *notes))
+
+
+def flattened(gaussians: Gaussians) -> Gaussians:
+    """Surfels as 3-D Gaussians: they have no extent along their third axis, whatever the file has there."""
+    sides, depth = gaussians.scales[:, :2], gaussians.scales[:, 2]
+    depth = torch.minimum(depth, FLAT * sides.amin(dim=1))
+    return gaussians.replace(scales=torch.cat([sides, depth[:, None]], dim=1))
+
+
+def comments_of_mode(splats: SplatFile) -> tuple[str, ...]:
+    """Comments for a PLY header, in the words of Brush and of Postshot; none for an ordinary cloud."""
+    if splats.info.get(SURFELS):
         return ("SplatRenderMode: 2dgs",)
-    if info.get(ANTIALIASED) is None:
-        return ()
-    return (
-        ("SplatRenderMode: mip", "antialiased 1")
-        if info[ANTIALIASED]
-        else ("SplatRenderMode: default", "antialiased 0")
-    )
+    return ("SplatRenderMode: mip", "antialiased 1") if splats.gaussians.antialiased else ()
 
 
-def mode_from_meta(meta: Mapping[str, Any]) -> dict[str, bool]:
-    """Read the mode from the `meta.json` of a SOG scene, for `info`; `model` has priority over `antialias`."""
-    model = meta.get("model")
-    if isinstance(model, str) and model in _MODELS:
-        return dict(_MODES[_MODELS[model]])
-    antialias = meta.get("antialias")
-    return {ANTIALIASED: antialias} if isinstance(antialias, bool) else {}
-
-
-def meta_of_mode(info: Mapping[str, Any]) -> dict[str, Any]:
-    """Keys for the `meta.json` of a SOG scene; none if `info` does not say."""
-    if info.get(SURFELS):
+def meta_of_mode(splats: SplatFile) -> dict[str, Any]:
+    """Keys for the `meta.json` of a SOG scene; none for an ordinary cloud."""
+    if splats.info.get(SURFELS):
         return {"model": "2dgs"}
-    if info.get(ANTIALIASED) is None:
-        return {}
-    return {"antialias": True, "model": "antialiased"} if info[ANTIALIASED] else {"antialias": False}
+    return {"antialias": True, "model": "antialiased"} if splats.gaussians.antialiased else {}
 
 
-def describe_lost_mode(info: Mapping[str, Any], name: str, holds: tuple[str, ...] = ()) -> tuple[str, ...]:
-    """Describe the parts of the mode that a format cannot store."""
-    return tuple(
-        f"{words}: {name} has no place for it" for key, words in _WORDS.items() if info.get(key) and key not in holds
-    )
+def describe_lost_mode(splats: SplatFile, name: str, *, antialiased: bool = False) -> tuple[str, ...]:
+    """Describe the parts of the mode that a format cannot store, which may hold `antialiased`."""
+    lost = [_ANTIALIASED] if splats.gaussians.antialiased and not antialiased else []
+    lost += ["rendering as surfels (2DGS)"] if splats.info.get(SURFELS) else []
+    return tuple(f"{words}: {name} has no place for it" for words in lost)

@@ -29,7 +29,7 @@ from .._files import HIDDEN, atomic_folder, atomic_path, open_current
 from ..gaussians import Gaussians
 from .order import morton_order
 from .palette import Palette, fit_codebook, fit_palette, nearest_codes
-from .render_mode import meta_of_mode
+from .render_mode import meta_of_mode, with_mode
 from .sidecar import read_sidecar
 from .smallest_three import pack_smallest_three, rotation_error, unpack_smallest_three
 from .sog_images import META, SogFiles, encode_image, write_zip
@@ -64,7 +64,7 @@ def matches(head: bytes) -> bool:
 def read(path: Path) -> SplatFile:
     """Read a .sog file, a folder with `meta.json`, or that `meta.json`; opacities of 0 and 1 stay 0 and 1.
 
-    `info` has `version`, and if the scene gives them `generator`, and `antialiased` or `surfels` (`render_mode`).
+    `info` has `version`, and if the scene gives them `generator` and `surfels` (`render_mode`).
 
     Raises:
         ValueError: if it is neither, a file is missing or damaged, or sizes and indices disagree.
@@ -94,7 +94,7 @@ def _read(path: Path, find: Callable[[str], Path]) -> SplatFile:
         opacities=_opacities(meta, rgba[:, 3]),
         sh=torch.from_numpy(sh),
     )
-    splats = SplatFile(gaussians, info={"format": NAME, **meta.facts})
+    splats = with_mode(SplatFile(gaussians, info={"format": NAME, **meta.facts}), meta.mode)
     return read_sidecar(path.parent, splats) if path.name == META else splats  # labels are next to the folder
 
 
@@ -104,7 +104,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
     Raises:
         ValueError: if the cloud has no colours, or there is a folder of that name with files that do not belong to a SOG scene.
     """
-    files = _encode(colours_to_write(splats.gaussians, ".sog"), meta_of_mode(splats.info))
+    files = _encode(colours_to_write(splats.gaussians, ".sog"), meta_of_mode(splats))
     if path.name.lower().endswith(SUFFIXES):
         with atomic_path(path) as temporary:
             write_zip(temporary, files)

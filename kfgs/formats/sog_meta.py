@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._card import short_repr
-from .render_mode import mode_from_meta
+from .render_mode import Mode, mode_from_meta
 
 _BYTES_TO_GAUSSIANS = 64  # the most Gaussians per byte: even equal ones need a few bits each
 
@@ -26,6 +26,7 @@ class SogMeta(NamedTuple):
     palette: int | None  # rows of shN; None in version 1
     degree: int | None  # of shN; None in version 1
     facts: dict[str, Any]  # for `SplatFile.info`
+    mode: Mode
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -67,9 +68,8 @@ def parse_meta(path: Path, meta: dict[str, Any], size: int) -> SogMeta:
     facts: dict[str, Any] = {"version": version}
     if isinstance(asset, dict) and isinstance(asset.get("generator"), str):
         facts["generator"] = asset["generator"]
-    facts |= mode_from_meta(meta)
     low, high = (_numbers(path, _get(path, meta, "means", key), f"means.{key}", 3) for key in ("mins", "maxs"))
-    return SogMeta(count, (low, high), tables, files, logits, palette, degree, facts)
+    return SogMeta(count, (low, high), tables, files, logits, palette, degree, facts, mode_from_meta(meta))
 
 
 def _get(path: Path, meta: dict[str, Any], group: str, key: str) -> Any:

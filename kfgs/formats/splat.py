@@ -85,7 +85,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
     with atomic_path(path) as temporary:
         rows.tofile(temporary)
     cut = describe_cut(rgba[:, :3], 0.0, 1.0, "colours", ".splat")
-    return describe_loss(splats, ".splat", 0) + cut + describe_lost_mode(splats.info, ".splat")
+    return describe_loss(splats, ".splat", 0) + cut + describe_lost_mode(splats, ".splat")
 
 
 def precision(gaussians: Gaussians) -> Precision:

@@ -34,11 +34,11 @@ class SplatFile:
     classes: tuple[str, ...] = ()
     """The name of each class index in `labels`; empty if the file has no names."""
     info: dict[str, Any] = field(default_factory=dict)
-    """Details of the file, as JSON: `format`, and values of the header. `antialiased` and `surfels` are the kind of rendering
-    that the cloud was trained for (`render_mode`). A format that cannot store them reports them as lost."""
+    """Details of the file, as JSON: `format`, and values of the header. `surfels` (true) are 2-D Gaussians (`render_mode`). A
+    format that cannot store that, or `gaussians.antialiased`, reports it as lost."""
 
     notes: tuple[str, ...] = ()
-    """What the reader left out or changed, in words. Commands print it."""
+    """What the reader left out or changed, and what is not drawn as the file says, in words. Commands print it."""
 
     _writer: ClassVar[Callable[..., Written]]
     """What `save` calls: `table.write_splats`, which sets it. The formats import this file, and the table knows the formats."""

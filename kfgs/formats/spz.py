@@ -33,8 +33,7 @@ from .._check import check_choice, check_whole
 from .._files import as_path, parse_json
 from .._typed import typed
 from ..gaussians import Gaussians
-from .render_mode import ANTIALIASED as ANTIALIASED_MODE
-from .render_mode import describe_lost_mode
+from .render_mode import Mode, describe_lost_mode, with_mode
 from .splat_file import SCORE, Precision, SplatFile
 from .spz_codec import (
     DC,
@@ -72,7 +71,7 @@ def matches(head: bytes) -> bool:
 def read(path: Path) -> SplatFile:
     """Read an SPZ file of version 1, 2, 3 or 4, gzipped or plain, into the axes of the 3DGS PLY.
 
-    `info` has `version`, `antialiased`, `fractional_bits`, `extensions` (types of records that were not understood, in
+    `info` has `version`, `fractional_bits`, `extensions` (types of records that were not understood, in
     hexadecimal) and `dropped` where the file has harmonics of degree 4.
 
     Raises:
@@ -82,11 +81,11 @@ def read(path: Path) -> SplatFile:
     records: dict[int, bytes] = dict(c.extensions)
     axes = _axes(path, records.pop(_COORDINATES, None))
     label_record = records.pop(LABELS, None)
-    info: dict[str, Any] = {"format": NAME, "version": c.version, ANTIALIASED_MODE: bool(c.flags & ANTIALIASED)}
+    info: dict[str, Any] = {"format": NAME, "version": c.version}
     info |= {"fractional_bits": c.fractional_bits, "extensions": [f"{kind:#010x}" for kind in records]}
     if c.degree > 3:
         info["dropped"] = f"spherical harmonics of degree {c.degree}: degree 3 was kept"
-    splats = SplatFile(unpack(path, c, axes), info=info)
+    splats = with_mode(SplatFile(unpack(path, c, axes), info=info), Mode(bool(c.flags & ANTIALIASED)))
     if label_record is None:
         return splats
     labels = _unpack_labels(path, label_record, c.count)
@@ -144,7 +143,7 @@ def write_spz(
         )
     assert g.sh is not None
     degree = int(g.sh.shape[1] ** 0.5) - 1
-    flags = ANTIALIASED if splats.info.get(ANTIALIASED_MODE) else 0
+    flags = ANTIALIASED if splats.gaussians.antialiased else 0
     records = [] if g.labels is None else [(LABELS, _pack_labels(_record(splats)))]
     streams = pack(g, version, fractional_bits, sh_bits)
     write_container(as_path(path), Container(version, len(g), degree, fractional_bits, flags, streams, records))
@@ -237,7 +236,7 @@ def _axes(path: Path, record: bytes | None) -> tuple[int, int, int]:
 
 
 def _lost(splats: SplatFile, g: Gaussians, fractional_bits: int) -> tuple[str, ...]:
-    lost = list(describe_loss(splats, ".spz", 3) + describe_lost_mode(splats.info, ".spz", (ANTIALIASED_MODE,)))
+    lost = list(describe_loss(splats, ".spz", 3) + describe_lost_mode(splats, ".spz", antialiased=True))
     if fractional_bits < _SPARSE_BITS:
         lost.append(
             f"positions finer than {2.0**-fractional_bits:g} units: the cloud reaches {g.means.abs().max().item():g} units "

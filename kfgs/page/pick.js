@@ -70,8 +70,10 @@ function alphaAt(cloud, i, m, focal, tangent, offset) {
     c += v * v;
   }
   const [dx, dy] = offset;
-  const power = (c * dx * dx - 2 * b * dx * dy + a * dy * dy) / (a * c - b * b);
-  return Math.min(0.99, cloud.opacityOf(i) * Math.exp(-0.5 * power));
+  const det = a * c - b * b, plain = Math.max(0, (a - 0.3) * (c - 0.3) - b * b);
+  const opacity = cloud.opacityOf(i) * (cloud.meta.antialiased ? Math.sqrt(plain / det) : 1);
+  const power = (c * dx * dx - 2 * b * dx * dy + a * dy * dy) / det;
+  return Math.min(0.99, opacity * Math.exp(-0.5 * power));
 }
 
 /**

@@ -389,6 +389,7 @@ export class Renderer {
     gl.uniform1i(at.asked, look.question === null ? 0 : 1);
     gl.uniform1i(at.masked, state.selected ? 1 : 0);
     gl.uniform1i(at.dim, look.dim ? 1 : 0);
+    gl.uniform1i(at.antialiased, meta.antialiased ? 1 : 0);
     gl.uniform3fv(at.center, meta.center);
     gl.uniform3fv(at.spread, meta.half);
     gl.uniform2fv(at.scaling, meta.scale);

@@ -29,6 +29,7 @@ uniform isampler2D labels, sources;
 uniform sampler2D scores, latents, colormap, classes, fars;
 uniform int count, rows, degree, mode;          // count: in view; mode: 0 color, 1 labels, 2 score, 3 latents
 uniform bool carried, asked, masked, dim;       // carried: labels come from the source; masked: selection is a mask
+uniform bool antialiased;                       // what is widened on the screen becomes fainter
 uniform vec3 center, spread;                    // of the box of the means
 uniform vec2 scaling, dcScale, scoreRange;      // lowest log and step
 uniform float shStep, gamma, lambda, mixing, near, share;   // share: of the Gaussians that are drawn
@@ -166,6 +167,7 @@ void main() {
   axis = dot(axis, axis) > 1e-20 ? normalize(axis) : vec2(1.0, 0.0);
   vec2 xy = focal * p.xy / p.z + pinhole.zw;
   if (!(large < 1e8)) return;
+  if (antialiased) opacity *= sqrt(dot(area, area) / det);
   if (share < 1.0) {                            // the others are left out: larger and denser ones fill their places
     large *= inversesqrt(share);
     small *= inversesqrt(share);

@@ -21,6 +21,7 @@ from ..evaluation.segmentation import VOID, check_truth
 from ..fields import Rule, SemanticField
 from ..formats.ply import Columns, other_elements, points_from_columns, read_ply, write_ply
 from ..formats.ply_3dgs import columns_from_gaussians, label_column
+from ..formats.render_mode import comments_of_mode
 from ..formats.sidecar import write_names
 from ..formats.splat_file import SCORE, SplatFile
 from ..gaussians import Gaussians
@@ -230,7 +231,7 @@ def save_labelled(
     path = as_path(path)
     assert gaussians.labels is not None
     columns = columns_from_gaussians(gaussians) | label_columns(gaussians.labels, classes.names, scores)
-    write_ply(path, columns, comments=(COMMENTS["gaussians.ply"],))
+    write_ply(path, columns, comments=(COMMENTS["gaussians.ply"], *comments_of_mode(SplatFile(gaussians))))
     return [path, write_names(path, classes.names, **{"labelled by": rule})]
 
 
@@ -270,7 +271,13 @@ def read_cloud(path: str | Path) -> Columns:
 
 @typed
 def label_cloud(
-    gaussians: Gaussians, cloud: Columns, out: str | Path, classes: LabelSet, *, distance: float | None = None
+    gaussians: Gaussians,
+    cloud: Columns,
+    out: str | Path,
+    classes: LabelSet,
+    *,
+    distance: float | None = None,
+    comments: tuple[str, ...] = (),
 ) -> tuple[Transfer, list[Path]]:
     """Carry labels to points or Gaussians by distance (Sec. 3.4), keeping all their other columns.
 
@@ -282,13 +289,14 @@ def label_cloud(
         out: the PLY file to write.
         classes: names for the JSON file next to it.
         distance: lambda of Sec. 3.4, in world units; None: from the clouds' spacing.
+        comments: those of the cloud's file (`formats.ply.read_comments`), which may say how it is drawn.
     """
     assert gaussians.labels is not None
     moved = transfer_labels(gaussians.means, gaussians.labels, points_from_columns(cloud), distance)
     added = label_columns(moved.labels, classes.names)
     if {"red", "green", "blue"} & set(cloud):
         added = {"class_id": added["class_id"]}
-    write_ply(out, cloud | added, comments=(COMMENTS["cloud.ply"],))
+    write_ply(out, cloud | added, comments=(COMMENTS["cloud.ply"], *comments))
     return moved, [
         as_path(out),
         write_names(out, classes.names, **{"distance": moved.distance, "distance from": moved.how}),

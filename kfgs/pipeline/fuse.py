@@ -119,7 +119,7 @@ def uplift_stage(
         {} if onto is None else {"goes_on": onto.folder.name, "views_before": len(onto.views), "views_new": len(new)}
     )
     return SemanticField(
-        Gaussians(**{name: tensors[name] for name in (*SHAPE, "features")}),
+        geometry.replace(**{name: tensors[name] for name in (*SHAPE, "features")}, sh=None, labels=None),
         info=grown,
         linear=LinearLatents(tensors["basis"]),
         seen=Seen(tensors["pixels"], tensors["agreement"]),

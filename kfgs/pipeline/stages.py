@@ -231,8 +231,9 @@ def digest_tensors(*tensors: Tensor) -> str:
 
 
 def digest_shape(gaussians: Gaussians) -> str:
-    """SHA-256 of positions, rotations, sizes and opacities."""
-    return digest_tensors(*(getattr(gaussians, name) for name in SHAPE))
+    """SHA-256 of positions, rotations, sizes and opacities; and of `antialiased` where it is set."""
+    shape = (getattr(gaussians, name) for name in SHAPE)
+    return digest_tensors(*shape, *[torch.tensor(True)] * gaussians.antialiased)
 
 
 def digest_scene(scene: Scene, views: Sequence[int]) -> str:

@@ -124,7 +124,15 @@ def add_cloud(
     cloud["opacity"] *= np.float32(options.opacity)
     _add_shapes(cloud, gaussians)
     follow = partial(seen_from, gaussians) if by_view else None
-    return as_gaussians(plotter, cloud, sort=options.sort, moving=options.moving, near=options.near, colors_from=follow)
+    return as_gaussians(
+        plotter,
+        cloud,
+        sort=options.sort,
+        moving=options.moving,
+        near=options.near,
+        antialiased=gaussians.antialiased,
+        colors_from=follow,
+    )
 
 
 def to_pyvista(

@@ -45,6 +45,10 @@ VERTEX_SHADER = {
         "if (cameraParallel == 0 && posDC.w <= {near})"
     ),
 }
+WIDENED = "cov2d += mat2(lowpassMatrix.x, lowpassMatrix.y, lowpassMatrix.y, lowpassMatrix.z);"
+FAINTER = f"""float plain = determinant(cov2d);
+      {WIDENED}
+      vertexColorVSOutput.a *= sqrt(max(plain, 0.0) / determinant(cov2d));"""
 DENSITY = "float gaussian = exp(-0.5*dist2);"
 FRAGMENT_SHADER = {
     DENSITY: f"{DENSITY} if (opacity*gaussian < {ALPHA_MIN:.9f}) discard; gaussian = min(gaussian, {ALPHA_MAX}/opacity);"
@@ -58,6 +62,7 @@ def as_gaussians(
     sort: bool,
     moving: Moving = "auto",
     near: float = NEAR,
+    antialiased: bool = False,
     colors_from: Callable[[Array], Array] | None = None,
 ) -> pv.Actor:
     """Draw a cloud with `index`, `rgb`, `scale`, `quat` (w, x, y, z; unit) and `opacity` as Gaussians.
@@ -75,6 +80,7 @@ def as_gaussians(
             for Gaussians with an opacity of at most 0.1), "gaussians", or "auto": points if a frame of Gaussians takes
             longer than 0.1 s.
         near: depth up to which nothing is drawn, world units (`Camera.near`).
+        antialiased: what the low-pass filter widens becomes fainter (`Gaussians.antialiased`).
         colors_from: a function from the camera's position [3] to `rgb` in the order of `index`; None: fixed colours.
     """
     actor = draw_mesh(plotter, cloud, style="points_gaussian", scalars="rgb", rgb=True, emissive=False, lighting=False)
@@ -87,7 +93,8 @@ def as_gaussians(
     mapper.SetBoundScale(BOUND)
     # room_0's field: 24 dB with VTK's shaders, 39 with our vertex shader, 43 with both. One view of five needs kfgs's near
     # plane: 23 dB without. If another VTK has other shader text, nothing is replaced, and test_agreement.py fails
-    for original, replacement in VERTEX_SHADER.items():
+    shader = VERTEX_SHADER | ({WIDENED: FAINTER} if antialiased else {})
+    for original, replacement in shader.items():
         actor.GetShaderProperty().AddVertexShaderReplacement(
             original, True, replacement.replace("{near}", f"{near:.9f}"), False
         )

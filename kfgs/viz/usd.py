@@ -91,7 +91,7 @@ def save_usd(path: str | Path, cloud: Gaussians | SplatFile, *, points: bool = F
         except RuntimeError as error:  # of USD: the system's words are somewhere in several lines
             code = next((code for code in UNNAMED if os.strerror(code) in str(error)), errno.EIO)
             raise OSError(code, os.strerror(code)) from error
-    lost = describe_loss(splats, path.suffix, 3) + describe_lost_mode(splats.info, path.suffix)
+    lost = describe_loss(splats, path.suffix, 3) + describe_lost_mode(splats, path.suffix)
     flat = ("shapes, opacities and harmonics of the Gaussians: points are round and opaque",) if points else ()
     return Written([path], lost + flat, None)
 

@@ -208,6 +208,20 @@ def test_a_resumed_fit_equals_an_undisturbed_one_bit_for_bit(tmp_path, stop_at):
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
+def test_an_antialiased_cloud_is_trained_as_it_is_drawn(tmp_path):
+    cloud = blobs().replace(scales=0.05 * blobs().scales, antialiased=True)  # smaller than a pixel
+    cameras = [look_at_origin(0.5 * i) for i in range(2)]
+    targets = [rasterize(cloud, camera).map for camera in cameras]
+    params, config = GaussianParams.from_gaussians(cloud), replace(SHORT, steps=2, report_every=1, densify_from=2)
+    path = tmp_path / "fit.safetensors"
+    fit = fit_field(params, cameras, targets, config, checkpoint=path)
+    assert fit.history[0]["loss"] < 1e-6  # it draws what it began as
+    assert fit.params.antialiased
+    assert fit_field(params, cameras, targets, config, checkpoint=path).params.antialiased  # as the file has it
+    with pytest.raises(ValueError, match="other params"):
+        fit_field(replace(params, antialiased=False), cameras, targets, config, checkpoint=path)
+
+
 def test_a_finished_checkpoint_returns_at_once(tmp_path):
     cameras, targets = scene(3)
     path = tmp_path / "fit.safetensors"

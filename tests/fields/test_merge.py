@@ -6,9 +6,10 @@ import pytest
 import torch
 from messages import tells
 
+from kfgs.cameras import Camera
 from kfgs.fields import merge_gaussians as merge_any
 from kfgs.gaussians import Gaussians
-from kfgs.splat import covariance_3d
+from kfgs.splat import covariance_3d, rasterize
 
 
 def merge_gaussians(*args, **options):
@@ -60,6 +61,19 @@ def test_two_equal_balls_become_their_mixture():
     assert found.opacities.item() == pytest.approx(2 * o * s * s / (s * math.hypot(s, a)), rel=1e-5)
     torch.testing.assert_close(found.features, torch.tensor([[0.9, 0.3]]))
     assert torch.linalg.vector_norm(found.quats).item() == pytest.approx(1, abs=1e-5)
+
+
+def test_merged_balls_smaller_than_a_pixel_are_antialiased_and_cover_as_much():
+    """The opacity that keeps o A keeps the light on the screen, too: compensated, a Gaussian covers 2 pi o sqrt(det S)."""
+    cloud = balls([[0.0, 0, 4], [0.002, 0, 4], [0, 0.003, 4]], [[1.0, 0]] * 3, 0.005, 0.5).replace(antialiased=True)
+    merged = merge_gaussians(cloud, torch.ones(3), 1, clusters=1).gaussians
+    camera = Camera(torch.eye(4), torch.tensor([[60.0, 0, 8.2], [0, 60, 7.9], [0, 0, 1]]), 16, 16)  # 0.08 pixels wide
+    before = sum(
+        float(rasterize(one, camera, engine="reference").alpha.sum()) for one in (cloud[0], cloud[1], cloud[2])
+    )
+    after = float(rasterize(merged, camera, engine="reference").alpha.sum())
+    assert merged.antialiased
+    assert after == pytest.approx(before, rel=0.05)  # alpha below 1/255 is not drawn
 
 
 def test_weights_move_the_mixture():
@@ -119,9 +133,7 @@ def test_the_faintest_are_dropped_as_far_as_their_share_goes():
 def test_splitting_every_gaussian_drops_no_more_of_what_is_shown():
     """Ten copies of each with a tenth of its weight: what is kept shows the same."""
     cloud, weights = random_cloud(200)
-    ten = Gaussians(
-        **{name: value.repeat(10, *[1] * (value.ndim - 1)) for name, value in vars(cloud).items() if value is not None}
-    )
+    ten = cloud[torch.arange(200).repeat(10)]
     whole = merge_any(cloud, weights, 150)
     split = merge_any(ten, weights.repeat(10) / 10, 150)
     for merged in (whole, split):

@@ -208,6 +208,16 @@ def test_disagreement_of_views_is_seen():
     torch.testing.assert_close(decoded(found), torch.tensor([[0.5, 0.5]]))
 
 
+def test_weights_of_an_antialiased_cloud_are_those_that_are_drawn():
+    tiny = balls([[0.0, 0, 2], [0.2, 0.1, 2]], scale=0.03).replace(antialiased=True)  # 0.12 pixels wide
+    fused = uplift_maps(tiny, ahead(2), random_maps(ahead(2)), PLAIN)
+    drawn = [rasterize(tiny[i].replace(features=torch.ones(1, 1)), ahead()[0], engine="reference") for i in range(2)]
+    assert fused.gaussians.antialiased
+    assert fused.pixels.tolist() == pytest.approx([2 * float(one.alpha.sum()) for one in drawn], rel=0.02)
+    plain = uplift_maps(tiny.replace(antialiased=False), ahead(2), random_maps(ahead(2)), PLAIN)
+    assert (plain.pixels > 5 * fused.pixels).all()
+
+
 def test_the_cloud_keeps_its_shape_and_loses_colours():
     gaussians = cloud()
     carried = gaussians.replace(sh=torch.zeros(12, 1, 3).double(), features=torch.ones(12, 2).double())

@@ -44,6 +44,33 @@ def write_gsplat(path: Path, raw: dict[str, Tensor]) -> Path:
     return path
 
 
+@pytest.mark.parametrize(
+    ("write", "name", "settings", "antialiased", "words"),
+    [
+        ("nerfstudio", "config.yml", "      rasterize_mode: antialiased\n", True, None),
+        ("nerfstudio", "config.yml", "      rasterize_mode: classic\n", False, None),
+        ("gsplat", "cfg.yml", "antialiased: true\napp_opt: false\n", True, None),
+        ("gsplat", "cfg.yml", "antialiased: false\nmodel_type: 2dgs\n", False, "2-D Gaussians"),
+        (
+            "gsplat",
+            "cfg.yml",
+            "antialiased: false\nwith_ut: true\n",
+            False,
+            "'with_ut: true', which kfgs does not know",
+        ),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.*dataparser_transforms")
+def test_the_settings_of_the_training_say_how_it_is_drawn(tmp_path, write, name, settings, antialiased, words):
+    write = {"gsplat": write_gsplat, "nerfstudio": write_nerfstudio}[write]
+    path = write(tmp_path / "run" / "ckpts" / "step-000029999.ckpt", raw_values())
+    (tmp_path / "run" / name).write_text("method: splatfacto\n" + settings)
+    splats = read_splats(path)
+    assert splats.gaussians.antialiased is antialiased
+    assert [note for note in splats.notes if words and words in note] == list(splats.notes)
+    assert bool(splats.notes) is bool(words)
+
+
 def write_nerfstudio(path: Path, raw: dict[str, Tensor], *, prefix: str = "_model.gauss_params.") -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     values = {

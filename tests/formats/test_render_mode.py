@@ -3,20 +3,24 @@
 import json
 import zipfile
 
+import numpy as np
+import oracles_splat as oracle
 import pytest
 import torch
 
+from kfgs.cameras import Camera
 from kfgs.formats import SplatFile, formats, read_splats, write_splats
-from kfgs.formats.ply import read_comments
-from kfgs.formats.render_mode import comments_of_mode, meta_of_mode, mode_from_comments, mode_from_meta
+from kfgs.formats.ply import read_comments, write_ply
+from kfgs.formats.render_mode import AS_FLAT, Mode, flattened, mode_from_comments, mode_from_meta
 from kfgs.gaussians import Gaussians
+from kfgs.splat import rasterize
 
 WRITABLE = [name for name, module in formats().items() if hasattr(module, "write")]
 HOLD_ANTIALIASED = ("compressed_ply", "ply", "spz", "sog")
 HOLD_SURFELS = ("compressed_ply", "ply", "sog")
 
 
-def _splats(**info) -> SplatFile:
+def _splats(antialiased: bool = False, **info) -> SplatFile:
     g = torch.Generator().manual_seed(2)
     cloud = Gaussians(
         means=torch.randn(5, 3, generator=g),
@@ -24,6 +28,7 @@ def _splats(**info) -> SplatFile:
         scales=torch.rand(5, 3, generator=g) + 0.1,
         opacities=torch.rand(5, generator=g),
         sh=torch.randn(5, 1, 3, generator=g) * 0.3,
+        antialiased=antialiased,
     )
     return SplatFile(cloud, info=info)
 
@@ -38,33 +43,26 @@ def _through(folder, to, splats):
 @pytest.mark.parametrize("to", WRITABLE)
 def test_antialiased_is_kept_or_named(tmp_path, to):
     suffix, lost, back = _through(tmp_path, to, _splats(antialiased=True))
-    if to in HOLD_ANTIALIASED:
-        assert (lost, back.info["antialiased"]) == ((), True)
-    else:
-        assert lost == (f"antialiased rendering: {suffix} has no place for it",)
-        assert "antialiased" not in back.info
+    kept = to in HOLD_ANTIALIASED
+    assert back.gaussians.antialiased is kept
+    assert lost == (() if kept else (f"antialiased rendering: {suffix} has no place for it",))
 
 
 @pytest.mark.parametrize("to", WRITABLE)
 def test_surfels_are_kept_or_named(tmp_path, to):
     suffix, lost, back = _through(tmp_path, to, _splats(surfels=True))
+    assert not back.gaussians.antialiased
     if to in HOLD_SURFELS:
-        assert (lost, back.info["surfels"], "antialiased" in back.info) == ((), True, False)
+        assert (lost, back.info["surfels"], back.notes) == ((), True, (AS_FLAT,))
     else:
         assert lost == (f"rendering as surfels (2DGS): {suffix} has no place for it",)
-        assert "surfels" not in back.info
+        assert ("surfels" in back.info, back.notes) == (False, ())
 
 
 @pytest.mark.parametrize("to", WRITABLE)
 def test_a_plain_cloud_stays_plain(tmp_path, to):
-    for info in ({"antialiased": False}, {}):
-        _, lost, back = _through(tmp_path, to, _splats(**info))
-        assert lost == ()
-        assert not back.info.get("antialiased")
-        if to in HOLD_ANTIALIASED and (info or to == "spz"):
-            assert back.info["antialiased"] is False
-        else:
-            assert "antialiased" not in back.info
+    _, lost, back = _through(tmp_path, to, _splats())
+    assert (lost, back.gaussians.antialiased, "surfels" in back.info, back.notes) == ((), False, False, ())
 
 
 def test_antialiased_goes_all_the_way_round(tmp_path):
@@ -72,30 +70,28 @@ def test_antialiased_goes_all_the_way_round(tmp_path):
     for i, suffix in enumerate((".spz", ".sog", ".compressed.ply", ".ply", ".spz")):
         write_splats(tmp_path / f"{i}{suffix}", splats)
         splats = read_splats(tmp_path / f"{i}{suffix}")
-    assert splats.info["antialiased"] is True
+    assert splats.gaussians.antialiased
     assert (tmp_path / "4.spz").read_bytes()[14] == 1  # the header's flags
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply"])
 def test_comments_are_those_that_others_look_for(tmp_path, suffix):
-    for info, comments in (
+    for mode, comments in (
         ({"antialiased": True}, ["SplatRenderMode: mip", "antialiased 1"]),
-        ({"antialiased": False}, ["SplatRenderMode: default", "antialiased 0"]),
         ({"surfels": True}, ["SplatRenderMode: 2dgs"]),
         ({}, []),
     ):
-        write_splats(tmp_path / f"a{suffix}", _splats(**info))
+        write_splats(tmp_path / f"a{suffix}", _splats(**mode))
         assert read_comments(tmp_path / f"a{suffix}") == ["written by kfgs", *comments]
 
 
 def test_meta_has_the_keys_that_others_look_for(tmp_path):
-    for info, keys in (
+    for mode, keys in (
         ({"antialiased": True}, {"antialias": True, "model": "antialiased"}),
-        ({"antialiased": False}, {"antialias": False}),
         ({"surfels": True}, {"model": "2dgs"}),
         ({}, {}),
     ):
-        write_splats(tmp_path / "a.sog", _splats(**info))
+        write_splats(tmp_path / "a.sog", _splats(**mode))
         with zipfile.ZipFile(tmp_path / "a.sog") as archive:
             meta = json.loads(archive.read("meta.json"))
         assert {key: meta[key] for key in ("antialias", "model") if key in meta} == keys
@@ -104,19 +100,20 @@ def test_meta_has_the_keys_that_others_look_for(tmp_path):
 @pytest.mark.parametrize(
     ("comments", "mode"),
     [
-        (["Exported from Brush", "SH degree: 3", "SplatRenderMode: mip"], {"antialiased": True}),
-        (["SplatRenderMode: default"], {"antialiased": False}),
-        (["SplatRenderMode: 2dgs"], {"surfels": True}),
-        (["Postshot v1.0.0", "postshot.anti_aliasing=1"], {"antialiased": True}),
-        (["postshot.anti_aliasing=0"], {"antialiased": False}),
-        (["antialiased 1"], {"antialiased": True}),
-        (["antialiased 0"], {"antialiased": False}),
-        (["  SPLATRENDERMODE:   MIP "], {"antialiased": True}),
-        (["antialiased 1", "SplatRenderMode: default"], {"antialiased": False}),
-        (["SplatRenderMode: default", "antialiased 1"], {"antialiased": True}),
-        (["SplatRenderMode: mip", "SplatRenderMode: 2dgs"], {"surfels": True}),
-        (["SplatRenderMode: mip", "SplatRenderMode: banana", "antialiased maybe"], {"antialiased": True}),
-        (["this scene is not antialiased 1", "antialiased", "SplatRenderMode:", ""], {}),
+        (["Exported from Brush", "SH degree: 3", "SplatRenderMode: mip"], Mode(True)),
+        (["SplatRenderMode: default"], Mode()),
+        (["SplatRenderMode: 2dgs"], Mode(surfels=True)),
+        (["Postshot v1.0.0", "postshot.anti_aliasing=1"], Mode(True)),
+        (["postshot.anti_aliasing=0"], Mode()),
+        (["antialiased 1"], Mode(True)),
+        (["antialiased 0"], Mode()),
+        (["  SPLATRENDERMODE:   MIP "], Mode(True)),
+        (["antialiased 1", "SplatRenderMode: default"], Mode()),
+        (["SplatRenderMode: default", "antialiased 1"], Mode(True)),
+        (["SplatRenderMode: mip", "SplatRenderMode: 2dgs"], Mode(surfels=True)),
+        (["SplatRenderMode: mip", "SplatRenderMode: 3dgut"], Mode(True, unknown=("SplatRenderMode: 3dgut",))),
+        (["antialiased 2"], Mode(unknown=("antialiased 2",))),
+        (["this scene is not antialiased 1", "antialiased", "SplatRenderMode:", ""], Mode()),
     ],
 )
 def test_comments_of_brush_and_postshot(comments, mode):
@@ -126,20 +123,75 @@ def test_comments_of_brush_and_postshot(comments, mode):
 @pytest.mark.parametrize(
     ("meta", "mode"),
     [
-        ({"antialias": True}, {"antialiased": True}),
-        ({"antialias": False}, {"antialiased": False}),
-        ({"model": "antialiased"}, {"antialiased": True}),
-        ({"model": "2dgs", "antialias": False}, {"surfels": True}),
-        ({"model": "default", "antialias": True}, {"antialiased": False}),
-        ({"model": "other", "antialias": True}, {"antialiased": True}),
-        ({"model": ["antialiased"], "antialias": 1}, {}),
-        ({}, {}),
+        ({"antialias": True}, Mode(True)),
+        ({"antialias": False}, Mode()),
+        ({"model": "antialiased"}, Mode(True)),
+        ({"model": "2dgs", "antialias": False}, Mode(surfels=True)),
+        ({"model": "default", "antialias": True}, Mode()),
+        ({"model": "3dgut", "antialias": True}, Mode(True, unknown=("model: '3dgut'",))),
+        ({"model": ["antialiased"], "antialias": 1}, Mode(unknown=("model: ['antialiased']", "antialias: 1"))),
+        ({}, Mode()),
     ],
 )
 def test_metas_of_both_spellings(meta, mode):
     assert mode_from_meta(meta) == mode
 
 
-def test_a_mode_that_is_not_known_is_not_claimed():
-    assert comments_of_mode({"antialiased": None}) == ()
-    assert meta_of_mode({"antialiased": None}) == {}
+def _columns(count=4):
+    g = np.random.default_rng(0)
+    names = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"rot_{i}" for i in range(4)))
+    return {name: g.normal(size=count).astype(np.float32) for name in names}
+
+
+def test_unknown_modes_are_told(tmp_path):
+    columns = _columns() | {f"scale_{i}": np.full(4, -3.0, np.float32) for i in range(3)}
+    write_ply(tmp_path / "a.ply", columns, comments=("SplatRenderMode: 3dgut",))
+    splats = read_splats(tmp_path / "a.ply")
+    assert not splats.gaussians.antialiased
+    assert len(splats.notes) == 1
+    assert "'SplatRenderMode: 3dgut'" in splats.notes[0]
+
+
+@pytest.mark.parametrize("comments", [(), ("SplatRenderMode: 2dgs",)])
+def test_two_scales_are_surfels_without_thickness(tmp_path, comments):
+    columns = _columns() | {"scale_0": np.full(4, -3.0, np.float32), "scale_1": np.full(4, -2.0, np.float32)}
+    if comments:  # some trainers keep a third scale that 2DGS does not use
+        columns["scale_2"] = np.full(4, -1.0, np.float32)
+    write_ply(tmp_path / "a.ply", columns, comments=comments)
+    splats = read_splats(tmp_path / "a.ply")
+    expected = np.exp([-3.0, -2.0, -3.0]) * [1, 1, 0.001]
+    np.testing.assert_allclose(splats.gaussians.scales.numpy(), np.tile(expected, (4, 1)), rtol=1e-6)
+    assert splats.notes == (AS_FLAT,)
+    write_splats(tmp_path / "b.ply", splats)
+    again = read_splats(tmp_path / "b.ply")
+    assert (again.info["surfels"], again.notes) == (True, (AS_FLAT,))
+    torch.testing.assert_close(again.gaussians.scales, splats.gaussians.scales)
+
+
+@pytest.mark.parametrize(("tilt", "most"), [(0, 0.01), (30, 0.025), (75, 0.05)])
+def test_surfels_drawn_as_flat_gaussians_are_nearly_those_of_2dgs(tilt, most):
+    turn = np.deg2rad(tilt) / 2
+    values = [0.1, -0.05, 3.0], [float(np.cos(turn)), 0.0, float(np.sin(turn)), 0.0]
+    surfel = Gaussians(*(torch.tensor([v]) for v in values), torch.full((1, 3), 0.1), torch.tensor([0.8]))
+    camera = Camera(torch.eye(4), torch.tensor([[250.0, 0, 30], [0, 250, 30], [0, 0, 1]]), 60, 60)
+    drawn = rasterize(flattened(surfel).replace(features=torch.ones(1, 1)), camera, engine="reference").alpha.numpy()
+    at = camera.viewmat.numpy(), camera.K.numpy().astype(float)
+    expected = [
+        [oracle.surfel_alpha(x + 0.5, y + 0.5, *values, [0.1, 0.1], 0.8, *at) for x in range(60)] for y in range(60)
+    ]
+    assert np.abs(drawn - expected).max() < most
+    assert drawn.max() > 0.7
+
+
+def test_the_3d_filter_of_mip_splatting_is_applied_once(tmp_path):
+    columns = _columns(2) | {f"scale_{i}": np.log(np.array([0.3, 0.4], np.float32)) for i in range(3)}
+    columns |= {"opacity": np.zeros(2, np.float32), "filter_3D": np.array([0.4, 0.0], np.float32)}
+    write_ply(tmp_path / "a.ply", columns)
+    splats = read_splats(tmp_path / "a.ply")
+    torch.testing.assert_close(splats.gaussians.scales[:, 0], torch.tensor([0.5, 0.4]))  # 3, 4, 5
+    torch.testing.assert_close(splats.gaussians.opacities, torch.tensor([0.5 * 0.6**3, 0.5]))
+    assert splats.gaussians.antialiased
+    write_splats(tmp_path / "b.ply", splats)
+    again = read_splats(tmp_path / "b.ply")
+    assert (again.gaussians.antialiased, again.extra) == (True, {})
+    torch.testing.assert_close(again.gaussians.scales, splats.gaussians.scales)

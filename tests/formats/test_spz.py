@@ -241,11 +241,11 @@ def test_the_axes_of_adobes_record_are_obeyed(tmp_path, value, signs):
 
 
 def test_antialiasing_is_kept(tmp_path):
-    splats = SplatFile(_cloud(), info={"antialiased": True})
+    splats = SplatFile(_cloud().replace(antialiased=True))
     write_spz(tmp_path / "a.spz", splats, version=3)
     again = read(tmp_path / "a.spz")
     write(tmp_path / "b.spz", again)
-    assert read(tmp_path / "b.spz").info["antialiased"] is True
+    assert read(tmp_path / "b.spz").gaussians.antialiased
     assert (tmp_path / "b.spz").read_bytes()[14] == 1
 
 

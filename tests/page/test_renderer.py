@@ -79,6 +79,25 @@ def test_gaussians_beside_and_around_the_camera(viewer, state):
     assert psnr(viewer.picture(camera), drawn(state, camera)) > ENOUGH
 
 
+PICK = "([places, drawn]) => places.map(([x, y]) => renderer.pick(x, y, Uint8Array.from(drawn)))"
+
+
+def test_antialiased_is_drawn_and_picked_with_opacity_compensation(browser, state):
+    cloud, camera = state.cloud("color"), state.cameras[0]
+    tiny = cloud.replace(scales=0.3 * cloud.scales, antialiased=True)
+    fine = Exploration(state.meaning, tiny, cameras=state.cameras, distance=0.2)
+    viewer = cases_web.Viewer(browser, pack_scene(fine))
+    picture = viewer.picture(camera)
+    plain = rasterize(tiny.replace(antialiased=False), camera, background=PAPER).map.clamp(0, 1).numpy()
+    assert psnr(picture, drawn(fine, camera)) > ENOUGH
+    assert psnr(picture, plain) < 30
+    places = [(x + 0.5, y + 0.5) for x in range(4, camera.width, 9) for y in range(4, camera.height, 9)]
+    picked = viewer.run(PICK, [places, [1] * len(tiny)])
+    wanted = [gaussian_at(tiny, camera, x, y) for x, y in places]
+    assert np.mean([a == (-1 if b is None else b) for a, b in zip(picked, wanted, strict=True)]) > 0.9
+    assert viewer.errors == []
+
+
 def test_labels_within_lambda(viewer, state):
     camera = state.cameras[2]
     for distance in (0.04, 0.2):
@@ -225,11 +244,10 @@ def test_a_pick_is_that_of_gaussian_at(viewer, state, side):
     viewer.picture(camera, side)
     places = [(x + 0.5, y + 0.5) for x in range(4, camera.width, 9) for y in range(4, camera.height, 9)]
     some = np.arange(len(state.cloud(side))) % 3 > 0
-    pick = "([places, drawn]) => places.map(([x, y]) => renderer.pick(x, y, Uint8Array.from(drawn)))"
-    rest = {index for index in viewer.run(pick, [places, some.astype(int).tolist()]) if index >= 0}
+    rest = {index for index in viewer.run(PICK, [places, some.astype(int).tolist()]) if index >= 0}
     assert rest
     assert some[list(rest)].all()
-    picked = viewer.run(pick, [places, np.ones(len(some), int).tolist()])
+    picked = viewer.run(PICK, [places, np.ones(len(some), int).tolist()])
     wanted = [gaussian_at(state.cloud(side), camera, x, y) for x, y in places]
     same = [a == (-1 if b is None else b) for a, b in zip(picked, wanted, strict=True)]
     assert sum(b is not None for b in wanted) > 20

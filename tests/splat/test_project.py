@@ -98,6 +98,57 @@ def test_low_pass_adds_to_the_variance(project):
     torch.testing.assert_close(wide.conics, torch.tensor([[0.5, 0, 0.5]]).double())
 
 
+def test_antialiased_opacity_by_hand(project):
+    # 0.1 pixels wide on the axis: det S = 0.01^2 of det (S + 0.3 I) = 0.31^2
+    ball = _balls([[0.0, 0.0, 2.0]], scale=0.01).replace(antialiased=True)
+    projected = project(ball, _straight())
+    assert projected.opacities.item() == pytest.approx(0.5 * 0.01 / 0.31, rel=1e-12)
+    reach = 2 * np.log(255 * 0.5 * 0.01 / 0.31)  # the fainter it is, the smaller is its box
+    assert projected.extents[0].tolist() == pytest.approx([np.sqrt(0.31 * reach)] * 2)
+    wide = _balls([[0.0, 0.0, 2.0]]).replace(antialiased=True)
+    assert project(wide, _straight(), low_pass=0.0).opacities.item() == 0.5
+    faint = project(ball.replace(scales=0.1 * ball.scales), _straight())
+    assert len(faint.index) == 0  # 0.5 * 0.0001 / 0.3001 is below 1/255
+
+
+def test_antialiased_gradients(project):
+    camera = a_camera()
+    cloud = gaussians_before(camera, 8, seed=8, spread=0.8).replace(antialiased=True, features=None)
+    cloud = cloud.replace(scales=0.3 * cloud.scales)
+    count = len(project(cloud, camera).index)
+    assert count >= 4
+    assert (project(cloud, camera).opacities < 0.8 * cloud.opacities[project(cloud, camera).index]).any()
+
+    def flat(means, quats, scales, opacities):
+        changed = cloud.replace(means=means, quats=quats, scales=scales, opacities=opacities)
+        return project(changed, camera)[:4]
+
+    inputs = [cloud.means, cloud.quats, cloud.scales, cloud.opacities]
+    assert torch.autograd.gradcheck(flat, [v.requires_grad_() for v in inputs])
+
+
+def test_antialiased_disc_seen_from_its_edge_has_no_gradient_that_is_nan(project):
+    disc = _balls([[0.0, 0.0, 2.0]] * 2).replace(antialiased=True)
+    disc.scales[0, 1] = 0.0  # one axis has no extent at all: det S = 0
+    leaves = [v.requires_grad_() for v in (disc.means, disc.quats, disc.scales, disc.opacities)]
+    projected = project(Gaussians(*leaves, antialiased=True), _straight())
+    assert projected.index.tolist() == [1]
+    sum((value**2).sum() for value in projected[:4]).backward()
+    assert all(torch.isfinite(leaf.grad).all() for leaf in leaves)
+
+
+def test_antialiased_needle_in_float32(project):
+    # 100 pixels long, 0.01 thick, at 45 degrees
+    quat = torch.tensor([[np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8)]], dtype=torch.float32)
+    scales = torch.tensor([[5.0, 5e-4, 5e-4]])
+    needle = Gaussians(torch.tensor([[0.0, 0, 1]]), quat, scales, torch.tensor([0.9]), antialiased=True)
+    camera = _straight(dtype=torch.float32)
+    values = (v[0].double().numpy() for v in (needle.means, needle.quats, needle.scales))
+    factor = oracle.compensation(*values, camera.viewmat.numpy(), camera.K.numpy(), 20, 10)
+    assert 0.01 < factor < 0.02
+    assert project(needle, camera).opacities.item() == pytest.approx(0.9 * factor, abs=1e-5)
+
+
 def test_principal_point_moves_the_picture_and_nothing_else(project):
     gaussians = gaussians_before(_straight(), 20, seed=3, spread=0.5)
     here = project(gaussians, _straight())

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from kfgs.cameras.camera import Camera, Distortion
 from kfgs.gaussians import Gaussians
-from kfgs.splat import SH_C0, rasterize
+from kfgs.splat import SH_C0, rasterize, rasterize_labels
 
 
 def _rotation(seed=0):
@@ -35,6 +35,24 @@ def test_agrees_with_the_equations_from_3d_to_the_map():
     torch.testing.assert_close(rendering.map, torch.from_numpy(maps), rtol=0, atol=TOLERANCE[torch.float64])
     torch.testing.assert_close(rendering.alpha, torch.from_numpy(alphas), rtol=0, atol=TOLERANCE[torch.float64])
     assert alphas.max() > 0.8
+
+
+@pytest.mark.parametrize("engine", ["reference", "auto"])
+def test_antialiased_agrees_with_the_equations(engine):
+    camera = a_camera()
+    gaussians = gaussians_before(camera, 40, seed=1, spread=1.5)
+    gaussians = gaussians.replace(scales=0.3 * gaussians.scales, antialiased=True)
+    values = [v.numpy() for v in (gaussians.means, gaussians.quats, gaussians.scales)]
+    pinhole = camera.viewmat.numpy(), camera.K.numpy(), camera.width, camera.height
+    lowered = gaussians.opacities.numpy() * [oracle.compensation(*row, *pinhole) for row in zip(*values, strict=True)]
+    maps, _ = oracle.render(*values, lowered, gaussians.features.numpy(), *pinhole)
+    drawn = rasterize(gaussians, camera, engine=engine).map
+    torch.testing.assert_close(drawn, torch.from_numpy(maps), rtol=0, atol=TOLERANCE[torch.float64])
+    plain = rasterize(gaussians.replace(antialiased=False), camera, engine=engine).map
+    assert (drawn - plain).abs().max() > 0.1
+    labels = rasterize_labels(gaussians, camera, engine=engine)
+    seen = labels.labels[..., 0] >= 0
+    torch.testing.assert_close(labels.scores[seen][:, 0], torch.from_numpy(maps).amax(2)[seen], rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

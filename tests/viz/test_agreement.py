@@ -53,6 +53,16 @@ def test_every_kind_of_colour_agrees_with_the_rasteriser(color_by):
     assert psnr(seen, expected) > 48  # measured: 52 to 54 dB; an 8-bit picture blended 60 times
 
 
+def test_antialiased_agrees_with_the_rasteriser():
+    gaussians, camera = some_gaussians(300), some_camera()
+    gaussians = gaussians.replace(scales=gaussians.scales * 0.1, antialiased=True)
+    with some_plotter() as plotter:
+        add_cloud(plotter, gaussians, color_by="rgb", style="gaussians")
+        seen = seen_by(plotter, camera)
+    assert psnr(seen, rendered(gaussians, camera)) > 45
+    assert psnr(seen, rendered(gaussians.replace(antialiased=False), camera)) < 35
+
+
 def test_gaussians_beside_the_picture_reach_into_it_as_in_the_rasteriser():
     """VTK as it is drops what is centred further out than 1.3 times the half picture."""
     camera = some_camera()

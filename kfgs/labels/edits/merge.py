@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -15,7 +17,7 @@ _ALWAYS = ("means", "quats", "scales", "opacities")
 
 @typed
 def join(first: SplatFile, second: SplatFile) -> SplatFile:
-    """The Gaussians of two clouds, the first before the second; dtype, device and `info` are those of the first.
+    """The Gaussians of two clouds, the first before the second; dtype, device, `info` and rendering are those of the first.
 
     - Spherical harmonics: the lower degree is padded with zeros, which changes no colour.
     - Labels: classes with the same name are the same class. If the first cloud has the name twice, the lowest label is
@@ -40,6 +42,13 @@ def join(first: SplatFile, second: SplatFile) -> SplatFile:
             for splats, column in zip((first, second), columns, strict=True)
         ]
         extra[name] = np.concatenate(filled)
+    if a.antialiased != b.antialiased:
+        how = ("fainter", "with") if a.antialiased else ("more opaque", "without")
+        warnings.warn(
+            f"insert: what is smaller than a pixel looks {how[0]} than in its own file: all is drawn {how[1]} antialiasing, as "
+            "the scene is",
+            stacklevel=2,
+        )
     gaussians = a.replace(**rows, sh=sh, features=features, labels=labels)
     return SplatFile(gaussians, extra, classes, first.info)
 

@@ -162,6 +162,7 @@ def _add_side(buffers: _Buffers, state: Exploration, side: Side) -> dict[str, An
     return {
         "count": len(cloud),
         "sh_degree": None if cloud.sh is None else degree,
+        "antialiased": cloud.antialiased,
         "center": center.tolist(),
         "half": half.tolist(),
         "scale": [lowest, step],

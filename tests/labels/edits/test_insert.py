@@ -40,6 +40,17 @@ def test_the_lower_degree_is_filled_up_and_looks_as_before(first, second):
     assert both.info == a.info
 
 
+@pytest.mark.parametrize(("scene", "part"), [(True, False), (False, True)])
+def test_what_is_inserted_is_drawn_as_the_scene_is(scene, part):
+    a, b = (
+        one.replace(gaussians=one.gaussians.replace(antialiased=flag))
+        for one, flag in ((splats(2), scene), (splats(1), part))
+    )
+    with pytest.warns(UserWarning, match=f"insert: .* {'fainter' if scene else 'more opaque'} than in its own file"):
+        both = join(a, b)
+    assert both.gaussians.antialiased is scene
+
+
 def test_classes_are_the_same_when_their_names_are():
     a = splats(3, labels=[0, 1, -1], classes=("wall", "chair"))
     b = splats(4, labels=[2, 0, -1, 1], classes=("chair", "wall", "vase", "never used"), seed=1)
