@@ -5,8 +5,13 @@ Readers call `tell`. The command line listens with `hear`: it prints notes, and 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+
+
+class Repair(str):
+    """A note about something broken that a reader left out or mended. `refuse_repairs` makes an error of it."""
+
 
 _listeners: list[Callable[[str], None]] = []
 _strict: list[bool] = []
@@ -40,3 +45,12 @@ def tell(note: str) -> None:
 def is_strict() -> bool:
     """Whether readers refuse a file with broken parts (`--strict`)."""
     return any(_strict)
+
+
+def refuse_repairs(where: str, notes: Iterable[str]) -> None:
+    """Raise a ValueError if a note is a `Repair`."""
+    repair = next((note for note in notes if isinstance(note, Repair)), None)
+    if repair is not None:
+        raise ValueError(
+            f"{where}: expected nothing broken (strict), got: {repair}; correct it, or read it without --strict (strict=False)"
+        )

@@ -120,7 +120,8 @@ def _inputs(named: Mapping[str, Any]) -> Iterator[tuple[str, Path]]:
 
 def _parts(command: str, scene: Path, images: Path | None = None) -> Iterator[Kept]:
     """The parts of a scene (a folder, or its transforms.json), but for what the command makes for it."""
-    from ..scenes.load import find_model, picture_folders
+    from ..scenes.load import picture_folders
+    from ..scenes.sub_models import find_model
 
     root = scene if scene.is_dir() else scene.parent
     model = find_model(root)

@@ -42,7 +42,7 @@ from ..pipeline.stages import digest_tensors
 from ..quant import FeatureMaps, LinearLatents
 from ..scenes import Scene, SceneError, load_scene
 from ..scenes.blocks import Block, partition, write_parts
-from ..scenes.load import find_model
+from ..scenes.sub_models import find_model
 from .batch import map_scenes
 from .in_blocks import BLOCKS, CORE, FACTS, FORMAT, FieldInBlocks, read_blocks
 

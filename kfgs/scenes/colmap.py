@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from .._files import as_path
+from .._files import Names, as_path
+from .._notes import Repair
 from ..cameras.camera import Camera, Distortion
 from .colmap_files import CAMERA_MODELS
 from .colmap_model import ColmapImage, ColmapModel, read_model
-from .files import SceneError, is_file, list_images, natural_key, some
+from .files import SceneError, find_pictures, list_images, natural_key, some, spelling_note
 from .posed import as_large_as_pictures, near_zero
 from .scene import Scene
 
@@ -82,22 +84,26 @@ def load_colmap(path: str | Path, images: str | Path) -> Scene:
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder; expected the images of {path} there")
     model = read_model(path)
-    views = sorted(model.images.values(), key=lambda image: natural_key(image.name))
-    posed = [image for image in views if image.pose is not None]
-    found = [image for image in posed if is_file(folder / image.name)]
-    paths = [folder / image.name for image in found]
-    cameras, shrunk = as_large_as_pictures(_cameras(path, model, found), paths, folder)
-    missing = [image.name for image in posed if not is_file(folder / image.name)]
+    views, notes = _posed(model)
+    files, there = find_pictures(folder, [image.name for image in views]), list_images(folder)
+    found = [
+        replace(view, name=files[view.name].relative_to(folder).as_posix()) for view in views if view.name in files
+    ]
+    found.sort(key=lambda view: natural_key(view.name))
+    missing = [image.name for image in views if image.name not in files]
     if not found:
         raise SceneError(
-            f"{folder}: expected the images of {path}, none of its {len(posed)} posed images ({some(missing, 3)}) "
-            "is there; give the right image folder"
+            f"{folder}: expected the images of {path}, none of its {len(views)} posed images ({some(missing, 3)}) "
+            f"is there; give the right image folder ({Names(there).advice(missing[0]) if missing else notes[0]})"
         )
-    notes = _unposed(views) + shrunk
+    paths = [folder / image.name for image in found]
+    cameras, shrunk = as_large_as_pictures(_cameras(path, model, found), paths, folder)
+    notes += [*shrunk, *spelling_note(folder, files)]
+    known = {image.name for image in (*found, *model.images.values())}
+    extra = [name for name in there if name not in known]
     if missing:
-        notes.append(f"{len(missing)} of {len(posed)} posed images have no file in {folder}: {some(missing)}")
-    names = {image.name for image in views}
-    extra = [name for name in list_images(folder) if name not in names]
+        near = f" ({Names(extra).advice(missing[0])})" if extra else ""
+        notes.append(f"{len(missing)} of {len(views)} posed images have no file in {folder}: {some(missing)}{near}")
     if extra:
         notes.append(f"{len(extra)} image files in {folder} have no pose in the model: {some(extra)}")
     if len(model.points) == 0:
@@ -114,19 +120,24 @@ def colmap_cameras(path: Path) -> tuple[list[Camera], list[str]]:
         SceneError: if the model is damaged, or a lens has no exact form in kfgs.
     """
     model = read_model(path)
+    views, notes = _posed(model)
+    return _cameras(path, model, [replace(view, name=view.name.replace("\\", "/")) for view in views]), notes
+
+
+def _posed(model: ColmapModel) -> tuple[list[ColmapImage], list[str]]:
+    """The images with a pose and a lens, in natural order of names, and notes about the others and all that is broken."""
     views = sorted(model.images.values(), key=lambda image: natural_key(image.name))
-    return _cameras(path, model, [image for image in views if image.pose is not None]), _unposed(views)
-
-
-def _unposed(views: list[ColmapImage]) -> list[str]:
-    """A note if images have no pose."""
     lost = [image.name for image in views if image.pose is None]
-    return [f"{len(lost)} images of the model have no pose and were left out: {some(lost)}"] if lost else []
+    notes = [f"{len(lost)} images of the model have no pose and were left out: {some(lost)}"] if lost else []
+    whole = [image for image in views if image.pose is not None and model.cameras[image.camera_id].usable]
+    return whole, [*map(Repair, notes), *model.notes]
 
 
 def _cameras(path: Path, model: ColmapModel, images: list[ColmapImage]) -> list[Camera]:
     lenses = {}
     for camera_id, camera in model.cameras.items():
+        if not camera.usable:
+            continue
         try:
             lenses[camera_id] = convert_intrinsics(camera.model, camera.params)
         except ValueError as error:

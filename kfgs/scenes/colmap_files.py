@@ -3,12 +3,14 @@
 A `Table` returns the fields of one record after the other. It compares every count with the rest of the file before using
 it, so memory is bounded by the size of the file.
 
-Fields are named by letters, as in `struct`: B, I and Q are unsigned integers of 1, 4 and 8 bytes, d is a float64. Three letters
-are ours: m is a camera model and s a sensor type (integers in .bin, words in .txt), x is an unused float64.
+Fields are named by letters, as in `struct`: B, I and Q are unsigned integers of 1, 4 and 8 bytes, d is a float64. Four letters
+are ours: m is a camera model and s a sensor type (integers in .bin, words in .txt), x is an unused float64, and z a float64
+that is NaN where the file has none that is finite and plausible.
 """
 
 from __future__ import annotations
 
+import math
 import mmap
 import re
 import struct
@@ -21,6 +23,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from .._files import text_encoding
 from .files import MAX_NUMBER, SceneError
 
 # COLMAP's id of a camera model: its name and its parameters. Those that begin with f are focal lengths.
@@ -53,6 +56,7 @@ ADVICE = "copy the model again from its source, or write it again with COLMAP"
 _LARGEST = {"B": 2**8 - 1, "I": 2**32 - 1, "Q": 2**64 - 1}
 _WORDS = {"m": {name: i for i, (name, _) in CAMERA_MODELS.items()}, "s": {"CAMERA": 0, "IMU": 1}}
 _NUMERIC = frozenset("0123456789+-.eE")  # characters of numbers in C++: no '1_000', no 'nan'
+_BROKEN = re.compile(r"[+-]?(nan(\(\w*\))?|inf(inity)?|1\.#\w+)", re.IGNORECASE)  # as C and Windows write them
 _LONGEST_NAME = 4096  # bytes, the longest path of Linux
 
 
@@ -70,7 +74,7 @@ def _kinds(fields: str) -> str:
 
 @lru_cache
 def _layout(fields: str) -> struct.Struct:
-    return struct.Struct("<" + _kinds(fields).replace("m", "i").replace("s", "i").replace("x", "8x"))
+    return struct.Struct("<" + _kinds(fields).replace("m", "i").replace("s", "i").replace("x", "8x").replace("z", "d"))
 
 
 class Table(Protocol):
@@ -80,7 +84,7 @@ class Table(Protocol):
         """Go through all records; gives their place in the file, for messages. `smallest`: the fields of the shortest."""
 
     def take(self, fields: str, names: str) -> tuple[Any, ...]:
-        """The next fields; floating-point numbers are finite. `names`: COLMAP's, separated by ", "."""
+        """The next fields; floating-point numbers are finite, except z. `names`: COLMAP's, separated by ", "."""
 
     def count(self, name: str, fields: str) -> int:
         """The next field as a number of items, each of at least these fields, that the rest can hold."""
@@ -113,9 +117,12 @@ class _Binary:
     def take(self, fields: str, names: str) -> tuple[Any, ...]:
         layout = _layout(fields)
         values = layout.unpack_from(self.data, self._advance(layout.size, names))
-        good = all(abs(value) < MAX_NUMBER for value in values if isinstance(value, float))
+        if all(abs(value) < MAX_NUMBER for value in values if isinstance(value, float)):
+            return values
+        pairs = list(zip(_kinds(fields).replace("x", ""), values, strict=True))
+        good = all(abs(value) < MAX_NUMBER for kind, value in pairs if kind == "d")
         require(good, self.where, f"finite, plausible numbers ({names})", list(values))
-        return values
+        return tuple(value if kind != "z" or abs(value) < MAX_NUMBER else math.nan for kind, value in pairs)
 
     def count(self, name: str, fields: str) -> int:
         return self._count("I", name, _layout(fields).size)
@@ -155,16 +162,16 @@ class _Text:
     """A .txt file: one record per line; blank lines and lines that begin with # are passed over."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.where, self.lines = path, str(path), self._lines()
+        self.path, self.where, self.line, self.lines = path, str(path), "", self._lines()
         self.words: deque[str] = deque()
 
     def _lines(self) -> Iterator[str]:
         """All lines; `where` names the last one."""
         try:
-            with self.path.open(encoding="utf-8") as file:
-                for number, line in enumerate(file, 1):
+            with self.path.open(encoding=text_encoding(self.path)) as file:
+                for number, self.line in enumerate(file, 1):
                     self.where = f"{self.path}, line {number}"
-                    yield line
+                    yield self.line
         except UnicodeDecodeError as error:
             raise SceneError(f"{self.path}: expected UTF-8 text, got other bytes ({error}); {ADVICE}") from error
 
@@ -186,22 +193,22 @@ class _Text:
         return int(count)
 
     def name(self) -> str:
-        where, (name, *more) = self.where, (self._value("name", "NAME"), *self.words)
-        advice = "rename the image, or write the model as binary (`colmap model_converter`): COLMAP would cut the name"
-        require(not more, where, "an image name without spaces", repr(" ".join([name, *more])), advice)
+        where, taken = self.where, len(self.line.split()) - len(self.words)
+        require(bool(self.words), where, "NAME", "the end of the line")
+        name = self.line.split(maxsplit=taken)[taken].strip()  # the rest of the line: a name may hold blanks
         below = next(self.lines, None)  # pycolmap silently drops an image without this line
         require(
             below is not None, where, "a line of 2-D points (perhaps empty) below each image", "the end of the file"
         )
         self.words = deque((below or "").split())
-        return str(name)
+        return name
 
     def rows(self, columns: np.dtype[Any], what: str) -> NDArray[Any]:
         words, width = list(self.words), len(columns.names or ())
         self.words.clear()
         expected = f"{what} as {' '.join(columns.names or ())}"
         require(len(words) % width == 0, self.where, expected, f"{len(words)} words")
-        wrong = [word for word in words if not _NUMERIC.issuperset(word)]
+        wrong = [word for word in words if not _NUMERIC.issuperset(word) and not _BROKEN.fullmatch(word)]
         require(not wrong, self.where, expected, wrong[:1])
         table = np.empty(len(words) // width, columns)
         try:
@@ -221,12 +228,12 @@ class _Text:
             good = word.isascii() and word.isdigit() and len(word) <= 20 and int(word) <= _LARGEST[kind]
             require(good, self.where, f"{name}: an integer in [0, {_LARGEST[kind]}]", repr(word))
             return int(word)
-        if kind == "name":
-            return word
         try:
-            number = float(word) if _NUMERIC.issuperset(word) else float("nan")
+            number = float(word) if _NUMERIC.issuperset(word) else math.nan
         except ValueError:
-            number = float("nan")
+            number = math.nan
+        if kind in "xz" and (_BROKEN.fullmatch(word) or abs(number) >= MAX_NUMBER):
+            return math.nan
         require(abs(number) < MAX_NUMBER, self.where, f"{name}: a finite number", repr(word))
         return number
 

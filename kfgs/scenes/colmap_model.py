@@ -1,8 +1,8 @@
-"""Read a COLMAP model (binary or text) and refuse what is damaged.
+"""Read a COLMAP model (binary or text): refuse what is damaged, leave out numbers that are none.
 
 This is the only reader of models in kfgs. pycolmap 4.2.1 is not safe with untrusted files: it loads a truncated cameras.bin
-with wrong intrinsics, a corrupt points3D.bin takes all memory, and random bytes in frames.bin never return. If this reader
-accepts a model, pycolmap reads it with the same result (`tests/scenes/test_colmap_model.py`).
+with wrong intrinsics, a corrupt points3D.bin takes all memory, and random bytes in frames.bin never return. If
+`read_whole_model` accepts a model, pycolmap reads it with the same result (`tests/scenes/test_colmap_model.py`).
 """
 
 from __future__ import annotations
@@ -19,11 +19,14 @@ from numpy.typing import NDArray
 
 from .._card import short_repr
 from .._files import as_path, open_current
+from .._notes import Repair
 from .colmap_files import CAMERA_MODELS, OBSERVATIONS, TRACK, Table, open_table, require
-from .files import MAX_SIDE, SceneError
+from .files import MAX_SIDE, SceneError, some
+from .poses import is_rotation, mending_notes
 
 FILES = ("cameras", "images", "points3D")
 QUATERNION_SLACK = 0.1  # text files are rounded; a norm farther from 1 means a wrong byte
+STRANGE = 0.5  # share of the 2-D points of tracks that see another point: two models, not a damaged one
 _POSE = "QW, QX, QY, QZ, TX, TY, TZ"
 _CAMERA_SENSOR = 0
 
@@ -41,6 +44,13 @@ class ColmapCamera:
     height: int
     params: tuple[float, ...]
 
+    @property
+    def usable(self) -> bool:
+        """Whether the parameters are numbers, and focal lengths above 0."""
+        names = dict(CAMERA_MODELS.values())[self.model].split(", ")
+        focal = [value for name, value in zip(names, self.params, strict=True) if name.startswith("f")]
+        return all(map(math.isfinite, self.params)) and all(f > 0 for f in focal)
+
 
 @dataclass(frozen=True)
 class ColmapImage:
@@ -49,7 +59,7 @@ class ColmapImage:
     name: str
     camera_id: int
     pose: Matrix | None
-    """[4, 4] world to camera; None: the place of the camera in its rig is unknown."""
+    """[4, 4] world to camera; None: the file has none, or the place of the camera in its rig is unknown."""
     observed: NDArray[np.int64]
     """[n] the id of the 3-D point that each 2-D point sees, -1 = none."""
 
@@ -72,6 +82,8 @@ class ColmapModel:
     """[P, 3]."""
     rigs: int
     """0 in the older layout of three files."""
+    notes: tuple[str, ...] = ()
+    """What was left out."""
 
     def __repr__(self) -> str:
         return f"ColmapModel({self.layout}, {len(self.cameras)} cameras, {len(self.images)} images, {len(self.points)} points)"
@@ -86,8 +98,9 @@ def read_model(path: str | Path) -> ColmapModel:
     """Read a COLMAP model: binary or text, three files or, from COLMAP 3.12 on, five (rigs, frames).
 
     Checked are: each count against the size of the file, the exact end of each file, camera models and their number of
-    parameters, finite numbers and plausible sizes, unit quaternions, names inside the image folder, ids that are
-    unique and refer to something that exists. Whether the poses are right is not checked.
+    parameters, plausible sizes, names inside the image folder, ids that are unique and refer to something that exists.
+    Whether the poses are right is not checked. Poses without finite numbers and a unit quaternion become None. Points without
+    finite numbers, and entries of tracks that lead to no 2-D point (of deleted images), are left out and noted.
 
     Args:
         path: the folder with `cameras`, `images`, `points3D` and perhaps `rigs`, `frames`, as .bin or as .txt.
@@ -113,10 +126,11 @@ def _read_files(folder: Path, find: Callable[[str], Path]) -> ColmapModel:
     files = {name: find(f"{name}.{whole[0]}") for name in (*FILES, "rigs", "frames")}
     tables = {name: open_table(file) for name, file in files.items() if file.is_file()}
     cameras = _read_cameras(tables["cameras"])
-    images = _read_images(tables["images"], cameras)
-    point_ids, points, colors = _read_points(tables["points3D"], str(files["points3D"]), images)
-    rigs = _read_rigs(tables["rigs"], cameras) if "rigs" in tables else {}
-    frames = _read_frames(tables["frames"], rigs, images) if "frames" in tables else {}
+    scales: dict[str, float] = {}
+    images = _read_images(tables["images"], cameras, scales)
+    point_ids, points, colors, notes = _read_points(tables["points3D"], str(files["points3D"]), images)
+    rigs = _read_rigs(tables["rigs"], cameras, scales) if "rigs" in tables else {}
+    frames = _read_frames(tables["frames"], rigs, images, scales) if "frames" in tables else {}
     require(
         bool(rigs) == bool(frames),
         str(folder),
@@ -129,7 +143,39 @@ def _read_files(folder: Path, find: Callable[[str], Path]) -> ColmapModel:
         message = f"{len(lost)} images in none (image {lost[:1]})"
         require(not lost, str(files["frames"]), "every image in one frame", message)
         images = {i: replace(image, pose=frames[i]) for i, image in images.items()}
-    return ColmapModel("binary" if whole[0] == "bin" else "text", cameras, images, point_ids, points, colors, len(rigs))
+    used = {key: scale for key, scale in scales.items() if not frames or not key.startswith("image ")}
+    notes += mending_notes([], used)
+    lensless = [image.name for image in images.values() if not cameras[image.camera_id].usable]
+    if lensless:
+        notes.append(
+            f"{len(lensless)} images have a camera without a focal length above 0 and finite parameters: {some(lensless)}"
+        )
+    layout = "binary" if whole[0] == "bin" else "text"
+    return ColmapModel(layout, cameras, images, point_ids, points, colors, len(rigs), tuple(map(Repair, notes)))
+
+
+def read_whole_model(path: str | Path) -> ColmapModel:
+    """Read a model for pycolmap, which needs all of it: nothing may be left out.
+
+    Raises:
+        FileNotFoundError: if there is no such folder.
+        SceneError: if the model is damaged or partly broken, or has names in text files that pycolmap would cut at a blank.
+    """
+    model = read_model(path)
+    for note in model.notes:
+        require(
+            False,
+            str(path),
+            "a model with nothing broken, for pycolmap",
+            note,
+            "write a whole one: kfgs sfm SCENE --out OUT",
+        )
+    blank = next((image.name for image in model.images.values() if len(image.name.split()) > 1), "")
+    require(
+        model.layout == "binary" or not blank, str(path), "names without blanks, at which COLMAP cuts those of text files",
+        repr(blank), "write _ for each blank, in images.txt and in the names of the files",
+    )  # fmt: skip
+    return model
 
 
 def _new(where: str, key: int, known: object) -> int:
@@ -137,10 +183,15 @@ def _new(where: str, key: int, known: object) -> int:
     return key
 
 
-def _pose(where: str, numbers: Sequence[float]) -> Matrix:  # [4, 4]
-    """A pose from qw qx qy qz tx ty tz. As in pycolmap, the quaternion is not normalised; the sums are in Eigen's order."""
+def _pose(numbers: Sequence[float], key: str, scales: dict[str, float]) -> Matrix | None:  # [4, 4]
+    """A pose from qw qx qy qz tx ty tz; None if they are no numbers, or the first four no unit quaternion.
+
+    As in pycolmap, the quaternion is not normalised, and the sums are in Eigen's order; unless the result is not a rotation
+    for `Camera`. Then it is, and `scales` receives its length.
+    """
     norm = math.hypot(*numbers[:4])
-    require(abs(norm - 1) < QUATERNION_SLACK, where, "a unit quaternion", f"{numbers[:4]} of length {norm:.3g}")
+    if not abs(norm - 1) < QUATERNION_SLACK or not all(map(math.isfinite, numbers)):
+        return None
     w, x, y, z, *translation = numbers
     x2, y2, z2 = 2 * x, 2 * y, 2 * z
     pose = np.eye(4)
@@ -150,7 +201,10 @@ def _pose(where: str, numbers: Sequence[float]) -> Matrix:  # [4, 4]
         [z2 * x - y2 * w, z2 * y + x2 * w, 1 - (x2 * x + y2 * y)],
     ]
     pose[:3, 3] = translation
-    return pose
+    if is_rotation(pose[:3, :3]):
+        return pose
+    scales[key] = norm
+    return _pose([*(number / norm for number in numbers[:4]), *translation], key, {})
 
 
 def _read_cameras(table: Table) -> dict[int, ColmapCamera]:
@@ -162,19 +216,17 @@ def _read_cameras(table: Table) -> dict[int, ColmapCamera]:
         width, height = table.take("QQ", "WIDTH, HEIGHT")
         good = 0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE
         require(good, where, f"an image of 1 to {MAX_SIDE} pixels a side", f"{width} x {height}")
-        values = table.take(f"{params.count(',') + 1}d", params)
-        focal = [value for key, value in zip(params.split(", "), values, strict=True) if key.startswith("f")]
-        require(all(f > 0 for f in focal), where, f"a focal length above 0 ({name}: {params})", list(values))
+        values = table.take(f"{params.count(',') + 1}z", params)
         cameras[_new(where, camera_id, cameras)] = ColmapCamera(name, width, height, values)
     return cameras
 
 
-def _read_images(table: Table, cameras: dict[int, ColmapCamera]) -> dict[int, ColmapImage]:
+def _read_images(table: Table, cameras: dict[int, ColmapCamera], scales: dict[str, float]) -> dict[int, ColmapImage]:
     images: dict[int, ColmapImage] = {}
     names: dict[str, int] = {}
     for where in table.records("image", "I7dIBQ"):  # B: the end of the name
-        image_id, *numbers, camera_id = table.take("I7dI", f"IMAGE_ID, {_POSE}, CAMERA_ID")
-        pose, name = _pose(where, numbers), table.name()
+        image_id, *numbers, camera_id = table.take("I7zI", f"IMAGE_ID, {_POSE}, CAMERA_ID")
+        name, pose = table.name(), _pose(numbers, f"image {image_id}", scales)
         inside = not PurePosixPath(name).is_absolute() and ".." not in PurePosixPath(name).parts
         require(
             bool(name) and name.isprintable() and inside,
@@ -195,11 +247,11 @@ def _read_images(table: Table, cameras: dict[int, ColmapCamera]) -> dict[int, Co
 
 def _read_points(
     table: Table, where: str, images: dict[int, ColmapImage]
-) -> tuple[NDArray[np.uint64], Matrix, NDArray[np.uint8]]:
-    """The points by ascending ids."""
+) -> tuple[NDArray[np.uint64], Matrix, NDArray[np.uint8], list[str]]:
+    """The points by ascending ids, and notes."""
     ids, xyz, rgb, tracks = array("Q"), array("d"), array("B"), [np.zeros(0, TRACK)]
     for _ in table.records("point", "Q3d3BxQ"):
-        point_id, x, y, z, *color = table.take("Q3d3Bx", "POINT3D_ID, X, Y, Z, R, G, B, ERROR")
+        point_id, x, y, z, *color = table.take("Q3z3Bx", "POINT3D_ID, X, Y, Z, R, G, B, ERROR")
         ids.append(point_id)
         xyz.extend((x, y, z))
         rgb.extend(color)
@@ -208,22 +260,24 @@ def _read_points(
     order = np.argsort(point_ids)
     twice = point_ids[order][1:] == point_ids[order][:-1]
     require(not twice.any(), where, "each point id once", f"{point_ids[order][1:][twice][:1]} again")
-    _check_tracks(
-        where, np.repeat(point_ids.view(np.int64), list(map(len, tracks[1:]))), np.concatenate(tracks), images
-    )
-    return (
-        point_ids[order],
-        np.array(xyz, np.float64).reshape(-1, 3)[order],
-        np.array(rgb, np.uint8).reshape(-1, 3)[order],
-    )
+    owner = np.repeat(point_ids.view(np.int64), list(map(len, tracks[1:])))
+    notes = _check_tracks(where, owner, np.concatenate(tracks), images)
+    points = np.array(xyz, np.float64).reshape(-1, 3)[order]
+    finite = np.isfinite(points).all(1)
+    if not finite.all():
+        shown = some([str(i) for i in point_ids[order][~finite][:6]])
+        notes.append(
+            f"{(~finite).sum()} of {len(points)} points have no finite, plausible place and were left out (ids {shown})"
+        )
+    return point_ids[order][finite], points[finite], np.array(rgb, np.uint8).reshape(-1, 3)[order][finite], notes
 
 
 def _check_tracks(
     where: str, owner: NDArray[np.int64], track: NDArray[np.void], images: dict[int, ColmapImage]
-) -> None:
-    """A point and the 2-D points of its track name each other, else pycolmap fails without naming a file.
+) -> list[str]:
+    """A note if 2-D points that tracks name are not there, or do not name the point of the track: pycolmap fails on them.
 
-    kfgs does not use the tracks. But images and points that do not fit together come from two different models.
+    kfgs does not use the tracks. But images and points of which most do not fit together come from two different models.
     """
     known = sorted(images)
     seen = [*(images[i].observed for i in known), np.zeros(1, np.int64)]  # at the end: no image, and what it sees
@@ -231,26 +285,22 @@ def _check_tracks(
     image_ids, observations = track["IMAGE_ID"].astype(np.int64), track["POINT2D_IDX"].astype(np.int64)
     ordered = np.array([*known, 2**40])
     place = np.searchsorted(ordered, image_ids)
-    good = (ordered[place] == image_ids) & (observations < sizes[place])
-    flat = np.where(good, np.cumsum(sizes)[place] - sizes[place] + observations, -1)
-    good &= np.concatenate(seen)[flat] == owner
+    there = (ordered[place] == image_ids) & (observations < sizes[place])
+    flat = np.where(there, np.cumsum(sizes)[place] - sizes[place] + observations, -1)
+    good = there & (np.concatenate(seen)[flat] == owner)
     if good.all():
-        return
-    wrong = int(np.flatnonzero(~good)[0])
-    image_id, observation = int(image_ids[wrong]), int(observations[wrong])
-    if image_id not in images:
-        found = "an image that is not in the model"
-    elif observation >= len(images[image_id].observed):
-        found = f"an image that has {len(images[image_id].observed)} 2-D points"
-    else:
-        found = f"which sees point {images[image_id].observed[observation]}"
+        return []
+    strange, lost = there & ~good, sorted(set(image_ids[ordered[place] != image_ids].tolist()))
+    wrong = int(np.flatnonzero(strange if strange.any() else ~good)[0])
+    example = f"point {int(owner[wrong]) % 2**64} names 2-D point {observations[wrong]} of image {image_ids[wrong]}"
     require(
-        False,
-        f"{where}, point {int(owner[wrong]) % 2**64}",
-        "a track over 2-D points that see it",
-        f"2-D point {observation} of image {image_id}, {found}",
-        "write images and points with the same run of COLMAP; if the 2-D points were removed, empty the tracks too",
-    )
+        strange.sum() <= STRANGE * there.sum(), where, "tracks over 2-D points that see them",
+        f"{strange.sum()} that see other points ({example})", "copy the images and points files of one model",
+    )  # fmt: skip
+    gone = f"; images {some(list(map(str, lost)))} are not in the model" if lost else ""
+    return [
+        f"{(~good).sum()} of {len(good)} entries of tracks lead to no 2-D point and were left out ({example}{gone})"
+    ]
 
 
 def _read_sensor(table: Table, where: str) -> Sensor:
@@ -259,7 +309,9 @@ def _read_sensor(table: Table, where: str) -> Sensor:
     return kind, sensor_id
 
 
-def _read_rigs(table: Table, cameras: dict[int, ColmapCamera]) -> dict[int, dict[Sensor, Matrix | None]]:
+def _read_rigs(
+    table: Table, cameras: dict[int, ColmapCamera], scales: dict[str, float]
+) -> dict[int, dict[Sensor, Matrix | None]]:
     """For each rig, the pose of each sensor (rig to sensor); None if unknown."""
     rigs: dict[int, dict[Sensor, Matrix | None]] = {}
     for where in table.records("rig", "II"):
@@ -274,22 +326,25 @@ def _read_rigs(table: Table, cameras: dict[int, ColmapCamera]) -> dict[int, dict
             if i:
                 (has_pose,) = table.take("B", "HAS_POSE")
                 require(has_pose in (0, 1), where, "HAS_POSE of 0 or 1", has_pose)
-                sensors[sensor] = _pose(where, table.take("7d", _POSE)) if has_pose else None
+                sensors[sensor] = _pose(table.take("7z", _POSE), f"rig {rig_id}", scales) if has_pose else None
         rigs[_new(where, rig_id, rigs)] = sensors
     return rigs
 
 
 def _read_frames(
-    table: Table, rigs: dict[int, dict[Sensor, Matrix | None]], images: dict[int, ColmapImage]
+    table: Table,
+    rigs: dict[int, dict[Sensor, Matrix | None]],
+    images: dict[int, ColmapImage],
+    scales: dict[str, float],
 ) -> dict[int, Matrix | None]:
     """World to camera of each image: the pose of its frame, then that of its camera in the rig."""
     poses: dict[int, Matrix | None] = {}
     frame_ids: set[int] = set()
     for where in table.records("frame", "II7dI"):
-        frame_id, rig_id, *numbers = table.take("II7d", f"FRAME_ID, RIG_ID, {_POSE}")
+        frame_id, rig_id, *numbers = table.take("II7z", f"FRAME_ID, RIG_ID, {_POSE}")
         here = f"{where}, frame {frame_id}"
         require(rig_id in rigs, here, "a rig of the model", f"rig {rig_id}")
-        rig_from_world = _pose(where, numbers)
+        rig_from_world = _pose(numbers, f"frame {frame_id}", scales)
         for _ in range(table.count("NUM_DATA_IDS", "sIQ")):
             sensor, (image_id,) = _read_sensor(table, where), table.take("Q", "DATA_ID")
             require(
@@ -301,6 +356,6 @@ def _read_frames(
             fits = image_id not in images or images[image_id].camera_id == sensor[1]
             require(fits, here, f"image {image_id} with the camera that took it", f"camera {sensor[1]}")
             placed = rigs[rig_id][sensor]
-            poses[image_id] = None if placed is None else placed @ rig_from_world
+            poses[image_id] = None if placed is None or rig_from_world is None else placed @ rig_from_world
         frame_ids.add(_new(where, frame_id, frame_ids))
     return poses

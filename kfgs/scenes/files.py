@@ -6,7 +6,7 @@ import importlib
 import os
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from PIL import Image
 from torch import Tensor
 
 from .._check import one_line
-from .._files import as_path, read_json
+from .._files import Names, as_path, folded_name, read_json
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
 HEIC_SUFFIXES = (".heic", ".heif")
@@ -82,6 +82,31 @@ def list_images(folder: str | Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) 
             if not name.startswith(".") and name.lower().endswith(suffixes):
                 names.append((Path(here) / name).relative_to(root).as_posix())
     return sorted(names, key=natural_key)
+
+
+def find_pictures(folder: Path, names: Iterable[str]) -> dict[str, Path]:
+    """The file of each name in a folder, as far as there is one: of this name, or the one that `Names` finds in its images."""
+    wanted = list(names)
+    files = {name: folder / name for name in wanted if is_file(folder / name)}
+    lost = [name for name in wanted if name not in files]
+    if lost:
+        others = Names(name for name in list_images(folder) if name not in files)
+        pairs = [(name, file) for name in lost if (file := others.find(name)) is not None]
+        for name, file in sorted(pairs, key=lambda pair: folded_name(pair[0]) != folded_name(pair[1])):
+            if folder / file not in files.values():  # two names that are one file: the nearer one has it
+                files[name] = folder / file
+    return files
+
+
+def spelling_note(folder: Path, files: Mapping[str, Path]) -> list[str]:
+    """A note if pictures have other names than those by which they were found."""
+    pairs = [(name, file.relative_to(folder).as_posix()) for name, file in files.items()]
+    other = [f"{name} is {file}" for name, file in pairs if name != file]
+    return (
+        [f"{len(other)} images of {folder} were found by a name that is spelled otherwise: {some(other)}"]
+        if other
+        else []
+    )
 
 
 def read_image(path: str | Path) -> Tensor:  # [H, W, 3] float32 in [0, 1]

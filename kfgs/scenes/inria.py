@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._files import as_path, file_stem
+from .._files import Names, as_path, file_stem
 from .._origin import to_world
 from ..formats.folders import newest_splat
 from ..formats.table import read_splats
@@ -77,7 +77,8 @@ def load_inria(folder: str | Path, images: str | Path | None = None) -> Scene:
     notes = (
         [f"{len(missing)} of {len(entries)} cameras have no picture in {pictures}: {some(missing)}"] if missing else []
     )
-    scene = scene_of_poses(folder, views, None, None, _points(folder), notes)
+    points, colors, told = _points(folder)
+    scene = scene_of_poses(folder, views, None, None, (points, colors), [*notes, *told])
     held_out = _held_out(order) if settings.get("eval") is True else set()
     test = [i for i, camera in enumerate(scene.cameras) if camera.name in held_out]
     return replace(scene, splits={"train": [i for i in range(len(scene)) if i not in test], "test": test})
@@ -135,11 +136,13 @@ def _find_pictures(folder: Path, settings: dict[str, Any]) -> Path:
 
 def _names(path: Path, entries: list[Any], pictures: Path) -> list[str | None]:
     """The picture of each camera, relative to the folder: 3DGS writes names with or without their folder and ending."""
+    listed = list_images(pictures)
     known: dict[str, set[str]] = {}
-    for name in list_images(pictures):
+    for name in listed:
         bare = name.rpartition("/")[2]
         for short in {name, file_stem(name), bare, file_stem(bare), bare.partition(".")[0]}:
             known.setdefault(short, set()).add(name)
+    others = Names(listed, bare=True)
     found: list[str | None] = []
     for i, entry in enumerate(entries):
         given = entry.get("img_name") if isinstance(entry, dict) else None
@@ -151,14 +154,16 @@ def _names(path: Path, entries: list[Any], pictures: Path) -> list[str | None]:
                 f"{path}, camera {i}: expected one picture {given!r} in {pictures}, got {some(sorted(fits))}; load the "
                 "folder that 3DGS was trained on, and give this one as the splat (--splat)"
             )
-        found.append(next(iter(fits), None))
+        found.append(next(iter(fits), others.find(str(given))))
     return found
 
 
 def _camera(where: str, entry: dict[str, Any]) -> tuple[Matrix, Matrix, tuple[int, int]]:
     """Camera to world [4, 4], K [3, 3] and (width, height)."""
     numbers: list[Any] = [entry.get(name) for name in ("width", "height", "fx", "fy")]
-    width, height, fx, fy = (n if type(n) in (int, float) and math.isfinite(n) else -1 for n in numbers)
+    if any(type(n) is float and not math.isfinite(n) for n in numbers):
+        return np.full((4, 4), np.nan), np.eye(3), (1, 1)  # a view without pose
+    width, height, fx, fy = (n if type(n) in (int, float) else -1 for n in numbers)
     if (
         min(width, height, fx, fy) <= 0
         or max(width, height) > MAX_SIDE
@@ -180,7 +185,7 @@ def _camera(where: str, entry: dict[str, Any]) -> tuple[Matrix, Matrix, tuple[in
     return pose, np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]]), (int(width), int(height))
 
 
-def _points(folder: Path) -> tuple[Tensor, Tensor]:
+def _points(folder: Path) -> tuple[Tensor, Tensor, list[str]]:
     try:
         if (folder / POINTS).is_file():
             return read_points(folder / POINTS)
@@ -188,7 +193,7 @@ def _points(folder: Path) -> tuple[Tensor, Tensor]:
     except ValueError as error:
         raise SceneError(str(error)) from error
     shades = torch.full((len(cloud), 3), 0.5) if cloud.sh is None else 0.5 + SH_C0 * cloud.sh[:, 0]
-    return to_world(cloud.means, cloud.origin), (shades.clamp(0, 1) * 255).round().to(torch.uint8)
+    return to_world(cloud.means, cloud.origin), (shades.clamp(0, 1) * 255).round().to(torch.uint8), []
 
 
 def _held_out(names: list[str]) -> set[str]:

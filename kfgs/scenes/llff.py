@@ -55,6 +55,11 @@ def load_llff(folder: str | Path, images: str | Path | None = None) -> Scene:
         pose = np.eye(4)
         pose[:3] = np.stack([row[:, 1], row[:, 0], -row[:, 2], row[:, 3]], 1)
         (height, width, focal), size = row[:, 4], picture_size(source / name)
+        if not np.isfinite(row).all():
+            views.append(
+                PosedPicture(name, source / name, pose * np.nan, f"{path}, row {i}", (np.eye(3), size))
+            )  # left out
+            continue
         if not fits_aspect((size[1], size[0]), (height, width)):
             raise SceneError(
                 f"{source / name}: expected the shape {width:g}x{height:g} that {path}, row {i}, says, got "
@@ -75,7 +80,7 @@ def _read(path: Path) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:  # [
         got = f"{values.dtype} {values.shape}"
         raise SceneError(f"{path}: expected floats [V, 17] as LLFF writes them, got {got}; copy it again")
     matrices = values[:, :15].astype(np.float64).reshape(-1, 3, 5)
-    if not (matrices[..., 4] > 0).all():
+    if (matrices[..., 4] <= 0).any():
         raise SceneError(
             f"{path}: expected height, width and focal length above 0 in the fifth column, got "
             f"{matrices[..., 4].min(0).tolist()}; copy it again"

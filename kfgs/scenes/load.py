@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -12,10 +12,10 @@ import torch
 
 from .._check import check_choice
 from .._files import as_path, real_path
+from .._notes import Repair, is_strict, refuse_repairs, tell
 from ..cameras.camera import Camera
 from ..formats.folders import newest_splat
 from .colmap import colmap_cameras, load_colmap
-from .colmap_model import has_model
 from .files import SceneError, natural_key, some
 from .inria import is_inria, load_inria
 from .llff import POSES, is_llff, load_llff
@@ -24,10 +24,10 @@ from .posed import near_zero
 from .replica import is_nice_slam, is_semantic_nerf, load_nice_slam, load_semantic_nerf
 from .scannet import is_scannet, load_scannet
 from .scene import Scene
-from .splits import RULES, choose_split, make_split, read_split, read_test_list
+from .splits import RULES, choose_split, make_split, read_lists, read_split
+from .sub_models import above, choice_note, find_model
 from .transforms import load_transforms, transforms_cameras
 
-MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap_ground_truth", ".")
 _TRANSFORMS = ("transforms.json", "transforms_train.json")
 
 SplitChoice = Literal["auto", "file", "df3dgs", "feature3dgs", "holdout8", "all"]
@@ -55,11 +55,14 @@ _LAYOUTS = (
 """Asked in this order, after COLMAP models and transforms.json: 3D-OVS and Mip-NeRF 360 have both a model and LLFF's poses."""
 
 
-def load_scene(path: str | Path, *, images: str | Path | None = None, split: SplitChoice = "auto") -> Scene:
+def load_scene(
+    path: str | Path, *, images: str | Path | None = None, split: SplitChoice = "auto", strict: bool = False
+) -> Scene:
     """Open a folder with pictures and their poses, in the layout of COLMAP, nerfstudio, or a data set.
 
-    The first of these is read: a COLMAP model in `sparse/0`, `sparse`, `colmap/sparse/0`, `colmap_ground_truth` or the
-    folder itself (binary before text); `transforms.json`; Blender's `transforms_train.json`; Replica as NICE-SLAM
+    The first of these is read: a COLMAP model in `sparse`, `colmap/sparse`, `dense/sparse`, `distorted/sparse`,
+    `colmap_ground_truth` or the folder itself (of several there, as `sparse/0` and `sparse/1`, that with most images; binary
+    before text); `transforms.json`; Blender's `transforms_train.json`; Replica as NICE-SLAM
     (`results/`, `traj.txt`) or Semantic-NeRF (`rgb/`, `traj_w_c.txt`) rendered it; ScanNet (`color/`, `pose/`); LLFF and
     3D-OVS (`poses_bounds.npy`); raw captures of Polycam (`keyframes/`); the output of Inria's 3DGS (`cameras.json`,
     `point_cloud/`). `docs/datasets.md` has them all.
@@ -69,9 +72,12 @@ def load_scene(path: str | Path, *, images: str | Path | None = None, split: Spl
         images: the image folder, also by its name in the scene folder, as in `"images_4"` of Mip-NeRF 360, whose cameras are
             then resized; None: `images/` beside the model or up to two folders above it, else the first of `images_2`,
             `images_4`, ..., else the scene folder. Replica, ScanNet and Polycam know one place only.
-        split: `"auto"`: split.json if there is one, else the model's test.txt, else the split of the transforms.json if it
+        split: `"auto"`: split.json if there is one, else lists of names beside the model or in the scene folder (`test.txt`,
+            `train_list.txt`, `train_test_lists.json`, ...: `splits.read_lists`), else the split of the transforms.json if it
             has one, else `"df3dgs"` for the videos of Replica, `"holdout8"` from 8 images, below 8 `"all"`; `"file"`:
             split.json; or a rule of `make_split`.
+        strict: refuse a scene of which something broken was left out or mended (poses of NaN or with a scale, tracks of
+            images that are gone); else the notes say it.
 
     Returns:
         The scene, with views in natural order of names, and cameras with a `near` for the size of the scene
@@ -93,7 +99,8 @@ def load_scene(path: str | Path, *, images: str | Path | None = None, split: Spl
         if str(root) in str(error):
             raise
         raise SceneError(f"{path}: {error}") from error
-    return _with_split(scene, root, split)
+    _refuse_or_tell(path, scene.notes, strict)
+    return _with_split(scene, path, split)
 
 
 def load_cameras(path: str | Path) -> list[Camera]:
@@ -134,7 +141,7 @@ def cameras_and_notes(path: str | Path) -> tuple[list[Camera], list[str]]:
     if model is not None:
         cameras, notes = colmap_cameras(model)
     elif path.exists() and _is_transforms(path):
-        cameras = transforms_cameras(path)
+        cameras, notes = transforms_cameras(path)
     else:
         return load_scene(path).undistorted().cameras, notes
     if not cameras:
@@ -144,7 +151,20 @@ def cameras_and_notes(path: str | Path) -> tuple[list[Camera], list[str]]:
         scene = Scene(cameras, [Path(camera.name) for camera in cameras], nothing, nothing.byte())
     except SceneError as error:  # of two names that are the same
         raise SceneError(f"{path}: {error}") from error
+    _refuse_or_tell(path, notes)
     return scene.with_near().undistorted().cameras, notes
+
+
+def _refuse_or_tell(path: Path, notes: Sequence[str], strict: bool = False) -> None:
+    """Print notes about what is broken, or make an error of the first one."""
+    if strict or is_strict():
+        try:
+            refuse_repairs(str(path), notes)
+        except ValueError as error:
+            raise SceneError(str(error)) from error
+    for note in notes:
+        if isinstance(note, Repair):
+            tell(note)
 
 
 def _with_splat(scene: Scene, root: Path) -> Scene:
@@ -191,10 +211,8 @@ def _load_views(path: Path, images: str | Path | None) -> Scene:
     model = find_model(path)
     if model is not None:
         scene = load_colmap(model, images if images is not None else find_images(path, model))
-        others = sorted(f.name for f in model.parent.iterdir() if f != model and has_model(f))
-        if model == path / "sparse/0" and others:
-            note = f"{model.parent} holds other models too ({some(others)}): COLMAP split the images; 0 is used"
-            scene = replace(scene, notes=(*scene.notes, note))
+        note = choice_note(path, model)
+        scene = scene if note is None else replace(scene, notes=(*scene.notes, note))
         return scene
     if _is_transforms(path):
         return load_transforms(path, images)
@@ -214,11 +232,6 @@ def _load_views(path: Path, images: str | Path | None) -> Scene:
 
 def _is_transforms(path: Path) -> bool:
     return path.suffix == ".json" or any((path / name).is_file() for name in _TRANSFORMS)
-
-
-def find_model(path: Path) -> Path | None:
-    """The COLMAP model that `load_scene` reads in a scene folder; None if there is none."""
-    return next((path / name for name in MODEL_FOLDERS if path.is_dir() and has_model(path / name)), None)
 
 
 def is_scene(path: str | Path) -> bool:
@@ -245,29 +258,34 @@ def _advice(path: Path) -> str:
 
 def find_images(root: Path, model: Path) -> Path:
     """The folder with the pictures of a scene's model; see `load_scene`."""
-    places = list(dict.fromkeys((root, real_path(model).parent, real_path(model).parent.parent)))
-    for above in places:
-        if (above / "images").is_dir():
-            return above / "images"
-    for above in places:
-        smaller = [folder for folder in above.glob("images_*") if folder.is_dir() and folder.name[7:].isdecimal()]
+    folders = above(model)
+    dense = [folder for folder in folders if folder.name in ("dense", "distorted")]  # pictures of their own
+    places = list(dict.fromkeys((*dense, root, *folders)))
+    for folder in places:
+        if (folder / "images").is_dir():
+            return folder / "images"
+    for folder in places:
+        smaller = [inner for inner in folder.glob("images_*") if inner.is_dir() and inner.name[7:].isdecimal()]
         if smaller:
-            return min(smaller, key=lambda folder: natural_key(folder.name))
-    return root
+            return min(smaller, key=lambda inner: natural_key(inner.name))
+    return next((folder / "input" for folder in dense if (folder / "input").is_dir()), root)
 
 
-def _with_split(scene: Scene, root: Path, split: SplitChoice) -> Scene:
-    file = root / "split.json"
+def _with_split(scene: Scene, path: Path, split: SplitChoice) -> Scene:
+    model, names = find_model(path), [camera.name for camera in scene.cameras]
+    root = path if path.is_dir() else path.parent
+    homes = [root] if model is None else list(dict.fromkeys((model, root, *above(model)[: 4 if model == path else 0])))
+    file = next((home / "split.json" for home in homes if (home / "split.json").is_file()), root / "split.json")
+    chosen = None
     if split == "file" or (split == "auto" and file.is_file()):
-        splits, unknown = read_split(file, [scene.stem(i) for i in range(len(scene))])
-        notes = [f"{len(unknown)} names in {file} are not in the scene: {some(unknown)}"] if unknown else []
-        return replace(scene, splits=splits, notes=(*scene.notes, *notes))
-    listed = [root / name / "test.txt" for name in MODEL_FOLDERS if (root / name / "test.txt").is_file()]
-    if split == "auto" and listed and has_model(listed[0].parent):
-        return replace(scene, splits=read_test_list(listed[0], [scene.stem(i) for i in range(len(scene))]))
-    if split == "auto" and scene.splits.get("test"):
+        chosen = read_split(file, names)
+    elif split == "auto":
+        chosen = next((lists for home in homes if (lists := read_lists(home, names)) is not None), None)
+    if chosen is not None:
+        return replace(scene, splits=chosen[0], notes=(*scene.notes, *chosen[1]))
+    if split == "auto" and (scene.splits.get("test") or len(scene.splits["train"]) < len(scene)):  # of its own lists
         return scene
-    replica = find_model(root) is None and (is_nice_slam(root) or is_semantic_nerf(root))
+    replica = model is None and (is_nice_slam(root) or is_semantic_nerf(root))
     rule = choose_split(len(scene), replica) if split == "auto" else split
     assert rule != "file"
     splits = make_split(len(scene), rule)

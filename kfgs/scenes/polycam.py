@@ -7,6 +7,7 @@ pictures are in millimetres and may be smaller than the pictures. So programs sa
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,8 @@ def _view(file: Path, images: Path, name: str) -> PosedPicture:
     content = read_scene_json(file, _AGAIN)
     values: dict[str, Any] = content if isinstance(content, dict) else {}
     keys = ("width", "height", "fx", "fy", "cx", "cy", *(f"t_{i}{j}" for i in range(3) for j in range(4)))
+    if any(type(values.get(key)) is float and not math.isfinite(values[key]) for key in keys):
+        return PosedPicture(name, images / name, np.full((4, 4), np.nan), str(file), (np.eye(3), (1, 1)))  # left out
     good = [type(values.get(key)) in (int, float) and abs(values[key]) < MAX_NUMBER for key in keys]
     width, height, fx, fy = (values.get(key, 0) for key in keys[:4])
     if not all(good) or not (

@@ -15,11 +15,14 @@ from torch import Tensor
 
 from .._card import short_repr
 from .._check import ORIGIN
+from .._files import read_text
+from .._notes import Repair
 from .._origin import choose_origin, describe_origin, to_local
 from ..cameras.camera import Camera
 from ..cameras.resample import fits_aspect
 from ..formats.ply import points_from_columns, read_ply
-from .files import MAX_NUMBER, SceneError, is_file, list_images, natural_key, open_picture, read_image, some
+from .files import SceneError, is_file, list_images, natural_key, open_picture, read_image, some
+from .poses import mend_pose, mending_notes
 from .scene import Scene
 
 MILLIMETRE = 1e-3  # metres: the step of most depth pictures
@@ -87,10 +90,8 @@ def read_numbers(path: Path, expected: str) -> Matrix:  # [rows, columns]
         FileNotFoundError: if there is no such file.
         SceneError: if it holds something else, or rows of several lengths.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected {expected} there")
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_text(path, expected).splitlines()
         rows = [[float(word) for word in line.replace(",", " ").split()] for line in lines if line.strip()]
         if not rows or len({len(row) for row in rows}) != 1:
             raise ValueError(f"{len(rows)} rows of {sorted({len(row) for row in rows})} numbers")
@@ -133,7 +134,7 @@ def numbered_pictures(folder: Path, pattern: str, poses: Path) -> tuple[list[Pos
         SceneError: if it is damaged, there is no picture, or a picture has no line.
     """
     matrices = read_poses(poses)
-    matches = [match for name in list_images(folder) if (match := re.fullmatch(pattern, name))]
+    matches = [match for name in list_images(folder) if (match := re.fullmatch(pattern, name, re.IGNORECASE))]
     if not matches:
         example = pattern.replace(r"(\d+)", "NUMBER").split("\\")[0]
         raise SceneError(
@@ -169,9 +170,10 @@ def scene_of_poses(
         SceneError: if no view has a pose, a pose is no rigid motion, or a picture has another shape than its camera.
     """
     views = sorted(views, key=lambda view: natural_key(view.name))
-    known = [bool(np.isfinite(view.pose).all() and np.abs(view.pose).max() < MAX_NUMBER) for view in views]
-    posed = [view for view, has_pose in zip(views, known, strict=True) if has_pose]
-    lost = [view.name for view, has_pose in zip(views, known, strict=True) if not has_pose]
+    mended = [mend_pose(view.pose) for view in views]
+    posed = [view._replace(pose=pose) for view, (pose, _) in zip(views, mended, strict=True) if pose is not None]
+    lost = [view.name for view, (pose, _) in zip(views, mended, strict=True) if pose is None]
+    scaled = {view.name: scale for view, (_, scale) in zip(views, mended, strict=True) if scale is not None}
     if not posed:
         raise SceneError(f"{folder}: expected poses of finite numbers, none of {len(views)} is; copy the poses again")
     cameras = []
@@ -180,7 +182,7 @@ def scene_of_poses(
         viewmat[:3, :3] = view.pose[:3, :3].T  # Camera refuses what is not a rotation
         viewmat[:3, 3] = -view.pose[:3, :3].T @ view.pose[:3, 3]
         try:
-            if view.pose[3].tolist() != [0, 0, 0, 1]:
+            if not np.allclose(view.pose[3], [0, 0, 0, 1], rtol=0, atol=1e-6):
                 raise ValueError(f"pose: expected 0 0 0 1 as its last row, got {view.pose[3].tolist()}")
             own_K, own_size = view.lens or (K, size)
             assert own_K is not None
@@ -191,7 +193,7 @@ def scene_of_poses(
             raise SceneError(f"{view.origin}: {error}; copy the poses again") from error
     paths = [view.path for view in posed]
     cameras, resized = as_large_as_pictures(cameras, paths)
-    said = [f"{len(lost)} views have no pose (not finite) and were left out: {some(lost)}"] if lost else []
+    said = mending_notes(lost, scaled)
     if points is None:
         points = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)
         said.append("no points: `kfgs fit` and `kfgs color` triangulate some from the poses before they train")
@@ -207,21 +209,23 @@ def near_zero(cameras: list[Camera], points: Tensor) -> tuple[list[Camera], Tens
     return local, to_local(points, origin), describe_origin(origin, "cameras and points")
 
 
-def read_points(path: Path) -> tuple[Tensor, Tensor]:  # [P, 3] float64, [P, 3] uint8
-    """The vertices of a PLY and their colours; grey if it has none.
+def read_points(path: Path) -> tuple[Tensor, Tensor, list[str]]:  # [P, 3] float64, [P, 3] uint8
+    """The vertices of a PLY and their colours, grey if it has none; and a note if some are left out as they are not finite.
 
     Raises:
-        ValueError: if it is damaged, or a coordinate is not finite.
+        ValueError: if it is damaged.
     """
     columns = read_ply(path)
     points = points_from_columns(columns)
-    if not torch.isfinite(points).all():
-        raise ValueError(f"{path}: expected finite coordinates, got NaN or infinity; write the point cloud again")
     colors = torch.full((len(points), 3), 128, dtype=torch.uint8)
     for i, name in enumerate(("red", "green", "blue")):
         if name in columns and columns[name].dtype.kind in "iu":
             colors[:, i] = torch.from_numpy(columns[name].clip(0, 255).astype("uint8"))
-    return points, colors
+    good = torch.isfinite(points).all(1)
+    if good.all():
+        return points, colors, []
+    note = f"{int((~good).sum())} of {len(points)} points of {path.name} are not finite and were left out"
+    return points[good], colors[good], [Repair(note)]
 
 
 def read_depth(path: Path) -> NDArray[Any]:  # [H, W]

@@ -57,7 +57,8 @@ def load_scannet(folder: str | Path) -> Scene:
     if len(with_pose) < len(names):
         lost = [name for name in names if name not in set(with_pose)]
         notes.append(f"{len(lost)} pictures have no file in pose/ and were left out: {some(lost)}")
-    return scene_of_poses(folder, views, K, size, _points(folder, views), notes)
+    points, told = _points(folder, views)
+    return scene_of_poses(folder, views, K, size, points, [*notes, *told])
 
 
 def _matrix(path: Path) -> Matrix:  # [4, 4]
@@ -67,15 +68,16 @@ def _matrix(path: Path) -> Matrix:  # [4, 4]
     return matrix
 
 
-def _points(folder: Path, views: list[PosedPicture]) -> tuple[Tensor, Tensor] | None:
+def _points(folder: Path, views: list[PosedPicture]) -> tuple[tuple[Tensor, Tensor] | None, list[str]]:
     meshes = sorted(folder.glob(f"*{MESH}"))
     if meshes:
         try:
-            return read_points(meshes[0])
+            points, colors, notes = read_points(meshes[0])
+            return (points, colors), notes
         except ValueError as error:
             raise SceneError(f"{error}; copy the mesh again, or remove it to take points from the depth") from error
     intrinsic = folder / "intrinsic" / "intrinsic_depth.txt"
     if not intrinsic.is_file():
-        return None
+        return None, []
     depths = [folder / "depth" / f"{file_stem(view.name)}.png" for view in views]
-    return points_from_depth(views, depths, _matrix(intrinsic)[:3, :3], _MILLIMETRES)
+    return points_from_depth(views, depths, _matrix(intrinsic)[:3, :3], _MILLIMETRES), []

@@ -10,13 +10,14 @@ from tqdm import tqdm
 
 from .._files import as_path, atomic_folder, check_output, file_stem, real_path
 from .colmap import load_colmap
-from .colmap_model import ColmapModel, has_model, read_model
-from .files import SceneError, list_images, some
-from .load import MODEL_FOLDERS, find_images
+from .colmap_model import ColmapModel, read_whole_model
+from .files import SceneError, find_pictures, list_images, some
+from .load import find_images
 from .pictures import refuse_heic
 from .posed import picture_size
 from .pycolmap_import import quiet_pycolmap, scene_errors
 from .sfm import SfmConfig, SfmReport, SfmRun, fill_database, timed
+from .sub_models import find_model
 
 KEPT = ("classes.json", "text.npy", "text.safetensors")  # files of the scene that are the same for more images
 
@@ -60,8 +61,8 @@ def extend_sfm(
     check_output("out", out, "a folder", apart=[scene], other=[images])
     if out.exists() and any(out.iterdir()):
         raise FileExistsError(f"out: expected a new folder, got {out}, which holds something; name another")
-    old, new = read_model(model), list_images(images)
-    _check_names(old, pictures, new, images)
+    old, new = read_whole_model(model), list_images(images)
+    files = _check_names(old, pictures, new, images)
     with (
         tempfile.TemporaryDirectory(prefix="kfgs-sfm-") as scratch,
         quiet_pycolmap() as pycolmap,
@@ -72,7 +73,7 @@ def extend_sfm(
         atomic_folder(out) as larger,
     ):
         names = sorted(image.name for image in old.images.values())
-        _link(larger / "images", {**dict.fromkeys(names, pictures), **dict.fromkeys(new, images)})
+        _link(larger / "images", files | {name: images / name for name in new})
         for name in KEPT:
             if (scene / name).is_file():
                 (larger / name).symlink_to(real_path(scene / name))
@@ -109,7 +110,7 @@ def extend_sfm(
 
 def _old_model(scene: Path) -> tuple[Path, Path]:
     """The folders of the scene's model and of its pictures; the model is read once, and refused if it is damaged."""
-    model = next((scene / name for name in MODEL_FOLDERS if has_model(scene / name)), None)
+    model = find_model(scene)
     if model is None:
         raise SceneError(
             f"{scene}: expected a scene with a COLMAP model (sparse/0), got none; estimate one with `kfgs sfm`"
@@ -119,17 +120,19 @@ def _old_model(scene: Path) -> tuple[Path, Path]:
     return model, pictures
 
 
-def _check_names(old: ColmapModel, pictures: Path, new: list[str], images: Path) -> None:
+def _check_names(old: ColmapModel, pictures: Path, new: list[str], images: Path) -> dict[str, Path]:
+    """The pictures of the old images by their names."""
     if not new:
         raise SceneError(f"{images}: expected new images (PNG, JPEG, TIFF, WebP), got none; name another folder")
     names = [image.name for image in old.images.values()]
-    lost = [name for name in names if not (pictures / name).is_file()]
+    files = find_pictures(pictures, names)
+    lost = [name for name in names if name not in files]
     if lost:
         raise FileNotFoundError(
             f"{pictures}: expected all images of the model, {some(lost)} are missing; put them there"
         )
     sizes = (
-        (image.name, picture_size(pictures / image.name), old.cameras[image.camera_id]) for image in old.images.values()
+        (image.name, picture_size(files[image.name]), old.cameras[image.camera_id]) for image in old.images.values()
     )
     wrong = [f"{name} ({size[0]}x{size[1]})" for name, size, lens in sizes if size != (lens.width, lens.height)]
     if wrong:
@@ -142,14 +145,15 @@ def _check_names(old: ColmapModel, pictures: Path, new: list[str], images: Path)
         raise SceneError(f"{images}: expected names that the scene does not have, got {some(twice)} again; rename them")
     if any(image.pose is None for image in old.images.values()):
         raise SceneError("scene: expected a model whose images all have poses, got some without; remove them from it")
+    return files
 
 
-def _link(folder: Path, sources: dict[str, Path]) -> None:
+def _link(folder: Path, files: dict[str, Path]) -> None:
     """Link pictures into one folder, under their names."""
-    for name, source in sources.items():
+    for name, file in files.items():
         place = folder / name
         place.parent.mkdir(parents=True, exist_ok=True)
-        place.symlink_to(real_path(source / name))
+        place.symlink_to(real_path(file))
 
 
 def _shared_camera(old: ColmapModel, picture: Path) -> int | None:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from .._check import check_choice
-from .._files import file_stem
-from .files import SceneError, read_scene_json
+from .._files import Names, file_stem, read_text
+from .files import SceneError, read_scene_json, some
 
 SplitRule = Literal["df3dgs", "feature3dgs", "holdout8", "all"]
 RULES: tuple[SplitRule, ...] = ("df3dgs", "feature3dgs", "holdout8", "all")
+SCANNETPP = "train_test_lists.json"
 LONG_VIDEO = 200  # frames of Replica: neighbours show the same, so that every tenth is enough
 
 
@@ -77,15 +78,15 @@ def choose_split(count: int, video: bool = False) -> SplitRule:
     return "holdout8" if count >= 8 else "all"
 
 
-def read_split(path: str | Path, stems: Sequence[str]) -> tuple[dict[str, list[int]], list[str]]:
-    """Read a split.json: `{"train": [stems], "test": [stems]}`; more splits are allowed.
+def read_split(path: str | Path, names: Sequence[str]) -> tuple[dict[str, list[int]], list[str]]:
+    """Read a split.json: `{"train": [names], "test": [names]}`; more splits are allowed. Without test, `val` is tested.
 
     Args:
         path: the file.
-        stems: the views of the scene in order; the names in the file may have a suffix.
+        names: the views of the scene in order; those in the file may lack the suffix.
 
     Returns:
-        The indices of each split in the order of the scene, and the names that the scene does not have.
+        The indices of each split in the order of the scene, and a note if the scene does not have all names.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -97,45 +98,80 @@ def read_split(path: str | Path, stems: Sequence[str]) -> tuple[dict[str, list[i
             f'{path}: expected {{"train": [names], "test": [names]}}, got {str(value)[:80]}; '
             "list file stems under at least 'train'"
         )
-    index = {stem: i for i, stem in enumerate(stems)}
-    splits: dict[str, list[int]] = {"train": [], "test": []}
-    unknown: list[str] = []
-    for name, listed in value.items():
-        found = [index.get(stem, index.get(file_stem(stem))) for stem in listed]
-        splits[name] = sorted({i for i in found if i is not None})
-        unknown += [stem for stem, i in zip(listed, found, strict=True) if i is None]
-    if not splits["train"]:
-        raise SceneError(
-            f"{path}: expected training views among the scene's {len(stems)} ({', '.join(stems[:3])}, ...), none of "
-            f"the {len(value['train'])} listed is there ({', '.join(value['train'][:3])}); correct the names"
-        )
-    both = sorted(set(splits["train"]) & set(splits["test"]))
-    if both:
-        raise SceneError(
-            f"{path}: expected train and test without a common view, {stems[both[0]]} and {len(both) - 1} more are in "
-            "both; scores on training views mean nothing: remove them from one"
-        )
-    return splits, unknown
+    return split_by_lists(str(path), value, names)
 
 
-def read_test_list(path: Path, stems: Sequence[str]) -> dict[str, list[int]]:
-    """Read a `test.txt` beside a COLMAP model, as 3DGS and Occam's LGS do: a held-out picture per line; the others train.
+def split_by_lists(
+    where: str, lists: Mapping[str, Sequence[str]], names: Sequence[str]
+) -> tuple[dict[str, list[int]], list[str]]:
+    """Splits from lists of names. What no list has is in no split; without a list for training, it trains.
+
+    Args:
+        where: the lists come from, for messages.
+        lists: names of views by split, with or without their folders and suffixes. Without test, `val` is tested too.
+        names: the views of the scene in order.
+
+    Returns:
+        The indices of each split in the order of the scene, and a note if the scene does not have all names.
 
     Raises:
-        SceneError: if a name is not in the scene, or none is left to train.
+        SceneError: if no training view is in the scene, or a view is in both train and test.
     """
-    names = [line.strip() for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
-    index = {stem: i for i, stem in enumerate(stems)}
-    found = [index.get(name, index.get(file_stem(name))) for name in names]
-    unknown = [name for name, i in zip(names, found, strict=True) if i is None]
-    test = {i for i in found if i is not None}
-    if unknown or not 0 < len(test) < len(stems):
-        got = f"{unknown[0]!r:.80}" if unknown else f"{len(test)} of them"
+    known, place = Names(names, bare=True), {name: i for i, name in enumerate(names)}
+    found = {split: [known.find(name) for name in listed] for split, listed in lists.items()}
+    splits = {split: sorted({place[name] for name in listed if name is not None}) for split, listed in found.items()}
+    splits["test"] = splits.get("test") or splits.get("val", [])
+    listed = {i for views in splits.values() for i in views}
+    splits = {"train": [i for i in range(len(names)) if i not in listed], **splits}
+    wanted = [name for names_of in lists.values() for name in names_of]
+    unknown = [name for name in wanted if known.find(name) is None]
+    if not splits["train"] or not listed:
+        got = f"none of {len(wanted)} listed is there" if unknown else "all of them for the test"
         raise SceneError(
-            f"{path}: expected names of some of the scene's {len(stems)} pictures ({', '.join(stems[:3])}, ...), got {got}; "
-            "correct the list, or choose another split"
+            f"{where}: expected training views among the scene's {len(names)} pictures ({some(list(names), 3)}), got {got} "
+            f"({some(unknown or wanted, 3)}); correct the names"
         )
-    return {"train": [i for i in range(len(stems)) if i not in test], "test": sorted(test)}
+    both = sorted(set(splits["train"]) & {*splits["test"], *splits.get("val", ())})
+    if both:
+        shown = f"{file_stem(names[both[0]])} and {len(both) - 1} more"
+        raise SceneError(
+            f"{where}: expected train and test without a common view, {shown} are in both; scores on training views mean "
+            "nothing: remove them from one"
+        )
+    advice = known.advice(unknown[0]) if unknown else ""
+    note = f"{len(unknown)} names in {where} are not in the scene: {some(unknown)} ({advice})"
+    return splits, [note] if unknown else []
+
+
+def read_lists(folder: Path, names: Sequence[str]) -> tuple[dict[str, list[int]], list[str]] | None:
+    """Read the lists of views in a folder, as other programs write them; None if there is none.
+
+    They are `train.txt`, `val.txt` and `test.txt`, also as `train_list.txt`: a name per line (3DGS and Occam's LGS put a
+    `test.txt` beside the model); or ScanNet++'s `train_test_lists.json`.
+
+    Raises:
+        SceneError: if a list is no text, or no training view is in the scene.
+    """
+    lists: dict[str, list[str]] = {}
+    for split in ("train", "val", "test"):
+        file = next(
+            (folder / name for name in (f"{split}.txt", f"{split}_list.txt") if (folder / name).is_file()), None
+        )
+        if file is not None:
+            try:
+                lines = read_text(file, "a list of names of views").split("\n")
+            except ValueError as error:
+                raise SceneError(str(error)) from error
+            lists[split] = [line.strip() for line in lines if line.strip()]
+    where = ", ".join(f"{split}.txt" if (folder / f"{split}.txt").is_file() else f"{split}_list.txt" for split in lists)
+    if not lists and (folder / SCANNETPP).is_file():
+        value, where = read_scene_json(folder / SCANNETPP, "correct it or remove it"), SCANNETPP
+        lists = {name: value[name] for name in ("train", "val", "test") if isinstance(value, dict) and name in value}
+        if not _is_split(lists):
+            raise SceneError(
+                f"{folder / SCANNETPP}: expected lists train and test, got {value!r:.80}; correct it or remove it"
+            )
+    return split_by_lists(str(folder / where), lists, names) if any(lists.values()) else None
 
 
 def _is_split(value: Any) -> bool:

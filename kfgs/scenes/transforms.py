@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from .._files import as_path
+from .._files import Names, as_path
 from .._origin import Origin
 from ..cameras.camera import Camera
-from .files import IMAGE_SUFFIXES, SceneError, is_file, natural_key, read_scene_json, some
+from .files import IMAGE_SUFFIXES, SceneError, is_file, list_images, natural_key, read_scene_json, some
 from .posed import MILLIMETRE, as_large_as_pictures, near_zero, picture_size, points_of_cameras, read_points
+from .poses import mending_notes
 from .scene import Scene
+from .splits import split_by_lists
 from .transforms_frame import Frame
 
 _UNNAMED_POINTS = "points3d.ply"
@@ -32,7 +35,25 @@ class _Reader:
     missing: list[str] = field(default_factory=list)
     outside: list[str] = field(default_factory=list)
     masked: int = 0
+    broken: list[str] = field(default_factory=list)
+    scaled: dict[str, float] = field(default_factory=dict)
+    respelled: dict[str, str] = field(default_factory=dict)
     depths: list[Path | None] = field(default_factory=list)
+
+    @cached_property
+    def names(self) -> dict[Path, Names]:
+        """The images in each folder where they may be, for names that are not there as they are written."""
+        folders = (self.images, self.root / "images", self.root)
+        return {folder: Names(list_images(folder)) for folder in folders if folder is not None}
+
+    def camera(self, frame: Frame, name: str) -> Camera | None:
+        """The camera of a frame; None, and noted, if something of it is broken."""
+        camera, scale = (None, None) if frame.broken else frame.camera(name)
+        if camera is None:
+            self.broken.append(name)
+        elif scale is not None:
+            self.scaled[name] = scale
+        return camera
 
     def with_depth(self, origin: Origin) -> list[tuple[Camera, Path, Path]]:
         """Camera, picture and depth picture of each view that has all three."""
@@ -48,7 +69,8 @@ def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene
     and `camera_angle_y` (radians) if focal lengths are missing, `k1 k2 p1 p2 [k3]` or, with a fisheye, `k1 k2 k3 k4`.
     Without `w, h` each frame has the size of its own picture, without `cx, cy` its centre.
 
-    A frame whose file is missing is left out and named in `notes`. Frames outside the scene folder (an absolute path, or
+    A frame whose file is missing, or whose pose or lens has NaN or infinite numbers, is left out and named in `notes`. A scale
+    of a pose is removed. Frames outside the scene folder (an absolute path, or
     `..`) are read if they are image files, and counted in `notes`. `ply_file_path` gives the points if it is inside the
     folder, without it the `points3d.ply` of 3DGS and OpenGaussian; else the scene has no points (P = 0), and a
     note says so. Without points, those of `depth_file_path` are taken (millimetres, or `integer_depth_scale`), if no lens
@@ -59,8 +81,9 @@ def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene
         images: where to look for image files before the scene folder. Other sizes than the file says resize the cameras.
 
     Returns:
-        The scene in natural order of names. Splits come from the file (`train_filenames`, `test_filenames`) or from Blender's
-        two files; else all views train.
+        The scene in natural order of names. Splits come from the file (`train_filenames`, `val_filenames`, `test_filenames`; what
+        none of them names is in no split) or from Blender's files; without test views, the validation views are tested. Else
+        all views train.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -74,33 +97,42 @@ def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene
     views = [(camera, image, split) for split, (reader, _) in readers.items() for camera, image in reader.views]
     missing = [name for reader, _ in readers.values() for name in reader.missing]
     outside = [name for reader, _ in readers.values() for name in reader.outside]
+    notes = [note for reader, _ in readers.values() for note in mending_notes(reader.broken, reader.scaled)]
     if not views:
+        lost = [*missing, *(name for reader, _ in readers.values() for name in reader.broken)]
         raise SceneError(
-            f"{path}: expected frames with image files, none of {len(missing)} has one ({some(missing, 3)}); "
-            "copy the images next to the file or pass their folder"
+            f"{path}: expected frames with image files and poses, none of {len(lost)} has both ({some(lost, 3)}); "
+            f"copy the images next to the file or pass their folder{''.join(f'; {note}' for note in notes)}"
         )
     views.sort(key=lambda view: natural_key(view[0].name))
     first, top = next(iter(readers.values()))
-    points, colors, notes = _points(first, top)
+    points, colors, told = _points(first, top)
     paths = [view[1] for view in views]
     cameras, points, far = near_zero([view[0] for view in views], points)
     if len(points) == 0:
         unit = Frame(first.path, "top level", top).number("integer_depth_scale", MILLIMETRE)  # world units per step
         frames = [frame for reader, _ in readers.values() for frame in reader.with_depth(cameras[0].origin)]
         found = points_of_cameras(frames, unit)
-        points, colors, notes = found or (points, colors, notes)
+        points, colors, told = found or (points, colors, told)
+    notes += told
     if missing:
         notes.append(f"{len(missing)} of {len(missing) + len(views)} frames have no image file: {some(missing)}")
     if outside:
         notes.append(f"{len(outside)} image files lie outside {first.root}: {some(outside, 3)}")
     if any(reader.masked for reader, _ in readers.values()):
         notes.append(f"{sum(reader.masked for reader, _ in readers.values())} frames have a mask_path; it is not used")
+    other = [f"{listed} is {file}" for reader, _ in readers.values() for listed, file in reader.respelled.items()]
+    if other:
+        notes.append(f"{len(other)} images were found by a name that is spelled otherwise: {some(other)}")
     cameras, shrunk = as_large_as_pictures(cameras, paths, first.images)
-    return Scene(cameras, paths, points, colors, _splits(views, first.root, top), (*notes, *shrunk, *far)).with_near()
+    splits, told = _splits(path, views, top)
+    return Scene(cameras, paths, points, colors, splits, (*notes, *shrunk, *told, *far)).with_near()
 
 
-def transforms_cameras(path: Path) -> list[Camera]:
+def transforms_cameras(path: Path) -> tuple[list[Camera], list[str]]:
     """The cameras (float64) of the files that `load_transforms` reads, by names, also of frames without an image file.
+
+    Notes say what is broken and left out.
 
     A frame without `file_path` is named by its number, `0007.png`. A picture is opened only if its frame has no `w, h`.
 
@@ -108,7 +140,7 @@ def transforms_cameras(path: Path) -> list[Camera]:
         FileNotFoundError: if there is no such file.
         SceneError: if it is damaged, a number is missing or implausible, or a lens is unknown to kfgs.
     """
-    cameras = []
+    cameras, notes = [], []
     for file in _files(path).values():
         reader = _Reader(file, file.parent, None)
         for i, (frame, _) in enumerate(_frames(reader, _read_top(reader))):
@@ -121,8 +153,9 @@ def transforms_cameras(path: Path) -> list[Camera]:
                 named = named.with_name(f"{named.name}.png")
             if found is not None and not {"w", "h"} <= set(frame.values):
                 frame.values["w"], frame.values["h"] = picture_size(found)
-            cameras.append(frame.camera(_name(reader, found or named)))
-    return sorted(cameras, key=lambda camera: natural_key(camera.name))
+            cameras.append(reader.camera(frame, _name(reader, found or named)))
+        notes += mending_notes(reader.broken, reader.scaled)
+    return sorted((c for c in cameras if c is not None), key=lambda camera: natural_key(camera.name)), notes
 
 
 def _files(path: Path) -> dict[str, Path]:
@@ -130,8 +163,10 @@ def _files(path: Path) -> dict[str, Path]:
     if path.is_dir():
         if (path / "transforms.json").is_file():
             return {"all": path / "transforms.json"}
-        parts = {name: path / f"transforms_{name}.json" for name in ("train", "test")}
+        parts = {name: path / f"transforms_{name}.json" for name in ("train", "test", "val")}
         found = {name: file for name, file in parts.items() if file.is_file()}
+        if "test" in found:  # then nobody needs those for validation
+            found.pop("val", None)
         if "train" not in found:
             raise FileNotFoundError(f"{path}: no transforms.json and no transforms_train.json; expected one of them")
         return found
@@ -168,34 +203,34 @@ def _read_frames(reader: _Reader) -> dict[str, Any]:
             reader.missing.append(listed)
             continue
         reader.masked += "mask_path" in values
-        if not {"w", "h"} <= set(
-            merged
-        ):  # Blender writes no size; a smaller copy in `images` is not what the file is about
+        if not {"w", "h"} <= set(merged):  # Blender; a smaller copy in `images` is not what the file is about
             merged["w"], merged["h"] = picture_size(_find_image(replace(reader, images=None), listed) or file)
-        reader.depths.append(_depth_file(reader, merged))
-        reader.views.append((frame.camera(_name(reader, file)), file))
+        camera = reader.camera(frame, _name(reader, file))
+        if camera is not None:
+            reader.depths.append(_depth_file(reader, merged))
+            reader.views.append((camera, file))
     return top
 
 
-def _candidates(reader: _Reader, listed: str) -> Iterator[Path]:
-    for spelled in dict.fromkeys((listed, listed.replace("\\", "/"))):
-        relative = PurePosixPath(spelled)
-        if reader.images is not None and not relative.is_absolute():
-            yield reader.images / relative
-            yield reader.images / PurePosixPath(*relative.parts[1:])
-        yield reader.root / relative
-
-
 def _find_image(reader: _Reader, listed: str) -> Path | None:
-    """The file of a frame: as listed, or (Blender) with a suffix added. Only image files count."""
+    """The file of a frame: as listed, or with a suffix added (Blender), or by `Names`. Only image files count."""
     if "\0" in listed:
         return None
-    for candidate in _candidates(reader, listed):
-        if candidate.suffix.lower() in IMAGE_SUFFIXES and is_file(candidate):
-            return candidate
+    relative = PurePosixPath(listed.replace("\\", "/"))
+    places = [reader.root / listed, reader.root / relative]
+    if reader.images is not None and not relative.is_absolute():
+        places = [reader.images / relative, reader.images / PurePosixPath(*relative.parts[1:]), *places]
+    for place in places:
+        if place.suffix.lower() in IMAGE_SUFFIXES and is_file(place):
+            return place
         for suffix in IMAGE_SUFFIXES:
-            if candidate.name and is_file(with_suffix := candidate.with_name(candidate.name + suffix)):
+            if place.name and is_file(with_suffix := place.with_name(place.name + suffix)):
                 return with_suffix
+    for folder, names in reader.names.items():
+        near = names.find(str(relative))
+        if near is not None:
+            reader.respelled[listed] = near
+            return folder / near
     return None
 
 
@@ -238,7 +273,8 @@ def _points(reader: _Reader, top: dict[str, Any]) -> tuple[Tensor, Tensor, list[
     if file is None or not _normal(file).is_relative_to(_normal(reader.root)) or not is_file(file):
         return *nothing, [f"no points: ply_file_path {listed!r:.200} is no file inside {reader.root}"]
     try:
-        return *read_points(file), notes
+        points, colors, told = read_points(file)
+        return points, colors, notes + told
     except ValueError as error:
         if notes:
             raise SceneError(f"{error}; write the points again, or remove the file to load without points") from error
@@ -256,18 +292,29 @@ def _depth_file(reader: _Reader, values: dict[str, Any]) -> Path | None:
     return file if file.suffix.lower() == ".png" and _normal(file).is_relative_to(_normal(reader.root)) else None
 
 
-def _splits(views: list[tuple[Camera, Path, str]], root: Path, top: dict[str, Any]) -> dict[str, list[int]]:
-    """The splits that the files give; if there are none, all views in train."""
-    origin = [split for _, _, split in views]
-    if "all" not in origin:
-        return {name: [i for i, split in enumerate(origin) if split == name] for name in ("train", "test")}
-    listed = {name: top.get(f"{name}_filenames") for name in ("train", "test")}
-    if all(isinstance(names, list) and names for names in listed.values()):
-        files = {_normal(path): i for i, (_, path, _) in enumerate(views)}
-        splits: dict[str, list[int]] = {}
-        for name, names in listed.items():
-            found = [files.get(_normal(root / file)) for file in names or () if isinstance(file, str)]
-            splits[name] = sorted({i for i in found if i is not None})
-        if splits["train"] and not set(splits["train"]) & set(splits["test"]):
-            return splits
-    return {"train": list(range(len(views))), "test": []}
+def _splits(
+    path: str | Path, views: list[tuple[Camera, Path, str]], top: dict[str, Any]
+) -> tuple[dict[str, list[int]], list[str]]:
+    """The splits that the files give; if there are none, all views in train. And notes."""
+    names = [camera.name for camera, _, _ in views]
+    lists = {name: top.get(f"{name}_filenames") for name in ("train", "val", "test")}
+    if views[0][2] != "all":
+        lists = {name: [camera.name for camera, _, split in views if split == name] for name in lists}
+    given = {
+        name: [word for word in words if isinstance(word, str)]
+        for name, words in lists.items()
+        if isinstance(words, list) and words
+    }
+    if not given:
+        return {"train": list(range(len(views))), "test": []}, []
+    known = Names(names, bare=True)
+    held = {known.find(word) for name in ("val", "test") for word in given.get(name, ())}
+    if "train" in given and any(known.find(word) in held for word in given["train"]):
+        own = [word for word in given["train"] if known.find(word) not in held]
+        if not own:
+            note = "all views that train are validation or test views, too: none is held out"
+            return split_by_lists(f"{path}", {"train": given["train"]}, names)[0], [note]
+        note = f"{len(given['train']) - len(own)} views of train_filenames are validation or test views, too: they do not train"
+        splits, notes = split_by_lists(f"{path}", given | {"train": own}, names)
+        return splits, [*notes, note]
+    return split_by_lists(f"{path}", given, names)

@@ -14,16 +14,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
-from torch import Tensor
 
 from ..cameras.camera import Camera, Distortion
 from .files import MAX_NUMBER, MAX_SIDE, SceneError
+from .poses import Matrix, mend_pose
 
 _PERSPECTIVE = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 _COEFFICIENTS = {"PINHOLE": (), "SIMPLE_PINHOLE": (), **dict.fromkeys(_FISHEYE, ("k1", "k2", "k3", "k4"))}
-_FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  # OpenGL axes to COLMAP's
+_LENS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "k1", "k2", "k3", "k4", "p1", "p2")
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL axes to COLMAP's
 
 
 @dataclass(frozen=True)
@@ -46,8 +48,20 @@ class Frame:
             raise self.fail(name, "a finite number", value, "add it at the top or in each frame")
         return float(value)
 
-    def camera(self, name: str) -> Camera:
-        """The camera with its lens; a SceneError if a value is missing or implausible."""
+    @property
+    def broken(self) -> bool:
+        """Whether its pose is missing, or a number of it or of the lens is NaN, infinite or implausible."""
+        rows = self.values.get("transform_matrix")
+        numbers = [self.values.get(name) for name in _LENS]
+        numbers += [number for row in rows if isinstance(row, list) for number in row] if isinstance(rows, list) else []
+        return rows is None or any(isinstance(n, float) and not abs(n) < MAX_NUMBER for n in numbers)
+
+    def camera(self, name: str) -> tuple[Camera | None, float | None]:
+        """The camera with its lens (None if its pose is no rotation), and the scale that was removed from the pose, if any.
+
+        Raises:
+            SceneError: if a value is missing or implausible.
+        """
         width, height = self.number("w"), self.number("h")
         if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE and width % 1 == 0 and height % 1 == 0):
             raise self.fail("", f"w and h of 1 to {MAX_SIDE} whole pixels", (width, height), "correct the size")
@@ -58,9 +72,14 @@ class Frame:
             raise self.fail("", expected, sorted(self.values), "add one at the top or in each frame")
         cx, cy = self.number("cx", width / 2), self.number("cy", height / 2)
         K = torch.tensor([[fx, 0, cx], [0, fx if fy is None else fy, cy], [0, 0, 1]], dtype=torch.float32)
-        viewmat, lens = self.viewmat(), self.distortion()
+        (pose, scale), lens = mend_pose(self.pose()), self.distortion()
+        if pose is None:
+            return None, None
+        viewmat = torch.eye(4, dtype=torch.float64)
+        rotation, centre = torch.from_numpy(pose[:3, :3].T), torch.from_numpy(pose[:3, 3])
+        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ centre  # Camera refuses what is not a rotation
         try:
-            return Camera(viewmat, K, int(width), int(height), name, lens)
+            return Camera(viewmat, K, int(width), int(height), name, lens), scale
         except ValueError as error:
             raise SceneError(f"{self.path}, {self.where} ({name}): {error}") from error
 
@@ -107,21 +126,17 @@ class Frame:
             )  # fmt: skip
         return Distortion("brown_conrady", (k[0], k[1], *p, *k[2:]))
 
-    def viewmat(self) -> Tensor:  # [4, 4] float64
-        """World to camera from a camera-to-world matrix with OpenGL axes."""
+    def pose(self) -> Matrix:  # [4, 4] float64
+        """Camera to world, x right, y down, z forward."""
         name, rows = "transform_matrix", self.values.get("transform_matrix")
         try:
-            pose = torch.tensor(rows, dtype=torch.float64)
-        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+            pose = np.array(rows, dtype=np.float64)
+        except (TypeError, ValueError, OverflowError) as error:
             raise self.fail(name, "4 rows of 4 numbers", rows, "write the file again") from error
         if pose.shape == (3, 4):
-            pose = torch.cat([pose, pose.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
-        if pose.shape != (4, 4) or not torch.isfinite(pose).all() or float(pose.abs().max()) > MAX_NUMBER:
-            raise self.fail(name, "4 rows of 4 finite numbers", rows, "write the file again")
-        if pose[3].tolist() != [0, 0, 0, 1]:
+            pose = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]])
+        if pose.shape != (4, 4):
+            raise self.fail(name, "4 rows of 4 numbers", rows, "write the file again")
+        if not np.allclose(pose[3], [0, 0, 0, 1], rtol=0, atol=1e-6):
             raise self.fail(name, "0 0 0 1 as the last row", pose[3].tolist(), "is it transposed?")
-        pose = pose @ _FLIP
-        viewmat = torch.eye(4, dtype=torch.float64)
-        viewmat[:3, :3] = pose[:3, :3].T  # Camera refuses what is not a rotation
-        viewmat[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-        return viewmat
+        return pose @ _FLIP

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from .._files import as_path, atomic_folder, check_output
-from .colmap_model import read_model
+from .colmap_model import read_whole_model
 from .files import SceneError
 from .pycolmap_import import quiet_pycolmap, scene_errors
 
@@ -36,7 +36,7 @@ def undistort_scene(images: str | Path, model: str | Path, out: str | Path) -> P
         raise SceneError(
             f"{out}: expected a new or empty folder for the undistorted scene, got one in use; choose another"
         )
-    read_model(model)  # pycolmap must see no damaged file
+    read_whole_model(model)  # pycolmap must see no damaged file
     advice = "check the images, or run `colmap image_undistorter` yourself"
     with (
         atomic_folder(out) as folder,

@@ -127,11 +127,13 @@ def test_the_wrong_image_folder_is_an_error(tmp_path: Path) -> None:
         load_colmap(model, tmp_path / "nowhere")
 
 
-def test_a_pose_that_is_no_rotation_is_named(tmp_path: Path) -> None:
-    model = write_text_model(tmp_path / "sparse", images="1 0.65 0.8 0 0 0 0 0 1 a.png\n\n", points3D="")
+def test_a_quaternion_that_is_not_of_length_1_is_normalised(tmp_path: Path) -> None:
+    model = write_text_model(tmp_path / "sparse", images="1 0.6006 0.8008 0 0 1 2 3 1 a.png\n\n", points3D="")
     write_picture(tmp_path / "images/a.png")
-    with pytest.raises(SceneError, match=tells("sparse, image a.png", "rotation", "write the model again")):
-        load_colmap(model, tmp_path / "images")
+    scene = load_colmap(model, tmp_path / "images")
+    turned = torch.tensor([[1, 0, 0, 1], [0, -0.28, -0.96, 2], [0, 0.96, -0.28, 3], [0, 0, 0, 1]])  # cos = 2 * 0.36 - 1
+    torch.testing.assert_close(scene.cameras[0].viewmat, turned)
+    assert any("1 poses have a scale (1.001) or a rounded rotation, which was removed: image 1" in n for n in scene.notes)
 
 
 def test_a_name_too_long_for_the_disk_is_a_missing_file(tmp_path: Path) -> None:

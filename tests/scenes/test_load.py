@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from colmap_models import write_model, write_picture
 from messages import tells
 
@@ -38,11 +39,120 @@ def test_a_model_folder_or_a_given_image_folder_will_do(tmp_path: Path) -> None:
     assert load_scene(tmp_path).image_paths == [tmp_path / "a.png"]  # beside the model, without images/
 
 
-def test_a_second_model_is_mentioned(tmp_path: Path) -> None:
-    for number in "01":
-        write_model(tmp_path / "sparse" / number, ["a.png"])
+@pytest.mark.parametrize(
+    ("models", "chosen", "other"),
+    [
+        ({"sparse/0": 1, "sparse/1": 3}, "sparse/1", "sparse/0"),
+        ({"sparse/0": 2, "sparse/1": 2}, "sparse/0", "sparse/1"),  # equal: the lowest number
+        ({"sparse/1": 3}, "sparse/1", None),
+        ({"sparse": 1, "sparse/0": 2}, "sparse/0", "sparse"),
+        ({"sparse/0/models/0": 1, "sparse/0/models/1": 3}, "sparse/0/models/1", "sparse/0/models/0"),  # hloc
+        ({"sparse/0": 3, "sparse/0/models/1": 1}, "sparse/0", "sparse/0/models/1"),
+        ({"sparse/models/0": 1, "sparse": 2}, "sparse", "sparse/models/0"),
+        ({"sparse/0": 1, "sparse/merged": 3}, "sparse/0", None),
+        ({"sparse/merged": 2}, "sparse/merged", None),
+        ({"dense/sparse": 2}, "dense/sparse", None),
+        ({"distorted/sparse/0": 1, "distorted/sparse/1": 2}, "distorted/sparse/1", "distorted/sparse/0"),
+        ({"colmap/sparse/0": 1, "colmap/sparse/1": 2}, "colmap/sparse/1", "colmap/sparse/0"),
+        ({"models/0": 1, ".": 2}, ".", "models/0"),
+    ],
+)
+@pytest.mark.parametrize("text", [False, True])
+def test_of_several_models_the_largest_is_used(
+    tmp_path: Path, models: dict[str, int], chosen: str, other: str | None, text: bool
+) -> None:
+    names = [f"{i}.png" for i in range(4)]
+    for place, count in models.items():
+        write_model(tmp_path / place, names[:count] if place == chosen else names[-count:], text=text)
+    _pictures(tmp_path / "images", names)
+    (tmp_path / "split.json").write_text(json.dumps({"train": names[:1] + names[-1:]}))
+    scene = load_scene(tmp_path)
+    assert [c.name for c in scene.cameras] == names[: models[chosen]]
+    notes = [note for note in scene.notes if "of several models" in note]
+    if other is None:
+        assert not notes
+        return
+    assert f"{chosen} with {models[chosen]} images is used" in notes[0]
+    assert f"{other} with {models[other]} images" in notes[0]
+    advised = load_scene(
+        notes[0].rpartition("as in ")[2]
+    )  # the advice works, and the lists of the scene hold there, too
+    assert advised.folder == tmp_path / other
+    assert [c.name for c in advised.cameras] == names[-models[other] :]
+    assert advised.image_paths[0].parent == tmp_path / "images"
+    assert advised.splits["train"] == [models[other] - 1]
+
+
+def test_pictures_beside_a_dense_model_are_its_own(tmp_path: Path) -> None:
+    write_model(tmp_path / "dense/sparse", ["a.png"])
     _pictures(tmp_path / "images", ["a.png"])
-    assert any("holds other models too (1)" in note for note in load_scene(tmp_path).notes)
+    assert load_scene(tmp_path).image_paths == [tmp_path / "images/a.png"]
+    _pictures(tmp_path / "dense/images", ["a.png"])
+    assert load_scene(tmp_path).image_paths == [tmp_path / "dense/images/a.png"]
+
+
+@pytest.mark.parametrize(
+    ("listed", "files"),
+    [
+        (["A.JPG", "B.JPG"], ["A.jpg", "B.jpg"]),
+        (["A.JPG", "B.JPG"], ["A.png", "B.png"]),
+        (["K\u00fcche.png", "b.png"], ["Ku\u0308che.png", "b.png"]),
+        (["left\\a.png", "right\\a.png"], ["left/a.png", "right/a.png"]),
+        (["images/a.png", "images/b.png"], ["a.png", "b.png"]),
+        (["a b.png", "a  (2).png"], ["a b.png", "a  (2).png"]),
+    ],
+)
+def test_pictures_are_found_by_names_that_are_spelled_otherwise(
+    tmp_path: Path, listed: list[str], files: list[str]
+) -> None:
+    write_model(tmp_path / "sparse/0", listed)
+    _pictures(tmp_path / "images", files)
+    scene = load_scene(tmp_path)
+    assert sorted(c.name for c in scene.cameras) == sorted(files)
+    assert sorted(scene.image_paths) == sorted(tmp_path / "images" / name for name in files)
+    assert all(scene.image(i).shape == (48, 64, 3) for i in range(2))
+    assert any("spelled otherwise" in note for note in scene.notes) == (listed != files)
+    assert not any("no pose in the model" in note for note in scene.notes)
+
+
+def test_a_file_is_never_two_views_and_the_nearest_name_is_told(tmp_path: Path) -> None:
+    write_model(tmp_path / "sparse/0", ["a.JPG", "a.png", "frame_1.png"])
+    _pictures(tmp_path / "images", ["a.jpg", "frame1.png"])
+    scene = load_scene(tmp_path)
+    assert [c.name for c in scene.cameras] == ["a.jpg"]
+    assert any(
+        "2 of 3 posed images have no file" in n and n.endswith("(did you mean 'frame1.png'?)") for n in scene.notes
+    )
+    (tmp_path / "images/a.jpg").unlink()
+    with pytest.raises(
+        SceneError, match=tells("none of its 3 posed images", "image folder", "did you mean 'frame1.png'?")
+    ):
+        load_scene(tmp_path)
+
+
+def test_deleted_images_and_broken_poses_are_left_out_and_strict_refuses_them(tmp_path: Path) -> None:
+    folder = write_model(tmp_path / "sparse/0", ["a.png", "b.png", "c.png", "d.png"], text=True, rigs=False)
+    _pictures(tmp_path / "images", ["a.png", "b.png", "c.png", "d.png"])
+    lines = (folder / "images.txt").read_text().splitlines()
+    at = {line.split()[-1]: i for i, line in enumerate(lines) if line.endswith(".png")}
+    words = lines[at["b.png"]].split()
+    scaled = [repr(float(word) * 1.01) for word in words[1:5]]
+    lines[at["b.png"]] = " ".join([words[0], *scaled, *words[5:]])
+    lines[at["c.png"]] = lines[at["c.png"]].replace(lines[at["c.png"]].split()[5], "nan")
+    del lines[at["d.png"] : at["d.png"] + 2]
+    before = load_scene(tmp_path)
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    scene = load_scene(tmp_path)
+    assert [c.name for c in scene.cameras] == ["a.png", "b.png"]
+    assert len(scene.points) == len(before.points)
+    torch.testing.assert_close(scene.cameras[1].viewmat, before.cameras[1].viewmat)
+    told = " ".join(scene.notes)
+    assert "1 images of the model have no pose and were left out: c.png" in told
+    assert "5 of 20 entries of tracks lead to no 2-D point" in told
+    assert "images 4 are not in the model" in told
+    assert "1 poses have a scale (1.01) or a rounded rotation, which was removed: image 2" in told
+    with pytest.raises(SceneError, match=tells(tmp_path, "nothing broken (strict)", "c.png", "without --strict")):
+        load_scene(tmp_path, strict=True)
 
 
 def test_every_loader_gives_a_near_plane_to_suit_a_small_frame(tmp_path: Path) -> None:

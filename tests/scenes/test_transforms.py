@@ -11,7 +11,7 @@ from messages import tells
 
 from kfgs.cameras.projection import project_points
 from kfgs.formats.ply import write_ply
-from kfgs.scenes import SceneError
+from kfgs.scenes import SceneError, load_cameras, load_scene
 from kfgs.scenes.transforms import load_transforms
 
 TOP = {"w": 64, "h": 48, "fl_x": 50.0, "fl_y": 55.0, "cx": 31.0, "cy": 25.0}
@@ -201,8 +201,9 @@ def test_point_clouds_elsewhere_or_broken(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match=tells("bad.ply:", "ply_file_path")):
         load_transforms(_write(tmp_path / "scene", ply_file_path="bad.ply"))
     write_ply(tmp_path / "scene/nan.ply", {name: np.full(1, np.nan, np.float32) for name in "xyz"})
-    with pytest.raises(SceneError, match=tells("nan.ply:", "finite", "got NaN")):
-        load_transforms(_write(tmp_path / "scene", ply_file_path="nan.ply"))
+    scene = load_transforms(_write(tmp_path / "scene", ply_file_path="nan.ply"))
+    assert len(scene.points) == 0
+    assert "1 of 1 points of nan.ply are not finite and were left out" in scene.notes
 
 
 def test_splits_and_masks_of_nerfstudio(tmp_path: Path) -> None:
@@ -220,11 +221,15 @@ def _frame(**changes: Any) -> list[dict[str, Any]]:
 BAD = [
     ([], {}, ("'frames'", "transforms.json")),
     ([3], {}, ("frame 0:", "'transform_matrix'", "got 3")),
-    (_frame(transform_matrix=None), {}, ("transform_matrix:", "expected 4", "got None")),
+    (
+        _frame(transform_matrix=None),
+        {},
+        ("none of 1 has both", "1 views have no pose or lens of finite numbers", "a.png"),
+    ),
     (_frame(transform_matrix=[[1, 2], [3]]), {}, ("transform_matrix:", "expected 4", "got [[")),
     (_frame(transform_matrix=[[1.0, 2.0]]), {}, ("transform_matrix:", "expected 4", "got [[1.0, 2.0]]")),
     (_frame(transform_matrix=[["a"] * 4] * 4), {}, ("transform_matrix:", "expected 4", "got [[")),
-    (_frame(transform_matrix=[[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]), {}, ("viewmat:", "rigid")),
+    (_frame(transform_matrix=[[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), {}, ("viewmat:", "rigid")),
     (
         _frame(transform_matrix=[[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
         {},
@@ -233,7 +238,7 @@ BAD = [
     (_frame(fl_x="wide"), {}, ("fl_x:", "got 'wide'")),
     (_frame(fl_x=True), {}, ("fl_x:", "got True")),
     (_frame(fl_x=-5), {}, ("(a.png):", "K[0, 0] (fx):", "got -5.0")),
-    (_frame(cx=1e300), {}, ("cx:", "got 1e+300")),
+    (_frame(cx=1e300), {}, ("none of 1 has both", "no pose or lens of finite numbers", "a.png")),
     (_frame(), {"fl_x": None}, ("'fl_x'", "'camera_angle_x'")),
     (_frame(), {"fl_x": None, "camera_angle_x": 4.0}, ("camera_angle_x:", "(0, pi)", "got 4.0")),
     (_frame(), {"w": 64.5}, ("w and h", "1 to 100000", "got (64.")),
@@ -320,3 +325,89 @@ def test_huge_integers_name_the_file(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace("64", "6" * 5000))
     with pytest.raises(SceneError, match=tells("transforms.json:", "JSON")):
         load_transforms(path)
+
+
+def _ring(count: int, **top: Any) -> dict[str, Any]:
+    frames = [{"file_path": f"images/{i}.png", "transform_matrix": LOOK_X} for i in range(count)]
+    return {"frames": frames, **top}
+
+
+@pytest.mark.parametrize(
+    ("lists", "train", "test"),
+    [
+        ({"train": ["images/0.png", "images/2.png"], "val": ["images/3.png"]}, [0, 2], [3]),  # no test: val is tested
+        ({"train": ["0.png"], "val": ["1"], "test": ["./images/2.png", "3.JPG"]}, [0], [2, 3]),
+        ({"val": ["images/3.png"]}, [0, 1, 2], [3]),  # no list of training views: all that is not held out
+        ({"train": ["images/0.png", "images/1.png"], "test": ["images/1.png"]}, [0], [1]),
+    ],
+)
+def test_lists_of_views_are_obeyed(
+    tmp_path: Path, lists: dict[str, list[str]], train: list[int], test: list[int]
+) -> None:
+    scene = load_transforms(
+        _write(tmp_path, **_ring(4, **{f"{name}_filenames": words for name, words in lists.items()}))
+    )
+    assert (scene.splits["train"], scene.splits["test"]) == (train, test)
+    assert scene.splits.get("val", test) == ([1] if "3.JPG" in str(lists) else test)
+
+
+def test_wrong_lists_are_told(tmp_path: Path) -> None:
+    unknown = _ring(4, train_filenames=["images/0.png", "images/1_.png"], val_filenames=["images/3.png"])
+    (note,) = (note for note in load_transforms(_write(tmp_path, **unknown)).notes if "not in the scene" in note)
+    assert note.startswith("1 names in ")
+    assert note.endswith("images/1_.png (did you mean '1.png'?)")
+    both = _ring(4, train_filenames=["0.png", "1.png"], test_filenames=["1.png"])
+    assert any("1 views of train_filenames" in note for note in load_transforms(_write(tmp_path, **both)).notes)
+    every = _ring(2, train_filenames=["0.png", "1.png"], test_filenames=["0.png", "1.png"])
+    scene = load_transforms(_write(tmp_path, **every))
+    assert scene.splits == {"train": [0, 1], "test": []}
+    assert any("none is held out" in note for note in scene.notes)
+
+
+def test_blender_without_test_views_is_tested_on_validation_views(tmp_path: Path) -> None:
+    for name, count in (("train", 3), ("val", 2), ("test", 1)):
+        for i in range(count):
+            write_picture(tmp_path / name / f"r_{i}.png")
+    for name, count in (("train", 3), ("val", 2)):
+        frames = [{"file_path": f"./{name}/r_{i}", "transform_matrix": LOOK_X} for i in range(count)]
+        _write(tmp_path, frames, f"transforms_{name}.json")
+    scene = load_transforms(tmp_path)
+    assert [scene.cameras[i].name for i in scene.splits["test"]] == ["val/r_0.png", "val/r_1.png"]
+    assert len(scene.splits["train"]) == 3
+    _write(tmp_path, [{"file_path": "./test/r_0", "transform_matrix": LOOK_X}], "transforms_test.json")
+    assert [c.name for c in load_transforms(tmp_path).cameras] == [
+        "test/r_0.png",
+        *(f"train/r_{i}.png" for i in range(3)),
+    ]
+
+
+@pytest.mark.parametrize("listed", ["images/A.JPG", "images\\A.jpg", "/home/me/room/images/A.png", "A.tif", "images/a"])
+def test_a_picture_is_found_by_a_name_that_is_spelled_otherwise(tmp_path: Path, listed: str) -> None:
+    file = _write(tmp_path, [{"file_path": "images/A.jpg", "transform_matrix": LOOK_X}])
+    content = json.loads(file.read_text())
+    content["frames"][0]["file_path"] = listed
+    file.write_text(json.dumps(content), encoding="utf-8-sig")
+    scene = load_transforms(file)
+    assert [camera.name for camera in scene.cameras] == ["A.jpg"]
+    assert any("spelled otherwise" in note for note in scene.notes) == (listed != "images\\A.jpg")
+
+
+def test_broken_frames_are_left_out_and_scales_removed(tmp_path: Path) -> None:
+    frames = _ring(5)["frames"]
+    matrix = np.array(LOOK_X, float)
+    frames[1]["transform_matrix"] = [[float("nan")] * 4] * 4
+    frames[2]["fl_x"] = float("inf")
+    matrix[:3, :3] *= 1.0005
+    matrix[3, 3] = 1 + 1e-8
+    frames[3]["transform_matrix"] = matrix.tolist()
+    del frames[4]["transform_matrix"]
+    file = _write(tmp_path, frames)
+    scene = load_scene(file)
+    assert [camera.name for camera in scene.cameras] == ["0.png", "3.png"]
+    torch.testing.assert_close(scene.cameras[1].viewmat, scene.cameras[0].viewmat)  # the centre stays
+    broken = "3 views have no pose or lens of finite numbers and were left out: 1.png, 2.png, 4.png"
+    assert broken in scene.notes
+    assert "1 poses have a scale (1.0005) or a rounded rotation, which was removed: 3.png" in scene.notes
+    assert [camera.name for camera in load_cameras(file)] == ["0.png", "3.png"]
+    with pytest.raises(SceneError, match=tells(file, "nothing broken (strict)", broken, "without --strict")):
+        load_scene(file, strict=True)

@@ -1,0 +1,76 @@
+"""Choose the COLMAP model of a scene folder: COLMAP and hloc write several if they cannot join all images."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+from .._files import current_file, real_path, text_encoding
+from .colmap_model import has_model
+from .files import natural_key, some
+
+PLACES = ("sparse", "colmap/sparse", "dense/sparse", "distorted/sparse", "colmap_ground_truth", ".")
+"""Folders of models, asked in this order; a model may also lie in their subfolders `N`, `N/models/M` and `models/M`."""
+
+
+def models_of(path: Path) -> list[Path]:
+    """The models of the first of `PLACES` that has some; in a subfolder without a number only if there is no other."""
+    for folder in (path / place for place in PLACES) if path.is_dir() else ():
+        inner = [] if folder == path else [name for name in _folders(folder) if name != "models"]
+        numbered = [name for name in inner if name.isdecimal()]
+        own = [f"models/{name}" for name in _folders(folder / "models")]
+        own += [f"{name}/models/{below}" for name in numbered for below in _folders(folder / name / "models")]
+        for names in ([*numbered, *own, ""], inner):
+            models = [folder / name for name in names if has_model(folder / name)]
+            if models:
+                return models
+    return []
+
+
+def find_model(path: Path) -> Path | None:
+    """The COLMAP model that `load_scene` reads in a scene folder, the one with most images; None if there is none."""
+    models = models_of(path)
+    return max(models, key=count_images) if len(models) > 1 else next(iter(models), None)  # the first of equal ones
+
+
+def choice_note(path: Path, model: Path) -> str | None:
+    """A note if the scene has other models than the one that was chosen."""
+    others = [other for other in models_of(path) if other != model]
+    if not others:
+        return None
+    listed = some([f"{other.relative_to(path)} with {count_images(other)} images" for other in others])
+    return (
+        f"{model.relative_to(path)} with {count_images(model)} images is used, the largest of several models; there is {listed} "
+        f"too: to use another, give its folder as the scene, as in {others[0]}"
+    )
+
+
+def above(model: Path) -> list[Path]:
+    """The folders above a model that may be its scene, nearest first: two, or all up to that which holds one of `PLACES`."""
+    parents = list(real_path(model).parents)[:6]
+    names = [folder.name for folder in parents]
+    count = names.index("sparse") + 2 if "sparse" in names else 0
+    inner = {place.partition("/")[0] for place in PLACES if "/" in place}
+    return parents[: max(2, count + (names[count - 1 : count] != [] and names[count - 1] in inner))]
+
+
+def count_images(model: Path) -> int:
+    """The number of images in a model, without reading them; 0 if it is damaged."""
+    binary, text = (current_file(model, f"images.{suffix}") for suffix in ("bin", "txt"))
+    try:
+        if binary.is_file():
+            with binary.open("rb") as file:
+                return int(struct.unpack("<Q", file.read(8))[0])
+        count = 0
+        with text.open(encoding=text_encoding(text)) as lines:
+            for line in lines:
+                if line.strip() and not line.lstrip().startswith("#"):
+                    count += 1
+                    next(lines, None)  # its 2-D points
+        return count
+    except (OSError, ValueError, struct.error):
+        return 0
+
+
+def _folders(folder: Path) -> list[str]:
+    return sorted((f.name for f in folder.iterdir() if f.is_dir()), key=natural_key) if folder.is_dir() else []
