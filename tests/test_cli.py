@@ -13,7 +13,7 @@ from small_room import fit_run, make_room
 from kfgs import scenes
 from kfgs.cli import main
 from kfgs.fields import SemanticField
-from kfgs.formats.ply import read_ply, write_ply
+from kfgs.formats.ply import read_comments, read_ply, write_ply
 
 
 @pytest.fixture(scope="module")
@@ -105,12 +105,14 @@ def test_nothing_of_the_users_is_overwritten(run, room, tmp_path, capsys, monkey
     assert cloud.read_bytes() == before
 
 
-def test_a_clouds_own_colours_are_kept(run, room, tmp_path):
+def test_a_clouds_own_colours_and_comments_are_kept(run, room, tmp_path):
     red = np.full(4, 200, np.uint8)
-    write_ply(tmp_path / "c.ply", {n: np.zeros(4, np.float32) for n in "xyz"} | {"red": red, "green": red, "blue": red})
+    columns = {n: np.zeros(4, np.float32) for n in "xyz"} | {"red": red, "green": red, "blue": red}
+    write_ply(tmp_path / "c.ply", columns, comments=("SplatRenderMode: mip",))
     arguments = ["label", str(run / "field"), "--scene", str(room), "--out", str(tmp_path / "o"), "--rule", "paper"]
     assert main([*arguments, "--cloud", str(tmp_path / "c.ply")]) == 0
     assert read_ply(tmp_path / "o" / "cloud.ply")["red"].tolist() == [200] * 4
+    assert "SplatRenderMode: mip" in read_comments(tmp_path / "o" / "cloud.ply")
 
 
 def test_a_mesh_is_refused_since_its_faces_would_be_lost(run, room, tmp_path, capsys):

@@ -127,6 +127,7 @@ def test_a_file_that_pygltflib_wrote_opens(tmp_path):
     assert g.quats.abs().argmax(1).tolist() == [3] * n  # z of w, x, y, z: the axis stays, its sense may turn
     assert g.sh.shape == (n, 1, 3)
     assert splats.info["color_space"] == "lin_rec709_display"
+    assert splats.notes == ("the file says colorSpace 'lin_rec709_display': drawn as if it were 'srgb_rec709_display'",)
 
 
 def test_labels_names_and_columns_travel(tmp_path):

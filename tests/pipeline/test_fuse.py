@@ -79,6 +79,10 @@ def test_a_second_run_reuses_the_stage_and_another_splat_makes_another(fitted, s
     assert torch.equal(again.field.features, fitted.field.features)
     moved = splat.replace(means=splat.means + 0.01)
     assert not fit_scene(scene, maps, fitted.folder, CONFIG, splat=moved).stages[0].reused
+    fine = fit_scene(scene, maps, fitted.folder, CONFIG, splat=splat.replace(antialiased=True))
+    assert not fine.stages[0].reused
+    assert fine.field.gaussians.antialiased
+    assert SemanticField.load(fine.field_path).gaussians.antialiased
     fit_scene(scene, maps, fitted.folder, CONFIG, splat=splat)  # the folder's field is the fixture's again
 
 
