@@ -19,7 +19,8 @@ from ..splat import rasterize
 COLOR_PROTOCOL = (
     "kfgs-color/1: each view rendered at its picture's full size on black and clipped to [0, 1], not rounded; PSNR of the "
     "mean squared error over all channels of the recorded pixels, kornia's SSIM (Gaussian window 11x11, sigma 1.5, inside "
-    "the picture) with unrecorded pixels black in both; mean over the views"
+    "the picture) with unrecorded pixels black in both; masked pixels are not recorded, and what is transparent in a picture is "
+    "black; mean over the views"
 )
 
 
@@ -85,7 +86,7 @@ def score_views(
         show: called with the stem, the rendering [H, W, 3] and the picture [H, W, 3] of each view.
 
     Raises:
-        ValueError: if the Gaussians carry no colours, a camera has distortion, or the split holds no view.
+        ValueError: if the Gaussians carry no colours, a camera has distortion, or the split holds no view, or only masked pixels.
     """
     if gaussians.sh is None:
         raise ValueError(
@@ -98,10 +99,16 @@ def score_views(
         rendered = rasterize(colors, scene.cameras[i], engine=engine).map.clamp(0, 1)
         if show is not None:
             show(scene.stem(i), rendered, taken)
+        if not bool(known.any()):  # masked as a whole
+            continue
         inside = known[..., None]
         rendered, taken = torch.where(inside, rendered, 0), torch.where(inside, taken, 0)
         level = psnr(rendered[known][:, None], taken[known][:, None])
         scores.append(ViewScore(scene.stem(i), float(level), float(ssim(rendered, taken))))
+    if not scores:
+        raise ValueError(
+            f"split: expected views with pixels that are not masked, got none in {split!r}; choose another split"
+        )
     count = len(scores)
     return ColorReport(
         views=tuple(scores),

@@ -25,8 +25,8 @@ class TrueView(NamedTuple):
     """A view, and the pixels that show the class."""
 
     camera: Camera
-    inside: Tensor  # [H, W] bool: the class is seen here
-    far: Tensor  # [H, W] bool: neither here nor within BORDER pixels
+    inside: Tensor  # [H, W] bool: the class is seen here, and the pixel is neither masked nor transparent
+    far: Tensor  # [H, W] bool: neither here nor within BORDER pixels, and not masked or transparent either
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -81,7 +81,12 @@ class SceneTruth:
             inside = load_label_map(path) == self.label
             _check_size(path, inside.shape, camera)
             grown = torch.nn.functional.max_pool2d(inside[None].float(), 2 * BORDER + 1, 1, BORDER)[0] > 0
-            yield TrueView(camera, inside, ~grown)
+            counted = self.scene.counted(i, camera.size)
+            yield (
+                TrueView(camera, inside, ~grown)
+                if counted is None
+                else TrueView(camera, inside & counted, ~grown & counted)
+            )
 
     def surface(self) -> tuple[Tensor, Tensor]:  # [P, 3] float32, [P] bool
         """Points of all surfaces, and which of them are the class's.

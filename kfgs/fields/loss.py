@@ -58,7 +58,9 @@ def l1_loss(
 class ColorLoss:
     """The loss of 3DGS for colours: (1 - ssim_weight) L1 + ssim_weight (1 - SSIM).
 
-    Pixels with NaN in any channel of the target are unknown: they and the SSIM windows that contain them do not count.
+    Pixels with NaN in any channel of the target are unknown: they and the SSIM windows that contain them do not count. A
+    target with one channel more than the rendered map is a photograph with transparent pixels: its last channel is compared
+    with the rendered opacity, so that the field becomes empty where the photograph is.
 
     Note:
         3DGS pads pictures with zeros for SSIM; here only windows inside the picture count, as in `kfgs.metrics.ssim`. A
@@ -76,14 +78,16 @@ class ColorLoss:
     def __call__(
         self,
         rendered: Tensor,  # [H, W, D]
-        alpha: Tensor,  # [H, W], not used
-        target: Tensor,  # [h, w, D]
+        alpha: Tensor,  # [H, W]
+        target: Tensor,  # [h, w, D] or [h, w, D + 1]
     ) -> Tensor:  # []
         """Compare a rendered picture with the photograph.
 
         Raises:
             ValueError: if the numbers of channels disagree.
         """
+        if target.shape[2] == rendered.shape[2] + 1:
+            rendered = torch.cat([rendered, alpha[..., None]], dim=2)
         if self.ssim_weight == 0 or min(target.shape[:2]) < SSIM_WINDOW:
             return l1_loss(rendered, alpha, target)
         picture = _resized(rendered, target)

@@ -156,7 +156,8 @@ class Trainer:
     def _target(self, view: int) -> Tensor:  # [h, w, D]
         target = as_tensor(f"targets[{view}]", self._targets[view], floating=True)
         channels = self.optimizer.params.channels
-        if target.ndim != 3 or target.shape[2] != channels:
+        clear = isinstance(self._loss, ColorLoss) and target.ndim == 3 and target.shape[2] == channels + 1
+        if target.ndim != 3 or (target.shape[2] != channels and not clear):
             raise ValueError(
                 f"targets[{view}]: expected [h, w, D] with D = {channels} (from params), got {tuple(target.shape)}; "
                 "start from GaussianParams.from_points(points, D)"

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from .._check import check_range
 from .._files import as_path, check_output, write_json
 from .._typed import typed
-from ..cameras import resize_labels, undistort_labels
+from ..cameras import resize_labels
 from ..evaluation import SegmentationReport, evaluate_segmentation, load_label_map
 from ..evaluation.segmentation import VOID, check_truth
 from ..fields import Rule, SemanticField
@@ -33,6 +33,7 @@ from ..viz.field_colors import feature_colors
 from ..viz.palette import UNLABELLED
 from ..viz.pictures import Array, check_pictures, write_png
 from .fit import FitResult, load_history
+from .maps import labels_of_view
 from .sheets import segmentation_sheet, teacher_labels
 
 SEGMENTED = ("predicted", "colored", "sheets", "overlay", "features")
@@ -144,17 +145,13 @@ def segment_scene(
 def true_labels(scene: Scene, folder: str | Path, split: str) -> dict[str, Tensor]:
     """The label pictures of a split's views by stem, as [H, W] with -1 = void; views without one are left out.
 
-    If the scene is undistorted, the label pictures are undistorted too.
+    If the scene is undistorted, the label pictures are undistorted too. Masked and transparent pixels are void.
     """
     truth = {}
     for i in scene.views(split):
         path = as_path(folder) / f"{scene.stem(i)}.png"
         if path.is_file():
-            labels = load_label_map(path)
-            if scene.lenses is not None and scene.lenses[i].distortion is not None:
-                lens = scene.lenses[i].resized(int(labels.shape[0]), int(labels.shape[1]))
-                labels = undistort_labels(labels, lens)
-            truth[scene.stem(i)] = labels
+            truth[scene.stem(i)] = labels_of_view(scene, i, load_label_map(path))
     return truth
 
 

@@ -7,6 +7,7 @@ from typing import Any
 from .._check import one_line
 from .._files import file_stem
 from ..evaluation import Encode, FieldMethod, LabelSet
+from ..evaluation.truth import MaskTruth
 from ..fields.parts import teacher_name
 from .question import LABELLED, Question
 
@@ -40,6 +41,8 @@ def notes_beside(question: Question, rule: str | None, method: Any, encode: Enco
         small, large = ("x".join(map(str, size)) for size in (sizes[0], sizes[-1]))
         several = f"{len(sizes)} sizes, {small} to {large}" if len(sizes) > 1 else small
         notes.append(f"scored pictures: {len(views)} of {several} (height x width)")
+    if isinstance(question.truth, MaskTruth) and any(question.scene.masks or ()):
+        notes.append(f"masks of photos are not used: {question.protocol.name} scores all pixels")
     teacher = _teacher_of(field, encode)
     return notes if teacher is None else [*notes, f"teacher: {one_line(teacher)}"]
 

@@ -27,7 +27,17 @@ from ..gaussians import Gaussians
 from ..scenes import Scene
 from .color_file import is_saved, may_replace, stage_gaussians, what_is
 from .points import with_points
-from .stages import Run, Stage, describe_lens, digest_scene, digest_shape, digest_tensors, is_whole, stage_generator
+from .stages import (
+    Run,
+    Stage,
+    describe_lens,
+    digest_pictures,
+    digest_scene,
+    digest_shape,
+    digest_tensors,
+    is_whole,
+    stage_generator,
+)
 from .train import check_scene, field_stage, training_device, with_extent
 
 
@@ -149,8 +159,9 @@ class ColorResult:
 class Photos(Sequence[Tensor]):
     """The training pictures at their training size: read at the first access, then kept as bytes.
 
-    A picture is [h, w, 3] float32 in [0, 1]. A pixel is NaN if it was not fully recorded (the border of an undistorted
-    picture). Bytes take a quarter of the memory: 0.9 MB for 639x479.
+    A picture is [h, w, 3] float32 in [0, 1], or [h, w, 4] if it has transparent pixels: colours before black, and
+    opacity. A pixel is NaN if it does not count wholly (masked, or at the border of an undistorted picture). Bytes take a
+    quarter of the memory: 0.9 MB for 639x479.
 
     Args:
         scene: the scene.
@@ -165,16 +176,18 @@ class Photos(Sequence[Tensor]):
     def __len__(self) -> int:
         return len(self._views)
 
-    def __getitem__(self, i: int) -> Tensor:  # type: ignore[override]  # [h, w, 3], one picture at a time
+    def __getitem__(self, i: int) -> Tensor:  # type: ignore[override]  # [h, w, 3 or 4], one picture at a time
         if i not in self._kept:
             self._kept[i] = self._read(i)
         bytes_, known = self._kept[i]
         picture = bytes_.float() / 255
         return picture if known is None else picture.masked_fill(~known[..., None], torch.nan)
 
-    def _read(self, i: int) -> tuple[Tensor, Tensor | None]:  # [h, w, 3] uint8, [h, w] bool
+    def _read(self, i: int) -> tuple[Tensor, Tensor | None]:  # [h, w, 3 or 4] uint8, [h, w] bool
         view, size = self._views[i], self._sizes[i]
-        picture, known = self._scene.image(view), self._scene.mask(view)
+        picture, known, alpha = self._scene.image(view), self._scene.mask(view), self._scene.alpha(view)
+        if alpha is not None:
+            picture = torch.cat([picture, alpha[..., None]], dim=2)
         inside = known.float()[..., None]
         picture = resize_map(picture, size, antialias=True)
         inside = resize_map(inside, size, antialias=True)[..., 0]
@@ -194,7 +207,8 @@ def fit_color(
 ) -> ColorResult:
     """Fit an ordinary 3DGS colour field to a scene's pictures, or resume it in a run folder.
 
-    Spherical harmonics up to `config.sh_degree`, L1 + D-SSIM, cloning, splitting and pruning as in 3DGS, on black.
+    Spherical harmonics up to `config.sh_degree`, L1 + D-SSIM, cloning, splitting and pruning as in 3DGS, on black. Masked
+    pixels do not count; where a picture is transparent, the field becomes empty.
 
     Args:
         scene: posed, undistorted views with their sparse points; without points, some are triangulated first.
@@ -309,7 +323,7 @@ def _inputs(run: Run, scene: Scene, views: Sequence[int], config: ColorConfig) -
     options = asdict(config) | {"field": with_extent(config.field, scene).identity()}
     extent = options["field"].pop("extent")
     return {
-        "pictures": run.digests([scene.image_paths[i] for i in views]),
+        "pictures": digest_pictures(run, scene, views),
         "lenses": None if scene.lenses is None else [describe_lens(scene.lenses[i]) for i in views],
         "scene": digest_scene(scene, views),
         "colors": digest_tensors(scene.colors),

@@ -15,8 +15,8 @@ from .._files import digest_value, read_json
 from .._ranks import once
 from ..cameras import Camera
 from ..fields import UpliftSums
-from .maps import Maps, UndistortedMaps
-from .stages import STAGE_FILE, Run, describe_lens, digest_tensors, is_whole
+from .maps import Maps, ViewMaps
+from .stages import STAGE_FILE, Run, digest_tensors, is_whole
 
 SUMS = "sums.safetensors"
 GROWTH = 2
@@ -44,7 +44,7 @@ class Earlier:
 
 
 def find_earlier(run: Run, inputs: dict[str, Any], cameras: Sequence[Camera], maps: Maps) -> list[Earlier]:
-    """Uplifts in the run folder with the same options, and some of the same views: equal maps, lenses and poses.
+    """Uplifts in the run folder with the same options, and some of the same views: equal maps, lenses, masks and poses.
 
     Args:
         run: the run folder.
@@ -69,7 +69,7 @@ def find_earlier(run: Run, inputs: dict[str, Any], cameras: Sequence[Camera], ma
                 {name: inputs_then.get(name) for name in wanted} == wanted
                 and views is not None
                 and len(views) < len(cameras) <= GROWTH * facts["first"]
-                and inputs_then["features"]["lenses"] == digest_lenses(maps, views)
+                and inputs_then["features"]["lenses"] == digest_changes(maps, views)
                 and inputs_then["cameras"] == _digest_then(cameras, views, facts["near"])
             ):
                 key = about.parent.name.removeprefix("uplift-")
@@ -86,11 +86,12 @@ def digest_cameras(cameras: Sequence[Camera]) -> str:
     return digest_tensors(*rows, facts)
 
 
-def digest_lenses(maps: Maps, views: Sequence[int] | None = None) -> str | None:
-    """SHA-256 of the lenses that are removed from the maps of some views (None: all); None if there are none."""
-    if not isinstance(maps, UndistortedMaps):
+def digest_changes(maps: Maps, views: Sequence[int] | None = None) -> str | None:
+    """SHA-256 of the lenses and masks that change the maps of some views (None: all); None if there are none."""
+    if not isinstance(maps, ViewMaps):
         return None
-    return digest_value([describe_lens(maps.lenses[i]) for i in (range(len(maps)) if views is None else views)])
+    changes = [maps.describe(i) for i in (range(len(maps)) if views is None else views)]
+    return digest_value(changes) if any(change is not None for change in changes) else None
 
 
 def _positions(then: list[list[str]], now: list[list[str]]) -> list[int] | None:

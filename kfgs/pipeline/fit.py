@@ -45,9 +45,9 @@ from ..quant import (
 from ..scenes import Scene
 from .color import ColorConfig
 from .config import FitConfig
-from .earlier import digest_lenses, find_earlier
-from .fuse import answers_stage, find_geometry, uplift_stage, without_lens
-from .maps import KnownFeatures, Maps, as_maps, check_readable, map_digests, map_shape
+from .earlier import digest_changes, find_earlier
+from .fuse import answers_stage, find_geometry, uplift_stage
+from .maps import KnownFeatures, Maps, as_maps, check_readable, map_digests, map_shape, maps_of_views
 from .points import with_points
 from .runs import check_current, keep_field, say_kept
 from .stages import Run, Stage, digest_scene, digest_tensors, stage_generator
@@ -318,9 +318,9 @@ def _paper_stages(job: _Job) -> SemanticField:
 
 def _job(run: Run, scene: Scene, maps: Maps, config: FitConfig, device: torch.device, progress: Progress) -> _Job:
     views = scene.views(config.split)
-    straight = without_lens(scene, maps, config)
-    features = {"files": map_digests(run, straight), "lenses": digest_lenses(straight)}
-    return _Job(run, scene, views, straight, features, config, device, progress)
+    seen = maps_of_views(scene, views, maps, undistorted=config.undistorted_features)
+    features = {"files": map_digests(run, seen), "lenses": digest_changes(seen)}
+    return _Job(run, scene, views, seen, features, config, device, progress)
 
 
 def _color_config(config: FitConfig) -> ColorConfig:

@@ -26,7 +26,7 @@ from ..scenes import Scene
 from .color import ColorConfig, colors_before, find_color, make_color
 from .config import FitConfig
 from .earlier import SUMS, Earlier, digest_cameras
-from .maps import ChosenMaps, Maps, UndistortedMaps, check_readable
+from .maps import ChosenMaps, Maps, check_readable, maps_of_views
 from .stages import SHAPE, Run, digest_shape, stage_generator
 
 
@@ -135,13 +135,6 @@ def _choose(run: Run, inputs: dict[str, Any], earlier: Sequence[Earlier]) -> Ear
     return next((one for one in fitting if run.has("uplift", {**inputs, "onto": one.key})), fitting[0])
 
 
-def without_lens(scene: Scene, maps: Maps, config: FitConfig) -> Maps:
-    """The maps of a run's views, undistorted."""
-    if scene.lenses is None or config.undistorted_features:
-        return maps
-    return UndistortedMaps(maps, [scene.lenses[i] for i in scene.views(config.split)])
-
-
 @typed
 def uplift(
     scene: Scene,
@@ -178,8 +171,8 @@ def uplift(
         splat = read_splats(splat)
     cloud = splat if isinstance(splat, Gaussians) else splat.gaussians
     options: dict[str, Any] = {"generator": stage_generator(config.seed, "uplift"), "progress": progress}
-    straight = without_lens(scene, maps, config)
-    found = uplift_maps(cloud.to("cpu"), cameras, straight, config.uplift, report=report, **options)
+    viewed = maps_of_views(scene, scene.views(config.split), maps, undistorted=config.undistorted_features)
+    found = uplift_maps(cloud.to("cpu"), cameras, viewed, config.uplift, report=report, **options)
     teacher = getattr(maps, "identity", None)
     info = {
         "method": "uplift",

@@ -1,8 +1,9 @@
-"""Prepare teacher maps for a run: undistort them if the scene is undistorted, and mark unknown pixels."""
+"""Prepare teacher maps for a run: as the scene's views are, without lens, and unknown where a pixel does not count."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -12,11 +13,14 @@ import torch
 from torch import Tensor
 
 from .._check import as_tensor
+from .._files import digest_file
 from .._ranks import once
 from .._rows import EPS, row_norms
-from ..cameras import Camera, undistort
+from ..cameras import undistort, undistort_labels
 from ..quant.maps import read_blocks
 from ..quant.sampling import SAMPLES, sample_grid
+from ..scenes import Scene
+from ..scenes.files import has_alpha
 from .stages import Run, describe_lens, digest_tensors
 
 
@@ -40,25 +44,55 @@ class Maps(Protocol):
         ...
 
 
-class UndistortedMaps:
-    """Turns maps of the original pictures into maps of undistorted views.
-
-    Outside the original picture the feature is all-zero.
+def maps_of_views(scene: Scene, views: Sequence[int], maps: Maps, *, undistorted: bool = False) -> Maps:
+    """Maps of some views' pictures as `ViewMaps`; unchanged if no view has a lens, a mask or transparent pixels.
 
     Args:
-        maps: one per view, of the distorted pictures.
-        lenses: the views' cameras with their distortion (`Scene.lenses`), at any size of the same aspect.
+        scene: as it is rendered.
+        views: indices of the views.
+        maps: one per view, of the pictures on disk.
+        undistorted: the maps are of undistorted pictures.
 
     Raises:
         ValueError: if the counts differ.
     """
+    if len(maps) != len(views):
+        raise ValueError(f"maps: expected {len(views)} (one per view), got {len(maps)}; give one for each")
+    chosen, lens = scene.select(views), scene.lenses is not None and not undistorted
+    changed = lens or any(changing_files(chosen, i) for i in range(len(chosen)))
+    return ViewMaps(maps, _as_taken(chosen) if lens else chosen, lens) if changed else maps
 
-    def __init__(self, maps: Maps, lenses: Sequence[Camera]) -> None:
-        if len(maps) != len(lenses):
-            raise ValueError(
-                f"lenses: expected {len(maps)} cameras (one per map), got {len(lenses)}; give one for each"
-            )
-        self.maps, self.lenses = maps, lenses
+
+def labels_of_view(scene: Scene, i: int, labels: Tensor) -> Tensor:  # [h, w] int64
+    """True labels of a view's picture as the view is: without lens, and void (-1) where a pixel does not count."""
+    taken, size = _as_taken(scene), (int(labels.shape[0]), int(labels.shape[1]))
+    counted, lens = taken.counted(i, size), taken.cameras[i].resized(*size)
+    labels = labels if counted is None else labels.where(counted, -1)
+    return labels if scene.lenses is None else undistort_labels(labels, lens)
+
+
+def changing_files(scene: Scene, i: int) -> list[Path]:
+    """The mask of a view, and its picture if that may have transparent pixels."""
+    mask, picture = None if scene.masks is None else scene.masks[i], scene.image_paths[i]
+    return [*([] if mask is None else [mask]), *([picture] if has_alpha(picture) else [])]
+
+
+def _as_taken(scene: Scene) -> Scene:
+    """The scene with its lenses."""
+    return scene if scene.lenses is None else replace(scene, cameras=scene.lenses, lenses=None)
+
+
+class ViewMaps:
+    """Maps of the views of a scene: without the lens, and all-zero outside the picture, where it is masked or transparent.
+
+    Args:
+        maps: one per view.
+        taken: the views in the frame of the maps.
+        straighten: whether the lenses of `taken` are removed.
+    """
+
+    def __init__(self, maps: Maps, taken: Scene, straighten: bool) -> None:
+        self.maps, self._taken, self._straighten = maps, taken, straighten
 
     @property
     def files(self) -> Sequence[Path]:
@@ -70,36 +104,47 @@ class UndistortedMaps:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(h, w, D) of the first map; undistorting does not change it."""
+        """(h, w, D) of the first map, which does not change."""
         return map_shape(self.maps)
 
     def digests(self) -> list[list[str]] | None:
         """The digests of the original maps; None if unknown."""
         return _own_digests(self.maps)
 
+    def describe(self, i: int) -> list[Any] | None:
+        """What decides the change of a map: the lens, and the files of mask and transparent picture; None: nothing."""
+        lens = describe_lens(self._taken.cameras[i]) if self._straighten else None
+        files = changing_files(self._taken, i)
+        return [lens, *map(digest_file, files)] if files else lens
+
     def __getitem__(self, i: int, /) -> Tensor:  # [h, w, D]
-        return self._straighten(i, self.maps[i])
+        return self._change(i, self.maps[i])
 
     def grid(self, i: int, step: tuple[int, int] | None = None, samples: int = SAMPLES) -> Tensor:  # [n, D]
-        """`sample_grid(self[i], step, samples=samples)`; if the view has no distortion, only these pixels are read."""
-        lens = self.lenses[i]
-        if lens.distortion is None and hasattr(self.maps, "grid"):
+        """`sample_grid(self[i], step, samples=samples)`; if the view's map does not change, only these pixels are read."""
+        if self._unchanged(i) and hasattr(self.maps, "grid"):
             return self.maps.grid(i, step, samples)  # type: ignore[no-any-return]
         if hasattr(self.maps, "grid_after"):  # recomputed maps, which store these samples
-            change, key = partial(self._straighten, i), describe_lens(lens)
+            change, key = partial(self._change, i), self.describe(i)
             return self.maps.grid_after(i, step, samples, change=change, key=key)  # type: ignore[no-any-return]
         return sample_grid(self[i], step, samples=samples)
 
     def blocks(self, i: int) -> Iterator[Tensor]:  # each [at most 32, w, D]
-        """The map a few rows at a time; a view with distortion is whole in memory."""
-        lens = self.lenses[i]
-        return read_blocks(self.maps, i) if lens.distortion is None else iter(self[i].split(32))
+        """The map a few rows at a time; one that changes is whole in memory."""
+        return read_blocks(self.maps, i) if self._unchanged(i) else iter(self[i].split(32))
 
-    def _straighten(self, i: int, features: Tensor) -> Tensor:  # [h, w, D] -> [h, w, D]
-        lens = self.lenses[i].resized(int(features.shape[0]), int(features.shape[1]))
-        if lens.distortion is None:
+    def _unchanged(self, i: int) -> bool:
+        distorted = self._straighten and self._taken.cameras[i].distortion is not None
+        return not distorted and not changing_files(self._taken, i)
+
+    def _change(self, i: int, features: Tensor) -> Tensor:  # [h, w, D] -> [h, w, D]
+        size = int(features.shape[0]), int(features.shape[1])
+        counted = self._taken.counted(i, size)
+        if counted is not None:  # before the lens is removed, which mixes neighbours
+            features = features * counted[..., None].to(features)
+        if not self._straighten or self._taken.cameras[i].distortion is None:
             return features
-        straight, _, inside = undistort(features, lens)
+        straight, _, inside = undistort(features, self._taken.cameras[i].resized(*size))
         return straight * inside[..., None]
 
 

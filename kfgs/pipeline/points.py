@@ -10,7 +10,7 @@ from .._arrays import read_safetensors
 from .._progress import Progress
 from .._tensors import save_tensors
 from ..scenes import Scene, SfmConfig, find_points
-from .stages import Run, describe_lens, digest_scene
+from .stages import Run, describe_lens, digest_pictures, digest_scene
 from .train import check_scene
 
 
@@ -25,7 +25,7 @@ def with_points(run: Run, scene: Scene, views: Sequence[int], seed: int, progres
         return scene
     seen = scene.select(views)
     inputs = {
-        "pictures": run.digests(seen.image_paths),
+        "pictures": digest_pictures(run, seen, range(len(seen))),
         "lenses": None if seen.lenses is None else [describe_lens(lens) for lens in seen.lenses],
         "scene": digest_scene(seen, range(len(seen))),
         "seed": seed,

@@ -14,7 +14,6 @@ from torch import Tensor
 from .._card import short_repr
 from .._check import check_choice
 from .._files import as_path
-from ..cameras import undistort_labels
 from ..evaluation import (
     Encode,
     FieldMethod,
@@ -37,7 +36,7 @@ from ..formats import read_splats
 from ..gaussians import Gaussians
 from ..labels.color import parse_color
 from ..scenes import Scene, load_scene
-from .maps import UndistortedMaps
+from .maps import changing_files, labels_of_view, maps_of_views
 
 EDIT_INPUTS = {"kfgs-removal/1": ("before", "removed"), "kfgs-recolor/1": ("before", "painted", "rgb")}
 """What the protocols of edits need besides the edited splat."""
@@ -186,7 +185,7 @@ def open_question(
     if kind == "Method":
         return replace(_ask_teacher(chosen, folder, loaded, truth, split), labels=labels)
     found: LabelTruth | MaskTruth = (find_labels if kind == "LabelTruth" else find_masks)(truth or folder)
-    found = _without_lens(_of_split(found, loaded, split), loaded)
+    found = _as_viewed(_of_split(found, loaded, split), loaded)
     views = tuple(truth_views(loaded, found))
     digests = {"views": _digest_views(views), "truth": _digest_truth(found)}
     return Question(chosen, folder, loaded, found, views, digests, inputs, labels)
@@ -226,16 +225,14 @@ def _ask_teacher(protocol: Any, folder: Path, scene: Scene, truth: str | Path | 
 
 
 def read_teacher(folder: Path, scene: Scene, views: Sequence[View], align_corners: bool = True) -> TeacherMethod:
-    """The maps of some views as a method; the lens is removed from them if it was removed from the scene.
+    """The maps of some views as a method, see `maps_of_views`.
 
     Raises:
         FileNotFoundError: if a view has no map.
     """
     index = {scene.stem(i): i for i in range(len(scene))}
     places = [index[view.stem] for view in views]
-    maps = FeatureFolder(folder).of(scene, [scene.stem(i) for i in places])
-    lenses = None if scene.lenses is None else [scene.lenses[i] for i in places]
-    read = maps if lenses is None else UndistortedMaps(maps, lenses)
+    read = maps_of_views(scene, places, FeatureFolder(folder).of(scene, places))
     by_stem = ReadWhenAsked({view.stem: partial(read.__getitem__, i) for i, view in enumerate(views)})
     return TeacherMethod(by_stem, f"teacher ({folder.name})", align_corners=align_corners)
 
@@ -263,25 +260,23 @@ def _of_split(truth: Any, scene: Scene, split: str | None) -> Any:
     return replace(truth, maps=kept) if labels else replace(truth, frames=kept)
 
 
-def _without_lens(truth: Any, scene: Scene) -> Any:
-    """Label pictures without distortion, as the scene's pictures."""
-    if scene.lenses is None:
-        return truth
-    lenses = {scene.stem(i): lens for i, lens in enumerate(scene.lenses) if lens.distortion is not None}
+def _as_viewed(truth: Any, scene: Scene) -> Any:
+    """Label pictures as the scene's views are, see `labels_of_view`."""
+    distorted = {scene.stem(i) for i, lens in enumerate(scene.lenses or ()) if lens.distortion is not None}
     if isinstance(truth, MaskTruth):
-        if lenses.keys() & set(truth.frames):
+        if distorted & set(truth.frames):
             raise ValueError(
                 "truth: expected masks of pictures without lens distortion, got distorted ones; undistort pictures and masks"
             )
         return truth
 
-    def read(stem: str) -> Tensor:
-        labels = _labels(truth.maps[stem])
-        if stem not in lenses:
-            return labels
-        return undistort_labels(labels, lenses[stem].resized(int(labels.shape[0]), int(labels.shape[1])))
+    index = {scene.stem(i): i for i in range(len(scene)) if scene.stem(i) in distorted or changing_files(scene, i)}
 
-    return replace(truth, maps=ReadWhenAsked({stem: partial(read, stem) for stem in truth.maps}))
+    def read(stem: str) -> Tensor | Path:
+        labels: Tensor | Path = truth.maps[stem]
+        return labels_of_view(scene, index[stem], _labels(labels)) if stem in index else labels
+
+    return replace(truth, maps=ReadWhenAsked({stem: partial(read, stem) for stem in truth.maps})) if index else truth
 
 
 def _labels(found: Tensor | Path) -> Tensor:
@@ -302,10 +297,11 @@ def _digest_truth(truth: LabelTruth | MaskTruth) -> str:
 
 
 def _digest_scene(scene: Scene, folder: Path, protocol: Any, inputs: Mapping[str, Any]) -> str:
-    """Of the photographs; of an edit, of the labels, the surfaces, the splat before and the class."""
+    """Of the photographs and their masks; of an edit, of the labels, the surfaces, the splat before and the class."""
     indices = scene.views(protocol.split)
     if not inputs:
-        return digest_data([scene.image_paths[i] for i in indices])
+        masks = [] if scene.masks is None else [mask for i in indices if (mask := scene.masks[i]) is not None]
+        return digest_data([*(scene.image_paths[i] for i in indices), *masks])
     files = [
         folder / "classes.json",
         folder / "surface.npz",

@@ -16,7 +16,7 @@ from ..scenes import Scene
 from ..viz import overlay_labels
 from ..viz.pictures import Array, legend_strip, picture_grid, resize_photo
 from ..viz.region_names import write_region_names
-from .maps import Maps, UndistortedMaps
+from .maps import maps_of_views
 from .side_by_side import draw_errors
 
 WIDTH = 480  # pixels of a panel
@@ -75,8 +75,7 @@ def teacher_labels(scene: Scene, view: int, folder: Path, classes: LabelSet) -> 
         None if there is no map of this view that can be read, or one with other channels than the classes.
     """
     try:
-        maps: Maps = FeatureFolder(folder).of(scene, [view])
-        features = (maps if scene.lenses is None else UndistortedMaps(maps, [scene.lenses[view]]))[0]
+        features = maps_of_views(scene, [view], FeatureFolder(folder).of(scene, [view]))[0]
     except (OSError, ValueError):
         return None
     if features.shape[-1] != classes.dim:

@@ -249,6 +249,14 @@ def digest_scene(scene: Scene, views: Sequence[int]) -> str:
     return digest_tensors(poses, intrinsics, sizes, scene.points, *([near] if (near != NEAR).any() else []))
 
 
+def digest_pictures(run: Run, scene: Scene, views: Sequence[int]) -> list[list[str]]:
+    """[file name, SHA-256] of the picture of each view, and the SHA-256 of its mask if it has one."""
+    pictures = run.digests([scene.image_paths[i] for i in views])
+    masks = [None if scene.masks is None else scene.masks[i] for i in views]
+    known = iter(run.digests([mask for mask in masks if mask is not None]))
+    return [row if mask is None else [*row, next(known)[1]] for row, mask in zip(pictures, masks, strict=True)]
+
+
 def describe_lens(lens: Camera) -> list[Any]:
     """The values that decide how a picture is undistorted."""
     return [lens.K.tolist(), lens.size, asdict(lens.distortion) if lens.distortion else None]

@@ -42,13 +42,14 @@ from ..pipeline.stages import digest_tensors
 from ..quant import FeatureMaps, LinearLatents
 from ..scenes import Scene, SceneError, load_scene
 from ..scenes.blocks import Block, partition, write_parts
+from ..scenes.masks import picture_folder
 from ..scenes.sub_models import find_model
 from .batch import map_scenes
 from .in_blocks import BLOCKS, CORE, FACTS, FORMAT, FieldInBlocks, read_blocks
 
 LATENTS, SPLAT = "latents.safetensors", "splat.ply"
 RUN = ".run"  # hidden: its field has the Gaussians of the reach, too, and `kfgs search` must not count them
-BESIDE = ("classes.json", "text.npy", "text.safetensors", "labels", "labels_scored")
+BESIDE = ("classes.json", "text.npy", "text.safetensors", "labels", "labels_scored", "masks")
 """Files and folders of a scene that belong to each of its blocks, too."""
 IDLE = ("device", "discard_sums")
 """Options of a fit that do not change what its field means."""
@@ -68,7 +69,7 @@ def split_scene(
 ) -> list[Block]:
     """Cut a scene into blocks, each a scene folder of its own that `fit_block` or any command takes.
 
-    Pictures, maps and labels are links into the scene. A block's COLMAP model has the images that see its core.
+    Pictures, masks, maps and labels are links into the scene. A block's COLMAP model has the images that see its core.
 
     Args:
         scene: a folder with a COLMAP model, whose tracks say which image sees which point.
@@ -158,7 +159,7 @@ def _held(latents: LinearLatents, maps: list[torch.Tensor]) -> float:
 def _write_block(folder: Path, block: Block, whole: Scene, maps_folder: Path, cloud: SplatFile | None) -> None:
     """Make the scene folder of a block, which has its model already."""
     assert whole.folder is not None
-    _link(folder / "images", _picture_folder(whole))
+    _link(folder / "images", picture_folder(whole.cameras[0].name, whole.image_paths[0]))
     _link(folder / "features", maps_folder)
     for name in BESIDE:
         if (whole.folder / name).exists():
@@ -299,12 +300,6 @@ def _splits(scene: Scene, block: Block) -> dict[str, list[str]]:
     return {
         name: [scene.stem(i) for i in views if scene.cameras[i].name in own] for name, views in scene.splits.items()
     }
-
-
-def _picture_folder(scene: Scene) -> Path:
-    """The folder that the names of a scene's pictures are relative to."""
-    path, name = scene.image_paths[0], Path(scene.cameras[0].name)
-    return path.parents[len(name.parts) - 1]
 
 
 def _link(place: Path, target: Path) -> None:

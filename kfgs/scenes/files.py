@@ -22,6 +22,7 @@ from .._files import Names, as_path, folded_name, read_json
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
 HEIC_SUFFIXES = (".heic", ".heif")
 """Of photographs by phones. Pillow reads them with pillow-heif only, and pycolmap never: `convert_heic` makes JPEGs of them."""
+MASKS = "masks"  # the folder of the masks of photos, as in COLMAP, brush and LichtFeld
 ORIENTATION = 0x0112  # EXIF's tag
 PIXELS, SMALL, COLORS, PACKED = 1 << 27, 1 << 24, 9 << 20, 200
 """Most pixels of a picture (4 GB while it is read), and most for each byte of its file, which photos have about 10 of, beyond
@@ -68,7 +69,7 @@ def is_file(path: Path) -> bool:
 def list_images(folder: str | Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[str]:
     """Names of the image files in a folder and its subfolders, relative to it, in natural order.
 
-    Hidden files and folders are left out; links to folders are not followed.
+    Hidden files and folders are left out, and so is a folder `masks` of the pictures; links to folders are not followed.
 
     Args:
         folder: the folder.
@@ -77,7 +78,7 @@ def list_images(folder: str | Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) 
     root = as_path(folder)
     names: list[str] = []
     for here, folders, files in os.walk(root):
-        folders[:] = [name for name in folders if not name.startswith(".")]
+        folders[:] = [name for name in folders if not (name.startswith(".") or (name == MASKS and here == str(root)))]
         for name in files:
             if not name.startswith(".") and name.lower().endswith(suffixes):
                 names.append((Path(here) / name).relative_to(root).as_posix())
@@ -109,11 +110,18 @@ def spelling_note(folder: Path, files: Mapping[str, Path]) -> list[str]:
     )
 
 
-def read_image(path: str | Path) -> Tensor:  # [H, W, 3] float32 in [0, 1]
-    """Read a PNG, JPEG, TIFF or WebP file. Transparent pixels are laid on white; EXIF orientation is ignored, as by COLMAP.
+def read_image(path: str | Path, background: str = "white") -> Tensor:  # [H, W, 3] float32 in [0, 1]
+    """Read a PNG, JPEG, TIFF or WebP file. EXIF orientation is ignored, as by COLMAP.
+
+    Transparent pixels are laid on white, as most cut-out objects are shown that networks were trained with. `Scene.image` lays
+    them on black, before which colours are trained.
 
     Grey, palette, CMYK and 16-bit pictures are converted. Pillow reads them all: kornia's reader gives the same values but
     refuses some of these, and its decoders panic when memory is short.
+
+    Args:
+        path: the file.
+        background: a colour of Pillow.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -126,10 +134,39 @@ def read_image(path: str | Path) -> Tensor:  # [H, W, 3] float32 in [0, 1]
             if values.dtype.kind == "f" or values.min(initial=0) < 0 or values.max(initial=0) > 65535:
                 raise ValueError(f"its pixels are {values.dtype}, not whole numbers of at most 16 bits")
             return torch.from_numpy(values.astype(np.float32) / 65535)[..., None].expand(-1, -1, 3).contiguous()
-        if "A" in picture.mode or "transparency" in picture.info:
+        if _may_be_clear(picture):
             whole = picture.convert("RGBA")
-            return _as_floats(Image.alpha_composite(Image.new("RGBA", whole.size, "white"), whole))
+            return _as_floats(Image.alpha_composite(Image.new("RGBA", whole.size, background), whole))
         return _as_floats(picture)
+
+
+def read_alpha(path: Path) -> Tensor | None:  # [H, W] float32 in [0, 1]
+    """The opacity of a picture's pixels; None if all are opaque, or there is no such file.
+
+    Raises:
+        SceneError: as `read_image`.
+    """
+    if not is_file(path):
+        return None
+    with open_picture(path, small=COLORS) as picture:
+        picture.getexif().pop(ORIENTATION, None)
+        if not _may_be_clear(picture):
+            return None
+        alpha = np.array(picture.convert("RGBA").getchannel("A"))
+        return None if alpha.min() == 255 else torch.from_numpy(alpha).float().div_(255)
+
+
+def has_alpha(path: Path) -> bool:
+    """Whether a file is a picture that may have transparent pixels, from its header."""
+    try:
+        with open_picture(path) as picture:
+            return _may_be_clear(picture)
+    except (OSError, ImportError, SceneError):
+        return False
+
+
+def _may_be_clear(picture: Image.Image) -> bool:
+    return not picture.mode.startswith(("I", "F")) and ("A" in picture.mode or "transparency" in picture.info)
 
 
 def _as_floats(picture: Image.Image) -> Tensor:  # [H, W, 3] in [0, 1]

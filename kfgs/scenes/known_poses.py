@@ -16,7 +16,7 @@ from .._files import atomic_folder, check_output, real_path
 from .._typed import typed
 from ..cameras.camera import Camera
 from .colmap_model import has_model
-from .files import SceneError
+from .files import MASKS, SceneError
 from .pycolmap_import import quiet_pycolmap, scene_errors
 from .scene import Scene
 from .sfm import SfmConfig, SfmReport, SfmRun, fill_database, timed
@@ -68,7 +68,9 @@ def find_points(
 def write_known_poses(
     scene: Scene, out: str | Path, *, config: SfmConfig | None = None, replace: bool = False, progress: bool = False
 ) -> SfmReport:
-    """Write a scene with known poses as a COLMAP model with triangulated points: `out/sparse/0`, and links in `out/images`.
+    """Write a scene with known poses as a COLMAP model with triangulated points in `out/sparse/0`.
+
+    `out/images` and `out/masks` have links to the pictures and their masks.
 
     Args:
         scene: posed views, with or without lens. All are used.
@@ -91,6 +93,10 @@ def write_known_poses(
         )
     links = {
         images / camera.name: real_path(path) for camera, path in zip(scene.cameras, scene.image_paths, strict=True)
+    }
+    masks = zip(scene.cameras, scene.masks or (), strict=scene.masks is not None)
+    links |= {
+        out / MASKS / f"{camera.name}{mask.suffix}": real_path(mask) for camera, mask in masks if mask is not None
     }
     taken = next((place for place, file in links.items() if place.exists() and real_path(place) != file), None)
     if taken is not None:
@@ -131,7 +137,9 @@ def _triangulate(scene: Scene, scratch: Path, config: SfmConfig, progress: bool)
         scene_errors("scene: expected pictures that fit their poses", advice),
         tqdm(disable=not progress, unit="image") as bar,
     ):
-        run = SfmRun(pycolmap, folder, names, scratch, config, bar)
+        masks = scene.masks or [None] * len(scene)
+        photos = dict(zip(names, zip(scene.image_paths, masks, strict=True), strict=True))
+        run = SfmRun(pycolmap, folder, names, scratch, config, bar, photos)
         known = _reconstruction(pycolmap, scene, names)
         fill_database(pycolmap, run.database, known)
         seconds = {"features": timed(lambda: run.extract(names, None, False))}

@@ -19,8 +19,9 @@ from .colmap import colmap_cameras, load_colmap
 from .files import SceneError, natural_key, some
 from .inria import is_inria, load_inria
 from .llff import POSES, is_llff, load_llff
+from .masks import check_mask, folder_masks, picture_folder
 from .polycam import is_polycam, load_polycam
-from .posed import near_zero
+from .posed import near_zero, picture_size
 from .replica import is_nice_slam, is_semantic_nerf, load_nice_slam, load_semantic_nerf
 from .scannet import is_scannet, load_scannet
 from .scene import Scene
@@ -95,6 +96,7 @@ def load_scene(
     root = path if path.is_dir() else path.parent
     try:
         scene = _with_splat(replace(_load_views(path, _given_folder(root, images)), folder=root), root)
+        scene = _with_masks(scene, root)
     except SceneError as error:  # of cameras that do not fit together
         if str(root) in str(error):
             raise
@@ -181,6 +183,18 @@ def _with_splat(scene: Scene, root: Path) -> Scene:
         f"agree, name it: --splat {splat}"
     )
     return replace(scene, notes=(*scene.notes, note))
+
+
+def _with_masks(scene: Scene, root: Path) -> Scene:
+    """The scene with the masks of a folder `masks`, if its file names none; a mask must have the shape of its photo."""
+    if scene.masks is None:
+        names = [camera.name for camera in scene.cameras]
+        masks, notes = folder_masks(names, picture_folder(names[0], scene.image_paths[0]), root)
+        scene = replace(scene, masks=masks, notes=(*scene.notes, *notes))
+    for mask, camera in zip(scene.masks or (), scene.cameras, strict=scene.masks is not None):
+        if mask is not None:
+            check_mask(mask, picture_size(mask), camera.size)
+    return scene
 
 
 def picture_folders(path: str | Path, images: str | Path | None = None) -> list[Path]:

@@ -21,7 +21,8 @@ from .._origin import choose_origin, describe_origin, to_local
 from ..cameras.camera import Camera
 from ..cameras.resample import fits_aspect
 from ..formats.ply import points_from_columns, read_ply
-from .files import SceneError, is_file, list_images, natural_key, open_picture, read_image, some
+from .files import SceneError, is_file, list_images, natural_key, open_picture, read_alpha, read_image, some
+from .masks import folder_masks, picture_folder, read_mask
 from .poses import mend_pose, mending_notes
 from .scene import Scene
 
@@ -40,6 +41,7 @@ class PosedPicture(NamedTuple):
     pose: Matrix  # [4, 4] camera to world, x right, y down, z forward
     origin: str  # the file, and the line, that the pose is from; for messages
     lens: tuple[Matrix, tuple[int, int]] | None = None  # its own K [3, 3] and (width, height); None: that of the scene
+    mask: Path | None = None  # that the scene's file names; None: that of a folder `masks`
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -252,6 +254,8 @@ def points_from_depth(
 ) -> tuple[Tensor, Tensor] | None:  # [P, 3] float64, [P, 3] uint8
     """About `DEPTH_POINTS` points of surfaces with their colours, from `DEPTH_VIEWS` evenly chosen depth pictures.
 
+    Pixels that are masked or transparent in the colour picture give none.
+
     Args:
         views: the pictures; those without a pose are left out.
         depths: their depth pictures; a missing file is left out.
@@ -266,37 +270,49 @@ def points_from_depth(
     if not found:
         return None
     chosen = [found[i] for i in np.unique(np.linspace(0, len(found) - 1, DEPTH_VIEWS).round().astype(int))]
+    names = [view.name for view, _ in chosen]
+    masks = folder_masks(names, picture_folder(names[0], chosen[0][0].path))[0] or [None] * len(chosen)
     points, colors = [], []
-    for view, file in chosen:
+    for (view, file), beside in zip(chosen, masks, strict=True):
         depth, image = read_depth(file).astype(np.float64) / scale, read_image(view.path).numpy()
         height, width = depth.shape
         step = max(int(np.sqrt(height * width * len(chosen) / DEPTH_POINTS)), 1)
         own = K if K is not None else _resized(view, (width, height))
         y, x = (axis.reshape(-1) for axis in np.mgrid[step // 2 : height : step, step // 2 : width : step])
-        z = depth[y, x]
+        rows, columns = y * image.shape[0] // height, x * image.shape[1] // width  # in the colour picture
+        z, mask, alpha = depth[y, x], view.mask or beside, read_alpha(view.path)
+        for kept in (
+            None if mask is None else read_mask(mask, image.shape[:2]),
+            None if alpha is None else alpha > 0.5,
+        ):
+            z = z if kept is None else z * kept.numpy()[rows, columns]
+        rows, columns = rows[z > 0], columns[z > 0]
         x, y, z = x[z > 0], y[z > 0], z[z > 0]
         local = np.stack([(x + 0.5 - own[0, 2]) / own[0, 0] * z, (y + 0.5 - own[1, 2]) / own[1, 1] * z, z], 1)
         points.append(local @ view.pose[:3, :3].T + view.pose[:3, 3])
-        colors.append(image[y * image.shape[0] // height, x * image.shape[1] // width])
+        colors.append(image[rows, columns])
     places, shades = np.concatenate(points), np.concatenate(colors)
     return torch.from_numpy(places), torch.from_numpy((shades * 255).round().astype(np.uint8))
 
 
 def points_of_cameras(
-    frames: Sequence[tuple[Camera, Path, Path]], unit: float
+    frames: Sequence[tuple[Camera, Path, Path, Path | None]], unit: float
 ) -> tuple[Tensor, Tensor, list[str]] | None:
     """Points from the depth pictures of cameras without lens, and a note; None if there are none.
 
     Args:
-        frames: camera, picture and depth picture.
+        frames: camera, picture, depth picture, and mask of the picture.
         unit: world units per step of the depth pictures.
 
     Raises:
         SceneError: if `unit` is not above 0, or a depth picture is none.
     """
     views = [
-        (PosedPicture(camera.name, path, torch.linalg.inv(camera.viewmat.double()).numpy(), str(depth), lens), depth)
-        for camera, path, depth in frames
+        (
+            PosedPicture(camera.name, path, torch.linalg.inv(camera.viewmat.double()).numpy(), str(depth), lens, mask),
+            depth,
+        )
+        for camera, path, depth, mask in frames
         if camera.distortion is None and (lens := (camera.K.double().numpy(), (camera.width, camera.height)))
     ]
     if not unit > 0:

@@ -16,11 +16,13 @@ from .._files import file_stem
 from ..cameras.bounds import camera_extent
 from ..cameras.camera import NEAR, Camera
 from ..cameras.undistort import undistort
-from .files import SceneError, read_image
+from .files import SceneError, read_alpha, read_image
+from .masks import read_mask, shrink_mask
 
 NEAR_SHARE = (
     0.1  # of the extent: 3DGS's near plane of 0.2 suits cameras 2 m apart; in smaller scenes it must be smaller
 )
+ROUNDING = 1e-3  # a pixel that takes less than this from masked ones, when a lens is removed, takes nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +53,13 @@ class Scene:
     """The path that the scene was loaded from."""
     splat: Path | None = None
     """A trained splat in the frame of the cameras, found in the scene's folder. `fit_scene` averages features onto it."""
+    masks: list[Path | None] | None = None
+    """V masks of the pictures on disk, None for a view without one: what is black in it is ignored by everything."""
 
     def __post_init__(self) -> None:
         check_shapes(("points", self.points, "P 3"), ("colors", self.colors, "P 3"))
         views = len(self.cameras)
-        for name, values in (("image_paths", self.image_paths), ("lenses", self.lenses)):
+        for name, values in (("image_paths", self.image_paths), ("lenses", self.lenses), ("masks", self.masks)):
             if values is not None and len(values) != views:
                 raise ValueError(f"{name}: expected {views} (one per camera), got {len(values)}; give one for each")
         stems = [file_stem(camera.name) for camera in self.cameras]
@@ -98,6 +102,7 @@ class Scene:
             **{f"split {name}": len(views) for name, views in self.splits.items()},
             "pixels": ", ".join(sizes[:3]) + (f" and {len(sizes) - 3} more sizes" if len(sizes) > 3 else ""),
             "lens": "distorted: use scene.undistorted()" if self.distorted else "pinhole",
+            "masks": None if self.masks is None else sum(mask is not None for mask in self.masks),
             "points": len(self.points),
             "extent": f"{self.extent:.4g} world units" if len(self) else None,
             "origin": ", ".join(f"{value:.15g}" for value in self.origin) if any(self.origin) else None,
@@ -123,14 +128,14 @@ class Scene:
         return self.splits[split]
 
     def image(self, i: int) -> Tensor:  # [H, W, 3] in [0, 1]
-        """Read the picture of view `i`; in an undistorted scene the lens is removed on the way.
+        """Read the picture of view `i`; in an undistorted scene the lens is removed on the way. Transparent pixels are black.
 
         Raises:
             FileNotFoundError: if the file is no longer there.
             SceneError: if it cannot be decoded, or is not of the camera's size.
         """
         lens = self.cameras[i] if self.lenses is None else self.lenses[i]
-        image = read_image(self.image_paths[i])
+        image = read_image(self.image_paths[i], "black")
         if image.shape[:2] != lens.size:
             raise SceneError(
                 f"{self.image_paths[i]}: expected {lens.width}x{lens.height} pixels as its camera says, got "
@@ -139,10 +144,35 @@ class Scene:
         return image if self.lenses is None else undistort(image, lens)[0]
 
     def mask(self, i: int) -> Tensor:  # [H, W] bool
-        """Which pixels of view `i` were recorded: all of them, or fewer at the border of an undistorted picture."""
+        """Which pixels of view `i` count: not those that are black in its mask, nor those beyond an undistorted picture."""
+        path = None if self.masks is None else self.masks[i]
         if self.lenses is None:
-            return torch.ones(self.cameras[i].size, dtype=torch.bool)
-        return undistort(torch.zeros(*self.lenses[i].size, 1), self.lenses[i])[2]
+            size = self.cameras[i].size
+            return torch.ones(size, dtype=torch.bool) if path is None else read_mask(path, size)
+        lens = self.lenses[i]
+        ignored = torch.zeros(lens.size) if path is None else (~read_mask(path, lens.size)).float()
+        share, _, recorded = undistort(ignored[..., None], lens)
+        return recorded & (share[..., 0] < ROUNDING)
+
+    def alpha(self, i: int) -> Tensor | None:  # [H, W] in [0, 1]
+        """The opacity of the picture of view `i`; None if no pixel is transparent. What is transparent is empty space."""
+        alpha = read_alpha(self.image_paths[i])
+        if alpha is None or self.lenses is None:
+            return alpha
+        return undistort(alpha[..., None], self.lenses[i])[0][..., 0]
+
+    def counted(self, i: int, size: tuple[int, int]) -> Tensor | None:  # [h, w] bool
+        """Where a map of view `i`, of any size, shows something that is neither masked nor mostly transparent.
+
+        None if the view has no mask and no transparent pixel.
+        """
+        alpha, masked = self.alpha(i), self.masks is not None and self.masks[i] is not None
+        if alpha is None and not masked:
+            return None
+        counted = shrink_mask(self.mask(i), size) if masked else torch.ones(size, dtype=torch.bool)
+        if alpha is not None:
+            counted &= torch.nn.functional.adaptive_avg_pool2d(alpha[None], size)[0] > 0.5
+        return counted
 
     @property
     def distorted(self) -> bool:
@@ -195,6 +225,7 @@ class Scene:
             cameras=[self.cameras[i] for i in indices],
             image_paths=[self.image_paths[i] for i in indices],
             lenses=None if self.lenses is None else [self.lenses[i] for i in indices],
+            masks=None if self.masks is None else [self.masks[i] for i in indices],
             splits={name: sorted(place[i] for i in views if i in place) for name, views in self.splits.items()},
         )
 

@@ -19,6 +19,7 @@ from ..formats.folders import newest_splat
 from .colmap import SUPPORTED_MODELS
 from .colmap_model import has_model
 from .files import SceneError, is_file, list_images, open_picture, some
+from .masks import folder_masks, write_colmap_masks
 from .pictures import refuse_heic
 from .pycolmap_import import quiet_pycolmap, scene_errors
 
@@ -95,6 +96,8 @@ def run_sfm(
 ) -> SfmReport:
     """Estimate cameras and a sparse cloud, and write them to `out/sparse/0`.
 
+    Nothing is found where a photo is transparent, or black in its mask (`masks/NAME.png`, in the folder or beside it).
+
     Args:
         images: folder of images (with subfolders); other files are ignored.
         out: scene folder; `out/sparse/0` appears complete or not at all.
@@ -147,7 +150,9 @@ def run_sfm(
         ),
         tqdm(disable=not progress, unit="image") as bar,
     ):
-        run = SfmRun(pycolmap, images, names, Path(scratch), config, bar)
+        masks = folder_masks(names, images)[0] or [None] * len(names)
+        photos = {name: (images / name, mask) for name, mask in zip(names, masks, strict=True)}
+        run = SfmRun(pycolmap, images, names, Path(scratch), config, bar, photos)
         seconds = {name: timed(stage) for name, stage in (("features", run.extract), ("matching", run.match))}
         seconds["mapping"] = timed(run.map)
         models = sorted(run.models, key=lambda model: -model.num_reg_images())
@@ -193,6 +198,8 @@ class SfmRun:
     scratch: Path
     config: SfmConfig
     bar: Any
+    photos: dict[str, tuple[Path, Path | None]]
+    """The file and the mask of each image."""
     models: list[Any] = field(default_factory=list)
 
     @property
@@ -220,6 +227,9 @@ class SfmRun:
         self.begin("features", len(names), "image")
         mode = colmap.CameraMode.SINGLE if single else colmap.CameraMode.PER_IMAGE
         reader: dict[str, Any] = {"camera_model": config.camera_model}
+        masks = write_colmap_masks(self.scratch / "masks", {name: self.photos[name] for name in names})
+        if masks is not None:
+            reader["mask_path"] = masks
         if camera is not None:
             reader["existing_camera_id"] = camera
         options = {"num_threads": config.num_threads, "sift": {"max_num_features": config.max_features}}

@@ -11,8 +11,9 @@ from tqdm import tqdm
 from .._files import as_path, atomic_folder, check_output, file_stem, real_path
 from .colmap import load_colmap
 from .colmap_model import ColmapModel, read_whole_model
-from .files import SceneError, find_pictures, list_images, some
+from .files import MASKS, SceneError, find_pictures, list_images, some
 from .load import find_images
+from .masks import folder_masks
 from .pictures import refuse_heic
 from .posed import picture_size
 from .pycolmap_import import quiet_pycolmap, scene_errors
@@ -38,7 +39,7 @@ def extend_sfm(
     Args:
         images: folder of the new images; their names differ from those of the scene.
         scene: scene folder with a COLMAP model, made by any program, and its pictures.
-        out: the larger scene: `sparse/0`, and `images` with a link to each picture. Classes and text table are linked.
+        out: the larger scene: `sparse/0`, and `images` and `masks` with links to the files. Classes and text table are linked.
         config: options. `min_registered` counts new images. `camera_model` is of new cameras: with `single_camera`, images
             as large as those of a scene of one camera are taken to be by that camera; other ones share a new camera.
         progress: show a bar.
@@ -73,11 +74,16 @@ def extend_sfm(
         atomic_folder(out) as larger,
     ):
         names = sorted(image.name for image in old.images.values())
-        _link(larger / "images", files | {name: images / name for name in new})
+        files |= {name: images / name for name in new}
+        masks = folder_masks(names, pictures, scene)[0] or [None] * len(names)
+        masks += folder_masks(new, images)[0] or [None] * len(new)
+        photos = {name: (files[name], mask) for name, mask in zip([*names, *new], masks, strict=True)}
+        _link(larger / "images", files)
+        _link(larger / MASKS, {f"{name}{mask.suffix}": mask for name, (_, mask) in photos.items() if mask is not None})
         for name in KEPT:
             if (scene / name).is_file():
                 (larger / name).symlink_to(real_path(scene / name))
-        run = SfmRun(pycolmap, larger / "images", [*names, *new], Path(scratch), config, bar)
+        run = SfmRun(pycolmap, larger / "images", [*names, *new], Path(scratch), config, bar, photos)
         known = pycolmap.Reconstruction(str(model))
         fill_database(pycolmap, run.database, known)
         camera = _shared_camera(old, images / new[0]) if config.single_camera else None
@@ -149,7 +155,7 @@ def _check_names(old: ColmapModel, pictures: Path, new: list[str], images: Path)
 
 
 def _link(folder: Path, files: dict[str, Path]) -> None:
-    """Link pictures into one folder, under their names."""
+    """Link files into one folder, under names of their own."""
     for name, file in files.items():
         place = folder / name
         place.parent.mkdir(parents=True, exist_ok=True)

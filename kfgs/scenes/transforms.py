@@ -14,7 +14,7 @@ from torch import Tensor
 from .._files import Names, as_path
 from .._origin import Origin
 from ..cameras.camera import Camera
-from .files import IMAGE_SUFFIXES, SceneError, is_file, list_images, natural_key, read_scene_json, some
+from .files import IMAGE_SUFFIXES, SceneError, find_pictures, is_file, list_images, natural_key, read_scene_json, some
 from .posed import MILLIMETRE, as_large_as_pictures, near_zero, picture_size, points_of_cameras, read_points
 from .poses import mending_notes
 from .scene import Scene
@@ -34,7 +34,8 @@ class _Reader:
     views: list[tuple[Camera, Path]] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
     outside: list[str] = field(default_factory=list)
-    masked: int = 0
+    masks: dict[Path, Path] = field(default_factory=dict)
+    unmasked: list[str] = field(default_factory=list)
     broken: list[str] = field(default_factory=list)
     scaled: dict[str, float] = field(default_factory=dict)
     respelled: dict[str, str] = field(default_factory=dict)
@@ -55,11 +56,11 @@ class _Reader:
             self.scaled[name] = scale
         return camera
 
-    def with_depth(self, origin: Origin) -> list[tuple[Camera, Path, Path]]:
-        """Camera, picture and depth picture of each view that has all three."""
+    def with_depth(self, origin: Origin) -> list[tuple[Camera, Path, Path, Path | None]]:
+        """Camera, picture, depth picture, and mask if there is one, of each view that has the first three."""
         both = zip(self.views, self.depths, strict=True)
         kept = [(camera, path, depth) for (camera, path), depth in both if depth is not None]
-        return [(camera.with_origin(origin).to(torch.float32), path, depth) for camera, path, depth in kept]
+        return [(c.with_origin(origin).to(torch.float32), path, depth, self.masks.get(path)) for c, path, depth in kept]
 
 
 def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene:
@@ -74,7 +75,7 @@ def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene
     `..`) are read if they are image files, and counted in `notes`. `ply_file_path` gives the points if it is inside the
     folder, without it the `points3d.ply` of 3DGS and OpenGaussian; else the scene has no points (P = 0), and a
     note says so. Without points, those of `depth_file_path` are taken (millimetres, or `integer_depth_scale`), if no lens
-    is distorted. `mask_path` is not read.
+    is distorted. What is black in a `mask_path` is ignored (`Scene.masks`); masks that are missing are counted in `notes`.
 
     Args:
         path: the file, or a folder with `transforms.json` or `transforms_train.json`.
@@ -119,14 +120,22 @@ def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene
         notes.append(f"{len(missing)} of {len(missing) + len(views)} frames have no image file: {some(missing)}")
     if outside:
         notes.append(f"{len(outside)} image files lie outside {first.root}: {some(outside, 3)}")
-    if any(reader.masked for reader, _ in readers.values()):
-        notes.append(f"{sum(reader.masked for reader, _ in readers.values())} frames have a mask_path; it is not used")
+    named = {image: mask for reader, _ in readers.values() for image, mask in reader.masks.items()}
+    masks = [named.get(path) for path in paths]
+    unmasked = [name for reader, _ in readers.values() for name in reader.unmasked]
+    if any(masks):
+        notes.append(
+            f"masks: {len(masks) - masks.count(None)} of {len(views)} frames have a mask_path; black is ignored"
+        )
+    if unmasked:
+        notes.append(f"{len(unmasked)} files of mask_path are missing, and those frames have no mask: {some(unmasked)}")
     other = [f"{listed} is {file}" for reader, _ in readers.values() for listed, file in reader.respelled.items()]
     if other:
         notes.append(f"{len(other)} images were found by a name that is spelled otherwise: {some(other)}")
     cameras, shrunk = as_large_as_pictures(cameras, paths, first.images)
     splits, told = _splits(path, views, top)
-    return Scene(cameras, paths, points, colors, splits, (*notes, *shrunk, *told, *far)).with_near()
+    scene = Scene(cameras, paths, points, colors, splits, (*notes, *shrunk, *told, *far)).with_near()
+    return replace(scene, masks=masks) if any(masks) else scene
 
 
 def transforms_cameras(path: Path) -> tuple[list[Camera], list[str]]:
@@ -202,7 +211,7 @@ def _read_frames(reader: _Reader) -> dict[str, Any]:
         if file is None:
             reader.missing.append(listed)
             continue
-        reader.masked += "mask_path" in values
+        _find_mask(reader, merged.get("mask_path"), file)
         if not {"w", "h"} <= set(merged):  # Blender; a smaller copy in `images` is not what the file is about
             merged["w"], merged["h"] = picture_size(_find_image(replace(reader, images=None), listed) or file)
         camera = reader.camera(frame, _name(reader, file))
@@ -232,6 +241,18 @@ def _find_image(reader: _Reader, listed: str) -> Path | None:
             reader.respelled[listed] = near
             return folder / near
     return None
+
+
+def _find_mask(reader: _Reader, listed: Any, image: Path) -> None:
+    """Note the mask of a frame, or that it is missing."""
+    if listed is None:
+        return
+    place = reader.root / str(listed).replace("\\", "/").replace("\0", "")
+    mask = find_pictures(place.parent, [place.name]).get(place.name)
+    if mask is None:
+        reader.unmasked.append(f"{listed!r:.200}")
+    else:
+        reader.masks[image] = mask
 
 
 def _name(reader: _Reader, file: Path) -> str:

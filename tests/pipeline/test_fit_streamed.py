@@ -10,7 +10,7 @@ from small_room import CONFIG, config, make_room
 from kfgs.cameras import Distortion
 from kfgs.features import FeatureFolder, RecomputedMaps, discard_maps, extract_features, pictures_of
 from kfgs.pipeline import Run, fit_scene
-from kfgs.pipeline.maps import UndistortedMaps, map_digests, map_shape
+from kfgs.pipeline.maps import map_digests, map_shape, maps_of_views
 from kfgs.quant import sample_grid
 from kfgs.scenes import load_scene
 
@@ -156,11 +156,13 @@ class _Grid(_Plain):
 def test_a_lens_passes_on_what_the_maps_offer_where_it_may(scene):
     features = torch.rand(6, 8, 3, generator=torch.Generator().manual_seed(0)) + 0.5
     lens = dataclasses.replace(scene.cameras[0], distortion=LENS)
-    offered = UndistortedMaps(_Grid([features, features]), [scene.cameras[0], lens])
+    views = scene.select([0, 1])
+    views = dataclasses.replace(views, lenses=[views.cameras[0], lens])
+    offered = maps_of_views(views, [0, 1], _Grid([features, features]))
     assert (offered.shape, offered.digests()) == ((6, 8, 3), [["a", "1"]])
     assert offered.grid(0, None, 10).tolist() == [[0.0, 0.0, 0.0]]
     assert torch.equal(offered.grid(1, (2, 3)), sample_grid(offered[1], (2, 3)))
     assert not torch.equal(offered[1], features)
-    bare = UndistortedMaps(_Plain([features]), [scene.cameras[0]])
+    bare = maps_of_views(views, [0], _Plain([features]))
     assert (bare.shape, bare.digests(), map_shape(bare)) == ((6, 8, 3), None, (6, 8, 3))
     assert torch.equal(bare.grid(0, None, 12), sample_grid(features, samples=12))

@@ -9,8 +9,8 @@ from small_room import CONFIG, make_room
 from kfgs.cameras import Camera, Distortion, undistort
 from kfgs.features import FeatureFolder
 from kfgs.pipeline import fit_scene
-from kfgs.pipeline.maps import KnownFeatures, UndistortedMaps
-from kfgs.scenes import load_scene
+from kfgs.pipeline.maps import KnownFeatures, maps_of_views
+from kfgs.scenes import Scene, load_scene
 
 LENS = Distortion("brown_conrady", (0.3, 0.05, 0.001, -0.002))
 
@@ -24,10 +24,20 @@ def _lens(width: int, height: int, distortion: Distortion | None = LENS) -> Came
     return Camera(torch.eye(4), K, width, height, distortion=distortion)
 
 
+def _views(*lenses):
+    cameras = [dataclasses.replace(lens, name=f"{i}.png") for i, lens in enumerate(lenses)]
+    scene = Scene(cameras, [Path(camera.name) for camera in cameras], torch.zeros(0, 3), torch.zeros(0, 3).byte())
+    return dataclasses.replace(scene.undistorted(), lenses=cameras)
+
+
+def _straight(maps, lenses):
+    return maps_of_views(_views(*lenses), range(len(lenses)), maps)
+
+
 def test_a_map_is_undistorted_as_the_picture_is_at_its_own_size():
     lens = _lens(160, 120)
     features = torch.rand(30, 40, 5, generator=torch.Generator().manual_seed(0)) + 0.5
-    maps = UndistortedMaps(_Maps([features]), [lens])
+    maps = _straight(_Maps([features]), [lens])
     expected, _, inside = undistort(features, lens.resized(30, 40))
     torch.testing.assert_close(maps[0][inside], expected[inside])
     assert (maps[0][~inside] == 0).all()
@@ -37,12 +47,12 @@ def test_a_map_is_undistorted_as_the_picture_is_at_its_own_size():
 
 def test_without_distortion_a_map_is_left_alone():
     features = torch.rand(30, 40, 5)
-    assert UndistortedMaps(_Maps([features]), [_lens(160, 120, None)])[0] is features
+    assert _straight(_Maps([features]), [_lens(160, 120, None)])[0] is features
 
 
 def test_blocks_are_the_undistorted_map():
     features = torch.rand(70, 40, 5, generator=torch.Generator().manual_seed(0)) + 0.5
-    maps = UndistortedMaps(_Maps([features, features]), [_lens(160, 280), _lens(160, 280, None)])
+    maps = _straight(_Maps([features, features]), [_lens(160, 280), _lens(160, 280, None)])
     for i in range(2):
         blocks = list(maps.blocks(i))
         assert [len(block) for block in blocks] == [32, 32, 6]
@@ -59,8 +69,8 @@ def test_unknown_pixels_become_nan_and_nothing_else_changes():
 
 
 def test_counts_must_agree():
-    with pytest.raises(ValueError, match=tells("lenses:", "expected 2", "got 1")):
-        UndistortedMaps(_Maps([torch.ones(2, 2, 1)] * 2), [_lens(4, 4)])
+    with pytest.raises(ValueError, match=tells("maps:", "expected 1", "got 2")):
+        _straight(_Maps([torch.ones(2, 2, 1)] * 2), [_lens(4, 4)])
 
 
 def test_a_distorted_scene_is_fitted_through_its_lens(tmp_path):

@@ -133,7 +133,9 @@ def test_a_quaternion_that_is_not_of_length_1_is_normalised(tmp_path: Path) -> N
     scene = load_colmap(model, tmp_path / "images")
     turned = torch.tensor([[1, 0, 0, 1], [0, -0.28, -0.96, 2], [0, 0.96, -0.28, 3], [0, 0, 0, 1]])  # cos = 2 * 0.36 - 1
     torch.testing.assert_close(scene.cameras[0].viewmat, turned)
-    assert any("1 poses have a scale (1.001) or a rounded rotation, which was removed: image 1" in n for n in scene.notes)
+    assert any(
+        "1 poses have a scale (1.001) or a rounded rotation, which was removed: image 1" in n for n in scene.notes
+    )
 
 
 def test_a_name_too_long_for_the_disk_is_a_missing_file(tmp_path: Path) -> None:

@@ -161,7 +161,15 @@ def test_neighbours_are_near_and_look_the_same_way() -> None:
 def test_pairs_are_compared_as_given(posed: Scene, tmp_path: Path) -> None:
     pycolmap, names = import_pycolmap(), [camera.name for camera in posed.cameras]
     with tqdm(disable=True) as bar:
-        run = SfmRun(pycolmap, posed.image_paths[0].parent, names, tmp_path, FEW, bar)
+        run = SfmRun(
+            pycolmap,
+            posed.image_paths[0].parent,
+            names,
+            tmp_path,
+            FEW,
+            bar,
+            dict.fromkeys(names, (posed.image_paths[0], None)),
+        )
         run.extract()
         run.match_pairs([(names[0], names[1]), (names[2], names[4])])
     with pycolmap.Database.open(run.database) as database:

@@ -144,7 +144,8 @@ def _matched(folder: Path, names: list[str]) -> set[frozenset[str]]:
         write_image(str(folder / "images" / name), picture.repeat_interleave(4, 2))
     config = SfmConfig(matching="sequential", max_features=200, num_threads=1)
     with tqdm(disable=True) as bar:
-        run = SfmRun(pycolmap, folder / "images", names, folder, config, bar)
+        photos = {name: (folder / "images" / name, None) for name in names}
+        run = SfmRun(pycolmap, folder / "images", names, folder, config, bar, photos)
         run.extract()
         run.match()
     with pycolmap.Database.open(run.database) as database:

@@ -211,7 +211,8 @@ def test_splits_and_masks_of_nerfstudio(tmp_path: Path) -> None:
     names = {"train_filenames": ["images/2.png", "./images/0.png"], "test_filenames": ["images/1.png"]}
     scene = load_transforms(_write(tmp_path, frames, **names))
     assert scene.splits == {"train": [0, 2], "test": [1]}
-    assert "3 frames have a mask_path; it is not used" in scene.notes
+    assert scene.masks is None
+    assert "3 files of mask_path are missing, and those frames have no mask: 'm.png', 'm.png', 'm.png'" in scene.notes
 
 
 def _frame(**changes: Any) -> list[dict[str, Any]]:

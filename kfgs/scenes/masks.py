@@ -1,0 +1,132 @@
+"""Masks of photos: where they are, how they are read, and what pycolmap gets of them. Black is ignored."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from .._files import Names, file_stem, real_path
+from .files import (
+    MASKS,
+    ORIENTATION,
+    SMALL,
+    SceneError,
+    has_alpha,
+    list_images,
+    open_picture,
+    read_alpha,
+    some,
+)
+
+
+def read_mask(path: Path, size: tuple[int, int]) -> Tensor:  # [H, W] bool
+    """Which pixels of a photo count: those of its mask that are brighter than half of the brightest one.
+
+    So masks of 0 and 1, of 0 and 255, and JPEG files mean the same. If the mask is larger than the photo, a pixel counts if all
+    of it does.
+
+    Args:
+        path: the mask, in any mode; what is transparent in it is black.
+        size: (H, W) of the photo, which has the shape of the mask.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        SceneError: if it cannot be decoded, or has another shape.
+    """
+    with open_picture(path, "a mask of a photo", "write it again", small=max(SMALL, size[0] * size[1])) as picture:
+        picture.getexif().pop(ORIENTATION, None)
+        check_mask(path, picture.size, size)
+        if picture.mode in ("1", "L") or picture.mode.startswith(("I", "F")):
+            bright = np.asarray(picture)
+        else:
+            whole = picture.convert("RGBA")
+            bright = np.asarray(Image.alpha_composite(Image.new("RGBA", whole.size, "black"), whole))[..., :3].max(2)
+        return shrink_mask(torch.from_numpy(bright > bright.max() / 2), size)
+
+
+def check_mask(path: Path, given: tuple[int, int], size: tuple[int, int]) -> None:
+    """Raise a SceneError unless a mask of (width, height) pixels has the shape of a photo of (height, width) pixels."""
+    (width, height), (rows, columns) = given, size
+    if abs(width * rows - height * columns) > max(width + rows, height + columns):
+        raise SceneError(
+            f"{path}: expected a mask in the shape of its photo ({columns}x{rows} pixels), got {width}x{height}; make it of this "
+            "photo, or take it away"
+        )
+
+
+def shrink_mask(mask: Tensor, size: tuple[int, int]) -> Tensor:  # [H, W] bool -> [h, w] bool
+    """A mask at another size: a pixel counts if everything that it covers does."""
+    if tuple(mask.shape) == tuple(size):
+        return mask
+    return torch.nn.functional.adaptive_max_pool2d((~mask)[None].float(), size)[0] == 0
+
+
+def picture_folder(name: str, path: Path) -> Path:
+    """The folder that the name of a picture is relative to."""
+    return path.parents[len(Path(name).parts) - 1]
+
+
+def folder_masks(
+    names: Sequence[str], pictures: Path, root: Path | None = None
+) -> tuple[list[Path | None] | None, list[str]]:
+    """The mask of each photo, from a folder `masks`, and a note about them; None if no photo has one.
+
+    The mask of `left/a.jpg` is `left/a.jpg.png` or `left/a.png`; other endings of pictures are read, too.
+
+    Args:
+        names: of the photos.
+        pictures: the folder that they are relative to. The masks are in it, or beside it.
+        root: a folder whose `masks` is preferred.
+    """
+    places = [pictures] if pictures == root else [pictures, pictures.parent, real_path(pictures).parent]
+    places = [place / MASKS for place in (*([] if root is None else [root]), *places)]
+    folder = next((place for place in places if place.is_dir() and list_images(place)), None)
+    if folder is None:
+        return None, []
+    files = list_images(folder)
+    known = Names(files)
+    chosen = [
+        known.find(name) or known.find(f"{file_stem(name)}.heic") for name in names
+    ]  # photos are converted from HEIC
+    counts = Counter(chosen)
+    masks = [folder / file if file is not None and counts[file] == 1 else None for file in chosen]
+    used = {mask for mask in masks if mask is not None}
+    if not used:
+        example = f"{file_stem(names[0])}.png" if names else "NAME.png"
+        return None, [
+            f"{folder}: none of {len(files)} masks ({some(files, 3)}) has the name of one photo, such as {example}; none is used"
+        ]
+    note = f"masks: {len(used)} of {len(names)} photos have one in {folder}; black is ignored"
+    extra = [file for file in files if folder / file not in used]
+    return masks, [
+        note + (f"; {len(extra)} more have the name of no photo, or of several: {some(extra, 3)}" if extra else "")
+    ]
+
+
+def write_colmap_masks(folder: Path, photos: Mapping[str, tuple[Path, Path | None]]) -> str | None:
+    """Write what pycolmap takes as `mask_path`: NAME.png for each photo, black where it is masked or transparent.
+
+    Args:
+        folder: to write to.
+        photos: file and mask of each photo by its name. If none has a mask or transparent pixels, nothing is written.
+
+    Returns:
+        The folder; None if nothing was written.
+    """
+    if not any(mask is not None or has_alpha(photo) for photo, mask in photos.values()):
+        return None
+    for name, (photo, mask) in photos.items():
+        with open_picture(photo) as picture:
+            size = picture.height, picture.width
+        alpha, kept = read_alpha(photo), torch.ones(size, dtype=torch.bool) if mask is None else read_mask(mask, size)
+        kept = kept if alpha is None else kept & (alpha > 0.5)
+        place = folder / f"{name}.png"
+        place.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(kept.numpy().astype(np.uint8) * 255).save(place)
+    return str(folder)
