@@ -155,9 +155,10 @@ class _Grid(_Plain):
 
 def test_a_lens_passes_on_what_the_maps_offer_where_it_may(scene):
     features = torch.rand(6, 8, 3, generator=torch.Generator().manual_seed(0)) + 0.5
-    lens = dataclasses.replace(scene.cameras[0], distortion=LENS)
     views = scene.select([0, 1])
-    views = dataclasses.replace(views, lenses=[views.cameras[0], lens])
+    views = dataclasses.replace(
+        views, lenses=[views.cameras[0], dataclasses.replace(views.cameras[1], distortion=LENS)]
+    )
     offered = maps_of_views(views, [0, 1], _Grid([features, features]))
     assert (offered.shape, offered.digests()) == ((6, 8, 3), [["a", "1"]])
     assert offered.grid(0, None, 10).tolist() == [[0.0, 0.0, 0.0]]
