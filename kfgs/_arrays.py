@@ -21,7 +21,6 @@ from ._files import as_path
 
 Array = NDArray[Any]
 SPARE, RATIO = 64 << 20, 100
-"""A compressed `.npz` may unpack to SPARE bytes plus RATIO times its own size."""
 _KINDS = "biufcU"  # of NumPy's dtype.kind: numbers and texts
 AGAIN = "copy it again, or write it again"
 _AXIS = 1 << 48  # longest axis; NumPy multiplies axes in 64 bits
@@ -29,6 +28,11 @@ _AXIS = 1 << 48  # longest axis; NumPy multiplies axes in 64 bits
 
 class FileError(ValueError):
     """A file that cannot be read. The message names the file, what was expected, what is wrong, and what to do."""
+
+
+def most_unpacked(packed: int) -> int:
+    """The most bytes that a compressed file of `packed` bytes may take in memory, whatever its format (promises.md)."""
+    return SPARE + RATIO * packed
 
 
 def read_array(
@@ -67,7 +71,7 @@ def read_arrays(
         path: the file.
         expected: what should be there, for the message.
         advice: the end of the message.
-        most: bytes that the arrays and their headers may have together; None: what `SPARE` and `RATIO` allow.
+        most: bytes that the arrays and their headers may have together; None: what `most_unpacked` allows.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -76,7 +80,7 @@ def read_arrays(
     found = {}
     with reading(path, expected, advice), zipfile.ZipFile(path) as archive:
         total = sum(entry.file_size for entry in archive.infolist())
-        most = SPARE + RATIO * as_path(path).stat().st_size if most is None else most
+        most = most_unpacked(as_path(path).stat().st_size) if most is None else most
         if total > most:
             raise ValueError(f"it would unpack to {total} bytes, expected at most {most}")
         for entry in archive.infolist():

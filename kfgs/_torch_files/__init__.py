@@ -141,11 +141,13 @@ def read_torch(path: Path, expected: str) -> Any:
         raise ValueError(f"{path}: expected {expected}, got {error}") from error
 
 
-def plain_tensor(path: Path, name: str, value: object, dtype: torch.dtype = torch.float32) -> Tensor:
+def plain_tensor(
+    path: Path, name: str, value: object, dtype: torch.dtype = torch.float32, *, finite: bool = True
+) -> Tensor:
     """A tensor of a file as floats, without its graph.
 
     Raises:
-        ValueError: if it is no dense tensor of finite numbers.
+        ValueError: if it is no dense tensor, or of numbers that are not `finite`.
     """
     if not isinstance(value, Tensor):
         raise ValueError(
@@ -156,7 +158,7 @@ def plain_tensor(path: Path, name: str, value: object, dtype: torch.dtype = torc
     except TorchFileError as error:
         raise ValueError(f"{path}: {name} is {error}") from error
     found = value.detach().to(dtype)
-    if not bool(torch.isfinite(found).all()):
+    if finite and not bool(torch.isfinite(found).all()):
         raise ValueError(f"{path}: expected finite numbers for {name}, got NaN or infinity; did the training diverge?")
     return found
 

@@ -19,6 +19,7 @@ import zstandard
 from safetensors import SafetensorError
 from torch import Tensor
 
+from .._arrays import most_unpacked
 from .._files import parse_json
 from ..formats.order import morton_codes
 from ..formats.values import unit_quats
@@ -49,8 +50,6 @@ ABOUT = "description"
 LEVEL = 19  # of zstd: the best compression that takes only seconds
 HEADER, WORDS = 1 << 20, 8 << 20
 """Most bytes of a header, and of the description."""
-SPARE, RATIO = 64 << 20, 100
-"""A file may unpack to SPARE bytes plus RATIO times its own size. A cloud that compresses better is stored uncompressed."""
 EDGE = 1e-4
 """Unpacked opacities keep this distance from 0 and 1, as everywhere in kfgs."""
 HUGE = 1e37
@@ -277,7 +276,8 @@ def _unpacked(entry: Entry, shape: tuple[int, ...] | list[int]) -> int:
 
 
 def _most(streams: dict[str, bytes]) -> int:
-    return SPARE + RATIO * sum(len(stream) for name, stream in streams.items() if name != ABOUT)
+    """The most bytes that these streams may unpack to. A cloud that compresses better is stored uncompressed."""
+    return most_unpacked(sum(len(stream) for name, stream in streams.items() if name != ABOUT))
 
 
 def _checked_shape(shape: Any) -> tuple[int, ...]:

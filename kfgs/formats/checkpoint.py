@@ -27,7 +27,7 @@ from ..gaussians import Gaussians
 from ..splat.transform import transform_gaussians
 from .render_mode import Mode, with_mode
 from .splat_file import SplatFile
-from .values import SH_C0, check_finite, positive_scales
+from .values import NO_DEGREE_4, SH_C0, positive_scales
 
 NAME = "checkpoint"
 SUFFIXES = (".pt", ".ckpt")
@@ -62,10 +62,11 @@ def read(path: Path) -> SplatFile:
         parts = [_gsplat(file, found if file == path else read_torch(file, _EXPECTED)) for file in files]
         info |= {"program": "gsplat", "frame": "that of gsplat's trainer, which normalises the scene by default"}
         info |= {"ranks": len(files)} if len(files) > 1 else {}
-        return with_mode(SplatFile(Gaussians.cat(parts), info=info), _mode(path))
+        return with_mode(SplatFile(Gaussians.cat(parts), info=info, notes=_dropped(found["splats"])), _mode(path))
     if isinstance(found.get("pipeline"), dict):
         cloud, frame = _undo_frame(path, _splatfacto(path, found["pipeline"]))
-        return with_mode(SplatFile(cloud, info=info | {"program": "nerfstudio", "frame": frame}), _mode(path))
+        info |= {"program": "nerfstudio", "frame": frame}
+        return with_mode(SplatFile(cloud, info=info, notes=_dropped(found["pipeline"])), _mode(path))
     got = f"one with {', '.join(map(str, list(found)[:5]))}" if found else type(top).__name__
     raise ValueError(f"{path}: expected {_EXPECTED}, got {got:.200}; name another file")
 
@@ -104,8 +105,8 @@ def _gsplat(path: Path, top: Any) -> Gaussians:
             f"{path}: expected colours as spherical harmonics (sh0, shN), got features for a network (app_opt); export a PLY "
             "with gsplat (--save_ply), or train without app_opt"
         )
-    raw = {name: plain_tensor(path, name, splats.get(name), _dtype(name)) for name in (*_NAMES, "sh0")}
-    rest = plain_tensor(path, "shN", splats["shN"]) if "shN" in splats else raw["sh0"][:, :0]
+    raw = {name: _raw(path, name, splats.get(name)) for name in (*_NAMES, "sh0")}
+    rest = _raw(path, "shN", splats["shN"]) if "shN" in splats else raw["sh0"][:, :0]
     return _cloud(path, raw, raw["sh0"], rest)
 
 
@@ -119,44 +120,48 @@ def _splatfacto(path: Path, state: dict[Any, Any]) -> Gaussians:
             "is this a checkpoint of another method?"
         )
     (prefix,) = prefixes
-    raw = {
-        name: plain_tensor(path, prefix + name, state.get(prefix + name), _dtype(name))
-        for name in (*_NAMES, "features_dc")
-    }
+    raw = {name: _raw(path, prefix + name, state.get(prefix + name)) for name in (*_NAMES, "features_dc")}
     dc = raw["features_dc"] if raw["features_dc"].ndim == 3 else raw["features_dc"][:, None]
     rest = (
-        plain_tensor(path, "features_rest", state[f"{prefix}features_rest"])
-        if f"{prefix}features_rest" in state
-        else dc[:, :0]
+        _raw(path, "features_rest", state[f"{prefix}features_rest"]) if f"{prefix}features_rest" in state else dc[:, :0]
     )
     if rest.ndim == 3 and rest.shape[1] == 0:  # trained without harmonics
         dc = (dc.sigmoid() - 0.5) / SH_C0
     return _cloud(path, raw, dc, rest)
 
 
-def _dtype(name: str) -> torch.dtype:
-    return torch.float64 if name == "means" else torch.float32  # places may be far from zero
+def _raw(path: Path, name: str, value: object) -> Tensor:
+    """A tensor of a file; broken Gaussians stay until `read_splats`, and places may be far from zero."""
+    return plain_tensor(path, name, value, torch.float64 if name.endswith("means") else torch.float32, finite=False)
 
 
 def _cloud(path: Path, raw: dict[str, Tensor], dc: Tensor, rest: Tensor) -> Gaussians:
-    """The Gaussians of raw values; a ValueError if shapes disagree or numbers overflow."""
+    """The Gaussians of raw values; a ValueError if shapes disagree."""
     N = len(raw["means"])
     shapes = {"means": [N, 3], "scales": [N, 3], "quats": [N, 4]}
     odd = [f"{name} {list(raw[name].shape)}" for name, shape in shapes.items() if list(raw[name].shape) != shape]
     odd += [f"opacities {list(raw['opacities'].shape)}"] if raw["opacities"].numel() != N else []
     odd += [f"colours {list(dc.shape)}"] if list(dc.shape) != [N, 1, 3] else []
-    if rest.ndim != 3 or rest.shape[1] not in (0, 3, 8, 15) or list(rest.shape[::2]) != [N, 3]:
+    if rest.ndim != 3 or rest.shape[1] not in (0, 3, 8, 15, 24) or list(rest.shape[::2]) != [N, 3]:
         odd.append(f"higher colours {list(rest.shape)}")
     if odd:
         raise ValueError(
             f"{path}: expected values of {N} Gaussians (from means), got {', '.join(odd)}; is the file damaged?"
         )
     scales = raw["scales"].exp()
-    check_finite(path, scales=scales.numpy())
     opacities = raw["opacities"].reshape(N).sigmoid()
     return Gaussians(
-        raw["means"], raw["quats"], positive_scales(path, scales.numpy()), opacities, sh=torch.cat([dc, rest], 1)
+        raw["means"],
+        raw["quats"],
+        positive_scales(path, scales.numpy()),
+        opacities,
+        sh=torch.cat([dc, rest], 1)[:, :16],
     )
+
+
+def _dropped(values: dict[Any, Any]) -> tuple[str, ...]:
+    rest = [value for name, value in values.items() if str(name).endswith(("shN", "features_rest"))]
+    return (NO_DEGREE_4,) if any(getattr(value, "shape", ())[1:] == (24, 3) for value in rest) else ()
 
 
 def _undo_frame(path: Path, cloud: Gaussians) -> tuple[Gaussians, str]:

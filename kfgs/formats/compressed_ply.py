@@ -28,7 +28,7 @@ from .ply import Columns, read_comments, read_ply_elements, write_ply_elements
 from .render_mode import comments_of_mode, mode_from_comments, with_mode
 from .smallest_three import pack_smallest_three, rotation_error, unpack_smallest_three
 from .splat_file import Precision, SplatFile
-from .values import SH_C0, check_finite, colours_to_write, describe_loss, positive_scales
+from .values import NO_DEGREE_4, SH_C0, colours_to_write, describe_coarse, describe_loss, positive_scales
 
 NAME = "compressed_ply"
 SUFFIXES = (".compressed.ply",)
@@ -48,6 +48,7 @@ _FIELDS = (11, 10, 11)  # bits of x, y and z
 _STEPS = np.array([2047, 1023, 2047], np.float32)  # between the bounds of positions and log scales
 _COLOR_STEPS = np.array([255, 255, 255], np.float32)
 _ALL_STEPS = (_STEPS, _STEPS, _COLOR_STEPS)
+_ROUGH = 0.02  # error of a base colour that is seen, and reported: 5 of 255
 _ROUNDING = 6 * 2.0**-24  # float32: of the bounds, their difference, the product and the sum
 
 
@@ -63,10 +64,10 @@ def matches(head: bytes) -> bool:
 
 
 def read(path: Path) -> SplatFile:
-    """Read a compressed PLY file with harmonics of degree 0 to 3; opacities of 0 and 1 stay 0 and 1.
+    """Read a compressed PLY file with harmonics of degree 0 to 4 (4 is dropped); opacities of 0 and 1 stay 0 and 1.
 
     Raises:
-        ValueError: if it is truncated, elements or columns are missing or disagree, or bounds are not finite.
+        ValueError: if it is truncated, or elements or columns are missing or disagree.
     """
     elements = read_ply_elements(path)
     chunk, vertex = (elements.get(name, {}) for name in ("chunk", "vertex"))
@@ -82,18 +83,19 @@ def read(path: Path) -> SplatFile:
     rgb = rgba[:, :3] if colours is None else _between(colours, rgba[:, :3])
     sh0 = (rgb - 0.5) / np.float32(SH_C0)
     sh = np.concatenate([sh0[:, None], _read_rest(path, elements.get("sh"), n)], 1)
-    with np.errstate(over="ignore"):  # refused below
+    with np.errstate(over="ignore"):  # left out
         scales = np.exp(log_scales)
-    check_finite(path, means=positions, scales=scales, sh=sh)
     gaussians = Gaussians(
         means=torch.from_numpy(positions),
         quats=_unpack_rotations(vertex["packed_rotation"]),
         scales=positive_scales(path, scales),
         opacities=torch.from_numpy(rgba[:, 3].copy()),
-        sh=torch.from_numpy(sh),
+        sh=torch.from_numpy(sh[:, :16]),
     )
     comments = read_comments(path)
-    return with_mode(SplatFile(gaussians, info={"format": NAME, "comments": comments}), mode_from_comments(comments))
+    notes = (NO_DEGREE_4,) if sh.shape[1] > 16 else ()
+    info = {"format": NAME, "comments": comments}
+    return with_mode(SplatFile(gaussians, info=info, notes=notes), mode_from_comments(comments))
 
 
 def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
@@ -131,7 +133,11 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
         steps_of_rest = np.clip(np.floor((rest / (2 * SH_LIMIT) + 0.5) * 256), 0, 255).astype(np.uint8)
         elements["sh"] = {f"f_rest_{i}": np.ascontiguousarray(column) for i, column in enumerate(steps_of_rest.T)}
     write_ply_elements(path, elements, comments=("written by kfgs", *comments_of_mode(splats)))
-    return describe_loss(splats, ".compressed.ply", 3) + _words_of_clipping(g)
+    return (
+        describe_loss(splats, ".compressed.ply", 3)
+        + describe_coarse(g, _half_steps(values[0], _STEPS), ".compressed.ply")
+        + _words_of_clipping(g, _half_steps(values[2], _COLOR_STEPS))
+    )
 
 
 def precision(gaussians: Gaussians) -> Precision:
@@ -184,7 +190,7 @@ def _position_between(bounds: _Bounds, values: NDArray[np.float64]) -> NDArray[n
 
 def _between(bounds: _Bounds, fraction: NDArray[np.float32]) -> NDArray[np.float32]:  # [N, 3]
     chunk = np.arange(len(fraction)) // CHUNK
-    with np.errstate(over="ignore", invalid="ignore"):  # refused by the caller
+    with np.errstate(over="ignore", invalid="ignore"):  # left out
         return bounds.low[chunk] + fraction * (bounds.high - bounds.low)[chunk]
 
 
@@ -221,9 +227,9 @@ def _read_rest(path: Path, columns: Columns | None, n: int) -> NDArray[np.float3
         return np.zeros((n, 0, 3), np.float32)
     names = [f"f_rest_{i}" for i in range(len(columns))]
     types = {column.dtype.name for column in columns.values()}
-    if len(names) not in (9, 24, 45) or set(names) != set(columns) or types != {"uint8"}:
+    if len(names) not in (9, 24, 45, 72) or set(names) != set(columns) or types != {"uint8"}:
         raise ValueError(
-            f"{path}: expected an 'sh' element of 9, 24 or 45 bytes f_rest_0, f_rest_1, ..., got {len(columns)} columns; "
+            f"{path}: expected an 'sh' element of 9, 24, 45 or 72 bytes f_rest_0, f_rest_1, ..., got {len(columns)} columns; "
             "write the file again"
         )
     if len(columns["f_rest_0"]) != n:
@@ -246,7 +252,6 @@ def _read_bounds(path: Path, chunk: Columns, axes: tuple[tuple[str, ...], tuple[
             f"{path}: expected 'chunk' with float {', '.join(names)}, {', '.join(wrong)} missing; write the file again"
         )
     low, high = (np.stack([chunk[name] for name in side], 1) for side in axes)
-    check_finite(path, bounds=np.concatenate([low, high], 1))
     return _Bounds(low, high)
 
 
@@ -266,8 +271,10 @@ def _check_elements(path: Path, chunk: Columns, vertex: Columns) -> int:
     return n
 
 
-def _words_of_clipping(g: Gaussians) -> tuple[str, ...]:
-    """Describe the values that the fixed ranges cut off."""
+def _words_of_clipping(
+    g: Gaussians, shades: NDArray[np.float64]
+) -> tuple[str, ...]:  # shades: [N, 3], errors of colours
+    """Describe the values that the fixed ranges cut off, and colours rounded because others of their chunk are far off."""
     assert g.sh is not None
     lost = []
     small = int((g.scales.log().abs() > LOG_SCALE_LIMIT).any(1).sum())
@@ -276,4 +283,10 @@ def _words_of_clipping(g: Gaussians) -> tuple[str, ...]:
     large = int((g.sh[:, 1:].abs() > SH_LIMIT).any(2).any(1).sum())
     if large:
         lost.append(f"strong higher harmonics of {large} Gaussians: .compressed.ply holds -4 to 4")
+    rough = (shades > _ROUGH).any(1)
+    if rough.any():
+        lost.append(
+            f"base colours of {int(rough.sum()):,} Gaussians, by up to {shades.max():.3g} (1 is white): others near them have "
+            "colours far outside 0 to 1"
+        )
     return tuple(lost)

@@ -39,14 +39,15 @@ from .render_mode import describe_lost_mode
 from .splat_file import SCORE, Precision, SplatFile
 from .values import (
     EXACT,
+    NO_DEGREE_4,
     SH_C0,
     UP_AND_BACK,
-    check_finite,
     colours_to_write,
     describe_loss,
     flip_axes,
     positive_scales,
     unit_quats,
+    whole_labels,
 )
 
 NAME = "gltf"
@@ -64,6 +65,7 @@ class _Part(NamedTuple):
     gaussians: Gaussians
     extra: Columns
     classes: tuple[str, ...]
+    notes: tuple[str, ...]
 
 
 def matches(head: bytes) -> bool:
@@ -117,8 +119,9 @@ def read(path: Path) -> SplatFile:
             f"{path}: expected a primitive with {EXTENSION}, got {ignored} primitives without; it holds no splats"
         )
     info = {"format": NAME, "color_space": ", ".join(sorted(spaces)), "primitives": len(parts), "ignored": ignored}
-    gaussians, extra, classes = _join(parts)
-    return SplatFile(flip_axes(gaussians, UP_AND_BACK), extra, classes, info, tuple(sorted(notes)))
+    whole = _join(parts)
+    all_notes = (*sorted(notes), *whole.notes)
+    return SplatFile(flip_axes(whole.gaussians, UP_AND_BACK), whole.extra, whole.classes, info, all_notes)
 
 
 def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
@@ -211,13 +214,12 @@ def _read_primitive(document: Document, primitive: dict[str, Any], where: str) -
     if means is None or quats is None or scales is None or opacities is None or base is None:
         raise document.wrong(f"{where}.attributes", "POSITION, ROTATION, SCALE, OPACITY and SH_DEGREE_0", [*attributes])
     coefficients = [base, *_higher(document, attributes, where, len(means))]
-    check_finite(document.path, positions=means, rotations=quats, scales=scales, opacities=opacities)
-    if opacities.size and not 0 <= opacities.min() <= opacities.max() <= 1:
-        raise document.wrong(f"{where}.OPACITY", "values in [0, 1]", [float(opacities.min()), float(opacities.max())])
+    outside = opacities[np.isfinite(opacities) & ((opacities < 0) | (opacities > 1))]
+    if outside.size:
+        raise document.wrong(f"{where}.OPACITY", "values in [0, 1]", outside[:4].tolist())
     if (scales < 0).any():  # "MUST NOT be negative": a draft's logarithms
         scales = np.exp(np.minimum(scales, np.float32(80)))
     sh = np.stack(coefficients, 1)
-    check_finite(document.path, colours=sh)
     gaussians = Gaussians(
         means=torch.from_numpy(means),
         quats=torch.from_numpy(quats)[:, [3, 0, 1, 2]],
@@ -237,11 +239,11 @@ def _coefficient(k: int) -> str:
 def _higher(
     document: Document, attributes: dict[str, Any], where: str, count: int
 ) -> list[NDArray[np.float32]]:  # of [N, 3]
-    """The coefficients of degrees 1 to 3, as far as present; each degree must be complete, and none skipped."""
-    have = [k for k in range(1, 16) if _coefficient(k) in attributes]
-    if len(have) not in (0, 3, 8, 15) or have != list(range(1, len(have) + 1)):
+    """The coefficients of degrees 1 to 4, as far as present; each degree must be complete, and none skipped."""
+    have = [k for k in range(1, 25) if _coefficient(k) in attributes]
+    if len(have) not in (0, 3, 8, 15, 24) or have != list(range(1, len(have) + 1)):
         raise document.wrong(f"{where}.attributes", "whole degrees of harmonics", [_coefficient(k) for k in have][-3:])
-    return [read_accessor(document, attributes[_coefficient(k)], 3, count) for k in have]
+    return [read_accessor(document, attributes[_coefficient(k)], 3, count) for k in have if k < 16]
 
 
 def _read_columns(
@@ -261,14 +263,15 @@ def _read_columns(
         name = names.get(attribute)
         name = name if isinstance(name, str) else attribute[1:].lower()
         extra[name] = read_accessor(document, index, 1, len(gaussians))[:, 0].copy()
+    notes = (NO_DEGREE_4,) if _coefficient(16) in attributes else ()
     labels = extra.pop("class_id", None)
     if labels is not None:
-        if not (labels == np.trunc(labels)).all() or (labels < -1).any() or (labels > EXACT).any():
+        if (labels != np.trunc(labels))[np.isfinite(labels)].any() or (labels < -1).any() or (labels > EXACT).any():
             raise document.wrong(f"{where}._CLASS_ID", "whole numbers of -1 or more", labels[:4].tolist())
-        gaussians = gaussians.replace(labels=torch.from_numpy(labels.astype(np.int64)))
+        gaussians = gaussians.replace(labels=whole_labels(labels))
     if labels is None or not isinstance(classes, list) or not all(isinstance(name, str) for name in classes):
         classes = []
-    return _Part(gaussians, extra, tuple(classes))
+    return _Part(gaussians, extra, tuple(classes), notes)
 
 
 def _join(parts: list[_Part]) -> _Part:
@@ -289,7 +292,8 @@ def _join(parts: list[_Part]) -> _Part:
     shared = [name for name in parts[0].extra if all(name in part.extra for part in parts)]
     extra = {name: np.concatenate([part.extra[name] for part in parts]) for name in shared}
     classes = max((part.classes for part in parts), key=len) if labelled else ()
-    return _Part(Gaussians.cat(padded), extra, classes)
+    notes = tuple(dict.fromkeys(note for part in parts for note in part.notes))
+    return _Part(Gaussians.cat(padded), extra, classes, notes)
 
 
 def _fallback(g: Gaussians) -> NDArray[np.uint8]:  # [N, 4]

@@ -14,7 +14,6 @@ from ..cameras.similarity import Similarity
 from ..gaussians import Gaussians
 from ..splat.transform import transform_gaussians
 from .gltf_container import Document
-from .values import check_finite
 
 _DEEPEST = 256  # nodes below nodes
 
@@ -56,8 +55,7 @@ def place(document: Document, where: str, gaussians: Gaussians, matrix: Tensor) 
     """Apply a node's matrix to the Gaussians of its mesh, and turn their colours with it.
 
     Raises:
-        ValueError: if the node mirrors, shears or scales the axes differently, or moves Gaussians out of the range of
-            float32.
+        ValueError: if the node mirrors, shears or scales the axes differently.
     """
     if torch.equal(matrix, torch.eye(4, dtype=torch.float64)):
         return gaussians
@@ -68,9 +66,7 @@ def place(document: Document, where: str, gaussians: Gaussians, matrix: Tensor) 
             f"{document.path}: {where}: expected a rotation, one scale for all axes and a translation ({error}); apply "
             "the node's transform in the program that wrote it"
         ) from error
-    moved = transform_gaussians(gaussians, similarity)
-    check_finite(document.path, positions=moved.means.numpy(), scales=moved.scales.numpy())
-    return moved
+    return transform_gaussians(gaussians, similarity)
 
 
 def _children(document: Document, index: int) -> list[Any]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..gaussians import Gaussians
 from .splat_file import SplatFile
-from .values import SH_C0, check_finite, positive_scales, unit_quats
+from .values import SH_C0, positive_scales
 
 NAME = "ksplat"
 SUFFIXES = (".ksplat",)
@@ -62,7 +62,7 @@ def read(path: Path) -> SplatFile:
     """Read a .ksplat file of compression level 0, 1 or 2 and harmonics of degree 0 to 2.
 
     Raises:
-        ValueError: if it is damaged: truncated, of another version, with counts that disagree or numbers not finite.
+        ValueError: if it is damaged: truncated, of another version, with counts that disagree.
     """
     data = path.read_bytes()
     if len(data) < _HEADER_BYTES:
@@ -132,21 +132,20 @@ def _read_section(
             raise ValueError(f"{path}: expected bucket centres of 12 bytes, got {s.bucket_bytes}; the file is damaged")
         centres = np.frombuffer(data, "<f4", 3 * s.buckets, centres_at).reshape(-1, 3)
         quantum = s.quantum or 32767
-        with np.errstate(over="ignore", invalid="ignore"):  # overflow is refused below
+        with np.errstate(over="ignore", invalid="ignore"):  # overflow is left out
             offsets = (means - quantum) * np.float32(s.block_size / 2 / quantum)
             means = offsets.astype(np.float64) + centres[_buckets(path, s, lengths)]
     scales, quats = rows["scales"].astype(np.float32), rows["quats"].astype(np.float32)
     sh = rows["sh"].astype(np.float32)
     if level == 2:
         sh = np.float32(sh_range[0]) + sh * np.float32((sh_range[1] - sh_range[0]) / 255)
-    check_finite(path, positions=means, scales=scales, rotations=quats, harmonics=sh)
     rgba = torch.from_numpy(rows["rgba"].astype(np.float32)) / 255
     rest = torch.zeros(s.size, (degree + 1) ** 2 - 1, 3)
     if s.size:  # the degree of an empty section has no meaning
         rest[:, : (s.degree + 1) ** 2 - 1] = torch.from_numpy(_by_coefficient(sh))
     gaussians = Gaussians(
         means=torch.from_numpy(means),
-        quats=unit_quats(torch.from_numpy(quats)),
+        quats=torch.from_numpy(quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), np.float32(1e-12))),
         scales=positive_scales(path, scales),
         opacities=rgba[:, 3].contiguous(),
         sh=torch.cat([((rgba[:, :3] - 0.5) / SH_C0)[:, None], rest], 1),

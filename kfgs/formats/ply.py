@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from codecs import BOM_UTF8
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -52,10 +53,10 @@ def _parse_header(path: Path, file: BinaryIO) -> _Header:
     head = file.read(_HEADER_BYTES)
     end = head.find(b"\nend_header") + 1
     newline = head.find(b"\n", end)
-    if not head.startswith(b"ply") or end < 1 or newline < 0:
+    if not head.removeprefix(BOM_UTF8).startswith(b"ply") or end < 1 or newline < 0:
         raise ValueError(f"{path}: expected a PLY file ('ply' ... 'end_header'), got something else")
     layout, version, elements, comments = "", "", [], []
-    for line in head[:end].decode("ascii", "replace").splitlines():
+    for line in _decode(head[:end]).split("\n"):
         words = line.split()
         if words[:1] == ["format"] and len(words) > 1:
             layout, version = words[1], " ".join(words[2:])
@@ -79,6 +80,14 @@ def _parse_header(path: Path, file: BinaryIO) -> _Header:
         raise ValueError(f"{path}: expected elements of different names, got {names!r:.80}; write the file again")
     file.seek(newline + 1)
     return _Header(layout, elements, comments, newline + 1)
+
+
+def _decode(head: bytes) -> str:
+    """A header's text: UTF-8, or else Latin-1, which holds any bytes."""
+    try:
+        return head.decode("utf-8")
+    except UnicodeDecodeError:
+        return head.decode("latin-1")
 
 
 def _check_vertex(path: Path, header: _Header) -> _Element:
@@ -233,7 +242,7 @@ def write_ply_elements(path: str | Path, elements: dict[str, Columns], *, commen
         header += [f"property {_NAMES[rows.dtype[column].str[1:]]} {column}" for column in names]
         tables.append(rows)
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
+        file.write("\n".join([*header, "end_header\n"]).encode())
         for rows in tables:
             rows.tofile(file)
 
@@ -243,6 +252,9 @@ def _pack_rows(columns: Columns) -> NDArray[Any]:
     if len(set(lengths.values())) != 1:
         raise ValueError(f"columns: expected columns of one length, got {lengths}")
     codes = {name: values.dtype.str[1:] for name, values in columns.items()}
+    split = [name for name in columns if name.split() != [name]]
+    if split:
+        raise ValueError(f"columns: expected names without blanks, got {split!r:.80}; rename them")
     unknown = {name: code for name, code in codes.items() if code not in _NAMES}
     if unknown:
         raise ValueError(f"columns: expected types {sorted(_NAMES)}, got {unknown}; convert them with astype")

@@ -1,7 +1,8 @@
 """The common 3DGS layout of a PLY file: written first by Inria's script, read by most programs.
 
 Columns x y z nx ny nz f_dc_* f_rest_* opacity scale_* rot_*, with opacity as a logit, scale as a natural logarithm,
-rotation as (w, x, y, z) and f_rest channel by channel. kfgs adds `class_id` and `score`; every other column is kept.
+rotation as (w, x, y, z) and f_rest channel by channel. Some have red, green, blue in place of f_dc_*.
+kfgs adds `class_id` and `score`; every other column is kept.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from ..gaussians import Gaussians
 from .ply import points_from_columns, read_comments, read_ply, stack_columns, write_ply
 from .render_mode import comments_of_mode, mode_from_comments, with_mode
 from .splat_file import Columns, Precision, SplatFile
-from .values import EXACT, check_finite, colours_to_write, describe_loss, near_zero, positive_scales
+from .values import EXACT, NO_DEGREE_4, SH_C0, colours_to_write, describe_loss, positive_scales, whole_labels
 
 NAME = "ply"
 SUFFIXES = (".ply",)
@@ -29,6 +30,7 @@ HOLDS_LABELS = True
 HOLDS_ORIGIN = True
 FILTER = "filter_3D"  # Mip-Splatting's own files: the 3-D filter's deviation, not yet part of scales and opacities
 NORMALS = ("nx", "ny", "nz")  # always zero in 3DGS files; written, not kept
+RGB = ("red", "green", "blue")  # colours, if there is no f_dc_*
 COEFFICIENTS = 16  # of harmonics of degree 3, which Inria's script always writes
 
 
@@ -38,38 +40,43 @@ def matches(head: bytes) -> bool:
 
 
 def read(path: Path) -> SplatFile:
-    """Read a 3DGS PLY with any degree of spherical harmonics; unknown columns go to `extra`.
+    """Read a 3DGS PLY with spherical harmonics of degree 0 to 4 (4 is dropped); unknown columns go to `extra`.
 
     The comments, or columns, say whether it is antialiased or has surfels (`render_mode`).
 
     Raises:
-        ValueError: if it is damaged, no 3DGS file, or a value is not a finite number; opacities of 0 and 1, whose logits
-            are infinite, stay 0 and 1.
+        ValueError: if it is damaged, or no 3DGS file; opacities of 0 and 1, whose logits are infinite, stay 0 and 1.
     """
     columns = read_ply(path)
     try:
         gaussians = gaussians_from_columns(columns)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    _check_values(path, gaussians)
     gaussians = gaussians.replace(scales=positive_scales(path, gaussians.scales.numpy()))
-    extra = {name: values for name, values in columns.items() if not _is_ours(name)}
+    used = () if gaussians.sh is None or "f_dc_0" in columns else RGB
+    extra = {name: values for name, values in columns.items() if not _is_ours(name) and name not in used}
+    notes = (NO_DEGREE_4,) if "f_rest_45" in columns else ()
     mode = mode_from_comments(read_comments(path))
     mode = mode._replace(
         surfels=mode.surfels or "scale_2" not in columns, antialiased=mode.antialiased or FILTER in columns
     )
-    return with_mode(SplatFile(gaussians, extra, info={"format": NAME}), mode)
+    return with_mode(SplatFile(gaussians, extra, info={"format": NAME}, notes=notes), mode)
 
 
 def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
-    """Write the 3DGS layout, labels and extra columns included; x, y, z are double if it has an origin. Nothing is lost."""
+    """Write the 3DGS layout, labels and extra columns included; x, y, z are double if it has an origin.
+
+    Nothing is lost but columns whose name PLY cannot have.
+    """
     comments = ("written by kfgs", *comments_of_mode(splats))
     columns = columns_from_gaussians(splats.gaussians)
     if any(splats.gaussians.origin):
         places = to_world(splats.gaussians.means.detach().cpu(), splats.gaussians.origin)
         columns |= {name: places[:, i].numpy() for i, name in enumerate("xyz")}
-    write_ply(path, columns | splats.extra, comments=comments)
-    return ()
+    own = {name: values for name, values in splats.extra.items() if name.split() == [name] and name not in columns}
+    write_ply(path, columns | own, comments=comments)
+    left = {name: values for name, values in splats.extra.items() if name not in own}
+    return describe_loss(splats.replace(gaussians=splats.gaussians.replace(features=None), extra=left), ".ply", 3)
 
 
 def write_plain(path: Path, splats: SplatFile) -> tuple[str, ...]:
@@ -88,12 +95,6 @@ def write_plain(path: Path, splats: SplatFile) -> tuple[str, ...]:
 def precision(gaussians: Gaussians) -> Precision:
     """float32 of logarithms and logits."""
     return Precision(means=0.0, scales=1e-5, rotation=1e-3, opacities=1e-5, sh0=0.0, sh_rest=0.0)
-
-
-def _check_values(path: Path, g: Gaussians) -> None:
-    values = {"means": g.means, "rotations": g.quats, "scales": g.scales, "opacities": g.opacities}
-    values |= {name: v for name, v in (("colours", g.sh), ("features", g.features)) if v is not None}
-    check_finite(path, **{name: value.numpy() for name, value in values.items()})
 
 
 def _is_ours(name: str) -> bool:
@@ -129,46 +130,43 @@ def gaussians_from_columns(columns: Columns) -> Gaussians:
             f"columns: expected the 3DGS layout, {', '.join(missing)} missing; is this a plain point cloud?"
         )
     dc_names, rest, features = (_numbered(columns, group) for group in ("f_dc_", "f_rest_", "semantic_"))
-    for group, names, counts in (("f_dc_", dc_names, (0, 3)), ("f_rest_", rest, (0, 9, 24, 45))):
-        if len(names) not in counts or (rest and not dc_names):
+    colours = bool(dc_names) or all(name in columns for name in RGB)
+    for group, names, counts in (("f_dc_", dc_names, (0, 3)), ("f_rest_", rest, (0, 9, 24, 45, 72))):
+        if len(names) not in counts or (rest and not colours):
             raise ValueError(
                 f"columns: expected {group}0, {group}1, ... of {' or '.join(map(str, counts))} columns (f_rest_* only "
-                f"with f_dc_0 to f_dc_2), got {len(names)} {group}*; write the file again"
+                f"with f_dc_0 to f_dc_2), got {len(names)} {group}*; export the splat with whole degrees of harmonics"
             )
     sh = None
-    if dc_names:
-        dc = stack_columns(columns, dc_names)[:, None]
+    if colours:
+        dc = (stack_columns(columns, dc_names) if dc_names else _dc_from_rgb(columns))[:, None]
         higher = dc[:, :0]
         if rest:  # stored channel-major
             higher = stack_columns(columns, rest).view(len(dc), 3, len(rest) // 3).transpose(1, 2)
-        sh = torch.cat([dc, higher], 1)
+        sh = torch.cat([dc, higher], 1)[:, :COEFFICIENTS]
     scales = stack_columns(columns, [f"scale_{i}" for i in range(3)]).exp()
     opacities = stack_columns(columns, ["opacity"])[:, 0].sigmoid()
     if FILTER in columns:  # Yu et al. 2024, eq. 7: a Gaussian that is widened becomes fainter
         narrow = scales.double()
         wide = (narrow**2 + stack_columns(columns, [FILTER]).double() ** 2).sqrt()
         scales, opacities = wide.float(), (opacities * (narrow / wide.clamp_min(1e-300)).prod(dim=1)).float()
-    cloud = Gaussians(
+    return Gaussians(
         means=points_from_columns(columns),
         quats=stack_columns(columns, [f"rot_{i}" for i in range(4)]),
         scales=scales,
         opacities=opacities,
         features=stack_columns(columns, features) if features else None,
         sh=sh,
-        labels=_labels(columns["class_id"]) if "class_id" in columns else None,
+        labels=whole_labels(columns["class_id"]) if "class_id" in columns else None,
     )
-    return near_zero(cloud)
 
 
-def _labels(values: NDArray[Any]) -> Tensor:  # [N] -> [N] int64
-    """Labels of any type of numbers; a ValueError for a number that is not whole."""
-    whole = np.isfinite(values) & (values == np.trunc(values)) & (np.abs(values.astype(np.float64)) < 2**53)
-    if not whole.all():
-        row = int((~whole).argmax())
-        raise ValueError(
-            f"class_id: expected whole numbers, got {values[row]} at Gaussian {row}; are these scores? name the column score"
-        )
-    return torch.from_numpy(values.astype(np.int64))
+def _dc_from_rgb(columns: Columns) -> Tensor:  # [N, 3]
+    """Coefficients of degree 0 from colours: whole numbers up to 255 (65535 if wider), or fractions from 0 to 1."""
+    rgb = stack_columns(columns, [*RGB])
+    code = columns[RGB[0]].dtype
+    largest = 1.0 if code.kind == "f" and not bool((rgb > 2).any()) else 255.0
+    return (rgb / (65535.0 if code == np.uint16 else largest) - 0.5) / SH_C0
 
 
 def columns_from_gaussians(gaussians: Gaussians) -> Columns:

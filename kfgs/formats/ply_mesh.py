@@ -76,7 +76,7 @@ def _read_faces(
 def _split(path: Path, face: _Element) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
     """The properties before and after the list."""
     with path.open("rb") as file:
-        head = file.read(1 << 20).split(b"end_header")[0].decode("ascii", "replace").splitlines()
+        head = file.read(1 << 20).split(b"end_header")[0].decode("latin-1").split("\n")
     with reading(path, "a mesh whose header has 'element face' and its list"):
         start = next(i for i, line in enumerate(head) if line.split()[:2] == ["element", "face"])
         place = next(i for i, line in enumerate(head[start:]) if line.split()[:2] == ["property", "list"])

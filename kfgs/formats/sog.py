@@ -35,7 +35,7 @@ from .smallest_three import pack_smallest_three, rotation_error, unpack_smallest
 from .sog_images import META, SogFiles, encode_image, write_zip
 from .sog_meta import SogMeta, parse_meta
 from .splat_file import Precision, SplatFile
-from .values import check_finite, colours_to_write, describe_loss, positive_scales
+from .values import NO_DEGREE_4, colours_to_write, describe_coarse, describe_loss, positive_scales
 
 NAME = "sog"
 SUFFIXES = (".sog",)
@@ -83,18 +83,18 @@ def _read(path: Path, find: Callable[[str], Path]) -> SplatFile:
         sh = np.concatenate([_look_up(meta.tables["sh0"], rgba[:, :3])[:, None], _read_rest(files, meta)], 1)
     bounds = np.array(meta.bounds)  # [2, 3]
     logs = bounds[0] + (bounds[1] - bounds[0]) * ((low + 256 * high) / _LEVELS)
-    with np.errstate(over="ignore", invalid="ignore"):  # refused below
+    with np.errstate(over="ignore", invalid="ignore"):  # left out
         means = np.sign(logs) * np.expm1(np.abs(logs))
         linear = np.exp(_look_up(meta.tables["scales"], scales[:, :3]))
-    check_finite(path, means=means, scales=linear, sh=sh)
     gaussians = Gaussians(
         means=torch.from_numpy(means),
         quats=quats,
         scales=positive_scales(path, linear),
         opacities=_opacities(meta, rgba[:, 3]),
-        sh=torch.from_numpy(sh),
+        sh=torch.from_numpy(sh[:, :16]),
     )
-    splats = with_mode(SplatFile(gaussians, info={"format": NAME, **meta.facts}), meta.mode)
+    notes = (NO_DEGREE_4,) if sh.shape[1] > 16 else ()
+    splats = with_mode(SplatFile(gaussians, info={"format": NAME, **meta.facts}, notes=notes), meta.mode)
     return read_sidecar(path.parent, splats) if path.name == META else splats  # labels are next to the folder
 
 
@@ -104,7 +104,8 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
     Raises:
         ValueError: if the cloud has no colours, or there is a folder of that name with files that do not belong to a SOG scene.
     """
-    files = _encode(colours_to_write(splats.gaussians, ".sog"), meta_of_mode(splats))
+    g = colours_to_write(splats.gaussians, ".sog")
+    files = _encode(g, meta_of_mode(splats))
     if path.name.lower().endswith(SUFFIXES):
         with atomic_path(path) as temporary:
             write_zip(temporary, files)
@@ -115,7 +116,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
                 (folder / name).write_bytes(data)
         for name in set(REST_FILES) - set(files):  # of an older scene with more harmonics
             (path / name).unlink(missing_ok=True)
-    return describe_loss(splats, ".sog", 3)
+    return describe_loss(splats, ".sog", 3) + describe_coarse(g, _errors(g.means.numpy()), ".sog")
 
 
 def precision(gaussians: Gaussians) -> Precision:
@@ -125,12 +126,9 @@ def precision(gaussians: Gaussians) -> Precision:
     """
     g = colours_to_write(gaussians, ".sog").select(morton_order(gaussians.means).cpu())
     assert g.sh is not None
-    logs = _log_positions(gaussians.means.detach().cpu().double().numpy())
-    half_step = (logs.max(0) - logs.min(0)) / _LEVELS / 2 if len(g) else np.zeros(3)
-    means = np.exp(np.abs(logs)) * np.expm1(half_step) * (1 + 1e-6) + np.exp(np.abs(logs)) * 2.0**-23
     rest = _fit_rest(g.sh)
     return Precision(
-        means=torch.from_numpy(means),
+        means=_errors(gaussians.means.detach().cpu().double().numpy()),
         scales=math.expm1(_code_error(g.scales.log().numpy())) + 1e-5,
         rotation=rotation_error(255),
         opacities=0.5 / 255 + 1e-6,
@@ -176,8 +174,8 @@ def _read_rest(files: SogFiles, meta: SogMeta) -> NDArray[np.float32]:  # [N, K 
     labels = _pixels(files, names[1], meta.gaussians)[:, :2].astype(np.int64) @ np.array([1, 256])
     size = int(labels.max(initial=-1)) + 1 if meta.palette is None else meta.palette
     lines = -(-size // _PER_LINE)
-    widths = {1: 3 * _PER_LINE, 2: 8 * _PER_LINE, 3: 15 * _PER_LINE}
-    image = files.read_image(names[0], lines * widths[meta.degree or 1], max(lines, 1024) * widths[3])[:, :, :3]
+    widths = {1: 3 * _PER_LINE, 2: 8 * _PER_LINE, 3: 15 * _PER_LINE, 4: 24 * _PER_LINE}
+    image = files.read_image(names[0], lines * widths[meta.degree or 1], max(lines, 1024) * widths[4])[:, :, :3]
     expected = [widths[meta.degree]] if meta.degree else list(widths.values())
     if image.shape[1] not in expected or len(image) < lines:
         raise ValueError(
@@ -197,6 +195,14 @@ def _read_rest(files: SogFiles, meta: SogMeta) -> NDArray[np.float32]:  # [N, K 
 
 def _log_positions(means: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sign(means) * np.log1p(np.abs(means))
+
+
+def _errors(means: NDArray[np.float64]) -> Tensor:  # [N, 3] -> [N, 3]
+    """The largest errors of positions: half a step of the logarithm."""
+    logs = _log_positions(means)
+    half_step = (logs.max(0) - logs.min(0)) / _LEVELS / 2 if len(means) else np.zeros(3)
+    size = np.exp(np.abs(logs))
+    return torch.from_numpy(size * np.expm1(half_step) * (1 + 1e-6) + size * 2.0**-23)
 
 
 def _encode(g: Gaussians, mode: dict[str, Any]) -> dict[str, bytes]:

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from .._card import short_repr
 from .render_mode import Mode, mode_from_meta
-
-_BYTES_TO_GAUSSIANS = 64  # the most Gaussians per byte: even equal ones need a few bits each
+from .values import check_count
 
 
 class SogMeta(NamedTuple):
@@ -48,10 +47,8 @@ def parse_meta(path: Path, meta: dict[str, Any], size: int) -> SogMeta:
         raise ValueError(f"{path}: expected SOG version 1 or 2, got {version!r:.40}; export it as version 2")
     shapes = _get(path, meta, "means", "shape") if version == 1 else None
     count = meta.get("count") if version == 2 else shapes[0] if isinstance(shapes, list) and shapes else None
-    if type(count) is not int or not 0 <= count <= _BYTES_TO_GAUSSIANS * size:
-        raise ValueError(
-            f"{path}: expected a count of Gaussians that {size} bytes can hold, got {count!r:.40}; the file is damaged"
-        )
+    if type(count) is not int or count < 0:
+        raise ValueError(f"{path}: expected a count of Gaussians, got {count!r:.40}; the file is damaged")
     groups = {"means": 2, "scales": 1, "quats": 1, "sh0": 1} | ({"shN": 2} if meta.get("shN") else {})
     files = {name: _file_names(path, meta, name, number) for name, number in groups.items()}
     fit = _table_v1 if version == 1 else _table_v2
@@ -59,7 +56,8 @@ def parse_meta(path: Path, meta: dict[str, Any], size: int) -> SogMeta:
     palette = degree = None
     if version == 2 and "shN" in files:
         palette = _whole(path, meta, "count", 1, 1 << 16)
-        degree = _whole(path, meta, "bands", 1, 3)
+        degree = _whole(path, meta, "bands", 1, 4)
+    check_count(path, count, (degree or 3) if "shN" in files else 0, size)
     logits = None
     if version == 1:
         ends = [_numbers(path, _get(path, meta, "sh0", key), f"sh0.{key}", 4)[3] for key in ("mins", "maxs")]

@@ -20,7 +20,6 @@ from .splat_file import Precision, SplatFile
 from .values import (
     SH_C0,
     byte_error,
-    check_finite,
     colours_to_write,
     describe_cut,
     describe_loss,
@@ -44,7 +43,7 @@ def read(path: Path) -> SplatFile:
     """Read a .splat file: colours of degree 0, opacities as stored (0 and 1 included).
 
     Raises:
-        ValueError: if its size is no multiple of 32 bytes, or a float is not finite, or a scale negative.
+        ValueError: if its size is no multiple of 32 bytes, or most scales are negative.
     """
     size = path.stat().st_size
     if size % RECORD.itemsize:
@@ -53,12 +52,12 @@ def read(path: Path) -> SplatFile:
             "file is truncated, or of another format"
         )
     rows = np.fromfile(path, dtype=RECORD)
-    check_finite(path, means=rows["means"], scales=rows["scales"])
     rgba = torch.from_numpy(rows["rgba"].astype(np.float32)) / 255
     quats = (torch.from_numpy(rows["quats"].astype(np.float32)) - 128) / 128
+    quats[~rows.view(np.uint8).reshape(-1, RECORD.itemsize).any(1)] = 0  # a row of zeros
     gaussians = Gaussians(
         means=torch.from_numpy(rows["means"].copy()),
-        quats=unit_quats(quats),
+        quats=quats / quats.norm(dim=1, keepdim=True).clamp(min=1e-12),  # 0 stays 0
         scales=positive_scales(path, rows["scales"]),
         opacities=rgba[:, 3].contiguous(),
         sh=((rgba[:, :3] - 0.5) / SH_C0)[:, None],

@@ -45,7 +45,15 @@ from .spz_codec import (
     unpack,
 )
 from .spz_streams import ANTIALIASED, GZIP, MAGIC, MAX_FRACTIONAL_BITS, Container, read_container, write_container
-from .values import UP_AND_BACK, check_splats, colours_to_write, describe_cut, describe_loss
+from .values import (
+    NO_DEGREE_4,
+    UP_AND_BACK,
+    check_splats,
+    colours_to_write,
+    describe_coarse,
+    describe_cut,
+    describe_loss,
+)
 
 NAME = "spz"
 SUFFIXES = (".spz",)
@@ -55,7 +63,6 @@ LABELS = 0x4B460001  # vendor 0x4B46 (KF), extension 1
 _LABELS_VERSION, _HAS_SCORE = 1, 0x1
 _LABELS_HEAD = struct.Struct("<HHII")
 _MAX_NAMES = 1 << 20
-_SPARSE_BITS = 8  # with fewer bits after the point (steps of 1/256 unit), the loss is reported
 
 
 def matches(head: bytes) -> bool:
@@ -71,8 +78,8 @@ def matches(head: bytes) -> bool:
 def read(path: Path) -> SplatFile:
     """Read an SPZ file of version 1, 2, 3 or 4, gzipped or plain, into the axes of the 3DGS PLY.
 
-    `info` has `version`, `fractional_bits`, `extensions` (types of records that were not understood, in
-    hexadecimal) and `dropped` where the file has harmonics of degree 4.
+    `info` has `version`, `fractional_bits`, and `extensions` (types of records that were not understood, in hexadecimal).
+    Harmonics of degree 4 are dropped.
 
     Raises:
         ValueError: if it is damaged, of another version, or in axes that no flip turns into those of the PLY.
@@ -83,9 +90,8 @@ def read(path: Path) -> SplatFile:
     label_record = records.pop(LABELS, None)
     info: dict[str, Any] = {"format": NAME, "version": c.version}
     info |= {"fractional_bits": c.fractional_bits, "extensions": [f"{kind:#010x}" for kind in records]}
-    if c.degree > 3:
-        info["dropped"] = f"spherical harmonics of degree {c.degree}: degree 3 was kept"
-    splats = with_mode(SplatFile(unpack(path, c, axes), info=info), Mode(bool(c.flags & ANTIALIASED)))
+    splats = SplatFile(unpack(c, axes), info=info, notes=(NO_DEGREE_4,) if c.degree > 3 else ())
+    splats = with_mode(splats, Mode(bool(c.flags & ANTIALIASED)))
     if label_record is None:
         return splats
     labels = _unpack_labels(path, label_record, c.count)
@@ -139,7 +145,7 @@ def write_spz(
         raise ValueError(
             f"means: expected coordinates within {2.0 ** (23 - fractional_bits):g} units for {fractional_bits} fractional "
             f"bits, got {g.means.abs().max().item():g}; "
-            + (f"choose {most} bits or fewer" if most >= 0 else "remove far Gaussians first")
+            + (f"choose {most} bits or fewer" if most >= 0 else "write .ply or .sog, which have no such limit")
         )
     assert g.sh is not None
     degree = int(g.sh.shape[1] ** 0.5) - 1
@@ -237,11 +243,7 @@ def _axes(path: Path, record: bytes | None) -> tuple[int, int, int]:
 
 def _lost(splats: SplatFile, g: Gaussians, fractional_bits: int) -> tuple[str, ...]:
     lost = list(describe_loss(splats, ".spz", 3) + describe_lost_mode(splats, ".spz", antialiased=True))
-    if fractional_bits < _SPARSE_BITS:
-        lost.append(
-            f"positions finer than {2.0**-fractional_bits:g} units: the cloud reaches {g.means.abs().max().item():g} units "
-            "from the origin, and .spz has 24 bits a coordinate"
-        )
+    lost += describe_coarse(g, 0.5 * 2.0**-fractional_bits, ".spz")
     assert g.sh is not None
     lost += describe_cut(g.sh[:, :1], -DC, DC, "colours", ".spz")
     lost += describe_cut(g.sh[:, 1:], -1.0, 127 / 128, "higher harmonics", ".spz")

@@ -10,7 +10,6 @@ bytes before version 3); sh: (byte - 128) / 128, coefficient by coefficient, red
 from __future__ import annotations
 
 from math import exp, floor, log2, sqrt
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -21,7 +20,7 @@ from ..gaussians import Gaussians
 from .smallest_three import join_largest, split_largest
 from .splat_file import Precision
 from .spz_streams import MAX_FRACTIONAL_BITS, Container
-from .values import UP_AND_BACK, byte_error, check_finite, flip_axes, unit_quats
+from .values import UP_AND_BACK, byte_error, flip_axes, unit_quats
 
 Bytes = NDArray[np.uint8]
 DC = 0.5 / 0.15  # the degree-0 coefficient of byte 255
@@ -30,14 +29,9 @@ _MAX_FIXED = (1 << 23) - 1
 _COMMON_BITS, _STEPS = 12, 14  # bits that every writer uses; a small cloud gets 2^14 steps across
 
 
-def unpack(path: Path, c: Container, axes: tuple[int, int, int] = UP_AND_BACK) -> Gaussians:
-    """The Gaussians of a container, in the axes of the 3DGS PLY; harmonics of degree 4 are left out.
-
-    Raises:
-        ValueError: if a float16 position (version 1) is not finite.
-    """
+def unpack(c: Container, axes: tuple[int, int, int] = UP_AND_BACK) -> Gaussians:
+    """The Gaussians of a container, in the axes of the 3DGS PLY; harmonics of degree 4 are left out."""
     means = _unpack_positions(c)
-    check_finite(path, positions=means)
     quats = _unpack_xyz(c.streams["rotations"]) if c.version < 3 else _unpack_smallest_three(c.streams["rotations"])
     kept = (min(c.degree, 3) + 1) ** 2 - 1
     coefficients = c.streams["sh"].reshape(c.count, (c.degree + 1) ** 2 - 1, 3)[:, :kept]

@@ -7,6 +7,8 @@ a flag; readers skip types that they do not know. All numbers are little-endian.
 
 from __future__ import annotations
 
+import gzip
+import io
 import struct
 import zlib
 from dataclasses import dataclass, field
@@ -16,8 +18,10 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
+from .._arrays import most_unpacked
 from .._card import short_repr
 from .._files import atomic_path
+from .values import check_count
 
 MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"
@@ -28,9 +32,6 @@ _LEGACY = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, fractiona
 _HEADER = struct.Struct("<4sIIBBBBI12x")  # the same, but the number of streams, and where the table begins
 _ENTRY = struct.Struct("<QQ")  # compressed and plain bytes of a stream
 _RECORD = struct.Struct("<II")
-_SLACK = 1 << 26  # bytes that may always be unpacked, whatever the file's size
-_GZIP_RATIO, _ZSTD_RATIO = 1032, 4096  # the best ratio of deflate; Zstandard exceeds its for equal Gaussians only
-_MAX_EXTENSIONS = 1 << 28  # bytes after the streams of a version 1 to 3 file
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,10 +98,8 @@ def write_container(path: Path, container: Container) -> None:
         file.writelines(parts)
 
 
-def _check_header(
-    path: Path, data: bytes | bytearray, ratio: int, size: int
-) -> tuple[int, int, int, int, int, dict[str, int]]:
-    """Check the fields that all versions share, and that `size` bytes can hold the streams; returns their sizes."""
+def _check_header(path: Path, data: bytes) -> tuple[int, int, int, int, int, dict[str, int]]:
+    """Check the fields that all versions share; returns them, and the sizes of the streams."""
     _, version, count, degree, bits, flags, _ = _LEGACY.unpack_from(data)
     if not 1 <= version <= 4:
         raise ValueError(
@@ -114,53 +113,45 @@ def _check_header(
         raise ValueError(
             f"{path}: expected 0 to {MAX_FRACTIONAL_BITS} fractional bits, got {bits}; the header is damaged"
         )
-    sizes = stream_sizes(version, count, degree)
-    if sum(sizes.values()) > ratio * size + (_SLACK if ratio > 1 else 0):
-        raise ValueError(
-            f"{path}: the header promises {count} Gaussians ({sum(sizes.values())} bytes), which a file of {size} bytes "
-            "cannot hold; it is truncated, or damaged"
-        )
-    return version, count, degree, bits, flags, sizes
+    return version, count, degree, bits, flags, stream_sizes(version, count, degree)
 
 
-def _inflate(path: Path, data: bytes) -> bytearray:
+def _inflate(path: Path, data: bytes) -> bytes:
     """The plain bytes of a gzip stream (one member or several), at most as many as its SPZ header implies."""
-    plain, rest, complete = bytearray(), data, False
     try:
-        limit = _plain_limit(path, zlib.decompressobj(wbits=31).decompress(data, _LEGACY.size), len(data))
-        while rest[:2] == GZIP and len(plain) <= limit:
-            member = zlib.decompressobj(wbits=31)
-            plain += member.decompress(rest, limit + 1 - len(plain))  # never 0: that means no limit
-            complete, rest = member.eof, member.unused_data
-    except zlib.error as error:
+        with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+            head = file.read(_LEGACY.size)
+            if head[:4] != MAGIC or len(head) < _LEGACY.size:
+                raise ValueError(
+                    f"{path}: expected an SPZ header in the gzip stream (NGSP), got {head[:4]!r}; the file is truncated, or of "
+                    "another format"
+                )
+            _, count, degree, _, flags, sizes = _check_header(path, head)
+            check_count(path, count, degree, len(data))
+            size = sum(sizes.values())
+            limit = (
+                most_unpacked(len(data)) if flags & ~ANTIALIASED else size
+            )  # other flags announce more after the streams
+            plain = file.read(limit + 1)
+    except EOFError as error:
+        raise ValueError(f"{path}: expected a whole gzip stream, got a part; the file is truncated") from error
+    except (zlib.error, OSError) as error:
         raise ValueError(
             f"{path}: expected a gzip stream, but it cannot be unpacked ({error}); it is damaged"
         ) from error
     if len(plain) > limit:
         raise ValueError(f"{path}: expected {limit} plain bytes by its header, got more; the file is damaged")
-    if not complete:
-        raise ValueError(f"{path}: expected a whole gzip stream, got {len(plain)} plain bytes; the file is truncated")
-    if rest.strip(b"\0"):
-        raise ValueError(f"{path}: expected the end after the gzip stream, got {len(rest)} bytes more; it is damaged")
-    return plain
+    return head + plain
 
 
-def _plain_limit(path: Path, head: bytes, size: int) -> int:
-    """How many plain bytes a gzip file of `size` bytes may hold, by its first 16 plain ones."""
-    if head[:4] != MAGIC or len(head) < _LEGACY.size:
-        raise ValueError(
-            f"{path}: expected an SPZ header in the gzip stream (NGSP), got {bytes(head[:4])!r}; the file is truncated, or of "
-            "another format"
-        )
-    *_, flags, sizes = _check_header(path, head, _GZIP_RATIO, size)
-    more = min(_MAX_EXTENSIONS, _GZIP_RATIO * size) if flags & ~ANTIALIASED else 0
-    return _LEGACY.size + sum(sizes.values()) + more
-
-
-def _parse_legacy(path: Path, data: bytes | bytearray) -> Container:
-    version, count, degree, bits, flags, sizes = _check_header(path, data, 1, len(data) - _LEGACY.size)
+def _parse_legacy(path: Path, data: bytes) -> Container:
+    version, count, degree, bits, flags, sizes = _check_header(path, data)
     if version == 4:
         raise ValueError(f"{path}: expected version 1 to 3 in a gzip stream, got 4; the file is damaged")
+    if (needed := sum(sizes.values())) > len(data) - _LEGACY.size:
+        raise ValueError(
+            f"{path}: expected {needed} bytes for {count} Gaussians, got {len(data) - _LEGACY.size}; the file is truncated"
+        )
     streams, at = {}, _LEGACY.size
     for name, size in sizes.items():
         streams[name] = np.frombuffer(data, np.uint8, size, at)
@@ -174,7 +165,7 @@ def _parse_legacy(path: Path, data: bytes | bytearray) -> Container:
     return Container(version, count, degree, bits, flags, streams, records)
 
 
-def _parse_records(path: Path, data: bytes | bytearray) -> list[tuple[int, bytes]]:
+def _parse_records(path: Path, data: bytes) -> list[tuple[int, bytes]]:
     records, at = [], 0
     while at < len(data):
         kind, length = _RECORD.unpack_from(data, at) if at + _RECORD.size <= len(data) else (0, len(data))
@@ -192,7 +183,8 @@ def _parse_streams(path: Path, data: bytes) -> Container:
     """Version 4: 32 bytes of header, extension records, the table of contents, one Zstandard frame per stream."""
     if len(data) < _HEADER.size:
         raise ValueError(f"{path}: expected a header of {_HEADER.size} bytes, got {len(data)}; the file is truncated")
-    version, count, degree, bits, flags, sizes = _check_header(path, data, _ZSTD_RATIO, len(data))
+    version, count, degree, bits, flags, sizes = _check_header(path, data)
+    check_count(path, count, degree, len(data))
     *_, number, start = _HEADER.unpack_from(data)
     names = [name for name, size in sizes.items() if size] if number < len(sizes) else list(sizes)
     end = start + number * _ENTRY.size

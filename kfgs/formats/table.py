@@ -23,13 +23,13 @@ and a line in `MODULES`.
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+from codecs import BOM_UTF8
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
 from .._files import as_path
-from .._notes import tell
+from .._notes import is_strict, tell
 from .._origin import describe_origin
 from .._typed import typed
 from ..gaussians import Gaussians
@@ -37,7 +37,7 @@ from .folders import PATTERNS, splat_file_of
 from .order import morton_order
 from .sidecar import find_names, names_path, read_sidecar, write_sidecar
 from .splat_file import SplatFile, Written
-from .values import check_splats, known_quats, near_zero
+from .values import check_splats, leave_out_broken, near_zero
 
 MODULES = (  # tried in this order: compressed PLY before PLY, because both end in .ply
     "compressed_ply",
@@ -77,7 +77,7 @@ def find_format(path: str | Path) -> ModuleType:
     if path.is_file():
         try:
             with path.open("rb") as file:
-                head = file.read(_HEAD_BYTES)
+                head = file.read(_HEAD_BYTES).removeprefix(BOM_UTF8)
         except OSError as error:  # Python names no file if reading fails
             raise type(error)(
                 f"{path}: expected a splat file that can be read ({error.strerror}); copy it again"
@@ -97,23 +97,25 @@ def find_format(path: str | Path) -> ModuleType:
     raise ValueError(f"{path}: expected a splat file of a known format, got something else; known are {known}")
 
 
-def read_splats(path: str | Path) -> SplatFile:
+def read_splats(path: str | Path, *, strict: bool = False) -> SplatFile:
     """Read a splat file of any known format, with labels and class names from it or from the files next to it.
 
-    A quaternion of length 0 is read as no rotation, (1, 0, 0, 0): rasterisers do the same.
+    Gaussians with NaN or infinity, and rows of zeros, are left out, with their labels and columns. A quaternion of length 0
+    is read as no rotation, (1, 0, 0, 0): rasterisers do the same. `notes` of the result says how many, and where.
 
     Args:
         path: the file; or the output folder of 3DGS, gsplat or nerfstudio, whose newest step is then read.
+        strict: refuse a file with Gaussians that are otherwise left out.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is of no known format, or damaged: truncated, with counts that disagree, numbers that are not
-            finite, or labels without a name in its classes.
+        ValueError: if it is of no known format, or damaged: truncated, with counts that disagree, no Gaussian with finite
+            numbers, or labels without a name in its classes.
     """
     path = splat_file_of(path)
     module = find_format(path)
-    splats: SplatFile = read_sidecar(path, module.read(path))
-    splats = replace(splats, gaussians=near_zero(splats.gaussians.replace(quats=known_quats(splats.gaussians.quats))))
+    splats = leave_out_broken(path, read_sidecar(path, module.read(path)), strict=strict or is_strict())
+    splats = splats.replace(gaussians=near_zero(splats.gaussians))
     labels = splats.gaussians.labels
     if labels is not None and len(labels):
         low, high = int(labels.min()), int(labels.max())

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from .._arrays import most_unpacked
 from .._check import ORIGIN, as_origin
 from .._origin import choose_origin, to_local
 from ..gaussians import Gaussians
@@ -20,6 +22,9 @@ UP_AND_BACK = (1, -1, -1)  # x right, y up, z back (RUB) against x right, y down
 _ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 _TINY_SCALE = 1e-10  # world units, instead of a scale of 0
 _SHORTEST = 1e-12  # of a quaternion; kornia divides by no less
+_SHOWN = 5  # rows that a note names
+_UNKNOWN = torch.iinfo(torch.int64).min  # a label that is no number
+NO_DEGREE_4 = "spherical harmonics of degree 4: read up to degree 3"
 EXACT = 1 << 24  # float32 holds all whole numbers up to this one
 _LABELS = 2**31 - 1  # the largest int32
 _EXPECTED = {
@@ -38,26 +43,105 @@ _RAW = {
 """What to do if most values are out of range."""
 
 
-def check_finite(path: Path, **values: NDArray[np.float32]) -> None:
-    """Raise a ValueError that names the file, the kind of value and the first Gaussian with NaN or infinity."""
-    for name, array in values.items():
-        bad = ~np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
-        if bad.any():
-            raise ValueError(
-                f"{path}: expected finite {name}, got {array[bad][0].tolist()} at Gaussian {int(bad.argmax())} and at "
-                f"{int(bad.sum()) - 1} more; the file is damaged, write it again"
-            )
+def check_count(path: Path, count: int, degree: int, packed: int) -> None:
+    """Raise a ValueError if a compressed file of `packed` bytes promises more Gaussians than `most_unpacked` allows.
 
-
-def positive_scales(path: Path, scales: NDArray[np.float32]) -> Tensor:  # [N, 3] float32 > 0
-    """Linear scales as read, zeros raised to 1e-10; negative ones are damage (ValueError)."""
-    if (scales < 0).any():
-        row = int((scales < 0).any(1).argmax())
+    They are counted as they will be in memory: float32.
+    """
+    size, most = 4 * (11 + 3 * (degree + 1) ** 2) * count, most_unpacked(packed)
+    if size > most:
         raise ValueError(
-            f"{path}: expected scales of 0 or more, got {scales[row].tolist()} at Gaussian {row}; the file is damaged, or "
-            "of another format"
+            f"{path}: expected at most {most} bytes from a compressed file of {packed}, got {count} Gaussians of {size} bytes by "
+            "its header; it is truncated or damaged, or export it as .ply"
         )
-    return torch.from_numpy(np.where(scales == 0, np.float32(_TINY_SCALE), scales))
+
+
+def leave_out_broken(path: Path, splats: SplatFile, *, strict: bool) -> SplatFile:
+    """Leave out the Gaussians that cannot be drawn, with their labels and columns: NaN, infinity, and rows of zeros.
+
+    Rows of zeros, which truncated exports have, have no rotation and repeat each other. Another quaternion of length 0 is
+    read as no rotation: rasterisers do the same. Each is noted; `info["left_out"]` has the rows of the file.
+
+    Raises:
+        ValueError: if nothing is left, or `strict` and something is broken.
+    """
+    g, N = splats.gaussians, len(splats)
+    bad = {
+        name: ~value.float().isfinite().reshape(N, -1).all(1)
+        for name in _EXPECTED
+        if N and (value := getattr(g, name)) is not None
+    }
+    bad = {name: rows for name, rows in bad.items() if bool(rows.any())}
+    broken = torch.stack([*bad.values(), torch.zeros(N, dtype=torch.bool)]).any(0)
+    unturned = (g.quats.norm(dim=1) <= _SHORTEST) & ~broken
+    empty = unturned.clone()
+    if unturned.any():
+        rows = torch.cat([g.means, g.scales, g.opacities[:, None]], 1)[unturned]
+        _, same, counts = rows.unique(dim=0, return_inverse=True, return_counts=True)
+        empty[unturned] = counts[same] > 1
+    left_out = _count(broken, f"have NaN or infinity in {', '.join(bad)}") + _count(empty, "are rows of zeros")
+    kept = ~(broken | empty)
+    if N and not kept.any():
+        raise ValueError(
+            f"{path}: expected Gaussians with finite values, got none: {'; '.join(left_out)}; read another file, for example an "
+            "earlier step of the training"
+        )
+    if left_out and strict:
+        raise ValueError(
+            f"{path}: expected finite values in every Gaussian, got others: {'; '.join(left_out)}; without --strict (in Python: "
+            "strict=False) they are left out"
+        )
+    notes = [f"{words}: left out" for words in left_out]
+    notes += [f"{words}: read as not turned" for words in _count(unturned & kept, "have a rotation of length 0")]
+    if g.labels is not None:
+        unknown = g.labels == _UNKNOWN
+        notes += [f"{words}: read as no class" for words in _count(unknown & kept, "have no number as class_id")]
+        g = g.replace(labels=g.labels.masked_fill(unknown, -1))
+    if not notes:
+        return splats
+    splats = splats.replace(gaussians=g.replace(quats=known_quats(g.quats)), notes=(*splats.notes, *notes))
+    if left_out:
+        splats = splats.select(kept).replace(info=splats.info | {"left_out": (~kept).nonzero()[:, 0].tolist()})
+    return splats
+
+
+def _count(rows: Tensor, what: str) -> list[str]:  # rows: [N] bool
+    """How many rows of a file there are, and where."""
+    places = rows.nonzero()[:, 0].tolist()
+    more = ", ..." if len(places) > _SHOWN else ""
+    where = ", ".join(map(str, places[:_SHOWN])) + more
+    return (
+        [f"{len(places):,} of {len(rows):,} Gaussians {what} ({'rows' if len(places) > 1 else 'row'} {where})"]
+        if places
+        else []
+    )
+
+
+def positive_scales(path: Path, scales: NDArray[np.float32]) -> Tensor:  # [N, 3] float32
+    """Linear scales as read, zeros raised to 1e-10. Negative ones become NaN; if most are, it is another format (ValueError)."""
+    negative = (scales < 0).any(1)
+    if 2 * negative.sum() > len(scales):
+        row = int(negative.argmax())
+        raise ValueError(
+            f"{path}: expected scales of 0 or more, got {scales[row].tolist()} at Gaussian {row} and others at "
+            f"{int(negative.sum()) - 1} more; it is of another format, or damaged: export it again, as .ply if you can"
+        )
+    return torch.from_numpy(
+        np.where(scales == 0, np.float32(_TINY_SCALE), np.where(negative[:, None], np.float32("nan"), scales))
+    )
+
+
+def whole_labels(values: NDArray[Any]) -> Tensor:  # [N] -> [N] int64
+    """Labels of any type of numbers; NaN is `_UNKNOWN` until `leave_out_broken`. A ValueError for one that is not whole."""
+    unknown = ~np.isfinite(values)
+    values = np.where(unknown, 0, values)
+    whole = (values == np.trunc(values)) & (np.abs(values.astype(np.float64)) < 2**53)
+    if not whole.all():
+        row = int((~whole).argmax())
+        raise ValueError(
+            f"class_id: expected whole numbers, got {values[row]} at Gaussian {row}; are these scores? name the column score"
+        )
+    return torch.from_numpy(np.where(unknown, _UNKNOWN, values.astype(np.int64)))
 
 
 def near_zero(g: Gaussians) -> Gaussians:
@@ -172,6 +256,18 @@ def describe_loss(splats: SplatFile, name: str, degree: int) -> tuple[str, ...]:
     if columns:
         lost.append(f"the columns {', '.join(columns)}: {name} has no place for them")
     return tuple(lost)
+
+
+def describe_coarse(g: Gaussians, errors: Any, name: str) -> tuple[str, ...]:  # errors: number or [N, 3], world units
+    """Describe positions that a format rounds so much that Gaussians move by more than twice their own size."""
+    off = torch.as_tensor(errors, dtype=torch.float64).expand(len(g), 3).norm(dim=1).cpu()
+    moved = off > 2 * g.scales.amax(1).cpu() if len(g) else off > 0
+    if not moved.any():
+        return ()
+    return (
+        f"positions of {int(moved.sum()):,} of {len(g):,} Gaussians, which move by up to {off[moved].max().item():.3g} units, "
+        f"more than their own size: {name} has too few digits for a cloud this wide; .ply and .glb keep them",
+    )
 
 
 def describe_cut(values: Tensor, low: float, high: float, what: str, name: str) -> tuple[str, ...]:  # values: [N, ...]

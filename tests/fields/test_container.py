@@ -98,7 +98,7 @@ def test_each_precision_is_smaller_and_all_are_smaller_than_the_numbers():
 
 
 def test_a_cloud_that_compresses_too_well_is_stored_so_that_its_own_reader_takes_it(monkeypatch):
-    monkeypatch.setattr(container, "SPARE", 1 << 12)
+    monkeypatch.setattr("kfgs._arrays.SPARE", 1 << 12)
     one = torch.ones(20_000, 3)
     same = {"quats": torch.ones(20_000, 4), "scales": one, "opacities": one[:, 0] / 2, "labels": one[:, 0].long()}
     made = field(n=20_000, means=one, features=torch.ones(20_000, 5), **same)

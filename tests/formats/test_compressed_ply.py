@@ -241,8 +241,6 @@ def _damage(elements, what):
     ("what", "message"),
     [
         ("chunks", ("expected 3", "600", "256", "got 2")),
-        ("bound", ("finite", "bounds", "inf", "Gaussian 1")),
-        ("overflow", ("finite", "scales", "inf")),
         ("column", ("'chunk'", "min_scale_z")),
         ("type", ("'chunk'", "min_x")),
         ("colour", ("'chunk'", "min_r", "max_b")),

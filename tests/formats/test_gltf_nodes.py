@@ -60,7 +60,7 @@ def test_a_node_that_moves_beyond_float32_is_named(tmp_path):
     root["nodes"] = [{"children": [1], "scale": [1e25] * 3}, root["nodes"][0]]
     root["scenes"][0]["nodes"] = [0]
     path.write_text(json.dumps(root))
-    with pytest.raises(ValueError, match=tells("bent.gltf:", "got [inf, -inf, -inf]")):
+    with pytest.raises(ValueError, match=tells("bent.gltf:", "5 of 5", "infinity")):
         read_splats(path)
 
 

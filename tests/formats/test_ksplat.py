@@ -90,13 +90,12 @@ BAD = {
     "bytes": (ksplat_file(1, [ksplat_section(1, [0], 0, 1, [], bytes=11)], 1), ("bucket", "12", "got 11")),
     "cut": (ksplat_file(1, [_S], 2)[:-1], ("2 Gaussians", "42 bytes", "truncated")),
     "more": (ksplat_file(1, [_S], 2) + b"x", ("expected 2 Gaussians", "damaged")),
-    "nan": (bytes(_NAN), ("got [nan, -2.0, 3.25]",)),
+    "nan": (bytes(_NAN), ("NaN", "means")),
     "wide block": (
         ksplat_file(1, [ksplat_section(1, [0], 0, 1, [], block=3e38, quantum=1)], 1),
-        ("got [inf, inf, inf]",),
+        ("infinity", "means"),
     ),
-    "block": (ksplat_file(1, [ksplat_section(1, [0], 0, 1, [], block=float("nan"))], 1), ("got [nan, nan, nan]",)),
-    "half": (ksplat_file(1, [_S], 2)[:-2] + b"\x00\x7c", ("finite", "inf", "Gaussian 1")),
+    "block": (ksplat_file(1, [ksplat_section(1, [0], 0, 1, [], block=float("nan"))], 1), ("NaN", "means")),
 }
 
 

@@ -91,7 +91,7 @@ def test_an_empty_file_is_an_empty_cloud(tmp_path):
 
 def test_degenerate_values_are_mended(tmp_path):
     (tmp_path / "a.splat").write_bytes(bytes(24) + bytes([9, 9, 9, 9]) + b"\x80" * 4)
-    g = read(tmp_path / "a.splat").gaussians
+    g = read_splats(tmp_path / "a.splat").gaussians
     assert g.quats.tolist() == [[1, 0, 0, 0]]
     assert bool((g.scales == 1e-10).all())
 
@@ -102,11 +102,7 @@ def test_degenerate_values_are_mended(tmp_path):
         (bytes(63), ("32", "got 63", "31")),
         (
             np.float32([0, 0, np.nan, 1, 1, 1]).tobytes() + bytes(8),
-            ("finite", "means", "got [0.0, 0.0, nan]", "Gaussian 0"),
-        ),
-        (
-            bytes(32) + np.float32([0, 0, 0, 1, np.inf, 1]).tobytes() + bytes(8),
-            ("finite", "scales", "got [1.0, inf, 1.0]", "Gaussian 1"),
+            ("1 of 1 Gaussians", "NaN", "means", "row 0"),
         ),
         (
             np.float32([0, 0, 0, 1, -1, 1]).tobytes() + bytes(8),

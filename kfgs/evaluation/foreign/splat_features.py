@@ -44,6 +44,9 @@ def load_splat_features(
     gaussians = file.gaussians
     if features is not None:
         values = _read_rows(as_path(features))
+        left_out = file.info.get("left_out", [])  # rows of the file
+        if left_out and len(values) == len(gaussians) + len(left_out):
+            values = torch.from_numpy(np.delete(values.numpy(), left_out, axis=0))
         if len(values) != len(gaussians):
             raise ValueError(
                 f"{features}: expected [{len(gaussians)}, D], a row for each Gaussian of {path}, got {list(values.shape)}; some "
