@@ -97,6 +97,10 @@ def leave_out_broken(path: Path, splats: SplatFile, *, strict: bool) -> SplatFil
         unknown = g.labels == _UNKNOWN
         notes += [f"{words}: read as no class" for words in _count(unknown & kept, "have no number as class_id")]
         g = g.replace(labels=g.labels.masked_fill(unknown, -1))
+        score = torch.from_numpy(np.asarray(splats.extra.get(SCORE, np.zeros(N)), np.float32))
+        if words := _count(~score.isfinite() & kept, "have no number as score"):
+            notes.append(f"{words[0]}: read as 0")
+            splats = splats.replace(extra=splats.extra | {SCORE: score.nan_to_num(0.0, 0.0, 0.0).numpy()})
     if not notes:
         return splats
     splats = splats.replace(gaussians=g.replace(quats=known_quats(g.quats)), notes=(*splats.notes, *notes))

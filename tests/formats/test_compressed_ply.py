@@ -60,7 +60,9 @@ def test_the_same_scene_as_spz_agrees(shared_data):
 @pytest.mark.parametrize("name", ["guitar.compressed.ply", "inria_9080.ply"])
 def test_real_files_survive(tmp_path, shared_data, name):
     cloud = read_splats(shared_data / "splats" / name).gaussians
-    assert write_splats(tmp_path / "a.compressed.ply", cloud).lost == ()
+    lost = write_splats(tmp_path / "a.compressed.ply", cloud).lost
+    far = ("170 of 9,080",) if name.startswith("inria") else ()  # a few of a wide scene: chunks are wide, too
+    assert [words in note for words, note in zip(far, lost, strict=True)] == [True] * len(far)
     assert find_format(tmp_path / "a.compressed.ply").NAME == "compressed_ply"
     order, stated = morton_order(cloud.means), precision(cloud)
     back = read(tmp_path / "a.compressed.ply").gaussians
