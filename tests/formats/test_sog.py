@@ -109,7 +109,7 @@ def test_a_folder_and_its_meta_are_read_like_the_zip(tmp_path):
     assert [path.name for path in written.paths] == ["scene", "scene.labels.npz", "scene.classes.json"]
     write_splats(tmp_path / "scene.sog", SplatFile(cloud))
     order, stated = written.order, precision(cloud)
-    zipped = read(tmp_path / "scene.sog").gaussians
+    zipped = read_splats(tmp_path / "scene.sog").gaussians
     for path in (tmp_path / "scene", tmp_path / "scene" / "meta.json"):
         assert find_format(path).NAME == "sog"
         back = read_splats(path)
@@ -160,7 +160,7 @@ def test_the_picture_stays_the_same(tmp_path, shared_data):
     cloud = read_splats(shared_data / "splats" / "inria_9080.ply").gaussians
     write(tmp_path / "a.sog", SplatFile(cloud))
     camera = Camera(torch.eye(4), torch.tensor([[90.0, 0, 64], [0, 90, 48], [0, 0, 1]]), 128, 96)
-    pictures = [rasterize(g, camera).map.clamp(0, 1) for g in (cloud, read(tmp_path / "a.sog").gaussians)]
+    pictures = [rasterize(g, camera).map.clamp(0, 1) for g in (cloud, read_splats(tmp_path / "a.sog").gaussians)]
     assert pictures[0].std() > 0.1
     assert -10 * (pictures[0] - pictures[1]).square().mean().log10() > 40
 
