@@ -266,7 +266,8 @@ def _pack_rows(columns: Columns) -> NDArray[Any]:
 
 def stack_columns(columns: Columns, names: list[str]) -> Tensor:  # [N, len(names)] float32
     """Some columns side by side."""
-    return torch.from_numpy(np.stack([columns[name] for name in names], -1).astype(np.float32))
+    with np.errstate(over="ignore"):  # of doubles; `read_splats` leaves them out
+        return torch.from_numpy(np.stack([columns[name] for name in names], -1).astype(np.float32))
 
 
 def points_from_columns(columns: Columns) -> Tensor:  # [N, 3] float64
