@@ -54,7 +54,7 @@ def read(path: Path) -> SplatFile:
     rows = np.fromfile(path, dtype=RECORD)
     rgba = torch.from_numpy(rows["rgba"].astype(np.float32)) / 255
     quats = (torch.from_numpy(rows["quats"].astype(np.float32)) - 128) / 128
-    quats[~rows.view(np.uint8).reshape(-1, RECORD.itemsize).any(1)] = 0  # a row of zeros
+    quats[torch.from_numpy(rows.view(np.uint8).reshape(-1, RECORD.itemsize) == 0).all(1)] = 0  # a row of zeros
     gaussians = Gaussians(
         means=torch.from_numpy(rows["means"].copy()),
         quats=quats / quats.norm(dim=1, keepdim=True).clamp(min=1e-12),  # 0 stays 0

@@ -112,13 +112,9 @@ def leave_out_broken(path: Path, splats: SplatFile, *, strict: bool) -> SplatFil
 def _count(rows: Tensor, what: str) -> list[str]:  # rows: [N] bool
     """How many rows of a file there are, and where."""
     places = rows.nonzero()[:, 0].tolist()
-    more = ", ..." if len(places) > _SHOWN else ""
-    where = ", ".join(map(str, places[:_SHOWN])) + more
-    return (
-        [f"{len(places):,} of {len(rows):,} Gaussians {what} ({'rows' if len(places) > 1 else 'row'} {where})"]
-        if places
-        else []
-    )
+    where = ", ".join([*map(str, places[:_SHOWN]), *["..."] * (len(places) > _SHOWN)])
+    word = "row" if len(places) == 1 else "rows"
+    return [f"{len(places):,} of {len(rows):,} Gaussians {what} ({word} {where})"] if places else []
 
 
 def positive_scales(path: Path, scales: NDArray[np.float32]) -> Tensor:  # [N, 3] float32
@@ -130,9 +126,8 @@ def positive_scales(path: Path, scales: NDArray[np.float32]) -> Tensor:  # [N, 3
             f"{path}: expected scales of 0 or more, got {scales[row].tolist()} at Gaussian {row} and others at "
             f"{int(negative.sum()) - 1} more; it is of another format, or damaged: export it again, as .ply if you can"
         )
-    return torch.from_numpy(
-        np.where(scales == 0, np.float32(_TINY_SCALE), np.where(negative[:, None], np.float32("nan"), scales))
-    )
+    usable = np.where(scales < 0, np.float32("nan"), scales)
+    return torch.from_numpy(np.where(scales == 0, np.float32(_TINY_SCALE), usable))
 
 
 def whole_labels(values: NDArray[Any]) -> Tensor:  # [N] -> [N] int64
