@@ -74,7 +74,8 @@ def sfm(
     """Find the cameras of photographs or of a video (structure from motion, pycolmap).
 
     Of a video, the sharpest frames are written to OUT/images first. HEIC photographs are written there as JPEG. A folder that
-    has poses already (transforms.json, ScanNet, Polycam, ...) keeps them: only its points are found.
+    has poses already (transforms.json, ScanNet, Polycam, ...) keeps them: only its points are found. Nothing is found where a
+    photograph is black in its mask, masks/NAME.png in the folder or beside it, or transparent.
 
     Examples:
         kfgs sfm photos/ --out scene/
@@ -92,7 +93,17 @@ def sfm(
         seed: Every random choice follows from it.
         replace: Replace a model that is in OUT/sparse/0 already; without it that is an error.
     """
-    from ..scenes import SfmConfig, extend_sfm, is_scene, link_images, load_scene, run_sfm, write_known_poses
+    from ..scenes import (
+        SfmConfig,
+        extend_sfm,
+        is_scene,
+        link_images,
+        list_images,
+        load_scene,
+        run_sfm,
+        write_known_poses,
+    )
+    from ..scenes.masks import folder_masks
     from ..scenes.pictures import is_video
 
     check_output("out", out, "a folder", other=[images], inside=["sparse/0"])
@@ -128,6 +139,8 @@ def sfm(
         wrote([out / "sparse" / "0", out / "images"])
         return
     images = _plain_pictures(images, out, fps)
+    for note in folder_masks(list_images(images), images)[1]:
+        say(f"note: {note}")
     say(str(run_sfm(images, out, config=config, replace=replace, progress=True)))
     written = [out / "sparse" / "0"]
     beside = out / "images"

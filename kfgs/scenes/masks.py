@@ -109,12 +109,15 @@ def folder_masks(
     ]
 
 
-def write_colmap_masks(folder: Path, photos: Mapping[str, tuple[Path, Path | None]]) -> str | None:
+def write_colmap_masks(
+    folder: Path, photos: Mapping[str, tuple[Path, Path | None]], ending: str = ".png"
+) -> str | None:
     """Write what pycolmap takes as `mask_path`: NAME.png for each photo, black where it is masked or transparent.
 
     Args:
         folder: to write to.
         photos: file and mask of each photo by its name. If none has a mask or transparent pixels, nothing is written.
+        ending: what follows NAME.
 
     Returns:
         The folder; None if nothing was written.
@@ -126,7 +129,7 @@ def write_colmap_masks(folder: Path, photos: Mapping[str, tuple[Path, Path | Non
             size = picture.height, picture.width
         alpha, kept = read_alpha(photo), torch.ones(size, dtype=torch.bool) if mask is None else read_mask(mask, size)
         kept = kept if alpha is None else kept & (alpha > 0.5)
-        place = folder / f"{name}.png"
+        place = folder / f"{name}{ending}"
         place.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(kept.numpy().astype(np.uint8) * 255).save(place)
     return str(folder)

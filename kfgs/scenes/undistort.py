@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
+
+from PIL import Image
 
 from .._files import as_path, atomic_folder, check_output
 from .colmap_model import read_whole_model
-from .files import SceneError
+from .files import MASKS, SceneError, list_images
+from .masks import folder_masks, write_colmap_masks
 from .pycolmap_import import quiet_pycolmap, scene_errors
+
+WHITE = (
+    250  # of 255: what is darker in an undistorted mask took something from a masked pixel; the rest is JPEG's noise
+)
 
 
 def undistort_scene(images: str | Path, model: str | Path, out: str | Path) -> Path:
     """Write a scene with pinhole cameras: `out/images` and `out/sparse/0`, undistorted by pycolmap.
 
     For lenses that `load_scene` refuses (FOV, THIN_PRISM_FISHEYE, EUCM, ...). `Scene.undistorted` handles all others without
-    new files.
+    new files. Pixels that take anything from masked or transparent ones are black in `out/masks`.
 
     Args:
         images: the distorted images.
@@ -44,6 +52,20 @@ def undistort_scene(images: str | Path, model: str | Path, out: str | Path) -> P
         scene_errors(f"{model}: expected a scene that pycolmap can undistort", advice),
     ):
         pycolmap.undistort_images(str(folder), str(model), str(images))
+        names = list_images(images)
+        masks = folder_masks(names, images)[0] or [None] * len(names)
+        photos = {name: (images / name, mask) for name, mask in zip(names, masks, strict=True)}
+        if write_colmap_masks(folder / "taken", photos, ending="") is not None:  # as if they were the photos
+            pycolmap.undistort_images(str(folder / "straight"), str(model), str(folder / "taken"))
+            straight = folder / "straight" / "images"
+            for name in list_images(straight):
+                with Image.open(straight / name) as picture:
+                    kept = picture.convert("L").point(lambda grey: 255 * (grey > WHITE))
+                place = folder / MASKS / f"{name}.png"
+                place.parent.mkdir(parents=True, exist_ok=True)
+                kept.save(place)
+            shutil.rmtree(folder / "taken")
+            shutil.rmtree(folder / "straight")
         written = folder / "sparse"
         (folder / "sparse_model").mkdir()
         written.rename(folder / "sparse_model" / "0")

@@ -9,6 +9,7 @@ from cases_sfm import WIDTH, downsized
 from kornia.io import write_image
 from messages import tells
 from oracles_cameras import align_similarity
+from PIL import Image
 from small_room import make_room
 from tqdm import tqdm
 
@@ -132,6 +133,33 @@ def test_pairs_of_a_video_follow_the_natural_order() -> None:
     assert {int(b[:-4]) for a, b in pairs if a == "8.png"} == {*range(9, 19), 24, 40}  # 8 + 16, 8 + 32
     assert len(pairs) == len(set(pairs))
     assert all(int(a[:-4]) < int(b[:-4]) for a, b in pairs)
+
+
+def test_nothing_is_found_where_a_photo_is_masked_or_transparent(tmp_path: Path) -> None:
+    pycolmap = import_pycolmap()
+    g = torch.Generator().manual_seed(0)
+    noise = torch.randint(0, 255, (24, 32, 3), generator=g, dtype=torch.uint8)
+    photo = noise.repeat_interleave(4, 0).repeat_interleave(4, 1).numpy()
+    half = np.full((96, 128), 255, np.uint8)
+    half[:, :64] = 0
+    (tmp_path / "images").mkdir()
+    names = ["masked.png", "clear.png", "whole.png"]
+    for name in names:
+        Image.fromarray(photo).save(tmp_path / "images" / name)
+    Image.fromarray(np.dstack([photo, half])).save(tmp_path / "images/clear.png")
+    Image.fromarray(half).save(tmp_path / "masked.png")
+    photos = {name: (tmp_path / "images" / name, None) for name in names} | {
+        "masked.png": (tmp_path / "images/masked.png", tmp_path / "masked.png")
+    }
+    with tqdm(disable=True) as bar:
+        run = SfmRun(pycolmap, tmp_path / "images", names, tmp_path, SfmConfig(num_threads=1), bar, photos)
+        run.extract()
+    with pycolmap.Database.open(run.database) as database:
+        leftmost = {
+            image.name: database.read_keypoints(image.image_id)[:, 0].min() for image in database.read_all_images()
+        }
+    assert leftmost["whole.png"] < 32
+    assert min(leftmost["masked.png"], leftmost["clear.png"]) >= 64
 
 
 def _matched(folder: Path, names: list[str]) -> set[frozenset[str]]:

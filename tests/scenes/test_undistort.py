@@ -1,9 +1,11 @@
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from colmap_models import write_model, write_picture
 from messages import tells
+from PIL import Image
 
 from kfgs.scenes import SceneError, load_scene, undistort_scene
 
@@ -23,6 +25,24 @@ def test_a_lens_that_kfgs_refuses_is_removed_by_pycolmap(tmp_path: Path) -> None
     expected = torch.tensor([30.5 * 3, 24.5 * 4, 9]) / 255  # the old picture at its principal point (31, 25)
     torch.testing.assert_close(image[row, column], expected, rtol=0, atol=0.02)
     assert len(scene.points) == 5
+
+
+def test_masks_go_through_the_same_lens(tmp_path: Path) -> None:
+    names = ["a.jpg", "b.png"]
+    model = write_model(tmp_path / "in/sparse/0", names, model="FOV", params=[50, 55, 31, 25, 0.3])
+    for name in names:
+        write_picture(tmp_path / "in/images" / name)
+    mask = np.full((48, 64), 255, np.uint8)
+    mask[:, :31] = 0  # left of the principal point
+    (tmp_path / "in/masks").mkdir()
+    Image.fromarray(mask).save(tmp_path / "in/masks/a.png")
+    out = undistort_scene(tmp_path / "in/images", model, tmp_path / "out")
+    scene = load_scene(out)
+    assert not {"taken", "straight"} & {file.name for file in out.iterdir()}
+    kept, centre = scene.mask(0), round(float(scene.cameras[0].K[0, 2]))
+    assert not kept[:, :centre].any()
+    assert kept[:, centre + 1 :].all()
+    assert scene.mask(1).all()
 
 
 def test_wrong_folders_are_refused(tmp_path: Path) -> None:
