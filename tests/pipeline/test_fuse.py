@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import torch
 from messages import tells
+from PIL import Image
 from safetensors.torch import load_file
 from small_room import make_room
 
 import kfgs
 from kfgs.cli import main
-from kfgs.features import FeatureFolder
+from kfgs.features import FeatureFolder, write_npy_map
 from kfgs.fields import Clicks, SemanticField, UpliftConfig
 from kfgs.formats import SplatFile, read_splats, write_splats
 from kfgs.gaussians import Gaussians
@@ -60,6 +61,34 @@ def fitted(scene, maps, splat, tmp_path_factory):
 @pytest.fixture(scope="module")
 def classes(room):
     return load_label_set(room / "classes.json", room / "text.npy")
+
+
+def test_photos_cut_to_portraits_give_nearly_the_same_labels(room, scene, maps, splat, classes, tmp_path):
+    """Every second photo, 80 x 60, keeps its columns 20 to 60 and a map of its own, 20 x 30 instead of 40 x 30 cells."""
+    frames = []
+    for i, view in enumerate(scene.views("train")):
+        camera, cut = scene.cameras[view], 20 * (i % 2)
+        picture = (scene.image(view)[:, cut : 80 - cut] * 255).byte().numpy()
+        (tmp_path / "images").mkdir(exist_ok=True)
+        Image.fromarray(picture).save(tmp_path / "images" / camera.name)
+        write_npy_map(tmp_path / "maps" / f"{scene.stem(view)}.npy", maps[i][:, cut // 2 : 40 - cut // 2])
+        pose = torch.linalg.inv(camera.viewmat.double()) @ torch.diag(torch.tensor([1.0, -1, -1, 1]).double())
+        K = camera.K.tolist()
+        frame = {"fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2] - cut, "cy": K[1][2]}
+        frames.append(frame | {"file_path": f"images/{camera.name}", "transform_matrix": pose.tolist()})
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    mixed = load_scene(tmp_path, split="all")
+    assert {camera.size for camera in mixed.cameras} == {(60, 80), (60, 40)}
+    cut_maps = FeatureFolder(tmp_path / "maps").of(mixed)
+    plain = FitConfig(uplift=UpliftConfig(corrections=0))
+    whole, part = (
+        uplift(views, given, splat, plain).classify(classes) for views, given in ((scene, maps), (mixed, cut_maps))
+    )
+    both = (whole.labels >= 0) & (part.labels >= 0)
+    assert both.float().mean() > 0.9
+    assert (whole.labels == part.labels)[both].float().mean() > 0.95  # 0.966
+    wrong = uplift(mixed, [one.flip(1) for one in cut_maps], splat, plain).classify(classes).labels
+    assert (whole.labels == wrong)[both].float().mean() < 0.7  # 0.659
 
 
 def test_a_splat_becomes_a_small_field_that_is_right_on_unseen_views(fitted, scene, classes, room, tmp_path):
