@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -39,7 +39,7 @@ class SfmConfig:
     camera_model: str = "SIMPLE_RADIAL"
     """COLMAP's name of the lens model to fit."""
     single_camera: bool = True
-    """True: one camera took all images, at one zoom and size. False: fit intrinsics to each image."""
+    """True: one camera took all images of a size, at one zoom. False: fit intrinsics to each image."""
     min_registered: float = 0.9
     """The share of the images that one model must place at least, in (0, 1]."""
     max_features: int = 8192
@@ -213,13 +213,18 @@ class SfmRun:
         self.bar.unit = unit
         self.bar.set_description(name)
 
-    def extract(self, names: list[str] | None = None, camera: int | None = None, single: bool | None = None) -> None:
+    def extract(
+        self,
+        names: list[str] | None = None,
+        known: Mapping[tuple[int, int], int] | None = None,
+        single: bool | None = None,
+    ) -> None:
         """Compute features of a few images at a time, so that the bar moves and Ctrl-C works.
 
         Args:
             names: which images; None: all.
-            camera: the camera of the database that took them; None makes one, or one for each image.
-            single: whether one camera took them; None: as the config says. An image of the database keeps its camera.
+            known: cameras of the database by the size (width, height) of their images; images of another size get new ones.
+            single: whether one camera took all of a size; None: as the config says. An image of the database keeps its camera.
         """
         colmap, config = self.pycolmap, self.config
         names, single = self.names if names is None else names, config.single_camera if single is None else single
@@ -227,20 +232,20 @@ class SfmRun:
         self.begin("features", len(names), "image")
         mode = colmap.CameraMode.SINGLE if single else colmap.CameraMode.PER_IMAGE
         reader: dict[str, Any] = {"camera_model": config.camera_model}
+        cameras = {size: {"existing_camera_id": camera} for size, camera in (known or {}).items()}
         masks = write_colmap_masks(self.scratch / "masks", {name: self.photos[name] for name in names})
         if masks is not None:
             reader["mask_path"] = masks
-        if camera is not None:
-            reader["existing_camera_id"] = camera
         options = {"num_threads": config.num_threads, "sift": {"max_num_features": config.max_features}}
-        for start in range(0, len(names), 8):
-            some_names = names[start : start + 8]
+        sizes = {name: _size(self.images / name) if single or cameras else (0, 0) for name in names}
+        groups = [(size, [name for name in names if sizes[name] == size]) for size in dict.fromkeys(sizes.values())]
+        for size, some_names in ((s, group[i : i + 8]) for s, group in groups for i in range(0, len(group), 8)):
             colmap.extract_features(
-                self.database, str(self.images), image_names=some_names, camera_mode=mode, reader_options=reader,
-                extraction_options=options, device=colmap.Device.cpu,
+                self.database, str(self.images), image_names=some_names, camera_mode=mode,
+                reader_options=reader | cameras.get(size, {}), extraction_options=options, device=colmap.Device.cpu,
             )  # fmt: skip
-            if single and "existing_camera_id" not in reader:
-                reader.update(self._camera_of(some_names))
+            if single and not cameras.get(size):
+                cameras[size] = self._camera_of(some_names)
             self.bar.update(len(some_names))
         with colmap.Database.open(self.database) as database:
             read = {image.name for image in database.read_all_images()}
@@ -358,7 +363,9 @@ def _require_one_model(images: Path, sizes: tuple[int, ...], names: list[str], c
         advice.append("use --matching exhaustive (in Python: matching='exhaustive')")
     advice.append("take overlapping photos between the parts")
     if config.single_camera:
-        advice.append("give --no-single-camera (in Python: single_camera=False) if sizes or zoom differ")
+        advice.append(
+            "give --no-single-camera (in Python: single_camera=False) if several cameras took them, or zoom differs"
+        )
     raise SceneError(
         f"{images}: expected at least {needed:.0f} of {len(names)} images registered in one model (min_registered = "
         f"{config.min_registered:g}), got {got}; {', or '.join(advice)}, or lower --min-registered (in Python: min_registered)"
@@ -367,9 +374,12 @@ def _require_one_model(images: Path, sizes: tuple[int, ...], names: list[str], c
 
 def _largest(images: Path, names: list[str]) -> tuple[int, int]:
     """(width, height) of the photo with the longest side; (0, 0) if none can be read."""
-    sizes = [(0, 0)]
-    for name in names:
-        if is_file(images / name):
-            with suppress(SceneError, ImportError), open_picture(images / name) as picture:
-                sizes.append(picture.size)
-    return max(sizes, key=max)
+    return max((_size(images / name) for name in names), key=max, default=(0, 0))
+
+
+def _size(path: Path) -> tuple[int, int]:
+    """(width, height) of a photo; (0, 0) if it cannot be read."""
+    if is_file(path):
+        with suppress(SceneError, ImportError), open_picture(path) as picture:
+            return picture.size
+    return 0, 0

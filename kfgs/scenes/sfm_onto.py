@@ -41,7 +41,7 @@ def extend_sfm(
         scene: scene folder with a COLMAP model, made by any program, and its pictures.
         out: the larger scene: `sparse/0`, and `images` and `masks` with links to the files. Classes and text table are linked.
         config: options. `min_registered` counts new images. `camera_model` is of new cameras: with `single_camera`, images
-            as large as those of a scene of one camera are taken to be by that camera; other ones share a new camera.
+            as large as those of a scene of one camera are taken to be by that camera; others share a new one for each size.
         progress: show a bar.
 
     Returns:
@@ -86,9 +86,10 @@ def extend_sfm(
         run = SfmRun(pycolmap, larger / "images", [*names, *new], Path(scratch), config, bar, photos)
         known = pycolmap.Reconstruction(str(model))
         fill_database(pycolmap, run.database, known)
-        camera = _shared_camera(old, images / new[0]) if config.single_camera else None
+        shared = {(lens.width, lens.height): number for number, lens in old.cameras.items()}
+        shared = shared if config.single_camera and len(old.cameras) == 1 else {}
         seconds = {"features": timed(lambda: run.extract(names, None, False))}
-        seconds["features"] += timed(lambda: run.extract(new, camera))
+        seconds["features"] += timed(lambda: run.extract(new, shared))
         seconds["matching"] = timed(run.match)
         found: list[Any] = []
         seconds["mapping"] = timed(lambda: found.append(_place(run, known, Path(scratch), len(new))))
@@ -160,14 +161,6 @@ def _link(folder: Path, files: dict[str, Path]) -> None:
         place = folder / name
         place.parent.mkdir(parents=True, exist_ok=True)
         place.symlink_to(real_path(file))
-
-
-def _shared_camera(old: ColmapModel, picture: Path) -> int | None:
-    """The camera of the scene, if it has one only, and the new pictures are as large as its pictures."""
-    if len(old.cameras) != 1:
-        return None
-    ((number, camera),) = old.cameras.items()
-    return number if picture_size(picture) == (camera.width, camera.height) else None
 
 
 def _place(run: SfmRun, known: Any, scratch: Path, count: int) -> Any:

@@ -181,6 +181,29 @@ def _matched(folder: Path, names: list[str]) -> set[frozenset[str]]:
         return {frozenset((a.name, b.name)) for a, b in pairs if database.exists_matches(a.image_id, b.image_id)}
 
 
+def test_one_camera_for_the_photos_of_each_size(tmp_path: Path) -> None:
+    """COLMAP alone leaves out what is not as large as the first photo."""
+    pycolmap, sizes = (
+        import_pycolmap(),
+        {"a.png": (96, 128), "b.png": (128, 96), "c.png": (96, 128), "d.png": (128, 96)},
+    )
+    for name, size in sizes.items():
+        noise = torch.randint(0, 255, (3, *size), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+        write_image(str(tmp_path / name), noise)
+    for single, count in ((True, 2), (False, 4)):
+        config = SfmConfig(single_camera=single, max_features=100, num_threads=1)
+        (scratch := tmp_path / str(single)).mkdir()
+        with tqdm(disable=True) as bar:
+            photos = {name: (tmp_path / name, None) for name in sizes}
+            run = SfmRun(pycolmap, tmp_path, list(sizes), scratch, config, bar, photos)
+            run.extract()
+        with pycolmap.Database.open(run.database) as database:
+            lenses = {camera.camera_id: camera for camera in database.read_all_cameras()}
+            of = {image.name: lenses[image.camera_id] for image in database.read_all_images()}
+        assert {name: (lens.height, lens.width) for name, lens in of.items()} == sizes
+        assert len(lenses) == count
+
+
 def test_sequential_matching_compares_9_with_10_and_not_1_with_12(tmp_path: Path) -> None:
     matched = _matched(tmp_path / "a", [f"{i}.png" for i in range(1, 14)])
     assert frozenset(("9.png", "10.png")) in matched
