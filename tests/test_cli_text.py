@@ -112,7 +112,7 @@ def test_text_writes_a_table_with_its_origin(tmp_path, capsys):
 )
 def test_text_names_what_is_wrong_and_writes_nothing(tmp_path, names, options, message):
     (tmp_path / "a.json").write_text('{"wall": 1}')
-    (tmp_path / "a.txt").write_bytes(b"\xff\xfew\x00")
+    (tmp_path / "a.txt").write_bytes(b"K\xfcche")
     (tmp_path / "a.yaml").write_text("- wall")
     given = {"teacher": "cases_text:TEACHER", "out": "t.safetensors"} | options
     given["out"] = tmp_path / given["out"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import hashlib
 import json
+import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -69,22 +70,22 @@ def write_json(path: str | Path, value: Any) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def read_json(path: str | Path) -> Any:
-    """Read a JSON file; the error names the file and what is wrong with it.
+def read_json(path: str | Path, expected: str = "a JSON file") -> Any:
+    """Read a JSON file; the error names the file, what was `expected`, and what is wrong with it.
 
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is not UTF-8 JSON, or larger than `LARGEST`.
     """
     path = as_path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected a JSON file there")
+    if not os.path.isfile(path):  # Path.is_file raises for a name that is too long for the disk
+        raise FileNotFoundError(f"{path}: no such file; expected {expected} there")
     if (size := path.stat().st_size) > LARGEST:  # in memory it would take some ten times as much
         raise ValueError(
             f"{path}: expected a JSON file of at most {bytes_in_words(LARGEST)}, got {bytes_in_words(size)}; split it"
         )
     try:
-        return parse_json(read_text(path, "a JSON file"))
+        return parse_json(read_text(path, expected))
     except ValueError as error:
         raise ValueError(f"{path}: expected a JSON file, but it cannot be parsed ({error})") from error
 
@@ -97,7 +98,7 @@ def read_text(path: str | Path, expected: str = "a text file") -> str:
         ValueError: if it is in another encoding.
     """
     path = as_path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):  # Path.is_file raises for a name that is too long for the disk
         raise FileNotFoundError(f"{path}: no such file; expected {expected} there")
     try:
         return path.read_text(encoding=text_encoding(path))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from .._files import file_stem
+from .._files import file_stem, folded_name
 from .._typed import typed
 from ..cameras import Camera
 from ..cameras.similarity import Similarity, fit_similarity
@@ -123,7 +123,8 @@ def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
 
 def common_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> list[tuple[Camera, Camera]]:
     """Pairs of cameras of the same name, in the order of `src`; `align_by_cameras` says when names are the same."""
-    keys = _keys(src, dst, lambda camera: PurePosixPath(file_stem(camera.name)).name)
+    keys = _keys(src, dst, lambda camera: PurePosixPath(folded_name(file_stem(camera.name))).name)
+    keys = keys or _keys(src, dst, lambda camera: folded_name(file_stem(camera.name)))
     keys = keys or _keys(src, dst, lambda camera: file_stem(camera.name)) or ({}, {})
     pairs = [(camera, keys[1][key]) for key, camera in keys[0].items() if key in keys[1]]
     if len(pairs) < 2:

@@ -6,7 +6,6 @@ import math
 import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -14,6 +13,7 @@ from torch import Tensor
 
 from .._card import cut
 from .._check import ORIGIN, as_origin, as_tensor, check_choice, check_range, check_shapes, moved_to
+from .._files import Names
 from .._origin import to_world
 
 DistortionModel = Literal["brown_conrady", "kannala_brandt"]
@@ -244,8 +244,11 @@ def view_named(cameras: Sequence[Camera], view: str | Camera, where: str) -> Cam
     """
     if isinstance(view, Camera):
         return view
-    found = [camera for camera in cameras if view in (camera.name, Path(camera.name).stem)]
+    names = Names((camera.name for camera in cameras), bare=True)
+    found = [camera for camera in cameras if camera.name == names.find(view)]
     if len(found) != 1:
         some = ", ".join(camera.name for camera in cameras[:3]) or "none"
-        raise ValueError(f"{where}: expected the name of a training view ({some}, ...), got {view!r}; correct it")
+        raise ValueError(
+            f"{where}: expected the name of a training view ({some}, ...), got {view!r}; {names.advice(view)}"
+        )
     return found[0]

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Sequence
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, Literal
 
-from .._files import check_output, check_own, read_json, real_path
+from .._files import Names, check_output, check_own, read_json, real_path
 from .edit_syntax import Edits, check_parts, classes_of, inserted_files, parse_edits
 from .files import check_alone, check_splat, check_target, open_splats
 from .options import Classes, Flag, Given, GivenBy, Positional, SceneOption, Several
@@ -295,16 +294,13 @@ def _cameras_to_show(splats: Any, scene: SceneOption, views: Sequence[str]) -> l
 
 def _choose_views(scene: Any, names: Sequence[str]) -> Any:
     """The scene with the named views only; a ValueError if a name is unknown, or one view is named twice."""
-    seen = set[str]()
+    known, seen = Names((camera.name for camera in scene.cameras), bare=True), set[str]()
     for name in names:
-        try:
-            (view,) = (camera.name for camera in scene.select([name]).cameras)
-        except ValueError as error:
-            near = difflib.get_close_matches(name, [camera.name for camera in scene.cameras], n=3, cutoff=0)
+        view = known.find(name)
+        if view is None:
             raise ValueError(
-                f"views: expected names of the scene's {len(scene)} views, got {name!r}; "
-                f"did you mean {' or '.join(map(repr, near))}?"
-            ) from error
+                f"views: expected names of the scene's {len(scene)} views, got {name!r}; {known.advice(name)}"
+            )
         if view in seen:
             raise ValueError(f"views: expected each view once, got {view!r} twice; name it once")
         seen.add(view)

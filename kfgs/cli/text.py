@@ -145,21 +145,11 @@ def read_words(names: str) -> list[str]:
 
 def _words_of_file(name: str, kind: str) -> Any:
     """The content of a .json file, or the lines of a .txt file."""
-    from .._files import read_json
+    from .._files import read_json, read_text
 
-    if not os.path.isfile(name):
-        what = (
-            "a JSON file there, with a list of classes" if kind == ".json" else "a text file there with a class a line"
-        )
-        raise FileNotFoundError(f"{name}: no such file; expected {what}")
     if kind == ".json":
-        return read_json(name)
-    try:
-        return Path(name).read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise ValueError(
-            f"{name}: expected a text file in UTF-8, but it cannot be read ({error}); save it so"
-        ) from error
+        return read_json(name, "a JSON file with a list of classes")
+    return read_text(name, "a text file with a class a line").splitlines()
 
 
 def text_encoder(teacher: Teacher) -> Callable[..., Any]:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 
-from .._files import as_path
+from .._files import Names, as_path, folded_name
 from ..scenes.files import IMAGE_SUFFIXES, some
 from .layouts import LAYOUTS, OWN, Reading, StoredMap, layout_of, open_map
 from .manifest import MANIFEST, MapRecord, read_manifest
@@ -79,24 +79,25 @@ class MapFinder:
     def find(self, stems: Sequence[str]) -> dict[str, list[Path]]:
         """The map files of each view: an empty list if there is none, several files if it is not clear which one to use.
 
-        A map has the stem of its picture; if the picture is in a subfolder, so is the map. If no view has a map there, the
-        last part of the stem is searched for in the folder and all its subfolders. A discarded map counts as its former
-        file.
+        A map has the stem of its picture, perhaps with other letters for the same (`folded_name`); if the picture is in a
+        subfolder, so is the map. If no view has a map there, the last part of the stem is searched for in the folder and all
+        its subfolders. A discarded map counts as its former file.
         """
         gone = {stem: [file] for stem in stems if (file := self.discarded(stem)) is not None}
         found = {stem: self.named(stem) for stem in stems if stem not in gone}
         if not all(found.values()):
             present = self.listed(deep=True)
-            found = {stem: files or present.get(stem, [])[:1] for stem, files in found.items()}
+            others = Names(stem for stem in present if stem not in found)
+            for stem in [stem for stem, files in found.items() if not files]:
+                near = others.find(stem)
+                same = stem if stem in present else near if near and folded_name(near) == folded_name(stem) else None
+                found[stem] = [] if same is None else present[same][:1]
             if not any(found.values()):
-                bases = Counter(PurePosixPath(stem).name for stem in found)
+                bases = Counter(map(_base, found))
                 by_base: dict[str, list[Path]] = {}
                 for stem, files in present.items():
-                    by_base.setdefault(PurePosixPath(stem).name, []).append(files[0])
-                found = {
-                    stem: by_base.get(base, []) if bases[base] == 1 else []
-                    for stem, base in ((stem, PurePosixPath(stem).name) for stem in found)
-                }
+                    by_base.setdefault(_base(stem), []).append(files[0])
+                found = {stem: by_base.get(_base(stem), []) if bases[_base(stem)] == 1 else [] for stem in found}
         return {stem: gone[stem] if stem in gone else found[stem] for stem in stems}
 
     def named(self, stem: str) -> list[Path]:
@@ -152,3 +153,7 @@ class MapFinder:
         kinds = Counter(layout_of(files[0], self.own) for files in self.listed(deep=True).values())
         common = None if self.manifest else next((kind for kind, _ in kinds.most_common(1)), None)
         return (common or OWN).suffix
+
+
+def _base(stem: str) -> str:
+    return PurePosixPath(folded_name(stem)).name

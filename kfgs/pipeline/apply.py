@@ -13,7 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._check import check_range
-from .._files import as_path, check_output, write_json
+from .._files import Names, as_path, check_output, write_json
 from .._typed import typed
 from ..cameras import resize_labels
 from ..evaluation import SegmentationReport, evaluate_segmentation, load_label_map
@@ -27,7 +27,7 @@ from ..formats.splat_file import SCORE, SplatFile
 from ..gaussians import Gaussians
 from ..labels import LabelSet, OfClass, Selection, Transfer, classify, transfer_labels
 from ..labels.questions import class_rows
-from ..scenes import Scene
+from ..scenes import Scene, list_images
 from ..viz import overlay_labels, palette, plot_codebook_history, plot_training, save_picture
 from ..viz.field_colors import feature_colors
 from ..viz.palette import UNLABELLED
@@ -148,10 +148,11 @@ def true_labels(scene: Scene, folder: str | Path, split: str) -> dict[str, Tenso
     If the scene is undistorted, the label pictures are undistorted too. Masked and transparent pixels are void.
     """
     truth = {}
+    names = Names(name for name in list_images(folder) if name.lower().endswith(".png"))
     for i in scene.views(split):
-        path = as_path(folder) / f"{scene.stem(i)}.png"
-        if path.is_file():
-            truth[scene.stem(i)] = labels_of_view(scene, i, load_label_map(path))
+        name = names.find(f"{scene.stem(i)}.png") or names.find(scene.cameras[i].name)
+        if name is not None:
+            truth[scene.stem(i)] = labels_of_view(scene, i, load_label_map(as_path(folder) / name))
     return truth
 
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from .._card import short_repr
-from .._files import check_output, read_json, write_json
+from .._files import check_output, folded_name, read_json, write_json
 from .._progress import Progress, as_progress
 from .._ranks import once
 from .._typed import typed
@@ -187,7 +187,9 @@ def _check_inputs(scene: Scene, views: Sequence[int], maps: Maps, config: FitCon
         )
     check_scene(scene, views)
     stems = getattr(maps, "stems", None)
-    if stems is not None and [Path(stem).name for stem in stems] != [Path(scene.stem(i)).name for i in views]:
+    if stems is not None and [Path(folded_name(stem)).name for stem in stems] != [
+        Path(folded_name(scene.stem(i))).name for i in views
+    ]:
         raise ValueError(
             f"maps: expected the maps of the views of split {split!r} in their order ({scene.stem(views[0])}, "
             f"...), got {stems[0]}, ...; read them with FeatureFolder(path).of(scene, {split!r})"

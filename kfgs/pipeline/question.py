@@ -28,6 +28,7 @@ from ..evaluation import (
 )
 from ..evaluation.datasets import find_labels, find_masks, find_points, truth_views
 from ..evaluation.datasets.files import ReadWhenAsked
+from ..evaluation.datasets.views import named_as_in
 from ..evaluation.digests import digest_data
 from ..evaluation.encoders import NotedEncoder
 from ..evaluation.segmentation import load_label_map
@@ -185,7 +186,7 @@ def open_question(
     if kind == "Method":
         return replace(_ask_teacher(chosen, folder, loaded, truth, split), labels=labels)
     found: LabelTruth | MaskTruth = (find_labels if kind == "LabelTruth" else find_masks)(truth or folder)
-    found = _as_viewed(_of_split(found, loaded, split), loaded)
+    found = _as_viewed(_of_split(named_as_in(loaded, found), loaded, split), loaded)
     views = tuple(truth_views(loaded, found))
     digests = {"views": _digest_views(views), "truth": _digest_truth(found)}
     return Question(chosen, folder, loaded, found, views, digests, inputs, labels)

@@ -18,6 +18,7 @@ import torch
 
 from .._check import as_array, check_whole
 from .._files import (
+    Names,
     as_path,
     atomic_folder,
     check_inside,
@@ -42,6 +43,7 @@ from ..pipeline.stages import digest_tensors
 from ..quant import FeatureMaps, LinearLatents
 from ..scenes import Scene, SceneError, load_scene
 from ..scenes.blocks import Block, partition, write_parts
+from ..scenes.colmap_model import read_whole_model
 from ..scenes.masks import picture_folder
 from ..scenes.sub_models import find_model
 from .batch import map_scenes
@@ -106,7 +108,7 @@ def split_scene(
     model = find_model(source)
     if model is None:
         raise SceneError(f"scene: expected a folder with a COLMAP model, got {source}; make one with `kfgs sfm`")
-    blocks = partition(model, count)
+    blocks = partition(read_whole_model(model), count)
     facts = {
         "format": FORMAT,
         "version": 1,
@@ -118,9 +120,9 @@ def split_scene(
     }
     _check_same(out, facts)
     check_inside(out, [f"{block.name}/sparse/0" for block in blocks])
-    training = {whole.cameras[i].name for i in whole.views("train")}
+    training = set(whole.views("train"))
     for block in blocks:
-        if not training & set(block.views):
+        if not training & set(_views_of(whole, block)):
             raise SceneError(
                 f"{block.name}: expected training views that see it, got none; ask for fewer blocks than {count}"
             )
@@ -296,10 +298,15 @@ def _box(field: SemanticField) -> tuple[list[float], list[float]]:
 
 def _splits(scene: Scene, block: Block) -> dict[str, list[str]]:
     """The block's views in each split."""
-    own = set(block.views)
-    return {
-        name: [scene.stem(i) for i in views if scene.cameras[i].name in own] for name, views in scene.splits.items()
-    }
+    own = _views_of(scene, block)
+    return {name: [scene.stem(i) for i in views if i in own] for name, views in scene.splits.items()}
+
+
+def _views_of(scene: Scene, block: Block) -> set[int]:
+    """The scene's views in a block, whose names are those of the model."""
+    place = {camera.name: i for i, camera in enumerate(scene.cameras)}
+    names = Names(place)
+    return {place[name] for view in block.views if (name := names.find(view)) is not None}
 
 
 def _link(place: Path, target: Path) -> None:

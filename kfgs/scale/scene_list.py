@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePath
 
 from .._check import one_line
-from .._files import as_path, real_path
+from .._files import as_path, read_text, real_path
 
 SHOWN = 5  # lines named in an error
 NAME = re.compile(r"[^\s./\\][^/\\\0-\x1f]*")  # a folder of that name can be made anywhere, and is not hidden
@@ -41,14 +41,7 @@ def read_scenes(path: str | Path) -> list[SceneEntry]:
         ValueError: if it lists no scene, two runs have the same name, or a folder does not exist; lines are numbered.
     """
     path = as_path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected a list of scenes, a folder or an URL per line")
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()  # Windows begins it with a mark
-    except UnicodeDecodeError as error:
-        raise ValueError(
-            f"{path}: expected a list of scenes in UTF-8, got other bytes ({error}); save it as UTF-8"
-        ) from error
+    lines = read_text(path, "a list of scenes, a folder or an URL per line,").splitlines()
     numbered = [(number, re.sub(r"(^|\s)#.*", "", line).strip()) for number, line in enumerate(lines, start=1)]
     found = {number: _entry(line, path.parent) for number, line in numbered if line}
     if not found:

@@ -106,7 +106,7 @@ def partition(
     check_range("share", share, 0, 1, closed=(True, False))
     images = [image for image in found.images.values() if image.pose is not None]
     ids = found.point_ids.astype(np.int64)
-    seen = [np.searchsorted(ids, image.observed[image.observed >= 0]) for image in images]
+    seen = [np.searchsorted(ids, image.observed[np.isin(image.observed, ids)]) for image in images]
     if not any(len(rows) for rows in seen):
         raise SceneError(
             "model: expected images that say which points they see, got none; make it with COLMAP (`kfgs sfm`)"

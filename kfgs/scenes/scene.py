@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .._card import html_card
 from .._check import ORIGIN, check_shapes
-from .._files import file_stem
+from .._files import Names, file_stem
 from ..cameras.bounds import camera_extent
 from ..cameras.camera import NEAR, Camera
 from ..cameras.undistort import undistort
@@ -237,15 +237,15 @@ class Scene:
                     "by name"
                 )
             return list(self.splits[which])
-        by_name = {camera.name: i for i, camera in enumerate(self.cameras)}
-        by_name |= {self.stem(i): i for i in range(len(self))}
+        place = {camera.name: i for i, camera in enumerate(self.cameras)}
+        names = Names(place, bare=True)
         indices: list[int] = []
         for view in which:
-            i = by_name.get(view) if isinstance(view, str) else index(view)  # also numpy's and torch's integers
-            if i is None or not 0 <= i < len(self):
+            i = place.get(names.find(view) or "", -1) if isinstance(view, str) else index(view)  # also torch's integers
+            if not 0 <= i < len(self):
+                advice = names.advice(view) if isinstance(view, str) else f"names are like {self.cameras[0].name!r}"
                 raise ValueError(
-                    f"which: expected names or indices of the scene's {len(self)} views, got {view!r}; "
-                    f"names are like {self.cameras[0].name!r}"
+                    f"which: expected names or indices of the scene's {len(self)} views, got {view!r}; {advice}"
                 )
             indices.append(i)
         if len(set(indices)) != len(indices):

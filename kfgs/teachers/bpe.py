@@ -195,7 +195,7 @@ def _read_text(path: Path) -> str:
         with path.open("rb") as raw:
             packed = raw.read(2) == b"\x1f\x8b"
         with gzip.open(path) if packed else path.open("rb") as file:
-            return file.read(_LIMIT).decode("utf-8")
+            return file.read(_LIMIT).decode("utf-8-sig")
     except (
         OSError,
         EOFError,

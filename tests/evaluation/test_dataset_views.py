@@ -11,9 +11,11 @@ from messages import tells
 from PIL import Image
 
 from kfgs.evaluation import LabelTruth, LerfOvs2D, MaskAndBoxes, MaskTruth, OVS3DClosed
-from kfgs.evaluation.datasets import load_3dovs, load_lerf_ovs, truth_views
+from kfgs.evaluation.datasets import load_3dovs, load_labels, load_lerf_ovs, truth_views
+from kfgs.evaluation.datasets.views import named_as_in
 from kfgs.evaluation.foreign import Level, SplattedMethod
 from kfgs.gaussians import Gaussians
+from kfgs.pipeline import true_labels
 from kfgs.scenes import Scene, load_scene
 
 EGG, BOWL = torch.eye(4)[0], torch.eye(4)[1]
@@ -96,7 +98,7 @@ def test_cameras_get_the_size_of_the_truth(tmp_path: Path) -> None:
 def test_truth_of_another_scene(tmp_path: Path) -> None:
     scene = _scene(tmp_path, ["frame_1.png", "b.png"])
     with pytest.raises(
-        ValueError, match=tells("2 views", "such as frame_1", "frame_00001 too (1 of 1", "one data set")
+        ValueError, match=tells("2 views", "frame_00001 too (1 of 1", "did you mean 'frame_1.png'?", "one data set")
     ):
         truth_views(scene, _mask_truth("frame_00001", 48, 64))
     with pytest.raises(ValueError, match=tells("'b'", "none", "leave the picture out")):
@@ -105,3 +107,32 @@ def test_truth_of_another_scene(tmp_path: Path) -> None:
     write_picture(tmp_path / "bent/images/a.png")
     with pytest.raises(ValueError, match=tells("distortion", "scene.undistorted()")):
         truth_views(load_scene(bent), _mask_truth("a", 48, 64))
+
+
+def test_truth_and_labels_are_found_by_names_that_are_spelled_otherwise(tmp_path: Path) -> None:
+    scene = _scene(tmp_path, ["A.JPG", "K\u00fcche.png", "left/b.png"])
+    files = {"a.png": 0, "Ku\u0308che.PNG": 1, "left/b.png.png": 2}
+    for name, value in files.items():
+        (tmp_path / "labels" / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.full((48, 64), value, np.uint8)).save(tmp_path / "labels" / name, "PNG")
+    (tmp_path / "labels/classes.json").write_text('["x", "y", "z"]', encoding="utf-8-sig")
+    found = true_labels(scene, tmp_path / "labels", "all")
+    assert {stem: int(labels[0, 0]) for stem, labels in found.items()} == {"A": 0, "K\u00fcche": 1, "left/b": 2}
+    truth = load_labels(tmp_path / "labels")
+    assert [(view.stem, view.camera.name) for view in truth_views(scene, truth)] == [
+        ("Ku\u0308che", "K\u00fcche.png"), ("a", "A.JPG"), ("left/b.png", "left/b.png"),
+    ]  # fmt: skip
+    named = named_as_in(scene, truth)
+    assert {stem: int(named.maps[stem][0, 0]) for stem in named.maps} == {"A": 0, "K\u00fcche": 1, "left/b": 2}
+
+
+def test_masks_are_found_by_texts_that_are_spelled_otherwise(tmp_path: Path) -> None:
+    folder = tmp_path / "segmentations"
+    for name in ("0/Apple.png", "0/Cafe\u0301.PNG"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.full((4, 4), 255, np.uint8)).save(folder / name, "PNG")
+    (folder / "classes.txt").write_bytes("\ufeffapple\r\ncaf\u00e9\r\n".encode())
+    assert list(load_3dovs(tmp_path).frames["0"]) == ["apple", "caf\u00e9"]
+    (folder / "0/Apple.png").rename(folder / "0/aple.png")
+    with pytest.raises(ValueError, match=tells("got aple", "did you mean 'apple'?")):
+        load_3dovs(tmp_path).frames["0"]

@@ -61,3 +61,17 @@ def test_what_to_do_about_missing_maps_depends_on_who_makes_them(tmp_path):
         "expected a feature map for each of 1 views, 1 missing: a.npy; make them with `kfgs features ... "
     )
     assert f"--split all --out {tmp_path}`" in text
+
+
+def test_a_map_is_found_by_a_name_that_is_spelled_otherwise(tmp_path):
+    touch(tmp_path, "Ku\u0308che.npy", "Left/A.npy", "b.npy", "B2.npy")
+    found = MapFinder(tmp_path).find(["K\u00fcche", "left/a", "b", "B", "c"])
+    assert [names(tmp_path, files) for files in found.values()] == [
+        ["Ku\u0308che.npy"],
+        ["Left/A.npy"],
+        ["b.npy"],
+        [],
+        [],
+    ]
+    found = MapFinder(tmp_path).find(["images/b2", "images/c"])  # by the last part, as nothing else is found
+    assert [names(tmp_path, files) for files in found.values()] == [["B2.npy"], []]

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 from messages import tells
+from safetensors.torch import load_file
 from small_room import make_room
 
 from kfgs.cameras import Distortion, Similarity
@@ -136,6 +137,16 @@ def test_pictures_that_give_no_points_are_refused(scene, tmp_path):
     with pytest.raises(ValueError, match=tells("scene:", "agree with the poses", "--ignore-poses")):
         fit_color(bare, tmp_path, CONFIG)
     assert not (tmp_path / "color.ply").exists()
+
+
+def test_few_points_are_used_where_pictures_give_none(scene, tmp_path):
+    said = []
+    few = dataclasses.replace(scene, points=scene.points[:20], colors=scene.colors[:20])
+    fit_color(few, tmp_path, dataclasses.replace(CONFIG, field=CONFIG.field.with_steps(1)), report=said.append)
+    assert any("the scene has only 20 points" in line for line in said)
+    assert any("the few points of the scene are used: scene: expected pictures that fit" in line for line in said)
+    (stage,) = (tmp_path / "stages").glob("points-*/points.safetensors")
+    assert torch.equal(load_file(stage)["points"], few.points)
 
 
 def test_bad_input_is_refused_before_any_work(scene, tmp_path):

@@ -51,7 +51,9 @@ def test_a_list_from_windows_is_read(listed, tmp_path):
         ("kitchen", str(tmp_path / "kitchen")),
         ("up", str(tmp_path / "attic" / "images")),
     ]
-    path.write_bytes("kitchen\r\n".encode("utf-16"))
+    path.write_bytes("kitchen\r\n".encode("utf-16"))  # as PowerShell writes it
+    assert [entry.name for entry in read_scenes(path)] == ["kitchen"]
+    path.write_bytes("K\u00fcche\r\n".encode("latin-1"))
     with pytest.raises(ValueError, match=tells("scenes.txt", "UTF-8")):
         read_scenes(path)
 

@@ -10,10 +10,12 @@ import torch
 from cases_sfm import downsized
 from messages import tells
 from PIL import Image
+from safetensors.torch import load_file
 from tqdm import tqdm
 
 from kfgs.cameras import Camera, Distortion
 from kfgs.cli import main
+from kfgs.formats.ply import write_ply
 from kfgs.scenes import Scene, SceneError, SfmConfig, find_points, load_scene, write_known_poses
 from kfgs.scenes.known_poses import neighbours
 from kfgs.scenes.pycolmap_import import import_pycolmap
@@ -90,15 +92,26 @@ def test_sfm_keeps_poses_it_is_given(posed: Scene, tmp_path: Path, capsys: pytes
     assert "--replace" in capsys.readouterr().err
 
 
-def test_a_field_of_a_scene_without_points_trains(posed: Scene, tmp_path: Path, capsys) -> None:
-    arguments = ["color", str(posed.folder), "--out", str(tmp_path / "run"), "--steps", "2", "--preset", "quick"]
+@pytest.mark.parametrize("count", [0, 2])
+def test_a_field_of_a_scene_with_few_or_no_points_trains(posed: Scene, tmp_path: Path, capsys, count: int) -> None:
+    folder, top = posed.folder, json.loads((posed.folder / "transforms.json").read_text())
+    if count:
+        folder = tmp_path / "scene"
+        folder.mkdir()
+        for frame in top["frames"]:
+            frame["file_path"] = str(posed.folder / frame["file_path"])
+        (folder / "transforms.json").write_text(json.dumps(top | {"ply_file_path": "two.ply"}))
+        write_ply(folder / "two.ply", {name: np.arange(2, dtype=np.float32) for name in "xyz"})
+    arguments = ["color", str(folder), "--out", str(tmp_path / "run"), "--steps", "2", "--preset", "quick"]
     assert main(arguments) == 0
     said = capsys.readouterr().out
-    assert "points: the scene has none" in said
+    assert f"points: the scene has {'only 2 points' if count else 'none'}, and training starts from points" in said
     assert "triangulated from" in said
     assert (tmp_path / "run/color.ply").is_file()
     assert main(arguments) == 0
     assert "points: found in points-" in capsys.readouterr().out
+    (tensors,) = (tmp_path / "run/stages").glob("points-*/points.safetensors")
+    assert len(load_file(tensors)["points"]) > 300
 
 
 def test_poses_that_do_not_fit_are_refused(posed: Scene) -> None:

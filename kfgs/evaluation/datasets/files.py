@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..._files import Names
 from ...scenes.files import open_picture, some
 
 T = TypeVar("T")
@@ -68,8 +69,16 @@ def find_folder(places: Sequence[Path], holds: str, what: str) -> Path:
     )
 
 
+def files_of_texts(folder: Path, texts: Sequence[str]) -> dict[str, Path]:
+    """The PNG files of a folder by the text that each is named after (`Names`), or by its own stem."""
+    known = Names(texts)
+    files = sorted(file for file in folder.iterdir() if file.suffix.lower() == ".png")
+    return {known.find(file.stem) or file.stem: file for file in files}
+
+
 def check_names(where: str, found: Sequence[str], known: Sequence[str], kind: str, advice: str) -> None:
     """Raise a ValueError unless every name is known."""
     unknown = [name for name in found if name not in set(known)]
     if unknown:
-        raise ValueError(f"{where}: expected {kind} {', '.join(known)}; got {some(unknown, 3)}; {advice}")
+        near = Names(known).advice(unknown[0])
+        raise ValueError(f"{where}: expected {kind} {', '.join(known)}; got {some(unknown, 3)} ({near}); {advice}")

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from ..._files import as_path, file_stem, read_json, real_path
+from ..._files import as_path, file_stem, read_json, read_text, real_path
 from ...scenes.files import list_images, some
 from ..class_lists import VOID_NAMES, name_key
 from ..truth import LabelTruth
@@ -124,10 +124,8 @@ def _json_pairs(path: Path) -> list[tuple[Any, Any]]:
 
 
 def _csv_pairs(path: Path) -> list[tuple[Any, Any]]:
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected a table of names with ids or colours there")
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        rows = [[cell.strip() for cell in row] for row in csv.reader(file) if any(cell.strip() for cell in row)]
+    lines = read_text(path, "a table of names with ids or colours").splitlines(keepends=True)
+    rows = [[cell.strip() for cell in row] for row in csv.reader(lines) if any(cell.strip() for cell in row)]
     if rows and not rows[0][-1].isdecimal():
         rows = rows[1:]  # a line of titles
     pairs: list[tuple[Any, Any]] = []

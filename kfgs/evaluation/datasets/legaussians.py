@@ -13,7 +13,7 @@ from ..._files import as_path
 from ...scenes.files import natural_key, some
 from ..class_lists import load_classes
 from ..truth import MaskAndBoxes, MaskTruth
-from .files import ReadWhenAsked, check_names, find_folder, read_mask
+from .files import ReadWhenAsked, check_names, files_of_texts, find_folder, read_mask
 
 
 def load_legaussians(path: str | Path, scene: str | None = None) -> MaskTruth:
@@ -53,7 +53,7 @@ def load_legaussians(path: str | Path, scene: str | None = None) -> MaskTruth:
 
 
 def _read_view(view: Path, texts: list[str] | None) -> dict[str, MaskAndBoxes]:
-    files = {file.stem: file for file in sorted(view.glob("*.png"))}
+    files = files_of_texts(view, texts or ())
     if texts is not None:
         check_names(
             str(view), list(files), texts, "masks of the texts", "rename the mask, or the folder of another scene"

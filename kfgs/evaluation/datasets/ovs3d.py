@@ -5,11 +5,10 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from ..._arrays import reading
-from ..._files import as_path, file_stem
+from ..._files import as_path, file_stem, read_text
 from ...scenes.files import list_images, natural_key, some
 from ..truth import MaskAndBoxes, MaskTruth
-from .files import ReadWhenAsked, check_names, read_mask
+from .files import ReadWhenAsked, check_names, files_of_texts, read_mask
 
 OVS3D_SCENES = ("bed", "bench", "blue_sofa", "covered_desk", "lawn", "office_desk", "room", "snacks", "sofa", "table")
 OVS3D_REPORTED = ("bed", "bench", "room", "sofa", "lawn")
@@ -53,8 +52,8 @@ def read_texts(folder: Path) -> list[str]:
         ValueError: if it is empty or has a text twice.
     """
     file = folder / "classes.txt"
-    with reading(file, "the texts of a 3D-OVS scene, one per line"):
-        texts = [line.strip() for line in file.read_text(encoding="utf-8").splitlines() if line.strip()]
+    lines = read_text(file, "the texts of a 3D-OVS scene, one per line").splitlines()
+    texts = [line.strip() for line in lines if line.strip()]
     if not texts or len(set(texts)) != len(texts):
         raise ValueError(
             f"{file}: expected different texts, one per line, got {some(texts) or 'none'}; correct the file"
@@ -87,7 +86,7 @@ def _stems(scene: Path, views: list[str]) -> list[str]:
 
 
 def _read_view(view: Path, texts: list[str]) -> dict[str, MaskAndBoxes]:
-    files = {file.stem: file for file in sorted(view.glob("*.png"))}
+    files = files_of_texts(view, texts)
     check_names(str(view), list(files), texts, "masks of the texts", "correct classes.txt or the name of the mask")
     if not files:
         raise ValueError(f"{view}: expected masks <text>.png of {some(texts)}, got none; copy the folder again")

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-import difflib
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from torch import Tensor
 
 from ..._check import check_choice
+from ..._files import Names
 from ..._typed import typed
 from ...scenes.files import some
 from ...scenes.scene import Scene
 from ..method import View
 from ..segmentation import load_label_map
 from ..truth import LabelTruth, MaskTruth
+from .files import ReadWhenAsked
 
 
 @typed
@@ -34,13 +38,13 @@ def truth_views(scene: Scene, truth: LabelTruth | MaskTruth, size: Literal["trut
     if scene.distorted:
         raise ValueError("scene: expected cameras without distortion, got a distorted scene; pass scene.undistorted()")
     stems = truth.maps if isinstance(truth, LabelTruth) else truth.frames
-    index = {scene.stem(i): i for i in range(len(scene))}
+    index = views_of(scene, stems)
     missing = [stem for stem in stems if stem not in index]
     if missing:
-        near = difflib.get_close_matches(missing[0], list(index), n=1, cutoff=0.0)
+        advice = Names(camera.name for camera in scene.cameras).advice(missing[0])
         raise ValueError(
-            f"truth: expected pictures of the scene ({len(scene)} views, such as {', '.join(near)}), got {some(missing, 3)} "
-            f"too ({len(missing)} of {len(stems)} are not in it); give the scene and the labels of one data set"
+            f"truth: expected pictures of the scene ({len(scene)} views), got {some(missing, 3)} too ({len(missing)} of "
+            f"{len(stems)} are not in it); {advice} Else give the scene and the labels of one data set"
         )
     views = []
     for stem in stems:
@@ -52,6 +56,23 @@ def truth_views(scene: Scene, truth: LabelTruth | MaskTruth, size: Literal["trut
             )
         views.append(View(stem, camera if size == "scene" else camera.resized(height, width)))
     return views
+
+
+def views_of(scene: Scene, stems: Iterable[str]) -> dict[str, int]:
+    """The view of each picture of a truth that is in the scene, by its name, which may be spelled otherwise (`Names`)."""
+    place = {camera.name: i for i, camera in enumerate(scene.cameras)}
+    names = Names(place, bare=True)
+    return {stem: place[name] for stem in stems if (name := names.find(stem)) is not None}
+
+
+def named_as_in(scene: Scene, truth: LabelTruth | MaskTruth) -> LabelTruth | MaskTruth:
+    """The truth with the scene's stems as the names of its pictures."""
+    known: Mapping[str, Any] = truth.maps if isinstance(truth, LabelTruth) else truth.frames
+    stems = {stem: scene.stem(i) for stem, i in views_of(scene, known).items()}
+    if all(stem == own for stem, own in stems.items()) or len(set(stems.values())) < len(stems):
+        return truth
+    renamed = ReadWhenAsked({stems.get(stem, stem): partial(known.__getitem__, stem) for stem in known})
+    return replace(truth, maps=renamed) if isinstance(truth, LabelTruth) else replace(truth, frames=renamed)
 
 
 def _size(truth: LabelTruth | MaskTruth, stem: str) -> tuple[int, int]:
