@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from .._card import short_repr
+from .._check import ORIGIN
 from .._files import as_path
 from .._progress import Progress, as_progress
 from .._ranks import agree, first
@@ -54,7 +55,8 @@ def fit_field(
     Each step uses `config.views_per_step` views, in random order; each view is used once before any is repeated.
 
     Args:
-        params: the start; not changed. They decide dtype and device of the fit.
+        params: the start; not changed. They decide dtype and device of the fit. Without an origin they are counted from that
+            of the cameras, as the points of a scene are.
         cameras: C posed cameras without distortion.
         targets: one map per camera, of any size, NaN where nothing is known (`l1_loss`); read one at a time
             and only by `len` and index, so they may live on disk.
@@ -81,6 +83,9 @@ def fit_field(
     config, progress = config or FieldConfig(), as_progress(progress)
     generator = generator or torch.Generator().manual_seed(0)
     _check_views(params, cameras, targets)
+    if params.origin == ORIGIN:
+        params = replace(params, origin=cameras[0].origin)
+    cameras = [camera.with_origin(params.origin) for camera in cameras]
     extent = check_extent(camera_extent(cameras, params.means)) if config.extent is None else config.extent
     trainer = Trainer(params, cameras, targets, config, extent, loss, generator)
     path, identity = (as_path(checkpoint) if checkpoint is not None else None), {}

@@ -13,7 +13,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from .._check import as_tensor, check_range, check_shapes, check_whole
+from .._check import ORIGIN, as_tensor, check_range, check_shapes, check_whole
+from .._origin import Origin
 from ..gaussians import Gaussians
 from ..splat.sh import rgb_to_sh0
 
@@ -39,6 +40,7 @@ class GaussianParams:
     features: Tensor | None = None  # [N, D]
     sh0: Tensor | None = None  # [N, 3], the coefficient of degree 0
     sh_rest: Tensor | None = None  # [N, K - 1, 3], K = (degree + 1)^2; None at degree 0
+    origin: Origin = ORIGIN  # as in `Gaussians`
     antialiased: bool = False  # as in `Gaussians`
 
     def __post_init__(self) -> None:
@@ -124,7 +126,8 @@ class GaussianParams:
             sh = torch.cat([self.sh0[:, None], *rest], dim=1)
         scales, opacities = self.log_scales.exp(), self.logit_opacities.sigmoid()
         shape = self.means, self.quats, scales, opacities
-        return Gaussians(*shape, features=self.features, sh=sh, antialiased=self.antialiased)
+        facts: dict[str, Any] = {"origin": self.origin, "antialiased": self.antialiased}
+        return Gaussians(*shape, features=self.features, sh=sh, **facts)
 
     @classmethod
     def from_gaussians(cls, gaussians: Gaussians) -> GaussianParams:
@@ -152,6 +155,7 @@ class GaussianParams:
             features=None if gaussians.features is None else gaussians.features.detach().clone(),
             sh0=None if sh is None else sh[:, 0].detach().clone(),
             sh_rest=sh[:, 1:].detach().clone() if sh is not None and higher else None,
+            origin=gaussians.origin,
             antialiased=gaussians.antialiased,
         )
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from .._check import as_tensor
 from .._ranks import agree, in_order
 from ..cameras import Camera
+from ..gaussians import FACTS
 from ..splat import rasterize
 from .checkpoint import Checkpoint, digest_tensors
 from .config import FieldConfig
@@ -214,7 +215,8 @@ class Trainer:
             if name != "generator":
                 kind, rest = name.split(".", 1)
                 parts[kind][rest] = value.to(device)
-        params = replace(GaussianParams.from_tensors(parts["params"]), antialiased=self.optimizer.params.antialiased)
+        facts: dict[str, Any] = {name: getattr(self.optimizer.params, name) for name in FACTS}
+        params = replace(GaussianParams.from_tensors(parts["params"]), **facts)
         self.optimizer = FieldOptimizer(params, self._config, extent=self._extent)
         self.optimizer.load_state_(parts["adam"])
         self.statistics = GradientStatistics(**parts["statistics"])

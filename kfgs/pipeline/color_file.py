@@ -8,12 +8,12 @@ from pathlib import Path
 import torch
 from safetensors import SafetensorError
 
-from .._arrays import read_safetensors
 from .._files import digest_file, hidden_folder
-from ..fields import GaussianParams
+from .._origin import to_world
 from ..formats import read_splats, write_splats
 from ..gaussians import Gaussians
 from .stages import Run
+from .train import PARAMS, stage_params
 
 
 def may_replace(run: Run, path: Path) -> bool:
@@ -24,7 +24,7 @@ def may_replace(run: Run, path: Path) -> bool:
         return False
     found = digest_file(path)
     with hidden_folder(run.folder) as place:
-        for params in sorted((run.folder / "stages").glob("color-*/params.safetensors")):
+        for params in sorted((run.folder / "stages").glob(f"color-*/{PARAMS}")):
             written = place / path.name
             try:
                 write_splats(written, stage_gaussians(params.parent))
@@ -48,7 +48,7 @@ def what_is(path: Path) -> str:
 
 def stage_gaussians(folder: Path) -> Gaussians:
     """The Gaussians of a finished colour stage."""
-    return GaussianParams.from_tensors(read_safetensors(folder / "params.safetensors")[0]).activated().detach()
+    return stage_params(folder).activated().detach()
 
 
 def is_saved(path: Path, ours: Gaussians) -> bool:
@@ -59,5 +59,7 @@ def is_saved(path: Path, ours: Gaussians) -> bool:
         return False
     if saved.sh is None or len(saved) != len(ours):
         return False
-    same = all(torch.equal(getattr(saved, name), getattr(ours, name)) for name in ("means", "quats", "sh"))
+    same = all(torch.equal(getattr(saved, name), getattr(ours, name)) for name in ("quats", "sh"))
+    places, wanted = (to_world(cloud.means, cloud.origin) for cloud in (saved, ours))
+    same &= torch.allclose(places, wanted, rtol=1e-12) if any(ours.origin) else torch.equal(places, wanted)
     return same and all(torch.allclose(getattr(saved, name), getattr(ours, name)) for name in ("scales", "opacities"))

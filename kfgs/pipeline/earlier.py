@@ -16,7 +16,7 @@ from .._ranks import once
 from ..cameras import Camera
 from ..fields import UpliftSums
 from .maps import Maps, ViewMaps
-from .stages import STAGE_FILE, Run, digest_tensors, is_whole
+from .stages import STAGE_FILE, Run, digest_tensors, is_whole, origin_tensors
 
 SUMS = "sums.safetensors"
 GROWTH = 2
@@ -83,7 +83,7 @@ def digest_cameras(cameras: Sequence[Camera]) -> str:
     """SHA-256 of poses, intrinsics, sizes and near planes."""
     rows = [tensor for camera in cameras for tensor in (camera.viewmat, camera.K)]
     facts = torch.tensor([[camera.width, camera.height, camera.near] for camera in cameras], dtype=torch.float64)
-    return digest_tensors(*rows, facts)
+    return digest_tensors(*rows, facts, *(origin_tensors(cameras[0].origin) if cameras else ()))
 
 
 def digest_changes(maps: Maps, views: Sequence[int] | None = None) -> str | None:

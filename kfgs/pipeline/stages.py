@@ -33,6 +33,7 @@ from .._files import (
     real_path,
     write_json,
 )
+from .._origin import Origin
 from .._ranks import first, meet, once
 from ..cameras import Camera
 from ..cameras.camera import NEAR
@@ -231,9 +232,10 @@ def digest_tensors(*tensors: Tensor) -> str:
 
 
 def digest_shape(gaussians: Gaussians) -> str:
-    """SHA-256 of positions, rotations, sizes and opacities; and of `antialiased` where it is set."""
+    """SHA-256 of positions, rotations, sizes and opacities; and of an origin, and `antialiased`, where they are set."""
     shape = (getattr(gaussians, name) for name in SHAPE)
-    return digest_tensors(*shape, *[torch.tensor(True)] * gaussians.antialiased)
+    facts = [*origin_tensors(gaussians.origin), *[torch.tensor(True)] * gaussians.antialiased]
+    return digest_tensors(*shape, *facts)
 
 
 def digest_scene(scene: Scene, views: Sequence[int]) -> str:
@@ -246,7 +248,13 @@ def digest_scene(scene: Scene, views: Sequence[int]) -> str:
     intrinsics = torch.stack([camera.K for camera in cameras])
     sizes = torch.tensor([camera.size for camera in cameras])
     near = torch.tensor([camera.near for camera in cameras], dtype=torch.float64)
-    return digest_tensors(poses, intrinsics, sizes, scene.points, *([near] if (near != NEAR).any() else []))
+    near_planes = [near] if (near != NEAR).any() else []
+    return digest_tensors(poses, intrinsics, sizes, scene.points, *near_planes, *origin_tensors(scene.origin))
+
+
+def origin_tensors(origin: Origin) -> list[Tensor]:  # each [3] float64
+    """An origin for a digest or a file; none if it is zero, so that what was made before there were origins stays valid."""
+    return [torch.tensor(origin, dtype=torch.float64)] if any(origin) else []
 
 
 def digest_pictures(run: Run, scene: Scene, views: Sequence[int]) -> list[list[str]]:

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from .._arrays import read_safetensors
+from .._check import ORIGIN, as_origin
 from .._files import write_json
 from .._ranks import once
 from .._tensors import save_tensors
@@ -19,7 +20,9 @@ from ..fields import FieldConfig, FieldFit, GaussianParams
 from ..fields.config import check_extent
 from ..scenes import Scene
 from ..splat import available_engines
-from .stages import Run, Stage
+from .stages import Run, Stage, origin_tensors
+
+PARAMS = "params.safetensors"
 
 FEW_POINTS = 100
 """A scene with fewer points has lost them (a deleted or cut points file): a single photo gives COLMAP hundreds. 2 points start
@@ -93,10 +96,18 @@ def field_stage(
     def make(folder: Path) -> float:
         started = time.perf_counter()
         fit = train(scratch)
-        save_tensors(folder / "params.safetensors", fit.params.to_tensors())
+        facts = {"origin": origin for origin in origin_tensors(fit.params.origin)}
+        save_tensors(folder / PARAMS, fit.params.to_tensors() | facts)
         write_json(folder / "history.json", fit.history)
         return max(0.0, fit.history[-1]["seconds"] - (time.perf_counter() - started))  # before it was killed
 
     stage = run.stage(name, inputs, make)
     once(lambda: scratch.unlink(missing_ok=True))
-    return GaussianParams.from_tensors(read_safetensors(stage.folder / "params.safetensors")[0]), stage
+    return stage_params(stage.folder), stage
+
+
+def stage_params(folder: Path) -> GaussianParams:
+    """The parameters that a finished stage of `field_stage` has."""
+    tensors = read_safetensors(folder / PARAMS)[0]
+    origin = as_origin(tensors["origin"].tolist()) if "origin" in tensors else ORIGIN
+    return replace(GaussianParams.from_tensors(tensors), origin=origin)
