@@ -118,3 +118,13 @@ def short_of_memory(error: BaseException) -> bool:
     """
     said = str(error).lower() if isinstance(error, RuntimeError) else ""
     return isinstance(error, MemoryError) or any(words in said for words in SHORT)
+
+
+def say_coordinate(value: float, digits: int) -> str:
+    """A coordinate for people: some digits, or two after the point if it is far from zero.
+
+    Example:
+        >>> say_coordinate(1.23456, 3), say_coordinate(5411932.123, 3)
+        ('1.23', '5411932.12')
+    """
+    return f"{value:.{digits}g}" if abs(value) < 10_000 else f"{value:.2f}"

@@ -96,7 +96,8 @@ def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
     """
     pairs = common_cameras(src, dst)
     names = [file_stem(a.name) for a, _ in pairs]
-    A, B = (np.stack([_center(pair[k]) for pair in pairs]) for k in (0, 1))  # [V, 3]
+    origins = pairs[0][0].origin, pairs[0][1].origin
+    A, B = (np.stack([_center(pair[k].to(torch.float64).with_origin(origins[k])) for pair in pairs]) for k in (0, 1))
     turns = np.stack([_rotation(b).T @ _rotation(a) for a, b in pairs])  # [V, 3, 3] source world to destination world
     sizes = _extents(B)
     if min(sizes[0] / max(1.0, np.abs(B).max()), _extents(A)[0] / max(1.0, np.abs(A).max())) < 1e-9:
@@ -118,6 +119,7 @@ def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
         "median angle": float(np.median(_angles(similarity, turns)[good])),
     }
     rms = float(np.sqrt((errors[good] ** 2).mean()))
+    similarity = similarity.between_worlds(*origins)
     return Alignment(similarity, rms, size, int(good.sum()), len(pairs), "cameras of the same names", details)
 
 
@@ -260,7 +262,7 @@ def _extents(centers: Array) -> list[float]:
 
 
 def _center(camera: Camera) -> Array:
-    return camera.to(torch.float64).center.cpu().numpy()
+    return camera.center.cpu().numpy()
 
 
 def _rotation(camera: Camera) -> Array:

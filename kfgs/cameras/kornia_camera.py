@@ -28,7 +28,8 @@ def to_kornia(cameras: Sequence[Camera], *, integer_centers: bool = False) -> Pi
         integer_centers: put pixel centres on integers, as kornia's grids do.
 
     Returns:
-        `intrinsics` and `extrinsics` [B, 4, 4], `height` and `width` [B] int64. Names and `near` are lost.
+        `intrinsics` and `extrinsics` [B, 4, 4], `height` and `width` [B] int64, counted from the origin of the first
+        camera. Names, `near` and that origin are lost.
 
     Raises:
         ValueError: if there is no camera, one has distortion, or they are on several devices.
@@ -49,6 +50,7 @@ def to_kornia(cameras: Sequence[Camera], *, integer_centers: bool = False) -> Pi
                 f"cameras[{i}]: expected a pinhole camera, got {camera.distortion.model} distortion (camera "
                 f"{camera.name!r}), which PinholeCamera cannot hold; undistort it first (kfgs.cameras.undistort)"
             )
+    cameras = [camera.with_origin(cameras[0].origin) for camera in cameras]
     matrices = [matrix for camera in cameras for matrix in (camera.K, camera.viewmat)]
     devices = {str(matrix.device) for matrix in matrices}
     if len(devices) > 1:

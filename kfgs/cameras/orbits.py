@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, hypot, pi, radians, sin, tan
 
 import torch
 from torch import Tensor
 
-from .._check import check_range, check_shapes, check_size, check_whole
+from .._check import ORIGIN, as_origin, check_range, check_shapes, check_size, check_whole
 from .._typed import typed
 from .bounds import robust_bounds
 from .camera import UP, Camera, unit_vector
@@ -80,6 +80,7 @@ def orbit_cameras(
     orbit: Orbit | None = None,
     *,
     up: Tensor | Sequence[float] = UP,  # [3]
+    origin: Sequence[float] = ORIGIN,  # [3]
 ) -> list[Camera]:
     """Cameras on a circle of constant elevation around a cloud, all looking at its middle.
 
@@ -90,6 +91,7 @@ def orbit_cameras(
         points: the cloud, usually `gaussians.means`.
         orbit: number of cameras, size, elevation, ...; None: the defaults of `Orbit`.
         up: the world's up. COLMAP's worlds often have no axis that points up: pass `estimate_up(scene.cameras)`.
+        origin: that the points are counted from, `gaussians.origin`.
 
     Raises:
         ValueError: if there are no points, one is not finite, or `up` has no direction.
@@ -118,10 +120,9 @@ def orbit_cameras(
     for number in range(orbit.frames):
         a = radians(orbit.start_degrees) + 2 * pi * number / orbit.frames
         outward = cos(e) * (cos(a) * east + sin(a) * north) + sin(e) * zenith
-        cameras.append(
-            Camera.look_at(
-                center + distance * outward, center, up=zenith, fov_degrees=orbit.fov_degrees,
-                width=width, height=height, name=f"orbit_{number:04d}", near=near,
-            )
+        view = Camera.look_at(
+            center + distance * outward, center, up=zenith, fov_degrees=orbit.fov_degrees,
+            width=width, height=height, name=f"orbit_{number:04d}", near=near,
         )  # fmt: skip
+        cameras.append(replace(view, origin=as_origin(origin)))
     return cameras

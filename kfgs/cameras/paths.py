@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
-from .._check import check_size, check_whole
+from .._check import ORIGIN, check_size, check_whole
 from .camera import Camera
 from .resample import fits_aspect
 
@@ -61,7 +61,8 @@ def path_cameras(
     check_whole("every", every, 1)
     if size is not None:
         check_size(size)
-    keys = _keys(cameras, every, closed)
+    origin = cameras[0].origin if cameras else ORIGIN
+    keys = _keys([camera.with_origin(origin) for camera in cameras], every, closed)
     height, width = size or cameras[0].size
     keys = [_in_frame(key, *cameras[0].size).resized(height, width) for key in keys]
     places, turns = _poses(keys)
@@ -79,7 +80,8 @@ def path_cameras(
         viewmat[:3, :3], viewmat[:3, 3] = R[number], t[number]
         K[0, 0], K[1, 1], K[0, 2], K[1, 2] = lenses[number]
         name = f"path_{number:04d}"
-        path.append(Camera(torch.from_numpy(viewmat), torch.from_numpy(K), width, height, name=name, near=near))
+        lens = torch.from_numpy(K), width, height
+        path.append(Camera(torch.from_numpy(viewmat), *lens, name=name, near=near, origin=origin))
     return path
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import atan, cos, degrees, pi, sin
 
 from torch import Tensor
@@ -28,7 +29,7 @@ def spiral_cameras(
 
     Args:
         camera: the view.
-        points: the cloud, usually `gaussians.means`.
+        points: the cloud, usually `gaussians.means`, counted from the origin of the view.
         frames: how many cameras.
         size: (height, width) in pixels of the new cameras; None: that of the view.
         turns: how often they go around.
@@ -59,9 +60,8 @@ def spiral_cameras(
         a = turns * part
         eye = center + r * (cos(a) * right + 0.6 * sin(a) * down + sin(part) * forward)
         name = f"spiral_{number:04d}"
-        cameras.append(
-            Camera.look_at(
-                eye, target, up=-down, fov_degrees=fov, width=width, height=height, name=name, near=camera.near
-            )
+        view = Camera.look_at(
+            eye, target, up=-down, fov_degrees=fov, width=width, height=height, name=name, near=camera.near
         )
+        cameras.append(replace(view, origin=camera.origin))
     return cameras

@@ -76,11 +76,12 @@ def render(
         cameras = classes.load_scene().undistorted().cameras
     colors = open_colors(found, color, meaning)
     semantic = meaning.gaussians
+    colors = None if colors is None else colors.with_origin(semantic.origin)
     if path == "orbit":
         semantic, colors = _opened(meaning.names, semantic, colors)
     words = [word.strip() for word in (show or ("labels" if colors is None else "photo,labels")).split(",")]
     shows = {_title(word): _show(word, meaning, semantic, colors) for word in words}
-    walk = walk_of(walked, (semantic if colors is None else colors).means, cameras, frames, width)
+    walk = walk_of(walked, semantic if colors is None else colors, cameras, frames, width)
     listed = semantic.labels.unique() if "labels" in words else None
     with tqdm(total=len(walk), desc="render", unit="frame") as bar:
         save_animation(
@@ -108,7 +109,7 @@ def _opened(names: Any, semantic: Any, colors: Any) -> tuple[Any, Any]:
         if label is None:
             return cloud.select(inside)
         own = cloud is semantic
-        labels = semantic.labels if own else transfer_labels(semantic.means, semantic.labels, cloud.means).labels
+        labels = semantic.labels if own else transfer_labels(semantic, semantic.labels, cloud).labels
         return cloud.select(inside & (labels != label))
 
     shown = kept(semantic)
@@ -196,7 +197,7 @@ def _own_walk(path: Path, frames: int | None, width: int | None, film: bool) -> 
 
 
 def walk_of(
-    path: Walk | list[Camera], points: Any, cameras: list[Camera], frames: int | None, width: int | None
+    path: Walk | list[Camera], cloud: Any, cameras: list[Camera], frames: int | None, width: int | None
 ) -> list[Camera]:
     """The cameras of a path that `check_walk` gave. Those of the scene are needed for a spiral and a flight along them."""
     from ..cameras import Orbit, orbit_cameras, path_cameras, spiral_cameras
@@ -211,20 +212,21 @@ def walk_of(
     if path == "orbit":
         size = (round(width * 3 / 4), width)
         orbit = Orbit(frames=frames, size=size, elevation_degrees=45, zoom=1.5, cut=0.6)
-        return orbit_cameras(points, orbit, up=upwards(cameras))
+        return orbit_cameras(cloud.means, orbit, up=upwards(cameras), origin=cloud.origin)
     if not cameras:
         raise ValueError(
             f"scene: expected --scene for --path {path}, whose cameras it needs, got none; or take an orbit"
         )
     import torch
 
+    cameras = [camera.with_origin(cloud.origin) for camera in cameras]
     centers = torch.stack([camera.center for camera in cameras]).double()
     middle = int((centers - centers.mean(dim=0)).norm(dim=1).argmin())
     view = cameras[0 if path == "cameras" else middle]
     size = (max(1, round(width * view.height / view.width)), width)
     if path == "cameras":
         return path_cameras(cameras, frames, every=max(1, round(len(cameras) / KEYS)), size=size)
-    return spiral_cameras(view, points, frames, size=size)
+    return spiral_cameras(view, cloud.means, frames, size=size)
 
 
 def _title(word: str) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from .._card import say_coordinate
 from .._files import InUseError, atomic_path, check_output, check_own, read_json, real_path, write_json
 from .files import check_alone
 from .options import Given, Positional, Teacher
@@ -184,7 +185,7 @@ def _say_table(scenes: Iterable[Any]) -> None:
         for i, part in enumerate(scene.parts[:SHOWN]):
             size = " x ".join(f"{side:.3g}" for side in sides[i]) + (" ?" if odd[i] else "")
             long = long or odd[i]
-            center = ", ".join(f"{x:.3g}" for x in part.center)
+            center = ", ".join(say_coordinate(x, 3) for x in part.center)
             view = "" if part.view is None else f"{part.share:.1%} of {part.view}"
             name, parts = (scene.path, str(len(scene.parts))) if i == 0 else ("", "")
             rows.append((name, parts, f"{mark}{part.score:.3f}", f"{mark}{part.count}", f"({center})", size, view))

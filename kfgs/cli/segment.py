@@ -207,7 +207,7 @@ def _segment_path(
     cameras = list(loaded.cameras) if classes.scene is None else classes.load_scene().undistorted().cameras
     colors = open_colors(field, color, loaded) if coco else None
     walk: dict[str, Camera] = {
-        file_stem(camera.name): camera for camera in walk_of(path, loaded.gaussians.means, cameras, frames, width)
+        file_stem(camera.name): camera for camera in walk_of(path, loaded.gaussians, cameras, frames, width)
     }
     if coco:
         check_coco(out, walk)

@@ -15,6 +15,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from .._check import ORIGIN
+from .._origin import recounted
 from ..cameras.camera import Camera
 from ..gaussians import Gaussians
 from ..splat import rasterize
@@ -192,7 +194,7 @@ def _is_nearest(
     of_class: Tensor,  # [P] bool
 ) -> Tensor:  # [N] bool
     """Which Gaussians stand nearer to the class's surface than to any other."""
-    nearest = cKDTree(points.numpy()).query(cloud.means.detach().cpu().numpy())[1]
+    nearest = cKDTree(recounted(points, ORIGIN, cloud.origin).numpy()).query(cloud.means.detach().cpu().numpy())[1]
     return of_class[torch.from_numpy(nearest)]
 
 

@@ -10,6 +10,8 @@ from typing import Any, ClassVar
 import numpy as np
 from torch import Tensor
 
+from .._check import ORIGIN
+from .._origin import recounted
 from ..gaussians import Gaussians
 from ..scenes import Scene
 from .class_lists import VOID_NAMES, name_key
@@ -88,7 +90,7 @@ class KfgsSurface:
             got = ", ".join(truth.names.values()) or "none"
             raise ValueError(f"truth: expected names of classes, got {got}; give the names of the points' labels")
         cosines = method.gaussian_cosines(encode_unit(needed(encode), names))[self.level]
-        points = truth.points.to(method.gaussians.means)
+        points = recounted(truth.points, ORIGIN, method.gaussians.origin).to(method.gaussians.means)
         target = match_names(truth, names)
         found = score_surface(method.gaussians.means, best_labels(cosines), points, target.labels)
         rows: list[Row] = [

@@ -179,7 +179,7 @@ class ScanNetPoints:
         predicted = predicted.cpu()
         if self.assign == "nearest":
             tree = cKDTree(gaussians.means.detach().cpu().double().numpy())
-            index = torch.from_numpy(tree.query(truth.points.cpu().double().numpy(), workers=-1)[1])
+            index = torch.from_numpy(tree.query(truth.points.cpu().double().numpy() - gaussians.origin, workers=-1)[1])
             opacities, predicted = opacities[index], predicted[index]
         elif len(gaussians) != len(target):
             raise ValueError(

@@ -11,7 +11,8 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from .._check import check_choice, check_range, check_whole
+from .._check import ORIGIN, check_choice, check_range, check_whole
+from .._origin import recounted
 from ..gaussians import Gaussians
 from .method import Method, View
 from .relevancy import Encode
@@ -66,7 +67,8 @@ def gaussian_truth(
     """
     cloud = gaussians.detach().to("cpu", torch.float64)
     known = labels.cpu() >= 0
-    places, classes = points.detach().cpu().double()[known], labels.cpu()[known]
+    places = recounted(points.detach().cpu().double(), ORIGIN, cloud.origin)[known]
+    classes = labels.cpu()[known]
     found = torch.full((len(cloud),), -1, dtype=torch.int64)
     if len(places) == 0 or len(cloud) == 0:
         return found

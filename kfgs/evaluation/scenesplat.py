@@ -12,7 +12,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from .._card import short_repr
-from .._check import check_choice, check_whole
+from .._check import ORIGIN, check_choice, check_whole
+from .._origin import recounted
 from ..metrics import ConfusionMatrix
 from ..scenes.files import some
 from .class_lists import VOID_NAMES, load_classes, name_key
@@ -151,7 +152,8 @@ class SceneSplatBench:
         means = method.gaussians.means.cpu()
         if self._drops:
             means, labels = means[labels >= 0], labels[labels >= 0]
-        found = vote_nearest(truth.points, means, labels, self.neighbours)
+        points = recounted(truth.points, ORIGIN, method.gaussians.origin)
+        found = vote_nearest(points, means, labels, self.neighbours)
         if not self.within_instances:
             return found
         if truth.instances is None:

@@ -8,7 +8,8 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from .._check import check_shapes
+from .._check import ORIGIN, check_shapes
+from .._origin import recounted
 from .._typed import typed
 from ..gaussians import Gaussians
 from ..splat.engines import ALPHA_MIN
@@ -36,7 +37,7 @@ def surface_density(
     """
     check_shapes(("points", points, "P 3"))
     cloud = gaussians.detach().to("cpu", torch.float64)
-    places = points.detach().to("cpu", torch.float64)
+    places = recounted(points.detach().to("cpu", torch.float64), ORIGIN, cloud.origin)
     density = torch.zeros(len(places), dtype=torch.float64)
     cloud = cloud.select(cloud.opacities > ALPHA_MIN)  # the others never reach 1/255
     if len(cloud) == 0 or len(places) == 0:

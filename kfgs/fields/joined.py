@@ -44,7 +44,7 @@ def join_fields(fields: Sequence[SemanticField]) -> SemanticField:
     views = list(dict.fromkeys(name for field in fields for name in field.info.get("views", ())))
     return replace(
         first,
-        gaussians=Gaussians.cat([field.gaussians for field in fields]),
+        gaussians=Gaussians.cat([field.gaussians.with_origin(first.gaussians.origin) for field in fields]),
         seen=seen,
         cameras=tuple(cameras.values()),
         info=first.info | {"views": views},

@@ -70,9 +70,6 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
     """
     comments = ("written by kfgs", *comments_of_mode(splats))
     columns = columns_from_gaussians(splats.gaussians)
-    if any(splats.gaussians.origin):
-        places = to_world(splats.gaussians.means.detach().cpu(), splats.gaussians.origin)
-        columns |= {name: places[:, i].numpy() for i, name in enumerate("xyz")}
     own = {name: values for name, values in splats.extra.items() if name.split() == [name] and name not in columns}
     write_ply(path, columns | own, comments=comments)
     left = {name: values for name, values in splats.extra.items() if name not in own}
@@ -170,7 +167,7 @@ def _dc_from_rgb(columns: Columns) -> Tensor:  # [N, 3]
 
 
 def columns_from_gaussians(gaussians: Gaussians) -> Columns:
-    """The 3DGS vertex table of a cloud: logits and logarithms, zero normals, `semantic_*` features, `class_id` labels."""
+    """The 3DGS vertex table of a cloud: places in the world, logits, logarithms, zero normals, `semantic_*`, `class_id`."""
     g = gaussians.detach().to("cpu", torch.float32)
     opacity = g.opacities.clamp(1e-7, 1 - 1e-7)
     groups: list[tuple[str, Tensor]] = []
@@ -179,7 +176,8 @@ def columns_from_gaussians(gaussians: Gaussians) -> Columns:
     groups += [("opacity", opacity.logit()[:, None]), ("scale", g.scales.log()), ("rot", g.quats)]
     if g.features is not None:
         groups.append(("semantic", g.features))
-    columns: Columns = {name: g.means[:, i].numpy() for i, name in enumerate("xyz")}
+    places = to_world(g.means, g.origin)
+    columns: Columns = {name: places[:, i].numpy() for i, name in enumerate("xyz")}
     columns |= {name: np.zeros(len(g), np.float32) for name in ("nx", "ny", "nz")}
     for group, values in groups:
         for i in range(values.shape[1]):

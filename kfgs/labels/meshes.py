@@ -120,7 +120,7 @@ def label_mesh(
     if splats.gaussians.labels is None:
         raise ValueError("labelled: expected Gaussians with labels, got none; `SemanticField.label` gives them some")
     vertices, faces = _triangles(mesh)
-    places = np.concatenate([vertices, vertices[faces].mean(axis=1)])
+    places = np.concatenate([vertices, vertices[faces].mean(axis=1)]) - splats.gaussians.origin
     found = transfer_labels(splats.gaussians, splats.gaussians.labels, places, distance, method=method)
     labels = as_array(found.labels)
     names = tuple(classes) or splats.classes

@@ -9,8 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .._card import say_coordinate
 from .._check import check_shapes, check_whole
-from .._origin import FAR_UNITS, to_world
+from .._origin import to_world
 from .._rows import check_finite
 from .._typed import typed
 from ..cameras import Camera
@@ -75,7 +76,7 @@ class Part:
         return Selection.of(mask, self.how)
 
     def __repr__(self) -> str:
-        place = ", ".join(f"{x:.3g}" if abs(x) < FAR_UNITS else f"{x:.2f}" for x in self.centroid.tolist())
+        place = ", ".join(say_coordinate(x, 3) for x in self.centroid.tolist())
         size = " x ".join(f"{2 * x:.3g}" for x in self.box.half.tolist())
         view = "" if self.best_view is None else f", {self.best_view.share:.1%} of {self.best_view.camera!r}"
         what = "Gaussian" if self.count == 1 else "Gaussians"

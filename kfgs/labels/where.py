@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from .._card import say_coordinate
 from .._check import check_range, check_whole
 from .._origin import to_world
 from .._rows import check_finite
@@ -181,7 +182,9 @@ class InSphere(Where):
     def _ask(self, cloud: SplatFile) -> Selection:
         points = _points(cloud)
         inside = (points - points.new_tensor(self.center)).norm(dim=1) <= self.radius
-        return Selection.of(inside, f"within {self.radius:.4g} of ({', '.join(f'{x:.4g}' for x in self.center)})")
+        return Selection.of(
+            inside, f"within {self.radius:.4g} of ({', '.join(say_coordinate(x, 4) for x in self.center)})"
+        )
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,9 @@ from PIL import Image
 from torch import Tensor
 from tqdm import tqdm
 
-from .._check import check_range
+from .._check import ORIGIN, check_range
 from .._files import Names, as_path, check_output, write_json
+from .._origin import recounted
 from .._typed import typed
 from ..cameras import resize_labels
 from ..evaluation import SegmentationReport, evaluate_segmentation, load_label_map
@@ -290,7 +291,8 @@ def label_cloud(
         comments: those of the cloud's file (`formats.ply.read_comments`), which may say how it is drawn.
     """
     assert gaussians.labels is not None
-    moved = transfer_labels(gaussians.means, gaussians.labels, points_from_columns(cloud), distance)
+    points = recounted(points_from_columns(cloud), ORIGIN, gaussians.origin)
+    moved = transfer_labels(gaussians.means, gaussians.labels, points, distance)
     added = label_columns(moved.labels, classes.names)
     if {"red", "green", "blue"} & set(cloud):
         added = {"class_id": added["class_id"]}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from .._card import LINE, cut
 from .._check import check_choice, check_range
+from .._origin import recounted
 from .._typed import typed
 from ..align.by_cameras import Alignment, align_by_cameras
 from ..align.by_shape import align_clouds
@@ -182,7 +183,9 @@ def _common_frame(
         assert cameras is not None
         alignment = align_by_cameras(cameras, frame)
         return alignment.similarity, alignment, f"aligned by {alignment.summary}"
-    clouds = [_solid(gaussians.means, gaussians.opacities) for gaussians in (field.gaussians, splats.gaussians)]
+    a, b = field.gaussians, splats.gaussians
+    places = a.means, recounted(b.means, b.origin, a.origin)
+    clouds = [_solid(means, cloud.opacities) for means, cloud in zip(places, (a, b), strict=True)]
     check = frames_agree(*clouds)
     if check.agree:
         return Similarity.identity(), None, check.summary
@@ -193,6 +196,7 @@ def _common_frame(
     if _stays(clouds[0], alignment):
         note = f"at first {check.summary}; but of all frames their own fits best, by the {alignment.how}: they share it"
         return Similarity.identity(), None, note
+    alignment = replace(alignment, similarity=alignment.similarity.between_worlds(a.origin, a.origin))
     return alignment.similarity, alignment, f"{check.summary}; aligned by {alignment.summary}"
 
 

@@ -7,7 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from .._check import ORIGIN
 from .._files import check_output, check_own
+from .._origin import recounted
 from ..evaluation import LabelSet, load_label_set, score_recolor, score_removal, score_surface, score_views
 from ..evaluation.datasets.surface_points import load_surface_points
 from ..evaluation.surface import SurfaceReport
@@ -176,7 +178,8 @@ def _label_surface(gaussians: Gaussians, folder: Path, out: Path, classes: Label
     assert gaussians.labels is not None
     truth = load_surface_points(folder)
     points, true = truth.points.float(), truth.labels
-    report = score_surface(gaussians.means, gaussians.labels, points, true)
+    local = recounted(points, ORIGIN, gaussians.origin)
+    report = score_surface(gaussians.means, gaussians.labels, local, true)
     columns = {name: points[:, i].contiguous().numpy() for i, name in enumerate("xyz")}
     write_ply(out, columns | label_columns(report.transfer.labels, classes.names), comments=("labels carried by kfgs",))
     return report

@@ -5,8 +5,12 @@ from __future__ import annotations
 from contextlib import suppress
 from pathlib import Path
 
+import torch
+
+from .._card import say_coordinate
 from .._check import one_line
 from .._files import as_path, bytes_in_words
+from .._origin import to_world
 from ..features import FeatureFolder
 from ..features.finder import MapFinder
 from ..features.manifest import MANIFEST, read_manifest
@@ -131,8 +135,9 @@ def _describe_maps(path: Path) -> str:
 def _describe_splats(path: Path, splats: SplatFile) -> str:
     lines = [f"{path}: {splats!r}"]
     if len(splats):
-        low, high = (values.tolist() for values in splats.gaussians.means.aminmax(dim=0))
-        lines += [f"  {axis}: {a:.4g} to {b:.4g}" for axis, a, b in zip("xyz", low, high, strict=True)]
+        corners = to_world(torch.stack(splats.gaussians.means.aminmax(dim=0)), splats.gaussians.origin)
+        ends = [[say_coordinate(value, 4) for value in corner] for corner in corners.tolist()]
+        lines += [f"  {axis}: {low} to {high}" for axis, low, high in zip("xyz", *ends, strict=True)]
     lines += [f"  {name}: {value}" for name, value in splats.info.items() if not isinstance(value, dict | list)]
     labels = splats.gaussians.labels
     if labels is not None:

@@ -96,8 +96,8 @@ def field_stage(
     def make(folder: Path) -> float:
         started = time.perf_counter()
         fit = train(scratch)
-        facts = {"origin": origin for origin in origin_tensors(fit.params.origin)}
-        save_tensors(folder / PARAMS, fit.params.to_tensors() | facts)
+        origin = dict(zip(("origin",), origin_tensors(fit.params.origin), strict=False))
+        save_tensors(folder / PARAMS, fit.params.to_tensors() | origin)
         write_json(folder / "history.json", fit.history)
         return max(0.0, fit.history[-1]["seconds"] - (time.perf_counter() - started))  # before it was killed
 

@@ -38,6 +38,8 @@ from ..fields.remembered import rebased
 from ..fields.store import DESCRIPTION, TENSORS
 from ..formats import SplatFile, read_splats, write_splats
 from ..formats.folders import splat_file_of
+from ..gaussians import Gaussians
+from ..labels.nearest import places_of
 from ..pipeline import FitConfig, fit_scene
 from ..pipeline.stages import digest_tensors
 from ..quant import FeatureMaps, LinearLatents
@@ -168,7 +170,7 @@ def _write_block(folder: Path, block: Block, whole: Scene, maps_folder: Path, cl
             _link(folder / name, whole.folder / name)
     write_json(folder / "split.json", _splits(whole, block))
     if cloud is not None:
-        means, radii = as_array(cloud.gaussians.means), REACH * as_array(cloud.gaussians.scales).max(1)
+        means, radii = _places(cloud.gaussians), REACH * as_array(cloud.gaussians.scales).max(1)
         write_splats(folder / SPLAT, cloud.select(torch.from_numpy(block.needs(means, radii))))
     write_json(folder / "block.json", block.to_json())
 
@@ -205,7 +207,7 @@ def fit_block(
     options = {name: value for name, value in asdict(config).items() if name not in IDLE}
     facts: dict[str, Any] = {"gaussians": 0, "of": 0, "box": None, "seconds": 0.0, "options": digest_value(options)}
     core = None
-    if splat is None or block.holds(as_array(splat.gaussians.means)).any():
+    if splat is None or block.holds(_places(splat.gaussians)).any():
         latents = LinearLatents.load(folder.parent / LATENTS)
         result = fit_scene(
             as_taken.undistorted(),
@@ -217,7 +219,7 @@ def fit_block(
             report=report,
             progress=progress,
         )
-        own = torch.from_numpy(block.holds(as_array(result.field.gaussians.means)))
+        own = torch.from_numpy(block.holds(_places(result.field.gaussians)))
         facts |= {"gaussians": int(own.sum()), "of": len(own), "seconds": round(result.seconds, 1)}
         if bool(own.any()):
             core = select_gaussians(result.field, own)
@@ -292,8 +294,13 @@ def _check_same(out: Path, facts: dict[str, Any]) -> None:
 
 def _box(field: SemanticField) -> tuple[list[float], list[float]]:
     """The box around a field's Gaussians, spread included."""
-    means, radii = as_array(field.gaussians.means), REACH * as_array(field.gaussians.scales).max(1)[:, None]
+    means, radii = _places(field.gaussians), REACH * as_array(field.gaussians.scales).max(1)[:, None]
     return (means - radii).min(0).tolist(), (means + radii).max(0).tolist()
+
+
+def _places(gaussians: Gaussians) -> Any:  # [N, 3]
+    """Where Gaussians are in the world, as the boxes of blocks are."""
+    return as_array(places_of("gaussians", gaussians))
 
 
 def _splits(scene: Scene, block: Block) -> dict[str, list[str]]:

@@ -13,12 +13,14 @@ import torch
 from torch import Tensor
 
 from .._arrays import reading
+from .._card import say_coordinate
 from .._check import as_array, check_range
 from .._files import as_path, current_file, read_json, real_path
 from ..cameras import Camera
 from ..fields import SemanticField, join_fields, remember, select_gaussians
 from ..gaussians import Gaussians
 from ..labels import LabelSet, Selection, transfer_labels
+from ..labels.nearest import places_of
 from ..scenes.blocks import Array, Block
 
 BLOCKS, CORE, FACTS, FORMAT = "blocks.json", "core", "core.json", "kfgs.blocks"
@@ -141,7 +143,7 @@ class FieldInBlocks:
         for block, box in zip(self.blocks, self.boxes, strict=True):
             if (low <= box[1]).all() and (high >= box[0]).all():
                 field = self.field(block.name)
-                means = as_array(field.gaussians.means)
+                means = as_array(places_of("gaussians", field.gaussians))
                 inside = ((means >= low) & (means <= high)).all(1)
                 if inside.any():
                     parts.append(select_gaussians(field, torch.from_numpy(inside)))
@@ -170,7 +172,7 @@ class FieldInBlocks:
             options: of `transfer_labels`.
         """
         check_range("distance", distance, 0, closed=(False, False))
-        means = as_array(dst.means)
+        means = as_array(places_of("dst", dst))
         labels = torch.full((len(means),), -1, dtype=torch.int64)
         for block in self.blocks:
             rows = np.flatnonzero(block.holds(means))
@@ -185,7 +187,7 @@ class FieldInBlocks:
 
 def in_numbers(box: tuple[list[float], list[float]]) -> str:
     """A box as `kfgs join --box` takes it."""
-    return ",".join(f"{x:.4g}" for corner in box for x in corner)
+    return ",".join(say_coordinate(x, 4) for corner in box for x in corner)
 
 
 def read_blocks(folder: Path) -> list[Block]:
@@ -212,7 +214,7 @@ def _described(folder: Path) -> tuple[str, list[Block]]:
 
 def _in_view(camera: Camera, low: list[float], high: list[float]) -> bool:
     """Whether a box may be in the picture: False only if all its corners are beyond one side of what the camera sees."""
-    corners = np.array(list(product(*zip(low, high, strict=True))))
+    corners = np.array(list(product(*zip(low, high, strict=True)))) - camera.origin
     viewmat, K = as_array(camera.viewmat).astype(np.float64), as_array(camera.K).astype(np.float64)
     x, y, z = K @ (viewmat[:3, :3] @ corners.T + viewmat[:3, 3:])
     beyond = (z < camera.near, x < 0, x > camera.width * z, y < 0, y > camera.height * z)

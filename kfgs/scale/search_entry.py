@@ -10,6 +10,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from .._card import short_repr
+from .._origin import Origin, to_local
 from ..cameras import Camera
 from ..fields import SemanticField
 from ..gaussians import Gaussians
@@ -77,7 +78,7 @@ def describe(field: SemanticField, book: SharedCodebook, classes: LabelSet | Non
             "count": np.array([len(one) for one in selections], np.int32),
             "score": np.array([_mean_score(one) for one in selections], np.float32),
         },
-        "parts": _part_rows(parts, in_parts),
+        "parts": _part_rows(parts, in_parts, field.gaussians.origin),
     }
     return Described(rows, book, outside)
 
@@ -154,7 +155,7 @@ def _atom_rows(points: Array, atoms: Grouped, shares: Array) -> Rows:  # [N, 3],
     }
 
 
-def _part_rows(parts: list[tuple[int, Part]], shares: Array) -> Rows:  # [C, P]
+def _part_rows(parts: list[tuple[int, Part]], shares: Array, origin: Origin) -> Rows:  # [C, P]
     if not parts:
         return empty_rows("parts")
     best = shares.argmax(axis=0) if len(shares) else np.full(len(parts), -1)
@@ -163,9 +164,9 @@ def _part_rows(parts: list[tuple[int, Part]], shares: Array) -> Rows:  # [C, P]
         "label": np.array([label for label, _ in parts], np.int32),
         "count": np.array([part.count for _, part in parts], np.int32),
         "score": np.array([part.score for _, part in parts], np.float32),
-        "center": torch.stack([part.centroid for _, part in parts]).cpu().numpy().astype(np.float32),
-        "low": torch.stack([part.extent[0] for _, part in parts]).cpu().numpy().astype(np.float32),
-        "high": torch.stack([part.extent[1] for _, part in parts]).cpu().numpy().astype(np.float32),
+        "center": to_local(torch.stack([part.centroid for _, part in parts]), origin).cpu().numpy(),
+        "low": to_local(torch.stack([part.extent[0] for _, part in parts]), origin).cpu().numpy(),
+        "high": to_local(torch.stack([part.extent[1] for _, part in parts]), origin).cpu().numpy(),
         "view": np.where(share > 0, best, -1).astype(np.int32),
         "share": share.astype(np.float32),
     }

@@ -89,6 +89,8 @@ class Entry:
     """Share of its known Gaussians whose word is farther than the tolerance."""
     rows: dict[str, Rows]
     """By kind: see `COLUMNS`."""
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """That the rows' positions are counted from."""
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -154,7 +156,7 @@ def write_index(path: Path, contents: Contents) -> None:
     from safetensors.numpy import save_file
 
     entries = [contents.entries[name] for name in sorted(contents.entries)]
-    names = ("path", "marks", "digests", "gaussians", "space", "table", "views", "outside")
+    names = ("path", "marks", "digests", "gaussians", "space", "table", "views", "outside", "origin")
     about = {
         "fields": [{name: getattr(entry, name) for name in names} for entry in entries],
         "spaces": [{"teacher": one.teacher, "tolerance": one.tolerance} for one in contents.spaces],
@@ -242,7 +244,8 @@ def _contents(tensors: dict[str, Array]) -> Contents:
         if len(digests) != len(marks):
             raise ValueError(f"it holds {len(digests)} digests of {len(marks)} files")
         facts = int(one["gaussians"]), space, table, views, float(one["outside"])
-        entries[path] = Entry(path, marks, digests, *facts, own)
+        x, y, z = map(float, one.get("origin", (0, 0, 0)))
+        entries[path] = Entry(path, marks, digests, *facts, own, (x, y, z))
     unread = {name: Unread(_marks(marks), str(why)) for name, (marks, why) in about["unread"].items()}
     return Contents(spaces, tables, entries, unread)
 

@@ -87,6 +87,7 @@ def scene_found(entry: Entry, count: int, score: float, exact: bool, parts: Iter
 
 def part_found(entry: Entry, rows: Rows, i: int, view: int, share: float) -> PartFound:
     """Row i of some columns as a part."""
-    center, low, high = (tuple(map(float, rows[name][i])) for name in ("center", "low", "high"))
+    places = (rows[name][i] for name in ("center", "low", "high"))
+    center, low, high = (tuple(float(x) + o for x, o in zip(place, entry.origin, strict=True)) for place in places)
     shown = (entry.views[view], float(share)) if view >= 0 else (None, 0.0)
     return PartFound(int(rows["count"][i]), float(rows["score"][i]), center, low, high, *shown)

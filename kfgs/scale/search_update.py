@@ -81,7 +81,7 @@ def add_field(contents: Contents, name: str, found: Marked, say: Callable[[str],
     contents.spaces[space] = Space(one.teacher, one.tolerance, described.book.words.cpu().float().numpy())
     table = None if classes is None else _table_of(contents, space, classes)
     views = tuple(camera.name for camera in field.cameras)
-    facts = len(field), space, table, views, described.outside, described.rows
+    facts = len(field), space, table, views, described.outside, described.rows, field.gaussians.origin
     return Entry(name, tuple(marks), tuple(digests), *facts)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from .._check import check_range, check_shapes
+from .._origin import choose_origin
 from .._typed import typed
 from ..gaussians import Gaussians
 from ..labels import OrientedBox, Selection
@@ -18,6 +19,7 @@ from .clouds import CloudOptions, Style, add_cloud
 from .legends import letters
 from .meshes import draw_mesh
 from .palette import palette
+from .places import origin_of
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -67,7 +69,7 @@ def add_boxes(
     check_range("line_width", line_width, 0, closed=(False, False))
     import pyvista as pv
 
-    corners = np.stack([box.corners.double().cpu().numpy() for box in boxes])  # [B, 8, 3]
+    corners = _corners(plotter, boxes)
     mesh = pv.line_segments_from_points(corners[:, np.array(EDGES)].reshape(-1, 3).astype(np.float32))
     mesh.cell_data["box"] = np.repeat(np.arange(len(boxes)), len(EDGES))
     mesh.cell_data["label"] = classes[mesh.cell_data["box"]]
@@ -98,7 +100,7 @@ def add_names(
         raise ValueError(f"names: expected {len(boxes)} (one per box, at least one), got {len(names)}; name each box")
     direction = np.asarray(up, dtype=np.float64)
     check_shapes(("up", direction, "3"))
-    corners = np.stack([box.corners.double().cpu().numpy() for box in boxes])
+    corners = _corners(plotter, boxes)
     height = (corners @ direction).max(axis=1) / (direction @ direction)
     centers = corners.mean(axis=1)
     tops = centers + np.outer(height - centers @ direction / (direction @ direction), direction)
@@ -156,13 +158,20 @@ def add_selections(
             )
         mask = selection.mask.cpu()
         labels[mask] = number
-        boxes.append(OrientedBox.around(gaussians.means.detach().cpu()[mask]))
+        boxes.append(selection.box(gaussians))
+    origin_of(plotter, gaussians.origin)
     labels = labels.to(gaussians.means.device)
     shown = gaussians.replace(labels=labels)
     if not rest:
         shown = shown.select(labels >= 0)
     cloud = add_cloud(plotter, shown, color_by=_colors(shown), style=style, options=options)
     return Selections(cloud, add_boxes(plotter, boxes), add_names(plotter, boxes, list(selections), up=up))
+
+
+def _corners(plotter: pv.Plotter, boxes: Sequence[OrientedBox]) -> Array:  # [B, 8, 3]
+    """The corners of boxes, which are in the world, counted from the plotter's origin."""
+    corners = torch.stack([box.corners.double().cpu() for box in boxes])
+    return corners.numpy() - origin_of(plotter, choose_origin(corners.flatten(0, 1)))
 
 
 def _colors(gaussians: Gaussians) -> Array:  # [N, 3] uint8

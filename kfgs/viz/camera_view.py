@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from math import atan, degrees, radians, tan
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
+from .._check import ORIGIN
 from .._typed import typed
 from ..cameras import Camera
 from ..cameras.camera import NEAR
 from .headless import make_plotter
+from .places import origin_of, placed
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -30,6 +33,7 @@ def look_through(plotter: pv.Plotter, camera: Camera) -> None:
     """
     if camera.distortion is not None:
         raise ValueError(f"camera: expected a pinhole camera, got distortion {camera.distortion}; undistort it first")
+    camera = placed(plotter, camera)
     K, E = camera.K.detach().double().cpu(), camera.viewmat.detach().double().cpu()
     fx, fy, cx, cy = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
     R, center = E[:3, :3], -E[:3, :3].T @ E[:3, 3]
@@ -108,7 +112,8 @@ def camera_of(plotter: pv.Plotter, subplot: tuple[int, int] = (0, 0), *, near: f
     fx = width / aspect * fy / height
     x, y = view.GetWindowCenter()
     K = [[fx, 0.0, (1 - x) * width / 2], [0.0, fy, (1 + y) * height / 2], [0.0, 0.0, 1.0]]
-    return Camera(torch.from_numpy(E), torch.tensor(K, dtype=torch.float64), width, height, near=near)
+    lens = torch.tensor(K, dtype=torch.float64), width, height
+    return Camera(torch.from_numpy(E), *lens, near=near, origin=origin_of(plotter, ORIGIN))
 
 
 def letterboxed(camera: Camera, height: int, width: int) -> Camera:
@@ -118,4 +123,4 @@ def letterboxed(camera: Camera, height: int, width: int) -> Camera:
     K[:2] *= scale
     K[0, 2] += (width - scale * camera.width) / 2
     K[1, 2] += (height - scale * camera.height) / 2
-    return Camera(camera.viewmat.detach().double().cpu(), K, width, height, camera.name, camera.distortion, camera.near)
+    return replace(camera, viewmat=camera.viewmat.detach().double().cpu(), K=K, width=width, height=height)

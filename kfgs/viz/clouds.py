@@ -14,6 +14,7 @@ import numpy as np
 from torch import Tensor
 
 from .._check import as_array, check_choice, check_range, check_shapes
+from .._origin import to_world
 from .._typed import typed
 from ..cameras.camera import NEAR
 from ..gaussians import Gaussians
@@ -23,6 +24,7 @@ from .field_colors import FeatureColors
 from .framing import frame_middle, middle_box
 from .gaussian_actor import Moving, as_gaussians
 from .meshes import draw_mesh
+from .places import placed
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -106,6 +108,7 @@ def add_cloud(
         raise ValueError(
             f"color_by: expected 'rgb' for style {style!r}, got 'view'; only 'gaussians' follow the camera"
         )
+    gaussians = placed(plotter, gaussians)
     colors = cloud_colors(gaussians, color_by, feature_colors, clim)
     cloud = _surfaces(gaussians, options) if style == "ellipsoids" else _points(gaussians)
     _fill(cloud, gaussians, colors)
@@ -143,6 +146,8 @@ def to_pyvista(
 ) -> pv.PolyData:
     """Convert a cloud to a pyvista point cloud: one point per Gaussian, values as named arrays.
 
+    Points are in the world: in float64 if the cloud has an origin.
+
     The arrays are `index`, `rgb` (uint8), `opacity`, `scale` (standard deviations), `quat` (w, x, y, z), and, if present,
     `label` and the values of `color_by` (`score`). `to_pyvista(cloud).plot(scalars="rgb", rgb=True)` shows it;
     `add_cloud` draws true Gaussians.
@@ -158,6 +163,8 @@ def to_pyvista(
     """
     colors = cloud_colors(gaussians, color_by, feature_colors)
     cloud = _points(gaussians)
+    if any(gaussians.origin):
+        cloud.points = as_array(to_world(gaussians.means, gaussians.origin))
     _fill(cloud, gaussians, colors)
     _add_shapes(cloud, gaussians)
     return cloud

@@ -62,7 +62,7 @@ def save_turntable(
     return save_animation(
         path,
         shows,
-        orbit_cameras(cloud.means, orbit, up=UP if up is None else up),
+        orbit_cameras(cloud.means, orbit, up=UP if up is None else up, origin=cloud.origin),
         fps=fps,
         names=names,
         progress=progress,

@@ -13,6 +13,7 @@ from .._check import as_array, check_range, check_shapes, check_whole
 from ..cameras import Camera, resize_map
 from .meshes import draw_mesh
 from .pictures import as_bytes
+from .places import placed
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -50,7 +51,7 @@ def add_cameras(
     depth, chosen = _depth(cameras, size), _chosen(cameras, most)
     import pyvista as pv
 
-    segments = np.concatenate([_frustum(cameras[i], depth) for i in chosen])  # [10 C, 2, 3]
+    segments = np.concatenate([_frustum(placed(plotter, cameras[i]), depth) for i in chosen])  # [10 C, 2, 3]
     mesh = pv.line_segments_from_points(segments.reshape(-1, 3))
     mesh.cell_data["camera"] = np.repeat(chosen, 10)
     return draw_mesh(plotter, mesh, color=color, line_width=line_width, lighting=False)
@@ -105,7 +106,7 @@ def add_camera_images(
         x, y = np.array([left + 0.5, left + width - 0.5]), np.array([top + 0.5, top + height - 0.5])
         x, y = x / atlas.shape[1], 1 - y / atlas.shape[0]  # OpenGL counts rows from below
         places += [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
-        corners += list(_frustum(cameras[i], depth)[:4, 1])
+        corners += list(_frustum(placed(plotter, cameras[i]), depth)[:4, 1])
     mesh = pv.PolyData.from_regular_faces(
         np.array(corners, dtype=np.float32), np.arange(4 * len(chosen)).reshape(-1, 4)
     )
@@ -125,7 +126,9 @@ def _depth(cameras: Sequence[Camera], size: float | None) -> float:
         raise TypeError(f"cameras: expected a list of cameras, got {type(cameras).__name__}; pass {hint}")
     if not cameras:
         raise ValueError("cameras: expected at least one camera, got none; load a scene with views")
-    centers = np.stack([as_array(camera.center) for camera in cameras]).astype(np.float64)
+    centers = np.stack([as_array(camera.with_origin(cameras[0].origin).center) for camera in cameras]).astype(
+        np.float64
+    )
     extent = float(np.ptp(centers, axis=0).max())
     depth = size if size is not None else (0.05 * extent if extent > 0 else 0.2)
     check_range("size", depth, 0, closed=(False, False))

@@ -16,6 +16,7 @@ from .clouds import Style, add_cloud
 from .headless import make_plotter
 from .legends import add_legend, letters
 from .palette import palette
+from .places import placed
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -92,7 +93,7 @@ def look_over(plotter: pv.Plotter, gaussians: Gaussians, up: Sequence[float] = (
     if np.linalg.norm(side) < 1e-6:  # along a diagonal
         side = np.cross(axis, (1.0, 0.0, 0.0))
     side /= np.linalg.norm(side)
-    means = gaussians.means.detach().cpu().double().numpy()
+    means = placed(plotter, gaussians).means.detach().cpu().double().numpy()
     middle = np.median(means, axis=0)
     distance = np.linalg.norm(means - middle, axis=1)
     kept = means[distance <= np.percentile(distance, FAR)]

@@ -15,6 +15,7 @@ from .frusta import evenly
 from .legends import add_legend
 from .meshes import draw_mesh
 from .palette import palette
+from .places import placed
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -75,6 +76,7 @@ def add_matches(
         ValueError: if the transfer belongs to other clouds.
     """
     check_shapes(("dst.means", dst.means, "N 3"), ("transfer.labels", transfer.labels, "N"))
+    src, dst = placed(plotter, src), placed(plotter, dst)
     moved = dst.replace(means=dst.means + torch.as_tensor(shift).to(dst.means))
     states = match_states(transfer)
     import pyvista as pv
@@ -122,6 +124,7 @@ def add_transfer(
     check_choice("color_by", color_by, ("label", "state"))
     check_shapes(("dst.means", dst.means, "N 3"), ("transfer.labels", transfer.labels, "N"))
     check_whole("sample", sample, 1)
+    src, dst = placed(plotter, src), placed(plotter, dst)
     labelled = np.flatnonzero(as_array(transfer.labels) >= 0)
     if labelled.size == 0:
         raise ValueError(

@@ -42,8 +42,9 @@ def save_usd(path: str | Path, cloud: Gaussians | SplatFile, *, points: bool = F
     known, `score` (a number per Gaussian), and the attribute `kfgs:class`, the name of its class; it is called after that, with
     `_` for what USD does not allow (`office_chair`), or `unlabelled`.
 
-    **Convention**: coordinates stay as they are. The file says that a unit is a metre (`metersPerUnit` 1) and that z is up
-    (`upAxis`), as kfgs assumes if no cameras tell; without these, USD means centimetres and y.
+    **Convention**: coordinates stay as they are; the origin of a cloud far from zero is the translation of `/splat`. The file
+    says that a unit is a metre (`metersPerUnit` 1) and that z is up (`upAxis`), as kfgs assumes if no cameras tell; without
+    these, USD means centimetres and y.
 
     Args:
         path: the file: .usdc (binary), .usda (text), .usd (binary) or .usdz (a .usdc in an uncompressed zip file).
@@ -60,7 +61,7 @@ def save_usd(path: str | Path, cloud: Gaussians | SplatFile, *, points: bool = F
     """
     path, splats = as_path(path), SplatFile(cloud) if isinstance(cloud, Gaussians) else cloud
     check_usd_core(path)
-    from pxr import Sdf, Usd, UsdGeom, UsdUtils
+    from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils
 
     if path.suffix.lower() not in USD:
         raise ValueError(f"path: expected a name that ends in {', '.join(USD)}, got {path.name!r}; rename it")
@@ -70,7 +71,10 @@ def save_usd(path: str | Path, cloud: Gaussians | SplatFile, *, points: bool = F
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
-    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/splat").GetPrim())
+    whole = UsdGeom.Xform.Define(stage, "/splat")
+    if any(splats.gaussians.origin):
+        whole.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*splats.gaussians.origin))
+    stage.SetDefaultPrim(whole.GetPrim())
     for label, part in ({-1: splats} if splats.gaussians.labels is None else splats.by_class()).items():
         name = splats.classes[label] if 0 <= label < len(splats.classes) else ""
         place = _place(stage, label, name)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ..._arrays import reading
 from ..._files import as_path, read_json, real_path
+from ..._origin import in_world
 from ...formats.ply import points_from_columns
 from ...formats.ply_mesh import read_mesh
 from ...scenes.files import natural_key, some
@@ -51,7 +52,7 @@ def load_replica_points(path: str | Path) -> PointTruth:
         )
     names, of_object = read_replica_info(file.with_name(INFO))
     with reading(file, "a mesh with vertices"):
-        points = points_from_columns(mesh.vertices)
+        points = in_world(points_from_columns(mesh.vertices))
     objects = np.repeat(mesh.faces["object_id"].astype(np.int64), mesh.counts)
     instances = _most_frequent(mesh.corners, objects, len(points))
     unique, inverse = np.unique(instances, return_inverse=True)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..._arrays import reading
 from ..._files import as_path, read_json
+from ..._origin import in_world
 from ...formats.ply import points_from_columns, read_ply
 from ...scenes.files import some
 from ..class_lists import load_classes
@@ -47,7 +48,7 @@ def load_scannet_points(path: str | Path) -> PointTruth:
         raise ValueError(f"{file}: expected NYU40 ids of 1 to 40, got only {got}; are these labels of another table?")
     names = {int(number): name for number, name in load_classes("scannet")["names"].items()}
     with reading(file, "a mesh with labelled vertices"):
-        points = points_from_columns(columns)
+        points = in_world(points_from_columns(columns))
     return PointTruth(points, labels, names, _instances(file, len(labels)))
 
 

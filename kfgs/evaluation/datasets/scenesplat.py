@@ -16,6 +16,7 @@ from torch import Tensor
 from ..._arrays import read_array
 from ..._check import check_choice
 from ..._files import as_path
+from ..._origin import in_world
 from ..class_lists import load_classes
 from ..truth import PointTruth
 
@@ -60,7 +61,7 @@ def load_scenesplat_points(path: str | Path, benchmark: str | None = None) -> Po
     labels = _labels(file, len(points), len(names), benchmark)
     objects = file.with_name("instance.npy")
     instances = _labels(objects, len(points), None, benchmark) if objects.is_file() else None
-    return PointTruth(torch.from_numpy(points.astype(np.float32)), labels, dict(enumerate(names)), instances)
+    return PointTruth(in_world(torch.from_numpy(points).double()), labels, dict(enumerate(names)), instances)
 
 
 def _find(folder: Path, benchmark: str | None) -> Path:

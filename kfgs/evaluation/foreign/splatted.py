@@ -133,7 +133,7 @@ def _join(clouds: Sequence[Gaussians]) -> tuple[Gaussians, list[Tensor]]:
     same = all(len(cloud) == len(first) and torch.equal(cloud.means, first.means) for cloud in bare[1:])
     if same:
         return first, [torch.arange(len(first))] * len(bare)
-    both = Gaussians.cat([cloud.replace(sh=None) for cloud in bare])
+    both = Gaussians.cat([cloud.replace(sh=None).with_origin(first.origin) for cloud in bare])
     geometry = torch.cat([both.means, both.quats, both.scales, both.opacities[:, None]], 1).numpy()
     _, index, inverse = np.unique(geometry, axis=0, return_index=True, return_inverse=True)
     order = np.sort(index)  # as they come, not by their coordinates

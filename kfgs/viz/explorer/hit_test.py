@@ -149,7 +149,7 @@ def _near_ray(
     gaussians: Gaussians, bounds: tuple[Tensor, Tensor], camera: Camera, place: tuple[float, float]
 ) -> Tensor:  # [m] int64, ascending
     """The Gaussians that can reach a place in the picture, by the bound of `project` without rotations."""
-    camera = camera.to(gaussians.means)
+    camera = camera.to(gaussians.means).with_origin(gaussians.origin)
     reach, largest = bounds
     points = gaussians.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     z = points[:, 2]

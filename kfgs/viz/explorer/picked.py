@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from ..._origin import to_world
 from ...cameras import Camera
 from ...gaussians import Gaussians
 from ..frusta import evenly
@@ -80,7 +81,7 @@ class Describe:
         cloud, label = self._clouds[side], self._label(side, index, distance)
         near, views = self._surroundings(side, index)
         nearest = -1 if side == "semantic" or self._carried is None else int(self._carried.source[index])
-        x, y, z = cloud.means[index].tolist()
+        x, y, z = to_world(cloud.means[index], cloud.origin).tolist()
         return Picked(
             side=side,
             index=index,

@@ -61,7 +61,7 @@ class Exploration:
             )
         clouds: dict[Side, Gaussians] = {"semantic": meaning.gaussians}
         if color is not None:
-            clouds["color"] = color
+            clouds["color"] = color.with_origin(meaning.gaussians.origin)
         for name, cloud in clouds.items():
             if len(cloud) == 0:
                 raise ValueError(f"{name}: expected at least one Gaussian, got none; choose another file")
@@ -73,10 +73,10 @@ class Exploration:
                     "those of scene.undistorted()"
                 )
         self.meaning = meaning
-        self.cameras = tuple(cameras)
+        self.cameras = tuple(camera.with_origin(meaning.gaussians.origin) for camera in cameras)
         self.sides: tuple[Side, ...] = tuple(clouds)
         self._clouds = clouds
-        self._carried = None if color is None else Carried(meaning.gaussians, color)
+        self._carried = None if color is None else Carried(meaning.gaussians, clouds["color"])
         self._own_labels = as_array(meaning.gaussians.labels).astype(np.int64)
         self._colors = SideColors(clouds, self._carried, meaning.feature_colors)
         self.show_choices: tuple[Show, ...] = ("labels", *self._colors.show_choices, "score")
