@@ -10,6 +10,7 @@ import tyro
 from tyro.conf import Positional as Positional
 from tyro.constructors import PrimitiveConstructorSpec
 
+from .._notes import Repair
 from .._ranks import place
 from .files import check_alone, open_field
 from .output import say
@@ -73,7 +74,7 @@ class Views:
         from ..scenes import load_scene
 
         loaded = load_scene(scene, images=self.images)
-        notes = loaded.notes
+        notes = tuple(note for note in loaded.notes if not isinstance(note, Repair))  # those are printed already
         if self.split == "all" and "all" not in loaded.splits:
             rule = f"split all: all {len(loaded)} views"
             notes = tuple(rule if note.startswith("split ") else note for note in notes)

@@ -33,6 +33,9 @@ _LENSES: dict[str, tuple[str | None, int]] = {
     "FISHEYE": ("kannala_brandt", 4),
 }
 _ONE_FOCAL_LENGTH = {name for name, params in CAMERA_MODELS.values() if params.startswith("f,")}
+PANORAMA = (
+    "cut perspective views out of the panoramas, and give these with their poses"  # no undistorter can flatten them
+)
 SUPPORTED_MODELS = tuple(_LENSES)
 
 
@@ -51,9 +54,10 @@ def convert_intrinsics(model: str, params: Sequence[float]) -> tuple[torch.Tenso
         SceneError: if the model has no exact form here (FOV, THIN_PRISM_FISHEYE, EUCM, ...).
     """
     if model not in _LENSES:
+        advice = "undistort the images first: `kfgs.scenes.undistort_scene(images, model, out)` or `colmap image_undistorter`"
         raise SceneError(
-            f"camera: expected one of the COLMAP models {', '.join(_LENSES)}, got {model}; undistort the images first: "
-            "`kfgs.scenes.undistort_scene(images, model, out)` or `colmap image_undistorter`"
+            f"camera: expected one of the COLMAP models {', '.join(_LENSES)}, got {model}; "
+            f"{PANORAMA if model == 'EQUIRECTANGULAR' else advice}"
         )
     kind, length = _LENSES[model]
     fx, fy, cx, cy, *lens = [params[0], *params] if model in _ONE_FOCAL_LENGTH else params

@@ -26,6 +26,7 @@ from .poses import is_rotation, mending_notes
 
 FILES = ("cameras", "images", "points3D")
 QUATERNION_SLACK = 0.1  # text files are rounded; a norm farther from 1 means a wrong byte
+ADVISED = "write a binary model of what is whole, with the same poses: `kfgs sfm SCENE --out OUT`"
 STRANGE = 0.5  # share of the 2-D points of tracks that see another point: two models, not a damaged one
 _POSE = "QW, QX, QY, QZ, TX, TY, TZ"
 _CAMERA_SENSOR = 0
@@ -162,19 +163,12 @@ def read_whole_model(path: str | Path) -> ColmapModel:
         SceneError: if the model is damaged or partly broken, or has names in text files that pycolmap would cut at a blank.
     """
     model = read_model(path)
-    for note in model.notes:
-        require(
-            False,
-            str(path),
-            "a model with nothing broken, for pycolmap",
-            note,
-            "write a whole one: kfgs sfm SCENE --out OUT",
-        )
+    whole = "a model with nothing broken, for pycolmap"
+    require(not model.notes, str(path), whole, model.notes[:1], ADVISED)
     blank = next((image.name for image in model.images.values() if len(image.name.split()) > 1), "")
-    require(
-        model.layout == "binary" or not blank, str(path), "names without blanks, at which COLMAP cuts those of text files",
-        repr(blank), "write _ for each blank, in images.txt and in the names of the files",
-    )  # fmt: skip
+    advice = f"{ADVISED}, or write _ for each blank, in images.txt and in the names of the files"
+    expected = "names without blanks, at which COLMAP cuts those of text files"
+    require(model.layout == "binary" or not blank, str(path), expected, repr(blank), advice)
     return model
 
 

@@ -98,7 +98,7 @@ def read_numbers(path: Path, expected: str) -> Matrix:  # [rows, columns]
         if not rows or len({len(row) for row in rows}) != 1:
             raise ValueError(f"{len(rows)} rows of {sorted({len(row) for row in rows})} numbers")
     except ValueError as error:
-        raise SceneError(f"{path}: expected {expected}, got something else ({error}); write the file again") from error
+        raise SceneError(f"{path}: expected {expected}, got something else ({error}); correct it") from error
     return np.array(rows, dtype=np.float64)
 
 
@@ -177,7 +177,9 @@ def scene_of_poses(
     lost = [view.name for view, (pose, _) in zip(views, mended, strict=True) if pose is None]
     scaled = {view.name: scale for view, (_, scale) in zip(views, mended, strict=True) if scale is not None}
     if not posed:
-        raise SceneError(f"{folder}: expected poses of finite numbers, none of {len(views)} is; copy the poses again")
+        raise SceneError(
+            f"{folder}: expected poses of finite numbers, none of {len(views)} is; estimate them (`kfgs sfm`)"
+        )
     cameras = []
     for view in posed:
         viewmat = np.eye(4)
@@ -192,7 +194,7 @@ def scene_of_poses(
             lens = torch.from_numpy(own_K).float(), *own_size
             cameras.append(Camera(torch.from_numpy(viewmat), *lens, view.name))
         except ValueError as error:
-            raise SceneError(f"{view.origin}: {error}; copy the poses again") from error
+            raise SceneError(f"{view.origin}: {error}; correct this pose") from error
     paths = [view.path for view in posed]
     cameras, resized = as_large_as_pictures(cameras, paths)
     said = mending_notes(lost, scaled)

@@ -67,7 +67,7 @@ class Scene:
             twice = next(stem for stem in stems if stems.count(stem) > 1)
             raise SceneError(
                 f"cameras: expected names that differ before the suffix (features and labels are found by them), "
-                f"got {twice!r} twice; rename one of the images"
+                f"got {twice!r} twice; move one of the two images away, or rename it here and in the file of the poses"
             )
         for name, indices in self.splits.items():
             wrong = [i for i in indices if not _is_index(i, views)]
@@ -139,7 +139,7 @@ class Scene:
         if image.shape[:2] != lens.size:
             raise SceneError(
                 f"{self.image_paths[i]}: expected {lens.width}x{lens.height} pixels as its camera says, got "
-                f"{image.shape[1]}x{image.shape[0]}; give the folder of full-size images, or resize the images"
+                f"{image.shape[1]}x{image.shape[0]}; replace it by a copy of that size"
             )
         return image if self.lenses is None else undistort(image, lens)[0]
 

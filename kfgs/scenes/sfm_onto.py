@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from .._files import as_path, atomic_folder, check_output, file_stem, real_path
 from .colmap import load_colmap
-from .colmap_model import ColmapModel, read_whole_model
+from .colmap_model import ADVISED, ColmapModel, read_whole_model
 from .files import MASKS, SceneError, find_pictures, list_images, some
 from .load import find_images
 from .masks import folder_masks
@@ -151,7 +151,7 @@ def _check_names(old: ColmapModel, pictures: Path, new: list[str], images: Path)
     if twice:
         raise SceneError(f"{images}: expected names that the scene does not have, got {some(twice)} again; rename them")
     if any(image.pose is None for image in old.images.values()):
-        raise SceneError("scene: expected a model whose images all have poses, got some without; remove them from it")
+        raise SceneError(f"scene: expected a model whose images all have poses, got some without; {ADVISED}")
     return files
 
 

@@ -183,7 +183,7 @@ def _files(path: Path) -> dict[str, Path]:
 
 
 def _read_top(reader: _Reader) -> dict[str, Any]:
-    top = read_scene_json(reader.path, "write the file again")
+    top = read_scene_json(reader.path, "correct it there")
     if not isinstance(top, dict) or not isinstance(top.get("frames"), list) or not top["frames"]:
         place = Frame(reader.path, "top level", {})
         raise place.fail("", "an object with a list of 'frames'", top, "is this a transforms.json?")
@@ -195,7 +195,7 @@ def _frames(reader: _Reader, top: dict[str, Any]) -> Iterator[tuple[Frame, Any]]
     for i, values in enumerate(top["frames"]):
         frame = Frame(reader.path, f"frame {i}", {})
         if not isinstance(values, dict):
-            raise frame.fail("", "an object with a 'transform_matrix'", values, "write the file again")
+            raise frame.fail("", "an object with a 'transform_matrix'", values, "take it out of the file")
         frame.values.update({**top, **values})
         yield frame, values
 
@@ -206,7 +206,7 @@ def _read_frames(reader: _Reader) -> dict[str, Any]:
     for frame, values in _frames(reader, top):
         merged, listed = frame.values, frame.values.get("file_path")
         if not isinstance(listed, str) or not listed:
-            raise frame.fail("", "an object with a 'file_path'", values, "write the file again")
+            raise frame.fail("", "an object with a 'file_path'", values, "add it, or take the frame out")
         file = _find_image(reader, listed)
         if file is None:
             reader.missing.append(listed)

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from ..cameras.camera import Camera, Distortion
+from .colmap import PANORAMA
 from .files import MAX_NUMBER, MAX_SIDE, SceneError
 from .poses import Matrix, mend_pose
 
@@ -25,6 +26,7 @@ _PERSPECTIVE = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RA
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 _COEFFICIENTS = {"PINHOLE": (), "SIMPLE_PINHOLE": (), **dict.fromkeys(_FISHEYE, ("k1", "k2", "k3", "k4"))}
 _LENS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "k1", "k2", "k3", "k4", "p1", "p2")
+_CORRECT = "correct it, or take the frame out of the file"
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL axes to COLMAP's
 
 
@@ -104,7 +106,8 @@ class Frame:
         model = "OPENCV_FISHEYE" if self.values.get("is_fisheye") is True else self.values.get("camera_model", "OPENCV")
         if model not in _PERSPECTIVE + _FISHEYE:
             expected = f"one of {', '.join(_PERSPECTIVE + _FISHEYE)}"
-            raise self.fail("camera_model", expected, model, "undistort the images first")
+            advice = PANORAMA if model == "EQUIRECTANGULAR" else "undistort the images first"
+            raise self.fail("camera_model", expected, model, advice)
         k = [self.number(f"k{i}", 0.0) for i in range(1, 7)]
         p = [self.number(f"p{i}", 0.0) for i in (1, 2)]
         coefficients = {**{f"k{i}": value for i, value in enumerate(k, 1)}, "p1": p[0], "p2": p[1]}
@@ -132,11 +135,13 @@ class Frame:
         try:
             pose = np.array(rows, dtype=np.float64)
         except (TypeError, ValueError, OverflowError) as error:
-            raise self.fail(name, "4 rows of 4 numbers", rows, "write the file again") from error
+            raise self.fail(name, "4 rows of 4 numbers", rows, _CORRECT) from error
         if pose.shape == (3, 4):
             pose = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]])
         if pose.shape != (4, 4):
-            raise self.fail(name, "4 rows of 4 numbers", rows, "write the file again")
+            raise self.fail(name, "4 rows of 4 numbers", rows, _CORRECT)
         if not np.allclose(pose[3], [0, 0, 0, 1], rtol=0, atol=1e-6):
-            raise self.fail(name, "0 0 0 1 as the last row", pose[3].tolist(), "is it transposed?")
+            raise self.fail(
+                name, "0 0 0 1 as the last row", pose[3].tolist(), "transpose the matrix, if its last column is 0 0 0 1"
+            )
         return pose @ _FLIP

@@ -8,6 +8,7 @@ from pathlib import Path
 from PIL import Image
 
 from .._files import as_path, atomic_folder, check_output
+from .colmap import PANORAMA
 from .colmap_model import read_whole_model
 from .files import MASKS, SceneError, list_images
 from .masks import folder_masks, write_colmap_masks
@@ -44,7 +45,9 @@ def undistort_scene(images: str | Path, model: str | Path, out: str | Path) -> P
         raise SceneError(
             f"{out}: expected a new or empty folder for the undistorted scene, got one in use; choose another"
         )
-    read_whole_model(model)  # pycolmap must see no damaged file
+    cameras = read_whole_model(model).cameras.values()  # pycolmap must see no damaged file
+    if any(camera.model == "EQUIRECTANGULAR" for camera in cameras):
+        raise SceneError(f"{model}: expected lenses that can be undistorted, got EQUIRECTANGULAR; {PANORAMA}")
     advice = "check the images, or run `colmap image_undistorter` yourself"
     with (
         atomic_folder(out) as folder,

@@ -121,7 +121,7 @@ def test_replica_that_is_not_whole(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match=tells("traj.txt", "2 rows of [2, 3] numbers")):
         load_scene(folder)
     (folder / "traj.txt").write_text("\n".join([_line(2 * POSE), *lines[1:]]))
-    with pytest.raises(SceneError, match=tells("traj.txt, line 1", "0 0 0 1", "copy the poses again")):
+    with pytest.raises(SceneError, match=tells("traj.txt, line 1", "0 0 0 1", "correct this pose")):
         load_scene(folder)
     (folder / "traj.txt").write_text("\n".join(lines))
     (tmp_path / "cam_params.json").write_text(json.dumps({"camera": CAMERA | {"w": 48, "h": 64}}))

@@ -17,6 +17,7 @@ from kfgs.cameras import Camera, Distortion
 from kfgs.cli import main
 from kfgs.formats.ply import write_ply
 from kfgs.scenes import Scene, SceneError, SfmConfig, find_points, load_scene, write_known_poses
+from kfgs.scenes.colmap_model import read_whole_model
 from kfgs.scenes.known_poses import neighbours
 from kfgs.scenes.pycolmap_import import import_pycolmap
 from kfgs.scenes.sfm import SfmRun
@@ -30,6 +31,7 @@ def posed(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Scene:
     folder = tmp_path_factory.mktemp("posed")
     truth = load_scene(shared_data / "lund_door", split="all").select(range(6))
     files = sorted(downsized(shared_data / "lund_door/images", folder / "images", 6).iterdir())
+    files[0] = files[0].rename(files[0].with_name(f"the  door {files[0].name}"))  # COLMAP cuts it in a text file
     with Image.open(files[0]) as picture:
         width, height = picture.size
     frames = []
@@ -85,6 +87,7 @@ def test_sfm_keeps_poses_it_is_given(posed: Scene, tmp_path: Path, capsys: pytes
             torch.tensor(mine.distortion.coefficients), torch.tensor(given.distortion.coefficients)
         )
     assert torch.equal(scene.image(2), posed.image(2))
+    assert len(read_whole_model(tmp_path / "out/sparse/0").images) == 6  # as its message advises for names with blanks
     again = ["sfm", str(posed.folder / "transforms.json"), "--out", str(tmp_path / "out")]
     assert main([*again, "--matching", "sequential"]) == 1
     assert "--ignore-poses" in capsys.readouterr().err

@@ -123,7 +123,13 @@ def test_a_file_is_never_two_views_and_the_nearest_name_is_told(tmp_path: Path) 
     assert any(
         "2 of 3 posed images have no file" in n and n.endswith("(did you mean 'frame1.png'?)") for n in scene.notes
     )
-    (tmp_path / "images/a.jpg").unlink()
+    (tmp_path / "images/a.jpg").rename(tmp_path / "images/a.JPG")
+    write_picture(tmp_path / "images/a.png")
+    with pytest.raises(SceneError, match=tells("'a' twice", "move one of the two images away")):
+        load_scene(tmp_path)
+    (tmp_path / "images/a.JPG").unlink()
+    assert [c.name for c in load_scene(tmp_path).cameras] == ["a.png"]
+    (tmp_path / "images/a.png").unlink()
     with pytest.raises(
         SceneError, match=tells("none of its 3 posed images", "image folder", "did you mean 'frame1.png'?")
     ):

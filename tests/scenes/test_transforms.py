@@ -244,7 +244,11 @@ BAD = [
     (_frame(), {"fl_x": None, "camera_angle_x": 4.0}, ("camera_angle_x:", "(0, pi)", "got 4.0")),
     (_frame(), {"w": 64.5}, ("w and h", "1 to 100000", "got (64.")),
     (_frame(), {"h": 0}, ("w and h", "1 to 100000", "got (64.")),
-    (_frame(), {"camera_model": "EQUIRECTANGULAR"}, ("camera_model:", "got 'EQUIRECTANGULAR'", "undistort")),
+    (
+        _frame(),
+        {"camera_model": "EQUIRECTANGULAR"},
+        ("camera_model:", "got 'EQUIRECTANGULAR'", "cut perspective views"),
+    ),
     (_frame(), {"k4": 0.1}, ("k1 k2 k3 p1 p2", '"camera_model": "FULL_OPENCV"')),
 ]
 
@@ -310,8 +314,21 @@ def test_coefficients_that_the_lens_does_not_know_are_refused(
 def test_a_transposed_pose_is_refused(tmp_path: Path) -> None:
     transposed = [list(row) for row in zip(*LOOK_X, strict=True)]
     frames = [{"file_path": "images/a.png", "transform_matrix": transposed}]
-    with pytest.raises(SceneError, match=tells("0 0 0 1", "got [1.0, 2.0, 3.0, 1.0]", "transposed")):
+    with pytest.raises(SceneError, match=tells("0 0 0 1", "got [1.0, 2.0, 3.0, 1.0]", "transpose the matrix")):
         load_transforms(_write(tmp_path, frames))
+    frames[0]["transform_matrix"] = np.array(transposed).T.tolist()
+    assert load_transforms(_write(tmp_path, frames)).cameras[0].center.tolist() == [1, 2, 3]
+
+
+def test_a_bad_frame_is_taken_out_as_advised(tmp_path: Path) -> None:
+    frames = _ring(2)["frames"]
+    for bad, advice in (
+        ({"transform_matrix": [[1, 2], [3]]}, "take the frame out of the file"),
+        ({"file_path": 7}, "take the frame out"),
+    ):
+        with pytest.raises(SceneError, match=advice):
+            load_transforms(_write(tmp_path, [*frames, frames[0] | bad]))
+    assert len(load_transforms(_write(tmp_path, frames))) == 2
 
 
 def test_hostile_paths_are_missing_files(tmp_path: Path) -> None:

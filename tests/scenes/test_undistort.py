@@ -45,6 +45,16 @@ def test_masks_go_through_the_same_lens(tmp_path: Path) -> None:
     assert scene.mask(1).all()
 
 
+def test_panoramas_are_no_lens_to_undistort(tmp_path: Path) -> None:
+    model = write_model(tmp_path / "sparse/0", ["a.png"], model="EQUIRECTANGULAR", params=[64, 48])
+    write_picture(tmp_path / "images/a.png")
+    advice = "cut perspective views out of the panoramas"
+    with pytest.raises(SceneError, match=advice):
+        undistort_scene(tmp_path / "images", model, tmp_path / "out")
+    with pytest.raises(SceneError, match=tells("got EQUIRECTANGULAR", advice)):
+        load_scene(tmp_path)
+
+
 def test_wrong_folders_are_refused(tmp_path: Path) -> None:
     model = write_model(tmp_path / "sparse/0", ["a.png"])
     with pytest.raises(FileNotFoundError, match=tells("images:", "no such folder", "sparse/0")):
