@@ -5,6 +5,8 @@ Names are imported when first used, so that `import kfgs` is quick and works on 
 
 from __future__ import annotations
 
+import os
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -146,3 +148,13 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return [*__all__, "__version__"]
+
+
+def _one_thread_after_a_fork() -> None:
+    """Keep torch to one thread in a forked child: the others of its parent are not there, and it would wait for them."""
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_one_thread_after_a_fork)

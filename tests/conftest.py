@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: two workers and the programs they start, a thread each
 import torch
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does
@@ -20,6 +22,18 @@ if (
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 gc.disable()  # until all tests are collected: nothing is garbage before
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_cmdline_main(config):
+    """All tests run on two workers, unless -n says otherwise; a file or a test that is named, in this process.
+
+    A worker that crashes ends the run and is named; else pytest-xdist would start it again and wait for it forever.
+    """
+    everything = config.args_source is config.ArgsSource.TESTPATHS and "PYTEST_XDIST_WORKER" not in os.environ
+    if everything and not config.option.usepdb and getattr(config.option, "numprocesses", 0) is None:
+        config.option.numprocesses, config.option.dist, config.option.maxworkerrestart = 2, "loadfile", "0"
+        config.option.durations = 15
 
 
 def pytest_collection_finish():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -164,13 +165,14 @@ def quick_on_a_cpu() -> Iterator[None]:
     The weights of dead units shrink to denormal numbers, which a CPU multiplies some ten times slower. And at most some hundred
     rows leave a second thread little to do, and with other busy programs its waiting slows every step (measured).
     """
-    threads = torch.get_num_threads()
+    smallest = sys.float_info.min  # its half is a denormal number
+    threads, flushed = torch.get_num_threads(), smallest / 2 == 0
     torch.set_num_threads(1)  # the denormal mode is a property of this thread alone
     torch.set_flush_denormal(True)
     try:
         yield
     finally:
-        torch.set_flush_denormal(False)
+        torch.set_flush_denormal(flushed)
         torch.set_num_threads(threads)
 
 

@@ -60,6 +60,7 @@ def open_client(
     """
     check_workers(scheduler, workers, slurm, threads)
     try:
+        import dask
         from dask.utils import parse_bytes
         from distributed import Client, LocalCluster
     except ImportError as error:
@@ -79,6 +80,9 @@ def open_client(
             yield client
         return
     once = {"allowed_failures": 0}  # the driver submits again what dies
+    # Dask sets these for its workers in this process, too, whose other children then count with one thread: other last bits
+    names = ("PYTHONHASHSEED", *dask.config.get("distributed.nanny.pre-spawn-environ"))
+    before = {name: os.environ.get(name) for name in names}
     if slurm is not None:
         cluster: Any = _slurm(slurm, threads, memory, once)
         cluster.adapt(minimum=workers or 1, maximum=workers or 1)  # also replaces jobs that ended
@@ -93,8 +97,12 @@ def open_client(
             silence_logs=logging.CRITICAL,
             preload=[__name__],  # each worker calls dask_setup
         )
-    with cluster, Client(cluster, set_as_default=False) as client:
-        yield client
+    try:
+        with cluster, Client(cluster, set_as_default=False) as client:
+            yield client
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name, None) if value is None else os.environ.update({name: value})
 
 
 def dask_setup(_: Any) -> None:

@@ -229,13 +229,17 @@ def score(job: Job, key: str, *, report: Report) -> dict[str, Any]:
 
 @contextmanager
 def _work(job: Job) -> Iterator[tuple[Place, Place]]:
-    """The places of a scene and its run, with the threads of a task."""
+    """The places of a scene and its run, with the threads of a task: later work of the process has its own again."""
+    threads = torch.get_num_threads()
     torch.set_num_threads(job.options.threads)
-    with open_place(job.source) as source, open_place(job.out) as out:
-        if type(out) is Place:
-            with suppress(OSError):  # only shown to people
-                out.write_text(AT_WORK, f"process {os.getpid()} of {socket.gethostname()}\n")
-        yield source, out
+    try:
+        with open_place(job.source) as source, open_place(job.out) as out:
+            if type(out) is Place:
+                with suppress(OSError):  # only shown to people
+                    out.write_text(AT_WORK, f"process {os.getpid()} of {socket.gethostname()}\n")
+            yield source, out
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _is_manifest(name: str) -> bool:

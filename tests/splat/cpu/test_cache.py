@@ -105,6 +105,49 @@ def test_later_processes_take_the_kernel_from_the_disk_until_a_file_changes(tmp_
         assert [name for name in found["python calls"] if name != "kernel"] == ["probe"]  # numba may report the kernel
 
 
+def _drive(tmp_path, dtype="float32", first=""):
+    """Run the kernel in a process of its own; what it prints, and stderr."""
+    (tmp_path / "kernels.py").write_text(KERNELS)
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, "-c", first + DRIVER, str(FILE), dtype]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["out"] == [1, 3, 5]
+    return found["hits"], done.stderr
+
+
+def test_a_full_disk_costs_the_cache_alone(tmp_path):
+    pytest.importorskip("resource")
+    full = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))\n"
+    for _ in range(2):
+        hits, said = _drive(tmp_path, first=full)
+        assert hits == 0
+        assert said.count(str(tmp_path / "cache")) == said.count("NUMBA_CACHE_DIR to another folder") == 1
+    assert [_drive(tmp_path) for _ in range(2)] == [(0, ""), (1, "")]  # with space, as the message says
+
+
+def test_a_damaged_cache_is_made_again(tmp_path):
+    for dtype in ("float32", "float64"):
+        _drive(tmp_path, dtype)
+    index, first, second = sorted(
+        (tmp_path / "cache").rglob("*.nb?"), key=lambda file: (file.suffix != ".nbi", file.name)
+    )
+    whole, kernel, other = (file.read_bytes() for file in (index, first, second))
+    assert whole != kernel != other
+    flipped = bytearray(kernel)
+    flipped[len(kernel) // 2] ^= 1
+    for file, damaged in (
+        (index, whole[: len(whole) // 2]),
+        (index, b""),
+        (first, kernel[:1000]),
+        (first, bytes(flipped)),
+        (first, other),  # the disk was full between index and kernel
+    ):
+        file.write_bytes(damaged)
+        assert [_drive(tmp_path) for _ in range(2)] == [(0, ""), (1, "")]
+
+
 def _load(file):
     spec = importlib.util.spec_from_file_location("copied_numba_cache", file)
     module = importlib.util.module_from_spec(spec)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,6 +11,7 @@ from zlib import crc32
 
 from numba import njit
 from numba.core import event
+from numba.core.caching import IndexDataCacheFile
 
 from kfgs._compiling import tell_compiling
 
@@ -30,12 +33,51 @@ def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         try:
             kernel = njit(cache=True, **options)(function)
             index = kernel._cache._cache_file
-            index._source_stamp = index._source_stamp, SOURCES
+            index.__class__, index._source_stamp = _Kept, (index._source_stamp, SOURCES)
         except (RuntimeError, AttributeError):  # no folder can be written, or another version of numba
             return njit(**options)(function)
         return kernel
 
     return decorate
+
+
+class _Kept(IndexDataCacheFile):  # type: ignore[misc]
+    """A kernel's files in the cache: those that cannot be read are made again, and those that cannot be written are missed.
+
+    Numba writes its index before the kernel. If the disk is full between them, or the process is killed, the index leads to
+    the code of an earlier kernel, so the code says what it is of.
+    """
+
+    said = False
+
+    def _load_index(self) -> Any:
+        try:
+            return super()._load_index()
+        except Exception:  # cut off, or of another user
+            return {}
+
+    def load(self, key: Any) -> Any:
+        try:
+            checksum, content = super().load(key)
+            stamp, made_for, data = pickle.loads(content) if crc32(content) == checksum else (None, None, None)
+        except Exception:  # there is none (None cannot be unpacked), or it is cut off
+            return None
+        return data if (stamp, made_for) == (self._source_stamp, key) else None
+
+    def save(self, key: Any, data: Any) -> None:
+        content = self._dump((self._source_stamp, key, data))
+        try:
+            super().save(key, (crc32(content), content))
+        except OSError as error:
+            if not _Kept.said:
+                _Kept.said = True
+                warnings.warn(
+                    f"{self._cache_path}: expected space for compiled kernels, got {error.strerror or error}; kfgs continues, "
+                    "and every process compiles them again, which takes a minute or two. Free some space there, or set "
+                    "NUMBA_CACHE_DIR to another folder",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
 
 
 class _Compiling(event.Listener):
