@@ -1,5 +1,7 @@
 """`kfgs` and `python -m kfgs`: the command line."""
 
+import os
+import re
 import signal
 import sys
 
@@ -12,6 +14,10 @@ def run() -> int:
         signal.signal(
             signal.SIGINT, end_at_once
         )  # outside the command, too: while it is imported, and when it has ended
+    if sys.flags.optimize > 1 and {"-h", "--help"} & {*sys.argv[1:]} and os.environ.get("PYTHONOPTIMIZE") != "1":
+        # the help is in docstrings, which Python leaves out (-OO): ask a Python that keeps them
+        kept = [word for word in sys.orig_argv[1:] if not re.fullmatch("-O+", word)]
+        os.execve(sys.executable, [sys.executable, *kept], {**os.environ, "PYTHONOPTIMIZE": "1"})
     from .cli import main
 
     return main()

@@ -197,8 +197,12 @@ def test_an_empty_path_is_not_the_current_folder(text, room, run, splat, tmp_pat
     monkeypatch.chdir(tmp_path / "here")
     monkeypatch.setattr(SemanticField, "load", None)
     words = [word.replace("|", "") for word in words_of(text, room=room, run=run, splat=splat, out=tmp_path / "out")]
-    refused(words, capsys, "empty")
+    refused(words, capsys, "empty", "write . for this folder")
     assert os.listdir() == []
+
+
+def test_an_empty_class_is_no_path(run, capsys):
+    refused(["select", "", run / "field"], capsys, "QUERY: expected a class", "such as chair")
 
 
 @pytest.mark.parametrize("name", [".run.lock", ".kfgs-unfinished", "field"])

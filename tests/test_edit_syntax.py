@@ -191,3 +191,13 @@ def test_an_insertion_with_part_of_a_translation_is_refused(tmp_path):
     (tmp_path / "a.ply").write_bytes(b"")
     with pytest.raises(ValueError, match=tells("insert:", "expected 3", "a.ply:1,2")):
         read(insert=[f"{tmp_path}/a.ply:1,2"])
+
+
+def test_a_class_of_that_exact_name_wins_over_a_part():
+    words = Edits(opacity=["chair/1/2:0.5"], remove=["Chair/1", "chair/2"])
+    edits = [edit for _, edit in parse_edits(words, ["chair", "chair/1"])]
+    assert edits == [
+        Opacity(Component(OfClass("chair/1"), None, 1), 0.5),
+        Remove(OfClass("Chair/1")),
+        Remove(Component(OfClass("chair"), None, 1)),
+    ]

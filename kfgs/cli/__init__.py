@@ -124,7 +124,7 @@ def _run(words: list[str], names: dict[str, str]) -> int:
     def spoken(message: str) -> str:
         return _in_options(message, names)
 
-    _check_words(given)
+    _check_words(given, command)
     with interruptible(), warnings_as_notes(spoken, strict=strict), said_on_stderr(), said_whole(), together():
         names |= _shown_names(command)
         options = {word.partition("=")[0] for word in given}
@@ -162,8 +162,11 @@ def _expand_home(word: str) -> str:
     return str(as_path(word)) if word.startswith("~") else word
 
 
-def _check_words(words: list[str]) -> None:
+def _check_words(words: list[str], command: Callable[..., None]) -> None:
     """Raise a ValueError for an empty word, which as a path would be the current folder."""
+    first = next(iter(inspect.signature(command).parameters), "")
+    if words[:1] == [""] and first in ("query", "names"):
+        raise ValueError(f"{first.upper()}: expected a class or a phrase, got an empty text; write one, such as chair")
     for before, word in zip(["", *words], words, strict=False):
         option = word[:-1] if word.startswith("--") and word.endswith("=") else before if not word else None
         if option is not None:

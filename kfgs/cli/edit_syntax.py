@@ -46,17 +46,17 @@ class Edits:
     """For parts as in "chair/2": Gaussians at most this far apart are one part, in world units, as in `kfgs select`."""
 
 
-def parse_edits(asked: Edits) -> list[tuple[str, Any]]:
+def parse_edits(asked: Edits, names: Sequence[str] = ()) -> list[tuple[str, Any]]:
     """The edits of the options, each after its words ("--scale lamp:2"), in the order of `Edits`: recolour before remove.
 
-    Parts of a class (`chair/1`) are counted after the earlier edits; removed parts of one class are counted together. A class
-    with a name that ends in `/1` can only be edited in Python.
+    Parts of a class (`chair/1`) are counted after the earlier edits; removed parts of one class are counted together. If one
+    of the class `names` is `chair/1`, that class is meant.
 
     Raises:
         ValueError: if an option lacks its value, or the value is of another kind (the message quotes the option's text), or
             there is a distance but no part.
     """
-    edits = list(_parse(asked, partial(_where, asked.distance)))
+    edits = list(_parse(asked, partial(_where, asked.distance, {name.casefold() for name in names})))
     if asked.distance is not None and not any(_parts(getattr(edit, "where", None)) for _, edit in edits):
         raise ValueError(
             f"distance: expected an edit of a part with it (--remove chair/2), got {asked.distance} and none; name a part, or "
@@ -176,12 +176,12 @@ def _parts(where: Any) -> list[Any]:
     return [where] if isinstance(where, Component) else []
 
 
-def _where(distance: float | None, option: str, words: str) -> Any:
+def _where(distance: float | None, names: set[str], option: str, words: str) -> Any:
     """A class, or one of its connected parts, as in `chair/2`."""
     from ..labels.where import Component, OfClass
 
     name, _, part = words.rpartition("/")
-    if not (name and part.isdecimal()):
+    if words.casefold() in names or not (name and part.isdecimal()):
         return OfClass(words)
     if int(part) == 0:
         raise ValueError(f"{option}: expected parts counted from 1, got {words!r}; '{name}/1' is the largest")

@@ -132,16 +132,18 @@ def edit(
         check_alone("views", ", ".join(views) or None, "without --scene, whose views they are")
         scene.check_images()
     replayed = EditList() if replay is None else EditList.load(replay, anywhere=True)  # the user's own file
-    asked, listed = parse_edits(edits), replayed
-    for _, one in asked:
-        listed = listed.then(one)
-    if len(listed) == 0:
+    asked = parse_edits(edits)
+    if not asked and not len(replayed):
         raise ValueError("edits: expected at least one, got none; give --remove, --recolor, --move or another")
-    check_target("out", out, *inserted_files(listed))
+    check_target("out", out, *inserted_files([*replayed, *(edit for _, edit in asked)]))
     by_class = [*classes_of(replayed), *classes_of(edit for _, edit in asked)]
     named = any(isinstance(one, str) for one in by_class)
     before = open_splats("splats", splats, labelled=bool(by_class), named=named)
-    check_parts(replayed.apply(before), [one for _, one in asked])
+    start, listed = replayed.apply(before), replayed
+    asked = parse_edits(edits, start.classes)
+    check_parts(start, [edit for _, edit in asked])
+    for _, edit in asked:
+        listed = listed.then(edit)
     cameras = [] if scene.scene is None else _cameras_to_show(before, scene, views)
     after = _apply(listed, before, [words for words, _ in asked])
     states = (cloud.gaussians for cloud in accumulate(listed, lambda cloud, one: one.apply(cloud), initial=before))

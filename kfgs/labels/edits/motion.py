@@ -125,15 +125,28 @@ class Duplicate(_Motion):
 
 
 def transformed(gaussians: Gaussians, similarity: Similarity, origin: Origin) -> Gaussians:
-    """`transform_gaussians`, counted from an origin; a ValueError if a number overflows, or a scale becomes 0."""
+    """`transform_gaussians`, counted from an origin; a ValueError if a number leaves the range in which its type is of use.
+
+    Fourth powers (determinants of 2-D covariances) stay finite, scales stay above 0, and positions are not rounded by more than
+    a tenth of the size of what moves, unless they were before.
+    """
     moved = transform_gaussians(gaussians, similarity).with_origin(origin)
-    for name, old, new in (("positions", gaussians.means, moved.means), ("scales", gaussians.scales, moved.scales)):
-        good = new.isfinite() & ((new > 0) if name == "scales" else True)
-        if not bool((good | ~old.isfinite()).all()):
-            raise ValueError(
-                f"{name}: expected finite ones that {new.dtype} can hold, got some beyond after scale {similarity.scale:g} and "
-                f"translation {[float(f'{part:.3g}') for part in similarity.translation.tolist()]}; move less far, or scale less"
-            )
+    limits = torch.finfo(moved.means.dtype)
+    sound = [
+        (one.means.abs() <= limits.max**0.25) & (one.scales > 0) & (one.scales <= limits.max**0.25)
+        for one in (gaussians, moved)
+    ]
+    good, rows = bool((sound[1] | ~sound[0]).all()), sound[0].all(dim=1)
+    if good and bool(rows.any()):
+        before, after = gaussians.means[rows].double(), moved.means[rows].double()
+        size = torch.maximum(before.amax(0) - before.amin(0), gaussians.scales[rows].amax(0)).max() * similarity.scale
+        good = bool(after.abs().max() * limits.eps <= max(0.1 * size, 2 * before.abs().max() * limits.eps))
+    if not good:
+        raise ValueError(
+            f"expected positions and scales that {moved.means.dtype} can tell apart, got some beyond after scale "
+            f"{similarity.scale:g} and translation {[float(f'{part:.3g}') for part in similarity.translation.tolist()]}; move "
+            "less far, or scale less"
+        )
     return moved
 
 

@@ -193,15 +193,26 @@ def test_the_centroid_of_what_is_invisible_is_the_plain_mean():
     "edit",
     [
         Move("chair", (1e39, 0, 0)),
+        Move("chair", (1e38, 0, 0)),
+        Move("chair", (0, 1e9, 0)),
         Move("chair", scale=1e200),
+        Move("chair", scale=1e30),
         Move("chair", scale=3, pivot=(1e38, 0, 3e38)),
         Move("chair", scale=1e-60),
         Duplicate("chair", (0, -1e39, 0)),
     ],
     ids=repr,
 )
-def test_what_overflows_is_an_error_and_no_infinity(edit):
+def test_what_leaves_the_range_of_float32_is_an_error(edit):
     splats = scene()
     splats = splats.replace(gaussians=splats.gaussians.to(torch.float32))
-    with pytest.raises(ValueError, match=tells("expected finite", "float32", "after scale", "less")):
+    with pytest.raises(ValueError, match=tells("expected positions and scales that", "float32", "after scale", "less")):
         edit.apply(splats)
+
+
+def test_a_kilometre_is_not_too_far():
+    splats = scene()
+    splats = splats.replace(gaussians=splats.gaussians.to(torch.float32))
+    chair = splats.gaussians.labels == 1
+    moved = Move("chair", (1000, 0, 0)).apply(splats).gaussians.means[chair] - splats.gaussians.means[chair]
+    torch.testing.assert_close(moved, torch.tensor([1000.0, 0, 0]).expand_as(moved), rtol=0, atol=1e-4)
