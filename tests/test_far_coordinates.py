@@ -8,10 +8,14 @@ import torch
 
 from kfgs import Camera, Gaussians, SplatFile, rasterize, read_splats, transfer_labels, write_splats
 from kfgs._origin import choose_origin, to_world
+from kfgs.align import align_by_cameras
+from kfgs.cameras import Orbit, orbit_cameras, path_cameras, spiral_cameras
 from kfgs.cameras.similarity import Similarity
+from kfgs.evaluation.surface_density import surface_density
 from kfgs.formats.ply import read_ply, write_ply
-from kfgs.labels import InBox, InSphere, Move, OfClass, Selection, connected_parts, join
+from kfgs.labels import InBox, InSphere, Move, OfClass, Selection, connected_parts, join, label_mesh
 from kfgs.splat.transform import transform_gaussians
+from kfgs.viz import save_usd
 
 UTM = np.array([448262.25, 5411932.5, 200.0])
 
@@ -198,3 +202,74 @@ def test_a_splat_file_says_its_origin_and_keeps_it(tmp_path):
     part = splats.select(torch.arange(5))
     assert part.gaussians.origin == splats.gaussians.origin != (0, 0, 0)
     assert SplatFile(part.gaussians).gaussians.detach().to(torch.float64).origin == splats.gaussians.origin
+
+
+def test_pictures_of_two_clouds_share_an_origin(tmp_path):
+    pv = pytest.importorskip("pyvista")
+    from kfgs.viz import add_boxes, add_cameras, add_cloud, look_through, to_pyvista, to_trimesh
+    from kfgs.viz.camera_view import camera_of
+
+    world = far_file(tmp_path / "far.ply")
+    gaussians = read_splats(tmp_path / "far.ply").gaussians
+    for points in (to_pyvista(gaussians).points, to_trimesh(gaussians).vertices):
+        np.testing.assert_allclose(points, world, rtol=0, atol=1e-4)
+    plotter = pv.Plotter(off_screen=True, window_size=(32, 24))
+    near = Camera.look_at((0, -4, 1), (0, 0, 0), width=32, height=24)
+    camera = Camera(near.viewmat, near.K, 32, 24, origin=tuple(UTM))
+    box = Selection.of(torch.ones(60, dtype=torch.bool)).box(gaussians)
+    actors = [add_cloud(plotter, gaussians), add_cloud(plotter, gaussians.with_origin(tuple(UTM + 50)))]
+    frames = add_boxes(plotter, [box]).mapper.dataset, add_cameras(plotter, [camera]).mapper.dataset
+    one, two = (actor.mapper.dataset.points for actor in actors)
+    np.testing.assert_allclose(one, two, rtol=0, atol=1e-4)
+    assert max(np.abs(np.asarray(mesh.points)).max() for mesh in frames) < 20
+    look_through(plotter, camera)
+    seen = camera_of(plotter)
+    np.testing.assert_allclose(to_world(seen.center, seen.origin), UTM + np.array([0, -4, 1]), rtol=0, atol=1e-4)
+    plotter.close()
+
+
+def test_cameras_around_a_far_cloud_see_it():
+    near, _ = cloud()
+    far = near.replace(origin=tuple(UTM))
+    (orbit,) = orbit_cameras(far.means, Orbit(frames=1, size=(24, 32)), origin=far.origin)
+    walk = path_cameras([orbit, orbit.with_origin(tuple(UTM + 9)), spiral_cameras(orbit, far.means, 3)[1]], 4)
+    for camera in (orbit, *walk):
+        assert float(rasterize(far, camera).alpha.max()) > 0.05
+
+
+def test_truth_and_meshes_meet_the_field_in_the_world():
+    near, places = cloud(count=200)
+    far = near.replace(origin=tuple(UTM))
+    world = places.numpy() + UTM
+    mesh = label_mesh((world, np.array([[0, 1, 2]])), far, classes=("a", "b", "c"))
+    assert torch.equal(torch.from_numpy(mesh.vertex_labels), near.labels)
+    density = surface_density(far, torch.from_numpy(world))
+    torch.testing.assert_close(density, surface_density(near, places), rtol=1e-4, atol=1e-6)
+
+
+def test_usd_has_the_origin_as_a_translation(tmp_path):
+    pxr = pytest.importorskip("pxr.Usd")
+    far_file(tmp_path / "far.ply")
+    splats = read_splats(tmp_path / "far.ply")
+    save_usd(tmp_path / "far.usda", splats)
+    stage = pxr.Stage.Open(str(tmp_path / "far.usda"))
+    assert tuple(stage.GetDefaultPrim().GetAttribute("xformOp:translate").Get()) == splats.gaussians.origin
+
+
+def test_a_checkpoint_in_double_keeps_its_place(tmp_path):
+    near, places = cloud()
+    raw = {"means": places + torch.from_numpy(UTM), "scales": near.scales.log(), "quats": near.quats}
+    raw |= {"opacities": near.opacities.logit(), "sh0": near.sh[:, :1], "shN": near.sh[:, 1:]}
+    torch.save({"step": 1, "splats": raw}, tmp_path / "ckpt_1.pt")
+    back = read_splats(tmp_path / "ckpt_1.pt").gaussians
+    assert np.abs(world_of(back) - places.numpy() - UTM).max() < 1e-5
+
+
+def test_cameras_of_two_frames_are_aligned_in_the_world():
+    ring = [(3 * np.cos(a), 3 * np.sin(a), 1.0 + 0.2 * a) for a in np.linspace(0, 5, 6)]
+    local = [Camera.look_at(eye, (0, 0, 0), width=32, height=24, name=f"{i}.png") for i, eye in enumerate(ring)]
+    turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    to_utm = Similarity(2.0, turn, torch.from_numpy(UTM))
+    found = align_by_cameras(local, [to_utm.apply_to_camera(camera) for camera in local]).similarity
+    point = torch.tensor([[0.3, -0.2, 1.0]]).double()
+    assert float((found.apply(point) - to_utm.apply(point)).abs().max()) < 1e-4

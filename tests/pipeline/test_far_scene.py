@@ -1,0 +1,102 @@
+"""A toy room moved to UTM: fit, colours, labels and edits are those of the room where it was, in the world's coordinates."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from cases_color import make_splat
+from small_room import FIELD, make_room
+
+from kfgs import FeatureFolder, SemanticField, UpliftConfig, attach, fit_scene, load_scene, read_splats
+from kfgs.cli import main
+from kfgs.fields import GaussianParams, join_fields
+from kfgs.formats.ply import read_ply, write_ply
+from kfgs.pipeline import FitConfig
+from kfgs.pipeline.color import ColorConfig, fit_color
+
+UTM = np.array([448262.0, 5411932.0, 200.0])
+COLOR = ColorConfig(sh_degree=1, field=dataclasses.replace(FIELD, steps=4, densify_from=5, densify_until=6))
+
+
+def fit(folder):
+    scene = load_scene(folder / "scene")
+    maps = FeatureFolder(folder / "scene" / "features", [scene.stem(i) for i in scene.views("train")])
+    config = FitConfig(uplift=UpliftConfig.field(max_gaussians=1_500))
+    fit_scene(scene, maps, folder / "run", config, splat=folder / "my.ply")
+    return SemanticField.load(folder / "run" / "field"), scene
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory):
+    """near/ and far/: a scene, my.ply, and a field of both; only the model and the splat of the second are moved."""
+    root = tmp_path_factory.mktemp("rooms")
+    for name, offset in (("near", 0 * UTM), ("far", UTM)):
+        make_splat(make_room(root / name / "scene"), root / name / "my.ply")
+        model = root / name / "scene" / "sparse" / "0"
+        whole = pycolmap.Reconstruction(str(model))
+        whole.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), offset))
+        whole.write(str(model))
+        table = read_ply(root / name / "my.ply")
+        moved = {axis: table[axis].astype(np.float64) + offset[i] for i, axis in enumerate("xyz")}
+        write_ply(root / name / "my.ply", table | moved)
+    return {name: (root / name, *fit(root / name)) for name in ("near", "far")}
+
+
+def test_labels_are_the_same(rooms):
+    (_, near, scene), (folder, far, moved) = rooms["near"], rooms["far"]
+    assert any("448262" in note for note in moved.notes)
+    assert moved.origin != near.gaussians.origin == (0, 0, 0)
+    assert np.abs(np.array(far.gaussians.origin) - UTM).max() < 5
+    classes = near.label_set()
+    same = [
+        (near.segment(a, classes) == far.segment(b, classes)).double().mean()
+        for a, b in zip(scene.cameras, moved.cameras, strict=True)
+    ]
+    assert min(same) > 0.995  # a pixel between two classes may fall the other way
+    packed = far.save(folder / "field.kfgs.safetensors", precision="small") or folder / "field.kfgs.safetensors"
+    assert SemanticField.load(packed).gaussians.origin == far.gaussians.origin
+    again = join_fields([far, dataclasses.replace(far, gaussians=far.gaussians.with_origin(UTM - 20))])
+    first, second = again.gaussians.means.chunk(2)
+    torch.testing.assert_close(first, second, rtol=0, atol=1e-4)
+
+
+def test_answers_and_files_are_in_the_world(rooms, capsys):
+    answers = {}
+    for name, (folder, field, _) in rooms.items():
+        attached = attach(field, folder / "my.ply")
+        attached.splats.save(folder / "labelled.ply")
+        assert main(["select", "chair", str(folder / "labelled.ply"), "--out", str(folder / "chosen")]) == 0
+        facts = json.loads((folder / "chosen" / "selection.json").read_text())
+        low, high = ([str(round(x, 3)) for x in corner] for corner in facts["parts"][0]["extent"])
+        edit = ["edit", str(folder / "labelled.ply"), "--remove", "chair", "--move", "sofa:0.5,0,0"]
+        assert main([*edit, "--out", str(folder / "edited.ply")]) == 0
+        capsys.readouterr()
+        assert main(["info", str(folder / "edited.ply")]) == 0
+        answers[name] = attached.labels, facts["parts"], (low, high), capsys.readouterr().out
+    assert torch.equal(answers["near"][0], answers["far"][0])
+    for near, far in zip(answers["near"][1], answers["far"][1], strict=True):
+        np.testing.assert_allclose(np.array(far["centroid"]) - UTM, near["centroid"], rtol=0, atol=1e-3)
+        np.testing.assert_allclose(np.array(far["extent"]) - UTM, near["extent"], rtol=0, atol=1e-3)
+        assert near["indices"] == far["indices"]
+    assert "448259" in answers["far"][3]
+    near, far = (read_ply(rooms[name][0] / "edited.ply") for name in ("near", "far"))
+    for i, axis in enumerate("xyz"):
+        np.testing.assert_allclose(far[axis] - UTM[i], near[axis], rtol=0, atol=1e-3)
+
+
+def test_colours_are_trained_where_the_scene_is(rooms):
+    clouds = {}
+    for name, (folder, _, scene) in rooms.items():
+        fit_color(scene, folder / "colors", COLOR)
+        clouds[name] = fit_color(load_scene(folder / "scene"), folder / "colors", COLOR).gaussians  # from its stage
+        saved = read_splats(folder / "colors" / "color.ply").gaussians
+        np.testing.assert_allclose(
+            saved.means.double() + torch.tensor(saved.origin), clouds[name].means.double() + torch.tensor(clouds[name].origin),
+            rtol=0, atol=1e-4,
+        )  # fmt: skip
+    far = clouds["far"].means.double().numpy() + np.array(clouds["far"].origin) - UTM
+    np.testing.assert_allclose(far, clouds["near"].means.numpy(), rtol=0, atol=1e-3)
+    assert GaussianParams.from_gaussians(clouds["far"]).activated().origin == clouds["far"].origin
