@@ -41,6 +41,7 @@ from ..formats.folders import splat_file_of
 from ..gaussians import Gaussians
 from ..labels.nearest import places_of
 from ..pipeline import FitConfig, fit_scene
+from ..pipeline.maps import maps_of_views
 from ..pipeline.stages import digest_tensors
 from ..quant import FeatureMaps, LinearLatents
 from ..scenes import Scene, SceneError, load_scene
@@ -104,7 +105,7 @@ def split_scene(
         check_whole("latents", latents, 1)
     whole = load_scene(source)
     cloud = None if splat is None else read_splats(splat)
-    maps = FeatureFolder(maps_folder).of(whole, "train")
+    maps = maps_of_views(whole, whole.views("train"), FeatureFolder(maps_folder).of(whole, "train"))
     if isinstance(latents, LinearLatents):
         say(_fit_of(latents, maps))
     model = find_model(source)

@@ -152,7 +152,7 @@ def _heic_names(folder: Path) -> list[str]:
 
 
 def convert_heic(images: str | Path, out: str | Path, *, progress: bool = False) -> list[Path]:
-    """Write the HEIC photographs of a folder as JPEG files, and links to its other pictures.
+    """Write the HEIC photographs of a folder as JPEG files, or PNG if some of it is transparent, and links to its other pictures.
 
     Args:
         images: the folder, with subfolders.
@@ -185,7 +185,10 @@ def convert_heic(images: str | Path, out: str | Path, *, progress: bool = False)
             with open_picture(images / name, "a HEIC photograph") as picture:
                 exif = picture.getexif()  # with the focal length, from which COLMAP starts
                 exif.pop(ORIENTATION, None)  # pillow-heif has turned the picture
-                picture.convert("RGB").save(target, quality=QUALITY, subsampling=0, exif=exif)
+                if picture.mode == "RGBA" and picture.getchannel("A").getextrema()[0] < 255:
+                    picture.save(target.with_suffix(".png"), exif=exif)
+                else:
+                    picture.convert("RGB").save(target, quality=QUALITY, subsampling=0, exif=exif)
         for name in others:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).symlink_to(real_path(images / name))

@@ -11,6 +11,7 @@ import pytest
 import torch
 from killed import kill_everywhere
 from messages import tells
+from PIL import Image
 
 from kfgs.cli import main
 from kfgs.evaluation import load_label_map
@@ -159,6 +160,19 @@ def test_any_engine_fits_blocks(fitted, town, splat, tmp_path):
     split_scene(town, tmp_path / "alone", 2, splat=splat, latents=12)
     other = fit_blocks(tmp_path / "alone", EVERY)
     assert torch.equal(one.joined().gaussians.features, other.joined().gaussians.features)
+
+
+def test_masks_go_with_the_photos(town, splat, tmp_path):
+    masked = shutil.copytree(town, tmp_path / "town", symlinks=True)
+    scene = load_scene(town)
+    mask = np.full((60, 80), 255, np.uint8)
+    mask[:, :30] = 0
+    for camera in scene.cameras:
+        (masked / "masks" / camera.name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(mask).save(masked / "masks" / f"{camera.name}.png")
+    for block in split_scene(masked, tmp_path / "blocks", 2, splat=splat, latents=4):
+        part = load_scene(tmp_path / "blocks" / block.name)
+        assert all(part.mask(i).sum() == 60 * 50 for i in range(len(part)))
 
 
 def test_other_blocks_are_not_overwritten(fitted, town):

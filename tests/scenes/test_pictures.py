@@ -187,7 +187,12 @@ def test_no_heic_photograph_is_lost_or_mistaken_for_another(tmp_path: Path) -> N
     with pytest.raises(SceneError, match=tells("b.HEIC", "b.heif", "rename")):
         convert_heic(photos, tmp_path / "out")
     (photos / "b.heif").unlink()
-    assert len(convert_heic(photos, tmp_path / "out")) == 2
+    cut = texture(3).convert("RGBA")
+    cut.putalpha(texture(4).convert("L"))  # an object that the phone cut out
+    pillow_heif.from_pillow(cut).save(photos / "cut.heic")
+    assert [file.name for file in convert_heic(photos, tmp_path / "out")] == ["a.png", "b.jpg", "cut.png"]
+    with Image.open(tmp_path / "out/cut.png") as picture:
+        assert picture.mode == "RGBA"
     data = bytearray((photos / "b.HEIC").read_bytes())
     data[-1] ^= 1
     (photos / "b.HEIC").write_bytes(data)  # another photograph of the same size
