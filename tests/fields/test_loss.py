@@ -115,7 +115,20 @@ def test_a_weight_outside_0_and_1_is_refused():
         ColorLoss(1.5)
 
 
-@pytest.mark.parametrize("channels", [1, 2, 4])
+def test_the_opacity_of_a_photograph_is_a_channel_more(path):
+    """The same as the loss of two pictures with four channels, with gradients in the colours and in the opacity."""
+    a, b = pictures()
+    alpha, wanted = a.roll(3, 0)[..., 0].clone(), b.roll(5, 1)[..., 1]
+    inputs = [a.clone().requires_grad_(), alpha.requires_grad_()]
+    four = torch.cat([inputs[0], inputs[1][..., None]], 2)
+    target = torch.cat([b, wanted[..., None]], 2)
+    value, want = ColorLoss()(*inputs, target), ColorLoss()(four, alpha, target)
+    assert float(value) == float(want)
+    torch.testing.assert_close(torch.autograd.grad(value, inputs), torch.autograd.grad(want, inputs))
+    assert float(ColorLoss(0.0)(*inputs, target)) == pytest.approx(float((four - target).abs().mean()), abs=1e-12)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 5])
 @pytest.mark.parametrize("measure", [l1_loss, ColorLoss()])
 def test_maps_of_other_channels_are_refused(measure, channels):
     a, _ = pictures()

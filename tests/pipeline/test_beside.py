@@ -11,7 +11,7 @@ from kfgs.pipeline.results import _all_notes
 
 
 def question(*views, name="kfgs-pooled/1"):
-    return SimpleNamespace(scored=views, protocol=SimpleNamespace(name=name))
+    return SimpleNamespace(scored=views, truth=None, protocol=SimpleNamespace(name=name))
 
 
 def field(method="fused", **info):
