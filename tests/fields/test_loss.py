@@ -123,9 +123,9 @@ def test_the_opacity_of_a_photograph_is_a_channel_more(path):
     four = torch.cat([inputs[0], inputs[1][..., None]], 2)
     target = torch.cat([b, wanted[..., None]], 2)
     value, want = ColorLoss()(*inputs, target), ColorLoss()(four, alpha, target)
-    assert float(value) == float(want)
+    assert value.item() == want.item()
     torch.testing.assert_close(torch.autograd.grad(value, inputs), torch.autograd.grad(want, inputs))
-    assert float(ColorLoss(0.0)(*inputs, target)) == pytest.approx(float((four - target).abs().mean()), abs=1e-12)
+    assert ColorLoss(0.0)(*inputs, target).item() == pytest.approx((four - target).abs().mean().item(), abs=1e-12)
 
 
 @pytest.mark.parametrize("channels", [1, 2, 5])
