@@ -185,7 +185,7 @@ def convert_heic(images: str | Path, out: str | Path, *, progress: bool = False)
             with open_picture(images / name, "a HEIC photograph") as picture:
                 exif = picture.getexif()  # with the focal length, from which COLMAP starts
                 exif.pop(ORIENTATION, None)  # pillow-heif has turned the picture
-                if picture.mode == "RGBA" and picture.getchannel("A").getextrema()[0] < 255:
+                if picture.mode == "RGBA" and np.asarray(picture.getchannel("A")).min() < 255:
                     picture.save(target.with_suffix(".png"), exif=exif)
                 else:
                     picture.convert("RGB").save(target, quality=QUALITY, subsampling=0, exif=exif)
