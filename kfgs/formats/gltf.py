@@ -218,7 +218,8 @@ def _read_primitive(document: Document, primitive: dict[str, Any], where: str) -
     if outside.size:
         raise document.wrong(f"{where}.OPACITY", "values in [0, 1]", outside[:4].tolist())
     if (scales < 0).any():  # "MUST NOT be negative": a draft's logarithms
-        scales = np.exp(np.minimum(scales, np.float32(80)))
+        with np.errstate(invalid="ignore"):  # left out
+            scales = np.exp(np.minimum(scales, np.float32(80)))
     sh = np.stack(coefficients, 1)
     gaussians = Gaussians(
         means=torch.from_numpy(means),

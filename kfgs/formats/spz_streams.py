@@ -32,6 +32,7 @@ _LEGACY = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, fractiona
 _HEADER = struct.Struct("<4sIIBBBBI12x")  # the same, but the number of streams, and where the table begins
 _ENTRY = struct.Struct("<QQ")  # compressed and plain bytes of a stream
 _RECORD = struct.Struct("<II")
+_PART = 1 << 20  # bytes that are unpacked at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +99,7 @@ def write_container(path: Path, container: Container) -> None:
         file.writelines(parts)
 
 
-def _check_header(path: Path, data: bytes) -> tuple[int, int, int, int, int, dict[str, int]]:
+def _check_header(path: Path, data: bytes | bytearray) -> tuple[int, int, int, int, int, dict[str, int]]:
     """Check the fields that all versions share; returns them, and the sizes of the streams."""
     _, version, count, degree, bits, flags, _ = _LEGACY.unpack_from(data)
     if not 1 <= version <= 4:
@@ -116,7 +117,7 @@ def _check_header(path: Path, data: bytes) -> tuple[int, int, int, int, int, dic
     return version, count, degree, bits, flags, stream_sizes(version, count, degree)
 
 
-def _inflate(path: Path, data: bytes) -> bytes:
+def _inflate(path: Path, data: bytes) -> bytearray:
     """The plain bytes of a gzip stream (one member or several), at most as many as its SPZ header implies."""
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
@@ -132,19 +133,21 @@ def _inflate(path: Path, data: bytes) -> bytes:
             limit = (
                 most_unpacked(len(data)) if flags & ~ANTIALIASED else size
             )  # other flags announce more after the streams
-            plain = file.read(limit + 1)
+            plain = bytearray(head)
+            while len(plain) <= _LEGACY.size + limit and (part := file.read(_PART)):
+                plain += part
     except EOFError as error:
         raise ValueError(f"{path}: expected a whole gzip stream, got a part; the file is truncated") from error
     except (zlib.error, OSError) as error:
         raise ValueError(
             f"{path}: expected a gzip stream, but it cannot be unpacked ({error}); it is damaged"
         ) from error
-    if len(plain) > limit:
+    if len(plain) > _LEGACY.size + limit:
         raise ValueError(f"{path}: expected {limit} plain bytes by its header, got more; the file is damaged")
-    return head + plain
+    return plain
 
 
-def _parse_legacy(path: Path, data: bytes) -> Container:
+def _parse_legacy(path: Path, data: bytes | bytearray) -> Container:
     version, count, degree, bits, flags, sizes = _check_header(path, data)
     if version == 4:
         raise ValueError(f"{path}: expected version 1 to 3 in a gzip stream, got 4; the file is damaged")
@@ -165,7 +168,7 @@ def _parse_legacy(path: Path, data: bytes) -> Container:
     return Container(version, count, degree, bits, flags, streams, records)
 
 
-def _parse_records(path: Path, data: bytes) -> list[tuple[int, bytes]]:
+def _parse_records(path: Path, data: bytes | bytearray) -> list[tuple[int, bytes]]:
     records, at = [], 0
     while at < len(data):
         kind, length = _RECORD.unpack_from(data, at) if at + _RECORD.size <= len(data) else (0, len(data))

@@ -29,6 +29,7 @@ from kfgs.evaluation.foreign import (
     load_splat_features,
 )
 from kfgs.formats import read_splats
+from kfgs.formats.ply import read_ply, write_ply
 
 
 def test_files_that_are_missing_or_of_another_program(tmp_path: Path) -> None:
@@ -88,6 +89,18 @@ def test_a_real_splat_without_and_with_features(tmp_path: Path, shared_data: Pat
     method = load_splat_features(ply, tmp_path / "lang.npy")
     text = random_rows(K, 6, seed=5)
     expected = cosines_of(values.numpy(), text.double().numpy())
+    np.testing.assert_allclose(method.gaussian_cosines(text)[0].numpy(), expected, atol=2e-5)
+
+
+def test_features_keep_step_with_the_gaussians_that_are_left(tmp_path: Path, shared_data: Path) -> None:
+    columns = read_ply(shared_data / "splats/inria_9080.ply")
+    columns["y"][[7, 8, 4000]] = np.nan
+    write_ply(tmp_path / "a.ply", columns)
+    values = random_rows(len(columns["y"]), 6)
+    np.save(tmp_path / "lang.npy", values.numpy())
+    method = load_splat_features(tmp_path / "a.ply", tmp_path / "lang.npy")
+    text = random_rows(K, 6, seed=5)
+    expected = cosines_of(np.delete(values.numpy(), [7, 8, 4000], axis=0), text.double().numpy())
     np.testing.assert_allclose(method.gaussian_cosines(text)[0].numpy(), expected, atol=2e-5)
 
 
