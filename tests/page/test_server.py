@@ -17,6 +17,7 @@ from messages import tells
 from kfgs.page.server import LONGEST_CALL, PageServer, pack_message, read_message
 
 PAGE, PACK = "<p>page</p>", bytes(range(256))
+GO = threading.Event()  # ends the call "wait" early
 
 
 def answer(name, args, attached):
@@ -25,7 +26,7 @@ def answer(name, args, attached):
     if name == "break":
         raise RuntimeError("out of memory\nin a kernel")
     if name == "wait":
-        time.sleep(float(args["seconds"]))
+        GO.wait(float(args["seconds"]))
     return {"name": name, "args": args}, attached[::-1]
 
 
@@ -151,13 +152,16 @@ def test_bodies_too_long_or_of_unknown_length_are_refused(server):
 def test_a_slow_call_holds_up_no_other(server):
     slow = threading.Thread(
         target=ask,
-        args=(server, secret(server) + "call", "POST", pack_message({"name": "wait", "args": {"seconds": 2}})),
+        args=(server, secret(server) + "call", "POST", pack_message({"name": "wait", "args": {"seconds": 100}})),
     )
     slow.start()
-    began = time.monotonic()
-    assert ask(server, secret(server))[0] == 200
-    assert time.monotonic() - began < 1.5
-    slow.join()
+    try:
+        assert ask(server, secret(server))[0] == 200
+        assert slow.is_alive()
+    finally:
+        GO.set()
+        slow.join()
+        GO.clear()
 
 
 def stalled(server, request, small=1 << 12):
@@ -203,7 +207,7 @@ def test_tabs_that_stall_hold_up_no_other(request_):
         assert time.monotonic() - began < 20  # far below PATIENCE, after which a stalled tab is given up
         began = time.monotonic()
         server.close()
-        assert time.monotonic() - began < 5
+        assert time.monotonic() - began < 20
         for tab in tabs:
             tab.close()
         while threading.active_count() >= before and time.monotonic() < end + 30:
@@ -233,7 +237,7 @@ def test_closing_leaves_no_thread_behind():
         ask(server, secret(server))
     server.close()
     server.close()
-    end = time.monotonic() + 10
+    end = time.monotonic() + 30
     while threading.active_count() > before and time.monotonic() < end:
         time.sleep(0.01)
     assert threading.active_count() == before
@@ -350,5 +354,5 @@ with PageServer("<p>page</p>") as server:
 
 
 def test_without_file_handles_the_server_does_not_spin():
-    done = subprocess.run([sys.executable, "-c", FULL], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", FULL], capture_output=True, text=True, timeout=300)
     assert 1 < int(done.stdout) < 40, done.stderr  # one in 0.1 s

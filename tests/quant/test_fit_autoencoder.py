@@ -4,7 +4,7 @@ import torch
 from messages import tells
 
 from kfgs.quant import AutoencoderConfig, Codebook, fit_autoencoder
-from kfgs.quant.fit_autoencoder import BLENDED, _blends, _cosine, _linears, _normalised_mlp
+from kfgs.quant.fit_autoencoder import BLENDED, _blends, _cosine, _linears, _normalised_mlp, quick_on_a_cpu
 
 SHORT = AutoencoderConfig.paper(encoder=(64, 32), decoder=(32, 128), steps=800, learning_rate=2e-3)
 
@@ -15,6 +15,20 @@ def realistic_codebook(groups=12, each=4, dim=96, seed=0):
     centres = torch.nn.functional.normalize(torch.randn(groups, dim, generator=generator), dim=1)
     spread = 0.23 * torch.randn(groups, each, dim, generator=generator) / dim**0.5
     return Codebook(11 * (centres[:, None] + spread).reshape(-1, dim))
+
+
+def test_denormal_numbers_are_afterwards_what_they_were_before():
+    denormal = torch.tensor(1e-310, dtype=torch.float64)
+    if not torch.set_flush_denormal(True):
+        pytest.skip("this processor has no such mode")
+    try:
+        for flushed in (True, False):
+            torch.set_flush_denormal(flushed)
+            with quick_on_a_cpu():
+                assert float(denormal * 1) == 0
+            assert (float(denormal * 1) == 0) is flushed
+    finally:
+        torch.set_flush_denormal(False)
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import torch
 from messages import tells
 from PIL import Image
 from small_batch import OPTIONS, make_rooms, one_process, results
@@ -38,8 +39,14 @@ def alone(rooms):
 
 @pytest.fixture(scope="module")
 def client():
-    with open_client(workers=2) as found:
-        yield found
+    """Dask sets variables for its workers in this process, too, which the programs that it starts later must not get."""
+    names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "PYTHONHASHSEED", "MALLOC_TRIM_THRESHOLD_")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("OMP_NUM_THREADS", "2")
+        before = [os.environ.get(name) for name in names]
+        with open_client(workers=2) as found:
+            yield found
+        assert [os.environ.get(name) for name in names] == before
 
 
 class Events(list):
@@ -391,10 +398,15 @@ def test_the_folder_says_what_waits_what_is_at_work_and_what_was_stopped(tmp_pat
 
     going, asked = threading.Event(), threading.Event()
 
+    threads = []
+
     def slow(job, *, report):
+        torch.set_num_threads(2)
         with stages._work(job):
+            threads.append(torch.get_num_threads())
             going.set()
             assert asked.wait(60)
+        threads.append(torch.get_num_threads())
         raise ValueError("no scene")
 
     monkeypatch.setattr(stages, "find_scene", slow)
@@ -419,6 +431,7 @@ def test_the_folder_says_what_waits_what_is_at_work_and_what_was_stopped(tmp_pat
         shutil.copytree(runs, tmp_path / "killed")  # the copy has no lock: what its driver's death leaves
         asked.set()
         assert [one.failure.message for one in batch.result()] == ["no scene"] * 4
+    assert threads == [1, 2] * 4  # later work of the process has its own again
     assert re.search(
         tells(f"{runs}: a batch at work, process {os.getpid()} of ", "3 scenes: 1 at work, 2 waiting"), said
     )
