@@ -112,7 +112,7 @@ class SogFiles:
         """The content of `meta.json`."""
         data = self.read(META, _META_BYTES)
         try:
-            meta = parse_json(data.decode("utf-8"))
+            meta = parse_json(data)
         except ValueError as error:
             raise ValueError(f"{self.path}: expected JSON in {META}, but it cannot be parsed ({error})") from error
         if not isinstance(meta, dict):

@@ -100,7 +100,7 @@ def _settings(path: Path) -> dict[str, Any]:
             raise ValueError(f"more than {_LONGEST} bytes")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of backslashes in paths
-            call = ast.parse(text.decode().strip(), mode="eval").body
+            call = ast.parse(text.decode("utf-8-sig").strip(), mode="eval").body
         if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Namespace"):
             raise ValueError("another expression")
         values = {word.arg: word.value for word in call.keywords}
