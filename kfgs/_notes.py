@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 
 class Repair(str):
-    """A note about something broken that a reader left out or mended. `refuse_repairs` makes an error of it."""
+    """A note about something broken that a reader left out or mended. `tell_repairs` tells it, or makes an error of it."""
 
 
 _listeners: list[Callable[[str], None]] = []
@@ -47,10 +47,11 @@ def is_strict() -> bool:
     return any(_strict)
 
 
-def refuse_repairs(where: str, notes: Iterable[str]) -> None:
-    """Raise a ValueError if a note is a `Repair`."""
-    repair = next((note for note in notes if isinstance(note, Repair)), None)
-    if repair is not None:
-        raise ValueError(
-            f"{where}: expected nothing broken (strict), got: {repair}; correct it, or read it without --strict (strict=False)"
-        )
+def tell_repairs(where: str, notes: Iterable[str], strict: bool, error: type[ValueError]) -> None:
+    """Tell each note that is a `Repair`; with `strict`, or `--strict`, raise an error instead."""
+    for note in notes:
+        if isinstance(note, Repair):
+            if strict or is_strict():
+                advice = "correct it, or read it without --strict (strict=False)"
+                raise error(f"{where}: expected nothing broken (strict), got: {note}; {advice}")
+            tell(note)

@@ -144,13 +144,10 @@ def _read_files(folder: Path, find: Callable[[str], Path]) -> ColmapModel:
         message = f"{len(lost)} images in none (image {lost[:1]})"
         require(not lost, str(files["frames"]), "every image in one frame", message)
         images = {i: replace(image, pose=frames[i]) for i, image in images.items()}
-    used = {key: scale for key, scale in scales.items() if not frames or not key.startswith("image ")}
-    notes += mending_notes([], used)
+    notes += mending_notes([], {k: v for k, v in scales.items() if not (frames and k.startswith("image "))})
     lensless = [image.name for image in images.values() if not cameras[image.camera_id].usable]
-    if lensless:
-        notes.append(
-            f"{len(lensless)} images have a camera without a focal length above 0 and finite parameters: {some(lensless)}"
-        )
+    lens = "a camera without a focal length above 0 and finite parameters"
+    notes += [f"{len(lensless)} images have {lens}: {some(lensless)}"] if lensless else []
     layout = "binary" if whole[0] == "bin" else "text"
     return ColmapModel(layout, cameras, images, point_ids, points, colors, len(rigs), tuple(map(Repair, notes)))
 
@@ -163,8 +160,7 @@ def read_whole_model(path: str | Path) -> ColmapModel:
         SceneError: if the model is damaged or partly broken, or has names in text files that pycolmap would cut at a blank.
     """
     model = read_model(path)
-    whole = "a model with nothing broken, for pycolmap"
-    require(not model.notes, str(path), whole, model.notes[:1], ADVISED)
+    require(not model.notes, str(path), "a model with nothing broken, for pycolmap", "; ".join(model.notes), ADVISED)
     blank = next((image.name for image in model.images.values() if len(image.name.split()) > 1), "")
     advice = f"{ADVISED}, or write _ for each blank, in images.txt and in the names of the files"
     expected = "names without blanks, at which COLMAP cuts those of text files"
@@ -259,10 +255,8 @@ def _read_points(
     points = np.array(xyz, np.float64).reshape(-1, 3)[order]
     finite = np.isfinite(points).all(1)
     if not finite.all():
-        shown = some([str(i) for i in point_ids[order][~finite][:6]])
-        notes.append(
-            f"{(~finite).sum()} of {len(points)} points have no finite, plausible place and were left out (ids {shown})"
-        )
+        shown = some(list(map(str, point_ids[order][~finite])))
+        notes.append(f"{(~finite).sum()} of {len(points)} points have no finite place and were left out (ids {shown})")
     return point_ids[order][finite], points[finite], np.array(rgb, np.uint8).reshape(-1, 3)[order][finite], notes
 
 
@@ -292,9 +286,8 @@ def _check_tracks(
         f"{strange.sum()} that see other points ({example})", "copy the images and points files of one model",
     )  # fmt: skip
     gone = f"; images {some(list(map(str, lost)))} are not in the model" if lost else ""
-    return [
-        f"{(~good).sum()} of {len(good)} entries of tracks lead to no 2-D point and were left out ({example}{gone})"
-    ]
+    count = f"{(~good).sum()} of {len(good)} entries of tracks"
+    return [f"{count} lead to no 2-D point that sees the point and were left out ({example}{gone})"]
 
 
 def _read_sensor(table: Table, where: str) -> Sensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -12,7 +12,7 @@ import torch
 
 from .._check import check_choice
 from .._files import as_path, real_path
-from .._notes import Repair, is_strict, refuse_repairs, tell
+from .._notes import tell_repairs
 from ..cameras.camera import Camera
 from ..formats.folders import newest_splat
 from .colmap import colmap_cameras, load_colmap
@@ -101,7 +101,7 @@ def load_scene(
         if str(root) in str(error):
             raise
         raise SceneError(f"{path}: {error}") from error
-    _refuse_or_tell(path, scene.notes, strict)
+    tell_repairs(str(path), scene.notes, strict, SceneError)
     return _with_split(scene, path, split)
 
 
@@ -153,20 +153,8 @@ def cameras_and_notes(path: str | Path) -> tuple[list[Camera], list[str]]:
         scene = Scene(cameras, [Path(camera.name) for camera in cameras], nothing, nothing.byte())
     except SceneError as error:  # of two names that are the same
         raise SceneError(f"{path}: {error}") from error
-    _refuse_or_tell(path, notes)
+    tell_repairs(str(path), notes, False, SceneError)
     return scene.with_near().undistorted().cameras, notes
-
-
-def _refuse_or_tell(path: Path, notes: Sequence[str], strict: bool = False) -> None:
-    """Print notes about what is broken, or make an error of the first one."""
-    if strict or is_strict():
-        try:
-            refuse_repairs(str(path), notes)
-        except ValueError as error:
-            raise SceneError(str(error)) from error
-    for note in notes:
-        if isinstance(note, Repair):
-            tell(note)
 
 
 def _with_splat(scene: Scene, root: Path) -> Scene:

@@ -328,14 +328,15 @@ def _splits(
     }
     if not given:
         return {"train": list(range(len(views))), "test": []}, []
-    known = Names(names, bare=True)
+    known, notes = Names(names, bare=True), []
     held = {known.find(word) for name in ("val", "test") for word in given.get(name, ())}
-    if "train" in given and any(known.find(word) in held for word in given["train"]):
-        own = [word for word in given["train"] if known.find(word) not in held]
-        if not own:
-            note = "all views that train are validation or test views, too: none is held out"
-            return split_by_lists(f"{path}", {"train": given["train"]}, names)[0], [note]
-        note = f"{len(given['train']) - len(own)} views of train_filenames are validation or test views, too: they do not train"
-        splits, notes = split_by_lists(f"{path}", given | {"train": own}, names)
-        return splits, [*notes, note]
-    return split_by_lists(f"{path}", given, names)
+    every, own = given.get("train", []), [word for word in given.get("train", ()) if known.find(word) not in held]
+    if every and not own:
+        given, notes = {"train": every}, ["all training views are validation or test views, too: none is held out"]
+    elif len(own) < len(every):
+        notes = [
+            f"{len(every) - len(own)} views of train_filenames are validation or test views, too: they do not train"
+        ]
+        given |= {"train": own}
+    splits, told = split_by_lists(str(path), given, names)
+    return splits, [*notes, *told]
