@@ -99,7 +99,7 @@ def test_command_lines_in_the_docs_are_understood(name, monkeypatch):
 
 # of SplatTransform, Dask, gsplat, torchrun
 OF_OTHERS = {"--spz-version", "--nthreads", "--no-normalize-world-space", "--rdzv-endpoint"}
-OF_BENCHMARKS = {"--kinds", "--quick", "--room-0", "--whole", "--atoms", "--copies"}
+OF_BENCHMARKS = {"--kinds", "--quick", "--room-0", "--whole", "--atoms", "--copies", "--compare"}
 
 
 @pytest.mark.parametrize("name", SHOWN)

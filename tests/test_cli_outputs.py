@@ -1,4 +1,4 @@
-"""What commands do before, while and after they write: outputs that cannot be written, full disks, earlier fields."""
+"""What commands do before, while and after they write: outputs that cannot be written, full disks."""
 
 import os
 import re
@@ -17,7 +17,6 @@ from kfgs.fields import SemanticField
 from kfgs.formats import write_splats
 from kfgs.formats.ply import write_ply
 from kfgs.gaussians import Gaussians
-from kfgs.pipeline.runs import list_fields
 
 
 @pytest.fixture(scope="module")
@@ -217,61 +216,6 @@ def test_a_model_is_not_replaced_unasked(room, tmp_path, capsys):
     before = files(scene)
     refused(["sfm", room / "images", "--out", scene], capsys, "sparse/0", "--replace")
     assert files(scene) == before
-
-
-@pytest.fixture
-def two(run, tmp_path):
-    """A run folder in which another field became current, and a user has a file in the field."""
-    out = tmp_path / "run"
-    shutil.copytree(run, out)
-    (out / "field" / "notes.txt").write_text("mine")
-    return out
-
-
-def test_runs_lists_compares_and_restores(two, room, capsys):
-    first = list_fields(two)[0].key
-    arguments = [
-        "fit",
-        room,
-        "--out",
-        two,
-        "--method",
-        "paper",
-        "--mode",
-        "adc",
-        "--steps",
-        "20",
-        "--max-gaussians",
-        "500",
-    ]
-    capsys.readouterr()
-    assert main([str(word) for word in arguments]) == 0
-    said = capsys.readouterr().out
-    assert f"kept as {two / f'field@{first}'}" in said
-    assert "kfgs runs" in said
-    assert (two / "field" / "notes.txt").read_text() == "mine"
-    second = list_fields(two)[0].key
-
-    assert main(["runs", str(two)]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert re.match(rf"current  {second}  paper, .* Gaussians, 20 steps \(field\), of \d{{4}}-", lines[0])
-    assert re.match(rf"         {first}  paper, .* Gaussians, 60 steps \(field\), of \d{{4}}-", lines[1])
-    assert "--restore KEY" in lines[2]
-
-    assert main(["runs", str(two), "--compare", first[:5]]) == 0
-    table = capsys.readouterr().out
-    assert re.search(rf"{first} +{second} \(current\)", table)
-    assert re.search(r"steps.field +60 +20", table)
-    assert "teacher_map" not in table
-    assert f"kfgs compare {two / f'field@{first}'} {two / 'field'}" in table
-
-    assert main(["runs", str(two), "--restore", first]) == 0
-    assert f"{two / 'field'} is now {first}" in capsys.readouterr().out
-    assert [field.key for field in list_fields(two)] == [first, second]
-    assert (two / "field" / "notes.txt").read_text() == "mine"
-    assert main(["info", str(two / "field")]) == 0
-    refused(["runs", two, "--restore", "nothing"], capsys, "key", first, second)
-    refused(["runs", room], capsys, room, "kfgs fit")
 
 
 def test_two_runs_of_kfgs_give_the_same_bytes(room, run, tmp_path):

@@ -41,7 +41,7 @@ LINES = {  # a command with its output {}; and one of its inputs that could be n
     "uplift": ("uplift {scene} {run}/field --out {}", "{run}/field"),
     "view": ("view {run}/field --where html --out {}", "{run}/field"),
 }
-NO_OUTPUT = {"info", "runs"}
+NO_OUTPUT = {"info"}
 
 
 @pytest.fixture(scope="module")

@@ -126,14 +126,6 @@ def _save_edits() -> None:
 
 
 @_in_python
-def _restore() -> int:
-    from kfgs.pipeline.runs import list_fields
-
-    key = next(one.key for one in list_fields("in/two") if not one.current)
-    return command("runs", "work/run", "--restore", key)() or 0
-
-
-@_in_python
 def _toy_room() -> None:
     from kfgs.toy import make_toy_room
 
@@ -223,10 +215,12 @@ def all_jobs() -> list[Job]:
             resumed=True,
         ),
         Job(
-            "restore an earlier field",
-            _restore,
+            "fit with other options",
+            command("fit", "in/room", "--splat", "in/other.ply", "--out", "work/run"),
             _with(files={"run": "two"}, notes=("run/field/mine.ply",)),
             fields=("run/field",),
+            loose=times,
+            resumed=True,
             shown=("run/report.html", "run/preview.png"),
         ),
         Job(

@@ -15,8 +15,6 @@ NUMBERS = "field.safetensors"
 """Beside it."""
 SUFFIX = ".kfgs.safetensors"
 """Of a field in one file."""
-KEPT = "field@"
-"""Beginning of the folders in which a run keeps its earlier fields."""
 ASIDE = ("stages", "unfinished")
 """Folders of a run that hold parts of its work."""
 NOTES = (".run.lock", "digests.json")
@@ -31,8 +29,8 @@ def describes_field(folder: Path) -> bool:
 def fields_below(folder: str | Path) -> Iterator[Path]:
     """All fields below a folder, folders and packed files, in the order of their names.
 
-    Links to folders are not followed. Hidden folders are left out. So are, in the folder of a run, its stages and the
-    earlier fields that it keeps (`field@<key>`); elsewhere a folder may have such a name.
+    Links to folders are not followed. Hidden folders are left out, and so are the stages in the folder of a run; elsewhere
+    a folder may have such a name.
 
     Raises:
         NotADirectoryError: if there is no such folder.
@@ -45,8 +43,7 @@ def fields_below(folder: str | Path) -> Iterator[Path]:
         return
     for entry in sorted(os.scandir(folder), key=lambda entry: entry.name):
         if entry.is_dir(follow_symlinks=False):
-            own = entry.name.startswith(KEPT) or entry.name in ASIDE
-            if not entry.name.startswith(".") and not (own and _is_run(folder)):
+            if not entry.name.startswith(".") and not (entry.name in ASIDE and _is_run(folder)):
                 yield from fields_below(entry.path)
         elif entry.name.endswith(SUFFIX) and not entry.name.startswith(".") and entry.is_file():
             yield Path(entry.path)

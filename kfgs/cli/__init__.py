@@ -34,7 +34,6 @@ from .pack import pack
 from .places import checked
 from .query import info, label, select
 from .render import render
-from .runs import runs
 from .search import search
 from .segment import segment
 from .splats import attach, convert, edit
@@ -46,7 +45,7 @@ GROUPS: dict[str, tuple[Any, ...]] = {
     "Make a semantic field": (sfm, features, text, fit, uplift),
     "More than one machine": (batch, blocks, join),
     "Ask it": (select, search, segment, label, view, render),
-    "Store it": (pack, runs),
+    "Store it": (pack,),
     "Score it": (evaluate, compare),
     "Colour splats": (color, attach, edit, convert),
 }

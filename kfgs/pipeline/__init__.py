@@ -26,7 +26,6 @@ from .label_pictures import segment_cameras, write_coco
 from .question import Question, open_question
 from .results import Compared, Results
 from .run_report import write_run_report
-from .runs import RunField, compare_fields, list_fields, restore_field
 from .stages import Run
 
 __all__ = [
@@ -36,19 +35,15 @@ __all__ = [
     "Question",
     "Results",
     "Run",
-    "RunField",
     "attach",
-    "compare_fields",
     "describe",
     "evaluate",
     "feature_colors",
     "fit_color",
     "fit_scene",
     "label_cloud",
-    "list_fields",
     "open_question",
     "read_cloud",
-    "restore_field",
     "save_labelled",
     "score_scene",
     "score_teacher",

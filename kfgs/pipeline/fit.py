@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from .._card import short_repr
-from .._files import check_output, folded_name, read_json, write_json
+from .._files import check_output, folded_name, is_own, read_json, write_json
 from .._progress import Progress, as_progress
 from .._ranks import once
 from .._typed import typed
@@ -29,7 +29,7 @@ from ..fields import (
     fit_field,
     remember,
 )
-from ..fields.store import holds_field
+from ..fields.store import check_place, holds_field
 from ..formats import SplatFile
 from ..gaussians import Gaussians
 from ..quant import (
@@ -43,15 +43,19 @@ from ..quant import (
     quantize_maps,
 )
 from ..scenes import Scene
+from ..viz.pictures import is_drawn
 from .color import ColorConfig
 from .config import FitConfig
 from .earlier import digest_changes, find_earlier
 from .fuse import answers_stage, find_geometry, uplift_stage
 from .maps import KnownFeatures, Maps, as_maps, check_readable, map_digests, map_shape, maps_of_views
 from .points import with_points
-from .runs import check_current, keep_field, say_kept
 from .stages import Run, Stage, digest_scene, digest_tensors, stage_generator
 from .train import check_scene, field_stage, training_device, with_extent
+
+FIELD = "field"
+REPORT, TITLE = "report.html", "<title>kfgs: "
+PICTURES = ("preview.png", "codebook.png", "field.png")  # with the report, what `write_run_report` writes
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +71,7 @@ class FitResult:
     @property
     def field_path(self) -> Path:
         """The folder of the saved field."""
-        return self.folder / "field"
+        return self.folder / FIELD
 
     @property
     def seconds(self) -> float:
@@ -218,8 +222,8 @@ def fit_scene(
         maps: one teacher map [h, w, D] per training view; read one at a time; a `FeatureFolder`, or a list in memory. When
             the stages that read them are finished, the maps may be deleted (`discard_maps`), except for the paper's mode
             `decouple`.
-        folder: the run folder; the finished field goes to `folder/field`. A field that other options made there before is kept as
-            `folder/field@<key>`; `restore_field` brings it back.
+        folder: the run folder; the finished field goes to `folder/field`. It replaces a field that other options made there,
+            and the report of that one. The stages stay, so going back to the old options is quick.
         config: the method and its options.
         splat: of method `fuse`, the Gaussians to fuse onto, in the scene's frame: a splat file or its content. None takes
             `scene.splat`; if the scene has none, it trains them on the pictures with `config.color` and writes them to
@@ -233,7 +237,7 @@ def fit_scene(
         TypeError: if `maps` is neither, or `progress` neither a bool nor a function.
         ValueError: if the counts of views and maps differ, a camera has distortion, there is no such device, a splat is given
             to the paper's method, or its mode `decouple` gets `RecomputedMaps`; if a map's file is damaged; if `folder` is a
-            file, another process works in it, or its field is damaged.
+            file, or another process works in it.
         FileExistsError: if `folder/field` is no field.
         FileNotFoundError: if a stage needs maps that were discarded, or a picture is missing.
     """
@@ -246,7 +250,7 @@ def fit_scene(
         raise ValueError("latents: expected none for method 'paper', whose autoencoder makes them; leave it out")
     run = Run(check_output("folder", folder, "a folder"), report)
     with run.locked():
-        check_current(run.folder)
+        check_place(run.folder / FIELD)
         if config.method == "paper" or (splat is None and scene.splat is None):  # else nothing is trained
             scene = with_points(run, scene, scene.views(config.split), config.seed, progress)
         job = _job(run, scene, maps, config, target_device, progress)
@@ -254,16 +258,22 @@ def fit_scene(
         done = FitResult(found, run.folder, run.stages)
         about |= _facts(job, found, done.field_path, getattr(maps, "identity", None))
         done = replace(done, field=replace(found, info=about, folder=done.field_path))
-        once(lambda: _save(done, run))
+        once(lambda: replace_field(run.folder, done.field))
     return done
 
 
-def _save(done: FitResult, run: Run) -> None:
-    """Make the field the current one of the run; one with other numbers is kept."""
-    if not holds_field(done.field_path, vars(done.field)):
-        before = keep_field(run.folder)
-        done.field.save(done.field_path)
-        say_kept(run, before)
+def replace_field(folder: Path, field: SemanticField) -> None:
+    """Write the field of a run folder in one step. The report of an older one is deleted first: a kill leaves no wrong report."""
+    if not holds_field(folder / FIELD, vars(field)):
+        for name in (REPORT, *PICTURES):
+            if is_own(folder / name, is_report if name == REPORT else is_drawn):
+                (folder / name).unlink()
+        field.save(folder / FIELD)
+
+
+def is_report(path: Path) -> bool:
+    """Whether a file is a page of `write_run_report`."""
+    return TITLE in path.read_text(encoding="utf-8")
 
 
 def _facts(job: _Job, field: SemanticField, path: Path, teacher: Any) -> dict[str, Any]:

@@ -25,11 +25,9 @@ from ..viz.pictures import as_bytes, check_pictures, legend_strip, picture_grid,
 from ..viz.region_names import write_region_names
 from .apply import write_training_pictures
 from .config import FitConfig
-from .fit import FitResult
-from .runs import SHOWN
+from .fit import PICTURES, REPORT, TITLE, FitResult, is_report
 
 WIDTH = 400  # pixels of a picture
-REPORT, TITLE = "report.html", "<title>kfgs: "
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 1240px; margin: 2em auto; padding: 0 1em; color: #1b1b1b }
 img { max-width: 100%; height: auto } h2 { margin-top: 2em } code, pre { background: #f3f3f5; border-radius: 4px }
@@ -77,9 +75,8 @@ def write_preview(
 
 def check_report(folder: Path) -> None:
     """Raise a FileExistsError if a run folder has files of the names that `write_run_report` writes, but not from it."""
-    pictures = [Path(name).stem for name in SHOWN if name != REPORT]
-    check_pictures(folder, pictures, "kfgs fit")
-    check_own(folder / REPORT, lambda path: TITLE in path.read_text(encoding="utf-8"), "kfgs fit")
+    check_pictures(folder, [Path(name).stem for name in PICTURES], "kfgs fit")
+    check_own(folder / REPORT, is_report, "kfgs fit")
 
 
 @typed

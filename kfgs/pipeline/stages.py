@@ -41,7 +41,7 @@ from ..gaussians import Gaussians
 from ..scenes import Scene
 
 STAGE_FILE, LOCK, DIGESTS = "stage.json", ".run.lock", "digests.json"
-WRITTEN = ("field", "field@*", "stages", "stages/*", "unfinished", "unfinished/*", "teacher", "teacher/*")
+WRITTEN = ("field", "stages", "stages/*", "unfinished", "unfinished/*", "teacher", "teacher/*")
 """The folders in a run folder that are written to."""
 SHAPE = ("means", "quats", "scales", "opacities")
 STAGE_VERSION = 2

@@ -191,9 +191,9 @@ def test_a_damaged_field_is_left_out_until_it_changes(tmp_path):
     assert index.update()[0].search("chair").unasked == {}
 
 
-def test_packed_fields_runs_and_nested_folders_are_found_earlier_fields_are_not(tmp_path):
+def test_packed_fields_runs_and_nested_folders_are_found_stages_are_not(tmp_path):
     field = scene([("wall", 0.0), ("chair", 0.0)], 1)
-    for place in ("deep/er/run/field", "run/field", "run/field@0123456789ab", "run/stages/x", ".hidden/field"):
+    for place in ("deep/er/run/field", "run/field", "run/stages/x", ".hidden/field"):
         field.save(tmp_path / place)
     field.save(tmp_path / "one.kfgs.safetensors")
     index, _ = SearchIndex.open(tmp_path).update()
@@ -234,12 +234,12 @@ def test_fifty_fields_are_searched_from_one_file(tmp_path):
 
 def test_a_run_may_be_called_as_a_part_of_a_run(tmp_path):
     field = scene([("wall", 0.0), ("chair", 0.0)], 1)
-    for name in ("stages", "unfinished", "field@home"):
+    for name in ("stages", "unfinished"):
         field.save(tmp_path / name / "field")
         field.save(tmp_path / "run" / name / "deep")  # in a run's own folders nothing is a result
     (tmp_path / "run" / "digests.json").write_text("{}")
     index, _ = SearchIndex.open(tmp_path).update()
-    assert index.fields == ("field@home/field", "stages/field", "unfinished/field")
+    assert index.fields == ("stages/field", "unfinished/field")
 
 
 def test_a_copied_archive_is_digested_once_and_a_moved_one_never(tmp_path, monkeypatch):
