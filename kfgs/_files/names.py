@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 import unicodedata
+from collections import Counter
 from collections.abc import Iterable
 from functools import cached_property
 from pathlib import PurePosixPath
@@ -64,9 +65,17 @@ class Names:
         for i in range(len(parts)):
             tail = "/".join(parts[i:])
             ways += [(folded, tail), (folded_stems, tail), (folded_stems, _ENDING.sub("", tail))]
-        ways += [(last, parts[-1]), (last, _ENDING.sub("", parts[-1]))] if self.bare else []
+        ways += [(last, plain), (last, _ENDING.sub("", plain))] if self.bare and len(parts) == 1 else []
         fits = next((table[word] for table, word in ways if word in table), [])
         return fits[0] if len(fits) == 1 else None
+
+    def find_each(self, names: Iterable[str]) -> list[str | None]:
+        """`find` for names of different things: what several of them find is only for one that is spelled so."""
+        pairs = [(name, self.find(name)) for name in names]
+        counts = Counter(fit for _, fit in pairs)
+        return [
+            fit if fit is None or counts[fit] == 1 or name in (fit, file_stem(fit)) else None for name, fit in pairs
+        ]
 
     def advice(self, name: str) -> str:
         """What to say about a name that is not found: the nearest one."""

@@ -150,8 +150,10 @@ def true_labels(scene: Scene, folder: str | Path, split: str) -> dict[str, Tenso
     """
     truth = {}
     names = Names(name for name in list_images(folder) if name.lower().endswith(".png"))
+    stems = names.find_each(f"{scene.stem(i)}.png" for i in range(len(scene)))
+    whole = names.find_each(camera.name for camera in scene.cameras)
     for i in scene.views(split):
-        name = names.find(f"{scene.stem(i)}.png") or names.find(scene.cameras[i].name)
+        name = stems[i] or whole[i]
         if name is not None:
             truth[scene.stem(i)] = labels_of_view(scene, i, load_label_map(as_path(folder) / name))
     return truth

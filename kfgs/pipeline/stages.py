@@ -39,6 +39,7 @@ from ..cameras import Camera
 from ..cameras.camera import NEAR
 from ..gaussians import Gaussians
 from ..scenes import Scene
+from ..scenes.files import has_alpha
 
 STAGE_FILE, LOCK, DIGESTS = "stage.json", ".run.lock", "digests.json"
 WRITTEN = ("field", "stages", "stages/*", "unfinished", "unfinished/*", "teacher", "teacher/*")
@@ -258,8 +259,10 @@ def origin_tensors(origin: Origin) -> list[Tensor]:  # each [3] float64
 
 
 def digest_pictures(run: Run, scene: Scene, views: Sequence[int]) -> list[list[str]]:
-    """[file name, SHA-256] of the picture of each view, and the SHA-256 of its mask if it has one."""
-    pictures = run.digests([scene.image_paths[i] for i in views])
+    """[file name, SHA-256] of the picture of each view, a word if it may be transparent, and the SHA-256 of its mask, if any."""
+    paths = [scene.image_paths[i] for i in views]
+    clear = once(lambda: [has_alpha(path) for path in paths])  # they were on white before
+    pictures = [[*row, "on black"] if one else row for row, one in zip(run.digests(paths), clear, strict=True)]
     masks = [None if scene.masks is None else scene.masks[i] for i in views]
     known = iter(run.digests([mask for mask in masks if mask is not None]))
     return [row if mask is None else [*row, next(known)[1]] for row, mask in zip(pictures, masks, strict=True)]

@@ -10,6 +10,7 @@ from typing import Any
 
 from .._check import check_whole
 from .._files import as_path
+from .._notes import is_strict
 from ..pipeline import FitConfig
 from ..scenes import SfmConfig
 
@@ -38,6 +39,8 @@ class BatchOptions:
     """Threads of each task. Equal numbers of threads give equal bits, however many workers there are."""
     discard_features: bool = False
     """Delete a scene's feature maps when its field is made."""
+    strict: bool = default(default_factory=is_strict)
+    """Refuse scenes of which something broken would be left out (`--strict`): workers do not hear the command line."""
 
     def __post_init__(self) -> None:
         check_whole("share", self.share, 1)

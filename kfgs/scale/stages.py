@@ -22,6 +22,7 @@ from typing import Any
 import torch
 
 from .._files import InUseError, digest_value, foreign, write_json
+from .._notes import hear
 from ..features import FeatureFolder, Picture, discard_maps, extract_features, join_features, pictures_of
 from ..fields import SemanticField
 from ..pipeline import fit_scene, segment_scene, true_labels
@@ -229,11 +230,12 @@ def score(job: Job, key: str, *, report: Report) -> dict[str, Any]:
 
 @contextmanager
 def _work(job: Job) -> Iterator[tuple[Place, Place]]:
-    """The places of a scene and its run, with the threads of a task: later work of the process has its own again."""
+    """The places of a scene and its run, with threads and `strict` of a task: later work of the process has its own again."""
     threads = torch.get_num_threads()
     torch.set_num_threads(job.options.threads)
     try:
-        with open_place(job.source) as source, open_place(job.out) as out:
+        quiet = hear(lambda note: None, strict=job.options.strict)  # notes of scenes are reported
+        with quiet, open_place(job.source) as source, open_place(job.out) as out:
             if type(out) is Place:
                 with suppress(OSError):  # only shown to people
                     out.write_text(AT_WORK, f"process {os.getpid()} of {socket.gethostname()}\n")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -91,11 +90,9 @@ def folder_masks(
         return None, []
     files = list_images(folder)
     known = Names(files)
-    chosen = [
-        known.find(name) or known.find(f"{file_stem(name)}.heic") for name in names
-    ]  # photos are converted from HEIC
-    counts = Counter(chosen)
-    masks = [folder / file if file is not None and counts[file] == 1 else None for file in chosen]
+    heic = [f"{file_stem(name)}.heic" for name in names]  # photos are converted from HEIC
+    chosen = [a or b for a, b in zip(known.find_each(names), known.find_each(heic), strict=True)]
+    masks = [None if file is None else folder / file for file in chosen]
     used = {mask for mask in masks if mask is not None}
     if not used:
         example = f"{file_stem(names[0])}.png" if names else "NAME.png"

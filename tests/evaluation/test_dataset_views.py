@@ -95,6 +95,17 @@ def test_cameras_get_the_size_of_the_truth(tmp_path: Path) -> None:
         truth_views(scene, _mask_truth("a", 32, 24))
 
 
+def test_labels_of_one_folder_are_not_those_of_another(tmp_path: Path) -> None:
+    """A rig has a picture `a` in each folder: flat labels could be of both."""
+    scene = _scene(tmp_path, ["left/a.png", "right/a.png", "left/b.png"])
+    Image.fromarray(np.zeros((48, 64), np.uint8)).save(tmp_path / "a.png")
+    Image.fromarray(np.ones((48, 64), np.uint8)).save(tmp_path / "b.png")
+    assert [*true_labels(scene, tmp_path, "all")] == ["left/b"]
+    assert truth_views(scene, _mask_truth("b", 48, 64))[0].camera.size == (48, 64)
+    with pytest.raises(ValueError, match=tells("right/b", "not in it")):
+        truth_views(scene, _mask_truth("right/b", 48, 64))
+
+
 def test_truth_of_another_scene(tmp_path: Path) -> None:
     scene = _scene(tmp_path, ["frame_1.png", "b.png"])
     with pytest.raises(

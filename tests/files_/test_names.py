@@ -49,6 +49,16 @@ def test_names_of_views_may_lack_their_folder_where_only_one_fits() -> None:
     ]
 
 
+def test_a_name_with_a_folder_is_not_that_of_another_folder() -> None:
+    names = Names(["left/a.png"], bare=True)
+    assert [names.find(name) for name in ("a.png", "images/left/a.png", "right/a.png")] == ["left/a.png"] * 2 + [None]
+
+
+def test_what_several_find_is_only_for_one_that_is_spelled_so() -> None:
+    assert Names(["a.png", "b.png"]).find_each(["left/a.png", "right/a.png", "left/b.jpg"]) == [None, None, "b.png"]
+    assert Names(["a.png"]).find_each(["a.png", "right/a.png"]) == ["a.png", None]
+
+
 def test_the_nearest_name_is_the_advice() -> None:
     assert Names(["rgb_1.png", "rgb_12.png", "depth.png"]).advice("DETH") == "did you mean 'depth.png'?"
     assert Names([]).advice("a") == "there are no names to choose from"

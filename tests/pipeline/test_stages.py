@@ -5,10 +5,11 @@ from pathlib import Path
 import pytest
 import torch
 from messages import tells
+from PIL import Image
 
 from kfgs._files import HIDDEN
 from kfgs.cameras import Camera
-from kfgs.pipeline.stages import Run, digest_scene, digest_tensors
+from kfgs.pipeline.stages import Run, digest_pictures, digest_scene, digest_tensors
 from kfgs.scenes import Scene
 
 
@@ -190,3 +191,13 @@ def test_links_in_a_run_folder_are_refused_before_anything_is_written(tmp_path, 
     (tmp_path / "named").symlink_to("mine")  # the run folder itself may be a link
     with Run(tmp_path / "named").locked():
         pass
+
+
+def test_only_transparent_pictures_have_another_key_than_before_they_were_on_black(tmp_path):
+    for name, mode in (("a.png", "RGB"), ("b.png", "RGBA")):
+        Image.new(mode, (4, 3)).save(tmp_path / name)
+    camera = Camera(torch.eye(4), torch.tensor([[4.0, 0, 2], [0, 4, 1.5], [0, 0, 1]]), 4, 3)
+    cameras, paths = [replace(camera, name=name) for name in "ab"], [tmp_path / "a.png", tmp_path / "b.png"]
+    scene, run = Scene(cameras, paths, torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)), Run(tmp_path)
+    before = run.digests(paths)
+    assert digest_pictures(run, scene, [0, 1]) == [before[0], [*before[1], "on black"]]

@@ -2,15 +2,19 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from colmap_models import write_model, write_picture
 from messages import tells
 
+from kfgs._notes import hear
 from kfgs.cli import main
 from kfgs.scale import BatchOptions, SceneEntry, run_batch, stages
 from kfgs.scale.options import Job
 from kfgs.scale.places import Place, open_place
+from kfgs.scenes import SceneError
 from tests.features.test_extract import paint
 
 OURS = {
@@ -127,6 +131,22 @@ def test_cameras_of_somebody_else_are_not_replaced(photos):
             stages.find_scene(job, report=print)
     assert own.read_text() == "mine"
     assert calls == []
+
+
+def test_workers_are_strict_if_the_command_is(tmp_path):
+    write_model(tmp_path / "in/sparse/0", ["a.png", "b.png"], text=True, rigs=False)
+    write_picture(tmp_path / "in/images/a.png")
+    images = tmp_path / "in/sparse/0/images.txt"
+    lines = images.read_text().splitlines()
+    number = next(i for i, line in enumerate(lines) if line.endswith("b.png"))
+    lines[number] = " ".join([*lines[number].split()[:5], "nan", *lines[number].split()[6:]])
+    images.write_text("\n".join(lines) + "\n")
+    with hear(print, strict=True):
+        options = BatchOptions()
+    job = Job(str(tmp_path / "in"), str(tmp_path / "out"), options)
+    with pytest.raises(SceneError, match=tells("nothing broken (strict)", "b.png", "without --strict")):
+        stages.find_scene(job, report=print)
+    assert stages.find_scene(replace(job, options=BatchOptions()), report=print)["views"] == {"train": 1}
 
 
 def test_a_killed_search_for_cameras_is_repeated(photos):

@@ -71,9 +71,9 @@ def find_folder(places: Sequence[Path], holds: str, what: str) -> Path:
 
 def files_of_texts(folder: Path, texts: Sequence[str]) -> dict[str, Path]:
     """The PNG files of a folder by the text that each is named after (`Names`), or by its own stem."""
-    known = Names(texts)
     files = sorted(file for file in folder.iterdir() if file.suffix.lower() == ".png")
-    return {known.find(file.stem) or file.stem: file for file in files}
+    found = Names(texts).find_each(file.stem for file in files)
+    return {text or file.stem: file for file, text in zip(files, found, strict=True)}
 
 
 def check_names(where: str, found: Sequence[str], known: Sequence[str], kind: str, advice: str) -> None:

@@ -61,8 +61,9 @@ def truth_views(scene: Scene, truth: LabelTruth | MaskTruth, size: Literal["trut
 def views_of(scene: Scene, stems: Iterable[str]) -> dict[str, int]:
     """The view of each picture of a truth that is in the scene, by its name, which may be spelled otherwise (`Names`)."""
     place = {camera.name: i for i, camera in enumerate(scene.cameras)}
-    names = Names(place, bare=True)
-    return {stem: place[name] for stem in stems if (name := names.find(stem)) is not None}
+    stems = list(stems)
+    names = Names(place, bare=True).find_each(stems)
+    return {stem: place[name] for stem, name in zip(stems, names, strict=True) if name is not None}
 
 
 def named_as_in(scene: Scene, truth: LabelTruth | MaskTruth) -> LabelTruth | MaskTruth:
