@@ -200,11 +200,13 @@ function pickPart(model, act) {
 
 function pickLines(model, found) {
   const color = model.packed.header.classes[found.label]?.color ?? [128, 128, 128];
-  const place = model.position(found.side, found.index);
+  const { origin } = model.packed.header;
+  const place = model.position(found.side, found.index).map((x, axis) => x + origin[axis]);
+  const at = place.map((x) => (Math.abs(x) < 10000 ? short(x) : x.toFixed(2))).join(", ");
   const score = Number.isFinite(found.score) ? `, score ${found.score.toFixed(3)}` : "";
   const lines = [
     h("p", {}, h("span", { class: "swatch", style: `background:${css(color)}` }), h("strong", {}, found.name), score),
-    h("p", { class: "note" }, `${model.kindOf(found.side)} ${found.index} at ${place.map(short).join(", ")}`),
+    h("p", { class: "note" }, `${model.kindOf(found.side)} ${found.index} at ${at}`),
   ];
   if (found.distance !== null) {
     const away = found.distance > 0 ? `${short(found.distance)} away` : "in the same place";

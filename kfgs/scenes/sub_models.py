@@ -11,6 +11,7 @@ from .files import natural_key, some
 
 PLACES = ("sparse", "colmap/sparse", "dense/sparse", "distorted/sparse", "colmap_ground_truth", ".")
 """Folders of models, asked in this order; a model may also lie in their subfolders `N`, `N/models/M` and `models/M`."""
+IMAGE = 73  # bytes of an image without 2-D points, with a name of one letter
 
 
 def models_of(path: Path) -> list[Path]:
@@ -60,7 +61,8 @@ def count_images(model: Path) -> int:
     try:
         if binary.is_file():
             with binary.open("rb") as file:
-                return int(struct.unpack("<Q", file.read(8))[0])
+                count = int(struct.unpack("<Q", file.read(8))[0])
+            return count if count * IMAGE <= binary.stat().st_size else 0
         count = 0
         with text.open(encoding=text_encoding(text)) as lines:
             for line in lines:

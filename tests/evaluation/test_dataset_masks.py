@@ -168,7 +168,10 @@ def test_3dovs_that_is_not_whole(tmp_path: Path) -> None:
         ValueError, match=tells("segmentations/00", "banana, black leather shoe", "camera", "classes.txt")
     ):
         load_3dovs(folder)
-    (folder / "segmentations/00/camera.png").unlink()
+    (folder / "segmentations/00/camera.png").rename(folder / "segmentations/00/banana.old.png")  # not the banana's
+    with pytest.raises(ValueError, match=tells("segmentations/00", "got banana.old")):
+        load_3dovs(folder)
+    (folder / "segmentations/00/banana.old.png").unlink()
     _mask(folder / "segmentations/00/banana.png", (1, 2, 3, 4), (20, 12))
     with pytest.raises(ValueError, match=tells("segmentations/00:", "'black leather shoe': (10, 12)")):
         load_3dovs(folder)

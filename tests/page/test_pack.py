@@ -151,6 +151,15 @@ def test_no_source_and_no_harmonics():
     assert packed.header["default_view"] is None
 
 
+def test_the_page_knows_where_a_far_scene_lies():
+    """What is picked there is told in the world."""
+    own, colors = cloud([[0.0, 0, 5]], [0]), cloud([[500001.0, 7, 5]])
+    far = SplatMeaning(SplatFile(own.replace(origin=(5e5, 0, 0)), {}, ("wall",)))
+    packed = pack_scene(Exploration(far, colors))
+    assert packed.header["origin"] == [5e5, 0, 0]
+    assert packed.header["sides"]["color"]["center"][0] == pytest.approx(1)
+
+
 def test_cameras_and_thumbnails():
     from cases_explorer import cameras
 

@@ -83,6 +83,16 @@ def test_of_several_models_the_largest_is_used(
     assert advised.splits["train"] == [models[other] - 1]
 
 
+def test_a_model_that_is_cut_off_is_not_the_largest(tmp_path: Path) -> None:
+    write_model(tmp_path / "sparse/0", ["a.png", "b.png"])
+    write_model(tmp_path / "sparse/1", ["a.png"])
+    _pictures(tmp_path / "images", ["a.png", "b.png"])
+    (tmp_path / "sparse/1/images.bin").write_bytes((10**6).to_bytes(8, "little"))
+    scene = load_scene(tmp_path)
+    assert len(scene) == 2
+    assert any("sparse/1 with 0 images" in note for note in scene.notes)
+
+
 def test_pictures_beside_a_dense_model_are_its_own(tmp_path: Path) -> None:
     write_model(tmp_path / "dense/sparse", ["a.png"])
     _pictures(tmp_path / "images", ["a.png"])

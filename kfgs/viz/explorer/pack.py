@@ -124,6 +124,7 @@ def pack_scene(
     header = {
         "version": VERSION,
         "title": title,
+        "origin": list(state.meaning.gaussians.origin),
         "sides": sides,
         "classes": _classes(state),
         "lambda": {"value": state.distance, "how": state.distance_how, "low": low, "high": high},
