@@ -226,6 +226,18 @@ class Camera:
         return replace(self, viewmat=moved_to(self.viewmat, *args, **kwargs), K=moved_to(self.K, *args, **kwargs))
 
 
+def at_one_origin(cameras: Sequence[Camera]) -> list[Camera]:
+    """The cameras, with all viewmats counted from the origin of the first.
+
+    Raises:
+        TypeError: if one is not a camera.
+    """
+    for i, camera in enumerate(cameras):
+        if not isinstance(camera, Camera):
+            raise TypeError(f"cameras[{i}]: expected a Camera, got {type(camera).__name__}; pass a list of cameras")
+    return [camera.with_origin(cameras[0].origin) for camera in cameras]
+
+
 def unit_vector(name: str, vector: Tensor | Sequence[float]) -> Tensor:  # [3] float64
     """The direction of a vector; errors name the argument `name`."""
     values = as_tensor(name, vector).detach().double().cpu()

@@ -10,7 +10,7 @@ from kornia.geometry.camera import PinholeCamera
 
 from .._check import check_shapes
 from .._typed import typed
-from .camera import NEAR, Camera
+from .camera import NEAR, Camera, at_one_origin
 
 
 @typed
@@ -50,7 +50,7 @@ def to_kornia(cameras: Sequence[Camera], *, integer_centers: bool = False) -> Pi
                 f"cameras[{i}]: expected a pinhole camera, got {camera.distortion.model} distortion (camera "
                 f"{camera.name!r}), which PinholeCamera cannot hold; undistort it first (kfgs.cameras.undistort)"
             )
-    cameras = [camera.with_origin(cameras[0].origin) for camera in cameras]
+    cameras = at_one_origin(cameras)
     matrices = [matrix for camera in cameras for matrix in (camera.K, camera.viewmat)]
     devices = {str(matrix.device) for matrix in matrices}
     if len(devices) > 1:

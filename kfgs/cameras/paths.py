@@ -11,8 +11,8 @@ import torch
 from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
-from .._check import ORIGIN, check_size, check_whole
-from .camera import Camera
+from .._check import check_size, check_whole
+from .camera import Camera, at_one_origin
 from .resample import fits_aspect
 
 Array = np.ndarray[Any, Any]
@@ -61,8 +61,7 @@ def path_cameras(
     check_whole("every", every, 1)
     if size is not None:
         check_size(size)
-    origin = cameras[0].origin if cameras else ORIGIN
-    keys = _keys([camera.with_origin(origin) for camera in cameras], every, closed)
+    keys = _keys(at_one_origin(cameras), every, closed)
     height, width = size or cameras[0].size
     keys = [_in_frame(key, *cameras[0].size).resized(height, width) for key in keys]
     places, turns = _poses(keys)
@@ -81,7 +80,7 @@ def path_cameras(
         K[0, 0], K[1, 1], K[0, 2], K[1, 2] = lenses[number]
         name = f"path_{number:04d}"
         lens = torch.from_numpy(K), width, height
-        path.append(Camera(torch.from_numpy(viewmat), *lens, name=name, near=near, origin=origin))
+        path.append(Camera(torch.from_numpy(viewmat), *lens, name=name, near=near, origin=cameras[0].origin))
     return path
 
 

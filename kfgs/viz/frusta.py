@@ -11,6 +11,7 @@ from torch import Tensor
 
 from .._check import as_array, check_range, check_shapes, check_whole
 from ..cameras import Camera, resize_map
+from ..cameras.camera import at_one_origin
 from .meshes import draw_mesh
 from .pictures import as_bytes
 from .places import placed
@@ -126,9 +127,7 @@ def _depth(cameras: Sequence[Camera], size: float | None) -> float:
         raise TypeError(f"cameras: expected a list of cameras, got {type(cameras).__name__}; pass {hint}")
     if not cameras:
         raise ValueError("cameras: expected at least one camera, got none; load a scene with views")
-    centers = np.stack([as_array(camera.with_origin(cameras[0].origin).center) for camera in cameras]).astype(
-        np.float64
-    )
+    centers = np.stack([as_array(camera.center) for camera in at_one_origin(cameras)]).astype(np.float64)
     extent = float(np.ptp(centers, axis=0).max())
     depth = size if size is not None else (0.05 * extent if extent > 0 else 0.2)
     check_range("size", depth, 0, closed=(False, False))

@@ -7,7 +7,7 @@ from weakref import WeakKeyDictionary
 
 from .._origin import Origin
 from ..cameras import Camera
-from ..gaussians import Gaussians
+from ..gaussians import Gaussians, check_gaussians
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -22,5 +22,7 @@ def origin_of(plotter: pv.Plotter, first: Origin) -> Origin:
 
 
 def placed(plotter: pv.Plotter, thing: Thing) -> Thing:
-    """Gaussians or a camera, counted from the plotter's origin."""
+    """Gaussians or a camera, counted from the plotter's origin; a TypeError if it is neither."""
+    if not isinstance(thing, Camera):
+        check_gaussians(thing)
     return thing.with_origin(origin_of(plotter, thing.origin))
