@@ -162,8 +162,9 @@ def _plain_pictures(images: Path, out: Path, fps: float | None) -> Path:
         say(f"{images}: the {len(frames)} sharpest frames are in {out / 'images'}")
     elif has_heic(images):
         found = convert_heic(images, out / "images", progress=True)
-        if (images.parent / "masks").is_dir() and not os.path.lexists(out / "masks"):
-            (out / "masks").symlink_to(real_path(images.parent / "masks"), target_is_directory=True)
+        masks = next((place / "masks" for place in (images, images.parent) if (place / "masks").is_dir()), None)
+        if masks is not None and not os.path.lexists(out / "masks"):
+            (out / "masks").symlink_to(real_path(masks), target_is_directory=True)
         say(f"{images}: HEIC photographs are JPEG files in {out / 'images'}, {len(found)} pictures in all")
     elif images.is_file():
         raise ValueError(

@@ -142,8 +142,8 @@ def _with_labels(beside: Path, path: Path, splats: SplatFile) -> SplatFile:
             f"{beside}: expected the labels of this version of {path.name}, got those of another version; delete it, or write "
             "both again"
         )
-    if (labels < -1).any() or (score is not None and (score.shape != labels.shape or not np.isfinite(score).all())):
-        raise ValueError(f"{beside}: expected class_id of -1 or more and as many finite scores, got others; delete it")
+    if (labels < -1).any() or (score is not None and score.shape != labels.shape):
+        raise ValueError(f"{beside}: expected class_id of -1 or more and as many scores, got others; delete it")
     extra = splats.extra if score is None else splats.extra | {SCORE: score}
     gaussians = splats.gaussians.replace(labels=torch.from_numpy(labels.astype(np.int64)))
     return splats.replace(gaussians=gaussians, extra=extra)

@@ -66,6 +66,14 @@ def test_labels_without_names_and_scores(path):
     assert (back.classes, back.extra) == ((), {})
 
 
+def test_scores_that_are_no_numbers_are_0_as_in_a_ply(path):
+    _bend(path, score=np.array([0.5, np.nan, 0.5, np.inf, 0.5, 0.5]))
+    back = read_splats(path)
+    assert back.extra["score"].tolist() == [0.5, 0, 0.5, 0, 0.5, 0.5]
+    assert back.gaussians.labels.tolist() == [-1, 0, 1, 2, -1, 0]
+    assert back.notes == ("2 of 6 Gaussians have no number as score (rows 1, 3): read as 0",)
+
+
 def test_labels_of_another_version_are_refused(path):
     content = path.read_bytes()
     path.write_bytes(content[32:] + content[:32])  # the same Gaussians in another order
@@ -83,8 +91,7 @@ def test_labels_of_another_version_are_refused(path):
         ({"class_id": None}, ("class_id and of", "got of, score", "delete")),
         ({"of": None}, ("class_id and of", "got class_id, score", "delete")),
         ({"of": np.array("other")}, ("a.splat", "another version")),
-        ({"score": np.full(6, np.nan)}, ("finite", "scores")),
-        ({"score": np.zeros(7)}, ("finite", "scores", "as many")),
+        ({"score": np.zeros(7)}, ("scores", "as many")),
         ({"score": np.zeros(100_000)}, ("800664 bytes", "6 Gaussians")),
         ({"class_id": np.array([None] * 6)}, ("read", "a.splat")),  # pickled objects are never loaded
     ],
