@@ -23,13 +23,14 @@ NEAR = 0.3  # metres
 
 def main() -> None:
     """Run, and print a table."""
+    from toy_town import make_toy_town
+
     from kfgs.fields import SemanticField, UpliftConfig
     from kfgs.formats import read_splats
     from kfgs.pipeline import ColorConfig, FitConfig, fit_color
     from kfgs.scale import FieldInBlocks, split_scene
     from kfgs.scenes import load_scene
     from kfgs.toy.room_folder import ToyConfig
-    from kfgs.toy.town import make_toy_town
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import kfgs
 
-LINES = 66_600  # of Python, docstrings included; a change may lower the number, and never raises it
+LINES = 66_200  # of Python, docstrings included; a change may lower the number, and never raises it
 
 
 def test_who_adds_lines_names_the_lines_that_go():

@@ -52,17 +52,6 @@ class FeatureReport:
         lines += [f"note: {name + ': ' if name else ''}{'; '.join(texts)}" for name, texts in self.notes.items()]
         return "\n".join(lines)
 
-    def raise_if_bad(self) -> None:
-        """Raise a ValueError with the first five problems and their number, unless every map fits."""
-        if self.ok:
-            return
-        first = [f"{name}: {'; '.join(texts)}" for name, texts in list(self.problems.items())[:5]]
-        more = f" | and {len(self.problems) - 5} more" if len(self.problems) > 5 else ""
-        raise ValueError(
-            f"{self.folder}: expected a map that fits for each of {self.views} views, got {len(self.problems)} that do "
-            f"not: {' | '.join(first)}{more}; encode these views again or leave them out"
-        )
-
 
 def check_maps(finder: MapFinder, sizes: dict[str, Size], reading: Reading, *, values: bool) -> FeatureReport:
     """Check the map of every view; see `FeatureFolder.check`.

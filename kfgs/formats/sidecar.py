@@ -25,14 +25,6 @@ def names_path(path: str | Path) -> Path:
     return path.with_name(path.name + ".classes.json")
 
 
-def shared_names_path(path: str | Path) -> Path:
-    """`scene.ply` -> `scene.classes.json`, a name that older versions of kfgs wrote; read if there is no `names_path`.
-
-    It may also belong to `scene.spz`, so it is never written or deleted.
-    """
-    return as_path(path).with_suffix(".classes.json")
-
-
 def labels_path(path: str | Path) -> Path:
     """`scene.splat` -> `scene.splat.labels.npz`: `class_id` and `score` of a format that cannot hold them."""
     path = as_path(path)
@@ -73,8 +65,7 @@ def write_sidecar(path: Path, splats: SplatFile, *, holds_labels: bool, holds_or
         written.append(origin_path(path))
     else:
         origin_path(path).unlink(missing_ok=True)
-    # an empty file of names prevents the shared one from being read
-    if labels is not None and (splats.classes or shared_names_path(path).is_file()):
+    if labels is not None and splats.classes:
         facts = splats.info.get("labels", {})
         written.append(write_names(path, splats.classes, **facts))
     else:
@@ -103,11 +94,8 @@ def read_sidecar(path: Path, splats: SplatFile) -> SplatFile:
 
 
 def find_names(path: str | Path) -> Path | None:
-    """The file with the class names of a splat file: `names_path`, or else `shared_names_path`; None if neither exists.
-
-    Both are looked for next to the path, then, if that is a link, next to the file that it leads to.
-    """
-    return _first(name(place) for name in (names_path, shared_names_path) for place in _places(path))
+    """The file with the class names of a splat file (`names_path`): next to the path or, if that is a link, to its target."""
+    return _first(names_path(place) for place in _places(path))
 
 
 def _places(path: str | Path) -> tuple[Path, ...]:

@@ -100,11 +100,6 @@ class CodebookConfig:
         """The paper's method and values; those of its released script if the paper gives none."""
         return CodebookConfig(**({"adaptive": False, "maximum": 100, "expand_below": 0.9} | changes))
 
-    @staticmethod
-    def cpu() -> CodebookConfig:
-        """The defaults, which take seconds on two cores."""
-        return CodebookConfig()
-
 
 @dataclass(frozen=True, eq=False)
 class CodebookFit:

@@ -51,7 +51,6 @@ def test_maps_that_fit_are_one_line(folder, values):
     assert (report.views, report.shape, report.dtype, report.notes) == (3, (6, 8, 16), "float16", {})
     assert report.bytes == sum((folder / f"{stem}.npy").stat().st_size for stem in "abc")
     assert str(report) == f"{folder}: 3 of 3 views have a map that fits; 6 x 8 cells, 16 channels, float16, 0.0 MB"
-    report.raise_if_bad()
 
 
 def test_all_that_does_not_fit_is_reported_at_once_by_file(folder):
@@ -84,8 +83,6 @@ def test_all_that_does_not_fit_is_reported_at_once_by_file(folder):
     assert lines[0].startswith(f"{folder}: 4 of 11 views have a map that fits; 6 x 8 cells, 16 channels, float16")
     assert len(lines) == 9
     assert sum(line.startswith("turned.npy: expected the aspect") for line in lines) == 1
-    with pytest.raises(ValueError, match=tells("11 views", "got 7", "2 more")):
-        report.raise_if_bad()
 
 
 def test_without_values_only_shape_and_kind_are_looked_at(folder):

@@ -8,7 +8,7 @@ import torch
 from messages import tells
 
 from kfgs.formats import SplatFile, read_splats, write_splats
-from kfgs.formats.sidecar import labels_path, names_path, read_names, shared_names_path, write_names
+from kfgs.formats.sidecar import labels_path, names_path, read_names, write_names
 from kfgs.gaussians import Gaussians
 
 CLASSES = ("wall", "Stuhl ä", "plant")
@@ -178,22 +178,6 @@ def test_names_of_files_that_share_a_stem_stay_apart(tmp_path):
     assert read_splats(tmp_path / "scene.ply").classes == CLASSES
     assert read_splats(tmp_path / "scene.spz").classes == ("a", "b", "c", "d")
     assert read_splats(tmp_path / "scene.splat").classes == ()
-
-
-def test_names_named_after_the_stem_are_read_and_left_alone(tmp_path):
-    path, shared = tmp_path / "scene.ply", tmp_path / "scene.classes.json"
-    write_splats(path, _splats())
-    names_path(path).rename(shared)
-    assert shared == shared_names_path(path)
-    assert read_splats(path).classes == CLASSES
-    content = shared.read_bytes()
-    write_splats(path, _splats().replace(classes=("x", "y", "z")))  # its own go first
-    assert read_splats(path).classes == ("x", "y", "z")
-    write_splats(path, _splats().replace(classes=()))  # without names: not those beside it either
-    assert read_splats(path).classes == ()
-    write_splats(path, _splats().gaussians.replace(labels=None))
-    assert not names_path(path).exists()
-    assert shared.read_bytes() == content
 
 
 def test_labels_and_names_are_found_through_a_link(path):

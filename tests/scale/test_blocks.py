@@ -13,6 +13,7 @@ from killed import kill_everywhere
 from messages import tells
 from PIL import Image
 
+from benchmarks.toy_town import make_toy_town
 from kfgs.cli import main
 from kfgs.evaluation import load_label_map
 from kfgs.features import FeatureFolder
@@ -35,7 +36,6 @@ from kfgs.scale.blocks import _put
 from kfgs.scale.in_blocks import _in_view
 from kfgs.scenes import SceneError, load_scene
 from kfgs.toy.room_folder import ToyConfig
-from kfgs.toy.town import make_toy_town
 
 ROOM = ToyConfig(
     train_views=8, test_views=2, size=(60, 80), feature_size=(30, 40), feature_dim=24, surface_points=3_000, sparse_points=800

@@ -76,11 +76,6 @@ class LSegConfig:
         """Hidden channels of a ViT block's MLP, fixed by kornia's ViT."""
         return 4 * self.width
 
-    @property
-    def text_mlp(self) -> int:
-        """Hidden channels of a text block's MLP."""
-        return 4 * self.text_width
-
 
 class LSegNetwork(nn.Module):
     """Features of a window at half its resolution: LSeg up to `head1`, before the last enlargement, which is linear.

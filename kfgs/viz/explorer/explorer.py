@@ -73,7 +73,6 @@ class Explorer:
         self._near = NEAR if self._camera is None else self._camera.near
         self.lock = RLock()
         self._listeners: list[Callable[[], None]] = []
-        self._at_close: list[Callable[[], None]] = []
         self._closed = False
         count = len(exploration.sides)
         self.plotter: pv.Plotter = make_plotter(
@@ -248,13 +247,6 @@ class Explorer:
         """Whether the explorer or its window is closed."""
         return self._closed or self.plotter.render_window is None  # the desktop can destroy a window
 
-    def on_close(self, callback: Callable[[], None]) -> None:
-        """Call a function once, when the explorer closes; immediately if it is closed."""
-        if self._closed:
-            callback()
-        else:
-            self._at_close.append(callback)
-
     def close(self) -> None:
         """Close the window; a second call does nothing."""
         with self.lock:
@@ -262,8 +254,6 @@ class Explorer:
                 return
             self._closed = True
             self.plotter.close()
-        while self._at_close:
-            self._at_close.pop(0)()
 
     def __enter__(self) -> Explorer:
         return self

@@ -124,7 +124,7 @@ def test_a_window_of_another_size_is_refused(case):
 
 def test_the_defaults_are_those_of_the_released_checkpoint():
     config = LSegConfig()
-    assert (config.grid, config.mlp, config.text_mlp) == (30, 4096, 2048)
+    assert (config.grid, config.mlp) == (30, 4096)
 
 
 @pytest.mark.parametrize(

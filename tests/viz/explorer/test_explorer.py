@@ -193,18 +193,6 @@ def test_a_window_that_the_desktop_destroyed_counts_as_closed():
             explorer.ask("chair")
 
 
-def test_who_waits_for_the_end_is_told_once():
-    told = []
-    explorer = an_explorer()
-    explorer.on_close(lambda: told.append(explorer.closed))
-    assert not told
-    explorer.close()
-    explorer.close()
-    assert told == [True]
-    explorer.on_close(lambda: told.append("late"))
-    assert told == [True, "late"]
-
-
 def test_verbs_of_two_threads_leave_a_window_that_draws(monkeypatch):
     """Without a lock the second finds drawing suppressed by the first, and leaves it so."""
     inside, both, exchange = Event(), Event(), Explorer._update_panes

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from .._check import check_whole
-from .._files import as_path, atomic_folder, check_output, read_json, write_json
-from ..scenes.pycolmap_import import quiet_pycolmap
-from .geometry import Array
-from .room_folder import ToyConfig, make_toy_room
+from kfgs._check import check_whole
+from kfgs._files import as_path, atomic_folder, check_output, read_json, write_json
+from kfgs.scenes.pycolmap_import import quiet_pycolmap
+from kfgs.toy.geometry import Array
+from kfgs.toy.room_folder import ToyConfig, make_toy_room
 
 STEP = 8.0, 7.0  # metres from one room to the next: rooms are 6 x 5
 FOLDERS = ("images", "labels", "features")
