@@ -94,7 +94,7 @@ ERRORS = {
         ),
         (
             ["{labelled}", "--out", "{o}.ply", "--opacity", "rug:0.5", "--scale", "chair:1e200"],
-            ("--scale chair:1e200: positions:", "finite"),
+            ("--scale chair:1e200:", "positions and scales", "scale less"),
         ),
         (["{labelled}", "--out", "{o}.ply", "--move", "chair:1,2"], ("--move:", "got 'chair:1,2'")),
         (["{labelled}", "--out", "{o}.ply", "--insert", "{tmp}/no.ply"], ("--insert:", "got '{tmp}/no.ply'")),
