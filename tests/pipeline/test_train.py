@@ -8,7 +8,7 @@ from messages import tells
 
 from kfgs.cameras import Camera
 from kfgs.pipeline import fit_color
-from kfgs.pipeline.train import check_scene, training_device
+from kfgs.pipeline.train import FEW_POINTS, check_scene, training_device
 from kfgs.scenes import Scene
 
 
@@ -38,14 +38,14 @@ def scene_with(points: torch.Tensor) -> Scene:
 def test_points_out_of_sight_of_all_views_are_refused():
     behind = torch.tensor([[0.0, 0, -2], [0.1, 0, -3], [50.0, 0, 1]])
     with pytest.raises(ValueError, match=tells("scene:", "got 3 out of sight of all 1 views", "one frame?")):
-        check_scene(scene_with(behind), [0])
-    check_scene(scene_with(behind), [0, 1])  # the other view shows two of them
-    check_scene(scene_with(torch.cat([behind, torch.tensor([[0.0, 0, 2]])])), [0])
+        check_scene(scene_with(behind), [0], few=1)
+    check_scene(scene_with(behind), [0, 1], few=1)  # the other view shows two of them
+    check_scene(scene_with(torch.cat([behind, torch.tensor([[0.0, 0, 2]])])), [0], few=1)
 
 
 def test_a_colour_field_of_points_out_of_sight_is_refused_before_training(tmp_path):
     with pytest.raises(ValueError, match=tells("out of sight")):
-        fit_color(scene_with(torch.tensor([[0.0, 0, -2], [0.1, 0, -3]])), tmp_path / "run")
+        fit_color(scene_with(torch.tensor([[0.0, 0, -2], [0.1, 0, -3]]).repeat(FEW_POINTS, 1)), tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
@@ -53,4 +53,4 @@ def test_a_colour_field_of_points_out_of_sight_is_refused_before_training(tmp_pa
 def test_a_scene_without_different_points_is_refused_before_the_work(count, got):
     points = torch.ones(count, 3)
     with pytest.raises(ValueError, match=tells("scene:", got, "kfgs sfm")):
-        check_scene(Scene([], [], points, torch.zeros(count, 3, dtype=torch.uint8)), [])
+        check_scene(Scene([], [], points, torch.zeros(count, 3, dtype=torch.uint8)), [], few=1)
