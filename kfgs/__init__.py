@@ -70,8 +70,6 @@ _WHERE = {
     "evaluate_segmentation": ".evaluation",
     "load_label_set": ".labels",
     "explore": ".viz",
-    "SearchIndex": ".scale",
-    "SharedCodebook": ".scale",
 }
 __version__ = "0.1.0"
 __all__ = sorted(_WHERE)
@@ -122,8 +120,6 @@ if TYPE_CHECKING:
     from .quant import fit_autoencoder as fit_autoencoder
     from .quant import fit_codebook as fit_codebook
     from .quant import quantize_maps as quantize_maps
-    from .scale import SearchIndex as SearchIndex
-    from .scale import SharedCodebook as SharedCodebook
     from .scenes import Scene as Scene
     from .scenes import SceneError as SceneError
     from .scenes import load_scene as load_scene

@@ -33,7 +33,6 @@ LINES = {  # a command with its output {}; and one of its inputs that could be n
     "label": ("label {run}/field --out {}", None),
     "pack": ("pack {packed} {}", "{packed}"),
     "render": ("render {run} --out {}.gif", None),
-    "search": ("search chair {run} --csv {}", None),
     "segment": ("segment {run}/field --out {}", None),
     "select": ("select chair {run}/field --out {}", None),
     "sfm": ("sfm {tmp}/photos --out {}", None),

@@ -7,12 +7,12 @@ from contextlib import suppress
 
 import pytest
 import torch
-from cases_search import scene
+from cases_blobs import scene
 from messages import tells
 from test_public import PACKAGES
 
 import kfgs
-from kfgs import Camera, CodebookConfig, SharedCodebook, SplatFile
+from kfgs import Camera, CodebookConfig, SplatFile
 from kfgs.features import FeatureFolder
 
 FIELD = scene([("chair", 0.0)])
@@ -94,8 +94,6 @@ def test_every_public_name_is_called():
         ),
         (lambda: kfgs.load_teacher([]), ("teacher: expected a name", "list")),
         (lambda: kfgs.score_views(None, None), ("gaussians: expected", "NoneType")),
-        (lambda: SharedCodebook(torch.eye(3)).nearest(torch.eye(3), linear=True), ("linear: expected", "bool")),
-        (lambda: SharedCodebook(torch.eye(3)).extended(torch.eye(3), linear=True), ("linear: expected", "bool")),
         (
             lambda: kfgs.attach(FIELD, GOOD["SplatFile"], FIELD.words, cameras="x"),
             ("cameras: expected", "Sequence", "str"),

@@ -1,7 +1,7 @@
 """The command line: `kfgs COMMAND ...`; `kfgs --help` lists the commands.
 
 Every command names the files it wrote, shows progress on long work, and ends with 0 (done), 1 (bad input, with one
-message that says what to do), 2 (wrong usage), 130 (interrupted; demo, features, fit, color, blocks, search and batch
+message that says what to do), 2 (wrong usage), 130 (interrupted; demo, features, fit, color, blocks and batch
 continue where they stopped) or 141 (its output was closed).
 """
 
@@ -34,7 +34,6 @@ from .pack import pack
 from .places import checked
 from .query import info, label, select
 from .render import render
-from .search import search
 from .segment import segment
 from .splats import attach, convert, edit
 from .text import text
@@ -44,13 +43,13 @@ GROUPS: dict[str, tuple[Any, ...]] = {
     "Start here": (demo, info),
     "Make a semantic field": (sfm, features, text, fit, uplift),
     "More than one machine": (batch, blocks, join),
-    "Ask it": (select, search, segment, label, view, render),
+    "Ask it": (select, segment, label, view, render),
     "Store it": (pack,),
     "Score it": (evaluate, compare),
     "Colour splats": (color, attach, edit, convert),
 }
 COMMANDS = {command.__name__: command for group in GROUPS.values() for command in group}
-RESUMED = {"demo", "features", "fit", "color", "batch", "blocks", "search"}  # commands that reuse their earlier work
+RESUMED = {"demo", "features", "fit", "color", "batch", "blocks"}  # commands that reuse their earlier work
 SHARED = {"fit", "uplift", "color"}  # commands that several processes (torchrun) do together
 STRICT = "--strict"  # of every command that reads files
 NARROW = 40  # columns: in a few, tyro never ends

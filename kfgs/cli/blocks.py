@@ -32,7 +32,7 @@ def blocks(
     """Make the field of a scene that is too large for one `kfgs fit`: cut it into blocks, and fit one after the other.
 
     A fit then needs the memory of one block. The scene needs a COLMAP model, and feature maps (`kfgs features`). Each block
-    becomes a scene folder of its own (OUT/block00, ...) with its field in core/. `kfgs search` asks all blocks; `kfgs join`
+    becomes a scene folder of its own (OUT/block00, ...) with its field in core/. `kfgs join`
     makes one field of all of them, or of a part, for all other commands.
 
     Examples:
@@ -64,7 +64,7 @@ def blocks(
         split_scene(scene, out, count, features=maps.folder(scene), splat=splat, latents=latents, report=say)
         done = fit_blocks(out, config, client=client, report=say)
     say(f"{len(done):,} Gaussians in {len(done.blocks)} blocks; all lie in the box {in_numbers(done.extent)}")
-    say(f"next: kfgs join {out} --out field, or with --box a part of it; kfgs search CLASS {out}")
+    say(f"next: kfgs join {out} --out field, or with --box a part of it")
     wrote([out / "blocks.json", *(out / block.name / "core" for block in done.blocks)])
 
 

@@ -1,6 +1,6 @@
 """More than one machine, more than one scene, and scenes that do not fit into one machine.
 
-Names are imported when first used: a search by a class name needs no torch.
+Names are imported when first used.
 """
 
 from __future__ import annotations
@@ -11,13 +11,8 @@ from typing import TYPE_CHECKING, Any
 _WHERE = {
     "BatchOptions": ".options",
     "FieldInBlocks": ".in_blocks",
-    "Found": ".search_found",
-    "PartFound": ".search_found",
-    "SceneFound": ".search_found",
     "SceneEntry": ".scene_list",
     "SceneResult": ".batch",
-    "SearchIndex": ".search",
-    "SharedCodebook": ".shared_codebook",
     "fit_block": ".blocks",
     "fit_blocks": ".blocks",
     "map_scenes": ".batch",
@@ -40,11 +35,6 @@ if TYPE_CHECKING:
     from .options import BatchOptions as BatchOptions
     from .scene_list import SceneEntry as SceneEntry
     from .scene_list import read_scenes as read_scenes
-    from .search import SearchIndex as SearchIndex
-    from .search_found import Found as Found
-    from .search_found import PartFound as PartFound
-    from .search_found import SceneFound as SceneFound
-    from .shared_codebook import SharedCodebook as SharedCodebook
 
 
 def __getattr__(name: str) -> Any:

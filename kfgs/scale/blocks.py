@@ -53,7 +53,7 @@ from .batch import map_scenes
 from .in_blocks import BLOCKS, CORE, FACTS, FORMAT, FieldInBlocks, read_blocks
 
 LATENTS, SPLAT = "latents.safetensors", "splat.ply"
-RUN = ".run"  # hidden: its field has the Gaussians of the reach, too, and `kfgs search` must not count them
+RUN = ".run"  # hidden: its field has the Gaussians of the reach, too
 BESIDE = ("classes.json", "text.npy", "text.safetensors", "labels", "labels_scored", "masks")
 """Files and folders of a scene that belong to each of its blocks, too."""
 IDLE = ("device", "discard_sums")

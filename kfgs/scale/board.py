@@ -88,5 +88,5 @@ def describe_batch(folder: Path) -> str | None:
             row.stages = {stage: STOPPED.get(word, word) for stage, word in row.stages.items()}
     advice = ["the same `kfgs batch` again goes on with scenes that are not done"]
     advice += ["with --retry-failed also with failed ones"] if any(row.failure for row in rows) else []
-    advice = [f"kfgs search WORD {folder}"] if all(row.value is not None for row in rows) else advice
+    advice = [f"kfgs select WORD {folder}/NAME"] if all(row.value is not None for row in rows) else advice
     return "\n".join([f"{head}; scenes that have not begun are not listed", table(rows), f"next: {', '.join(advice)}"])

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from cases_search import COUNT, scene
+from cases_blobs import COUNT, scene
 
 from kfgs import Camera, SemanticField, label_set_from_examples
 from kfgs.fields import Box, Clicks, Picked

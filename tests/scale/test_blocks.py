@@ -244,13 +244,6 @@ def test_the_commands(town, splat, tmp_path, capsys):
     assert "blocks.json" in capsys.readouterr().err
 
 
-def test_a_search_counts_every_gaussian_once(fitted, capsys):
-    expected = sum(int(selection.mask.sum()) for _, selection in fitted.query("chair"))
-    assert main(["search", "chair", str(fitted.folder)]) == 0
-    assert f"{expected} Gaussians" in capsys.readouterr().out
-    (fitted.folder / "search.kfgs").unlink()
-
-
 def test_a_joined_field_remembers_the_whole_scene(fitted, town, tmp_path):
     fitted.joined().save(tmp_path / "deep/field")
     field = SemanticField.load(tmp_path / "deep/field")

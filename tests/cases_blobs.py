@@ -44,10 +44,3 @@ def scene(things, seed=0, words=None, teacher="toy", noise=0.05):
     info = {"teacher": {"name": teacher}}
     words = table(info=info) if words is None else words
     return SemanticField(cloud, linear=linear, info=info, words=words, cameras=tuple(cameras))
-
-
-def save_scenes(folder, **scenes):
-    """Save fields as FOLDER/NAME/field."""
-    for name, field in scenes.items():
-        field.save(folder / name / "field")
-    return folder
