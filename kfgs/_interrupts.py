@@ -11,8 +11,6 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any
 
-from ._ranks import place
-
 CODE = 130  # as shells count it: 128 + SIGINT
 IMPORTS = ("<frozen importlib._bootstrap>", "_find_and_load")
 
@@ -52,7 +50,7 @@ def interruptible() -> Iterator[None]:
 
     signal.signal(signal.SIGINT, interrupt)
     ended = signal.getsignal(signal.SIGTERM)
-    asked = ended is signal.SIG_DFL and place()[1] == 1  # torchrun ends its processes itself
+    asked = ended is signal.SIG_DFL
     if asked:
         signal.signal(signal.SIGTERM, interrupt)
     sys.unraisablehook = forgotten

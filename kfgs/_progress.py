@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from ._ranks import first
-
 Progress = bool | Callable[[dict[str, Any]], None]
 """True shows a bar, a function is called with each new row, False does neither."""
 
@@ -17,18 +15,16 @@ Progress = bool | Callable[[dict[str, Any]], None]
 def as_progress(progress: Any) -> Progress:
     """A function as it is; a number or NumPy's truth value as a bool, so that `is True` may be asked; None as False.
 
-    Of several processes on one job, only the first shows progress; in the others it is False.
-
     Raises:
         TypeError: if it is something else.
     """
     if callable(progress):
-        return progress if first() else False
+        return progress
     if not isinstance(progress, Real | np.bool_ | None):
         raise TypeError(
             f"progress: expected True, False or a function, got {progress!r:.60}; True shows a bar, a function gets each row"
         )
-    return bool(progress) and first()
+    return bool(progress)
 
 
 def as_bar(progress: Any) -> bool:

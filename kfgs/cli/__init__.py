@@ -23,7 +23,6 @@ import tyro
 
 from .._card import error_line, short_of_memory
 from .._interrupts import interruptible
-from .._ranks import LostError, PeerError, first, place, together
 from .batch import batch
 from .blocks import blocks, join
 from .evaluate import compare, evaluate
@@ -50,7 +49,6 @@ GROUPS: dict[str, tuple[Any, ...]] = {
 }
 COMMANDS = {command.__name__: command for group in GROUPS.values() for command in group}
 RESUMED = {"demo", "features", "fit", "color", "batch", "blocks"}  # commands that reuse their earlier work
-SHARED = {"fit", "uplift", "color"}  # commands that several processes (torchrun) do together
 STRICT = "--strict"  # of every command that reads files
 NARROW = 40  # columns: in a few, tyro never ends
 STYLE = (
@@ -72,7 +70,6 @@ def main(arguments: list[str] | None = None) -> int:
     if shutil.get_terminal_size().columns < NARROW:
         os.environ["COLUMNS"] = str(NARROW)
     words, names = sys.argv[1:] if arguments is None else arguments, dict[str, str]()
-    rank = 0
 
     def failed(message: object) -> int:
         with suppress(OSError):  # nobody can be told
@@ -80,20 +77,16 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
 
     try:
-        rank, _ = place()
         return _run(words, names)
-    except PeerError as error:  # that process has said it, perhaps into another log
-        return failed(error) if rank == 0 else 1
     except KeyboardInterrupt:
         goes_on = bool(RESUMED & {*words[:1]})
         with suppress(OSError):  # the same Ctrl-C may have ended who read it
-            if rank == 0:
-                say("interrupted" + ("; the same command goes on where it stopped" if goes_on else ""), sys.stderr)
+            say("interrupted" + ("; the same command goes on where it stopped" if goes_on else ""), sys.stderr)
         return 130
     except BrokenPipeError:
         return 141
     except (ValueError, TypeError, OSError, ImportError, ArithmeticError) as error:
-        return failed(error) if rank == 0 or isinstance(error, LostError) else 1  # the first process says it for all
+        return failed(error)
     except (MemoryError, RuntimeError) as error:
         if not short_of_memory(error):
             raise
@@ -105,34 +98,28 @@ def _run(words: list[str], names: dict[str, str]) -> int:
     """Run the command that the words ask for; `names` receives the command-line names of its parameters."""
     name, *given = [_expand_home(word) for word in words] or [""]
     given, strict = [word for word in given if word != STRICT], STRICT in given
-    rank, size = place()
     if name not in COMMANDS:
         told = {"-h": _overview, "--help": _overview, "--version": _version}.get(name)
-        if rank == 0:  # one of several processes speaks for all
-            say(told() if told else _unknown(name), None if told else sys.stderr)
+        say(told() if told else _unknown(name), None if told else sys.stderr)
         if told:
             return 0
         raise SystemExit(2)
     _check_working_directory()
     command = COMMANDS[name]
     called[:] = ["kfgs", name, *given, *[STRICT][:strict]]
-    if size > 1 and name not in SHARED:
-        raise ValueError(f"expected one process for `kfgs {name}`, got {size} by torchrun; start it without")
 
     def spoken(message: str) -> str:
         return _in_options(message, names)
 
     _check_words(given, command)
-    with interruptible(), warnings_as_notes(spoken, strict=strict), said_on_stderr(), said_whole(), together():
+    with interruptible(), warnings_as_notes(spoken, strict=strict), said_on_stderr(), said_whole():
         names |= _shown_names(command)
         options = {word.partition("=")[0] for word in given}
         if "text" in names and "--text" in options and "--classes" not in options:
             names["classes"] = "--text"  # the table of classes came from there
         command.__doc__ = re.sub(r"\n {8,}(?!kfgs)", " ", inspect.getdoc(command) or "")  # an option's text on one line
         about = _description(command)
-        tyro.cli(
-            checked(command), prog=f"kfgs {name}", description=about, args=given, config=STYLE, console_outputs=first()
-        )
+        tyro.cli(checked(command), prog=f"kfgs {name}", description=about, args=given, config=STYLE)
     return 0
 
 

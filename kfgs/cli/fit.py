@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .._files import check_output, check_own, read_json, real_path
-from .._ranks import once
 from .features import check_discard, choose_teacher, stored_maps
 from .files import check_alone, is_field, open_field, open_splats
 from .options import (
@@ -236,8 +235,6 @@ def fit(
         check_alone("splat", splat, "with --method paper, which trains its own Gaussians")
     elif splat is not None:
         check_alone("steps", training.steps, "with --splat, which needs no training")
-    else:
-        training.say_idle()
     as_taken = views.load(scene)
     if splat is None and as_taken.splat is not None and method.method != "paper":
         check_alone(
@@ -264,18 +261,15 @@ def fit(
             check_discard(found, config)
     result = fit_scene(loaded, found, out, config, splat=splat, report=say, progress=True)
 
-    def finish() -> None:
-        if teacher.teacher is not None:
-            found.clear()  # the samples; the stages made of them are found without
-        command = f"cd {shlex.quote(os.getcwd())}\n{shlex.join(called)}"
-        written = [result.field_path, *write_run_report(result, loaded, config, command=command)]
-        say(result.field.summary())
-        if discard_features:
-            freed = bytes_in_words(discard_maps(found.path, found.stems))
-            say(f"{found.path}: {freed} of {len(found)} dense maps deleted; what was made of them is in {out}")
-        wrote(written)
-
-    once(finish)
+    if teacher.teacher is not None:
+        found.clear()  # the samples; the stages made of them are found without
+    command = f"cd {shlex.quote(os.getcwd())}\n{shlex.join(called)}"
+    written = [result.field_path, *write_run_report(result, loaded, config, command=command)]
+    say(result.field.summary())
+    if discard_features:
+        freed = bytes_in_words(discard_maps(found.path, found.stems))
+        say(f"{found.path}: {freed} of {len(found)} dense maps deleted; what was made of them is in {out}")
+    wrote(written)
 
 
 def uplift(
@@ -312,7 +306,7 @@ def uplift(
     fused = UpliftConfig(max_gaussians=max_gaussians)
     config = FitConfig(uplift=fused, split=views.split, undistorted_features=maps.undistorted_features)
     field = uplift_scene(loaded, found, cloud, config, folder=out, progress=True, report=say)
-    once(lambda: field.save(out))
+    field.save(out)
     say(field.summary())
     wrote([out])
 
@@ -347,7 +341,6 @@ def color(
     check_whole("pictures", pictures, 0)
     check_output("out", out, "a folder")
     config = {"quick": ColorConfig.quick, "cpu": ColorConfig.cpu, "paper": ColorConfig.paper}[preset]()
-    training.say_idle()
     fields = config.field if training.steps is None else config.field.with_steps(training.steps)
     fields = dataclasses.replace(fields, views_per_step=training.views_per_step)
     if training.max_gaussians is not None:
@@ -363,15 +356,12 @@ def color(
     took = f"{result.seconds / 60:.1f} min" if result.seconds >= 60 else f"{result.seconds:.0f} s"
     say(f"{result.gaussians!r} in {took}")
 
-    def finish() -> None:
-        written = [result.path]
-        if tested:
-            scores = score_views(result.gaussians, loaded, "test", show=beside)
-            write_report(out / "scores.json", color=scores)
-            say(str(scores))
-            written += [*beside.written, out / "scores.json"]
-        else:
-            say("note: no views are held out (split 'test', not trained on): nothing to score against")
-        wrote(written)
-
-    once(finish)
+    written = [result.path]
+    if tested:
+        scores = score_views(result.gaussians, loaded, "test", show=beside)
+        write_report(out / "scores.json", color=scores)
+        say(str(scores))
+        written += [*beside.written, out / "scores.json"]
+    else:
+        say("note: no views are held out (split 'test', not trained on): nothing to score against")
+    wrote(written)

@@ -11,7 +11,6 @@ from tyro.conf import Positional as Positional
 from tyro.constructors import PrimitiveConstructorSpec
 
 from .._notes import Repair
-from .._ranks import place
 from .files import check_alone, open_field
 from .output import say
 
@@ -165,22 +164,13 @@ class Training:
     steps: Given[int] = None
     """Training steps; the preset's when not given."""
     views_per_step: int = 1
-    """Views whose gradients are averaged in a step; several processes (torchrun) share them."""
+    """Views whose gradients are averaged in a step."""
     max_gaussians: Given[int] = None
     """At most this many Gaussians (training begins with one per point, even if these are more); the preset's when not given."""
     seed: int = 0
     """Every random choice follows from it."""
     device: Device = "auto"
     """auto (a GPU if there is one), cpu or cuda."""
-
-    def say_idle(self) -> None:
-        """Say so if steps have fewer views than there are processes."""
-        size = place()[1]
-        if self.views_per_step < size:
-            say(
-                f"note: a training step has {self.views_per_step} view(s), so only as many of the {size} processes train; "
-                f"--views-per-step {size} gives each a view (and another result)"
-            )
 
 
 @dataclass(frozen=True)

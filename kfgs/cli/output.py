@@ -12,7 +12,6 @@ from statistics import median
 from typing import Any, TextIO
 
 from .._notes import hear
-from .._ranks import first
 
 LINE, END = 2000, 600
 """Most characters of a printed line, and how many of them are from its end, where an error says what to do."""
@@ -38,14 +37,12 @@ def say(text: str, file: TextIO | None = None) -> None:
     r"""Print a line at once, to standard output or a file; the place that prints.
 
     Names from foreign files may hold anything: what is not printable is shown as Python writes it (`\x1b`), and the middle
-    of a very long line is left out. Of several processes on one job, only the first prints.
+    of a very long line is left out.
 
     Raises:
         BrokenPipeError: if the reader of the stream has ended, for instance `head`.
         OSError: if the stream cannot take the line, for instance because the disk is full.
     """
-    if not first():
-        return
     stream = file or sys.stdout
     with _writing(stream):
         print("\n".join(_shown(line) for line in text.split("\n")), file=stream, flush=True)
@@ -141,8 +138,7 @@ def said_on_stderr() -> Iterator[None]:
     from .._compiling import say_compiling
 
     def tell(text: str) -> None:
-        if first():
-            print(f"note: {text}", file=sys.stderr, flush=True)  # noqa: T201
+        print(f"note: {text}", file=sys.stderr, flush=True)  # noqa: T201
 
     with say_compiling(tell):
         yield

@@ -15,7 +15,6 @@ from .._card import short_repr
 from .._check import ORIGIN
 from .._files import as_path
 from .._progress import Progress, as_progress
-from .._ranks import agree, first
 from ..cameras import Camera
 from ..cameras.bounds import camera_extent
 from .checkpoint import identify_fit, read_checkpoint, write_checkpoint
@@ -96,7 +95,6 @@ def fit_field(
         if saved is not None:
             trainer.restore_(saved)
         path.parent.mkdir(parents=True, exist_ok=True)
-    agree("the start of a fit", lambda: f"{trainer.step} {identity} {trainer.digest()}")
     if trainer.step < config.steps:
         trainer.warm_up()
     with tqdm(total=config.steps, initial=trainer.step, disable=progress is not True, desc="field", unit="step") as bar:
@@ -107,10 +105,8 @@ def fit_field(
                 bar.set_postfix(loss=f"{row['loss']:.4f}", Gaussians=row["count"], refresh=False)
                 if callable(progress):
                     progress(dict(row))
-            if trainer.step % config.checkpoint_every == 0 or trainer.step == config.steps:
-                agree(f"the Gaussians at step {trainer.step}", trainer.digest)
-                if path is not None and first():
-                    write_checkpoint(path, trainer.snapshot(), identity)
+            if path is not None and (trainer.step % config.checkpoint_every == 0 or trainer.step == config.steps):
+                write_checkpoint(path, trainer.snapshot(), identity)
     return FieldFit(trainer.optimizer.params.map(torch.Tensor.detach), trainer.history)
 
 

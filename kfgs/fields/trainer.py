@@ -12,11 +12,10 @@ import torch
 from torch import Tensor
 
 from .._check import as_tensor
-from .._ranks import agree, in_order
 from ..cameras import Camera
 from ..gaussians import FACTS
 from ..splat import rasterize
-from .checkpoint import Checkpoint, digest_tensors
+from .checkpoint import Checkpoint
 from .config import FieldConfig
 from .densify import GradientStatistics, densify, lowered_opacities
 from .loss import ColorLoss, Loss, l1_loss
@@ -82,7 +81,7 @@ class Trainer:
         """Average the gradients of the views of this step, in their order, and follow them."""
         views, params = [self._next_view() for _ in range(self._config.views_per_step)], self.optimizer.params
         gradients: dict[str, Tensor] = {}
-        for part in in_order(views, self._look):
+        for part in map(self._look, views):
             self._losses += float(part.pop("loss")) / len(views)
             if "pixels" in part:
                 index, moved, (height, width) = part.pop("index"), part.pop("pixels"), part.pop("size").tolist()
@@ -138,7 +137,6 @@ class Trainer:
             )
         self.optimizer.replace_(*grown)
         self.statistics = GradientStatistics.zeros(grown.params)
-        agree(f"the Gaussians at step {self.step}", self.digest)
 
     def _report_(self) -> dict[str, Any]:
         since = self.step - (self.history[-1]["step"] if self.history else 0)
@@ -187,10 +185,6 @@ class Trainer:
                 camera = camera.resized(min(height, camera.height), min(width, camera.width))
             self._render_cameras[view, divisor] = camera if divisor == 1 else shrink_camera(camera, divisor)
         return self._render_cameras[view, divisor]
-
-    def digest(self) -> str:
-        """SHA-256 of the Gaussians as they are now."""
-        return digest_tensors(self.optimizer.params.to_tensors().values())
 
     def snapshot(self) -> Checkpoint:
         """Everything that `restore_` needs."""

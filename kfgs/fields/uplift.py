@@ -19,7 +19,6 @@ from tqdm import tqdm
 from .._card import short_repr
 from .._check import check_range, check_whole
 from .._progress import as_bar
-from .._ranks import first
 from .._rows import row_norms, unit_rows
 from .._typed import typed
 from ..cameras import Camera
@@ -137,7 +136,7 @@ def uplift_maps(
         `found.latents.encode(unit features)`.
     """
     config, progress = config or UpliftConfig(), as_bar(progress)
-    say = report if report is not None and first() else lambda text: None
+    say = report if report is not None else lambda text: None
     cloud = _checked(gaussians, cameras, maps, latents, before, config)
     steps = len(cameras) * (1 + config.corrections + (config.max_gaussians is not None and config.corrections > 0))
     with torch.no_grad(), tqdm(total=steps, desc="uplift", unit="view", disable=not progress) as bar:

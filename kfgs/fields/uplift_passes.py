@@ -9,7 +9,6 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from .._ranks import in_order
 from ..cameras import Camera, resize_map
 from ..gaussians import Gaussians
 from ..labels.views import sum_pixels
@@ -28,7 +27,7 @@ def average(cloud: Gaussians, views: WorkingMaps, bar: Any) -> tuple[Tensor, Ten
         camera, features, _, scale = views[i]
         return _part(cloud, camera, features, scale)
 
-    for i, part in enumerate(in_order(range(len(views)), look)):
+    for i, part in enumerate(map(look, range(len(views)))):
         half = sums[views.half(i)]
         before = half[:, -1].clone()
         half.index_add_(0, part["index"], part["total"])
@@ -64,7 +63,7 @@ def correct(
         covered = shrink_map(alpha[..., None], factor)  # the rest of the pixel is empty: no Gaussian can explain it
         return _part(cloud, camera, covered * features - shrink_map(rendered, factor), scale)
 
-    for i, part in enumerate(in_order(range(len(views)), look)):
+    for i, part in enumerate(map(look, range(len(views)))):
         lacking[views.half(i)].index_add_(0, part["index"], part["total"])
         bar.update()
     corrections = per_weight(add_sums(lacking, old_lacking))

@@ -14,7 +14,6 @@ from torch import Tensor
 from .._arrays import read_arrays
 from .._check import as_tensor, check_shapes
 from .._files import atomic_path
-from .._ranks import in_order
 from .._rows import ENCODE, EPS, check_directions, row_norms, unit_rows
 from ..cameras import Camera
 from ..cameras.resample import from_bchw, to_bchw
@@ -172,7 +171,7 @@ def working_directions(
 
     if len(views) == 0:
         raise ValueError("maps: expected at least one, got none; pass the maps of the training views")
-    for part in in_order(views, look):
+    for part in map(look, views):
         moment = moment + part["moment"]
     assert isinstance(moment, Tensor)
     if known is None:

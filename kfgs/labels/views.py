@@ -15,7 +15,6 @@ from torch import Tensor
 
 from .._card import short_repr
 from .._check import check_range
-from .._ranks import in_order
 from .._typed import typed
 from ..cameras import Camera
 from ..gaussians import Gaussians
@@ -85,7 +84,7 @@ def average_views(
 def average_shown(
     gaussians: Gaussians, views: Iterable[T], show: Callable[[T], tuple[Camera, Tensor]], *, engine: str = "auto"
 ) -> ViewAverage:
-    """`average_views`, with a function that makes the camera and the map of a view; several processes share the views."""
+    """`average_views`, with a function that makes the camera and the map of a view."""
     sums, weights = None, torch.zeros(len(gaussians)).to(gaussians.means)
 
     def look(view: T) -> dict[str, Tensor]:
@@ -100,7 +99,7 @@ def average_shown(
         return {"index": index, "total": total, "weight": weight}
 
     with torch.no_grad():
-        for part in in_order(views, look):
+        for part in map(look, views):
             if sums is None:
                 sums = torch.zeros(len(gaussians), part["total"].shape[1]).to(gaussians.means)
             sums.index_add_(0, part["index"], part["total"])

@@ -1,6 +1,5 @@
 """The whole job (the paper's Figure 2) as a few resumable calls, and the uses of a finished field."""
 
-from .._ranks import together
 from ..viz.field_colors import feature_colors
 from .apply import (
     label_cloud,
@@ -50,7 +49,6 @@ __all__ = [
     "segment_cameras",
     "segment_scene",
     "select_labelled",
-    "together",
     "true_labels",
     "uplift",
     "views_of_change",

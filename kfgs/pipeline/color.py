@@ -18,7 +18,6 @@ from .._card import short_repr
 from .._check import check_range, check_whole
 from .._files import check_output, read_json
 from .._progress import Progress, as_progress
-from .._ranks import once
 from .._typed import typed
 from ..cameras import Camera, resize_map
 from ..fields import ColorLoss, FieldConfig, FieldFit, GaussianParams, fit_field
@@ -266,7 +265,7 @@ def make_color(
             run.say(f"color.ply: replaced; Gaussians that were trained in {run.folder} before stay in its stages")
         write_splats(path, result.gaussians)
 
-    once(write)
+    write()
     return result
 
 
@@ -345,7 +344,7 @@ def _color_stage(
     inputs = _inputs(run, scene, views, config)
 
     def train(checkpoint: Path) -> FieldFit:
-        once(check)
+        check()
         generator = stage_generator(config.seed, "color")
         start = GaussianParams.from_points(
             scene.points,

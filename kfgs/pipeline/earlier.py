@@ -12,7 +12,6 @@ import torch
 
 from .._arrays import read_safetensors
 from .._files import digest_value, read_json
-from .._ranks import once
 from ..cameras import Camera
 from ..fields import UpliftSums
 from .maps import Maps, ViewMaps
@@ -76,7 +75,7 @@ def find_earlier(run: Run, inputs: dict[str, Any], cameras: Sequence[Camera], ma
                 found.append({"key": key, "views": views, "first": facts["first"], "geometry": inputs_then["geometry"]})
         return sorted(found, key=lambda one: -len(one["views"]))
 
-    return [Earlier(folder=run.folder / "stages" / f"uplift-{one['key']}", **one) for one in once(look)]
+    return [Earlier(folder=run.folder / "stages" / f"uplift-{one['key']}", **one) for one in look()]
 
 
 def digest_cameras(cameras: Sequence[Camera]) -> str:

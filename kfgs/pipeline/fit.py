@@ -19,7 +19,6 @@ from torch import Tensor
 from .._card import short_repr
 from .._files import check_output, folded_name, is_own, read_json, write_json
 from .._progress import Progress, as_progress
-from .._ranks import once
 from .._typed import typed
 from ..cameras import Camera
 from ..fields import (
@@ -130,7 +129,7 @@ def _index_stage(job: _Job, codebook: Codebook, upstream: Stage) -> tuple[IndexM
         quantize_maps(job.maps, codebook, progress=progress, scratch=scratch).save(folder / "index_maps.safetensors")
 
     stage = job.run.stage("index_maps", inputs, make)
-    once(lambda: shutil.rmtree(scratch, ignore_errors=True))
+    shutil.rmtree(scratch, ignore_errors=True)
     return IndexMaps.load(stage.folder / "index_maps.safetensors"), stage
 
 
@@ -258,7 +257,7 @@ def fit_scene(
         done = FitResult(found, run.folder, run.stages)
         about |= _facts(job, found, done.field_path, getattr(maps, "identity", None))
         done = replace(done, field=replace(found, info=about, folder=done.field_path))
-        once(lambda: replace_field(run.folder, done.field))
+        replace_field(run.folder, done.field)
     return done
 
 

@@ -13,7 +13,6 @@ import torch
 from .._arrays import read_safetensors
 from .._files import as_path, bytes_in_words, write_json
 from .._progress import Progress
-from .._ranks import once
 from .._tensors import save_tensors
 from .._typed import typed
 from ..cameras import Camera
@@ -113,7 +112,7 @@ def uplift_stage(
             run.say(f"kept {bytes_in_words((folder / SUMS).stat().st_size)}, so that views can be added later")
 
     stage = run.stage("uplift", inputs, make)
-    once(lambda: shutil.rmtree(scratch, ignore_errors=True))
+    shutil.rmtree(scratch, ignore_errors=True)
     tensors = read_safetensors(stage.folder / "uplift.safetensors")[0]
     grown = (
         {} if onto is None else {"goes_on": onto.folder.name, "views_before": len(onto.views), "views_new": len(new)}

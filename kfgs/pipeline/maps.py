@@ -14,7 +14,6 @@ from torch import Tensor
 
 from .._check import as_tensor
 from .._files import digest_file
-from .._ranks import once
 from .._rows import EPS, row_norms
 from ..cameras import undistort, undistort_labels
 from ..quant.maps import read_blocks
@@ -239,7 +238,7 @@ class KnownFeatures(Sequence[Tensor]):
 
 def map_digests(run: Run, maps: Maps) -> list[list[str]]:
     """[file name, SHA-256] of each map: from the maps if they know (they may have been discarded), else from the files."""
-    known = once(lambda: _own_digests(maps))
+    known = _own_digests(maps)
     return run.digests(maps.files) if known is None else known
 
 

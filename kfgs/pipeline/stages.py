@@ -11,10 +11,9 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -34,7 +33,6 @@ from .._files import (
     write_json,
 )
 from .._origin import Origin
-from .._ranks import first, meet, once
 from ..cameras import Camera
 from ..cameras.camera import NEAR
 from ..gaussians import Gaussians
@@ -99,7 +97,7 @@ class Run:
         """
         key = _key(name, inputs)
         target = self.folder / "stages" / f"{name}-{key}"
-        if once((target / STAGE_FILE).is_file):
+        if (target / STAGE_FILE).is_file():
             about = read_stage(target / STAGE_FILE)
             if about.get("inputs") != json.loads(json.dumps(inputs)):
                 raise ValueError(
@@ -115,12 +113,11 @@ class Run:
         else:
             self.say(f"{name}: working")
             start = time.perf_counter()
-            with _stage_folder(target) as temporary, say_compiling(self.say):
+            with atomic_folder(target) as temporary, say_compiling(self.say):
                 earlier = make(temporary) or 0.0
                 seconds = time.perf_counter() - start + earlier
                 about = {"name": name, "inputs": inputs, "seconds": seconds, "files": _sizes(temporary)}
                 write_json(temporary / STAGE_FILE, about)
-            seconds = once(lambda: seconds)  # which also waits until the stage is in place
             done = Stage(name, key, target, seconds, False)
             self.say(f"{name}: done in {seconds:.1f} s")
         self.stages.append(done)
@@ -137,17 +134,14 @@ class Run:
         check_inside(
             self.folder, (place.relative_to(self.folder) for name in WRITTEN for place in self.folder.glob(name))
         )
-        with locked(self.folder, LOCK) if first() else nullcontext():
-            if first():
-                for place in (self.folder, self.folder / "field"):  # a run that finds all it needs writes neither
-                    finish_writing(place)
-            meet()
+        with locked(self.folder, LOCK):
+            for place in (self.folder, self.folder / "field"):  # a run that finds all it needs writes neither
+                finish_writing(place)
             yield
-            meet()
 
     def has(self, name: str, inputs: dict[str, Any]) -> bool:
         """Whether the stage of these inputs is finished."""
-        return bool(once((self.folder / "stages" / f"{name}-{_key(name, inputs)}" / STAGE_FILE).is_file))
+        return (self.folder / "stages" / f"{name}-{_key(name, inputs)}" / STAGE_FILE).is_file()
 
     def scratch(self, name: str, inputs: dict[str, Any]) -> Path:
         """A path for the unfinished work of a stage (checkpoints), kept until the stage is done."""
@@ -155,9 +149,6 @@ class Run:
 
     def digests(self, paths: Sequence[Path]) -> list[list[str]]:
         """[file name, SHA-256] of each file; unchanged files are not read again."""
-        return once(lambda: self._digests(paths))  # type: ignore[no-any-return]
-
-    def _digests(self, paths: Sequence[Path]) -> list[list[str]]:
         cache = _known_digests(self.folder / DIGESTS)
         result, changed = [], False
         for path in paths:
@@ -174,8 +165,8 @@ class Run:
         return result
 
     def say(self, text: str) -> None:
-        """Report a line, if anyone listens; of several processes, only the first does."""
-        if self.report is not None and first():
+        """Report a line, if anyone listens."""
+        if self.report is not None:
             self.report(text)
 
 
@@ -190,13 +181,6 @@ def _known_digests(path: Path) -> dict[str, Any]:
 
 def _key(name: str, inputs: dict[str, Any]) -> str:
     return digest_value({"name": name, "inputs": inputs, "version": STAGE_VERSION})[:12]
-
-
-@contextmanager
-def _stage_folder(target: Path) -> Iterator[Path]:
-    """The folder to fill. Of several processes that make a stage together, only the first one's is kept."""
-    with atomic_folder(target) if first() else TemporaryDirectory(prefix="kfgs_") as folder:
-        yield Path(folder)
 
 
 def _sizes(folder: Path) -> dict[str, int]:
@@ -261,7 +245,7 @@ def origin_tensors(origin: Origin) -> list[Tensor]:  # each [3] float64
 def digest_pictures(run: Run, scene: Scene, views: Sequence[int]) -> list[list[str]]:
     """[file name, SHA-256] of the picture of each view, a word if it may be transparent, and the SHA-256 of its mask, if any."""
     paths = [scene.image_paths[i] for i in views]
-    clear = once(lambda: [has_alpha(path) for path in paths])  # they were on white before
+    clear = [has_alpha(path) for path in paths]  # they were on white before
     pictures = [[*row, "on black"] if one else row for row, one in zip(run.digests(paths), clear, strict=True)]
     masks = [None if scene.masks is None else scene.masks[i] for i in views]
     known = iter(run.digests([mask for mask in masks if mask is not None]))

@@ -13,7 +13,6 @@ import torch
 from .._arrays import read_safetensors
 from .._check import ORIGIN, as_origin
 from .._files import write_json
-from .._ranks import once
 from .._tensors import save_tensors
 from ..cameras.projection import project_points
 from ..fields import FieldConfig, FieldFit, GaussianParams
@@ -102,7 +101,7 @@ def field_stage(
         return max(0.0, fit.history[-1]["seconds"] - (time.perf_counter() - started))  # before it was killed
 
     stage = run.stage(name, inputs, make)
-    once(lambda: scratch.unlink(missing_ok=True))
+    scratch.unlink(missing_ok=True)
     return stage_params(stage.folder), stage
 
 

@@ -13,7 +13,6 @@ from tqdm import tqdm
 from .._card import short_repr
 from .._check import as_tensor, check_range, check_shapes, check_whole
 from .._progress import Progress, as_progress
-from .._ranks import in_order
 from .._rows import ENCODE, EPS, check_directions, row_norms, unit_rows
 from .._typed import typed
 from .codebook import Codebook
@@ -211,7 +210,7 @@ def _pool(maps: FeatureMaps, config: CodebookConfig, progress: Progress) -> Tens
             features = features[torch.arange(most, device=features.device) * len(features) // most]
         return {"features": unit_rows(features)}
 
-    shared = in_order(range(len(maps)), look)
+    shared = map(look, range(len(maps)))
     for i, part in enumerate(tqdm(shared, desc="codebook", total=len(maps), disable=progress is not True)):
         parts.append(part["features"])
         check_shapes((f"maps[{i}]", parts[-1], ("n", parts[0].shape[1])))
@@ -262,7 +261,7 @@ def _fit_paper(
             order = torch.randperm(len(maps), generator=generator, device=generator.device).tolist()
             tally = Tally(alpha)
             period = 1 if epoch < config.eager_epochs else config.step_every
-            for seen, part in enumerate(in_order(order, look), start=1):
+            for seen, part in enumerate(map(look, order), start=1):
                 book.learn_from(part["features"], tally)
                 if seen % period == 0 or seen == len(order):
                     book.step(tally)
@@ -273,7 +272,7 @@ def _fit_paper(
                 progress(dict(history[-1]))
         codebook = Codebook(book.adam.rows)
         usage, tally = torch.zeros(codebook.size, dtype=torch.int64), Tally(alpha)
-        for part in in_order(range(len(maps)), look):
+        for part in map(look, range(len(maps))):
             index, similarity = codebook.nearest(part["features"])
             usage += torch.bincount(index, minlength=codebook.size).cpu()
             tally.see(similarity)

@@ -16,7 +16,6 @@ from .._arrays import read_array, reading
 from .._check import as_tensor, check_shapes
 from .._files import atomic_path
 from .._progress import as_bar
-from .._ranks import in_order
 from .._rows import ENCODE, EPS, check_directions
 from .._typed import typed
 from ._store import read_tensors, write_tensors
@@ -185,7 +184,7 @@ def quantize_maps(
                 np.save(temporary, index)
         return {"index": torch.from_numpy(index)}
 
-    shared = tqdm(in_order(range(len(maps)), look), desc="quantise", total=len(maps), disable=not as_bar(progress))
+    shared = tqdm(map(look, range(len(maps))), desc="quantise", total=len(maps), disable=not as_bar(progress))
     return IndexMaps([part["index"].numpy() for part in shared], codebook.size)
 
 
