@@ -97,8 +97,8 @@ def test_command_lines_in_the_docs_are_understood(name, monkeypatch):
         assert {word for word in line if word.startswith("--")} <= {*known, "--help"}, line
 
 
-# of SplatTransform, Dask
-OF_OTHERS = {"--spz-version", "--nthreads"}
+# of SplatTransform, Dask, gsplat
+OF_OTHERS = {"--spz-version", "--nthreads", "--no-normalize-world-space"}
 OF_BENCHMARKS = {"--kinds", "--quick", "--room-0", "--whole", "--atoms", "--copies", "--compare"}
 
 
