@@ -28,7 +28,7 @@ import torch  # noqa: E402
 from transfer import room  # noqa: E402
 
 from kfgs.formats import SplatFile  # noqa: E402
-from kfgs.viz.explorer import Exploration, ExploreOptions, Explorer, SplatMeaning  # noqa: E402
+from kfgs.viewer import Exploration, ExploreOptions, Explorer, SplatMeaning  # noqa: E402
 
 SEMANTIC = 20_000
 MOVING, STILL = 15.0, 0.0001  # frames per second that VTK asks for while the mouse moves the camera, and when it rests

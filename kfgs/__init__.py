@@ -69,7 +69,7 @@ _WHERE = {
     "label_set_from_examples": ".fields",
     "evaluate_segmentation": ".evaluation",
     "load_label_set": ".labels",
-    "explore": ".viz",
+    "explore": ".viewer",
 }
 __version__ = "0.1.0"
 __all__ = sorted(_WHERE)
@@ -133,7 +133,7 @@ if TYPE_CHECKING:
     from .teachers import make_label_set as make_label_set
     from .toy import ToyConfig as ToyConfig
     from .toy import make_toy_room as make_toy_room
-    from .viz import explore as explore
+    from .viewer import explore as explore
 
 
 def __getattr__(name: str) -> Any:

@@ -134,8 +134,8 @@ Image.fromarray(viz.draw_view(view, lambda plotter: viz.add_selections(plotter, 
 # every control is a method. A higher $\gamma$ keeps only what is surest.
 
 # %%
-options = viz.ExploreOptions(height=360, width=960)
-with viz.explore(field, color, classes=classes, cameras=cameras, where="picture", options=options) as view:
+options = kfgs.viewer.ExploreOptions(height=360, width=960)
+with kfgs.explore(field, color, classes=classes, cameras=cameras, where="picture", options=options) as view:
     view.look_from(camera)
     view.ask(word)
     view.set_gamma(0.8)
@@ -151,7 +151,7 @@ Image.fromarray(picture)
 
 # %%
 first = camera.resized(2 * camera.height, 2 * camera.width)
-viewer = viz.explore(field, color, classes=classes, cameras=[first, *cameras], where="notebook")
+viewer = kfgs.explore(field, color, classes=classes, cameras=[first, *cameras], where="notebook")
 viewer.ask(word)
 viewer
 

@@ -171,7 +171,7 @@ Image.fromarray(np.concatenate([sheet, viz.legend_strip(torch.arange(len(phrases
 # %% [markdown]
 # ## Further
 #
-# - `viz.explore(field, classes=classes, embed=lambda phrase: teacher.encode_text([phrase])[0])` opens the viewer; with
+# - `kfgs.explore(field, classes=classes, embed=lambda phrase: teacher.encode_text([phrase])[0])` opens the viewer; with
 #   `embed`, you can type any text that the teacher understands.
 # - The field is saved in `run/field`. `kfgs view`, `kfgs select` and `kfgs render` take it from a shell.
 # - `kfgs sfm`, `kfgs features` and `kfgs fit` are these cells as commands.

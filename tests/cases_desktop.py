@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from cases_explorer import cloud, splat_file
 
-from kfgs.viz.explorer import ExploreOptions, Explorer
-from kfgs.viz.explorer.desktop import Desktop
-from kfgs.viz.explorer.meaning import SplatMeaning
-from kfgs.viz.explorer.state import Exploration
+from kfgs.viewer import ExploreOptions, Explorer
+from kfgs.viewer.desktop import Desktop
+from kfgs.viewer.meaning import SplatMeaning
+from kfgs.viewer.state import Exploration
 
 HEIGHT, WIDTH = 420, 600  # pixels
 

@@ -17,8 +17,8 @@ from kfgs.quant.autoencoder import Autoencoder
 from kfgs.quant.codebook import Codebook
 from kfgs.quant.linear import fit_linear_latents
 from kfgs.splat import rgb_to_sh0
-from kfgs.viz.explorer.meaning import SplatMeaning
-from kfgs.viz.explorer.state import Exploration
+from kfgs.viewer.meaning import SplatMeaning
+from kfgs.viewer.state import Exploration
 
 DIM, WORDS = 16, 12
 NAMES = ("wall", "chair", "table", "office chair")

@@ -7,7 +7,7 @@ import torch
 
 from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
-from kfgs.viz.explorer import Exploration, ExploreOptions, Explorer, SplatMeaning
+from kfgs.viewer import Exploration, ExploreOptions, Explorer, SplatMeaning
 
 NAMES = ("table", "chair", "<b>{{ 1 + 1 }}</b>")  # the last must stay words
 TABLE, CHAIR, ODD = range(3)

@@ -12,11 +12,10 @@ import torch
 
 from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
-from kfgs.page import inline_script
 from kfgs.scenes import load_scene
 from kfgs.splat import rgb_to_sh0
+from kfgs.viewer import Exploration, SplatMeaning, inline_script
 from kfgs.viz import palette
-from kfgs.viz.explorer import Exploration, SplatMeaning
 
 CHROMIUM = next((path for path in ("/usr/bin/chromium", "/usr/bin/chromium-browser") if Path(path).exists()), None)
 SECONDS = 300  # of patience with a busy machine, for each thing that is waited for

@@ -7,9 +7,9 @@ from cases_viz import some_camera, some_gaussians
 
 from kfgs.formats import SplatFile
 from kfgs.splat.rasterize import rasterize
-from kfgs.viz.explorer import ExploreOptions, Explorer
-from kfgs.viz.explorer.meaning import SplatMeaning
-from kfgs.viz.explorer.state import Exploration
+from kfgs.viewer import ExploreOptions, Explorer
+from kfgs.viewer.meaning import SplatMeaning
+from kfgs.viewer.state import Exploration
 
 NAMES = ("wall", "chair", "table", "sofa", "lamp")
 TITLE, LEGEND = 30, 120  # pixels that a title and a legend cover

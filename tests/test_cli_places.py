@@ -160,7 +160,7 @@ def test_pictures_elsewhere_are_known_from_what_the_field_remembers(desk, tmp_pa
 
 
 def test_the_page_puts_no_picture_among_those_of_the_scene(desk, capsys, monkeypatch):
-    monkeypatch.setattr("kfgs.page.serving.wait", lambda: pytest.fail("it was served"))
+    monkeypatch.setattr("kfgs.viewer.serving.wait", lambda: pytest.fail("it was served"))
     refused("view {run} --out {scene}/images/mine", desk, capsys, "--out", "pictures", desk["scene"] / "images")
 
 

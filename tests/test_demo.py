@@ -5,8 +5,8 @@ import sys
 import pytest
 
 from kfgs import cli
-from kfgs.page import serving
 from kfgs.pipeline import demo
+from kfgs.viewer import serving
 
 fit = sys.modules["kfgs.cli.fit"]  # kfgs.cli.fit is the command
 

@@ -20,13 +20,13 @@ FLOORS = (
     {"_card", "_names"},
     {"_check", "_compiling", "_files", "_interrupts", "_notes", "_progress", "_rows", "_tensors"},
     {"_typed", "_origin"},
-    {"_arrays", "_torch_files", "gaussians", "cameras", "page"},
+    {"_arrays", "_torch_files", "gaussians", "cameras"},
     {"splat", "quant", "metrics"},
     {"formats"},
     {"scenes", "labels"},
     {"toy", "align"},
     {"teachers", "fields", "viz"},
-    {"features"},
+    {"features", "viewer"},
     {"evaluation"},
     {"pipeline"},
     {"scale"},
@@ -35,13 +35,13 @@ FLOORS = (
     {"__main__"},
 )
 FLOOR = {place: floor for floor, places in enumerate(FLOORS) for place in places}
-TYPES_ONLY = {("viz", "fields")}  # viz may take a field as an argument
+TYPES_ONLY = {("viz", "fields"), ("viewer", "fields")}  # viz may take a field as an argument
 
 THIRD_PARTY = {
     "pycolmap": "kfgs/scenes/",
-    "pyvista": "kfgs/viz/",
+    "pyvista": "kfgs/vi",
     "vtk": "kfgs/viz/",
-    "vtkmodules": "kfgs/viz/",
+    "vtkmodules": "kfgs/vi",
     "trimesh": "kfgs/viz/",
     "open3d": "kfgs/viz/",
     "pxr": "kfgs/viz/",
@@ -51,9 +51,9 @@ THIRD_PARTY = {
     "transformers": "kfgs/teachers/",
     "tokenizers": "kfgs/teachers/",
     "huggingface_hub": "kfgs/teachers/",
-    "IPython": "kfgs/viz/explorer/",
-    "anywidget": "kfgs/viz/explorer/",
-    "traitlets": "kfgs/viz/explorer/",
+    "IPython": "kfgs/viewer/",
+    "anywidget": "kfgs/viewer/",
+    "traitlets": "kfgs/viewer/",
     "dask": "kfgs/scale/",
     "distributed": "kfgs/scale/",
     "dask_jobqueue": "kfgs/scale/",

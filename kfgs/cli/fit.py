@@ -46,9 +46,9 @@ def demo(out: Path = Path("kfgs_demo"), seed: int = 0) -> None:
         out: Folder for the scene, the run and its results; running again continues where it stopped.
         seed: Every random choice follows from it.
     """
-    from ..page.serving import has_display
     from ..pipeline import demo as run_demo
     from ..toy.room_folder import ToyConfig
+    from ..viz.headless import has_display
 
     check_output("out", out, "a folder")
     room = ToyConfig(train_views=36, test_views=9, seed=seed)

@@ -77,8 +77,7 @@ def view(
         _check_older(out, place)
     read = functools.partial(_read, source, color, ask, distance, out, classes, teacher)
     if place == "browser":
-        key = functools.partial(_key, source, color, ask, distance, classes, teacher, display.show)
-        _serve(read, key, source, out, classes, display)
+        _serve(read, source, out, classes, display)
         return
     for name, given, usual in (("host", display.host, "127.0.0.1"), ("port", display.port, 0)):
         check_alone(name, None if given == usual else given, "without --where browser, whose page listens there")
@@ -91,43 +90,23 @@ def view(
         _draw(state, place, out, display)
 
 
-def _serve(
-    read: Callable[[], Any], key: Callable[[], str | None], source: Path, out: Path, classes: Classes, display: Display
-) -> None:
-    """Serve the page until Ctrl-C; the browser starts, and shows what it showed the last time, while Python loads."""
-    from ..page.document import PYTHON_START, document
-    from ..page.kept import keep_scene, read_scene
-    from ..page.server import PageServer
-    from ..page.serving import announce, wait
+def _serve(read: Callable[[], Any], source: Path, out: Path, classes: Classes, display: Display) -> None:
+    """Serve the page until Ctrl-C; the browser starts while Python loads."""
+    from ..viewer.document import PYTHON_START, document
+    from ..viewer.server import PageServer
+    from ..viewer.serving import announce, wait
 
     if not source.exists():
         read()  # says what is wrong
     with PageServer(document(_title(source), PYTHON_START), display.host, display.port) as page:
-        before = key()
-        kept = None if before is None else read_scene(before)
-        if kept is not None:
-            page.show(kept)
         announce(page, out, say)
-        packed = _viewer(read(), source, out, classes, display).show_in(page)
-        if before is not None and packed != kept and key() == before:
-            keep_scene(before, packed)
+        _viewer(read(), source, out, classes, display).show_in(page)
         wait()
-
-
-def _key(source: Path, color: Path | None, *options: Any) -> str | None:
-    """What the page's scene depends on; see `scene_key`."""
-    from ..page.kept import scene_key
-
-    words = [real_path(source), color and real_path(color), *options]
-    named = [value for option in options if dataclasses.is_dataclass(option) for value in vars(option).values()]
-    run = source.parent if source.name == "field" else source  # its colours are shown, too
-    inputs = [run, *([color] if color else []), *(value for value in named if isinstance(value, Path))]
-    return scene_key(words, inputs)
 
 
 def _check_drawing(place: Where) -> None:
     """Raise a ValueError if a window or a picture is impossible here."""
-    from ..viz.explorer.entry import check_place
+    from ..viewer.entry import check_place
     from ..viz.headless import require
 
     try:
@@ -150,7 +129,7 @@ def _read(
     """The exploration, whose pictures and selections go to `out`."""
     from .._check import check_range
     from ..fields.store import find_field
-    from ..viz.explorer import Exploration
+    from ..viewer import Exploration
 
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
@@ -171,7 +150,7 @@ def _read(
 
 
 def _viewer(state: Any, source: Path, out: Path, classes: Classes, display: Display) -> Any:
-    from ..viz.explorer import ExploreOptions, Viewer
+    from ..viewer import ExploreOptions, Viewer
 
     state.set_show(display.show or state.first_show)
     scene = classes.scene_of(getattr(state.meaning, "field", None))
@@ -180,7 +159,7 @@ def _viewer(state: Any, source: Path, out: Path, classes: Classes, display: Disp
 
 def _check_older(out: Path, place: Where) -> None:
     """Raise a FileExistsError if a file that will be written is there, but not from `kfgs view`."""
-    from ..page.document import ROOT
+    from ..viewer.document import ROOT
     from ..viz.pictures import check_pictures
 
     if place == "html":
@@ -197,7 +176,7 @@ def _title(source: Path) -> str:
 
 def _draw(state: Any, place: Where, out: Path, display: Display) -> None:
     """Open a window until the user closes it, or write its picture."""
-    from ..viz.explorer import ExploreOptions, Explorer, open_window
+    from ..viewer import ExploreOptions, Explorer, open_window
 
     options = ExploreOptions(style=display.style, out=out)
     with Explorer(state, options, off_screen=place != "window") as explorer:
@@ -229,7 +208,7 @@ def open_colors(field: Path | None, color: Path | None, meaning: Any) -> Any:
 
 def open_meaning(source: Path, classes: Classes, teacher: Teacher) -> tuple[Any, list[Any]]:
     """The answers to questions, and the cameras of the scene (those that a field was trained on)."""
-    from ..viz.explorer import FieldMeaning, SplatMeaning
+    from ..viewer import FieldMeaning, SplatMeaning
 
     if is_field(source) or not source.exists():
         field = classes.open_field("source", source)

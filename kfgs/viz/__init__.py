@@ -7,7 +7,6 @@ from .camera_view import draw_view, look_through
 from .clouds import CloudOptions, add_cloud, recolor_cloud, to_pyvista
 from .confusions import plot_confusion, plot_largest_confusions
 from .examples import draw_examples
-from .explorer import Exploration, ExploreOptions, Explorer, Viewer, explore
 from .field_colors import FeatureColors, feature_colors
 from .film_frames import show_cloud
 from .films import save_flythrough, save_turntable
@@ -30,12 +29,8 @@ from .usd import save_usd
 
 __all__ = [
     "CloudOptions",
-    "Exploration",
-    "ExploreOptions",
-    "Explorer",
     "FeatureColors",
     "Matches",
-    "Viewer",
     "add_boxes",
     "add_camera_images",
     "add_cameras",
@@ -49,7 +44,6 @@ __all__ = [
     "available",
     "draw_examples",
     "draw_view",
-    "explore",
     "feature_colors",
     "legend_strip",
     "linked_clouds",

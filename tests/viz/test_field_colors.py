@@ -11,9 +11,9 @@ from kfgs.fields import SemanticField
 from kfgs.gaussians import Gaussians
 from kfgs.quant import Autoencoder, Codebook, fit_linear_latents
 from kfgs.splat import Rendering
+from kfgs.viewer.meaning import FieldMeaning
+from kfgs.viewer.state import Exploration
 from kfgs.viz import FeatureColors, feature_colors
-from kfgs.viz.explorer.meaning import FieldMeaning
-from kfgs.viz.explorer.state import Exploration
 
 WORDS = torch.tensor([[2.0, 0, 0, 0, 0], [0, 3, 0, 0, 0], [0, 0, 1, 0, 0], [0, 0, 0, 1, 1]])
 CODER = Autoencoder(

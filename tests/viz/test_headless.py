@@ -9,7 +9,7 @@ import pytest
 from cases_window import an_explorer
 from messages import tells
 
-from kfgs.page.serving import has_display
+from kfgs.viewer.serving import has_display
 from kfgs.viz import available, headless, make_plotter
 
 VARIABLES = ("DISPLAY", "WAYLAND_DISPLAY", *headless.WITHOUT_DISPLAY)
@@ -204,10 +204,10 @@ def test_a_missing_driver_is_told_by_every_entry():
 import numpy
 from kfgs.formats import SplatFile
 from kfgs.viz import available, linked_clouds, make_plotter
-from kfgs.viz.explorer import explore
-from kfgs.viz.explorer.state import Exploration
-from kfgs.viz.explorer.explorer import Explorer
-from kfgs.viz.explorer.meaning import SplatMeaning
+from kfgs.viewer import explore
+from kfgs.viewer.state import Exploration
+from kfgs.viewer.explorer import Explorer
+from kfgs.viewer.meaning import SplatMeaning
 {CLOUD}
 splats = SplatFile(gaussians, {{}}, ("a", "b", "c"))
 assert not available()

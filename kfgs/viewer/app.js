@@ -1,0 +1,610 @@
+/** The viewer's interface: `mount` puts it into an element. Data come from a pack, answers from a link. */
+
+import { drawBoxes } from "./boxes.js";
+import { viewOf } from "./camera.js";
+import { TOOLS, makeCaptions, makeHelp, makePhoto, makeRail, makeTop, makeViews } from "./chrome.js";
+import { download, h, keep, kept, svg } from "./dom.js";
+import { Eye } from "./eye.js";
+import { Model } from "./model.js";
+import { makePanel } from "./panel.js";
+import { Panes } from "./panes.js";
+import { Tools } from "./tools.js";
+
+const MODES = { color: "Colour", labels: "Classes", score: "Score", latents: "Latents" };
+const BACKGROUND = { light: [0.957, 0.961, 0.969], dark: [0.094, 0.102, 0.118] };
+const GLIDE = 350; // milliseconds of a move to another view
+const SAID = 9000; // milliseconds that a message stays
+const BRUSH = [6, 24, 120]; // pixels: smallest, first, largest radius
+const NARROW = { narrow: 900, slim: 640, thin: 480 }; // CSS pixels of the width
+const LOW = 420; // of the height
+const HOVER = 120; // milliseconds that the pointer rests before a tooltip
+const REMEMBER = 500; // milliseconds after the last change
+const ASIDE = 1; // how far beside the originals copies appear, of their radius
+
+/**
+ * Show a scene in an element.
+ * @param {HTMLElement} root filled; the page gives it a size
+ * @param {{header: object, data: ArrayBuffer}} packed see kfgs/viewer/pack.py
+ * @param {object} link see link.js
+ * @returns {Promise<App>} has `model`, `panes`, `eye`, `ask(words)`, `settled()`, `dispose()`
+ */
+export async function mount(root, packed, link) {
+  const app = (root.viewer = new App(root, packed, link));
+  try {
+    await app.start();
+  } catch (error) {
+    app.fail(error.message);
+    throw error;
+  }
+  return app;
+}
+
+class App {
+  constructor(root, packed, link) {
+    Object.assign(this, { root, packed, link, header: packed.header, model: new Model(packed) });
+    this.modes = possibleModes(packed.header);
+    this.brushRadius = BRUSH[1];
+    this.photo = null; // number of the view whose photo is shown
+    this.view = null; // number of the view that the camera is at
+    this.urls = new Map();
+    this.place = `kfgs ${location.pathname}`;
+    this.build();
+  }
+
+  build() {
+    const { root, model } = this;
+    this.canvas = h("canvas", { role: "img", "aria-label": `3-D view of ${this.header.title}` });
+    this.panes = new Panes(this.canvas, model);
+    this.stage = h("main", { class: "stage", tabIndex: 0, "aria-label": "View of the scene; press ? for the keys" });
+    this.loading = h("p", { class: "loading", role: "status" }, "Loading the scene…");
+    this.said = h("div", { class: "said card", role: "status", "aria-live": "polite" });
+    this.toast = h("p", { class: "toast", role: "alert", hidden: true });
+    this.tip = h("p", { class: "tip card", role: "tooltip", hidden: true });
+    this.boxes = svg("svg", { class: "overlay boxes", "aria-hidden": "true" });
+    this.help = makeHelp();
+    this.top = makeTop(this);
+    this.rail = makeRail(this);
+    this.captions = makeCaptions(this);
+    this.views = makeViews(this);
+    this.photoOver = makePhoto();
+    const act = { ask: (words) => this.ask(words), fit: () => this.fit(), duplicate: () => this.duplicate() };
+    this.panel = makePanel(model, { ...act, save: () => this.saveState(), open: (file) => this.openFile(file), ...this.files() });
+    const foot = h("div", { class: "foot" }, this.said, this.views.element);
+    const over = [...this.photoOver.elements, this.boxes, this.rail.element, this.captions.element, foot, this.tip, this.toast];
+    this.stage.append(this.canvas, this.loading, ...over);
+    root.classList.add("kfgs");
+    root.setAttribute("aria-busy", "true");
+    root.replaceChildren(this.top.element, this.stage, this.panel.element, this.help);
+    this.setTheme(matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
+  }
+
+  async start() {
+    const { panes, model } = this;
+    const onlost = () => this.fail("The graphics card stopped drawing. Reload the page.");
+    await panes.start({ background: BACKGROUND[this.theme], onlost });
+    this.eye = panes.eye = new Eye(this.header, model.extent(model.side));
+    panes.ondraw = () => (this.placePhoto(), this.drawBoxes());
+    this.tools = new Tools(this.stage, this.eye, this);
+    if (Number.isInteger(this.header.default_view)) this.goTo(this.header.default_view);
+    model.addEventListener("change", () => (this.refresh(), this.remember()));
+    this.hold();
+    this.watch();
+    await this.begin();
+    await this.remembered();
+    await this.panes.first();
+    this.loading.remove();
+    this.root.removeAttribute("aria-busy");
+    this.stage.focus({ preventScroll: true });
+  }
+
+  /** Show what Python showed: mode, hidden classes, question, gamma. */
+  async begin() {
+    const { show, hidden = [], words, gamma } = this.header.start ?? {};
+    if (show in this.modes) this.panes.list[0].mode = show;
+    this.model.setHidden(hidden);
+    if (words) await this.ask(words);
+    if (words && gamma !== this.model.gamma) this.model.setGamma(gamma);
+    this.model.past = [];
+    this.refreshPanes();
+  }
+
+  /** Take no edits until Python has checked that the scene is not outdated; without Python there is nothing to check. */
+  hold() {
+    const { link, model } = this;
+    if (!link.checked) return;
+    model.unchecked = true;
+    link.checked.then(() => (model.unchecked = false));
+    model.addEventListener("unchecked", () => this.say("Python still checks whether this scene is outdated. Edit it in a few seconds."));
+  }
+
+  watch() {
+    const resize = () => {
+      const { clientWidth: width, clientHeight: height } = this.root;
+      for (const [name, most] of Object.entries(NARROW)) this.root.classList.toggle(name, width <= most);
+      this.root.classList.toggle("low", height <= LOW);
+      this.panes.resize(this.stage.clientWidth, this.stage.clientHeight);
+    };
+    const sizes = new ResizeObserver(resize);
+    for (const one of [this.root, this.stage]) sizes.observe(one);
+    resize();
+    const until = new AbortController();
+    const listen = (target, name, act) => target.addEventListener(name, act, { signal: until.signal });
+    const keys = this.alone ? document : this.root; // on a page of its own: wherever the focus is
+    listen(keys, "keydown", (event) => this.key(event));
+    listen(keys, "keyup", (event) => this.tools.release(event));
+    listen(window, "blur", () => this.tools.releaseAll());
+    listen(window, "beforeunload", (event) => this.alone && this.model.edited && event.preventDefault()); // the tab may close
+    this.dispose = () => {
+      until.abort();
+      sizes.disconnect();
+      this.urls.forEach((url) => URL.revokeObjectURL(url));
+      this.panes.dispose();
+      this.root.replaceChildren();
+    };
+  }
+
+  /** Whether the page is the viewer's own. */
+  get alone() {
+    return this.root.parentElement === document.body;
+  }
+
+  /** Resolves when the picture is that of the state. */
+  settled() {
+    return this.panes.settled();
+  }
+
+  // showing the state
+
+  refresh() {
+    this.panel.refresh();
+    this.top.refresh();
+    this.said.replaceChildren(...this.model.sentences().map((line) => h("p", {}, line)));
+    this.panes.hurry();
+  }
+
+  refreshPanes() {
+    this.panes.activate(0);
+    this.panes.forgetCamera();
+    this.captions.refresh();
+    this.refresh();
+  }
+
+  /** Show a message for a while; "" hides it. */
+  say(text) {
+    this.toast.textContent = text;
+    this.toast.hidden = !text;
+    clearTimeout(this.toastTimer);
+    if (text) this.toastTimer = setTimeout(() => (this.toast.hidden = true), SAID);
+  }
+
+  /** Say in place of the scene why it cannot be shown. */
+  fail(text) {
+    this.root.removeAttribute("aria-busy");
+    this.loading.textContent = text;
+    this.loading.setAttribute("role", "alert");
+    this.stage.append(this.loading);
+  }
+
+  // what a person does
+
+  /**
+   * Search; a message says why there is no answer. No words clear the search. Only the last search is answered. Then keys are
+   * those of the view, if they were those of the search box.
+   */
+  async ask(words) {
+    const turn = (this.asking = {});
+    const before = this.model.answer;
+    const wanted = () => this.asking === turn && this.model.answer === before;
+    const { element, input } = this.top.search;
+    this.say("");
+    element.removeAttribute("aria-busy");
+    if (!words?.trim()) return this.model.ask(null);
+    element.setAttribute("aria-busy", "true");
+    try {
+      const answer = await this.link.ask(words);
+      if (!wanted()) return;
+      this.model.ask(answer);
+      if (document.activeElement === input) this.stage.focus({ preventScroll: true });
+    } catch (error) {
+      if (wanted()) this.say(error.message);
+    } finally {
+      if (this.asking === turn) element.removeAttribute("aria-busy");
+    }
+  }
+
+  setMode(mode) {
+    this.hidePhoto();
+    this.panes.list[0].mode = mode;
+    this.refreshPanes();
+  }
+
+  nextMode() {
+    const modes = Object.keys(this.modes);
+    this.setMode(modes[(modes.indexOf(this.panes.list[0].mode) + 1) % modes.length]);
+  }
+
+  setLayout(layout) {
+    this.hidePhoto();
+    this.panes.arrange(layout, this.modes);
+    this.refreshPanes();
+  }
+
+  setSlider(place) {
+    this.panes.slider = place;
+    this.captions.place();
+    this.panes.forgetCamera(); // the renderer forgets the old borders
+    this.panes.hurry();
+  }
+
+  setTool(tool) {
+    this.tools.setTool(tool);
+    this.rail.set(tool);
+  }
+
+  setTheme(theme) {
+    this.root.dataset.theme = this.theme = theme;
+    if (!this.panes.renderer) return;
+    this.panes.renderer.background = BACKGROUND[theme];
+    this.panes.redraw();
+  }
+
+  async savePicture() {
+    await this.settled();
+    this.canvas.toBlob((blob) => download("kfgs.png", blob));
+  }
+
+  /** What only Python can do; nothing in an exported file. */
+  files() {
+    const { link, model } = this;
+    if (!link.python) return {};
+    const sides = (of) => Object.fromEntries(model.sides.map((side) => [side, of(side)]));
+    const edits = () => sides((side) => model.editsOf(side));
+    const lambda = () => (model.carried ? model.lambda : null);
+    const asked = () => ({ words: model.words, gamma: model.gamma, lambda: lambda() });
+    const wrote = (paths) => this.say(`Saved: ${paths.join(", ")}`);
+    return {
+      describe: (side, index) => link.describe(side, index),
+      similar: this.header.examples && (() => this.attempt(async () => model.ask(await link.similar(model.meant())))),
+      split: () => this.attempt(() => this.split()),
+      saveSelection: () => this.attempt(async () =>
+        wrote(await link.saveSelection({ ...asked(), edits: edits(), masks: sides((side) => model.selected(side)) }))),
+      saveEdits: () => this.attempt(async () => wrote(await link.saveEdits(edits(), lambda()))),
+    };
+  }
+
+  /** Do something, or say why it cannot be done. */
+  async attempt(act) {
+    try {
+      return await act();
+    } catch (error) {
+      this.say(error.message);
+    }
+  }
+
+  async split() {
+    const { model } = this;
+    const [side, name] = [model.side, model.words ?? "part"];
+    model.setParts({ side, name, ...(await this.link.parts(side, model.selected(side), model.editsOf(side))) });
+  }
+
+  /** Copy the selection, to the right in the picture. */
+  duplicate() {
+    const { model, eye } = this;
+    const found = model.extent(model.side);
+    if (!found || !model.duplicate([0, 1, 2].map((axis) => ASIDE * found.radius * eye.view.R[axis]))) return;
+    this.setTool("shift");
+    this.say("Drag the copy into its place; F shows it.");
+  }
+
+  // the state: saved, opened, remembered when the tab is reloaded
+
+  saveState() {
+    download("kfgs_view.json", new Blob([this.state()], { type: "application/json" }));
+  }
+
+  /** The state as JSON, with what the first pane shows from where. */
+  state() {
+    return JSON.stringify({ ...this.model.toJSON(), mode: this.panes.list[0].mode, view: this.eye.view });
+  }
+
+  openFile(file) {
+    return file && this.attempt(async () => {
+      await this.link.checked;
+      await this.open(await new Response(file).json().catch(() => null));
+    });
+  }
+
+  /** Show a state that `Model.toJSON` gave; without its question, if nobody answers that any more. */
+  async open(saved) {
+    const answer = saved?.words ? await this.attempt(() => this.link.ask(saved.words)) : null;
+    this.model.fromJSON(saved, answer ?? null);
+    const { mode, view } = saved;
+    if (mode in this.modes) this.panes.list[0].mode = mode;
+    if (possibleView(view)) {
+      this.leaveView();
+      this.eye.view = view;
+    }
+    this.refreshPanes();
+  }
+
+  /** Keep edits and selection for a reload of the tab. */
+  remember() {
+    if (!this.alone || this.root.hasAttribute("aria-busy")) return;
+    clearTimeout(this.remembering);
+    const { model } = this;
+    const wanted = () => (model.edited || model.selecting ? this.state() : null);
+    this.remembering = setTimeout(() => {
+      if (keep(this.place, wanted()) || this.warned) return;
+      this.warned = true;
+      this.say("This browser cannot keep so much for a reload of the tab: “Save state” writes it into a file.");
+    }, REMEMBER);
+  }
+
+  async remembered() {
+    const text = this.alone && kept(this.place);
+    if (!text) return;
+    await this.open(JSON.parse(text)).catch(() => keep(this.place, null)); // of another scene at this address
+    this.model.past = [];
+  }
+
+  // what the tools ask for (see tools.js); places are CSS pixels of the stage
+
+  /** A click picks; in a split view, counts are then of this pane's cloud. */
+  click(x, y) {
+    const { side } = this.panes.activate(x);
+    this.model.pick(side, this.panes.under(x, y));
+  }
+
+  twice(x, y) {
+    const { side } = this.panes.activate(x);
+    const index = this.panes.under(x, y);
+    if (index < 0) return;
+    this.leaveView();
+    this.glide(() => this.eye.setPivot(this.model.position(side, index), true));
+  }
+
+  /** A drag begins: turn about what is in the middle of the picture. */
+  grab() {
+    if (!this.eye.loose) return;
+    const { clientWidth, clientHeight } = this.stage;
+    const [pane] = this.panes.list;
+    const index = this.panes.under(clientWidth / (this.panes.layout === "split" ? 4 : 2), clientHeight / 2, pane);
+    if (index >= 0) this.eye.setPivot(this.model.position(pane.side, index));
+  }
+
+  shape(polygon, how) {
+    const { side } = this.panes.activate(polygon[0][0]);
+    this.model.select(side, this.panes.inside(polygon), how);
+  }
+
+  /** Paint the selection: a ball around the Gaussian under the pointer, as wide as the brush there. */
+  brush(x, y, how, first) {
+    const { side } = first ? this.panes.activate(x) : this.panes.active;
+    const index = this.panes.under(x, y, this.panes.active, true);
+    if (index < 0) return;
+    const center = this.model.position(side, index);
+    const radius = (this.brushRadius * this.panes.depth(center)) / this.eye.focal;
+    this.model.paint(side, this.model.ball(side, center, radius), how, first);
+  }
+
+  /** Select what lies in a ball around the Gaussian under the pointer, as wide as was dragged. */
+  ball(x, y, radius, how) {
+    const { side } = this.panes.activate(x);
+    const index = this.panes.under(x, y, this.panes.active, true);
+    if (index < 0) return;
+    const center = this.model.position(side, index);
+    this.model.select(side, this.model.ball(side, center, (radius * this.panes.depth(center)) / this.eye.focal), how);
+  }
+
+  /** Move the selected Gaussians with the pointer, parallel to the picture; `upward`: along the scene's upward direction. */
+  shift(dx, dy, upward, first) {
+    const { model, eye } = this;
+    const found = model.extent(model.side);
+    if (!found || !model.counts(model.side).selected) return this.say("Select something first, to move it.");
+    const step = this.panes.depth(found.center) / eye.focal;
+    const [right, down, up] = [eye.view.R.slice(0, 3), eye.view.R.slice(3, 6), eye.up];
+    const by = [0, 1, 2].map((axis) => step * (upward ? -dy * up[axis] : dx * right[axis] + dy * down[axis]));
+    model.move(by, !first);
+  }
+
+  /** A tooltip for the Gaussian under the pointer, when it rests; null hides it. */
+  hover(place) {
+    clearTimeout(this.hovering);
+    this.tip.hidden = true;
+    if (place) this.hovering = setTimeout(() => this.showTip(...place), HOVER);
+  }
+
+  showTip(x, y) {
+    const pane = this.panes.at(x);
+    const found = this.model.describe({ side: pane.side, index: this.panes.under(x, y, pane) });
+    if (!found) return;
+    this.tip.textContent = Number.isFinite(found.score) ? `${found.name}, ${found.score.toFixed(2)}` : found.name;
+    Object.assign(this.tip.style, { left: `${x + 14}px`, top: `${y + 14}px` });
+    this.tip.hidden = false;
+  }
+
+  brushSize() {
+    return this.brushRadius;
+  }
+
+  sizeBrush(factor) {
+    this.brushRadius = Math.min(Math.max(this.brushRadius * factor, BRUSH[0]), BRUSH[2]);
+  }
+
+  // the camera
+
+  /** A person moved the camera. */
+  moved() {
+    cancelAnimationFrame(this.gliding);
+    this.leaveView();
+    this.moves();
+  }
+
+  /** The camera is no longer at one of the scene's views. */
+  leaveView() {
+    if (this.view !== null) this.views.set(null);
+    this.view = null;
+    this.hidePhoto();
+  }
+
+  moves() {
+    this.panes.forgetCamera();
+    this.panes.hurry();
+  }
+
+  /** Change the camera over a third of a second. */
+  glide(change) {
+    const from = this.eye.view;
+    change();
+    const to = this.eye.view;
+    cancelAnimationFrame(this.gliding);
+    if (this.root.hasAttribute("aria-busy") || matchMedia("(prefers-reduced-motion: reduce)").matches) return this.moves();
+    const start = performance.now();
+    const step = (now) => {
+      const t = Math.min(Math.max((now - start) / GLIDE, 0), 1);
+      this.eye.toward(from, to, t * t * (3 - 2 * t));
+      this.moves();
+      if (t < 1) this.gliding = requestAnimationFrame(step);
+    };
+    this.eye.view = from;
+    this.gliding = requestAnimationFrame(step);
+  }
+
+  /** Move the camera so that the selection fills the view; without one, go to the first view, since a room has walls. */
+  fit() {
+    const { model, header } = this;
+    const found = model.extent(model.side);
+    if (!found) return;
+    if (!model.counts(model.side).selected && Number.isInteger(header.default_view)) return this.goTo(header.default_view);
+    this.leaveView();
+    const from = model.counts(model.side).selected ? this.viewThatSees(found) : null;
+    this.glide(() => this.eye.fit(found, from));
+  }
+
+  /** The nearest of the scene's cameras in whose picture a ball lies, or lies most completely; null without cameras. */
+  viewThatSees({ center, radius }) {
+    const { cameras } = this.header;
+    const cost = ({ viewmat: m, K: [fx, fy, cx, cy], width, height }) => {
+      const [x, y, z] = [0, 4, 8].map((row) => m[row] * center[0] + m[row + 1] * center[1] + m[row + 2] * center[2] + m[row + 3]);
+      if (z < radius / 4) return Infinity; // behind it, or in the middle
+      const out = (place, half, size) => (Math.max(0, half - place) + Math.max(0, place + half - size)) / size;
+      const cut = out((fx * x) / z + cx, (fx * radius) / z, width) + out((fy * y) / z + cy, (fy * radius) / z, height);
+      return 10 * cut + z / radius / 10;
+    };
+    return cameras.reduce((best, own) => (cost(own) < (best ? cost(best) : Infinity) ? own : best), null);
+  }
+
+  /** Go to a camera of the scene. */
+  goTo(at) {
+    this.view = at;
+    this.glide(() => this.eye.lookThrough(this.header.cameras[at]));
+    this.views.set(at);
+    if (this.photo !== null) this.showPhoto(at);
+  }
+
+  /** Go to the next camera of the scene, or the one before. */
+  step(by) {
+    const count = this.header.cameras.length;
+    if (count) this.goTo(((this.view ?? (by > 0 ? -1 : 0)) + by + count) % count);
+  }
+
+  // the photo over the view
+
+  thumbnail(at) {
+    const entry = this.header.buffers[this.header.cameras[at].thumbnail];
+    if (entry && !this.urls.has(at)) {
+      const bytes = this.packed.data.slice(entry.offset, entry.offset + entry.length);
+      this.urls.set(at, URL.createObjectURL(new Blob([bytes], { type: "image/jpeg" })));
+    }
+    return this.urls.get(at) ?? null;
+  }
+
+  togglePhoto() {
+    if (this.photo !== null) return this.hidePhoto();
+    const at = this.view ?? this.nearestView();
+    if (at === null) return;
+    if (this.view === null) this.goTo(at);
+    this.showPhoto(at);
+  }
+
+  /** The view with a photo that sees most nearly what is seen now; 60 degrees count as the radius of the scene. */
+  nearestView() {
+    const { position, R } = this.eye.view;
+    let [best, least] = [null, Infinity];
+    this.header.cameras.forEach(({ viewmat, thumbnail }, at) => {
+      const own = viewOf(viewmat, 1);
+      const away = Math.hypot(...own.position.map((value, axis) => value - position[axis])) / this.eye.ball.radius;
+      const far = away + 2 * (1 - [6, 7, 8].reduce((all, k) => all + R[k] * own.R[k], 0));
+      if (thumbnail && far < least) [best, least] = [at, far];
+    });
+    return best;
+  }
+
+  /** Lay the photo of a view over the scene, null: none. */
+  showPhoto(at) {
+    const url = at === null ? null : this.thumbnail(at);
+    this.photo = url && at;
+    this.eye.whole = url !== null;
+    this.photoOver.show(url);
+    this.panes.forgetCamera();
+    this.refresh();
+  }
+
+  hidePhoto() {
+    if (this.photo !== null) this.showPhoto(null);
+  }
+
+  placePhoto() {
+    if (this.photo === null) return;
+    const camera = this.header.cameras[this.photo];
+    const { clientWidth, clientHeight } = this.stage;
+    const scale = Math.min(clientWidth / camera.width, clientHeight / camera.height);
+    const [width, height] = [camera.width * scale, camera.height * scale];
+    this.photoOver.place({ width, height, left: (clientWidth - width) / 2, top: (clientHeight - height) / 2 });
+  }
+
+  /** Boxes around connected parts. */
+  drawBoxes() {
+    const { parts, name = "" } = this.model.parts ?? { parts: [] };
+    const [pane] = this.panes.list.filter(({ side }) => side === this.model.parts?.side);
+    const found = pane ? parts.map(({ corners }, at) => ({ corners, name: `${name} ${at + 1}` })) : [];
+    drawBoxes(this.boxes, found, (point) => this.panes.project(point, pane));
+  }
+
+  // keys
+
+  key(event) {
+    if (this.help.open || event.target.matches("input[type=text], input[type=search], select")) return;
+    const { model } = this;
+    const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+    if (event.ctrlKey || event.metaKey) {
+      const undo = () => (event.shiftKey ? model.redo() : model.undo());
+      return void this.run({ z: undo, y: () => model.redo(), i: () => model.invert() }[key], event);
+    }
+    if (event.target.matches("input[type=range]") && key.startsWith("Arrow")) return;
+    const keys = {
+      "?": () => this.help.showModal(), "/": () => this.top.search.input.focus(), f: () => this.fit(),
+      m: () => this.nextMode(), p: () => this.togglePhoto(), "[": () => this.step(-1), "]": () => this.step(1),
+      ",": () => this.sizeBrush(0.8), ".": () => this.sizeBrush(1.25),
+      Delete: () => model.remove(), Backspace: () => model.remove(),
+      Escape: () => (this.tools.tool === "move" ? model.clear() : this.setTool("move")),
+    };
+    for (const [tool, [, own]] of Object.entries(TOOLS)) keys[own] = () => this.setTool(tool);
+    if (!this.run(keys[key], event) && this.tools.press(event)) event.preventDefault();
+  }
+
+  run(action, event) {
+    if (!action) return false;
+    event.preventDefault();
+    action();
+    return true;
+  }
+}
+
+const possibleView = (view) =>
+  [...(view?.R ?? []), ...(view?.position ?? []), view?.distance].filter(Number.isFinite).length === 13;
+
+function possibleModes({ sides, buffers }) {
+  const absent = { color: !sides.color && sides.semantic.sh_degree === null, latents: !buffers["semantic/latents"] };
+  return Object.fromEntries(Object.entries(MODES).filter(([mode]) => !absent[mode]));
+}

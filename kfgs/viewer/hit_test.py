@@ -1,0 +1,164 @@
+"""Find the Gaussian under a pixel, the views that see a Gaussian, and its neighbours.
+
+Computed from rendering weights w = T alpha (Eq. 3), because VTK's picker only knows points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from .._check import check_range, check_shapes, check_whole
+from ..cameras import Camera
+from ..gaussians import Gaussians
+from ..splat import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, project
+from ..splat.project import FIELD_OF_VIEW_MARGIN
+from ..viz.gaussian_actor import LOW_PASS
+
+BACKGROUND = 0.05  # a pixel covered less than this shows the background
+LEAST_WEIGHT = 0.01  # a view sees a Gaussian if its weight there is above this
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A view that sees a Gaussian."""
+
+    name: str  # of the camera
+    index: int  # of the camera in the list
+    weight: float  # w = T alpha of the Gaussian at its projected centre, in (0.01, 0.99]
+
+
+def gaussian_at(
+    gaussians: Gaussians,
+    camera: Camera,
+    x: float,
+    y: float,
+    mask: Tensor | None = None,  # [N] bool
+) -> int | None:
+    """The Gaussian with the largest rendering weight w = T alpha at a pixel (Eq. 3).
+
+    **Convention**: pixels, x to the right and y down; the centre of the first pixel is (0.5, 0.5).
+
+    Args:
+        gaussians: the cloud.
+        camera: the view, without distortion.
+        x: column.
+        y: row.
+        mask: which Gaussians exist here; None: all.
+
+    Returns:
+        Its index; of equal weights, that of the nearest. None if less than 5 % of the pixel is covered (background), or
+        the pixel is outside the picture.
+
+    Raises:
+        ValueError: if shapes disagree, a number is not finite, or the camera has distortion.
+    """
+    check_shapes(("gaussians.means", gaussians.means, "N 3"), ("mask", mask, "N"))
+    for name, value in (("x", x), ("y", y)):
+        check_range(name, value, float("-inf"), closed=(False, False))
+    if not (0 <= x < camera.width and 0 <= y < camera.height):
+        return None
+    with torch.no_grad():
+        index, weights = _weights_at(gaussians, _bounds(gaussians), camera, (x, y), mask)
+    if float(weights.sum()) < BACKGROUND:
+        return None
+    return int(index[weights.argmax()])
+
+
+def views_seeing(gaussians: Gaussians, index: int, cameras: Sequence[Camera]) -> list[Sight]:
+    """The views that see a Gaussian: its weight T alpha at its projected centre is above 0.01. Best views first.
+
+    Args:
+        gaussians: the whole cloud, because Gaussians in front hide others.
+        index: which Gaussian.
+        cameras: views without distortion; equally good ones stay in their order.
+
+    Raises:
+        ValueError: if there is no such Gaussian, or a camera has distortion.
+    """
+    check_whole("index", index, 0, len(gaussians) - 1)
+    sights = []
+    with torch.no_grad():
+        bounds = _bounds(gaussians)
+        for number, camera in enumerate(cameras):
+            own = project(gaussians.select(torch.tensor([index], device=gaussians.means.device)), camera)
+            if len(own.index) == 0:
+                continue
+            x, y = own.means2d[0].tolist()
+            if not (0 <= x < camera.width and 0 <= y < camera.height):
+                continue
+            found, weights = _weights_at(gaussians, bounds, camera, (x, y))
+            weight = float(weights[found == index].sum())
+            if weight > LEAST_WEIGHT:
+                sights.append(Sight(camera.name, number, weight))
+    return sorted(sights, key=lambda sight: -sight.weight)
+
+
+def neighbours_of(
+    means: Tensor,  # [N, 3]
+    index: int,
+    count: int = 8,
+) -> tuple[Tensor, Tensor]:  # [n] int64, [n]
+    """The nearest other Gaussians, nearest first, and the distances of their means in world units.
+
+    Raises:
+        ValueError: if there is no such Gaussian, or `count` is not positive.
+    """
+    check_shapes(("means", means, "N 3"))
+    check_whole("index", index, 0, len(means) - 1)
+    check_whole("count", count, 1)
+    distances = torch.linalg.vector_norm(means.detach().double() - means[index].detach().double(), dim=1)
+    distances[index] = torch.inf
+    near = distances.topk(min(count, len(means) - 1), largest=False)
+    return near.indices, near.values
+
+
+def _bounds(gaussians: Gaussians) -> tuple[Tensor, Tensor]:  # [N], [N]
+    """Bounds of a footprint in any view: d^T C d where alpha falls to 1/255, and the largest variance."""
+    return 2 * torch.log(gaussians.opacities / ALPHA_MIN), gaussians.scales.amax(dim=1).square()
+
+
+def _weights_at(
+    gaussians: Gaussians,
+    bounds: tuple[Tensor, Tensor],
+    camera: Camera,
+    place: tuple[float, float],  # (x, y)
+    mask: Tensor | None = None,  # [N] bool
+) -> tuple[Tensor, Tensor]:  # [m] int64, [m]
+    """Weights of the Gaussians composited at a place, front to back (point 2 of the engines' contract)."""
+    index = _near_ray(gaussians, bounds, camera, place)
+    if mask is not None:
+        index = index[mask.to(index.device)[index]]
+    seen = project(gaussians.select(index), camera)
+    dx, dy = (torch.tensor(place).to(seen.means2d) - seen.means2d).unbind(1)
+    a, b, c = seen.conics.unbind(1)
+    alphas = (seen.opacities * torch.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))).clamp_max(ALPHA_MAX)
+    order = seen.depths.argsort(stable=True)  # by depth, then by index
+    order = order[alphas[order] >= ALPHA_MIN]
+    alphas = alphas[order]
+    after = torch.cumprod(1 - alphas, dim=0)
+    before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
+    drawn = after >= TRANSMITTANCE_MIN  # `after` decreases, so these come first
+    return index[seen.index[order]][drawn], (alphas * before)[drawn]
+
+
+def _near_ray(
+    gaussians: Gaussians, bounds: tuple[Tensor, Tensor], camera: Camera, place: tuple[float, float]
+) -> Tensor:  # [m] int64, ascending
+    """The Gaussians that can reach a place in the picture, by the bound of `project` without rotations."""
+    camera = camera.to(gaussians.means).with_origin(gaussians.origin)
+    reach, largest = bounds
+    points = gaussians.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    z = points[:, 2]
+    near = (z > camera.near) & (reach >= 0)
+    for axis, size in enumerate((camera.width, camera.height)):
+        f, c = float(camera.K[axis, axis]), float(camera.K[axis, 2])
+        tangent = points[:, axis] / z
+        middle, half = (size / 2 - c) / f, FIELD_OF_VIEW_MARGIN * size / 2 / f
+        slope = 1 + tangent.clamp(middle - half, middle + half).square()  # of row `axis` of J, squared, times (z / f)^2
+        variance = largest * slope * (f / z).square() + LOW_PASS
+        near &= (f * tangent + (c - place[axis])).square() <= 1.01 * reach * variance + 1e-3  # room for rounding
+    return near.nonzero()[:, 0]

@@ -1,0 +1,323 @@
+"""Pack an exploration for the viewer in JavaScript: one JSON header and one block of bytes.
+
+The splats are quantised: 16 bytes for shape and opacity, 4 for the constant colour, and one byte for each further harmonic
+coefficient. Most of these bytes are 0, so `Packed.compressed` makes them small. Labels, scores, sources and distances
+are exact: what JavaScript selects is what Python selects.
+"""
+
+from __future__ import annotations
+
+import io
+import zlib
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from PIL import Image
+
+from .._card import short_repr
+from .._check import as_array
+from ..cameras import Camera
+from ..formats.smallest_three import pack_smallest_three
+from ..gaussians import Gaussians
+from ..splat import SH_C0
+from ..viz.cloud_colors import COLORMAP
+from ..viz.linked import upwards
+from ..viz.palette import palette
+from .carried import Array
+from .picked import Side
+from .side_colors import GREY
+from .state import Exploration
+
+VERSION = 1
+ALIGN = 16  # bytes: an offset at which JavaScript may start an array of any type
+MEAN_STEPS = (1 << 21) - 1  # 21 bits for each coordinate
+SCALE_RANGE = 12.0  # in log units: smaller scales are far below a pixel and become the smallest one
+DC_STEPS = (1 << 10) - 1
+# Of the harmonics above degree 0. 1/32 is 2 dB better (room_0: 50 instead of 48 dB), with 2 to 3 bytes a Gaussian more.
+SH_STEP = 1 / 20
+SH_PLANES = {0: 0, 1: 2, 2: 3, 3: 6}  # texels of 8 bytes that hold the coefficients above degree 0
+
+
+class Packed(NamedTuple):
+    """What the viewer loads."""
+
+    header: dict[str, Any]
+    data: bytes
+
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+    def compressed(self, level: int = 6) -> bytes:
+        """The data as a zlib stream, which JavaScript's `inflate` reads.
+
+        The bytes of each buffer are sorted by their place in a row first, because the last bytes of all rows are more alike
+        than the bytes of one row.
+        """
+        parts, end = [], 0
+        for entry in self.header["buffers"].values():
+            parts.append(self.data[end : entry["offset"]])  # padding
+            end = entry["offset"] + entry["length"]
+            rows = np.frombuffer(self.data[entry["offset"] : end], np.uint8).reshape(-1, _row_bytes(entry))
+            parts.append(np.ascontiguousarray(rows.T).tobytes())
+        return zlib.compress(b"".join([*parts, self.data[end:]]), level)
+
+
+def _row_bytes(entry: dict[str, Any]) -> int:
+    """Bytes of the last axis, or of one number if there is only one axis."""
+    shape: list[int] = entry["shape"]
+    return np.dtype(entry["type"]).itemsize * (shape[-1] if len(shape) > 1 else 1)
+
+
+class _Buffers:
+    """Collects arrays, each at a multiple of 16 bytes."""
+
+    def __init__(self) -> None:
+        self.table: dict[str, dict[str, Any]] = {}
+        self._parts: list[bytes] = []
+        self._size = 0
+
+    def add(self, name: str, array: Array) -> None:
+        array = np.ascontiguousarray(array)
+        content = array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()
+        entry = {"offset": self._size, "length": len(content), "type": array.dtype.name, "shape": list(array.shape)}
+        self.table[name] = entry
+        padding = -len(content) % ALIGN
+        self._parts += [content, bytes(padding)]
+        self._size += len(content) + padding
+
+    def joined(self) -> bytes:
+        return b"".join(self._parts)
+
+
+def pack_scene(
+    state: Exploration,
+    *,
+    title: str = "kfgs",
+    questions: Iterable[str] | None = None,
+    thumbnails: Iterable[Array | None] = (),  # [h, w, 3] uint8, one for each camera
+) -> Packed:
+    """Pack both sides of an exploration, the classes with their scores, and the cameras.
+
+    Row i of every buffer is Gaussian i of Python. A score is NaN where nothing is known about a Gaussian.
+
+    Args:
+        state: its question, gamma and hidden classes are not packed; its lambda is.
+        title: of the page.
+        questions: class names whose scores are packed; None: all classes.
+        thumbnails: pictures of the cameras, in their order; fewer are allowed, None leaves one out.
+
+    Raises:
+        ValueError: if a number of a Gaussian is not finite.
+    """
+    buffers = _Buffers()
+    sides = {side: _add_side(buffers, state, side) for side in state.sides}
+    _add_meaning(buffers, state)
+    if state.carried is not None:
+        buffers.add("color/source", state.carried.source.astype(np.int32))
+        buffers.add("color/far", rounded_far(state.carried.far, state.distance))
+    from matplotlib import colormaps
+
+    buffers.add("colormap", colormaps[COLORMAP](np.arange(256), bytes=True)[:, :3])
+    low, high = state.distance_range
+    header = {
+        "version": VERSION,
+        "title": title,
+        "origin": list(state.meaning.gaussians.origin),
+        "sides": sides,
+        "classes": _classes(state),
+        "lambda": {"value": state.distance, "how": state.distance_how, "low": low, "high": high},
+        "by": state.meaning.by,
+        "phrases": state.meaning.phrases,
+        "examples": state.meaning.examples,
+        "clim": list(state.clim) if state.asked is None else [0.0, 1.0],
+        "cameras": _cameras(buffers, state.cameras, thumbnails),
+        "up": upwards(state.cameras),
+        "default_view": 0 if state.cameras else None,
+        "query": _add_scores(buffers, state, state.meaning.names if questions is None else questions),
+        "buffers": buffers.table,
+    }
+    return Packed(header, buffers.joined())
+
+
+def _add_side(buffers: _Buffers, state: Exploration, side: Side) -> dict[str, Any]:
+    """Add the splats of a side; returns what is needed to decode them."""
+    cloud = state.cloud(side)
+    _check_finite(side, cloud)
+    places = as_array(cloud.means).astype(np.float64)
+    center, half = core_box(places)
+    log_scales = np.log(np.maximum(as_array(cloud.scales).astype(np.float64), 1e-30))
+    highest = float(log_scales.max())
+    lowest = max(float(log_scales.min()), highest - SCALE_RANGE)
+    step = max(highest - lowest, 1e-6) / 255
+    buffers.add(f"{side}/splats", pack_splats(cloud, center, half, lowest, step))
+    degree = 0 if cloud.sh is None else int(cloud.sh.shape[1] ** 0.5) - 1
+    base = _base_colors(state, side)
+    dc_low, dc_high = min(float(base.min()), 0.0), max(float(base.max()), 1.0)  # room for new colours
+    dc_step = max(dc_high - dc_low, 1e-6) / DC_STEPS
+    buffers.add(f"{side}/dc", pack_dc(base, dc_low, dc_step))
+    if degree:
+        assert cloud.sh is not None
+        buffers.add(f"{side}/sh", pack_sh(as_array(cloud.sh), SH_STEP))
+    return {
+        "count": len(cloud),
+        "sh_degree": None if cloud.sh is None else degree,
+        "antialiased": cloud.antialiased,
+        "center": center.tolist(),
+        "half": half.tolist(),
+        "scale": [lowest, step],
+        "dc": [dc_low, dc_step],
+        "sh_step": SH_STEP,
+    }
+
+
+def rounded_far(far: Array, given: float) -> Array:  # [N] float64 -> [N] float32
+    """Distances rounded down, so that `rounded < lambda` says what `far < lambda` does for every lambda that is a float32.
+
+    The viewer sets only such lambdas. Between a float32 and the next one lies no other, so a lambda above the lower one is at
+    least the upper one. The lambda that is given at the start may be any number: distances next to it are rounded for it.
+    """
+    nearest = far.astype(np.float32)
+    down = np.where(nearest > far, np.nextafter(nearest, np.float32(-np.inf)), nearest)
+    wrong = (down < given) & (far >= given)
+    return np.where(wrong, np.nextafter(down, np.float32(np.inf)), down).astype(np.float32)
+
+
+def _check_finite(side: Side, cloud: Gaussians) -> None:
+    """JSON has no NaN, and one such number would spoil the steps of all others."""
+    for name in ("quats", "scales", "opacities", "sh"):
+        values = getattr(cloud, name)
+        if values is None or bool(torch.isfinite(values).all()):
+            continue
+        row = int((~torch.isfinite(values.reshape(len(cloud), -1))).any(1).nonzero()[0])
+        raise ValueError(
+            f"{side}.{name}: expected finite numbers, got {values[row].flatten()[:4].tolist()} at {row}; remove this Gaussian"
+        )
+
+
+def core_box(means: Array) -> tuple[Array, Array]:  # [N, 3] -> [3], [3]
+    """Centre and half-size of the box that holds the middle 98 % of the means on each axis, twice as large.
+
+    Inside, positions have equal steps of a millionth of the box; outside, the steps grow with the distance.
+    """
+    low, high = np.quantile(means, [0.01, 0.99], axis=0)
+    return (low + high) / 2, np.maximum(high - low, 1e-6)
+
+
+def pack_splats(
+    cloud: Gaussians,
+    center: Array,  # [3]
+    half: Array,  # [3]
+    lowest: float,
+    step: float,
+) -> Array:  # [N, 4] uint32
+    """Position (3 x 21 bits), rotation (2 + 3 x 10), log-scales (3 x 8) and opacity (8) of each Gaussian in 16 bytes."""
+    u = (as_array(cloud.means).astype(np.float64) - center) / half
+    size = np.maximum(np.abs(u), 1e-30)
+    contracted = np.where(size <= 1, u, (2 - 1 / size) * np.sign(u))  # all of space in [-2, 2]
+    x, y, z = np.rint((contracted + 2) / 4 * MEAN_STEPS).astype(np.uint32).T
+    largest, others = pack_smallest_three(cloud.quats, 1023)
+    a, b, c = others.astype(np.uint32).T
+    logs = np.log(np.maximum(as_array(cloud.scales).astype(np.float64), 1e-30))
+    sx, sy, sz = np.rint(np.clip((logs - lowest) / step, 0, 255)).astype(np.uint32).T
+    opacity = np.rint(np.clip(as_array(cloud.opacities).astype(np.float64), 0, 1) * 255).astype(np.uint32)
+    words = [
+        x | (y << np.uint32(21)),
+        (y >> np.uint32(11)) | (z << np.uint32(10)),
+        a | (b << np.uint32(10)) | (c << np.uint32(20)) | (largest[:, 0].astype(np.uint32) << np.uint32(30)),
+        sx | (sy << np.uint32(8)) | (sz << np.uint32(16)) | (opacity << np.uint32(24)),
+    ]
+    return np.stack(words, axis=1)
+
+
+def pack_dc(base: Array, low: float, step: float) -> Array:  # [N, 3] -> [N] uint32
+    """The constant colour with 10 bits a channel."""
+    r, g, b = np.rint(np.clip((base - low) / step, 0, DC_STEPS)).astype(np.uint32).T
+    return r | (g << np.uint32(10)) | (b << np.uint32(20))
+
+
+def pack_sh(sh: Array, step: float) -> Array:  # [N, K, 3] -> [planes, N, 2] uint32
+    """The coefficients above degree 0 as signed bytes, eight to a texel; texel t of all Gaussians is plane t."""
+    N, K, _ = sh.shape
+    planes = SH_PLANES[int(K**0.5) - 1]
+    rows = np.zeros((N, planes * 8), dtype=np.int8)
+    rows[:, : (K - 1) * 3] = np.rint(np.clip(sh[:, 1:].reshape(N, -1) / step, -127, 127)).astype(np.int8)
+    return rows.view("<u4").reshape(N, planes, 2).transpose(1, 0, 2)
+
+
+def _base_colors(state: Exploration, side: Side) -> Array:  # [N, 3] float64
+    """The colour of degree 0; of a cloud without harmonics, that of the other side."""
+    cloud = state.cloud(side)
+    if cloud.sh is not None:
+        return as_array(cloud.sh[:, 0]).astype(np.float64) * SH_C0 + 0.5
+    if "rgb" in state.show_choices:
+        return state.base_colors(side).astype(np.float64) / 255
+    return np.full((len(cloud), 3), GREY[0] / 255)
+
+
+def _add_meaning(buffers: _Buffers, state: Exploration) -> None:
+    labels = state.labels("semantic")
+    buffers.add("semantic/labels", labels.astype(np.int16))
+    scores = np.where(labels >= 0, as_array(state.meaning.scores).astype(np.float32), np.float32("nan"))
+    buffers.add("semantic/label_scores", scores.astype(np.float32))
+    if "latents" in state.show_choices:
+        buffers.add("semantic/latents", state.latents("semantic"))
+
+
+def _add_scores(buffers: _Buffers, state: Exploration, questions: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Add the score of each question, and return what the answer suggests, by name."""
+    found: dict[str, dict[str, Any]] = {}
+    for words in questions:
+        asked = state.meaning.ask(words)
+        if asked.words in found:
+            continue
+        name = f"scores/{len(found)}"
+        scores = as_array(asked.selection.scores).astype(np.float32)
+        buffers.add(name, np.where(as_array(asked.valid), scores, np.float32("nan")).astype(np.float32))
+        suggested = asked.selection
+        found[asked.words] = {
+            "gamma": suggested.threshold,
+            "how": suggested.how,
+            "low": asked.low,
+            "high": asked.high,
+            "known": asked.known,
+            "buffer": name,
+        }
+    return found
+
+
+def _classes(state: Exploration) -> list[dict[str, Any]]:
+    names = state.meaning.names
+    colors = palette(torch.arange(len(names)), names)
+    return [{"name": name, "color": color.tolist()} for name, color in zip(state.meaning.names, colors, strict=True)]
+
+
+def _cameras(buffers: _Buffers, cameras: Iterable[Camera], thumbnails: Iterable[Array | None]) -> list[dict[str, Any]]:
+    pictures = iter(thumbnails)
+    packed = []
+    for index, camera in enumerate(cameras):
+        K = camera.K.detach().double().cpu()
+        picture = next(pictures, None)
+        name = None if picture is None else f"thumbnails/{index}"
+        if name is not None and picture is not None:
+            buffers.add(name, np.frombuffer(as_jpeg(picture), dtype=np.uint8))
+        packed.append(
+            {
+                "name": camera.name,
+                "width": camera.width,
+                "height": camera.height,
+                "viewmat": camera.viewmat.detach().double().cpu().flatten().tolist(),
+                "K": [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])],
+                "near": camera.near,
+                "thumbnail": name,
+            }
+        )
+    return packed
+
+
+def as_jpeg(picture: Array) -> bytes:  # [h, w, 3] uint8
+    """A picture as a JPEG file."""
+    stream = io.BytesIO()
+    Image.fromarray(picture).save(stream, "JPEG", quality=80)
+    return stream.getvalue()

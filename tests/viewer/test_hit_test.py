@@ -1,0 +1,144 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from cases_explorer import cloud
+from cases_viz import some_camera, some_gaussians
+from messages import tells
+
+from kfgs.cameras import Camera, Distortion
+from kfgs.splat import rasterize
+from kfgs.viewer.hit_test import gaussian_at, neighbours_of, views_seeing
+
+
+def straight(shift=0.0, name="front"):
+    """Looks along z with the axis at pixel (20.5, 10.5)."""
+    viewmat = torch.eye(4)
+    viewmat[0, 3] = shift
+    return Camera(viewmat, torch.tensor([[50.0, 0, 20.5], [0, 50, 10.5], [0, 0, 1]]), 40, 20, name)
+
+
+def row(depths, opacities, scale=0.05):
+    """Balls on the axis: at pixel (20.5, 10.5) each one's density is 1."""
+    n = len(depths)
+    return cloud([[0, 0, z] for z in depths]).replace(
+        opacities=torch.tensor(opacities), scales=torch.full((n, 3), scale)
+    )
+
+
+@pytest.mark.parametrize(
+    ("opacities", "expected"),
+    [
+        ([0.4, 0.9], 1),  # 0.4 and 0.6 x 0.9 = 0.54
+        ([0.5, 0.9], 0),  # 0.5 and 0.5 x 0.9 = 0.45
+        ([0.9, 0.9], 0),
+        ([0.03, 0.6], 1),
+        ([1.0, 1.0], 0),  # alphas are at most 0.99
+        ([0.04, 0.0], 0 - 1),  # together less than 5 %: background
+        ([0.06, 0.0], 0),
+    ],
+)
+def test_of_two_behind_each_other_the_larger_weight_wins(opacities, expected):
+    for order in ([0, 1], [1, 0]):  # whichever comes first in the cloud
+        made = row([3.0, 5.0], opacities).select(torch.tensor(order))
+        found = gaussian_at(made, straight(), 20.5, 10.5)
+        assert found == (None if expected < 0 else order.index(expected))
+
+
+def test_a_large_faint_one_in_front_does_not_hide_an_opaque_one():
+    made = row([2.0, 6.0], [0.2, 0.95])
+    made = made.replace(scales=torch.tensor([[1.0] * 3, [0.1] * 3]))
+    assert gaussian_at(made, straight(), 20.5, 10.5) == 1
+    assert gaussian_at(made, straight(), 30.5, 10.5) == 0  # beside the small one there is only haze
+
+
+def test_background_outside_and_behind_the_camera():
+    made = row([3.0, -3.0], [0.5, 0.99])
+    assert gaussian_at(made, straight(), 20.5, 10.5) == 0
+    assert gaussian_at(made, straight(), 38.5, 2.5) is None  # nothing there
+    assert gaussian_at(made.select(torch.tensor([1])), straight(), 20.5, 10.5) is None  # behind
+    assert gaussian_at(row([0.1], [0.99]), straight(), 20.5, 10.5) is None  # nearer than camera.near
+    for x, y in ((-0.1, 10.5), (40.0, 10.5), (20.5, -1), (20.5, 20)):
+        assert gaussian_at(row([3.0], [0.99], scale=9.0), straight(), x, y) is None
+
+
+def test_what_is_not_drawn_neither_shows_nor_hides():
+    made = row([3.0, 4.0, 5.0], [0.9, 0.8, 0.9])
+    for mask, expected in (([1, 1, 1], 0), ([0, 1, 1], 1), ([0, 0, 1], 2), ([0, 0, 0], None)):
+        assert gaussian_at(made, straight(), 20.5, 10.5, torch.tensor(mask, dtype=torch.bool)) == expected
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("opaque", [False, True])
+def test_agrees_with_a_rendering_that_names_each_gaussian(seed, opaque):
+    """One-hot features: channel i of the picture is the weight of Gaussian i."""
+    made = some_gaussians(60, seed).to(torch.float64)
+    if opaque:  # pixels stop early
+        made = made.replace(opacities=0.9 + 0.1 * made.opacities)
+    camera = some_camera(24, 32)
+    camera = replace(camera, K=camera.K * torch.tensor([[0.2], [0.2], [1.0]], dtype=torch.float64))
+    mask = torch.rand(60, generator=torch.Generator().manual_seed(seed)) < 0.7
+    for drawn in (torch.ones(60, dtype=torch.bool), mask):
+        index = drawn.nonzero()[:, 0]
+        one_hot = torch.eye(60, dtype=torch.float64)[index]
+        picture = rasterize(made.select(index).replace(features=one_hot, sh=None), camera, engine="reference").map
+        winner = picture.argmax(dim=-1)
+        expected = torch.where(picture.sum(dim=-1) < 0.05, -1, winner)
+        found = [[gaussian_at(made, camera, x + 0.5, y + 0.5, drawn) for x in range(1, 32, 3)] for y in range(0, 24, 2)]
+        got = torch.tensor([[-1 if one is None else one for one in line] for line in found])
+        assert torch.equal(got, expected[::2, 1::3])
+        assert len(got.unique()) > 10
+        assert -1 in got
+
+
+def test_views_that_see_a_gaussian_the_best_first():
+    # the second, behind the first on the axis of the first view, is seen past it from the side
+    made = row([3.0, 6.0], [0.8, 0.9])
+    away = Camera(torch.diag(torch.tensor([-1.0, 1, -1, 1])), straight().K, 40, 20, "away")
+    views = [straight(), away, straight(1.0, "side"), straight(100.0, "far")]
+    sights = views_seeing(made, 1, views)
+    assert [(s.name, s.index) for s in sights] == [("side", 2), ("front", 0)]
+    assert [s.weight for s in sights] == pytest.approx([0.9, 0.2 * 0.9], abs=1e-6)
+    assert views_seeing(made, 0, [straight()])[0].weight == pytest.approx(0.8)
+    hidden = row([3.0, 6.0], [0.995, 0.9])
+    assert views_seeing(hidden, 1, [straight()]) == []  # 0.01 x 0.9 is no sight
+    assert views_seeing(hidden, 1, []) == []
+
+
+def test_equally_good_views_keep_their_order():
+    made = row([3.0], [0.7])
+    assert [s.name for s in views_seeing(made, 0, [straight(name="b"), straight(name="a")])] == ["b", "a"]
+
+
+def test_neighbours_by_distance():
+    means = torch.rand(40, 3, generator=torch.Generator().manual_seed(0))
+    index, distance = neighbours_of(means, 7, 5)
+    far = np.sqrt(((means.double().numpy() - means[7].double().numpy()) ** 2).sum(axis=1))
+    order = np.argsort(far)[1:6]
+    assert index.tolist() == order.tolist()
+    np.testing.assert_allclose(distance.numpy(), far[order], rtol=1e-12)
+    assert len(neighbours_of(means[:3], 0)[0]) == 2
+    assert len(neighbours_of(means[:1], 0)[0]) == 0
+
+
+def test_one_at_the_same_place_is_a_neighbour():
+    index, distance = neighbours_of(torch.zeros(2, 3), 1)
+    assert (index.tolist(), distance.tolist()) == ([0], [0.0])
+
+
+def test_wrong_arguments():
+    made = row([3.0], [0.5])
+    with pytest.raises(ValueError, match=tells("x:", "(-inf, inf)", "got nan")):
+        gaussian_at(made, straight(), float("nan"), 1.0)
+    with pytest.raises(ValueError, match=tells("mask:", "[N]", "N = 1", "gaussians.means", "got (2,)")):
+        gaussian_at(made, straight(), 1.0, 1.0, torch.ones(2, dtype=torch.bool))
+    bent = replace(straight(), distortion=Distortion("kannala_brandt", (0.1, 0, 0, 0)))
+    with pytest.raises(ValueError, match=tells("camera:", "got kannala_brandt")):
+        gaussian_at(made, bent, 1.0, 1.0)
+    with pytest.raises(ValueError, match=tells("index:", "[0, 0]", "got 1")):
+        views_seeing(made, 1, [straight()])
+    with pytest.raises(ValueError, match=tells("index:", "[0, 0]", "got -1")):
+        neighbours_of(made.means, -1)
+    with pytest.raises(ValueError, match=tells("count:", "[1, inf)", "got 0")):
+        neighbours_of(made.means, 0, 0)

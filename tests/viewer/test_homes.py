@@ -1,0 +1,197 @@
+"""The same person in the page, in a notebook's widget and in the exported file: what they do selects what Python selects."""
+
+import base64
+import json
+from contextlib import contextmanager
+
+import cases_explorer
+import cases_page
+import numpy as np
+import pytest
+from cases_web import SECONDS, needs_chromium, software_chromium
+
+from kfgs.formats import read_splats
+from kfgs.viewer import Exploration, ExploreOptions, FieldMeaning, Viewer, save_html
+
+pytestmark = needs_chromium
+
+WIDGET = """async ({script, style, values}) => {
+  const decode = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  const encode = (bytes) => btoa(String.fromCharCode(...bytes));
+  const state = {...values, data: new DataView(decode(values.data).buffer)}, handlers = {};
+  const model = {
+    get: (name) => state[name],
+    on: (name, handler) => (handlers[name] ??= []).push(handler),
+    send: async (message, _, buffers) => {
+      const [answer, attached] = await python(JSON.stringify(message), encode(new Uint8Array(buffers[0])));
+      handlers["msg:custom"].forEach((handler) => handler(answer, [new DataView(decode(attached).buffer)]));
+    },
+  };
+  document.head.append(Object.assign(document.createElement("style"), {textContent: style}));
+  const made = await import(URL.createObjectURL(new Blob([script], {type: "text/javascript"})));
+  await made.default.render({model, el: document.body});
+  globalThis.viewer = document.querySelector(".kfgs").viewer;
+}"""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with software_chromium() as opened:
+        yield opened
+
+
+@contextmanager
+def in_page(page, state, out):
+    with Viewer(state, ExploreOptions(out=out)).open_page() as served:
+        page.goto(served.url)
+        yield
+
+
+@contextmanager
+def in_file(page, state, out):
+    page.goto(save_html(state, out.parent / "scene.html").as_uri())
+    yield
+
+
+@contextmanager
+def in_widget(page, state, out):
+    pytest.importorskip("anywidget")
+    widget = Viewer(state, ExploreOptions(out=out)).widget
+
+    def python(message, attached):
+        sent = []
+        widget.send = lambda *found: sent.append(found)
+        widget._handle_custom_msg(json.loads(message), [base64.b64decode(attached)])
+        ((answer, (more,)),) = sent
+        return answer, base64.b64encode(more).decode()
+
+    page.expose_function("python", python)
+    page.set_content("<body></body>")
+    values = {name: getattr(widget, name) for name in ("header", "question", "height")}
+    values["data"] = base64.b64encode(widget.data).decode()
+    page.evaluate(WIDGET, {"script": str(widget._esm), "style": str(widget._css), "values": values})
+    yield
+    widget.close()
+
+
+def mask(page, side):
+    return np.array(page.evaluate(f"[...viewer.model.selected('{side}')]"), bool)
+
+
+def agree(page, state):
+    for side in state.sides:
+        np.testing.assert_array_equal(mask(page, side), state.selected(side))
+    assert page.evaluate("viewer.model.counts('color').none") == int((state.labels("color") < 0).sum())
+
+
+@pytest.mark.parametrize("home", [in_page, in_file, in_widget], ids=["page", "file", "widget"])
+def test_one_person_everywhere(browser, tmp_path, home):
+    state, out = cases_page.exploration(), tmp_path / "out"
+    page = browser.new_page(viewport={"width": 800, "height": 600})
+    page.set_default_timeout(1000 * SECONDS)
+    errors = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
+    with home(page, state, out):
+        page.wait_for_selector(".kfgs:not([aria-busy])")
+        page.fill("#query", "lamp")  # no class
+        page.press("#query", "Enter")
+        needs = "kfgs view” or in a notebook" if home is in_file else "--teacher"
+        page.wait_for_selector(f"[role=alert]:has-text('“lamp” is none of the classes'):has-text('{needs}')")
+        page.fill("#query", "chair")  # query
+        page.press("#query", "Enter")
+        page.wait_for_selector("h2:has-text('Search: chair')")
+        state.ask("chair")
+        agree(page, state)
+        page.locator(".slider:has(#gamma) input.number").fill("0.5")  # gamma
+        page.locator(".slider:has(#gamma) input.number").press("Enter")
+        state.set_gamma(0.5)
+        page.locator(".slider:has(#lambda) input.number").fill("0.35")  # lambda
+        page.locator(".slider:has(#lambda) input.number").press("Enter")
+        state.set_distance(0.35)
+        agree(page, state)
+        x, y, width, height = page.locator(".stage").bounding_box().values()
+        page.mouse.click(x + width / 2, y + height / 2)  # pick: perhaps nothing is there
+        page.evaluate("viewer.model.pick('color', 200)")
+        page.wait_for_selector(".picked p")
+        assert "colour Gaussian 200" in page.locator(".picked").inner_text()
+        page.keyboard.press("3")  # lasso
+        page.mouse.move(x + 0.1 * width, y + 0.1 * height)
+        page.mouse.down()
+        for across, down in ((0.6, 0.1), (0.6, 0.9), (0.1, 0.9)):
+            page.mouse.move(x + across * width, y + down * height, steps=3)
+        page.mouse.up()
+        selected = mask(page, "color")
+        assert 0 < selected.sum() < len(selected)
+        page.locator(".stage").focus()
+        page.keyboard.press("Delete")  # remove
+        assert page.evaluate("viewer.model.counts('color').total") == int((~selected).sum())
+        page.keyboard.press("Control+z")  # undo
+        np.testing.assert_array_equal(mask(page, "color"), selected)
+        if home is in_file:  # export
+            assert not page.locator("text=Save Gaussians").is_visible()
+            assert (
+                json.loads(page.evaluate("JSON.stringify(viewer.model)"))["sides"]["color"]["selected"]
+                == np.flatnonzero(selected).tolist()
+            )
+        else:
+            page.click("text=Parts")
+            page.click("li:has-text('chair 1') button, li:has-text('part 1') button")
+            part = mask(page, "color")
+            assert 0 < part.sum() <= selected.sum()
+            assert not (part & ~selected).any()
+            page.locator(".stage").focus()
+            page.keyboard.press("Control+z")
+            page.click("text=Save Gaussians")
+            page.wait_for_selector("[role=alert]:has-text('Saved:')")
+            written = read_splats(out / "selection_001" / "selection_color.ply").gaussians
+            np.testing.assert_allclose(written.means, state.cloud("color").means[selected], rtol=1e-6)
+            page.locator(".stage").focus()
+            page.keyboard.press("Delete")
+            page.click("text=Save edited scene")
+            page.wait_for_selector("[role=alert]:has-text('edited_001')")
+            assert len(read_splats(out / "edited_001" / "color.ply").gaussians) == int((~selected).sum())
+    page.close()
+    assert errors == []
+
+
+@pytest.mark.parametrize("home", [in_page, in_file], ids=["page", "file"])
+def test_the_renderer_has_the_scores_of_the_class_whatever_the_names(browser, tmp_path, home):
+    """JavaScript sorts names that are numbers; two classes of one name are one question."""
+    state = cases_page.exploration(("10", "10", "2"))
+    page = browser.new_page(viewport={"width": 800, "height": 600})
+    page.set_default_timeout(1000 * SECONDS)
+    with home(page, state, tmp_path / "out"):
+        page.wait_for_selector(".kfgs:not([aria-busy])")
+        for words in ("10", "2"):
+            page.evaluate("words => viewer.ask(words)", words)
+            state.ask(words)
+            agree(page, state)
+            used = "viewer.panes.renderer.scores[viewer.panes.question(viewer.model.answer)]"
+            assert page.evaluate(f"viewer.model.answer.scores.every((score, i) => Object.is(score, {used}[i]))")
+    page.close()
+
+
+@pytest.mark.parametrize("phrase", ["a soft seat", "1", "null"])
+def test_a_phrase_that_only_python_can_answer(browser, tmp_path, phrase):
+    field = cases_explorer.field("fused")
+    words = {phrase: field.linear.decode(field.features[20])}
+    meaning = FieldMeaning(field, cases_explorer.classes(), embed=words.__getitem__)
+    state = Exploration(meaning, cases_explorer.cloud(field.gaussians.means[:40] + 0.05), distance=1.0)
+    page = browser.new_page(viewport={"width": 800, "height": 600})
+    page.set_default_timeout(1000 * SECONDS)
+    with in_page(page, state, tmp_path / "out"):
+        page.wait_for_selector(".kfgs:not([aria-busy])")
+        packed = "['null', 0, 1].map((name) => [...viewer.panes.renderer.scores[name]].map(String))"
+        before = page.evaluate(packed)
+        page.fill("#query", phrase)
+        page.press("#query", "Enter")
+        page.wait_for_selector(f"h2:has-text('Search: {phrase}')")
+        page.evaluate("viewer.settled()")  # the renderer hears of it with the next frame
+        state.ask(phrase)
+        agree(page, state)
+        assert state.selected("semantic").any()
+        assert page.evaluate("viewer.panes.question(viewer.model.answer)") == f"words 1 {phrase}"
+        assert page.evaluate("viewer.panes.renderer.look.question") == f"words 1 {phrase}"
+        assert page.evaluate(packed) == before
+    page.close()

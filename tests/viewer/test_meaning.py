@@ -1,0 +1,336 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from cases_explorer import (
+    DIM,
+    MODES,
+    NAMES,
+    TRAINED,
+    cameras,
+    classes,
+    cloud,
+    codebook,
+    field,
+    linear,
+    splat_file,
+    stored,
+)
+from messages import tells
+
+from kfgs.fields import SemanticField, answers, semantic_field
+from kfgs.viewer.meaning import FieldMeaning, SplatMeaning
+from kfgs.viewer.state import Exploration
+
+HOWS = [*((mode, how) for mode in TRAINED for how in ("own", "views", "answered")), ("fused", "fused")]
+KINDS = pytest.mark.parametrize(("mode", "how"), HOWS, ids=[f"{mode}-{how}" for mode, how in HOWS])
+BY = {
+    "own": "each Gaussian's own latent (Sec. 3.4)",
+    "views": "what 3 views show of each Gaussian",
+    "answered": "what the training views show of each Gaussian",
+    "fused": "what the training views show of each Gaussian",
+}
+
+
+def asked_and_answering(mode, how):
+    """What the explorer is given, and the field whose `query` it must agree with.
+
+    `own`: a trained field and no views. `views`: a trained field, and views to find its answers from. `answered`: a trained
+    field that has its answers; other views must not change them. `fused`: a field that needs none.
+    """
+    made = field(mode)
+    if how in ("own", "fused"):
+        return (made, ()), made
+    answered = made.with_answers(cameras())
+    return ((made, cameras()), answered) if how == "views" else ((answered, cameras(1)), answered)
+
+
+def embed(words):
+    """An encoder that knows how to place any words between two codewords."""
+    return 0.3 * codebook().codewords[len(words) % 12] + codebook().codewords[4]
+
+
+def same_answer(asked, found):
+    """The very same Gaussians, scores, gamma and reason."""
+    assert torch.equal(asked.selection.mask, found.mask)
+    assert torch.equal(asked.selection.scores, found.scores)
+    assert (asked.selection.threshold, asked.selection.how) == (found.threshold, found.how)
+
+
+@KINDS
+def test_labels_are_those_of_the_field(mode, how):
+    (source, views), answering = asked_and_answering(mode, how)
+    made = FieldMeaning(source, classes(), cameras=views)
+    found = answering.classify(classes())
+    assert torch.equal(made.gaussians.labels, found.labels)
+    assert torch.equal(made.scores, found.scores)
+    assert len(set(found.labels.tolist())) == 5  # all four classes, and none
+    assert (made.names, made.by) == (NAMES, BY[how])
+
+
+@KINDS
+def test_a_class_is_answered_as_query_answers_its_name(mode, how):
+    (source, views), answering = asked_and_answering(mode, how)
+    made, given = FieldMeaning(source, classes(), cameras=views), classes()
+    for index, name in enumerate(NAMES):
+        asked, found = made.ask(name), answering.query(name, given)
+        same_answer(asked, found)
+        others = given.embeddings[[i for i in range(4) if i != index]]
+        same_answer(asked, answering.query(given.embeddings[index], given, negatives=others))
+        same_answer(asked, answering.query(given.embeddings[index], given))  # a class's own embedding is that class
+        assert len(found) > 0
+        assert (asked.words, asked.low, asked.high, asked.known) == (name, 0.0, 1.0, True)
+        assert torch.equal(asked.valid, answering.known)
+
+
+@KINDS
+def test_a_class_selects_what_it_is_the_label_of(mode, how):
+    """With the other classes as negatives and gamma 0.5 both say: more like it than like any other."""
+    (source, views), _ = asked_and_answering(mode, how)
+    made = FieldMeaning(source, classes(), cameras=views)
+    for index, name in enumerate(NAMES):
+        assert torch.equal(made.ask(name).selection.mask, made.gaussians.labels == index)
+
+
+def test_the_answers_of_a_fused_field_by_hand():
+    made, given = FieldMeaning(field("fused"), classes()), classes()
+    features = (field("fused").features @ linear().basis.T).double().numpy()
+    words = given.embeddings.double().numpy()
+    for index, name in enumerate(NAMES):
+        chosen = []
+        for i, feature in enumerate(features):
+            length = np.linalg.norm(feature)
+            cosines = [feature @ word / max(length, 1e-30) / np.linalg.norm(word) for word in words]
+            if length > 0 and cosines[index] > max(cosines[:index] + cosines[index + 1 :]):
+                chosen.append(i)
+        assert made.ask(name).selection.indices.tolist() == chosen
+        assert len(chosen) > 0
+
+
+@KINDS
+def test_a_phrase_is_told_from_the_canonical_words(mode, how):
+    (source, views), answering = asked_and_answering(mode, how)
+    given = classes()
+    made = FieldMeaning(source, given, cameras=views, embed=embed)
+    asked = made.ask("a red thing")
+    same_answer(asked, answering.query(embed("a red thing"), given))
+    same_answer(asked, answering.query(embed("a red thing"), given, negatives=given.negatives))
+    assert (asked.low, asked.high, asked.known, made.phrases) == (0.0, 1.0, False, True)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float64])
+def test_an_encoder_of_another_precision_changes_nothing_between_the_two(dtype):
+    row = embed("a red thing").to(dtype)
+    asked = FieldMeaning(field("fused"), classes(), embed=lambda words: row).ask("a red thing")
+    same_answer(asked, field("fused").query(row, classes()))
+    close = field("fused").query(row.float(), classes())
+    torch.testing.assert_close(asked.selection.scores, close.scores, rtol=0, atol=1e-6)
+
+
+@KINDS
+def test_a_canonical_word_is_not_told_from_itself(mode, how):
+    (source, views), answering = asked_and_answering(mode, how)
+    given = classes()
+    stuff = 2 * given.negatives[1] * (1 + 1e-6 * torch.arange(DIM))  # the same words, another length, rounded
+    asked = FieldMeaning(source, given, cameras=views, embed=lambda words: stuff).ask("stuff")
+    same_answer(asked, answering.query(stuff, given))
+    same_answer(asked, answering.query(stuff, given, negatives=given.negatives[:1]))
+    assert len(asked.selection) > 0
+
+
+@KINDS
+def test_without_canonical_words_the_cosine_of_a_phrase_counts(mode, how):
+    (source, views), answering = asked_and_answering(mode, how)
+    given = classes(negatives=False)
+    asked = FieldMeaning(source, given, cameras=views, embed=embed).ask("a red thing")
+    same_answer(asked, answering.query(embed("a red thing"), given))
+    same_answer(asked, answering.query(embed("a red thing"), given, negatives="none"))
+
+
+@KINDS
+def test_without_negatives_the_cosine_counts_and_gamma_comes_from_the_scores(mode, how):
+    (source, views), answering = asked_and_answering(mode, how)
+    given = classes(1, negatives=False)
+    asked = FieldMeaning(source, given, cameras=views).ask("wall")
+    same_answer(asked, answering.query("wall", given))
+    own = asked.selection.scores[asked.valid]
+    assert (asked.low, asked.high) == (float(own.min()), float(own.max()))
+    assert asked.low < asked.selection.threshold < asked.high
+    # what nothing is known of is never selected, however low gamma is
+    lowest = answering.query("wall", given, -1.0)
+    assert torch.equal((asked.selection.scores > -1.0) & asked.valid, lowest.mask)
+    assert not bool(asked.valid[2 if how in ("views", "answered") else 0])
+
+
+def test_a_single_class_is_told_from_the_canonical_words():
+    asked = FieldMeaning(field(), classes(1)).ask("wall")
+    same_answer(asked, field().query("wall", classes(1), negatives="canonical"))
+    assert (asked.low, asked.high) == (0.0, 1.0)
+
+
+def drawn(monkeypatch):
+    """Counts the views that are rendered from now on."""
+    count, rasterize = [], answers.rasterize
+    for module in (answers, semantic_field):
+        monkeypatch.setattr(module, "rasterize", lambda *args, **kw: count.append(1) or rasterize(*args, **kw))
+    return count
+
+
+@pytest.mark.parametrize("mode", TRAINED)
+def test_one_pass_over_the_views_answers_every_question(mode, monkeypatch):
+    count = drawn(monkeypatch)
+    made = FieldMeaning(field(mode), classes(), cameras=cameras(), embed=embed)
+    assert len(count) == 3
+    for words in (*NAMES, "a red thing"):
+        made.ask(words)
+    assert len(count) == 3
+    assert made.ask(" a red thing") is made.ask("a red thing")
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_field_that_has_its_answers_renders_nothing(mode, monkeypatch):
+    made = field(mode).with_answers(cameras())
+    count = drawn(monkeypatch)
+    opened = FieldMeaning(made, classes(), cameras=cameras(), embed=embed)
+    for words in (*NAMES, "a red thing"):
+        opened.ask(words)
+    assert len(count) == 0
+    assert opened.by == BY["answered"]
+
+
+def test_a_field_without_answers_finds_them_from_its_own_cameras():
+    made = replace(field(), cameras=tuple(cameras()))
+    opened = FieldMeaning(made, classes())
+    assert opened.by == BY["views"]
+    same_answer(opened.ask("chair"), field().with_answers(cameras()).query("chair", classes()))
+
+
+def test_all_views_that_are_given_are_asked():
+    views = cameras(35)
+    made = FieldMeaning(field(), classes(), cameras=views)
+    assert torch.equal(made.scores, field().with_answers(views).classify(classes()).scores)
+
+
+@pytest.mark.parametrize("mode", ["adc+sc", "fused"])
+def test_a_field_is_asked_by_the_classes_that_it_remembers(mode, tmp_path):
+    made = stored(tmp_path, mode)
+    opened = FieldMeaning(made, embed=embed)
+    assert opened.names == NAMES
+    for name in NAMES:
+        same_answer(opened.ask(name), made.query(name))
+    same_answer(opened.ask("a red thing"), made.query(embed("a red thing")))
+
+
+def test_a_field_that_remembers_no_classes_needs_some():
+    with pytest.raises(ValueError, match=tells("classes:", "got neither")):
+        FieldMeaning(field())
+
+
+def test_words_are_found_whatever_their_case_and_kept():
+    made = FieldMeaning(field(), classes())
+    assert made.ask("CHAIR ").words == "chair"
+    assert made.ask("chair") is made.ask("Chair")
+
+
+def test_words_that_cannot_be_answered():
+    made = FieldMeaning(field(), classes())
+    with pytest.raises(ValueError, match=tells("class:", "got 'chiar'", "'chair'")):
+        made.ask("chiar")
+    with pytest.raises(ValueError, match=tells("class:", "wall, chair, table", "got ''")):
+        FieldMeaning(field(), classes(), embed=embed).ask("  ")
+    short = FieldMeaning(field(), classes(), embed=lambda words: torch.ones(DIM - 1))
+    with pytest.raises(ValueError, match=tells("embed:", "[16]", "'sofa'", "got (15,)")):
+        short.ask("sofa")
+
+
+def test_classes_of_another_teacher(monkeypatch):
+    count = drawn(monkeypatch)
+    wide = replace(classes(negatives=False), embeddings=torch.ones(4, DIM + 1))
+    with pytest.raises(ValueError, match=tells("classes:", "[C, 16]", "got (4, 17)")):
+        FieldMeaning(field(), wide, cameras=cameras())
+    assert not count  # refused before the views are rendered
+    ours = SemanticField(*[getattr(field("decouple"), part) for part in ("gaussians", "codebook", "autoencoder")])
+    ours.info["teacher"] = {"name": "lseg"}
+    with pytest.warns(UserWarning, match=tells("classes:", "'lseg'", "'clip'")) as warned:
+        FieldMeaning(ours, replace(classes(), info={"teacher": {"name": "clip"}})).ask("chair")
+    assert len(warned) == 1  # not again at every question
+
+
+def test_scores_that_are_all_the_same_still_have_a_range():
+    same = field("decouple")
+    alike = SemanticField(same.gaussians.replace(features=torch.ones(80, DIM)))
+    asked = FieldMeaning(alike, classes(1, negatives=False)).ask("wall")
+    assert asked.low < asked.high
+    assert asked.low <= asked.selection.threshold <= asked.high
+
+
+LABELS = [1, 1, 3, -1, 0]
+LINE = [[float(i), 0, 0] for i in range(5)]
+
+
+def test_a_splat_is_asked_by_class():
+    made = SplatMeaning(splat_file(cloud(LINE, LABELS)))
+    asked = made.ask("Chair")
+    assert asked.words == "chair"
+    assert asked.selection.indices.tolist() == [0, 1]
+    assert asked.selection.scores.tolist() == [1, 1, 0, 0, 0]
+    assert (asked.low, asked.high, asked.selection.threshold) == (0.0, 1.0, 0.0)
+    assert made.scores.tolist() == [1] * 5
+    assert (made.by, made.phrases) == ("the file's classes", False)
+    assert len(made.ask("table").selection) == 0  # a class of which there is none
+    with pytest.raises(ValueError, match=tells("class:", "got 'chairs'", "'chair'")):
+        made.ask("chairs")
+
+
+def test_scores_of_a_splat():
+    made = SplatMeaning(splat_file(cloud(LINE, LABELS), np.array([0.8, 0.9, 0.5, 0.1, 0.7], np.float32)))
+    asked = made.ask("chair")
+    assert asked.selection.scores.tolist() == pytest.approx([0.8, 0.9, 0, 0, 0])
+    assert (asked.low, asked.high) == (0.0, 1.0)
+    assert made.by == "the file's classes and scores"
+
+
+def test_cosines_below_zero_and_missing_scores_still_select_the_whole_class():
+    made = SplatMeaning(splat_file(cloud(LINE, LABELS), np.array([-0.2, np.nan, 0.5, 0.1, 0.7], np.float32)))
+    asked = made.ask("chair")
+    assert asked.selection.indices.tolist() == [0, 1]  # a score that is missing counts as the least
+    assert asked.low < asked.high == pytest.approx(-0.2)
+    assert asked.valid.tolist() == [True, True, False, False, False]
+
+
+def test_splats_without_labels_or_names():
+    with pytest.raises(ValueError, match=tells("splats.gaussians.labels:", "[N]", "got None", "`kfgs attach`")):
+        SplatMeaning(splat_file(cloud(LINE)))
+    with pytest.raises(ValueError, match=tells("class:", "got 'zebra'; take one of these classes")):
+        SplatMeaning(splat_file(cloud(LINE, LABELS))).ask("zebra")
+    made = SplatMeaning(splat_file(cloud(LINE, LABELS)).replace(classes=("wall",)))
+    assert made.names == ("wall", "class 1", "class 2", "class 3")
+    assert made.ask("class 3").selection.indices.tolist() == [2]
+
+
+def test_classes_of_one_name_are_one():
+    made = SplatMeaning(splat_file(cloud(LINE, LABELS)).replace(classes=("wall", "chair", "rug", "chair")))
+    assert made.ask("chair").selection.indices.tolist() == [0, 1, 2]
+
+
+def test_a_name_may_begin_with_a_space():
+    made = SplatMeaning(splat_file(cloud(LINE, LABELS)).replace(classes=("wall", " chair", "rug", "lamp")))
+    assert made.ask(" chair").words == " chair"
+    assert made.ask(" lamp ").words == "lamp"
+
+
+@pytest.mark.parametrize("score", [0.0, 1.0, 100.0, 300.0, 65536.0, 1e30, -5e6])
+def test_all_of_a_class_answer_where_their_scores_are_equal(score):
+    """float32 has no number between 300 and 300 - 1e-5."""
+    made = SplatMeaning(splat_file(cloud(torch.rand(50, 3), [1] * 30 + [0] * 20), np.full(50, score, np.float32)))
+    asked = made.ask("chair")
+    assert asked.selection.mask.tolist() == [True] * 30 + [False] * 20
+    assert asked.low == asked.selection.threshold < asked.high
+    state = Exploration(made)
+    state.ask("chair")
+    state.set_show("score")
+    assert state.selected("semantic").sum() == 30
+    assert len(state.colors("semantic")) == 50
+    state.set_gamma(state.gamma_range[1])
+    assert not state.selected("semantic").any()

@@ -1,0 +1,162 @@
+"""What the viewer asks of Python: the same answers as the explorer's state, and files that hold what was selected."""
+
+import json
+
+import cases_explorer
+import numpy as np
+import pytest
+import torch
+from messages import tells
+
+from kfgs.formats import read_splats
+from kfgs.labels import EditList, Selection, connected_parts
+from kfgs.splat import rgb_to_sh0
+from kfgs.viewer import Exploration, FieldMeaning
+from kfgs.viewer.session import Session
+
+
+def index(*numbers):
+    return {"kind": "index", "indices": numbers}
+
+
+def bits_of(mask):
+    """A mask as the viewer sends it."""
+    return np.packbits(mask.numpy(), bitorder="little").tobytes()
+
+
+@pytest.fixture
+def session(tmp_path):
+    meaning = FieldMeaning(cases_explorer.field("fused"), cases_explorer.classes())
+    color = cases_explorer.cloud(
+        torch.rand(60, 3, generator=torch.Generator().manual_seed(2)) * 2 + torch.tensor([-1, -1, 4])
+    )
+    color = color.replace(sh=rgb_to_sh0(torch.rand(60, 3))[:, None])
+    state = Exploration(meaning, color, cameras=cases_explorer.cameras(), distance=0.4)
+    return Session(state, tmp_path / "out")
+
+
+def test_an_answer_is_that_of_the_state(session):
+    answer, attached = session.call("ask", {"words": " chair "})
+    asked = session.state.meaning.ask("chair")
+    scores = torch.from_numpy(np.frombuffer(attached, "<f4").copy())
+    assert answer["words"] == "chair"
+    assert answer["number"] == session.state.meaning.names.index("chair")
+    assert (answer["gamma"], answer["low"], answer["high"]) == (asked.selection.threshold, asked.low, asked.high)
+    assert scores.isnan().equal(~asked.valid)
+    assert scores[asked.valid].equal(asked.selection.scores[asked.valid].float())
+    assert (scores > answer["gamma"]).equal(asked.selection.mask)
+
+
+def test_what_surrounds_a_gaussian(session):
+    found, _ = session.call("describe", {"side": "semantic", "index": 5})
+    picked = session.state.pick("semantic", 5)
+    assert len(found["views"]) == len(picked.views)
+
+
+def test_connected_parts_of_a_selection(session):
+    mask = torch.arange(60) % 2 == 0
+    answer, attached = session.call("parts", {"side": "color"}, bits_of(mask))
+    numbers = torch.from_numpy(np.frombuffer(attached, "<i2").copy())
+    expected = connected_parts(session.state.cloud("color"), Selection.of(mask, ""), most=16)
+    assert [part["count"] for part in answer["parts"]] == [part.count for part in expected]
+    for number, part in enumerate(expected):
+        assert (numbers == number).nonzero()[:, 0].equal(part.indices)
+    assert (numbers[~mask] == -1).all()
+
+
+def test_a_selection_by_hand_is_written(session):
+    masks = {side: torch.arange(len(session.state.cloud(side))) % 3 == 0 for side in session.state.sides}
+    attached = b"".join(map(bits_of, masks.values()))
+    args = {"words": None, "gamma": None, "lambda": 0.5, "sides": list(masks)}
+    answer, _ = session.call("save_selection", args, attached)
+    folder = session.out / "selection_001"
+    assert {path.rsplit("/", 1)[1] for path in answer["paths"]} == {path.name for path in folder.iterdir()}
+    details = json.loads((folder / "selection.json").read_text())
+    for side, mask in masks.items():
+        assert details[side]["selected"] == int(mask.sum())
+        assert len(read_splats(folder / f"selection_{side}.ply").gaussians) == int(mask.sum())
+    assert details["lambda"] == 0.5
+
+
+def test_edits_are_written_and_can_be_replayed(session):
+    edits = [
+        {"op": "recolor", "where": index(0, 1), "rgb": [1, 0, 0], "mode": "tint"},
+        {"op": "opacity", "where": index(1, 2), "factor": 0.5},
+        {"op": "remove", "where": index(3, 4)},
+    ]
+    session.call("save_edits", {"edits": {"color": edits, "semantic": []}})
+    folder = session.out / "edited_001"
+    made, before = read_splats(folder / "color.ply").gaussians, session.state.cloud("color")
+    assert len(made) == len(before) - 2
+    torch.testing.assert_close(made.opacities[2], 0.5 * before.opacities[2])
+    assert [edit.op for edit in EditList.load(folder / "color.json")] == ["recolor", "opacity", "remove"]
+    assert not (folder / "semantic.ply").exists()
+
+
+def test_copies_are_saved_and_split_as_they_are_in_the_viewer(session):
+    copied = [0, 1, 2, 3]
+    edits = {"color": [
+        {"op": "duplicate", "where": index(*copied), "translation": [100, 0, 0]},
+        {"op": "opacity", "where": index(60, 61), "factor": 0.5},
+        {"op": "remove", "where": index(0, 1)},
+    ]}  # fmt: skip
+    mask = torch.arange(64) >= 60
+    args = {"words": "chair", "gamma": 0.4, "lambda": 0.5, "sides": ["color"], "edits": edits}
+    session.call("save_selection", args, bits_of(mask))
+    made = read_splats(session.out / "selection_001" / "selection_color.ply").gaussians
+    cloud = session.state.cloud("color")
+    torch.testing.assert_close(made.means, cloud.means[copied] + torch.tensor([100.0, 0, 0]))
+    torch.testing.assert_close(made.opacities, cloud.opacities[copied] * torch.tensor([0.5, 0.5, 1, 1]))
+    answer, attached = session.call(
+        "parts", {"side": "color", "edits": edits}, bits_of(torch.ones(64, dtype=torch.bool))
+    )
+    numbers = np.frombuffer(attached, "<i2")
+    assert len(numbers) == 64
+    assert not set(numbers[:60]) & set(numbers[60:]) - {-1}
+    assert np.array(answer["parts"][0]["corners"]).shape == (8, 3)
+
+
+def test_what_is_like_a_selection(session):
+    state = session.state
+    labels = torch.from_numpy(state.labels("semantic"))
+    label = int(labels[labels >= 0].mode().values)
+    chosen = labels == label
+    answer, attached = session.call("similar", {}, bits_of(chosen))
+    scores = torch.from_numpy(np.frombuffer(attached, "<f4").copy())
+    found = scores > answer["gamma"]
+    assert (answer["words"], answer["number"]) == ("like the selection", None)
+    assert (found & chosen).sum() == pytest.approx(0.9 * int(chosen.sum()), abs=1)
+    assert scores[chosen].mean() > scores[~chosen & ~scores.isnan()].mean()
+
+
+@pytest.mark.parametrize(
+    ("name", "args", "attached", "words"),
+    [
+        ("ask", {}, b"", ["args", "words"]),
+        ("ask", {"words": 3}, b"", ["words"]),
+        ("ask", {"words": "sky"}, b"", ["sky"]),
+        ("describe", {"side": "left", "index": 1}, b"", ["side"]),
+        ("describe", {"side": "color", "index": 10**9}, b"", ["index"]),
+        ("save_selection", {"sides": ["color"]}, b"\0", ["attached"]),
+        ("save_selection", {"sides": []}, b"", ["selection"]),
+        ("save_edits", {"edits": {"color": [{"op": "remove", "where": index(10**9)}]}}, b"", ["indices"]),
+        ("save_edits", {"edits": {"color": [{"op": "recolor", "where": index(1), "rgb": [300, 0, 0]}]}}, b"", ["rgb"]),
+        ("save_edits", {"edits": {"color": [{"op": "insert", "source": "/etc/passwd"}]}}, b"", ["op"]),
+        (
+            "save_edits",
+            {"edits": {"color": [{"op": "remove", "where": {"kind": "class", "name": "chair"}}]}},
+            b"",
+            ["where"],
+        ),
+        ("save_edits", {"edits": {"left": []}}, b"", ["side"]),
+        ("save_edits", {"edits": {}}, b"", ["edits"]),
+        ("save_selection", {"sides": 5}, b"", ["sides: expected a list", "5"]),
+        ("save_edits", {"edits": 5}, b"", ["edits: expected a dict", "5"]),
+        ("similar", {}, bytes(10), ["selection"]),
+        ("delete", {}, b"", ["name"]),
+    ],
+)
+def test_wrong_calls(session, name, args, attached, words):
+    with pytest.raises((ValueError, TypeError), match=tells(*words)):
+        session.call(name, args, attached)
+    assert not session.out.exists()

@@ -1,0 +1,229 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from cases_explorer import LINE, MODES, cameras, cloud, field, grid, grid_clouds, line, splat_file
+from cases_explorer import classes as some_classes
+from messages import tells
+
+from kfgs.cameras import Distortion
+from kfgs.labels import transfer_labels
+from kfgs.viewer.meaning import FieldMeaning, SplatMeaning
+from kfgs.viewer.state import Exploration
+
+
+@pytest.mark.parametrize("distance", [0.5, 1.0, 1.5, 2**0.5, 2.0, 3.3, 100.0])
+def test_the_colour_side_is_labelled_as_transfer_labels_does(distance):
+    semantic, color = grid_clouds()
+    made = grid()
+    made.set_distance(distance)
+    expected = transfer_labels(semantic, semantic.labels, color, distance)
+    assert made.labels("color").tolist() == expected.labels.tolist()
+    assert made.details()["color"]["orphaned"] == expected.orphaned
+    made.ask("chair")
+    scores = made.meaning.ask("chair").selection.scores
+    reached = expected.sources >= 0
+    sources = expected.sources.clamp_min(0)
+    mask = made.meaning.ask("chair").selection.mask
+    assert made.selected("color").tolist() == (mask[sources] & reached).tolist()
+    known = (semantic.labels == 1)[sources] & reached
+    expected_scores = torch.where(known, scores[sources], torch.nan)
+    np.testing.assert_array_equal(made.scores("color"), expected_scores.double().numpy())
+
+
+def test_ties_are_many_and_the_distances_those_of_transfer_labels():
+    semantic, color = grid_clouds()
+    expected = transfer_labels(semantic, semantic.labels, color, 1000.0)
+    far = torch.cdist(color.means.double(), semantic.means[semantic.labels >= 0].double())
+    assert int(((far == far.amin(dim=1, keepdim=True)).sum(dim=1) > 1).sum()) > 100
+    carried = grid()._carried
+    assert carried.source.tolist() == expected.sources.tolist()
+    np.testing.assert_array_equal(carried.far.astype(np.float32), expected.distances.numpy())
+
+
+def test_lambda_without_a_number_is_that_of_transfer_labels():
+    semantic, color = grid_clouds()
+    expected = transfer_labels(semantic, semantic.labels, color)
+    made = grid()
+    assert (made.distance, made.distance_how) == (expected.distance, expected.how)
+    assert made.distance_range == (made.distance / 30, made.distance * 30)
+    assert grid(distance=1000.0).distance_range[1] == 1000.0
+    given = grid(distance=0.7)
+    assert (given.distance, given.distance_how) == (0.7, "given")
+
+
+def test_lambda_is_strict():
+    made = line(1.0)
+    assert made.labels("color").tolist() == [1, -1, 2, -1, -1]  # the second is exactly 1 from the chair
+    made.set_distance(1.0001)
+    assert made.labels("color").tolist() == [1, 1, 2, -1, -1]
+    made.set_distance(3.5)
+    assert made.labels("color").tolist() == [1, 1, 2, 2, -1]  # what has no class gives none, and hides none behind it
+    made.set_distance(1e-6)
+    assert made.labels("color").tolist() == [-1] * 5
+
+
+def test_gamma_selects_on_both_sides():
+    made = line()
+    asked = made.ask("chair")
+    assert (made.gamma, made.gamma_range) == (asked.selection.threshold, (0.0, 1.0))
+    assert made.selected("semantic").tolist() == [True, False, False]
+    assert made.selected("color").tolist() == [True, False, False, False, False]
+    made.set_gamma(0.85)
+    assert (made.gamma, made.gamma_how) == (0.85, "given")
+    assert not made.selected("semantic").any()
+    assert not made.selected("color").any()
+    made.set_gamma(1 + 1e-8)  # a slider's rounding
+    assert made.gamma == 1.0
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("views", [(), tuple(cameras())], ids=["own", "views"])
+def test_any_gamma_of_a_field_is_that_of_query(mode, views):
+    given = some_classes(1, negatives=False)
+    answering = field(mode).with_answers(views) if views else field(mode)
+    state = Exploration(FieldMeaning(field(mode), given, cameras=views))
+    state.ask("wall")
+    low, high = state.gamma_range
+    for share in (0, 0.3, 0.9, 1):
+        state.set_gamma(low + share * (high - low))
+        assert state.selected("semantic").tolist() == answering.query("wall", given, state.gamma).mask.tolist()
+
+
+def test_a_question_comes_and_goes():
+    made = line()
+    assert made.asked is None
+    assert not made.selected("color").any()
+    assert made.gamma_range == (0.0, 1.0)
+    made.ask("chair")
+    with pytest.raises(ValueError, match=tells("class:", "'chair'", "got 'chiar'")):
+        made.ask("chiar")
+    assert made.asked.words == "chair"  # that of before stays
+    assert made.ask("") is None
+    assert (made.asked, made.gamma) == (None, None)
+    made.ask("table")
+    assert made.ask(None) is None
+    assert not made.selected("semantic").any()
+
+
+def test_the_same_splat_on_both_sides():
+    semantic = cloud(LINE, [0, 1, -1, 3], sh=torch.rand(4, 1, 3))
+    made = Exploration(SplatMeaning(splat_file(semantic)), semantic)
+    made.set_distance(0.5)
+    assert made.labels("color").tolist() == [0, 1, -1, 3]
+    made.ask("chair")
+    assert made.selected("color").tolist() == [False, True, False, False]
+    for show in made.show_choices:
+        made.set_show(show)
+        if show != "latents":
+            assert made.colors("color").tolist() == made.colors("semantic").tolist()
+
+
+def test_hidden_classes_are_not_drawn():
+    made = line()
+    assert made.drawn("color").all()
+    made.set_hidden([1, -1])
+    assert made.drawn("semantic").tolist() == [False, True, False]
+    assert made.drawn("color").tolist() == [False, False, True, False, False]
+    assert made.hidden == {1, -1}
+    made.ask("chair")
+    assert made.selected("semantic").tolist() == [True, False, False]  # hiding is not deselecting
+    made.set_hidden([])
+    assert made.drawn("semantic").all()
+
+
+def test_numbers_out_of_range():
+    made = line()
+    with pytest.raises(ValueError, match=tells("gamma:", "got none", "0.5")):
+        made.set_gamma(0.5)
+    made.ask("chair")
+    for gamma in (-0.1, 1.1, float("nan")):
+        with pytest.raises(ValueError, match=tells("gamma:", f"got {gamma}")):
+            made.set_gamma(gamma)
+    assert made.gamma == 0.0
+    for distance in (0.0, -1.0, float("inf"), float("nan")):
+        with pytest.raises(ValueError, match=tells("distance:", "(0, inf)", f"got {distance}")):
+            made.set_distance(distance)
+    with pytest.raises(ValueError, match=tells("labels:", "[-1, 3]", "got 4")):
+        made.set_hidden([1, 4])
+    assert (made.distance, made.hidden) == (1.0, frozenset())
+    with pytest.raises(ValueError, match=tells("index:", "[0, 4]", "got 5")):
+        made.pick("color", 5)
+
+
+def test_clouds_that_cannot_be_explored():
+    with pytest.raises(TypeError, match=tells("meaning: expected", "got NoneType")):
+        Exploration(None)
+    with pytest.raises(ValueError, match=tells("color:", "got none")):
+        Exploration(SplatMeaning(splat_file(cloud(LINE, [0] * 4))), cloud(torch.zeros(0, 3)))
+    bent = replace(cameras()[0], distortion=Distortion("kannala_brandt", (0.1, 0, 0, 0)))
+    with pytest.raises(ValueError, match=tells("cameras:", "got kannala_brandt", "('view_0')")):
+        line(cameras=[bent])
+    hole = cloud(LINE).replace(means=torch.full((4, 3), torch.nan))
+    with pytest.raises(ValueError, match=tells("color.means:", "got NaN", "row 0")):
+        Exploration(SplatMeaning(splat_file(cloud(LINE, [0] * 4))), hole)
+    labelled = hole.replace(labels=torch.zeros(4, dtype=torch.int64))
+    with pytest.raises(ValueError, match=tells("meaning.gaussians.means:", "got NaN")):
+        Exploration(SplatMeaning(splat_file(labelled)))
+    unlabelled = SplatMeaning(splat_file(cloud(LINE, [0] * 4)))
+    unlabelled.gaussians = cloud(LINE)
+    with pytest.raises(ValueError, match=tells("meaning.gaussians.labels:", "[N]", "got None", "FieldMeaning")):
+        Exploration(unlabelled)
+
+
+def test_facts_are_json_and_lines_say_them():
+    made = line()
+    made.ask("chair")
+    facts = json.loads(json.dumps(made.details(), allow_nan=False))
+    assert facts["words"] == "chair"
+    assert (facts["gamma"], facts["gamma_how"]) == (0.0, "all of the class")
+    assert (facts["lambda"], facts["lambda_how"], facts["by"]) == (1.0, "given", "the file's classes and scores")
+    assert facts["semantic"] == {
+        "total": 3,
+        "selected": 1,
+        "classes": [["wall", 0], ["chair", 1], ["table", 1], ["office chair", 0]],
+        "none": 1,
+    }
+    assert (facts["color"]["total"], facts["color"]["selected"], facts["color"]["orphaned"]) == (5, 1, 3)
+    assert made.lines() == [
+        "'chair': score > 0 (all of the class)",
+        "semantic: 1 of 3 Gaussians",
+        "colour: 1 of 5 Gaussians",
+        "3 of 5 colour Gaussians are farther than lambda = 1 from any labelled one, so they have no class",
+    ]
+    made.ask(None)
+    assert made.lines()[0] == "semantic: 3 Gaussians"
+
+
+@pytest.mark.parametrize("value", ["0,05", None, [], True], ids=str)
+def test_what_is_no_number_is_refused(value):
+    made = line()
+    made.ask("chair")
+    for name, verb in (("gamma", made.set_gamma), ("distance", made.set_distance)):
+        with pytest.raises(TypeError, match=tells(f"{name}:", "number", f"({type(value).__name__})")):
+            verb(value)
+    made.set_gamma(np.float32(0.5))
+    assert made.gamma == 0.5
+
+
+@pytest.mark.parametrize("words", [5, b"chair", ["chair"]], ids=str)
+def test_what_is_no_text_is_refused(words):
+    made = line()
+    with pytest.raises(TypeError, match=tells("words:", "text", f"({type(words).__name__})")):
+        made.ask(words)
+    assert made.asked is None
+
+
+def test_hidden_classes_are_a_list_of_labels_or_names():
+    made = line()
+    made.set_hidden(["table", -1])
+    assert made.hidden == {2, -1}
+    for labels in ("chair", 2):
+        with pytest.raises(TypeError, match=tells("labels:", f"got {labels!r}")):
+            made.set_hidden(labels)
+    with pytest.raises(ValueError, match=tells("class:", "'chair'", "got 'chiar'")):
+        made.set_hidden(["chiar"])
+    assert made.hidden == {2, -1}
+    assert made.present == {1, 2, -1}

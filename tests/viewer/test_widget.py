@@ -1,0 +1,120 @@
+"""The notebook widget: what is sent to the browser, and how calls are answered. Its JavaScript: tests/page."""
+
+import base64
+import io
+import subprocess
+import sys
+
+import cases_explorer
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+pytest.importorskip("anywidget")
+
+from kfgs.splat import rasterize, rgb_to_sh0
+from kfgs.viewer import Exploration, FieldMeaning, Viewer, pack
+from kfgs.viewer.widget import make_widget
+from kfgs.viz import explore
+
+
+def exploration():
+    generator = torch.Generator().manual_seed(2)
+    means = torch.rand(60, 3, generator=generator) * 2 + torch.tensor([-1, -1, 4])
+    color = cases_explorer.cloud(means, sh=rgb_to_sh0(torch.rand(60, 3, generator=generator))[:, None])
+    meaning = FieldMeaning(cases_explorer.field("fused"), cases_explorer.classes())
+    return Exploration(meaning, color, cameras=cases_explorer.cameras(), distance=0.4)
+
+
+def answers(widget, *messages):
+    sent = []
+    widget.send = lambda *found: sent.append(found)
+    for message in messages:
+        widget._handle_custom_msg(message, [b""])
+    return sent
+
+
+def still_of(state):
+    bundle = make_widget(state)._repr_mimebundle_()
+    file = base64.b64decode((bundle[0] if isinstance(bundle, tuple) else bundle)["image/jpeg"])
+    return np.asarray(Image.open(io.BytesIO(file))).astype(int)
+
+
+def test_the_scene_is_sent_once(tmp_path):
+    state = exploration()
+    state.ask("chair")
+    widget = make_widget(state, title="room", out=tmp_path)
+    packed = pack.pack_scene(exploration(), title="room")
+    assert widget.header["buffers"] == packed.header["buffers"]
+    assert widget.header["start"]["words"] == "chair"
+    assert widget.data == packed.compressed()
+    assert (widget.question, widget.header["phrases"]) == ("chair", False)
+
+
+def test_calls_are_answered_with_their_number(tmp_path):
+    widget = make_widget(exploration(), out=tmp_path)
+    (first, scores), (second, _) = answers(
+        widget, {"id": 7, "name": "ask", "args": {"words": "chair"}}, {"id": 8, "name": "ask", "args": {"words": "sky"}}
+    )
+    assert first["id"] == 7
+    asked = exploration().meaning.ask("chair")
+    assert np.array_equal(np.frombuffer(scores[0], "<f4") > 0.5, asked.selection.mask.numpy())
+    assert second["id"] == 8
+    assert "sky" in second["answer"]["error"]
+    ((wrong, _),) = answers(widget, {"id": 9})
+    assert "name" in wrong["answer"]["error"]
+
+
+def test_explore_in_a_notebook_gives_a_viewer():
+    state = exploration()
+    viewer = explore(
+        cases_explorer.field("fused"), state.cloud("color"), classes=cases_explorer.classes(), where="notebook"
+    )
+    assert isinstance(viewer, Viewer)
+    viewer.ask("chair")
+    assert viewer.widget.question == "chair"
+    viewer.ask(None)
+    assert viewer.widget.question == ""
+    bundle = viewer._repr_mimebundle_()
+    assert "application/vnd.jupyter.widget-view+json" in (bundle[0] if isinstance(bundle, tuple) else bundle)
+    viewer.close()
+
+
+@pytest.mark.parametrize("show", ["rgb", "labels"])
+def test_a_picture_stands_in_where_widgets_cannot_run(show):
+    state = exploration()
+    state.set_show(show)
+    picture = still_of(state)
+    assert picture.shape[:2] == (state.cameras[0].height, state.cameras[0].width)
+    cloud = state.cloud("color")
+    if show == "labels":
+        cloud = cloud.replace(features=torch.from_numpy(state.colors("color")) / 255, sh=None)
+    truth = rasterize(cloud, state.cameras[0], background=torch.ones(3)).map.clamp(0, 1)
+    assert np.abs(picture / 255 - truth.numpy()).mean() < 0.03
+
+
+def test_after_a_question_the_picture_shows_the_answer():
+    state = exploration()
+    state.set_show("rgb")
+    plain = still_of(state)
+    state.ask("chair")
+    asked = still_of(state)
+    selected = state.selected("color")
+    assert 0 < selected.sum() < len(selected)
+    colors = state.colors("color") / 255
+    colors[~selected] = 0.6 + 0.4 * colors[~selected].mean(axis=1, keepdims=True)  # three fifths white, no hue
+    cloud = state.cloud("color").replace(features=torch.from_numpy(colors).float(), sh=None)
+    expected = rasterize(cloud, state.cameras[0], background=torch.ones(3)).map.numpy()
+    error, change = (np.abs(asked - other).mean() for other in (255 * expected, plain))
+    assert 2 * error < change
+
+
+def test_without_anywidget_the_install_line_is_told():
+    code = (
+        "import sys; sys.modules['anywidget'] = None\n"
+        "from kfgs.viewer.widget import require_widget\n"
+        "try: require_widget()\nexcept ImportError as error: print(error)"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert "kfgs[notebook]" in said
