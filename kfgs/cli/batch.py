@@ -94,9 +94,6 @@ def batch(
         max_gaussians=training.max_gaussians,
         views_per_step=training.views_per_step,
     )
-    config = dataclasses.replace(
-        config, discard_sums=True
-    )  # a thousand scenes would keep 40 GB for views that may never come
     options = BatchOptions(
         teacher=teacher.teacher,
         weights=teacher.weights,

@@ -180,8 +180,6 @@ def fit(
     *,
     splat: Given[Path] = None,
     discard_features: Flag = False,
-    refit: Flag = False,
-    discard_sums: Flag = False,
     method: FieldMethod,
     views: Views,
     maps: Maps,
@@ -206,9 +204,6 @@ def fit(
         splat: Any splat file of the scene, in its frame: the Gaussians to average onto.
         discard_features: Delete the feature maps when the stages made of them are done. Later runs with the same options
             do not need them; runs with other options (another --splat, for example) do.
-        refit: Fuse all views again, and train all Gaussians again. Without it, views that are new since an earlier fit in OUT are
-            added to its result, and its Gaussians stay, until there are twice as many views.
-        discard_sums: Do not keep what is needed to add views later (about 240 bytes for each Gaussian of the splat).
     """
     from .._files import bytes_in_words
     from ..features import RecomputedMaps, discard_maps
@@ -224,11 +219,7 @@ def fit(
         views_per_step=training.views_per_step,
         split=views.split,
     )
-    if method.method == "paper":
-        check_alone("refit", refit, "with --method paper, which always trains on all views")
-        check_alone("discard_sums", discard_sums, "with --method paper, which keeps none")
     config = dataclasses.replace(config, undistorted_features=maps.undistorted_features, device=training.device)
-    config = dataclasses.replace(config, refit=refit, discard_sums=discard_sums)
     check_output("out", out, "a folder")
     check_report(out)
     if method.method == "paper":

@@ -13,7 +13,6 @@ from .precision import Rounding
 from .remembered import recall_scene, remember
 from .semantic_field import Rule, SemanticField
 from .uplift import UpliftConfig, sample_latents, uplift_maps
-from .uplift_sums import UpliftSums
 from .views import score_pixels
 
 __all__ = [
@@ -32,7 +31,6 @@ __all__ = [
     "Seen",
     "SemanticField",
     "UpliftConfig",
-    "UpliftSums",
     "fit_field",
     "fused_answers",
     "join_fields",

@@ -18,7 +18,6 @@ from .._check import as_tensor
 from .._files import atomic_path, digest_value, parse_json
 from .._tensors import save_tensors
 from ..cameras import Camera
-from ..cameras.camera import NEAR
 from .config import FieldConfig
 from .params import GaussianParams
 
@@ -46,15 +45,13 @@ def identify_fit(
 ) -> dict[str, str]:
     """A digest of each input of a fit. Of the targets, only their number and the first map count.
 
-    The extent of the config may be None, so the caller puts the one in use into `others`. Near planes count where one is not
-    at 0.2, and `antialiased` if it is set: checkpoints from before stay valid.
+    The extent of the config may be None, so the caller puts the one in use into `others`.
     """
     options = {name: value for name, value in config.identity().items() if name not in ("checkpoint_every", "extent")}
     views = [tensor for camera in cameras for tensor in (camera.viewmat, camera.K, torch.tensor(camera.size))]
-    near = torch.tensor([camera.near for camera in cameras], dtype=torch.float64)
-    views += [near] if (near != NEAR).any() else []
+    views.append(torch.tensor([camera.near for camera in cameras], dtype=torch.float64))
     return {
-        "params": digest_tensors([*params.to_tensors().values(), *[torch.tensor(True)] * params.antialiased]),
+        "params": digest_tensors([*params.to_tensors().values(), torch.tensor(params.antialiased)]),
         "cameras": digest_tensors(views),
         "targets": digest_tensors([torch.tensor(len(targets)), as_tensor("targets[0]", targets[0], floating=True)]),
         "config": digest_value(options),

@@ -29,7 +29,6 @@ from ..quant import FeatureMaps
 from ..quant.linear import LinearLatents, fit_linear_latents
 from .merge import FAINT, Merged, merge_gaussians
 from .uplift_passes import average, correct, per_weight, some
-from .uplift_sums import UpliftSums, add_sums, extend_directions
 from .working_maps import WorkingMaps, working_directions
 
 SPARSE = 0.3  # share of the views' pixels: a splat of the scene fills nearly all of them
@@ -82,8 +81,6 @@ class Uplifted:
     agreement: Tensor  # [N] in [0, 1]
     """Length of the mean of the unit features at its pixels: 1 if all are equal, 0 = never shown. For merged Gaussians the mean
     over their members."""
-    sums: UpliftSums | None = None
-    """For `uplift_maps(before=...)`, which adds views later; None if there is more than one pass of corrections."""
 
     __repr__ = short_repr
 
@@ -96,7 +93,6 @@ def uplift_maps(
     config: UpliftConfig | None = None,
     *,
     latents: LinearLatents | None = None,
-    before: UpliftSums | None = None,
     generator: torch.Generator | None = None,
     scratch: Path | None = None,
     progress: bool = False,
@@ -114,8 +110,6 @@ def uplift_maps(
         maps: one per camera, covering its picture at any size; all-zero features mean "unknown".
         config: see `UpliftConfig`.
         latents: those of other fields (`sample_latents`), with which these shall agree; None: fitted to this scene.
-        before: `sums` of an earlier call with the same Gaussians, options and `latents`. The views are then new ones, which are
-            added to the earlier ones; those are not looked at again.
         generator: draws the first centres of merging; None: seed 0.
         scratch: a folder for these files, used for these maps only; files of a killed process are used again. The caller
             deletes it. None: a temporary folder.
@@ -125,44 +119,36 @@ def uplift_maps(
     Raises:
         TypeError: if `progress` is a function: there are no rows to call it with.
         ValueError: if counts or shapes disagree, `write_splats` would refuse the Gaussians, a map is not finite, no map has
-            features, no view shows any Gaussian, or `before` is of other Gaussians or options.
+            features, or no view shows any Gaussian.
 
     Note:
-        With `before`, the means are those of all views, up to rounding. Two things differ from one call with all views. The
-        earlier latents stay; others are added if the new means need them. And in the corrections, each group of views is
-        compared with its own mean instead of that of all views.
-
         To continue by training, start `fit_field` with `GaussianParams.from_gaussians(found.gaussians)` and the maps
         `found.latents.encode(unit features)`.
     """
     config, progress = config or UpliftConfig(), as_bar(progress)
     say = report if report is not None else lambda text: None
-    cloud = _checked(gaussians, cameras, maps, latents, before, config)
+    cloud = _checked(gaussians, cameras, maps)
     steps = len(cameras) * (1 + config.corrections + (config.max_gaussians is not None and config.corrections > 0))
     with torch.no_grad(), tqdm(total=steps, desc="uplift", unit="view", disable=not progress) as bar:
-        known = None if before is None else before.latents.basis
-        directions = (working_directions(maps, known=known) if latents is None else latents.basis).to(cloud.means)
-        count = 0 if before is None else before.views[0]
-        with WorkingMaps(cameras, maps, directions, config.pixels, scratch, count) as views:
-            own, shown = average(cloud, views, bar)
-            _check_shown(shown, cameras, before, say)
-            means, shown, agreement = _with_earlier(own, shown, before)
+        directions = (working_directions(maps) if latents is None else latents.basis).to(cloud.means)
+        with WorkingMaps(cameras, maps, directions, config.pixels, scratch) as views:
+            sums, shown = average(cloud, views, bar)
+            _check_shown(shown, cameras, say)
+            means = _mean(sums)
+            agreement = row_norms(means).clamp_max(1)
             if latents is None:
-                chosen = _directions(means, shown, before, config, say)
-                views.project(chosen)
-                own = torch.cat([own[..., :-1] @ chosen, own[..., -1:]], dim=-1)
-                latents = LinearLatents((directions.double() @ chosen.double()).to(directions))
+                fitted = fit_linear_latents(
+                    unit_rows(means), _capped(shown), keep=config.keep, maximum=config.max_latents
+                )
+                views.project(fitted.basis)
+                sums = torch.cat([sums[..., :-1] @ fitted.basis, sums[..., -1:]], dim=-1)
+                latents = LinearLatents((directions.double() @ fitted.basis.double()).to(directions))
             say(f"fused {len(cameras)} maps of {latents.dim} channels as {latents.latent} latents")
-            old = None if before is None else before.sums
-            sums, passes = add_sums(own, old), []  # of these views, and of the earlier ones
-            lacking = [None, None] if before is None else [before.lacking(k) for k in range(2)]
-            facts = {"shown": shown, "agreement": agreement}
             for _ in range(config.corrections):
-                own, old, found = correct(cloud, own, old, lacking[0], views, bar)
-                passes.append(found)
+                sums = correct(cloud, sums, views, bar)
             if config.max_gaussians is not None:
                 merged = merge_gaussians(
-                    cloud.replace(features=_mean(add_sums(own, old))),
+                    cloud.replace(features=_mean(sums)),
                     shown,
                     config.max_gaussians,
                     faint=config.faint,
@@ -171,17 +157,10 @@ def uplift_maps(
                 say(f"{len(merged.gaussians)} of {len(cloud)} Gaussians left")
                 cloud, agreement = merged.gaussians, _pooled(agreement * shown, merged) / some(merged.weights)
                 shown = merged.weights
-                own = _pooled_halves(own, merged)
-                old, after = (None if one is None else _pooled_halves(one, merged) for one in (old, lacking[1]))
+                sums = torch.stack([_pooled(half, merged) for half in sums])
                 if config.corrections:
-                    own, old, found = correct(cloud, own, old, after, views, bar)
-                    passes.append(torch.where(merged.source[:, None] < 0, 0, found[:, merged.source.clamp_min(0)]))
-    kept = None
-    if config.corrections < 2:
-        halves = torch.stack(passes).half() if passes else sums.new_zeros(0, *sums.shape, dtype=torch.float16)
-        total = count + len(cameras)
-        kept = UpliftSums(latents, sums, halves, **facts, views=(total, total if before is None else before.views[1]))
-    return Uplifted(cloud.replace(features=_mean(add_sums(own, old))), latents, shown, agreement, kept)
+                    sums = correct(cloud, sums, views, bar)
+    return Uplifted(cloud.replace(features=_mean(sums)), latents, shown, agreement)
 
 
 @typed
@@ -201,14 +180,7 @@ def sample_latents(maps: FeatureMaps, *, count: int = 32, views: int = 256) -> L
     return LinearLatents(working_directions(maps, count, views))
 
 
-def _checked(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    maps: FeatureMaps,
-    latents: LinearLatents | None,
-    before: UpliftSums | None,
-    config: UpliftConfig,
-) -> Gaussians:
+def _checked(gaussians: Gaussians, cameras: Sequence[Camera], maps: FeatureMaps) -> Gaussians:
     """The Gaussians without colours and features, after a check of the arguments of `uplift_maps`."""
     if len(gaussians) == 0:
         raise ValueError("gaussians: expected at least one, got none; there is nothing to carry features to")
@@ -216,57 +188,20 @@ def _checked(
         raise ValueError(
             f"maps: expected one per camera ({len(cameras)}, at least one), got {len(maps)}; pass the views that have maps"
         )
-    if before is not None:
-        passes = 0 if config.corrections == 0 else 1 + (config.max_gaussians is not None)
-        same = latents is None or torch.equal(latents.basis, before.latents.basis)
-        if config.corrections > 1 or tuple(before.corrections.shape[0::2]) != (passes, len(gaussians)) or not same:
-            raise ValueError(
-                f"before: expected sums of these {len(gaussians)} Gaussians, latents and options, with at most one pass of "
-                f"corrections, got those of {before.sums.shape[1]} with {len(before.corrections)}; leave it out, and "
-                "give the maps of all views"
-            )
     cloud = gaussians.replace(sh=None, features=None, labels=None).detach()
     check_splats(SplatFile(cloud))
     return cloud.to(torch.promote_types(cloud.means.dtype, torch.float32))
 
 
-def _check_shown(
-    shown: Tensor, cameras: Sequence[Camera], before: UpliftSums | None, say: Callable[[str], None]
-) -> None:
-    """Refuse views that show no Gaussian, if there are no earlier views, and say if they show few."""
-    if before is None and not bool((shown > 0).any()):
+def _check_shown(shown: Tensor, cameras: Sequence[Camera], say: Callable[[str], None]) -> None:
+    """Refuse views that show no Gaussian, and say if they show few."""
+    if not bool((shown > 0).any()):
         raise ValueError(
             "cameras: expected views that show the Gaussians, got none that does; do both share one frame?"
         )
     filled = float(shown.sum()) / sum(camera.width * camera.height for camera in cameras)
     if filled < SPARSE:
         say(f"note: the Gaussians fill {filled:.0%} of the views; are they in the cameras' frame?")
-
-
-def _with_earlier(own: Tensor, shown: Tensor, before: UpliftSums | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean features [N, d'], pixels shown [N] and agreement [N] of these views and earlier ones."""
-    if before is None:
-        means = _mean(own)
-        return means, shown, row_norms(means).clamp_max(1)
-    sums = add_sums(own, before.sums)
-    means, outside = _mean(sums), before.outside / some(sums[..., -1].sum(0))
-    return means, shown + before.shown, torch.hypot(row_norms(means), outside).clamp_max(1)
-
-
-def _directions(
-    means: Tensor, shown: Tensor, before: UpliftSums | None, config: UpliftConfig, say: Callable[[str], None]
-) -> Tensor:  # [d', d]
-    """The latents of the mean features, in the working directions; earlier latents stay, and others are added to them."""
-    weights = _capped(shown)
-    if before is None:
-        return fit_linear_latents(unit_rows(means), weights, keep=config.keep, maximum=config.max_latents).basis
-    known = before.latents.latent
-    chosen, outside = extend_directions(means, weights, known, config.keep, config.max_latents)
-    added = f"{chosen.shape[1] - known} added" if chosen.shape[1] > known else "none added"
-    say(
-        f"{outside:.2%} of the features' variation is outside of the {known} latents ({1 - config.keep:.2%} may be): {added}"
-    )
-    return chosen
 
 
 def _mean(sums: Tensor) -> Tensor:  # [2, N, d + 1] -> [N, d]
@@ -279,10 +214,6 @@ def _pooled(values: Tensor, merged: Merged) -> Tensor:  # [N, ...] -> [M, ...]
     rows = merged.source >= 0
     sums = values.new_zeros(len(merged.gaussians), *values.shape[1:])
     return sums.index_add_(0, merged.source[rows], values[rows])
-
-
-def _pooled_halves(sums: Tensor, merged: Merged) -> Tensor:  # [2, N, ...] -> [2, M, ...]
-    return torch.stack([_pooled(half, merged) for half in sums])
 
 
 def _capped(weights: Tensor) -> Tensor:

@@ -13,7 +13,6 @@ from ..cameras import Camera, resize_map
 from ..gaussians import Gaussians
 from ..labels.views import sum_pixels
 from ..splat import rasterize
-from .uplift_sums import add_sums
 from .working_maps import WorkingMaps, shrink_map
 
 NEIGHBOURS = 17  # a Gaussian and its 16 nearest, whose corrections are judged together
@@ -28,7 +27,7 @@ def average(cloud: Gaussians, views: WorkingMaps, bar: Any) -> tuple[Tensor, Ten
         return _part(cloud, camera, features, scale)
 
     for i, part in enumerate(map(look, range(len(views)))):
-        half = sums[views.half(i)]
+        half = sums[i % 2]
         before = half[:, -1].clone()
         half.index_add_(0, part["index"], part["total"])
         shown += float(part["scale"]) * (half[:, -1] - before)
@@ -36,47 +35,26 @@ def average(cloud: Gaussians, views: WorkingMaps, bar: Any) -> tuple[Tensor, Ten
     return sums, shown
 
 
-def correct(
-    cloud: Gaussians, sums: Tensor, old: Tensor | None, old_lacking: Tensor | None, views: WorkingMaps, bar: Any
-) -> tuple[Tensor, Tensor | None, Tensor]:  # [2, N, d + 1], [2, N, d + 1], [2, N, d]
+def correct(cloud: Gaussians, sums: Tensor, views: WorkingMaps, bar: Any) -> Tensor:  # sums: [2, N, d + 1]
     """One pass of SIRT: correct each Gaussian's feature by the weighted mean of the difference at its pixels, without noise.
 
     The even and the odd views make one reconstruction each. Signal is the part of the two corrections that agrees among
-    neighbours (`reliability`); both take the reliable share.
-
-    Args:
-        cloud: the Gaussians.
-        sums: of these views.
-        old: of earlier views, with their own sums of differences, `old_lacking`.
-        views: these views.
-        bar: counts them.
-
-    Returns:
-        Corrected sums of these and of earlier views, and the corrections before noise was taken out of them.
+    neighbours (`reliability`); both take the reliable share. Returns the corrected sums.
     """
-    halves = per_weight(sums)
-    lacking = torch.zeros_like(sums)
+    halves, lacking = per_weight(sums), torch.zeros_like(sums)
 
     def look(i: int) -> dict[str, Tensor]:
         camera, features, factor, scale = views[i]
-        rendered, alpha, _ = rasterize(cloud.replace(features=halves[views.half(i)]), camera)
+        rendered, alpha, _ = rasterize(cloud.replace(features=halves[i % 2]), camera)
         covered = shrink_map(alpha[..., None], factor)  # the rest of the pixel is empty: no Gaussian can explain it
         return _part(cloud, camera, covered * features - shrink_map(rendered, factor), scale)
 
     for i, part in enumerate(map(look, range(len(views)))):
-        lacking[views.half(i)].index_add_(0, part["index"], part["total"])
+        lacking[i % 2].index_add_(0, part["index"], part["total"])
         bar.update()
-    corrections = per_weight(add_sums(lacking, old_lacking))
+    corrections, weights = per_weight(lacking), sums[..., -1:]
     share = reliability(corrections[0], corrections[1], _neighbours(cloud.means))[:, None]
-    if old is not None and old_lacking is not None:
-        old = _moved(old, share * per_weight(old_lacking))
-    return _moved(sums, share * per_weight(lacking)), old, corrections
-
-
-def _moved(sums: Tensor, change: Tensor) -> Tensor:  # [2, N, d + 1], [2, N, d] -> [2, N, d + 1]
-    """Sums whose means are changed."""
-    weights = sums[..., -1:]
-    return torch.cat([(per_weight(sums) + change) * weights, weights], dim=-1)
+    return torch.cat([(halves + share * corrections) * weights, weights], dim=-1)
 
 
 def reliability(one: Tensor, other: Tensor, near: Tensor) -> Tensor:  # [N, d] x 2, [N, k] -> [N] in [0, 1]

@@ -18,7 +18,7 @@ from .._rows import ENCODE, EPS, check_directions, row_norms, unit_rows
 from ..cameras import Camera
 from ..cameras.resample import from_bchw, to_bchw
 from ..quant import FeatureMaps
-from ..quant.linear import NOISE, principal_directions
+from ..quant.linear import principal_directions
 from ..quant.maps import read_blocks
 from ..quant.sampling import sample_grid
 
@@ -57,13 +57,11 @@ class WorkingMaps:
         directions: Tensor,
         pixels: int,
         scratch: Path | None,
-        before: int = 0,  # number of earlier views
     ) -> None:
         self._cameras, self._maps, self._directions, self._pixels = cameras, maps, directions, pixels
         self._temporary = tempfile.TemporaryDirectory(prefix="kfgs_") if scratch is None else None
         self._folder = Path(self._temporary.name) if self._temporary is not None else Path(scratch or "")
         self._basis: Tensor | None = None
-        self._before = before
 
     def __enter__(self) -> WorkingMaps:
         return self
@@ -79,10 +77,6 @@ class WorkingMaps:
     def channels(self) -> int:
         """Number of current directions."""
         return int((self._directions if self._basis is None else self._basis).shape[1])
-
-    def half(self, i: int) -> int:
-        """0 for even views, 1 for odd ones, counted from the first of the earlier views."""
-        return (self._before + i) % 2
 
     def project(self, basis: Tensor) -> None:  # [d', d]
         """From now on return maps in these directions, given in the working directions."""
@@ -144,12 +138,8 @@ def working_directions(
     maps: FeatureMaps,
     count: int = WORKING,
     most: int | None = None,
-    known: Tensor | None = None,  # [D, d] orthonormal
 ) -> Tensor:  # [D, d']
-    """The main `count` directions of unit features, from samples of at most `most` (32) evenly spread maps.
-
-    With `known` directions, these come first; the others are the main directions of what is outside of them.
-    """
+    """The main `count` directions of unit features, from samples of at most `most` (32) evenly spread maps."""
     samples = LOOKED_AT[1]
     views = sorted({round(i) for i in np.linspace(0, len(maps) - 1, min(most or LOOKED_AT[0], len(maps)))})
     moment: Tensor | float = 0.0
@@ -174,16 +164,9 @@ def working_directions(
     for part in map(look, views):
         moment = moment + part["moment"]
     assert isinstance(moment, Tensor)
-    if known is None:
-        values, directions = principal_directions(moment)
-    else:
-        known = known.to(moment)
-        rest = torch.eye(len(known)).to(moment) - known @ known.T
-        values, directions = principal_directions(rest @ moment @ rest)
-        directions = directions[:, values > NOISE * moment.trace()][:, : len(known) - known.shape[1]]
-        values, directions = moment.trace()[None], torch.cat([known.to(directions), directions], dim=1)
+    values, directions = principal_directions(moment)
     if not float(values[0]) > 0:
         raise ValueError(
             f"maps: expected nonzero features (longer than {EPS:g}), got {len(maps)} maps without; check the teacher"
         )
-    return directions[:, : count if known is None else max(count, known.shape[1])].float()
+    return directions[:, :count].float()

@@ -32,7 +32,6 @@ from .stages import (
     describe_lens,
     digest_pictures,
     digest_scene,
-    digest_shape,
     digest_tensors,
     is_whole,
     stage_generator,
@@ -294,27 +293,6 @@ def _whole_stages(run: Run) -> list[Path]:
     """The descriptions of the colour stages in the run that are not damaged."""
     found = sorted((run.folder / "stages").glob("color-*/stage.json"))
     return [about for about in found if is_whole(about.parent)]
-
-
-def colors_before(
-    run: Run, scene: Scene, config: ColorConfig, geometries: Sequence[str]
-) -> tuple[Gaussians, int, str] | None:
-    """Gaussians that were trained on some of a scene's pictures, with these options or more steps; their steps, and their stage.
-
-    They have the first digest in `geometries` that a stage has.
-    """
-    wanted = json.loads(json.dumps(_inputs(run, scene, scene.views(config.split), config)))
-    if run.has("color", wanted):
-        return None
-    found = {}
-    for about in _whole_stages(run) if geometries else ():
-        inputs = read_json(about)["inputs"]
-        steps = int(inputs["config"]["field"]["steps"])
-        same = inputs["config"] == wanted["config"] or steps > config.field.steps
-        if same and all(picture in wanted["pictures"] for picture in inputs["pictures"]):
-            cloud = stage_gaussians(about.parent)
-            found[digest_shape(cloud)] = cloud, steps, about.parent.name
-    return next((found[one] for one in geometries if one in found), None)
 
 
 def _inputs(run: Run, scene: Scene, views: Sequence[int], config: ColorConfig) -> dict[str, Any]:

@@ -33,11 +33,6 @@ class FitConfig:
     """The split of training views; "all" trains on all views."""
     device: str = "auto"
     """Where to train a field, see `training_device`; the other stages and the result stay on the CPU."""
-    refit: bool = False
-    """Of method `fuse`: fuse all views again, even if an earlier field in the run folder has some of them. By default, new views
-    are added to it, and Gaussians that were trained on earlier pictures are kept."""
-    discard_sums: bool = False
-    """Of method `fuse`: do not keep what is needed to add views later (about 240 bytes for each Gaussian of the splat)."""
     undistorted_features: bool = False
     """Whether the teacher saw undistorted pictures; if not, its maps are undistorted like the pictures."""
     uplift: UpliftConfig = default(default_factory=UpliftConfig.field)

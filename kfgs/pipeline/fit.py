@@ -45,9 +45,8 @@ from ..scenes import Scene
 from ..viz.pictures import is_drawn
 from .color import ColorConfig
 from .config import FitConfig
-from .earlier import digest_changes, find_earlier
 from .fuse import answers_stage, find_geometry, uplift_stage
-from .maps import KnownFeatures, Maps, as_maps, check_readable, map_digests, map_shape, maps_of_views
+from .maps import KnownFeatures, Maps, as_maps, check_readable, digest_changes, map_digests, map_shape, maps_of_views
 from .points import with_points
 from .stages import Run, Stage, digest_scene, digest_tensors, stage_generator
 from .train import check_scene, field_stage, training_device, with_extent
@@ -300,12 +299,11 @@ def _make_field(
     inputs = {"features": job.features, "config": asdict(config.uplift), "seed": config.seed}
     if latents is not None:
         inputs["latents"] = digest_tensors(latents.basis)
-    earlier = [] if config.refit else find_earlier(job.run, inputs, job.cameras, job.maps)
     given = job.run, job.scene, splat, _color_config(config), job.device, job.progress
-    geometry, origin = find_geometry(*given, earlier)
-    options = config.uplift, inputs, job.progress is True, latents, earlier, not config.discard_sums
+    geometry, origin = find_geometry(*given)
+    options = config.uplift, inputs, job.progress is True, latents
     found = uplift_stage(job.run, geometry, job.cameras, job.maps, *options)
-    return found, {"method": config.method, **origin, **found.info}
+    return found, {"method": config.method, **origin}
 
 
 def _paper_stages(job: _Job) -> SemanticField:

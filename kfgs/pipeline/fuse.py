@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from .._arrays import read_safetensors
-from .._files import as_path, bytes_in_words, write_json
+from .._files import as_path, write_json
 from .._progress import Progress
 from .._tensors import save_tensors
 from .._typed import typed
@@ -22,11 +22,10 @@ from ..formats.folders import splat_file_of
 from ..gaussians import Gaussians
 from ..quant import LinearLatents
 from ..scenes import Scene
-from .color import ColorConfig, colors_before, find_color, make_color
+from .color import ColorConfig, find_color, make_color
 from .config import FitConfig
-from .earlier import SUMS, Earlier, digest_cameras
-from .maps import ChosenMaps, Maps, check_readable, maps_of_views
-from .stages import SHAPE, Run, digest_shape, stage_generator
+from .maps import Maps, check_readable, maps_of_views
+from .stages import SHAPE, Run, digest_cameras, digest_shape, stage_generator
 
 
 def find_geometry(
@@ -36,14 +35,12 @@ def find_geometry(
     config: ColorConfig,
     device: torch.device,
     progress: Progress,
-    earlier: Sequence[Earlier] = (),
 ) -> tuple[Gaussians, dict[str, Any]]:
     """The Gaussians to fuse onto, and their origin, for `field.json`.
 
     Without a splat they are those of the scene's own splat, or else the colour field of the run. Its stage is found again
     if it is there. A longer colour field of the same scene, as `kfgs color` makes it in the same run folder, is taken
-    instead. A shorter one is not, but its `color.ply` stays. If there is none,
-    but an `earlier` uplift of some of the views has one, that is taken.
+    instead. A shorter one is not, but its `color.ply` stays.
     """
     splat = scene.splat if splat is None else splat
     if isinstance(splat, Gaussians):
@@ -54,11 +51,6 @@ def find_geometry(
         return read_splats(splat).gaussians, {"geometry": str(splat_file_of(splat))}
     found = find_color(run, scene, config)
     if found is None:
-        before = colors_before(run, scene, config, [one.geometry for one in earlier])
-        if before is not None:
-            cloud, steps, name = before
-            run.say(f"geometry: {name}, trained before there were new pictures; --refit trains it again")
-            return cloud, {"geometry": f"trained on earlier pictures ({name})", "steps": {"color": steps}}
         found = make_color(run, scene, config, device, progress, overwrite=False).gaussians, config.field.steps
     gaussians, steps = found
     return gaussians, {"geometry": "trained on the pictures", "steps": {"color": steps}}
@@ -73,65 +65,37 @@ def uplift_stage(
     inputs: dict[str, Any],
     progress: bool,
     latents: LinearLatents | None = None,
-    earlier: Sequence[Earlier] = (),
-    keep_sums: bool = True,
 ) -> SemanticField:
     """Fuse the maps onto the Gaussians, merge and compress, as a stage of a run.
 
     `inputs` are those in addition to Gaussians and cameras: `features` (the maps), `config`, `seed`, and the digest of
-    `latents` if there are some. Of the `earlier` uplifts, the first one of these Gaussians is gone on from, unless the stage
-    of all views is finished. The key of the stage then follows from that of the earlier one, too.
+    `latents` if there are some.
     """
     inputs = {"geometry": digest_shape(geometry), "cameras": digest_cameras(cameras), **inputs}
-    onto = _choose(run, inputs, earlier)
-    if onto is not None:
-        inputs["onto"] = onto.key
     pictures = {"features": inputs["features"], "cameras": inputs["cameras"], "pixels": config.pixels}
-    pictures |= {name: inputs[name] for name in ("latents", "onto") if name in inputs}
+    pictures |= {name: inputs[name] for name in ("latents",) if name in inputs}
     scratch = run.scratch("uplift", pictures)
-    new = [i for i in range(len(cameras)) if onto is None or i not in set(onto.views)]
-    if onto is not None:
-        run.say(f"uplift: goes on from the {len(onto.views)} views of {onto.folder.name}; {len(new)} new")
 
     def make(folder: Path) -> None:
-        chosen = maps if onto is None else ChosenMaps(maps, new)
-        check_readable(chosen, "the uplift")
+        check_readable(maps, "the uplift")
         options: dict[str, Any] = {"scratch": scratch, "progress": progress, "report": run.report, "latents": latents}
-        options |= {"before": None if onto is None else onto.sums}
         generator = stage_generator(inputs["seed"], "uplift")
-        seen = [cameras[i] for i in new]
-        found = uplift_maps(geometry.to("cpu"), seen, chosen, config, generator=generator, **options)
+        found = uplift_maps(geometry.to("cpu"), cameras, maps, config, generator=generator, **options)
         cloud = found.gaussians
         tensors = {name: getattr(cloud, name) for name in (*SHAPE, "features")}
         tensors |= {"basis": found.latents.basis, "pixels": found.pixels, "agreement": found.agreement}
         save_tensors(folder / "uplift.safetensors", tensors)
-        facts = {"gaussians": len(cloud), "latents": found.latents.latent, "near": [one.near for one in cameras]}
-        write_json(folder / "facts.json", {**facts, "first": len(cameras) if onto is None else onto.first})
-        if keep_sums and found.sums is not None:
-            save_tensors(folder / SUMS, found.sums.to_tensors())
-            run.say(f"kept {bytes_in_words((folder / SUMS).stat().st_size)}, so that views can be added later")
+        write_json(folder / "facts.json", {"gaussians": len(cloud), "latents": found.latents.latent})
 
     stage = run.stage("uplift", inputs, make)
     shutil.rmtree(scratch, ignore_errors=True)
     tensors = read_safetensors(stage.folder / "uplift.safetensors")[0]
-    grown = (
-        {} if onto is None else {"goes_on": onto.folder.name, "views_before": len(onto.views), "views_new": len(new)}
-    )
     return SemanticField(
         geometry.replace(**{name: tensors[name] for name in (*SHAPE, "features")}, sh=None, labels=None),
-        info=grown,
         linear=LinearLatents(tensors["basis"]),
         seen=Seen(tensors["pixels"], tensors["agreement"]),
         cameras=tuple(cameras),
     )
-
-
-def _choose(run: Run, inputs: dict[str, Any], earlier: Sequence[Earlier]) -> Earlier | None:
-    """The uplift to go on from: one from which this stage was made before, else that with the most views."""
-    fitting = [one for one in earlier if one.geometry == inputs["geometry"]]
-    if not fitting or run.has("uplift", inputs):
-        return None
-    return next((one for one in fitting if run.has("uplift", {**inputs, "onto": one.key})), fitting[0])
 
 
 @typed

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from .._check import as_tensor
-from .._files import digest_file
+from .._files import digest_file, digest_value
 from .._rows import EPS, row_norms
 from ..cameras import undistort, undistort_labels
 from ..quant.maps import read_blocks
@@ -147,45 +147,6 @@ class ViewMaps:
         return straight * inside[..., None]
 
 
-class ChosenMaps(Sequence[Tensor]):
-    """Some of the maps.
-
-    Args:
-        maps: one per view.
-        chosen: positions among them; one may be repeated.
-        digests: what `digests` returns; None: unknown.
-    """
-
-    def __init__(self, maps: Maps, chosen: Sequence[int], digests: list[list[str]] | None = None) -> None:
-        self._maps, self._chosen, self._digests = maps, chosen, digests
-        self.files = [maps.files[i] for i in chosen] if maps.files else []
-
-    def __len__(self) -> int:
-        return len(self._chosen)
-
-    def __getitem__(self, i: int) -> Tensor:  # type: ignore[override]  # [h, w, D]
-        return self._maps[self._chosen[i]]
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """(h, w, D) of the first of all maps."""
-        return map_shape(self._maps)
-
-    def digests(self) -> list[list[str]] | None:
-        """As given."""
-        return self._digests
-
-    def grid(self, i: int, step: tuple[int, int] | None = None, samples: int = SAMPLES) -> Tensor:  # [n, D]
-        """`sample_grid(self[i], step, samples=samples)`."""
-        if hasattr(self._maps, "grid"):
-            return self._maps.grid(self._chosen[i], step, samples)  # type: ignore[no-any-return]
-        return sample_grid(self[i], step, samples=samples)
-
-    def blocks(self, i: int) -> Iterator[Tensor]:  # each [at most 32, w, D]
-        """The map a few rows at a time."""
-        return read_blocks(self._maps, self._chosen[i])
-
-
 class MapsInMemory(Sequence[Tensor]):
     """Maps that are tensors or arrays: they have no files, and their values are digested."""
 
@@ -260,3 +221,11 @@ def check_readable(maps: Maps, stage: str) -> None:
 
 def _own_digests(maps: Maps) -> list[list[str]] | None:
     return maps.digests() if hasattr(maps, "digests") else None  # type: ignore[no-any-return]
+
+
+def digest_changes(maps: Maps) -> str | None:
+    """SHA-256 of the lenses and masks that change the maps; None if there are none."""
+    if not isinstance(maps, ViewMaps):
+        return None
+    changes = [maps.describe(i) for i in range(len(maps))]
+    return digest_value(changes) if any(change is not None for change in changes) else None

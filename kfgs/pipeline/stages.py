@@ -223,6 +223,13 @@ def digest_shape(gaussians: Gaussians) -> str:
     return digest_tensors(*shape, *facts)
 
 
+def digest_cameras(cameras: Sequence[Camera]) -> str:
+    """SHA-256 of poses, intrinsics, sizes and near planes."""
+    rows = [tensor for camera in cameras for tensor in (camera.viewmat, camera.K)]
+    facts = torch.tensor([[camera.width, camera.height, camera.near] for camera in cameras], dtype=torch.float64)
+    return digest_tensors(*rows, facts, *(origin_tensors(cameras[0].origin) if cameras else ()))
+
+
 def digest_scene(scene: Scene, views: Sequence[int]) -> str:
     """SHA-256 of some views' poses, intrinsics, sizes and near planes, and of the sparse points.
 

@@ -56,7 +56,7 @@ LATENTS, SPLAT = "latents.safetensors", "splat.ply"
 RUN = ".run"  # hidden: its field has the Gaussians of the reach, too
 BESIDE = ("classes.json", "text.npy", "text.safetensors", "labels", "labels_scored", "masks")
 """Files and folders of a scene that belong to each of its blocks, too."""
-IDLE = ("device", "discard_sums")
+IDLE = ("device",)
 """Options of a fit that do not change what its field means."""
 LOOKED_AT = 8  # maps, to say how well given latents fit
 REACH = 3.0  # standard deviations: farther out, a Gaussian is below 1/255 of any pixel
