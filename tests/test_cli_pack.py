@@ -125,21 +125,6 @@ def test_scores_travel_in_the_file(place, tmp_path, capsys):
     assert out.read_bytes() == before
 
 
-def test_the_same_command_succeeds_again_and_ends_what_a_killed_one_began(place, tmp_path, capsys):
-    """A run that ended after its last step, but before it could say so, must not stand in the way of the next."""
-    words = ["pack", str(place / f"room{ENDING}"), str(tmp_path / "field")]
-    assert main(words) == 0
-    made = {path.name: path.read_bytes() for path in (tmp_path / "field").iterdir()}
-    waiting = tmp_path / "field" / ".kfgs-unfinished" / "waiting"
-    waiting.mkdir(parents=True)
-    (tmp_path / "field" / "field.json").rename(waiting / "field.json")
-    assert main(words) == 0, capsys.readouterr().err
-    assert {path.name: path.read_bytes() for path in (tmp_path / "field").iterdir()} == made
-    changed = SemanticField.load(tmp_path / "field")
-    SemanticField(**{**vars(changed), "info": {**changed.info, "scores": [1]}}).save(tmp_path / "field")
-    assert main(words) == 1  # the notes are others
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

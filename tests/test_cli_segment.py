@@ -53,37 +53,6 @@ def test_coco_of_the_views_of_a_split_has_their_photographs(desk, tmp_path, caps
         assert np.array_equal(read(tmp_path / "coco" / "images" / f"{stem}.png"), read(scene.image_paths[i])[..., :3])
 
 
-def test_a_folder_holds_the_results_of_one_run_and_files_of_others(desk, tmp_path, capsys):
-    assert segment(desk, tmp_path, "--split", "train", "--coco", "--pictures", "2") == 0
-    for name in ("predicted/mine.png", "coco/images/mine.png"):
-        Image.new("RGB", (4, 3)).save(tmp_path / name)  # kfgs did not draw these
-    (tmp_path / "sheets" / "notes.txt").write_text("mine")
-    assert (tmp_path / "scores.json").is_file()
-    capsys.readouterr()
-    assert segment(desk, tmp_path, "--path", "cameras", "--frames", 2, "--width", 32) == 0
-    said = capsys.readouterr().out
-    left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
-    drawn = {
-        f"{folder}/{path.name}" for folder in ("predicted", "colored") for path in (tmp_path / "colored").iterdir()
-    }
-    assert len(drawn) == 4
-    assert left == drawn | {"predicted/mine.png", "coco/images/mine.png", "sheets/notes.txt"}
-    assert not (tmp_path / "overlay").exists()
-    # of 6 views: predicted, colored and coco/images, 2 views x (sheets, overlay, features); annotations, scores, 2 plots
-    assert f"note: deleted {6 * 3 + 2 * 3 + 4} files of an earlier `kfgs segment` in {tmp_path}" in said
-    assert f"{tmp_path / 'colored'}  (2 files)" in said
-
-
-def test_a_run_that_fails_deletes_nothing_of_an_earlier_one(desk, tmp_path, capsys):
-    assert segment(desk, tmp_path, "--pictures", "1") == 0
-    before = {path for path in tmp_path.rglob("*") if path.is_file()}
-    stem = load_scene(desk / "scene").stem(load_scene(desk / "scene").views("train")[0])
-    Image.new("RGB", (4, 3)).save(tmp_path / "colored" / f"{stem}.png")
-    assert segment(desk, tmp_path, "--split", "train") == 1
-    assert stem in capsys.readouterr().err
-    assert before < {path for path in tmp_path.rglob("*") if path.is_file()}
-
-
 @pytest.mark.parametrize("path", ["orbit", "spiral", "cameras"])
 def test_a_path_is_segmented_with_the_colours_that_it_sees(desk, tmp_path, path, capsys):
     words = ["--path", path, "--frames", 3, "--width", 64, "--coco", "--color", desk / "my.ply"]
@@ -196,19 +165,6 @@ def test_a_path_through_the_cameras_of_a_scene_without_pictures(desk, tmp_path):
         f"path_{i:04d}.png" for i in range(4)
     ]
     assert read(tmp_path / "out" / "predicted" / "path_0000.png").shape == (24, 32)
-
-
-@pytest.mark.parametrize("name", ["annotations.json", "images/view_{}.png"])
-def test_files_of_others_are_not_replaced(desk, tmp_path, name, capsys):
-    scene = load_scene(desk / "scene")
-    name = name.replace("view_{}", scene.stem(scene.views("test")[0]))
-    place = tmp_path / "coco" / name
-    place.parent.mkdir(parents=True)
-    place.write_text("{}")
-    assert segment(desk, tmp_path, "--coco") == 1
-    assert str(place) in capsys.readouterr().err
-    assert place.read_text() == "{}"
-    assert not (tmp_path / "predicted").exists()
 
 
 PLACES = (

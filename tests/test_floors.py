@@ -17,7 +17,7 @@ ROOT = Path(kfgs.__file__).parent
 
 # From the bottom up. Places of one row never import each other; evaluation lies under pipeline, which scores with it.
 FLOORS = (
-    {"_card", "_names"},
+    {"_card", "_names", "_stems"},
     {"_check", "_compiling", "_files", "_interrupts", "_notes", "_progress", "_rows", "_tensors"},
     {"_typed", "_origin"},
     {"_arrays", "_torch_files", "gaussians", "cameras"},

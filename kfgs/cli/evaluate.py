@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from .._files import check_output, check_own, read_json, real_path
+from .._files import check_output, real_path
 from .files import is_field
 from .options import Classes, Flag, Given, GivenRule, Name, Positional, Several, Teacher
 from .output import say, wrote
@@ -126,14 +126,10 @@ def compare(
     """
     from .._check import check_range
     from ..pipeline.results import Results
-    from ..viz.pictures import check_pictures
 
     check_range("pictures", pictures, 0)
     if out is not None:
         check_output("out", out, "a folder")
-        older = out / "compare.json"
-        check_own(older, lambda path: all(one["protocol"] for one in read_json(path).values()), "kfgs compare")
-        check_own(out / "compare.txt", lambda _: older.is_file(), "kfgs compare")
     results = Results.read(runs, with_file)
     protocol = protocol or (results.first.report.protocol if results.first else "kfgs-pooled/1")
     results.check(protocol)
@@ -147,8 +143,6 @@ def compare(
             if results.new:
                 raise
             missing = [f"no pictures: {error}"]
-    if out is not None and draw and question is not None:
-        check_pictures(out, (view.stem for view in question.scored), "kfgs compare")
     compared = results.score(question, encode, draw=draw)
     written = [] if out is None else compared.write(out, question, encode, pictures)
     say("\n".join([str(compared), *(f"note: {note}" for note in (*missing, *compared.notes))]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from .._files import check_output, check_own, read_json, real_path
+from .._files import check_output, real_path
 
 # Heavy imports happen inside the functions, so that `kfgs --help` answers at once.
 
@@ -34,21 +34,6 @@ def check_target(name: str, target: Path, *sources: Path, endings: tuple[str, ..
     for source in sources:
         if real_path(target) == real_path(source):
             raise ValueError(f"{name}: expected another file than {source}, got the same; give another name")
-
-
-def check_splat(path: Path, comment: str, writer: str) -> None:
-    """Raise a FileExistsError unless a PLY file, and the names of its classes beside it, are absent or of `writer`.
-
-    Args:
-        path: the file, whose name the user did not give.
-        comment: what `writer` says in its header.
-        writer: "kfgs label".
-    """
-    from ..formats.ply import read_comments
-    from ..formats.sidecar import names_path
-
-    check_own(path, lambda path: comment in read_comments(path), writer)
-    check_own(names_path(path), lambda path: isinstance(read_json(path)["class_id"], dict), writer)
 
 
 def check_alone(name: str, given: object, why: str) -> None:

@@ -6,8 +6,8 @@ import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
-from .._files import atomic_folder, check_output, check_own, read_json, real_path
-from .files import check_alone, check_splat, is_field, open_splats
+from .._files import atomic_folder, check_output, real_path
+from .files import check_alone, is_field, open_splats
 from .options import Classes, Given, Positional, Rule, Teacher
 from .output import lengths_odd, say, say_counts, wrote
 from .text import ask
@@ -65,7 +65,6 @@ def select(
         raise ValueError(f"query, source: expected a class, then a file, got {query!r}, {str(source)!r}; swap them")
     if out is not None:
         check_output("out", out, "a folder")
-        _check_older(out)
     if threshold is not None:
         check_range("threshold", threshold, 0, 1)
     classes.check_images()
@@ -150,7 +149,6 @@ def label(
     from .._check import check_range
     from ..formats.ply import read_comments
     from ..pipeline import label_cloud, read_cloud, save_labelled
-    from ..pipeline.apply import COMMENTS
 
     for name, value, other, needed in (
         ("threshold", threshold, "query", query),
@@ -163,8 +161,6 @@ def label(
         check_range("distance", distance, 0, closed=(False, False))
     if cloud is not None and real_path(cloud) in {real_path(out / name) for name in ("gaussians.ply", "cloud.ply")}:
         raise ValueError(f"out: expected another folder than that of --cloud, got {out}; {cloud} would be overwritten")
-    for name, comment in list(COMMENTS.items())[: 1 if cloud is None else 2]:
-        check_splat(out / name, comment, "kfgs label")
     loaded = classes.open_field("field", field)
     label_set = classes.of_field(loaded)
     carried = None if cloud is None else read_cloud(cloud)
@@ -213,18 +209,6 @@ def _times_as_long(things: list[Any]) -> list[str]:
     """What is said of parts that may be two things in one."""
     odd = lengths_odd([2 * float(thing.box.half.max()) for thing in things])
     return ["" if one is None else f" ? ({one:.1f} times as long as the median: two in one?)" for one in odd]
-
-
-def _check_older(out: Path) -> None:
-    """Raise a FileExistsError if a folder has files of the names that `select` writes, but not from an older selection."""
-    from ..viz.pictures import check_pictures
-
-    facts = out / "selection.json"
-    check_own(facts, lambda path: "parts" in read_json(path) and bool(read_json(path)["query"]), "kfgs select")
-    check_splat(out / "selection.ply", "written by kfgs", "kfgs select")
-    check_pictures(out, ["parts"], "kfgs select")
-    if not facts.is_file():
-        check_own(out / "selection.ply", lambda _: False, "kfgs select")
 
 
 def _save(folder: Path, query: str, cloud: Any, found: Any, things: list[Any]) -> None:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .._files import check_output, check_own, is_own, read_json
+from .._files import check_output, read_json
 from .files import check_alone, open_field
 from .options import Classes, Flag, Given, GivenWalk, Positional, Rule, Walk
 from .output import say, wrote
@@ -51,7 +49,7 @@ def segment(
     Args:
         field: The folder that `kfgs fit` wrote (RUN/field).
         out: Folder for label maps (predicted/ has class numbers, colored/ shows them in colours), pictures and scores.json. It
-            holds the results of one run: those of an earlier run are replaced or deleted, files of other programs stay.
+            holds the results; files of the same names are replaced.
         split: Which views: train, test, all, or another split that SCENE/split.json names; by default test.
         path: Segment the cameras of a path instead of the views of a split: orbit, spiral or cameras, as in `kfgs render`; or a
             file or folder with cameras of your own (transforms.json, COLMAP model, scene; without pictures, too): exactly
@@ -70,9 +68,8 @@ def segment(
     from ..fields import recall_scene
     from ..pipeline import score_scene, segment_scene, true_labels, write_coco, write_report
     from ..pipeline.apply import SEGMENTED
-    from ..pipeline.label_pictures import check_coco, picture_names
+    from ..pipeline.label_pictures import picture_names
     from ..viz import plot_iou, plot_largest_confusions
-    from ..viz.pictures import check_pictures
 
     check_output("out", out, "a folder")
     if path is not None:
@@ -83,8 +80,7 @@ def segment(
         walk = check_walk(path, frames, width)
         if isinstance(walk, list):
             picture_names(walk, "path")
-        with _one_run(out) as written:
-            written += _segment_path(field, out, walk, frames, width, color, coco, rule, classes)
+        wrote(_segment_path(field, out, walk, frames, width, color, coco, rule, classes))
         return
     split, pictures = "test" if split is None else split, PICTURES if pictures is None else pictures
     alone: dict[str, object] = {"frames": frames, "width": width, "color": color}
@@ -111,75 +107,33 @@ def segment(
     if features is not None and not features.is_dir():
         raise ValueError(f"features: expected a folder of feature maps, got {features}, which is none; name another")
     maps = features or (scene / "features" if (scene / "features").is_dir() else None)
-    if truth:
-        check_own(out / "scores.json", _is_result, "kfgs segment")
-        check_pictures(out, ("confusion", "iou"), "kfgs segment")
+    found = segment_scene(
+        loaded_field,
+        loaded,
+        label_set,
+        out,
+        split=split,
+        rule=rule,
+        pictures=pictures,
+        truth=truth,
+        maps=maps,
+        progress=True,
+    )
+    written = [out / name for name in SEGMENTED]
     if coco:
-        check_coco(out, (loaded.stem(i) for i in loaded.views(split)))
-    with _one_run(out) as written:
-        found = segment_scene(
-            loaded_field,
-            loaded,
-            label_set,
-            out,
-            split=split,
-            rule=rule,
-            pictures=pictures,
-            truth=truth,
-            maps=maps,
-            progress=True,
-        )
-        written += [out / name for name in SEGMENTED]
-        if coco:
-            views = {loaded.stem(i): i for i in loaded.views(split)}
-            written.append(write_coco(out, found, label_set.names, lambda stem: loaded.image(views[stem])))
-        if truth:
-            scores = score_scene(found, truth, label_set)
-            write_report(out / "scores.json", segmentation=scores, truth=str(folder), field=str(field), rule=rule)
-            picture = out / "confusion.png"
-            plot_largest_confusions(scores.confusion, list(label_set.names), picture, misses=scores.misses)
-            plot_iou(scores.iou, list(label_set.names), out / "iou.png")
-            written += [out / name for name in ("scores.json", "confusion.png", "iou.png")]
-            say(str(scores))
-        else:
-            say(f"note: no label pictures of split {split!r} to score against")
-
-
-@contextmanager
-def _one_run(out: Path) -> Iterator[list[Path]]:
-    """Name what a run writes to a folder (the list that it fills), and delete what an earlier run left there.
-
-    If the block fails, nothing is deleted.
-    """
-    from ..pipeline.apply import SEGMENTED
-    from ..pipeline.label_pictures import COCO
-
-    folders = [folder for folder in (out / name for name in (*SEGMENTED, COCO)) if not folder.is_symlink()]
-    places = [place for folder in folders for place in folder.rglob("*")]
-    places += [out / name for name in ("scores.json", "confusion.png", "iou.png")]
-    numbers = {place: place.stat().st_ino for place in places if is_own(place, _is_result)}
-    written: list[Path] = []
-    yield written
-    # a file that was replaced has another number
-    older = [file for file, number in numbers.items() if file.stat().st_ino == number]
-    for file in older:
-        file.unlink()
-    for folder in sorted({file.parent for file in older}, reverse=True):
-        with suppress(OSError):  # it is not empty
-            folder.rmdir()
-    if older:
-        say(f"note: deleted {len(older)} files of an earlier `kfgs segment` in {out}")
+        views = {loaded.stem(i): i for i in loaded.views(split)}
+        written.append(write_coco(out, found, label_set.names, lambda stem: loaded.image(views[stem])))
+    if truth:
+        scores = score_scene(found, truth, label_set)
+        write_report(out / "scores.json", segmentation=scores, truth=str(folder), field=str(field), rule=rule)
+        picture = out / "confusion.png"
+        plot_largest_confusions(scores.confusion, list(label_set.names), picture, misses=scores.misses)
+        plot_iou(scores.iou, list(label_set.names), out / "iou.png")
+        written += [out / name for name in ("scores.json", "confusion.png", "iou.png")]
+        say(str(scores))
+    else:
+        say(f"note: no label pictures of split {split!r} to score against")
     wrote([path for path in written if path.exists()])
-
-
-def _is_result(file: Path) -> bool:
-    """Whether `kfgs segment` wrote a file."""
-    from ..evaluation.datasets.coco import is_ours
-    from ..viz.pictures import is_drawn
-
-    if file.name == "annotations.json":
-        return is_ours(file)
-    return bool(read_json(file)["segmentation"]) if file.name == "scores.json" else is_drawn(file)
 
 
 def _segment_path(
@@ -195,7 +149,6 @@ def _segment_path(
 ) -> list[Path]:
     """Segment the cameras of a path, and with --coco render the colours that they see; name what was written."""
     from ..pipeline import segment_cameras, write_coco
-    from ..pipeline.label_pictures import check_coco
     from ..scenes import file_stem
     from ..viz import show_cloud
 
@@ -209,8 +162,6 @@ def _segment_path(
     walk: dict[str, Camera] = {
         file_stem(camera.name): camera for camera in walk_of(path, loaded.gaussians, cameras, frames, width)
     }
-    if coco:
-        check_coco(out, walk)
     found = segment_cameras(loaded, list(walk.values()), label_set, out, rule=rule, progress=True)
     written = [out / "predicted", out / "colored"]
     if coco:

@@ -8,9 +8,9 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any, Literal
 
-from .._files import Names, check_output, check_own, read_json, real_path
+from .._files import Names, check_output, real_path
 from .edit_syntax import Edits, check_parts, classes_of, inserted_files, parse_edits
-from .files import check_alone, check_splat, check_target, open_splats
+from .files import check_alone, check_target, open_splats
 from .options import Classes, Flag, Given, GivenBy, Positional, SceneOption, Several
 from .output import say, say_counts, say_lost, wrote
 
@@ -121,13 +121,10 @@ def edit(
     from ..formats import write_splats
     from ..labels.edits import EditList
     from ..pipeline.compare import views_of_edits, write_comparison
-    from ..viz.pictures import check_pictures
 
     check_target("out", out)
     saved = _edits_beside(out, replay)
     check_whole("pictures", pictures, 0)
-    if scene.scene is not None and pictures:
-        check_pictures(out.parent, [out.name], "kfgs edit")
     if scene.scene is None:
         check_alone("views", ", ".join(views) or None, "without --scene, whose views they are")
         scene.check_images()
@@ -236,7 +233,6 @@ def _convert_by_class(source: Path, folder: Path) -> None:
     extra = {name: values for name, values in splats.extra.items() if name != SCORE}
     parts = {_file_name(label, splats.classes): part for label, part in splats.replace(extra=extra).by_class().items()}
     for name in parts:
-        check_splat(folder / name, "written by kfgs", "kfgs convert")
         if real_path(folder / name) == real_path(source):
             raise ValueError(
                 f"target: expected another folder than that of {source}, got {folder}; it would be overwritten"
@@ -273,11 +269,10 @@ def _apply(edits: Any, splats: Any, asked: list[str]) -> Any:
 
 def _edits_beside(out: Path, replay: Path | None) -> Path:
     """The file for the edits of a splat file; an error if it is the file to replay, another file, or cannot be written."""
-    from ..labels.edits.edit_list import FORMAT, edits_path
+    from ..labels.edits.edit_list import edits_path
 
     saved = edits_path(out)
     check_output("out", saved, "a file")
-    check_own(saved, lambda path: read_json(path)["format"] == FORMAT, "kfgs edit")
     if replay is not None and real_path(replay) == real_path(saved):
         raise ValueError(
             f"replay: expected another file than {saved}, where the edits behind {out} are saved, got the same; give --out "

@@ -86,13 +86,10 @@ def _text_of_examples(out: Path, field: Any, examples: dict[str, Any]) -> None:
     """Write a table of examples and, if the photographs of their views are at hand, a picture of what was shown."""
     from ..fields import label_set_from_examples
     from ..viz import draw_examples, save_picture
-    from ..viz.pictures import check_pictures
     from ..viz.shows import Photos
 
     scene = Classes().scene_of(field)
     drawn = scene is not None and any(hasattr(one, "view") for shown in examples.values() for one in shown)
-    if drawn:
-        check_pictures(out.parent, [out.name], "kfgs text")
     made = label_set_from_examples(field, examples)
     made.save(out)
     written = [out]

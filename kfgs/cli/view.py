@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from .._files import check_output, check_own, real_path
+from .._files import check_output, real_path
 from .files import check_alone, check_joined, is_field, open_splats
 from .options import Classes, Given, Positional, Teacher
 from .output import say, wrote
@@ -74,7 +74,6 @@ def view(
     check_joined("source", source)
     if where in ("html", "picture") or out.exists():  # the others write only when asked
         check_output("out", out, "a folder")
-        _check_older(out, place)
     read = functools.partial(_read, source, color, ask, distance, out, classes, teacher)
     if place == "browser":
         _serve(read, source, out, classes, display)
@@ -155,17 +154,6 @@ def _viewer(state: Any, source: Path, out: Path, classes: Classes, display: Disp
     state.set_show(display.show or state.first_show)
     scene = classes.scene_of(getattr(state.meaning, "field", None))
     return Viewer(state, ExploreOptions(out=out), title=_title(source), scene=scene)
-
-
-def _check_older(out: Path, place: Where) -> None:
-    """Raise a FileExistsError if a file that will be written is there, but not from `kfgs view`."""
-    from ..viewer.document import ROOT
-    from ..viz.pictures import check_pictures
-
-    if place == "html":
-        check_own(out / "view.html", lambda path: ROOT in path.read_text(encoding="utf-8"), "kfgs view")
-    if place == "picture":
-        check_pictures(out, ["view"], "kfgs view")
 
 
 def _title(source: Path) -> str:

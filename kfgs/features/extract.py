@@ -16,9 +16,7 @@ from .._check import one_line
 from .._files import (
     as_path,
     bytes_in_words,
-    check_inside,
     digest_file,
-    finish_writing,
     locked,
     seconds_in_words,
 )
@@ -79,13 +77,10 @@ def extract_features(
             f"part: expected letters and digits, and no overwrite, which would delete the maps of other parts, got {part!r}, "
             f"overwrite={overwrite}; use another word, or another folder"
         )
-    check_inside(folder, (Path(picture.stem).parent for picture in chosen))
     identity = identify(teacher)
     if folder.is_dir():  # one that is refused stays as it is, without a lock file
         check_maps(folder, identity, chosen, overwrite=overwrite, part=part)
     with locked(folder, LOCK if part is None else f".features.part-{part}.lock"):
-        for place in {folder, *(map_file(folder, picture.stem).parent for picture in chosen)}:
-            finish_writing(place)  # if all maps are there, nothing is written that would sweep
         writer = MapWriter(folder, identity, chosen, overwrite=overwrite, part=part)
         digests = {picture.stem: digest_file(picture.path) for picture in chosen}
         doubts = {stem: writer.doubt(stem, digest) for stem, digest in digests.items()}

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from .._files import digest_file, real_path
-from .._files.paths import noted_path
 from .._typed import typed
 from ..labels import LabelSet, load_label_set
 
@@ -112,3 +111,8 @@ def _is_of(files: list[Path], channels: int) -> bool:
 
 def _relative(path: Path, field: Path) -> str:
     return Path(os.path.relpath(real_path(path), real_path(field))).as_posix()
+
+
+def noted_path(place: Path, noted: str) -> Path:
+    """The absolute form of a path that is relative to a folder. Links are resolved first: it is noted of the real folder."""
+    return Path(os.path.normpath(real_path(place) / noted))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,7 @@ from torch import Tensor
 
 from .._arrays import read_safetensors
 from .._check import ORIGIN, as_origin, check_choice
-from .._files import as_path, atomic_folder, atomic_path, current_file, digest_file, open_current, read_json, write_json
-from .._files.fields import DESCRIPTION as DESCRIPTION
-from .._files.fields import NUMBERS as TENSORS
-from .._files.fields import SUFFIX as SUFFIX
-from .._files.fields import describes_field as describes_field
+from .._files import as_path, atomic_folder, atomic_path, digest_file, read_json, write_json
 from .._origin import Origin
 from .._tensors import save_tensors
 from ..cameras import Camera
@@ -31,8 +27,17 @@ from .parts import check_parts
 from .precision import PRECISIONS, Rounding
 from .remembered import check_notes, rebased, recall_classes
 
+DESCRIPTION, TENSORS = "field.json", "field.safetensors"
+"""The files in the folder of a field; the first one holds the digest of the second."""
+SUFFIX = ".kfgs.safetensors"
+"""Of a field in one file."""
 FORMAT, VERSIONS = "kfgs.semantic_field", (1, 2, 3)
 """Version 2 may hold linear latents, fused answers and cameras; version 3 the classes."""
+
+
+def describes_field(folder: Path) -> bool:
+    """Whether a folder is that of a field."""
+    return (folder / DESCRIPTION).is_file()
 
 
 def find_field(path: str | Path) -> Path | None:
@@ -46,7 +51,7 @@ def find_field(path: str | Path) -> Path | None:
 
 def field_data(path: Path) -> Path:
     """The file with the numbers of a field: in its folder, or the packed file."""
-    return current_file(path, TENSORS) if path.is_dir() else path
+    return path / TENSORS if path.is_dir() else path
 
 
 def save_field(path: str | Path, parts: Mapping[str, Any], precision: str | Rounding | None = None) -> None:
@@ -131,7 +136,7 @@ def read_description(path: Path) -> dict[str, Any]:
         FileNotFoundError: if there is no field.
         ValueError: if the file is damaged, or of another format or version.
     """
-    return open_current(path, lambda find: _read_description(path, find(DESCRIPTION)))
+    return _read_description(path, path / DESCRIPTION)
 
 
 def _read_description(path: Path, file: Path) -> dict[str, Any]:
@@ -154,17 +159,13 @@ def _read_description(path: Path, file: Path) -> dict[str, Any]:
 
 def _read_folder(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors and description of a field folder."""
-
-    def read(find: Callable[[str], Path]) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        description, file = _read_description(path, find(DESCRIPTION)), find(TENSORS)
-        if not file.is_file() or digest_file(file) != description.get("sha256"):
-            raise ValueError(
-                f"{path}: expected {TENSORS} as it was saved, got {'another' if file.is_file() else 'none'}; copy the whole "
-                "folder again, or fit the field again"
-            )
-        return read_safetensors(file, "the numbers of a field", "fit it again")[0], description
-
-    return open_current(path, read)
+    description, file = read_description(path), path / TENSORS
+    if not file.is_file() or digest_file(file) != description.get("sha256"):
+        raise ValueError(
+            f"{path}: expected {TENSORS} as it was saved, got {'another' if file.is_file() else 'none'}; copy the whole "
+            "folder again, or fit the field again"
+        )
+    return read_safetensors(file, "the numbers of a field", "fit it again")[0], description
 
 
 def _peek(path: Path) -> dict[str, Any] | None:

@@ -15,8 +15,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .._files import HIDDEN, atomic_folder, atomic_path, open_current
+from .._files import atomic_folder, atomic_path
 from ..gaussians import Gaussians
 from .order import morton_order
 from .palette import Palette, fit_codebook, fit_palette, nearest_codes
@@ -69,11 +67,7 @@ def read(path: Path) -> SplatFile:
     Raises:
         ValueError: if it is neither, a file is missing or damaged, or sizes and indices disagree.
     """
-    return open_current(path if path.is_dir() else path.parent, partial(_read, path))
-
-
-def _read(path: Path, find: Callable[[str], Path]) -> SplatFile:
-    with SogFiles(path, find) as files:
+    with SogFiles(path) as files:
         meta = parse_meta(path, files.read_meta(), files.size())
         n = meta.gaussians
         low, high = (_pixels(files, name, n)[:, :3].astype(np.float64) for name in meta.files["means"])
@@ -281,8 +275,7 @@ def _check_folder(path: Path) -> None:
         return
     others = [] if path.is_dir() else [path.name]
     if path.is_dir():
-        known = (META, HIDDEN)
-        others = [file.name for file in path.iterdir() if file.name not in known and file.suffix != ".webp"]
+        others = [file.name for file in path.iterdir() if file.name != META and file.suffix != ".webp"]
     if others or path.name == META:
         raise ValueError(
             f"path: expected a new folder, or one with a SOG scene alone, got {path} with {', '.join(others[:3])}; choose "

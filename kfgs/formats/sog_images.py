@@ -7,7 +7,6 @@ import math
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +27,10 @@ class SogFiles:
 
     Args:
         path: a zip file, a folder, or the `meta.json` in it.
-        find: gives the path of a file in the folder.
     """
 
-    def __init__(self, path: Path, find: Callable[[str], Path]) -> None:
-        self.path, self._find = path, find
+    def __init__(self, path: Path) -> None:
+        self.path = path
         self._zip: zipfile.ZipFile | None = None
         self._folder = path if path.is_dir() else path.parent
         if path.is_file() and path.name != META:
@@ -76,7 +74,7 @@ class SogFiles:
         return data
 
     def _read_folder(self, name: str, limit: int) -> bytes:
-        file = self._find(name)
+        file = self._folder / name
         if not file.is_file():
             raise ValueError(f"{self.path}: expected {name!r} in the folder, got no such file; copy all of the scene")
         with file.open("rb") as stream:

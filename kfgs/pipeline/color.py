@@ -24,7 +24,6 @@ from ..fields import ColorLoss, FieldConfig, FieldFit, GaussianParams, fit_field
 from ..formats import write_splats
 from ..gaussians import Gaussians
 from ..scenes import Scene
-from .color_file import is_saved, may_replace, stage_gaussians, what_is
 from .points import with_points
 from .stages import (
     Run,
@@ -36,7 +35,7 @@ from .stages import (
     is_whole,
     stage_generator,
 )
-from .train import check_scene, field_stage, training_device, with_extent
+from .train import check_scene, field_stage, stage_params, training_device, with_extent
 
 
 @dataclass(frozen=True)
@@ -210,9 +209,8 @@ def fit_color(
 
     Args:
         scene: posed, undistorted views with their sparse points; without points, some are triangulated first.
-        folder: the run folder; `folder/color.ply` receives the Gaussians, in place of those of an earlier fit with other
-            options. Its stage stays in the folder, so the earlier call brings them back at once. Any other `color.ply`,
-            and one with labels, is never replaced.
+        folder: the run folder; `folder/color.ply` receives the Gaussians, in place of those of an earlier fit.
+            Its stage stays in the folder, so the earlier call brings them back at once.
         config: the schedule; that of 3DGS when not given.
         report: receives one line per stage.
         progress: True shows a bar; a function receives the rows of the history as they appear.
@@ -220,8 +218,7 @@ def fit_color(
 
     Raises:
         ValueError: if a camera has distortion, there is no such device, the scene's points are out of sight, the
-            split has no views, `folder/color.ply` is a file that no fit in this folder wrote, or another process works in
-            `folder`.
+            split has no views, or another process works in `folder`.
     """
     config, progress = config or ColorConfig.paper(), as_progress(progress)
     check_scene(scene, scene.views(config.split))
@@ -237,34 +234,13 @@ def make_color(
     """The colour stage of a run, and the PLY file of its Gaussians.
 
     Args:
-        overwrite: replace the `color.ply` of another colour stage of the run; any other file there is an error, before
-            training. If False, a file that is there stays.
+        overwrite: replace a `color.ply` that is there.
     """
     path = run.folder / "color.ply"
-
-    def check() -> None:
-        if overwrite and not may_replace(run, path):
-            raise ValueError(
-                f"{path}: expected no file, or what an earlier colour fit of {run.folder} wrote, found another file (or "
-                "labels added to it); move it away, or name another run folder (--out)"
-            )
-
-    params = _color_stage(run, scene, scene.views(config.split), config, device, progress, check)
+    params = _color_stage(run, scene, scene.views(config.split), config, device, progress)
     result = ColorResult(params.activated().detach(), path, run.stages)
-
-    def write() -> None:
-        if is_saved(path, result.gaussians):
-            return
-        if os.path.lexists(path):
-            if not overwrite:
-                here = f"the {len(result.gaussians):,} Gaussians of the field are in {result.stages[-1].folder}"
-                run.say(f"color.ply: left as it is; it {what_is(path)}; {here}")
-                return
-            check()  # it may have come during training
-            run.say(f"color.ply: replaced; Gaussians that were trained in {run.folder} before stay in its stages")
+    if overwrite or not os.path.lexists(path):
         write_splats(path, result.gaussians)
-
-    write()
     return result
 
 
@@ -286,7 +262,7 @@ def find_color(run: Run, scene: Scene, config: ColorConfig) -> tuple[Gaussians, 
     if best is None or best[0] <= config.field.steps:
         return None
     run.say(f"geometry: the colours of {best[0]:,} steps that are in {run.folder}")
-    return stage_gaussians(best[1]), best[0]
+    return stage_params(best[1]).activated().detach(), best[0]
 
 
 def _whole_stages(run: Run) -> list[Path]:
@@ -316,13 +292,11 @@ def _color_stage(
     config: ColorConfig,
     device: torch.device,
     progress: Progress,
-    check: Callable[[], None],
 ) -> GaussianParams:
-    """The stage's parameters; `check` is called before training, but not for a stage that is finished."""
+    """The stage's parameters."""
     inputs = _inputs(run, scene, views, config)
 
     def train(checkpoint: Path) -> FieldFit:
-        check()
         generator = stage_generator(config.seed, "color")
         start = GaussianParams.from_points(
             scene.points,

@@ -16,7 +16,7 @@ from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..splat import rasterize
 from ..viz import save_picture
-from ..viz.pictures import check_pictures, picture_grid
+from ..viz.pictures import picture_grid
 
 PREVIEW = 96  # pixels: width of the renderings that choose the viewpoints
 VISIBLE = 8 / 255  # a pixel has changed if a channel changed by more than this
@@ -119,11 +119,10 @@ class PhotoPictures:
     """A callback for `score_views` that draws some renderings side by side with their photographs."""
 
     def __init__(self, folder: Path, stems: Sequence[str], count: int) -> None:
-        """Draw `count` of the views, evenly spread, into `folder/<stem>.png`; see `check_pictures` for what is refused."""
+        """Draw `count` of the views, evenly spread, into `folder/<stem>.png`."""
         self.folder, self.written = folder, list[Path]()
         places = np.linspace(0, len(stems) - 1, min(count, len(stems))).round().astype(int)
         self._chosen = {stems[i] for i in places}
-        check_pictures(folder.parent, (f"{folder.name}/{stem}" for stem in self._chosen), "kfgs color")
 
     def __call__(self, stem: str, rendered: Tensor, taken: Tensor) -> None:
         """Draw the view if it was chosen."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from .._check import ORIGIN
-from .._files import check_output, check_own
+from .._files import check_output
 from .._origin import recounted
 from ..evaluation import LabelSet, load_label_set, score_recolor, score_removal, score_surface, score_views
 from ..evaluation.datasets.surface_points import load_surface_points
@@ -39,9 +39,6 @@ from .run_report import write_run_report
 
 REMOVED, PAINTED, PAINT = "chair", "plant", "#c04040"  # the edits of the paper's Figures 5 and 4
 TITLES = ("before", "after")
-FOLDERS = ("scene", "run", "segmentation")
-SPLATS, PICTURES = ("gaussians", "surface", "color", "removed", "recolored"), ("removed", "recolored")
-FILES = (*(f"{name}.ply" for name in SPLATS), *(f"{name}.png" for name in PICTURES), "scores.json")
 
 
 def run(
@@ -61,11 +58,8 @@ def run(
         report: called with one line per step.
         progress: show progress bars.
     """
-    out, say = check_output("out", out, "a folder", inside=FOLDERS), report or (lambda text: None)
+    out, say = check_output("out", out, "a folder"), report or (lambda text: None)
     config = config or FitConfig.cpu()
-    if not (out / "scene" / "toy.json").is_file():  # then no demo was here
-        for name in FILES:
-            check_own(out / name, lambda _: False, "kfgs demo")
     say(
         "1. A room. The demo makes a small furnished room, so that the truth is known exactly: photos, cameras, and for each "
         "photo what a 2-D network would say about its pixels, with the errors of such networks."

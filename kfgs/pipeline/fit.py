@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from .._card import short_repr
-from .._files import check_output, folded_name, is_own, read_json, write_json
+from .._files import check_output, folded_name, read_json, write_json
 from .._progress import Progress, as_progress
 from .._typed import typed
 from ..cameras import Camera
@@ -42,7 +42,6 @@ from ..quant import (
     quantize_maps,
 )
 from ..scenes import Scene
-from ..viz.pictures import is_drawn
 from .color import ColorConfig
 from .config import FitConfig
 from .fuse import answers_stage, find_geometry, uplift_stage
@@ -264,14 +263,8 @@ def replace_field(folder: Path, field: SemanticField) -> None:
     """Write the field of a run folder in one step. The report of an older one is deleted first: a kill leaves no wrong report."""
     if not holds_field(folder / FIELD, vars(field)):
         for name in (REPORT, *PICTURES):
-            if is_own(folder / name, is_report if name == REPORT else is_drawn):
-                (folder / name).unlink()
+            (folder / name).unlink(missing_ok=True)
         field.save(folder / FIELD)
-
-
-def is_report(path: Path) -> bool:
-    """Whether a file is a page of `write_run_report`."""
-    return TITLE in path.read_text(encoding="utf-8")
 
 
 def _facts(job: _Job, field: SemanticField, path: Path, teacher: Any) -> dict[str, Any]:

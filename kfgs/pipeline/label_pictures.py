@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from unicodedata import category
 
 from torch import Tensor
 from tqdm import tqdm
 
-from .._files import HIDDEN, as_path, check_output, check_own, file_stem
+from .._files import as_path, check_output, file_stem
 from .._typed import typed
 from ..cameras import Camera
-from ..evaluation.datasets.coco import is_ours, save_coco
+from ..evaluation.datasets.coco import save_coco
 from ..fields import Rule, SemanticField
 from ..labels import LabelSet
 from ..viz import save_picture
-from ..viz.pictures import Array, check_pictures
-from .apply import SEGMENTED, check_classes, save_colored_labels, save_label_map
+from ..viz.pictures import Array
+from .apply import check_classes, save_colored_labels, save_label_map
 
 COCO = "coco"  # the folder with annotations.json and images/
 CONTROL = ("Cc", "Cs")  # Unicode's categories of control characters and of halves of a character
@@ -54,9 +54,7 @@ def segment_cameras(
             than a byte can hold.
     """
     out, names = as_path(out), picture_names(cameras)
-    for folder in SEGMENTED[:2]:
-        check_output("out", out / folder, "a folder")
-        check_pictures(out, (f"{folder}/{name}" for name in names), "kfgs segment")
+    check_output("out", out, "a folder")
     check_classes(field, classes)
     found: dict[str, Tensor] = {}
     for name, camera in zip(names, tqdm(cameras, desc="segment", unit="view", disable=not progress), strict=True):
@@ -70,7 +68,7 @@ def picture_names(cameras: Sequence[Camera], argument: str = "cameras") -> list[
     """The names of the cameras without suffixes, as those of pictures in an output folder.
 
     Raises:
-        ValueError: if one is missing, repeated, or cannot be a picture's name: absolute, with "..", in kfgs's hidden folder,
+        ValueError: if one is missing, repeated, or cannot be a picture's name: absolute, with "..",
             with control characters, too long, or that of a folder that another one needs. It names `argument`.
     """
     names = [file_stem(camera.name or "") for camera in cameras]
@@ -81,20 +79,13 @@ def picture_names(cameras: Sequence[Camera], argument: str = "cameras") -> list[
     folders = {str(folder) for name in names for folder in PurePosixPath(name).parents}
     for name in names:
         parts = PurePosixPath(f"{name}.png").parts
-        odd = name.startswith("/") or {"..", HIDDEN} & {*parts} or any(category(one) in CONTROL for one in name)
+        odd = name.startswith("/") or ".." in parts or any(category(one) in CONTROL for one in name)
         if odd or f"{name}.png" in folders or max(len(os.fsencode(part)) for part in parts) > LONGEST:
             raise ValueError(
                 f"{argument}: expected cameras whose names can be those of pictures, got {name!r:.120}; rename it (no folder of "
-                f"this name with .png, no '..', no {HIDDEN}, no control characters, at most {LONGEST} bytes)"
+                f"this name with .png, no '..', no control characters, at most {LONGEST} bytes)"
             )
     return names
-
-
-def check_coco(out: Path, names: Iterable[str]) -> None:
-    """Check before the work that `write_coco` may write there."""
-    check_output("out", out / COCO, "a folder")
-    check_pictures(out, (f"{COCO}/images/{name}" for name in names), "kfgs segment")
-    check_own(out / COCO / "annotations.json", is_ours, "kfgs segment")
 
 
 @typed
@@ -119,7 +110,7 @@ def write_coco(
         The folder `coco`.
     """
     folder = as_path(out) / COCO
-    check_coco(as_path(out), labels)
+    check_output("out", folder, "a folder")
     for name in labels:
         if picture is not None:
             save_picture(folder / "images" / f"{name}.png", picture(name))

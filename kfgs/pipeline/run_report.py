@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from .._files import atomic_path, bytes_in_words, check_own, current_file, real_path, seconds_in_words
+from .._files import atomic_path, bytes_in_words, real_path, seconds_in_words
 from .._typed import typed
 from ..fields import SemanticField
 from ..fields.store import DESCRIPTION, TENSORS
@@ -21,11 +21,11 @@ from ..labels import LabelSet
 from ..scenes import Scene
 from ..viz import overlay_labels, save_picture
 from ..viz.field_colors import feature_colors
-from ..viz.pictures import as_bytes, check_pictures, legend_strip, picture_grid, resize_photo
+from ..viz.pictures import as_bytes, legend_strip, picture_grid, resize_photo
 from ..viz.region_names import write_region_names
 from .apply import write_training_pictures
 from .config import FitConfig
-from .fit import PICTURES, REPORT, TITLE, FitResult, is_report
+from .fit import REPORT, TITLE, FitResult
 
 WIDTH = 400  # pixels of a picture
 STYLE = """
@@ -73,12 +73,6 @@ def write_preview(
     return path
 
 
-def check_report(folder: Path) -> None:
-    """Raise a FileExistsError if a run folder has files of the names that `write_run_report` writes, but not from it."""
-    check_pictures(folder, [Path(name).stem for name in PICTURES], "kfgs fit")
-    check_own(folder / REPORT, is_report, "kfgs fit")
-
-
 @typed
 def write_run_report(
     result: FitResult,
@@ -101,7 +95,7 @@ def write_run_report(
     preview = write_preview(result.folder / "preview.png", result.field, scene, config.split)
     training = write_training_pictures(result)
     field, info = result.field, result.field.info
-    size = sum(current_file(result.field_path, name).stat().st_size for name in (TENSORS, DESCRIPTION))
+    size = sum((result.field_path / name).stat().st_size for name in (TENSORS, DESCRIPTION))
     teacher = info.get("teacher") or {}
     facts = {
         "scene": f"{scene.folder or 'in memory'}: {len(scene)} views, {len(info.get('views', ()))} of them used",

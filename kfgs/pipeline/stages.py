@@ -23,10 +23,8 @@ from .._arrays import reading
 from .._compiling import say_compiling
 from .._files import (
     atomic_folder,
-    check_inside,
     digest_file,
     digest_value,
-    finish_writing,
     locked,
     read_json,
     real_path,
@@ -125,18 +123,8 @@ class Run:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep other processes from working in the folder, and finish what a killed one began to write there.
-
-        Raises:
-            ValueError: if one works there already; the message says which. Also if a folder in it is a link. Nothing is
-                written then.
-        """
-        check_inside(
-            self.folder, (place.relative_to(self.folder) for name in WRITTEN for place in self.folder.glob(name))
-        )
+        """Keep other processes from working in the folder; a ValueError if one works there already."""
         with locked(self.folder, LOCK):
-            for place in (self.folder, self.folder / "field"):  # a run that finds all it needs writes neither
-                finish_writing(place)
             yield
 
     def has(self, name: str, inputs: dict[str, Any]) -> bool:

@@ -12,10 +12,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from .._files import check_output, locked, parse_json
+from .._files import check_output, locked
 from .driver import Engine, Event, Failure, Plan, Task, drive, limit
 from .options import BatchOptions, Job
-from .places import WRITER, Place, StoredPlace, begun_at
+from .places import Place, StoredPlace, begun_at
 from .scene_list import SceneEntry, as_entries, check_apart, is_url
 
 STAGES = ("scene", "features", "fit", "segment", "evaluate")
@@ -188,8 +188,7 @@ def check_runs(entries: Sequence[SceneEntry], out: str | Path) -> Path | None:
     check_apart(entries, out)
     if is_url(str(out)):
         return None
-    written = [f"{entry.name}/{folder}" for entry in entries for folder in WRITTEN]
-    return check_output("out", out, "a folder", inside=written).absolute()
+    return check_output("out", out, "a folder").absolute()
 
 
 def _plan(job: Job) -> Generator[tuple[str, list[Task]], list[Any], Any]:
@@ -225,11 +224,6 @@ class _Record:
 
     def begin(self, retry_failed: bool) -> bool:
         """Read what an earlier batch left; whether its failure is to be forgotten."""
-        self.place.check_own(STATE, lambda text: parse_json(text)["format"] == FORMAT)
-        self.place.check_own(LOG, lambda text: LOGGED.match(text) is not None)
-        self.place.check_own("scores.json", lambda text: parse_json(text)["command"] == WRITER)
-        for stage in ("sfm", *STAGES[1:]):
-            self.place.check_own(f"done/{stage}.json", lambda text: "key" in parse_json(text))
         self._log = self.place.read_text(LOG) or ""
         before = self.place.read_json(STATE)
         failure = before.get("failure") if before.get("format") == FORMAT else None

@@ -21,9 +21,7 @@ from .._files import (
     Names,
     as_path,
     atomic_folder,
-    check_inside,
     check_output,
-    check_own,
     digest_file,
     digest_value,
     locked,
@@ -98,7 +96,7 @@ def split_scene(
     """
     source, say = as_path(scene), report or (lambda text: None)
     maps_folder = source / "features" if features is None else as_path(features)
-    out = check_output("out", out, "a folder", apart=[maps_folder], other=[source])
+    out = check_output("out", out, "a folder")
     if isinstance(latents, str | Path):
         latents = LinearLatents.load(latents)
     elif not isinstance(latents, LinearLatents):
@@ -122,7 +120,6 @@ def split_scene(
         "blocks": [b.to_json() for b in blocks],
     }
     _check_same(out, facts)
-    check_inside(out, [f"{block.name}/sparse/0" for block in blocks])
     training = set(whole.views("train"))
     for block in blocks:
         if not training & set(_views_of(whole, block)):
@@ -201,7 +198,6 @@ def fit_block(
     """
     folder, config = as_path(folder), config or FitConfig()
     block = Block.from_json(read_json(folder / "block.json"))
-    check_inside(folder, [RUN, CORE])
     as_taken = load_scene(folder)
     maps = FeatureFolder(folder / "features").of(as_taken, config.split)
     splat = read_splats(folder / SPLAT) if (folder / SPLAT).is_file() else None
@@ -282,11 +278,8 @@ def fit_blocks(
 
 
 def _check_same(out: Path, facts: dict[str, Any]) -> None:
-    """Raise a ValueError if the folder holds other blocks, or a FileExistsError if it holds files of somebody else."""
-    if not (out / BLOCKS).is_file():  # it is written first: what is there without it is not of kfgs
-        for name in (BLOCKS, LATENTS, *(block["name"] for block in facts["blocks"])):
-            check_own(out / name, lambda _: False, "kfgs blocks")
-    elif read_json(out / BLOCKS) != facts:
+    """Raise a ValueError if the folder holds other blocks."""
+    if (out / BLOCKS).is_file() and read_json(out / BLOCKS) != facts:
         raise ValueError(
             f"out: expected a new folder, or one with these blocks, got {out} with others (of another scene, splat, maps, ...); "
             "choose another, or delete it"

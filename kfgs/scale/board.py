@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from .._card import cut
-from .._check import one_line
-from .._files import is_locked, seconds_in_words
+from .._files import InUseError, locked, seconds_in_words
 from .batch import LOCK, STAGES, Row, read_rows
 from .driver import Event
 
@@ -78,11 +77,15 @@ def describe_batch(folder: Path) -> str | None:
     if not rows:
         return None
     file = folder / LOCK
-    works = is_locked(file)
     head = f"{folder}: a batch"
+    try:
+        with locked(file.parent, file.name):
+            works = False
+    except InUseError:
+        works = True
     if works:
-        head += f" at work, {one_line(file.read_text(errors='replace'), 200)}"
-    elif works is False and not all(row.ended for row in rows):
+        head += " at work"
+    elif not all(row.ended for row in rows):
         head += " that was stopped"
         for row in rows:
             row.stages = {stage: STOPPED.get(word, word) for stage, word in row.stages.items()}

@@ -15,7 +15,7 @@ from torch import Tensor
 from .._arrays import reading
 from .._card import say_coordinate
 from .._check import as_array, check_range
-from .._files import as_path, current_file, read_json, real_path
+from .._files import as_path, read_json, real_path
 from ..cameras import Camera
 from ..fields import SemanticField, join_fields, remember, select_gaussians
 from ..gaussians import Gaussians
@@ -54,7 +54,7 @@ class FieldInBlocks:
         blocks, counts, boxes = [], [], []
         options = dict[Any, str]()
         for block in read_blocks(folder):
-            file = current_file(folder / block.name / CORE, FACTS)
+            file = folder / block.name / CORE / FACTS
             if not file.is_file():
                 raise FileNotFoundError(f"{file}: no such file; fit the block first, with fit_blocks or `kfgs blocks`")
             facts = read_json(file)

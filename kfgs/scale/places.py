@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from .._files import atomic_path, check_own, foreign, parse_json, real_path
+from .._files import atomic_path, parse_json, real_path
 from .scene_list import is_url
 
 WRITER = "kfgs batch"
@@ -83,10 +83,6 @@ class Place:
     def remove(self, name: str) -> None:
         """Delete a file, if it is there."""
         (self.path / name).unlink(missing_ok=True)
-
-    def check_own(self, name: str, ours: Callable[[str], bool]) -> None:
-        """Check that a text may be replaced: there is none, or `kfgs batch` wrote it, see `_files.check_own`."""
-        check_own(self.path / name, lambda path: ours(path.read_text(encoding="utf-8")), WRITER)
 
     def read_json(self, name: str) -> dict[str, Any]:
         """A JSON object that a batch wrote; an empty one if there is none, or it is damaged."""
@@ -166,16 +162,6 @@ class StoredPlace(Place):
     def write_text(self, name: str, text: str) -> None:
         """See `Place.write_text`; an object store shows an object when it is whole."""
         self.files.pipe_file(self._at(name), text.encode("utf-8"))
-
-    def check_own(self, name: str, ours: Callable[[str], bool]) -> None:
-        """See `Place.check_own`."""
-        try:
-            text = self.read_text(name)
-            known = text is None or ours(text)
-        except (ValueError, LookupError, TypeError):
-            known = False
-        if not known:
-            raise foreign(f"{self.url}/{name}", WRITER)
 
     def remove(self, name: str) -> None:
         """See `Place.remove`."""

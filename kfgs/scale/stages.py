@@ -21,7 +21,7 @@ from typing import Any
 
 import torch
 
-from .._files import InUseError, digest_value, foreign, write_json
+from .._files import InUseError, digest_value, write_json
 from .._notes import hear
 from ..features import FeatureFolder, Picture, discard_maps, extract_features, join_features, pictures_of
 from ..fields import SemanticField
@@ -60,9 +60,6 @@ def find_scene(job: Job, *, report: Report) -> dict[str, Any]:
             )
             config = job.options.sfm_config
             keys["sfm"] = _key(keys["photos"], asdict(config))
-            model = "scene/sparse/0"
-            if not out.read_json(_description("sfm")) and any(map(inside(model), out.listing())):
-                raise foreign(f"{job.out}/{model}", WRITER)
 
             def make() -> dict[str, Any]:
                 with _advice(job.source, photos):

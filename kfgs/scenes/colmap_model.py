@@ -9,16 +9,15 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .._card import short_repr
-from .._files import as_path, open_current
+from .._files import as_path
 from .._notes import Repair
 from .colmap_files import CAMERA_MODELS, OBSERVATIONS, TRACK, Table, open_table, require
 from .files import MAX_SIDE, SceneError, some
@@ -113,18 +112,14 @@ def read_model(path: str | Path) -> ColmapModel:
     folder = as_path(path)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder; expected a COLMAP model there")
-    return open_current(folder, partial(_read_files, folder))
-
-
-def _read_files(folder: Path, find: Callable[[str], Path]) -> ColmapModel:
-    whole = [suffix for suffix in ("bin", "txt") if all(find(f"{name}.{suffix}").is_file() for name in FILES)]
+    whole = [suffix for suffix in ("bin", "txt") if all((folder / f"{name}.{suffix}").is_file() for name in FILES)]
     if not whole:
         present = sorted(file.name for file in folder.iterdir() if file.stem in FILES)
         raise SceneError(
             f"{folder}: expected a COLMAP model (cameras, images and points3D, all as .bin or all as .txt), got "
             f"{', '.join(present) or 'none of these files'}; copy the missing files or run COLMAP (`kfgs sfm`)"
         )
-    files = {name: find(f"{name}.{whole[0]}") for name in (*FILES, "rigs", "frames")}
+    files = {name: folder / f"{name}.{whole[0]}" for name in (*FILES, "rigs", "frames")}
     tables = {name: open_table(file) for name, file in files.items() if file.is_file()}
     cameras = _read_cameras(tables["cameras"])
     scales: dict[str, float] = {}

@@ -84,7 +84,7 @@ def write_known_poses(
         SceneError: as for `find_points`.
         ImportError: if pycolmap is not installed.
     """
-    out = check_output("out", out, "a folder", inside=["sparse/0"])
+    out = check_output("out", out, "a folder")
     model, images = out / "sparse" / "0", out / "images"
     if has_model(model) and not replace:
         raise FileExistsError(

@@ -123,7 +123,9 @@ def run_sfm(
     images, out, config = as_path(images), as_path(out), config or SfmConfig()
     if not images.is_dir():
         raise FileNotFoundError(f"{images}: no such folder; expected the images there")
-    check_output("out", out, "a folder", other=[images], inside=["sparse/0"])
+    check_output("out", out, "a folder")
+    if real_path(out) == real_path(images):
+        raise ValueError(f"out: expected another folder than that of the images, got {out}; name the folder above it")
     model = out / "sparse" / "0"
     if has_model(model) and not replace:
         raise FileExistsError(

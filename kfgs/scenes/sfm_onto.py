@@ -59,7 +59,7 @@ def extend_sfm(
             raise FileNotFoundError(f"{folder}: no such folder; expected images and a scene")
     refuse_heic(images)
     model, pictures = _old_model(scene)
-    check_output("out", out, "a folder", apart=[scene], other=[images])
+    check_output("out", out, "a folder")
     if out.exists() and any(out.iterdir()):
         raise FileExistsError(f"out: expected a new folder, got {out}, which holds something; name another")
     old, new = read_whole_model(model), list_images(images)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
-from .._files import current_file, real_path, text_encoding
+from .._files import real_path, text_encoding
 from .colmap_model import has_model
 from .files import natural_key, some
 
@@ -57,7 +57,7 @@ def above(model: Path) -> list[Path]:
 
 def count_images(model: Path) -> int:
     """The number of images in a model, without reading them; 0 if it is damaged."""
-    binary, text = (current_file(model, f"images.{suffix}") for suffix in ("bin", "txt"))
+    binary, text = (model / f"images.{suffix}" for suffix in ("bin", "txt"))
     try:
         if binary.is_file():
             with binary.open("rb") as file:

@@ -40,7 +40,7 @@ def undistort_scene(images: str | Path, model: str | Path, out: str | Path) -> P
     images, model, out = as_path(images), as_path(model), as_path(out)
     if not images.is_dir():
         raise FileNotFoundError(f"{images}: no such folder; expected the images of {model} there")
-    check_output("out", out, "a folder", apart=[images])
+    check_output("out", out, "a folder")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise SceneError(
             f"{out}: expected a new or empty folder for the undistorted scene, got one in use; choose another"

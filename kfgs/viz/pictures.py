@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numbers
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from .._check import as_array, check_range, check_shapes
-from .._files import as_path, atomic_path, check_inside, check_own
+from .._files import as_path, atomic_path
 from .._typed import typed
 from .palette import palette
 
@@ -167,31 +167,6 @@ def write_png(path: Path, picture: Image.Image) -> None:
         note.add_text(key, value)
     with atomic_path(path) as temporary:
         picture.save(temporary, format="PNG", pnginfo=note)
-
-
-def is_drawn(path: Path) -> bool:
-    """Whether kfgs drew a picture (`write_png`, `save_figure`)."""
-    with path.open("rb") as file:
-        head = file.read(HEAD)
-    return head.startswith(b"\x89PNG") and all(f"tEXt{key}\0{value}".encode() in head for key, value in DRAWN.items())
-
-
-def check_pictures(folder: Path, names: Iterable[str], writer: str) -> None:
-    """Check before the work that it may write pictures: no link leads elsewhere, and those that are there it drew itself.
-
-    Args:
-        folder: the output folder.
-        names: of the pictures in it, without ".png": "sheets/view_1".
-        writer: for the message: "kfgs segment".
-
-    Raises:
-        ValueError: if a folder in `folder` is a link.
-        FileExistsError: if a picture is not one of kfgs.
-    """
-    for name in names:
-        picture = folder / f"{name}.png"
-        check_inside(folder, [picture.parent.relative_to(folder)])
-        check_own(picture, is_drawn, writer)
 
 
 @typed

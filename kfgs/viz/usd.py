@@ -13,7 +13,6 @@ import numpy as np
 
 from .._check import as_array
 from .._files import as_path, atomic_path
-from .._files.errors import UNNAMED
 from .._typed import typed
 from ..formats.render_mode import describe_lost_mode
 from ..formats.splat_file import SCORE, SplatFile, Written
@@ -93,7 +92,14 @@ def save_usd(path: str | Path, cloud: Gaussians | SplatFile, *, points: bool = F
             if packed:
                 UsdUtils.CreateNewUsdzPackage(str(layer), str(temporary))
         except RuntimeError as error:  # of USD: the system's words are somewhere in several lines
-            code = next((code for code in UNNAMED if os.strerror(code) in str(error)), errno.EIO)
+            code = next(
+                (
+                    code
+                    for code in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+                    if os.strerror(code) in str(error)
+                ),
+                errno.EIO,
+            )
             raise OSError(code, os.strerror(code)) from error
     lost = describe_loss(splats, path.suffix, 3) + describe_lost_mode(splats, path.suffix)
     flat = ("shapes, opacities and harmonics of the Gaussians: points are round and opaque",) if points else ()

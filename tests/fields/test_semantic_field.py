@@ -14,8 +14,7 @@ from messages import tells
 from safetensors.torch import save_file
 
 from kfgs import Camera, Gaussians
-from kfgs._files import HIDDEN, atomic, current_file
-from kfgs.fields import Seen, SemanticField, store
+from kfgs.fields import Seen, SemanticField
 from kfgs.metrics import MIB
 from kfgs.quant import Autoencoder, Codebook, LinearLatents
 
@@ -426,25 +425,6 @@ def test_saving_replaces_an_older_field_and_nothing_else(tmp_path):
     assert (precious / "chapter1.tex").exists()
     with pytest.raises(FileExistsError, match=tells("path:", "folder", "chapter1.tex")):
         field().save(precious / "chapter1.tex")
-
-
-def test_a_field_is_found_while_another_process_moves_it_to_its_place(tmp_path, monkeypatch):
-    saved = field("adc")
-    saved.save(tmp_path / "field")
-    asked = []
-
-    def just_moved(folder, name):
-        """Where `name` was when a reader asked; it is moved before the reader opens it."""
-        asked.append(name)
-        return folder / HIDDEN / "waiting" / name if len(asked) == 1 else current_file(folder, name)
-
-    for module in (store, atomic):
-        monkeypatch.setattr(module, "current_file", just_moved)
-    assert store.describes_field(tmp_path / "field")
-    saved.save(tmp_path / "field")  # not "something else"
-    asked.clear()
-    assert len(SemanticField.load(tmp_path / "field")) == len(saved)
-    assert len(asked) > 2
 
 
 def test_info_must_be_json(tmp_path):

@@ -7,7 +7,6 @@ import torch
 from messages import tells
 from PIL import Image
 
-from kfgs._files import HIDDEN
 from kfgs.cameras import Camera
 from kfgs.pipeline.stages import Run, digest_pictures, digest_scene, digest_tensors
 from kfgs.scenes import Scene
@@ -32,21 +31,6 @@ def test_a_finished_stage_is_found_again_by_another_process(tmp_path):
     assert again.key == first.key
     assert again.seconds == first.seconds
     assert (again.folder / "value").read_text() == "one"
-
-
-def test_a_run_that_finds_all_it_needs_finishes_what_a_killed_one_was_moving(tmp_path):
-    field = tmp_path / "field"
-    waiting = field / HIDDEN / "waiting"
-    waiting.mkdir(parents=True)
-    (field / "field.json").write_text("new")
-    (field / "field.safetensors").write_text("old")
-    (waiting / "field.safetensors").write_text("new")
-    (tmp_path / HIDDEN / "new-dead").mkdir(parents=True)
-    (tmp_path / HIDDEN / "new-dead" / ".kfgs-lock").touch()
-    with Run(tmp_path).locked():
-        assert (field / "field.safetensors").read_text() == "new"
-    names = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*"))
-    assert names == [".run.lock", "field", "field/field.json", "field/field.safetensors"]
 
 
 def test_other_inputs_make_another_stage_and_keep_the_first(tmp_path):

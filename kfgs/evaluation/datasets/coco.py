@@ -122,11 +122,6 @@ def save_coco(
     write_json(path, {"info": info, "images": images, "annotations": annotations, "categories": categories})
 
 
-def is_ours(path: Path) -> bool:
-    """Whether `save_coco` wrote a file."""
-    return bool(read_json(path)["info"]["description"] == WRITER)
-
-
 def _read(path: Path) -> tuple[dict[int, str], dict[str, _Picture]]:
     """The categories by id, and the pictures by stem."""
     top = read_json(path)

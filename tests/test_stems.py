@@ -1,10 +1,8 @@
-"""One rule for names of pictures, and one reader of texts."""
-
-import codecs
+"""One rule for names of pictures."""
 
 import pytest
 
-from kfgs._files import Names, read_json, read_text
+from kfgs._stems import Names
 
 
 @pytest.mark.parametrize(
@@ -62,21 +60,3 @@ def test_what_several_find_is_only_for_one_that_is_spelled_so() -> None:
 def test_the_nearest_name_is_the_advice() -> None:
     assert Names(["rgb_1.png", "rgb_12.png", "depth.png"]).advice("DETH") == "did you mean 'depth.png'?"
     assert Names([]).advice("a") == "there are no names to choose from"
-
-
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
-def test_texts_and_json_are_read_with_any_mark(encoding: str, tmp_path) -> None:
-    (tmp_path / "a.txt").write_bytes("K\u00fcche\r\nFlur\r\n".encode(encoding))
-    (tmp_path / "a.json").write_bytes('{"K\u00fcche": 1}'.encode(encoding))
-    assert read_text(tmp_path / "a.txt") == "K\u00fcche\nFlur\n"
-    assert read_json(tmp_path / "a.json") == {"K\u00fcche": 1}
-
-
-def test_another_encoding_is_refused_in_words(tmp_path) -> None:
-    file = tmp_path / "a.txt"
-    file.write_bytes("K\u00fcche".encode("latin-1"))
-    with pytest.raises(ValueError, match=r"a\.txt: expected a list in UTF-8, got other bytes \(.*\); save it as UTF-8"):
-        read_text(file, "a list")
-    file.write_bytes(codecs.BOM_UTF16_LE + b"a")
-    with pytest.raises(ValueError, match="save it as UTF-8"):
-        read_text(file, "a list")

@@ -1,4 +1,4 @@
-"""Look up names of pictures as file systems and tools respell them."""
+"""Names of pictures and views, as file systems and tools respell them."""
 
 from __future__ import annotations
 
