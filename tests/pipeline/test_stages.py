@@ -74,16 +74,6 @@ def test_a_damaged_stage_is_named(tmp_path):
         run.stage("a", {"x": 1}, _maker([], "whole"))
 
 
-def test_what_a_killed_process_left_is_swept_and_its_time_is_counted(tmp_path):
-    left = tmp_path / "stages" / ".kfgs-unfinished" / "new-left"
-    left.mkdir(parents=True)
-    (left / ".kfgs-lock").touch()
-    (left / "half").write_text("half")
-    stage = Run(tmp_path).stage("a", {}, lambda folder: 1000.0)
-    assert [path.name for path in (tmp_path / "stages").iterdir()] == [stage.folder.name]
-    assert stage.seconds >= 1000
-
-
 def test_digests_follow_content_and_order_and_tell_equal_names_apart(tmp_path):
     run = Run(tmp_path / "run")
     path, twin = tmp_path / "f.bin", tmp_path / "sub" / "f.bin"
@@ -160,21 +150,6 @@ def test_damaged_entries_of_the_cache_are_made_again(tmp_path, entry):
     (name,) = json.loads(cache.read_text())
     cache.write_text(json.dumps({name: json.loads(entry)}))
     assert Run(tmp_path / "run").digests([tmp_path / "a.npy"]) == whole
-
-
-@pytest.mark.parametrize("name", ["field", "stages", "stages/color-1", "unfinished", "teacher"])
-def test_links_in_a_run_folder_are_refused_before_anything_is_written(tmp_path, name):
-    (tmp_path / "mine").mkdir()
-    place = tmp_path / "run" / name
-    place.parent.mkdir(parents=True)
-    place.symlink_to(tmp_path / "mine")
-    before = set((tmp_path / "run").rglob("*"))
-    with pytest.raises(ValueError, match=tells(place, "a link")), Run(tmp_path / "run").locked():
-        pass
-    assert set(tmp_path.rglob("*")) == before | {tmp_path / "mine", tmp_path / "run"}
-    (tmp_path / "named").symlink_to("mine")  # the run folder itself may be a link
-    with Run(tmp_path / "named").locked():
-        pass
 
 
 def test_only_transparent_pictures_have_another_key_than_before_they_were_on_black(tmp_path):
