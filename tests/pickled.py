@@ -2,12 +2,8 @@
 
 import io
 import pickle
-import pickletools
 import struct
 import zipfile
-from collections import OrderedDict
-
-import torch
 
 
 class Call:
@@ -18,31 +14,6 @@ class Call:
 
     def __reduce__(self):
         return self.parts
-
-
-class Stored:
-    """Pickles as a reference to a storage."""
-
-    def __init__(self, *key) -> None:
-        self.key = key
-
-
-class Pickler(pickle.Pickler):
-    def persistent_id(self, value):
-        return value.key if isinstance(value, Stored) else None
-
-
-def pickled(value: object) -> bytes:
-    data = io.BytesIO()
-    Pickler(data, 2).dump(value)
-    return data.getvalue()
-
-
-def tensor(offset=0, size=(4,), stride=(1,), numel=4, *, legacy: bool = False) -> Call:
-    """What a float tensor in a file is: a call of torch."""
-    key = ("storage", torch.FloatStorage, "0", "cpu", numel)
-    storage = Stored(*key, None) if legacy else Stored(*key)
-    return Call(torch._utils._rebuild_tensor_v2, storage, offset, size, stride, False, OrderedDict())
 
 
 def text(value: str) -> bytes:
@@ -71,27 +42,4 @@ def legacy(body: bytes, *storages: bytes) -> bytes:
     return b"".join(pickle.dumps(part, 2) for part in head) + body + keys + values
 
 
-def lightning(body: bytes) -> bytes:
-    """A good checkpoint, whose dict has one item more: `body`."""
-    good = io.BytesIO()
-    torch.save({"state_dict": {"a": torch.ones(2)}, "callbacks": None}, good)
-    with zipfile.ZipFile(good) as file:
-        records = {info.filename: file.read(info) for info in file.infolist()}
-    root = next(name for name in records if name.endswith("data.pkl"))
-    assert records[root].endswith(b"u.")
-    records[root] = records[root][:-1] + text("evil") + _inside(body) + b"s."
-    return zip_of(records)
-
-
-def _inside(body: bytes) -> bytes:
-    """A pickle without its protocol, frames and end, to be put into another one."""
-    spans = [(opcode.name, position) for opcode, _, position in pickletools.genops(body)]
-    ends = [position for _, position in spans[1:]] + [len(body)]
-    return b"".join(
-        body[start:end]
-        for (name, start), end in zip(spans, ends, strict=True)
-        if name not in ("PROTO", "FRAME", "STOP", "MEMOIZE", "BINPUT")
-    )
-
-
-CONTAINERS = {"pickle": lambda body: body, "zip": archive, "legacy": legacy, "lightning": lightning}
+CONTAINERS = {"zip": archive, "legacy": legacy}

@@ -16,7 +16,7 @@ from torch import Tensor
 from .._arrays import FileError, read_array, read_safetensors
 from .._check import check_shapes
 from .._files import as_path, atomic_path
-from .._torch_files import Placeholder, check_plain, load_torch_file
+from .._torch_files import plain_tensor, read_torch
 from .._typed import typed
 from ..cameras.resample import fits_aspect
 from ..scenes.files import some
@@ -57,13 +57,7 @@ class Layout(NamedTuple):
 
 
 def _open_torch(file: Path, _: Reading) -> Any:
-    found = load_torch_file(file)
-    if isinstance(found, Placeholder):
-        raise ValueError("it holds objects other than tensors, which are not run")
-    if not isinstance(found, Tensor):
-        return found
-    check_plain(found)
-    return found.detach()  # saved by a training run, it may ask for gradients
+    return plain_tensor(file, "the map", read_torch(file, "a feature map", AGAIN), None, finite=False)
 
 
 def _open_numpy(file: Path, _: Reading) -> Any:

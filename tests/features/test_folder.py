@@ -151,10 +151,10 @@ def test_values_that_are_not_finite_are_refused_by_name(tmp_path, value):
 
 def test_a_file_that_is_no_tensor_is_refused(tmp_path):
     save_pt(tmp_path, "a", {"features": features(0)})
-    with pytest.raises(TypeError, match=tells("a_fmap_CxHxW.pt:", "tensor", "got a dict")):
+    with pytest.raises(ValueError, match=tells("a_fmap_CxHxW.pt:", "tensor", "got dict")):
         FeatureFolder(tmp_path, ["a"])[0]
     save_pt(tmp_path, "s", features(0).to_sparse())
-    with pytest.raises(ValueError, match=tells("s_fmap_CxHxW.pt", "dense tensors", "sparse")):
+    with pytest.raises(ValueError, match=tells("s_fmap_CxHxW.pt", "dense tensor", "sparse")):
         FeatureFolder(tmp_path, ["s"])[0]
     save_pt(tmp_path, "b", features(0).long())
     with pytest.raises(ValueError, match=tells("b_fmap_CxHxW.pt:", "got torch.int64")):
@@ -162,7 +162,7 @@ def test_a_file_that_is_no_tensor_is_refused(tmp_path):
     save_pt(tmp_path, "m", torch.empty(8, 3, 4, device="meta"))
     save_pt(tmp_path, "n", torch.nested.nested_tensor([torch.ones(3, 4), torch.ones(2, 4)], layout=torch.jagged))
     for stem in ("m", "n"):
-        with pytest.raises(ValueError, match=tells(f"{stem}_fmap_CxHxW.pt:", "feature map", "read")):
+        with pytest.raises(ValueError, match=tells(f"{stem}_fmap_CxHxW.pt:")):
             FeatureFolder(tmp_path, [stem])[0]
     np.save(tmp_path / "c.npy", np.ones((3, 4), np.float32))
     with pytest.raises(ValueError, match=tells("c.npy:", "[h, w, D]", "got (3, 4)")):
@@ -180,7 +180,7 @@ def test_damaged_and_hostile_files_are_named(tmp_path):
     header = b"{'descr':'<f4','fortran_order':False,'shape':(99999999999,9999999999,99999999)}".ljust(118)
     (tmp_path / "huge.npy").write_bytes(b"\x93NUMPY\x01\x00v\x00" + header)
     for stem in ("cut", "junk", "code", "empty", "object", "huge"):
-        with pytest.raises(ValueError, match=tells(stem, "feature map", "read")):
+        with pytest.raises(ValueError, match=tells(stem, "feature map", "encode it again")):
             FeatureFolder(tmp_path, [stem])[0]
     with pytest.raises(ValueError, match=tells("huge.npy:", "header states")):
         FeatureFolder(tmp_path, ["huge"])[0]
@@ -480,7 +480,7 @@ def test_a_map_saved_by_a_training_run_needs_no_gradient(tmp_path):
 def test_a_map_that_repeats_a_few_bytes_is_refused(tmp_path):
     save_pt(tmp_path, "a", torch.ones(1, 1, 1).expand(100_000, 100_000, 10_000))  # 4 bytes on disk, 400 TB read
     assert (tmp_path / "a_fmap_CxHxW.pt").stat().st_size < 4000
-    said = ("a_fmap_CxHxW.pt:", "strides", "contiguous")
+    said = ("a_fmap_CxHxW.pt:", "only 1", "contiguous")
     with pytest.raises(ValueError, match=tells(*said)):
         FeatureFolder(tmp_path, ["a"])[0]
 
