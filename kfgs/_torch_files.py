@@ -73,7 +73,7 @@ def read_torch(path: Path, expected: str, advice: str = SAVE) -> Any:
                 return torch.load(path, map_location="cpu", mmap=zipped, weights_only=True)
             except UnpicklingError as error:  # a page of text, with the reason inside
                 reason = re.split(r"\n\n|error: ", str(error).partition("\n\nCheck the documentation")[0].strip())[-1]
-                raise ValueError(f"{reason.strip(" .")}; nothing was run") from error
+                raise ValueError(f"{reason.strip()} Nothing was run") from error
 
 
 def _stand_ins(path: Path) -> list[Any]:

@@ -107,7 +107,7 @@ def test_features_keep_step_with_the_gaussians_that_are_left(tmp_path: Path, sha
 def test_nothing_in_a_checkpoint_is_run(tmp_path: Path) -> None:
     mark = tmp_path / "mark"
     torch.save((Call(os.system, f"touch {mark}"), 30000), tmp_path / "chkpnt30000_langfeat_1.pth")
-    with pytest.raises(ValueError, match=tells("chkpnt30000_langfeat_1.pth", "nothing was run")):
+    with pytest.raises(ValueError, match=tells("chkpnt30000_langfeat_1.pth", "Nothing was run")):
         load_occam(tmp_path)
     assert not mark.exists()
 

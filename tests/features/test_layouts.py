@@ -137,6 +137,6 @@ class Harmful:
 def test_a_file_with_code_in_it_is_named_and_runs_nothing(tmp_path, zipped):
     made, file = tmp_path / "made", tmp_path / "a_fmap_CxHxW.pt"
     torch.save({"features": Harmful(made)}, file, _use_new_zipfile_serialization=zipped)
-    with pytest.raises(ValueError, match=tells(file, "cannot be read", "posix.mkdir", "nothing was run")):
+    with pytest.raises(ValueError, match=tells(file, "cannot be read", "posix.mkdir", "Nothing was run")):
         open_map(file)
     assert not made.exists()
