@@ -1,0 +1,35 @@
+"""The card's picture: the semantic and the colour cloud side by side in pyvista, and the labels that pass between them."""
+
+import numpy as np
+import torch
+
+import kfgs
+from kfgs import viz
+
+
+def test_linked_clouds_and_their_transfer(fused, color, room):
+    semantic = fused.label(room.classes)
+    carried = kfgs.transfer_labels(semantic, semantic.labels, color)
+    names = room.classes.names
+    plotter = viz.linked_clouds(semantic, color, names=names, camera=room.unseen[0], height=300, off_screen=True)
+    left, right = np.split(plotter.screenshot(return_img=True), 2, axis=1)
+    plotter.close()
+    shown = {tuple(c) for c in viz.palette(semantic.labels.unique(), names).tolist()}
+    flat = left.reshape(-1, 3).astype(int)
+    near = [int((np.abs(flat - color).max(1) < 12).sum()) for color in shown]
+    assert sum(count > 20 for count in near) >= 6  # the classes' colours are on the left
+    assert right.std() > 20  # photographs' colours on the right
+    assert np.abs(left.astype(int) - right).mean() > 10
+
+    plotter = viz.make_plotter(300, 400, off_screen=True)
+    aside = color.replace(means=color.means + torch.tensor([0.0, 0.0, 2.0]))
+    actor = viz.add_transfer(plotter, semantic, aside, carried, sample=200)
+    lines = actor.mapper.dataset
+    plotter.close()
+    source, target = lines.cell_data["source"], lines.cell_data["destination"]
+    assert lines.n_cells == 200
+    assert np.array_equal(semantic.labels.numpy()[source], carried.labels.numpy()[target])
+    ends = lines.points.reshape(-1, 2, 3)
+    np.testing.assert_allclose(ends[:, 1], semantic.means.numpy()[source], atol=1e-5)
+    np.testing.assert_allclose(ends[:, 0], aside.means.numpy()[target], atol=1e-5)
+    assert (np.linalg.norm(ends[:, 0] - [0, 0, 2] - ends[:, 1], axis=1) < carried.distance).all()
