@@ -23,12 +23,11 @@ from torch.nn.functional import one_hot
 
 from kfgs.cameras import resize_map
 from kfgs.evaluation import load_label_set
-from kfgs.features import FeatureFolder
 from kfgs.formats import read_splats
 from kfgs.labels import average_views, classify
 from kfgs.pipeline import score_scene, score_teacher, true_labels
 from kfgs.quant import Codebook, CodebookConfig, LatentMaps, fit_codebook, quantize_maps
-from kfgs.scenes import load_scene
+from kfgs.scenes import FeatureFolder, load_scene
 from kfgs.splat import rasterize
 
 HEIGHT = 120  # of the maps that are averaged onto the splat

@@ -16,9 +16,8 @@ import torch
 from devices import MapsOn, add_device
 
 from kfgs._files import write_json
-from kfgs.features import FeatureFolder
 from kfgs.quant import CodebookConfig, fit_codebook
-from kfgs.scenes import load_scene
+from kfgs.scenes import FeatureFolder, load_scene
 from kfgs.viz.figures import new_figure, save_figure
 
 

@@ -17,9 +17,8 @@ from baselines.common import within
 from torch import Tensor
 
 from kfgs._rows import unit_rows
-from kfgs.features import FeatureFolder
 from kfgs.fields import SemanticField
-from kfgs.scenes import load_scene
+from kfgs.scenes import FeatureFolder, load_scene
 from kfgs.viz import save_picture
 from kfgs.viz.field_colors import FeatureColors
 from kfgs.viz.pictures import picture_grid

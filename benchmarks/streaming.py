@@ -29,14 +29,13 @@ import torch
 from devices import CPU, MapsOn, add_device, wait
 
 from kfgs.cameras import resize_map
-from kfgs.features import FeatureFolder, Picture, extract_features, pictures_of
 from kfgs.fields import UpliftConfig, uplift_maps
 from kfgs.formats import read_splats
 from kfgs.pipeline.fuse import uplift_stage
 from kfgs.pipeline.maps import map_digests
 from kfgs.pipeline.stages import Run
 from kfgs.quant import Codebook, CodebookConfig, fit_codebook, quantize_maps
-from kfgs.scenes import load_scene
+from kfgs.scenes import FeatureFolder, Picture, extract_features, load_scene, pictures_of
 
 STAGES = ("start", "extract", "codebook", "index maps", "uplift")
 

@@ -28,14 +28,13 @@ from kfgs.cameras import Camera
 from kfgs.evaluation import FieldMethod, LabelTruth, Method, TeacherMethod, View, label_view, load_label_set
 from kfgs.evaluation.segmentation import SegmentationReport, evaluate_segmentation
 from kfgs.evaluation.teacher_agreement import TeacherAgreement
-from kfgs.features import FeatureFolder
 from kfgs.fields import FieldConfig, SemanticField, pack_field
 from kfgs.formats import read_splats
 from kfgs.labels import LabelSet
 from kfgs.pipeline import FitConfig, fit_scene, true_labels
 from kfgs.pipeline.apply import save_label_map
 from kfgs.pipeline.maps import Maps
-from kfgs.scenes import Scene, load_scene
+from kfgs.scenes import FeatureFolder, Scene, load_scene
 
 QUICK_STEPS = {"decouple": 350, "adc": 350, "adc+sc": 800, "own-adc+sc": 800}
 FPS_VIEWS = 5

@@ -78,9 +78,8 @@ def main() -> None:
 
 
 def _fit_whole(town: Path, run: Path, config: Any, splat: Path) -> None:
-    from kfgs.features import FeatureFolder
     from kfgs.pipeline import fit_scene
-    from kfgs.scenes import load_scene
+    from kfgs.scenes import FeatureFolder, load_scene
 
     scene = load_scene(town)
     fit_scene(scene, FeatureFolder(town / "features").of(scene, "train"), run, config, splat=splat)

@@ -48,13 +48,11 @@ _WHERE = {
     "score_views": ".evaluation",
     "transfer_labels": ".labels",
     "label_splats": ".labels",
-    "FeatureFolder": ".features",
+    "FeatureFolder": ".scenes",
     "load_teacher": ".teachers",
-    "extract_features": ".features",
-    "pictures_of": ".features",
+    "extract_features": ".scenes",
     "make_label_set": ".teachers",
     "Teacher": ".teachers",
-    "RecomputedMaps": ".features",
     "uplift": ".pipeline",
     "UpliftConfig": ".fields",
     "FieldConfig": ".fields",
@@ -81,10 +79,6 @@ if TYPE_CHECKING:
     from .cameras import resize_map as resize_map
     from .evaluation import evaluate_segmentation as evaluate_segmentation
     from .evaluation import score_views as score_views
-    from .features import FeatureFolder as FeatureFolder
-    from .features import RecomputedMaps as RecomputedMaps
-    from .features import extract_features as extract_features
-    from .features import pictures_of as pictures_of
     from .fields import FieldConfig as FieldConfig
     from .fields import GaussianParams as GaussianParams
     from .fields import SemanticField as SemanticField
@@ -120,8 +114,10 @@ if TYPE_CHECKING:
     from .quant import fit_autoencoder as fit_autoencoder
     from .quant import fit_codebook as fit_codebook
     from .quant import quantize_maps as quantize_maps
+    from .scenes import FeatureFolder as FeatureFolder
     from .scenes import Scene as Scene
     from .scenes import SceneError as SceneError
+    from .scenes import extract_features as extract_features
     from .scenes import load_scene as load_scene
     from .scenes import run_sfm as run_sfm
     from .splat import Rendering as Rendering

@@ -47,8 +47,7 @@ Image.fromarray(viz.picture_grid([shown[:4], shown[4:]], width=256))
 # fifth is left out too, to look into the room.
 
 # %% tags=["thumbnail"]
-from kfgs.cameras import Orbit, estimate_up, orbit_cameras
-from kfgs.scenes import robust_bounds
+from kfgs.cameras import Orbit, estimate_up, orbit_cameras, robust_bounds
 
 up = estimate_up(scene.cameras).to(scene.points)
 inside = robust_bounds(scene.points).inside

@@ -61,8 +61,7 @@ print(scene)
 # `estimate_up` reads the latter from how the camera was held.
 
 # %%
-from kfgs.cameras import Orbit, estimate_up, orbit_cameras
-from kfgs.scenes import robust_bounds
+from kfgs.cameras import Orbit, estimate_up, orbit_cameras, robust_bounds
 
 inside = robust_bounds(scene.points).inside
 points, colors = scene.points[inside], scene.colors[inside]

@@ -7,12 +7,11 @@ from pathlib import Path
 from small_room import ROOM
 from tiny_teacher import Tiny
 
-from kfgs.features import FeatureFolder, extract_features
 from kfgs.fields import SemanticField
 from kfgs.labels import load_label_set
 from kfgs.pipeline import ColorConfig, FitConfig, evaluate, fit_scene, segment_scene, true_labels
 from kfgs.scale import BatchOptions
-from kfgs.scenes import load_scene
+from kfgs.scenes import FeatureFolder, extract_features, load_scene
 from kfgs.toy.room_folder import make_toy_room
 
 COLOR = dataclasses.replace(

@@ -144,8 +144,6 @@ def test_version_and_overview(capsys):
     [
         ("attach run/field a.ply --out b.ply --by color", ["views", "distance"]),
         ("fit scene --out run --method paper --mode fast", ["decouple", "adc", "adc+sc"]),
-        ("fit scene --out run --level xl", ["default", "s", "m", "l"]),
-        ("features scene --check maps --level xl", ["default", "s", "m", "l"]),
     ],
 )
 def test_a_wrong_choice_is_told_the_words_that_can_be_given(line, choices, capsys, monkeypatch):

@@ -10,11 +10,10 @@ from PIL import Image, ImageSequence
 from small_room import make_room
 
 from kfgs.cli import main
-from kfgs.features import FeatureFolder
 from kfgs.formats import SplatFile, read_splats, write_splats
 from kfgs.pipeline import FitConfig, fit_color, fit_scene
 from kfgs.pipeline.color import ColorConfig
-from kfgs.scenes import load_scene
+from kfgs.scenes import FeatureFolder, load_scene
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from test_public import PACKAGES
 
 import kfgs
 from kfgs import Camera, CodebookConfig, SplatFile
-from kfgs.features import FeatureFolder
+from kfgs.scenes import pictures_of
 
 FIELD = scene([("chair", 0.0)])
 GOOD = {
@@ -78,7 +78,6 @@ def test_every_public_name_is_called():
     ("call", "parts"),
     [
         (lambda: SplatFile(FIELD.gaussians, extra=None), ("extra: expected", "dict")),
-        (lambda: FeatureFolder(".", level=torch.zeros(2)), ("level",)),
         (lambda: kfgs.label_set_from_examples(FIELD, [1]), ("examples: expected", "dict", "list")),
         (lambda: kfgs.evaluate_segmentation(len, [1], "ab"), ("truth: expected", "dict", "list")),
         (lambda: kfgs.evaluate_segmentation(len, torch.zeros(2), ["a"]), ("truth: expected", "dict", "Tensor")),
@@ -117,6 +116,6 @@ def test_the_argument_is_named(call, parts):
 
 def test_the_maps_of_no_scene(tmp_path):
     with pytest.raises((TypeError, ValueError), match=tells("scene: expected a Scene", "NoneType")):
-        FeatureFolder(tmp_path).of(None)
+        pictures_of(None)
     with pytest.raises(TypeError, match=tells("scene: expected a Scene", "str", "load_scene")):
-        kfgs.pictures_of("S")
+        pictures_of("S")

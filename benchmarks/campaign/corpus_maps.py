@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 from safetensors.torch import save_file
 
-from kfgs.features import Picture, extract_features
+from kfgs.scenes import Picture, extract_features
 
 from .corpus import SEED, Add
 

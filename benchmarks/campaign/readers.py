@@ -138,7 +138,7 @@ def _edits(path: Path) -> None:
 
 
 def _maps(path: Path) -> None:
-    from kfgs.features import FeatureFolder
+    from kfgs.scenes import FeatureFolder
 
     folder = FeatureFolder(path)
     folder.check()
@@ -147,7 +147,7 @@ def _maps(path: Path) -> None:
 
 
 def _manifest(path: Path) -> None:
-    from kfgs.features import read_manifest
+    from kfgs.scenes.extract import read_manifest
 
     repr(read_manifest(path))
 

@@ -1,5 +1,6 @@
 """Posed cameras, paths of cameras, projection, lens distortion and resampling, carried by kornia."""
 
+from .bounds import robust_bounds
 from .camera import Camera, Distortion
 from .kornia_camera import from_kornia, to_kornia
 from .orbits import Orbit, estimate_up, orbit_cameras
@@ -25,6 +26,7 @@ __all__ = [
     "projection_jacobian",
     "resize_labels",
     "resize_map",
+    "robust_bounds",
     "spiral_cameras",
     "to_kornia",
     "undistort",

@@ -8,7 +8,7 @@ from typing import Any
 
 from .._files import check_output
 from .files import check_alone
-from .options import Device, Flag, Given, GivenLevel, Level, MapTeacher, SceneFolder, Views
+from .options import Device, Flag, Given, MapTeacher, SceneFolder, Views
 from .output import say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -20,7 +20,6 @@ def features(
     out: Given[Path] = None,
     overwrite: Flag = False,
     check: Given[Path] = None,
-    level: GivenLevel = None,
     device: Device = "auto",
     teacher: MapTeacher,
     views: Views,
@@ -32,30 +31,27 @@ def features(
     Examples:
         kfgs features scene/ --teacher lseg --weights demo_e200.ckpt
         kfgs features scene/ --teacher dinov2 --weights facebook/dinov2-small --out maps/
-        kfgs features scene/ --check maps/    # by Feature 3DGS, LangSplat, or in .npy or .safetensors
+        kfgs features scene/ --check maps/    # by Feature 3DGS, or in .npy or .safetensors
 
     Args:
         out: Folder for the maps; by default SCENE/features.
         overwrite: Replace maps that kfgs made with another teacher, other weights or other options; without it they are an
             error. Maps of other programs always are.
         check: Check this folder of maps instead, and report every file that does not fit.
-        level: For --check: which masks of LangSplat's maps, default, subparts (s), parts (m) or wholes (l).
         device: Where the teacher runs: auto (a GPU if there is one), cpu or cuda.
     """
-    from ..features import FeatureFolder, extract_features
+    from ..scenes import FeatureFolder, extract_features
 
     if check is not None:
         for name, given in (("teacher", teacher.teacher), ("weights", teacher.weights), ("out", out)):
             check_alone(name, given, "with --check, which encodes nothing")
-    else:
-        check_alone("level", level, "without --check; it is of LangSplat's maps")
     target = out if out is not None else scene_folder(scene) / "features"
     if check is None:
         check_output("out", target, "a folder")
     loaded = views.load(scene)
     chosen = "" if views.split == "train" else f" --split {views.split}"
     if check is not None:
-        found = FeatureFolder(check, level=level or "default").check(loaded, views.split)
+        found = FeatureFolder(check).of(loaded, views.split).check()
         say(str(found))
         if not found.ok:
             raise ValueError(
@@ -66,9 +62,9 @@ def features(
         say(f"next: kfgs fit {scene} --out run --features {check}{chosen}")
         return
     network = choose_teacher(teacher.teacher, teacher.weights, teacher.fast, teacher.size, device)
-    made = extract_features(network, loaded, target, views.split, overwrite=overwrite, report=say, progress=True)
-    shapes = sorted({" x ".join(map(str, record.shape)) for record in made.maps.values()})
-    say(f"{len(made.maps)} maps of {', '.join(shapes)} by {teacher_words(made.teacher)}")
+    extract_features(network, loaded, target, views.split, overwrite=overwrite, progress=True)
+    maps = FeatureFolder(target).of(loaded, views.split)
+    say(f"{len(maps)} maps of {' x '.join(map(str, maps.shape))} by {teacher_words(maps.identity or {})}")
     say(f"next: kfgs fit {scene} --out run" + ("" if out is None else f" --features {out}") + chosen)
     wrote([target])
 
@@ -110,30 +106,11 @@ def teacher_options(name: str, fast: bool, size: tuple[int, ...]) -> dict[str, A
     return options
 
 
-def stored_maps(scene: Any, views: list[int], folder: Path, level: Level | None) -> Any:
+def stored_maps(scene: Any, views: list[int], folder: Path) -> Any:
     """The maps of some views of a scene."""
-    from ..features import FeatureFolder
+    from ..scenes import FeatureFolder
 
-    maps = FeatureFolder(folder, level=level or "default").of(scene, views)
-    if not maps.has_masks:
-        check_alone("level", level, f"with {folder}, whose maps are not LangSplat's")
-    return maps
-
-
-def check_discard(maps: Any, config: Any) -> None:
-    """Check before the work that dense maps can be deleted after it.
-
-    Raises:
-        ValueError: if the mode makes no index maps, or kfgs did not make these maps and cannot make them again.
-    """
-    from ..features import discard_maps
-
-    if config.needs_maps:
-        raise ValueError(
-            "discard-features: expected a mode that makes index maps (adc or adc+sc), got decouple, which learns from the "
-            "dense maps themselves; leave it out"
-        )
-    discard_maps(maps.path, maps.stems, dry_run=True)
+    return FeatureFolder(folder).of(scene, views)
 
 
 def scene_folder(scene: Path) -> Path:

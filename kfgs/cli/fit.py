@@ -9,10 +9,10 @@ import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from .._files import check_output, real_path
-from .features import check_discard, choose_teacher, stored_maps
+from .features import choose_teacher, stored_maps
 from .files import check_alone, is_field, open_field, open_splats
 from .options import (
     CameraSearch,
@@ -63,7 +63,6 @@ def demo(out: Path = Path("kfgs_demo"), seed: int = 0) -> None:
 def sfm(
     images: Positional[Path],
     out: Path,
-    onto: Given[Path] = None,
     fps: Given[float] = None,
     seed: int = 0,
     replace: Flag = False,
@@ -81,20 +80,16 @@ def sfm(
         kfgs sfm video.mp4 --out scene/ --fps 2
         kfgs sfm frames/ --out scene/ --matching sequential    # frames of a video
         kfgs sfm capture/ --out scene/                         # capture/ has poses: they are kept
-        kfgs sfm more/ --onto scene/ --out larger/             # new photographs of a known scene
 
     Args:
         images: Folder of photographs, a video, or a folder with poses.
         out: Scene folder to make; OUT/sparse/0 receives the COLMAP model.
-        onto: A scene with a COLMAP model: place the photographs in it. Its own cameras do not move, and it is not written to;
-            OUT has the pictures of both, as links.
         fps: Frames of each second of a video that are used, 2 when not given: the sharpest of each half second.
         seed: Every random choice follows from it.
         replace: Replace a model that is in OUT/sparse/0 already; without it that is an error.
     """
     from ..scenes import (
         SfmConfig,
-        extend_sfm,
         is_scene,
         link_images,
         list_images,
@@ -116,15 +111,6 @@ def sfm(
         min_registered=search.min_registered,
         seed=seed,
     )
-    if onto is not None:
-        check_alone("replace", replace, "with --onto, which needs a new folder")
-        if video:
-            raise ValueError(
-                "images: expected photographs with --onto, got a video; write its frames with `kfgs sfm` first"
-            )
-        say(str(extend_sfm(images, onto, out, config=config, progress=True)))
-        wrote([out / "sparse" / "0", out / "images"])
-        return
     if not video and not search.ignore_poses and (is_scene(images) or images.suffix == ".json"):
         for name, given in (("matching", search.matching), ("no_single_camera", search.no_single_camera)):
             check_alone(
@@ -179,7 +165,6 @@ def fit(
     out: Path,
     *,
     splat: Given[Path] = None,
-    discard_features: Flag = False,
     method: FieldMethod,
     views: Views,
     maps: Maps,
@@ -196,19 +181,16 @@ def fit(
     Examples:
         kfgs fit scene/ --out run/ --splat my.ply
         kfgs fit scene/ --out run/ --features maps/
-        kfgs fit scene/ --out run/ --teacher lseg --weights demo_e200.ckpt    # stores no feature maps
+        kfgs fit scene/ --out run/ --teacher lseg --weights demo_e200.ckpt    # maps in run/features
         kfgs fit scene/ --out run/ --method paper --preset paper
 
     Args:
         out: Run folder; OUT/field receives the field, OUT/report.html what was made. Running again continues where it stopped.
         splat: Any splat file of the scene, in its frame: the Gaussians to average onto.
-        discard_features: Delete the feature maps when the stages made of them are done. Later runs with the same options
-            do not need them; runs with other options (another --splat, for example) do.
     """
-    from .._files import bytes_in_words
-    from ..features import RecomputedMaps, discard_maps
     from ..pipeline import fit_scene, write_run_report
     from ..pipeline.train import check_scene
+    from ..scenes import extract_features
 
     config = fit_config(
         method,
@@ -233,31 +215,23 @@ def fit(
     chosen = loaded.views(views.split)
     check_scene(loaded, chosen)  # before hours of features
     if teacher.teacher is not None:
-        for name, given in (("features", maps.features), ("level", maps.level)):
-            check_alone(name, given, "with --teacher, whose maps are not stored")
-        check_alone("discard_features", discard_features, "with --teacher, which stores no dense maps")
+        check_alone("features", maps.features, "with --teacher, whose maps are stored in OUT/features")
         check_alone(
             "undistorted_features", maps.undistorted_features, "with --teacher, which sees the original pictures"
         )
         network = choose_teacher(teacher.teacher, teacher.weights, teacher.fast, teacher.size, training.device)
-        found: Any = RecomputedMaps(network, as_taken, views.split, out / "teacher")
+        extract_features(network, as_taken, out / "features", views.split, overwrite=True, progress=True)
+        found = stored_maps(as_taken, chosen, out / "features")
     else:
         teacher.check_weights()
         check_alone("size", teacher.size or None, "without --teacher, whose option it is")
         check_alone("fast", teacher.fast, "without --teacher, whose option it is")
-        found = stored_maps(as_taken, chosen, maps.folder(scene), maps.level)
-        if discard_features:
-            check_discard(found, config)
+        found = stored_maps(as_taken, chosen, maps.folder(scene))
     result = fit_scene(loaded, found, out, config, splat=splat, report=say, progress=True)
 
-    if teacher.teacher is not None:
-        found.clear()  # the samples; the stages made of them are found without
     command = f"cd {shlex.quote(os.getcwd())}\n{shlex.join(called)}"
     written = [result.field_path, *write_run_report(result, loaded, config, command=command)]
     say(result.field.summary())
-    if discard_features:
-        freed = bytes_in_words(discard_maps(found.path, found.stems))
-        say(f"{found.path}: {freed} of {len(found)} dense maps deleted; what was made of them is in {out}")
     wrote(written)
 
 
@@ -290,7 +264,7 @@ def uplift(
     check_place(out)
     as_taken = views.load(scene)
     loaded = as_taken.undistorted()
-    found = stored_maps(as_taken, loaded.views(views.split), maps.folder(scene), maps.level)
+    found = stored_maps(as_taken, loaded.views(views.split), maps.folder(scene))
     cloud = (open_field if is_field(splat) else open_splats)("splat", splat).gaussians
     fused = UpliftConfig(max_gaussians=max_gaussians)
     config = FitConfig(uplift=fused, split=views.split, undistorted_features=maps.undistorted_features)

@@ -38,14 +38,12 @@ def _choice(kind: Any) -> PrimitiveConstructorSpec[Any]:
     )
 
 
-Level = Literal["default", "s", "m", "l"]  # of LangSplat: SAM's own choice of masks; subparts, parts, wholes
 Mode = Literal["decouple", "adc", "adc+sc"]  # of the paper's Table 1
 By = Literal["views", "distance"]
 LabelRule = Literal["own", "nearest"]  # of `kfgs evaluate`: who says the class of a pixel
 Walk = Literal["orbit", "spiral", "cameras"] | Path  # paths of cameras
 Rule = Literal["fused", "paper"]
 GivenWalk = Annotated[Walk | None, _quiet]
-GivenLevel = Annotated[Level | None, _choice(Level), _quiet]
 GivenMode = Annotated[Mode | None, _choice(Mode), _quiet]
 Matching = Literal["exhaustive", "sequential"]  # of `kfgs sfm`: which pairs of pictures are compared
 GivenMatching = Annotated[Matching | None, _choice(Matching), _quiet]
@@ -103,9 +101,7 @@ class Maps:
     """Feature maps that exist already."""
 
     features: Given[Path] = None
-    """Folder of maps by `kfgs features`, Feature 3DGS or LangSplat; SCENE/features when not given."""
-    level: GivenLevel = None
-    """Which masks of LangSplat's maps: default, subparts (s), parts (m) or wholes (l)."""
+    """Folder of maps by `kfgs features` or Feature 3DGS; SCENE/features when not given."""
     undistorted_features: Flag = False
     """The teacher saw undistorted pictures, so no lens has to be removed from its maps."""
 

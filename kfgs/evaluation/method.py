@@ -11,10 +11,10 @@ from torch import Tensor
 from .._rows import EPS, row_norms, unit_embeddings, unit_rows
 from .._typed import typed
 from ..cameras import Camera
-from ..features import FeatureFolder
 from ..fields import SemanticField
 from ..gaussians import Gaussians
 from ..labels import nearest_codeword
+from ..scenes import FeatureFolder
 
 CHUNK = 8192  # pixels decoded at once
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -15,9 +15,6 @@ from .._card import LINE, cut
 from .._check import check_choice, check_range
 from .._origin import recounted
 from .._typed import typed
-from ..align.by_cameras import Alignment, align_by_cameras
-from ..align.by_shape import align_clouds
-from ..align.frames import frames_agree
 from ..cameras import Camera
 from ..cameras.similarity import Similarity
 from ..evaluation import LabelSet
@@ -27,13 +24,12 @@ from ..formats.splat_file import SCORE, SplatFile
 from ..gaussians import Gaussians
 from ..labels import Transfer, transfer_labels, vote_labels
 from ..labels.transfer import Method
-from ..scenes import SceneError
+from ..scenes import Alignment, SceneError, align_by_cameras, frames_agree
 from ..splat.transform import transform_gaussians
 
 By = Literal["distance", "views"]
 WAYS: tuple[By, ...] = ("distance", "views")
 SOLID = 0.05  # fainter Gaussians are not used to find the frame: they can be anywhere
-STAYS = 0.005  # of the scene's size: an alignment that moves half of the points by less is ignored
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +77,7 @@ def attach(
     """Give every Gaussian of a splat the class that the semantic field has at its position.
 
     Frames: a given similarity is used. If cameras of the splat are given, a similarity is fitted to those with the same
-    names. Otherwise `frames_agree` checks whether both share one frame, and if not, the clouds are aligned.
+    names. Otherwise `frames_agree` checks whether both share one frame, and if not, that is an error.
 
     Classes, `by="views"`: the field segments its training views, and each Gaussian of the splat takes the class of most of
     the pixels that it fills in them (the score is the winner's share of its votes). A Gaussian that no view shows takes the
@@ -189,22 +185,10 @@ def _common_frame(
     check = frames_agree(*clouds)
     if check.agree:
         return Similarity.identity(), None, check.summary
-    try:
-        alignment = align_clouds(*clouds)
-    except SceneError as error:
-        raise SceneError(f"{error} (in Python: frame=Similarity.identity() says that both share one frame)") from error
-    if _stays(clouds[0], alignment):
-        note = f"at first {check.summary}; but of all frames their own fits best, by the {alignment.how}: they share it"
-        return Similarity.identity(), None, note
-    alignment = replace(alignment, similarity=alignment.similarity.between_worlds(a.origin, a.origin))
-    return alignment.similarity, alignment, f"{check.summary}; aligned by {alignment.summary}"
-
-
-def _stays(means: Tensor, alignment: Alignment) -> bool:  # [N, 3]
-    """Whether an alignment moves the points by no more than the uncertainty of sparse clouds."""
-    places = means.detach().double().cpu()
-    shifts = (alignment.similarity.apply(places) - places).norm(dim=1)
-    return float(shifts.median()) < STAYS * alignment.size
+    raise SceneError(
+        f"{check.summary}; give the cameras of the splat, some with the names of the field's (frame=, --splat-scene), or say "
+        "that both share one frame (frame=Similarity.identity(), --same-frame)"
+    )
 
 
 def _solid(means: Tensor, opacities: Tensor) -> Tensor:  # [N, 3], [N] -> [n, 3]

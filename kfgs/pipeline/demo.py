@@ -13,13 +13,12 @@ from .._origin import recounted
 from ..evaluation import LabelSet, load_label_set, score_recolor, score_removal, score_surface, score_views
 from ..evaluation.datasets.surface_points import load_surface_points
 from ..evaluation.surface import SurfaceReport
-from ..features import FeatureFolder
 from ..formats import SplatFile, write_splats
 from ..formats.ply import write_ply
 from ..gaussians import Gaussians
 from ..labels import EditList, OfClass, Recolor, Remove, connected_parts, parse_color
 from ..labels.edits.edit_list import edits_path
-from ..scenes import Scene, load_scene
+from ..scenes import FeatureFolder, Scene, load_scene
 from ..toy.room_folder import ToyConfig, make_toy_room
 from .apply import (
     label_columns,

@@ -11,15 +11,13 @@ from .._card import say_coordinate
 from .._check import one_line
 from .._files import as_path, bytes_in_words
 from .._origin import to_world
-from ..features import FeatureFolder
-from ..features.finder import MapFinder
-from ..features.manifest import MANIFEST, read_manifest
 from ..fields import SemanticField
 from ..fields.store import find_field
 from ..formats import SplatFile, find_format, read_splats
 from ..formats.folders import splat_file_of
 from ..formats.ply import read_ply
-from ..scenes import SceneError, is_scene, list_images, load_scene
+from ..scenes import FeatureFolder, SceneError, is_scene, list_images, load_scene
+from ..scenes.extract import MANIFEST
 from ..scenes.files import IMAGE_SUFFIXES, natural_key, some
 from .stages import read_stage
 
@@ -100,12 +98,10 @@ def _describe_others(path: Path, error: SceneError) -> str:
 
 
 def _describe_other_maps(path: Path, error: SceneError) -> str:
-    if not MapFinder(path).listed(deep=True):
-        raise error
-    maps = FeatureFolder(path)
-    h, w, D = maps.shape
-    notes = "".join(f"\n  {note}" for note in maps.check(values=False).notes[""])
-    return f"{path}: {len(maps)} feature maps of another program\n  {h} x {w} cells, {D} channels{notes}"
+    try:
+        return _describe_maps(path)
+    except (FileNotFoundError, ValueError):
+        raise error from None
 
 
 def _photos_in(path: Path) -> Path | None:
@@ -116,18 +112,15 @@ def _photos_in(path: Path) -> Path | None:
 
 
 def _describe_maps(path: Path) -> str:
-    manifest = read_manifest(path)
-    assert manifest is not None
-    records = manifest.maps.values()
-    shapes = sorted({record.shape for record in records})
-    there = sum((path / record.file).is_file() for record in records)
+    maps = FeatureFolder(path)
+    h, w, D = maps.shape
+    about = maps.identity or {"name": "another program"}
     lines = [
-        f"{path}: {len(records)} feature maps by {one_line(manifest.teacher.get('name', 'an unknown teacher'))}",
-        *(f"  {h} x {w} cells, {D} channels" for h, w, D in shapes),
-        f"  {bytes_in_words(sum(record.bytes for record in records))} in half precision"
-        + (f", {there} of {len(records)} maps still there" if there < len(records) else ""),
-        f"  teacher's time: {sum(record.seconds for record in records):.0f} s",
-        *(f"  {one_line(name)}: {one_line(value, 200)}" for name, value in manifest.teacher.items() if name != "name"),
+        f"{path}: {len(maps)} feature maps by {one_line(about.get('name', 'an unknown teacher'))}",
+        f"  {h} x {w} cells, {D} channels",
+        f"  {bytes_in_words(sum(file.stat().st_size for file in maps.files))}",
+        *(f"  {one_line(name)}: {one_line(value, 200)}" for name, value in about.items() if name != "name"),
+        *(f"  {note}" for note in maps.check(values=False).notes),
     ]
     return "\n".join(lines)
 

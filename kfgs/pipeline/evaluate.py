@@ -17,11 +17,11 @@ from ..evaluation import Encode, FieldMethod, LabelSet, Method, Report
 from ..evaluation.digests import digest_data
 from ..evaluation.encoders import TableEncoder
 from ..evaluation.foreign import SplattedMethod, load_foreign
-from ..features.manifest import MANIFEST
 from ..fields import SemanticField
 from ..fields.store import field_data, find_field
 from ..formats import read_splats
 from ..gaussians import Gaussians
+from ..scenes.extract import MANIFEST
 from .beside import notes_beside
 from .question import IN_SPACE, OF_COLORS, Question, colors_of, open_question, read_teacher
 

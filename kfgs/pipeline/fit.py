@@ -175,11 +175,6 @@ def _check_inputs(scene: Scene, views: Sequence[int], maps: Maps, config: FitCon
     """Check inputs that would otherwise fail only after the first stages."""
     split = config.split
     if config.needs_maps:
-        if getattr(maps, "recomputed", False):
-            raise ValueError(
-                "maps: expected stored maps for mode 'decouple', which looks at one in every step, got maps that run the "
-                "teacher each time; store them with extract_features, or use another mode"
-            )
         check_readable(maps, "mode 'decouple'")
     if len(views) != len(maps):
         raise ValueError(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -123,9 +122,6 @@ class ViewMaps:
         """`sample_grid(self[i], step, samples=samples)`; if the view's map does not change, only these pixels are read."""
         if self._unchanged(i) and hasattr(self.maps, "grid"):
             return self.maps.grid(i, step, samples)  # type: ignore[no-any-return]
-        if hasattr(self.maps, "grid_after"):  # recomputed maps, which store these samples
-            change, key = partial(self._change, i), self.describe(i)
-            return self.maps.grid_after(i, step, samples, change=change, key=key)  # type: ignore[no-any-return]
         return sample_grid(self[i], step, samples=samples)
 
     def blocks(self, i: int) -> Iterator[Tensor]:  # each [at most 32, w, D]

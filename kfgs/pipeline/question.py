@@ -32,11 +32,10 @@ from ..evaluation.datasets.views import named_as_in
 from ..evaluation.digests import digest_data
 from ..evaluation.encoders import NotedEncoder
 from ..evaluation.segmentation import load_label_map
-from ..features import FeatureFolder
 from ..formats import read_splats
 from ..gaussians import Gaussians
 from ..labels.color import parse_color
-from ..scenes import Scene, load_scene
+from ..scenes import FeatureFolder, Scene, load_scene
 from .maps import changing_files, labels_of_view, maps_of_views
 
 EDIT_INPUTS = {"kfgs-removal/1": ("before", "removed"), "kfgs-recolor/1": ("before", "painted", "rgb")}

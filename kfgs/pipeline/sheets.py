@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from ..cameras import resize_labels
-from ..features import FeatureFolder
 from ..labels import LabelSet, classify
-from ..scenes import Scene
+from ..scenes import FeatureFolder, Scene
 from ..viz import overlay_labels
 from ..viz.pictures import Array, legend_strip, picture_grid, resize_photo
 from ..viz.region_names import write_region_names

@@ -4,7 +4,8 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.scenes import load_scene, robust_bounds
+from kfgs.cameras import robust_bounds
+from kfgs.scenes import load_scene
 
 
 def test_outliers_do_not_move_the_box() -> None:

@@ -17,10 +17,10 @@ from kfgs.evaluation import (
     get_protocol,
     label_view,
 )
-from kfgs.features import FeatureFolder, save_feature_map
 from kfgs.fields import SemanticField
 from kfgs.labels.scores import CANONICAL
 from kfgs.quant import Autoencoder, Codebook, LinearLatents
+from kfgs.scenes import FeatureFolder, save_feature_map
 
 DIM = 6
 ROWS = torch.nn.functional.normalize(

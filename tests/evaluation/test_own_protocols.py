@@ -20,10 +20,9 @@ from kfgs.evaluation import (
     score_surface,
     score_views,
 )
-from kfgs.features import FeatureFolder
 from kfgs.labels import load_label_set, transfer_labels
 from kfgs.pipeline.apply import score_teacher, true_labels
-from kfgs.scenes import load_scene
+from kfgs.scenes import FeatureFolder, load_scene
 from kfgs.splat import rgb_to_sh0
 
 NAMES = ("a", "b", "c")

@@ -10,11 +10,10 @@ from small_room import CONFIG, config, make_room
 
 from kfgs.cameras import Distortion
 from kfgs.evaluation import load_label_set
-from kfgs.features import FeatureFolder, save_feature_map
 from kfgs.fields import SemanticField
 from kfgs.pipeline import fit_scene, score_scene, score_teacher, segment_scene, true_labels
 from kfgs.pipeline.fit import load_history
-from kfgs.scenes import load_scene
+from kfgs.scenes import FeatureFolder, load_scene, save_feature_map
 
 
 @pytest.fixture(scope="module")

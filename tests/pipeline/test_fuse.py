@@ -14,7 +14,6 @@ from small_room import make_room
 
 import kfgs
 from kfgs.cli import main
-from kfgs.features import FeatureFolder, write_npy_map
 from kfgs.fields import Clicks, SemanticField, UpliftConfig
 from kfgs.formats import SplatFile, read_splats, write_splats
 from kfgs.gaussians import Gaussians
@@ -22,7 +21,7 @@ from kfgs.labels import load_label_set
 from kfgs.pipeline import FitConfig, fit_color, fit_scene, score_scene, segment_scene, true_labels, uplift
 from kfgs.pipeline.color import ColorConfig
 from kfgs.pipeline.stages import LOCK
-from kfgs.scenes import load_scene
+from kfgs.scenes import FeatureFolder, load_scene, save_feature_map
 from kfgs.viz import explore
 
 CONFIG = FitConfig(uplift=UpliftConfig.field(max_gaussians=1_500))
@@ -71,7 +70,7 @@ def test_photos_cut_to_portraits_give_nearly_the_same_labels(room, scene, maps, 
         picture = (scene.image(view)[:, cut : 80 - cut] * 255).byte().numpy()
         (tmp_path / "images").mkdir(exist_ok=True)
         Image.fromarray(picture).save(tmp_path / "images" / camera.name)
-        write_npy_map(tmp_path / "maps" / f"{scene.stem(view)}.npy", maps[i][:, cut // 2 : 40 - cut // 2])
+        save_feature_map(tmp_path / "maps", scene.stem(view), maps[i][:, cut // 2 : 40 - cut // 2])
         pose = torch.linalg.inv(camera.viewmat.double()) @ torch.diag(torch.tensor([1.0, -1, -1, 1]).double())
         K = camera.K.tolist()
         frame = {"fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2] - cut, "cy": K[1][2]}

@@ -7,10 +7,9 @@ from messages import tells
 from small_room import CONFIG, make_room
 
 from kfgs.cameras import Camera, Distortion, undistort
-from kfgs.features import FeatureFolder
 from kfgs.pipeline import fit_scene
 from kfgs.pipeline.maps import KnownFeatures, maps_of_views
-from kfgs.scenes import Scene, load_scene
+from kfgs.scenes import FeatureFolder, Scene, load_scene
 
 LENS = Distortion("brown_conrady", (0.3, 0.05, 0.001, -0.002))
 

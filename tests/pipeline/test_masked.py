@@ -12,12 +12,11 @@ from small_room import ROOM
 
 from kfgs import Camera, FeatureFolder, fit_scene, load_scene, rasterize
 from kfgs.evaluation import LabelTruth, score_views
-from kfgs.features import save_feature_map
 from kfgs.fields import UpliftConfig
 from kfgs.pipeline import FitConfig, uplift
 from kfgs.pipeline.color import ColorConfig, Photos, fit_color
 from kfgs.pipeline.question import open_question
-from kfgs.scenes import Scene
+from kfgs.scenes import Scene, save_feature_map
 from kfgs.toy.room_folder import make_toy_room
 
 FIELD = replace(ColorConfig.quick().field.with_steps(150), densify_every=10, max_gaussians=3_000)

@@ -9,12 +9,11 @@ from killed import kill_everywhere
 from messages import tells
 from small_room import make_room
 
-from kfgs.features import FeatureFolder
 from kfgs.fields import SemanticField
 from kfgs.gaussians import Gaussians
 from kfgs.pipeline import FitConfig, fit_scene
 from kfgs.pipeline.stages import LOCK, Run
-from kfgs.scenes import load_scene
+from kfgs.scenes import FeatureFolder, load_scene
 
 REPLACED = """
 import numpy as np, torch

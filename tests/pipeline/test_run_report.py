@@ -7,11 +7,10 @@ import pytest
 from PIL import Image
 from small_room import CONFIG, make_room
 
-from kfgs.features import FeatureFolder
 from kfgs.fields import UpliftConfig
 from kfgs.pipeline import FitConfig, fit_scene, write_run_report
 from kfgs.pipeline.run_report import WIDTH, write_preview
-from kfgs.scenes import load_scene
+from kfgs.scenes import FeatureFolder, load_scene
 
 
 @pytest.fixture(scope="module")

@@ -4,11 +4,10 @@ from PIL import Image
 from small_room import make_room
 
 from kfgs.evaluation import load_label_map
-from kfgs.features import save_feature_map
 from kfgs.labels import LabelSet
 from kfgs.pipeline.apply import save_colored_labels
 from kfgs.pipeline.sheets import WIDTH, segmentation_sheet, teacher_labels
-from kfgs.scenes import load_scene
+from kfgs.scenes import load_scene, save_feature_map
 from kfgs.viz import palette
 
 NAMES = ["wall", "chair", "rug"]

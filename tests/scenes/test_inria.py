@@ -15,12 +15,11 @@ from small_room import make_room
 
 from kfgs import load_scene, read_splats
 from kfgs.cli import main
-from kfgs.features import FeatureFolder
 from kfgs.fields import SemanticField
 from kfgs.formats import write_splats
 from kfgs.formats.ply import write_ply
 from kfgs.pipeline import fit_scene
-from kfgs.scenes import SceneError, is_scene
+from kfgs.scenes import FeatureFolder, SceneError, is_scene
 from kfgs.scenes.scene import Scene
 
 

@@ -128,7 +128,6 @@ def test_sfm_of_a_video(shared_data: Path, tmp_path: Path, capsys: pytest.Captur
     assert 5 <= len(scene) <= 6
     assert scene.image(0).shape == (frames[0].height, frames[0].width, 3)
     assert len(scene.points) > 100
-    assert main([*arguments, "--onto", str(tmp_path / "scene")]) == 1
     for file, message in (("a.gif", ".mp4, .mov"), ("gone.mp4", "no such folder")):
         (tmp_path / "a.gif").write_bytes(b"GIF89a")
         assert main(["sfm", str(tmp_path / file), "--out", str(tmp_path / "other")]) == 1

@@ -5,8 +5,8 @@ import torch
 from cases_clouds import room, surface
 from messages import tells
 
-from kfgs.align import frames_agree
 from kfgs.cameras.similarity import Similarity
+from kfgs.scenes.frames import frames_agree
 
 
 def similarity(scale=1.0, shift=(0.0, 0.0, 0.0), rotation=None):

@@ -1,0 +1,239 @@
+"""Write a teacher's feature maps of a scene's pictures, one file per picture; a map that exists is not computed again."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from .._check import one_line
+from .._files import as_path, digest_file, locked, read_json, write_json
+from .feature_files import ENDINGS, OWN, Size, save_feature_map
+from .files import read_image, some
+from .scene import Scene
+
+MANIFEST, FORMAT, LOCK = "features.json", "kfgs-features/2", ".features.lock"
+Split = str | Sequence[str] | Sequence[int]
+"""The name of a split, `all`, or a list of view names or indices."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture: the name of its view, its file, and its size if it is known."""
+
+    stem: str
+    """The view's name without its suffix; its map has the same stem."""
+    path: Path
+    size: Size | None = None
+    """(H, W) in pixels."""
+
+    def read(self) -> Tensor:  # [H, W, 3] float32 RGB in [0, 1]
+        """Read the file; raises as `scenes.read_image`."""
+        return read_image(self.path)
+
+
+def pictures_of(scene: Scene, split: Split = "all") -> list[Picture]:
+    """The pictures of some views of a scene, as they are on disk: lens distortion is not removed.
+
+    Args:
+        scene: the views.
+        split: the name of a split, `all`, or a list of view names or indices.
+
+    Raises:
+        ValueError: if the scene has no such split or view, or the split is empty.
+    """
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene: expected a Scene, got {type(scene).__name__}; pass load_scene(folder)")
+    chosen = scene.select(scene.views(split) if isinstance(split, str) else split)
+    return [Picture(chosen.stem(i), chosen.image_paths[i], chosen.cameras[i].size) for i in range(len(chosen))]
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Which teacher made the maps of a folder, and from which pictures (`features.json`)."""
+
+    teacher: dict[str, Any]
+    """The identity of the teacher: its name, weights and options, as JSON."""
+    pictures: dict[str, str] = field(default_factory=dict)
+    """The SHA-256 of each picture, by the stem of its map."""
+
+    def save(self, folder: Path) -> None:
+        """Write `features.json`."""
+        write_json(folder / MANIFEST, {"format": FORMAT, **asdict(self)})
+
+
+def read_manifest(folder: str | Path) -> Manifest | None:
+    """The manifest of a folder of maps; None if it has none, because another program wrote the maps.
+
+    Raises:
+        ValueError: if it is damaged.
+    """
+    path = as_path(folder) / MANIFEST
+    if not path.is_file():
+        return None
+    value = read_json(path)
+    entries = value if isinstance(value, dict) and value.get("format") == FORMAT else {}
+    teacher, pictures = entries.get("teacher"), entries.get("pictures")
+    if not isinstance(teacher, dict) or not isinstance(pictures, dict):
+        raise ValueError(
+            f"{path}: expected a manifest of kfgs ({FORMAT}), got something else; delete it to use the maps without it, "
+            "or delete it and the maps and run `kfgs features`, which makes them again"
+        )
+    return Manifest(teacher, {str(stem): str(digest) for stem, digest in pictures.items()})
+
+
+def extract_features(
+    teacher: Any,
+    pictures: Scene | Sequence[Picture],
+    folder: str | Path,
+    split: Split = "train",
+    *,
+    overwrite: bool = False,
+    progress: bool = False,
+) -> Manifest:
+    """Write a teacher's map of each picture to a folder that `FeatureFolder` reads. After a killed call, call it again.
+
+    A map is `<stem>.npy`, float16 [h, w, D]. `features.json` records which teacher made it from which picture. A map is made
+    if there is none, or if its picture has changed. Memory holds one picture and its map at a time.
+
+    Args:
+        teacher: an object with `encode_image`, from [3, H, W] RGB in [0, 1] to [D, h, w], a `name` and perhaps `identity`
+            (JSON of everything that the features depend on: weights, options), as in `kfgs.teachers`; or a function, which is
+            known by its name alone.
+        pictures: a scene, whose pictures are taken as they are on disk, or a list, see `pictures_of`.
+        folder: for the maps; made if it does not exist.
+        split: of a scene: the name of a split, `all`, or a list of view names or indices.
+        overwrite: replace maps that kfgs made by another teacher (or with other weights or options).
+        progress: show a progress bar.
+
+    Returns:
+        The manifest, with all maps that kfgs made in the folder.
+
+    Raises:
+        TypeError: if `teacher` is not a teacher, or JSON cannot hold its identity.
+        ValueError: if there are no pictures or two have the same stem; if a map is not [D, h, w], not finite in float16, or
+            has other channels than the one before; if the folder holds maps of another teacher (without `overwrite`) or
+            of another program, or another process is writing to it.
+        FileNotFoundError: if a picture is missing.
+    """
+    folder, (encode, identity) = as_path(folder), _as_encoder(teacher)
+    chosen = _check_pictures(pictures_of(pictures, split) if isinstance(pictures, Scene) else pictures)
+    _check_folder(folder, identity, chosen, overwrite)  # a folder that is refused stays as it is, without a lock file
+    with locked(folder, LOCK):
+        manifest = read_manifest(folder)
+        if manifest is not None and manifest.teacher != identity:
+            for stem in manifest.pictures:
+                if _is_inside(stem):
+                    (folder / f"{stem}{OWN}").unlink(missing_ok=True)
+            manifest = None
+        manifest = manifest or Manifest(identity)
+        manifest.save(folder)
+        channels: int | None = None
+        for picture in tqdm(chosen, desc="features", unit="image", disable=not progress):
+            digest, file = digest_file(picture.path), folder / f"{picture.stem}{OWN}"
+            if file.is_file() and manifest.pictures.get(picture.stem) == digest:
+                continue
+            features = _encode(encode, identity["name"], picture)
+            if features.shape[2] != (channels or features.shape[2]):
+                raise ValueError(
+                    f"teacher {identity['name']!r}: expected {channels} channels for {picture.path} as before, got "
+                    f"{features.shape[2]}; use one teacher with the same options for all pictures"
+                )
+            channels = int(features.shape[2])
+            save_feature_map(folder, picture.stem, features)
+            manifest = replace(manifest, pictures={**manifest.pictures, picture.stem: digest})
+            manifest.save(folder)
+    return manifest
+
+
+def _as_encoder(teacher: Any) -> tuple[Callable[[Tensor], Tensor], dict[str, Any]]:
+    """The function from a picture to features, and what is known about the teacher as JSON."""
+    encode = getattr(teacher, "encode_image", teacher)
+    if inspect.isclass(teacher) or not callable(encode):
+        raise TypeError(
+            "teacher: expected an object with encode_image, or a function from [3, H, W] to [D, h, w], got "
+            f"{teacher.__name__ if inspect.isclass(teacher) else type(teacher).__name__}; load_teacher(name) loads one"
+        )
+    name = getattr(teacher, "name", None) or getattr(teacher, "__name__", type(teacher).__name__)
+    identity = getattr(teacher, "identity", None) or {}
+    try:
+        return encode, json.loads(json.dumps({"name": name, **identity}, allow_nan=False))  # tuples become lists
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"teacher.identity: expected plain values that JSON can hold, got {identity!r} ({error}); leave out the rest"
+        ) from error
+
+
+def _check_pictures(pictures: Sequence[Picture]) -> list[Picture]:
+    if not isinstance(pictures, Sequence) or not all(isinstance(picture, Picture) for picture in pictures):
+        raise TypeError(f"pictures: expected a Scene or a list of Picture, got {type(pictures).__name__}; load one")
+    stems = [picture.stem for picture in pictures]
+    twice = sorted({stem for stem in stems if stems.count(stem) > 1})
+    if not stems or twice:
+        got = f"{some(twice)} more than once" if twice else "none"
+        raise ValueError(f"pictures: expected at least one picture, each stem once, got {got}; rename them")
+    for picture in pictures:
+        if not _is_inside(picture.stem):
+            raise ValueError(
+                f"stem: expected a name within the folder of maps, got {picture.stem!r}; rename the picture"
+            )
+        if not picture.path.is_file():
+            raise FileNotFoundError(f"{picture.path}: no such file; expected the picture of view {picture.stem!r}")
+    return list(pictures)
+
+
+def _is_inside(stem: str) -> bool:
+    return bool(stem) and not PurePosixPath(stem).is_absolute() and ".." not in PurePosixPath(stem).parts
+
+
+def _check_folder(folder: Path, identity: dict[str, Any], pictures: list[Picture], overwrite: bool) -> None:
+    """Raise a ValueError if a folder holds maps of another program, or of another teacher."""
+    manifest = read_manifest(folder)
+    files = (folder / f"{picture.stem}{ending}" for picture in pictures for ending in ENDINGS)
+    other = next((file for file in files if file.is_file() and (manifest is None or not file.name.endswith(OWN))), None)
+    if other is not None:
+        raise ValueError(
+            f"{folder}: expected a folder without maps of other programs, got {other.relative_to(folder)} and no record of it "
+            f"in {MANIFEST}; use another folder"
+        )
+    if manifest is not None and manifest.teacher != identity and not overwrite:
+        keys = [key for key in {**manifest.teacher, **identity} if manifest.teacher.get(key) != identity.get(key)]
+        there, now = ({key: teacher.get(key) for key in keys} for teacher in (manifest.teacher, identity))
+        raise ValueError(
+            f"{folder}: expected maps of the same teacher as now ({one_line(json.dumps(now), 200)}), got others "
+            f"({one_line(json.dumps(there), 200)}); use another folder, or pass overwrite=True (--overwrite) to give up its "
+            f"{len(manifest.pictures)} maps"
+        )
+
+
+def _encode(encode: Callable[[Tensor], Tensor], name: str, picture: Picture) -> Tensor:  # [h, w, D] float16
+    """A teacher's map of one picture as it is stored: channels last, rounded to half precision, on the CPU."""
+    with torch.inference_mode():
+        features = encode(picture.read().permute(2, 0, 1).contiguous())
+        if not isinstance(features, Tensor) or features.layout != torch.strided:
+            raise TypeError(f"teacher {name!r}: expected a dense tensor [D, h, w], got a {type(features).__name__}")
+        if features.ndim != 3 or 0 in features.shape or not features.is_floating_point():
+            raise ValueError(
+                f"teacher {name!r}: expected floats [D, h, w] for one picture, got {features.dtype} "
+                f"{tuple(features.shape)}; leave out the batch axis"
+            )
+        half = features.permute(1, 2, 0).to(torch.float16).cpu().contiguous()
+        if not bool(torch.isfinite(half).all()):
+            raise ValueError(
+                f"teacher {name!r}: expected finite features below 65504 (they are stored as float16) for {picture.path}, got "
+                f"values from {float(features.min()):g} to {float(features.max()):g}; check its weights, or scale the rows"
+            )
+        empty = ~half.any(-1)
+        if bool(empty.any()) and bool(features[:, empty.to(features.device)].any()):
+            raise ValueError(
+                f"teacher {name!r}: expected features above 6e-8 (they are stored as float16) for {picture.path}, got some "
+                "that become all-zero, which means unknown; scale them, or bring the rows to unit length"
+            )
+    return half

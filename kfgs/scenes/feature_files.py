@@ -1,0 +1,158 @@
+"""One view's feature map on disk: open it without reading its values, read some of its rows, write it."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .._arrays import FileError, read_array, read_safetensors
+from .._check import as_tensor, check_shapes
+from .._files import as_path, atomic_path
+from ..cameras.resample import fits_aspect
+
+StoredMap = Tensor | NDArray[Any]
+"""A map [h, w, D], mapped into memory: values are read when they are used."""
+Size = tuple[int, int]
+"""(H, W) of a picture."""
+
+OWN, FEATURE_3DGS, SAFETENSORS = ".npy", "_fmap_CxHxW.pt", ".safetensors"
+ENDINGS = (OWN, FEATURE_3DGS, SAFETENSORS)
+"""Endings of a map's file after the picture's stem. If a view has several maps, the first of this order is read."""
+WIDTHS = frozenset((128, 256, 384, 512, 768, 1024, 1152, 1280, 1536))
+"""Numbers of channels of known encoders. A first axis of one of these sizes, and a last axis of none, hints at [D, h, w]."""
+AGAIN = "encode it again, or leave the photo out (split.json)"
+ROW_BLOCK = 32  # rows of a map converted at a time: 30 MB in single precision at 480 x 512 channels
+
+
+def open_map(
+    file: Path, channels: int | None = None, size: Size | None = None, *, own: bool = False
+) -> StoredMap:  # [h, w, D]
+    """Map a file into memory without reading its values.
+
+    Args:
+        file: the map.
+        channels: D, if it is known; it decides the order of the axes, and then the aspect of the picture does.
+        size: of the view's picture, if it is known.
+        own: kfgs wrote the map, so it is [h, w, D].
+
+    Raises:
+        ValueError: if the file cannot be read, is not a map of floats, or the order of its axes is not clear.
+        TypeError: if it holds anything but one tensor.
+    """
+    try:
+        values = _load(file)
+    except (FileError, TypeError):
+        raise
+    except Exception as error:  # a damaged pickle raises almost anything: struct.error, KeyError, EOFError, ...
+        reason = str(error).split(". ")[0].strip()[:120]
+        raise ValueError(f"{file}: expected a feature map, but it cannot be read ({reason}); {AGAIN}") from error
+    if not isinstance(values, np.ndarray) and not (isinstance(values, Tensor) and values.layout == torch.strided):
+        kind = type(values).__name__
+        raise TypeError(f"{file}: expected one dense tensor of features, got a {kind}; save the tensor alone")
+    if not (values.is_floating_point() if isinstance(values, Tensor) else values.dtype.kind == "f"):
+        raise ValueError(f"{file}: expected floating-point features, got {values.dtype}; {AGAIN}")
+    if values.ndim != 3 or 0 in values.shape:
+        raise ValueError(f"{file}: expected a map [h, w, D], got {tuple(values.shape)}; save one view per file")
+    known = "D h w" if file.name.endswith(FEATURE_3DGS) else "h w D" if own and file.name.endswith(OWN) else None
+    if (known or find_axes(str(file), tuple(map(int, values.shape)), channels, size)) == "D h w":
+        return values.permute(1, 2, 0) if isinstance(values, Tensor) else values.transpose(1, 2, 0)
+    return values
+
+
+def _load(file: Path) -> Any:
+    if file.name.endswith(FEATURE_3DGS):
+        values = torch.load(file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file))
+        plain = isinstance(values, Tensor) and values.layout == torch.strided and not values.is_meta
+        if plain and values.untyped_storage().nbytes() < values.numel() * values.element_size():
+            raise ValueError("its values repeat")  # a few bytes on disk that would fill the memory
+        return (
+            values.detach() if isinstance(values, Tensor) else values
+        )  # saved by a training run, it may ask for gradients
+    if file.name.endswith(OWN):
+        return read_array(file, "a feature map", AGAIN, mapped=True)
+    tensors = list(read_safetensors(file, "a feature map", AGAIN)[0].values())
+    if len(tensors) != 1:
+        raise ValueError(f"expected one tensor, got {len(tensors)}")
+    return tensors[0]
+
+
+def find_axes(
+    name: str, shape: tuple[int, ...], channels: int | None = None, size: Size | None = None
+) -> Literal["h w D", "D h w"]:
+    """The order of the axes of a map: [h, w, D], as kfgs writes it, or [D, h, w], as encoders return it.
+
+    A known number of channels decides, then the picture's aspect. If both orders fit, or nothing is known, it is [h, w, D].
+
+    Raises:
+        ValueError: if nothing is known, and the sizes look like [D, h, w].
+
+    Example:
+        >>> find_axes("a.npy", (512, 90, 120), channels=512), find_axes("a.npy", (90, 120, 512))
+        ('D h w', 'h w D')
+    """
+    first, middle, last = shape
+    if channels is not None and channels in (first, last) and first != last:
+        return "h w D" if last == channels else "D h w"
+    if size is not None:
+        if fits_aspect((first, middle), size):
+            return "h w D"
+        if fits_aspect((middle, last), size):
+            return "D h w"
+    stretched, plain = max(first / middle, middle / first) > 3, max(middle / last, last / middle) <= 3
+    if channels is None and first in WIDTHS and last not in WIDTHS and (last > 64 or (stretched and plain)):
+        raise ValueError(
+            f"{name}: expected a map [h, w, D], got {shape}, which may also be [D, h, w]; give the number of channels "
+            "or the size of the picture, or save it as [h, w, D]"
+        )
+    return "h w D"
+
+
+def read_rows(
+    stored: StoredMap,  # [h, w, D]
+    rows: slice = slice(None),
+    columns: slice = slice(None),
+) -> Iterator[Tensor]:  # each [at most ROW_BLOCK, columns, D] float32
+    """Copy some rows and columns of a map in single precision, a few rows at a time; only these are read from disk."""
+    chosen = range(int(stored.shape[0]))[rows]
+    for start in range(0, len(chosen), ROW_BLOCK):
+        part = chosen[start : start + ROW_BLOCK]
+        block = stored[part.start : part.stop : part.step, columns]
+        if isinstance(block, Tensor):
+            yield block.float() if block.dtype != torch.float32 else block.clone()
+        else:
+            with np.errstate(over="ignore"):  # a value beyond single precision becomes infinite
+                yield torch.from_numpy(np.array(block, np.float32, order="C"))
+
+
+def count_bad(values: Tensor) -> int:  # any shape, not empty
+    """Count NaN and infinite values; if the extremes are finite there are none, and the tensor is not copied."""
+    low, high = values.aminmax()  # NaN if any value is
+    return 0 if math.isfinite(low) and math.isfinite(high) else int((~torch.isfinite(values)).sum())
+
+
+def save_feature_map(path: str | Path, stem: str, features: Tensor) -> Path:  # features: [h, w, D]
+    """Write one view's map as kfgs stores it: `<stem>.npy`, float16 [h, w, D]; the file appears whole or not at all.
+
+    Raises:
+        ValueError: if `features` is not [h, w, D], or not finite in float16 (largest value 65504).
+    """
+    features = as_tensor("features", features, floating=True)
+    check_shapes(("features", features, "h w D"))
+    half = features.detach().to(torch.float16).cpu().contiguous()
+    if count_bad(half):
+        raise ValueError(
+            f"features: expected finite values below 65504 (they are stored as float16), got others for {stem!r}; "
+            "normalise the rows"
+        )
+    target = as_path(path) / f"{stem}{OWN}"
+    with atomic_path(target) as temporary, temporary.open("wb") as file:
+        np.save(file, half.numpy())
+    return target

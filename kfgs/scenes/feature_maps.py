@@ -1,0 +1,312 @@
+"""A folder of feature maps, one per picture, read one view at a time."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import Any, overload
+
+import torch
+from torch import Tensor
+
+from .._files import Names, as_path, folded_name
+from .._rows import EPS, row_norms
+from ..cameras.resample import fits_aspect
+from ..quant.sampling import grid_slices
+from .extract import Split, pictures_of, read_manifest
+from .feature_files import AGAIN, ENDINGS, Size, StoredMap, count_bad, open_map, read_rows
+from .files import IMAGE_SUFFIXES, some
+from .scene import Scene
+
+HOLES = 0.5  # share of all-zero features from which a map gets a note
+
+
+@dataclass
+class FeatureReport:
+    """What `FeatureFolder.check` says about a folder of maps."""
+
+    folder: Path
+    views: int
+    """The number of views checked."""
+    shape: tuple[int, int, int] | None = None
+    """(h, w, D) of most maps; None if none could be opened."""
+    problems: dict[str, str] = field(default_factory=dict)
+    """Why a map cannot be used, by the file's name (if there is none, by the view's stem)."""
+    notes: list[str] = field(default_factory=list)
+    """Remarks about maps that can be used."""
+
+    @property
+    def ok(self) -> bool:
+        """Whether every view has a map that fits."""
+        return not self.problems
+
+    def __str__(self) -> str:
+        size = "no map could be opened" if self.shape is None else "{} x {} cells, {} channels".format(*self.shape)
+        lines = [f"{self.folder}: {self.views - len(self.problems)} of {self.views} views have a map that fits; {size}"]
+        lines += [f"{name}: {text}" for name, text in self.problems.items()]
+        return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
+
+
+class FeatureFolder(Sequence[Tensor]):
+    """The teacher's feature maps of some views: item i is view i's map, [h, w, D] float32, read from disk at each access.
+
+    `FeatureFolder(path).of(scene, "train")` has the maps of a scene's split, for `fit_scene`.
+
+    Known files, which may be mixed: `<stem>_fmap_CxHxW.pt` (Feature 3DGS and DF-3DGS: a tensor [D, h, w]), `<stem>.npy` and
+    `<stem>.safetensors` (an array [h, w, D]; [D, h, w] is recognised by `channels` or the picture's aspect), in half, single
+    or double precision. The picture's ending may follow the stem. The map of a picture in a subfolder is in a subfolder of
+    the same name; if no view has a map there, maps are searched by the last part of their names.
+
+    No map is kept in memory. Maps may differ in size (pictures of several sizes), not in channels; an all-zero feature means
+    "unknown".
+
+    Args:
+        path: the folder.
+        stems: image names without their ending, in order; None: all maps of the folder and its subfolders, sorted.
+        channels: the expected D, for instance that of the text embeddings; None: that of the first map.
+        sizes: (H, W) of each view's picture, which distinguishes [h, w, D] from [D, h, w].
+
+    Raises:
+        NotADirectoryError: if `path` is not a folder.
+        FileNotFoundError: if views have no map; the message names them.
+        ValueError: if `stems` is empty or repeats one. When a map is read: if it cannot be read, is not finite, or has other
+            channels than the first; the message names the file.
+        TypeError: when a map is read: if the file holds anything but one tensor.
+
+    Example:
+        >>> import tempfile
+        >>> from kfgs.scenes import save_feature_map
+        >>> folder = tempfile.mkdtemp()
+        >>> _ = save_feature_map(folder, "view_0", torch.ones(3, 4, 8))
+        >>> maps = FeatureFolder(folder)
+        >>> len(maps), maps.shape, maps[0].dtype
+        (1, (3, 4, 8), torch.float32)
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        stems: Sequence[str] | None = None,
+        *,
+        channels: int | None = None,
+        sizes: Sequence[Size | None] | None = None,
+    ) -> None:
+        self.path = as_path(path)
+        if not self.path.is_dir():
+            got = "a file" if self.path.exists() else "nothing there"
+            raise NotADirectoryError(f"{self.path}: expected a folder of feature maps, got {got}; check its name")
+        manifest = read_manifest(self.path)
+        self.identity: dict[str, Any] | None = manifest.teacher if manifest else None
+        """What is known about the teacher if kfgs made the maps, else None."""
+        if isinstance(stems, str):
+            raise TypeError(f"stems: expected a list of image stems, got the text {stems!r}; put it into a list")
+        self.stems = sorted(self._listed) if stems is None else list(stems)
+        """The names of the views."""
+        twice = [stem for stem, count in Counter(self.stems).items() if count > 1]
+        if not self.stems or twice:
+            got = f"{some(twice)} more than once" if twice else "none"
+            raise ValueError(
+                f"stems (in {self.path}): expected at least one view, each once, got {got}; name the views"
+            )
+        self.channels, self.sizes = channels, None if sizes is None else list(sizes)
+        if self.sizes is not None and len(self.sizes) != len(self.stems):
+            raise ValueError(
+                f"sizes: expected {len(self.stems)} (one per view), got {len(self.sizes)}; give one for each"
+            )
+        if stems is not None:
+            _ = self.files  # views without a map are an error here, not hours later
+
+    def of(self, scene: Scene, split: Split = "train") -> FeatureFolder:
+        """The maps of some views of a scene.
+
+        Args:
+            scene: the views.
+            split: the name of a split, `all`, or a list of view names or indices.
+
+        Raises:
+            FileNotFoundError, ValueError: if the scene has no such views, or as for a `FeatureFolder` of these `stems`.
+        """
+        pictures = pictures_of(scene, split)
+        stems, sizes = [picture.stem for picture in pictures], [picture.size for picture in pictures]
+        return FeatureFolder(self.path, stems, channels=self.channels, sizes=sizes)
+
+    def __len__(self) -> int:
+        return len(self.stems)
+
+    def __repr__(self) -> str:
+        return f"FeatureFolder({str(self.path)!r}, {len(self)} views)"
+
+    @cached_property
+    def _listed(self) -> dict[str, Path]:
+        """All maps of the folder by stem; of several files with one stem, the first in the order of `ENDINGS`."""
+        listed: dict[str, Path] = {}
+        for ending in ENDINGS:
+            for here, folders, names in os.walk(self.path):
+                folders[:] = sorted(name for name in folders if not name.startswith("."))
+                for name in sorted(name for name in names if name.endswith(ending) and not name.startswith(".")):
+                    stem = (Path(here) / name).relative_to(self.path).as_posix().removesuffix(ending)
+                    after = PurePosixPath(stem).suffix  # rgb_1.png.npy is the map of rgb_1, too
+                    stem = stem.removesuffix(after) if after.lower() in IMAGE_SUFFIXES else stem
+                    listed.setdefault(stem, Path(here) / name)
+        return listed
+
+    def _find(self, stems: Sequence[str]) -> dict[str, Path]:
+        """The map of each view that has one."""
+        folded = {folded_name(stem): stem for stem in self._listed}
+        names = {stem: stem if stem in self._listed else folded.get(folded_name(stem)) for stem in stems}
+        if not any(names.values()):
+            names = dict(zip(stems, Names(self._listed, bare=True).find_each(stems), strict=True))
+        return {stem: self._listed[name] for stem, name in names.items() if name is not None}
+
+    @cached_property
+    def files(self) -> list[Path]:
+        """The file of each view's map."""
+        files = self._find(self.stems)
+        missing = [stem for stem in self.stems if stem not in files]
+        if missing:
+            raise FileNotFoundError(f"{self.path}: {self._explain(missing)}")
+        return [files[stem] for stem in self.stems]
+
+    def _explain(self, missing: list[str]) -> str:
+        """The message for views without a map: which views, and the names of the maps that exist."""
+        text = f"expected a feature map for each of {len(self)} views, {len(missing)} missing: {some(missing)}"
+        others = sorted(set(self._listed) - set(self.stems))
+        if len(missing) == len(self) and others and self.identity is None:
+            return (
+                f"{text}; the maps there ({len(others)}) are called {some(others, 3)}, but the pictures "
+                f"{some(self.stems, 3)}: rename the maps to the names of the pictures"
+            )
+        split = "" if self.identity is None else f" --split all --out {self.path}"
+        return f"{text}; make them with `kfgs features SCENE{split}`, or leave these views out"
+
+    @cached_property
+    def shape(self) -> tuple[int, int, int]:
+        """(h, w, D) of the first map; opens its file, without reading its values."""
+        h, w, D = map(int, self._open(0).shape)
+        if self.channels is not None and self.channels != D:
+            raise ValueError(
+                f"{self.files[0]}: expected {self.channels} channels, got {D} in a map of {h} x {w}; "
+                "use maps and embeddings of the same encoder"
+            )
+        return h, w, D
+
+    @overload
+    def __getitem__(self, index: int) -> Tensor: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> FeatureFolder: ...
+
+    def __getitem__(self, index: int | slice) -> Tensor | FeatureFolder:
+        if isinstance(index, slice):
+            sizes = None if self.sizes is None else self.sizes[index]
+            return FeatureFolder(self.path, self.stems[index], channels=self.channels, sizes=sizes)
+        return torch.cat(list(self.blocks(index)))
+
+    def grid(self, i: int, step: tuple[int, int] | None, samples: int) -> Tensor:  # [n, D] float32
+        """`quant.sample_grid(maps[i], step, samples=samples)`, reading no more of the file than these pixels.
+
+        Raises:
+            ValueError: as when the whole map is read, but only the values that are read are checked.
+        """
+        stored = self._checked(i)
+        rows, columns = grid_slices(int(stored.shape[0]), int(stored.shape[1]), step, samples=samples)
+        return torch.cat(list(self._finite(i, read_rows(stored, rows, columns)))).flatten(0, 1)
+
+    def blocks(self, i: int) -> Iterator[Tensor]:  # each [at most 32, w, D] float32
+        """Read a map a few rows at a time, which takes less memory than `maps[i]`; raises as when the whole map is read."""
+        return self._finite(i, read_rows(self._checked(i)))
+
+    def _open(self, i: int) -> StoredMap:  # [h, w, D]
+        size = self.sizes[i] if self.sizes else None
+        return open_map(self.files[i], self.channels, size, own=self.identity is not None)
+
+    def _checked(self, i: int) -> StoredMap:  # [h, w, D]
+        """View i's map on disk, if it has the channels of the first."""
+        stored = self._open(i)
+        if stored.shape[2] != self.shape[2]:
+            raise ValueError(
+                f"{self.files[i]}: expected {self.shape[2]} channels as in {self.files[0].name}, got {stored.shape[2]}; {AGAIN}"
+            )
+        return stored
+
+    def _finite(self, i: int, blocks: Iterator[Tensor]) -> Iterator[Tensor]:
+        for block in blocks:
+            if bad := count_bad(block):
+                raise ValueError(
+                    f"{self.files[i]}: expected finite features, got {bad} NaN or infinite values; {AGAIN}"
+                )
+            yield block
+
+    def check(self, *, values: bool = True) -> FeatureReport:
+        """Check the map of every view, and report everything that does not fit.
+
+        Problems: no map; a file that cannot be read or is not a map of floats; other channels than most; a map that looks
+        transposed; NaN or infinite values; a map of zeros only. Notes: maps of several sizes; many all-zero features.
+
+        Args:
+            values: False checks only shape and type, in milliseconds.
+        """
+        report = FeatureReport(self.path, len(self))
+        files = self._find(self.stems)
+        missing = [stem for stem in self.stems if stem not in files]
+        report.problems |= dict.fromkeys(missing, "missing")
+        if missing:
+            report.notes.append(self._explain(missing))
+        shapes: dict[str, tuple[int, int, int]] = {}
+        turned: dict[str, str] = {}
+        for stem, size in zip(self.stems, self.sizes or [None] * len(self), strict=True):
+            if stem not in files:
+                continue
+            name = files[stem].relative_to(self.path).as_posix()
+            try:
+                stored = open_map(files[stem], self.channels, size, own=self.identity is not None)
+            except (ValueError, TypeError) as error:
+                report.problems[name] = str(error).removeprefix(f"{files[stem]}: ")
+                continue
+            h, w, D = shapes[name] = tuple(map(int, stored.shape))
+            if size is not None and not fits_aspect((h, w), size) and fits_aspect((w, h), size):
+                turned[name] = f"expected the aspect of a picture of {size}, got {h} x {w} cells (transposed?)"
+            if values:
+                _check_values(name, stored, report)
+        if shapes:
+            report.shape = Counter(shapes.values()).most_common(1)[0][0]
+            D = self.channels or report.shape[2]
+            report.problems |= {
+                name: f"expected {D} channels, got {shape[2]}" for name, shape in shapes.items() if shape[2] != D
+            }
+        cells = Counter(shape[:2] for shape in shapes.values()).most_common()
+        if len(cells) > 1 or (self.identity is None and len(turned) == len(shapes)):  # else an encoder with one grid
+            report.problems |= turned
+        if len(cells) > 1:
+            report.notes.append(
+                f"maps of {len(cells)} sizes: {some([f'{h} x {w} ({count})' for (h, w), count in cells])}"
+            )
+        return report
+
+    def check_files(self) -> None:
+        """`check` every map without reading its values, before a long run.
+
+        Raises:
+            ValueError: if one does not fit; the first is named, and the others counted.
+        """
+        problems = self.check(values=False).problems
+        for name, text in problems.items():
+            more = f" ({len(problems) - 1} more do not fit; `kfgs features SCENE --check {self.path}` names them)"
+            raise ValueError(f"{self.path / name}: {text}; {AGAIN}{more if len(problems) > 1 else ''}")
+
+
+def _check_values(name: str, stored: StoredMap, report: FeatureReport) -> None:
+    """Count values that are not finite, and features that are all-zero, a few rows at a time."""
+    bad = zeros = 0
+    for rows in read_rows(stored):
+        bad += count_bad(rows)
+        zeros += int((row_norms(rows) <= EPS).sum())
+    share = zeros / (int(stored.shape[0]) * int(stored.shape[1]))
+    if bad or share == 1:
+        report.problems[name] = f"{bad} NaN or infinite values" if bad else "every feature is all-zero"
+    elif share >= HOLES:
+        report.notes.append(f"{name}: {100 * share:.0f} % of the features are all-zero: nothing is known there")

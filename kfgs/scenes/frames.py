@@ -1,0 +1,358 @@
+"""Two frames of one scene: the similarity between them, from cameras of the same names; and whether two clouds share one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import PurePosixPath
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from .._check import as_tensor, check_shapes
+from .._files import file_stem, folded_name
+from ..cameras.bounds import robust_bounds
+from ..cameras.camera import Camera
+from ..cameras.similarity import Similarity, fit_similarity
+from .files import SceneError, some
+
+Array = np.ndarray[Any, Any]
+
+MAX_ERROR = 0.03  # of the cameras' extent: two SfM runs of one scene differ by well below a hundredth
+MAX_ANGLE = 15.0  # degrees between a camera's two orientations, after alignment
+MIN_INLIERS = 0.5  # share of the common cameras that must fit
+TRIPOD = 0.01  # cameras closer together than this share of the extent stand at one place
+ROUNDING = 1e-4  # of the extent: poses in float32 may be off by that, where the frame stands far from its origin
+SIGMAS = 4.0  # in the last fits, cameras farther off than this many median distances are left out
+PAIRS = 5_000  # pairs of cameras tried for scale and place
+
+SAMPLE = 20_000  # points of each cloud that are measured
+REACH_SPACINGS, REACH_SIZE, REACH_MOST = 2.0, 0.01, 0.025
+"""Near: closer than 2 spacings of the other cloud or 1 % of the scene's size, at most 2.5 %: else all is near a sparse cloud."""
+NEAR_SHARE, LEAST_SHARE = 0.8, 0.3
+"""Shares of the points of the better and of the worse cloud that must be near. (Field and colour splat of Replica's room_0: 0.88;
+the toy room turned by half a turn: 0.63.) The second is low because one cloud may be a part of the other, and not 0 because a
+fog of points that fills a room is near everything in it."""
+DRIFT_SHARE, DRIFT_SIZE = 0.9, 0.005
+"""The best fit nearby may move 90 % of the surface, along its normals, by at most this share of the size. (Same frame: 0.0007 for
+room_0, up to 0.003 with few points; 5 % larger: 0.007 to 0.018. The shares of near points hardly change then.)"""
+NEARBY, FITTED, FEWEST = 0.05, 3_000, 12  # of the size: counterparts; points of the fit; fewer points give no surface
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """A similarity that brings a source frame onto a destination frame, and how well it fits."""
+
+    similarity: Similarity
+    """x_dst = scale R x_src + t."""
+    rms: float
+    """Root mean square distance of the inliers, world units of the destination."""
+    size: float
+    """Extent of the compared cameras in the destination, world units."""
+    inliers: int
+    """Cameras that fit."""
+    count: int
+    """Cameras that were compared."""
+    details: dict[str, Any] = field(default_factory=dict)
+    """More numbers as JSON, for instance the worst cameras by name."""
+
+    def __repr__(self) -> str:
+        return f"Alignment({self.summary})"
+
+    @property
+    def summary(self) -> str:
+        """One sentence: the scale, how many fit and how closely."""
+        return (
+            f"cameras of the same names: scale {self.similarity.scale:.6g}, {self.inliers} of {self.count} fit, rms "
+            f"{self.rms:.3g} ({self.rms / self.size:.2%} of the extent {self.size:.3g})"
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """The similarity's matrix and every number, as plain lists and floats."""
+        matrix, scale = self.similarity.matrix().tolist(), float(self.similarity.scale)
+        facts = {"rms": self.rms, "rms of extent": self.rms / self.size, "inliers": self.inliers, "count": self.count}
+        return {"matrix": matrix, "scale": scale, **facts, **self.details}
+
+
+def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
+    """The similarity between two reconstructions of the same pictures, from the cameras that have the same names.
+
+    Wrong poses are left out as long as half of the common cameras agree. The rotation is the one that most orientations agree
+    on; scale and translation come from the pair of centres that fits most cameras; least squares on the cameras that fit, in
+    place and in orientation, refine all (`fit_similarity`, Umeyama 1991).
+
+    Args:
+        src: posed cameras in the source frame; distortion and intrinsics are not used.
+        dst: posed cameras in the destination frame.
+
+    Returns:
+        The similarity from the source frame to the destination frame; `details` names the cameras that fit worst.
+
+    Raises:
+        SceneError: if fewer than two names are common, all common cameras stand at one place (no scale follows), or
+            fewer than half agree on one similarity.
+
+    Note:
+        Names are compared without folder and suffix ("images/a.JPG" is "a.png"), unless names repeat without folders.
+    """
+    for name, side in (("src", src), ("dst", dst)):
+        if not isinstance(side, Sequence) or not all(isinstance(camera, Camera) for camera in side):
+            raise TypeError(
+                f"{name}: expected a list of cameras, got {type(side).__name__}; load_cameras(folder) gives one"
+            )
+    pairs = _common_cameras(src, dst)
+    names = [file_stem(a.name) for a, _ in pairs]
+    origins = pairs[0][0].origin, pairs[0][1].origin
+    A, B = (np.stack([_center(pair[k], origins[k]) for pair in pairs]) for k in (0, 1))
+    turns = np.stack([_rotation(b).T @ _rotation(a) for a, b in pairs])  # [V, 3, 3] source world to destination world
+    sizes = _extents(B)
+    if min(sizes[0] / max(1.0, np.abs(B).max()), _extents(A)[0] / max(1.0, np.abs(A).max())) < 1e-9:
+        raise SceneError(
+            f"cameras: expected common cameras at different places, got {len(pairs)} at one ({some(names)}), from which "
+            "no scale follows; give more views, or pass the similarity"
+        )
+    similarity, good, size = None, np.zeros(len(A), dtype=bool), sizes[0]
+    for trial in sizes:
+        start = _start(A, B, turns, MAX_ERROR * trial)
+        if start is not None:
+            fit, fits = _refine(start, A, B, turns, trial)
+            spread = np.ptp(B[fits], axis=0).max(initial=0.0) if fits.any() else 0.0
+            if spread > TRIPOD * trial and fits.sum() > good.sum():  # at one place any scale fits
+                similarity, good, size = fit, fits, trial
+        if good.sum() >= max(2, MIN_INLIERS * len(A)):
+            break
+    if similarity is None or good.sum() < max(2, MIN_INLIERS * len(A)):
+        raise SceneError(
+            f"cameras: expected at least half of the {len(pairs)} common cameras to fit one similarity, got "
+            f"{int(good.sum())}; check that the names mean the same pictures in both, or pass the similarity"
+        )
+    errors = _distances(similarity, A, B)
+    details = {
+        "worst cameras": {names[i]: float(errors[i]) for i in np.argsort(-errors)[:5]},
+        "left out": [name for name, ok in zip(names, good, strict=True) if not ok],
+        "median angle": float(np.median(_angles(similarity, turns)[good])),
+    }
+    rms = float(np.sqrt((errors[good] ** 2).mean()))
+    return Alignment(similarity.between_worlds(*origins), rms, size, int(good.sum()), len(pairs), details)
+
+
+def _common_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> list[tuple[Camera, Camera]]:
+    keys: tuple[Callable[[str], str], ...] = (lambda name: PurePosixPath(folded_name(name)).name, folded_name, str)
+    for key in keys:  # the shortest form in which names do not repeat
+        there, here = ({key(file_stem(camera.name)): camera for camera in side} for side in (dst, src))
+        if len(there) == len(dst) and len(here) == len(src):
+            break
+    pairs = [(camera, there[name]) for name, camera in here.items() if name in there]
+    if len(pairs) < 2:
+        raise SceneError(
+            f"cameras: expected at least two names that both have, got {len(pairs)} (source: "
+            f"{some([c.name for c in src], 3)}; destination: {some([c.name for c in dst], 3)}); give both the names of "
+            "their pictures, or pass the similarity"
+        )
+    return pairs
+
+
+def _start(A: Array, B: Array, turns: Array, reach: float) -> Similarity | None:
+    """The rotation that most cameras' orientations agree on, then scale and translation from the best pair of centres."""
+    near = (np.einsum("iab,jab->ij", turns, turns) - 1) / 2 > np.cos(np.radians(MAX_ANGLE))
+    row = near[int(near.sum(1).argmax())]
+    R = _nearest_rotation(turns[row].sum(0))
+    turned, there = A[row] @ R.T, B[row]  # [n, 3]
+    i, j = np.triu_indices(len(turned), 1)
+    chosen = np.random.default_rng(0).permutation(len(i))[:PAIRS]
+    i, j = i[chosen], j[chosen]
+    base, other = turned[j] - turned[i], there[j] - there[i]
+    scales = (base * other).sum(1) / np.maximum((base**2).sum(1), 1e-300)
+    best, most = None, 0
+    for scale, first in zip(scales, i, strict=True):
+        if scale > 0:
+            shift = there[first] - scale * turned[first]
+            fits = int((np.linalg.norm(scale * turned + shift - there, axis=1) < reach).sum())
+            if fits > most:
+                best, most = _similarity(scale, R, shift), fits
+    return best
+
+
+def _refine(start: Similarity, A: Array, B: Array, turns: Array, size: float) -> tuple[Similarity, Array]:
+    """Least squares over the cameras that fit, repeated until they stay the same; gives the fit and these cameras."""
+
+    def fitting(limit: float) -> Array:
+        good: Array = (_distances(similarity, A, B) <= limit) & (_angles(similarity, turns) <= MAX_ANGLE)
+        return good
+
+    similarity = start
+    good = fitting(MAX_ERROR * size)
+    for _ in range(10):
+        if good.sum() < 2:
+            break
+        a, b = A[good] - A[good].mean(0), B[good] - B[good].mean(0)
+        widths = np.linalg.svd(a, compute_uv=False)
+        if len(a) < 3 or widths[1] < 1e-3 * widths[0]:  # on a line: the rotation is that of the orientations
+            R = _nearest_rotation(turns[good].sum(0))
+            scale = float(((a @ R.T) * b).sum() / (a**2).sum())
+            similarity = _similarity(scale, R, B[good].mean(0) - scale * R @ A[good].mean(0))
+        else:
+            similarity = fit_similarity(torch.from_numpy(A[good]), torch.from_numpy(B[good]))
+        typical = float(np.median(_distances(similarity, A, B)[good]))
+        before, good = good, fitting(min(MAX_ERROR * size, SIGMAS * typical + ROUNDING * size))
+        if bool((good == before).all()):
+            break
+    return similarity, good
+
+
+def _distances(similarity: Similarity, A: Array, B: Array) -> Array:
+    return np.linalg.norm(similarity.apply(torch.from_numpy(A)).numpy() - B, axis=1)
+
+
+def _angles(similarity: Similarity, turns: Array) -> Array:
+    """Degrees between the rotation of each camera from frame to frame and that of the similarity."""
+    cosines = (np.einsum("vij,ij->v", turns, similarity.rotation.numpy()) - 1) / 2
+    return np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+
+
+def _extents(centers: Array) -> list[float]:
+    """Estimates of the size of the region that the cameras stand in, the likeliest first.
+
+    Usually twice the median distance from the median centre, which wrong poses do not change, then twice the upper quartile.
+    If half of the cameras stand on one tripod, the quartile comes first. If nearly all do, it is twice the largest distance.
+    """
+    distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    median, upper, largest = (2 * float(np.quantile(distances, q)) for q in (0.5, 0.75, 1.0))
+    if upper <= TRIPOD * largest and median <= TRIPOD * largest:
+        return [largest]
+    return [upper, median] if median <= TRIPOD * upper else [median, upper]
+
+
+def _center(camera: Camera, origin: tuple[float, float, float]) -> Array:
+    return camera.to(torch.float64).with_origin(origin).center.cpu().numpy()
+
+
+def _rotation(camera: Camera) -> Array:
+    return camera.viewmat[:3, :3].detach().double().cpu().numpy()
+
+
+def _nearest_rotation(matrix: Array) -> Array:  # [3, 3]
+    """The rotation nearest to a matrix; of a sum of rotations, their mean."""
+    U, _, Vt = np.linalg.svd(matrix)
+    rotation: Array = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    return rotation
+
+
+def _similarity(scale: float, rotation: Array, translation: Array) -> Similarity:
+    return Similarity(float(scale), torch.from_numpy(np.array(rotation)), torch.from_numpy(np.array(translation)))
+
+
+class FrameCheck(NamedTuple):
+    """Whether two clouds agree, and why."""
+
+    agree: bool
+    summary: str  # one sentence with the numbers
+    near: tuple[float, float]  # share of src's points near dst, and of dst's near src
+    reach: tuple[float, float]  # the distances that count as near dst, and near src, world units
+    drift: float  # how far the best fit nearby moves the surface of src, along its normals, world units
+
+
+def frames_agree(
+    src: Tensor,  # [N, 3]
+    dst: Tensor,  # [M, 3]
+) -> FrameCheck:
+    """Decide whether two clouds of one scene are in the same frame.
+
+    A point is near when it is closer to the other cloud than 2 of that cloud's spacings (median distance to the next
+    point), at least 1 % and at most 2.5 % of the scene's size (diagonal of the `robust_bounds` of the smaller cloud).
+    The clouds agree if 80 % of the points of one and 30 % of the other are near, and if they do not fit better a little
+    elsewhere: least squares on point-to-plane distances moves 90 % of the points by less than 0.5 % of the size.
+
+    Raises:
+        ValueError: if shapes disagree, a cloud has fewer than two points, or a number is not finite.
+    """
+    src, dst = as_tensor("src", src), as_tensor("dst", dst)
+    check_shapes(("src", src, "N 3"), ("dst", dst, "M 3"))
+    a, b = _bulk("src", src), _bulk("dst", dst)
+    size = min(float(np.linalg.norm(np.ptp(cloud, axis=0))) for cloud in (a, b))
+    trees = cKDTree(a), cKDTree(b)
+    spacings = [float(np.median(tree.query(tree.data[:: max(1, tree.n // 5_000)], k=2)[0][:, 1])) for tree in trees]
+    to_src, to_dst = (min(max(REACH_SPACINGS * one, REACH_SIZE * size), REACH_MOST * size) for one in spacings)
+    distances = trees[1].query(a)[0], trees[0].query(b)[0]
+    near = float((distances[0] < to_dst).mean()), float((distances[1] < to_src).mean())
+    drift = _drift(*(cloud[d < NEARBY * size] for cloud, d in zip((a, b), distances, strict=True)))
+    agree = max(near) >= NEAR_SHARE and min(near) >= LEAST_SHARE and drift <= DRIFT_SIZE * size
+    summary = (
+        f"the frames {'agree' if agree else 'disagree'}: {near[0]:.0%} and {near[1]:.0%} of the points lie within "
+        f"{to_dst:.3g} and {to_src:.3g} of the other cloud (spacings {spacings[0]:.3g} and {spacings[1]:.3g}, size "
+        f"{size:.3g}), and the best fit nearby moves their surface by {drift:.3g}"
+    )
+    return FrameCheck(agree, summary, near, (to_dst, to_src), drift)
+
+
+def _bulk(name: str, points: Tensor) -> Array:
+    """The points within robust bounds as float64, thinned to about `SAMPLE`, without duplicates (the spacing would be 0)."""
+    values = points.detach().double().cpu()
+    finite = values.isfinite().all(1)
+    if not bool(finite.all()):
+        row = int((~finite).nonzero()[0])
+        raise ValueError(
+            f"{name}: expected finite positions, got NaN or infinity in row {row}; remove such points first"
+        )
+    if len(values) < 2:
+        raise ValueError(f"{name}: expected at least two points, got {len(values)}; there is nothing to compare")
+    kept: Array = values[robust_bounds(values, margin=0.0).inside].numpy() if len(values) > 100 else values.numpy()
+    return np.unique(kept[:: max(1, len(kept) // SAMPLE)], axis=0)
+
+
+def _drift(a: Array, b: Array) -> float:
+    """How far the best fit nearby moves the surface of a; 0 if there are too few points to fit.
+
+    Least squares on the distances to the other cloud's tangent planes, both ways, with weights (Geman-McClure) of a reach
+    that shrinks. Only the motion along the normals counts, because a wall can slide along itself unnoticed; the quantile
+    `DRIFT_SHARE` leaves out edges, where normals are wrong.
+    """
+    if min(len(a), len(b)) < FEWEST:
+        return 0.0
+    (a, m, tree_a), (b, n, tree_b) = _with_normals(a), _with_normals(b)
+    spacing = max(float(np.median(tree.query(tree.data, k=2)[0][:, 1])) for tree in (tree_a, tree_b))
+    R, s, t = np.eye(3), 1.0, np.zeros(3)
+    for reach in REACH_SPACINGS * spacing * np.geomspace(2, 0.5, 10):
+        moved = s * a @ R.T + t
+        d, i = tree_b.query(moved)
+        e, j = tree_a.query((b - t) @ R / s)
+        P, Q = np.concatenate([moved, moved[j]]), np.concatenate([b[i], b])
+        normals = np.concatenate([n[i], m[j] @ R.T])
+        squares, counts = np.concatenate([d**2, (e * s) ** 2]), np.repeat([len(d), len(e)], [len(d), len(e)])
+        w = ((reach**2 / (reach**2 + squares)) ** 2 / counts)[:, None]
+        center = P.mean(0)
+        rows = np.concatenate(
+            [np.cross(P - center, normals), normals, ((P - center) * normals).sum(1)[:, None]], axis=1
+        )
+        system = (rows * w).T @ rows  # [7, 7]: turn, shift, scale
+        damping = 1e-4 * np.diag(np.maximum(np.diag(system), 1e-12 * np.trace(system)))
+        x = np.linalg.solve(system + damping, (rows * w).T @ ((Q - P) * normals).sum(1))
+        turn, factor = Rotation.from_rotvec(x[:3]).as_matrix(), float(np.exp(np.clip(x[6], -0.1, 0.1)))
+        t = factor * turn @ (t - center) + center + x[3:6]
+        R, s = _nearest_rotation(turn @ R), s * factor
+    shift = s * a @ R.T + t - a
+    return float(np.quantile(np.abs((shift * m).sum(1)), DRIFT_SHARE))
+
+
+def _with_normals(points: Array) -> tuple[Array, Array, cKDTree]:
+    """At most `FITTED` points, evenly over the surface (means of the cells of a grid), their normals, and a tree of them."""
+    cell, low = float(np.ptp(points, axis=0).max()), points.min(0)
+    thinned = points
+    while len(points) > FITTED:
+        key = np.floor((points - low) / cell).astype(np.int64) @ np.array([1, 1 << 20, 1 << 40])
+        _, inverse, counts = np.unique(key, return_inverse=True, return_counts=True)
+        if len(counts) > 0.8 * FITTED:
+            sums = [np.bincount(inverse, points[:, k]) for k in range(3)]
+            thinned = (np.stack(sums, axis=1) / counts[:, None])[
+                np.random.default_rng(0).permutation(len(counts))[:FITTED]
+            ]
+            break
+        cell /= 1.1
+    tree = cKDTree(thinned)
+    near = thinned[tree.query(thinned, k=min(12, len(thinned)))[1]]  # [n, k, 3]
+    near = near - near.mean(1, keepdims=True)
+    return thinned, np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))[1][:, :, 0], tree

@@ -1,0 +1,253 @@
+"""Feature maps of kfgs and of other programs, read one view at a time."""
+
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from messages import tells
+from safetensors.torch import save_file
+
+from kfgs.quant import CodebookConfig, fit_codebook, sample_grid
+from kfgs.scenes import FeatureFolder, save_feature_map
+
+FILES = ("pt", "npy", "safetensors")
+
+
+def features(seed: int, size: tuple[int, int, int] = (3, 4, 8)) -> torch.Tensor:  # [h, w, D]
+    return torch.randn(size, generator=torch.Generator().manual_seed(seed))
+
+
+def save_pt(folder, stem: str, value) -> None:
+    torch.save(value, folder / f"{stem}_fmap_CxHxW.pt")
+
+
+def save_any(folder, stem: str, kind: str, want: torch.Tensor) -> None:
+    if kind == "pt":
+        save_pt(folder, stem, want.permute(2, 0, 1).contiguous())
+    elif kind == "npy":
+        np.save(folder / f"{stem}.npy", want.numpy())
+    else:
+        save_file({"f": want}, folder / f"{stem}.safetensors")
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("zipped", [True, False])
+def test_reads_feature_3dgs_maps_channels_last(tmp_path, dtype, zipped):
+    want = features(0)
+    file = tmp_path / "a_fmap_CxHxW.pt"
+    torch.save(want.permute(2, 0, 1).to(dtype).requires_grad_(), file, _use_new_zipfile_serialization=zipped)
+    got = FeatureFolder(tmp_path, ["a"])[0]
+    assert got.dtype == torch.float32
+    assert not got.requires_grad
+    assert torch.equal(got, want.to(dtype).float())
+
+
+@pytest.mark.parametrize("dtype", ["<f2", "<f4", "<f8", ">f4"])
+def test_reads_numpy_maps_as_they_lie(tmp_path, dtype):
+    want = features(1).numpy().astype(dtype)
+    np.save(tmp_path / "a.npy", want)
+    assert np.array_equal(FeatureFolder(tmp_path, ["a"])[0].numpy(), want.astype(np.float32))
+
+
+def test_keeps_the_order_asked_for_and_mixes_files(tmp_path):
+    for i, stem in enumerate(("view_10", "view_2", "view_1")):
+        save_pt(tmp_path, stem, torch.full((8, 3, 4), float(i)))
+    np.save(tmp_path / "extra.npy", np.full((3, 4, 8), 9.0))
+    maps = FeatureFolder(tmp_path, ["view_2", "extra", "view_10"])
+    assert [float(m[0, 0, 0]) for m in maps] == [1.0, 9.0, 0.0]
+    assert FeatureFolder(tmp_path).stems == ["extra", "view_1", "view_10", "view_2"]
+    assert maps[1:].stems == ["extra", "view_10"]
+    with pytest.raises(IndexError):
+        maps[3]
+
+
+def test_a_map_is_the_callers_own_copy(tmp_path):
+    for kind in FILES:
+        save_any(tmp_path, kind, kind, features(0))
+        maps = FeatureFolder(tmp_path, [kind])
+        maps[0].zero_()  # neither the file nor the next read changes
+        assert torch.equal(maps[0], features(0))
+
+
+def test_saved_map_comes_back_rounded_to_half(tmp_path):
+    want = features(3)
+    save_feature_map(tmp_path / "new", "a", want)
+    assert torch.equal(FeatureFolder(tmp_path / "new", ["a"])[0], want.half().float())
+    with pytest.raises(ValueError, match=tells("features:", "finite", "65504")):
+        save_feature_map(tmp_path / "new", "b", want * 1e6)
+    assert [file.name for file in (tmp_path / "new").glob("*.npy")] == ["a.npy"]
+
+
+def test_bad_arguments(tmp_path):
+    with pytest.raises(NotADirectoryError, match=tells("nowhere: ", "folder")):
+        FeatureFolder(tmp_path / "nowhere", ["a"])
+    for stems in (None, []):
+        with pytest.raises(ValueError, match=tells("stems", tmp_path, "at least one view", "none")):
+            FeatureFolder(tmp_path, stems)
+    with pytest.raises(TypeError, match=tells("stems", "list", "'a'")):
+        FeatureFolder(tmp_path, "a")
+    save_pt(tmp_path, "a", features(0).permute(2, 0, 1))
+    with pytest.raises(ValueError, match=tells("stems", "each once", "a")):
+        FeatureFolder(tmp_path, ["a", "a"])
+    with pytest.raises(ValueError, match=tells("a_fmap_CxHxW.pt:", "expected 512", "got 8")):
+        _ = FeatureFolder(tmp_path, ["a"], channels=512)[0]
+    with pytest.raises(ValueError, match=tells("sizes:", "expected 1", "got 2")):
+        FeatureFolder(tmp_path, ["a"], sizes=[(60, 80)] * 2)
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_maps_may_differ_in_size_but_not_in_channels(tmp_path, kind):
+    made = {"a": features(0, (12, 16, 8)), "b": features(1, (16, 12, 8)), "c": features(2, (12, 14, 8))}
+    for stem, want in made.items():
+        save_any(tmp_path, stem, kind, want)
+    maps = FeatureFolder(tmp_path, list(made), sizes=[(96, 128), (128, 96), (96, 119)])
+    maps.check_files()
+    for i, want in enumerate(made.values()):
+        assert torch.equal(maps[i], want)
+        assert torch.equal(maps.grid(i, (2, 3), 1), want[1::2, 1::3].flatten(0, 1))
+    save_any(tmp_path, "b", kind, features(1, (16, 12, 9)))
+    for read in (lambda: maps[1], lambda: maps.grid(1, None, 9), lambda: next(maps.blocks(1)), maps.check_files):
+        with pytest.raises(ValueError, match=tells("b", "8 channels", "got 9", "encode it again")):
+            read()
+
+
+def test_a_map_that_is_turned_against_its_picture_is_refused_before_the_work(tmp_path):
+    made = {"a": features(0, (12, 16, 8)), "b": features(1, (16, 12, 8)), "c": features(2, (16, 12, 8))}
+    for stem, want in made.items():
+        np.save(tmp_path / f"{stem}.npy", want.numpy())
+    maps = FeatureFolder(tmp_path, list(made), sizes=[(96, 128), (128, 96), (96, 128)])
+    with pytest.raises(ValueError, match=tells("c.npy:", "(96, 128)", "16 x 12 cells (transposed?)", "again")):
+        maps.check_files()
+    maps[:2].check_files()  # without this photo, as the message says
+
+
+def test_the_report_names_every_file_that_does_not_fit(tmp_path):
+    made = {"good": features(0), "nan": features(1), "zero": torch.zeros(3, 4, 8), "wide": features(2, (3, 4, 9))}
+    made["nan"][1, 2, 3] = torch.nan
+    made["holes"] = features(3)
+    made["holes"][:2] = 0
+    for stem, want in made.items():
+        np.save(tmp_path / f"{stem}.npy", want.numpy())
+    (tmp_path / "cut.npy").write_bytes(b"\x93NUMPY")
+    save_pt(tmp_path, "dict", {"features": features(0)})
+    report = FeatureFolder(tmp_path).check()
+    assert set(report.problems) == {"nan.npy", "zero.npy", "wide.npy", "cut.npy", "dict_fmap_CxHxW.pt"}
+    assert (report.ok, report.views, report.shape) == (False, 7, (3, 4, 8))
+    for words in (
+        ("2 of 7 views",), ("nan.npy", "1 NaN"), ("zero.npy", "all-zero"), ("wide.npy", "8 channels", "got 9"),
+        ("cut.npy", "read"), ("dict_fmap_CxHxW.pt", "dict"), ("holes.npy", "67 %"),
+    ):  # fmt: skip
+        assert any(all(word in line for word in words) for line in str(report).splitlines()), words
+    assert FeatureFolder(tmp_path, ["good", "holes"]).check().ok
+    assert not FeatureFolder(tmp_path, ["nan"]).check().ok
+    assert FeatureFolder(tmp_path, ["nan"]).check(values=False).ok
+
+
+def test_a_file_that_is_not_one_tensor_of_floats_is_refused(tmp_path):
+    save_pt(tmp_path, "a", {"features": features(0)})
+    with pytest.raises(TypeError, match=tells("a_fmap_CxHxW.pt:", "tensor", "got a dict")):
+        FeatureFolder(tmp_path, ["a"])[0]
+    save_pt(tmp_path, "b", features(0).long())
+    with pytest.raises(ValueError, match=tells("b_fmap_CxHxW.pt:", "got torch.int64")):
+        FeatureFolder(tmp_path, ["b"])[0]
+    np.save(tmp_path / "c.npy", np.ones((3, 4), np.float32))
+    with pytest.raises(ValueError, match=tells("c.npy:", "[h, w, D]", "got (3, 4)")):
+        FeatureFolder(tmp_path, ["c"])[0]
+
+
+def test_damaged_and_hostile_files_are_named(tmp_path):
+    save_pt(tmp_path, "cut", torch.ones(64, 30, 40))
+    cut = tmp_path / "cut_fmap_CxHxW.pt"
+    cut.write_bytes(cut.read_bytes()[:10_000])
+    (tmp_path / "junk_fmap_CxHxW.pt").write_bytes(b"junk")
+    (tmp_path / "code_fmap_CxHxW.pt").write_bytes(pickle.dumps(pytest.raises))
+    (tmp_path / "empty.npy").write_bytes(b"")
+    np.save(tmp_path / "object.npy", np.array([object()]), allow_pickle=True)
+    header = b"{'descr':'<f4','fortran_order':False,'shape':(99999999999,9999999999,99999999)}".ljust(118)
+    (tmp_path / "huge.npy").write_bytes(b"\x93NUMPY\x01\x00v\x00" + header)
+    save_pt(tmp_path, "repeats", torch.ones(1, 1, 1).expand(100_000, 100_000, 10_000))  # 4 bytes on disk, 400 TB read
+    for stem in ("cut", "junk", "code", "empty", "object", "huge", "repeats"):
+        with pytest.raises(ValueError, match=tells(stem, "feature map", "read")):
+            FeatureFolder(tmp_path, [stem])[0]
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_grids_and_blocks_are_those_of_the_whole_map(tmp_path, kind):
+    want = features(4, (70, 50, 8))
+    save_any(tmp_path, "a", kind, want)
+    maps = FeatureFolder(tmp_path, ["a"])
+    assert maps.shape == (70, 50, 8)
+    for step, samples in (((2, 3), 1), (None, 100), (None, 10_000), ((100, 100), 1)):
+        assert torch.equal(maps.grid(0, step, samples), sample_grid(maps[0], step, samples=samples))
+    blocks = list(maps.blocks(0))
+    assert [len(block) for block in blocks] == [32, 32, 6]
+    assert torch.equal(torch.cat(blocks), maps[0])
+    want[0::2] = torch.nan
+    save_any(tmp_path, "a", kind, want)
+    maps = FeatureFolder(tmp_path, ["a"])
+    assert torch.equal(maps.grid(0, (2, 3), 1), want[1::2, 1::3].reshape(-1, 8))  # looks at nothing else
+    with pytest.raises(ValueError, match=tells("a", "finite", "NaN")):
+        maps[0]
+
+
+@pytest.mark.parametrize("name", ["rgb_1.png.npy", "rgb_1.JPG_fmap_CxHxW.pt", "rgb_1.jpeg.safetensors"])
+def test_the_whole_name_of_the_picture_is_a_stem_too(tmp_path, name):
+    stem, _, kind = name.replace("_fmap_CxHxW", "").rpartition(".")
+    save_any(tmp_path, stem, kind, features(5))
+    assert torch.equal(FeatureFolder(tmp_path, ["rgb_1"])[0], features(5))
+    assert FeatureFolder(tmp_path).stems == ["rgb_1"]
+
+
+def test_pictures_in_subfolders_have_their_maps_there(tmp_path):
+    for i, folder in enumerate(("left", "right")):
+        (tmp_path / folder).mkdir()
+        np.save(tmp_path / folder / "0001.npy", features(i).numpy())
+    maps = FeatureFolder(tmp_path, ["right/0001", "LEFT/0001"])
+    assert torch.equal(maps[0], features(1))
+    assert torch.equal(maps[1], features(0))
+    with pytest.raises(FileNotFoundError, match=tells("1 missing", "0001", "left/0001, right/0001")):
+        FeatureFolder(tmp_path, ["0001"])  # which of them?
+
+
+def test_last_parts_of_names_are_looked_for_when_nothing_else_fits(tmp_path):
+    (tmp_path / "feat").mkdir()
+    np.save(tmp_path / "feat" / "b.npy", features(1).numpy())
+    np.save(tmp_path / "a.npy", features(0).numpy())
+    maps = FeatureFolder(tmp_path, ["train/a"])
+    assert [file.relative_to(tmp_path).as_posix() for file in maps.files] == ["a.npy"]
+    assert FeatureFolder(tmp_path, ["b"]).files == [tmp_path / "feat" / "b.npy"]
+    with pytest.raises(FileNotFoundError, match=tells("2 views", "1 missing: b")):
+        FeatureFolder(tmp_path, ["a", "b"])  # a fits as it is: then so must b
+    with pytest.raises(FileNotFoundError, match=tells("2 views", "2 missing", "left/a")):
+        FeatureFolder(tmp_path, ["left/a", "right/a"])  # which of them?
+
+
+def test_names_of_other_maps_are_shown_when_none_fits(tmp_path):
+    for i in range(4):
+        np.save(tmp_path / f"frame_{i}.npy", features(i).numpy())
+    with pytest.raises(FileNotFoundError, match=tells("(4)", "frame_0, frame_1, frame_2", "rgb_0, rgb_1", "rename")):
+        FeatureFolder(tmp_path, ["rgb_0", "rgb_1"])
+
+
+def test_sizes_of_pictures_or_channels_tell_the_order_of_the_axes(tmp_path):
+    want = features(6, (6, 8, 20))
+    np.save(tmp_path / "a.npy", want.permute(2, 0, 1).numpy())
+    np.save(tmp_path / "b.npy", want.numpy())
+    maps = FeatureFolder(tmp_path, ["a", "b"], sizes=[(60, 80), (60, 80)])
+    assert torch.equal(maps[0], want)
+    assert torch.equal(maps[1:][0], want)
+    assert torch.equal(FeatureFolder(tmp_path, ["a"], channels=20)[0], want)
+    np.save(tmp_path / "c.npy", np.zeros((512, 9, 100), np.float32))
+    with pytest.raises(ValueError, match=tells("c.npy:", "got (512, 9, 100)", "[D, h, w]")):
+        _ = FeatureFolder(tmp_path, ["c"]).shape
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_a_codebook_is_the_same_with_grids_and_with_whole_maps(tmp_path, kind):
+    for i in range(3):
+        save_any(tmp_path, f"view_{i}", kind, features(i, (40, 30, 8)).half())
+    maps = FeatureFolder(tmp_path)
+    config = CodebookConfig(initial=3, maximum=9, epochs=2, samples=200)
+    disk, memory = fit_codebook(maps, config), fit_codebook([maps[i] for i in range(3)], config)
+    assert torch.equal(disk.codebook.codewords, memory.codebook.codewords)
