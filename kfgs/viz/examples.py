@@ -11,7 +11,6 @@ from PIL.Image import Resampling
 from torch import Tensor
 
 from .._check import as_array, check_shapes, check_whole
-from .._typed import typed
 from ..cameras import Camera
 from ..cameras.camera import view_named
 from .palette import palette
@@ -24,7 +23,6 @@ BRIGHT = 160  # mean of the channels; brighter colours have a dark rim, the othe
 Color = tuple[int, ...]
 
 
-@typed
 def draw_examples(
     cameras: Sequence[Camera],
     examples: Mapping[str, Any],
@@ -45,16 +43,23 @@ def draw_examples(
 
     Raises:
         ValueError: if no example lies in a view, or a view is unknown.
-        TypeError: if something is no example.
+        TypeError: if something is not an example.
     """
     check_whole("width", width, 16)
     shown: dict[int, tuple[Camera, list[tuple[Any, Color]]]] = {}
     for label, (name, given) in enumerate(examples.items()):
         color = tuple(palette(np.array([label]), list(examples))[0].tolist())
-        for i, one in enumerate(given if isinstance(given, Sequence) else [given]):
-            if not hasattr(one, "indices"):
-                camera = _camera(cameras, one, f"examples[{name!r}][{i}]")
-                shown.setdefault(id(camera), (camera, []))[1].append((one, color))
+        for i, example in enumerate(given if isinstance(given, Sequence) else [given]):
+            if hasattr(example, "indices"):
+                continue
+            view = getattr(example, "view", None)
+            if not isinstance(view, str | Camera):
+                raise TypeError(
+                    f"examples[{name!r}][{i}]: expected Clicks, a Box or a Mask, got {type(example).__name__}; "
+                    "kfgs.fields has them"
+                )
+            camera = view_named(cameras, view, f"examples[{name!r}][{i}]")
+            shown.setdefault(id(camera), (camera, []))[1].append((example, color))
     if not shown:
         raise ValueError("examples: expected at least one in a view, got none; pass Clicks, a Box or a Mask")
     views = list(shown.values())[:MOST]
@@ -62,17 +67,9 @@ def draw_examples(
     columns = min(COLUMNS, len(pictures))
     titles = [camera.name for camera, _ in views] + [""] * (-len(pictures) % columns)
     pictures += [np.full((1, width, 3), 255, np.uint8)] * (-len(pictures) % columns)
-    rows = [
-        picture_grid([pictures[i : i + columns]], titles[i : i + columns]) for i in range(0, len(pictures), columns)
-    ]
+    starts = range(0, len(pictures), columns)
+    rows = [picture_grid([pictures[i : i + columns]], titles[i : i + columns]) for i in starts]
     return np.concatenate([*rows, legend_strip(np.arange(len(examples)), list(examples), rows[0].shape[1])])
-
-
-def _camera(cameras: Sequence[Camera], example: Any, name: str) -> Camera:
-    view = getattr(example, "view", None)
-    if not isinstance(view, str | Camera):
-        raise TypeError(f"{name}: expected Clicks, a Box or a Mask, got {type(example).__name__}; kfgs.fields has them")
-    return view_named(cameras, view, name)
 
 
 def _marked(camera: Camera, photo: Tensor | Array, marks: list[tuple[Any, Color]], width: int) -> Array:
@@ -81,18 +78,18 @@ def _marked(camera: Camera, photo: Tensor | Array, marks: list[tuple[Any, Color]
     size = width, max(1, round(camera.height * width / camera.width))  # Pillow's order
     picture = Image.fromarray(np.ascontiguousarray(as_bytes(photo))).resize(size, Resampling.BOX)
     pen, across, down = ImageDraw.Draw(picture), size[0] / camera.width, size[1] / camera.height
-    for one, color in marks:
+    for example, color in marks:
         rim = LEGEND_INK if sum(color) > 3 * BRIGHT else LEGEND_PAPER
-        if hasattr(one, "mask"):
-            check_shapes(("mask", one.mask, camera.size))
-            _outline(picture, as_array(one.mask, "mask").astype(bool), color, rim)
-        elif hasattr(one, "corners"):
-            x0, y0, x1, y1 = one.corners
+        if hasattr(example, "mask"):
+            check_shapes(("mask", example.mask, camera.size))
+            _outline(picture, as_array(example.mask, "mask").astype(bool), color, rim)
+        elif hasattr(example, "corners"):
+            x0, y0, x1, y1 = example.corners
             box = x0 * across, y0 * down, x1 * across, y1 * down
             pen.rectangle(box, outline=rim, width=2 * LINE)
             pen.rectangle(box, outline=color, width=LINE)
         else:
-            for x, y in ((x * across, y * down) for x, y in one.points):
+            for x, y in ((x * across, y * down) for x, y in example.points):
                 pen.ellipse((x - DOT, y - DOT, x + DOT, y + DOT), fill=color, outline=rim, width=LINE // 2)
     return np.asarray(picture)
 

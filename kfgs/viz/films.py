@@ -1,106 +1,252 @@
-"""Films of a scene: a turn around it, or a flight along its cameras."""
+"""Pictures of clouds from any camera, drawn by kfgs's rasteriser, and films of them: GIF with Pillow, MP4 with imageio-ffmpeg.
+
+Unlike pyvista it needs no display and no OpenGL, and scores are computed from the same pictures. A *show* is a function from
+a camera to a picture [H, W, 3] of the camera's size (uint8, or floats in [0, 1]).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import importlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any, Literal
 
+import numpy as np
+import torch
+from PIL import Image
 from torch import Tensor
 
-from ..cameras import Camera, Orbit, estimate_up, orbit_cameras, path_cameras
-from ..cameras.camera import UP
-from ..gaussians import Gaussians
-from .animation import Progress, save_animation
-from .film_frames import Show
+from .._check import check_choice, check_range, check_shapes
+from .._files import as_path, atomic_path
+from ..cameras import Camera
+from ..gaussians import Gaussians, check_gaussians
+from ..labels.color import parse_color
+from ..scenes import Scene
+from ..splat import rasterize, rasterize_labels
+from .colors import Array, FeatureColors, cloud_colors, color_by_default
+from .palette import palette
+from .pictures import as_bytes, legend_strip, overlay_labels, picture_grid, resize_photo
 
-KEYS = 40  # cameras of a long walk that become keys: enough to follow it, few enough to smooth out a shaking hand
+Show = Callable[[Camera], Any]
+ColorBy = Literal["label", "rgb", "feature", "opacity"]
+GIF_FPS = 50.0  # browsers slow down films with shorter frames than 0.02 s
+SUFFIXES = (".gif", ".mp4")
+COVERED = 0.5  # opacity from which a pixel has a class
+OUTLINE = (213, 94, 0)  # vermilion of Okabe and Ito
+ALPHA = 0.65  # of classes over a picture
+FADED = 0.7  # share of white in what is not selected
 
 
-def save_turntable(
-    path: str | Path,
-    shows: Gaussians | Mapping[str, Gaussians | Show],
+def show_cloud(
+    gaussians: Gaussians,
     *,
-    orbit: Orbit | None = None,
-    up: Tensor | Sequence[float] | None = None,  # [3]
-    cameras: Sequence[Camera] | None = None,
-    fps: float = 15.0,
+    color_by: ColorBy | None = None,
+    feature_colors: FeatureColors | None = None,
+    background: str | Sequence[float] = "white",
     names: Sequence[str] | None = None,
-    progress: Progress | None = None,
-) -> Path:
-    """Write a turn around a scene as a GIF or MP4 that can repeat without a jump.
+) -> Show:
+    """Make a function camera -> picture [H, W, 3] uint8 that draws a cloud with `rasterize`.
 
-    A GIF takes about 60 kB per frame of 360x480 with textured colours, and 40 kB with labels. `orbit` sets the number and
-    the size of frames.
+    Labels and features become one colour per Gaussian, and the colours are composited (Eq. 3 with three channels), so they
+    blend at borders. `rgb` is the colour of the harmonics, which depends on the direction.
 
     Args:
-        path: a name that ends in .gif or .mp4.
-        shows: Gaussians, or several things by title, side by side (`save_animation`). The cameras turn around the first
-            Gaussians among them.
-        orbit: number of cameras, size, elevation, ...; None: the defaults of `kfgs.cameras.Orbit`.
-        up: the world's up; None: from `cameras`, else +z.
-        cameras: the scene's cameras, to estimate `up`.
-        fps: frames per second.
-        names: class names for a legend below.
-        progress: called after each frame with (done, all).
-
-    Returns:
-        `path`.
+        gaussians: what to draw; on any device.
+        color_by: `label` (the palette), `rgb`, `feature` (through `feature_colors`) or `opacity`; None: as `add_cloud`.
+        feature_colors: the scene's projection of features to colours; None: one for this cloud alone.
+        background: a colour by name or three numbers in [0, 1].
+        names: class names: they decide the colours of labels, as in `palette`.
 
     Raises:
-        ValueError: if nothing can be shown, or there are no Gaussians to turn around (then pass `orbit_cameras` to
-            `save_animation`).
-        ImportError: for .mp4, if imageio-ffmpeg is not installed.
+        ValueError: if the cloud is empty or lacks what to colour by.
     """
-    things = shows.values() if isinstance(shows, Mapping) else [shows]
-    cloud = next((thing for thing in things if isinstance(thing, Gaussians)), None)
-    if cloud is None:
-        raise ValueError(
-            "shows: expected Gaussians to go round, got only functions; pass orbit_cameras(points) to save_animation"
-        )
-    if up is None and cameras:
-        up = estimate_up(cameras)
-    return save_animation(
-        path,
-        shows,
-        orbit_cameras(cloud.means, orbit, up=UP if up is None else up, origin=cloud.origin),
-        fps=fps,
-        names=names,
-        progress=progress,
-    )
+    check_gaussians(gaussians)
+    color_by = color_by or color_by_default(gaussians)
+    check_choice("color_by", color_by, ("label", "rgb", "feature", "opacity"))
+    if len(gaussians) == 0:
+        raise ValueError("gaussians: expected at least one Gaussian to draw, got none; widen the selection")
+    painted = gaussians.detach().replace(features=None)
+    rgb = cloud_colors(gaussians, color_by, feature_colors).rgb
+    if color_by != "rgb":
+        if color_by == "label" and gaussians.labels is not None:
+            rgb = palette(gaussians.labels, names)
+        painted = painted.replace(features=torch.from_numpy(rgb).to(gaussians.means) / 255, sh=None)
+    paper = torch.tensor(parse_color(background, "background")).to(gaussians.means)
+
+    def show(camera: Camera) -> Array:
+        with torch.no_grad():
+            return as_bytes(rasterize(painted, camera.to(painted.means), background=paper).map)
+
+    return show
 
 
-def save_flythrough(
+def show_classes(gaussians: Gaussians, names: Sequence[str], under: Show | None = None) -> Show:
+    """Make a function camera -> picture that gives each pixel the colour of its class, over another picture if given.
+
+    A pixel has the class that most of its Gaussians have, weighted as in a rendering; none if nothing covers it.
+
+    Args:
+        gaussians: with labels.
+        names: class names by index, which decide the colours.
+        under: draws the picture below, for instance `show_cloud(colors)`; None: white paper.
+    """
+    if gaussians.labels is None:
+        raise ValueError("gaussians: expected labels, got None; classify them first")
+    labels = gaussians.labels.long()
+    count = max(int(labels.max()) + 1, 1) if len(labels) else 1
+    votes = torch.nn.functional.one_hot(labels.clamp_min(0), count).to(gaussians.means) * (labels >= 0)[:, None]
+    voting = gaussians.detach().replace(features=votes, sh=None, labels=None)
+
+    def show(camera: Camera) -> Array:
+        ranked = rasterize_labels(voting, camera.to(voting.means))
+        known = (ranked.alphas >= COVERED) & (ranked.scores[..., 0] > 0)
+        classes = torch.where(known, ranked.labels[..., 0], -1).cpu().numpy()
+        if under is None:
+            return np.where((classes >= 0)[..., None], palette(classes, names), 255).astype(np.uint8)
+        photo = as_bytes(under(camera))
+        drawn = overlay_labels(photo / 255, classes, names, alpha=ALPHA, legend=False)
+        return np.where((classes >= 0)[..., None], drawn, photo)
+
+    return show
+
+
+def show_selection(gaussians: Gaussians, mask: Tensor, under: Show | None = None) -> Show:
+    """Make a function camera -> picture in which a selection keeps its colours, with an outline, and the rest fades.
+
+    Args:
+        gaussians: what was selected from.
+        mask: which are selected, [N] bool.
+        under: draws the picture, for instance `show_cloud(colors)`; None: the selection is dark on white paper.
+    """
+    check_shapes(("gaussians.opacities", gaussians.opacities, "N"), ("mask", mask, "N"))
+    marked = gaussians.detach().replace(features=mask[:, None].to(gaussians.means), sh=None, labels=None)
+
+    def show(camera: Camera) -> Array:
+        from skimage.segmentation import find_boundaries
+
+        with torch.no_grad():
+            inside = rasterize(marked, camera.to(marked.means)).map[..., 0].cpu().numpy() > 0.5
+        photo = np.where(inside, 60, 255)[..., None].repeat(3, -1) if under is None else as_bytes(under(camera))
+        gray = photo.mean(-1, keepdims=True)
+        picture = np.where(inside[..., None], photo, FADED * 255 + (1 - FADED) * gray)
+        picture[find_boundaries(inside, mode="thick")] = OUTLINE
+        return np.rint(picture).astype(np.uint8)
+
+    return show
+
+
+class Photos:
+    """The photographs of an undistorted scene by the names of its views: a show; grey where there is no photograph."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._places = {camera.name: i for i, camera in enumerate(scene.cameras) if scene.image_paths[i].is_file()}
+
+    def __contains__(self, camera: Camera) -> bool:
+        """Whether there is a photograph of this view."""
+        return camera.name in self._places
+
+    def __call__(self, camera: Camera) -> Array:  # [H, W, 3] uint8
+        """The photograph at the camera's size."""
+        if camera not in self:
+            return np.full((camera.height, camera.width, 3), 200, np.uint8)
+        return as_bytes(resize_photo(self._scene.image(self._places[camera.name]), camera.size))
+
+
+def save_animation(
     path: str | Path,
     shows: Gaussians | Show | Mapping[str, Gaussians | Show],
     cameras: Sequence[Camera],
     *,
-    frames: int = 150,
-    size: tuple[int, int] | None = None,
     fps: float = 15.0,
     names: Sequence[str] | None = None,
-    progress: Progress | None = None,
+    listed: Tensor | Array | None = None,  # any shape, int
+    progress: Callable[[int, int], object] | None = None,
 ) -> Path:
-    """Write a flight along posed cameras as a GIF or MP4.
-
-    For other keys or a closed walk pass `path_cameras(...)` to `save_animation`.
+    """Draw a cloud, or several side by side, from each camera, and write the frames as a GIF or an MP4 video.
 
     Args:
-        path: a name that ends in .gif or .mp4.
-        shows: Gaussians, a function camera -> picture, or several by title, side by side (`save_animation`).
-        cameras: the scene's cameras in the order of the walk; at most about 40 of them become keys, evenly chosen.
-        frames: number of frames.
-        size: (height, width) in pixels of each picture; None: the first camera's.
-        fps: frames per second.
-        names: class names for a legend below.
+        path: a name that ends in .gif or .mp4. The file appears whole or not at all.
+        shows: Gaussians, a function camera -> picture (`show_cloud`), or several of these by title, shown side by side.
+        cameras: one per frame, all of one size (`kfgs.cameras.orbit_cameras`, `path_cameras`).
+        fps: frames per second, at least 0.01, and at most 50 in a GIF, which counts hundredths of a second.
+        names: class names: they decide the colours of labelled Gaussians.
+        listed: the labels in a legend below every frame, with these names; None: no legend.
         progress: called after each frame with (done, all).
 
-    Returns:
-        `path`.
-
     Raises:
-        ValueError: if nothing can be shown, or there are fewer than two different views.
+        ValueError: if there is nothing to show or no camera, sizes differ, or the name ends otherwise.
         ImportError: for .mp4, if imageio-ffmpeg is not installed.
     """
-    every = max(1, round(len(cameras) / KEYS))
-    walk = path_cameras(cameras, frames, every=every, size=size)
-    return save_animation(path, shows, walk, fps=fps, names=names, progress=progress)
+    named = shows if isinstance(shows, Mapping) else {"": shows}
+    if not named or not cameras:
+        raise ValueError(
+            "shows, cameras: expected at least one of each, got none; kfgs.cameras.orbit_cameras makes some"
+        )
+    sizes = sorted({camera.size for camera in cameras})
+    if len(sizes) > 1:
+        raise ValueError(f"cameras: expected one size for all frames, got {sizes}; pass path_cameras(cameras, frames)")
+    target = check_target(path, fps)
+    drawn = {t: show_cloud(show, names=names) if isinstance(show, Gaussians) else show for t, show in named.items()}
+
+    def frames() -> Iterator[Array]:
+        for done, camera in enumerate(cameras, start=1):
+            pictures = [as_bytes(show(camera)) for show in drawn.values()]
+            frame = pictures[0] if list(drawn) == [""] else picture_grid([pictures], list(drawn))
+            if names is not None and listed is not None:
+                frame = np.concatenate([frame, legend_strip(listed, names, frame.shape[1])])
+            yield frame
+            if progress is not None:
+                progress(done, len(cameras))
+
+    with atomic_path(target) as temporary:
+        (_write_gif if target.suffix.lower() == ".gif" else _write_mp4)(temporary, frames(), fps)
+    return target
+
+
+def check_target(path: str | Path, fps: float) -> Path:
+    """Check the target before the first frame is drawn."""
+    target = as_path(path)
+    suffix = target.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ValueError(f"path: expected a name that ends in .gif or .mp4, got {target.name!r}; rename it")
+    check_range("fps", fps, 0.01, GIF_FPS if suffix == ".gif" else 240)  # a GIF counts to 655 seconds
+    if suffix == ".mp4":
+        _ffmpeg()
+    return target
+
+
+def _write_gif(path: Path, frames: Iterator[Array], fps: float) -> None:
+    # an octree keeps the hue of small areas, as in a legend; dots of dithering would flicker
+    indexed = [
+        Image.fromarray(frame).quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+        for frame in frames
+    ]
+    # one call for all frames, so that Pillow stores only what changes between two frames
+    duration = round(100 / fps) * 10  # milliseconds; the file counts in hundredths of a second
+    indexed[0].save(path, format="GIF", save_all=True, append_images=indexed[1:], duration=duration, loop=0)
+
+
+def _write_mp4(path: Path, frames: Iterator[Array], fps: float) -> None:
+    writer = None
+    for frame in frames:
+        height, width = ((edge + 1) // 2 * 2 for edge in frame.shape[:2])  # H.264 needs even sizes: a white edge
+        paper = np.full((height, width, 3), 255, np.uint8)
+        paper[: frame.shape[0], : frame.shape[1]] = frame
+        if writer is None:
+            options = {"fps": fps, "codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+            writer = _ffmpeg().write_frames(str(path), (width, height), **options)
+            writer.send(None)
+        writer.send(paper)
+    assert writer is not None
+    writer.close()
+
+
+def _ffmpeg() -> Any:
+    try:
+        return importlib.import_module("imageio_ffmpeg")
+    except ImportError as error:
+        raise ImportError(
+            "path: expected imageio-ffmpeg to write .mp4, but it is not installed; run: pip install imageio-ffmpeg "
+            "(or write a .gif, which needs nothing)"
+        ) from error

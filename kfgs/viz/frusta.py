@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
+from PIL import Image
 from torch import Tensor
 
 from .._check import as_array, check_range, check_shapes, check_whole
-from ..cameras import Camera, resize_map
+from ..cameras import Camera
 from ..cameras.camera import at_one_origin
-from .meshes import draw_mesh
+from .colors import Array
+from .linked import evenly
 from .pictures import as_bytes
-from .places import placed
+from .plotter import draw_mesh, placed
 
 if TYPE_CHECKING:
     import pyvista as pv
 
-Array = np.ndarray[Any, Any]
 ATLAS = 4096  # edge of the texture in pixels; every OpenGL allows more
 PICTURE = 512  # the longest edge of one picture in it, in pixels
 
@@ -39,7 +39,7 @@ def add_cameras(
         plotter: where to draw.
         cameras: their distortion is ignored here.
         size: depth of the pyramids, world units; None: a twentieth of the extent of the cameras' positions.
-        color: one that pyvista knows.
+        color: a colour that pyvista knows.
         line_width: in pixels.
         most: draw at most this many, evenly chosen; None: all.
 
@@ -49,7 +49,7 @@ def add_cameras(
     Raises:
         ValueError: if there are no cameras, or the size or `most` is not positive.
     """
-    depth, chosen = _depth(cameras, size), _chosen(cameras, most)
+    depth, chosen = _chosen(cameras, size, most)
     import pyvista as pv
 
     segments = np.concatenate([_frustum(placed(plotter, cameras[i]), depth) for i in chosen])  # [10 C, 2, 3]
@@ -84,9 +84,9 @@ def add_camera_images(
         The actor; its mesh's cells carry `camera`, the index.
 
     Raises:
-        ValueError: if there are no cameras, not as many images, an image is none, or a number is out of range.
+        ValueError: if there are no cameras, not as many images, an image is not [H, W, 3], or a number is out of range.
     """
-    depth, chosen = _depth(cameras, size), _chosen(cameras, most)
+    depth, chosen = _chosen(cameras, size, most)
     check_range("opacity", opacity, 0, 1, closed=(False, True))
     if not callable(images) and len(images) != len(cameras):
         raise ValueError(f"images: expected {len(cameras)} (one per camera), got {len(images)}; give one for each")
@@ -99,54 +99,33 @@ def add_camera_images(
     for slot, i in enumerate(chosen):
         picture = images(int(i)) if callable(images) else images[i]
         check_shapes((f"images[{i}]", picture, "H W 3"))
-        small = _reduced(picture, cell)
+        small = Image.fromarray(as_bytes(picture))
+        small.thumbnail((cell, cell), Image.Resampling.BOX)
         top, left = cell * (slot // columns), cell * (slot % columns)
-        height, width = small.shape[:2]
-        atlas[top : top + height, left : left + width] = small
+        atlas[top : top + small.height, left : left + small.width] = np.asarray(small)
         # half a pixel inside, so that the neighbour in the texture does not show at the border
-        x, y = np.array([left + 0.5, left + width - 0.5]), np.array([top + 0.5, top + height - 0.5])
+        x, y = np.array([left + 0.5, left + small.width - 0.5]), np.array([top + 0.5, top + small.height - 0.5])
         x, y = x / atlas.shape[1], 1 - y / atlas.shape[0]  # OpenGL counts rows from below
         places += [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
         corners += list(_frustum(placed(plotter, cameras[i]), depth)[:4, 1])
-    mesh = pv.PolyData.from_regular_faces(
-        np.array(corners, dtype=np.float32), np.arange(4 * len(chosen)).reshape(-1, 4)
-    )
+    faces = np.arange(4 * len(chosen)).reshape(-1, 4)
+    mesh = pv.PolyData.from_regular_faces(np.array(corners, dtype=np.float32), faces)
     mesh.active_texture_coordinates = np.array(places, dtype=np.float32)
     mesh.cell_data["camera"] = chosen
     return draw_mesh(plotter, mesh, texture=pv.numpy_to_texture(atlas), lighting=False, opacity=opacity)
 
 
-def evenly(count: int, most: int | None) -> Array:  # [min(count, most)] int64
-    """At most `most` indices below `count`, evenly spaced, with both ends; None: all."""
-    return np.unique(np.linspace(0, count - 1, count if most is None else min(most, count)).round().astype(np.int64))
-
-
-def _depth(cameras: Sequence[Camera], size: float | None) -> float:
-    if not isinstance(cameras, Sequence):
-        hint = "its .cameras" if hasattr(cameras, "cameras") else "a list"
-        raise TypeError(f"cameras: expected a list of cameras, got {type(cameras).__name__}; pass {hint}")
+def _chosen(cameras: Sequence[Camera], size: float | None, most: int | None) -> tuple[float, Array]:
+    """The depth of the pyramids, and which cameras are drawn."""
     if not cameras:
         raise ValueError("cameras: expected at least one camera, got none; load a scene with views")
+    if most is not None:
+        check_whole("most", most, 1)
     centers = np.stack([as_array(camera.center) for camera in at_one_origin(cameras)]).astype(np.float64)
     extent = float(np.ptp(centers, axis=0).max())
     depth = size if size is not None else (0.05 * extent if extent > 0 else 0.2)
     check_range("size", depth, 0, closed=(False, False))
-    return depth
-
-
-def _chosen(cameras: Sequence[Camera], most: int | None) -> Array:
-    if most is not None:
-        check_whole("most", most, 1)
-    return evenly(len(cameras), most)
-
-
-def _reduced(picture: Tensor | Array, longest: int) -> Array:  # [h, w, 3] uint8
-    values = torch.from_numpy(as_bytes(picture).copy()).float() / 255
-    scale = longest / max(values.shape[:2])
-    if scale < 1:
-        height, width = (max(1, int(scale * edge)) for edge in values.shape[:2])
-        values = resize_map(values, (height, width), antialias=True)
-    return as_bytes(values)
+    return depth, evenly(len(cameras), most)
 
 
 def _frustum(camera: Camera, depth: float) -> Array:  # [10, 2, 3]

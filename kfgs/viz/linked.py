@@ -1,28 +1,31 @@
-"""Show the semantic and the colour cloud side by side, with one camera."""
+"""Two clouds with one camera, and the labels that one gave to the other (Sec. 3.4): who gave what to whom, and who got none."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from .._check import check_whole
+from .._check import as_array, check_choice, check_shapes, check_whole
 from ..cameras import Camera, estimate_up
 from ..gaussians import Gaussians
-from .camera_view import look_through
-from .cloud_colors import ColorBy
+from ..labels import Transfer
 from .clouds import Style, add_cloud
-from .headless import make_plotter
-from .legends import add_legend, letters
+from .colors import Array, ColorBy
+from .legends import add_legend, add_title
 from .palette import palette
-from .places import placed
+from .plotter import draw_mesh, look_through, make_plotter, placed
 
 if TYPE_CHECKING:
     import pyvista as pv
 
 FAR = 99.0  # percentile of distances from the middle that the first view shows: floaters stay outside
 TITLES = {"label": "classes", "rgb": "colours", "view": "colours", "opacity": "opacity"}
+LINES = 500  # more lines than this hide the clouds
+STATES = ("matched", "ambiguous", "orphaned")  # ambiguous: labelled, but its sources disagree; orphaned: no label
+STATE_COLORS = np.array([[86, 180, 233], [213, 94, 0], [0, 0, 255]], np.uint8)  # every eye can tell them apart
+Shift = tuple[float, float, float]
 
 
 def linked_clouds(
@@ -61,8 +64,7 @@ def linked_clouds(
     try:
         for column, (cloud, by) in enumerate(zip((semantic, color), color_by, strict=True)):
             plotter.subplot(0, column)
-            title = f"{('semantic', 'colour')[column]} field: {TITLES.get(by, by)}"
-            add_title(plotter, title)
+            add_title(plotter, f"{('semantic', 'colour')[column]} field: {TITLES.get(by, by)}")
             if names is not None and by == "label" and cloud.labels is not None:
                 add_cloud(plotter, cloud, color_by=palette(cloud.labels, names), style=style)
                 add_legend(plotter, cloud.labels, names)
@@ -81,9 +83,107 @@ def linked_clouds(
     return plotter
 
 
-def add_title(plotter: pv.Plotter, title: str) -> pv.CornerAnnotation:
-    """Write a title over the active subplot, in a colour that can be read on its background."""
-    return plotter.add_text(title, position="upper_edge", font_size=10, color=letters(plotter))
+def add_transfer(
+    plotter: pv.Plotter,
+    src: Gaussians,
+    dst: Gaussians,
+    transfer: Transfer,
+    *,
+    color_by: Literal["label", "state"] = "label",
+    names: Sequence[str] | None = None,
+    shift: Shift = (0.0, 0.0, 0.0),
+    sample: int = LINES,
+    line_width: float = 1.0,
+) -> pv.Actor:
+    """Draw a line from each labelled destination to the source of its label.
+
+    Lines are as short as lambda. To see them, draw the destinations aside: pass a `shift` here, and draw the cloud
+    `dst.replace(means=dst.means + shift)`. Cells carry `label`, `state`, `source`, `destination`, `distance` and `rgb`.
+
+    Args:
+        plotter: where to draw.
+        src: the Gaussians that labels came from.
+        dst: the Gaussians that received them.
+        transfer: the result of `transfer_labels` for these two.
+        color_by: the palette of labels, or `state`: 0 matched, 1 ambiguous (its sources disagree).
+        names: class names, for the colours of labels as in `palette`.
+        shift: added to the destinations' positions, world units.
+        sample: the most lines, evenly chosen among the labelled destinations.
+        line_width: in pixels.
+
+    Raises:
+        ValueError: if the transfer belongs to other clouds, or nothing was labelled.
+    """
+    import pyvista as pv
+
+    check_choice("color_by", color_by, ("label", "state"))
+    check_shapes(("dst.means", dst.means, "N 3"), ("transfer.labels", transfer.labels, "N"))
+    check_whole("sample", sample, 1)
+    src, dst = placed(plotter, src), placed(plotter, dst)
+    labelled = np.flatnonzero(as_array(transfer.labels) >= 0)
+    if labelled.size == 0:
+        raise ValueError(
+            f"transfer: expected labelled Gaussians to draw, got none within {transfer.distance:g}; raise the distance"
+        )
+    chosen = labelled[evenly(labelled.size, sample)]
+    sources = as_array(transfer.sources)[chosen]
+    if sources.max() >= len(src):
+        raise ValueError(
+            f"transfer: expected sources below {len(src)} (from src), got {sources.max()}; pass its own clouds"
+        )
+    ends = np.stack([as_array(dst.means)[chosen] + shift, as_array(src.means)[sources]], axis=1).reshape(-1, 3)
+    labels, states = as_array(transfer.labels)[chosen], match_states(transfer)[chosen]
+    lines = pv.line_segments_from_points(ends.astype(np.float32))
+    lines.cell_data["label"], lines.cell_data["state"] = labels, states
+    lines.cell_data["source"], lines.cell_data["destination"] = sources, chosen
+    lines.cell_data["distance"] = as_array(transfer.distances)[chosen]
+    lines.cell_data["rgb"] = palette(labels, names) if color_by == "label" else STATE_COLORS[states]
+    return draw_mesh(plotter, lines, scalars="rgb", rgb=True, line_width=line_width, lighting=False)
+
+
+def add_matches(
+    plotter: pv.Plotter,
+    src: Gaussians,
+    dst: Gaussians,
+    transfer: Transfer,
+    *,
+    shift: Shift = (0.0, 0.0, 0.0),
+    sample: int = LINES,
+    point_size: float = 3.0,
+) -> pv.Actor:
+    """Draw the destinations as matched, ambiguous or orphaned points, lines to their sources, and how many of each.
+
+    Draw the sources with `add_cloud`. Arguments as in `add_transfer`.
+
+    Returns:
+        The points, with `state` (0 matched, 1 ambiguous: labelled, but its sources disagree, 2 orphaned), `label`,
+        `distance` and `rgb`.
+
+    Raises:
+        ValueError: if the transfer belongs to other clouds.
+    """
+    import pyvista as pv
+
+    check_shapes(("dst.means", dst.means, "N 3"), ("transfer.labels", transfer.labels, "N"))
+    moved = placed(plotter, dst)
+    states = match_states(transfer)
+    points = pv.PolyData((as_array(moved.means) + shift).astype(np.float32))
+    points["state"], points["label"] = states, as_array(transfer.labels)
+    points["distance"], points["rgb"] = as_array(transfer.distances), STATE_COLORS[states]
+    dots = draw_mesh(plotter, points, style="points", scalars="rgb", rgb=True, point_size=point_size, lighting=False)
+    if transfer.labelled:
+        add_transfer(plotter, src, dst, transfer, color_by="state", shift=shift, sample=sample)
+    counts = np.bincount(states, minlength=len(STATES))
+    names = [f"{name} {count:,}" for name, count in zip(STATES, counts, strict=True)]
+    if transfer.labelled > sample:
+        names[:2] = [f"{name} (1 line in {transfer.labelled / sample:.3g})" for name in names[:2]]
+    add_legend(plotter, np.unique(states), names, colors=STATE_COLORS)
+    return dots
+
+
+def match_states(transfer: Transfer) -> Array:  # [N] int64
+    """The state of each destination, an index into `STATES`."""
+    return np.where(as_array(transfer.labels) < 0, 2, np.where(as_array(transfer.disagree), 1, 0))
 
 
 def look_over(plotter: pv.Plotter, gaussians: Gaussians, up: Sequence[float] = (0.0, 0.0, 1.0)) -> None:
@@ -93,13 +193,11 @@ def look_over(plotter: pv.Plotter, gaussians: Gaussians, up: Sequence[float] = (
     if np.linalg.norm(side) < 1e-6:  # along a diagonal
         side = np.cross(axis, (1.0, 0.0, 0.0))
     side /= np.linalg.norm(side)
-    means = placed(plotter, gaussians).means.detach().cpu().double().numpy()
-    middle = np.median(means, axis=0)
-    distance = np.linalg.norm(means - middle, axis=1)
+    means = as_array(placed(plotter, gaussians).means).astype(np.float64)
+    distance = np.linalg.norm(means - np.median(means, axis=0), axis=1)
     kept = means[distance <= np.percentile(distance, FAR)]
-    bounds = np.stack([kept.min(axis=0), kept.max(axis=0)], axis=1).reshape(-1)
     plotter.view_vector(axis + side + np.cross(axis, side), viewup=axis)
-    plotter.renderer.ResetCamera(*bounds)
+    plotter.renderer.ResetCamera(*np.stack([kept.min(axis=0), kept.max(axis=0)], axis=1).reshape(-1))
     for renderer in plotter.renderers:
         renderer.camera_set = True
         renderer.ResetCameraClippingRange()
@@ -111,3 +209,8 @@ def upwards(cameras: Sequence[Camera]) -> list[float]:
         return [float(x) for x in estimate_up(cameras)]
     except ValueError:
         return [0.0, 0.0, 1.0]
+
+
+def evenly(count: int, most: int | None) -> Array:  # [min(count, most)] int64
+    """At most `most` indices below `count`, evenly spaced, with both ends; None: all."""
+    return np.unique(np.linspace(0, count - 1, count if most is None else min(most, count)).round().astype(np.int64))

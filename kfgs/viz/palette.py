@@ -71,17 +71,10 @@ def palette(
     labels: Tensor | np.ndarray[Any, Any],  # [...] int
     names: Sequence[str] | None = None,
 ) -> np.ndarray[Any, Any]:  # [..., 3] uint8
-    """The colour of each label, safe for colour-blind eyes; -1 is grey.
+    """The colour of each label, safe for colour-blind eyes; -1 is grey. From 256 on the colours repeat.
 
-    With names, a class has the same colour in every scene: `name_slots` chooses it. Without names, label k has the k-th
-    colour.
-
-    Args:
-        labels: class indices of any shape. From 256 on the colours repeat.
-        names: all class names by index.
-
-    Returns:
-        RGB, 8 bit, one more axis than `labels`.
+    With all class names by index, a class has the same colour in every scene (`name_slots`). Without names, label k has
+    the k-th colour.
 
     Raises:
         TypeError: if the labels are not integers.
@@ -91,8 +84,8 @@ def palette(
         >>> import torch
         >>> palette(torch.tensor([0, -1])).tolist()
         [[241, 234, 11], [128, 128, 128]]
-        >>> one, other = palette(torch.tensor([0]), ["chair", "wall"]), palette(torch.tensor([2]), ["rug", "wall", "chair"])
-        >>> bool((one == other).all())
+        >>> chair, same = palette(torch.tensor([0]), ["chair", "wall"]), palette(torch.tensor([1]), ["rug", "chair"])
+        >>> bool((chair == same).all())
         True
     """
     values = as_array(labels, "labels")
@@ -117,20 +110,16 @@ def name_slots(names: Sequence[str]) -> list[int]:
     other words the first in the alphabet. The others move to the next free colour: of the first 20, then of 64, then of 256.
     """
     words = [" ".join(name.lower().replace("_", " ").replace("-", " ").split()) for name in names]
-    slots, taken = [0] * len(names), set[int]()
+    slots: dict[int, int] = {}
     order = sorted(range(len(names)), key=lambda i: (_RANKS.get(words[i], 0), words[i], i))
-    moving = []
     for i in order:
         home = _HOMES.get(words[i])
-        if home is None or home in taken:
-            moving.append(i)
-        else:
+        if home is not None and home not in slots.values():
             slots[i] = home
-            taken.add(home)
-    for i in moving:
-        slots[i] = _free_slot(words[i], taken)
-        taken.add(slots[i])
-    return slots
+    for i in order:
+        if i not in slots:
+            slots[i] = _free_slot(words[i], set(slots.values()))
+    return [slots[i] for i in range(len(names))]
 
 
 def _free_slot(word: str, taken: set[int]) -> int:

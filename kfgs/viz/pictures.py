@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numbers
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,9 +13,8 @@ from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from .._check import as_array, check_range, check_shapes
+from .._check import as_array, check_range, check_shapes, check_whole
 from .._files import as_path, atomic_path
-from .._typed import typed
 from .palette import palette
 
 Array = np.ndarray[Any, Any]
@@ -32,7 +30,6 @@ def overlay_labels(
     names: Sequence[str] | None = None,
     *,
     alpha: float = 0.55,
-    boundaries: bool = True,
     legend: bool = True,
 ) -> Array:  # [H + legend, W, 3] uint8
     """Blend label colours over a photograph, draw the borders between labels, and add a legend below.
@@ -46,21 +43,19 @@ def overlay_labels(
         labels: one per pixel of the image.
         names: class names by index: they decide the colours, and the classes present are listed under the picture.
         alpha: weight of the label colours, in [0, 1].
-        boundaries: darken the pixels on both sides of a border.
         legend: False: names decide the colours only.
 
     Raises:
         ValueError: if sizes disagree, `alpha` is out of range, or a label has no name.
     """
+    from skimage.segmentation import find_boundaries
+
     check_shapes(("image", image, "H W 3"), ("labels", labels, "H W"))
     check_range("alpha", alpha, 0, 1)
     photo, classes = np.clip(as_array(image, "image").astype(np.float64), 0, 1), as_array(labels, "labels")
     blended = (1 - alpha) * photo + alpha * palette(classes, names) / 255
-    if boundaries:
-        from skimage.segmentation import find_boundaries
-
-        blended[find_boundaries(classes, mode="thick")] *= 0.35
-    picture = _to_bytes(blended)
+    blended[find_boundaries(classes, mode="thick")] *= 0.35
+    picture = as_bytes(blended)
     if names is None or not legend:
         return picture
     return np.concatenate([picture, legend_strip(classes, names, picture.shape[1])], axis=0)
@@ -76,41 +71,23 @@ def legend_strip(
     Raises:
         ValueError: if a label has no name.
     """
-    return _draw_legend(labels, names, width, int(np.clip(width / 40, 10, 22)))
+    return draw_legend(labels, names, int(np.clip(width / 40, 10, 22)), width=width)
 
 
-def legend_column(
+def draw_legend(
     labels: Tensor | Array,  # any shape, int
     names: Sequence[str],
-    size: int = 14,
+    size: int,
     *,
+    width: int | None = None,
     height: int | None = None,
     colors: Array | None = None,  # [C, 3] uint8
 ) -> Array:  # [h, w, 3] uint8
-    """A legend of the classes present, one per line.
+    """A legend of the classes present, with letters of `size` pixels.
 
-    Args:
-        labels: the classes present are listed.
-        names: class names by index.
-        size: of the letters, pixels.
-        height: the largest height of a column in pixels, before another begins; None: no limit.
-        colors: of each class; None: `palette` with these names.
-
-    Raises:
-        ValueError: if a label has no name.
+    With a width, entries go from left to right and wrap. Without, there is one per line, in columns of at most `height`.
+    `colors` are those of each class; None: `palette` with these names.
     """
-    return _draw_legend(labels, names, None, size, height, colors)
-
-
-def _draw_legend(
-    labels: Tensor | Array,
-    names: Sequence[str],
-    width: int | None,
-    size: int,
-    height: int | None = None,
-    colors: Array | None = None,
-) -> Array:
-    """With a width: entries from left to right, wrapped. Without: one per line, in columns up to `height`."""
     present = [int(label) for label in np.unique(as_array(labels, "labels"))]
     check_names(present, names)
     swatches = palette(np.array(present), names) if colors is None else colors[present]
@@ -146,7 +123,7 @@ def save_picture(
     """Write a PNG file, whole or not at all. Floats are clipped to [0, 1].
 
     Raises:
-        ValueError: if the name does not end in .png, or the array is no picture.
+        ValueError: if the name does not end in .png, or the array is not a picture.
     """
     target, values = as_path(path), as_array(picture, "picture")
     if target.suffix.lower() != ".png":
@@ -169,7 +146,6 @@ def write_png(path: Path, picture: Image.Image) -> None:
         picture.save(temporary, format="PNG", pnginfo=note)
 
 
-@typed
 def picture_grid(
     rows: Sequence[Sequence[Tensor | Array]],  # each [H, W, 3] in [0, 1] or uint8
     titles: Sequence[str] = (),
@@ -182,11 +158,10 @@ def picture_grid(
         rows: R rows of C pictures. Smaller ones stand in the middle of their row and column.
         titles: C titles, or none.
         width: width of each picture in pixels; all pictures are resized to it and to the proportions of the first in their
-            row, for instance a feature map beside its photograph. Shrinking averages pixels. Enlarging repeats them, so
-            that a coarse map looks coarse.
+            row. Shrinking averages pixels. Enlarging repeats them, so that a coarse map looks coarse.
 
     Raises:
-        ValueError: if there is no picture, rows or titles differ in number, or `width` is no positive whole number.
+        ValueError: if there is no picture, rows or titles differ in number, or `width` is not a positive whole number.
 
     Example:
         >>> photo, coarse = np.zeros((60, 80, 3)), np.ones((6, 8, 3))
@@ -203,6 +178,7 @@ def picture_grid(
         check_shapes((f"rows[{i}][{j}]", rows[i][j], "H W 3"))
     pictures = [[as_bytes(picture) for picture in row] for row in rows]
     if width is not None:
+        check_whole("width", width, 1)
         pictures = [_resize_alike(row, width) for row in pictures]
     heights = [max(picture.shape[0] for picture in row) for row in pictures]
     width = max(picture.shape[1] for row in pictures for picture in row)
@@ -228,13 +204,15 @@ def resize_photo(photo: Tensor, size: tuple[int, int]) -> Tensor:  # [H, W, 3] -
 
 
 def as_bytes(picture: Tensor | Array) -> Array:
-    """A picture in uint8: floats are clipped to [0, 1], bytes stay as they are."""
+    """A picture in uint8: floats are clipped to [0, 1] and rounded, NaN is black; bytes stay as they are."""
     values = as_array(picture, "picture")
-    return values if values.dtype == np.uint8 else _to_bytes(values)
+    if values.dtype == np.uint8:
+        return values
+    return np.asarray(np.round(np.clip(np.nan_to_num(values, nan=0.0), 0, 1) * 255), dtype=np.uint8)
 
 
 def check_names(labels: Sequence[int], names: Sequence[str]) -> None:
-    """Raise a ValueError if a label has no name, a TypeError if `names` is no list of names."""
+    """Raise a ValueError if a label has no name, a TypeError if `names` is not a list of names."""
     if isinstance(names, str) or not isinstance(names, Sequence):
         hint = "its .names" if hasattr(names, "names") else "a list"
         raise TypeError(f"names: expected a list of class names, got {type(names).__name__}; pass {hint}")
@@ -244,17 +222,8 @@ def check_names(labels: Sequence[int], names: Sequence[str]) -> None:
         )
 
 
-def _to_bytes(unit: Array) -> Array:
-    """[0, 1] -> 0..255, rounded; NaN becomes black."""
-    return np.asarray(np.round(np.clip(np.nan_to_num(unit, nan=0.0), 0, 1) * 255), dtype=np.uint8)
-
-
 def _resize_alike(pictures: list[Array], width: int) -> list[Array]:
     """All pictures of a row `width` pixels wide and in the proportions of the first."""
-    if not isinstance(width, numbers.Integral) or width < 1:
-        raise ValueError(
-            f"width: expected a positive whole number of pixels, got {width!r}; pass an integer, for instance 320"
-        )
     if not all(picture.size for picture in pictures):
         raise ValueError("rows: expected pictures of at least one pixel, got an empty one; leave it out")
     high, wide = pictures[0].shape[:2]

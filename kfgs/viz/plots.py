@@ -1,10 +1,11 @@
-"""Plots with matplotlib: training curves, IoU by class, and quality against storage.
+"""Four plots with matplotlib: histories, IoU by class, scores of a query, quality against storage.
 
-Every function returns its figure, draws into `ax` if given, and writes a PNG file only if given a path.
+Every function returns its figure, and writes a PNG file only if given a path.
 """
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,72 +14,64 @@ import numpy as np
 from torch import Tensor
 
 from .._check import as_array, check_shapes
-from .._typed import typed
-from .figures import (
-    INK,
-    LINES,
-    Array,
-    Row,
-    add_legend_below,
-    axes_for,
-    check_class_names,
-    count_from_zero,
-    draw_curve,
-    finish,
-    is_number,
-    panels_for,
-)
+from .._files import as_path, atomic_path
+from ..labels import Selection
+from .colors import Array
 from .palette import palette
+from .pictures import DRAWN
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+Row = Mapping[str, Any]  # of a recorded history: numbers by name
+LINES = np.array([[0, 114, 178], [213, 94, 0], [0, 158, 115], [204, 121, 167], [86, 180, 233], [230, 159, 0]]) / 255
+"""Okabe and Ito's darker colours, which are readable as lines."""
+INK, REST = (0.08, 0.08, 0.08), (0.75, 0.75, 0.75)
 STEPS = ("step", "iteration", "epoch")  # keys for the x axis
-CLOCK = ("seconds",)  # not drawn by default: a nearly straight line
 COUNTS = {"size", "added", "pruned", "count", "gaussians"}  # whole numbers, drawn from zero
+BINS, STEEP = 80, 5.0  # counts are logarithmic if the highest bin of the rest is this many times that of the selected
 
 
-@typed
-def plot_codebook_history(
-    history: Sequence[Row], path: str | Path | None = None, *, ax: Sequence[Axes] | Array | None = None
-) -> Figure:
-    """Draw how the codebook grew (Sec. 3.3.1): its size and all other recorded numbers that are not always 0.
+def plot_history(history: Sequence[Row] | Mapping[str, Sequence[Row]], path: str | Path | None = None) -> Figure:
+    """Draw every number that a training or a codebook's growth (Figure 6) recorded, one panel each, loss or size first.
 
-    Args:
-        history: `CodebookFit.history`: one row per round of growth, or per epoch of the paper's method (with a loss).
-        path: a .png file to write; None writes none.
-        ax: axes to draw into, one for each recorded number; None makes a figure.
-
-    Raises:
-        ValueError: if the history is empty or has no numbers, or there are too few axes.
-    """
-    return _plot_rows(history, path, ax, first="size", title="Codebook")
-
-
-@typed
-def plot_training(
-    history: Sequence[Row],
-    path: str | Path | None = None,
-    *,
-    leave_out: Sequence[str] = CLOCK,
-    ax: Sequence[Axes] | Array | None = None,
-) -> Figure:
-    """Draw every number that a training recorded over its steps, one panel each, the loss first.
-
-    Numbers that are always 0 are named in the title only.
+    Numbers that are always 0 are left out, and so are `seconds`, a nearly straight line.
 
     Args:
-        history: rows with `step` (or `iteration`, or `epoch`) and numbers, for instance `FieldFit.history`.
+        history: rows with `step` (or `iteration`, or `epoch`) and numbers: `FieldFit.history`, `CodebookFit.history`; or
+            several histories by name, which get a line each.
         path: a .png file to write; None writes none.
-        leave_out: numbers not to draw; () draws all.
-        ax: axes to draw into, one for each number; None makes a figure.
 
     Raises:
-        ValueError: if the history is empty or has no numbers, or there are too few axes.
+        ValueError: if there are no rows with numbers.
     """
-    rows = [{key: value for key, value in row.items() if key not in leave_out} for row in history]
-    return _plot_rows(rows, path, ax, first="loss", title="Training")
+    named = history if isinstance(history, Mapping) else {"": history}
+    rows = [row for part in named.values() for row in part]
+    keys = [key for key in dict.fromkeys(key for row in rows for key in row) if key not in (*STEPS, "seconds")]
+    keys = [key for key in keys if any(_is_number(row.get(key)) and row[key] for row in rows)]
+    if not keys:
+        raise ValueError(f"history: expected rows with numbers to draw, got {len(rows)} without; was anything trained?")
+    keys.sort(key=lambda key: key not in ("loss", "size"))  # stable: the others keep their order
+    columns = 2 if len(keys) == 4 else min(3, len(keys))
+    lines = -(-len(keys) // columns)
+    figure = new_figure(4.2 * columns, 2.9 * lines + 0.4)
+    for panel, key in enumerate(keys):
+        axes = figure.add_subplot(lines, columns, panel + 1)
+        for i, (name, part) in enumerate(named.items()):
+            step = next((word for word in STEPS if part and word in part[0]), "row")
+            points = [(row.get(step, at), row[key]) for at, row in enumerate(part) if _is_number(row.get(key))]
+            x, y = zip(*points, strict=True) if points else ((), ())
+            color = LINES[(panel if len(named) == 1 else i) % len(LINES)]
+            # not clipped: zeros show over the frame
+            axes.plot(x, y, color=color, marker="o" if len(x) < 40 else None, markersize=3, label=name, clip_on=False)
+            axes.set(xlabel=step, title=key)
+        axes.grid(alpha=0.3)
+        if key in COUNTS:
+            axes.set_ylim(0, 1.06 * max(1, *(row[key] for row in rows if _is_number(row.get(key)))))
+    if len(named) > 1:
+        _legend_below(axes)
+    return finish(figure, path)
 
 
 def plot_iou(
@@ -88,8 +81,6 @@ def plot_iou(
     *,
     reference: Tensor | Array | None = None,  # [C] as iou
     reference_name: str = "reference",
-    title: str = "Intersection over union by class (%)",
-    ax: Axes | None = None,
 ) -> Figure:
     """Draw the IoU of each class as a bar in its colour, best first, with the mean as a line; in per cent.
 
@@ -102,20 +93,18 @@ def plot_iou(
         path: a .png file to write; None writes none.
         reference: IoU to compare with, marked on each bar: of the 2-D teacher, or of another method.
         reference_name: its name in the legend.
-        title: over the picture.
-        ax: axes to draw into; None makes a figure.
 
     Raises:
         ValueError: if names or reference are not one per class, a value lies outside [0, 1], or no class occurs.
     """
-    check_shapes(("iou", iou, "C"), ("reference", reference, "C"))
+    check_shapes(("iou", iou, "C"), ("reference", reference, "C"), ("names", np.array(names), "C"))
     values = 100 * _shares("iou", iou)
-    check_class_names(names, len(values), "iou")
     shown = np.flatnonzero(~np.isnan(values))
     if len(shown) == 0:
         raise ValueError(f"iou: expected a class that occurs, got {len(values)} NaN; was anything scored?")
     shown = shown[np.argsort(-values[shown], kind="stable")]
-    axes, rows = axes_for(ax, 7.2, 0.3 * len(shown) + 1.5), np.arange(len(shown))
+    figure, rows = new_figure(7.2, 0.3 * len(shown) + 1.5), np.arange(len(shown))
+    axes = figure.add_subplot()
     axes.barh(rows, values[shown], color=palette(shown, names) / 255, edgecolor=INK, linewidth=0.6, height=0.75)
     for row, value in enumerate(values[shown]):
         axes.text(101, row, f"{value:.1f}", va="center", fontsize=9)
@@ -129,21 +118,59 @@ def plot_iou(
     axes.set_yticks(rows, [names[int(i)] for i in shown])
     absent = len(values) - len(shown)
     note = f" (classes that do not occur: {absent} of {len(values)})" if absent else ""
-    axes.set(xlim=(0, 107), ylim=(len(shown) - 0.4, -0.6), title=title, xlabel=f"IoU in %{note}")
-    axes.set_xticks(range(0, 101, 20))
+    axes.set(xlim=(0, 107), ylim=(len(shown) - 0.4, -0.6), xlabel=f"IoU in %{note}", xticks=range(0, 101, 20))
+    axes.set_title("Intersection over union by class (%)")
     axes.grid(axis="x", alpha=0.3)
     axes.set_axisbelow(True)
-    add_legend_below(axes, own=ax is None)
-    return finish(axes, path)
+    _legend_below(axes)
+    return finish(figure, path)
 
 
-@typed
+def plot_scores(selection: Selection, path: str | Path | None = None) -> Figure:
+    """Draw a histogram of scores: selected Gaussians in blue, the rest in grey, and gamma as a line between bins.
+
+    The title says how many are selected and where gamma comes from. Counts are logarithmic if the highest bin of the
+    selected is less than a fifth of the highest bin of the rest.
+
+    Args:
+        selection: the result of a query; without a threshold there is no gamma.
+        path: a .png file to write; None writes none.
+
+    Raises:
+        ValueError: if there are no Gaussians, or the file's name does not end in .png.
+    """
+    scores, mask = as_array(selection.scores.double()), as_array(selection.mask)
+    if scores.size == 0:
+        raise ValueError("selection: expected the scores of at least one Gaussian, got none; ask a cloud that has some")
+    gamma = selection.threshold
+    known = scores if gamma is None else np.append(scores, gamma)
+    width, zero = max(float(np.ptp(known)), 1e-3) / BINS, float(known.min()) if gamma is None else gamma
+    first, last = np.floor((known.min() - zero) / width), np.ceil((known.max() - zero) / width)
+    edges = zero + width * np.arange(first - 1, last + 2)  # an empty bin on either side, so rounding loses no score
+    counts = [np.histogram(scores[part], edges)[0] for part in (~mask, mask)]
+    figure = new_figure(7.0, 4.0)
+    axes = figure.add_subplot()
+    for count, name, color in zip(counts, ("not selected", "selected"), (REST, tuple(LINES[0])), strict=True):
+        axes.bar(edges[:-1], count, width, align="edge", color=color, label=f"{name} {count.sum():,}")
+    if gamma is not None:
+        axes.axvline(gamma, color="black", linewidth=1.5, label=f"gamma = {gamma:.4g}")
+    axes.set(xlabel="score", ylabel="Gaussians")
+    if counts[1].any() and counts[0].max() > STEEP * counts[1].max():
+        axes.set_yscale("log")
+        axes.set(ylim=(0.7, 2 * counts[0].max()), ylabel="Gaussians (logarithmic)")
+    share = f"{len(selection):,} of {len(mask):,} selected ({len(selection) / len(mask):.1%})"
+    axes.set_title("\n".join([share, *textwrap.wrap(selection.how, 88)[:3]]), fontsize=10)
+    axes.legend(frameon=False)
+    axes.grid(alpha=0.3)
+    axes.set_axisbelow(True)
+    return finish(figure, path)
+
+
 def plot_quality_storage(
     points: Mapping[str, tuple[float, float]],
     path: str | Path | None = None,
     *,
     reference: Mapping[str, tuple[float, float]] | None = None,
-    ax: Axes | None = None,
 ) -> Figure:
     """Draw segmentation quality against size: mIoU in per cent over MiB (logarithmic), with the name of each point.
 
@@ -151,66 +178,60 @@ def plot_quality_storage(
         points: name to (storage in MiB, mIoU in [0, 1]).
         path: a .png file to write; None writes none.
         reference: published points, drawn hollow: for instance rows of Table 1, whose "MB" are MiB.
-        ax: axes to draw into; None makes a figure.
 
     Raises:
         ValueError: if there is no point, a size is not positive and finite, or an mIoU lies outside [0, 1].
     """
     groups = [(points, LINES[0], "o", "measured"), (reference or {}, "none", "s", "reference")]
-    if not points and not reference:
+    rows = [(name, *pair) for group, *_ in groups for name, pair in group.items()]
+    for name, mib, miou in rows:
+        if not (0 < mib < float("inf") and 0 <= miou <= 1):
+            raise ValueError(f"points[{name!r}]: expected (MiB above 0, mIoU in [0, 1]), got ({mib!r}, {miou!r})")
+    if not rows:
         raise ValueError("points: expected at least one name with (MiB, mIoU), got none; pass what was measured")
-    axes = axes_for(ax, 7.6, 5.2)
-    places: list[tuple[str, float, float]] = []
+    figure = new_figure(7.6, 5.2)
+    axes = figure.add_subplot()
     for group, color, marker, label in groups:
-        if not group:
-            continue
-        rows = [(name, *_quality_point(name, pair)) for name, pair in group.items()]
-        _, x, y = zip(*rows, strict=True)
-        axes.scatter(x, y, s=55, color=color, edgecolor=INK, linewidth=1.1, marker=marker, label=label, zorder=3)
-        places += rows
+        if group:
+            x, y = zip(*group.values(), strict=True)
+            axes.scatter(x, 100 * np.array(y), s=55, color=color, edgecolor=INK, marker=marker, label=label, zorder=3)
     axes.set_xscale("log")
     axes.margins(x=0.3, y=0.12)
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.set(xlabel="storage in MiB", ylabel="mIoU in %", title="Quality against storage")
     axes.grid(alpha=0.3, which="both")
     if points and reference:
-        add_legend_below(axes, own=ax is None)
-    figure = finish(axes, None)
-    figure.draw_without_rendering()  # computes the layout, and so the positions of the points
-    if ax is None:
-        figure.set_layout_engine("none")
-    _name_points(axes, places)
-    return finish(axes, path)
+        _legend_below(axes)
+    for name, mib, miou in rows:
+        close = sum(abs(np.log10(x / mib)) < 0.35 and 0 < 100 * (y - miou) < 4 for _, x, y in rows)
+        place = {"ha": "right", "xytext": (-8, 0)} if close else {"ha": "left", "xytext": (8, 0)}
+        axes.annotate(name, (mib, 100 * miou), textcoords="offset points", va="center", fontsize=9, **place)
+    return finish(figure, path)
 
 
-def _plot_rows(
-    history: Sequence[Row], path: str | Path | None, ax: Sequence[Axes] | Array | None, *, first: str, title: str
-) -> Figure:
-    """One panel per recorded number that is not always 0; the axes of counts start at zero."""
-    if not history:
-        raise ValueError("history: expected at least one row, got none; was anything trained?")
-    step = next((name for name in STEPS if name in history[0]), None)
-    keys = [key for key in dict.fromkeys(key for row in history for key in row) if key not in STEPS]
-    keys = [key for key in keys if any(is_number(row.get(key)) for row in history)]
-    if not keys:
-        raise ValueError(f"history: expected rows with numbers to draw, got keys {sorted(history[0])}")
-    living = [key for key in keys if any(is_number(row.get(key)) and row[key] for row in history)]
-    dead = [f"{key} is always 0" for key in keys if living and key not in living]
-    keys = living or keys
-    keys.sort(key=lambda key: key != first)  # stable: the others keep their order
-    columns = 2 if len(keys) == 4 else min(3, len(keys))
-    lines = -(-len(keys) // columns)
-    panels, own = panels_for(ax, len(keys), columns, 4.2 * columns, 2.9 * lines + 0.4)
-    for panel, (axes, key) in enumerate(zip(panels, keys, strict=True)):
-        x = [i if step is None else row[step] for i, row in enumerate(history) if is_number(row.get(key))]
-        y = [row[key] for row in history if is_number(row.get(key))]
-        draw_curve(axes, x, y, panel)
-        axes.set(xlabel=step or "row", title=key)
-        if key in COUNTS:
-            count_from_zero(axes, y)
-    if own:
-        panels[0].figure.suptitle("; ".join([title, *dead]))
-    return finish(panels[0], path)
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure without matplotlib's global state; sizes in inches."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def finish(figure: Figure, path: str | Path | None) -> Figure:
+    """The figure, written as a PNG file, whole or not at all, if there is a path."""
+    if path is not None:
+        if as_path(path).suffix.lower() != ".png":
+            raise ValueError(f"path: expected a name that ends in .png, got {as_path(path).name!r}; rename it")
+        with atomic_path(path) as temporary:
+            # tight: otherwise labels next to square pictures are cut
+            figure.savefig(temporary, format="png", bbox_inches="tight", metadata=DRAWN)
+    return figure
+
+
+def _legend_below(axes: Axes) -> None:
+    axes.figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
 
 
 def _shares(name: str, values: Tensor | Array) -> Array:
@@ -221,36 +242,5 @@ def _shares(name: str, values: Tensor | Array) -> Array:
     return shares
 
 
-def _quality_point(name: str, pair: tuple[float, float]) -> tuple[float, float]:
-    """(MiB, per cent) of one point, checked."""
-    mib, miou = pair
-    if not (0 < mib < float("inf") and 0 <= miou <= 1):
-        raise ValueError(
-            f"points[{name!r}]: expected (MiB above 0, mIoU in [0, 1]), got ({mib!r}, {miou!r}); "
-            "give sizes in MiB and mIoU as a fraction, in this order"
-        )
-    return float(mib), 100 * float(miou)
-
-
-def _name_points(axes: Axes, places: Sequence[tuple[str, float, float]]) -> None:
-    """Write each name beside its point, on the side where it covers the fewest points and earlier names."""
-    spots = axes.transData.transform([(x, y) for _, x, y in places])
-    frame = axes.get_window_extent()
-    taken: list[Any] = []
-    sides = [((8, 0), "left", "center"), ((-8, 0), "right", "center"), ((0, 8), "center", "bottom")]
-    sides += [((0, -8), "center", "top"), ((8, 9), "left", "bottom"), ((8, -9), "left", "top")]
-    for name, x, y in places:
-        tried = []
-        for offset, ha, va in sides:
-            text = axes.annotate(name, (x, y), offset, textcoords="offset points", ha=ha, va=va, fontsize=9)
-            box = text.get_window_extent()
-            covered = sum(box.overlaps(other) for other in taken) + int(box.count_contains(spots))
-            outside = box.x0 < frame.x0 or box.x1 > frame.x1
-            tried.append((covered + 2 * outside, text, box))
-            text.set_visible(False)
-        _, text, box = min(tried, key=lambda entry: entry[0])  # the first of equally good ones
-        text.set_visible(True)
-        taken.append(box)
-        for _, other, _ in tried:
-            if other is not text:
-                other.remove()
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

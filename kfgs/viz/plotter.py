@@ -1,0 +1,241 @@
+"""Plotters that work with and without a display, their views from posed cameras, and one origin for all that they draw."""
+
+from __future__ import annotations
+
+import functools
+import gc
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from math import atan, degrees, radians, tan
+from typing import TYPE_CHECKING, Any, TypeVar
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+
+from .._check import ORIGIN, check_whole
+from .._origin import Origin
+from ..cameras import Camera
+from ..cameras.camera import NEAR
+from ..gaussians import Gaussians, check_gaussians
+from ..splat.engines import available_engines
+
+if TYPE_CHECKING:
+    import pyvista as pv
+
+Thing = TypeVar("Thing", Gaussians, Camera)
+WITHOUT_DISPLAY = {"VTK_DEFAULT_OPENGL_WINDOW": "vtkEGLRenderWindow", "PYVISTA_OFF_SCREEN": "true"}
+DEBIAN_PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri"
+PROBE_SECONDS = 120  # a first start of VTK from a cold disk takes tens of seconds
+PROBE = """
+import pyvista as pv
+plotter = pv.Plotter(off_screen=True, window_size=(8, 8))
+plotter.background_color = (255, 0, 0)
+plotter.add_mesh(pv.Sphere(radius=0.01))
+picture = plotter.screenshot(return_img=True)
+plotter.close()
+assert picture.shape == (8, 8, 3) and tuple(picture[0, 0]) == (255, 0, 0), picture
+"""
+_origins: WeakKeyDictionary[pv.Plotter, Origin] = WeakKeyDictionary()
+
+
+def has_display() -> bool:
+    """Whether windows can be opened (Windows and macOS: always)."""
+    if not sys.platform.startswith("linux"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def prepare() -> None:
+    """On Linux without a display, make VTK use EGL and pyvista draw off-screen, before pyvista is imported."""
+    if not has_display():
+        for name, value in WITHOUT_DISPLAY.items():
+            os.environ.setdefault(name, value)
+
+
+@functools.cache
+def trouble() -> str:
+    """Why no 3-D picture can be drawn here; empty if it can.
+
+    An 8 x 8 picture is drawn in another process, once: without an OpenGL driver VTK ends Python with a segfault.
+    """
+    prepare()
+    try:
+        result = subprocess.run(
+            [sys.executable, "-c", PROBE], capture_output=True, text=True, timeout=PROBE_SECONDS, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return f"the trial picture did not finish ({error})"
+    if result.returncode < 0 or result.returncode == 139:  # killed by a signal, 139 = 128 + SIGSEGV through a shell
+        return f"the trial picture crashed (exit status {result.returncode}): no OpenGL driver"
+    last = (result.stderr.strip().splitlines() or ["no message"])[-1]
+    return f"the trial picture failed ({last})" if result.returncode else ""
+
+
+def available() -> bool:
+    """Whether 3-D pictures can be drawn here. The first call takes a second or two, later ones nothing."""
+    return not trouble()
+
+
+def require() -> None:
+    """Raise a RuntimeError if nothing can be drawn here; VTK would crash."""
+    if trouble():
+        raise RuntimeError(
+            f"3-D pictures cannot be drawn here: expected a working OpenGL, but {trouble()}; "
+            f"on Debian or Ubuntu run: apt-get install {DEBIAN_PACKAGES}"
+        )
+
+
+def make_plotter(
+    height: int = 768,
+    width: int = 1024,
+    *,
+    shape: tuple[int, int] = (1, 1),
+    off_screen: bool | None = None,
+    background: str = "white",
+) -> pv.Plotter:
+    """A pyvista plotter that works with and without a display.
+
+    Args:
+        height: of the window, pixels.
+        width: of the window, pixels.
+        shape: (rows, columns) of subplots.
+        off_screen: draw without a window; None: only where there is no display.
+        background: a colour that pyvista knows.
+
+    Raises:
+        RuntimeError: if nothing can be drawn here; the message names the packages to install.
+        ValueError: if a size is not positive.
+    """
+    check_whole("height", height, 1)
+    check_whole("width", width, 1)
+    require()
+    # Mesa's software driver loads its own LLVM. Loading numba's or triton's after it can crash Python, before it works
+    available_engines("cpu")
+    import pyvista as pv
+
+    # pyvista's plotters lie in reference cycles. If the objects of a closed window are freed between two renders of
+    # another one, Mesa's software driver can crash at the next render
+    gc.collect()
+    hidden = not has_display() if off_screen is None else off_screen
+    options: dict[str, Any] = {"shape": shape} if shape != (1, 1) else {}
+    plotter = pv.Plotter(off_screen=hidden, window_size=(width, height), **options)
+    plotter.set_background(background)
+    return plotter
+
+
+def origin_of(plotter: pv.Plotter, first: Origin) -> Origin:
+    """The origin of all that is drawn in a plotter (VTK draws float32); if nothing is yet, `first` becomes it."""
+    return _origins.setdefault(plotter, first)
+
+
+def placed(plotter: pv.Plotter, thing: Thing) -> Thing:
+    """Gaussians or a camera, counted from the plotter's origin; a TypeError if it is neither."""
+    if not isinstance(thing, Camera):
+        check_gaussians(thing)
+    return thing.with_origin(origin_of(plotter, thing.origin))
+
+
+def draw_mesh(plotter: pv.Plotter, mesh: pv.PolyData, **options: Any) -> pv.Actor:
+    """`plotter.add_mesh(mesh, **options)`, but `actor.mapper.dataset` stays valid as long as the actor lives.
+
+    pyvista 0.49 holds only a weak reference, so the arrays of the mesh could be freed when the next one is drawn.
+    """
+    actor = plotter.add_mesh(mesh, **options)
+    actor.AddObserver("DeleteEvent", lambda *_, mesh=mesh: mesh)  # the default argument holds the mesh
+    return actor
+
+
+def look_through(plotter: pv.Plotter, camera: Camera) -> None:
+    """Set the active subplot's view to a camera, including its principal point and both focal lengths.
+
+    The picture fills the window, so make the window with the camera's proportions (`make_plotter(camera.height,
+    camera.width)`), or it is stretched.
+
+    Raises:
+        ValueError: if the camera's lens distorts.
+    """
+    if camera.distortion is not None:
+        raise ValueError(f"camera: expected a pinhole camera, got distortion {camera.distortion}; undistort it first")
+    camera = placed(plotter, camera)
+    K, E = camera.K.detach().double().cpu(), camera.viewmat.detach().double().cpu()
+    fx, fy, cx, cy = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+    R, center = E[:3, :3], -E[:3, :3].T @ E[:3, 3]
+    view = plotter.camera
+    view.position = tuple(center.tolist())
+    view.focal_point = tuple((center + R[2]).tolist())  # z of the camera points forward ...
+    view.up = tuple((-R[1]).tolist())  # ... and y down
+    view.view_angle = degrees(2 * atan(camera.height / 2 / fy))
+    view.SetWindowCenter(1 - 2 * cx / camera.width, 2 * cy / camera.height - 1)
+    view.SetExplicitAspectRatio((camera.width / fx) / (camera.height / fy))
+    view.SetUseExplicitAspectRatio(True)
+    plotter.camera_set = True  # otherwise the first render moves the camera to see everything
+    plotter.renderer.ResetCameraClippingRange()
+
+
+def draw_view(
+    camera: Camera,
+    draw: Callable[[pv.Plotter], object],
+    *,
+    background: str = "white",
+) -> np.ndarray[Any, Any]:  # [H, W, 3] uint8
+    """Draw with pyvista what a camera sees, and return the picture. No window opens, and the plotter is closed.
+
+    For a window that can be turned, make a plotter with `make_plotter` and call `look_through` and `show` yourself.
+
+    Args:
+        camera: where to look from; the picture has its size.
+        draw: called with the plotter; adds to it what is to be seen. What it returns is not used.
+        background: a colour that pyvista knows.
+
+    Raises:
+        RuntimeError: if nothing can be drawn here; the message names the packages to install.
+        ValueError: if the camera's lens distorts.
+
+    Example:
+        >>> from kfgs.viz import add_cloud
+        >>> picture = draw_view(camera, lambda plotter: add_cloud(plotter, cloud))  # doctest: +SKIP
+    """
+    plotter = make_plotter(*camera.size, off_screen=True, background=background)
+    try:
+        draw(plotter)
+        look_through(plotter, camera)
+        return np.asarray(plotter.screenshot(return_img=True))
+    finally:
+        plotter.close()
+
+
+def camera_of(plotter: pv.Plotter, subplot: tuple[int, int] = (0, 0), *, near: float = NEAR) -> Camera:
+    """The posed camera (float64) of a subplot's current view, with the subplot's size: the inverse of `look_through`.
+
+    VTK's own near plane depends on its depth buffer and says nothing, so `near` (world units) is given.
+    """
+    renderer = plotter.renderers[plotter.renderers.loc_to_index(subplot)]
+    view = renderer.GetActiveCamera()
+    width, height = renderer.GetSize()
+    matrix = view.GetViewTransformMatrix()
+    E = np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])
+    E[1:3] *= -1  # VTK's y points up and z backward
+    aspect = view.GetExplicitAspectRatio() if view.GetUseExplicitAspectRatio() else width / height
+    fy = height / 2 / tan(radians(view.GetViewAngle()) / 2)
+    fx = width / aspect * fy / height
+    x, y = view.GetWindowCenter()
+    K = [[fx, 0.0, (1 - x) * width / 2], [0.0, fy, (1 + y) * height / 2], [0.0, 0.0, 1.0]]
+    lens = torch.tensor(K, dtype=torch.float64), width, height
+    return Camera(torch.from_numpy(E), *lens, near=near, origin=origin_of(plotter, ORIGIN))
+
+
+def letterboxed(camera: Camera, height: int, width: int) -> Camera:
+    """Resize a camera. The old view stays complete and centred, at its aspect ratio."""
+    scale = min(height / camera.height, width / camera.width)
+    K = camera.K.detach().double().cpu().clone()
+    K[:2] *= scale
+    K[0, 2] += (width - scale * camera.width) / 2
+    K[1, 2] += (height - scale * camera.height) / 2
+    return replace(camera, viewmat=camera.viewmat.detach().double().cpu(), K=K, width=width, height=height)
+
+
+prepare()  # before the user makes a plotter
