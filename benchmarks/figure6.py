@@ -18,7 +18,7 @@ from devices import MapsOn, add_device
 from kfgs._files import write_json
 from kfgs.quant import CodebookConfig, fit_codebook
 from kfgs.scenes import FeatureFolder, load_scene
-from kfgs.viz.figures import new_figure, save_figure
+from kfgs.viz.plots import finish, new_figure
 
 
 def history_of(scene: Path, features: Path, epochs: int | None, device: torch.device) -> dict[str, Any]:
@@ -45,7 +45,7 @@ def draw(path: Path, scenes: list[dict[str, Any]]) -> None:
         axes.set(xlabel=across, ylabel="codewords", title=f"{rule} rule", ylim=(0, 1.35 * scenes[0]["limit"][rule]))
         axes.grid(alpha=0.3)
         axes.legend(loc="upper center", ncols=3)
-    save_figure(figure, path)
+    finish(figure, path)
 
 
 def main() -> None:

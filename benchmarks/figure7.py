@@ -19,8 +19,7 @@ from torch import Tensor
 from kfgs._rows import unit_rows
 from kfgs.fields import SemanticField
 from kfgs.scenes import FeatureFolder, load_scene
-from kfgs.viz import save_picture
-from kfgs.viz.field_colors import FeatureColors
+from kfgs.viz import FeatureColors, save_picture
 from kfgs.viz.pictures import picture_grid
 
 PIXELS = 20_000  # of a rendered map: 512 channels of it take 40 MB

@@ -14,7 +14,7 @@ from kfgs.evaluation import load_label_map, load_label_set
 from kfgs.metrics import MIB
 from kfgs.scenes import load_scene
 from kfgs.viz import overlay_labels, plot_quality_storage, save_picture
-from kfgs.viz.figures import new_figure, save_figure
+from kfgs.viz.plots import finish, new_figure
 from kfgs.viz.pictures import legend_strip, picture_grid
 
 COLUMNS = 5  # of the picture of labels
@@ -122,12 +122,12 @@ def draw_plots(out: Path, scene: Path, truth: str, results: list[dict[str, Any]]
         ax=figure.add_subplot(),
         reference={name: (p["mib"], p["miou"] / 100) for name, p in paper.items()},
     )
-    save_figure(figure, out / "quality_storage.png")
+    finish(figure, out / "quality_storage.png")
     figure = new_figure(7.6, 5.2)
     axes = figure.add_subplot()
     plot_quality_storage(times, ax=axes)
     axes.set(xlabel="minutes beyond the shared coloured Gaussians, on this machine", title="Quality against time")
-    save_figure(figure, out / "quality_time.png")
+    finish(figure, out / "quality_time.png")
     draw_labels(out, scene, truth, results)
 
 

@@ -25,7 +25,7 @@ from kfgs.evaluation import FieldMethod
 from kfgs.fields import FieldConfig
 from kfgs.metrics import MIB
 from kfgs.pipeline import FitConfig, fit_scene
-from kfgs.viz.figures import new_figure, save_figure
+from kfgs.viz.plots import finish, new_figure
 
 FULL = 512
 PAPER = {  # mIoU, minutes, thousand Gaussians, MB, FPS
@@ -106,7 +106,7 @@ def draw(path: Path, rows: list[dict[str, Any]]) -> None:
         axes.set(xlabel="numbers of a latent (512: no autoencoder)", ylabel=label)
         axes.grid(alpha=0.3)
         axes.legend()
-    save_figure(figure, path)
+    finish(figure, path)
 
 
 def main() -> None:

@@ -7,7 +7,8 @@ import torch
 
 from kfgs.cameras import Camera
 from kfgs.gaussians import Gaussians
-from kfgs.viz import available, headless, make_plotter
+from kfgs.viz import available, make_plotter
+from kfgs.viz.plotter import trouble
 
 C0 = 0.28209479177387814
 
@@ -40,7 +41,7 @@ def some_camera(height=120, width=160):
 @contextmanager
 def some_plotter(background="black"):
     if not available():
-        pytest.skip(headless.probe().reason)
+        pytest.skip(trouble())
     plotter = make_plotter(120, 160, background=background, off_screen=True)
     try:
         yield plotter

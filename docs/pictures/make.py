@@ -30,10 +30,9 @@ from kfgs import (
     viz,
 )
 from kfgs.pipeline import true_labels
-from kfgs.viz.field_colors import colors_of_features
-from kfgs.viz.film_frames import show_cloud
+from kfgs.viz import FeatureColors
+from kfgs.viz.films import show_classes, show_cloud, show_selection
 from kfgs.viz.palette import palette
-from kfgs.viz.shows import show_classes, show_selection
 
 HERE = Path(__file__).resolve().parent
 LARGEST = 100_000  # bytes
@@ -115,7 +114,7 @@ def draw_codebook(demo: Demo) -> None:
     features = FeatureFolder(demo.folder / "features", [demo.stem])[0].float()
     words = book.codewords[book.quantize(features)]
     both = torch.cat([features.flatten(0, 1), words.flatten(0, 1)])
-    colors = colors_of_features(both)(both)
+    colors = FeatureColors.fit(both)(both)
     before, after = (part.reshape(*features.shape[:2], 3) for part in np.split(np.asarray(colors), 2))
     save(
         "site_codebook.jpg",

@@ -20,15 +20,13 @@ def check_target(name: str, target: Path, *sources: Path, endings: tuple[str, ..
         endings: those of the file; by default those of splat files.
     """
     from ..formats import formats
-    from ..formats.table import USD
 
-    more = "" if endings else f" (`kfgs convert` writes USD, too: {', '.join(USD)})"
     if not endings:
         endings = tuple(ending for one in formats().values() if hasattr(one, "write") for ending in one.SUFFIXES)
     if not target.name.lower().endswith(endings):
         raise ValueError(
             f"{name}: expected a file whose name ends in one of {', '.join(endings)}, got {target}; "
-            f"the ending chooses the format{more}"
+            f"the ending chooses the format"
         )
     check_output(name, target, "a file")
     for source in sources:

@@ -48,7 +48,7 @@ def demo(out: Path = Path("kfgs_demo"), seed: int = 0) -> None:
     """
     from ..pipeline import demo as run_demo
     from ..toy.room_folder import ToyConfig
-    from ..viz.headless import has_display
+    from ..viz.plotter import has_display
 
     check_output("out", out, "a folder")
     room = ToyConfig(train_views=36, test_views=9, seed=seed)

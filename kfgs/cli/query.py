@@ -226,7 +226,7 @@ def _draw(path: Path, query: str, gaussians: Any, things: list[Any], cameras: An
     """Draw the parts over photographs; without them over the cloud's own colours, if it has some."""
     from ..pipeline.part_pictures import write_parts
     from ..viz import show_cloud
-    from ..viz.shows import Photos
+    from ..viz.films import Photos
 
     under = None if gaussians.sh is None else show_cloud(gaussians, color_by="rgb")
     under = under if scene is None else Photos(scene)

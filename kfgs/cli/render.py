@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
 WORDS = "photo, labels, features or query=TEXT"
+KEYS = 40  # cameras of a long walk that become keys: enough to follow it, few enough to smooth out a shaking hand
 FRAMES, WIDTH = 72, 480  # of a path without cameras of your own
 MOST_FRAMES = 100_000  # more than an hour of film at 25 a second
 LARGEST = 1 << 14  # pixels on a side: a square picture in floats takes 3 GB
@@ -62,7 +63,7 @@ def render(
 
     from ..fields.store import find_field
     from ..viz import save_animation
-    from ..viz.animation import SUFFIXES, check_target
+    from ..viz.films import SUFFIXES, check_target
 
     check_output("out", out, "a file")
     if out.suffix.lower() not in SUFFIXES:
@@ -201,7 +202,6 @@ def walk_of(
 ) -> list[Camera]:
     """The cameras of a path that `check_walk` gave. Those of the scene are needed for a spiral and a flight along them."""
     from ..cameras import Orbit, orbit_cameras, path_cameras, spiral_cameras
-    from ..viz.films import KEYS
     from ..viz.linked import upwards
 
     if isinstance(path, list):
@@ -235,7 +235,7 @@ def _title(word: str) -> str:
 
 def _show(word: str, meaning: Any, semantic: Any, colors: Any) -> Any:
     from ..viz import show_cloud
-    from ..viz.shows import show_classes, show_selection
+    from ..viz.films import show_classes, show_selection
 
     under = None if colors is None else show_cloud(colors, color_by="rgb")
     if word == "photo":

@@ -69,7 +69,7 @@ def segment(
     from ..pipeline import score_scene, segment_scene, true_labels, write_coco, write_report
     from ..pipeline.apply import SEGMENTED
     from ..pipeline.label_pictures import picture_names
-    from ..viz import plot_iou, plot_largest_confusions
+    from ..viz import plot_iou
 
     check_output("out", out, "a folder")
     if path is not None:
@@ -126,10 +126,8 @@ def segment(
     if truth:
         scores = score_scene(found, truth, label_set)
         write_report(out / "scores.json", segmentation=scores, truth=str(folder), field=str(field), rule=rule)
-        picture = out / "confusion.png"
-        plot_largest_confusions(scores.confusion, list(label_set.names), picture, misses=scores.misses)
         plot_iou(scores.iou, list(label_set.names), out / "iou.png")
-        written += [out / name for name in ("scores.json", "confusion.png", "iou.png")]
+        written += [out / name for name in ("scores.json", "iou.png")]
         say(str(scores))
     else:
         say(f"note: no label pictures of split {split!r} to score against")

@@ -167,7 +167,6 @@ def convert(
     *,
     plain: Flag = False,
     by_class: Flag = False,
-    points: Flag = False,
 ) -> None:
     """Convert a splat file to another format. Classes are kept; losses of the new format are reported.
 
@@ -177,38 +176,24 @@ def convert(
         kfgs convert output/ scene.ply    # the newest splat of 3DGS, gsplat or nerfstudio
         kfgs convert labelled.ply for_unity.ply --plain
         kfgs convert labelled.ply objects/ --by-class
-        kfgs convert labelled.ply room.usdc
 
     Args:
         source: A .ply (3DGS, or SuperSplat's compressed), .splat, .ksplat, .spz, .sog, .glb or .gltf file; a checkpoint of
             gsplat (.pt) or nerfstudio (.ckpt); or the output folder of 3DGS, gsplat or nerfstudio, whose newest splat is read.
-        target: The file to write; its ending chooses the format: .ply, .compressed.ply, .splat, .spz, .sog, .glb, .gltf; or
-            .usdc, .usda, .usd, .usdz (USD, which needs usd-core) with an object for each class.
+        target: The file to write; its ending chooses the format: .ply, .compressed.ply, .splat, .spz, .sog, .glb, .gltf.
         plain: Write a .ply with exactly the properties of Inria's 3DGS, for importers that fail on others. The classes go to
             a file beside it, which kfgs finds again.
         by_class: TARGET is a folder that receives one plain .ply for each class, 05_chair.ply for class 5.
-        points: For USD: write points in their base colour, for programs that do not know Gaussians.
     """
     from ..formats import write_splats
-    from ..formats.table import USD
 
-    usd = target.suffix.lower() in USD and not (by_class and target.is_dir())  # a folder may have any name
-    if usd:
-        for name, given in (("plain", plain), ("by_class", by_class)):
-            check_alone(name, given, "for USD, which has an object for each class")
-    else:
-        check_alone("points", points, "without a TARGET in USD (.usdc)")
     if by_class:
         check_alone("plain", plain, "with --by-class, whose files are plain")
         return _convert_by_class(source, target)
-    check_target("target", target, endings=USD if usd else ())
-    if usd:  # pyvista takes a second to import
-        from ..viz.usd import check_usd_core, save_usd
-
-        check_usd_core(target)
+    check_target("target", target)
     splats = open_splats("source", source)
     shown = repr(splats)
-    written = save_usd(target, splats, points=points) if usd else write_splats(target, splats, plain=plain)
+    written = write_splats(target, splats, plain=plain)
     say(shown)
     say_lost(written)
     say(f"{_bytes_of(source) / 2**10:,.1f} KiB -> {_bytes_of(target) / 2**10:,.1f} KiB")

@@ -86,7 +86,7 @@ def _text_of_examples(out: Path, field: Any, examples: dict[str, Any]) -> None:
     """Write a table of examples and, if the photographs of their views are at hand, a picture of what was shown."""
     from ..fields import label_set_from_examples
     from ..viz import draw_examples, save_picture
-    from ..viz.shows import Photos
+    from ..viz.films import Photos
 
     scene = Classes().scene_of(field)
     drawn = scene is not None and any(hasattr(one, "view") for shown in examples.values() for one in shown)

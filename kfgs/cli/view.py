@@ -28,8 +28,6 @@ class Display:
 
     show: Given[Literal["labels", "rgb", "score", "latents"]] = None
     """The meaning of the colours at the start. When not given: the page shows colours if there are any, all else labels."""
-    style: Literal["auto", "gaussians", "points"] = "auto"
-    """Window and picture: gaussians as they are rasterised, or points (quick); auto: points if there are many."""
     host: str = "127.0.0.1"
     """Address on which the page listens. Anything but 127.0.0.1 lets others look and save."""
     port: int = 0
@@ -76,7 +74,7 @@ def view(
         check_output("out", out, "a folder")
     read = functools.partial(_read, source, color, ask, distance, out, classes, teacher)
     if place == "browser":
-        _serve(read, source, out, classes, display)
+        _viewer(read(), source, out, classes, display).serve(display.host, display.port, report=say)
         return
     for name, given, usual in (("host", display.host, "127.0.0.1"), ("port", display.port, 0)):
         check_alone(name, None if given == usual else given, "without --where browser, whose page listens there")
@@ -89,30 +87,16 @@ def view(
         _draw(state, place, out, display)
 
 
-def _serve(read: Callable[[], Any], source: Path, out: Path, classes: Classes, display: Display) -> None:
-    """Serve the page until Ctrl-C; the browser starts while Python loads."""
-    from ..viewer.document import PYTHON_START, document
-    from ..viewer.server import PageServer
-    from ..viewer.serving import announce, wait
-
-    if not source.exists():
-        read()  # says what is wrong
-    with PageServer(document(_title(source), PYTHON_START), display.host, display.port) as page:
-        announce(page, out, say)
-        _viewer(read(), source, out, classes, display).show_in(page)
-        wait()
-
-
 def _check_drawing(place: Where) -> None:
     """Raise a ValueError if a window or a picture is impossible here."""
-    from ..viewer.entry import check_place
-    from ..viz.headless import require
+    from ..viz.plotter import has_display, require
 
+    if place == "window" and not has_display():
+        raise ValueError("where: expected a display for a window, got none; use browser or picture")
     try:
         if place in ("window", "picture"):
-            check_place(place)
             require()
-    except RuntimeError as error:  # nothing to open, or nothing draws here
+    except RuntimeError as error:  # nothing draws here
         raise ValueError(str(error)) from error
 
 
@@ -149,11 +133,11 @@ def _read(
 
 
 def _viewer(state: Any, source: Path, out: Path, classes: Classes, display: Display) -> Any:
-    from ..viewer import ExploreOptions, Viewer
+    from ..viewer import Viewer
 
     state.set_show(display.show or state.first_show)
     scene = classes.scene_of(getattr(state.meaning, "field", None))
-    return Viewer(state, ExploreOptions(out=out), title=_title(source), scene=scene)
+    return Viewer(state, title=_title(source), scene=scene, out=out)
 
 
 def _title(source: Path) -> str:
@@ -164,13 +148,12 @@ def _title(source: Path) -> str:
 
 def _draw(state: Any, place: Where, out: Path, display: Display) -> None:
     """Open a window until the user closes it, or write its picture."""
-    from ..viewer import ExploreOptions, Explorer, open_window
+    from ..viewer import Explorer
 
-    options = ExploreOptions(style=display.style, out=out)
-    with Explorer(state, options, off_screen=place != "window") as explorer:
+    with Explorer(state, out=out, off_screen=place != "window") as explorer:
         explorer.set_show(display.show or "labels")
         if place == "window":
-            open_window(explorer)
+            explorer.show()
         else:
             explorer.screenshot(out / "view.png")
             wrote([out / "view.png"])

@@ -49,9 +49,6 @@ MODULES = (  # tried in this order: compressed PLY before PLY, because both end 
     "ksplat",
     "splat",
 )
-USD = (".usdc", ".usda", ".usd", ".usdz")
-"""Endings of USD, which `viz.save_usd` writes and nothing reads."""
-_USD_MAGIC = (b"PXR-USDC", b"#usda ")
 _HEAD_BYTES = 1 << 16
 
 
@@ -82,10 +79,6 @@ def find_format(path: str | Path) -> ModuleType:
             raise type(error)(
                 f"{path}: expected a splat file that can be read ({error.strerror}); copy it again"
             ) from error
-    if head.startswith(_USD_MAGIC) or (head.startswith(b"PK") and path.suffix.lower() == ".usdz"):
-        raise ValueError(
-            f"{path}: expected a splat file, got USD, which kfgs writes but does not read; convert from the splat"
-        )
     for module in formats().values():
         if module.matches(head) or (path.is_dir() and module.NAME == "sog" and (path / "meta.json").is_file()):
             return module

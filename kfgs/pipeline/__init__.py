@@ -1,6 +1,5 @@
 """The whole job (the paper's Figure 2) as a few resumable calls, and the uses of a finished field."""
 
-from ..viz.field_colors import feature_colors
 from .apply import (
     label_cloud,
     read_cloud,
@@ -37,7 +36,6 @@ __all__ = [
     "attach",
     "describe",
     "evaluate",
-    "feature_colors",
     "fit_color",
     "fit_scene",
     "label_cloud",

@@ -29,8 +29,7 @@ from ..gaussians import Gaussians
 from ..labels import LabelSet, OfClass, Selection, Transfer, classify, transfer_labels
 from ..labels.questions import class_rows
 from ..scenes import Scene, list_images
-from ..viz import overlay_labels, palette, plot_codebook_history, plot_training, save_picture
-from ..viz.field_colors import feature_colors
+from ..viz import FeatureColors, overlay_labels, palette, plot_history, save_picture
 from ..viz.palette import UNLABELLED
 from ..viz.pictures import Array, write_png
 from .fit import FitResult, load_history
@@ -113,7 +112,7 @@ def segment_scene(
         check_truth(known, len(classes), f"truth[{stem!r}]")
     views = scene.views(split)
     shown = {views[i] for i in np.linspace(0, len(views) - 1, min(pictures, len(views))).round().astype(int)}
-    colors = feature_colors(field)
+    colors = FeatureColors.fit(field.features)
     results: dict[str, Tensor] = {}
     for i in tqdm(views, desc="segment", unit="view", disable=not progress):
         camera, stem = scene.cameras[i], scene.stem(i)
@@ -308,10 +307,9 @@ def write_report(path: Path, **parts: Any) -> None:
 @typed
 def write_training_pictures(result: FitResult) -> list[Path]:
     """Plot the histories of a run's codebook and field into its folder; return the pictures written."""
-    draw = {"codebook": plot_codebook_history, "field": plot_training}
     written = []
     for stage in result.stages:
-        if stage.name in draw:  # `decouple` has no codebook
+        if stage.name in ("codebook", "field"):  # `decouple` has no codebook
             written.append(result.folder / f"{stage.name}.png")
-            draw[stage.name](load_history(stage), written[-1])
+            plot_history(load_history(stage), written[-1])
     return written

@@ -11,9 +11,8 @@ from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels.parts import Part
 from ..viz import save_picture
-from ..viz.film_frames import Show
+from ..viz.films import Show, show_selection
 from ..viz.pictures import picture_grid
-from ..viz.shows import show_selection
 
 WIDTH = 360  # pixels of a picture
 MOST = 12  # parts in one sheet

@@ -19,10 +19,8 @@ from ..fields import SemanticField
 from ..fields.store import DESCRIPTION, TENSORS
 from ..labels import LabelSet
 from ..scenes import Scene
-from ..viz import overlay_labels, save_picture
-from ..viz.field_colors import feature_colors
+from ..viz import FeatureColors, overlay_labels, save_picture
 from ..viz.pictures import as_bytes, legend_strip, picture_grid, resize_photo
-from ..viz.region_names import write_region_names
 from .apply import write_training_pictures
 from .config import FitConfig
 from .fit import REPORT, TITLE, FitResult
@@ -51,7 +49,7 @@ def write_preview(
     chosen = [
         views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)
     ]  # not the ends, which often are alike
-    classes, colors = _classes(field), feature_colors(field)
+    classes, colors = _classes(field), FeatureColors.fit(field.features)
     titles = ["photograph", "features as colours"] + ([] if classes is None else ["labels"])
     rows, seen = [], []
     for view in chosen:
@@ -62,8 +60,7 @@ def write_preview(
             row = [as_bytes(photo), colors(field.render(camera).map)]
         if classes is not None:
             labels = field.segment(camera, classes).cpu()
-            drawn = overlay_labels(photo, labels, classes.names, legend=False)
-            row.append(write_region_names(drawn, labels, classes.names))
+            row.append(overlay_labels(photo, labels, classes.names, legend=False))
             seen.append(labels.unique())
         rows.append(row)
     sheet = picture_grid(rows, titles, width=WIDTH)

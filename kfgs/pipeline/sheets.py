@@ -14,7 +14,6 @@ from ..labels import LabelSet, classify
 from ..scenes import FeatureFolder, Scene
 from ..viz import overlay_labels
 from ..viz.pictures import Array, legend_strip, picture_grid, resize_photo
-from ..viz.region_names import write_region_names
 from .maps import maps_of_views
 from .side_by_side import draw_errors
 
@@ -41,7 +40,7 @@ def segmentation_sheet(
     maps = {title: resize_labels(one, (high, WIDTH)) for title, one in found.items() if one is not None}
     panels: dict[str, Tensor | Array] = {"photo": small}
     for title, one in maps.items():
-        panels[title] = write_region_names(overlay_labels(small, one, names, legend=False), one, names)
+        panels[title] = overlay_labels(small, one, names, legend=False)
     if truth is not None:
         known, wrong = truth >= 0, resize_labels(labels, (truth.shape[0], truth.shape[1])) != truth
         share = float((wrong & known).sum() / known.sum().clamp_min(1))

@@ -4,24 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from .._card import short_repr
-from .._check import as_tensor
 from ..cameras import Camera
+from ..fields import SemanticField
 from ..formats import SplatFile
 from ..formats.splat_file import SCORE
 from ..gaussians import Gaussians
 from ..labels import LabelSet, OfClass, Selection, class_index, class_indices
 from ..labels.questions import class_rows, make_question
-from ..viz.field_colors import FeatureColors, colors_of_features, feature_colors
-
-if TYPE_CHECKING:
-    from ..fields import SemanticField
+from ..viz.colors import FeatureColors
 
 UNIT = (0.0, 1.0)
 KEPT = 0.9  # of a selection, by the suggested gamma of what is like it
@@ -45,33 +42,19 @@ class Asked(NamedTuple):
 class Meaning(Protocol):
     """A semantic cloud that answers questions."""
 
-    gaussians: Gaussians
-    """With labels, [N] int64, -1 = none; features [N, d] or None."""
-    names: tuple[str, ...]
-    """Class names in label order."""
-    scores: Tensor
-    """[N] scores of the labels."""
-    by: str
-    """One line: how labels and scores were found."""
-    phrases: bool
-    """Whether it answers more than class names."""
-    examples: bool
-    """Whether it answers `similar`."""
+    gaussians: Gaussians  # with labels, [N] int64, -1 = none; features [N, d] or None
+    names: tuple[str, ...]  # class names in label order
+    scores: Tensor  # [N] of the labels
+    by: str  # one line: how labels and scores were found
+    phrases: bool  # whether it answers more than class names
+    examples: bool  # whether it answers `similar`
 
     def ask(self, words: str) -> Asked:
-        """Answer a class name or, if `phrases`, any text.
-
-        Raises:
-            ValueError: if there is no answer; the message offers similar names.
-        """
+        """Answer a class name or, if `phrases`, any text; a ValueError that offers similar names if there is no answer."""
         ...
 
     def similar(self, mask: Tensor) -> Asked:  # [N] bool
-        """Answer "what is like these Gaussians?".
-
-        Raises:
-            ValueError: if nothing is known about any of them, or there is nothing to compare.
-        """
+        """Answer "what is like these Gaussians?"; a ValueError if nothing is known about any of them."""
         ...
 
     def feature_colors(self) -> FeatureColors:
@@ -96,10 +79,9 @@ class FieldMeaning:
 
     Raises:
         ValueError: if the embeddings and the field's features differ in channels, or there are no classes.
-
-    Note:
-        Warns if the classes were embedded by another teacher than the field's, when both are known.
     """
+
+    examples = True
 
     def __init__(
         self,
@@ -112,26 +94,34 @@ class FieldMeaning:
         classes = field.label_set() if classes is None else classes
         class_rows(classes, field.dim, field.info)  # checks them before views are rendered
         self._classes = replace(classes, info={})  # the teachers were compared just now: warn once, not per question
-        self.field, self.by = _with_answers(field, cameras or field.cameras)
-        labels, self.scores = self.field.classify(self._classes)
+        views = list(cameras or field.cameras)
+        self.by = "each Gaussian's own latent (Sec. 3.4)"
+        if field.linear is not None:
+            self.by = "what the training views show of each Gaussian"
+        elif views:
+            field, self.by = field.with_answers(views), f"what {len(views)} views show of each Gaussian"
+        self.field = field
+        labels, self.scores = field.classify(self._classes)
         self._embed = embed
         self._answers: dict[str, Asked] = {}
-        self.names = classes.names
-        self.phrases, self.examples = embed is not None, True
+        self.names, self.phrases = classes.names, embed is not None
         self.gaussians = field.gaussians.replace(labels=labels)
 
     def ask(self, words: str) -> Asked:
         """Answer a class name or, with an encoder, any text. Answers are cached.
 
         Raises:
-            ValueError: if it is no class and there is no encoder, or the encoder belongs to another teacher.
+            ValueError: if it is not a class and there is no encoder, or the encoder belongs to another teacher.
         """
         words = words if words in self.names else words.strip()
         known = self._classes.knows(words)
         if known:
             words = self.names[class_index(words, self.names)]
         if words not in self._answers:
-            self._answers[words] = self._answer(words, words if known else self._phrase(words))
+            target = words if known else self._phrase(words)
+            selection = self.field.query(target, self._classes)
+            question = make_question(target, self._classes, "auto", self.field.dim, {})
+            self._answers[words] = _asked(words, selection, self.field.known, question.negatives is not None, known)
         return self._answers[words]
 
     def similar(self, mask: Tensor) -> Asked:  # [N] bool
@@ -141,7 +131,7 @@ class FieldMeaning:
             ValueError: if nothing is known about any of them.
         """
         field = self.field
-        chosen = as_tensor("mask", mask).to(field.known.device) & field.known
+        chosen = mask.to(field.known.device) & field.known
         if not bool(chosen.any()):
             raise ValueError("selection: expected Gaussians with features, got none; select others, or raise lambda")
         rows = chosen.nonzero()[:, 0]
@@ -149,14 +139,13 @@ class FieldMeaning:
         target = torch.nn.functional.normalize(features, dim=1).mean(0)
         scores = field.query(target, self._classes, score="cosine").scores
         gamma = float(scores[chosen].quantile(1 - KEPT))
-        found = Selection(
-            field.known & (scores > gamma), scores, gamma, f"{KEPT:.0%} of the selection are more like it"
-        )
-        return _asked("like the selection", found, field.known, False, False)
+        how = f"{KEPT:.0%} of the selection are more like it"
+        selection = Selection(field.known & (scores > gamma), scores, gamma, how)
+        return _asked("like the selection", selection, field.known, False, False)
 
     def feature_colors(self) -> FeatureColors:
-        """The field's projection, so latents have the same colours as in its rendered views."""
-        return feature_colors(self.field)
+        """The projection of the field's latents, the same as in its rendered views."""
+        return FeatureColors.fit(self.field.features)
 
     def _phrase(self, words: str) -> Tensor:  # [D]
         if self._embed is None or not words:
@@ -173,11 +162,6 @@ class FieldMeaning:
                 "pass the text encoder of the teacher whose features this field was fitted to"
             )
         return target
-
-    def _answer(self, words: str, target: str | Tensor) -> Asked:
-        found = self.field.query(target, self._classes)
-        question = make_question(target, self._classes, "auto", self.field.dim, {})
-        return _asked(words, found, self.field.known, question.negatives is not None, isinstance(target, str))
 
 
 class SplatMeaning:
@@ -202,10 +186,11 @@ class SplatMeaning:
         self.gaussians = splats.gaussians
         count = max(len(splats.classes), int(labels.max()) + 1 if len(labels) else 0)
         self.names = splats.classes + tuple(f"class {i}" for i in range(len(splats.classes), count))
-        self.by = "the file's classes"
-        score = splats.extra.get(SCORE)
-        self.scores = _file_scores(self.gaussians, score)
-        if score is not None:
+        self.scores, self.by = torch.ones_like(self.gaussians.opacities), "the file's classes"
+        if SCORE in splats.extra:  # scores that are not finite become the lowest finite one
+            values = torch.from_numpy(np.asarray(splats.extra[SCORE])).to(self.gaussians.means)
+            finite = torch.isfinite(values)
+            self.scores = torch.where(finite, values, values[finite].min() if bool(finite.any()) else 1.0)
             self.by += " and scores"
         self._answers: dict[str, Asked] = {}
 
@@ -226,8 +211,8 @@ class SplatMeaning:
             else:  # strictly below the lowest score, even after rounding to the precision of the scores
                 below = float(torch.nextafter(own.min(), own.new_tensor(-torch.inf)))
                 low = min(low - 0.01 * max(high - low, 1e-3), below)
-            found = Selection(member & (scores > low), scores, low, "all of the class")
-            self._answers[words] = Asked(words, found, low, high, True, member)
+            selection = Selection(member & (scores > low), scores, low, "all of the class")
+            self._answers[words] = Asked(words, selection, low, high, True, member)
         return self._answers[words]
 
     def similar(self, mask: Tensor) -> Asked:  # [N] bool
@@ -237,33 +222,14 @@ class SplatMeaning:
     def feature_colors(self) -> FeatureColors:
         """A projection fitted to the features of the Gaussians that have some."""
         assert self.gaussians.features is not None
-        return colors_of_features(self.gaussians.features)
+        return FeatureColors.fit(self.gaussians.features)
 
 
-def _with_answers(field: SemanticField, cameras: Sequence[Camera]) -> tuple[SemanticField, str]:
-    """Compute fused features if they are missing and there are views; also say where the answers come from."""
-    if field.linear is not None:
-        return field, "what the training views show of each Gaussian"
-    if not cameras:
-        return field, "each Gaussian's own latent (Sec. 3.4)"
-    views = list(cameras)
-    return field.with_answers(views), f"what {len(views)} views show of each Gaussian"
-
-
-def _file_scores(gaussians: Gaussians, score: np.ndarray | None) -> Tensor:  # type: ignore[type-arg]  # [N]
-    """A file's scores; scores that are not finite become the lowest finite one."""
-    if score is None:
-        return torch.ones_like(gaussians.opacities)
-    values = torch.from_numpy(np.asarray(score)).to(gaussians.means)
-    finite = torch.isfinite(values)
-    return torch.where(finite, values, values[finite].min() if bool(finite.any()) else torch.ones_like(values[:1]))
-
-
-def _asked(words: str, found: Selection, valid: Tensor, relevant: bool, known: bool) -> Asked:
+def _asked(words: str, selection: Selection, valid: Tensor, relevant: bool, known: bool) -> Asked:
     """Add the range of useful gammas."""
     if relevant or not bool(valid.any()):
-        return Asked(words, found, *UNIT, known, valid)
-    own = found.scores[valid]
-    gamma = float(found.threshold or 0.0)
+        return Asked(words, selection, *UNIT, known, valid)
+    own = selection.scores[valid]
+    gamma = float(selection.threshold or 0.0)
     low, high = min(gamma, float(own.min())), max(gamma, float(own.max()))
-    return Asked(words, found, low, high if high > low else low + 1e-3, known, valid)
+    return Asked(words, selection, low, high if high > low else low + 1e-3, known, valid)

@@ -18,17 +18,15 @@ from PIL import Image
 
 from .._card import short_repr
 from .._check import as_array
-from ..cameras import Camera
 from ..formats.smallest_three import pack_smallest_three
 from ..gaussians import Gaussians
+from ..scenes import Scene
 from ..splat import SH_C0
-from ..viz.cloud_colors import COLORMAP
+from ..viz.colors import COLORMAP, Array
+from ..viz.films import Photos
 from ..viz.linked import upwards
 from ..viz.palette import palette
-from .carried import Array
-from .picked import Side
-from .side_colors import GREY
-from .state import Exploration
+from .state import GREY, Exploration, Side
 
 VERSION = 1
 ALIGN = 16  # bytes: an offset at which JavaScript may start an array of any type
@@ -38,6 +36,7 @@ DC_STEPS = (1 << 10) - 1
 # Of the harmonics above degree 0. 1/32 is 2 dB better (room_0: 50 instead of 48 dB), with 2 to 3 bytes a Gaussian more.
 SH_STEP = 1 / 20
 SH_PLANES = {0: 0, 1: 2, 2: 3, 3: 6}  # texels of 8 bytes that hold the coefficients above degree 0
+PHOTO = 400  # pixels: the longer edge of a photo in the page, about 20 KB
 
 
 class Packed(NamedTuple):
@@ -53,21 +52,16 @@ class Packed(NamedTuple):
         """The data as a zlib stream, which JavaScript's `inflate` reads.
 
         The bytes of each buffer are sorted by their place in a row first, because the last bytes of all rows are more alike
-        than the bytes of one row.
+        than the bytes of one row. A row is the last axis, or a number if there is only one axis.
         """
         parts, end = [], 0
         for entry in self.header["buffers"].values():
             parts.append(self.data[end : entry["offset"]])  # padding
             end = entry["offset"] + entry["length"]
-            rows = np.frombuffer(self.data[entry["offset"] : end], np.uint8).reshape(-1, _row_bytes(entry))
+            width = np.dtype(entry["type"]).itemsize * (entry["shape"][-1] if len(entry["shape"]) > 1 else 1)
+            rows = np.frombuffer(self.data[entry["offset"] : end], np.uint8).reshape(-1, width)
             parts.append(np.ascontiguousarray(rows.T).tobytes())
         return zlib.compress(b"".join([*parts, self.data[end:]]), level)
-
-
-def _row_bytes(entry: dict[str, Any]) -> int:
-    """Bytes of the last axis, or of one number if there is only one axis."""
-    shape: list[int] = entry["shape"]
-    return np.dtype(entry["type"]).itemsize * (shape[-1] if len(shape) > 1 else 1)
 
 
 class _Buffers:
@@ -91,51 +85,57 @@ class _Buffers:
         return b"".join(self._parts)
 
 
-def pack_scene(
-    state: Exploration,
-    *,
-    title: str = "kfgs",
-    questions: Iterable[str] | None = None,
-    thumbnails: Iterable[Array | None] = (),  # [h, w, 3] uint8, one for each camera
-) -> Packed:
-    """Pack both sides of an exploration, the classes with their scores, and the cameras.
+def pack_scene(state: Exploration, *, title: str = "kfgs", scene: Scene | None = None) -> Packed:
+    """Pack both sides of an exploration, the classes with their scores, the cameras, and what is asked and shown now.
 
     Row i of every buffer is Gaussian i of Python. A score is NaN where nothing is known about a Gaussian.
 
     Args:
-        state: its question, gamma and hidden classes are not packed; its lambda is.
+        state: what is packed.
         title: of the page.
-        questions: class names whose scores are packed; None: all classes.
-        thumbnails: pictures of the cameras, in their order; fewer are allowed, None leaves one out.
+        scene: has the photos of the exploration's cameras, found by name; None: without photos.
 
     Raises:
         ValueError: if a number of a Gaussian is not finite.
     """
-    buffers = _Buffers()
-    sides = {side: _add_side(buffers, state, side) for side in state.sides}
-    _add_meaning(buffers, state)
-    if state.carried is not None:
-        buffers.add("color/source", state.carried.source.astype(np.int32))
-        buffers.add("color/far", rounded_far(state.carried.far, state.distance))
     from matplotlib import colormaps
 
+    buffers, meaning, asked = _Buffers(), state.meaning, state.asked
+    sides = {side: _add_side(buffers, state, side) for side in state.sides}
+    labels = state.labels("semantic")
+    scores = np.where(labels >= 0, as_array(meaning.scores).astype(np.float32), np.float32("nan"))
+    buffers.add("semantic/labels", labels.astype(np.int16))
+    buffers.add("semantic/label_scores", scores.astype(np.float32))
+    if "latents" in state.show_choices:
+        buffers.add("semantic/latents", state.latents())
+    if "color" in state.sides:
+        buffers.add("color/source", state.source.astype(np.int32))
+        buffers.add("color/far", rounded_far(state.far, state.distance))
     buffers.add("colormap", colormaps[COLORMAP](np.arange(256), bytes=True)[:, :3])
     low, high = state.distance_range
+    colors = palette(torch.arange(len(meaning.names)), meaning.names)
     header = {
         "version": VERSION,
         "title": title,
-        "origin": list(state.meaning.gaussians.origin),
+        "origin": list(meaning.gaussians.origin),
         "sides": sides,
-        "classes": _classes(state),
+        "classes": [{"name": name, "color": rgb.tolist()} for name, rgb in zip(meaning.names, colors, strict=True)],
         "lambda": {"value": state.distance, "how": state.distance_how, "low": low, "high": high},
-        "by": state.meaning.by,
-        "phrases": state.meaning.phrases,
-        "examples": state.meaning.examples,
-        "clim": list(state.clim) if state.asked is None else [0.0, 1.0],
-        "cameras": _cameras(buffers, state.cameras, thumbnails),
+        "by": meaning.by,
+        "phrases": meaning.phrases,
+        "examples": meaning.examples,
+        "clim": list(state.clim) if asked is None else [0.0, 1.0],
+        "cameras": _add_cameras(buffers, state, scene),
         "up": upwards(state.cameras),
         "default_view": 0 if state.cameras else None,
-        "query": _add_scores(buffers, state, state.meaning.names if questions is None else questions),
+        "query": _add_scores(
+            buffers, state, [*meaning.names, *([] if asked is None or asked.known else [asked.words])]
+        ),
+        "start": {
+            "show": "color" if state.show == "rgb" else state.show,
+            "words": None if asked is None else asked.words,
+            "gamma": state.gamma,
+        },
         "buffers": buffers.table,
     }
     return Packed(header, buffers.joined())
@@ -256,59 +256,42 @@ def _base_colors(state: Exploration, side: Side) -> Array:  # [N, 3] float64
     return np.full((len(cloud), 3), GREY[0] / 255)
 
 
-def _add_meaning(buffers: _Buffers, state: Exploration) -> None:
-    labels = state.labels("semantic")
-    buffers.add("semantic/labels", labels.astype(np.int16))
-    scores = np.where(labels >= 0, as_array(state.meaning.scores).astype(np.float32), np.float32("nan"))
-    buffers.add("semantic/label_scores", scores.astype(np.float32))
-    if "latents" in state.show_choices:
-        buffers.add("semantic/latents", state.latents("semantic"))
-
-
 def _add_scores(buffers: _Buffers, state: Exploration, questions: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Add the score of each question, and return what the answer suggests, by name."""
-    found: dict[str, dict[str, Any]] = {}
+    answers: dict[str, dict[str, Any]] = {}
     for words in questions:
         asked = state.meaning.ask(words)
-        if asked.words in found:
+        if asked.words in answers:
             continue
-        name = f"scores/{len(found)}"
+        name = f"scores/{len(answers)}"
         scores = as_array(asked.selection.scores).astype(np.float32)
         buffers.add(name, np.where(as_array(asked.valid), scores, np.float32("nan")).astype(np.float32))
-        suggested = asked.selection
-        found[asked.words] = {
-            "gamma": suggested.threshold,
-            "how": suggested.how,
+        answers[asked.words] = {
+            "gamma": asked.selection.threshold,
+            "how": asked.selection.how,
             "low": asked.low,
             "high": asked.high,
             "known": asked.known,
             "buffer": name,
         }
-    return found
+    return answers
 
 
-def _classes(state: Exploration) -> list[dict[str, Any]]:
-    names = state.meaning.names
-    colors = palette(torch.arange(len(names)), names)
-    return [{"name": name, "color": color.tolist()} for name, color in zip(state.meaning.names, colors, strict=True)]
-
-
-def _cameras(buffers: _Buffers, cameras: Iterable[Camera], thumbnails: Iterable[Array | None]) -> list[dict[str, Any]]:
-    pictures = iter(thumbnails)
-    packed = []
-    for index, camera in enumerate(cameras):
-        K = camera.K.detach().double().cpu()
-        picture = next(pictures, None)
-        name = None if picture is None else f"thumbnails/{index}"
-        if name is not None and picture is not None:
-            buffers.add(name, np.frombuffer(as_jpeg(picture), dtype=np.uint8))
+def _add_cameras(buffers: _Buffers, state: Exploration, scene: Scene | None) -> list[dict[str, Any]]:
+    """Add the photos of the cameras that have one, and describe all cameras."""
+    photos, packed = None if scene is None else Photos(scene), []
+    for index, camera in enumerate(state.cameras):
+        name = None
+        if photos is not None and camera in photos:
+            name = f"thumbnails/{index}"
+            buffers.add(name, np.frombuffer(as_jpeg(photos(camera.fitted(PHOTO))), dtype=np.uint8))
         packed.append(
             {
                 "name": camera.name,
                 "width": camera.width,
                 "height": camera.height,
                 "viewmat": camera.viewmat.detach().double().cpu().flatten().tolist(),
-                "K": [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])],
+                "K": [camera.K[row, column].item() for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))],
                 "near": camera.near,
                 "thumbnail": name,
             }

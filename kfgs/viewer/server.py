@@ -13,13 +13,10 @@ import secrets
 import socket
 import struct
 import sys
-import time
-import zlib
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import ip_address
-from threading import Event, Thread
+from threading import Thread
 from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
@@ -30,30 +27,26 @@ REFUSED = "This page opens with the whole link that kfgs gave.\n"
 LONGEST_CALL = 16 << 20
 """Bytes: a selection of many million Gaussians, as bits."""
 PATIENCE = 60.0
-"""Seconds after which a connection is closed that neither sends nor reads, or that has not shown the secret."""
-STRANGERS = 64
-"""Most connections that have not shown the secret; the oldest is closed for a new one."""
-PAUSE = 0.1
-"""Seconds until a connection is accepted for which no file handle is left."""
+"""Seconds after which a connection that neither sends nor reads is closed."""
 POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' blob:; style-src 'unsafe-inline'; img-src 'self' blob: data:; "
     "connect-src 'self'; worker-src blob:; form-action 'none'; base-uri 'none'; frame-ancestors 'self'"
 )
 
 Call = Callable[[str, dict[str, Any], bytes], tuple[dict[str, Any], bytes]]
-"""(name, arguments, attached bytes) -> answer and attached bytes. A ValueError or TypeError is told to the page."""
+"""(name, arguments, attached bytes) -> answer and attached bytes. The page shows the message of a ValueError or TypeError."""
 
 
 class PageServer:
     """Serves a page from a thread of its own, until `close` or the end of a `with` block.
 
-    The page is there at once; who asks for the scene waits until `show`, and who calls until `show` with an answer. So the
-    browser starts while Python loads.
     A call is a POST to `call`: 4 bytes with the length of a JSON text (little-endian), the JSON {"name", "args"}, and
     attached bytes; the answer has the same form.
 
     Args:
         document: the page, HTML.
+        pack: the scene, for `readMessage` of link.js.
+        call: answers calls, in several threads at once.
         host: address to listen on. With one that other machines can reach, everyone who has the link can look and save.
         port: 0 to 65535; 0: a free one.
 
@@ -61,21 +54,19 @@ class PageServer:
         ValueError: if the address is not one of this machine, or the port is taken.
     """
 
-    def __init__(self, document: str, host: str = "127.0.0.1", port: int = 0) -> None:
+    def __init__(self, document: str, pack: bytes, call: Call, host: str = "127.0.0.1", port: int = 0) -> None:
         if not host.strip():
             raise ValueError(
                 f"host: expected an address of this machine, got {host!r}; 127.0.0.1 is for this machine alone, 0.0.0.0 "
                 "for everyone"
             )
         self.secret = secrets.token_urlsafe(24)
-        self._host = host
-        self._document = document.encode()
-        self._pack = b""
-        self._call: Call = _no_answer
-        self._shown, self._loaded, self._closed = Event(), Event(), Event()
+        self.files = {"": ("text/html; charset=utf-8", document.encode()), "pack": ("application/octet-stream", pack)}
+        self.call, self._host = call, host
         handler = type("Handler", (_Handler,), {"page": self})
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
-            self._server = _server_class(host)((host.strip("[]"), port), handler)
+            self._server = type("Server", (_Server,), {"address_family": family})((host.strip("[]"), port), handler)
         except (OSError, OverflowError) as error:  # OverflowError: a port above 65535
             raise ValueError(
                 f"host, port: expected an address of this machine and a port that is free, got {host!r} and {port} "
@@ -83,46 +74,6 @@ class PageServer:
             ) from error
         self._thread = Thread(target=self._server.serve_forever, name="kfgs-page", daemon=True)
         self._thread.start()
-
-    def show(self, pack: bytes, call: Call | None = None) -> None:
-        """Give the page its scene, and what answers its calls.
-
-        Args:
-            pack: the scene, for `readMessage` of link.js.
-            call: answers calls, in several threads at once. None: this scene was kept from an earlier time, and Python still
-                loads; calls wait. If the scene then is another one, the page loads itself again.
-        """
-        self._pack = pack
-        self._shown.set()
-        if call is not None:
-            self._call = call
-            self._loaded.set()
-
-    def file(self, name: str) -> tuple[str, bytes] | None:
-        """Media type and content of a file; None for others than these, and after the end.
-
-        - "": the page
-        - "pack": the scene, as soon as there is one
-        - "version": which scene Python shows once it has loaded, as "pack" has it in its header `ETag`
-        """
-        if name == "":
-            return "text/html; charset=utf-8", self._document
-        if name == "pack" and self._wait(self._shown):
-            return "application/octet-stream", self._pack
-        if name == "version" and self._wait(self._loaded):
-            return "text/plain", version_of(self._pack).encode()
-        return None
-
-    def answer(self, read: Callable[[], tuple[Mapping[str, Any], bytes]]) -> tuple[dict[str, Any], bytes]:
-        """Answer a call of the page when Python has loaded; see `answer_call`."""
-        self._wait(self._loaded)
-        return answer_call(self._call, read)
-
-    def _wait(self, event: Event) -> bool:
-        """Whether it happens, sooner or later."""
-        while not event.wait(0.05) and not self._closed.is_set():
-            pass
-        return event.is_set()
 
     @property
     def url(self) -> str:
@@ -138,7 +89,6 @@ class PageServer:
 
     def close(self) -> None:
         """Stop listening; a second call does nothing."""
-        self._closed.set()
         if self._thread.is_alive():
             self._server.shutdown()
             self._thread.join()
@@ -149,11 +99,6 @@ class PageServer:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def version_of(content: bytes) -> str:
-    """What tells one content from another."""
-    return f'"{zlib.crc32(content):08x}"'
 
 
 def is_loopback(host: str) -> bool:
@@ -172,22 +117,18 @@ def pack_message(answer: Mapping[str, Any], attached: bytes = b"") -> bytes:
 
 def read_message(message: bytes) -> tuple[dict[str, Any], bytes]:
     """The inverse of `pack_message`; a ValueError for anything else."""
-    if len(message) < 4:
-        raise ValueError(f"message: expected at least 4 bytes, got {len(message)}; send what the page's script makes")
-    (length,) = struct.unpack_from("<I", message)
+    (length,) = struct.unpack_from("<I", message) if len(message) >= 4 else (len(message),)
     try:
         answer = parse_json(message[4 : 4 + length])
-    except ValueError as error:
-        raise ValueError(
-            f"message: expected JSON ({type(error).__name__}); send what the page's script makes"
-        ) from None
+    except ValueError:
+        answer = None
     if length > len(message) - 4 or not isinstance(answer, dict):
-        raise ValueError("message: expected an object and its length, got others; send what the page's script makes")
+        raise ValueError("message: expected an object in JSON after its length, got others; send what the page makes")
     return answer, message[4 + length :]
 
 
 def answer_call(call: Call, read: Callable[[], tuple[Mapping[str, Any], bytes]]) -> tuple[dict[str, Any], bytes]:
-    """Read a call, {"name", "args"} and attached bytes, and answer it; whatever fails is told to the page, and Python goes on."""
+    """Read a call, {"name", "args"} and attached bytes, and answer it; the page shows whatever fails, and Python continues."""
     try:
         asked, attached = read()
         args = asked.get("args") or {}
@@ -195,65 +136,14 @@ def answer_call(call: Call, read: Callable[[], tuple[Mapping[str, Any], bytes]])
             raise ValueError(f"args: expected an object, got {args!r:.80}; send what the page's script makes")
         return call(str(asked.get("name")), dict(args), attached)
     except Exception as error:
-        return _error_answer(error)
-
-
-def _error_answer(error: Exception) -> tuple[dict[str, Any], bytes]:
-    """What the page is told instead of an answer. The type is named only if the error is not about the arguments."""
-    about_arguments = isinstance(error, ValueError | TypeError | OSError) and str(error)
-    return {"error": str(error) if about_arguments else error_line(error)}, b""
-
-
-def _no_answer(*_: object) -> tuple[dict[str, Any], bytes]:
-    raise ValueError("Python ended before it had loaded the scene; its terminal says why")
-
-
-def _server_class(host: str) -> type[ThreadingHTTPServer]:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    return type("Server", (_Server,), {"address_family": family})
+        # the type is named only if the error is not about the arguments
+        about_arguments = isinstance(error, ValueError | TypeError | OSError) and str(error)
+        return {"error": str(error) if about_arguments else error_line(error)}, b""
 
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self._strangers: dict[
-            socket.socket, float
-        ] = {}  # until when each has time to show the secret, the oldest first
-        super().__init__(*args, **kwargs)
-
-    def get_request(self) -> tuple[socket.socket, Any]:
-        try:
-            return super().get_request()
-        except OSError:  # no file handle is left; the connection waits, and asking again at once would only burn time
-            self._hang_up(1)
-            time.sleep(PAUSE)
-            raise
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        self._strangers[request] = time.monotonic() + PATIENCE
-        self._hang_up(len(self._strangers) - STRANGERS)
-        super().process_request(request, client_address)
-
-    def service_actions(self) -> None:
-        now = time.monotonic()
-        self._hang_up(sum(until < now for until in list(self._strangers.values())))
-
-    def know(self, request: Any) -> None:
-        """A connection has shown the secret: it may take its time."""
-        self._strangers.pop(request, None)
-
-    def shutdown_request(self, request: Any) -> None:
-        self.know(request)
-        super().shutdown_request(request)
-
-    def _hang_up(self, count: int) -> None:
-        """End the oldest connections that have not shown the secret; their threads find the end of the request."""
-        for request in list(self._strangers)[: max(count, 0)]:
-            self.know(request)
-            with suppress(OSError):
-                request.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """One line for a bug of ours; nothing if the browser hung up."""
@@ -264,18 +154,13 @@ class _Server(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     page: PageServer
-    server: _Server
     timeout = PATIENCE
 
     def do_GET(self) -> None:
         name = self._name()
-        if name is None:
-            return
-        found = self.page.file(name)
-        if found is None:
-            self._answer(404, "text/plain", b"There is no such file.\n")
-        else:
-            self._answer(200, *found)
+        if name is not None:
+            missing = "text/plain", b"There is no such file.\n"
+            self._answer(200 if name in self.page.files else 404, *self.page.files.get(name, missing))
 
     def do_POST(self) -> None:
         name = self._name()
@@ -285,7 +170,7 @@ class _Handler(BaseHTTPRequestHandler):
         if name != "call" or not length.isdecimal() or len(length) > 20 or int(length) > LONGEST_CALL:
             self._answer(400, "text/plain", b"This address is the page's own.\n")
             return
-        answer = self.page.answer(lambda: read_message(self.rfile.read(int(length))))
+        answer = answer_call(self.page.call, lambda: read_message(self.rfile.read(int(length))))
         self._answer(200, "application/octet-stream", pack_message(*answer))
 
     def _name(self) -> str | None:
@@ -297,24 +182,22 @@ class _Handler(BaseHTTPRequestHandler):
             allowed = False
         if origin is not None and _split(origin).netloc.lower() != host.lower():
             allowed = False
-        if not allowed:
-            self._answer(403, "text/plain", REFUSED.encode())
-            return None
-        self.server.know(self.request)
-        return parts[2]
+        if allowed:
+            return parts[2]
+        self._answer(403, "text/plain", REFUSED.encode())
+        return None
 
     def _answer(self, status: int, kind: str, content: bytes) -> None:
+        headers = {
+            "Content-Type": kind,
+            "Content-Length": str(len(content)),
+            "Content-Security-Policy": POLICY,
+            "Referrer-Policy": "no-referrer",  # the address holds the secret
+            "X-Content-Type-Options": "nosniff",
+            "Cache-Control": "no-store",
+        }
         try:
             self.send_response(status)
-            headers = {
-                "Content-Type": kind,
-                "Content-Length": str(len(content)),
-                "ETag": version_of(content),
-                "Content-Security-Policy": POLICY,
-                "Referrer-Policy": "no-referrer",  # the address holds the secret
-                "X-Content-Type-Options": "nosniff",
-                "Cache-Control": "no-store",
-            }
             for name, value in headers.items():
                 self.send_header(name, value)
             self.end_headers()

@@ -1,46 +1,46 @@
-"""The explorer's state: question, gamma, lambda, colours, hidden classes, picked Gaussian. Draws nothing."""
+"""What the viewer shows: two clouds, a question, gamma and lambda. Draws nothing; page, notebook and window all use it."""
 
 from __future__ import annotations
 
 import numbers
-from collections.abc import Iterable, Sequence
-from pathlib import Path
-from typing import Any, Literal, get_args
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import numpy as np
-import torch
+from scipy.spatial import cKDTree
 
-from .._check import as_array, check_choice, check_range, check_whole
-from .._files import as_path
+from .._check import as_array, check_choice, check_range
 from ..cameras import Camera
 from ..gaussians import Gaussians
-from ..labels import Selection, class_indices
-from ..labels.nearest import positions
-from ..viz.palette import palette
-from .carried import SPAN, Array, Carried
+from ..labels.nearest import Sources, explained_distance, neighbours_together, positions
+from ..splat import sh0_to_rgb
+from ..viz.colors import Array, cloud_colors
+from ..viz.palette import UNLABELLED, palette
+from ..viz.pictures import as_bytes
 from .meaning import Asked, Meaning
-from .picked import SIDE_WORDS, Describe, Picked, Side
-from .saved import SelectedSide, save_sides
-from .side_colors import SideColors
 
+Side = Literal["semantic", "color"]
 Show = Literal["labels", "rgb", "score", "latents"]
+SIDE_WORDS: dict[Side, str] = {"semantic": "semantic", "color": "colour"}
+GREY = np.array(UNLABELLED, dtype=np.uint8)
+SPAN = 30.0  # the lambda slider reaches from a 30th of the suggestion to 30 times it
 
 
 class Exploration:
-    """What the explorer shows: `Explorer`'s methods change it, the other methods say what to draw.
+    """The state of a viewer. The methods `ask` and `set_...` change it, the others say what to draw.
 
     A colour Gaussian takes the label of the nearest labelled semantic Gaussian if that is strictly closer than lambda
     (Sec. 3.4), and is selected if that one is. The nearest one is computed once, so changing lambda or gamma takes
-    milliseconds.
+    milliseconds and selects what `transfer_labels` selects.
 
     Args:
-        meaning: the semantic cloud and its answers.
+        meaning: the semantic cloud and its answers, a `FieldMeaning` or a `SplatMeaning`.
         color: the colour cloud, in the same frame; None: the semantic side alone.
-        cameras: views without distortion, to find those that see a picked Gaussian; at most 30 are used, evenly chosen.
+        cameras: views without distortion, to find those that see a Gaussian.
         distance: lambda, world units; None: from the clouds' spacing (`labels.default_distance`).
 
     Raises:
-        ValueError: if a cloud is empty, a position is not finite, or lambda is not positive.
+        ValueError: if a cloud is empty, a position is not finite, lambda is not positive, or a lens distorts.
     """
 
     def __init__(
@@ -51,21 +51,15 @@ class Exploration:
         cameras: Sequence[Camera] = (),
         distance: float | None = None,
     ) -> None:
-        if not isinstance(getattr(meaning, "gaussians", None), Gaussians):
-            raise TypeError(
-                f"meaning: expected a FieldMeaning or a SplatMeaning, got {type(meaning).__name__}; `explore` makes one"
-            )
-        if meaning.gaussians.labels is None:
-            raise ValueError(
-                "meaning.gaussians.labels: expected labels [N], got None; use FieldMeaning or SplatMeaning"
-            )
-        clouds: dict[Side, Gaussians] = {"semantic": meaning.gaussians}
+        semantic = meaning.gaussians
+        assert semantic.labels is not None
+        self._clouds: dict[Side, Gaussians] = {"semantic": semantic}
         if color is not None:
-            clouds["color"] = color.with_origin(meaning.gaussians.origin)
-        for name, cloud in clouds.items():
+            self._clouds["color"] = color.with_origin(semantic.origin)
+        for side, cloud in self._clouds.items():
             if len(cloud) == 0:
-                raise ValueError(f"{name}: expected at least one Gaussian, got none; choose another file")
-        positions("meaning.gaussians.means", meaning.gaussians.means)
+                raise ValueError(f"{side}: expected at least one Gaussian, got none; choose another file")
+            positions(f"{side}.means", cloud.means)
         for camera in cameras:
             if camera.distortion is not None:
                 raise ValueError(
@@ -73,50 +67,34 @@ class Exploration:
                     "those of scene.undistorted()"
                 )
         self.meaning = meaning
-        self.cameras = tuple(camera.with_origin(meaning.gaussians.origin) for camera in cameras)
-        self.sides: tuple[Side, ...] = tuple(clouds)
-        self._clouds = clouds
-        self._carried = None if color is None else Carried(meaning.gaussians, clouds["color"])
-        self._own_labels = as_array(meaning.gaussians.labels).astype(np.int64)
-        self._colors = SideColors(clouds, self._carried, meaning.feature_colors)
-        self.show_choices: tuple[Show, ...] = ("labels", *self._colors.show_choices, "score")
+        self.cameras = tuple(camera.with_origin(semantic.origin) for camera in cameras)
+        self.sides: tuple[Side, ...] = tuple(self._clouds)
+        self._own_labels = as_array(semantic.labels).astype(np.int64)
+        self.source, self.far, suggested, self.distance_how = self._find_sources()
+        self._cache: dict[tuple[str, Side], Array] = {}
+        colored = any(cloud.sh is not None for cloud in self._clouds.values())
+        shows: dict[Show, bool] = {
+            "labels": True,
+            "rgb": colored,
+            "latents": semantic.features is not None,
+            "score": True,
+        }
+        self.show_choices = tuple(show for show, possible in shows.items() if possible)
         self.show: Show = "labels"
         self.asked: Asked | None = None
         self.gamma: float | None = None
         self.gamma_how = ""
-        self.hidden: frozenset[int] = frozenset()
-        suggested = 1.0 if self._carried is None else self._carried.suggested
-        self.distance, self.distance_how = suggested, "no colour side" if self._carried is None else self._carried.how
+        self.distance = suggested
         if distance is not None:
             self.set_distance(distance)
         self.distance_range = min(suggested / SPAN, self.distance), max(suggested * SPAN, self.distance)
-        self._picked: tuple[Side, int] | None = None
-        self._describe = Describe(meaning, clouds, self._carried, self.cameras)
-
-    @property
-    def first_show(self) -> Show:
-        """The meaning of the colours that the viewer opens with: the clouds' own if they have some, else classes."""
-        return "rgb" if "rgb" in self.show_choices else "labels"
-
-    @property
-    def gamma_range(self) -> tuple[float, float]:
-        """The smallest and the largest useful gamma; 0 and 1 without a question."""
-        return (0.0, 1.0) if self.asked is None else (self.asked.low, self.asked.high)
-
-    @property
-    def picked(self) -> Picked | None:
-        """The picked Gaussian under the current question and lambda; None if it is hidden."""
-        if self._picked is None:
-            return None
-        picked = self._describe(*self._picked, self.asked, self.distance)
-        return None if picked.label in self.hidden else picked
 
     def ask(self, words: str | None) -> Asked | None:
-        """See `Explorer.ask`. Sets gamma to the value that the answer suggests."""
-        if not isinstance(words, str | None):
-            raise TypeError(
-                f"words: expected text, got {words!r} ({type(words).__name__}); ask for one class or phrase"
-            )
+        """Ask for a class or a phrase, with the gamma that the answer suggests. None or "" clears the question.
+
+        Raises:
+            ValueError: if there is no answer to these words; the earlier question stays.
+        """
         if words is None or not words.strip():
             self.asked, self.gamma, self.gamma_how = None, None, ""
             return None
@@ -125,7 +103,11 @@ class Exploration:
         return self.asked
 
     def set_gamma(self, gamma: float) -> None:
-        """See `Explorer.set_gamma`; the range is `gamma_range`."""
+        """Select the Gaussians that score above gamma.
+
+        Raises:
+            ValueError: if no question is asked, or gamma is out of `gamma_range`.
+        """
         if self.asked is None:
             raise ValueError(f"gamma: expected a question that it applies to, got none (gamma {gamma!r}); ask first")
         check_number("gamma", gamma)
@@ -135,34 +117,29 @@ class Exploration:
         self.gamma, self.gamma_how = min(max(float(gamma), low), high), "given"
 
     def set_distance(self, distance: float) -> None:
-        """See `Explorer.set_distance`."""
+        """Set lambda: colour Gaussians closer than this to a semantic one take its label. In world units, positive."""
         check_number("distance", distance)
         check_range("distance", distance, 0, closed=(False, False))
         self.distance, self.distance_how = float(distance), "given"
 
     def set_show(self, show: Show) -> None:
-        """See `Explorer.set_show`."""
-        check_choice("show", show, get_args(Show))
-        if show not in self.show_choices:
-            lacking = "harmonics (sh)" if show == "rgb" else "features"
-            raise ValueError(
-                f"show: expected one of {', '.join(self.show_choices)} (no cloud has {lacking}), got {show!r}; "
-                "choose one of these"
-            )
+        """Choose what the colours mean: classes, own colours, scores or latents.
+
+        Raises:
+            ValueError: if it is unknown, or these clouds do not have it.
+        """
+        check_choice("show", show, self.show_choices)
         self.show = show
 
-    def set_hidden(self, labels: Iterable[int | str]) -> None:
-        """See `Explorer.set_hidden`."""
-        if isinstance(labels, str) or not isinstance(labels, Iterable):
-            raise TypeError(f"labels: expected a list of labels or names, got {labels!r}; pass [{labels!r}]")
-        wanted: list[int] = []
-        for label in labels:
-            if isinstance(label, str):
-                wanted += class_indices(label, self.meaning.names)
-            else:
-                check_whole("labels", label, -1, len(self.meaning.names) - 1)
-                wanted.append(int(label))
-        self.hidden = frozenset(wanted)
+    @property
+    def first_show(self) -> Show:
+        """The meaning of the colours that the page opens with: the clouds' own if they have some, else classes."""
+        return "rgb" if "rgb" in self.show_choices else "labels"
+
+    @property
+    def gamma_range(self) -> tuple[float, float]:
+        """The smallest and the largest useful gamma; 0 and 1 without a question."""
+        return (0.0, 1.0) if self.asked is None else (self.asked.low, self.asked.high)
 
     def cloud(self, side: Side) -> Gaussians:
         """The Gaussians of a side."""
@@ -171,49 +148,21 @@ class Exploration:
 
     def labels(self, side: Side) -> Array:  # [N] int64
         """The label of each Gaussian of a side, -1 = none."""
-        self.cloud(side)
-        return self._own_labels if self._carried is None or side == "semantic" else self._take(self._own_labels, -1)
-
-    @property
-    def carried(self) -> Carried | None:
-        """The source of each colour Gaussian; None without a colour side."""
-        return self._carried
-
-    def base_colors(self, side: Side) -> Array:  # [N, 3] uint8
-        """The colours of a side from everywhere; if it has none, those of the other side."""
-        return self._colors.rgb(side)
-
-    def latents(self, side: Side) -> Array:  # [N, 3] uint8
-        """The latents of a side as colours."""
-        return self._colors.latents(side, self.distance)
+        return self._on(side, self._own_labels, -1)
 
     def selected(self, side: Side) -> Array:  # [N] bool
-        """Which Gaussians of a side are selected, hidden or not; none without a question."""
-        cloud = self.cloud(side)
+        """Which Gaussians of a side are selected; none without a question."""
         if self.asked is None or self.gamma is None:
-            return np.zeros(len(cloud), dtype=bool)
-        own = as_array((self.asked.selection.scores > self.gamma) & self.asked.valid)
-        return own if side == "semantic" else self._take(own, False)
-
-    def drawn(self, side: Side) -> Array:  # [N] bool
-        """Which Gaussians of a side are not in a hidden class."""
-        labels = self.labels(side)
-        return ~np.isin(labels, list(self.hidden)) if self.hidden else np.ones(len(labels), dtype=bool)
-
-    @property
-    def present(self) -> frozenset[int]:
-        """The labels present on either side now, hidden or not; -1 included if a Gaussian has none."""
-        return frozenset(int(label) for side in self.sides for label in np.unique(self.labels(side)))
+            return np.zeros(len(self.cloud(side)), dtype=bool)
+        return self._on(side, as_array((self.asked.selection.scores > self.gamma) & self.asked.valid), False)
 
     def scores(self, side: Side) -> Array:  # [N] float64
         """Scores of the question, or of the labels if there is no question; NaN if unknown."""
-        self.cloud(side)
         if self.asked is None:
             values, known = self.meaning.scores, self._own_labels >= 0
         else:
             values, known = self.asked.selection.scores, as_array(self.asked.valid)
-        own = np.where(known, as_array(values).astype(np.float64), np.nan)
-        return own if side == "semantic" else self._take(own, np.nan)
+        return self._on(side, np.where(known, as_array(values).astype(np.float64), np.nan), np.nan)
 
     @property
     def clim(self) -> tuple[float, float]:
@@ -226,24 +175,32 @@ class Exploration:
 
     def colors(self, side: Side) -> Array:  # [N, 3] uint8
         """The colours of a side under the current `show`; grey if unknown."""
-        self.cloud(side)
         if self.show == "labels":
             return palette(self.labels(side), self.meaning.names)
         if self.show == "score":
-            return self._colors.of_scores(side, self.scores(side), self.clim)
-        if self.show == "rgb":
-            return self._colors.rgb(side)
-        return self._colors.latents(side, self.distance)
+            return cloud_colors(self.cloud(side), self.scores(side), clim=self.clim).rgb
+        return self.base_colors(side) if self.show == "rgb" else self._on(side, self.latents(), GREY)
 
-    def pick(self, side: Side, index: int) -> Picked:
-        """Pick a Gaussian."""
-        check_whole("index", index, 0, len(self.cloud(side)) - 1)
-        self._picked = side, int(index)
-        return self._describe(*self._picked, self.asked, self.distance)
+    def base_colors(self, side: Side) -> Array:  # [N, 3] uint8
+        """The colours of a side from everywhere; if it has none, those of the nearest Gaussians of the other side."""
+        if ("rgb", side) not in self._cache:
+            own = self.cloud(side)
+            if own.sh is not None:
+                self._cache["rgb", side] = as_bytes(sh0_to_rgb(own.sh[:, 0].detach()))
+            else:
+                other: Side = "color" if side == "semantic" else "semantic"
+                tree = cKDTree(as_array(self.cloud(other).means), balanced_tree=False, compact_nodes=False)
+                self._cache["rgb", side] = self.base_colors(other)[tree.query(as_array(own.means), workers=-1)[1]]
+        return self._cache["rgb", side]
 
-    def drop_pick(self) -> None:
-        """Pick nothing."""
-        self._picked = None
+    def latents(self) -> Array:  # [S, 3] uint8
+        """The latents of the semantic side as colours; grey if a latent was never learnt."""
+        if ("latents", "semantic") not in self._cache:
+            features = self._clouds["semantic"].features
+            assert features is not None
+            rgb = self.meaning.feature_colors()(features)
+            self._cache["latents", "semantic"] = np.where(as_array(features.any(dim=1))[:, None], rgb, GREY)
+        return self._cache["latents", "semantic"]
 
     def details(self) -> dict[str, Any]:
         """The state as JSON: question, gamma, lambda, and the count of each class on each side.
@@ -267,8 +224,6 @@ class Exploration:
                 "classes": [[name, int(count)] for name, count in zip(self.meaning.names, counts[1:], strict=True)],
                 "none": int(counts[0]),
             }
-        if "color" in self.sides:
-            details["color"]["orphaned"] = details["color"]["none"]
         return details
 
     def lines(self) -> list[str]:
@@ -277,63 +232,42 @@ class Exploration:
         if self.asked is not None:
             lines.append(f"{self.asked.words!r}: score > {self.gamma:.3g} ({self.gamma_how})")
         for side in self.sides:
-            total, chosen = len(self.cloud(side)), ""
-            if self.asked is not None:
-                chosen = f"{int(self.selected(side).sum()):,} of "
-            lines.append(f"{SIDE_WORDS[side]}: {chosen}{total:,} Gaussians")
+            chosen = "" if self.asked is None else f"{int(self.selected(side).sum()):,} of "
+            lines.append(f"{SIDE_WORDS[side]}: {chosen}{len(self.cloud(side)):,} Gaussians")
         if "color" in self.sides:
             orphaned, total = int((self.labels("color") < 0).sum()), len(self.cloud("color"))
             far = f"farther than lambda = {self.distance:.3g} from any labelled one"
             lines.append(f"{orphaned:,} of {total:,} colour Gaussians are {far}, so they have no class")
         return lines
 
-    def save_selection(self, folder: str | Path) -> list[Path]:
-        """Write the selection: numbers as selection.json, the Gaussians of each side as selection_<side>.ply.
+    def _find_sources(self) -> tuple[Array, Array, float, str]:
+        """For each colour Gaussian the nearest labelled semantic one (-1: none is labelled), its distance; and lambda.
 
-        selection.json lists the connected parts (at most the 16 largest), each with the best of at most 30 evenly chosen
-        views. Hidden Gaussians are written too. Either all files appear or none; a side without a selection has no file.
-
-        Raises:
-            ValueError: if nothing is selected on any side.
+        The same as `transfer_labels(..., method="nearest")`, for all lambdas at once. Ties go to the lowest index.
         """
-        sides = {
-            side: SelectedSide(
-                self.cloud(side),
-                self.selection(side),
-                torch.from_numpy(self.labels(side)),
-                torch.from_numpy(self.scores(side)),
-            )
-            for side in self.sides
-            if self.selected(side).any()
-        }
-        if not sides:
-            words = "no question is asked"
-            if self.asked is not None:
-                words = f"score > {self.gamma:.4g} for {self.asked.words!r}"
-            raise ValueError(
-                f"selection: expected at least one Gaussian, got none ({words}); ask first, or lower gamma"
-            )
-        return save_sides(sides, self.details(), self.meaning.names, self.cameras, as_path(folder))
+        if "color" not in self._clouds:
+            return np.zeros(0, np.int64), np.zeros(0), 1.0, "no colour side"
+        points, targets = (positions(side, cloud.means) for side, cloud in self._clouds.items())
+        source, far = np.full(len(targets), -1, dtype=np.int64), np.full(len(targets), np.inf)
+        kept = np.flatnonzero(self._own_labels >= 0)
+        if kept.size == 0:
+            return source, far, 1.0, "no labelled source"
+        sources = Sources(points[kept], self._own_labels[kept])
+        order = neighbours_together(targets)
+        near = sources.near(targets[order], 1, np.inf)
+        source[order], far[order] = kept[sources.first][near.source[:, 0]], near.distance[:, 0]
+        return source, far, *explained_distance(sources.tree, targets)
 
-    def selection(self, side: Side) -> Selection:
-        """The selection on a side, with its scores (0 if unknown) and gamma.
-
-        Raises:
-            ValueError: if no question is asked.
-        """
-        if self.asked is None:
-            raise ValueError("selection: expected a question, got none; ask for something first")
-        scores = torch.from_numpy(np.nan_to_num(self.scores(side), nan=0.0))
-        mask = torch.from_numpy(self.selected(side))
-        return Selection(mask, scores, self.gamma, self.gamma_how)
-
-    def _take(self, values: Array, nothing: Any) -> Array:
-        """Carry values of the semantic Gaussians to the colour side; `nothing` beyond lambda."""
-        assert self._carried is not None
-        return np.where(self._carried.within(self.distance), values[self._carried.source], nothing)
+    def _on(self, side: Side, own: Array, nothing: Any) -> Array:
+        """Values of the semantic Gaussians, or carried from them to the colour side; `nothing` beyond lambda."""
+        check_choice("side", side, self.sides)
+        if side == "semantic":
+            return own
+        reached = np.less(self.far, self.distance)
+        return np.where(reached.reshape(-1, *[1] * (own.ndim - 1)), own[self.source], nothing).astype(own.dtype)
 
 
 def check_number(name: str, value: object) -> None:
-    """Raise a TypeError unless `value` is a number and no bool."""
+    """Raise a TypeError unless `value` is a number and not a bool."""
     if not isinstance(value, numbers.Real) or isinstance(value, bool):
         raise TypeError(f"{name}: expected a number, got {value!r} ({type(value).__name__}); pass a float")

@@ -1,47 +1,162 @@
-"""`Viewer`: an exploration in the WebGL viewer, as a page, a notebook widget, or one file to share."""
+"""`explore`, and `Viewer`: an exploration in the WebGL viewer, as a page, a notebook widget, or one file to share."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import base64
+import sys
+import webbrowser
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from threading import Event
+from typing import TYPE_CHECKING, Any, Literal
 
-from .document import PYTHON_START, document
-from .html import save_html, scene_for_page
-from .options import ExploreOptions
-from .server import PageServer
-from .serving import announce, wait
+import torch
+from torch import Tensor
+
+from .._check import check_choice
+from ..cameras import Camera
+from ..fields import SemanticField
+from ..formats import SplatFile
+from ..gaussians import Gaussians
+from ..labels import LabelSet
+from ..scenes import Scene
+from ..splat import rasterize
+from ..viz.pictures import as_bytes
+from ..viz.plotter import has_display
+from .meaning import FieldMeaning, Meaning, SplatMeaning
+from .pack import as_jpeg, pack_scene
+from .page import APP, document, inline_script, read_text, save_html
+from .server import PageServer, answer_call, pack_message
 from .session import Session
 from .state import Exploration
-from .widget import make_widget
+from .window import Explorer
 
 if TYPE_CHECKING:
-    from ..scenes import Scene
+    from anywidget import AnyWidget
+
+Where = Literal["auto", "window", "browser", "notebook", "picture"]
+STILL = 800  # pixels: the longer edge of the picture where widgets cannot run
+PALE = 0.6  # share of white in the grey of what a question did not select
+START = """
+export default {
+  async render({ model, el }) {
+    const root = document.createElement("div");
+    root.style.height = `${model.get("height")}px`;
+    root.dataset.lmSuppressShortcuts = "true"; // JupyterLab's keys would act on cells
+    el.append(root);
+    const raw = model.get("data");
+    const bytes = new Uint8Array(raw.buffer, raw.byteOffset, raw.byteLength);
+    const header = model.get("header");
+    const packed = { header, data: await kfgs.inflate(bytes, header) };
+    const link = new kfgs.PythonLink(kfgs.callWidget(model), header);
+    const app = await kfgs.mount(root, packed, link);
+    const ask = () => app.ask(model.get("question"));
+    model.on("change:question", ask);
+    return () => {
+      model.off("change:question", ask);
+      app.dispose();
+    };
+  },
+};
+"""
+
+
+def explore(
+    source: SemanticField | SplatFile,
+    color: Gaussians | SplatFile | None = None,
+    *,
+    classes: LabelSet | None = None,
+    cameras: Sequence[Camera] = (),
+    embed: Callable[[str], Tensor] | None = None,
+    distance: float | None = None,
+    where: Where = "auto",
+    out: str | Path = "kfgs_view",
+    height: int = 640,
+) -> Explorer | Viewer:
+    """Explore a scene: search by text, change gamma and lambda, pick and select Gaussians, edit, save.
+
+    A selection in the semantic cloud also lights up in the colour cloud: each colour Gaussian takes the label of the
+    nearest semantic one within lambda (Sec. 3.4). A window and a picture are drawn by pyvista, with both clouds side by side:
+    the returned `Explorer` has `ask("chair")`, `set_gamma(0.6)`, `screenshot("chair.png")`. A page and a notebook are drawn
+    by the browser: a `Viewer`, with `ask` and `save_html`.
+
+    Args:
+        source: a semantic field (search by text) or a labelled splat (search by class).
+        color: the colour scene, in the same frame; None shows the source alone.
+        classes: names and embeddings in the teacher's space; None: those that the field remembers. A splat has its own.
+        cameras: views to search for those that see a picked Gaussian; empty: the field's own. A field without fused
+            features computes them from these views. Without any view, it uses each Gaussian's own latent, which is noisy.
+        embed: the teacher's text encoder, text -> [D], to search for more than the classes.
+        distance: lambda, world units; None: from the clouds' spacing.
+        where: `window` (blocks until you close it), `browser` (a page that only this machine can open; blocks until
+            Ctrl-C), `notebook` (a widget, as the last value of a cell), or `picture` (opens nothing). `auto`: the notebook if
+            there is one, else the browser if there is a display, else a picture.
+        out: folder for saved pictures and selections.
+        height: of the window or the widget, pixels.
+
+    Raises:
+        ValueError: if there is nothing to show, or arguments contradict each other.
+        ImportError: if anywidget is missing for `notebook`.
+        RuntimeError: if nothing can be drawn here, or there is no display for a window.
+    """
+    check_choice("where", where, ("auto", "window", "browser", "notebook", "picture"))
+    if where == "auto":
+        where = "notebook" if in_notebook() else "browser" if has_display() else "picture"
+    if where == "notebook":
+        require_widget()
+    meaning: Meaning
+    if isinstance(source, SplatFile):
+        if classes is not None or embed is not None:
+            raise ValueError(
+                "classes, embed: expected none with a splat, which has its own classes, got one; leave it out"
+            )
+        meaning = SplatMeaning(source)
+    elif isinstance(source, SemanticField):
+        cameras = cameras or source.cameras
+        meaning = FieldMeaning(source, classes, cameras=cameras, embed=embed)
+    else:
+        raise TypeError(f"source: expected a SemanticField or a SplatFile, got {type(source).__name__}; pass one")
+    cloud = color.gaussians if isinstance(color, SplatFile) else color
+    state = Exploration(meaning, cloud, cameras=cameras, distance=distance)
+    if where in ("browser", "notebook"):
+        state.set_show(state.first_show)
+        viewer = Viewer(state, out=out, height=height)
+        if where == "browser":
+            viewer.serve()
+        return viewer
+    explorer = Explorer(state, out=out, height=height, off_screen=where != "window")
+    if where == "window":
+        explorer.show()
+    return explorer
 
 
 class Viewer:
     """The WebGL viewer of an exploration. As the last value of a notebook's cell it is a widget.
 
-    The browser draws, and keeps what a person changes; Python answers texts and writes files. It opens with the state's question,
-    gamma, lambda, colours and hidden classes. After that, page and state are independent, except that `ask` in Python also
-    asks in an open widget.
+    The browser draws, and keeps what a person changes; Python answers texts and writes files. It opens with the state's
+    question, gamma, lambda and colours. After that, page and state are independent, except that `ask` in Python also asks
+    in an open widget.
 
     Args:
         exploration: the state.
-        options: height of the widget, folder for files.
         title: shown above the scene.
         scene: has the photos of the exploration's cameras, found by name; None: without photos.
+        out: folder for files that are saved, on the machine of this program.
+        height: of the widget, CSS pixels.
     """
 
     def __init__(
         self,
         exploration: Exploration,
-        options: ExploreOptions = ExploreOptions(),  # noqa: B008  frozen
         *,
         title: str = "kfgs",
         scene: Scene | None = None,
+        out: str | Path = "kfgs_view",
+        height: int = 640,
     ) -> None:
-        self.state, self.options, self.title, self.scene = exploration, options, title, scene
+        self.state, self.title, self.scene, self.height = exploration, title, scene, height
+        self.session = Session(exploration, out)
         self._widget: Any = None
 
     def ask(self, words: str | None) -> None:
@@ -54,20 +169,6 @@ class Viewer:
         if self._widget is not None:
             self._widget.question = words or ""
 
-    @property
-    def widget(self) -> Any:
-        """The notebook widget (anywidget), made when it is first wanted.
-
-        Raises:
-            ImportError: if anywidget is missing.
-        """
-        if self._widget is None:
-            options = self.options
-            self._widget = make_widget(
-                self.state, title=self.title, scene=self.scene, out=options.out, height=options.height
-            )
-        return self._widget
-
     def serve(self, host: str = "127.0.0.1", port: int = 0, *, report: Callable[[str], object] | None = None) -> None:
         """Open the page in the browser, and serve it until Ctrl-C.
 
@@ -79,25 +180,44 @@ class Viewer:
         Raises:
             ValueError: if the address is not one of this machine, or the port is taken.
         """
+        say = report or (lambda line: sys.stderr.write(line + "\n"))
         with self.open_page(host, port) as page:
-            announce(page, self.options.out, report)
-            wait()
+            say(f"the viewer is open at {page.url}")
+            if not page.local:
+                say(
+                    "note: everyone who reaches this address and has the link can look, and save pictures and selections into "
+                    f"{self.session.out}; nothing on the way is encrypted"
+                )
+            say("Ctrl-C ends it; closing the tab does not")
+            if has_display():  # without a display, Python would open a browser in the terminal
+                webbrowser.open(page.url)
+            with suppress(KeyboardInterrupt):
+                Event().wait()
 
     def open_page(self, host: str = "127.0.0.1", port: int = 0) -> PageServer:
         """Serve the page from a thread: `url` of the result is its link, `close()` ends it. Otherwise as `serve`."""
-        page = PageServer(document(self.title, PYTHON_START), host, port)
-        self.show_in(page)
-        return page
-
-    def show_in(self, page: PageServer) -> bytes:
-        """Give a page its scene, packed; returns it."""
-        packed = scene_for_page(self.state, title=self.title, scene=self.scene)
-        page.show(packed, Session(self.state, self.options.out).call)
-        return packed
+        packed = pack_message(*pack_scene(self.state, title=self.title, scene=self.scene))
+        return PageServer(document(self.title), packed, self.session.call, host, port)
 
     def save_html(self, path: str | Path) -> Path:
-        """Write one file that works offline, from a double click; see `kfgs.viewer.save_html`."""
+        """Write one file with the scene and the viewer, which opens in any browser with a double click, offline.
+
+        Classes can be searched, gamma and lambda changed, Gaussians selected and edited. New phrases need Python.
+
+        Raises:
+            ValueError: if the name does not end in .html.
+        """
         return save_html(self.state, path, title=self.title, scene=self.scene)
+
+    @property
+    def widget(self) -> AnyWidget:
+        """The notebook widget (anywidget), made when it is first wanted; an ImportError if anywidget is missing.
+
+        Where widgets cannot run, on a page of GitHub for instance, a picture from the first camera is shown.
+        """
+        if self._widget is None:
+            self._widget = self._make_widget()
+        return self._widget
 
     def close(self) -> None:
         """Close the widget, if there is one."""
@@ -109,3 +229,72 @@ class Viewer:
 
     def __repr__(self) -> str:
         return f"<Viewer: {'; '.join(self.state.lines())}>"
+
+    def _make_widget(self) -> AnyWidget:
+        require_widget()
+        import anywidget
+        import traitlets
+
+        state, session = self.state, self.session
+        packed = pack_scene(state, title=self.title, scene=self.scene)
+
+        class Widget(anywidget.AnyWidget):  # type: ignore[misc]
+            _esm = inline_script(APP) + START
+            _css = read_text("app.css")
+            header = traitlets.Dict().tag(sync=True)
+            data = traitlets.Bytes().tag(sync=True)
+            question = traitlets.Unicode().tag(sync=True)
+            height = traitlets.Int().tag(sync=True)
+
+            def _repr_mimebundle_(self, **options: Any) -> Any:
+                made = super()._repr_mimebundle_(**options)
+                bundle = made[0] if isinstance(made, tuple) else made
+                if bundle is not None and state.cameras:
+                    bundle["image/jpeg"] = still(state)
+                return made
+
+        words = "" if state.asked is None else state.asked.words
+        widget = Widget(header=packed.header, data=packed.compressed(), question=words, height=self.height)
+
+        def answer(_: Any, message: Any, buffers: list[Any]) -> None:
+            attached = bytes(buffers[0]) if buffers else b""
+            answered, more = answer_call(session.call, lambda: (message, attached))
+            widget.send({"id": message.get("id"), "answer": answered}, [more])
+
+        widget.on_msg(answer)
+        return widget
+
+
+def require_widget() -> None:
+    """Raise an ImportError with the install line if anywidget is missing."""
+    try:
+        import anywidget  # noqa: F401
+    except ImportError:
+        raise ImportError(
+            'where: expected the package anywidget for a notebook, got none; pip install "kfgs[notebook]"'
+        ) from None
+
+
+def in_notebook() -> bool:
+    """Whether a Jupyter kernel runs this program."""
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    return getattr(shell, "kernel", None) is not None
+
+
+def still(state: Exploration) -> str:
+    """What the first camera sees, in the colours that the viewer opens with: a JPEG file in base64, as notebooks hold it.
+
+    After a question, what it did not select is pale.
+    """
+    side, camera = state.sides[-1], state.cameras[0].fitted(STILL)
+    cloud = state.cloud(side)
+    if state.asked is not None or state.show != "rgb" or cloud.sh is None:
+        colors = torch.from_numpy(state.colors(side)).to(cloud.means) / 255
+        if state.asked is not None:
+            rest = ~torch.from_numpy(state.selected(side)).to(colors.device)
+            colors[rest] = PALE + (1 - PALE) * colors[rest].mean(dim=1, keepdim=True)
+        cloud = cloud.replace(features=colors, sh=None)
+    with torch.no_grad():
+        picture = as_bytes(rasterize(cloud.replace(labels=None), camera, background=cloud.means.new_ones(3)).map)
+    return base64.b64encode(as_jpeg(picture)).decode("ascii")

@@ -170,8 +170,8 @@ def _scale(name: str, values: Array, clim: tuple[float, float] | None) -> CloudC
     finite = np.isfinite(values)
     if clim is None:
         known = values[finite] if finite.any() else np.zeros(1)
-        ends = [np.quantile(known, (0.01, 0.99)), (known.min(), known.max()), (known[0] - 0.5, known[0] + 0.5)]
-        clim = next((float(low), float(high)) for low, high in ends if low < high)
+        low, high = (float(end) for end in np.quantile(known, (0.01, 0.99)))
+        clim = (low, high) if low < high else (float(known.min()) - 0.5, float(known.max()) + 0.5)
     check_range("clim[0]", clim[0], -np.inf, closed=(False, False))
     check_range("clim[1]", clim[1], clim[0], closed=(False, False))
     unit = np.where(finite, (values - clim[0]) / (clim[1] - clim[0]), 0.0)

@@ -75,7 +75,7 @@ def add_scalar_bar(plotter: pv.Plotter, cloud: pv.Actor | tuple[float, float], t
         plotter: where the cloud is.
         cloud: the actor from `add_cloud`, coloured by scores or opacity; or the numbers of the darkest and the brightest
             colour.
-        title: over the bar.
+        title: over the bar; another one for each bar of a plotter.
 
     Raises:
         ValueError: if the cloud is not coloured by numbers, or two numbers do not ascend.

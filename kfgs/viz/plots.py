@@ -204,8 +204,8 @@ def plot_quality_storage(
         _legend_below(axes)
     for name, mib, miou in rows:
         close = sum(abs(np.log10(x / mib)) < 0.35 and 0 < 100 * (y - miou) < 4 for _, x, y in rows)
-        place = {"ha": "right", "xytext": (-8, 0)} if close else {"ha": "left", "xytext": (8, 0)}
-        axes.annotate(name, (mib, 100 * miou), textcoords="offset points", va="center", fontsize=9, **place)
+        shift, side = (-8, "right") if close else (8, "left")
+        axes.annotate(name, (mib, 100 * miou), (shift, 0), textcoords="offset points", ha=side, va="center", fontsize=9)
     return finish(figure, path)
 
 

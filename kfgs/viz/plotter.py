@@ -8,7 +8,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from math import atan, degrees, radians, tan
 from typing import TYPE_CHECKING, Any, TypeVar
 from weakref import WeakKeyDictionary
@@ -226,16 +225,6 @@ def camera_of(plotter: pv.Plotter, subplot: tuple[int, int] = (0, 0), *, near: f
     K = [[fx, 0.0, (1 - x) * width / 2], [0.0, fy, (1 + y) * height / 2], [0.0, 0.0, 1.0]]
     lens = torch.tensor(K, dtype=torch.float64), width, height
     return Camera(torch.from_numpy(E), *lens, near=near, origin=origin_of(plotter, ORIGIN))
-
-
-def letterboxed(camera: Camera, height: int, width: int) -> Camera:
-    """Resize a camera. The old view stays complete and centred, at its aspect ratio."""
-    scale = min(height / camera.height, width / camera.width)
-    K = camera.K.detach().double().cpu().clone()
-    K[:2] *= scale
-    K[0, 2] += (width - scale * camera.width) / 2
-    K[1, 2] += (height - scale * camera.height) / 2
-    return replace(camera, viewmat=camera.viewmat.detach().double().cpu(), K=K, width=width, height=height)
 
 
 prepare()  # before the user makes a plotter

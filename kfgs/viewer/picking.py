@@ -1,4 +1,4 @@
-"""Find the Gaussian under a pixel, the views that see a Gaussian, and its neighbours.
+"""Find the Gaussian under a pixel, and the views that see a Gaussian.
 
 Computed from rendering weights w = T alpha (Eq. 3), because VTK's picker only knows points.
 """
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .._check import check_range, check_shapes, check_whole
+from .._check import check_shapes, check_whole
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..splat import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, project
@@ -52,20 +52,13 @@ def gaussian_at(
     Returns:
         Its index; of equal weights, that of the nearest. None if less than 5 % of the pixel is covered (background), or
         the pixel is outside the picture.
-
-    Raises:
-        ValueError: if shapes disagree, a number is not finite, or the camera has distortion.
     """
     check_shapes(("gaussians.means", gaussians.means, "N 3"), ("mask", mask, "N"))
-    for name, value in (("x", x), ("y", y)):
-        check_range(name, value, float("-inf"), closed=(False, False))
     if not (0 <= x < camera.width and 0 <= y < camera.height):
         return None
     with torch.no_grad():
-        index, weights = _weights_at(gaussians, _bounds(gaussians), camera, (x, y), mask)
-    if float(weights.sum()) < BACKGROUND:
-        return None
-    return int(index[weights.argmax()])
+        index, weights = _weights_at(gaussians, camera, (x, y), mask)
+    return None if float(weights.sum()) < BACKGROUND else int(index[weights.argmax()])
 
 
 def views_seeing(gaussians: Gaussians, index: int, cameras: Sequence[Camera]) -> list[Sight]:
@@ -77,59 +70,33 @@ def views_seeing(gaussians: Gaussians, index: int, cameras: Sequence[Camera]) ->
         cameras: views without distortion; equally good ones stay in their order.
 
     Raises:
-        ValueError: if there is no such Gaussian, or a camera has distortion.
+        ValueError: if there is no such Gaussian.
     """
     check_whole("index", index, 0, len(gaussians) - 1)
     sights = []
     with torch.no_grad():
-        bounds = _bounds(gaussians)
         for number, camera in enumerate(cameras):
-            own = project(gaussians.select(torch.tensor([index], device=gaussians.means.device)), camera)
+            own = project(gaussians.select(index), camera)
             if len(own.index) == 0:
                 continue
             x, y = own.means2d[0].tolist()
             if not (0 <= x < camera.width and 0 <= y < camera.height):
                 continue
-            found, weights = _weights_at(gaussians, bounds, camera, (x, y))
-            weight = float(weights[found == index].sum())
+            seen, weights = _weights_at(gaussians, camera, (x, y))
+            weight = float(weights[seen == index].sum())
             if weight > LEAST_WEIGHT:
                 sights.append(Sight(camera.name, number, weight))
     return sorted(sights, key=lambda sight: -sight.weight)
 
 
-def neighbours_of(
-    means: Tensor,  # [N, 3]
-    index: int,
-    count: int = 8,
-) -> tuple[Tensor, Tensor]:  # [n] int64, [n]
-    """The nearest other Gaussians, nearest first, and the distances of their means in world units.
-
-    Raises:
-        ValueError: if there is no such Gaussian, or `count` is not positive.
-    """
-    check_shapes(("means", means, "N 3"))
-    check_whole("index", index, 0, len(means) - 1)
-    check_whole("count", count, 1)
-    distances = torch.linalg.vector_norm(means.detach().double() - means[index].detach().double(), dim=1)
-    distances[index] = torch.inf
-    near = distances.topk(min(count, len(means) - 1), largest=False)
-    return near.indices, near.values
-
-
-def _bounds(gaussians: Gaussians) -> tuple[Tensor, Tensor]:  # [N], [N]
-    """Bounds of a footprint in any view: d^T C d where alpha falls to 1/255, and the largest variance."""
-    return 2 * torch.log(gaussians.opacities / ALPHA_MIN), gaussians.scales.amax(dim=1).square()
-
-
 def _weights_at(
     gaussians: Gaussians,
-    bounds: tuple[Tensor, Tensor],
     camera: Camera,
     place: tuple[float, float],  # (x, y)
     mask: Tensor | None = None,  # [N] bool
 ) -> tuple[Tensor, Tensor]:  # [m] int64, [m]
     """Weights of the Gaussians composited at a place, front to back (point 2 of the engines' contract)."""
-    index = _near_ray(gaussians, bounds, camera, place)
+    index = _near_ray(gaussians, camera, place)
     if mask is not None:
         index = index[mask.to(index.device)[index]]
     seen = project(gaussians.select(index), camera)
@@ -145,12 +112,11 @@ def _weights_at(
     return index[seen.index[order]][drawn], (alphas * before)[drawn]
 
 
-def _near_ray(
-    gaussians: Gaussians, bounds: tuple[Tensor, Tensor], camera: Camera, place: tuple[float, float]
-) -> Tensor:  # [m] int64, ascending
+def _near_ray(gaussians: Gaussians, camera: Camera, place: tuple[float, float]) -> Tensor:  # [m] int64, ascending
     """The Gaussians that can reach a place in the picture, by the bound of `project` without rotations."""
     camera = camera.to(gaussians.means).with_origin(gaussians.origin)
-    reach, largest = bounds
+    reach = 2 * torch.log(gaussians.opacities / ALPHA_MIN)  # d^T C d where alpha falls to 1/255
+    largest = gaussians.scales.amax(dim=1).square()
     points = gaussians.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     z = points[:, 2]
     near = (z > camera.near) & (reach >= 0)
