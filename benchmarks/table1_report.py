@@ -14,8 +14,8 @@ from kfgs.evaluation import load_label_map, load_label_set
 from kfgs.metrics import MIB
 from kfgs.scenes import load_scene
 from kfgs.viz import overlay_labels, plot_quality_storage, save_picture
-from kfgs.viz.plots import finish, new_figure
 from kfgs.viz.pictures import legend_strip, picture_grid
+from kfgs.viz.plots import finish, new_figure
 
 COLUMNS = 5  # of the picture of labels
 HEAD = (

@@ -5,9 +5,9 @@ from contextlib import contextmanager
 import numpy as np
 import torch
 from cases_explorer import cloud, splat_file
+from kfgs.viewer.desktop import Desktop
 
 from kfgs.viewer import ExploreOptions, Explorer
-from kfgs.viewer.desktop import Desktop
 from kfgs.viewer.meaning import SplatMeaning
 from kfgs.viewer.state import Exploration
 

@@ -206,8 +206,9 @@ def test_a_splat_file_says_its_origin_and_keeps_it(tmp_path):
 
 def test_pictures_of_two_clouds_share_an_origin(tmp_path):
     pv = pytest.importorskip("pyvista")
-    from kfgs.viz import add_boxes, add_cameras, add_cloud, look_through, to_pyvista, to_trimesh
     from kfgs.viz.camera_view import camera_of
+
+    from kfgs.viz import add_boxes, add_cameras, add_cloud, look_through, to_pyvista, to_trimesh
 
     world = far_file(tmp_path / "far.ply")
     gaussians = read_splats(tmp_path / "far.ply").gaussians

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from cases_desktop import HEIGHT, WIDTH, clouds, drag, press, seen, shot
 from cases_explorer import splat_file
+from kfgs.viewer.desktop import Desktop, open_window
 from messages import tells
 from PIL import Image
 
 from kfgs.viewer import ExploreOptions, Explorer
-from kfgs.viewer.desktop import Desktop, open_window
 from kfgs.viewer.meaning import SplatMeaning
 from kfgs.viewer.state import Exploration
 from kfgs.viz import available, headless

@@ -1,10 +1,10 @@
 import pytest
 import torch
 from cases_explorer import NAMES, cameras, classes, cloud, field, splat_file, stored
+from kfgs.viewer.entry import meaning_of
 from messages import tells
 
 from kfgs.viewer import ExploreOptions, FieldMeaning, SplatMeaning, explore
-from kfgs.viewer.entry import meaning_of
 
 SMALL = ExploreOptions(height=120, width=320)
 

@@ -5,11 +5,11 @@ import pytest
 import torch
 from cases_explorer import cloud
 from cases_viz import some_camera, some_gaussians
+from kfgs.viewer.hit_test import gaussian_at, neighbours_of, views_seeing
 from messages import tells
 
 from kfgs.cameras import Camera, Distortion
 from kfgs.splat import rasterize
-from kfgs.viewer.hit_test import gaussian_at, neighbours_of, views_seeing
 
 
 def straight(shift=0.0, name="front"):

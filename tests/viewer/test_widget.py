@@ -13,9 +13,10 @@ from PIL import Image
 
 pytest.importorskip("anywidget")
 
+from kfgs.viewer.widget import make_widget
+
 from kfgs.splat import rasterize, rgb_to_sh0
 from kfgs.viewer import Exploration, FieldMeaning, Viewer, pack
-from kfgs.viewer.widget import make_widget
 from kfgs.viz import explore
 
 

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 
 import pytest
 from cases_window import an_explorer
+from kfgs.viewer.serving import has_display
 from messages import tells
 
-from kfgs.viewer.serving import has_display
 from kfgs.viz import available, headless, make_plotter
 
 VARIABLES = ("DISPLAY", "WAYLAND_DISPLAY", *headless.WITHOUT_DISPLAY)
