@@ -51,7 +51,7 @@ def features(
     loaded = views.load(scene)
     chosen = "" if views.split == "train" else f" --split {views.split}"
     if check is not None:
-        found = FeatureFolder(check).of(loaded, views.split).check()
+        found = FeatureFolder(check).check(loaded, views.split)
         say(str(found))
         if not found.ok:
             raise ValueError(

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import torch
 
-from .._files import Names, as_path
+from .._files import Names
 from .._notes import Repair
 from ..cameras.camera import Camera, Distortion
 from .colmap_files import CAMERA_MODELS
 from .colmap_model import ColmapImage, ColmapModel, read_model
 from .files import SceneError, find_pictures, list_images, natural_key, some, spelling_note
-from .posed import as_large_as_pictures, near_zero
+from .posed import NO_POINTS, as_large_as_pictures, assemble_scene
 from .scene import Scene
 
 # COLMAP's model: (our lens, its number of coefficients). COLMAP's own order after the intrinsics is ours in each case:
@@ -32,23 +32,12 @@ _LENSES: dict[str, tuple[str | None, int]] = {
     "SIMPLE_FISHEYE": ("kannala_brandt", 4),
     "FISHEYE": ("kannala_brandt", 4),
 }
-_ONE_FOCAL_LENGTH = {name for name, params in CAMERA_MODELS.values() if params.startswith("f,")}
-PANORAMA = (
-    "cut perspective views out of the panoramas, and give these with their poses"  # no undistorter can flatten them
-)
+PANORAMA = "cut perspective views out of the panoramas, and give these with their poses"  # no undistorter flattens them
 SUPPORTED_MODELS = tuple(_LENSES)
 
 
 def convert_intrinsics(model: str, params: Sequence[float]) -> tuple[torch.Tensor, Distortion | None]:
-    """K [3, 3] float64 and the lens of a COLMAP camera.
-
-    All models of kfgs are exact: SIMPLE_RADIAL and RADIAL are Brown-Conrady with zeros behind k1 (k2), the FISHEYE
-    family without thin prisms is Kannala-Brandt with zeros behind. A perspective lens with all coefficients zero is a
-    pinhole.
-
-    Args:
-        model: COLMAP's name.
-        params: its parameters, in COLMAP's order.
+    """K [3, 3] float64 and the lens of a COLMAP camera; a perspective lens with all coefficients zero is a pinhole.
 
     Raises:
         SceneError: if the model has no exact form here (FOV, THIN_PRISM_FISHEYE, EUCM, ...).
@@ -60,7 +49,7 @@ def convert_intrinsics(model: str, params: Sequence[float]) -> tuple[torch.Tenso
             f"{PANORAMA if model == 'EQUIRECTANGULAR' else advice}"
         )
     kind, length = _LENSES[model]
-    fx, fy, cx, cy, *lens = [params[0], *params] if model in _ONE_FOCAL_LENGTH else params
+    fx, fy, cx, cy, *lens = [params[0], *params] if CAMERA_MODELS[model].startswith("f ") else params
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     if kind is None or (kind == "brown_conrady" and not any(lens)):
         return K, None
@@ -68,61 +57,51 @@ def convert_intrinsics(model: str, params: Sequence[float]) -> tuple[torch.Tenso
     return K, Distortion(kind, coefficients)  # type: ignore[arg-type]  # the table holds only these two names
 
 
-def load_colmap(path: str | Path, images: str | Path) -> Scene:
+def load_colmap(path: Path, images: Path) -> Scene:
     """Read a COLMAP model and pair it with its image files.
 
     Args:
-        path: the model's folder (cameras, images, points3D; binary or text; with or without rigs and frames).
+        path: the model's folder (cameras, images, points3D; binary or text).
         images: the folder that the model's image names are relative to. Its pictures may have another size than the model
             says, as in `images_2`, `images_4` of Mip-NeRF 360: the cameras are resized to them.
-
-    Returns:
-        The scene in natural order of names, points in order of their COLMAP ids, every view in the `train` split.
-        `notes` say which images have no pose or no file, and were left out.
 
     Raises:
         FileNotFoundError: if a folder is missing.
         SceneError: if the model is damaged, a lens has no exact form in kfgs, or no image has both a pose and a file.
     """
-    path, folder = as_path(path), as_path(images)
-    if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: no such folder; expected the images of {path} there")
+    if not images.is_dir():
+        raise FileNotFoundError(f"{images}: no such folder; expected the images of {path} there")
     model = read_model(path)
     views, notes = _posed(model)
-    files, there = find_pictures(folder, [image.name for image in views]), list_images(folder)
+    files, there = find_pictures(images, [view.name for view in views]), list_images(images)
     found = [
-        replace(view, name=files[view.name].relative_to(folder).as_posix()) for view in views if view.name in files
+        replace(view, name=files[view.name].relative_to(images).as_posix()) for view in views if view.name in files
     ]
-    found.sort(key=lambda view: natural_key(view.name))
-    missing = [image.name for image in views if image.name not in files]
+    missing = [view.name for view in views if view.name not in files]
     if not found:
         raise SceneError(
-            f"{folder}: expected the images of {path}, none of its {len(views)} posed images ({some(missing, 3)}) "
+            f"{images}: expected the images of {path}, none of its {len(views)} posed images ({some(missing, 3)}) "
             f"is there; give the right image folder ({Names(there).advice(missing[0]) if missing else notes[0]})"
         )
-    paths = [folder / image.name for image in found]
-    cameras, shrunk = as_large_as_pictures(_cameras(path, model, found), paths, folder)
-    notes += [*shrunk, *spelling_note(folder, files)]
-    known = {image.name for image in (*found, *model.images.values())}
+    found.sort(key=lambda view: natural_key(view.name))
+    paths = [images / view.name for view in found]
+    cameras, resized = as_large_as_pictures(_cameras(path, model, found), paths, images)
+    notes += [*resized, *spelling_note(images, files)]
+    known = {view.name for view in (*found, *model.images.values())}
     extra = [name for name in there if name not in known]
     if missing:
         near = f" ({Names(extra).advice(missing[0])})" if extra else ""
-        notes.append(f"{len(missing)} of {len(views)} posed images have no file in {folder}: {some(missing)}{near}")
+        notes.append(f"{len(missing)} of {len(views)} posed images have no file in {images}: {some(missing)}{near}")
     if extra:
-        notes.append(f"{len(extra)} image files in {folder} have no pose in the model: {some(extra)}")
+        notes.append(f"{len(extra)} image files in {images} have no pose in the model: {some(extra)}")
     if len(model.points) == 0:
-        notes.append("no points: `kfgs fit` and `kfgs color` triangulate some from the poses before they train")
-    cameras, points, far = near_zero(cameras, torch.from_numpy(model.points))
-    splits = {"train": list(range(len(found))), "test": []}
-    return Scene(cameras, paths, points, torch.from_numpy(model.colors), splits, (*notes, *far)).with_near()
+        notes.append(NO_POINTS)
+    points, colors = torch.from_numpy(model.points), torch.from_numpy(model.colors)
+    return assemble_scene(cameras, paths, points, colors, notes)
 
 
 def colmap_cameras(path: Path) -> tuple[list[Camera], list[str]]:
-    """The cameras (in float64) of a model's images with a pose, by names, and notes; the image files need not be there.
-
-    Raises:
-        SceneError: if the model is damaged, or a lens has no exact form in kfgs.
-    """
+    """The cameras (in float64) of a model's images with a pose, by names, and notes; the image files need not be there."""
     model = read_model(path)
     views, notes = _posed(model)
     return _cameras(path, model, [replace(view, name=view.name.replace("\\", "/")) for view in views]), notes
@@ -138,21 +117,13 @@ def _posed(model: ColmapModel) -> tuple[list[ColmapImage], list[str]]:
 
 
 def _cameras(path: Path, model: ColmapModel, images: list[ColmapImage]) -> list[Camera]:
-    lenses = {}
-    for camera_id, camera in model.cameras.items():
-        if not camera.usable:
-            continue
-        try:
-            lenses[camera_id] = convert_intrinsics(camera.model, camera.params)
-        except ValueError as error:
-            raise SceneError(f"{path}, camera {camera_id}: {error}") from error
     cameras = []
     for image in images:
-        camera, (K, distortion) = model.cameras[image.camera_id], lenses[image.camera_id]
+        camera = model.cameras[image.camera_id]
         try:
-            cameras.append(
-                Camera(torch.from_numpy(image.pose), K.float(), camera.width, camera.height, image.name, distortion)
-            )
+            K, lens = convert_intrinsics(camera.model, camera.params)
+            pose = torch.from_numpy(image.pose)
+            cameras.append(Camera(pose, K.float(), camera.width, camera.height, image.name, lens))
         except ValueError as error:
-            raise SceneError(f"{path}, image {image.name}: {error}; write the model again with COLMAP") from error
+            raise SceneError(f"{path}, image {image.name}, camera {image.camera_id}: {error}") from error
     return cameras

@@ -168,17 +168,17 @@ class FeatureFolder(Sequence[Tensor]):
         files = self._find(self.stems)
         missing = [stem for stem in self.stems if stem not in files]
         if missing:
-            raise FileNotFoundError(f"{self.path}: {self._explain(missing)}")
+            raise FileNotFoundError(f"{self.path}: {self._explain(self.stems, missing)}")
         return [files[stem] for stem in self.stems]
 
-    def _explain(self, missing: list[str]) -> str:
+    def _explain(self, stems: list[str], missing: list[str]) -> str:
         """The message for views without a map: which views, and the names of the maps that exist."""
-        text = f"expected a feature map for each of {len(self)} views, {len(missing)} missing: {some(missing)}"
-        others = sorted(set(self._listed) - set(self.stems))
-        if len(missing) == len(self) and others and self.identity is None:
+        text = f"expected a feature map for each of {len(stems)} views, {len(missing)} missing: {some(missing)}"
+        others = sorted(set(self._listed) - set(stems))
+        if len(missing) == len(stems) and others and self.identity is None:
             return (
                 f"{text}; the maps there ({len(others)}) are called {some(others, 3)}, but the pictures "
-                f"{some(self.stems, 3)}: rename the maps to the names of the pictures"
+                f"{some(stems, 3)}: rename the maps to the names of the pictures"
             )
         split = "" if self.identity is None else f" --split all --out {self.path}"
         return f"{text}; make them with `kfgs features SCENE{split}`, or leave these views out"
@@ -241,24 +241,30 @@ class FeatureFolder(Sequence[Tensor]):
                 )
             yield block
 
-    def check(self, *, values: bool = True) -> FeatureReport:
+    def check(self, scene: Scene | None = None, split: Split = "train", *, values: bool = True) -> FeatureReport:
         """Check the map of every view, and report everything that does not fit.
 
         Problems: no map; a file that cannot be read or is not a map of floats; other channels than most; a map that looks
         transposed; NaN or infinite values; a map of zeros only. Notes: maps of several sizes; many all-zero features.
 
         Args:
+            scene: whose views to check; None: those of this folder.
+            split: of the scene, as in `of`.
             values: False checks only shape and type, in milliseconds.
         """
-        report = FeatureReport(self.path, len(self))
-        files = self._find(self.stems)
-        missing = [stem for stem in self.stems if stem not in files]
+        stems, sizes = self.stems, self.sizes or [None] * len(self)
+        if scene is not None:
+            pictures = pictures_of(scene, split)
+            stems, sizes = [picture.stem for picture in pictures], [picture.size for picture in pictures]
+        report = FeatureReport(self.path, len(stems))
+        files = self._find(stems)
+        missing = [stem for stem in stems if stem not in files]
         report.problems |= dict.fromkeys(missing, "missing")
         if missing:
-            report.notes.append(self._explain(missing))
+            report.notes.append(self._explain(stems, missing))
         shapes: dict[str, tuple[int, int, int]] = {}
         turned: dict[str, str] = {}
-        for stem, size in zip(self.stems, self.sizes or [None] * len(self), strict=True):
+        for stem, size in zip(stems, sizes, strict=True):
             if stem not in files:
                 continue
             name = files[stem].relative_to(self.path).as_posix()

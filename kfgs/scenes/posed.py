@@ -30,6 +30,8 @@ MILLIMETRE = 1e-3  # metres: the step of most depth pictures
 DEPTH_VIEWS = 25  # depth pictures that are read for points: enough to see a room from all sides, a second to decode
 DEPTH_POINTS = 100_000  # points from all of them: what structure from motion gives for a room, and more
 
+NO_POINTS = "no points: `kfgs fit` and `kfgs color` triangulate some from the poses before they train"
+
 Matrix = NDArray[np.float64]
 
 
@@ -200,10 +202,17 @@ def scene_of_poses(
     said = mending_notes(lost, scaled)
     if points is None:
         points = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)
-        said.append("no points: `kfgs fit` and `kfgs color` triangulate some from the poses before they train")
-    cameras, places, far = near_zero(cameras, points[0])
+        said.append(NO_POINTS)
+    return assemble_scene(cameras, paths, *points, [*notes, *resized, *said])
+
+
+def assemble_scene(
+    cameras: list[Camera], paths: list[Path], points: Tensor, colors: Tensor, notes: Sequence[str]
+) -> Scene:
+    """A scene of cameras and points [P, 3] in float64 of the world; every view is in the `train` split."""
+    cameras, places, far = near_zero(cameras, points)
     splits = {"train": list(range(len(cameras))), "test": []}
-    return Scene(cameras, paths, places, points[1], splits, (*notes, *resized, *said, *far)).with_near()
+    return Scene(cameras, paths, places, colors, splits, (*notes, *far)).with_near()
 
 
 def near_zero(cameras: list[Camera], points: Tensor) -> tuple[list[Camera], Tensor, list[str]]:

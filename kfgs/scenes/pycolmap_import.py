@@ -1,75 +1,58 @@
-"""Import pycolmap late, after Pillow and without its log; turn its exceptions into a SceneError.
+"""Import pycolmap late, after Pillow and without its log; give it whole models only; turn its exceptions into a SceneError.
 
 Pillow's C module must be loaded **before** pycolmap. In the other order (pycolmap 4.2.1, Pillow 13.0.0, Linux wheels)
-the first PNG that Pillow writes corrupts the heap and aborts the process ("corrupted size vs. prev_size" in
-ImagingZipEncode). So this file, which every import of `kfgs.scenes` reads, loads Pillow if it is installed.
+the first PNG that Pillow writes corrupts the heap and aborts the process. So this file loads Pillow.
 """
 
 from __future__ import annotations
 
-import contextlib
 import signal
+import tempfile
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
-from .files import SceneError
+import PIL.Image  # noqa: F401  # see above: the order matters
 
-with contextlib.suppress(ImportError):
-    import PIL.Image  # noqa: F401  # see above: the order matters
+from .._files import real_path
+from .colmap_model import FILES, model_suffix, read_whole_model
+from .files import SceneError
 
 # Exceptions of pycolmap for unusable input (a failed CHECK is a ValueError, a missing id an IndexError).
 FAILURES = (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OSError)
 
-_FATAL = 3  # glog's levels: 0 info, 1 warning, 2 error, 3 fatal
-
 
 def import_pycolmap() -> Any:
     """The module, loaded at the first call. Raises an ImportError if it is not installed, with the install line."""
+    main = threading.current_thread() is threading.main_thread()
     before = signal.getsignal(signal.SIGTERM)
     try:
-        with _late_interrupt():
-            import pycolmap
+        import pycolmap
     except ImportError as error:
         raise ImportError(
-            "pycolmap: needed to estimate cameras, to undistort and to align, but it cannot be imported; "
+            "pycolmap: needed to estimate cameras and to undistort, but it cannot be imported; "
             f"run `pip install 'pycolmap>=4.0'` ({error})"
         ) from error
-    # pycolmap's log library prints a stack when the process receives SIGTERM; put the earlier handler back.
-    if before is not None and threading.current_thread() is threading.main_thread():
+    if before is not None and main:  # pycolmap's log library prints a stack at SIGTERM; put the earlier handler back
         signal.signal(signal.SIGTERM, before)
     return pycolmap
 
 
-@contextlib.contextmanager
-def _late_interrupt() -> Iterator[None]:
-    """Deliver Ctrl-C only after the block: inside a C++ module that loads, it would become an ImportError or a crash."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    came: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)
-        if came:
-            signal.raise_signal(signal.SIGINT)
-
-
-@contextlib.contextmanager
+@contextmanager
 def quiet_pycolmap() -> Iterator[Any]:
     """Pycolmap without its log: failures come as exceptions. The log level is restored afterwards."""
     pycolmap = import_pycolmap()
     before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = _FATAL
+    pycolmap.logging.minloglevel = 3  # fatal
     try:
         yield pycolmap
     finally:
         pycolmap.logging.minloglevel = before
 
 
-@contextlib.contextmanager
+@contextmanager
 def scene_errors(what: str, advice: str) -> Iterator[None]:
     """Turn pycolmap's exceptions into a SceneError that begins with `what` and ends with `advice`."""
     try:
@@ -79,3 +62,19 @@ def scene_errors(what: str, advice: str) -> Iterator[None]:
     except FAILURES as error:
         lines = str(error).strip().splitlines()
         raise SceneError(f"{what} ({type(error).__name__}: {lines[0] if lines else 'no text'}); {advice}") from error
+
+
+@contextmanager
+def whole_model(folder: Path) -> Iterator[Path]:
+    """A folder with links to the checked files of a model, for pycolmap; rigs and frames are left out.
+
+    Raises:
+        FileNotFoundError: if there is no such folder.
+        SceneError: as `read_whole_model`.
+    """
+    read_whole_model(folder)
+    suffix = model_suffix(folder)
+    with tempfile.TemporaryDirectory(prefix="kfgs-model-") as scratch:
+        for name in FILES:  # random bytes in frames.bin would never return
+            (Path(scratch) / f"{name}.{suffix}").symlink_to(real_path(folder / f"{name}.{suffix}"))
+        yield Path(scratch)

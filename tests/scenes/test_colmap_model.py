@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from colmap_models import (
     CAMERAS,
-    FRAMES,
     IMAGES,
     POINTS,
-    RIGS,
     pycolmap,
     read_with_pycolmap,
     write_model,
@@ -19,9 +17,10 @@ from colmap_models import (
 )
 from messages import tells
 
-from kfgs.scenes import ColmapModel, SceneError, read_model
+from kfgs.scenes import SceneError
 from kfgs.scenes.colmap_files import CAMERA_MODELS
-from kfgs.scenes.colmap_model import read_whole_model
+from kfgs.scenes.colmap_model import ColmapModel, read_model, read_whole_model
+from kfgs.scenes.pycolmap_import import whole_model
 
 LAYOUTS = [(text, rigs) for text in (False, True) for rigs in (False, True)]
 
@@ -29,7 +28,8 @@ LAYOUTS = [(text, rigs) for text in (False, True) for rigs in (False, True)]
 def _read_alike(folder: Path) -> ColmapModel:
     """Read a model with kfgs and with pycolmap; cameras, poses and points must be the same to the last bit."""
     ours = read_whole_model(folder)
-    theirs = read_with_pycolmap(folder)
+    with whole_model(folder) as safe:
+        theirs = read_with_pycolmap(safe)
     assert set(ours.cameras) == set(theirs.cameras)
     for i, camera in theirs.cameras.items():
         expected = (camera.model_name, camera.width, camera.height, tuple(camera.params))
@@ -45,7 +45,7 @@ def _read_alike(folder: Path) -> ColmapModel:
     for i, image in theirs.images.items():
         pose = ours.images[i].pose
         assert pose is not None
-        assert np.array_equal(pose[:3], image.cam_from_world().matrix())
+        np.testing.assert_allclose(pose[:3], image.cam_from_world().matrix(), rtol=0, atol=1e-14)
         assert pose[3].tolist() == [0, 0, 0, 1]
         seen = [point.point3D_id if point.has_point3D() else -1 for point in image.points2D]
         assert ours.images[i].observed.tolist() == seen
@@ -59,23 +59,20 @@ def _read_alike(folder: Path) -> ColmapModel:
 @pytest.mark.parametrize(("text", "rigs"), LAYOUTS)
 def test_models_are_read_as_pycolmap_reads_them(tmp_path: Path, text: bool, rigs: bool) -> None:
     model = _read_alike(write_model(tmp_path / "m", ["a.png", "sub/b.png", "c.png"], text=text, rigs=rigs))
-    assert (model.layout, len(model.cameras), len(model.images), len(model.points), model.rigs) == (
-        "text" if text else "binary", 1, 3, 5, int(rigs),
-    )  # fmt: skip
+    assert (len(model.cameras), len(model.images), len(model.points)) == (1, 3, 5)
 
 
 @pytest.mark.parametrize("folder", ["room_0/sparse/0", "lund_door/colmap_ground_truth"])
 def test_real_models_are_read_as_pycolmap_reads_them(shared_data: Path, folder: str) -> None:
     model = _read_alike(shared_data / folder)
-    assert len(repr(model)) < 100
-    facts = (model.layout, len(model.cameras), len(model.images), len(model.points), model.rigs)
-    assert facts == {"r": ("binary", 1, 180, 18543, 0), "l": ("text", 1, 12, 11384, 0)}[folder[0]]
+    facts = len(model.cameras), len(model.images), len(model.points)
+    assert facts == {"r": (1, 180, 18543), "l": (1, 12, 11384)}[folder[0]]
 
 
 @pytest.mark.parametrize("text", [False, True])
-@pytest.mark.parametrize("name", [name for name, _ in CAMERA_MODELS.values()])
+@pytest.mark.parametrize("name", list(CAMERA_MODELS))
 def test_every_camera_model_is_read(tmp_path: Path, name: str, text: bool) -> None:
-    params = [50 + i / 7 for i in range(len(dict(CAMERA_MODELS.values())[name].split(",")))]
+    params = [50 + i / 7 for i in range(len(CAMERA_MODELS[name].split()))]
     folder = write_model(tmp_path / "m", ["a.png"], text=text, model=name, params=params)
     assert _read_alike(folder).cameras[1].model == name
 
@@ -108,7 +105,7 @@ def test_rigs_place_their_cameras_as_in_pycolmap(tmp_path: Path, text: bool) -> 
     (tmp_path / "m").mkdir()
     rec.write_text(tmp_path / "m") if text else rec.write(tmp_path / "m")
     model, theirs = read_model(tmp_path / "m"), read_with_pycolmap(tmp_path / "m")
-    assert (len(model.images), model.rigs) == (12, 1)
+    assert len(model.images) == 12
     for i, image in model.images.items():
         assert image.pose is not None
         np.testing.assert_allclose(image.pose[:3], theirs.images[i].cam_from_world().matrix(), rtol=0, atol=1e-14)
@@ -120,12 +117,11 @@ def test_camera_models_are_those_of_pycolmap() -> None:
         if int(member) >= 0:
             camera = pycolmap.Camera.create_from_model_id(1, member, 100.0, 64, 48)
             theirs[int(member)] = (name, [word.strip() for word in camera.params_info.split(",")])
-    assert theirs == {i: (name, params.split(", ")) for i, (name, params) in CAMERA_MODELS.items()}
+    assert theirs == {i: (name, params.split()) for i, (name, params) in enumerate(CAMERA_MODELS.items())}
 
 
-@pytest.mark.parametrize("rigs", [False, True])
-def test_every_truncation_of_every_binary_file_is_refused(tmp_path: Path, rigs: bool) -> None:
-    folder = write_model(tmp_path / "m", ["a.png", "b.png"], rigs=rigs)
+def test_every_truncation_of_every_binary_file_is_refused(tmp_path: Path) -> None:
+    folder = write_model(tmp_path / "m", ["a.png", "b.png"], rigs=False)
     for file in sorted(folder.iterdir()):
         whole = file.read_bytes()
         for length in range(len(whole)):
@@ -161,9 +157,9 @@ def _mutate(data: bytes, rng: random.Random) -> bytes:
     return bytes(changed)
 
 
-@pytest.mark.parametrize(("text", "rigs"), LAYOUTS)
-def test_corrupt_models_are_refused_or_load_with_equal_shapes(tmp_path: Path, text: bool, rigs: bool) -> None:
-    folder = write_model(tmp_path / "m", ["a.png", "b.png"], text=text, rigs=rigs)
+@pytest.mark.parametrize("text", [False, True])
+def test_corrupt_models_are_refused_or_load_with_equal_shapes(tmp_path: Path, text: bool) -> None:
+    folder = write_model(tmp_path / "m", ["a.png", "b.png"], text=text, rigs=False)
     expected = _shape(_read_alike(folder))
     files = {file: file.read_bytes() for file in sorted(folder.iterdir())}
     rng, outcome = random.Random(7), Counter[str]()
@@ -172,7 +168,8 @@ def test_corrupt_models_are_refused_or_load_with_equal_shapes(tmp_path: Path, te
         file.write_bytes(_mutate(files[file], rng))
         try:
             lost = any(image.pose is None for image in read_whole_model(folder).images.values())
-            read_with_pycolmap(folder)  # undistort_scene hands it to pycolmap, which must not hang
+            with whole_model(folder) as safe:  # undistort_scene hands it to pycolmap, which must not hang
+                read_with_pycolmap(safe)
             found = _shape(read_model(folder) if lost else _read_alike(folder))
         except SceneError:
             outcome["refused"] += 1
@@ -187,7 +184,7 @@ def test_corrupt_models_are_refused_or_load_with_equal_shapes(tmp_path: Path, te
 
 def test_a_huge_count_is_refused_before_anything_is_allocated(tmp_path: Path) -> None:
     folder = write_model(tmp_path / "m", ["a.png"])
-    for name in ("cameras", "images", "points3D", "rigs", "frames"):
+    for name in ("cameras", "images", "points3D"):
         file = folder / f"{name}.bin"
         whole = file.read_bytes()
         for count in (2**40, 2**64 - 1):
@@ -201,47 +198,33 @@ def test_the_message_names_file_place_and_cure(tmp_path: Path) -> None:
     folder = write_model(tmp_path / "m", ["a.png"])
     file = folder / "cameras.bin"
     file.write_bytes(file.read_bytes()[:-5])
-    parts = ("cameras.bin, camera 0", "32 bytes (fx, fy, cx, cy) at byte 32", "after 27", "truncated", "copy the model")
+    parts = ("cameras.bin, camera 0", "32 bytes at byte 32", "got 27", "truncated", "copy the model")
     with pytest.raises(SceneError, match=tells(*parts)):
         read_model(folder)
 
 
 BAD_TABLES = [
     ({"cameras": CAMERAS.replace("PINHOLE", "BANANA")}, ["cameras.txt, line 1", "MODEL", "RADIAL", "'BANANA'"]),
-    ({"cameras": CAMERAS.replace("31 25", "31")}, ["line 1", "cy", "end of the line"]),
-    ({"cameras": CAMERAS.replace("31 25", "31 25 9")}, ["line 1", "end of the line", "got 9"]),
-    ({"cameras": CAMERAS.replace("50 55", "5_0 55")}, ["fx", "finite", "'5_0'"]),
+    ({"cameras": CAMERAS.replace("31 25", "31")}, ["line 1", "fx fy cx cy", "got 3"]),
+    ({"cameras": CAMERAS.replace("31 25", "31 25 9")}, ["line 1", "fx fy cx cy", "got 5"]),
+    ({"cameras": CAMERAS.replace("50 55", "half 55")}, ["line 1", "PARAMS", "'half'"]),
     ({"cameras": CAMERAS.replace("64 48", "0 48")}, ["1 to 100000 pixels", "0 x 48"]),
-    ({"cameras": CAMERAS.replace("64 48", "64 4800000")}, ["1 to 100000 pixels", "64 x 4800000"]),
-    ({"cameras": CAMERAS.replace("64 48", "-64 48")}, ["WIDTH", "integer in [0, ", "'-64'"]),
+    ({"cameras": CAMERAS.replace("64 48", "-64 48")}, ["1 to 100000 pixels", "-64 x 48"]),
     ({"cameras": CAMERAS + CAMERAS}, ["line 2", "an id that no other has", "1 again"]),
     ({"cameras": CAMERAS.replace("1 P", "2 P")}, ["image 1", "a camera of the model (2)", "got camera 1"]),
-    ({"cameras": ""}, ["image 1", "a camera of the model", "it has none"]),
-    ({"images": IMAGES.replace("1 2 3 1 b", "1 x 3 1 b")}, ["TY", "finite", "'x'"]),
+    ({"images": IMAGES.replace("1 2 3 1 b", "1 x 3 1 b")}, ["line 3", "TY", "'x'"]),
     ({"images": IMAGES.replace("b.png", "../b.png")}, ["inside the image folder", "'../b.png'", "rename"]),
     ({"images": IMAGES.replace("b.png", "/etc/b.png")}, ["inside the image folder", "'/etc/b.png'", "rename"]),
     ({"images": IMAGES.replace("b.png", "a.png")}, ["image 2", "name", "'a.png' again", "as image 1"]),
     ({"images": IMAGES.replace("2 0.6", "1 0.6")}, ["line 3", "an id that no other has", "1 again"]),
     ({"images": IMAGES.removesuffix("5 6 7\n")}, ["line 3", "a line of 2-D points", "the end of the file"]),
     ({"images": IMAGES.replace("5 6 7", "5 6")}, ["line 4", "2-D points as X Y POINT3D_ID", "2 words"]),
-    ({"images": IMAGES.replace("5 6 7", "5 six 7")}, ["line 4", "2-D points as X Y POINT3D_ID", "'six'"]),
     ({"images": IMAGES.replace("5 6 7", "5 6 7.5")}, ["line 4", "2-D points as X Y POINT3D_ID", "'7.5'"]),
     ({"images": IMAGES.replace("2 7 3", "2 8 3").replace("5 6 7", "5 6 8")}, ["2 that see other points", "one model"]),
     ({"points3D": POINTS + POINTS}, ["points3D.txt", "each point id once", "7"]),
-    ({"points3D": POINTS.replace("10 20 30", "10 256 30")}, ["points3D.txt, line 1", "G", "[0, 255]", "'256'"]),
-    ({"points3D": POINTS.replace("0.5", "half")}, ["ERROR", "finite", "'half'"]),
-    ({"points3D": POINTS.replace("1 0 2 0", "1 0 2")}, ["track as IMAGE_ID POINT2D_IDX", "3 words"]),
-    ({"points3D": POINTS.replace("1 0 2 0", "1 0 -2 0")}, ["track as IMAGE_ID POINT2D_IDX", "-2"]),
-    ({"rigs": RIGS}, ["rigs.txt and frames.txt together", "1 rigs", "frames of 0 images", "delete both"]),
-    ({"frames": FRAMES}, ["frames.txt, line 1", "a rig of the model", "rig 1"]),
-    ({"rigs": RIGS.replace("CAMERA 1", "CAMERA 5"), "frames": FRAMES}, ["rig 1", "a camera of the model", "camera 5"]),
-    ({"rigs": RIGS.replace("CAMERA", "SONAR"), "frames": FRAMES}, ["SENSOR_TYPE", "CAMERA, IMU", "'SONAR'"]),
-    ({"rigs": "1 9999999 CAMERA 1\n", "frames": FRAMES}, ["rigs.txt, line 1", "NUM_SENSORS", "9999999"]),
-    ({"rigs": "1 2 CAMERA 1 CAMERA 1 0\n", "frames": FRAMES}, ["rigs.txt, line 1", "each sensor once"]),
-    ({"rigs": RIGS, "frames": FRAMES.replace("2 1 0.6", "2 5 0.6")}, ["frame 2", "a rig of the model", "rig 5"]),
-    ({"rigs": RIGS, "frames": FRAMES.replace("A 1 2", "A 3 2")}, ["frame 2", "a sensor of rig 1", "sensor 3"]),
-    ({"rigs": RIGS, "frames": FRAMES.replace("A 1 2", "A 1 1")}, ["images of one frame only", "image 1"]),
-    ({"rigs": RIGS, "frames": FRAMES.splitlines()[0]}, ["every image in one frame", "1 images in none"]),
+    ({"points3D": POINTS.replace("10 20 30", "10 256 30")}, ["points3D.txt, line 1", "R G B", "256"]),
+    ({"points3D": POINTS.replace("1 0 2 0", "1 0 2")}, ["points3D.txt, line 1", "TRACK"]),
+    ({"points3D": POINTS.replace("1 0 2 0", "1 0 -2 0")}, ["points3D.txt, line 1", "-2"]),
 ]
 
 
@@ -303,10 +286,8 @@ def test_an_image_whose_pose_is_broken_has_none(tmp_path: Path, numbers: str) ->
 def test_names_may_hold_blanks_which_colmap_cuts_in_text_files(tmp_path: Path) -> None:
     folder = write_text_model(tmp_path / "m", images=IMAGES.replace("b.png", " my  shot (1).png"))
     assert [image.name for image in read_model(folder).images.values()] == ["a.png", "my  shot (1).png"]
-    with pytest.raises(SceneError, match=tells("without blanks", "'my  shot (1).png'", "write _ for each blank")):
+    with pytest.raises(SceneError, match=tells("without blanks", "'my  shot (1).png'", "kfgs sfm SCENE --out OUT")):
         read_whole_model(folder)
-    advised = (folder / "images.txt").read_text().replace("my  shot (1).png", "my__shot_(1).png")
-    assert _read_alike(write_text_model(tmp_path / "advised", images=advised)).images[2].name == "my__shot_(1).png"
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
@@ -320,8 +301,7 @@ def test_text_files_may_begin_with_a_mark(tmp_path: Path, encoding: str) -> None
 def test_honest_variants_pass(tmp_path: Path) -> None:
     variants: list[dict[str, str]] = [
         {},
-        {"rigs": RIGS, "frames": FRAMES},
-        {"rigs": "# none\n", "frames": ""},
+        {"rigs": "rubbish", "frames": "rubbish"},  # the images file has every pose
         {"cameras": "# comment\n\n" + CAMERAS.replace("\n", "\r\n")},
         {"images": "1 1 0 0 0 0 0 0 1 a.png\n\n", "points3D": ""},
     ]
@@ -367,8 +347,6 @@ def test_bad_binary_values_are_refused(tmp_path: Path) -> None:
     refused("cameras.bin", 16, "<Q", 0, "an image of 1 to 100000", "0 x 48")
     refused("images.bin", 8 + 4 + 56, "<I", 77, "image 1", "a camera of the model (1)", "camera 77")
     refused("images.bin", 8 + 64, "<B", 0xFF, "UTF-8")
-    refused("rigs.bin", 16, "<i", 7, "type 0 (camera) or 1 (IMU)", "got 7")
-    refused("frames.bin", 12, "<I", 4, "a rig of the model", "rig 4")
 
 
 def test_nobody_needs_the_error_of_a_point(tmp_path: Path) -> None:
@@ -393,4 +371,4 @@ def test_missing_folder_and_files_are_named(tmp_path: Path) -> None:
 def test_binary_is_read_where_both_are_present(tmp_path: Path) -> None:
     folder = write_model(tmp_path / "m", ["a.png"])
     write_text_model(folder, cameras="rubbish")
-    assert read_model(folder).layout == "binary"
+    assert len(read_model(folder).points) == 5
