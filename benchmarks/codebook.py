@@ -22,9 +22,8 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from kfgs.cameras import resize_map
-from kfgs.evaluation import load_label_set
 from kfgs.formats import read_splats
-from kfgs.labels import average_views, classify
+from kfgs.labels import average_views, classify, load_label_set
 from kfgs.pipeline import score_scene, score_teacher, true_labels
 from kfgs.quant import Codebook, CodebookConfig, LatentMaps, fit_codebook, quantize_maps
 from kfgs.scenes import FeatureFolder, load_scene

@@ -15,15 +15,16 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from editing import score_recolor, score_removal
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from kfgs import SemanticField, attach, load_label_set, load_scene, read_splats
 from kfgs.cameras import Camera, undistort_labels
-from kfgs.evaluation import LabelSet, load_label_map, score_recolor, score_removal
+from kfgs.evaluation import load_label_map
 from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
-from kfgs.labels import EditList, Recolor, Remove, average_views, transfer_labels, vote_labels
+from kfgs.labels import EditList, LabelSet, Recolor, Remove, average_views, transfer_labels, vote_labels
 from kfgs.scenes import Scene
 
 REACH = 0.05  # metres: a Gaussian farther from every true surface point has no true class

@@ -37,8 +37,8 @@ from torch.nn.functional import cross_entropy, linear, normalize
 
 from kfgs._files import atomic_folder, atomic_path, digest_file
 from kfgs.cameras import resize_labels
-from kfgs.evaluation import SegmentationReport, load_label_map, load_label_set
-from kfgs.labels import LabelSet, classify
+from kfgs.evaluation import SegmentationReport, load_label_map
+from kfgs.labels import LabelSet, classify, load_label_set
 from kfgs.pipeline import score_teacher, true_labels
 from kfgs.scenes import FeatureFolder, Scene, extract_features, load_scene, pictures_of
 from kfgs.teachers import Teacher, load_teacher

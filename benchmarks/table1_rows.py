@@ -25,12 +25,12 @@ from safetensors.torch import save_file
 from kfgs._files import read_json, write_json
 from kfgs._rows import unit_rows
 from kfgs.cameras import Camera
-from kfgs.evaluation import FieldMethod, LabelTruth, Method, TeacherMethod, View, label_view, load_label_set
+from kfgs.evaluation import FieldMethod, LabelTruth, Method, TeacherMethod, View, label_view
 from kfgs.evaluation.segmentation import SegmentationReport, evaluate_segmentation
 from kfgs.evaluation.teacher_agreement import TeacherAgreement
 from kfgs.fields import FieldConfig, SemanticField, pack_field
 from kfgs.formats import read_splats
-from kfgs.labels import LabelSet
+from kfgs.labels import LabelSet, load_label_set
 from kfgs.pipeline import FitConfig, fit_scene, true_labels
 from kfgs.pipeline.apply import save_label_map
 from kfgs.pipeline.maps import Maps

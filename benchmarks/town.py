@@ -107,15 +107,15 @@ def _measured(do: Any, args: tuple[Any, ...]) -> dict[str, Any]:
 
 def _print(name: str, field: Any, scene: Any, town: Path, blocks: Any, facts: dict[str, Any]) -> None:
     """One row: scores of a field."""
-    from kfgs.evaluation import evaluate_segmentation, load_label_set, score_surface
-    from kfgs.evaluation.datasets.surface_points import load_surface_points
+    from kfgs.evaluation import evaluate_segmentation, find_points, score_surface
+    from kfgs.labels import load_label_set
     from kfgs.pipeline import true_labels
 
     classes = load_label_set(town / "classes.json", town / "text.npy")
     truth = true_labels(scene, town / "labels", "test")
     cameras = {scene.stem(i): scene.cameras[i] for i in scene.views("test")}
     report = evaluate_segmentation(lambda stem: field.segment(cameras[stem], classes), truth, classes.names)
-    true = load_surface_points(town)
+    true = find_points(town)
     points, labels = true.points, true.labels
     labelled = field.label(classes)
     row = {"miou": round(float(report.miou.value), 4), "gaussians": len(field), **facts}

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from kfgs.evaluation import load_label_set
 from kfgs.fields import SemanticField
 from kfgs.formats import write_splats
 from kfgs.gaussians import Gaussians
+from kfgs.labels import load_label_set
 from kfgs.scenes import load_scene
 from kfgs.viz import palette
 

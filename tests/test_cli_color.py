@@ -17,11 +17,11 @@ from small_room import make_room
 import kfgs.pipeline.color as color_module
 from kfgs.cli import main
 from kfgs.cli.splats import _file_name
-from kfgs.evaluation import load_label_set
 from kfgs.fields import SemanticField
 from kfgs.formats import read_splats, write_splats
 from kfgs.formats.ply import read_ply
 from kfgs.formats.sidecar import names_path
+from kfgs.labels import load_label_set
 from kfgs.labels.edits import EditList
 from kfgs.pipeline.color import Photos
 from kfgs.pipeline.compare import views_of_edits

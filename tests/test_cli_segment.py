@@ -14,7 +14,7 @@ from small_room import make_desk
 from kfgs.cameras import orbit_cameras
 from kfgs.cli import main
 from kfgs.cli.render import check_walk, walk_of
-from kfgs.evaluation.datasets import load_coco_labels
+from kfgs.evaluation.coco import load_coco_labels
 from kfgs.fields import SemanticField
 from kfgs.pipeline import segment_cameras, write_coco
 from kfgs.pipeline.label_pictures import picture_names

@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 import torch
+from kfgs.evaluation.surface_density import surface_density
 
 from kfgs import Camera, Gaussians, SplatFile, rasterize, read_splats, transfer_labels, write_splats
 from kfgs._origin import choose_origin, to_world
 from kfgs.cameras import Orbit, orbit_cameras, path_cameras, spiral_cameras
 from kfgs.cameras.similarity import Similarity
-from kfgs.evaluation.surface_density import surface_density
 from kfgs.formats.ply import read_ply, write_ply
 from kfgs.labels import InBox, InSphere, Move, OfClass, Selection, connected_parts, join, label_mesh
 from kfgs.scenes import align_by_cameras

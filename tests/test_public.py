@@ -14,7 +14,7 @@ import kfgs
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = [
-    "kfgs.cameras", "kfgs.evaluation", "kfgs.evaluation.datasets", "kfgs.evaluation.foreign",
+    "kfgs.cameras", "kfgs.evaluation",
     "kfgs.fields", "kfgs.formats", "kfgs.labels", "kfgs.metrics", "kfgs.pipeline",
     "kfgs.quant", "kfgs.scale", "kfgs.scenes", "kfgs.splat", "kfgs.teachers", "kfgs.toy", "kfgs.viz",
 ]  # fmt: skip

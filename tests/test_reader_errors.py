@@ -10,7 +10,9 @@ import torch
 from messages import tells
 from PIL import Image
 
-from kfgs.evaluation.datasets import load_3dovs, load_coco_labels, load_replica_points, load_scannet_points
+from kfgs.evaluation.coco import load_coco_labels
+from kfgs.evaluation.replica import load_replica_points
+from kfgs.evaluation.scannet import load_scannet_points
 from kfgs.fields import read_examples
 from kfgs.formats import read_splats
 from kfgs.formats.ply import write_ply
@@ -93,23 +95,6 @@ def test_an_image_longer_than_any_is_refused_before_masks_are_filled(tmp_path):
     (tmp_path / "annotations.json").write_text(json.dumps(whole))
     with pytest.raises(ValueError, match=tells("annotations.json", "size of image 'a'", "16777216")):
         load_coco_labels(tmp_path / "annotations.json")
-
-
-def test_texts_that_are_not_utf8(tmp_path):
-    (tmp_path / "segmentations" / "00").mkdir(parents=True)
-    Image.new("L", (4, 3)).save(tmp_path / "segmentations" / "00" / "chair.png")
-    (tmp_path / "segmentations" / "classes.txt").write_bytes(b"chair\n\xd2\n")
-    with pytest.raises(ValueError, match=tells("classes.txt", "texts of a 3D-OVS scene", "utf-8")):
-        load_3dovs(tmp_path)
-
-
-def test_masks_of_several_sizes_name_their_view(tmp_path):
-    (tmp_path / "segmentations" / "00").mkdir(parents=True)
-    for name, width in (("chair", 4), ("plant", 5)):
-        Image.new("L", (width, 3)).save(tmp_path / "segmentations" / "00" / f"{name}.png")
-    (tmp_path / "segmentations" / "classes.txt").write_text("chair\nplant\n")
-    with pytest.raises(ValueError, match=tells("segmentations/00:", "one size", "(3, 4)", "(3, 5)")):
-        load_3dovs(tmp_path)
 
 
 def test_a_camera_of_whole_numbers_beyond_int64(tmp_path):

@@ -59,7 +59,7 @@ def _coco(place: Path, add: Add) -> None:
 
 
 def _lerf(place: Path, add: Add) -> None:
-    from kfgs.evaluation import load_classes
+    from published.class_lists import load_classes
 
     place.mkdir(parents=True)
     for number in load_classes("lerf_ovs")["frames"]["ramen"]:

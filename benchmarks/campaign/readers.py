@@ -31,14 +31,13 @@ def _scene(path: Path) -> None:
 
 
 def _points(path: Path) -> None:
-    from kfgs.evaluation.datasets import find_points
+    from kfgs.evaluation import find_points
 
     find_points(path)
 
 
 def _labels(path: Path) -> None:
-    from kfgs.evaluation.datasets import find_labels
-    from kfgs.evaluation.segmentation import load_label_map
+    from kfgs.evaluation import find_labels, load_label_map
 
     maps = find_labels(path).maps
     for stem in maps:
@@ -48,7 +47,7 @@ def _labels(path: Path) -> None:
 
 
 def _masks(path: Path) -> None:
-    from kfgs.evaluation.datasets import find_masks
+    from published.truth.find import find_masks
 
     frames = find_masks(path).frames
     for stem in frames:
@@ -166,7 +165,7 @@ def _tokenizer(path: Path) -> None:
 
 
 def _foreign(path: Path) -> None:
-    from kfgs.evaluation.foreign import load_foreign
+    from published.foreign import load_foreign
 
     load_foreign(path)
 

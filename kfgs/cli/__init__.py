@@ -25,7 +25,7 @@ from .._card import error_line, short_of_memory
 from .._interrupts import interruptible
 from .batch import batch
 from .blocks import blocks, join
-from .evaluate import compare, evaluate
+from .evaluate import evaluate
 from .features import features
 from .fit import color, demo, fit, sfm, uplift
 from .output import called, open_streams, said_on_stderr, said_whole, say, warnings_as_notes
@@ -44,7 +44,7 @@ GROUPS: dict[str, tuple[Any, ...]] = {
     "More than one machine": (batch, blocks, join),
     "Ask it": (select, segment, label, view, render),
     "Store it": (pack,),
-    "Score it": (evaluate, compare),
+    "Score it": (evaluate,),
     "Colour splats": (color, attach, edit, convert),
 }
 COMMANDS = {command.__name__: command for group in GROUPS.values() for command in group}

@@ -103,7 +103,7 @@ def _text_of_examples(out: Path, field: Any, examples: dict[str, Any]) -> None:
 def _examples(path: Path) -> dict[str, Any]:
     """The examples of a file, which may be COCO's."""
     from .._files import read_json
-    from ..evaluation.datasets import load_coco_examples
+    from ..evaluation.coco import load_coco_examples
     from ..fields import read_examples
 
     content = read_json(path)

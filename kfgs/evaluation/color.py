@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._typed import typed
 from ..gaussians import Gaussians
 from ..metrics import Score, psnr, ssim
 from ..scenes import Scene
@@ -50,11 +49,6 @@ class ColorReport:
             f"{worst.psnr:.2f} dB ({worst.name}) ({self.psnr.protocol.split(':')[0]})"
         )
 
-    @property
-    def text(self) -> str:
-        """The same, and what the protocol says."""
-        return f"{self}\n{self.psnr.protocol}"
-
     def to_json(self) -> dict[str, Any]:
         """The scores as plain numbers; an infinite PSNR (equal pictures) is null."""
         views = {view.name: {"psnr": _finite(view.psnr), "ssim": view.ssim} for view in self.views}
@@ -67,7 +61,6 @@ class ColorReport:
 
 
 @torch.no_grad()
-@typed
 def score_views(
     gaussians: Gaussians,
     scene: Scene,

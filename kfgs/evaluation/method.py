@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from .._rows import EPS, row_norms, unit_embeddings, unit_rows
-from .._typed import typed
 from ..cameras import Camera
 from ..fields import SemanticField
 from ..gaussians import Gaussians
@@ -59,7 +58,6 @@ class Labeller(Protocol):
         """The class of each pixel, -1 where nothing is known."""
 
 
-@typed
 def best_labels(cosines: Tensor) -> Tensor:  # [..., K] -> [...] int64
     """The text with the largest cosine; -1 where the cosines are NaN. A tie goes to the lowest.
 
@@ -74,14 +72,13 @@ def best_labels(cosines: Tensor) -> Tensor:  # [..., K] -> [...] int64
 
 
 def check_level(method: Method, level: int | str) -> None:
-    """Raise a ValueError unless the method has a map of that level; the name of a rule is no level."""
+    """Raise a ValueError unless the method has a map of that level, or `level` is the name of a rule."""
     if not isinstance(level, str) and not 0 <= level < method.levels:
         raise ValueError(
             f"level: expected 0 to {method.levels - 1} (the levels of {method.name!r}), got {level}; choose one of them"
         )
 
 
-@typed
 def label_view(method: Method, view: View, text: Tensor, level: int = 0) -> Tensor:  # [H, W] int64
     """The class of each pixel: the method's own answer if it has one (`Labeller`), else the class with the largest cosine.
 
@@ -117,7 +114,6 @@ def annotated(views: Sequence[View], stems: Iterable[str]) -> list[View]:
     return found
 
 
-@typed
 class FieldMethod:
     """A `SemanticField` as a method: one level.
 

@@ -1,22 +1,18 @@
-"""What a protocol says about a method: scores that carry the protocol's name, and all that is needed to get them again."""
+"""The result of a protocol: scores that carry its name, and what is needed to get them again."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass, field, fields
 from typing import Any
 
-from .._typed import typed
-
 SHOWN = 4
-"""An option with more values is only counted in the short form."""
+"""Of an option with more values, the short form only prints the number."""
 Row = Mapping[str, Any]
 """One line of a report's table: "view", "text" or "class", and numbers."""
 
 
-@typed
 @dataclass(frozen=True, eq=False)
 class Report:
     """Scores under a named protocol.
@@ -25,11 +21,11 @@ class Report:
     """
 
     protocol: str
-    """Name and version: "lerf-ovs-2d/1"."""
+    """Name and version: "kfgs-pooled/1"."""
     scores: Mapping[str, float]
     """By name; the first is the headline. NaN where nothing could be measured."""
     rows: tuple[Row, ...] = ()
-    """What the scores are made of, for each view or class."""
+    """The scores of each view or class."""
     method: str = ""
     """What was scored."""
     about: str = ""
@@ -37,21 +33,11 @@ class Report:
     options: Mapping[str, Any] = field(default_factory=dict)
     """The protocol's options, plain values."""
     changed: tuple[str, ...] = ()
-    """Options that are not as published."""
-    always: tuple[str, ...] = ()
-    """Options that are printed even if they are: they move the score so much."""
-    digests: Mapping[str, str] = field(default_factory=dict)
-    """Of the data and of the field, by name."""
-    command: str = ""
-    """What was run."""
-    machine: str = ""
-    """Where it was run."""
+    """The options that are printed with the score, because they are not as published."""
     notes: tuple[str, ...] = ()
-    """What the protocol decided by the data: which texts were asked, which names were not scored."""
-
-    def __post_init__(self) -> None:
-        if not self.scores:
-            raise ValueError("scores: expected at least one, got none; name what was measured")
+    """What decides how the score is to be read: views that were trained on, sizes, the teacher."""
+    command: str = ""
+    machine: str = ""
 
     def __getitem__(self, name: str) -> float:
         """A score by its name."""
@@ -65,10 +51,10 @@ class Report:
         return next(iter(self.scores.values()))
 
     def __str__(self) -> str:
-        """All scores, the protocol, and the options that differ from it as published or are always named."""
+        """All scores, the protocol, and the options that differ from it as published."""
         numbers = ", ".join(f"{name} {value:.3f}" for name, value in self.scores.items())
-        named = [name for name in self.options if name in self.changed or name in self.always]
-        return f"{numbers} ({', '.join([self.protocol, *(f'{name}={_short(self.options[name])}' for name in named)])})"
+        options = [f"{name}={_short(self.options[name])}" for name in self.options if name in self.changed]
+        return f"{numbers} ({', '.join([self.protocol, *options])})"
 
     def __repr__(self) -> str:
         return f"Report({self}, {len(self.rows)} rows)"
@@ -80,7 +66,6 @@ class Report:
         lines += [f"  {self.about}"] if self.about else []
         lines += [f"  {name} = {value}" for name, value in self.options.items()]
         lines += [f"  note: {note}" for note in self.notes]
-        lines += [f"  {name}: {value}" for name, value in self.digests.items()]
         lines += [f"  command: {self.command}"] if self.command else []
         lines += [f"  machine: {self.machine}"] if self.machine else []
         for row in self.rows:
@@ -88,59 +73,18 @@ class Report:
             lines.append("    " + ", ".join(parts))
         return "\n".join(lines)
 
-    def of(self, *, command: str = "", digests: Mapping[str, str] | None = None, machine: str = "") -> Report:
-        """The same report with the command that made it, digests of data and field, and the machine."""
-        both = {**self.digests, **(digests or {})}
-        return replace(self, command=command or self.command, digests=both, machine=machine or self.machine)
-
     def to_json(self) -> dict[str, Any]:
-        """Plain values: protocol, version, options, scores, rows, digests, command.
-
-        A number that is not finite is null; but an infinite score, such as the PSNR of equal pictures, is the text "inf".
-        """
-        name, _, version = self.protocol.partition("/")
-        return {
-            "protocol": self.protocol,
-            "name": name,
-            "version": int(version) if version.isdigit() else version,
-            "about": self.about,
-            "method": self.method,
-            "options": plain(self.options),
-            "changed": list(self.changed),
-            "always": list(self.always),
-            "scores": {name: str(score) if math.isinf(score) else plain(score) for name, score in self.scores.items()},
-            "rows": plain(self.rows),
-            "digests": plain(self.digests),
-            "command": self.command,
-            "machine": self.machine,
-            "notes": list(self.notes),
-        }
-
-    @staticmethod
-    def from_json(value: Mapping[str, Any]) -> Report:
-        """The report that `to_json` gave; a score that is null becomes NaN.
-
-        Raises:
-            ValueError: if it is something else.
-        """
-        try:
-            scores = {str(name): math.nan if score is None else float(score) for name, score in value["scores"].items()}
-            texts = ("protocol", "about", "method", "command", "machine")
-            parts: dict[str, Any] = {name: str(value[name]) for name in texts if name in value}
-            parts |= {name: dict(value[name]) for name in ("options", "digests") if name in value}
-            parts |= {name: tuple(map(str, value.get(name, ()))) for name in ("changed", "always", "notes")}
-            return Report(scores=scores, rows=tuple(dict(row) for row in value["rows"]), **parts)
-        except (KeyError, TypeError, AttributeError, ValueError) as error:
-            raise ValueError(
-                f"value: expected a report in JSON, as `kfgs evaluate --out` writes it, got something else ({error!r})"
-            ) from error
+        """Plain values. NaN is null; an infinite score, such as the PSNR of equal pictures, is the text "inf"."""
+        values = {entry.name: plain(getattr(self, entry.name)) for entry in fields(self)}
+        infinite = {name: str(score) for name, score in self.scores.items() if math.isinf(score)}
+        return values | {"scores": values["scores"] | infinite}
 
 
 def make_report(
     protocol: Any,
     method: str,
     scores: Mapping[str, float],
-    rows: list[Row] | tuple[Row, ...],
+    rows: Sequence[Row],
     notes: Sequence[str] = (),
 ) -> Report:
     """The report of a protocol: a frozen dataclass with `name` and `about`, whose fields are its options."""
@@ -155,35 +99,8 @@ def make_report(
         about=protocol.about,
         options=options,
         changed=changed,
-        always=getattr(protocol, "always", ()),
         notes=tuple(notes),
     )
-
-
-@typed
-def average(reports: Sequence[Report]) -> Report:
-    """The plain mean of a protocol's scores over several scenes, as published tables have it; one row for each scene.
-
-    Args:
-        reports: of one method, protocol and options. The row of a report is named by its digest "scene", or counted.
-
-    Raises:
-        ValueError: if there is none, or protocols, options or methods differ.
-    """
-    if not reports:
-        raise ValueError("reports: expected at least one, got none; score some scenes")
-    first = reports[0]
-    for i, report in enumerate(reports):
-        for name in ("protocol", "options", "method"):
-            if getattr(report, name) != getattr(first, name):
-                raise ValueError(
-                    f"reports[{i}]: expected the {name} of the first, {getattr(first, name)!r}, got "
-                    f"{getattr(report, name)!r}; score all scenes alike"
-                )
-    rows = [{"scene": report.digests.get("scene", i), **report.scores} for i, report in enumerate(reports)]
-    scores = {name: mean(report.scores[name] for report in reports) for name in first.scores}
-    notes = tuple(dict.fromkeys(note for report in reports for note in report.notes))
-    return replace(first, scores=scores, rows=tuple(rows), notes=notes, digests={}, command="")
 
 
 def mean(values: Iterable[float]) -> float:
@@ -192,26 +109,18 @@ def mean(values: Iterable[float]) -> float:
     return sum(listed) / len(listed) if listed else math.nan
 
 
-def _short(value: Any) -> str:
-    if isinstance(value, list | tuple) and len(value) > SHOWN:
-        return f"{len(value)} values"
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
-
-
 def plain(value: Any) -> Any:
-    """A value as JSON holds it: numbers that are not finite become None, tuples lists, tensors nested lists."""
-    if isinstance(value, bool | str | int) or value is None:
-        return value
+    """A value as JSON holds it: numbers that are not finite become None, tuples lists."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | set | frozenset | range):
+    if isinstance(value, list | tuple):
         return [plain(item) for item in value]
-    if is_dataclass(value) and not isinstance(value, type):
-        return {entry.name: plain(getattr(value, entry.name)) for entry in fields(value)}
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    if isinstance(value, Path):
-        return str(value)
-    raise TypeError(f"value: expected something that JSON can hold, got {type(value).__name__}; convert it first")
+    return value
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, list | tuple) and len(value) > SHOWN:
+        return f"{len(value)} values"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -7,39 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
 from torch import Tensor
 
 from .._card import short_repr
 from .._check import as_tensor
-from .._files import as_path
-from .._typed import typed
 from ..cameras import resize_labels
 from ..metrics import ConfusionMatrix, Score
-from ..scenes.files import open_picture
+from .label_pictures import load_label_map
 
-VOID = 255
 PROTOCOL = (
     "kfgs-pooled/1: one confusion matrix over all views, mean IoU over the classes that occur in truth or prediction, "
     "void (255) ignored, predictions resized to the truth by nearest neighbour"
 )
-
-
-def load_label_map(path: str | Path) -> Tensor:  # [H, W] int64, -1 = void
-    """Read a label picture (8-bit class indices, 255 = void).
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is not an 8-bit single-channel picture.
-    """
-    path = as_path(path)
-    with open_picture(path, "a picture of labels", "write it again") as picture:
-        mode = picture.mode
-        values = torch.from_numpy(np.array(picture)).long() if mode in ("L", "P") else None
-    if values is None:
-        raise ValueError(f"{path}: expected 8-bit class indices (mode L or P), got mode {mode}")
-    return torch.where(values == VOID, -1, values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +39,6 @@ class SegmentationReport:
         rows = [f"{self.miou}", f"{self.accuracy}", f"over {self.views} views; IoU by class:"]
         rows += [f"  {name:<16s} {float(value):.3f}" for name, value in zip(self.names, self.iou, strict=True)]
         return "\n".join(rows)
-
-    @property
-    def text(self) -> str:
-        """The same, and what the protocol says."""
-        return f"{self}\n{PROTOCOL}"
 
     def to_json(self) -> dict[str, Any]:
         """The scores as plain numbers; classes that occur in neither truth nor prediction are null."""
@@ -89,7 +63,6 @@ def check_truth(target: Tensor, classes: int, name: str) -> None:  # target: [H,
         )
 
 
-@typed
 def evaluate_segmentation(
     predict: Callable[[str], Tensor],  # stem -> labels [h, w]
     truth: Mapping[str, Path | Tensor],  # stem -> label picture, or its labels [H, W] with -1 = void

@@ -30,11 +30,6 @@ class SurfaceReport:
     def __str__(self) -> str:
         return f"agreement {self.agreement:.3f} ({SURFACE_PROTOCOL.split(':')[0]}, {self.points:,} points)"
 
-    @property
-    def text(self) -> str:
-        """The same, and what the protocol says."""
-        return f"{self}\n{SURFACE_PROTOCOL}"
-
     def to_json(self) -> dict[str, object]:
         """The report as plain values."""
         return {

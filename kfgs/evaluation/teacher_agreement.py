@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple
+from importlib.resources import files
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
-from .._check import check_choice, check_size, check_whole
 from ..scenes.files import natural_key
-from .class_lists import load_classes
 from .method import Method, View, label_view
-from .relevancy import Encode, encode_unit
 from .report import Report, Row, make_report, mean
+from .texts import Encode, encode_unit
+
+MERGED = ((89, 14), (28, 3), (57, 39))
+"""ADE20K's classes that become others: television to door, rug to floor, pillow to cushion."""
+LARGEST = (360, 480)  # (height, width): wider views are scored at this size
+SIZE = (119, 159)  # (height, width) to which both label maps are brought, "as in the NeRF baseline"
+MOST = 7  # classes whose IoU is averaged
 
 
 class Agreement(NamedTuple):
@@ -26,25 +32,12 @@ class Agreement(NamedTuple):
     """Mean IoU of the classes that are most frequent in both maps together."""
 
 
-def merge_labels(labels: Tensor, merged: Sequence[tuple[int, int]]) -> Tensor:  # [...] int64 -> [...] int64
-    """Replace the first label of each pair by the second, in order."""
-    for old, new in merged:
-        labels = labels.where(labels != old, new)
-    return labels
-
-
-def resize_by_corners(labels: Tensor, size: tuple[int, int]) -> Tensor:  # [H, W] -> [h, w]
-    """Resize labels as torch's "nearest" does: row i reads row floor(i H / h), the label at the pixel's corner."""
-    rows, columns = (torch.arange(new) * old // new for new, old in zip(size, labels.shape, strict=True))
-    return labels[rows.to(labels.device)[:, None], columns.to(labels.device)]
-
-
 def teacher_agreement(
     teacher: Tensor,  # [H, W] int64, -1 = the teacher says nothing
     student: Tensor,  # [H, W] int64, -1 = the field knows nothing
-    most: int = 7,
+    most: int = MOST,
 ) -> Agreement:
-    """Accuracy and "IoU7": the labels of both maps are counted together, the `most` most frequent ones have their IoU averaged.
+    """Accuracy and "IoU7": labels of both maps are counted together, the IoU of the `most` most frequent ones is averaged.
 
     Pixels where the teacher says nothing are left out; where only the student says nothing, it is wrong. Of equally
     frequent labels the lowest counts. NaN if no pixel is left.
@@ -59,10 +52,8 @@ def teacher_agreement(
         return Agreement(float("nan"), float("nan"))
     labels, counts = torch.cat([teacher, student[student >= 0]]).unique(return_counts=True)
     frequent = labels[counts.sort(descending=True, stable=True).indices[:most]]
-    ious = []
-    for label in frequent:
-        a, b = teacher == label, student == label
-        ious.append(int((a & b).sum()) / int((a | b).sum()))
+    pairs = ((teacher == label, student == label) for label in frequent)
+    ious = [int((a & b).sum()) / int((a | b).sum()) for a, b in pairs]
     return Agreement(float((teacher == student).double().mean()), sum(ious) / len(ious))
 
 
@@ -83,31 +74,16 @@ class TeacherAgreement:
         "classes of both; mean over the views; no ground truth"
     )
 
-    texts: Literal["first-word", "full"] | tuple[str, ...] = "first-word"
-    """LSeg's label file splits names at spaces, so the published numbers ask "coffee" for a coffee table, and "screen" twice.
-    "full" asks whole names. A tuple asks other classes, for instance those of a teacher that knows its own."""
-    merged: tuple[tuple[int, int], ...] = ((90, 15), (29, 4), (58, 40))
-    """Classes that become others, counted from 1: television to door, rug to floor, pillow to cushion. Not for other texts."""
+    own_labels: ClassVar[bool] = False
+    """Every method takes the text with the largest cosine."""
+
+    texts: tuple[str, ...] | None = None
+    """The classes that are asked. None: LSeg's 150 classes of ADE20K as published. Its label file splits names at spaces, so
+    "coffee" is asked for a coffee table, and "screen" twice; three pairs of classes are merged."""
     split: tuple[int, int] | None = (8, 2)
     """Of the views sorted by the numbers in their names, every 8th from index 2. None: all views that are given."""
-    largest: tuple[int, int] = (360, 480)
-    """(height, width): wider views are scored at this size."""
-    size: tuple[int, int] = (119, 159)
-    """(height, width) to which both label maps are brought, "as in the NeRF baseline"."""
-    most: int = 7
-    """How many classes the IoU is averaged over."""
     level: int = 0
-    """Of a method with several."""
-
-    def __post_init__(self) -> None:
-        if isinstance(self.texts, str):
-            check_choice("texts", self.texts, ("first-word", "full"))
-        if self.split is not None:
-            check_whole("split (step)", self.split[0], 1)
-            check_whole("split (first)", self.split[1], 0)
-        check_size(self.largest, "largest")
-        check_size(self.size)
-        check_whole("most", self.most, 1)
+    """The map of a method with several."""
 
     def score(self, method: Method, truth: Method, views: Sequence[View], encode: Encode) -> Report:
         """Compare a method with its teacher.
@@ -122,28 +98,28 @@ class TeacherAgreement:
             ValueError: if the split holds no view.
         """
         chosen = self.chosen(views)
-        asked = load_classes("ade20k")[self.texts] if isinstance(self.texts, str) else self.texts
-        merged = [(old - 1, new - 1) for old, new in self.merged] if isinstance(self.texts, str) else []
-        text = encode_unit(encode, asked)
+        text = encode_unit(encode, ade20k_words() if self.texts is None else self.texts)
         rows: list[Row] = []
         for view in chosen:
-            if view.camera.width > self.largest[1]:
-                view = view._replace(camera=view.camera.resized(*self.largest))
-            maps = (label_view(one, view, text, self.level if one is method else 0) for one in (truth, method))
-            taught, found = (resize_by_corners(merge_labels(labels.cpu(), merged), self.size) for labels in maps)
-            accuracy, iou = teacher_agreement(taught, found, self.most)
+            if view.camera.width > LARGEST[1]:
+                view = view._replace(camera=view.camera.resized(*LARGEST))
+            maps = (label_view(truth, view, text), label_view(method, view, text, self.level))
+            accuracy, iou = teacher_agreement(*(self._as_scored(labels.cpu()) for labels in maps))
             rows.append({"view": view.stem, "mIoU": iou, "accuracy": accuracy})
         scores = {name: mean(row[name] for row in rows) for name in ("mIoU", "accuracy")}
-        return make_report(self, method.name, scores, rows, self._notes(len(chosen), len(views)))
+        step, first = self.split or (1, 0)
+        note = (
+            f"{len(chosen)} of {len(views)} views are scored: one in {step} from index {first}, in the order of the numbers "
+            "in their names"
+        )
+        return make_report(self, method.name, scores, rows, [note] if self.split else [])
 
-    def _notes(self, scored: int, given: int) -> list[str]:
-        if self.split is None:
-            return []
-        step, first = self.split
-        return [
-            f"{scored} of {given} views are scored: one in {step} from index {first}, in the order of the numbers in their "
-            "names; split=none scores all"
-        ]
+    def _as_scored(self, labels: Tensor) -> Tensor:  # [H, W] -> SIZE
+        """Labels with merged classes, resized as torch's "nearest" does: row i reads row floor(i H / h)."""
+        for old, new in MERGED if self.texts is None else ():
+            labels = labels.where(labels != old, new)
+        rows, columns = (torch.arange(new) * old // new for new, old in zip(SIZE, labels.shape, strict=True))
+        return labels[rows[:, None], columns]
 
     def chosen(self, views: Sequence[View]) -> list[View]:
         """The views of `split`, sorted by the numbers in their names.
@@ -151,10 +127,15 @@ class TeacherAgreement:
         Raises:
             ValueError: if there is none.
         """
-        ordered = sorted(views, key=lambda view: natural_key(view.stem))
-        found = ordered if self.split is None else ordered[self.split[1] :: self.split[0]]
-        if not found:
-            raise ValueError(
-                f"views: expected more than {(self.split or (0, 0))[1]}, got {len(ordered)}; pass split=None"
-            )
-        return found
+        step, first = self.split or (1, 0)
+        chosen = sorted(views, key=lambda view: natural_key(view.stem))[first::step]
+        if not chosen:
+            raise ValueError(f"views: expected more than {first}, got {len(views)}; pass split=None")
+        return chosen
+
+
+def ade20k_words() -> list[str]:
+    """LSeg's 150 words for ADE20K, as its label file has them."""
+    text = files("kfgs.evaluation").joinpath("data", "ade20k.json").read_text("utf-8")
+    words: list[str] = json.loads(text)["first-word"]
+    return words

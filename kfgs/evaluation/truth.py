@@ -1,20 +1,22 @@
-"""Ground truth of a scene, as data-set readers give it and protocols take it: nothing here reads a file."""
+"""Ground truth of a scene: classes of pixels, and classes of points on its surfaces."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import TypeVar
 
 from torch import Tensor
 
 from .._card import short_repr
 from .._check import check_shapes
-from .._typed import typed
+
+T = TypeVar("T")
+VOID_NAMES = ("void", "unlabeled", "unlabelled", "unknown", "ignore")
+"""Names that mean "no class". Their pixels and points are not scored."""
 
 
-@typed
 @dataclass(frozen=True, eq=False)
 class LabelTruth:
     """A closed set of classes, and the class of each pixel."""
@@ -26,57 +28,10 @@ class LabelTruth:
 
     __repr__ = short_repr
 
-    def __post_init__(self) -> None:
-        for stem, labels in self.maps.items():
-            if isinstance(labels, Tensor):
-                check_shapes((f"maps[{stem!r}]", labels, "H W"))
-                if labels.is_floating_point():
-                    raise TypeError(f"maps[{stem!r}]: expected whole numbers, got {labels.dtype}; convert with .long()")
 
-
-class MaskAndBoxes(NamedTuple):
-    """Where one text is in a picture."""
-
-    mask: Tensor  # [H, W] bool
-    boxes: Tensor | None = None  # [B, 4] x1, y1, x2, y2 in pixels, one for each object
-
-    def __repr__(self) -> str:
-        return short_repr(self)
-
-
-@typed
-@dataclass(frozen=True, eq=False)
-class MaskTruth:
-    """Masks of texts in some pictures; those of one picture may overlap, and leave pixels without any."""
-
-    frames: Mapping[str, Mapping[str, MaskAndBoxes]]
-    """By the picture's stem, then by text. A text that a frame lacks is not asked there."""
-    scene: str | None = None
-    """The data set's name of the scene ("figurines"), where a protocol has a list of texts for it."""
-    listed: tuple[str, ...] = ()
-    """The data set's own list of the scene's texts (`classes.txt` of 3D-OVS), whether a picture has a mask of each or not."""
-
-    __repr__ = short_repr
-
-    def __post_init__(self) -> None:
-        for stem, texts in self.frames.items():
-            sizes = []
-            for text, (mask, boxes) in texts.items():
-                name = f"frames[{stem!r}][{text!r}]"
-                check_shapes((f"{name}.mask", mask, "H W"), (f"{name}.boxes", boxes, "B 4"))
-                sizes.append((f"{name}.mask", mask, "H W"))
-            check_shapes(*sizes)
-
-    @property
-    def texts(self) -> tuple[str, ...]:
-        """All texts that have a mask, in the order of their first appearance."""
-        return tuple(dict.fromkeys(text for texts in self.frames.values() for text in texts))
-
-
-@typed
 @dataclass(frozen=True, eq=False)
 class PointTruth:
-    """Labelled points of a scene's surfaces."""
+    """Labelled points on the surfaces of a scene."""
 
     points: Tensor  # [P, 3] world units
     labels: Tensor  # [P] int64: the data set's own ids
@@ -88,5 +43,38 @@ class PointTruth:
 
     def __post_init__(self) -> None:
         check_shapes(("points", self.points, "P 3"), ("labels", self.labels, "P"), ("instances", self.instances, "P"))
-        if self.labels.is_floating_point():
-            raise TypeError(f"labels: expected whole numbers, got {self.labels.dtype}; convert with .long()")
+
+
+class ReadWhenAsked(Mapping[str, T]):
+    """Values by name that are read from disk when they are asked for. Only the last one stays in memory."""
+
+    def __init__(self, readers: Mapping[str, Callable[[], T]]) -> None:
+        self._readers = dict(readers)
+        self._last: tuple[str, T] | None = None
+
+    def __getitem__(self, key: str) -> T:
+        last = self._last  # read once: another thread may change it
+        if last is None or last[0] != key:
+            last = self._last = (key, self._readers[key]())
+        return last[1]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._readers)
+
+    def __len__(self) -> int:
+        return len(self._readers)
+
+
+def name_key(name: str) -> str:
+    """The form in which class names are compared: no case, spaces, hyphens or underscores.
+
+    Example:
+        >>> name_key("Shower-Curtain") == name_key("showercurtain")
+        True
+    """
+    return name.casefold().translate(str.maketrans("", "", " -_"))
+
+
+def is_void(name: str) -> bool:
+    """Whether a name means "no class"."""
+    return name_key(name) in VOID_NAMES

@@ -19,7 +19,7 @@ from ..cameras import Camera
 from ..cameras.camera import view_named
 from ..gaussians import as_rows
 from ..labels import LabelSet
-from ..labels.polygons import decode_rle
+from ..labels.run_lengths import decode_rle
 from .semantic_field import SemanticField
 
 LONGEST = 4096

@@ -17,21 +17,17 @@ from .color import ColorConfig, fit_color
 from .compare import views_of_change, write_comparison
 from .config import FitConfig
 from .describe import describe
-from .evaluate import evaluate
+from .evaluate import Question, evaluate, open_question
 from .fit import fit_scene
 from .fuse import uplift
 from .label_pictures import segment_cameras, write_coco
-from .question import Question, open_question
-from .results import Compared, Results
 from .run_report import write_run_report
 from .stages import Run
 
 __all__ = [
     "ColorConfig",
-    "Compared",
     "FitConfig",
     "Question",
-    "Results",
     "Run",
     "attach",
     "describe",

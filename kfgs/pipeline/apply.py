@@ -18,7 +18,9 @@ from .._origin import recounted
 from .._typed import typed
 from ..cameras import resize_labels
 from ..evaluation import SegmentationReport, evaluate_segmentation, load_label_map
-from ..evaluation.segmentation import VOID, check_truth
+from ..evaluation.label_pictures import VOID
+from ..evaluation.segmentation import check_truth
+from ..evaluation.views import labels_of_view
 from ..fields import Rule, SemanticField
 from ..formats.ply import Columns, other_elements, points_from_columns, read_ply, write_ply
 from ..formats.ply_3dgs import columns_from_gaussians, label_column
@@ -33,7 +35,6 @@ from ..viz import FeatureColors, overlay_labels, palette, plot_history, save_pic
 from ..viz.palette import UNLABELLED
 from ..viz.pictures import Array, write_png
 from .fit import FitResult, load_history
-from .maps import labels_of_view
 from .sheets import segmentation_sheet, teacher_labels
 
 SEGMENTED = ("predicted", "colored", "sheets", "overlay", "features")

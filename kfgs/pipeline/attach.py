@@ -17,12 +17,11 @@ from .._origin import recounted
 from .._typed import typed
 from ..cameras import Camera
 from ..cameras.similarity import Similarity
-from ..evaluation import LabelSet
 from ..fields import SemanticField
 from ..formats import read_splats
 from ..formats.splat_file import SCORE, SplatFile
 from ..gaussians import Gaussians
-from ..labels import Transfer, transfer_labels, vote_labels
+from ..labels import LabelSet, Transfer, transfer_labels, vote_labels
 from ..labels.transfer import Method
 from ..scenes import Alignment, SceneError, align_by_cameras, frames_agree
 from ..splat.transform import transform_gaussians

@@ -5,18 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from .._check import ORIGIN
 from .._files import check_output
 from .._origin import recounted
-from ..evaluation import LabelSet, load_label_set, score_recolor, score_removal, score_surface, score_views
-from ..evaluation.datasets.surface_points import load_surface_points
+from ..evaluation import find_points, score_surface, score_views
 from ..evaluation.surface import SurfaceReport
 from ..formats import SplatFile, write_splats
 from ..formats.ply import write_ply
 from ..gaussians import Gaussians
-from ..labels import EditList, OfClass, Recolor, Remove, connected_parts, parse_color
+from ..labels import (
+    EditList,
+    LabelSet,
+    OfClass,
+    Recolor,
+    Remove,
+    connected_parts,
+    load_label_set,
+    parse_color,
+)
 from ..labels.edits.edit_list import edits_path
 from ..scenes import FeatureFolder, Scene, load_scene
 from ..toy.room_folder import ToyConfig, make_toy_room
@@ -111,16 +118,15 @@ def run(
     say(f"surface points: {surface}")
     say(
         f'5. Edits. The classes are carried over to the splat with the colours, and then "{REMOVED}" is a name for Gaussians: '
-        f"the {REMOVED}s are removed, and the {PAINTED}s are painted red. Both are compared with what the room would look like."
+        f"the {REMOVED}s are removed, and the {PAINTED}s are painted red. Pictures show the views that change most."
     )
-    edited, edit_scores = _edit_colors(out, scene, folder, fitted, colored.gaussians, classes, say)
+    edited = _edit_colors(out, scene, fitted, colored.gaussians, classes, say)
     write_report(
         out / "scores.json",
         unseen_views=scores,
         teacher=teacher,
         surface=surface,
         color=quality,
-        **edit_scores,
         seconds=colored.seconds + fitted.seconds,
     )
     segmentation = out / "segmentation"
@@ -138,19 +144,20 @@ def run(
 def _edit_colors(
     out: Path,
     scene: Scene,
-    folder: Path,
     fitted: FitResult,
     colors: Gaussians,
     classes: LabelSet,
     say: Callable[[str], None],
-) -> tuple[list[Path], dict[str, Any]]:
-    """Attach the classes to the colours, remove the chairs and recolour the plants; returns files and scores."""
+) -> list[Path]:
+    """Attach the classes to the colours, remove the chairs and recolour the plants; returns the files."""
     splats = attach(fitted.field, SplatFile(colors), classes).splats
     written = write_splats(out / "color.ply", splats).paths
     for part in connected_parts(splats.gaussians, OfClass(REMOVED).select(splats), fitted.field.cameras):
         say(f"  {REMOVED}: {part!r}")
-    rgb = parse_color(PAINT)
-    edits = {"removed": EditList((Remove(OfClass(REMOVED)),)), "recolored": EditList((Recolor(OfClass(PAINTED), rgb),))}
+    edits = {
+        "removed": EditList((Remove(OfClass(REMOVED)),)),
+        "recolored": EditList((Recolor(OfClass(PAINTED), parse_color(PAINT)),)),
+    }
     after = {name: edit.apply(splats) for name, edit in edits.items()}
     for name, edit in edits.items():
         written += [*write_splats(out / f"{name}.ply", after[name]).paths, edit.save(edits_path(out / f"{name}.ply"))]
@@ -158,18 +165,13 @@ def _edit_colors(
         views = views_of_change(*before_after, scene.cameras)
         picture = out / f"{name}.png"
         written.append(write_comparison(picture, *before_after, [scene.cameras[i] for i in views], titles=TITLES))
-    before = splats.gaussians
-    removal = score_removal(before, after["removed"].gaussians, folder, REMOVED)
-    recolored = score_recolor(before, after["recolored"].gaussians, folder, PAINTED, rgb)
-    say(str(removal))
-    say(str(recolored))
-    return written, {"removal": removal, "recolor": recolored}
+    return written
 
 
 def _label_surface(gaussians: Gaussians, folder: Path, out: Path, classes: LabelSet) -> SurfaceReport:
     """Carry the Gaussians' labels to the room's true surface points and score them (protocol `kfgs-surface/1`)."""
     assert gaussians.labels is not None
-    truth = load_surface_points(folder)
+    truth = find_points(folder)
     points, true = truth.points.float(), truth.labels
     local = recounted(points, ORIGIN, gaussians.origin)
     report = score_surface(gaussians.means, gaussians.labels, local, true)

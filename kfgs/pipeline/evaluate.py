@@ -1,93 +1,158 @@
-"""Score a result under a named protocol: a field of kfgs, a result of another program, or the teacher itself."""
+"""Score a result under a named protocol: a field of kfgs, the teacher itself, a colour splat, or any other method."""
 
 from __future__ import annotations
 
 import os
 import platform
 import re
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import torch
 
-from .._files import as_path, digest_file
-from ..evaluation import Encode, FieldMethod, LabelSet, Method, Report
-from ..evaluation.digests import digest_data
-from ..evaluation.encoders import TableEncoder
-from ..evaluation.foreign import SplattedMethod, load_foreign
+from .._card import short_repr
+from .._files import as_path, file_stem
+from ..evaluation import (
+    Encode,
+    FieldMethod,
+    Labeller,
+    Method,
+    Report,
+    TeacherAgreement,
+    TeacherMethod,
+    View,
+    get_protocol,
+)
+from ..evaluation.texts import as_encoder
+from ..evaluation.truth import ReadWhenAsked
 from ..fields import SemanticField
-from ..fields.store import field_data, find_field
+from ..fields.parts import teacher_name
+from ..fields.store import find_field
 from ..formats import read_splats
 from ..gaussians import Gaussians
-from ..scenes.extract import MANIFEST
-from .beside import notes_beside
-from .question import IN_SPACE, OF_COLORS, Question, colors_of, open_question, read_teacher
+from ..labels import LabelSet
+from ..scenes import FeatureFolder, Scene, load_scene
+from .maps import maps_of_views
 
-MAPS = ("*_fmap_CxHxW.pt", "*_s.npy", "*.npy")  # files of maps in a folder that kfgs did not fill
+LabelRule = Literal["own", "nearest"]
+
+
+class Question(NamedTuple):
+    """What a method is asked: the same for every method that is compared."""
+
+    protocol: Any
+    """Of `kfgs.evaluation.PROTOCOLS`, or an object with the same members."""
+    scene: Scene
+    """Without distortion."""
+    truth: Any
+    """What the protocol compares with."""
+    views: Sequence[View]
+    """The views that are scored; empty if points are."""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+
+def open_question(
+    scene: str | Path,
+    protocol: Any = "kfgs-pooled/1",
+    *,
+    truth: str | Path | None = None,
+    split: str | None = None,
+    images: str | Path | None = None,
+) -> Question:
+    """Read a scene and its ground truth for a protocol.
+
+    Args:
+        scene: its folder.
+        protocol: a name of `kfgs.evaluation.PROTOCOLS`, or a protocol.
+        truth: where the ground truth is, if not in the scene's folder (`find_labels`, `find_points`). For
+            `feature3dgs-teacher/1` the folder of the teacher's maps; None: `features/` in the scene.
+        split: which views. None depends on the protocol: the test views, or all views with labels if no test view has
+            some; of a teacher's maps all views.
+        images: folder of the pictures.
+
+    Raises:
+        FileNotFoundError: if the scene or its truth is missing.
+        ValueError: if protocol, split or truth do not fit.
+    """
+    protocol = get_protocol(protocol) if isinstance(protocol, str) else protocol
+    folder, place = as_path(scene), None if truth is None else as_path(truth)
+    loaded = load_scene(folder, images=images).undistorted()
+    if not isinstance(protocol, TeacherAgreement):
+        return Question(protocol, loaded, *protocol.open(loaded, folder, place, split))
+    maps = place or folder / "features"
+    if not maps.is_dir():
+        raise FileNotFoundError(f"truth: expected a folder of the teacher's feature maps, got {maps}; name another")
+    views = [View(loaded.stem(i), loaded.cameras[i]) for i in loaded.views(split or "all")]
+    return Question(protocol, loaded, read_teacher(maps, loaded, protocol.chosen(views), align_corners=True), views)
 
 
 def evaluate(
     field: str | Path | Method | Gaussians,
     scene: str | Path | Question,
-    protocol: str = "kfgs-pooled/1",
+    protocol: Any = "kfgs-pooled/1",
     *,
     encode: Encode | LabelSet | None = None,
-    with_file: str | Path | None = None,
+    labels: LabelRule | None = None,
     command: str = "",
     **asked: Any,
 ) -> Report:
     """Score a result in a scene under a protocol.
 
     Args:
-        field: a field folder or a run folder of kfgs, a result of another program (`load_foreign`), a splat with features, a
-            folder of a teacher's feature maps; or a `Method`. For colours and edits, a colour splat.
+        field: a field or run of kfgs, a folder of a teacher's feature maps, or a `Method`. For `kfgs-color/1` Gaussians with
+            colours, a splat, or a run that has one.
         scene: its folder; or a question that was opened before (`open_question`), to ask several methods the same.
-        protocol: a name of `kfgs.evaluation.PROTOCOLS`; a question has its own.
-        encode: a label set, or the teacher's text encoder. Not needed for colours and edits.
-        with_file: a second file of a foreign result, see `load_foreign`.
+        protocol: as in `open_question`; a question has its own.
+        encode: a label set, or the teacher's text encoder. Not needed for colours. `feature3dgs-teacher/1` asks the classes of
+            a label set, and LSeg's words of a text encoder.
+        labels: how a field of kfgs decides the class of a pixel: `own` is `SemanticField.segment`; `nearest` is the text with
+            the largest cosine, as for other methods. None: `own` in kfgs's protocols, `nearest` in those of others.
         command: kept in the report.
-        **asked: `truth`, `split`, `images`, `options` and `labels`, as in `open_question`; not with a question.
+        **asked: `truth`, `split` and `images`, as in `open_question`; not with a question.
 
     Returns:
-        Scores with protocol, options, digests of data and field, command and machine. Its notes say what belongs beside a
-        score: the rule for labels, which views were trained on, the size of the pictures, the teacher.
+        Scores, and notes on what decides how they are to be read.
 
     Raises:
         FileNotFoundError: if the result, the scene or its truth is missing.
         ValueError: if something does not fit, such as an unknown protocol, or texts without embeddings.
         TypeError: if a protocol of Gaussians is asked about a teacher, or a question and something that belongs to it are given.
     """
-    if isinstance(scene, Question):
-        if asked:
-            raise TypeError(
-                f"scene: expected a folder with {', '.join(asked)}, got a question, which has these; pass them to open_question"
-            )
-        question = scene
+    if isinstance(scene, Question) and asked:
+        raise TypeError(f"scene: expected a folder with {', '.join(asked)}, got a question; pass them to open_question")
+    question = scene if isinstance(scene, Question) else open_question(scene, protocol, **asked)
+    scorer = question.protocol
+    of_colors = getattr(scorer, "of_colors", False)
+    rule = getattr(scorer, "own_labels", None)
+    if labels is not None and rule is None:
+        raise ValueError(f"labels: expected none with {scorer.name}, which takes no class per pixel, got {labels!r}")
+    method: Any = open_result(field, question) if isinstance(field, str | Path) else field
+    if of_colors:
+        cloud = method if isinstance(method, Gaussians) else method.gaussians
+        if cloud is None or cloud.sh is None:
+            raise ValueError(f"field: expected Gaussians with colours for {scorer.name}, got none; name a colour splat")
+        report: Report = scorer.score(cloud.replace(sh=cloud.sh.to(torch.float32)), question.truth)
     else:
-        check_kind(field, protocol)
-        question = open_question(scene, protocol, **asked)
-    method = open_result(field, question, with_file) if isinstance(field, str | Path) else field
-    name = question.protocol.name
-    encoder = TableEncoder(encode) if isinstance(encode, LabelSet) else encode
-    report = question.score(colors_of(method, name) if name in OF_COLORS else method, encoder)
-    beside = notes_beside(question, report.options.get("labels"), method, encode)
-    report = replace(report, notes=(*report.notes, *beside))
-    return report.of(command=command, digests={"field": digest_method(method)}, machine=this_machine())
+        if isinstance(method, FieldMethod) and rule is not None and (labels is not None or method is not field):
+            method = FieldMethod(method.field, method.name, own_labels=rule if labels is None else labels == "own")
+        if isinstance(scorer, TeacherAgreement) and isinstance(encode, LabelSet) and scorer.texts is None:
+            scorer = replace(scorer, texts=encode.names)
+        report = scorer.score(method, question.truth, list(question.views), as_encoder(encode))
+    if rule is not None and isinstance(method, Labeller):
+        own = getattr(method, "own_labels", True)
+        changed = (*report.changed, "labels") if own != rule else report.changed
+        report = replace(report, options={**report.options, "labels": "own" if own else "nearest"}, changed=changed)
+    notes = (*report.notes, *_notes(question, method, encode))
+    return replace(report, notes=notes, command=command, machine=this_machine())
 
 
-def check_kind(field: Any, protocol: str) -> None:
-    """Raise a TypeError if a protocol of Gaussians or colours is asked about a folder of a teacher's maps."""
-    name = next((one for one in (*IN_SPACE, *OF_COLORS) if protocol in (one, one.partition("/")[0])), None)
-    if name is not None and isinstance(field, str | Path) and is_maps(as_path(field)):
-        raise TypeError(
-            f"field: expected a result with Gaussians for {name}, got {field}, a teacher's feature maps; use a protocol of views"
-        )
-
-
-def open_result(path: str | Path, question: Question, with_file: str | Path | None = None) -> Method | Gaussians:
-    """Read a result as a method that the question's protocol can score; of colours and edits, Gaussians.
+def open_result(path: str | Path, question: Question) -> Method | Gaussians:
+    """Read a result as a method that the question's protocol can score; for colours, Gaussians.
 
     Raises:
         FileNotFoundError: if it is missing.
@@ -95,60 +160,64 @@ def open_result(path: str | Path, question: Question, with_file: str | Path | No
     """
     path = as_path(path)
     folder = find_field(path)
-    if with_file is not None and (folder is not None or is_maps(path)):
-        raise ValueError(f"with_file: expected none with a result of kfgs, got {with_file}; leave it out")
-    if question.protocol.name in OF_COLORS:
-        places: tuple[Path, ...] = (path, path / "color.ply", path.parent / "color.ply" if folder == path else path)
-        places = tuple(one for one in places if one != folder)
-        splat = next((one for one in places if one.is_file() and one.suffix not in (".pth", ".pt")), None)
-        if splat is not None:
-            return read_splats(splat).gaussians
-        if folder is not None:
-            raise FileNotFoundError(
-                f"{path / 'color.ply'}: no such file; expected a colour splat for {question.protocol.name}; name one"
-            )
+    if getattr(question.protocol, "of_colors", False):
+        splat = path if path.is_file() else (path.parent if folder == path else path) / "color.ply"
+        if not splat.is_file():
+            raise FileNotFoundError(f"{splat}: no such file; expected a colour splat for {question.protocol.name}")
+        return read_splats(splat).gaussians
     if folder is not None:
-        return FieldMethod(SemanticField.load(folder), own_labels=question.rule == "own")
-    if (path / "stages").is_dir() and (path / "color.ply").is_file():
-        raise ValueError(
-            f"field: expected a result with features for {question.protocol.name}, got {path}, which has colours (color.ply) "
-            f"but no features; give it some with `kfgs fit SCENE --out {path}`, or with `kfgs uplift SCENE "
-            f"{path / 'color.ply'} --out FIELD`"
-        )
-    if (path / "stages").is_dir():
-        raise ValueError(f"field: expected a finished run, got {path}, an unfinished one; fit it again to go on")
+        return FieldMethod(SemanticField.load(folder))
     if is_maps(path):
-        return read_teacher(path, question.scene, question.scored, align_corners=False)
-    return load_foreign(path, with_file)
-
-
-def is_maps(path: Path) -> bool:
-    """Whether a folder has a teacher's feature maps."""
-    if not path.is_dir() or find_field(path) == path:
-        return False
-    return (
-        (path / MANIFEST).is_file()
-        or any(next(path.glob(name), None) is not None for name in MAPS[:2])
-        or (next(path.glob(MAPS[2]), None) is not None and not (path / "images").is_dir())
+        if not question.views:
+            raise TypeError(
+                f"field: expected one with Gaussians for {question.protocol.name}, got maps of a teacher: {path}"
+            )
+        return read_teacher(path, question.scene, question.views)
+    raise ValueError(
+        f"field: expected a field or a finished run of kfgs, or a folder of feature maps, got {path}; results of other "
+        "programs are scored by benchmarks/protocols.py"
     )
 
 
-def digest_method(method: Any) -> str:
-    """SHA-256 of what decides a method's answers: a field's file, Gaussians and decoders, or a teacher's maps of the views."""
-    if isinstance(method, FieldMethod):
-        folder = method.field.folder
-        file = None if folder is None else field_data(folder)
-        if file is not None and file.is_file():
-            return digest_file(file)
-        return digest_data([method.field.gaussians, method.field.features])
-    if isinstance(method, Gaussians):
-        return digest_data(method)
-    if isinstance(method, SplattedMethod):
-        return digest_data([list(method.parts)])
-    maps = getattr(method, "maps", None)
-    if isinstance(maps, Mapping):
-        return digest_data({stem: digest_data(maps[stem]) for stem in maps})
-    return digest_data([method.name, method.gaussians])
+def is_maps(path: Path) -> bool:
+    """Whether a folder has feature maps, and is not a scene."""
+    patterns = ("features.json", "*_fmap_CxHxW.pt", "*_s.npy", "*.npy")
+    return path.is_dir() and not (path / "images").is_dir() and any(any(path.glob(name)) for name in patterns)
+
+
+def read_teacher(folder: Path, scene: Scene, views: Sequence[View], *, align_corners: bool = False) -> TeacherMethod:
+    """The maps of some views as a method, see `maps_of_views`.
+
+    Raises:
+        FileNotFoundError: if a view has no map.
+    """
+    index = {scene.stem(i): i for i in range(len(scene))}
+    places = [index[view.stem] for view in views]
+    maps = maps_of_views(scene, places, FeatureFolder(folder).of(scene, places))
+    by_stem = ReadWhenAsked({view.stem: partial(maps.__getitem__, i) for i, view in enumerate(views)})
+    return TeacherMethod(by_stem, f"teacher ({folder.name})", align_corners=align_corners)
+
+
+def _notes(question: Question, method: Any, encode: Any) -> list[str]:
+    """Facts that decide how a score is to be read; what is not known is left out."""
+    field = method.field if isinstance(method, FieldMethod) else None
+    chosen = getattr(question.protocol, "chosen", None)
+    views = question.views if chosen is None else chosen(question.views)
+    notes = []
+    if field is not None and views:
+        names = field.info.get("views") or [camera.name for camera in field.cameras]
+        trained = {file_stem(str(name)) for name in names} & {view.stem for view in views}
+        notes += [f"{len(trained)} of {len(views)} scored views were trained on"] if trained else []
+    sizes = sorted({view.camera.size for view in views}, key=lambda size: size[0] * size[1])
+    if sizes:
+        several = [f"{height}x{width}" for height, width in dict.fromkeys((sizes[0], sizes[-1]))]
+        notes.append(f"scored pictures: {len(views)} of {' to '.join(several)} (height x width)")
+    teacher = None if field is None else teacher_name(field.info)
+    if teacher is None and isinstance(encode, LabelSet):
+        teacher = teacher_name(encode.info)
+    if teacher is None:
+        teacher = getattr(getattr(encode, "__self__", None), "name", None)  # of a teacher's method `encode_text`
+    return notes if teacher is None else [*notes, f"teacher: {teacher}"]
 
 
 def this_machine() -> str:
@@ -156,7 +225,7 @@ def this_machine() -> str:
     model = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.is_file():
-        found = re.search(r"model name\s*:\s*(.+)", info.read_text(encoding="utf-8", errors="replace"))
-        model = found[1].strip() if found else model
+        line = re.search(r"model name\s*:\s*(.+)", info.read_text(encoding="utf-8", errors="replace"))
+        model = line[1].strip() if line else model
     gpu = f", {torch.cuda.get_device_name()}" if torch.cuda.is_available() else ""
     return f"{model}, {torch.get_num_threads()} of {os.cpu_count()} threads{gpu}, torch {torch.__version__}"

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from .._files import as_path, check_output, file_stem
 from .._typed import typed
 from ..cameras import Camera
-from ..evaluation.datasets.coco import save_coco
+from ..evaluation.coco import save_coco
 from ..fields import Rule, SemanticField
 from ..labels import LabelSet
 from ..viz import save_picture

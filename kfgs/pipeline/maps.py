@@ -14,7 +14,7 @@ from torch import Tensor
 from .._check import as_tensor
 from .._files import digest_file, digest_value
 from .._rows import EPS, row_norms
-from ..cameras import undistort, undistort_labels
+from ..cameras import undistort
 from ..quant.maps import read_blocks
 from ..quant.sampling import SAMPLES, sample_grid
 from ..scenes import Scene
@@ -59,14 +59,6 @@ def maps_of_views(scene: Scene, views: Sequence[int], maps: Maps, *, undistorted
     chosen, lens = scene.select(views), scene.lenses is not None and not undistorted
     changed = lens or any(changing_files(chosen, i) for i in range(len(chosen)))
     return ViewMaps(maps, _as_taken(chosen) if lens else chosen, lens) if changed else maps
-
-
-def labels_of_view(scene: Scene, i: int, labels: Tensor) -> Tensor:  # [h, w] int64
-    """True labels of a view's picture as the view is: without lens, and void (-1) where a pixel does not count."""
-    taken, size = _as_taken(scene), (int(labels.shape[0]), int(labels.shape[1]))
-    counted, lens = taken.counted(i, size), taken.cameras[i].resized(*size)
-    labels = labels if counted is None else labels.where(counted, -1)
-    return labels if scene.lenses is None else undistort_labels(labels, lens)
 
 
 def changing_files(scene: Scene, i: int) -> list[Path]:

@@ -15,9 +15,10 @@ from ..scenes import FeatureFolder, Scene
 from ..viz import overlay_labels
 from ..viz.pictures import Array, legend_strip, picture_grid, resize_photo
 from .maps import maps_of_views
-from .side_by_side import draw_errors
 
 WIDTH = 480  # pixels of a panel
+WRONG = (0.835, 0.369, 0.0)  # vermilion of Okabe and Ito, over a grey photograph
+VOID = 0.5  # grey, as the palette's "no class"
 
 
 def segmentation_sheet(
@@ -79,3 +80,11 @@ def teacher_labels(scene: Scene, view: int, folder: Path, classes: LabelSet) -> 
     if features.shape[-1] != classes.dim:
         return None
     return classify(features.flatten(0, 1), classes.embeddings).labels.view(features.shape[:2])
+
+
+def draw_errors(photo: Tensor, wrong: Tensor, void: Tensor | None = None) -> Tensor:  # [H, W, 3], [H, W] -> [H, W, 3]
+    """The photograph in light grey, errors in vermilion, what is not scored in plain grey."""
+    grey = (0.5 + 0.5 * photo.mean(-1, keepdim=True)).expand_as(photo)
+    share = 0.85 * wrong.clamp(0, 1)[..., None]
+    drawn = (1 - share) * grey + share * torch.tensor(WRONG).to(photo)
+    return drawn if void is None else drawn.where(~void[..., None], VOID)

@@ -6,9 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from .._files import read_json
-from ..evaluation import LabelSet
 from ..fields.remembered import CLASSES
-from ..labels import load_label_set
+from ..labels import LabelSet, load_label_set
 from ..scenes import Scene, SceneError, is_scene, list_images, load_scene
 from .options import Job
 from .places import Place

@@ -3,15 +3,9 @@ import numpy as np
 import oracles_protocols as dull
 import pytest
 import torch
-import torch.nn.functional as F
 
-from kfgs.evaluation.class_lists import load_classes
-from kfgs.evaluation.teacher_agreement import (
-    TeacherAgreement,
-    merge_labels,
-    resize_by_corners,
-    teacher_agreement,
-)
+from kfgs.evaluation import TeacherAgreement
+from kfgs.evaluation.teacher_agreement import MERGED, SIZE, ade20k_words, teacher_agreement
 
 
 def test_iou7_by_hand():
@@ -33,20 +27,13 @@ def test_a_view_of_which_the_teacher_says_nothing():
     assert np.isnan(teacher_agreement(torch.full((2, 2), -1), torch.zeros(2, 2).long())).all()
 
 
-def test_labels_are_resized_at_their_corners():
-    labels = torch.randint(0, 9, (360, 480), generator=torch.Generator().manual_seed(0))
-    want = F.interpolate(labels[None, None].double(), (119, 159), mode="nearest")[0, 0].long()
-    assert torch.equal(resize_by_corners(labels, (119, 159)), want)
-
-
 def test_texts_and_merges_are_the_published_ones():
-    ade = load_classes("ade20k")
-    assert len(ade["first-word"]) == len(set(ade["full"])) == 150
-    assert [i for i, name in enumerate(ade["first-word"], 1) if name == "screen"] == [59, 131]
-    names = [(ade["full"][old - 1], ade["full"][new - 1]) for old, new in TeacherAgreement().merged]
-    assert names == [("television", "door"), ("rug", "floor"), ("pillow", "cushion")]
-    assert ade["full"][64] == "coffee table"
-    assert merge_labels(torch.tensor([89, 28, 57, 0]), [(89, 14), (28, 3), (57, 39)]).tolist() == [14, 3, 39, 0]
+    words = ade20k_words()
+    assert len(words) == 150
+    assert [i for i, name in enumerate(words, 1) if name == "screen"] == [59, 131]
+    assert [(words[old], words[new]) for old, new in MERGED] == [
+        ("television", "door"), ("rug", "floor"), ("pillow", "cushion"),
+    ]  # fmt: skip
 
 
 def _methods(texts, stems, height, width):
@@ -57,38 +44,41 @@ def _methods(texts, stems, height, width):
 
 
 def test_the_whole_protocol_against_loops():
-    texts = load_classes("ade20k")["full"]
+    """Labels are merged, then resized as torch's "nearest" does: row y of 119 reads row y 24 // 119."""
+    words = ade20k_words()
+    texts = list(dict.fromkeys(words))
     stems = [f"rgb_{i}" for i in range(12)]
     teacher, student = _methods(texts, stems, 24, 32)
     views = [cases.view(stem, 24, 32) for stem in sorted(stems)]  # as text: rgb_0, rgb_1, rgb_10, ...
-    report = TeacherAgreement(texts="full", size=(9, 12)).score(student, teacher, views, teacher.encode)
+    report = TeacherAgreement().score(student, teacher, views, teacher.encode)
     scores = []
     for stem in ("rgb_2", "rgb_10"):  # by number: indices 2 and 10
         maps = []
-        for one in (teacher, student):
-            labels = np.argmax([one.maps[stem][text][0] for text in texts], axis=0)
-            for old, new in ((89, 14), (28, 3), (57, 39)):
+        for method in (teacher, student):
+            labels = np.argmax([method.maps[stem][text][0] for text in words], axis=0)
+            for old, new in MERGED:
                 labels[labels == old] = new
-            maps.append(np.array([[labels[y * 24 // 9, x * 32 // 12] for x in range(12)] for y in range(9)]))
+            maps.append(
+                np.array(
+                    [[labels[y * 24 // SIZE[0], x * 32 // SIZE[1]] for x in range(SIZE[1])] for y in range(SIZE[0])]
+                )
+            )
         scores.append(dull.teacher_agreement(*maps))
     assert [row["view"] for row in report.rows] == ["rgb_2", "rgb_10"]
     assert (report["accuracy"], report["mIoU"]) == pytest.approx(np.mean(scores, 0), abs=1e-9)
-    assert str(report).endswith("(feature3dgs-teacher/1, texts=full, size=[9, 12])")
+    assert str(report).endswith("(feature3dgs-teacher/1)")
     assert report.notes == (
-        "2 of 12 views are scored: one in 8 from index 2, in the order of the numbers in their names; split=none scores all",
+        "2 of 12 views are scored: one in 8 from index 2, in the order of the numbers in their names",
     )
 
 
-def test_other_texts_views_and_sizes():
+def test_other_texts_and_views():
     texts = ["a", "b", "c"]
-    teacher, student = _methods(texts, ["x", "y"], 20, 30)
-    wide = [cases.view("x", 40, 60), cases.view("y", 40, 60)]
-    protocol = TeacherAgreement(texts=("a", "b", "c"), split=None, largest=(20, 30))
-    report = protocol.score(teacher, teacher, wide, teacher.encode)
+    teacher, student = _methods(texts, ["x", "y"], 360, 480)
+    wide = [cases.view("x", 720, 960), cases.view("y", 720, 960)]  # scored at 360x480
+    report = TeacherAgreement(texts=("a", "b", "c"), split=None).score(teacher, teacher, wide, teacher.encode)
     assert report.scores == {"mIoU": 1.0, "accuracy": 1.0}
     assert len(report.rows) == 2
     assert report.notes == ()
     with pytest.raises(ValueError, match="expected more than 2, got 2; pass split=None"):
         TeacherAgreement().score(student, teacher, wide, teacher.encode)
-    with pytest.raises(ValueError, match="texts: expected one of 'first-word'"):
-        TeacherAgreement(texts="short")

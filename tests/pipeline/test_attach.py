@@ -13,13 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from kfgs.cameras import Camera
 from kfgs.cameras.similarity import Similarity
-from kfgs.evaluation import LabelSet
 from kfgs.fields import SemanticField
 from kfgs.formats.sidecar import names_path
 from kfgs.formats.splat_file import SplatFile
 from kfgs.formats.table import read_splats, write_splats
 from kfgs.gaussians import Gaussians
-from kfgs.labels import transfer_labels
+from kfgs.labels import LabelSet, transfer_labels
 from kfgs.pipeline.attach import attach
 from kfgs.scenes import SceneError
 from kfgs.splat.transform import transform_gaussians

@@ -9,8 +9,8 @@ from safetensors.torch import save_file
 from small_room import CONFIG, config, make_room
 
 from kfgs.cameras import Distortion
-from kfgs.evaluation import load_label_set
 from kfgs.fields import SemanticField
+from kfgs.labels import load_label_set
 from kfgs.pipeline import fit_scene, score_scene, score_teacher, segment_scene, true_labels
 from kfgs.pipeline.fit import load_history
 from kfgs.scenes import FeatureFolder, load_scene, save_feature_map

@@ -13,9 +13,8 @@ from small_room import ROOM
 from kfgs import Camera, FeatureFolder, fit_scene, load_scene, rasterize
 from kfgs.evaluation import LabelTruth, score_views
 from kfgs.fields import UpliftConfig
-from kfgs.pipeline import FitConfig, uplift
+from kfgs.pipeline import FitConfig, open_question, uplift
 from kfgs.pipeline.color import ColorConfig, Photos, fit_color
-from kfgs.pipeline.question import open_question
 from kfgs.scenes import Scene, save_feature_map
 from kfgs.toy.room_folder import make_toy_room
 

@@ -1,0 +1,66 @@
+"""Find the ground truth of a scene by its files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from .._files import as_path
+from .label_pictures import load_labels
+from .replica import load_replica_points, load_semantic_nerf_labels
+from .scannet import load_scannet_points
+from .surface_points import load_surface_points
+from .truth import LabelTruth, PointTruth
+
+Place = tuple[str, Callable[[Path], Any]]
+"""A pattern of files in a folder, and the reader of a folder that has some."""
+
+
+def find_labels(path: str | Path) -> LabelTruth:
+    """The label pictures of a scene, a folder of them, or a COCO JSON.
+
+    Looked for in this order: `labels_scored/`, `labels/`, `semantic_class/`, `annotations.json`, PNGs in the folder itself.
+
+    Raises:
+        FileNotFoundError: if there are none.
+        ValueError: if a file is damaged.
+    """
+    places: list[Place] = [
+        ("labels_scored/*.png", lambda at: load_labels(at / "labels_scored")),
+        ("labels/*.png", lambda at: load_labels(at / "labels")),
+        ("semantic_class/*.png", load_semantic_nerf_labels),
+        ("annotations.json", lambda at: load_labels(at / "annotations.json")),
+        ("*.png", load_labels),
+    ]
+    return read_first(as_path(path), places, "label pictures", load_labels)
+
+
+def find_points(path: str | Path) -> PointTruth:
+    """The labelled points of a scene: of Replica, of ScanNet, or of kfgs's toy room; or the file of a mesh.
+
+    Raises:
+        FileNotFoundError: if there are none.
+        ValueError: if a file is damaged.
+    """
+    path = as_path(path)
+    places: list[Place] = [
+        ("habitat/mesh_semantic.ply", load_replica_points),
+        ("mesh_semantic.ply", load_replica_points),
+        ("*_vh_clean_2.labels.ply", load_scannet_points),
+        ("surface.npz", load_surface_points),
+    ]
+    as_file = load_scannet_points if path.name.endswith(".labels.ply") else load_replica_points
+    return read_first(path, places, "labelled points", as_file)
+
+
+def read_first(path: Path, places: list[Place], what: str, as_file: Callable[[Path], Any]) -> Any:
+    """Read with the first reader whose files are there."""
+    if path.is_file():
+        return as_file(path)
+    for pattern, read in places:
+        if path.is_dir() and next(path.glob(pattern), None) is not None:
+            return read(path)
+    tried = ", ".join(pattern for pattern, _ in places)
+    problem = "found none" if path.is_dir() else "which is not a folder"
+    raise FileNotFoundError(f"truth: expected {what} in {path} ({tried}), {problem}; name the folder that has them")

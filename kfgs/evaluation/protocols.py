@@ -1,0 +1,169 @@
+"""The protocols of kfgs by name. Each is a frozen dataclass: its fields are options, with the published values as defaults.
+
+`open` reads what is asked of every method: the truth, and the views that are scored. `score` asks one method. Whatever has
+these two members, `name` and `about` is a protocol; `benchmarks/published` has more.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+
+from .._check import ORIGIN
+from .._origin import recounted
+from ..gaussians import Gaussians
+from ..scenes import Scene
+from .color import COLOR_PROTOCOL, score_views
+from .find import find_points
+from .method import Method, View, annotated, best_labels, check_level, label_view
+from .report import Report, Row, make_report
+from .segmentation import PROTOCOL, evaluate_segmentation
+from .surface import SURFACE_PROTOCOL, score_surface
+from .teacher_agreement import TeacherAgreement
+from .texts import Encode, encode_unit
+from .truth import LabelTruth, PointTruth, is_void
+from .views import label_views
+
+
+@dataclass(frozen=True)
+class KfgsPooled:
+    """Closed-set segmentation of views: `evaluate_segmentation` as a protocol."""
+
+    name: ClassVar[str] = "kfgs-pooled/1"
+    about: ClassVar[str] = PROTOCOL.partition(": ")[2]
+    own_labels: ClassVar[bool] = True
+    """A field says the class of a pixel by its own rule, not by the largest cosine."""
+    open = staticmethod(label_views)
+
+    level: int = 0
+    """The map of a method with several."""
+
+    def score(self, method: Method, truth: LabelTruth, views: Sequence[View], encode: Encode) -> Report:
+        """Segment each view that has a label picture.
+
+        Raises:
+            ValueError: if a label picture has no view, or the truth holds nothing that can be scored.
+        """
+        text = encode_unit(encode, truth.names)
+        cameras = {view.stem: view for view in annotated(views, truth.maps)}
+        scored = evaluate_segmentation(
+            lambda stem: label_view(method, cameras[stem], text, self.level).cpu(), truth.maps, truth.names
+        )
+        pairs = zip(scored.names, scored.iou.tolist(), strict=True)
+        rows: list[Row] = [{"class": name, "IoU": iou} for name, iou in pairs if iou == iou]
+        return make_report(self, method.name, {"mIoU": scored.miou.value, "accuracy": scored.accuracy.value}, rows)
+
+
+@dataclass(frozen=True)
+class KfgsSurface:
+    """Classes of surface points, carried over from the nearest labelled Gaussian: `score_surface` as a protocol."""
+
+    name: ClassVar[str] = "kfgs-surface/1"
+    about: ClassVar[str] = SURFACE_PROTOCOL.partition(": ")[2]
+
+    level: int = 0
+    """The map of a method with several."""
+
+    @staticmethod
+    def open(
+        scene: Scene, folder: Path, truth: Path | None = None, split: str | None = None
+    ) -> tuple[PointTruth, list[View]]:
+        """The labelled points of the scene (`find_points`); no views."""
+        return find_points(truth or folder), []
+
+    def score(self, method: Method, truth: PointTruth, views: Sequence[View], encode: Encode) -> Report:
+        """Label the Gaussians with the truth's names, and carry the labels to its points; `views` are not used.
+
+        A name that means "no class" (`VOID_NAMES`) is not asked, and its points are not scored; a note counts them.
+
+        Raises:
+            TypeError: if the method has no Gaussians.
+            ValueError: if no point has a class, or the truth names none.
+        """
+        if method.gaussians is None:
+            raise TypeError(f"method: expected one with Gaussians, got {method.name!r}; use a protocol of views")
+        check_level(method, self.level)
+        names = tuple(dict.fromkeys(name for name in truth.names.values() if not is_void(name)))
+        if not names:
+            got = ", ".join(truth.names.values()) or "none"
+            raise ValueError(f"truth: expected names of classes, got {got}; give the names of the points' labels")
+        cosines = method.gaussian_cosines(encode_unit(encode, names))[self.level]
+        points = recounted(truth.points, ORIGIN, method.gaussians.origin).to(method.gaussians.means)
+        target, left_out = torch.full_like(truth.labels, -1), list[str]()
+        for label, name in truth.names.items():
+            same = truth.labels == label
+            if not is_void(name):
+                target[same] = names.index(name)
+            elif bool(same.any()):
+                left_out.append(f"{name} ({int(same.sum())} points)")
+        scored = score_surface(method.gaussians.means, best_labels(cosines), points, target)
+        carried = scored.transfer
+        row = {"lambda": carried.distance, "labelled": carried.labelled, "points": scored.points}
+        notes = [f"not scored, no class: {', '.join(left_out)}"] if left_out else []
+        return make_report(self, method.name, {"agreement": scored.agreement}, [row], notes)
+
+
+@dataclass(frozen=True)
+class KfgsColor:
+    """Pictures of views that a colour field has not learnt: `score_views` as a protocol."""
+
+    name: ClassVar[str] = "kfgs-color/1"
+    about: ClassVar[str] = COLOR_PROTOCOL.partition(": ")[2]
+    of_colors: ClassVar[bool] = True
+    """Scores Gaussians with colours, not a method with features."""
+
+    @staticmethod
+    def open(
+        scene: Scene, folder: Path, truth: Path | None = None, split: str | None = None
+    ) -> tuple[Scene, list[View]]:
+        """The scene with the views of the split (None: the test views).
+
+        Raises:
+            ValueError: if another truth is named.
+        """
+        if truth is not None:
+            raise ValueError(f"truth: expected none with kfgs-color/1 (the photos are), got {truth}; leave it out")
+        chosen = scene.select(scene.views(split or "test"))
+        return chosen, [View(chosen.stem(i), camera) for i, camera in enumerate(chosen.cameras)]
+
+    def score(
+        self, method: Gaussians, truth: Scene, views: Sequence[View] = (), encode: Encode | None = None
+    ) -> Report:
+        """Render all views of the scene `truth`, and compare them with its photos."""
+        scored = score_views(method, truth, "all")
+        rows: list[Row] = [{"view": view.name, "PSNR": view.psnr, "SSIM": view.ssim} for view in scored.views]
+        return make_report(self, "", {"PSNR": scored.psnr.value, "SSIM": scored.ssim.value}, rows)
+
+
+PROTOCOLS: dict[str, Any] = {kind.name: kind for kind in (KfgsPooled, KfgsSurface, KfgsColor, TeacherAgreement)}
+"""The protocols by name; see docs/protocols.md."""
+
+
+def get_protocol(name: str, protocols: dict[str, Any] = PROTOCOLS, **options: Any) -> Any:
+    """A protocol by its name, with or without its version: "kfgs-pooled/1", "kfgs-pooled".
+
+    Args:
+        name: one of `protocols`.
+        protocols: where to look.
+        **options: fields of the protocol; the others are as published.
+
+    Raises:
+        ValueError: if there is no such protocol or version; the message names the nearest ones.
+        TypeError: if the protocol has no such option.
+
+    Example:
+        >>> get_protocol("feature3dgs-teacher", split=None).split is None
+        True
+    """
+    known = (kind for key, kind in protocols.items() if name in (key, key.partition("/")[0]))
+    kind = next(known, None)
+    if kind is None:
+        near = difflib.get_close_matches(name, protocols, n=3, cutoff=0.4)
+        hint = f"; did you mean {' or '.join(near)}?" if near else ""
+        raise ValueError(f"protocol: expected one of {', '.join(protocols)}, got {name!r}{hint}")
+    return kind(**options)

@@ -1,0 +1,255 @@
+"""Masks of texts: LERF-OVS, 3D-OVS, LEGaussians. The folders are written here as those data sets have them."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from messages import tells
+from PIL import Image
+from published.class_lists import load_classes
+from published.mask_truth import MaskTruth
+from published.truth.find import find_masks
+from published.truth.legaussians import load_legaussians
+from published.truth.lerf_ovs import load_lerf_ovs
+from published.truth.ovs3d import load_3dovs
+
+FRAMES = load_classes("lerf_ovs")["frames"]
+LEGAUSSIANS = load_classes("legaussians") | load_classes("legaussians_views")
+SQUARE = [[2, 1], [5, 1], [5, 3], [2, 3]]
+
+
+def _object(category: str, outline: list, box: list | None = None) -> dict:
+    return {"category": category, "bbox": box or [2, 1, 5, 3], "segmentation": outline, "group": 0, "iscrowd": 0}
+
+
+def _lerf(folder: Path, scene: str = "ramen", objects: list[dict] | None = None) -> Path:
+    labels = folder / "label" / scene
+    labels.mkdir(parents=True, exist_ok=True)
+    objects = [_object("egg", SQUARE), _object("sake cup", [[7, 7], [9, 7], [9, 9]])] if objects is None else objects
+    for number in FRAMES[scene]:
+        info = {"name": f"frame_{number:05d}.jpg", "width": 12, "height": 10}
+        (labels / f"frame_{number:05d}.json").write_text(json.dumps({"info": info, "objects": objects}))
+    return labels
+
+
+def test_lerf_ovs_objects_of_one_text_are_one_mask_with_several_boxes(tmp_path: Path) -> None:
+    objects = [
+        _object("egg", SQUARE),
+        _object("bowl", [[0, 0], [1, 0], [1, 1]]),
+        _object("egg", [[8, 8], [9, 8], [9, 9]], [8, 8, 9, 9]),
+    ]
+    truth = load_lerf_ovs(_lerf(tmp_path, objects=objects))
+    assert list(truth.frames) == [f"frame_{n:05d}" for n in (6, 24, 60, 65, 81, 119, 128)]
+    frame = truth.frames["frame_00024"]
+    assert list(frame) == ["egg", "bowl"]
+    expected = torch.zeros(10, 12, dtype=torch.bool)
+    expected[1:4, 2:6] = True  # borders of the polygon belong to it
+    expected[8, 8] = expected[8, 9] = expected[9, 9] = True
+    assert torch.equal(frame["egg"].mask, expected)
+    assert frame["egg"].boxes.tolist() == [[2, 1, 5, 3], [8, 8, 9, 9]]
+    assert int(frame["bowl"].mask.sum()) == 3
+    assert truth.texts == ("egg", "bowl")
+
+
+def test_lerf_ovs_from_the_scene_or_the_folder_of_all(tmp_path: Path) -> None:
+    _lerf(tmp_path)
+    (tmp_path / "ramen/images").mkdir(parents=True)
+    (tmp_path / "ramen/transforms.json").write_text("{}")  # no label
+    for path, scene in ((tmp_path / "ramen", None), (tmp_path, "ramen"), (tmp_path, None)):
+        assert len(load_lerf_ovs(path, scene).frames) == 7
+        assert load_lerf_ovs(path, scene).scene == "ramen"
+    (tmp_path / "label/ramen").rename(tmp_path / "ramen/label")  # a scene with labels of its own
+    for truth in (load_lerf_ovs(tmp_path / "ramen"), find_masks(tmp_path / "ramen")):
+        assert (len(truth.frames), truth.scene) == (7, "ramen")
+    _lerf(tmp_path, "ramen")
+    _lerf(tmp_path, "teatime")
+    with pytest.raises(ValueError, match=tells("scene", "ramen, teatime", "None")):
+        load_lerf_ovs(tmp_path)
+    with pytest.raises(FileNotFoundError, match=tells("garden", "*.json", "looked in", "give the right folder")):
+        load_lerf_ovs(tmp_path, "garden")
+
+
+def test_lerf_ovs_that_is_not_whole(tmp_path: Path) -> None:
+    folder = _lerf(tmp_path)
+    (folder / "frame_00081.json").unlink()
+    with pytest.raises(FileNotFoundError, match=tells("ramen", "frame_00081 missing", "download")):
+        load_lerf_ovs(folder)
+    _lerf(tmp_path, objects=[_object("egg", SQUARE), {"category": "bowl", "bbox": [1, 2, 3, 4]}])
+    with pytest.raises(ValueError, match=tells("frame_00006.json, object 1", "'bowl'", "segmentation")):
+        load_lerf_ovs(folder)
+    for outline in ([[1, 2], [3]], [], [["a", 1]], [[1e9, 2]], 7, [[float("nan"), 1]]):
+        _lerf(tmp_path, objects=[_object("egg", outline)])
+        with pytest.raises(ValueError, match=tells("object 0", "'egg'")):
+            load_lerf_ovs(folder)
+    _lerf(tmp_path)
+    Image.new("RGB", (10, 12)).save(folder / "frame_00006.jpg")
+    with pytest.raises(ValueError, match=tells("frame_00006.json", "frame_00006.jpg (10x12)", "12x10")):
+        load_lerf_ovs(folder)
+    (folder / "frame_00006.json").write_text('{"shapes": []}')
+    with pytest.raises(ValueError, match=tells("frame_00006.json", "objects", "another kind of label file")):
+        load_lerf_ovs(folder)
+    (folder / "frame_00006.json").write_text("{")
+    with pytest.raises(ValueError, match=tells("frame_00006.json", "cannot be parsed")):
+        load_lerf_ovs(folder)
+
+
+def test_lerf_ovs_objects_outside_their_picture(tmp_path: Path) -> None:
+    partly = _object("egg", [[-3, 8], [1, 8], [1, 14], [-3, 14]])  # the picture has 12 x 10 pixels
+    frame = load_lerf_ovs(_lerf(tmp_path, objects=[partly])).frames["frame_00006"]
+    expected = torch.zeros(10, 12, dtype=torch.bool)
+    expected[8:, :2] = True
+    assert torch.equal(frame["egg"].mask, expected)
+    for x, y in ((12, 0), (-4, 0), (0, 10), (0, -4)):
+        away = [[x, y], [x + 3, y], [x + 3, y + 3], [x, y + 3]]
+        folder = _lerf(tmp_path, objects=[partly, _object("bowl", away)])
+        parts = (
+            "frame_00006.json, object 1",
+            "'bowl'",
+            "12x10",
+            f"x {x} to {x + 3}, y {y} to {y + 3}",
+            "correct the file",
+        )
+        with pytest.raises(ValueError, match=tells(*parts)):
+            load_lerf_ovs(folder)
+
+
+def test_lerf_ovs_tables() -> None:
+    assert {scene: len(frames) for scene, frames in FRAMES.items()} == {
+        "figurines": 4, "ramen": 7, "teatime": 6, "waldo_kitchen": 5,
+    }  # fmt: skip
+    assert {scene: len(texts) for scene, texts in load_classes("lerf_ovs")["texts"].items()} == {
+        "figurines": 21, "ramen": 14, "teatime": 14, "waldo_kitchen": 18,
+    }  # fmt: skip
+
+
+def _mask(path: Path, box: tuple[int, int, int, int], size: tuple[int, int] = (10, 12), value: int = 255) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    grey = np.zeros(size, np.uint8)
+    grey[box[1] : box[3], box[0] : box[2]] = value
+    Image.fromarray(grey).save(path)
+
+
+def _3dovs(folder: Path) -> Path:
+    (folder / "segmentations").mkdir(parents=True)
+    (folder / "segmentations/classes.txt").write_text("banana\nblack leather shoe\n\n")
+    (folder / "images").mkdir()
+    for i in range(12):
+        Image.new("RGB", (12, 10)).save(folder / f"images/{i:02d}.jpg")
+    for view in ("00", "4"):
+        _mask(folder / f"segmentations/{view}/banana.png", (1, 2, 3, 4))
+        _mask(folder / f"segmentations/{view}/black leather shoe.png", (5, 2, 9, 4), value=1 if view == "4" else 255)
+    (folder / "segmentations/4/banana.png").unlink()
+    return folder
+
+
+def test_3dovs(tmp_path: Path) -> None:
+    truth = load_3dovs(_3dovs(tmp_path / "bed"))
+    assert truth.listed == ("banana", "black leather shoe")
+    assert isinstance(truth, MaskTruth)
+    assert {stem: list(texts) for stem, texts in truth.frames.items()} == {
+        "00": ["banana", "black leather shoe"],
+        "04": ["black leather shoe"],
+    }
+    assert truth.frames["00"]["banana"].mask.nonzero().tolist() == [[2, 1], [2, 2], [3, 1], [3, 2]]
+    assert int(truth.frames["04"]["black leather shoe"].mask.sum()) == 8  # a mask of zeros and ones
+    assert truth.frames["00"]["banana"].boxes is None
+    assert len(load_3dovs(tmp_path / "bed/segmentations").frames) == 2
+
+
+def test_3dovs_that_is_not_whole(tmp_path: Path) -> None:
+    folder = _3dovs(tmp_path)
+    _mask(folder / "segmentations/00/camera.png", (1, 2, 3, 4))
+    with pytest.raises(
+        ValueError, match=tells("segmentations/00", "banana, black leather shoe", "camera", "classes.txt")
+    ):
+        load_3dovs(folder)
+    (folder / "segmentations/00/camera.png").rename(folder / "segmentations/00/banana.old.png")  # not the banana's
+    with pytest.raises(ValueError, match=tells("segmentations/00", "got banana.old")):
+        load_3dovs(folder)
+    (folder / "segmentations/00/banana.old.png").unlink()
+    _mask(folder / "segmentations/00/banana.png", (1, 2, 3, 4), (20, 12))
+    with pytest.raises(ValueError, match=tells("segmentations/00:", "'black leather shoe': (10, 12)")):
+        load_3dovs(folder)
+    (folder / "segmentations/00/banana.png").write_text("no picture")
+    with pytest.raises(ValueError, match=tells("00/banana.png", "cannot be decoded", "copy it again")):
+        load_3dovs(folder)
+    (folder / "segmentations/00").rename(folder / "segmentations/77")
+    with pytest.raises(ValueError, match=tells("segmentations/77", "images", "'77'", "rename")):
+        load_3dovs(folder)
+    (folder / "segmentations/classes.txt").write_text("\n")
+    with pytest.raises(ValueError, match=tells("classes.txt", "different texts", "none")):
+        load_3dovs(folder)
+    (folder / "segmentations/classes.txt").unlink()
+    with pytest.raises(FileNotFoundError, match=tells("classes.txt", "3D-OVS")):
+        load_3dovs(folder)
+
+
+def _legaussians(folder: Path, scene: str = "kitchen") -> Path:
+    texts = LEGAUSSIANS[scene]
+    for i, view in enumerate(LEGAUSSIANS["views"][scene]):
+        _mask(folder / scene / "segmentations" / view / f"{texts[i % len(texts)]}.png", (1, 2, 3, 4))
+    return folder / scene
+
+
+def test_legaussians(tmp_path: Path) -> None:
+    folder = _legaussians(tmp_path)
+    _mask(folder / "segmentations/DSCF0660/Wood plat.png", (0, 0, 12, 10))
+    _mask(folder / "segmentations/DSCF9999/Wood plat.png", (0, 0, 12, 10))
+    truth = load_legaussians(folder)
+    assert list(truth.frames) == LEGAUSSIANS["views"]["kitchen"]
+    assert list(truth.frames["DSCF0660"]) == ["LEGO Technic 856 Bulldozer", "Wood plat"]
+    assert bool(truth.frames["DSCF0660"]["Wood plat"].mask.all())
+    assert len(load_legaussians(tmp_path, "kitchen").frames) == 28
+    folder.rename(tmp_path / "mine")
+    assert len(load_legaussians(tmp_path / "mine").frames) == 29  # of an unknown scene, what is there
+
+
+def test_legaussians_that_is_not_whole(tmp_path: Path) -> None:
+    folder = _legaussians(tmp_path)
+    _mask(folder / "segmentations/DSCF0670/toaster.png", (1, 2, 3, 4))
+    with pytest.raises(ValueError, match=tells("DSCF0670", "Wood plat", "toaster", "rename")):
+        load_legaussians(folder)
+    (folder / "segmentations/DSCF0930").rename(folder / "other")
+    with pytest.raises(FileNotFoundError, match=tells("28 views of kitchen", "DSCF0930 missing")):
+        load_legaussians(folder)
+    with pytest.raises(FileNotFoundError, match=tells("garden", "*/*.png")):
+        load_legaussians(tmp_path, "garden")
+
+
+def test_the_numbers_of_legaussians_views() -> None:
+    assert {scene: len(views) for scene, views in LEGAUSSIANS["views"].items()} == {
+        "bicycle": 19, "bonsai": 29, "counter": 24, "garden": 18, "kitchen": 28, "room": 19,
+    }  # fmt: skip
+    for views in LEGAUSSIANS["views"].values():
+        assert len(set(views)) == len(views)
+        assert all(re.fullmatch(r"(_DSC|DSCF)\d{4}|DSC\d{5}", view) for view in views)
+    assert LEGAUSSIANS["codes"] == {
+        "bicycle": 128,
+        "bonsai": 64,
+        "counter": 128,
+        "garden": 128,
+        "kitchen": 32,
+        "room": 128,
+    }
+
+
+def test_masks_are_found_by_their_files(tmp_path: Path) -> None:
+    _lerf(tmp_path / "lerf")
+    (tmp_path / "lerf/ramen/images").mkdir(parents=True)
+    scenes = (tmp_path / "lerf/ramen", tmp_path / "lerf/label/ramen", tmp_path / "lerf")
+    for place, texts in (
+        *((place, ("egg", "sake cup")) for place in scenes),
+        (_3dovs(tmp_path / "bed"), ("banana", "black leather shoe")),
+        (tmp_path / "bed/segmentations", ("banana", "black leather shoe")),
+        (_legaussians(tmp_path), tuple(LEGAUSSIANS["kitchen"])),
+    ):
+        assert set(find_masks(place).texts) <= set(texts), place
+    with pytest.raises(FileNotFoundError, match=tells("truth", "masks", "images", "segmentations/classes.txt", "none")):
+        find_masks(tmp_path / "bed/images")
+    (tmp_path / "scene/images").mkdir(parents=True)
+    (tmp_path / "scene/classes.json").write_text("[]")  # a scene's loose JSON is no ground truth
+    with pytest.raises(FileNotFoundError, match=tells("truth", "masks", "none")):
+        find_masks(tmp_path / "scene")

@@ -1,0 +1,121 @@
+import cases_methods as cases
+import numpy as np
+import oracles_protocols as dull
+import pytest
+import torch
+from published.lerf_2d import LerfOvs2D, activate, localise
+from published.mask_truth import MaskAndBoxes, MaskTruth
+from published.relevancy import box_mean
+
+from kfgs.labels.scores import CANONICAL
+
+SIZE = (38, 46)
+TEXTS = ("mug", "spoon", "plate")
+
+
+def _scene(levels=3, seed=0):
+    rng = np.random.default_rng(seed)
+    stems = ["frame_00002", "frame_00041"]
+    maps = cases.random_maps(rng, stems, [*TEXTS, *CANONICAL], levels, *SIZE)
+    frames = {}
+    for stem, texts in zip(stems, (TEXTS[:2], TEXTS[1:]), strict=True):
+        frames[stem] = {}
+        for text in texts:
+            x, y = rng.integers(0, 28, 2)
+            mask = torch.zeros(SIZE, dtype=torch.bool)
+            mask[y : y + 9, x : x + 12] = True
+            maps[stem][text][:, mask.numpy()] += rng.uniform(0.1, 0.3, (levels, 1))
+            boxes = torch.tensor([[x, y, x + 12, y + 9], [0, 0, 2, 2]]).double()
+            frames[stem][text] = MaskAndBoxes(mask, boxes)
+    for one in maps.values():
+        for text in one:
+            one[text][:, :3, :4] = np.nan  # nothing is known in a corner
+    return cases.Numbers([*TEXTS, *CANONICAL], maps), MaskTruth(frames), [cases.view(stem, *SIZE) for stem in stems]
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("filter", ["langsplat", "langsplatv2"])
+def test_the_whole_protocol_against_loops(filter, seed):
+    method, truth, views = _scene(seed=seed)
+    reports = {
+        level: LerfOvs2D(level=level, filter=filter).score(method, truth, views[::-1], method.encode)
+        for level in ("chosen", "oracle", 1)
+    }
+    want = {"chosen": [], "oracle": [], 1: []}
+    hits = []
+    for stem, texts in truth.frames.items():
+        for text, (mask, boxes) in texts.items():
+            found = dull.relevancy_maps(method.maps[stem], text, CANONICAL)
+            ious, level, hit = dull.lerf_2d(found, mask.numpy(), boxes.tolist(), filter=filter)
+            want["chosen"].append(ious[level])
+            want["oracle"].append(max(ious))
+            want[1].append(ious[1])
+            hits.append(hit)
+    for level, report in reports.items():
+        assert report["mIoU"] == pytest.approx(np.mean(want[level]), abs=1e-9)
+    assert reports["chosen"]["localisation"] == np.mean(hits)
+    assert reports["oracle"]["localisation"] == np.mean(hits)
+    assert 0.05 < reports["chosen"]["mIoU"] <= reports["oracle"]["mIoU"] < 1
+
+
+def test_the_threshold_and_the_scale_are_options():
+    method, truth, views = _scene()
+    report = LerfOvs2D(threshold=0.2, scale=30).score(method, truth, views, method.encode)
+    ious = []
+    for stem, texts in truth.frames.items():
+        for text, (mask, boxes) in texts.items():
+            found = dull.relevancy_maps(method.maps[stem], text, CANONICAL, 30.0)
+            each, level, _ = dull.lerf_2d(found, mask.numpy(), boxes.tolist(), 0.2)
+            ious.append(each[level])
+    assert report["mIoU"] == pytest.approx(np.mean(ious), abs=1e-9)
+    assert str(report).endswith("(lerf-ovs-2d/1, threshold=0.2, scale=30)")
+
+
+def test_a_perfect_spot_is_found_by_hand():
+    """A plateau of 1 in a map of 0: blended with its mean it is 0.745 at (26, 36), which
+    is stretched to 0.49. Far outside it is 0."""
+    relevancy = torch.zeros(2, 80, 90)
+    relevancy[1, 20:60, 30:70] = 1
+    found = activate(relevancy)
+    assert found.chosen == 1
+    assert found.masks[1, 26:54, 36:64].all()
+    assert not found.masks[1, :15].any()
+    smoothed = box_mean(relevancy)
+    assert localise(smoothed, torch.tensor([[45.0, 35.0, 54.0, 44.0]]))
+    assert not localise(smoothed, torch.tensor([[0.0, 0.0, 20.0, 79.0]]))
+
+
+def test_edges_of_a_box_count():
+    impulse = torch.zeros(1, 100, 100)
+    impulse[0, 40, 50] = 900  # the mean is 1 on rows 26 to 55 and columns 36 to 65
+    smoothed = box_mean(impulse)
+    assert localise(smoothed, torch.tensor([[65.0, 55.0, 90.0, 90.0]]))
+    assert not localise(smoothed, torch.tensor([[65.5, 0.0, 90.0, 99.0]]))
+
+
+def test_texts_without_boxes_are_not_localised():
+    method, truth, views = _scene()
+    frames = {stem: {text: MaskAndBoxes(m.mask) for text, m in texts.items()} for stem, texts in truth.frames.items()}
+    report = LerfOvs2D().score(method, MaskTruth(frames), views, method.encode)
+    assert np.isnan(report["localisation"])
+    assert report.to_json()["scores"]["localisation"] is None
+
+
+def test_bad_input_is_named():
+    method, truth, views = _scene()
+    with pytest.raises(ValueError, match="got none for frame_00041; pass views"):
+        LerfOvs2D().score(method, truth, views[:1], method.encode)
+    with pytest.raises(ValueError, match="level: expected one of 'chosen', 'oracle'"):
+        LerfOvs2D(level="best")
+    frames = {"frame_00002": {"mug": MaskAndBoxes(torch.zeros(3, 3).bool())}}
+    with pytest.raises(ValueError, match="use cameras of the size of the annotated pictures"):
+        LerfOvs2D().score(method, MaskTruth(frames), views, method.encode)
+
+
+def test_a_method_that_knows_nothing_of_a_view_hits_no_box():
+    texts = ["mug", *CANONICAL]
+    method = cases.Numbers(texts, {"a": {text: torch.full((2, 12, 16), torch.nan) for text in texts}})
+    mask = torch.ones(12, 16, dtype=torch.bool)
+    truth = MaskTruth({"a": {"mug": MaskAndBoxes(mask, torch.tensor([[3.0, 3, 9, 9]]))}})
+    report = LerfOvs2D().score(method, truth, [cases.view("a", 12, 16)], method.encode)
+    assert dict(report.scores) == {"mIoU": 0, "localisation": 0}

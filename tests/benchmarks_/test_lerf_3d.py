@@ -1,0 +1,215 @@
+import cases_methods as cases
+import numpy as np
+import oracles_protocols as dull
+import oracles_uplift
+import pytest
+import torch
+from published.class_lists import load_classes
+from published.lerf_3d import LerfOvs3D, nearest_gaussians, share_above, silhouette
+from published.mask_truth import MaskAndBoxes, MaskTruth
+
+from kfgs.evaluation import TeacherMethod
+from kfgs.labels.scores import CANONICAL
+
+SIZE = (18, 24)
+TEXTS = ("mug", "spoon", "plate")
+
+
+def _scene(levels=3, seed=0, apart=False):
+    rng = np.random.default_rng(seed)
+    cloud = cases.spread_gaussians(rng, 40, scale=0.25)
+    own = {text: rng.uniform(0.1, 0.4, (levels, 40)) for text in (*TEXTS, *CANONICAL)}
+    for values in own.values():
+        values[:, 5] = np.nan  # nothing is known of one Gaussian
+        if apart:  # each level knows other Gaussians, the last none
+            values[0, 6:18], values[1, 14:30], values[2] = np.nan, np.nan, np.nan
+    frames = {}
+    for stem, texts in (("frame_1", TEXTS[:2]), ("frame_2", TEXTS)):
+        frames[stem] = {t: MaskAndBoxes(torch.from_numpy(rng.uniform(size=SIZE) < 0.6)) for t in texts}
+    method = cases.Numbers([*TEXTS, *CANONICAL], own=own, gaussians=cloud)
+    return method, MaskTruth(frames), [cases.view(stem, *SIZE) for stem in frames]
+
+
+def _silhouette(cloud, selected, threshold):
+    parts = [x.double().numpy()[selected] for x in (cloud.means, cloud.quats, cloud.scales, cloud.opacities)]
+    camera = cases.camera(*SIZE)
+    viewmat, k = camera.viewmat.double().numpy(), camera.K.double().numpy()
+    weights = oracles_uplift.blend_weights(*parts, viewmat, k, camera.width, camera.height)
+    return weights.sum(-1) > threshold
+
+
+PROTOCOLS = {
+    "argmax": LerfOvs3D(),
+    "vala": LerfOvs3D.vala(),
+    "dr_splat": LerfOvs3D.dr_splat(),
+    "level": LerfOvs3D(selection="smoothed", threshold=0.3, level=1, neighbours=4),
+}
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("apart", [False, True])
+def test_the_whole_protocol_against_loops(name, seed, apart):
+    method, truth, views = _scene(seed=seed, apart=apart)
+    protocol = PROTOCOLS[name]
+    report = protocol.score(method, truth, views, method.encode)
+    own = {t: v[[1]] for t, v in method.own.items()} if name == "level" else method.own
+    selected = {}
+    for text in TEXTS:
+        if name == "argmax":
+            selected[text] = dull.select_argmax(own, TEXTS, text)
+        else:
+            options = {"threshold": protocol.threshold, "smoothed": protocol.selection == "smoothed"}
+            means = method.gaussians.means.double().tolist()
+            selected[text] = dull.select_by_relevancy(
+                own, text, CANONICAL, means, neighbours=protocol.neighbours, **options
+            )
+        found = protocol.select(method, TEXTS, method.encode)[text].numpy()
+        assert np.array_equal(found, selected[text])
+        assert not found[5]
+        assert found.any()
+    ious = [
+        dull.iou(_silhouette(method.gaussians, selected[text], protocol.silhouette), mask.numpy())
+        for texts in truth.frames.values()
+        for text, (mask, _) in texts.items()
+    ]
+    assert report["mIoU"] == pytest.approx(np.mean(ious), abs=2e-3)  # float32 at the silhouette's threshold
+    assert report["Acc@0.25"] == np.mean(np.array(ious) > 0.25)
+    assert report["Acc@0.5"] == np.mean(np.array(ious) > 0.5)
+
+
+def _line(levels):
+    """Two texts' cosines with Gaussians on a line, by level; a relevancy is sigmoid(10 (cosine - 0.2))."""
+    cloud = cases.spread_gaussians(np.random.default_rng(0), len(levels[0]))
+    cloud = cloud.replace(means=torch.tensor([[float(i), 0, 3] for i in range(len(levels[0]))]))
+    own = {"mug": np.array(levels), **{text: np.where(np.isnan(levels), np.nan, 0.2) for text in CANONICAL}}
+    return cases.Numbers(list(own), own=own, gaussians=cloud)
+
+
+def test_each_level_has_its_own_gaussians_by_hand():
+    nan = np.nan
+    # level 0 knows Gaussians 0 to 2, level 1 knows 3 and 4: no Gaussian is known in both
+    method = _line([[0.3, 0.1, 0.1, nan, nan], [nan, nan, nan, 0.4, 0.1]])
+    found = LerfOvs3D.dr_splat().select(method, ["mug"], method.encode)["mug"]
+    assert found.tolist() == [False, False, False, True, False]  # sigmoid(2) of level 1 beats sigmoid(1)
+    fixed = LerfOvs3D(selection="relevancy", threshold=0.5, level=0).select(method, ["mug"], method.encode)["mug"]
+    assert fixed.tolist() == [True, False, False, False, False]
+    smooth = LerfOvs3D(selection="smoothed", threshold=0.6, neighbours=2)
+    # level 1: 0.881 and 0.269, each averaged with both (0.575): 0.728 > 0.422, stretched to 1 and 0
+    assert smooth.select(method, ["mug"], method.encode)["mug"].tolist() == [False, False, False, True, False]
+    # level 0 wins by its one Gaussian of 0.9 until it is blended with its neighbour: 0.999, 0.018 give 0.754, level 1 has 0.953
+    method = _line([[0.9, -0.2, nan, nan, nan], [nan, nan, nan, 0.5, 0.5]])
+    assert (
+        smooth.select(method, ["mug"], method.encode)["mug"].tolist() == [False] * 5
+    )  # a flat level: nothing above its mean
+    plain = LerfOvs3D.dr_splat().select(method, ["mug"], method.encode)["mug"]
+    assert plain.tolist() == [True, False, False, False, False]
+
+
+def test_argmax_asks_the_published_list_of_the_scene():
+    published = load_classes("lerf_ovs")["texts"]["teatime"]
+    rng = np.random.default_rng(3)
+    texts = ["Sheep", "stuffed bear", *(text for text in published if text not in ("sheep", "stuffed bear")), "kettle"]
+    own = {text: rng.uniform(0.1, 0.4, (1, 60)) for text in texts}
+    method = cases.Numbers(texts, own=own, gaussians=cases.spread_gaussians(rng, 60))
+    mask = MaskAndBoxes(torch.ones(SIZE, dtype=torch.bool))
+    frames = {"a": {"Sheep": mask, "stuffed bear": mask}}
+    views = [cases.view("a", *SIZE)]
+    counts = {}
+    for scene in ("teatime", None, "my desk"):
+        report = LerfOvs3D().score(method, MaskTruth(frames, scene), views, method.encode)
+        counts[scene] = sum(row["Gaussians"] for row in report.rows)
+        (note,) = report.notes
+        assert note.startswith(
+            "argmax over the 14 published texts of teatime"
+            if scene == "teatime"
+            else "argmax over the annotated texts (2)"
+        )
+    fourteen = [texts[0], *(text for text in published if text != "sheep")]
+    expected = [dull.select_argmax(own, fourteen, text).sum() for text in ("Sheep", "stuffed bear")]
+    assert counts == {"teatime": sum(expected), None: 60, "my desk": 60}
+    more = {"a": {"kettle": mask}}
+    report = LerfOvs3D().score(
+        method,
+        MaskTruth(more, "teatime"),
+        views,
+        lambda asked: method.encode(["Sheep" if text == "sheep" else text for text in asked]),
+    )
+    assert report.notes == ("argmax over the 14 published texts of teatime, and of the truth besides: kettle",)
+    given = LerfOvs3D(texts=("Sheep", "stuffed bear", "plate")).score(
+        method, MaskTruth(frames, "teatime"), views, method.encode
+    )
+    assert given.notes == ("argmax over the 3 texts of the option `texts`",)
+    with pytest.raises(ValueError, match="asked: expected all texts that are looked for, got none of plate; add them"):
+        LerfOvs3D().select(method, ["plate"], method.encode, ["Sheep"])
+
+
+def test_both_thresholds_are_printed():
+    method, truth, views = _scene()
+    said = str(LerfOvs3D.vala().score(method, truth, views, method.encode))
+    assert said.endswith("(lerf-ovs-3d/1, selection=smoothed, threshold=0.6, silhouette=0.0392)")
+    said = str(LerfOvs3D().score(method, truth, views, method.encode))
+    assert said.endswith("(lerf-ovs-3d/1, selection=argmax, threshold=0.6, silhouette=0.7)")
+
+
+def test_accuracy_is_strict_by_hand():
+    assert share_above([0.25, 0.26], 0.25) == 0.5
+    assert np.isnan(share_above([], 0.5))
+
+
+def test_the_silhouette_is_that_of_the_selection_alone():
+    method, _, views = _scene()
+    nothing = torch.zeros(40, dtype=torch.bool)
+    assert not silhouette(method.gaussians, nothing, views[0].camera).any()
+    wide = silhouette(method.gaussians, ~nothing, views[0].camera, 10 / 255)
+    assert wide.sum() > silhouette(method.gaussians, ~nothing, views[0].camera, 0.7).sum() > 0
+
+
+def test_a_method_that_knows_nothing_scores_zero():
+    method, truth, views = _scene()
+    for values in method.own.values():
+        values[:] = np.nan
+    for protocol in PROTOCOLS.values():
+        assert protocol.score(method, truth, views, method.encode)["mIoU"] == 0
+
+
+def test_the_nearest_include_the_gaussian_itself():
+    means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
+    assert nearest_gaussians(means, 2).tolist() == [[0, 1], [1, 0], [2, 1]]
+    assert nearest_gaussians(means, 9).shape == (3, 3)
+
+
+def test_the_scenes_texts_are_the_published_ones():
+    texts = load_classes("lerf_ovs")["texts"]
+    assert {scene: len(names) for scene, names in texts.items()} == {
+        "waldo_kitchen": 18,
+        "ramen": 14,
+        "figurines": 21,
+        "teatime": 14,
+    }
+
+
+def test_other_texts_of_the_scene_compete():
+    method, truth, views = _scene(levels=1)
+    few = LerfOvs3D().select(method, ["mug"], method.encode)["mug"]
+    assert few.sum() == 39  # no other text
+    some = LerfOvs3D(texts=TEXTS).select(method, ["mug"], method.encode)["mug"]
+    assert 0 < some.sum() < 39
+    with pytest.raises(ValueError, match="expected all annotated texts, got none of plate; add them"):
+        LerfOvs3D(texts=TEXTS[:2]).score(method, truth, views, method.encode)
+
+
+def test_bad_input_is_named():
+    method, truth, views = _scene()
+    with pytest.raises(TypeError, match="expected one with Gaussians, got 'teacher' without"):
+        LerfOvs3D().score(TeacherMethod({}), truth, views, method.encode)
+    with pytest.raises(ValueError, match="selection: expected one of 'argmax'"):
+        LerfOvs3D(selection="leaf")
+
+
+@pytest.mark.parametrize("protocol", [LerfOvs3D(), LerfOvs3D.vala(), LerfOvs3D.dr_splat()])
+def test_a_method_without_gaussians_selects_none(protocol):
+    method, truth, views = _scene()
+    method.gaussians = method.gaussians.select(torch.zeros(40, dtype=torch.bool))
+    method.own = {text: values[:, :0] for text, values in method.own.items()}
+    assert protocol.score(method, truth, views, method.encode).value == 0

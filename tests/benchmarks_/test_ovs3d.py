@@ -1,0 +1,150 @@
+import cases_methods as cases
+import numpy as np
+import oracles_protocols as dull
+import pytest
+import torch
+from published.mask_truth import MaskAndBoxes, MaskTruth
+from published.ovs3d import OVS3DClosed, OVS3DStability, OVS3DThreshold, one_hot_accuracy
+from published.stable_threshold import stable_mask
+
+from kfgs.labels.scores import CANONICAL
+
+SIZE = (36, 42)
+TEXTS = ("grape", "sofa", "wall", "lamp")
+
+
+def _scene(seed, levels=2, contrast=0.25):
+    rng = np.random.default_rng(seed)
+    stems = ["00", "07"]
+    maps = cases.random_maps(rng, stems, [*TEXTS, *CANONICAL], levels, *SIZE)
+    frames = {}
+    for stem, texts in zip(stems, (TEXTS[:3], TEXTS[1:]), strict=True):
+        frames[stem] = {}
+        for i, text in enumerate(texts):
+            large = np.zeros((72, 84), bool)
+            y, x = 20 * i, rng.integers(0, 50)
+            large[y : y + 18 + i, x : x + 30] = True  # may touch the next
+            frames[stem][text] = MaskAndBoxes(torch.from_numpy(large))
+            maps[stem][text][:, large[1::2, 1::2]] += rng.uniform(0.5, 1.5, (levels, 1)) * contrast
+    for one in maps.values():
+        for values in one.values():
+            values[:, -2:, -3:] = np.nan
+    return cases.Numbers([*TEXTS, *CANONICAL], maps), MaskTruth(frames), [cases.view(stem, *SIZE) for stem in stems]
+
+
+def _small(mask):
+    return mask.numpy()[1::2, 1::2]  # the pixel at each centre
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_closed_against_loops(seed):
+    method, truth, views = _scene(seed)
+    report = OVS3DClosed(texts=TEXTS, level=1).score(method, truth, views, method.encode)
+    ious, shares = [], []
+    for stem, texts in truth.frames.items():
+        values = np.stack([method.maps[stem][text][1] for text in TEXTS])
+        labels = np.where(np.isnan(values[0]), -1, np.argmax(np.nan_to_num(values), axis=0))
+        for text, (mask, _) in texts.items():
+            ious.append(dull.iou(labels == TEXTS.index(text), _small(mask)))
+        right = 0
+        for y in range(SIZE[0]):
+            for x in range(SIZE[1]):
+                row = [text in texts and bool(_small(texts[text].mask)[y, x]) for text in TEXTS]
+                right += row == [labels[y, x] == i for i in range(len(TEXTS))]
+        shares.append(right / (SIZE[0] * SIZE[1]))
+    assert tuple(report.scores.values()) == pytest.approx((np.mean(ious), np.mean(shares)), abs=1e-12)
+    assert report["mIoU"] > 0.05
+
+
+def test_closed_asks_the_scenes_whole_list():
+    method, truth, views = _scene(0)
+    some = {stem: {text: one for text, one in texts.items() if text != "lamp"} for stem, texts in truth.frames.items()}
+    whole, masks = MaskTruth(some, listed=TEXTS), MaskTruth(some)  # no mask of the lamp in any view
+    want = OVS3DClosed(texts=TEXTS).score(method, masks, views, method.encode)
+    report = OVS3DClosed().score(method, whole, views, method.encode)
+    assert report.scores == want.scores
+    assert report.notes == ("argmax over 4 texts of the scene's list",)
+    fewer = OVS3DClosed().score(method, masks, views, method.encode)
+    assert fewer.scores != want.scores
+    assert fewer.notes == ("argmax over 3 texts of the masks: no list is known",)
+
+
+def test_accuracy_by_hand():
+    masks = [torch.tensor([[True, True, False, False]]), torch.tensor([[False, True, False, True]])]
+    assert one_hot_accuracy(torch.tensor([[0, 0, 1, 1]]), masks) == 0.5  # two masks, and none, are never a label's
+    assert one_hot_accuracy(torch.tensor([[0, 0, -1, 1]]), masks) == 0.75
+
+
+def test_closed_uses_the_methods_own_labels():
+    method, truth, views = _scene(0)
+    labeller = cases.Labels(method.texts, method.maps)
+    own = OVS3DClosed(texts=TEXTS).score(labeller, truth, views, method.encode)
+    assert own.scores == OVS3DClosed(texts=TEXTS, level=1).score(method, truth, views, method.encode).scores
+    with pytest.raises(ValueError, match="expected all annotated texts, got none of lamp; add them"):
+        OVS3DClosed(texts=TEXTS[:3]).score(method, truth, views, method.encode)
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("filter", ["langsplat", "langsplatv2"])
+def test_threshold_against_loops(filter, seed):
+    method, truth, views = _scene(seed)
+    stretched = OVS3DThreshold(filter=filter).score(method, truth, views, method.encode)
+    plain = OVS3DThreshold(stretched=False, threshold=0.55).score(method, truth, views, method.encode)
+    want, plainly = [], []
+    for stem, texts in truth.frames.items():
+        for text, (mask, _) in texts.items():
+            found = dull.relevancy_maps(method.maps[stem], text, CANONICAL)
+            ious, level, _ = dull.lerf_2d(found, _small(mask), [], filter=filter)
+            want.append(ious[level])
+            best = found[int(np.argmax([one.max() for one in found]))]
+            plainly.append(dull.iou(best > 0.55, _small(mask)))
+    assert stretched["mIoU"] == pytest.approx(np.mean(want), abs=1e-9)
+    assert plain["mIoU"] == pytest.approx(np.mean(plainly), abs=1e-9)
+
+
+def test_a_stable_threshold_by_hand():
+    """A quarter of the pixels score 0, a quarter 1, and half lie between 0.2 and 0.4, where the mask shrinks by 2.5 per unit
+    of threshold. From 0.41 to 0.99 nothing changes: the middle is 0.70."""
+    level = torch.zeros(1, 20, 20)
+    level[:, :5], level[:, 5:15] = 1.0, torch.linspace(0.2, 0.4, 200).view(10, 20)
+    found = stable_mask(level)
+    assert found.threshold == pytest.approx(0.70, abs=0.01)
+    assert found.mask[0, :5].all()
+    assert found.mask.sum() == 100
+
+
+def test_one_step_is_hidden_by_the_median():
+    level = torch.zeros(1, 20, 20)
+    level[:, :5], level[:, 5:10] = 1.0, 0.3
+    assert stable_mask(level).threshold == 0.50  # the middle of all thresholds
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_stability_against_loops(seed):
+    method, truth, views = _scene(seed, levels=3, contrast=0.1 if seed else 0.6)
+    protocol = OVS3DStability(steepest=0.6) if seed == 3 else OVS3DStability()
+    report = protocol.score(method, truth, views, method.encode)
+    ious, rows = [], iter(report.rows)
+    for stem, texts in truth.frames.items():
+        for text, (mask, _) in texts.items():
+            found = dull.relevancy_maps(method.maps[stem], text, CANONICAL)
+            seen, level, threshold = dull.stable_mask(found, steepest=protocol.steepest)
+            row = next(rows)
+            assert (row["level"], row["threshold"]) == (level, pytest.approx(threshold))
+            ious.append(dull.iou(dull.majority(seen), _small(mask)))
+    assert report["mIoU"] == pytest.approx(np.mean(ious), abs=1e-9)
+
+
+def test_without_a_stable_threshold_it_is_one_half():
+    ramp = torch.linspace(0, 1, 400).view(1, 20, 20)
+    flat = stable_mask(torch.cat([0.5 * ramp, ramp]), steepest=0.1)
+    assert (flat.level, flat.threshold) == (1, 0.5)
+    assert flat.mask.sum() == 200
+    assert not stable_mask(torch.ones(1, 4, 4)).mask.any()
+
+
+def test_bad_options_are_named():
+    with pytest.raises(ValueError, match="steepest: expected a number in"):
+        OVS3DStability(steepest=0)
+    with pytest.raises(ValueError, match="level: expected one of 'chosen'"):
+        OVS3DThreshold(level="oracle")

@@ -1,0 +1,115 @@
+import numpy as np
+import oracles_protocols as dull
+import pytest
+import torch
+from published.relevancy import (
+    box_mean,
+    clean_mask,
+    fill_unknown,
+    lerf_relevancy,
+    majority,
+    mask_iou,
+    pool_majority,
+    pool_mean,
+    smooth_relevancy,
+    stretch,
+)
+
+SIZES = [(40, 33), (9, 12), (31, 1), (1, 1)]
+
+
+def test_relevancy_by_hand():
+    found = lerf_relevancy(torch.tensor([0.30]), torch.tensor([0.25, 0.20, 0.10, 0.28]))
+    assert float(found) == pytest.approx(0.549834, abs=1e-6)
+
+
+def test_relevancy_against_the_pairwise_softmax():
+    rng = np.random.default_rng(0)
+    positive, negatives = rng.uniform(-1, 1, (5, 4, 3)), rng.uniform(-1, 1, (5, 4, 6))
+    found = lerf_relevancy(torch.from_numpy(positive), torch.from_numpy(negatives), 7.0)
+    for i in np.ndindex(5, 4, 3):
+        assert float(found[i]) == pytest.approx(dull.relevancy(positive[i], negatives[i[:2]], 7.0), abs=1e-12)
+
+
+def test_box_offsets_by_hand():
+    impulse = torch.zeros(100, 100)
+    impulse[40, 50] = 900
+    want = torch.zeros(100, 100)
+    want[26:56, 36:66] = 1
+    torch.testing.assert_close(box_mean(impulse), want)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_filters_against_loops(size):
+    rng = np.random.default_rng(1)
+    image = rng.uniform(size=size)
+    maps = torch.from_numpy(np.stack([image, 2 * image]))
+    for found, want in ((box_mean(maps), dull.box_mean(image)), (pool_mean(maps), dull.pool_mean(image))):
+        np.testing.assert_allclose(found[0], want, atol=1e-12)
+        np.testing.assert_allclose(found[1], 2 * want, atol=1e-12)
+    for share in (0.3, 0.5, 0.7):
+        mask = rng.uniform(size=size) < share
+        both = torch.from_numpy(np.stack([mask, ~mask]))
+        for skip_last in (True, False):
+            assert np.array_equal(majority(both, skip_last=skip_last)[0], dull.majority(mask, skip_last=skip_last))
+            assert np.array_equal(majority(both, skip_last=skip_last)[1], dull.majority(~mask, skip_last=skip_last))
+        assert np.array_equal(pool_majority(both)[0], dull.pool_majority(mask))
+
+
+def test_majority_never_looks_at_the_last_row_and_column():
+    assert majority(torch.ones(10, 10, dtype=torch.bool)).all()
+    edge = torch.zeros(10, 10, dtype=torch.bool)
+    edge[-1], edge[:, -1] = True, True
+    assert not majority(edge).any()
+    assert majority(edge, 3, skip_last=False).any()  # the corner's window: 3 of 4
+
+
+def test_a_tie_of_the_majority_is_false():
+    half = torch.zeros(20, 20, dtype=torch.bool)
+    half[:, ::2] = True
+    found = majority(half, 7, skip_last=False)
+    assert not found[10, 0]  # its columns 0 to 3: two of four
+    assert not majority(half[:, 1:], 7, skip_last=False)[10, 0]
+    with pytest.raises(ValueError, match="expected an odd number"):
+        majority(half, 6)
+
+
+def test_filters_by_name():
+    image, mask = torch.rand(20, 20), torch.rand(20, 20) > 0.5
+    assert torch.equal(smooth_relevancy(image, "langsplat"), box_mean(image))
+    assert torch.equal(smooth_relevancy(image, "langsplatv2"), pool_mean(image))
+    assert torch.equal(clean_mask(mask, "langsplat"), majority(mask))
+    assert torch.equal(clean_mask(mask, "langsplatv2"), pool_majority(mask))
+    with pytest.raises(ValueError, match="filter: expected one of 'langsplat'"):
+        clean_mask(mask, "gags")
+
+
+def test_unknown_pixels_are_the_least_relevant():
+    nan = float("nan")
+    maps = torch.tensor([[[0.4, nan], [0.9, 0.6]], [[nan, nan], [nan, nan]]])
+    assert fill_unknown(maps).tolist() == torch.tensor([[[0.4, 0.4], [0.9, 0.6]], [[0, 0], [0, 0]]]).tolist()
+
+
+def test_an_unknown_pixel_is_selected_only_with_all_known_ones():
+    nan = float("nan")
+    for known, threshold, expected in (([0.6, 0.9], 0.5, True), ([0.6, 0.9], 0.7, False)):
+        assert bool((fill_unknown(torch.tensor([[*known, nan]])) >= threshold)[0, 2]) is expected
+    stretched = stretch(fill_unknown(torch.tensor([[0.6, 0.9, nan]])))
+    assert stretched.tolist() == [[0, 1, 0]]  # no threshold above 0 selects it
+
+
+def test_stretch_against_loops():
+    values = np.random.default_rng(2).uniform(size=(3, 5, 4))
+    found = stretch(torch.from_numpy(values))
+    for i in range(3):
+        np.testing.assert_allclose(found[i], dull.stretch(values[i]), atol=1e-12)
+    assert stretch(torch.ones(4, 4)).eq(0).all()
+
+
+def test_overlap():
+    nothing, some = torch.zeros(2, 2, dtype=torch.bool), torch.tensor([[True, False], [True, True]])
+    assert mask_iou(nothing, nothing) == 0
+    assert mask_iou(nothing, nothing, empty=1.0) == 1
+    assert mask_iou(some, torch.ones(2, 2).bool()) == 0.75
+    with pytest.raises(ValueError, match=r"expected the size of the truth, \(2, 2\), got \(2, 3\)"):
+        mask_iou(torch.zeros(2, 3).bool(), nothing)

@@ -1,0 +1,200 @@
+import cases_methods as cases
+import numpy as np
+import oracles_protocols as dull
+import pytest
+import torch
+from messages import tells
+from published.scannet_points import ScanNetPoints, class_indices, class_scores, scannet_classes
+from published.scannet_volume import ScanNetVolume, gaussian_truth, significance
+
+from kfgs.evaluation import PointTruth, TeacherMethod
+from kfgs.evaluation.scannet import nyu40_names
+from kfgs.gaussians import Gaussians
+
+NYU = nyu40_names()
+
+
+def test_scores_by_hand():
+    gt, pred = torch.tensor([1, 1, 2, 0]) - 1, torch.tensor([1, 2, 2, 1]) - 1
+    found = class_scores(pred, gt, 2)
+    assert found["IoU"].tolist() == [0.5, 0.5]
+    assert found["recall"].nanmean() == 0.75
+    assert dull.scannet(pred.numpy() + 1, gt.numpy() + 1) == pytest.approx((0.5, 0.75, 2 / 3))
+
+
+def test_classes_are_opengaussians():
+    for count in (19, 15, 10):
+        ids, names = scannet_classes(count)
+        assert len(ids) == len(names) == count
+    assert set(scannet_classes(10)[0]) < set(scannet_classes(15)[0]) < set(scannet_classes(19)[0])
+    assert dict(zip(*scannet_classes(19), strict=True))[28] == "showercurtain"
+    assert class_indices(torch.tensor([4, 0, 2, 39]), [2, 4]).tolist() == [1, -1, 0, -1]
+    with pytest.raises(ValueError, match="classes: expected one of 19, 15, 10"):
+        ScanNetPoints(classes=20)
+
+
+def _scene(seed, count=60, points=60):
+    rng = np.random.default_rng(seed)
+    names = scannet_classes(19)[1]
+    own = {name: rng.uniform(0, 0.3, (2, count)) for name in names}
+    for values in own.values():
+        values[:, 3] = np.nan
+    cloud = cases.spread_gaussians(rng, count, scale=0.4)
+    where = cloud.means[:points] if points == count else None
+    if where is None:
+        where = torch.from_numpy(np.c_[rng.uniform(-1.5, 1.5, (points, 2)), rng.uniform(2.5, 5.5, points)]).float()
+    labels = torch.from_numpy(rng.choice([0, 1, 2, 4, 5, 13, 33, 40], points))
+    return cases.Numbers(names, own=own, gaussians=cloud), PointTruth(where, labels, NYU)
+
+
+def _remap(labels, ids):
+    return np.array([ids.index(label) + 1 if label in ids else 0 for label in labels.tolist()])
+
+
+def _argmax(method, names, level, unknown):
+    values = np.stack([method.own[name][level] for name in names])
+    return np.where(np.isnan(values[0]), unknown, 1 + np.argmax(np.nan_to_num(values), axis=0))
+
+
+@pytest.mark.parametrize("classes", [19, 15, 10])
+def test_points_against_loops(classes):
+    method, truth = _scene(classes)
+    ids, names = scannet_classes(classes)
+    gt = _remap(truth.labels, ids)
+    gt[method.gaussians.opacities.numpy() < 0.1] = 0
+    for unknown, label in (("first class", 1), ("none", 0)):
+        report = ScanNetPoints(classes=classes, unknown=unknown, level=1).score(method, truth, (), method.encode)
+        want = dull.scannet(_argmax(method, names, 1, label), gt)
+        assert tuple(report.scores.values()) == pytest.approx(want, abs=1e-12)
+
+
+def test_a_transparent_gaussian_is_not_scored():
+    method, truth = _scene(0)
+    opacities = torch.full((60,), 0.9)
+    opacities[7] = 0.09
+    method.gaussians = method.gaussians.replace(opacities=opacities)
+    labels = torch.zeros(60, dtype=torch.int64)
+    labels[7], labels[8] = 4, 5
+    truth = PointTruth(truth.points, labels, NYU)
+    assert [row["class"] for row in ScanNetPoints().score(method, truth, (), method.encode).rows] == ["chair"]
+    both = ScanNetPoints(least_opacity=0.0).score(method, truth, (), method.encode)
+    assert {row["class"] for row in both.rows} == {"bed", "chair"}
+
+
+def test_densified_scenes_ask_the_nearest_gaussian():
+    method, truth = _scene(1, points=90)
+    with pytest.raises(ValueError, match="expected 90 Gaussians .one at each vertex of truth.points., got 60"):
+        ScanNetPoints().score(method, truth, (), method.encode)
+    report = ScanNetPoints(assign="nearest").score(method, truth, (), method.encode)
+    ids, names = scannet_classes(19)
+    means = method.gaussians.means.tolist()
+    near = np.array([dull.nearest(means, point, 1)[0] for point in truth.points.tolist()])
+    gt = _remap(truth.labels, ids)
+    gt[method.gaussians.opacities.numpy()[near] < 0.1] = 0
+    want = dull.scannet(_argmax(method, names, 0, 1)[near], gt)
+    assert tuple(report.scores.values()) == pytest.approx(want, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("nearest", "radius", "balanced", "vote"),
+    [(1000, 5.0, True, "near"), (7, 2.0, True, "near"), (1000, 1.5, False, "near"), (1000, 1.5, False, "far")],
+)
+def test_volume_against_loops(nearest, radius, balanced, vote):
+    method, truth = _scene(2, points=150)
+    ids, names = scannet_classes(19)
+    cloud = method.gaussians
+    parts = [x.double().numpy() for x in (cloud.means, cloud.quats, cloud.scales)]
+    labels = _remap(truth.labels, ids)
+    gt = dull.gaussian_truth(*parts, truth.points.double().numpy(), labels, nearest, radius, balanced, vote == "far")
+    options = {"nearest": nearest, "radius": radius, "balanced": balanced, "vote": vote}
+    found = gaussian_truth(cloud, truth.points, torch.from_numpy(labels) - 1, **options)
+    assert np.array_equal(found.numpy() + 1, gt)
+    assert len(set(gt.tolist())) > 3
+    weights = parts[2].prod(1) * cloud.opacities.double().numpy()
+    np.testing.assert_allclose(significance(cloud), weights, rtol=1e-12)
+    protocol = ScanNetVolume(**options)
+    report = protocol.score(method, truth, (), method.encode)
+    want = dull.scannet(_argmax(method, names, 0, 0), gt, weights)
+    assert tuple(report.scores.values()) == pytest.approx(want, abs=1e-12)
+
+
+def test_gaussians_far_from_every_vertex_are_not_scored():
+    method, truth = _scene(2)
+    cloud = method.gaussians
+    far = gaussian_truth(cloud, truth.points + 100, class_indices(truth.labels, [1, 2]))
+    assert far.eq(-1).all()
+    assert gaussian_truth(cloud, truth.points, torch.full((60,), -1)).eq(-1).all()
+
+
+def test_a_flat_gaussian_takes_the_nearest_class_though_every_vertex_is_many_deviations_away():
+    flat = torch.tensor([[0.1, 0.1, 5e-4]])  # 60 and 100 deviations: exp(-d^2 / 2) is 0 in float64
+    disc = Gaussians(torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), flat, torch.ones(1))
+    points = torch.tensor([[0, 0, 0.03], [0, 0, 0.05]])
+    assert gaussian_truth(disc, points, torch.tensor([5, 2])).item() == 5
+    assert gaussian_truth(disc, points, torch.tensor([2, 5])).item() == 2
+
+
+def test_vertices_without_a_class_do_not_vote():
+    ball = Gaussians(torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 3), torch.ones(1))
+    points = torch.tensor([[0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1], [3.0, 0, 0]])
+    labels = torch.tensor([-1, -1, -1, 4])
+    assert (
+        gaussian_truth(ball, points, labels).item() == 4
+    )  # a labelled one within 5 scales wins over three nearer ones
+    assert gaussian_truth(ball, points, labels, nearest=1).item() == 4  # which do not use up the nearest
+    assert gaussian_truth(ball, points, labels, radius=2.9).item() == -1
+
+
+def test_a_near_minority_beats_a_far_crowd_only_when_balanced():
+    ball = cases.spread_gaussians(np.random.default_rng(0), 1).replace(means=torch.zeros(1, 3), scales=torch.ones(1, 3))
+    points = torch.tensor([[0.1, 0, 0], *[[2.0, 0.01 * i, 0] for i in range(30)]])
+    labels = torch.tensor([1] + [0] * 30)
+    assert gaussian_truth(ball, points, labels).item() == 1
+    assert gaussian_truth(ball, points, labels, balanced=False).item() == 0
+
+
+def test_the_sum_of_distances_prefers_far_and_frequent_classes():
+    ball = Gaussians(torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 2.0), torch.ones(1))
+    points = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 4]])  # at d = 0.5, 0.5 and 2
+    labels = torch.tensor([3, 3, 5])
+    assert gaussian_truth(ball, points, labels).item() == 3
+    assert gaussian_truth(ball, points, labels, vote="far", balanced=False).item() == 5  # 2 against 1
+    frequent = torch.tensor([3, 5, 5])
+    assert gaussian_truth(ball, points[[2, 0, 1]], frequent, vote="far", balanced=False).item() == 3
+    crowd = torch.cat([points[2:], points[:1].expand(5, 3)])  # 2 against 5 times 0.5
+    assert gaussian_truth(ball, crowd, torch.tensor([5] + [3] * 5), vote="far", balanced=False).item() == 3
+    with pytest.raises(ValueError, match="vote: expected one of 'near', 'far', got 'sum'"):
+        ScanNetVolume(vote="sum")
+
+
+@pytest.mark.parametrize("protocol", [ScanNetPoints(), ScanNetVolume()])
+def test_bad_input_is_named(protocol):
+    method, truth = _scene(0)
+    with pytest.raises(TypeError, match="expected one with Gaussians, got 'teacher' without"):
+        protocol.score(TeacherMethod({}), truth, (), method.encode)
+
+
+@pytest.mark.parametrize("protocol", [ScanNetPoints(), ScanNetVolume()])
+def test_labels_of_another_data_set_are_refused(protocol):
+    method, truth = _scene(0)
+    replica = PointTruth(truth.points, truth.labels, {0: "wall", 1: "floor", 28: "Shower Curtain", 80: "chair"})
+    with pytest.raises(ValueError, match=tells("truth", "NYU40", "1 = 'floor'", "scenesplat-fmiou/1")):
+        protocol.score(method, replica, (), method.encode)
+    spelled = PointTruth(truth.points, truth.labels, {**NYU, 28: "Shower Curtain"})
+    want = protocol.score(method, truth, (), method.encode)
+    assert protocol.score(method, spelled, (), method.encode).scores == want.scores
+
+
+@pytest.mark.parametrize("protocol", [ScanNetPoints(), ScanNetVolume()])
+def test_nothing_to_score_is_an_error(protocol):
+    method, truth = _scene(0)
+    other = PointTruth(truth.points, torch.full_like(truth.labels, 40), NYU)
+    with pytest.raises(ValueError, match=tells("truth", "19 classes", "none among 60")):
+        protocol.score(method, other, (), method.encode)
+    far = PointTruth(truth.points + 100, truth.labels, NYU)
+    if isinstance(protocol, ScanNetVolume):
+        with pytest.raises(ValueError, match=tells("method", "within 5 scales", "one frame")):
+            protocol.score(method, far, (), method.encode)
+    else:
+        with pytest.raises(ValueError, match=tells("method", "opacity of at least 1", "least_opacity")):
+            ScanNetPoints(least_opacity=1.0).score(method, truth, (), method.encode)

@@ -1,0 +1,201 @@
+import cases_methods as cases
+import numpy as np
+import oracles_protocols as dull
+import pytest
+import torch
+from published.class_lists import load_classes
+from published.scenesplat import BENCHMARKS, SceneSplatBench, match_names, vote_instances, vote_nearest
+
+from kfgs.evaluation import PointTruth, TeacherMethod
+from kfgs.evaluation.scannet import nyu40_names
+from kfgs.evaluation.truth import name_key
+
+LISTS = load_classes("scenesplat")
+USED = ("wall", "floor", "chair", "table", "sink")
+OTHERS = ("something else",)
+
+
+def _scene(seed, texts, gaussians=70, points=90):
+    rng = np.random.default_rng(seed)
+    own = {text: rng.uniform(0, 0.3, (1, gaussians)) for text in texts}
+    for text in texts:
+        if text.removeprefix("this is a ") in USED:
+            own[text] += 0.15
+        own[text][:, :9] = np.nan
+    cloud = cases.spread_gaussians(rng, gaussians)
+    where = torch.from_numpy(np.c_[rng.uniform(-1, 1, (points, 2)), rng.uniform(3, 5, points)]).float()
+    names = {3: "chair", 7: "wall", 11: "floor", 12: "table", 40: "sink", 41: "something else"}
+    labels = torch.from_numpy(rng.choice([-1, *names], points))
+    truth = PointTruth(where, labels, names, instances=torch.from_numpy(rng.integers(-1, 6, points)))
+    return cases.Numbers(texts, own=own, gaussians=cloud), truth
+
+
+def _expected(method, truth, texts, classes, protocol):
+    values = np.stack([method.own[text][0] for text in texts])
+    labels = np.where(np.isnan(values[0]), -1, np.argmax(np.nan_to_num(values), axis=0))
+    if protocol.least_cosine is not None:
+        labels = np.where(np.nan_to_num(values, nan=-2).max(0) < protocol.least_cosine, -1, labels)
+    means = method.gaussians.means.tolist()
+    keep = [i for i in range(len(labels)) if labels[i] >= 0 or not protocol.drop_unknown]
+    pred = dull.vote_nearest(truth.points.tolist(), [means[i] for i in keep], labels[keep], protocol.neighbours)
+    gt = [classes.index(truth.names[i]) if truth.names.get(i) in classes else -1 for i in truth.labels.tolist()]
+    return pred, np.array(gt)
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"neighbours": 3, "drop_unknown": True}, {"least_cosine": 0.35, "neighbours": 5}]
+)
+def test_several_scenes_share_one_matrix(options):
+    classes, dropped = LISTS["scannet20"]["classes"], LISTS["scannet20"]["dropped"]
+    texts = [f"this is a {name}" for name in classes]
+    protocol = SceneSplatBench(**options, ignored=OTHERS)
+    scenes = [_scene(seed, texts) for seed in (0, 1)]
+    both = [_expected(*scene, texts, classes, protocol) for scene in scenes]
+    report = protocol.score_scenes(scenes, scenes[0][0].encode)
+    pred, gt = (np.concatenate(parts) for parts in zip(*both, strict=True))
+    want = dull.scenesplat(pred, gt, classes, dropped)
+    assert tuple(report.scores.values()) == pytest.approx(want, abs=1e-12)
+    assert list(report.scores) == ["f-mIoU", "f-mAcc", "mIoU", "mAcc", "accuracy"]
+    assert {row["class"] for row in report.rows} == set(USED)
+    alone = protocol.score(*scenes[0], (), scenes[0][0].encode)
+    assert tuple(alone.scores.values()) == pytest.approx(dull.scenesplat(*both[0], classes, dropped), abs=1e-12)
+
+
+def test_holicity_asks_six_prompts_for_four_classes():
+    prompts = LISTS["holicity4"]["prompts"]
+    texts = [prompt for prompt, _ in prompts]
+    method, truth = _scene(3, texts)
+    names = dict(zip((3, 7, 11, 12), LISTS["holicity4"]["classes"], strict=True))
+    truth = PointTruth(truth.points, truth.labels, names)
+    report = SceneSplatBench(benchmark="holicity4", neighbours=4).score(method, truth, (), method.encode)
+    values = np.stack([method.own[text][0] for text in texts])
+    six = np.where(np.isnan(values[0]), -1, np.argmax(np.nan_to_num(values), axis=0))
+    labels = np.array([prompts[i][1] if i >= 0 else -1 for i in six])
+    pred = dull.vote_nearest(truth.points.tolist(), method.gaussians.means.tolist(), labels, 4)
+    gt = np.array([[3, 7, 11, 12].index(i) if i in (3, 7, 11, 12) else -1 for i in truth.labels.tolist()])
+    want = dull.scenesplat(pred, gt, LISTS["holicity4"]["classes"], [])
+    assert tuple(report.scores.values()) == pytest.approx(want, abs=1e-12)
+    assert report["f-mIoU"] == report["mIoU"]
+
+
+def test_votes_by_hand():
+    means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [9, 0, 0]])
+    labels = torch.tensor([2, 1, -1, -1])
+    points = torch.tensor([[0.4, 0, 0], [9.0, 0, 0]])
+    assert vote_nearest(points, means, labels, 2).tolist() == [1, -1]  # a tie goes to the lowest
+    assert vote_nearest(points, means, labels, 3).tolist() == [1, -1]  # and "none" loses it
+    assert vote_nearest(points, means[:0], labels[:0]).tolist() == [-1, -1]
+    labels, instances = torch.tensor([0, 1, 1, 2, 3]), torch.tensor([4, 4, 4, -1, 0])
+    assert vote_instances(labels, instances).tolist() == [1, 1, 1, 2, 3]
+
+
+def test_true_instances_are_an_option():
+    texts = [f"this is a {name}" for name in LISTS["scannet20"]["classes"]]
+    method, truth = _scene(0, texts)
+    usual, inflated = SceneSplatBench(ignored=OTHERS), SceneSplatBench(within_instances=True, ignored=OTHERS)
+    assert (
+        usual.score(method, truth, (), method.encode).scores != inflated.score(method, truth, (), method.encode).scores
+    )
+    bare = PointTruth(truth.points, truth.labels, truth.names)
+    with pytest.raises(ValueError, match="expected instances for within_instances"):
+        inflated.score(method, bare, (), method.encode)
+
+
+def test_lists_are_complete():
+    counts = {"scannet20": 20, "scannet200": 200, "scannetpp100": 100, "matterport21": 21, "holicity4": 4}
+    for name in BENCHMARKS:
+        assert len(set(LISTS[name]["classes"])) == counts[name]
+        assert set(LISTS[name]["dropped"]) <= set(LISTS[name]["classes"])
+        assert len({name_key(one) for one in LISTS[name]["classes"]}) == counts[name]
+
+
+def _named(labels, names):
+    return PointTruth(torch.zeros(len(labels), 3), torch.tensor(labels), names)
+
+
+NYU40 = nyu40_names()
+
+
+@pytest.mark.parametrize(("benchmark", "ceiling"), [("scannet20", -1), ("matterport21", 20)])
+def test_all_names_of_scannet_find_their_class(benchmark, ceiling):
+    classes = LISTS[benchmark]["classes"]
+    # ids of NYU40: wall, showercurtain, otherfurniture, ceiling, blinds (twice), none, not in the table
+    found = match_names(_named([1, 28, 39, 22, 13, 13, 0, 77], NYU40), classes)
+    assert found.labels.tolist() == [0, 15, 19, ceiling, -1, -1, -1, -1]
+    assert found.left_out == ({"blinds": 2} if ceiling == 20 else {"blinds": 2, "ceiling": 1})
+
+
+def test_names_in_another_spelling_are_matched_and_strange_ones_are_an_error():
+    classes = ("wall", "shower curtain", "tv stand")
+    found = match_names(
+        _named([0, 1, 2, 3, -1], {0: "Wall", 1: "shower_curtain", 2: "TV-Stand", 3: "Unlabelled"}), classes
+    )
+    assert found.labels.tolist() == [0, 1, 2, -1, -1]
+    assert found.left_out == {"Unlabelled": 1}
+    names = {0: "wall", 1: "showercurtains", 2: "sofa", 3: "nowhere"}  # two classes have no name: one may be theirs
+    strange = _named([0, 1, 2, 2], names)
+    with pytest.raises(
+        ValueError, match=r"shower curtain, tv stand among them, got points named showercurtains, sofa;"
+    ):
+        match_names(strange, classes)
+    with pytest.raises(ValueError, match="give the others as ignored=sofa$"):
+        match_names(strange, classes, ["Shower Curtains"])
+    found = match_names(strange, classes, ["Shower Curtains", "sofa"])
+    assert found.labels.tolist() == [0, -1, -1, -1]
+    assert found.left_out == {"showercurtains": 1, "sofa": 2}
+    with pytest.raises(ValueError, match="ignored: expected names that are no classes of the protocol, got TV stand"):
+        match_names(strange, classes, ["TV stand"])
+
+
+def test_an_exact_name_wins_over_another_spelling():
+    assert match_names(_named([0, 1], {0: "a-b", 1: "a b"}), ("a b", "a-b")).labels.tolist() == [1, 0]
+    assert match_names(_named([0], {0: "A B"}), ("a b", "a-b")).labels.tolist() == [0]
+
+
+def test_the_report_says_which_names_were_not_scored():
+    classes = LISTS["scannet20"]["classes"]
+    texts = [f"this is a {name}" for name in classes]
+    method, truth = _scene(0, texts)
+    count = int((truth.labels == 41).sum())
+    report = SceneSplatBench(ignored=OTHERS).score(method, truth, (), method.encode)
+    assert f"not scored, no class of scannet20: something else ({count} points)" in report.notes
+    with pytest.raises(ValueError, match="got points named something else; correct"):
+        SceneSplatBench().score(method, truth, (), method.encode)
+    known = truth.labels != 41
+    whole = PointTruth(truth.points[known], truth.labels[known], truth.names)
+    report = SceneSplatBench().score(method, whole, (), method.encode)
+    assert report.notes == ("Gaussians without a feature vote for none",)
+
+
+@pytest.mark.parametrize(("benchmark", "published"), [("scannetpp100", 1.0), ("scannet20", 0.0)])
+def test_gaussians_without_a_feature_vote_as_published(benchmark, published):
+    texts = [f"this is a {name}" for name in LISTS[benchmark]["classes"]]
+    own = {text: np.full((1, 5), 0.1) for text in texts}
+    own["this is a chair"][:] = 0.2
+    for values in own.values():
+        values[:, :3] = np.nan  # three of five know nothing: if they vote, "none" wins
+    method = cases.Numbers(texts, own=own, gaussians=cases.spread_gaussians(np.random.default_rng(0), 5))
+    truth = _named([7], {7: "chair"})
+    scores = {}
+    for drop in (None, True, False):
+        report = SceneSplatBench(benchmark=benchmark, drop_unknown=drop).score(method, truth, (), method.encode)
+        scores[drop] = report["mAcc"]
+        assert report.notes[0].endswith("left out of the vote" if scores[drop] else "vote for none")
+        assert ("drop_unknown" in str(report)) == (drop is not None)
+    assert scores == {None: published, True: 1.0, False: 0.0}
+
+
+def test_bad_input_is_named():
+    texts = [f"this is a {name}" for name in LISTS["scannet20"]["classes"]]
+    method, truth = _scene(0, texts)
+    with pytest.raises(ValueError, match="expected names such as wall, floor, cabinet .of the benchmark., got a"):
+        SceneSplatBench().score(method, PointTruth(truth.points, truth.labels, {1: "a"}), (), method.encode)
+    with pytest.raises(ValueError, match="scenes: expected at least one"):
+        SceneSplatBench().score_scenes([], method.encode)
+    with pytest.raises(TypeError, match="expected one with Gaussians, got 'teacher' without"):
+        SceneSplatBench(ignored=OTHERS).score(TeacherMethod({}), truth, (), method.encode)
+    with pytest.raises(ValueError, match="template: expected a text with {}"):
+        SceneSplatBench(template="a")
+    nothing = PointTruth(truth.points, torch.full_like(truth.labels, -1), truth.names)
+    with pytest.raises(ValueError, match="truth: expected points of some class of scannet20, got none in 1 scenes"):
+        SceneSplatBench().score(method, nothing, (), method.encode)

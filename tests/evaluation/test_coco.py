@@ -1,0 +1,119 @@
+"""COCO's JSON: what other programs export, and what kfgs writes."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from messages import tells
+
+from kfgs.evaluation import load_labels
+from kfgs.evaluation.coco import load_coco_examples, load_coco_labels, save_coco
+
+
+def _coco(path: Path, **changes: object) -> Path:
+    annotations = [
+        {"id": 1, "image_id": 3, "category_id": 18, "bbox": [1, 0, 2, 2], "segmentation": [[1, 0, 3, 0, 3, 2, 1, 2]]},
+        {"image_id": 3, "category_id": 1, "bbox": [0, 0, 2, 1], "segmentation": {"counts": [0, 1, 2, 1, 8], "size": [3, 4]}},
+        {"id": 3, "image_id": 3, "category_id": 18, "bbox": [3, 2, 1, 1], "segmentation": {"size": [3, 4], "counts": ";1"}},
+    ]  # fmt: skip
+    top = {
+        "images": [
+            {"id": 3, "file_name": "left/a.jpg", "width": 4, "height": 3},
+            {"id": 5, "file_name": "b.jpg", "width": 2, "height": 1},
+        ],
+        "categories": [{"id": 18, "name": "dog"}, {"id": 1, "name": "person"}],
+        "annotations": annotations,
+    }
+    path.write_text(json.dumps(top | changes))
+    return path
+
+
+def test_coco(tmp_path: Path) -> None:
+    path = _coco(tmp_path / "annotations.json")
+    truth = load_labels(path)
+    assert truth.names == ("dog", "person")
+    # polygon: columns 1-2 of rows 0-1; then runs down the columns: (0, 0) and (0, 1) are the person's; last pixel the dog's
+    assert {stem: labels.tolist() for stem, labels in truth.maps.items()} == {
+        "left/a": [[1, 1, 0, -1], [-1, 0, 0, -1], [-1, -1, -1, 0]],
+        "b": [[-1, -1]],
+    }
+
+
+@pytest.mark.parametrize(
+    ("changes", "parts"),
+    [
+        ({"category_id": 7}, ("annotation 9", "category", "7")),
+        ({"category_id": [7]}, ("annotation 9", "category", "[7]")),
+        ({"segmentation": [[1, 2, 3, 4]]}, ("annotation 9", "polygons")),
+        ({"segmentation": []}, ("annotation 9", "polygons")),
+        ({"segmentation": {"size": [4, 3], "counts": [12]}}, ("annotation 9", "size [4, 3]", "[3, 4]")),
+        ({"segmentation": {"size": [3, 4], "counts": [2]}}, ("annotation 9", "add up to 3 x 4")),
+        ({"segmentation": {"size": [3, 4], "counts": "zz"}}, ("annotation 9", "polygons")),
+        ({"segmentation": [[0, 0, 1, 0, 1, 1e30]]}, ("annotation 9", "100000 pixels")),
+        ({"segmentation": [[5, 0, 7, 0, 7, 2]]}, ("annotation 9", "outside the image of 4x3")),
+    ],
+)
+def test_coco_annotations_that_are_damaged(tmp_path: Path, changes: dict, parts: tuple[str, ...]) -> None:
+    good = {"id": 9, "image_id": 3, "category_id": 1, "bbox": [0, 0, 1, 1], "segmentation": [[0, 0, 1, 0, 1, 1]]}
+    path = _coco(tmp_path / "coco.json", annotations=[good | changes])
+    with pytest.raises(ValueError, match=tells("coco.json", *parts)):
+        load_coco_labels(path).maps["left/a"]
+
+
+def test_coco_objects_that_leave_their_picture_or_are_thin(tmp_path: Path) -> None:
+    good = {"id": 9, "image_id": 3, "category_id": 1, "bbox": [0, 0, 1, 1]}
+    for outline, labels in (
+        ([2, 1, 9, 1, 9, 9, 2, 9], [[-1, -1, -1, -1], [-1, -1, 1, 1], [-1, -1, 1, 1]]),  # the rest of it is outside
+        ([1, 1, 1.2, 1, 1.2, 1.2], [[-1] * 4] * 3),  # inside, but between the centres of pixels
+    ):
+        path = _coco(tmp_path / "coco.json", annotations=[good | {"segmentation": [outline]}])
+        assert load_coco_labels(path).maps["left/a"].tolist() == labels
+
+
+def test_a_category_of_coco_that_means_no_class_is_not_scored(tmp_path: Path) -> None:
+    named = [{"id": 18, "name": "Un-labelled"}, {"id": 1, "name": "person"}, {"id": 7, "name": "cat"}]
+    here = {"image_id": 3, "bbox": [0, 0, 2, 1]}
+    both = [
+        here | {"category_id": 1, "segmentation": [[0, 0, 4, 0, 4, 3, 0, 3]]},
+        here | {"category_id": 18, "segmentation": [[1, 0, 3, 0, 3, 2, 1, 2]]},  # over the person
+    ]
+    truth = load_coco_labels(_coco(tmp_path / "coco.json", categories=named, annotations=both))
+    assert truth.names == ("person", "cat")
+    assert truth.maps["left/a"].tolist() == [[0, -1, -1, 0], [0, -1, -1, 0], [0, 0, 0, 0]]
+    assert truth.maps["b"].tolist() == [[-1, -1]]
+    examples = load_coco_examples(tmp_path / "coco.json")
+    assert {name: [mask.view for mask in masks] for name, masks in examples.items()} == {"person": ["left/a"]}
+    with pytest.raises(ValueError, match=tells("coco.json", "expected objects as examples")):
+        load_coco_examples(_coco(tmp_path / "coco.json", categories=named, annotations=both[1:]))
+
+
+def test_coco_files_that_are_damaged(tmp_path: Path) -> None:
+    path = tmp_path / "coco.json"
+    for changes in ({"images": None}, {"annotations": [{"image_id": 77}]}, {"categories": [{"id": 1}]}):
+        with pytest.raises(ValueError, match=tells("coco.json", "'categories', 'images' and 'annotations'")):
+            load_coco_labels(_coco(path, **changes))
+    with pytest.raises(ValueError, match=tells("coco.json", "size of image 'x'")):
+        load_coco_labels(_coco(path, images=[{"id": 3, "file_name": "x.png", "width": 0, "height": 3}], annotations=[]))
+
+
+def test_label_maps_come_back_from_coco(tmp_path: Path) -> None:
+    maps = {
+        "left/a.png": torch.tensor([[-1, 2, 2], [0, 2, -1], [0, 0, -1], [2, -1, -1]]),
+        "b.png": torch.tensor([[1, 1]]),
+        "c.png": torch.full((2, 2), -1),
+    }
+    names = ("wall", "dog", "cat")
+    save_coco(tmp_path / "coco.json", maps, names)
+    truth = load_coco_labels(tmp_path / "coco.json")
+    assert truth.names == names
+    assert {f"{stem}.png": labels.tolist() for stem, labels in truth.maps.items()} == {
+        name: labels.tolist() for name, labels in maps.items()
+    }
+    written = json.loads((tmp_path / "coco.json").read_text())
+    cat = next(one for one in written["annotations"] if one["category_id"] == 3)
+    assert (cat["area"], cat["bbox"], cat["iscrowd"], cat["image_id"]) == (4, [0, 0, 3, 4], 0, 1)
+    assert [one["id"] for one in written["annotations"]] == [1, 2, 3]
+    assert written["images"][1] == {"id": 2, "file_name": "b.png", "height": 1, "width": 2}
+    with pytest.raises(ValueError, match=tells("labels:", "below 2", "got 2 in left/a.png")):
+        save_coco(tmp_path / "coco.json", maps, names[:2])

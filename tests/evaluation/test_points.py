@@ -1,0 +1,151 @@
+"""Labelled points: ScanNet and Replica, and the label pictures of Semantic-NeRF. Files are written here in their layouts."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from meshes import QUADS, XYZ, write_mesh
+from messages import tells
+from PIL import Image
+
+from kfgs.evaluation import find_labels, find_points
+from kfgs.evaluation.replica import load_replica_points, load_semantic_nerf_labels
+from kfgs.evaluation.scannet import load_scannet_points
+from kfgs.formats.ply import write_ply
+
+
+def _vertices() -> dict[str, np.ndarray]:
+    return {name: XYZ[:, i] for i, name in enumerate("xyz")}
+
+
+def _scannet(folder: Path, labels: list[int]) -> Path:
+    colors = {name: np.zeros(6, np.uint8) for name in ("red", "green", "blue", "alpha")}
+    write_ply(
+        folder / "scene0000_00_vh_clean_2.labels.ply", _vertices() | colors | {"label": np.array(labels, np.uint16)}
+    )
+    return folder
+
+
+def test_scannet_points(tmp_path: Path) -> None:
+    truth = load_scannet_points(_scannet(tmp_path, [0, 1, 1, 5, 28, 40]))
+    assert truth.points.tolist() == XYZ.tolist()
+    assert truth.labels.tolist() == [0, 1, 1, 5, 28, 40]
+    assert (truth.names[1], truth.names[28], truth.instances) == ("wall", "showercurtain", None)
+    (tmp_path / "scene0000_00_vh_clean_2.0.010000.segs.json").write_text(json.dumps({"segIndices": [7, 7, 9, 9, 3, 5]}))
+    groups = [{"id": 0, "objectId": 0, "segments": [7], "label": "wall"}, {"objectId": 1, "segments": [3, 9]}]
+    (tmp_path / "scene0000_00.aggregation.json").write_text(json.dumps({"segGroups": groups}))
+    truth = load_scannet_points(tmp_path / "scene0000_00_vh_clean_2.labels.ply")
+    assert truth.instances is not None
+    assert truth.instances.tolist() == [0, 0, 1, 1, 1, -1]
+
+
+def test_scannet_points_that_are_not_whole(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=tells(tmp_path, "_vh_clean_2.labels.ply", "none")):
+        load_scannet_points(tmp_path)
+    _scannet(tmp_path, [0, 0, 0, 0, 0, 99])
+    with pytest.raises(ValueError, match=tells("labels.ply", "NYU40 ids", "[0, 99]")):
+        load_scannet_points(tmp_path)
+    write_ply(tmp_path / "mesh.ply", _vertices())
+    with pytest.raises(ValueError, match=tells("mesh.ply", "'label'", "x, y, z")):
+        load_scannet_points(tmp_path / "mesh.ply")
+    _scannet(tmp_path, [1] * 6)
+    (tmp_path / "scene0000_00_vh_clean_2.0.010000.segs.json").write_text(json.dumps({"segIndices": [7, 7]}))
+    (tmp_path / "scene0000_00.aggregation.json").write_text(json.dumps({"segGroups": []}))
+    with pytest.raises(ValueError, match=tells("segs.json", "6 vertices", "(2,)")):
+        load_scannet_points(tmp_path)
+    (tmp_path / "scene0000_00.aggregation.json").write_text(json.dumps({"segGroups": [{"id": 1}]}))
+    with pytest.raises(ValueError, match=tells("aggregation.json", "objectId")):
+        load_scannet_points(tmp_path)
+
+
+INFO = {
+    "classes": [{"id": 20, "name": "chair"}, {"id": 80, "name": "table"}],
+    "objects": [{"id": 4, "class_id": 80, "class_name": "table"}, {"id": 9, "class_id": -1, "class_name": ""}],
+}
+
+
+def _replica(folder: Path) -> Path:
+    write_mesh(folder / "habitat/mesh_semantic.ply", QUADS)
+    (folder / "habitat/info_semantic.json").write_text(json.dumps(INFO))
+    return folder
+
+
+def test_replica_points(tmp_path: Path) -> None:
+    truth = load_replica_points(_replica(tmp_path))
+    # faces of each vertex: 0: 4 9; 1: 4 9 9 4; 2: 4 9 4; 3: 4 9 4; 4: 9 9 4; 5: none. A tie goes to the lower object.
+    assert truth.instances is not None
+    assert truth.instances.tolist() == [4, 4, 4, 4, 9, -1]
+    assert truth.labels.tolist() == [80, 80, 80, 80, -1, -1]
+    assert truth.names == {20: "chair", 80: "table"}
+    assert truth.points.tolist() == XYZ.tolist()
+    assert len(load_replica_points(tmp_path / "habitat").points) == 6
+
+
+def test_replica_points_that_are_not_whole(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=tells("habitat/mesh_semantic.ply")):
+        load_replica_points(tmp_path)
+    _replica(tmp_path)
+    write_mesh(tmp_path / "habitat/mesh_semantic.ply", QUADS, extra=False)
+    with pytest.raises(ValueError, match=tells("mesh_semantic.ply", "'object_id'", "corners only")):
+        load_replica_points(tmp_path)
+    write_mesh(tmp_path / "habitat/mesh_semantic.ply", QUADS)
+    broken = INFO | {"objects": [{"id": 4, "class_id": 81}]}
+    (tmp_path / "habitat/info_semantic.json").write_text(json.dumps(broken))
+    with pytest.raises(ValueError, match=tells("info_semantic.json", "2 classes", "81")):
+        load_replica_points(tmp_path)
+    (tmp_path / "habitat/info_semantic.json").write_text("{}")
+    with pytest.raises(ValueError, match=tells("info_semantic.json", "classes")):
+        load_replica_points(tmp_path)
+    (tmp_path / "habitat/info_semantic.json").unlink()
+    with pytest.raises(FileNotFoundError, match="info_semantic.json"):
+        load_replica_points(tmp_path)
+
+
+def test_labels_of_semantic_nerf(tmp_path: Path) -> None:
+    sequence = tmp_path / "room_0/Sequence_1"
+    (sequence / "semantic_class").mkdir(parents=True)
+    for i, ids in ((0, [[80, 0], [20, 99]]), (10, [[20, 20], [20, 20]])):
+        Image.fromarray(np.array(ids, np.uint8)).save(sequence / f"semantic_class/semantic_class_{i}.png")
+    with pytest.raises(FileNotFoundError, match=tells("info_semantic.json", "info=PATH")):
+        load_semantic_nerf_labels(sequence)
+    (tmp_path / "room_0/habitat").mkdir()
+    (tmp_path / "room_0/habitat/info_semantic.json").write_text(json.dumps(INFO))
+    truth = load_semantic_nerf_labels(sequence)
+    assert truth.names == ("chair", "table")
+    assert {stem: labels.tolist() for stem, labels in truth.maps.items()} == {
+        "rgb_0": [[1, -1], [0, -1]],
+        "rgb_10": [[0, 0], [0, 0]],
+    }
+    Image.new("RGB", (2, 2)).save(sequence / "semantic_class/semantic_class_0.png")
+    with pytest.raises(ValueError, match=tells("semantic_class_0.png", "one channel", "vis_")):
+        load_semantic_nerf_labels(sequence)
+    for file in (sequence / "semantic_class").iterdir():
+        Image.new("L", (2, 2), 99).save(file)
+    with pytest.raises(ValueError, match=tells("semantic_class", "none of 2 pictures")):
+        load_semantic_nerf_labels(sequence)
+    with pytest.raises(FileNotFoundError, match=tells("semantic_class_0.png")):
+        load_semantic_nerf_labels(tmp_path)
+
+
+def test_points_and_labels_are_found_by_their_files(tmp_path: Path) -> None:
+    scannet = _scannet(tmp_path / "scene0000_00", [0, 1, 1, 5, 28, 40])
+    assert find_points(scannet).labels.tolist() == [0, 1, 1, 5, 28, 40]
+    np.savez(tmp_path / "surface.npz", points=np.zeros((2, 3), np.float32), labels=np.array([1, 0], np.uint8))
+    (tmp_path / "classes.json").write_text('["wall", "floor"]')
+    found = find_points(tmp_path)
+    assert (found.labels.tolist(), found.names) == ([1, 0], {0: "wall", 1: "floor"})
+    (tmp_path / "surface.npz").write_bytes(b"no arrays")
+    with pytest.raises(ValueError, match=tells("surface.npz", "'points' and 'labels'", "make the room again")):
+        find_points(tmp_path)
+    with pytest.raises(
+        FileNotFoundError, match=tells("truth", "labelled points", "habitat/mesh_semantic.ply", "not a folder")
+    ):
+        find_points(tmp_path / "nowhere")
+    with pytest.raises(FileNotFoundError, match=tells("truth", "label pictures", "labels_scored/*.png", "none")):
+        find_labels(tmp_path)
+    for name, grey in (("labels", 0), ("labels_scored", 1)):
+        (tmp_path / name).mkdir()
+        Image.fromarray(np.full((2, 2), grey, np.uint8)).save(tmp_path / name / "a.png")
+    assert find_labels(tmp_path).maps["a"].unique().tolist() == [1]  # the scored ones come first
+    assert find_labels(tmp_path / "labels").maps["a"].unique().tolist() == [0]

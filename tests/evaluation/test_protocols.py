@@ -1,0 +1,152 @@
+import cases_methods as cases
+import numpy as np
+import pytest
+import torch
+from small_room import make_room
+
+from kfgs.evaluation import (
+    KfgsColor,
+    KfgsPooled,
+    KfgsSurface,
+    LabelTruth,
+    PointTruth,
+    TeacherMethod,
+    View,
+    evaluate_segmentation,
+    get_protocol,
+    score_surface,
+    score_views,
+)
+from kfgs.labels import load_label_set, transfer_labels
+from kfgs.pipeline.apply import score_teacher, true_labels
+from kfgs.scenes import FeatureFolder, load_scene
+from kfgs.splat import rgb_to_sh0
+
+NAMES = ("a", "b", "c")
+
+
+def test_pooled_is_evaluate_segmentation():
+    rng = np.random.default_rng(0)
+    method = cases.Numbers(NAMES, cases.random_maps(rng, ["x", "y"], NAMES, 2, 9, 12))
+    truth = LabelTruth(NAMES, {stem: torch.from_numpy(rng.integers(-1, 3, (18, 24))) for stem in ("x", "y")})
+    views = [cases.view(stem, 9, 12) for stem in ("z", "y", "x")]
+    report = KfgsPooled(level=1).score(method, truth, views, method.encode)
+    labels = {stem: np.argmax([maps[n][1] for n in NAMES], 0) for stem, maps in method.maps.items()}
+    hits, either, right, total = np.zeros(3), np.zeros(3), 0, 0
+    for stem, target in truth.maps.items():
+        large = labels[stem].repeat(2, 0).repeat(2, 1)
+        for p, t in zip(large.ravel(), target.numpy().ravel(), strict=True):
+            if t >= 0:
+                right, total = right + (p == t), total + 1
+                for c in range(3):
+                    hits[c] += p == c and t == c
+                    either[c] += p == c or t == c
+    assert report["mIoU"] == pytest.approx((hits / either).mean())
+    assert report["accuracy"] == pytest.approx(right / total)
+    assert str(report) == f"mIoU {report['mIoU']:.3f}, accuracy {report['accuracy']:.3f} (kfgs-pooled/1, level=1)"
+    assert "one confusion matrix over all views" in report.text
+    with pytest.raises(ValueError, match="got none for y; pass views with these stems"):
+        KfgsPooled().score(method, truth, views[:1] + views[2:], method.encode)
+
+
+def test_surface_neither_asks_nor_scores_names_that_mean_no_class():
+    rng = np.random.default_rng(2)
+    own = {name: rng.uniform(size=(1, 60)) for name in NAMES}
+    method = cases.Numbers(NAMES, own=own, gaussians=cases.spread_gaussians(rng, 60))
+    points = method.gaussians.means[rng.integers(0, 60, 90)]
+    ids = torch.from_numpy(rng.choice([2, 5, 7, 9], 90))
+    names = {2: "a", 5: "b", 9: "c"}
+    want = KfgsSurface().score(method, PointTruth(points, ids, names), (), method.encode)  # 7 has no name: not scored
+    asked = []
+
+    def encode(texts):
+        asked.extend(texts)
+        return method.encode(texts)
+
+    found = KfgsSurface().score(method, PointTruth(points, ids, {**names, 7: "Unlabelled"}), (), encode)
+    assert asked == ["a", "b", "c"]
+    assert (found.scores, found.rows) == (want.scores, want.rows)
+    assert want.notes == ()
+    assert found.notes == (f"not scored, no class: Unlabelled ({int((ids == 7).sum())} points)",)
+    with pytest.raises(ValueError, match="truth: expected names of classes, got void"):
+        KfgsSurface().score(method, PointTruth(points, ids, {7: "void"}), (), method.encode)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    return make_room(tmp_path_factory.mktemp("own") / "room")
+
+
+def test_the_teacher_scores_as_the_demo_says(room):
+    scene, classes = load_scene(room), load_label_set(room / "classes.json", room / "text.npy")
+    truth = true_labels(scene, room / "labels", "test")
+    folder = FeatureFolder(room / "features", list(truth))
+    views = [View(scene.stem(i), scene.cameras[i].resized(*folder.shape[:2])) for i in scene.views("test")]
+    method = TeacherMethod(folder)
+    rows = {name: row for name, row in zip(classes.names, classes.embeddings, strict=True)}
+    report = KfgsPooled().score(
+        method, LabelTruth(tuple(classes.names), truth), views, lambda texts: torch.stack([rows[t] for t in texts])
+    )
+    want = score_teacher(lambda stem: folder[folder.stems.index(stem)], truth, classes, (30, 40))
+    assert report["mIoU"] == pytest.approx(want.miou.value)
+    assert report["accuracy"] == pytest.approx(want.accuracy.value)
+
+
+def test_surface_carries_labels_to_points():
+    rng = np.random.default_rng(1)
+    own = {name: rng.uniform(size=(1, 50)) for name in NAMES}
+    for values in own.values():
+        values[:, :5] = np.nan
+    method = cases.Numbers(NAMES, own=own, gaussians=cases.spread_gaussians(rng, 50))
+    points = method.gaussians.means[rng.integers(0, 50, 80)] + 0.05 * torch.randn(80, 3)
+    ids = torch.from_numpy(rng.choice([0, 2, 5, 9], 80))
+    report = KfgsSurface().score(method, PointTruth(points, ids, {2: "a", 5: "b", 9: "c"}), (), method.encode)
+    labels = np.argmax([own[n][0] for n in NAMES], 0)
+    labels[:5] = -1
+    moved = transfer_labels(method.gaussians.means, torch.from_numpy(labels), points)
+    right = [moved.labels[i] == {2: 0, 5: 1, 9: 2}[int(t)] for i, t in enumerate(ids) if t > 0]
+    assert report["agreement"] == pytest.approx(np.mean(right))
+    assert str(report).endswith("(kfgs-surface/1)")
+    with pytest.raises(TypeError, match="expected one with Gaussians"):
+        KfgsSurface().score(TeacherMethod({}), PointTruth(points, ids, {2: "a"}), (), method.encode)
+    found = score_surface(method.gaussians.means, torch.from_numpy(labels), points, torch.zeros(80).long())
+    assert "kfgs-surface/1, 80 points" in str(found)
+    assert found.to_json()["points"] == 80
+    with pytest.raises(ValueError, match="expected some point with a class"):
+        score_surface(method.gaussians.means, torch.from_numpy(labels), points, torch.full((80,), -1))
+
+
+def test_pictures_are_scored_as_score_views_does(room):
+    scene = load_scene(room)
+    with np.load(room / "surface.npz") as surface:
+        points = torch.from_numpy(surface["points"]).float()
+    colors = torch.rand(len(points), 3, generator=torch.Generator().manual_seed(0))
+    cloud = cases.spread_gaussians(np.random.default_rng(2), len(points))
+    cloud = cloud.replace(means=points, scales=torch.full((len(points), 3), 0.05), sh=rgb_to_sh0(colors)[:, None])
+    truth, views = KfgsColor.open(scene, room)
+    assert [view.stem for view in views] == [scene.stem(i) for i in scene.views("test")]
+    want = score_views(cloud, scene)
+    assert KfgsColor().score(cloud, truth).scores == {"PSNR": want.psnr.value, "SSIM": want.ssim.value}
+    assert "(kfgs-color/1)" in str(want)
+    with pytest.raises(ValueError, match="truth: expected none with kfgs-color/1"):
+        KfgsColor.open(scene, room, room)
+
+
+def test_protocols_are_found_by_name():
+    assert get_protocol("kfgs-pooled", level=2) == get_protocol("kfgs-pooled/1", level=2) == KfgsPooled(level=2)
+    with pytest.raises(ValueError, match="expected one of kfgs-pooled/1, .* did you mean kfgs-pooled/1"):
+        get_protocol("kfgs-poled")
+    with pytest.raises(TypeError, match="threshold"):
+        get_protocol("kfgs-pooled", threshold=0.5)
+
+
+def test_a_named_score_is_short_and_its_text_long():
+    report = evaluate_segmentation(lambda stem: torch.tensor([[0, 1]]), {"a": torch.tensor([[0, 0]])}, ["x", "y"])
+    assert str(report.miou) == "mIoU 0.250 (kfgs-pooled/1)"
+    assert report.miou.text.startswith("mIoU 0.2500 (kfgs-pooled/1: one confusion matrix")
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_surface_without_a_label_has_no_agreement(count):
+    found = score_surface(torch.zeros(count, 3), torch.full((count,), -1), torch.zeros(2, 3), torch.tensor([0, 1]))
+    assert (found.agreement, found.transfer.labelled, found.points) == (0, 0, 2)
