@@ -157,7 +157,7 @@ def main() -> None:
     print(f"| {len(scenes)} scenes | seconds | speed-up | submitted again | scenes byte-equal |\n|---|---|---|---|---|")
     for name, row in found.items():
         print(f"| {name} | {row['seconds']} | {row['speed-up']} | {row['submitted again']} | {row['byte-equal']} |")
-    field = runs["one worker"] / scenes[0].name / "field" / "field.safetensors"
+    field = runs["one worker"] / scenes[0].name / "field.kfgs"
     print(f"{field.name} of {scenes[0].name}: {digest_file(field)[:12]}")
 
 

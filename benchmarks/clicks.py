@@ -85,7 +85,7 @@ def main() -> None:
             for name, shown in CLICKS.items()
         }
         classes = label_set_from_examples(field, examples)
-        scene = load_scene(recall_scene(field.info, field.folder)).undistorted()
+        scene = load_scene(recall_scene(field.info)).undistorted()
         [camera] = [one for one in scene.cameras if one.name.startswith(VIEW)]
         found = field.segment(camera, classes) == classes.index(THING)
         true = outline(*camera.size)

@@ -1,7 +1,7 @@
 """What labels carried to a colour scene are worth, class by class.
 
 python benchmarks/edits.py toy DEMO                   # DEMO: what `kfgs demo --out DEMO` wrote
-python benchmarks/edits.py real ROOM_0 FIELD COLOR    # FIELD: RUN/field, COLOR: a splat in the same frame
+python benchmarks/edits.py real ROOM_0 FIELD COLOR    # FIELD: RUN/field.kfgs, COLOR: a splat in the same frame
 
 Prints which rule labels the colour cloud best (mIoU, and mIoU weighted by what each Gaussian shows), and, for the toy room,
 the removal and the recolouring of every class (`kfgs-removal/1`, `kfgs-recolor/1`).
@@ -50,7 +50,7 @@ def compare_rules(
     print(f"{'semantic Gaussians by':24s} {'rule':12s}  mIoU  weighted  without label")
     sources = {
         "what the views show": field.classify(classes).labels,
-        "own latents (Sec. 3.4)": field.classify(classes, rule="paper").labels,
+        "own latents (Sec. 3.4)": field.paper.classify(classes).labels,
     }
     for who, labels in sources.items():
         for method in ("nearest", "vote", "mahalanobis"):
@@ -98,7 +98,7 @@ def toy(demo: Path) -> None:
     """The toy room that `kfgs demo` made: truth is the class of the nearest surface point."""
     folder = demo / "scene"
     scene, classes = load_scene(folder), load_label_set(folder / "classes.json", folder / "text.npy")
-    field, splats = SemanticField.load(demo / "run" / "field"), read_splats(demo / "run" / "color.ply")
+    field, splats = SemanticField.load(demo / "run" / "field.kfgs"), read_splats(demo / "run" / "color.ply")
     cameras = [scene.cameras[i] for i in scene.views("train")]
     with np.load(folder / "surface.npz") as surface:
         distance, nearest = cKDTree(surface["points"]).query(splats.gaussians.means.numpy())

@@ -2,7 +2,7 @@
 
     python benchmarks/figure7.py SCENE FEATURES OUT.png FIELD [FIELD ...] [--views STEM ...] [--names NAME ...]
 
-A FIELD is a folder that `kfgs fit` wrote, for instance OUT/rows/adc-quick-0/run/field of `table1.py`. All pictures share three
+A FIELD is what `kfgs fit` wrote, for instance OUT/rows/adc-quick-0/run/field.kfgs of `table1.py`. All pictures share three
 colour axes, the principal ones of the teacher's unit features in these views; FEATURES must hold maps of them. The column
 "quantised" shows the teacher's map through the codebook of the first field that has one.
 """
@@ -40,7 +40,7 @@ def main() -> None:
     chosen = [i for i in test if scene.stem(i) in args.views] if args.views else test[:: max(1, len(test) // 3)][:3]
     maps = FeatureFolder(args.features, [scene.stem(i) for i in chosen])
     fields = [SemanticField.load(path) for path in args.fields]
-    book = next((field.codebook for field in fields if field.codebook is not None), None)
+    book = next((field.decoder.codebook for field in fields if hasattr(field.decoder, "codebook")), None)
     colors = FeatureColors.fit(torch.cat([unit_rows(maps[i].flatten(0, 1)) for i in range(len(chosen))]))
 
     def shown(features: Tensor) -> object:  # [h, w, D]
@@ -53,7 +53,7 @@ def main() -> None:
         if book is not None:
             row.append(shown(book.codewords[book.quantize(maps[i])]))
         rows.append(row + [shown(field.feature_map(camera)) for field in fields])
-    names = args.names or [field.method for field in fields]
+    names = args.names or [field.decoder.name for field in fields]
     titles = ["photo", "teacher", *(["quantised"] if book is not None else []), *names]
     save_picture(args.out, picture_grid(rows, titles, width=260))
     print(args.out)

@@ -35,7 +35,7 @@ from kfgs import (
 )
 from kfgs._files import write_json
 from kfgs.evaluation import load_label_map
-from kfgs.fields import Seen, pack_field, unpack_field, uplift_maps
+from kfgs.fields import uplift_maps
 from kfgs.labels import vote_labels
 from kfgs.pipeline import score_scene, score_teacher, true_labels
 from kfgs.pipeline.fuse import without_lens
@@ -80,11 +80,9 @@ def uplifted(room: Room, splat: Gaussians, corrections: int) -> tuple[SemanticFi
     maps = without_lens(scene, room.maps, FitConfig())
     wait()
     start = time.perf_counter()
-    found = uplift_maps(splat, cameras, maps, UpliftConfig(corrections=corrections))
+    field = uplift_maps(splat, cameras, maps, UpliftConfig(corrections=corrections))
     wait()
     seconds = time.perf_counter() - start
-    seen = Seen(found.pixels, found.agreement)
-    field = SemanticField(found.gaussians, linear=found.latents, seen=seen, cameras=tuple(cameras))
     return field.to("cpu"), seconds
 
 
@@ -119,7 +117,7 @@ def _average_all(room: Room, field: SemanticField) -> torch.Tensor:
     parts = []
     for start in range(0, room.maps[0].shape[-1], 63):
         found = uplift_maps(field.gaussians, field.cameras, Part(start), UpliftConfig(keep=1.0, max_latents=64))
-        parts.append(found.latents.decode(found.gaussians.features)[:, :-1])
+        parts.append(found.decode(found.features)[:, :-1])
     return torch.cat(parts, dim=1)
 
 
@@ -152,14 +150,15 @@ def main() -> None:
             field, seconds = uplifted(room, splat, corrections)
             miou, accuracy = room.score(field)
             print(
-                f"uplift, {corrections} corrections: {len(field)} Gaussians, {field.channels} latents, {seconds:.1f} s, "
+                f"uplift, {corrections} corrections: {len(field)} Gaussians, {field.decoder.latent} latents, {seconds:.1f} s, "
                 f"mIoU {miou:.2f}, accuracy {accuracy:.2f}, queries {room.queries(field):.3f}"
             )
     for seed in args.seeds:
         config = FitConfig(seed=seed, device=str(args.device))
         result = fit_scene(room.scene, room.maps, args.out / str(seed), config, splat=args.splat, report=print)
-        field, data = result.field, pack_field(result.field)
-        packed = unpack_field(data)
+        field, small = result.field, args.out / f"{seed}.kfgs"
+        field.save(small, "small")
+        packed = SemanticField.load(small)
         miou, accuracy = room.score(field)
         row = {
             "seed": seed,
@@ -167,8 +166,8 @@ def main() -> None:
             "accuracy": accuracy,
             "queries": room.queries(field),
             "gaussians": len(field),
-            "latents": field.channels,
-            "packed_mib": len(data) / 2**20,
+            "latents": field.decoder.latent,
+            "packed_mib": small.stat().st_size / 2**20,
             "miou_packed": room.score(packed)[0],
             "seconds": {stage.name: round(stage.seconds, 1) for stage in result.stages},
             **({} if args.words is None or seed != args.seeds[0] else open_vocabulary(room, packed, args.words)),

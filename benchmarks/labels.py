@@ -24,8 +24,8 @@ from engines_room import room, view
 from torch import Tensor
 
 from kfgs import Camera
-from kfgs.fields import SemanticField, score_pixels
-from kfgs.labels import LOGIT_SCALES, label_pixels, relevancy
+from kfgs.fields import Autoencoded, Linear, SemanticField
+from kfgs.labels import LOGIT_SCALES, label_codewords, label_pixels, relevancy
 from kfgs.quant import Autoencoder, Codebook, LinearLatents
 from kfgs.scenes import load_scene
 from kfgs.splat import bin_tiles, project, rasterize, rasterize_labels
@@ -79,7 +79,7 @@ def main() -> None:
         cameras = load_scene(args.scene).cameras if args.scene else field.cameras
         fields, camera = [field], cameras[0].resized(height, width)
         try:
-            rows = field.label_set().embeddings  # the field's own classes, whatever --classes says
+            rows = field.classes.embeddings  # the field's own classes, whatever --classes says
         except (ValueError, FileNotFoundError):  # it has none, or their files are elsewhere
             rows = torch.randn(args.classes, field.dim, generator=g)
         if len(rows) < 5:
@@ -100,7 +100,7 @@ def main() -> None:
     for field in fields:
         for row in compare(field, camera, rows, args.repeats):
             print(row, flush=True)
-        if field.method == "fused":
+        if isinstance(field.decoder, Linear):
             print(parts(field, camera, rows, args.repeats), flush=True)
     print(f"\nload {os.getloadavg()[0]:.1f} at the end")
 
@@ -111,7 +111,7 @@ def random_linear(count: int, rows: Tensor, g: torch.Generator) -> SemanticField
     cloud = room(count, LINEAR)
     noise = 0.1 * torch.randn(count, LINEAR, generator=g)
     latents = torch.nn.functional.normalize(rows @ basis)[boxes(cloud.means) % len(rows)] + noise
-    return SemanticField(cloud.replace(features=latents), linear=LinearLatents(basis))
+    return SemanticField(cloud.replace(features=latents), Linear(LinearLatents(basis)))
 
 
 def boxes(means: Tensor) -> Tensor:
@@ -134,12 +134,12 @@ def random_decoded(count: int, g: torch.Generator) -> SemanticField:
     cloud = cloud.replace(
         features=latents[boxes(cloud.means) % CODEWORDS] + 0.02 * torch.randn(count, LATENTS, generator=g)
     )
-    return SemanticField(cloud, Codebook(autoencoder.decode(latents)), autoencoder)
+    return SemanticField(cloud, Autoencoded(Codebook(autoencoder.decode(latents)), autoencoder))
 
 
 def compare(field: SemanticField, camera: Camera, rows: Tensor, repeats: int) -> list[Row]:
     """The rows of a field of either kind."""
-    if field.method == "fused":
+    if isinstance(field.decoder, Linear):
         many = torch.randn(64, *rows.shape, generator=torch.Generator().manual_seed(1)).to(rows)
         texts = (iter([*many] * 2 * (1 + repeats)) for _ in range(2))
         old_texts, new_texts = texts
@@ -148,7 +148,7 @@ def compare(field: SemanticField, camera: Camera, rows: Tensor, repeats: int) ->
             measure(
                 "label map by rendered features",
                 lambda: similar(field, camera, rows),
-                lambda: field.segment(camera, rows, rule="paper"),
+                lambda: field.paper.segment(camera, rows),
                 repeats,
             ),
             measure(
@@ -160,7 +160,7 @@ def compare(field: SemanticField, camera: Camera, rows: Tensor, repeats: int) ->
             measure(
                 "text query, score of each pixel",
                 lambda: compared(field, camera, next(old_texts)),
-                lambda: score_pixels(field, camera, next(new_texts)[0], None, negatives=rows[1:5]).scores[..., 0],
+                lambda: field.score_pixels(camera, next(new_texts)[0], None, negatives=rows[1:5]).scores[..., 0],
                 repeats,
                 "blended scores, not scores of blended features",
             ),
@@ -171,16 +171,17 @@ def compare(field: SemanticField, camera: Camera, rows: Tensor, repeats: int) ->
                 repeats,
             ),
         ]
-    if field.autoencoder is None:
+    if not isinstance(field.decoder, Autoencoded):
         raise SystemExit("--field: expected one with linear latents or with an autoencoder")
-    table = field.codeword_labels(rows)
+    book, coder = field.decoder.codebook, field.decoder.autoencoder
+    table = label_codewords(book.codewords, rows)
     rendering = field.render(camera)
     covered = rendering.alpha > 0
     return [
         measure(
             "exact decode",
             lambda: decoded(field, rendering.map, table.labels, covered),
-            lambda: label_pixels(rendering.map, field.codebook, table, field.autoencoder, covered=covered),
+            lambda: label_pixels(rendering.map, book, table, coder, covered=covered),
             max(2, repeats // 5),
         )
     ]
@@ -217,31 +218,29 @@ def blended(field: SemanticField, camera: Camera, rows: Tensor, top: int = 1) ->
 
 def similar(field: SemanticField, camera: Camera, rows: Tensor) -> Tensor:
     """The label map of the first versions: the features rendered, and similarities [H W, C] of all pixels."""
-    assert field.linear is not None
     seen = field.render(camera)
     unit = torch.nn.functional.normalize(rows, dim=1)
     pixels = seen.map.flatten(0, 1)
-    labels = torch.cat([field.linear.cosines(part, unit).argmax(dim=1) for part in pixels.split(CHUNK)])
+    labels = torch.cat([field.decoder.cosines(part, unit).argmax(dim=1) for part in pixels.split(CHUNK)])
     return labels.view(camera.size).masked_fill(seen.alpha <= 0, -1)
 
 
 def compared(field: SemanticField, camera: Camera, rows: Tensor) -> Tensor:
     """The old text query: the features rendered, and each pixel compared with the target and four negatives."""
-    assert field.linear is not None
     unit = torch.nn.functional.normalize(rows[:5], dim=1)
     pixels = field.render(camera).map.flatten(0, 1)
-    cosines = torch.cat([field.linear.cosines(part, unit) for part in pixels.split(CHUNK)])
+    cosines = torch.cat([field.decoder.cosines(part, unit) for part in pixels.split(CHUNK)])
     return relevancy(cosines[:, 0], cosines[:, 1:]).view(camera.size)
 
 
 def decoded(field: SemanticField, latents: Tensor, table: Tensor, covered: Tensor) -> Tensor:
     """The old exact decode: every pixel's feature, and the codeword most similar to it."""
-    assert field.autoencoder is not None
-    assert field.codebook is not None
+    decoder = field.decoder
+    assert isinstance(decoder, Autoencoded)
     labels = torch.full(covered.shape, -1, device=covered.device)
     with torch.no_grad():
         parts = latents[covered].split(CHUNK)
-        labels[covered] = torch.cat([table[field.codebook.quantize(field.autoencoder.decode(part))] for part in parts])
+        labels[covered] = torch.cat([table[decoder.codebook.quantize(decoder.decode(part))] for part in parts])
     return labels
 
 

@@ -25,7 +25,8 @@ from kfgs import SemanticField, load_label_set, load_scene, read_splats, write_s
 from kfgs._files import atomic_path, write_json
 from kfgs.evaluation import FieldMethod, evaluate_segmentation
 from kfgs.evaluation.method import View, label_view
-from kfgs.fields.precision import SMALL, Rounding
+from kfgs.fields import Linear
+from kfgs.fields.packing import SMALL, Rounding
 from kfgs.fields.store import SUFFIX
 from kfgs.formats import SplatFile
 from kfgs.pipeline import true_labels
@@ -100,13 +101,13 @@ def scaled(factor: float) -> Rounding:
 
 
 def packed(room: Room, field: SemanticField, out: Path) -> list[Point]:
-    """The folder, the named precisions, and the curve."""
+    """Without loss, the named precisions, and the curve."""
     points = []
-    asked: list[tuple[str, str, Any]] = [("folder", "float32", None)]
-    asked += [(name, "kfgs", name) for name in ("lossless", "fine", "small", "tiny")]
+    asked: list[tuple[str, str, Any]] = [("lossless", "float32", None)]
+    asked += [(name, "kfgs", name) for name in ("fine", "small", "tiny")]
     asked += [(f"small x {factor:g}", "curve", scaled(factor)) for factor in FACTORS]
     for name, kind, precision in asked:
-        path = out / (name.replace(" ", "_") + ("" if precision is None else SUFFIX))
+        path = out / (name.replace(" ", "_") + SUFFIX)
         field.save(path, precision)
         back, took = quickest(lambda path=path: SemanticField.load(path))
         points.append(Point(name, kind, size_of(path), **room.score(back), load_ms=took))
@@ -115,12 +116,13 @@ def packed(room: Room, field: SemanticField, out: Path) -> list[Point]:
 
 def carried(room: Room, field: SemanticField, out: Path) -> list[Point]:
     """PLY, SPZ and SOG."""
-    assert field.linear is not None
+    assert isinstance(field.decoder, Linear)
+    basis = field.decoder.latents.basis
     C = len(room.classes)
     labels = field.classify(room.classes).labels
     cloud = field.gaussians.replace(labels=labels, sh=torch.zeros(len(field), 1, 3))
     beside = out / "latents.safetensors"
-    parts = {"latents": field.features.half(), "basis": field.linear.basis.half()}
+    parts = {"latents": field.features.half(), "basis": basis.half()}
     save_file({name: value.contiguous() for name, value in parts.items()}, beside)
     points = []
     for ending in ("ply", "spz", "sog"):
@@ -132,18 +134,18 @@ def carried(room: Room, field: SemanticField, out: Path) -> list[Point]:
         own = [one for one in written.paths if not one.name.endswith(".classes.json")]
         bare = out / "basis.safetensors"
         if ending == "ply":
-            save_file({"basis": field.linear.basis.contiguous()}, bare)
-            found = room.score(SemanticField(back, linear=field.linear))
+            save_file({"basis": basis.contiguous()}, bare)
+            found = room.score(SemanticField(back, field.decoder))
             points.append(Point("PLY, latents as columns", "ply", size_of(*own, bare), **found, load_ms=took))
             continue
         votes = torch.nn.functional.one_hot(back.labels.clamp_min(0), C).float() * (back.labels >= 0)[:, None]
-        alone = SemanticField(back.replace(features=votes), linear=LinearLatents(torch.eye(C)))
+        alone = SemanticField(back.replace(features=votes), Linear(LinearLatents(torch.eye(C))))
         points.append(
             Point(f"{ending.upper()}, labels", ending, size_of(*own), **room.score(alone, torch.eye(C)), load_ms=took)
         )
         kept = load_file(beside)
         latents = kept["latents"].float() if order is None else kept["latents"].float()[order]
-        whole = SemanticField(back.replace(features=latents), linear=LinearLatents(kept["basis"].float()))
+        whole = SemanticField(back.replace(features=latents), Linear(LinearLatents(kept["basis"].float())))
         name = f"{ending.upper()} + float16 latents"
         points.append(Point(name, ending, size_of(*own, beside), **room.score(whole), load_ms=took))
     return points
@@ -204,13 +206,13 @@ def main() -> None:
     parser.add_argument("--truth", default="labels_scored")
     args = parser.parse_args()
     room, field = Room(args.scene, args.truth, args.every), SemanticField.load(args.field)
-    if field.method != "fused":
-        parser.error(f"FIELD: expected a fused field, got {field.method!r}; fit it with method 'fuse'")
+    if not isinstance(field.decoder, Linear):
+        parser.error(f"FIELD: expected a fused field, got {field!r}; fit it with the default method")
     args.out.mkdir(parents=True, exist_ok=True)
-    field = replace(field, words=room.classes)
+    field = replace(field, classes=room.classes)
     points = packed(room, field, args.out) + carried(room, field, args.out)
     text = table(points, len(field))
-    print(f"{len(field)} Gaussians, {field.channels} latents, {len(room.views)} views\n{text}")
+    print(f"{len(field)} Gaussians, {field.decoder.latent} latents, {len(room.views)} views\n{text}")
     write_json(args.out / "rate.json", [asdict(point) for point in points])
     with atomic_path(args.out / "rate.md") as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")

@@ -28,7 +28,7 @@ from kfgs.cameras import Camera
 from kfgs.evaluation import FieldMethod, LabelTruth, Method, TeacherMethod, View, label_view
 from kfgs.evaluation.segmentation import SegmentationReport, evaluate_segmentation
 from kfgs.evaluation.teacher_agreement import TeacherAgreement
-from kfgs.fields import FieldConfig, SemanticField, pack_field
+from kfgs.fields import FieldConfig, Linear, SemanticField
 from kfgs.formats import read_splats
 from kfgs.labels import LabelSet, load_label_set
 from kfgs.pipeline import FitConfig, fit_scene, true_labels
@@ -248,11 +248,12 @@ def make_kfgs(row: Row, room: Room, request: dict[str, Any], folder: Path) -> Ma
     for stage in result.stages:
         stages[stage.name] = stages.get(stage.name, 0.0) + stage.seconds
     facts = {
-        "dim": str(field.channels), "gaussians": len(field), "storage": field.storage(),
-        "disk": sum(file.stat().st_size for file in result.field_path.iterdir()), "stages": stages,
+        "dim": str(field.decoder.latent), "gaussians": len(field), "storage": field.storage(),
+        "disk": result.field_path.stat().st_size, "stages": stages,
     }  # fmt: skip
     if row.mode is None:
-        facts["packed"] = len(pack_field(field))
+        field.save(folder / "packed.kfgs", "small")
+        facts["packed"] = (folder / "packed.kfgs").stat().st_size
 
     def on(device: torch.device) -> tuple[Method, Callable[[Camera], Any]]:
         moved = field.to(device)
@@ -263,9 +264,12 @@ def make_kfgs(row: Row, room: Room, request: dict[str, Any], folder: Path) -> Ma
 
 def field_codec(field: SemanticField) -> Callable[[torch.Tensor], torch.Tensor] | None:
     """What a field's compression alone makes of features; None if it stores them as they are."""
-    book, network, linear = field.codebook, field.autoencoder, field.linear
+    decoder = field.decoder
+    if isinstance(decoder, Linear):
+        return lambda rows: decoder.latents.decode(decoder.latents.encode(rows))
+    book, network = (getattr(decoder, name, None) for name in ("codebook", "autoencoder"))
     if book is None:
-        return None if linear is None or field.method != "fused" else lambda rows: linear.decode(linear.encode(rows))
+        return None
     if network is None:
         return lambda rows: book.codewords[book.quantize(rows)]
     decoded = network.decode(network.encode(book.codewords))

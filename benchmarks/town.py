@@ -61,7 +61,7 @@ def main() -> None:
     began = time.perf_counter()
     whole = _apart(_fit_whole, town, args.out / f"run{args.seed}", config, splat)
     whole["seconds"] = time.perf_counter() - began
-    _print("whole", SemanticField.load(args.out / f"run{args.seed}" / "field"), scene, town, None, whole)
+    _print("whole", SemanticField.load(args.out / f"run{args.seed}" / "field.kfgs"), scene, town, None, whole)
     folder = args.out / f"blocks{args.seed}"
     blocks = split_scene(town, folder, args.blocks, splat=splat)
     began, facts = time.perf_counter(), []
@@ -74,7 +74,7 @@ def main() -> None:
         print(f"  {block.name}: {len(block.views)} views, {share:.0%} of the Gaussians, {facts[-1]}")
     took = {"seconds": time.perf_counter() - began, "peak_mib": max(fact["peak_mib"] for fact in facts)}
     _print(f"{args.blocks} blocks", FieldInBlocks.open(folder).joined(), scene, town, blocks, took)
-    _print("whole", SemanticField.load(args.out / f"run{args.seed}" / "field"), scene, town, blocks, whole)
+    _print("whole", SemanticField.load(args.out / f"run{args.seed}" / "field.kfgs"), scene, town, blocks, whole)
 
 
 def _fit_whole(town: Path, run: Path, config: Any, splat: Path) -> None:

@@ -125,9 +125,9 @@ Shown(pictures / "iou.png", width=700)
 # cameras, and how they came about. What is loaded answers exactly as before.
 
 # %%
-again = kfgs.SemanticField.load(run / "field")
+again = kfgs.SemanticField.load(run / "field.kfgs")
 assert torch.equal(again.segment(camera, classes), found[scene.stem(test[k])])
-size = sum(path.stat().st_size for path in (run / "field").iterdir()) / 2**20
+size = sum(path.stat().st_size for path in (run / "field.kfgs").iterdir()) / 2**20
 maps_size = len(maps) * maps[0].numel() * 2 / 2**20
 print(f"the field: {size:.1f} MiB; the teacher's maps that it was made of: {maps_size:.0f} MiB")
 

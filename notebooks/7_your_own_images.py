@@ -172,7 +172,7 @@ Image.fromarray(np.concatenate([sheet, viz.legend_strip(torch.arange(len(phrases
 #
 # - `kfgs.explore(field, classes=classes, embed=lambda phrase: teacher.encode_text([phrase])[0])` opens the viewer; with
 #   `embed`, you can type any text that the teacher understands.
-# - The field is saved in `run/field`. `kfgs view`, `kfgs select` and `kfgs render` take it from a shell.
+# - The field is saved in `run/field.kfgs`. `kfgs view`, `kfgs select` and `kfgs render` take it from a shell.
 # - `kfgs sfm`, `kfgs features` and `kfgs fit` are these cells as commands.
 #
 # Next: [8_compare_methods](8_compare_methods.ipynb) asks which method to take.

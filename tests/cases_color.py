@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from kfgs.fields import SemanticField
+from kfgs.fields import Identity, SemanticField
 from kfgs.formats import write_splats
 from kfgs.gaussians import Gaussians
 from kfgs.labels import load_label_set
@@ -29,7 +29,8 @@ def make_field(room: Path, folder: Path) -> Path:
     cloud, labels = surface(room)
     classes, scene = load_label_set(room / "classes.json", room / "text.npy"), load_scene(room)
     views = [scene.cameras[i].name for i in scene.views("train")]
-    SemanticField(cloud.replace(features=classes.embeddings[labels].float()), info={"views": views}).save(folder)
+    decoder, info = Identity(classes.dim), {"views": views}
+    SemanticField(cloud.replace(features=classes.embeddings[labels].float()), decoder, info=info).save(folder)
     return folder
 
 

@@ -8,8 +8,7 @@ import torch
 
 from kfgs._rows import unit_rows
 from kfgs.cameras import Camera
-from kfgs.fields import SemanticField
-from kfgs.fields.remembered import remember
+from kfgs.fields import Autoencoded, Codewords, Identity, Linear, SemanticField
 from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
 from kfgs.labels import LabelSet
@@ -79,9 +78,11 @@ def field(mode="adc+sc", n=80, seed=0):
         features=features,
     )
     if mode == "fused":
-        return SemanticField(gaussians, linear=linear())
-    book = None if mode == "decouple" else codebook()
-    return SemanticField(gaussians, book, autoencoder() if mode == "adc+sc" else None)
+        return SemanticField(gaussians, Linear(linear()))
+    if mode == "decouple":
+        return SemanticField(gaussians, Identity(DIM))
+    trained = Autoencoded(codebook(), autoencoder()) if mode == "adc+sc" else Codewords(codebook())
+    return SemanticField(gaussians, trained)
 
 
 def stored(folder, mode="fused", **changes):
@@ -89,9 +90,9 @@ def stored(folder, mode="fused", **changes):
     scene = folder / "scene"
     scene.mkdir()
     classes().save(scene / "text.safetensors")
-    made = replace(field(mode), info=remember(scene, folder / "field"), **changes)
-    made.save(folder / "field")
-    return SemanticField.load(folder / "field")
+    made = replace(field(mode), info={"scene": str(scene)}, classes=classes(), **changes)
+    made.save(folder / "field.kfgs")
+    return SemanticField.load(folder / "field.kfgs")
 
 
 def classes(count=4, negatives=True):

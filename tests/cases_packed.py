@@ -7,7 +7,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from kfgs import Camera, Gaussians
-from kfgs.fields import Seen, SemanticField
+from kfgs.fields import Autoencoded, Codewords, Identity, Linear, Seen, SemanticField
 from kfgs.labels import LabelSet
 from kfgs.quant import Autoencoder, Codebook, LinearLatents
 
@@ -36,17 +36,21 @@ def field(method="fused", n=300, seed=0, **changes):
         "labels": torch.arange(n),
         "antialiased": method == "fused",
     }
-    parts = {}
+    decoder, fused = Identity(DIM), None
     if "adc" in method:
-        parts["codebook"] = Codebook(torch.randn(7, DIM, generator=g) * torch.logspace(-2, 2, 7)[:, None])
+        codebook = Codebook(torch.randn(7, DIM, generator=g) * torch.logspace(-2, 2, 7)[:, None])
+        decoder = Codewords(codebook)
     if method == "adc+sc":
         layers = [[(torch.randn(o, i, generator=g), torch.randn(o, generator=g)) for i, o in pairs]
                   for pairs in (((DIM, 8), (8, 4)), ((4, 8), (8, DIM)))]  # fmt: skip
-        parts["autoencoder"] = Autoencoder(*(tuple(pairs) for pairs in layers), low=-0.5, high=0.75)
+        decoder = Autoencoded(codebook, Autoencoder(*(tuple(pairs) for pairs in layers), low=-0.5, high=0.75))
     if method == "fused":
-        parts["linear"] = _basis(d, g)
-    else:
-        parts |= {"linear": _basis(6, g), "answers": torch.randn(n, 6, generator=g) * torch.rand(n, 1, generator=g)}
+        decoder = Linear(_basis(d, g))
+    gaussians = Gaussians(**cloud | changes)
+    seen = Seen(torch.rand(n, generator=g) * 5000, torch.rand(n, generator=g))
+    if method != "fused":
+        latents = torch.randn(n, 6, generator=g) * torch.rand(n, 1, generator=g)
+        fused = SemanticField(gaussians.replace(features=latents), Linear(_basis(6, g)), seen=seen)
     pose = torch.eye(4)
     pose[:3, :3] = torch.from_numpy(Rotation.from_euler("xyz", [0.1, 0.5, 1.0]).as_matrix()).float()
     K = torch.tensor([[40.0, 0, 20], [0, 41, 8], [0, 0, 1]])
@@ -54,14 +58,9 @@ def field(method="fused", n=300, seed=0, **changes):
         ("wall", "rote Stühle"), torch.randn(2, DIM, generator=g) * 9, torch.randn(1, DIM, generator=g), ("object",),
         {"teacher": {"name": "toy"}},
     )  # fmt: skip
-    return SemanticField(
-        Gaussians(**cloud | changes),
-        info={"method": method, "nested": {"a": [1, None]}},
-        seen=Seen(torch.rand(n, generator=g) * 5000, torch.rand(n, generator=g)),
-        cameras=(Camera(pose, K, 40, 16, "first"), Camera(torch.eye(4), K, 39, 16, "Zweite", near=0.01)),
-        words=words,
-        **parts,
-    )
+    cameras = Camera(pose, K, 40, 16, "first"), Camera(torch.eye(4), K, 39, 16, "Zweite", near=0.01)
+    info = {"method": method, "nested": {"a": [1, None]}}
+    return SemanticField(gaussians, decoder, cameras, words, info, seen, fused)
 
 
 def assert_same(one, other):
@@ -70,18 +69,15 @@ def assert_same(one, other):
         found = getattr(other.gaussians, name)
         tensor = isinstance(value, torch.Tensor)
         assert value.dtype == found.dtype and torch.equal(value, found) if tensor else value == found, name
-    for part in ("codebook", "autoencoder", "linear"):
-        ours, theirs = getattr(one, part), getattr(other, part)
-        assert (ours is None) == (theirs is None), part
-        if ours is not None:
-            pairs = ours.to_tensors(), theirs.to_tensors()
-            assert list(pairs[0]) == list(pairs[1])
-            assert all(torch.equal(pairs[0][name], pairs[1][name]) for name in pairs[0]), part
-    assert (one.answers is None) == (other.answers is None)
-    assert one.answers is None or torch.equal(one.answers, other.answers)
+    assert type(one.decoder) is type(other.decoder)
+    ours, theirs = one.decoder.to_tensors(), other.decoder.to_tensors()
+    assert list(ours) == list(theirs)
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+    assert (one.fused is None) == (other.fused is None)
+    assert one.fused is None or torch.equal(one.fused.features, other.fused.features)
     assert all(torch.equal(a, b) for a, b in zip(one.seen, other.seen, strict=True))
     assert_same_notes(one, other)
-    assert torch.equal(one.words.embeddings, other.words.embeddings)
+    assert torch.equal(one.classes.embeddings, other.classes.embeddings)
     assert one.info == other.info
 
 
@@ -92,7 +88,7 @@ def assert_same_notes(one, other):
         assert torch.equal(a.K, b.K)
         assert torch.equal(a.viewmat, b.viewmat)
     for name in ("names", "negative_names", "info"):
-        assert getattr(one.words, name) == getattr(other.words, name)
+        assert getattr(one.classes, name) == getattr(other.classes, name)
 
 
 def assert_within(made, back):
@@ -107,10 +103,9 @@ def assert_within(made, back):
     close(before.opacities, after.opacities, errors["gaussians.opacities"] + 1e-4)
     assert 0 < float(after.opacities.min()) <= float(after.opacities.max()) < 1
     assert_ellipsoids(before, after, errors)
-    rows = (before.features, after.features) if made.answers is None else (made.answers[order], back.answers)
-    if rows[0].numel():
-        name = "gaussians.features" if made.answers is None else "answers.latents"
-        close(*rows, errors[name])
+    if before.features.numel():
+        if made.fused is not None:
+            close(made.fused.features[order], back.fused.features, errors["fused.latents"])
         close(before.features, after.features, errors["gaussians.features"])
     assert torch.equal(made.known[order], back.known)
     pixels, agreement = (value[order] for value in made.seen)
@@ -122,18 +117,14 @@ def assert_within(made, back):
 
 
 def _decoders(made, back):
-    yield made.words.embeddings, back.words.embeddings, "words.embeddings"
-    if made.words.negatives is not None:
-        yield made.words.negatives, back.words.negatives, "words.negatives"
-    if made.codebook is not None:
-        yield made.codebook.codewords, back.codebook.codewords, "codebook.codewords"
-    if made.autoencoder is not None:
-        pairs = made.autoencoder.to_tensors(), back.autoencoder.to_tensors()
-        for name in pairs[0]:
-            if name.endswith("weight"):
-                yield pairs[0][name], pairs[1][name], f"autoencoder.{name}"
-            else:
-                assert torch.equal(pairs[0][name], pairs[1][name])
+    yield made.classes.embeddings, back.classes.embeddings, "classes.embeddings"
+    yield made.classes.negatives, back.classes.negatives, "classes.negatives"
+    pairs = made.decoder.to_tensors(), back.decoder.to_tensors()
+    for name in pairs[0]:
+        if name.endswith("weight") or name == "codebook.codewords":
+            yield pairs[0][name], pairs[1][name], name
+        elif name != "linear.basis":
+            assert torch.equal(pairs[0][name], pairs[1][name])
 
 
 def close(one, other, error):

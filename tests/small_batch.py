@@ -37,8 +37,8 @@ def one_process(room: Path, out: Path) -> Path:
     fit_scene(scene.undistorted(), FeatureFolder(out / "features").of(scene), out, FIT)
     classes = load_label_set(room / "classes.json", room / "text.npy")
     truth = true_labels(scene, room / "labels", "test")
-    segment_scene(SemanticField.load(out / "field"), scene, classes, out / "segmented", pictures=0, truth=truth)
-    report = evaluate(out / "field", room, encode=classes, truth=room / "labels")
+    segment_scene(SemanticField.load(out / "field.kfgs"), scene, classes, out / "segmented", pictures=0, truth=truth)
+    report = evaluate(out / "field.kfgs", room, encode=classes, truth=room / "labels")
     (out / "scores.json").write_text(json.dumps({"scene": room.name, **report.to_json()}, indent=2) + "\n")
     return out
 

@@ -42,7 +42,7 @@ def make_room(folder: Path) -> Path:
 
 
 def make_desk(folder: Path) -> Path:
-    """A folder as a user has it after `kfgs fit`: scene/, run/field, and a splat of another program, my.ply."""
+    """A folder as a user has it after `kfgs fit`: scene/, run/field.kfgs, and a splat of another program, my.ply."""
     make_splat(make_room(folder / "scene"), folder / "my.ply")
     scene = load_scene(folder / "scene")
     maps = FeatureFolder(folder / "scene" / "features", [scene.stem(i) for i in scene.views("train")])

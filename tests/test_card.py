@@ -18,6 +18,7 @@ from torch import Tensor
 import kfgs
 from kfgs import Autoencoder, Camera, Codebook, Gaussians, SemanticField, rasterize
 from kfgs._card import LONGEST, html_card, short_repr, short_value
+from kfgs.fields import Autoencoded
 from kfgs.formats import SplatFile
 from kfgs.labels import LabelSet, Selection
 from kfgs.labels.edits import EditList, Remove
@@ -131,7 +132,7 @@ def test_lines_stay_short_and_cards_are_tables():
     layers = [(torch.rand(out, width), torch.rand(out)) for width, out in widths]
     autoencoder = Autoencoder(tuple(layers[:2]), tuple(layers[2:]), 0.0, 1.0)
     cloud = Gaussians(torch.rand(50, 3), torch.rand(50, 4), torch.rand(50, 3), torch.rand(50), torch.rand(50, 9))
-    field = SemanticField(cloud, book, autoencoder, {"teacher": {"name": "<lseg>"}})
+    field = SemanticField(cloud, Autoencoded(book, autoencoder), info={"teacher": {"name": "<lseg>"}})
     viewmat = torch.eye(4)
     viewmat[2, 3] = 3.0
     camera = Camera(viewmat, torch.tensor([[30.0, 0, 15], [0, 30, 10], [0, 0, 1]]), 30, 20)

@@ -28,8 +28,7 @@ def run(room, tmp_path_factory):
 
 def test_fit_names_what_it_wrote(run):
     for name in (
-        "field/field.json",
-        "field/field.safetensors",
+        "field.kfgs",
         "codebook.png",
         "field.png",
         "preview.png",
@@ -39,7 +38,7 @@ def test_fit_names_what_it_wrote(run):
 
 
 def test_info_knows_fields_runs_scenes_and_plys(run, room, tmp_path, capsys):
-    for path in (run, run / "field"):
+    for path in (run, run / "field.kfgs"):
         assert main(["info", str(path)]) == 0
         assert "Gaussians" in capsys.readouterr().out
     assert main(["info", str(room)]) == 0
@@ -56,7 +55,7 @@ def test_info_knows_fields_runs_scenes_and_plys(run, room, tmp_path, capsys):
 
 def test_segment_scores_where_truth_is_known(run, room, tmp_path, capsys):
     out = tmp_path / "seg"
-    assert main(["segment", str(run / "field"), "--scene", str(room), "--out", str(out), "--pictures", "1"]) == 0
+    assert main(["segment", str(run / "field.kfgs"), "--scene", str(room), "--out", str(out), "--pictures", "1"]) == 0
     said = capsys.readouterr().out
     assert "kfgs-pooled/1" in said
     scores = json.loads((out / "scores.json").read_text())
@@ -73,7 +72,7 @@ def test_label_carries_classes_to_another_cloud_and_keeps_its_columns(run, room,
     out = tmp_path / "labelled"
     arguments = [
         "label",
-        str(run / "field"),
+        str(run / "field.kfgs"),
         "--scene",
         str(room),
         "--out",
@@ -93,13 +92,13 @@ def test_label_carries_classes_to_another_cloud_and_keeps_its_columns(run, room,
 
 def test_nothing_of_the_users_is_overwritten(run, room, tmp_path, capsys, monkeypatch):
     before = (room / "labels" / "view_001.png").read_bytes()
-    assert main(["segment", str(run / "field"), "--scene", str(room), "--out", str(room), "--pictures", "0"]) == 0
+    assert main(["segment", str(run / "field.kfgs"), "--scene", str(room), "--out", str(room), "--pictures", "0"]) == 0
     assert (room / "labels" / "view_001.png").read_bytes() == before
     cloud = tmp_path / "gaussians.ply"
     write_ply(cloud, {name: np.zeros(3, np.float32) for name in "xyz"})
     before = cloud.read_bytes()
     monkeypatch.setattr(SemanticField, "load", None)  # the work
-    arguments = ["label", str(run / "field"), "--scene", str(room), "--out", str(tmp_path), "--cloud", str(cloud)]
+    arguments = ["label", str(run / "field.kfgs"), "--scene", str(room), "--out", str(tmp_path), "--cloud", str(cloud)]
     assert main(arguments) == 1
     assert "would be overwritten" in capsys.readouterr().err
     assert cloud.read_bytes() == before
@@ -109,7 +108,16 @@ def test_a_clouds_own_colours_and_comments_are_kept(run, room, tmp_path):
     red = np.full(4, 200, np.uint8)
     columns = {n: np.zeros(4, np.float32) for n in "xyz"} | {"red": red, "green": red, "blue": red}
     write_ply(tmp_path / "c.ply", columns, comments=("SplatRenderMode: mip",))
-    arguments = ["label", str(run / "field"), "--scene", str(room), "--out", str(tmp_path / "o"), "--rule", "paper"]
+    arguments = [
+        "label",
+        str(run / "field.kfgs"),
+        "--scene",
+        str(room),
+        "--out",
+        str(tmp_path / "o"),
+        "--rule",
+        "paper",
+    ]
     assert main([*arguments, "--cloud", str(tmp_path / "c.ply")]) == 0
     assert read_ply(tmp_path / "o" / "cloud.ply")["red"].tolist() == [200] * 4
     assert "SplatRenderMode: mip" in read_comments(tmp_path / "o" / "cloud.ply")
@@ -119,20 +127,22 @@ def test_a_mesh_is_refused_since_its_faces_would_be_lost(run, room, tmp_path, ca
     header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
     faces = "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
     (tmp_path / "mesh.ply").write_text(header + faces)
-    arguments = ["label", str(run / "field"), "--scene", str(room), "--out", str(tmp_path / "o")]
+    arguments = ["label", str(run / "field.kfgs"), "--scene", str(room), "--out", str(tmp_path / "o")]
     assert main([*arguments, "--cloud", str(tmp_path / "mesh.ply")]) == 1
     assert "mesh.ply: expected nothing but points, got face" in capsys.readouterr().err
     assert not (tmp_path / "o").exists()
 
 
 def test_views_without_label_pictures_are_segmented_without_a_score(run, room, tmp_path, capsys):
-    arguments = ["segment", str(run / "field"), "--scene", str(room), "--out", str(tmp_path), "--pictures", "0"]
+    arguments = ["segment", str(run / "field.kfgs"), "--scene", str(room), "--out", str(tmp_path), "--pictures", "0"]
     assert main([*arguments, "--split", "train"]) == 0
     assert "trained on 6 of these views" in capsys.readouterr().out
 
 
 def test_a_single_query_reports_its_threshold(run, room, tmp_path, capsys):
-    assert main(["label", str(run / "field"), "--scene", str(room), "--out", str(tmp_path), "--query", "chair"]) == 0
+    assert (
+        main(["label", str(run / "field.kfgs"), "--scene", str(room), "--out", str(tmp_path), "--query", "chair"]) == 0
+    )
     assert "above gamma = " in capsys.readouterr().out
     labels = read_ply(tmp_path / "gaussians.ply")["class_id"]
     names = json.loads((tmp_path / "gaussians.ply.classes.json").read_text())["class_id"]
@@ -146,7 +156,7 @@ def test_a_single_query_reports_its_threshold(run, room, tmp_path, capsys):
         (["info", "{tmp}/nothing"], ("{tmp}/nothing:", "no such file or folder")),
         (
             ["segment", "{tmp}", "--scene", "{room}", "--out", "{tmp}/o"],
-            ("FIELD:", "field.json", "got {tmp}", "`kfgs fit`"),
+            ("FIELD:", "field.kfgs", "got {tmp}", "`kfgs fit`"),
         ),
         (
             ["fit", "{room}", "--features", "{tmp}/nothing", "--out", "{tmp}/o"],
@@ -159,7 +169,7 @@ def test_a_single_query_reports_its_threshold(run, room, tmp_path, capsys):
             ("--split:", "train, test", "got 'val'"),
         ),
         (
-            ["label", "{run}/field", "--out", "{tmp}/o", "--classes", "{room}/classes.json"],
+            ["label", "{run}/field.kfgs", "--out", "{tmp}/o", "--classes", "{room}/classes.json"],
             ("--classes, --text:", "got none", "--scene", "`kfgs text`"),
         ),
         (
@@ -171,27 +181,27 @@ def test_a_single_query_reports_its_threshold(run, room, tmp_path, capsys):
             ("--splat:", "--method paper", "got a.ply"),
         ),
         (
-            ["label", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--query", "dragon"],
+            ["label", "{run}/field.kfgs", "--scene", "{room}", "--out", "{tmp}/o", "--query", "dragon"],
             ("class:", "got 'dragon'"),
         ),
         (
-            ["label", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--distance", "1"],
+            ["label", "{run}/field.kfgs", "--scene", "{room}", "--out", "{tmp}/o", "--distance", "1"],
             ("--distance:", "--cloud", "got none"),
         ),
         (
-            ["label", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--threshold", "1"],
+            ["label", "{run}/field.kfgs", "--scene", "{room}", "--out", "{tmp}/o", "--threshold", "1"],
             ("--threshold:", "--query", "got none"),
         ),
         (
-            ["label", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--cloud", "{room}/no.ply"],
+            ["label", "{run}/field.kfgs", "--scene", "{room}", "--out", "{tmp}/o", "--cloud", "{room}/no.ply"],
             ("{room}/no.ply:", "no such file"),
         ),
         (
-            ["segment", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--features", "{tmp}/none"],
+            ["segment", "{run}/field.kfgs", "--scene", "{room}", "--out", "{tmp}/o", "--features", "{tmp}/none"],
             "--features: expected a folder of feature maps",
         ),
         (
-            ["segment", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--labels", "{tmp}"],
+            ["segment", "{run}/field.kfgs", "--scene", "{room}", "--out", "{tmp}/o", "--labels", "{tmp}"],
             ("--labels:", "{tmp}", "'test'", "none"),
         ),
         (["sfm", "{tmp}", "--out", "{tmp}/o"], ("{tmp}:", "3 images", "got 0")),

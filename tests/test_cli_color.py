@@ -17,7 +17,7 @@ from small_room import make_room
 import kfgs.pipeline.color as color_module
 from kfgs.cli import main
 from kfgs.cli.splats import _file_name
-from kfgs.fields import SemanticField
+from kfgs.fields import SemanticField, fuse_views
 from kfgs.formats import read_splats, write_splats
 from kfgs.formats.ply import read_ply
 from kfgs.formats.sidecar import names_path
@@ -43,7 +43,7 @@ def truth(room):
 
 @pytest.fixture(scope="module")
 def field(room, tmp_path_factory):
-    return make_field(room, tmp_path_factory.mktemp("run") / "run" / "field")
+    return make_field(room, tmp_path_factory.mktemp("run") / "run" / "field.kfgs")
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +132,7 @@ def test_attach_by_distance_gives_each_gaussian_the_class_at_its_place(labelled,
     assert (found.gaussians.labels == truth).float().mean() > 0.9
     scene = load_scene(room).select("train")
     classes = load_label_set(room / "classes.json", room / "text.npy")
-    semantic = SemanticField.load(field).with_answers(scene.cameras).classify(classes).labels
+    semantic = fuse_views(SemanticField.load(field), scene.cameras).classify(classes).labels
     assert torch.equal(torch.from_numpy(found.extra["score"] == 1), semantic >= 0)  # the same place: no distance
     assert torch.equal(found.gaussians.labels[semantic >= 0], semantic[semantic >= 0])
     assert found.classes == tuple(json.loads((room / "classes.json").read_text()))
@@ -481,11 +481,12 @@ def test_names_of_files_by_class():
 def test_all_photographs_can_be_used_and_none_is_left_to_score(room, splat, tmp_path, capsys):
     every = sorted(path.stem for path in (room / "images").iterdir())
     assert main(["fit", str(room), "--out", str(tmp_path / "run"), "--splat", str(splat), "--split", "all"]) == 0
-    field = SemanticField.load(tmp_path / "run" / "field")
+    field = SemanticField.load(tmp_path / "run" / "field.kfgs")
     assert [Path(name).stem for name in field.info["views"]] == every
     out = tmp_path / "segmented"
     assert (
-        main(["segment", str(tmp_path / "run" / "field"), "--out", str(out), "--split", "all", "--pictures", "0"]) == 0
+        main(["segment", str(tmp_path / "run" / "field.kfgs"), "--out", str(out), "--split", "all", "--pictures", "0"])
+        == 0
     )
     assert sorted(path.stem for path in (out / "predicted").iterdir()) == every
     capsys.readouterr()

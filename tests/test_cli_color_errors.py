@@ -211,7 +211,7 @@ def places(tmp_path_factory):
     """
     folder = tmp_path_factory.mktemp("errors")
     room = make_room(folder / "scene")
-    field, splat = make_field(room, folder / "run" / "field"), make_splat(room, folder / "splat.ply")
+    field, splat = make_field(room, folder / "run" / "field.kfgs"), make_splat(room, folder / "splat.ply")
     labelled = folder / "labelled.ply"
     arguments = ["attach", str(field), str(splat), "--scene", str(room), "--by", "distance", "--same-frame"]
     assert main([*arguments, "--out", str(labelled)]) == 0

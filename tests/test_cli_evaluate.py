@@ -33,7 +33,7 @@ def splats(room, tmp_path_factory):
 @pytest.fixture(scope="module")
 def fused(room, splats, tmp_path_factory):
     """A field whose own rule (votes) is not the nearest text."""
-    out = tmp_path_factory.mktemp("fused") / "field"
+    out = tmp_path_factory.mktemp("fused") / "field.kfgs"
     assert main(["uplift", str(room), str(splats / "before.ply"), "--out", str(out)]) == 0
     return out
 
@@ -72,7 +72,7 @@ def test_a_run_remembers_its_scene_and_its_score_is_the_protocols(run, words, as
 @pytest.mark.parametrize(
     ("words", "shown"),
     [
-        ("{run}/field --scene {room}", "mIoU"),
+        ("{run}/field.kfgs --scene {room}", "mIoU"),
         ("{run} --protocol kfgs-surface", "agreement"),
         ("{splats}/before.ply --scene {room} --protocol kfgs-color", "PSNR"),
         ("{run} --protocol feature3dgs-teacher --truth {room}/features", "mIoU"),

@@ -142,7 +142,7 @@ def test_version_and_overview(capsys):
 @pytest.mark.parametrize(
     ("line", "choices"),
     [
-        ("attach run/field a.ply --out b.ply --by color", ["views", "distance"]),
+        ("attach run/field.kfgs a.ply --out b.ply --by color", ["views", "distance"]),
         ("fit scene --out run --method paper --mode fast", ["decouple", "adc", "adc+sc"]),
     ],
 )

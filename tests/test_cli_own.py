@@ -29,8 +29,8 @@ def run(room, tmp_path_factory):
 @pytest.fixture(scope="module")
 def other(run, tmp_path_factory):
     """Another result, to compare with."""
-    out = tmp_path_factory.mktemp("other") / "tiny.kfgs.safetensors"
-    assert main(["pack", str(run / "field"), str(out), "--precision", "tiny"]) == 0
+    out = tmp_path_factory.mktemp("other") / "tiny.kfgs"
+    assert main(["pack", str(run / "field.kfgs"), str(out), "--precision", "tiny"]) == 0
     return out
 
 
@@ -80,7 +80,7 @@ def test_each_output_of_edit_has_its_own_edits(splat, tmp_path):
 
 def test_a_comparison_puts_no_picture_over_one_of_the_scene(room, run, other, capsys):
     before = files(room)
-    words = ["compare", run / "field", other, "--scene", room, "--out", room / "images"]
+    words = ["compare", run / "field.kfgs", other, "--scene", room, "--out", room / "images"]
     refused(words, capsys, room / "images", "pictures and feature maps")
     assert files(room) == before
 
@@ -90,7 +90,7 @@ def test_a_comparison_puts_no_picture_over_one_of_the_scene(room, run, other, ca
     [
         "fit {room} --out |",
         "color {room} --out=|",
-        "label {run}/field --out |",
+        "label {run}/field.kfgs --out |",
         "convert {splat} |",
         "info |",
         "fit | --out {out}",
@@ -106,7 +106,7 @@ def test_an_empty_path_is_not_the_current_folder(text, room, run, splat, tmp_pat
 
 
 def test_an_empty_class_is_no_path(run, capsys):
-    refused(["select", "", run / "field"], capsys, "QUERY: expected a class", "such as chair")
+    refused(["select", "", run / "field.kfgs"], capsys, "QUERY: expected a class", "such as chair")
 
 
 def test_pictures_say_that_kfgs_drew_them(tmp_path):

@@ -15,10 +15,9 @@ from small_room import make_desk
 from kfgs.cli import COMMANDS, main
 from kfgs.cli.places import OUTPUTS
 from kfgs.fields import SemanticField
-from kfgs.fields.remembered import remember
 
 LINES = {  # a command with its output {}; and one of its inputs that could be named as the output, if there is one
-    "attach": ("attach {run}/field {splat} --out {}.ply", "{splat}"),
+    "attach": ("attach {run}/field.kfgs {splat} --out {}.ply", "{splat}"),
     "batch": ("batch {list} --out {} --scheduler tcp://127.0.0.1:1", None),
     "blocks": ("blocks {scene} --out {} --count 2", None),
     "color": ("color {scene} --out {}", None),
@@ -26,19 +25,19 @@ LINES = {  # a command with its output {}; and one of its inputs that could be n
     "convert": ("convert {splat} {}.ply", "{splat}"),
     "demo": ("demo --out {}", None),
     "edit": ("edit {labelled} --remove chair --out {}.ply", "{labelled}"),
-    "evaluate": ("evaluate {run} --out {}", "{run}/field/field.json"),
+    "evaluate": ("evaluate {run} --out {}", "{run}/field.kfgs"),
     "features": ("features {scene} --teacher lseg --weights {tmp}/none --out {}", None),
     "fit": ("fit {scene} --splat {splat} --out {}", None),
     "join": ("join {scene} --out {}", None),
-    "label": ("label {run}/field --out {}", None),
+    "label": ("label {run}/field.kfgs --out {}", None),
     "pack": ("pack {packed} {}", "{packed}"),
     "render": ("render {run} --out {}.gif", None),
-    "segment": ("segment {run}/field --out {}", None),
-    "select": ("select chair {run}/field --out {}", None),
+    "segment": ("segment {run}/field.kfgs --out {}", None),
+    "select": ("select chair {run}/field.kfgs --out {}", None),
     "sfm": ("sfm {tmp}/photos --out {}", None),
     "text": ("text chair --teacher lseg --weights {table} --out {}.safetensors", "{table}"),
-    "uplift": ("uplift {scene} {run}/field --out {}", "{run}/field"),
-    "view": ("view {run}/field --where html --out {}", "{run}/field"),
+    "uplift": ("uplift {scene} {run}/field.kfgs --out {}", "{run}/field.kfgs"),
+    "view": ("view {run}/field.kfgs --where html --out {}", "{run}/field.kfgs"),
 }
 NO_OUTPUT = {"info"}
 
@@ -49,15 +48,15 @@ def desk(tmp_path_factory):
     folder = make_desk(tmp_path_factory.mktemp("desk"))
     scene, run = folder / "scene", folder / "run"
     places = {"tmp": folder, "scene": scene, "run": run, "splat": folder / "my.ply", "list": folder / "list.txt"}
-    places |= {"packed": folder / "p.kfgs.safetensors", "labelled": folder / "l.ply"}
+    places |= {"packed": folder / "p.kfgs", "labelled": folder / "l.ply"}
     places["list"].write_text(f"{scene}\n")
     places["table"] = folder / "lseg.safetensors"
     places["table"].write_text("weights")
     shutil.copytree(scene / "images", folder / "photos")
     shutil.copyfile(places["splat"], run / "color.ply")
     (scene / "labels").mkdir(exist_ok=True)
-    assert main(["pack", str(run / "field"), str(places["packed"])]) == 0
-    assert main(["attach", str(run / "field"), str(places["splat"]), "--out", str(places["labelled"])]) == 0
+    assert main(["pack", str(run / "field.kfgs"), str(places["packed"])]) == 0
+    assert main(["attach", str(run / "field.kfgs"), str(places["splat"]), "--out", str(places["labelled"])]) == 0
     return places
 
 
@@ -114,8 +113,8 @@ FILES = {  # an existing file of the scene, the run or the user, and commands th
     "{scene}/sparse/0/images.bin": ["evaluate {run} --out"],
     "{scene}/split.json": ["evaluate {run} --out", "search chair {run} --json"],
     "{scene}/text.npy": ["evaluate {run} --out"],
-    "{scene}/classes.json": ["evaluate {run}/field --out"],
-    "{run}/field/field.safetensors": ["evaluate {run} --out", "evaluate {run}/field --out"],
+    "{scene}/classes.json": ["evaluate {run}/field.kfgs --out"],
+    "{run}/field.kfgs": ["evaluate {run} --out", "evaluate {run}/field.kfgs --out"],
     "{run}/color.ply": ["convert {run}/color.ply", "evaluate {run} --out"],
     "{packed}": ["evaluate {packed} --out"],
     "{labelled}": ["evaluate {labelled} --scene {scene} --protocol kfgs-removal --set before={labelled} --out"],
@@ -129,7 +128,7 @@ def test_an_input_or_a_file_of_the_scene_is_not_replaced(file, line, desk, capsy
     refused(f"{line} {file}", desk, capsys, "give another")
 
 
-@pytest.mark.parametrize("option", ["segment {run}/field --labels", "evaluate {run} --truth"])
+@pytest.mark.parametrize("option", ["segment {run}/field.kfgs --labels", "evaluate {run} --truth"])
 def test_nothing_is_written_into_folders_that_an_option_names(option, desk, capsys):
     """Of maps and true labels, wherever they are."""
     (desk["tmp"] / "given").mkdir(exist_ok=True)
@@ -148,11 +147,9 @@ def test_pictures_elsewhere_are_known_from_what_the_field_remembers(desk, tmp_pa
         {"file_path": f"../photos/{path.name}", "transform_matrix": np.eye(4).tolist()} for path in photos.iterdir()
     ]
     (scene / "transforms.json").write_text(json.dumps({**size, "frames": frames}))
-    field = dataclasses.replace(SemanticField.load(desk["run"] / "field"), words=None)
-    for place in (tmp_path / "run" / "field", tmp_path / "a.kfgs.safetensors"):
-        about = {name: value for name, value in field.info.items() if name not in ("scene", "classes")}
-        moved = dataclasses.replace(field, info=about | remember(scene, place), folder=None)
-        moved.save(place)
+    field = dataclasses.replace(SemanticField.load(desk["run"]), classes=None)
+    for place in (tmp_path / "run" / "field.kfgs", tmp_path / "a.kfgs"):
+        dataclasses.replace(field, info=field.info | {"scene": str(scene)}).save(place)
         for source in {place, tmp_path / "run"} - {place.parent if place.is_file() else None}:
             for line in ("evaluate {} --out {out}", "select chair {} --out {out}", "render {} --out {out}.gif"):
                 words = line.replace("{}", str(source)).replace("{out}", str(photos / "new"))
@@ -170,9 +167,12 @@ def test_what_a_command_makes_for_a_scene_or_beside_it_is_written(desk, capsys):
     examples = desk["tmp"] / "examples.json"
     examples.write_text('{"chair": [{"gaussians": [1]}], "floor": [{"gaussians": [2]}]}')
     for line, written in (
-        (f"text --examples {examples} --field {run}/field --out {scene}/text.safetensors", scene / "text.safetensors"),
+        (
+            f"text --examples {examples} --field {run}/field.kfgs --out {scene}/text.safetensors",
+            scene / "text.safetensors",
+        ),
         (f"evaluate {run} --out {run}/scores.json", run / "scores.json"),
-        (f"select chair {run}/field --out {scene}/chairs", scene / "chairs"),
+        (f"select chair {run}/field.kfgs --out {scene}/chairs", scene / "chairs"),
     ):
         for _ in range(2):
             assert main(line.split()) == 0, capsys.readouterr().err

@@ -27,7 +27,7 @@ def desk(tmp_path_factory):
 
 
 def segment(desk, out, *words):
-    return main(["segment", str(desk / "run" / "field"), "--out", str(out), *map(str, words)])
+    return main(["segment", str(desk / "run" / "field.kfgs"), "--out", str(out), *map(str, words)])
 
 
 def read(path):
@@ -45,7 +45,7 @@ def test_coco_of_the_views_of_a_split_has_their_photographs(desk, tmp_path, caps
     assert str(tmp_path / "coco") in capsys.readouterr().out
     scene = load_scene(desk / "scene")
     truth = load_coco_labels(tmp_path / "coco" / "annotations.json")
-    assert truth.names == SemanticField.load(desk / "run" / "field").label_set().names
+    assert truth.names == SemanticField.load(desk / "run" / "field.kfgs").label_set().names
     assert set(truth.maps) == {scene.stem(i) for i in scene.views("test")}
     for i in scene.views("test"):
         stem = scene.stem(i)
@@ -78,18 +78,18 @@ def test_a_path_alone_gives_label_pictures(desk, tmp_path):
 
 
 def test_cameras_of_your_own(desk, tmp_path):
-    field = SemanticField.load(desk / "run" / "field")
+    field = SemanticField.load(desk / "run" / "field.kfgs")
     orbit = orbit_cameras(field.gaussians.means)[:2]
     cameras = [camera.resized(30, 40) for camera in orbit]
-    found = segment_cameras(field, cameras, field.label_set(), tmp_path)
+    found = segment_cameras(field, cameras, field.classes, tmp_path)
     assert list(found) == [camera.name for camera in cameras]
-    expected = field.segment(cameras[0], field.label_set())
+    expected = field.segment(cameras[0], field.classes)
     assert torch.equal(found[cameras[0].name], expected)
     assert np.array_equal(read(tmp_path / "predicted" / f"{cameras[0].name}.png"), as_predicted(expected))
-    folder = write_coco(tmp_path, found, field.label_set().names)
+    folder = write_coco(tmp_path, found, field.classes.names)
     assert [path.name for path in folder.iterdir()] == ["annotations.json"]
     with pytest.raises(ValueError, match=tells("cameras:", "a name of its own")):
-        segment_cameras(field, [cameras[0], cameras[0]], field.label_set(), tmp_path)
+        segment_cameras(field, [cameras[0], cameras[0]], field.classes, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -132,13 +132,13 @@ def own_cameras(folder, cameras, name="{}"):
 
 
 def test_exactly_the_cameras_of_a_file_are_segmented(desk, tmp_path, capsys):
-    field = SemanticField.load(desk / "run" / "field")
+    field = SemanticField.load(desk / "run" / "field.kfgs")
     cameras = [camera.resized(30 + i, 40) for i, camera in enumerate(field.cameras[:3])]
     file = own_cameras(tmp_path / "in", cameras, "views/v_{}.jpg")
     assert segment(desk, tmp_path / "out", "--path", file, "--coco", "--color", desk / "my.ply") == 0
     capsys.readouterr()
     for i, camera in enumerate(cameras):
-        expected = as_predicted(field.segment(camera, field.label_set()))
+        expected = as_predicted(field.segment(camera, field.classes))
         found = read(tmp_path / "out" / "predicted" / "views" / f"v_{i}.png")
         assert found.shape == camera.size
         assert (found != expected).mean() < 2e-3  # the inverse of a pose is rounded: a pixel or two at an edge
@@ -146,7 +146,7 @@ def test_exactly_the_cameras_of_a_file_are_segmented(desk, tmp_path, capsys):
 
 
 def test_own_cameras_draw_from_the_depth_from_which_those_of_the_scene_do(desk, tmp_path):
-    cameras = SemanticField.load(desk / "run" / "field").cameras
+    cameras = SemanticField.load(desk / "run" / "field.kfgs").cameras
     moved = dataclasses.replace(
         cameras[0], viewmat=cameras[0].viewmat + torch.eye(4)[3] * 1e-3 * torch.tensor([[1], [0], [0], [0]])
     )

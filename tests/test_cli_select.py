@@ -20,12 +20,12 @@ def desk(tmp_path_factory):
 
 
 def said_of(desk, capsys, *words):
-    assert main(["select", "chair", str(desk / "run" / "field"), *words]) == 0
+    assert main(["select", "chair", str(desk / "run" / "field.kfgs"), *words]) == 0
     return capsys.readouterr().out.splitlines()[1:]
 
 
 def test_parts_that_are_not_listed_are_counted(desk, capsys):
-    field = SemanticField.load(desk / "run" / "field")
+    field = SemanticField.load(desk / "run" / "field.kfgs")
     every = connected_parts(field.gaussians, field.query("chair"), smallest=1)
     listed = connected_parts(field.gaussians, field.query("chair"))
     assert {part.total for part in (*every, *listed)} == {len(every)}
@@ -41,13 +41,13 @@ def test_parts_that_are_not_listed_are_counted(desk, capsys):
     assert said_of(desk, capsys, "--smallest", "1000000") == [
         "  no part has 1000000 Gaussians; give a smaller --smallest"
     ]
-    assert main(["select", "chair", str(desk / "run" / "field"), "--smallest", "0"]) == 1
+    assert main(["select", "chair", str(desk / "run" / "field.kfgs"), "--smallest", "0"]) == 1
     assert "--smallest: expected" in capsys.readouterr().err
 
 
 def test_the_distance_within_which_gaussians_are_one_part_can_be_given(desk, capsys):
     whole, joined = said_of(desk, capsys, "--smallest", "1", "--distance", "100")
-    field = SemanticField.load(desk / "run" / "field")
+    field = SemanticField.load(desk / "run" / "field.kfgs")
     assert whole.startswith(f"  Part({len(field.query('chair'))} Gaussians")
     assert joined == "  parts are joined within 100; --distance changes it"
 
@@ -73,7 +73,7 @@ def test_two_parts_have_no_median_to_compare_with():
     assert lengths_odd([0.0, 0.0, 1.0]) == [None] * 3
 
 
-@pytest.mark.parametrize("name", ["field/field.json", "field/field.safetensors", ""])
+@pytest.mark.parametrize("name", ["field.kfgs", ""])
 def test_a_path_beside_the_fields_folder_is_answered_with_that_folder(desk, name, capsys):
     assert main(["select", "chair", str(desk / "run" / name)]) == 1
     assert re.search(tells("SOURCE: ", f"pass {desk / 'run' / 'field'}\n"), capsys.readouterr().err)
@@ -81,7 +81,7 @@ def test_a_path_beside_the_fields_folder_is_answered_with_that_folder(desk, name
 
 def test_info_names_the_scene_as_it_can_be_typed(desk, monkeypatch, capsys):
     monkeypatch.chdir(desk)
-    for path in ("run", "run/field", "run/field/field.json"):
+    for path in ("run", "run/field.kfgs"):
         assert main(["info", path]) == 0
         lines = capsys.readouterr().out.splitlines()
         assert "  scene: scene" in lines

@@ -40,8 +40,8 @@ def test_a_reader_that_ends_is_no_error(words, tmp_path):
 def desk(tmp_path_factory):
     folder = make_desk(tmp_path_factory.mktemp("desk"))
     for words in (
-        "attach {0}/run/field {0}/my.ply --out {0}/labelled.ply",
-        "pack {0}/run/field {0}/p.kfgs.safetensors",
+        "attach {0}/run/field.kfgs {0}/my.ply --out {0}/labelled.ply",
+        "pack {0}/run/field.kfgs {0}/p.kfgs",
         "search floor {0}/run",  # which says that it makes the index
     ):
         assert cli.main(words.format(folder).split()) == 0
@@ -51,15 +51,15 @@ def desk(tmp_path_factory):
 @pytest.mark.parametrize(
     ("words", "written"),
     [
-        ("attach {0}/run/field {0}/my.ply --out {1}/a.ply", "a.ply"),
-        ("label {0}/run/field --out {1}/a", "a/gaussians.ply"),
-        ("label {0}/run/field --out {1}/a --cloud {0}/my.ply", "a/cloud.ply"),
-        ("select floor {0}/run/field --out {1}/a", "a/selection.json"),
+        ("attach {0}/run/field.kfgs {0}/my.ply --out {1}/a.ply", "a.ply"),
+        ("label {0}/run/field.kfgs --out {1}/a", "a/gaussians.ply"),
+        ("label {0}/run/field.kfgs --out {1}/a --cloud {0}/my.ply", "a/cloud.ply"),
+        ("select floor {0}/run/field.kfgs --out {1}/a", "a/selection.json"),
         ("edit {0}/labelled.ply --remove floor --out {1}/a.ply", "a.ply.edits.json"),
         ("convert {0}/labelled.ply {1}/a.splat", "a.splat"),
         ("convert {0}/labelled.ply {1}/a --by-class", "a"),
         ("search floor {0}/run --json {1}/a.json", "a.json"),
-        ("compare {0}/run {0}/p.kfgs.safetensors --out {1}/a --pictures 0", "a/compare.json"),
+        ("compare {0}/run {0}/p.kfgs --out {1}/a --pictures 0", "a/compare.json"),
         ("evaluate {0}/run --out {1}/a.json", "a.json"),
     ],
 )

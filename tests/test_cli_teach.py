@@ -255,7 +255,7 @@ def test_fit_with_a_teacher_gives_the_same_codebook_index_maps_and_field(
         assert found.keys() == expected.keys()
         assert all(torch.equal(found[key], expected[key]) for key in expected), name
     assert len(list((tmp_path / "run" / "features").glob("*.npy"))) == len(pictures)
-    fields = [SemanticField.load(one / "field") for one in (tmp_path / "run", run)]
+    fields = [SemanticField.load(one / "field.kfgs") for one in (tmp_path / "run", run)]
     assert fields[0].info["teacher"] == fields[1].info["teacher"]
     assert main(arguments) == 0
     assert seen() == 0
@@ -267,19 +267,19 @@ def test_words_of_the_same_weights_query_the_field(run, weights, tmp_path, capsy
     table = tmp_path / "text.safetensors"
     assert main(["text", "wooden door,stone wall,ground", *TEACHER, str(weights), "--out", str(table)]) == 0
     assert "3 classes, 16 channels each, by lseg, as '{}'" in capsys.readouterr().out
-    field = SemanticField.load(run / "field")
-    assert main(["select", "wooden door", str(run / "field"), "--text", str(table)]) == 0
+    field = SemanticField.load(run / "field.kfgs")
+    assert main(["select", "wooden door", str(run / "field.kfgs"), "--text", str(table)]) == 0
     first = capsys.readouterr().out
     assert f" of {len(field)} Gaussians" in first
     assert "2 negatives" in first
     assert "text of another" not in first
     teacher = ["--text", str(table), *TEACHER, str(weights)]
-    assert main(["select", "wooden door", str(run / "field"), *teacher]) == 0
+    assert main(["select", "wooden door", str(run / "field.kfgs"), *teacher]) == 0
     assert capsys.readouterr().out == first  # embedded anew, it is the same
-    assert main(["select", "the old door behind the arch", str(run / "field"), *TEACHER, str(weights)]) == 0
+    assert main(["select", "the old door behind the arch", str(run / "field.kfgs"), *TEACHER, str(weights)]) == 0
     assert f" of {len(field)} Gaussians" in capsys.readouterr().out
     other = save_checkpoint(tmp_path / "other.ckpt", seed=1)
-    assert main(["select", "a door", str(run / "field"), *TEACHER, str(other)]) == 0
+    assert main(["select", "a door", str(run / "field.kfgs"), *TEACHER, str(other)]) == 0
     assert "got text of another" in capsys.readouterr().out
 
 

@@ -17,7 +17,7 @@ from kfgs.cli import main
 from kfgs.cli.options import Classes, Teacher
 from kfgs.cli.text import read_words
 from kfgs.cli.text import text as text_command
-from kfgs.fields import SemanticField, read_examples
+from kfgs.fields import Identity, SemanticField, read_examples
 from kfgs.labels import load_label_set
 from kfgs.scenes import load_scene
 from kfgs.teachers.prompts import make_label_set
@@ -47,10 +47,11 @@ def truth(room):
 @pytest.fixture(scope="module")
 def field(room, truth, names, tmp_path_factory):
     """The room's surface, each Gaussian with the text embedding of its class, as the teacher of letters gives it."""
-    cloud, folder = surface(room)[0], tmp_path_factory.mktemp("field") / "field"
+    cloud, folder = surface(room)[0], tmp_path_factory.mktemp("field") / "field.kfgs"
     scene = load_scene(room)
     info = {"views": [scene.cameras[i].name for i in scene.views("train")], "teacher": TEACHER.identity}
-    SemanticField(cloud.replace(features=make_label_set(TEACHER, names).embeddings[truth]), info=info).save(folder)
+    rows = make_label_set(TEACHER, names).embeddings
+    SemanticField(cloud.replace(features=rows[truth]), Identity(rows.shape[1]), info=info).save(folder)
     return folder
 
 
@@ -345,7 +346,9 @@ def test_annotations_of_coco_are_classes_by_example(room, truth, names, tmp_path
     scene, words = load_scene(room), make_label_set(TEACHER, names).embeddings
     views = scene.views("train")[:3]
     cameras = tuple(scene.cameras[i] for i in scene.views("train"))
-    SemanticField(surface(room)[0].replace(features=words[truth]), cameras=cameras).save(tmp_path / "field")
+    SemanticField(surface(room)[0].replace(features=words[truth]), Identity(words.shape[1]), cameras).save(
+        tmp_path / "field.kfgs"
+    )
     images, annotations = [], []
     for number, view in enumerate(views):
         name = scene.cameras[view].name
@@ -373,7 +376,7 @@ def test_annotations_of_coco_are_classes_by_example(room, truth, names, tmp_path
         "--examples",
         str(tmp_path / "annotations.json"),
         "--field",
-        str(tmp_path / "field"),
+        str(tmp_path / "field.kfgs"),
         "--out",
         str(table),
     ]
@@ -387,9 +390,9 @@ def test_annotations_of_coco_are_classes_by_example(room, truth, names, tmp_path
 def test_examples_are_drawn_in_the_photographs_of_the_field(tmp_path, capsys):
     folder = make_desk(tmp_path)
     clicks, out = tmp_path / "clicks.json", tmp_path / "shown.safetensors"
-    view = SemanticField.load(folder / "run/field").cameras[0].name
+    view = SemanticField.load(folder / "run/field.kfgs").cameras[0].name
     clicks.write_text(json.dumps({"chair": [{"view": view, "points": [[20, 30]]}], "wall": [{"gaussians": [3]}]}))
-    words = ["text", "--examples", str(clicks), "--field", str(folder / "run/field"), "--out", str(out)]
+    words = ["text", "--examples", str(clicks), "--field", str(folder / "run/field.kfgs"), "--out", str(out)]
     assert main(words) == 0
     picture = tmp_path / "shown.safetensors.png"
     assert f"wrote:\n  {out}\n  {picture}\n" in capsys.readouterr().out

@@ -13,7 +13,7 @@ from PIL import Image
 from small_room import make_room
 
 from kfgs.cli import main
-from kfgs.fields import SemanticField, remember
+from kfgs.fields import Identity, SemanticField
 from kfgs.formats import SplatFile, write_splats
 from kfgs.scenes import load_scene
 from kfgs.splat import rgb_to_sh0
@@ -37,7 +37,9 @@ def files(room, tmp_path_factory):
     table = make_label_set(TEACHER, names)
     table.save(folder / "text.safetensors")
     info = {"views": [scene.cameras[i].name for i in scene.views("train")], "teacher": TEACHER.identity}
-    SemanticField(cloud.replace(features=table.embeddings[truth]), info=info).save(folder / "field")
+    SemanticField(cloud.replace(features=table.embeddings[truth]), Identity(table.dim), info=info).save(
+        folder / "field.kfgs"
+    )
     write_splats(folder / "labelled.ply", SplatFile(cloud.replace(labels=truth), classes=tuple(names)))
     colored = cloud.replace(sh=rgb_to_sh0(torch.full((len(cloud), 3), 0.5))[:, None], labels=None)
     write_splats(folder / "color.ply", SplatFile(colored))
@@ -68,7 +70,7 @@ def test_a_question_lights_up_on_both_sides(room, files, tmp_path, capsys):
     names = json.loads((room / "classes.json").read_text())
     name = names[int(truth.mode().values)]
     words = ["--text", files / "text.safetensors", "--color", files / "color.ply", "--distance", 1e-3]
-    said = drawn([files / "field", *words, "--ask", name, "--where", "picture", "--out", tmp_path / "out"], capsys)
+    said = drawn([files / "field.kfgs", *words, "--ask", name, "--where", "picture", "--out", tmp_path / "out"], capsys)
     n, total = count(room, truth, name), len(truth)
     assert f"semantic: {n} of {total} Gaussians" in said.replace(",", "")
     assert f"colour: {n} of {total} Gaussians" in said.replace(",", "")  # every colour Gaussian lies on its source
@@ -89,7 +91,7 @@ def test_a_labelled_splat_is_asked_by_class(room, files, tmp_path, capsys):
 
 def test_any_phrase_with_a_teacher(files, tmp_path, capsys):
     said = drawn(
-        [files / "field", "--text", files / "text.safetensors", *LETTERS, "--ask", "zebra crossing", "--where", "picture",
+        [files / "field.kfgs", "--text", files / "text.safetensors", *LETTERS, "--ask", "zebra crossing", "--where", "picture",
          "--out", tmp_path],
         capsys,
     )  # fmt: skip
@@ -116,7 +118,16 @@ def test_clouds_in_different_frames_are_noted(files, tmp_path, capsys):
 def test_a_file_to_share_needs_no_driver(room, files, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(headless, "probe", lambda: headless.Probe(False, "the trial picture crashed"))
     words = ["--scene", room, "--text", files / "text.safetensors", *LETTERS]
-    arguments = [files / "field", *words, "--color", files / "color.ply", "--ask", "zebra crossing", "--where", "html"]
+    arguments = [
+        files / "field.kfgs",
+        *words,
+        "--color",
+        files / "color.ply",
+        "--ask",
+        "zebra crossing",
+        "--where",
+        "html",
+    ]
     assert main(["view", *map(str, arguments), "--out", str(tmp_path / "out")]) == 0
     assert "view.html" in capsys.readouterr().out
     page = (tmp_path / "out" / "view.html").read_text()
@@ -129,10 +140,9 @@ def test_a_file_to_share_needs_no_driver(room, files, tmp_path, monkeypatch, cap
 
 def test_a_run_folder_brings_its_colours_and_the_photos_of_its_scene(room, files, tmp_path, capsys):
     scene = load_scene(room)
-    made = SemanticField.load(files / "field")
+    made = SemanticField.load(files / "field.kfgs")
     train = tuple(scene.cameras[i] for i in scene.views("train"))
-    info = made.info | remember(room, files / "field")
-    replace(made, info=info, cameras=train).save(tmp_path / "run" / "field")
+    replace(made, info=made.info | {"scene": str(room)}, cameras=train).save(tmp_path / "run" / "field.kfgs")
     shutil.copy(files / "color.ply", tmp_path / "run" / "color.ply")
     words = ["--text", files / "text.safetensors"]
     assert main(["view", *map(str, [tmp_path / "run", *words, "--where", "html", "--out", tmp_path / "out"])]) == 0
@@ -145,7 +155,7 @@ def test_a_run_folder_brings_its_colours_and_the_photos_of_its_scene(room, files
 
 def test_no_driver_is_told_before_anything_is_read(files, monkeypatch, capsys):
     monkeypatch.setattr(headless, "probe", lambda: headless.Probe(False, "the trial picture crashed"))
-    assert main(["view", str(files / "field"), "--where", "picture"]) == 1
+    assert main(["view", str(files / "field.kfgs"), "--where", "picture"]) == 1
     said = capsys.readouterr()
     assert "3-D pictures cannot be drawn here: expected a working OpenGL, but the trial picture crashed" in said.err
     assert said.out == ""
@@ -184,5 +194,5 @@ def test_interrupted_it_does_not_promise_to_go_on(files, monkeypatch, capsys):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(headless, "probe", interrupt)
-    assert main(["view", str(files / "field"), "--where", "picture"]) == 130
+    assert main(["view", str(files / "field.kfgs"), "--where", "picture"]) == 130
     assert capsys.readouterr().err == "interrupted\n"

@@ -22,7 +22,7 @@ from kfgs import (
     read_splats,
     write_splats,
 )
-from kfgs.fields import remember
+from kfgs.fields import fuse_views, scene_classes
 
 SHORT = FitConfig(uplift=UpliftConfig.field(max_gaussians=2_000))
 ROOT = Path(kfgs.__file__).parents[1]
@@ -58,10 +58,10 @@ def test_examples_run_one_after_the_other(examples, desk, monkeypatch):
     exec(fitting.replace("FitConfig.cpu()", "SHORT"), known)
     assert known["chair"].mask.shape == (len(known["field"]),)
     assert len(known["carried"].labels) == len(known["other_points"])
-    make_field(Path("scene"), Path("run/field"))  # a few small maps know no plant: this one knows the truth
-    made, scene = SemanticField.load("run/field"), load_scene("scene")
-    made = replace(made, info=made.info | remember(Path("scene"), Path("run/field")))
-    made.with_answers([scene.cameras[i] for i in scene.views("train")]).save("run/field")
+    make_field(Path("scene"), Path("run/field.kfgs"))  # a few small maps know no plant: this one knows the truth
+    made, scene = SemanticField.load("run/field.kfgs"), load_scene("scene")
+    made = replace(made, info=made.info | {"scene": "scene"}, classes=scene_classes(Path("scene")))
+    fuse_views(made, [scene.cameras[i] for i in scene.views("train")]).save("run/field.kfgs")
     exec(editing, known)
     before, after = known["found"].splats, read_splats("edited.ply")
     chairs = before.gaussians.labels == before.classes.index("chair")

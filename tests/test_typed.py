@@ -11,7 +11,7 @@ from kfgs import Gaussians
 from kfgs._check import check_range
 from kfgs._typed import typed
 from kfgs.cameras import Camera
-from kfgs.fields import SemanticField
+from kfgs.fields import Identity, SemanticField
 from kfgs.formats import write_splats
 from kfgs.labels import transfer_labels
 from kfgs.labels.scores import select_by_similarity
@@ -22,7 +22,7 @@ from kfgs.scenes import Scene
 
 SCENE = Scene([], [], torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))
 CLOUD = Gaussians(torch.eye(3), torch.ones(3, 4), torch.ones(3, 3), torch.full((3,), 0.5), features=torch.eye(3))
-FIELD = SemanticField(CLOUD)
+FIELD = SemanticField(CLOUD, Identity(3))
 
 
 @pytest.mark.parametrize(

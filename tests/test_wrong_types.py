@@ -20,7 +20,7 @@ GOOD = {
     "Gaussians": FIELD.gaussians,
     "SemanticField": FIELD,
     "Camera": Camera.look_at((0, -4, 0), (0, 0, 0)),
-    "LabelSet": FIELD.words,
+    "LabelSet": FIELD.classes,
     "SplatFile": SplatFile(FIELD.gaussians),
 }
 """What is passed for a first parameter of this type, so that the second one is looked at, too."""
@@ -94,15 +94,15 @@ def test_every_public_name_is_called():
         (lambda: kfgs.load_teacher([]), ("teacher: expected a name", "list")),
         (lambda: kfgs.score_views(None, None), ("gaussians: expected", "NoneType")),
         (
-            lambda: kfgs.attach(FIELD, GOOD["SplatFile"], FIELD.words, cameras="x"),
+            lambda: kfgs.attach(FIELD, GOOD["SplatFile"], FIELD.classes, cameras="x"),
             ("cameras: expected", "Sequence", "str"),
         ),
         (
-            lambda: kfgs.attach(FIELD, GOOD["SplatFile"], FIELD.words, cameras=torch.zeros(3)),
+            lambda: kfgs.attach(FIELD, GOOD["SplatFile"], FIELD.classes, cameras=torch.zeros(3)),
             ("cameras: expected", "Tensor"),
         ),
         (
-            lambda: kfgs.attach(FIELD, GOOD["SplatFile"], FIELD.words, cameras=["a"]),
+            lambda: kfgs.attach(FIELD, GOOD["SplatFile"], FIELD.classes, cameras=["a"]),
             ("cameras[0]: expected a Camera", "str"),
         ),
         (lambda: CodebookConfig(grid_step=torch.zeros(0)), ("grid_step: expected", "Tensor")),

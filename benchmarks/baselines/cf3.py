@@ -182,14 +182,15 @@ def fit(task: Task, config: CF3Config) -> Fitted:
     cameras = [within(camera, config.pixels) for camera in task.cameras]
     with clock.stage("lift"):
         found = uplift_maps(task.frozen, task.cameras, task.maps, options, generator=task.generator())
-        seen = found.pixels > 0
-        agreement = found.agreement.where(seen, 2.0)
+        assert found.seen is not None
+        seen = found.seen.pixels > 0
+        agreement = found.seen.agreement.where(seen, 2.0)
         dropped = agreement.argsort()[: int(VARIANCE_SHARE * int(seen.sum()))]
         seen[dropped] = False
         lifted = found.gaussians.select(seen)
     with clock.stage("autoencoder"):
         assert lifted.features is not None
-        rows = unit_rows(found.latents.decode(lifted.features))
+        rows = unit_rows(found.decoder.decode(lifted.features))
         with quick_on_a_cpu():
             network = fit_autoencoder(rows, config, task.seed)
         with torch.no_grad():

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from kfgs.cameras import Camera
-from kfgs.fields import Seen, SemanticField
+from kfgs.fields import Autoencoded, Codewords, Linear, Seen, SemanticField
 from kfgs.fields.checkpoint import Checkpoint, write_checkpoint
 from kfgs.formats import write_splats
 from kfgs.gaussians import Gaussians
@@ -47,16 +47,17 @@ def tiny_field(method: str = "fused", n: int = 16) -> SemanticField:
         random(n, 3), random(n, 4), torch.exp(random(n, 3) - 3), torch.rand(n, generator=g) * 0.9 + 0.05,
         features=random(n, d),
     )  # fmt: skip
-    parts: dict[str, object] = {"linear": LinearLatents(torch.linalg.qr(random(DIM, 3)).Q)}
-    if method != "fused":
-        parts |= {"codebook": Codebook(random(5, DIM)), "answers": random(n, 3)}
+    linear, book, fused = Linear(LinearLatents(torch.linalg.qr(random(DIM, 3)).Q)), Codebook(random(5, DIM)), None
+    decoder: Linear | Codewords | Autoencoded = linear if method == "fused" else Codewords(book)
     if method == "adc+sc":
         layers = (((random(2, DIM), random(2)),), ((random(DIM, 2), random(DIM)),))
-        parts["autoencoder"] = Autoencoder(*layers, low=-0.5, high=0.75)
+        decoder = Autoencoded(book, Autoencoder(*layers, low=-0.5, high=0.75))
+    if method != "fused":
+        fused = SemanticField(gaussians.replace(features=random(n, 3)), linear)
     words = LabelSet(("wall", "chair"), random(2, DIM), random(1, DIM), ("object",), {"teacher": {"name": "toy"}})
     camera = Camera(torch.eye(4), torch.tensor([[40.0, 0, 20], [0, 41, 8], [0, 0, 1]]), 40, 16, "first")
     seen = Seen(torch.rand(n, generator=g) * 50, torch.rand(n, generator=g))
-    return SemanticField(gaussians, info={"seconds": 1.5}, seen=seen, cameras=(camera,), words=words, **parts)
+    return SemanticField(gaussians, decoder, (camera,), words, {"seconds": 1.5}, seen, fused)
 
 
 def make(folder: Path, add: Add) -> None:
@@ -64,11 +65,11 @@ def make(folder: Path, add: Add) -> None:
     for method in ("fused", "adc+sc"):
         place = folder / method
         field = tiny_field(method)
-        field.save(place / "field")
-        add("field", place, "field/field.json", "field/field.safetensors", opens="field")
-        for precision in ("lossless", "fine", "tiny"):
-            field.save(place / f"{precision}.kfgs.safetensors", precision)
-            add("field", place, f"{precision}.kfgs.safetensors")
+        field.save(place / "field.kfgs")
+        add("field", place, "field.kfgs")
+        for precision in ("fine", "tiny"):
+            field.save(place / f"{precision}.kfgs", precision)
+            add("field", place, f"{precision}.kfgs")
     _classes(folder / "classes", add)
     _parts(folder / "parts", add)
     _edits(folder / "edits", add)
@@ -76,7 +77,7 @@ def make(folder: Path, add: Add) -> None:
 
 def _classes(place: Path, add: Add) -> None:
     place.mkdir()
-    words = tiny_field().words
+    words = tiny_field().classes
     assert words is not None
     words.save(place / "text.safetensors")
     (place / "classes.json").write_text(json.dumps(["wall", "chair"]))
@@ -92,11 +93,10 @@ def _classes(place: Path, add: Add) -> None:
 
 def _parts(place: Path, add: Add) -> None:
     place.mkdir()
-    field = tiny_field("adc+sc")
-    assert field.codebook is not None
-    assert field.autoencoder is not None
-    field.codebook.save(place / "codebook.safetensors")
-    field.autoencoder.save(place / "autoencoder.safetensors")
+    decoder = tiny_field("adc+sc").decoder
+    assert isinstance(decoder, Autoencoded)
+    decoder.codebook.save(place / "codebook.safetensors")
+    decoder.autoencoder.save(place / "autoencoder.safetensors")
     IndexMaps([np.arange(12, dtype=np.uint8).reshape(3, 4) % 6], 5).save(place / "maps.npz")
     add("codebook", place, "codebook.safetensors")
     add("autoencoder", place, "autoencoder.safetensors")

@@ -55,10 +55,10 @@ def make_fixture(folder: Path) -> None:
 
     steps = [
         toy,
-        command("uplift", "room", "labelled.ply", "--out", "run/field"),
+        command("uplift", "room", "labelled.ply", "--out", "run/field.kfgs"),
         command("uplift", "room", "other.ply", "--out", "older"),
-        command("pack", "run/field", "packed.kfgs.safetensors"),
-        command("label", "run/field", "--out", "labelled", "--query", "chair", "--scene", "room"),
+        command("pack", "run/field.kfgs", "packed.kfgs"),
+        command("label", "run/field.kfgs", "--out", "labelled", "--query", "chair", "--scene", "room"),
         command("fit", "room", "--splat", "other.ply", "--out", "two"),
         command("fit", "room", "--splat", "labelled.ply", "--out", "two"),
     ]
@@ -136,7 +136,7 @@ def _toy_room() -> None:
 
 def all_jobs() -> list[Job]:
     """Every job, the quick ones first."""
-    field, room = "in/run/field", ("--scene", "in/room")
+    field, room = "in/run/field.kfgs", ("--scene", "in/room")
     images, times = (".html", ".png"), (".json", ".html", ".png")
     return [
         Job("convert", command("convert", "in/labelled.ply", "work/a.spz"), _with(files={"a.spz": "other.ply"})),
@@ -157,12 +157,12 @@ def all_jobs() -> list[Job]:
         ),
         Job(
             "pack",
-            command("pack", field, "work/a.kfgs.safetensors"),
-            _with(files={"a.kfgs.safetensors": "packed.kfgs.safetensors"}),
+            command("pack", field, "work/a.kfgs"),
+            _with(files={"a.kfgs": "packed.kfgs"}),
         ),
         Job(
             "unpack",
-            command("pack", "in/packed.kfgs.safetensors", "work/field"),
+            command("pack", "in/packed.kfgs", "work/field.kfgs"),
             _with(),
             fields=("field",),
         ),
@@ -195,7 +195,7 @@ def all_jobs() -> list[Job]:
         Job("save html", _save_html, _with()),
         Job(
             "uplift",
-            command("uplift", "in/room", "in/labelled.ply", "--out", "work/field"),
+            command("uplift", "in/room", "in/labelled.ply", "--out", "work/field.kfgs"),
             _with(files={"field": "older"}, notes=("notes.txt", "field/notes.txt")),
             fields=("field",),
         ),
@@ -209,8 +209,8 @@ def all_jobs() -> list[Job]:
         Job(
             "fit",
             command("fit", "in/room", "--splat", "in/labelled.ply", "--out", "work/run"),
-            _with(files={"run/field": "older"}, notes=("run/field/mine.ply", "run/notes.txt")),
-            fields=("run/field",),
+            _with(files={"run/field.kfgs": "older"}, notes=("run/field/mine.ply", "run/notes.txt")),
+            fields=("run/field.kfgs",),
             loose=times,
             resumed=True,
         ),
@@ -218,7 +218,7 @@ def all_jobs() -> list[Job]:
             "fit with other options",
             command("fit", "in/room", "--splat", "in/other.ply", "--out", "work/run"),
             _with(files={"run": "two"}, notes=("run/field/mine.ply",)),
-            fields=("run/field",),
+            fields=("run/field.kfgs",),
             loose=times,
             resumed=True,
             shown=("run/report.html", "run/preview.png"),
@@ -240,7 +240,7 @@ def all_jobs() -> list[Job]:
                 "work/run",
             ),
             _with(notes=("run/notes.txt",)),
-            fields=("run/field",),
+            fields=("run/field.kfgs",),
             loose=times,
             resumed=True,
         ),

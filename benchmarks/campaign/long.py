@@ -94,7 +94,7 @@ def _fits(folder: Path, seed: int) -> Callable[[int], object]:
 
     scene = load_scene(make_toy_room(folder / "room", ROOM))
     maps = FeatureFolder(folder / "room/features").of(scene, "train")
-    return lambda i: uplift(scene, maps, cloud(60)).save(folder / "field")
+    return lambda i: uplift(scene, maps, cloud(60)).save(folder / "field.kfgs")
 
 
 def _views(folder: Path, seed: int) -> Callable[[int], object]:
@@ -105,7 +105,7 @@ def _views(folder: Path, seed: int) -> Callable[[int], object]:
     from .corpus_fields import tiny_field
 
     field = tiny_field()
-    viewer = explore(field, classes=field.words, where="notebook")
+    viewer = explore(field, classes=field.classes, where="notebook")
 
     def do(i: int) -> None:
         with viewer.open_page() as page, urlopen(page.url, timeout=60) as answer:

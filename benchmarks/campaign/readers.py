@@ -72,7 +72,7 @@ def _field(path: Path) -> None:
     field = SemanticField.load(path)
     field.summary()
     repr(field)
-    if field.words is not None:
+    if field.classes is not None:
         field.classify()
 
 

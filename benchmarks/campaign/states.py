@@ -45,7 +45,7 @@ def field_state(folder: Path) -> str:
         return "none"
     field = SemanticField.load(folder)
     parts = [field.gaussians.means, field.gaussians.scales, field.gaussians.opacities, field.features]
-    parts += [] if field.linear is None else [field.linear.basis]
+    parts += field.decoder.to_tensors().values()
     rows = b"".join(part.contiguous().numpy().tobytes() for part in parts)
     return _digest(rows + json.dumps(_timeless(dict(field.info)), sort_keys=True, default=str).encode())
 

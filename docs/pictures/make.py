@@ -45,7 +45,7 @@ class Demo:
     def __init__(self, folder: Path) -> None:
         self.folder = folder / "scene"
         self.scene = load_scene(self.folder)
-        self.field = SemanticField.load(folder / "run" / "field")
+        self.field = SemanticField.load(folder / "run" / "field.kfgs")
         self.words = load_label_set(self.folder / "classes.json", self.folder / "text.npy")
         self.splat = read_splats(folder / "color.ply")
         chair = self.words.index("chair")

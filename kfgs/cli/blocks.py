@@ -79,7 +79,7 @@ def join(
 
     Args:
         city: The folder that `kfgs blocks` made.
-        out: Field folder to write, outside of CITY.
+        out: File of the field to write (*.kfgs), outside of CITY.
         box: Six numbers: x, y, z of the low corner, then of the high one, in the scene's units; inf and -inf: no limit. Only
             blocks that touch the box are read. `kfgs blocks` prints the box around all.
     """
@@ -87,7 +87,7 @@ def join(
     from ..scale import FieldInBlocks
 
     corners = _corners(box)
-    check_output("out", out, "a folder")
+    check_output("out", out, "a file")
     found = FieldInBlocks.open(city)
     if real_path(out).is_relative_to(real_path(city)):
         raise ValueError(f"out: expected a place outside {city}, which is read, got {out}; give another")

@@ -83,7 +83,7 @@ def with_scene(classes: Classes, field: Path) -> Classes:
     from ..fields.store import find_field
 
     loaded = SemanticField.load(find_field(field) or field)
-    return dataclasses.replace(classes, scene=recall_scene(loaded.info, loaded.folder))
+    return dataclasses.replace(classes, scene=recall_scene(loaded.info))
 
 
 def find_encoder(teacher: Teacher, classes: Classes, field: Path) -> Any:
@@ -101,5 +101,5 @@ def find_encoder(teacher: Teacher, classes: Classes, field: Path) -> Any:
         from ..fields.store import find_field
 
         loaded = SemanticField.load(find_field(field) or field)
-        return loaded.label_set() if loaded.has_classes else None
+        return loaded.classes
     return None

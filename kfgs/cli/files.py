@@ -50,22 +50,18 @@ def is_field(path: Path) -> bool:
 
 
 def open_field(name: str, field: Path) -> Any:
-    """Load a semantic field. Raises a ValueError if the path is no field."""
+    """Load a semantic field, of a run folder its `field.kfgs`. Raises a ValueError if the path is not a field."""
     from ..fields import SemanticField
-    from ..fields.store import SUFFIX, find_field
+    from ..fields.store import find_field
 
     found = find_field(field)
-    if found != field:
+    if found is None:
         check_joined(name, field)
-        what = "a file" if field.is_file() else "a folder without one" if field.is_dir() else "no such folder"
-        hint = "make one with `kfgs fit`"
-        if found is not None:
-            what, hint = "a file in a field's folder" if field.is_file() else "a run folder", f"pass {found}"
+        what = "a file" if field.is_file() else "a folder without one" if field.is_dir() else "no such file"
         raise ValueError(
-            f"{name}: expected the folder that `kfgs fit` wrote (RUN/field, with field.json), or a field in one file "
-            f"(*{SUFFIX}), got {field}, {what}; {hint}"
+            f"{name}: expected a field (RUN/field.kfgs, or the run folder), got {field}, {what}; make one with `kfgs fit`"
         )
-    return SemanticField.load(field)
+    return SemanticField.load(found)
 
 
 def open_splats(name: str, path: Path, *, labelled: bool = False, named: bool = False) -> Any:

@@ -53,7 +53,7 @@ def demo(out: Path = Path("kfgs_demo"), seed: int = 0) -> None:
     check_output("out", out, "a folder")
     room = ToyConfig(train_views=36, test_views=9, seed=seed)
     wrote(run_demo.run(out, fit_config(FieldMethod(), seed=seed), room=room, report=say, progress=True))
-    look = ["view", str(out / "run" / "field"), "--scene", str(out / "scene"), "--color", str(out / "color.ply")]
+    look = ["view", str(out / "run" / "field.kfgs"), "--scene", str(out / "scene"), "--color", str(out / "color.ply")]
     say(f'6. Look. Type "chair" there, select, edit: kfgs {shlex.join(look)}')
     if has_display() and sys.stdin.isatty() and sys.stdout.isatty():
         with suppress(KeyboardInterrupt):  # the viewer ends by it
@@ -185,7 +185,7 @@ def fit(
         kfgs fit scene/ --out run/ --method paper --preset paper
 
     Args:
-        out: Run folder; OUT/field receives the field, OUT/report.html what was made. Running again continues where it stopped.
+        out: Run folder; OUT/field.kfgs receives the field, OUT/report.html what was made. Running again continues.
         splat: Any splat file of the scene, in its frame: the Gaussians to average onto.
     """
     from ..pipeline import fit_scene, write_run_report
@@ -247,12 +247,12 @@ def uplift(
     """Give every Gaussian of a splat the teacher's features, without training: `kfgs fit` without merging.
 
     Examples:
-        kfgs uplift scene/ my.ply --out field/
-        kfgs uplift scene/ my.ply --out field/ --features maps/ --max-gaussians 100000
+        kfgs uplift scene/ my.ply --out my.kfgs
+        kfgs uplift scene/ my.ply --out my.kfgs --features maps/ --max-gaussians 100000
 
     Args:
-        splat: Any splat file of the scene, or a field folder, in the scene's frame.
-        out: The field folder to write.
+        splat: Any splat file of the scene, or a field, in the scene's frame.
+        out: The file to write (*.kfgs).
         max_gaussians: Prune and merge to at most this many; every Gaussian is kept when not given.
     """
     from ..fields import UpliftConfig
@@ -260,7 +260,7 @@ def uplift(
     from ..pipeline import FitConfig
     from ..pipeline.fuse import uplift as uplift_scene
 
-    check_output("out", out, "a folder")
+    check_output("out", out, "a file")
     check_place(out)
     as_taken = views.load(scene)
     loaded = as_taken.undistorted()
@@ -268,7 +268,7 @@ def uplift(
     cloud = (open_field if is_field(splat) else open_splats)("splat", splat).gaussians
     fused = UpliftConfig(max_gaussians=max_gaussians)
     config = FitConfig(uplift=fused, split=views.split, undistorted_features=maps.undistorted_features)
-    field = uplift_scene(loaded, found, cloud, config, folder=out, progress=True, report=say)
+    field = uplift_scene(loaded, found, cloud, config, progress=True, report=say)
     field.save(out)
     say(field.summary())
     wrote([out])

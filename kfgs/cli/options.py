@@ -228,7 +228,7 @@ class Classes(SceneOption):
 
         found = self.files()
         if found is None:
-            place = getattr(field, "folder", None) or "RUN/field"
+            place = getattr(field, "folder", None) or "RUN/field.kfgs"
             raise ValueError(
                 "classes, text: expected class names (.json) and embeddings (.npy), or a table (.safetensors), got none; "
                 "pass --classes and --text, or --scene, or --text alone with a table of `kfgs text`. Without words, show "
@@ -249,7 +249,7 @@ class Classes(SceneOption):
     def of_field(self, field: Any) -> Any:
         """The label set of these options; without options, that of the field."""
         given = any(path is not None for path in (self.scene, self.classes, self.text))
-        return self.load_classes(field) if given or not field.has_classes else field.label_set()
+        return self.load_classes(field) if given or field.classes is None else field.classes
 
     def scene_of(self, field: Any | None) -> Any:
         """The scene of --scene or of the field, for its photographs; None if there is none, or it is gone."""
@@ -264,15 +264,12 @@ class Classes(SceneOption):
             return None
 
     def open_field(self, name: str, path: Path) -> Any:
-        """Open a field with fused features; an old field computes them from the views of --scene, if given."""
+        """Open a field with fused features; a trained one without them computes them from the views of --scene, if given."""
+        from ..fields import Linear, fuse_views
+
         field = open_field(name, path)
-        if field.linear is not None and (field.cameras or self.scene is None):
-            return field
-        if self.scene is None:
-            say(
-                "note: this field was made by an older kfgs and does not hold what the views show of each Gaussian. Its answers "
-                "are noisier. Pass --scene, or fit it again"
-            )
+        fused = field.fused is not None or isinstance(field.decoder, Linear)
+        if self.scene is None or (fused and field.cameras):
             return field
         loaded = self.load_scene().undistorted()
         trained = set(field.info.get("views", ())) or {loaded.cameras[i].name for i in loaded.splits.get("train", ())}
@@ -282,7 +279,7 @@ class Classes(SceneOption):
                 f"scene: expected the views that the field was trained on ({', '.join(sorted(trained)[:3])}, ...), got "
                 f"{len(loaded.cameras)} others in {self.scene}; pass the field's own scene, or --classes and --text instead"
             )
-        return field.with_answers(voting)
+        return fuse_views(field, voting)
 
 
 def remembered_scene(field: Any) -> Path | None:
@@ -290,7 +287,7 @@ def remembered_scene(field: Any) -> Path | None:
     from ..fields import recall_scene
 
     try:
-        return recall_scene(field.info, field.folder)
+        return recall_scene(field.info)
     except (OSError, ValueError):
         return None
 

@@ -1,4 +1,4 @@
-"""The command pack: a field folder to one small file, and back."""
+"""The command pack: a field in a small file."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from .._files import check_output
-from .files import check_alone, open_field
+from .files import open_field
 from .options import Classes, GivenPrecision, Positional
 from .output import say, wrote
 
@@ -22,7 +22,7 @@ UNITS = {
     "seen.pixels": "of a count, and as much of a pixel",
 }
 """What the error of a tensor is measured in. Opacities, latents and agreement have their own numbers, the others shares."""
-PLAIN = ("gaussians.opacities", "gaussians.features", "answers.latents", "seen.agreement")
+PLAIN = ("gaussians.opacities", "gaussians.features", "fused.latents", "seen.agreement")
 Scores = Annotated[tuple[Path, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="FILE")]
 
 
@@ -34,70 +34,51 @@ def pack(
     scores: Scores = (),
     classes: Classes,
 ) -> None:
-    """Put a field into one small file with its classes and cameras, or such a file back into a folder.
-
-    Every command that takes a field folder takes the file as well.
+    """Write a field again: small, with the errors that you allow, and with other words if you name some.
 
     Examples:
-        kfgs pack run/field room.kfgs.safetensors
-        kfgs pack run/field room.kfgs.safetensors --precision fine --scores scores.json
-        kfgs pack run/field room.kfgs.safetensors --text words.safetensors    # other words than the scene's
-        kfgs pack room.kfgs.safetensors field/
+        kfgs pack run/ room.kfgs
+        kfgs pack run/ room.kfgs --precision fine --scores scores.json
+        kfgs pack run/ room.kfgs --text words.safetensors    # other words than the scene's
 
     Args:
-        field: A field folder (RUN/field), or a field in one file.
-        out: A file whose name ends in .kfgs.safetensors; any other name is a folder.
+        field: A field (RUN/field.kfgs, or the run folder).
+        out: A file whose name ends in .kfgs.
         precision: lossless; fine (labels hardly change); small (the default: 0.6 MB for 50,000 Gaussians); tiny. The
             errors of each are printed, and kept in the file. All but lossless sort the Gaussians.
         scores: What `kfgs evaluate --out` wrote about this field: its scores travel in the file. Can be given several times.
     """
-    from ..fields.store import SUFFIX, check_place, describes_field, holds_field
+    from ..fields.store import check_place
     from ..labels.questions import class_rows
 
     classes.check_images()
-    single = out.name.endswith(SUFFIX)
-    check_output("out", out, "a file" if single else "a folder")
+    check_output("out", out, "a file")
     check_place(out)
-    if not single:
-        check_alone("precision", precision, f"for a folder, which keeps every bit; a file ends in {SUFFIX}")
     opened = open_field("field", field)
     if any(given is not None for given in (classes.scene, classes.classes, classes.text)):
         words = classes.load_classes()
         class_rows(words, opened.dim, opened.info)  # of the field's teacher
-        opened = dataclasses.replace(opened, words=words)
+        opened = dataclasses.replace(opened, classes=words)
     if scores:
         kept = [*_listed(opened.info.get("scores")), *(_read_scores(path) for path in scores)]
         opened = dataclasses.replace(opened, info={**opened.info, "scores": kept})
-    if (
-        not single and describes_field(out) and not holds_field(out, vars(opened))
-    ):  # of a run, perhaps: it may have cost hours
-        raise ValueError(
-            f"out: expected a new folder, got {out}, which holds another field; give another name, or rename that one"
-        )
-    opened.save(out, (precision or "small") if single else None)
-    if single:
-        _tell(out, opened)
+    precision = precision or "small"
+    opened.save(out, None if precision == "lossless" else precision)
+    if precision != "lossless":
+        _tell(out)
     wrote([out])
 
 
-def _tell(out: Path, before: Any) -> None:
+def _tell(out: Path) -> None:
     """The bytes and the error of each part of a packed field, read back from its file."""
-    from ..fields import SemanticField
-    from ..fields.container import stream_sizes
+    from ..fields.store import read_description, stream_sizes
 
-    after = SemanticField.load(out)
-    noted = _listed(after.info.get("rounded"))
-    new = len(noted) > len(_listed(before.info.get("rounded")))
-    errors = noted[-1]["errors"] if new else {}
-    for name, size in stream_sizes(out.read_bytes()).items():
+    about = read_description(out)
+    errors = about["info"]["rounded"][-1]["errors"]
+    for name, size in stream_sizes(out).items():
         say(f"  {name:<32s} {size:>10,d} bytes  {_error_in_words(name, errors.get(name))}".rstrip())
-    say(f"{len(after):,} Gaussians in {out.stat().st_size / 2**20:.2f} MiB")
-    if new:
-        say(
-            "note: neighbours now lie side by side (Morton order), so indices into the old field do not fit the new one"
-        )
-    if before.has_classes and after.words is None:
-        say("note: without classes, whose files are gone or have changed; pass --text or --scene to put them in")
+    say(f"{about['gaussians']:,} Gaussians in {out.stat().st_size / 2**20:.2f} MiB")
+    say("note: neighbours now lie side by side (Morton order), so indices into the old field do not fit the new one")
 
 
 def _error_in_words(name: str, error: float | None) -> str:

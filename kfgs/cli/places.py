@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
+import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -138,7 +139,7 @@ def _parts(command: str, scene: Path, images: Path | None = None) -> Iterator[Ke
 def _of_field(command: str, path: Path, images: Path | None) -> Iterator[Kept]:
     """The files of a field or run, and the parts of the scene that it remembers; the splat of another program's folder."""
     from ..fields import recall_scene
-    from ..fields.store import DESCRIPTION, TENSORS, find_field, load_field, read_description
+    from ..fields.store import find_field, read_description
     from ..formats.folders import newest_splat
 
     field, splat = find_field(path), newest_splat(path)
@@ -146,14 +147,13 @@ def _of_field(command: str, path: Path, images: Path | None) -> Iterator[Kept]:
         yield Kept(splat, "which is read")
     if field is None:
         return
-    if field.is_dir():
-        yield from (Kept(one, "of the field that is read") for one in (field, field / DESCRIPTION, field / TENSORS))
+    yield Kept(field, "the field that is read")
     if field != path:
         yield Kept(path / "color.ply", "the colours of the run")
         yield Kept(path / "stages", "the stages of the run", whole=True)
     try:
-        info = (read_description if field.is_dir() else load_field)(field)["info"]
-        scene = recall_scene(info, field)
+        info = read_description(field)["info"]
+        scene = recall_scene({"scene": os.path.normpath(field.parent / info["scene"])})
     except (OSError, ValueError, LookupError, AttributeError):  # the command says what is wrong with the field
         return
     yield from _parts(command, scene, images)

@@ -37,13 +37,13 @@ def select(
     `kfgs edit` understands.
 
     Examples:
-        kfgs select chair run/field
+        kfgs select chair run/field.kfgs
         kfgs select chair labelled.ply --scene scene/ --out chairs/
-        kfgs select "the red chair by the window" run/field --teacher lseg --weights demo_e200.ckpt
+        kfgs select "the red chair by the window" run/field.kfgs --teacher lseg --weights demo_e200.ckpt
 
     Args:
         query: A class name, "chair"; with --teacher any phrase.
-        source: A field folder (RUN/field), or a splat with classes.
+        source: A field folder (RUN/field.kfgs), or a splat with classes.
         out: Folder for selection.json (with the indices), selection.ply (the Gaussians) and parts.png (each part in its best
             view, if the cameras are known).
         threshold: Scores must be above it. For a field it is the paper's gamma; by default 0.5 for a relevancy, else derived
@@ -131,11 +131,11 @@ def label(
     """Label the Gaussians of a field, and carry the labels to a cloud of points by distance.
 
     Examples:
-        kfgs label run/field --out labelled/
-        kfgs label run/field --out labelled/ --cloud points.ply --distance 0.05
+        kfgs label run/field.kfgs --out labelled/
+        kfgs label run/field.kfgs --out labelled/ --cloud points.ply --distance 0.05
 
     Args:
-        field: The folder that `kfgs fit` wrote (RUN/field).
+        field: The folder that `kfgs fit` wrote (RUN/field.kfgs).
         out: Folder for gaussians.ply, and cloud.ply if there is a --cloud.
         query: Label only the Gaussians of this class, as `kfgs select` finds them.
         threshold: The paper's gamma for --query: scores must be above it; see `kfgs select`.
@@ -162,15 +162,16 @@ def label(
     if cloud is not None and real_path(cloud) in {real_path(out / name) for name in ("gaussians.ply", "cloud.ply")}:
         raise ValueError(f"out: expected another folder than that of --cloud, got {out}; {cloud} would be overwritten")
     loaded = classes.open_field("field", field)
+    asked = loaded.paper if rule == "paper" else loaded
     label_set = classes.of_field(loaded)
     carried = None if cloud is None else read_cloud(cloud)
     said = () if cloud is None else tuple(read_comments(cloud))
     if query is None:
-        labels, scores = loaded.classify(label_set, rule=rule)
+        labels, scores = asked.classify(label_set)
         who = "what the views show of each Gaussian" if rule == "fused" else "each Gaussian's own latent (Sec. 3.4)"
         how = f"{who}; score = cosine"
     else:
-        found = loaded.query(query, label_set, threshold, rule=rule)
+        found = asked.query(query, label_set, threshold)
         labels, scores = torch.where(found.mask, label_set.index(query), -1), found.scores
         how = f"{query}: {len(found)} Gaussians above gamma = {found.threshold:.4f} ({found.how})"
     gaussians = loaded.gaussians.replace(labels=labels)
@@ -192,7 +193,7 @@ def info(path: Positional[Path]) -> None:
     """Describe a field, a run, the runs of a batch, a scene, a folder of feature maps, a splat or a PLY of points.
 
     Examples:
-        kfgs info run/field
+        kfgs info run/field.kfgs
         kfgs info scene/
 
     Args:

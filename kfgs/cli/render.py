@@ -46,7 +46,7 @@ def render(
         kfgs render run/ --path my_cameras.json --out mine.mp4
 
     Args:
-        source: A run folder, a field (RUN/field), or a splat with classes.
+        source: A run folder, a field (RUN/field.kfgs), or a splat with classes.
         out: The film, .gif or .mp4 (which needs imageio-ffmpeg).
         path: orbit goes around the scene and looks in from above: what is in front is cut away, and a class "ceiling" is left
             out. spiral sways at the camera in the middle. cameras flies along the scene's cameras. A file or folder

@@ -40,14 +40,14 @@ def segment(
     """Segment the views of a scene with a field; score them if there are label pictures. Or segment a camera path.
 
     Examples:
-        kfgs segment run/field --out segmented/
-        kfgs segment run/field --out segmented/ --scene scene/ --text words.safetensors --split train
-        kfgs segment run/field --out segmented/ --split train --coco
-        kfgs segment run/field --out masks/ --path spiral --frames 40 --coco
-        kfgs segment run/field --out masks/ --path my_cameras.json --coco
+        kfgs segment run/field.kfgs --out segmented/
+        kfgs segment run/field.kfgs --out segmented/ --scene scene/ --text words.safetensors --split train
+        kfgs segment run/field.kfgs --out segmented/ --split train --coco
+        kfgs segment run/field.kfgs --out masks/ --path spiral --frames 40 --coco
+        kfgs segment run/field.kfgs --out masks/ --path my_cameras.json --coco
 
     Args:
-        field: The folder that `kfgs fit` wrote (RUN/field).
+        field: The folder that `kfgs fit` wrote (RUN/field.kfgs).
         out: Folder for label maps (predicted/ has class numbers, colored/ shows them in colours), pictures and scores.json. It
             holds the results; files of the same names are replaced.
         split: Which views: train, test, all, or another split that SCENE/split.json names; by default test.
@@ -87,7 +87,7 @@ def segment(
     for name, given in alone.items():
         check_alone(name, given, "without --path, which it belongs to")
     loaded_field = open_field("field", field)
-    scene = recall_scene(loaded_field.info, loaded_field.folder) if classes.scene is None else classes.scene
+    scene = recall_scene(loaded_field.info) if classes.scene is None else classes.scene
     classes = dataclasses.replace(classes, scene=scene)
     loaded, label_set = classes.load_scene().undistorted(), classes.load_classes()
     folder = labels or next((scene / name for name in ("labels_scored", "labels") if (scene / name).is_dir()), None)
@@ -108,12 +108,11 @@ def segment(
         raise ValueError(f"features: expected a folder of feature maps, got {features}, which is none; name another")
     maps = features or (scene / "features" if (scene / "features").is_dir() else None)
     found = segment_scene(
-        loaded_field,
+        loaded_field.paper if rule == "paper" else loaded_field,
         loaded,
         label_set,
         out,
         split=split,
-        rule=rule,
         pictures=pictures,
         truth=truth,
         maps=maps,
@@ -160,7 +159,7 @@ def _segment_path(
     walk: dict[str, Camera] = {
         file_stem(camera.name): camera for camera in walk_of(path, loaded.gaussians, cameras, frames, width)
     }
-    found = segment_cameras(loaded, list(walk.values()), label_set, out, rule=rule, progress=True)
+    found = segment_cameras(loaded, list(walk.values()), label_set, out, progress=True)
     written = [out / "predicted", out / "colored"]
     if coco:
         show = None if colors is None else show_cloud(colors, color_by="rgb")

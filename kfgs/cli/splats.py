@@ -36,12 +36,12 @@ def attach(
     The frames of field and splat are compared first, and aligned if they differ.
 
     Examples:
-        kfgs attach run/field run/color.ply --out labelled.ply
-        kfgs attach run/field my.spz --out labelled.spz --splat-scene my_scene/
-        kfgs attach run/field my.ply --out labelled.ply --by distance --distance 0.05    # the paper's rule
+        kfgs attach run/field.kfgs run/color.ply --out labelled.ply
+        kfgs attach run/field.kfgs my.spz --out labelled.spz --splat-scene my_scene/
+        kfgs attach run/field.kfgs my.ply --out labelled.ply --by distance --distance 0.05    # the paper's rule
 
     Args:
-        field: The folder that `kfgs fit` wrote (RUN/field).
+        field: The folder that `kfgs fit` wrote (RUN/field.kfgs).
         splats: A splat of the same scene in any format, by any program.
         out: The labelled splat to write; its ending chooses the format.
         by: views (the default): the field segments its training views, and each Gaussian takes the class of the pixels that

@@ -33,7 +33,7 @@ def text(
     Examples:
         kfgs text wall,floor,chair,plant --teacher lseg --weights demo_e200.ckpt --out scene/text.safetensors
         kfgs text "chair;armchair;seat,plant" --teacher clip --weights openai/clip-vit-base-patch16
-        kfgs text --examples clicks.json --field run/field    # for a teacher without text
+        kfgs text --examples clicks.json --field run/field.kfgs    # for a teacher without text
 
     In clicks.json each class has its examples: {"chair": [{"view": "a.png", "points": [[x, y]]}, {"view": "b.png",
     "box": [x0, y0, x1, y1]}, {"gaussians": [3, 14]}], ...}. A mask of Segment Anything is {"view": "a.png", "segmentation":
@@ -187,7 +187,7 @@ def ask(query: str, classes: Classes, teacher: Teacher, field: Any) -> tuple[Any
     found = classes.files()
     named = classes.classes is not None or classes.text is not None
     there = found is not None and (named or all(path.is_file() for path in found))
-    label_set = classes.load_classes() if there else field.label_set() if "classes" in field.info else None
+    label_set = classes.load_classes() if there else field.classes
     templates = None if label_set is None else label_set.info.get("templates")
     asked = text_encoder(teacher)([query], templates=templates)
     if label_set is None:

@@ -141,9 +141,11 @@ def _viewer(state: Any, source: Path, out: Path, classes: Classes, display: Disp
 
 
 def _title(source: Path) -> str:
-    """What tells one page from another: the run of RUN/field, else the file."""
+    """What tells one page from another: the run of RUN/field.kfgs, else the file."""
+    from ..fields.store import NAME
+
     path = real_path(source)
-    return path.parent.name if path.name == "field" else path.stem
+    return path.parent.name if path.name == NAME else path.stem
 
 
 def _draw(state: Any, place: Where, out: Path, display: Display) -> None:
@@ -167,7 +169,7 @@ def open_colors(field: Path | None, color: Path | None, meaning: Any) -> Any:
         return open_splats("color", color).gaussians
     if meaning.gaussians.sh is not None:
         return meaning.gaussians
-    if field is None or field.is_file():
+    if field is None:
         return None
     geometry = read_description(field).get("info", {}).get("geometry")
     for place in (field.parent / "color.ply", Path(str(geometry))):

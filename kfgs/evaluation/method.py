@@ -12,7 +12,6 @@ from .._rows import EPS, row_norms, unit_embeddings, unit_rows
 from ..cameras import Camera
 from ..fields import SemanticField
 from ..gaussians import Gaussians
-from ..labels import nearest_codeword
 from ..scenes import FeatureFolder
 
 CHUNK = 8192  # pixels decoded at once
@@ -122,7 +121,7 @@ class FieldMethod:
 
     Args:
         field: any field.
-        name: for tables; None: "kfgs" and the field's method.
+        name: for tables; None: "kfgs" and the name of the field's decoder.
         own_labels: False takes the class with the largest cosine, as for the other methods.
     """
 
@@ -130,7 +129,7 @@ class FieldMethod:
 
     def __init__(self, field: SemanticField, name: str | None = None, *, own_labels: bool = True) -> None:
         self.field = field
-        self.name = f"kfgs {field.method}" if name is None else name
+        self.name = f"kfgs {field.decoder.name}" if name is None else name
         self.own_labels = own_labels
 
     def __repr__(self) -> str:
@@ -147,20 +146,9 @@ class FieldMethod:
         unit = unit_embeddings(text, "text").to(field.features)
         with torch.no_grad():
             rendering = field.render(view.camera)
-            parts = rendering.map.flatten(0, 1).split(CHUNK)
-            if field.linear is not None and field.method == "fused":
-                found = torch.cat([field.linear.cosines(part, unit) for part in parts])
-                known = row_norms(rendering.map) > EPS
-            elif field.codebook is not None and field.autoencoder is not None:
-                centres = field.autoencoder.encode(field.codebook.codewords).to(unit)
-                per_codeword = field.codebook.unit.to(unit) @ unit.T  # [codewords, K]
-                found = torch.cat([per_codeword[nearest_codeword(part, centres)] for part in parts])
-                known = rendering.alpha > 0
-            else:
-                found = torch.cat([unit_rows(field.decode(part)) @ unit.T for part in parts])
-                known = row_norms(rendering.map) > EPS
-        known = known & (rendering.alpha > 0)
-        return found.view(*view.camera.size, -1).masked_fill(~known[..., None], torch.nan)[None]
+            labels, scores = field.decoder.label_pixels(rendering.map, unit, len(unit), rendering.alpha > 0)
+            unknown = torch.full_like(scores, torch.nan)
+            return torch.where(labels < 0, unknown, unknown.scatter(2, labels.clamp_min(0), scores))[None]
 
     def labels(self, view: View, text: Tensor) -> Tensor:  # [K, D] -> [H, W] int64
         """The class of each pixel: what `SemanticField.segment` says, or the largest cosine."""

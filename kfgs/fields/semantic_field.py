@@ -1,123 +1,142 @@
-"""The finished semantic field: Gaussians with latents, their decoder, and the rule that gives each Gaussian a class."""
+"""The finished semantic field: Gaussians with latents, their decoder, and the questions that it answers."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from dataclasses import field as default
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
 
-from .._card import html_card
-from .._check import as_tensor, check_choice
-from .._files import as_path
+from .._card import html_card, short_repr
+from .._check import as_tensor, check_shapes, check_whole
 from .._rows import unit_embeddings
-from .._typed import typed
 from ..cameras import Camera
 from ..gaussians import Gaussians, as_rows
-from ..labels import Classification, CodewordLabels, LabelSet, Score, Selection, label_codewords, select_by_similarity
+from ..labels import Classification, LabelSet, Score, Selection, select_by_similarity
 from ..labels.questions import Classes, Negatives, check_rows, class_rows, make_question
-from ..quant import Autoencoder, Codebook, LinearLatents
-from ..splat import Ranked, Rendering, rasterize
-from . import parts
-from .answers import Answers, Seen, fused_answers
-from .precision import PrecisionName, Rounding
-from .remembered import recall_classes
+from ..metrics import MIB, semantic_storage_bytes
+from ..splat import Ranked, Rendering, rasterize, rasterize_labels
+from .decoders import Decoder
+from .packing import Precision
 from .store import load_field, save_field
-from .views import Rule, rank_classes
+from .votes import Votes, rank_votes
+
+_VOTES: WeakKeyDictionary[Any, tuple[Any, Tensor, Votes]] = WeakKeyDictionary()
+"""Votes depend on the text alone, so the last ones of each field are kept, with the text they answer."""
 
 
-@typed
+class Seen(NamedTuple):
+    """How well the training views show each Gaussian."""
+
+    pixels: Tensor  # [N] number of pixels that it fills, in all training views
+    agreement: Tensor  # [N] in [0, 1]: length of the mean of the unit features at its pixels
+
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+    def to(self, *args: Any, **kwargs: Any) -> Seen:
+        """Both on another device or in another dtype, as `torch.Tensor.to`."""
+        return Seen(*(value.to(*args, **kwargs) for value in self))
+
+
 @dataclass(frozen=True, eq=False)
 class SemanticField:
     """The result of a fit: find things (`query`), give each Gaussian a class (`classify`) or each pixel (`segment`).
 
     `field.gaussians[field.query("chair")]` are the Gaussians of the chair.
 
-    **Latents.** A Gaussian holds d numbers. They are linear in the teacher's features (`linear`, made by `uplift`), or as in
-    one of the three rows of Table 1: with codebook and autoencoder, d latents ("decouple+ADC+SC"); with the codebook
-    only, features near codewords ("decouple+ADC"); with neither, the teacher's features ("just decouple").
-
     **The rule.** The class or score of a Gaussian is that of its *fused* feature: the mean over the pixels of the training
-    views that show it. Selections, labels of other clouds, and the views of a fused field follow from it. `rule="paper"` is
-    Sec. 3.4 as printed: decode and quantise a Gaussian's own latent, or a pixel's rendered one.
+    views that show it. A field made by `uplift_maps` has these as its latents. A trained field holds them as a second field of
+    the same Gaussians, `fused`, which answers for it. `field.paper` answers by Sec. 3.4 as printed: decode and quantise a
+    Gaussian's own latent, or a pixel's rendered one.
     """
 
     gaussians: Gaussians
-    codebook: Codebook | None = None
-    autoencoder: Autoencoder | None = None
-    info: dict[str, Any] = default(default_factory=dict)
-    """The origin of the field, as JSON."""
-    linear: LinearLatents | None = None
-    """Decodes linear latents: `answers` if there are any, else the Gaussians' features."""
-    answers: Tensor | None = None  # [N, e]
-    """Each Gaussian's fused feature, as linear latents; None if the Gaussians' features are already fused."""
-    seen: Seen | None = None
-    """How well the training views show each Gaussian."""
+    """With latents as features [N, d]."""
+    decoder: Decoder
+    """What the latents mean: `Linear`, or one of the rows of Table 1 (`Identity`, `Codewords`, `Autoencoded`)."""
     cameras: tuple[Camera, ...] = ()
     """The training views, undistorted."""
-    words: LabelSet | None = None
-    """The classes of its scene with their text table, if the field holds them itself."""
-    folder: Path | None = None
-    """The folder or file it was loaded from."""
+    classes: LabelSet | None = None
+    """The classes of its scene with their text table."""
+    info: dict[str, Any] = field(default_factory=dict)
+    """The origin of the field, as JSON."""
+    seen: Seen | None = None
+    """How well the training views show each Gaussian."""
+    fused: SemanticField | None = None
+    """The fused features of a trained field (`fuse_views`), with a `Linear` decoder."""
 
     def __post_init__(self) -> None:
-        parts.check_parts(self.gaussians, self.codebook, self.autoencoder, self.linear, self.answers, self.seen)
+        if self.gaussians.features is None:
+            raise ValueError("gaussians: expected features [N, d], got None; fit them with fit_field")
+        rows = "gaussians.features", self.gaussians.features, ("N", self.decoder.latent)
+        seen = () if self.seen is None else (("seen.pixels", self.seen[0], "N"), ("seen.agreement", self.seen[1], "N"))
+        check_shapes(rows, *seen)
+        if self.fused is not None and (len(self.fused) != len(self) or self.fused.dim != self.dim):
+            raise ValueError(f"fused: expected a field of the same Gaussians and teacher, got {self.fused!r}")
 
     @property
     def features(self) -> Tensor:  # [N, d]
-        """The Gaussians' latents (or features, of a field without compression)."""
+        """The Gaussians' latents."""
         assert self.gaussians.features is not None
         return self.gaussians.features
 
     @property
-    def channels(self) -> int:
-        """d, the channels of a Gaussian."""
-        return int(self.features.shape[1])
-
-    @property
     def dim(self) -> int:
         """D, the channels of the teacher's features."""
-        if self.linear is not None and self._is_linear:
-            return self.linear.dim
-        return self.channels if self.codebook is None else self.codebook.dim
-
-    @property
-    def method(self) -> str:
-        """Either "fused", or the row of Table 1."""
-        if self._is_linear:
-            return "fused"
-        return "just decouple" if self.codebook is None else "decouple+ADC" + ("+SC" if self.autoencoder else "")
+        return self.decoder.dim
 
     @property
     def known(self) -> Tensor:  # [N] bool
         """Which Gaussians a training view has shown; nothing is known about the others, so they have no class."""
-        return self._own.any(dim=1)
+        return (self if self.fused is None else self.fused).features.any(dim=1)
+
+    @property
+    def paper(self) -> SemanticField:
+        """The same field, which answers by Sec. 3.4 as printed: without fused features, every pixel decoded."""
+        decoder: Any = self.decoder
+        return replace(self, fused=None, decoder=replace(decoder, paper=True))
 
     def __len__(self) -> int:
         return len(self.gaussians)
 
     def __repr__(self) -> str:
-        return f"SemanticField({self.method}: {len(self)} Gaussians, {self.channels} channels for {self.dim})"
+        channels = f"{self.features.shape[1]} channels for {self.dim}"
+        return f"SemanticField({self.decoder.name}: {len(self)} Gaussians, {channels})"
 
     def _repr_html_(self) -> str:
-        return html_card("SemanticField", parts.card_facts(self))
+        teacher = self.info.get("teacher")
+        facts = {
+            "method": self.decoder.name,
+            "Gaussians": len(self),
+            "channels": f"{self.features.shape[1]} for {self.dim} of the teacher",
+            "teacher": teacher.get("name") if isinstance(teacher, dict) else None,
+            "training views": len(self.cameras),
+            "classes": None if self.classes is None else len(self.classes),
+            "size as Table 1 counts it": f"{self.storage() / MIB:.2f} MiB",
+        }
+        return html_card("SemanticField", facts)
 
     def to(self, *args: Any, **kwargs: Any) -> SemanticField:
         """The field on another device or in another dtype; the arguments are those of `torch.Tensor.to`.
 
-        Cameras that you pass to `segment` and `render` afterwards must be on the same device. `folder` stays.
+        Cameras that you pass to `segment` and `render` afterwards must be on the same device.
         """
-        names = ("gaussians", "codebook", "autoencoder", "linear", "answers", "seen")
-        moved = {name: part.to(*args, **kwargs) for name in names if (part := getattr(self, name)) is not None}
+        parts = {name: getattr(self, name) for name in ("gaussians", "decoder", "seen", "fused")}
+        moved = {name: part.to(*args, **kwargs) for name, part in parts.items() if part is not None}
         return replace(self, **moved, cameras=tuple(camera.to(*args, **kwargs) for camera in self.cameras))
+
+    def select(self, which: Tensor) -> SemanticField:  # [N] bool or [n] int64
+        """A field of some of its Gaussians, with all that is known about them."""
+        seen = None if self.seen is None else Seen(*(values[which] for values in self.seen))
+        fused = None if self.fused is None else self.fused.select(which)
+        return replace(self, gaussians=self.gaussians.select(which), seen=seen, fused=fused)
 
     # Maps
 
-    @typed
     def render(self, camera: Camera, *, engine: str = "auto") -> Rendering:
         """The latent map F_r (Eq. 3) from a viewpoint, with its alpha. No gradient."""
         with torch.no_grad():
@@ -125,59 +144,54 @@ class SemanticField:
 
     def decode(self, latents: Tensor) -> Tensor:  # [..., d] -> [..., D]
         """Decode latents to the teacher's space (Psi of Sec. 3.3.2, or B z); features are returned unchanged."""
+        latents = as_tensor("latents", latents, floating=True)
+        if latents.ndim == 0 or latents.shape[-1] != self.decoder.latent:
+            raise ValueError(
+                f"latents: expected [..., {self.decoder.latent}] (from gaussians), got {tuple(latents.shape)}; pass maps or "
+                "features of this field"
+            )
         with torch.no_grad():
-            return parts.decode_latents(self, as_tensor("latents", latents, floating=True))
+            return self.decoder.decode(latents)
 
     def feature_map(self, camera: Camera) -> Tensor:  # [H, W, D]
         """Render the teacher's features from a viewpoint. 512 channels at 640x480 take 630 MB."""
         return self.decode(self.render(camera).map)
 
-    # The rule
+    # Answers
 
-    def cosines(self, rows: Tensor, *, rule: Rule = "fused") -> Tensor:  # [M, D] -> [N, M]
-        """The cosine of each Gaussian's feature with some rows; 0 if nothing is known about the Gaussian.
-
-        Args:
-            rows: embeddings in the teacher's space, of any length.
-            rule: `fused`: its fused feature. `paper`: the codeword nearest to its own decoded latent (Sec. 3.4). A field
-                made without its training views has no fused features, and always follows the paper.
+    def cosines(self, rows: Tensor) -> Tensor:  # [M, D] -> [N, M]
+        """The cosine of each Gaussian's feature with some rows in the teacher's space; 0 if nothing is known about it.
 
         Raises:
             ValueError: if there is no row, shapes disagree, or a row is all-zero.
         """
-        check_choice("rule", rule, get_args(Rule))
         rows = as_tensor("rows", rows, floating=True)
         check_rows("rows", rows, ("M",), self.dim)
-        unit = unit_embeddings(rows, "rows").to(self.features)
+        source = self if self.fused is None else self.fused
         with torch.no_grad():
-            if self.linear is not None and (rule == "fused" or self._is_linear):
-                return self.linear.cosines(self._own, unit)
-            return parts.latent_cosines(self, unit)
+            return source.decoder.cosines(source.features, unit_embeddings(rows, "rows").to(source.features))
 
     def own_features(self, rows: Tensor) -> Tensor:  # [n] int64 -> [n, D]
-        """The features of some Gaussians by the rule, all-zero if unknown. Rows and errors: see `Gaussians.select`."""
+        """The features of some Gaussians, all-zero if unknown. Rows and errors: see `Gaussians.select`."""
+        source = self if self.fused is None else self.fused
         rows = as_rows("rows", rows, len(self)).to(self.features.device)
-        if self.linear is not None:
-            return self.linear.decode(self._own[rows])
-        return self.decode(self.features[rows]) * self.known[rows, None]
+        return source.decode(source.features[rows]) * source.known[rows, None]
 
-    def classify(self, classes: Classes | None = None, *, rule: Rule = "fused") -> Classification:
+    def classify(self, classes: Classes | None = None) -> Classification:
         """The class of each Gaussian by max-similarity (Sec. 3.4), and its cosine with that class.
 
         Args:
-            classes: a label set, or embeddings [C, D]; None: the field's own (`label_set`).
-            rule: see `cosines`.
+            classes: a label set, or embeddings [C, D]; None: the field's own.
 
         Returns:
             Labels [N], -1 if nothing is known about the Gaussian, and scores [N]. A tie goes to the lowest class.
         """
-        scores, labels = self.cosines(self._rows(classes), rule=rule).max(dim=1)
-        nothing = ~self._known(rule)
-        return Classification(labels.masked_fill(nothing, -1), scores.masked_fill(nothing, 0))
+        scores, labels = self.cosines(self._rows(classes)).max(dim=1)
+        return Classification(labels.masked_fill(~self.known, -1), scores.masked_fill(~self.known, 0))
 
-    def label(self, classes: Classes | None = None, *, rule: Rule = "fused") -> Gaussians:
+    def label(self, classes: Classes | None = None) -> Gaussians:
         """The Gaussians with the labels of `classify`."""
-        return self.gaussians.replace(labels=self.classify(classes, rule=rule).labels)
+        return self.gaussians.replace(labels=self.classify(classes).labels)
 
     def query(
         self,
@@ -188,7 +202,6 @@ class SemanticField:
         negatives: Negatives | Tensor = "auto",
         score: Score | None = None,
         logit_scale: float | str = "clip",
-        rule: Rule = "fused",
     ) -> Selection:
         """The Gaussians of one thing: those with a score above a threshold (gamma of Sec. 3.4).
 
@@ -197,155 +210,137 @@ class SemanticField:
 
         Args:
             target: the name of a class, or an embedding [D].
-            classes: to look up the name and for the negatives; None: the field's own (`label_set`).
+            classes: to look up the name and for the negatives; None: the field's own.
             threshold: gamma. None: 0.5 for a relevancy, else derived from the scores; `how` of the result explains it.
             negatives: "classes", "canonical" (words of the classes' table), "none", rows [M, D], or "auto" as above.
             score: "relevancy", "softmax" over target and negatives, or "cosine". None: relevancy if there are negatives.
             logit_scale: for the softmax: "raw", "lseg", "clip", or a number that multiplies the cosines.
-            rule: see `cosines`.
 
         Raises:
             ValueError: if there is no such class, shapes disagree, a row is all-zero, or an option is unknown.
         """
-        if not isinstance(target, str):
-            target = as_tensor("target", target, floating=True)
         if score == "cosine" and isinstance(negatives, str) and negatives == "auto":
             negatives = "none"
-        classes = parts.classes_to_ask(self, target, negatives) if classes is None else classes
-        asked = make_question(target, classes, negatives, self.dim, self.info)
-        cosines = self.cosines(asked.rows, rule=rule)
-        against = None if asked.negatives is None else cosines[:, 1:]
+        question = make_question(target, self.classes if classes is None else classes, negatives, self.dim, self.info)
+        cosines = self.cosines(question.rows)
+        against = None if question.negatives is None else cosines[:, 1:]
         options: dict[str, Any] = {"score": score, "logit_scale": logit_scale}
-        return select_by_similarity(cosines[:, 0], against, threshold, self._known(rule), **options)
+        return select_by_similarity(cosines[:, 0], against, threshold, self.known, **options)
 
-    @typed
-    def segment(
-        self, camera: Camera, classes: Classes | None = None, *, rule: Rule = "fused"
-    ) -> Tensor:  # [H, W] int64
-        """The class of each pixel from a viewpoint; -1 for empty pixels.
+    def segment(self, camera: Camera, classes: Classes | None = None) -> Tensor:  # [H, W] int64
+        """The class of each pixel from a viewpoint, -1 for empty pixels; the rule is that of the decoder.
 
         Args:
             camera: any viewpoint.
-            classes: a label set, or embeddings [C, D]; None: the field's own (`label_set`).
-            rule: `fused`: in a fused field each Gaussian divides one vote among the classes (the softmax of 100 times the
-                cosines, CLIP's scale), and a pixel takes the class with most blended votes. A trained field has learnt
-                blends of latents, so a pixel takes the codeword with the latent nearest to the rendered one. `paper`: render
-                the latent map, decode every pixel, quantise, look up (Sec. 3.4). Without an autoencoder, the class most
-                similar to the rendered feature wins; only `paper` quantises it first.
-
-        Raises:
-            ValueError: if shapes disagree or `rule` is unknown.
+            classes: a label set, or embeddings [C, D]; None: the field's own.
         """
-        return rank_classes(self, camera, self._rows(classes), rule, early=True).labels[..., 0]
+        return self._rank(camera, classes, 1, early=True).labels[..., 0]
 
-    def rank(self, camera: Camera, classes: Classes | None = None, *, top: int = 1, rule: Rule = "fused") -> Ranked:
+    def rank(self, camera: Camera, classes: Classes | None = None, *, top: int = 1) -> Ranked:
         """The `top` best classes of each pixel by the rule of `segment`, and their scores.
-
-        Args:
-            camera: any viewpoint.
-            classes: as in `segment`.
-            top: how many classes, from 1 to C.
-            rule: as in `segment`.
 
         Returns:
             Labels and scores [H, W, top], the best first; -1 and 0 where there is no class. And the opacity [H, W]. Scores are
-            blended votes, from 0 to 1; of a trained field with codewords, cosines of the pixel's codeword with the classes;
-            without codewords, by the rule `paper`, numbers that only compare the classes of one pixel.
+            blended votes, from 0 to 1; of a field with codewords, cosines of the pixel's codeword with the classes; where
+            features are compared, numbers that only compare the classes of one pixel.
 
         Raises:
-            ValueError: as `segment`, and if `top` is out of range.
+            ValueError: if shapes disagree, or `top` is not from 1 to C.
         """
-        return rank_classes(self, camera, self._rows(classes), rule, top)
+        return self._rank(camera, classes, top, early=False)
 
-    def codeword_labels(self, embeddings: Tensor) -> CodewordLabels:  # [C, D]
-        """The class of each codeword (Sec. 3.4).
+    def score_pixels(
+        self, camera: Camera, target: str | Tensor, classes: Classes | None = None, **options: Any
+    ) -> Ranked:
+        """How well each pixel fits one thing: the mean score of the Gaussians that it shows, by how much it shows of each.
 
-        Raises:
-            ValueError: if the field has no codebook, or shapes disagree.
+        The arguments are those of `query`, but no threshold. Scores [H, W, 1] are by default relevancies, above 0.5 where the
+        target fits best; labels are 0, and -1 where nothing was drawn.
         """
-        embeddings = as_tensor("embeddings", embeddings, floating=True)
-        check_rows("embeddings", embeddings, ("C",), self.dim)
-        if self.codebook is None:
-            raise ValueError("codebook: expected one, got None in this field; use classify or segment, which need none")
-        return label_codewords(self.codebook.codewords, embeddings)
-
-    def with_answers(self, cameras: Sequence[Camera], found: Answers | None = None) -> SemanticField:
-        """Add fused features computed from views, and these views. A fused field keeps its features.
-
-        Args:
-            cameras: the training views.
-            found: the result of `fused_answers`; None calls it.
-
-        Raises:
-            ValueError: if there is no camera.
-        """
-        if not cameras:
-            raise ValueError("cameras: expected at least one, got none; pass those that the field was trained with")
-        if not self._is_linear:
-            found = found or fused_answers(self.gaussians, self.codebook, self.autoencoder, cameras)
-            self = replace(self, answers=found.latents, linear=found.linear, seen=found.seen)
-        return replace(self, cameras=tuple(cameras))
-
-    def label_set(self) -> LabelSet:
-        """The classes that the field holds or remembers from its scene.
-
-        Raises:
-            ValueError: if there are none, or they have changed.
-            FileNotFoundError: if their files are missing.
-        """
-        return recall_classes(self.info, self.folder) if self.words is None else self.words
-
-    @property
-    def has_classes(self) -> bool:
-        """Whether the field holds classes, or remembers where they are."""
-        return self.words is not None or "classes" in self.info
+        scores = self.query(target, classes, 0.0, **options).scores
+        shown = rasterize_labels(self.gaussians.replace(features=scores[:, None].contiguous(), sh=None), camera)
+        return shown._replace(scores=shown.scores / shown.alphas[..., None].clamp_min(1e-6))
 
     # Size and files
 
     def storage(self) -> int:
         """Bytes as in Table 1: every attribute of the Gaussians, and their decoder, in float32.
 
-        Without an autoencoder, the table counts no codebook; here it counts, because labelling needs it. Fused answers do
-        not count.
+        Without an autoencoder, the table counts no codebook; here it counts, because labelling needs it. `fused` does not.
         """
-        return parts.storage_bytes(self)
+        return semantic_storage_bytes(len(self), self.features.shape[1], 0, self.decoder.parameters)
 
     def summary(self) -> str:
-        """A few lines of text: counts, channels, codewords, size."""
-        return parts.summary_text(self)
+        """A few lines of text: counts, channels, size, origin."""
+        facts = {name: value for name, value in self.info.items() if not isinstance(value, list | dict)}
+        teacher = self.info.get("teacher")
+        if isinstance(teacher, dict):
+            facts = {"teacher": teacher.get("name"), **facts}
+        if self.classes is not None:
+            facts["classes"] = f"{len(self.classes)}, with their text table"
+        if isinstance(rounded := self.info.get("rounded"), list):
+            facts["rounded"] = ", ".join(
+                str(entry.get("precision"))[:20] for entry in rounded if isinstance(entry, dict)
+            )
+        first = f"{self!r}\n  size as Table 1 counts it: {self.storage() / MIB:.2f} MiB"
+        return "\n".join([first, *(f"  {name}: {value}" for name, value in facts.items())])
 
-    def save(self, path: str | Path, precision: PrecisionName | Rounding | None = None) -> None:
-        """Write a folder (`field.safetensors` and `field.json`), or one file if `path` ends in `.kfgs.safetensors`.
-
-        It is written whole or not at all; an older field is replaced. One file also holds the classes and their text table.
+    def save(self, path: str | Path, precision: Precision | None = None) -> None:
+        """Write one file, whole or not at all; an older field is replaced.
 
         Args:
-            path: of the folder or file.
-            precision: of one file: "lossless" (the default), "fine", "small", "tiny" or your own `Rounding`. All but the first
-                sort the Gaussians, and note their errors in `info["rounded"]`.
+            path: of the file; its name ends in `.kfgs`.
+            precision: None keeps every bit. "fine", "small", "tiny" or your own `Rounding` pack it: Gaussians are sorted, and
+                their errors noted in `info["rounded"]`.
 
         Raises:
             FileExistsError: if there is something other than a field at `path`.
-            ValueError: if `info` is not JSON, the precision is unknown, or a folder gets one. For one file also if a number is
-                not finite, an opacity lies outside [0, 1], a scale is negative, or a number is too large to be rounded.
+            ValueError: if `info` is not JSON, the name ends otherwise, or (packed) a number cannot be rounded.
         """
         save_field(path, vars(self), precision)
 
     @classmethod
     def load(cls, path: str | Path) -> SemanticField:
-        """Read what `save` wrote; a FileNotFoundError if nothing is there, a ValueError if it is no field or damaged."""
-        return cls(**load_field(path), folder=as_path(path))
+        """Read what `save` wrote; of a folder, its `field.kfgs`.
 
-    @property
-    def _is_linear(self) -> bool:
-        return self.linear is not None and self.answers is None
-
-    @property
-    def _own(self) -> Tensor:  # [N, e]
-        return self.features if self.answers is None else self.answers
-
-    def _known(self, rule: Rule) -> Tensor:  # [N] bool
-        return self.known if rule == "fused" else self.features.any(dim=1)
+        Raises:
+            FileNotFoundError: if there is nothing.
+            ValueError: if it is not a field, or damaged.
+        """
+        parts, seen, fused = load_field(path)
+        seen = None if seen is None else Seen(*seen)
+        return cls(**parts, seen=seen, fused=None if fused is None else cls(**fused, seen=seen))
 
     def _rows(self, classes: Classes | None) -> Tensor:  # [C, D]
-        return class_rows(self.label_set() if classes is None else parts.checked_classes(classes), self.dim, self.info)
+        if isinstance(classes, str):
+            raise TypeError(
+                f"classes: expected a LabelSet or embeddings [C, D], got the name {classes!r}; query({classes!r}) finds the "
+                "Gaussians of one class"
+            )
+        if classes is None and self.classes is None:
+            raise ValueError("classes: expected a label set, got none, and the field holds none; pass the classes")
+        return class_rows(self.classes if classes is None else classes, self.dim, self.info)
+
+    def _rank(self, camera: Camera, classes: Classes | None, top: int, *, early: bool) -> Ranked:
+        rows = self._rows(classes)
+        check_whole("top", top, 1, len(rows))
+        with torch.no_grad():
+            votes = self._votes(rows)
+            if votes is not None:
+                return rank_votes(self.gaussians, camera, votes, top, early=early)
+            rendering = self.render(camera)
+            unit = unit_embeddings(rows).to(self.features)
+            labels = self.decoder.label_pixels(rendering.map, unit, top, rendering.alpha > 0)
+            return Ranked(*labels, rendering.alpha)
+
+    def _votes(self, rows: Tensor) -> Votes | None:
+        """What the Gaussians say about some classes; that for the last text is kept."""
+        features = self.features
+        version = None if features.is_inference() else features._version  # changed in place: votes are counted again
+        kept = _VOTES.get(self)
+        if kept is not None and kept[0] == version is not None and torch.equal(kept[1], rows.to(kept[1])):
+            return kept[2]
+        votes = self.decoder.votes(features, unit_embeddings(rows).to(features))
+        if votes is not None:
+            _VOTES[self] = version, rows.detach().clone(), votes
+        return votes

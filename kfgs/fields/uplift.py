@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from .._card import short_repr
 from .._check import check_range, check_whole
 from .._progress import as_bar
 from .._rows import row_norms, unit_rows
@@ -27,7 +26,9 @@ from ..formats.values import check_splats
 from ..gaussians import Gaussians
 from ..quant import FeatureMaps
 from ..quant.linear import LinearLatents, fit_linear_latents
+from .decoders import Linear
 from .merge import FAINT, Merged, merge_gaussians
+from .semantic_field import Seen, SemanticField
 from .uplift_passes import average, correct, per_weight, some
 from .working_maps import WorkingMaps, working_directions
 
@@ -68,23 +69,6 @@ class UpliftConfig:
         return UpliftConfig(**({"max_gaussians": 50_000} | changes))
 
 
-@dataclass(frozen=True, eq=False)
-class Uplifted:
-    """Gaussians with fused features, and measures of their reliability."""
-
-    gaussians: Gaussians
-    """With latents as features; all-zero where no view shows the Gaussian."""
-    latents: LinearLatents
-    """The decoder of the latents."""
-    pixels: Tensor  # [N]
-    """Number of pixels that the Gaussian fills, in all views."""
-    agreement: Tensor  # [N] in [0, 1]
-    """Length of the mean of the unit features at its pixels: 1 if all are equal, 0 = never shown. For merged Gaussians the mean
-    over their members."""
-
-    __repr__ = short_repr
-
-
 @typed
 def uplift_maps(
     gaussians: Gaussians,
@@ -97,7 +81,7 @@ def uplift_maps(
     scratch: Path | None = None,
     progress: bool = False,
     report: Callable[[str], None] | None = None,
-) -> Uplifted:
+) -> SemanticField:
     """Average feature maps onto Gaussians by rendering weight, correct for blending, and keep few linear latents.
 
     Only the directions of features matter. No classes are used, so the result answers any text. Each map is read once for
@@ -116,14 +100,18 @@ def uplift_maps(
         progress: show a bar.
         report: called with a line per step.
 
+    Returns:
+        A field with a `Linear` decoder. Latents are all-zero where no view shows the Gaussian. `seen.agreement` of merged
+        Gaussians is the mean over their members.
+
     Raises:
         TypeError: if `progress` is a function: there are no rows to call it with.
         ValueError: if counts or shapes disagree, `write_splats` would refuse the Gaussians, a map is not finite, no map has
             features, or no view shows any Gaussian.
 
     Note:
-        To continue by training, start `fit_field` with `GaussianParams.from_gaussians(found.gaussians)` and the maps
-        `found.latents.encode(unit features)`.
+        To continue by training, start `fit_field` with `GaussianParams.from_gaussians(field.gaussians)` and the maps
+        `field.decoder.latents.encode(unit features)`.
     """
     config, progress = config or UpliftConfig(), as_bar(progress)
     say = report if report is not None else lambda text: None
@@ -160,7 +148,8 @@ def uplift_maps(
                 sums = torch.stack([_pooled(half, merged) for half in sums])
                 if config.corrections:
                     sums = correct(cloud, sums, views, bar)
-    return Uplifted(cloud.replace(features=_mean(sums)), latents, shown, agreement)
+    fused = cloud.replace(features=_mean(sums))
+    return SemanticField(fused, Linear(latents), tuple(cameras), seen=Seen(shown, agreement))
 
 
 @typed

@@ -21,7 +21,7 @@ from ..evaluation import SegmentationReport, evaluate_segmentation, load_label_m
 from ..evaluation.label_pictures import VOID
 from ..evaluation.segmentation import check_truth
 from ..evaluation.views import labels_of_view
-from ..fields import Rule, SemanticField
+from ..fields import SemanticField
 from ..formats.ply import Columns, other_elements, points_from_columns, read_ply, write_ply
 from ..formats.ply_3dgs import columns_from_gaussians, label_column
 from ..formats.render_mode import comments_of_mode
@@ -81,7 +81,6 @@ def segment_scene(
     out: str | Path,
     *,
     split: str = "test",
-    rule: Rule = "fused",
     pictures: int = 4,
     truth: Mapping[str, Tensor] | None = None,
     maps: Path | None = None,
@@ -90,13 +89,12 @@ def segment_scene(
     """Segment every view of a split (Sec. 3.4) and write the label maps and some pictures.
 
     Args:
-        field: a finished field in the frame of `scene`.
+        field: a finished field in the frame of `scene`. `field.paper` decodes every pixel, which takes seconds a view.
         scene: posed views without distortion.
         classes: names and embeddings in the teacher's space.
         out: receives `predicted/<stem>.png` (class numbers, 255 = none), `colored/<stem>.png` (the same in the classes'
             colours) and, for `pictures` evenly spread views, `sheets/`, `overlay/` and `features/`.
         split: which views.
-        rule: as in `SemanticField.segment`; `paper` decodes every pixel, which takes seconds a view.
         pictures: how many views get a sheet, an overlay and a feature picture.
         truth: from `true_labels`, for the sheets.
         maps: folder of the teacher's maps, for the sheets; views without a map have no teacher there.
@@ -117,7 +115,7 @@ def segment_scene(
     results: dict[str, Tensor] = {}
     for i in tqdm(views, desc="segment", unit="view", disable=not progress):
         camera, stem = scene.cameras[i], scene.stem(i)
-        labels = field.segment(camera, classes, rule=rule)
+        labels = field.segment(camera, classes)
         save_label_map(out / "predicted" / f"{stem}.png", labels)
         save_colored_labels(out / "colored" / f"{stem}.png", labels, classes.names)
         if i in shown:

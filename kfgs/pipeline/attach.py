@@ -17,7 +17,7 @@ from .._origin import recounted
 from .._typed import typed
 from ..cameras import Camera
 from ..cameras.similarity import Similarity
-from ..fields import SemanticField
+from ..fields import SemanticField, fuse_views
 from ..formats import read_splats
 from ..formats.splat_file import SCORE, SplatFile
 from ..gaussians import Gaussians
@@ -110,10 +110,10 @@ def attach(
         splats = read_splats(splats)
     elif isinstance(splats, Gaussians):
         splats = SplatFile(splats)
-    classes = field.label_set() if classes is None else classes
+    classes = field.classes if classes is None else classes
     cameras = cameras or field.cameras or None
-    if field.linear is None and cameras:
-        field = field.with_answers(cameras)
+    if field.fused is None and cameras:
+        field = fuse_views(field, cameras)
     by = by or ("distance" if cameras is None else "views")
     check_choice("by", by, WAYS)
     _check_frame(frame)

@@ -38,8 +38,7 @@ def describe(path: str | Path) -> str:
         raise FileNotFoundError(f"{path}: no such file or folder; expected a field, a run, a scene or a splat file")
     field = find_field(path)
     if field is not None:
-        size = [f"  one file of {path.stat().st_size / 2**20:.2f} MiB"] if field.is_file() else []
-        return "\n".join([SemanticField.load(field).summary(), *size])
+        return f"{SemanticField.load(field).summary()}\n  one file of {field.stat().st_size / 2**20:.2f} MiB"
     if path.is_file() or (splat_file_of(path) != path and not is_scene(path)):
         if find_format(path).NAME == "ply":
             columns = read_ply(splat_file_of(path))

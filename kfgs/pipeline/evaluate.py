@@ -29,7 +29,6 @@ from ..evaluation import (
 from ..evaluation.texts import as_encoder
 from ..evaluation.truth import ReadWhenAsked
 from ..fields import SemanticField
-from ..fields.parts import teacher_name
 from ..fields.store import find_field
 from ..formats import read_splats
 from ..gaussians import Gaussians
@@ -196,6 +195,12 @@ def read_teacher(folder: Path, scene: Scene, views: Sequence[View], *, align_cor
     maps = maps_of_views(scene, places, FeatureFolder(folder).of(scene, places))
     by_stem = ReadWhenAsked({view.stem: partial(maps.__getitem__, i) for i, view in enumerate(views)})
     return TeacherMethod(by_stem, f"teacher ({folder.name})", align_corners=align_corners)
+
+
+def teacher_name(info: dict[str, Any]) -> str | None:
+    """The name of the teacher in the `info` of a field or label set; None if unknown."""
+    teacher = info.get("teacher")
+    return str(teacher.get("name")) if isinstance(teacher, dict) else None
 
 
 def _notes(question: Question, method: Any, encode: Any) -> list[str]:

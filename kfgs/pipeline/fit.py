@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from .._card import short_repr
-from .._files import check_output, folded_name, read_json, write_json
+from .._files import check_output, folded_name, read_json, real_path, write_json
 from .._progress import Progress, as_progress
 from .._typed import typed
 from ..cameras import Camera
@@ -26,9 +26,10 @@ from ..fields import (
     GaussianParams,
     SemanticField,
     fit_field,
-    remember,
+    scene_classes,
 )
-from ..fields.store import check_place, holds_field
+from ..fields.decoders import Autoencoded, Codewords, Decoder, Identity
+from ..fields.store import NAME, check_place, holds_field
 from ..formats import SplatFile
 from ..gaussians import Gaussians
 from ..quant import (
@@ -50,7 +51,6 @@ from .points import with_points
 from .stages import Run, Stage, digest_scene, digest_tensors, stage_generator
 from .train import check_scene, field_stage, training_device, with_extent
 
-FIELD = "field"
 REPORT, TITLE = "report.html", "<title>kfgs: "
 PICTURES = ("preview.png", "codebook.png", "field.png")  # with the report, what `write_run_report` writes
 
@@ -67,8 +67,8 @@ class FitResult:
 
     @property
     def field_path(self) -> Path:
-        """The folder of the saved field."""
-        return self.folder / FIELD
+        """The file of the saved field."""
+        return self.folder / NAME
 
     @property
     def seconds(self) -> float:
@@ -214,7 +214,7 @@ def fit_scene(
         maps: one teacher map [h, w, D] per training view; read one at a time; a `FeatureFolder`, or a list in memory. When
             the stages that read them are finished, the maps may be deleted (`discard_maps`), except for the paper's mode
             `decouple`.
-        folder: the run folder; the finished field goes to `folder/field`. It replaces a field that other options made there,
+        folder: the run folder; the finished field goes to `folder/field.kfgs`. It replaces a field that other options made there,
             and the report of that one. The stages stay, so going back to the old options is quick.
         config: the method and its options.
         splat: of method `fuse`, the Gaussians to fuse onto, in the scene's frame: a splat file or its content. None takes
@@ -230,7 +230,7 @@ def fit_scene(
         ValueError: if the counts of views and maps differ, a camera has distortion, there is no such device, a splat is given
             to the paper's method, or its mode `decouple` gets `RecomputedMaps`; if a map's file is damaged; if `folder` is a
             file, or another process works in it.
-        FileExistsError: if `folder/field` is no field.
+        FileExistsError: if `folder/field.kfgs` is not a field.
         FileNotFoundError: if a stage needs maps that were discarded, or a picture is missing.
     """
     config, progress, maps = config or FitConfig(), as_progress(progress), as_maps(maps)
@@ -242,35 +242,37 @@ def fit_scene(
         raise ValueError("latents: expected none for method 'paper', whose autoencoder makes them; leave it out")
     run = Run(check_output("folder", folder, "a folder"), report)
     with run.locked():
-        check_place(run.folder / FIELD)
+        check_place(run.folder / NAME)
         if config.method == "paper" or (splat is None and scene.splat is None):  # else nothing is trained
             scene = with_points(run, scene, scene.views(config.split), config.seed, progress)
         job = _job(run, scene, maps, config, target_device, progress)
         found, about = _make_field(job, splat, latents)
         done = FitResult(found, run.folder, run.stages)
-        about |= _facts(job, found, done.field_path, getattr(maps, "identity", None))
-        done = replace(done, field=replace(found, info=about, folder=done.field_path))
+        about |= _facts(job, getattr(maps, "identity", None))
+        folder = scene.folder
+        classes = None if folder is None else scene_classes(folder, found.dim)
+        done = replace(done, field=replace(found, info=about, classes=classes))
         replace_field(run.folder, done.field)
     return done
 
 
 def replace_field(folder: Path, field: SemanticField) -> None:
     """Write the field of a run folder in one step. The report of an older one is deleted first: a kill leaves no wrong report."""
-    if not holds_field(folder / FIELD, vars(field)):
+    if not holds_field(folder / NAME, vars(field)):
         for name in (REPORT, *PICTURES):
             (folder / name).unlink(missing_ok=True)
-        field.save(folder / FIELD)
+        field.save(folder / NAME)
 
 
-def _facts(job: _Job, field: SemanticField, path: Path, teacher: Any) -> dict[str, Any]:
-    """What `field.json` says about the origin of a field."""
+def _facts(job: _Job, teacher: Any) -> dict[str, Any]:
+    """The `info` of a field about its origin."""
     scene, stages = job.scene, job.run.stages
     return {
         "seed": job.config.seed,
         "views": [camera.name for camera in job.cameras],
         "teacher_map": list(map_shape(job.maps)),
         **({"teacher": teacher} if teacher else {}),
-        **({} if scene.folder is None else remember(scene.folder, path, field.dim)),
+        **({} if scene.folder is None else {"scene": str(real_path(scene.folder))}),
         "seconds": {stage.name: round(stage.seconds, 3) for stage in stages},
         "kfgs": version("kfgs"),
     }
@@ -279,7 +281,7 @@ def _facts(job: _Job, field: SemanticField, path: Path, teacher: Any) -> dict[st
 def _make_field(
     job: _Job, splat: Gaussians | SplatFile | str | Path | None, latents: LinearLatents | None = None
 ) -> tuple[SemanticField, dict[str, Any]]:
-    """All stages of a method: the field, and what decided it, for `field.json`."""
+    """All stages of a method: the field, and what decided it, for its `info`."""
     config = job.config
     if config.method == "paper":
         about = {"method": config.method, "mode": config.mode, "steps": {"field": config.field.steps}}
@@ -296,21 +298,22 @@ def _make_field(
 
 def _paper_stages(job: _Job) -> SemanticField:
     """Figure 2: codebook, index maps, autoencoder, and Gaussians trained on the latent maps."""
-    codebook, autoencoder, mode = None, None, job.config.mode
+    mode = job.config.mode
     targets: Sequence[Tensor] = KnownFeatures(job.maps)
+    decoder: Decoder = Identity(map_shape(job.maps)[-1])
     if mode == "decouple":
         inputs: dict[str, Any] = {"mode": mode, "features": job.features}
     else:
         codebook, made = _codebook_stage(job)
         index_maps, indexed = _index_stage(job, codebook, made)
         inputs = {"mode": mode, "index_maps": indexed.key}
-        targets = LatentMaps(index_maps, codebook.codewords)
+        targets, decoder = LatentMaps(index_maps, codebook.codewords), Codewords(codebook)
         if mode == "adc+sc":
             autoencoder, compressed = _autoencoder_stage(job, codebook, made)
-            inputs["autoencoder"] = compressed.key
+            inputs["autoencoder"], decoder = compressed.key, Autoencoded(codebook, autoencoder)
             with torch.no_grad():
                 targets = LatentMaps(index_maps, autoencoder.encode(codebook.codewords))
-    return SemanticField(_field_stage(job, targets, inputs).activated().detach(), codebook, autoencoder)
+    return SemanticField(_field_stage(job, targets, inputs).activated().detach(), decoder)
 
 
 def _job(run: Run, scene: Scene, maps: Maps, config: FitConfig, device: torch.device, progress: Progress) -> _Job:

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from .._arrays import read_safetensors
-from .._files import as_path, write_json
+from .._files import real_path, write_json
 from .._progress import Progress
-from .._tensors import save_tensors
 from .._typed import typed
 from ..cameras import Camera
-from ..fields import Answers, Seen, SemanticField, UpliftConfig, fused_answers, remember, uplift_maps
+from ..fields import SemanticField, UpliftConfig, fuse_views, scene_classes, uplift_maps
+from ..fields.store import NAME
 from ..formats import SplatFile, read_splats
 from ..formats.folders import splat_file_of
 from ..gaussians import Gaussians
@@ -25,7 +25,7 @@ from ..scenes import Scene
 from .color import ColorConfig, find_color, make_color
 from .config import FitConfig
 from .maps import Maps, check_readable, maps_of_views
-from .stages import SHAPE, Run, digest_cameras, digest_shape, stage_generator
+from .stages import Run, digest_cameras, digest_shape, stage_generator
 
 
 def find_geometry(
@@ -36,7 +36,7 @@ def find_geometry(
     device: torch.device,
     progress: Progress,
 ) -> tuple[Gaussians, dict[str, Any]]:
-    """The Gaussians to fuse onto, and their origin, for `field.json`.
+    """The Gaussians to fuse onto, and their origin, for the field's `info`.
 
     Without a splat they are those of the scene's own splat, or else the colour field of the run. Its stage is found again
     if it is there. A longer colour field of the same scene, as `kfgs color` makes it in the same run folder, is taken
@@ -80,22 +80,13 @@ def uplift_stage(
         check_readable(maps, "the uplift")
         options: dict[str, Any] = {"scratch": scratch, "progress": progress, "report": run.report, "latents": latents}
         generator = stage_generator(inputs["seed"], "uplift")
-        found = uplift_maps(geometry.to("cpu"), cameras, maps, config, generator=generator, **options)
-        cloud = found.gaussians
-        tensors = {name: getattr(cloud, name) for name in (*SHAPE, "features")}
-        tensors |= {"basis": found.latents.basis, "pixels": found.pixels, "agreement": found.agreement}
-        save_tensors(folder / "uplift.safetensors", tensors)
-        write_json(folder / "facts.json", {"gaussians": len(cloud), "latents": found.latents.latent})
+        field = uplift_maps(geometry.to("cpu"), cameras, maps, config, generator=generator, **options)
+        field.save(folder / NAME)
+        write_json(folder / "facts.json", {"gaussians": len(field), "latents": field.decoder.latent})
 
     stage = run.stage("uplift", inputs, make)
     shutil.rmtree(scratch, ignore_errors=True)
-    tensors = read_safetensors(stage.folder / "uplift.safetensors")[0]
-    return SemanticField(
-        geometry.replace(**{name: tensors[name] for name in (*SHAPE, "features")}, sh=None, labels=None),
-        linear=LinearLatents(tensors["basis"]),
-        seen=Seen(tensors["pixels"], tensors["agreement"]),
-        cameras=tuple(cameras),
-    )
+    return SemanticField.load(stage.folder)
 
 
 @typed
@@ -105,7 +96,6 @@ def uplift(
     splat: Gaussians | SplatFile | SemanticField | str | Path,
     config: FitConfig | None = None,
     *,
-    folder: str | Path | None = None,
     progress: bool = False,
     report: Callable[[str], None] | None = None,
 ) -> SemanticField:
@@ -117,7 +107,6 @@ def uplift(
         splat: the Gaussians, a splat file or its content, or a field.
         config: only `uplift`, `split`, `undistorted_features` and `seed` are used. None: the training views, and every
             Gaussian stays unchanged.
-        folder: where the field will be saved; its notes about the scene are relative to it.
         progress: show a bar.
         report: called with a line per step.
 
@@ -135,32 +124,23 @@ def uplift(
     cloud = splat if isinstance(splat, Gaussians) else splat.gaussians
     options: dict[str, Any] = {"generator": stage_generator(config.seed, "uplift"), "progress": progress}
     viewed = maps_of_views(scene, scene.views(config.split), maps, undistorted=config.undistorted_features)
-    found = uplift_maps(cloud.to("cpu"), cameras, viewed, config.uplift, report=report, **options)
+    field = uplift_maps(cloud.to("cpu"), cameras, viewed, config.uplift, report=report, **options)
     teacher = getattr(maps, "identity", None)
     info = {
         "method": "uplift",
         "views": [camera.name for camera in cameras],
         **({"teacher": teacher} if teacher else {}),
-        **(
-            {} if folder is None or scene.folder is None else remember(scene.folder, as_path(folder), found.latents.dim)
-        ),
+        **({} if scene.folder is None else {"scene": str(real_path(scene.folder))}),
         "kfgs": version("kfgs"),
     }
-    seen = Seen(found.pixels, found.agreement)
-    place = None if folder is None else as_path(folder)
-    return SemanticField(found.gaussians, info=info, linear=found.latents, seen=seen, cameras=cameras, folder=place)
+    classes = None if scene.folder is None else scene_classes(scene.folder, field.dim)
+    return replace(field, info=info, classes=classes)
 
 
 def answers_stage(run: Run, field: SemanticField, cameras: Sequence[Camera]) -> SemanticField:
     """Compute the fused features of a trained field, as a stage of a run."""
     field_stage = next(stage for stage in reversed(run.stages) if stage.name == "field")
     inputs = {"field": field_stage.key}
-
-    def make(folder: Path) -> None:
-        found = fused_answers(field.gaussians, field.codebook, field.autoencoder, cameras)
-        tensors = {"latents": found.latents, "basis": found.linear.basis, **found.seen._asdict()}
-        save_tensors(folder / "answers.safetensors", tensors)
-
-    tensors = read_safetensors(run.stage("answers", inputs, make).folder / "answers.safetensors")[0]
-    seen = Seen(tensors["pixels"], tensors["agreement"])
-    return field.with_answers(cameras, Answers(tensors["latents"], LinearLatents(tensors["basis"]), seen))
+    return SemanticField.load(
+        run.stage("answers", inputs, lambda folder: fuse_views(field, cameras).save(folder / NAME)).folder
+    )

@@ -14,7 +14,7 @@ from .._files import as_path, check_output, file_stem
 from .._typed import typed
 from ..cameras import Camera
 from ..evaluation.coco import save_coco
-from ..fields import Rule, SemanticField
+from ..fields import SemanticField
 from ..labels import LabelSet
 from ..viz import save_picture
 from ..viz.pictures import Array
@@ -32,7 +32,6 @@ def segment_cameras(
     classes: LabelSet,
     out: str | Path,
     *,
-    rule: Rule = "fused",
     progress: bool = False,
 ) -> dict[str, Tensor]:
     """Segment what any cameras see, and write label pictures. For views of a scene, `segment_scene` adds photographs.
@@ -43,7 +42,6 @@ def segment_cameras(
             `spiral_cameras`, or your own.
         classes: names and embeddings in the teacher's space.
         out: receives `predicted/<name>.png` (class numbers, 255 = none) and `colored/<name>.png` (in the classes' colours).
-        rule: as in `SemanticField.segment`.
         progress: show a progress bar.
 
     Returns:
@@ -58,7 +56,7 @@ def segment_cameras(
     check_classes(field, classes)
     found: dict[str, Tensor] = {}
     for name, camera in zip(names, tqdm(cameras, desc="segment", unit="view", disable=not progress), strict=True):
-        found[name] = field.segment(camera, classes, rule=rule)
+        found[name] = field.segment(camera, classes)
         save_label_map(out / "predicted" / f"{name}.png", found[name])
         save_colored_labels(out / "colored" / f"{name}.png", found[name], classes.names)
     return found

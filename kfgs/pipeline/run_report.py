@@ -16,7 +16,6 @@ import torch
 from .._files import atomic_path, bytes_in_words, real_path, seconds_in_words
 from .._typed import typed
 from ..fields import SemanticField
-from ..fields.store import DESCRIPTION, TENSORS
 from ..labels import LabelSet
 from ..scenes import Scene
 from ..viz import FeatureColors, overlay_labels, save_picture
@@ -92,17 +91,17 @@ def write_run_report(
     preview = write_preview(result.folder / "preview.png", result.field, scene, config.split)
     training = write_training_pictures(result)
     field, info = result.field, result.field.info
-    size = sum((result.field_path / name).stat().st_size for name in (TENSORS, DESCRIPTION))
-    teacher = info.get("teacher") or {}
+    size = result.field_path.stat().st_size
+    teacher, codebook = info.get("teacher") or {}, getattr(field.decoder, "codebook", None)
     facts = {
         "scene": f"{scene.folder or 'in memory'}: {len(scene)} views, {len(info.get('views', ()))} of them used",
         "teacher": teacher.get("name", "not known"),
         "teacher's maps": " x ".join(map(str, info.get("teacher_map", ()))),
-        "method": field.method,
+        "method": field.decoder.name,
         "geometry": info.get("geometry", "trained with the field"),
         "Gaussians": f"{len(field):,}",
-        "numbers for each Gaussian's meaning": f"{field.channels}, for {field.dim} channels of the teacher",
-        "codewords": None if field.codebook is None else field.codebook.size,
+        "numbers for each Gaussian's meaning": f"{field.features.shape[1]}, for {field.dim} channels of the teacher",
+        "codewords": None if codebook is None else codebook.size,
         "size on disk": bytes_in_words(size),
         "size as the paper's Table 1 counts it": bytes_in_words(field.storage()),
         "seed": info.get("seed"),
@@ -139,7 +138,7 @@ def write_run_report(
 
 
 def _classes(field: SemanticField) -> LabelSet | None:
-    return field.label_set() if field.has_classes else None
+    return field.classes
 
 
 def _next(path: Path, field: SemanticField) -> str:

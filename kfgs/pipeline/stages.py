@@ -38,10 +38,10 @@ from ..scenes import Scene
 from ..scenes.files import has_alpha
 
 STAGE_FILE, LOCK, DIGESTS = "stage.json", ".run.lock", "digests.json"
-WRITTEN = ("field", "stages", "stages/*", "unfinished", "unfinished/*", "teacher", "teacher/*")
+WRITTEN = ("stages", "stages/*", "unfinished", "unfinished/*", "teacher", "teacher/*")
 """The folders in a run folder that are written to."""
 SHAPE = ("means", "quats", "scales", "opacities")
-STAGE_VERSION = 2
+STAGE_VERSION = 3
 """Part of every key: raised if the same inputs give another result in a new version, so that old stages are not reused."""
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +31,8 @@ from .._files import (
 )
 from .._rows import unit_rows
 from ..features import FeatureFolder
-from ..fields import SemanticField, sample_latents, select_gaussians
-from ..fields.remembered import rebased
-from ..fields.store import DESCRIPTION, TENSORS
+from ..fields import SemanticField, sample_latents
+from ..fields.store import NAME
 from ..formats import SplatFile, read_splats, write_splats
 from ..formats.folders import splat_file_of
 from ..gaussians import Gaussians
@@ -219,7 +218,7 @@ def fit_block(
         own = torch.from_numpy(block.holds(_places(result.field.gaussians)))
         facts |= {"gaussians": int(own.sum()), "of": len(own), "seconds": round(result.seconds, 1)}
         if bool(own.any()):
-            core = select_gaussians(result.field, own)
+            core = result.field.select(own)
             facts["box"] = _box(core)
     _put(folder / CORE, core, facts)
     return facts
@@ -228,12 +227,11 @@ def fit_block(
 def _put(place: Path, core: SemanticField | None, facts: dict[str, Any]) -> None:
     """Write the core of a block, if it has Gaussians, and the facts about it, in one step."""
     with atomic_folder(place) as new:
-        if core is not None:  # its notes are relative to where it is going to be
-            replace(core, info=rebased(core.info, core.folder, place), folder=None).save(new)
+        if core is not None:
+            core.save(new / NAME)
         write_json(new / FACTS, facts)
     if core is None:  # what is left of an older one
-        for name in (DESCRIPTION, TENSORS):
-            (place / name).unlink(missing_ok=True)
+        (place / NAME).unlink(missing_ok=True)
 
 
 def fit_blocks(

@@ -17,7 +17,7 @@ from .._card import say_coordinate
 from .._check import as_array, check_range
 from .._files import as_path, read_json, real_path
 from ..cameras import Camera
-from ..fields import SemanticField, join_fields, remember, select_gaussians
+from ..fields import SemanticField, join_fields, scene_classes
 from ..gaussians import Gaussians
 from ..labels import LabelSet, Selection, transfer_labels
 from ..labels.nearest import places_of
@@ -104,10 +104,8 @@ class FieldInBlocks:
         """Parts as one field, which remembers the scene of all blocks."""
         field = join_fields(parts)
         scene = real_path(self.folder / _described(self.folder)[0])
-        info = {
-            name: value for name, value in field.info.items() if name not in ("geometry", "seconds", "scene", "classes")
-        }
-        return replace(field, info=info | remember(scene, self.folder, field.dim), folder=self.folder)
+        info = {name: value for name, value in field.info.items() if name not in ("geometry", "seconds")}
+        return replace(field, info=info | {"scene": str(scene)}, classes=scene_classes(scene, field.dim))
 
     def within(self, low: Sequence[float], high: Sequence[float]) -> SemanticField:
         """The Gaussians whose centres lie in a box, as one field; only blocks that touch the box are read.
@@ -146,7 +144,7 @@ class FieldInBlocks:
                 means = as_array(places_of("gaussians", field.gaussians))
                 inside = ((means >= low) & (means <= high)).all(1)
                 if inside.any():
-                    parts.append(select_gaussians(field, torch.from_numpy(inside)))
+                    parts.append(field.select(torch.from_numpy(inside)))
         return parts
 
     def seen_from(self, camera: Camera) -> SemanticField:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from .._files import read_json
-from ..fields.remembered import CLASSES
+from ..fields.notes import CLASSES
 from ..labels import LabelSet, load_label_set
 from ..scenes import Scene, SceneError, is_scene, list_images, load_scene
 from .options import Job

@@ -25,6 +25,7 @@ from .._files import InUseError, digest_value, write_json
 from .._notes import hear
 from ..features import FeatureFolder, Picture, discard_maps, extract_features, join_features, pictures_of
 from ..fields import SemanticField
+from ..fields.store import NAME
 from ..pipeline import fit_scene, segment_scene, true_labels
 from ..pipeline.evaluate import evaluate
 from ..pipeline.train import training_device
@@ -172,7 +173,7 @@ def fit(job: Job, key: str, *, report: Report) -> dict[str, Any]:
             earlier = sum(stage.seconds for stage in made.stages if stage.reused)
             return {"gaussians": len(made.field), "latents": made.field.features.shape[1], "seconds": earlier}
 
-        result = _stage(out, "fit", key, ("field",), ("features", "scene", "stages", "field", "color.ply"), make)
+        result = _stage(out, "fit", key, (NAME,), ("features", "scene", "stages", NAME, "color.ply"), make)
         if options.discard_features and options.teacher is not None and (out.path / "features").is_dir():
             discard_maps(out.path / "features")
             out.store()
@@ -188,7 +189,7 @@ def segment(job: Job, key: str, split: str, *, report: Report) -> dict[str, Any]
             scene, truth = load(source, out).undistorted(), truth_of(source)
             known = {} if truth is None else true_labels(scene, truth, split)
             made = segment_scene(
-                SemanticField.load(out.path / "field"),
+                SemanticField.load(out.path),
                 scene,
                 classes_of(job, source),
                 out.path / "segmented",
@@ -198,7 +199,7 @@ def segment(job: Job, key: str, split: str, *, report: Report) -> dict[str, Any]
             )
             return {"views": len(made)}
 
-        return _stage(out, "segment", key, ("segmented",), ("field", "scene"), make)
+        return _stage(out, "segment", key, ("segmented",), (NAME, "scene"), make)
 
 
 def score(job: Job, key: str, *, report: Report) -> dict[str, Any]:
@@ -210,7 +211,7 @@ def score(job: Job, key: str, *, report: Report) -> dict[str, Any]:
             photos = photos_of(source)
             folder, images = (source.path, None) if not photos else (out.path / "scene", source.path / photos)
             found = evaluate(
-                out.path / "field",
+                out.path / NAME,
                 folder,
                 PROTOCOL,
                 encode=classes_of(job, source),
@@ -222,7 +223,7 @@ def score(job: Job, key: str, *, report: Report) -> dict[str, Any]:
             report(str(found))
             return {"miou": found.to_json()["scores"]["mIoU"]}
 
-        return _stage(out, "evaluate", key, ("scores.json",), ("field", "scene"), make)
+        return _stage(out, "evaluate", key, ("scores.json",), (NAME, "scene"), make)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .._card import short_repr
 from ..cameras import Camera
-from ..fields import SemanticField
+from ..fields import Linear, SemanticField, fuse_views
 from ..formats import SplatFile
 from ..formats.splat_file import SCORE
 from ..gaussians import Gaussians
@@ -73,7 +73,7 @@ class FieldMeaning:
         field: a finished field.
         classes: names and embeddings in the teacher's space; None: those that the field remembers.
         cameras: the training views, used only to compute fused features if the field has none yet
-            (`SemanticField.with_answers`); empty: the field's own. Without any view, each Gaussian's own latent decides,
+            (`fields.fuse_views`); empty: the field's own. Without any view, each Gaussian's own latent decides,
             as in the paper.
         embed: the teacher's text encoder, text -> [D]; without it only classes can be asked.
 
@@ -91,15 +91,15 @@ class FieldMeaning:
         cameras: Sequence[Camera] = (),
         embed: Callable[[str], Tensor] | None = None,
     ) -> None:
-        classes = field.label_set() if classes is None else classes
+        classes = field.classes if classes is None else classes
         class_rows(classes, field.dim, field.info)  # checks them before views are rendered
         self._classes = replace(classes, info={})  # the teachers were compared just now: warn once, not per question
         views = list(cameras or field.cameras)
         self.by = "each Gaussian's own latent (Sec. 3.4)"
-        if field.linear is not None:
+        if field.fused is not None or isinstance(field.decoder, Linear):
             self.by = "what the training views show of each Gaussian"
         elif views:
-            field, self.by = field.with_answers(views), f"what {len(views)} views show of each Gaussian"
+            field, self.by = fuse_views(field, views), f"what {len(views)} views show of each Gaussian"
         self.field = field
         labels, self.scores = field.classify(self._classes)
         self._embed = embed

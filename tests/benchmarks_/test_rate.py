@@ -7,14 +7,14 @@ import rate
 import torch
 from cases_packed import field
 
-from kfgs.fields.precision import SMALL
+from kfgs.fields.packing import SMALL
 
 
 class Room:
     """Scores a field by the labels of its Gaussians instead of views, and remembers it."""
 
     def __init__(self, made):
-        self.classes, self.seen = made.words, []
+        self.classes, self.seen = made.classes, []
 
     def score(self, found, text=None):
         self.seen.append(found.classify(self.classes if text is None else text).labels)

@@ -202,7 +202,7 @@ def inside(desk, tmp_path, monkeypatch):
 @pytest.fixture
 def encode():
     """A text encoder that knows the classes of the room; other words are like the wall."""
-    words = kfgs.SemanticField.load("run/field").label_set()
+    words = kfgs.SemanticField.load("run/field.kfgs").classes
     return lambda texts: words.embeddings[[words.names.index(text) if text in words.names else 0 for text in texts]]
 
 
@@ -224,7 +224,7 @@ def test_the_python_of_other_pages_runs(page, inside):
     if page == "howto/export":
         pytest.importorskip("trimesh")
     Path("kfgs_demo").symlink_to(".")
-    kfgs.write_splats("labelled.ply", kfgs.attach(kfgs.SemanticField.load("run/field"), "my.ply").splats)
+    kfgs.write_splats("labelled.ply", kfgs.attach(kfgs.SemanticField.load("run/field.kfgs"), "my.ply").splats)
     known = {}
     for block in blocks_of(page):
         exec(block, known)
@@ -233,7 +233,7 @@ def test_the_python_of_other_pages_runs(page, inside):
 def test_the_python_of_protocols_runs(inside, encode, capsys):
     Path("room").symlink_to("scene")
     scene = kfgs.load_scene("room")
-    names = kfgs.SemanticField.load("run/field").label_set().names
+    names = kfgs.SemanticField.load("run/field.kfgs").classes.names
     teacher = SimpleNamespace(encode_text=encode)
     known = {"names": names, "maps": true_labels(scene, "room/labels", "test"), "teacher": teacher}
     [block] = blocks_of("protocols")
@@ -249,7 +249,7 @@ def test_the_python_of_datasets_runs(inside, encode):
     chair = {"category": "chair", "segmentation": [[10, 10], [40, 10], [40, 40], [10, 40]], "bbox": [10, 10, 40, 40]}
     label = {"info": {"name": "view_001.png", "width": 80, "height": 60}, "objects": [chair]}
     Path("lerf_ovs/label/desk/view_001.json").write_text(json.dumps(label))
-    known = {"method": FieldMethod(kfgs.SemanticField.load("run/field")), "encode": encode}
+    known = {"method": FieldMethod(kfgs.SemanticField.load("run/field.kfgs")), "encode": encode}
     [block] = blocks_of("datasets")
     exec(block.replace("figurines", "desk"), known)
     assert known["report"].protocol == "lerf-ovs-2d/1"

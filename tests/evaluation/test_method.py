@@ -15,7 +15,7 @@ from kfgs.evaluation import (
     best_labels,
     label_view,
 )
-from kfgs.fields import SemanticField
+from kfgs.fields import Autoencoded, Codewords, Identity, Linear, SemanticField
 from kfgs.quant import Autoencoder, Codebook, LinearLatents
 from kfgs.scenes import FeatureFolder, save_feature_map
 
@@ -29,23 +29,24 @@ VIEW = View("a", Camera(torch.eye(4), torch.tensor([[40.0, 0, 20], [0, 40, 8], [
 def _field(mode: str) -> SemanticField:
     """Three balls side by side with the features e0, e1, e2 at columns 10, 20, 30; the last ball of four knows nothing."""
     features = torch.cat([torch.eye(3, DIM) * torch.tensor([[1.0], [2.0], [0.5]]), torch.zeros(1, DIM)])
-    parts = {}
+    decoder = Identity(DIM)
     if mode == "fused":
-        parts["linear"] = LinearLatents(torch.eye(DIM, 4))
+        decoder = Linear(LinearLatents(torch.eye(DIM, 4)))
         features = features[:, :4]
     if mode in ("codebook", "autoencoder"):
-        parts["codebook"] = Codebook(torch.eye(3, DIM) * 3)
+        decoder = Codewords(Codebook(torch.eye(3, DIM) * 3))
     if mode == "autoencoder":
-        parts["autoencoder"] = Autoencoder(
+        autoencoder = Autoencoder(
             encoder=((torch.eye(4, DIM), torch.zeros(4)),),
             decoder=((torch.eye(DIM, 4), torch.zeros(DIM)), (torch.eye(DIM), torch.zeros(DIM))),
             low=0.0,
             high=3.0,
         )
-        features = torch.cat([parts["autoencoder"].encode(torch.eye(3, DIM) * 3).detach(), torch.zeros(1, 4)])
+        decoder = Autoencoded(decoder.codebook, autoencoder)
+        features = torch.cat([autoencoder.encode(torch.eye(3, DIM) * 3).detach(), torch.zeros(1, 4)])
     means = torch.tensor([[-1.25, 0, 5], [0, 0, 5], [1.25, 0, 5], [50, 0, 5]])
     cloud = Gaussians(means, torch.eye(4)[:1].repeat(4, 1), torch.full((4, 3), 0.1), torch.full((4,), 0.9), features)
-    return SemanticField(cloud, **parts)
+    return SemanticField(cloud, decoder)
 
 
 @pytest.mark.parametrize("mode", ["plain", "fused", "codebook", "autoencoder"])

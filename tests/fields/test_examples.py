@@ -36,9 +36,9 @@ def test_a_huge_view_is_drawn_small_and_says_the_same(monkeypatch):
 
 def test_a_stored_camera_of_more_pixels_than_any_picture_is_refused(tmp_path):
     huge = replace(VIEW, width=20_000, height=20_000)
-    replace(FIELD, cameras=(huge,)).save(tmp_path / "field")
+    replace(FIELD, cameras=(huge,)).save(tmp_path / "field.kfgs")
     with pytest.raises(ValueError, match=r"134,217,728 pixels.*20,000 x 20,000"):
-        SemanticField.load(tmp_path / "field")
+        SemanticField.load(tmp_path / "field.kfgs")
     assert isinstance(huge, Camera)
     assert len(FIELD) == 2 * COUNT
 

@@ -257,7 +257,7 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
 
 def test_a_folder_that_is_deleted_meanwhile_is_noticed_at_the_next_checkpoint(tmp_path):
     cameras, targets = scene()
-    path, steps = tmp_path / "run" / "unfinished" / "field", []
+    path, steps = tmp_path / "run" / "unfinished" / "field.kfgs", []
 
     def watch(row):
         steps.append(row["step"])

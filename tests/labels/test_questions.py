@@ -6,7 +6,7 @@ import torch
 from messages import tells
 
 from kfgs import Camera, Gaussians
-from kfgs.fields import SemanticField
+from kfgs.fields import Identity, SemanticField
 from kfgs.labels import LabelSet
 from kfgs.labels.questions import class_rows, make_question
 
@@ -65,7 +65,7 @@ def field(teacher="lseg"):
     features = torch.cat([FIVE, torch.zeros(1, 5)])
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(6, 1)
     gaussians = Gaussians(torch.rand(6, 3), quats, torch.full((6, 3), 0.1), torch.full((6,), 0.9), features)
-    return SemanticField(gaussians, info={"teacher": {"name": teacher}})
+    return SemanticField(gaussians, Identity(gaussians.features.shape[1]), info={"teacher": {"name": teacher}})
 
 
 def test_negatives_are_the_classes_the_canonical_words_or_none():

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from kfgs.cameras import Camera
 from kfgs.cameras.similarity import Similarity
-from kfgs.fields import SemanticField
+from kfgs.fields import Identity, SemanticField
 from kfgs.formats.sidecar import names_path
 from kfgs.formats.splat_file import SplatFile
 from kfgs.formats.table import read_splats, write_splats
@@ -42,7 +42,8 @@ def cloud(count, seed, **others):
 
 def a_field(count=4_000):
     gaussians = cloud(count, 0)
-    return SemanticField(gaussians.replace(features=CLASSES.embeddings[true_labels(gaussians.means)]))
+    made = gaussians.replace(features=CLASSES.embeddings[true_labels(gaussians.means)])
+    return SemanticField(made, Identity(CLASSES.dim))
 
 
 def a_splat(count=6_000):
@@ -118,13 +119,17 @@ def test_other_rules_of_distance_outvote_mistakes_and_score_by_the_share_of_weig
     )
     there = splats.replace(gaussians=transform_gaussians(splats.gaussians, similarity))
     given = {"distance": 0.5, "method": method}
-    attached = attach(SemanticField(semantic), there, CLASSES, frame=similarity, **given)
+    attached = attach(
+        SemanticField(semantic, Identity(semantic.features.shape[1])), there, CLASSES, frame=similarity, **given
+    )
     expected = transfer_labels(transform_gaussians(semantic, similarity), said, there.gaussians, **given)
     assert attached.transfer.method == method
     assert torch.equal(attached.labels, expected.labels)
     torch.testing.assert_close(torch.from_numpy(attached.splats.extra["score"]), expected.shares.float())
     assert float(expected.shares[expected.labels >= 0].min()) < 0.6  # some are not sure
-    nearest = attach(SemanticField(semantic), there, CLASSES, frame=similarity, distance=0.5)
+    nearest = attach(
+        SemanticField(semantic, Identity(semantic.features.shape[1])), there, CLASSES, frame=similarity, distance=0.5
+    )
     assert accuracy(attached.labels, splats) > accuracy(nearest.labels, splats) + 0.02
     assert "share of the weights" in attached.splats.info["labels"]["score"]
     assert attached.splats.info["labels"]["method"] == method

@@ -91,9 +91,9 @@ def test_photos_cut_to_portraits_give_nearly_the_same_labels(room, scene, maps, 
 
 
 def test_a_splat_becomes_a_small_field_that_is_right_on_unseen_views(fitted, scene, classes, room, tmp_path):
-    assert fitted.field.method == "fused"
+    assert fitted.field.decoder.name == "fused"
     assert len(fitted.field) <= 1_500
-    assert fitted.field.channels <= 32
+    assert fitted.field.decoder.latent <= 32
     found = segment_scene(fitted.field, scene, classes, tmp_path, pictures=1)
     truth = true_labels(scene, room / "labels", "test")
     assert score_scene(found, truth, classes).accuracy.value > 0.75
@@ -129,11 +129,11 @@ def test_without_a_splat_gaussians_are_trained_and_a_longer_colour_fit_is_taken(
     made = fit_scene(scene, maps, tmp_path, config)
     assert [(stage.name, stage.reused) for stage in made.stages] == [("color", False), ("uplift", False)]
     assert (tmp_path / "color.ply").is_file()
-    written = (tmp_path / "field" / "field.safetensors").stat().st_mtime_ns
+    written = (tmp_path / "field.kfgs").stat().st_mtime_ns
     again = fit_scene(scene, maps, tmp_path, config)
     assert [(stage.name, stage.reused) for stage in again.stages] == [("color", True), ("uplift", True)]
     assert again.field.info == made.field.info
-    assert (tmp_path / "field" / "field.safetensors").stat().st_mtime_ns == written
+    assert (tmp_path / "field.kfgs").stat().st_mtime_ns == written
     other = fit_scene(scene, maps, tmp_path, dataclasses.replace(config, seed=1))
     assert not any(stage.reused for stage in other.stages)
     longer = dataclasses.replace(quick, field=quick.field.with_steps(40))
@@ -211,7 +211,7 @@ def test_the_paper_takes_no_splat(scene, maps, splat, tmp_path):
 
 def test_a_field_remembers_classes_and_cameras(fitted, scene, classes):
     loaded = SemanticField.load(fitted.field_path)
-    assert loaded.label_set().names == classes.names
+    assert loaded.classes.names == classes.names
     assert [camera.name for camera in loaded.cameras] == [scene.cameras[i].name for i in scene.views("train")]
     camera = scene.cameras[scene.views("test")[0]]
     assert torch.equal(loaded.segment(camera), fitted.field.segment(camera, classes))
@@ -219,7 +219,7 @@ def test_a_field_remembers_classes_and_cameras(fitted, scene, classes):
 
 
 def test_uplift_keeps_every_gaussian_and_is_a_field_like_any_other(scene, maps, splat, classes, tmp_path):
-    found = kfgs.uplift(scene, maps, splat, folder=tmp_path / "field")
+    found = kfgs.uplift(scene, maps, splat, folder=tmp_path / "field.kfgs")
     assert len(found) == len(splat)
     assert torch.equal(found.gaussians.means, splat.means)
     assert found.seen is not None
@@ -228,8 +228,8 @@ def test_uplift_keeps_every_gaussian_and_is_a_field_like_any_other(scene, maps, 
     assert torch.equal(found.known, shown)
     assert (found.classify(classes).labels[~shown] == -1).all()
     assert float(found.seen.agreement.max()) <= 1
-    found.save(tmp_path / "field")
-    assert torch.equal(SemanticField.load(tmp_path / "field").classify().labels, found.classify(classes).labels)
+    found.save(tmp_path / "field.kfgs")
+    assert torch.equal(SemanticField.load(tmp_path / "field.kfgs").classify().labels, found.classify(classes).labels)
     twice = uplift(scene, maps, found)  # a field's Gaussians will do
     assert torch.equal(twice.features, found.features)
 
@@ -263,15 +263,15 @@ def test_the_command_line_needs_the_field_alone(fitted, splat, scene, tmp_path, 
 
 
 def test_a_field_that_is_saved_elsewhere_still_finds_its_classes(fitted, classes, tmp_path):
-    SemanticField.load(fitted.field_path).save(tmp_path / "deep" / "er" / "field")
-    assert SemanticField.load(tmp_path / "deep" / "er" / "field").label_set().names == classes.names
+    SemanticField.load(fitted.field_path).save(tmp_path / "deep" / "er" / "field.kfgs")
+    assert SemanticField.load(tmp_path / "deep" / "er" / "field.kfgs").classes.names == classes.names
 
 
 def test_a_moved_scene_is_told(fitted, room, tmp_path, capsys):
     shutil.copytree(fitted.folder, tmp_path / "elsewhere" / "run")
-    assert main(["select", "chair", str(tmp_path / "elsewhere" / "run" / "field")]) == 1
+    assert main(["select", "chair", str(tmp_path / "elsewhere" / "run" / "field.kfgs")]) == 1
     assert "where this field's classes were; pass the classes" in capsys.readouterr().err
-    arguments = ["select", "chair", str(tmp_path / "elsewhere" / "run" / "field"), "--scene", str(room)]
+    arguments = ["select", "chair", str(tmp_path / "elsewhere" / "run" / "field.kfgs"), "--scene", str(room)]
     assert main(arguments) == 0
 
 
@@ -283,7 +283,7 @@ def test_fit_and_uplift_from_the_command_line(room, splat, scene, tmp_path, caps
     assert main([*arguments, "--splat", str(tmp_path / "splat.ply"), "--max-gaussians", "900"]) == 0
     said = capsys.readouterr().out
     assert "semantic field (fused)" in said
-    assert len(SemanticField.load(tmp_path / "run" / "field")) <= 900
+    assert len(SemanticField.load(tmp_path / "run" / "field.kfgs")) <= 900
     arguments = ["uplift", str(room), str(tmp_path / "splat.ply"), "--features", str(features)]
     assert main([*arguments, "--out", str(tmp_path / "up")]) == 0
     assert len(SemanticField.load(tmp_path / "up")) == len(splat)

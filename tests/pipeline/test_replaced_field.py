@@ -17,7 +17,7 @@ from kfgs.scenes import FeatureFolder, load_scene
 
 REPLACED = """
 import numpy as np, torch
-from kfgs.fields import SemanticField
+from kfgs.fields import Identity, SemanticField
 from kfgs.gaussians import Gaussians
 from kfgs.pipeline.fit import REPORT, TITLE, replace_field
 from kfgs.viz import save_picture
@@ -25,11 +25,12 @@ from kfgs.viz import save_picture
 def tiny_field(number):
     means = torch.arange(12.0).view(4, 3) + number
     quats = torch.tensor([1.0, 0, 0, 0]).repeat(4, 1)
-    return SemanticField(Gaussians(means, quats, torch.full((4, 3), 0.5), torch.full((4,), 0.5), features=torch.eye(4)))
+    cloud = Gaussians(means, quats, torch.full((4, 3), 0.5), torch.full((4,), 0.5), features=torch.eye(4))
+    return SemanticField(cloud, Identity(4))
 
 def prepare(folder):
-    tiny_field(0).save(folder / "field")
-    (folder / "field" / "notes.txt").write_text("mine")
+    tiny_field(0).save(folder / "field.kfgs")
+    (folder / "notes.txt").write_text("mine")
     (folder / REPORT).write_text(TITLE + "0")
     save_picture(folder / "preview.png", np.zeros((2, 2), np.uint8))
     (folder / "codebook.png").write_text("mine")
@@ -42,9 +43,9 @@ def work(folder):
 def test_at_every_kill_a_field_is_whole_and_its_report_its_own_or_gone(tmp_path):
     seen = set()
     for folder in kill_everywhere(REPLACED, tmp_path / "kills"):
-        first = int(SemanticField.load(folder / "field").gaussians.means[0, 0])
+        first = int(SemanticField.load(folder / "field.kfgs").gaussians.means[0, 0])
         seen.add((first, *(name for name in ("report.html", "preview.png") if (folder / name).exists())))
-        assert (folder / "codebook.png").read_text() == (folder / "field" / "notes.txt").read_text() == "mine"
+        assert (folder / "notes.txt").read_text() == "mine"
     assert seen == {(0, "report.html", "preview.png"), (0, "preview.png"), (0,), (1,)}
 
 
@@ -64,37 +65,34 @@ def tiny_splat(scene):
 def test_going_back_to_the_old_options_makes_no_stage_again(fuse, tmp_path):
     scene, maps, config, splat = fuse
     one = fit_scene(scene, maps, tmp_path, config, splat=splat)
-    before = (tmp_path / "field" / "field.safetensors").read_bytes()
-    (one.field_path / "notes.txt").write_text("mine")
+    before = (tmp_path / "field.kfgs").read_bytes()
     fewer = dataclasses.replace(config, uplift=dataclasses.replace(config.uplift, max_gaussians=10))
     fit_scene(scene, maps, tmp_path, fewer, splat=splat)
-    assert len(SemanticField.load(tmp_path / "field")) == 10 < len(one.field)
-    assert {path.name for path in tmp_path.glob("field*")} == {"field"}
+    assert len(SemanticField.load(tmp_path / "field.kfgs")) == 10 < len(one.field)
     again = fit_scene(scene, maps, tmp_path, config, splat=splat)
     assert all(stage.reused for stage in again.stages)
-    assert (tmp_path / "field" / "field.safetensors").read_bytes() == before
-    assert (tmp_path / "field" / "notes.txt").read_text() == "mine"
+    assert (tmp_path / "field.kfgs").read_bytes() == before
 
 
 def test_a_damaged_field_is_replaced(fuse, tmp_path):
     scene, maps, config, splat = fuse
     fit_scene(scene, maps, tmp_path, config, splat=splat)
-    for name, size in (("field.safetensors", 100), ("field.json", 50), ("field.json", 0)):
-        os.truncate(tmp_path / "field" / name, size)
-        with pytest.raises(ValueError, match="fit|damaged|JSON"):
-            SemanticField.load(tmp_path / "field")
+    for size in (1000, 100, 0):
+        os.truncate(tmp_path / "field.kfgs", size)
+        with pytest.raises(ValueError, match="fit the field again"):
+            SemanticField.load(tmp_path / "field.kfgs")
         fit_scene(scene, maps, tmp_path, config, splat=splat)
-        SemanticField.load(tmp_path / "field")
+        SemanticField.load(tmp_path / "field.kfgs")
 
 
 def test_what_is_no_field_is_named_before_the_work(fuse, tmp_path):
     scene, maps, config, splat = fuse
-    (tmp_path / "field").mkdir()
-    (tmp_path / "field" / "notes.txt").write_text("mine")
-    with pytest.raises(FileExistsError, match=tells(tmp_path / "field", "something else")):
+    (tmp_path / "field.kfgs").mkdir()
+    (tmp_path / "field.kfgs" / "notes.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match=tells(tmp_path / "field.kfgs", "something else")):
         fit_scene(scene, maps, tmp_path, config, splat=splat)
     assert not (tmp_path / "stages").exists()
-    assert [path.name for path in (tmp_path / "field").iterdir()] == ["notes.txt"]
+    assert [path.name for path in (tmp_path / "field.kfgs").iterdir()] == ["notes.txt"]
 
 
 def test_a_second_fit_in_the_folder_is_refused_and_destroys_nothing(fuse, tmp_path):

@@ -6,7 +6,7 @@ from messages import tells
 
 from kfgs import Gaussians
 from kfgs.cameras import Camera
-from kfgs.fields import SemanticField
+from kfgs.fields import Identity, SemanticField
 from kfgs.labels import LabelSet
 from kfgs.pipeline import segment_scene
 from kfgs.pipeline.describe import describe
@@ -20,7 +20,7 @@ def parts(folder):
     cloud = Gaussians(torch.eye(3), torch.ones(3, 4), torch.ones(3, 3), torch.full((3,), 0.5), features=torch.eye(3))
     none = torch.zeros(0, 3)
     scene = Scene([camera], [folder / "images/a.png"], none, none.byte(), {"test": [0]}, folder=folder)
-    return SemanticField(cloud), scene, WORDS
+    return SemanticField(cloud, Identity(cloud.features.shape[1])), scene, WORDS
 
 
 @pytest.mark.parametrize("out", ["maps", "maps/inside"])

@@ -131,12 +131,12 @@ def test_only_what_depends_on_a_change_is_done_again(rooms, alone, tmp_path):
         return events.stages("room0"), events.rows[0].stages
 
     assert batch()[0] == FIT_STAGES
-    assert {name: data for name, data in results(runs / "room0").items() if name != "field/field.json"} == {
-        name: data for name, data in alone["room0"].items() if name != "field/field.json"
+    assert {name: data for name, data in results(runs / "room0").items() if name != "field.kfgs"} == {
+        name: data for name, data in alone["room0"].items() if name != "field.kfgs"
     }
     assert batch(pictures=1)[0] == ["scene", "segment"]
     assert (runs / "room0" / "segmented" / "sheets").is_dir()
-    shutil.rmtree(runs / "room0" / "field")
+    shutil.rmtree(runs / "room0" / "field.kfgs")
     assert batch(pictures=1) == (
         ["scene", "fit"],
         {"scene": "done", "features": "found", "fit": "done", "segment": "found", "evaluate": "found"},
@@ -204,7 +204,7 @@ def check_store(root, files, alone, tmp_path):
     assert events.stages("room0") == [*FIT_STAGES, "scene"]
     files.get(f"{root}/runs/room0", str(tmp_path / "got"), recursive=True)
     found = results(tmp_path / "got")
-    for name in set(alone["room0"]) - {"field/field.json"}:  # which says where the scene was
+    for name in set(alone["room0"]) - {"field.kfgs"}:  # which says where the scene was
         assert found[name] == alone["room0"][name], name
     assert set(found) == set(alone["room0"])
     assert (tmp_path / "got" / "state.json").is_file()
@@ -234,7 +234,7 @@ def test_photos_get_their_cameras_first(rooms, tmp_path, monkeypatch):
     run = tmp_path / "runs" / "photos"
     assert f"note: no poses in {photos}: " in (run / "log.txt").read_text()
     assert (run / "scene" / "images").resolve() == photos
-    assert (run / "field" / "field.json").is_file()
+    assert (run / "field.kfgs").is_file()
     assert not (run / "segmented").exists()  # no classes are known
     assert not table_.exists()
 

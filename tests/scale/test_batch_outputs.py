@@ -239,7 +239,7 @@ def test_a_damaged_note_of_a_finished_stage_counts_as_not_done(tmp_path, damage)
     place, made = Place(tmp_path), []
 
     def make():
-        (tmp_path / "field").write_text("numbers")
+        (tmp_path / "field.kfgs").write_text("numbers")
         made.append(len(made))
         return {"gaussians": 7, "latents": 3}
 

@@ -18,12 +18,12 @@ from kfgs.cli import main
 from kfgs.evaluation import load_label_map
 from kfgs.features import FeatureFolder
 from kfgs.fields import (
+    Linear,
     SemanticField,
     UpliftConfig,
     join_fields,
     recall_scene,
     sample_latents,
-    select_gaussians,
     uplift_maps,
 )
 from kfgs.formats import SplatFile, read_splats, write_splats
@@ -196,12 +196,12 @@ def test_what_cannot_be_cut_or_opened(tmp_path, town):
 
 def test_fields_join_only_if_their_latents_agree(fitted):
     one, other = fitted.field("block00"), fitted.field("block01")
-    turned = dataclasses.replace(other, linear=LinearLatents(other.linear.basis.flip(1)))
+    turned = dataclasses.replace(other, decoder=Linear(LinearLatents(other.decoder.latents.basis.flip(1))))
     with pytest.raises(ValueError, match=tells("fields[1]", "latents")):
         join_fields([one, turned])
     with pytest.raises(ValueError, match=tells("fields", "none")):
         join_fields([])
-    half = select_gaussians(one, torch.arange(len(one)) % 2 == 0)
+    half = one.select(torch.arange(len(one)) % 2 == 0)
     assert torch.equal(half.seen.pixels, one.seen.pixels[::2])
     assert torch.equal(half.cosines(torch.eye(24)[:2]), one.cosines(torch.eye(24)[:2])[::2])
 
@@ -224,11 +224,11 @@ def test_the_commands(town, splat, tmp_path, capsys):
     assert main(["blocks", str(town), "--out", str(tmp_path / "none"), "--count", "2", "--workers", "0"]) == 1
     assert "--workers" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
-    assert main(["join", str(out), "--out", str(tmp_path / "field")]) == 0
-    assert len(SemanticField.load(tmp_path / "field")) == len(FieldInBlocks.open(out))
+    assert main(["join", str(out), "--out", str(tmp_path / "field.kfgs")]) == 0
+    assert len(SemanticField.load(tmp_path / "field.kfgs")) == len(FieldInBlocks.open(out))
     box = ["--box=-4,-4,-1,4,4,4"]
     assert main(["join", str(out), "--out", str(tmp_path / "part"), *box]) == 0
-    assert len(SemanticField.load(tmp_path / "part")) < len(SemanticField.load(tmp_path / "field"))
+    assert len(SemanticField.load(tmp_path / "part")) < len(SemanticField.load(tmp_path / "field.kfgs"))
     assert main(["join", str(out), "--out", str(tmp_path / "x"), "--box", "1,2,3"]) == 1
     assert "six numbers" in capsys.readouterr().err
     for command in (["view"], ["select", "chair"]):
@@ -245,11 +245,11 @@ def test_the_commands(town, splat, tmp_path, capsys):
 
 
 def test_a_joined_field_remembers_the_whole_scene(fitted, town, tmp_path):
-    fitted.joined().save(tmp_path / "deep/field")
-    field = SemanticField.load(tmp_path / "deep/field")
-    assert recall_scene(field.info, field.folder).samefile(town)
+    fitted.joined().save(tmp_path / "deep/field.kfgs")
+    field = SemanticField.load(tmp_path / "deep/field.kfgs")
+    assert recall_scene(field.info).samefile(town)
     assert "geometry" not in field.info
-    assert field.label_set().names == fitted.field("block00").label_set().names
+    assert field.classes.names == fitted.field("block00").classes.names
 
 
 @pytest.mark.parametrize(
@@ -393,8 +393,8 @@ def test_a_city_behind_a_link_remembers_its_scene(town, splat, tmp_path):
     (tmp_path / "city").symlink_to("deep/er/city")
     split_scene(town, tmp_path / "city", 2, splat=splat, latents=4)
     field = fit_blocks(tmp_path / "city", EVERY).joined()
-    assert recall_scene(field.info, field.folder).samefile(town)
-    assert field.has_classes
+    assert recall_scene(field.info).samefile(town)
+    assert field.classes is not None
 
 
 @pytest.mark.parametrize("name", ["latents.safetensors", "block00/splat.ply", "block00/mine.txt", "block01"])
@@ -422,12 +422,12 @@ def test_a_fit_that_ends_early_leaves_the_old_core(fitted, monkeypatch):
 
 PUT = """
 import json, os, shutil, torch
-from kfgs.fields import SemanticField, select_gaussians
+from kfgs.fields import Linear, SemanticField
 from kfgs.scale.blocks import _put
 from pathlib import Path
 city = Path({city!r})
 new = SemanticField.load(city / "block00/core")
-new = select_gaussians(new, torch.arange(len(new)) < {count})
+new = new.select(torch.arange(len(new)) < {count})
 facts = json.loads((city / "block00/core/core.json").read_text()) | {{"gaussians": {count}}}
 def prepare(folder):
     shutil.copytree(city / "block00/core", folder / "block00/core")
@@ -455,7 +455,7 @@ def test_a_block_that_becomes_empty_leaves_no_core(fitted, tmp_path):
     facts = {"gaussians": 1, "options": "a"}
     _put(place, fitted.field("block00"), facts)
     moved = SemanticField.load(place)
-    assert recall_scene(moved.info, moved.folder).samefile(fitted.folder / "block00")
+    assert recall_scene(moved.info).samefile(fitted.folder / "block00")
     _put(place, None, {"gaussians": 0})
     assert [path.name for path in place.iterdir()] == ["core.json"]
     _put(place, fitted.field("block00"), facts)
@@ -473,7 +473,7 @@ def test_blocks_of_different_options_are_not_joined(town, splat, tmp_path, capsy
     other = dataclasses.replace(EVERY, seed=7)
     fit_block(city / "block00", other)
     capsys.readouterr()
-    assert main(["join", str(city), "--out", str(tmp_path / "field")]) == 1
+    assert main(["join", str(city), "--out", str(tmp_path / "field.kfgs")]) == 1
     assert re.search(tells(city, "same options", "block00", "block01", "again"), capsys.readouterr().err)
-    assert not (tmp_path / "field").exists()
+    assert not (tmp_path / "field.kfgs").exists()
     assert len(fit_blocks(city, other).joined()) > 0

@@ -104,7 +104,7 @@ def test_fit_averages_onto_its_gaussians(room: Path, output: Path, tmp_path: Pat
     assert main(["fit", str(output), *maps, "--out", str(run)]) == 0
     said = capsys.readouterr().out
     assert "iteration_30000" in said
-    field = SemanticField.load(run / "field")
+    field = SemanticField.load(run / "field.kfgs")
     assert field.info["geometry"].endswith("iteration_30000/point_cloud.ply")
     assert not (run / "color.ply").exists()
     assert main(["fit", str(output), *maps, "--out", str(run), "--steps", "5"]) == 1
@@ -119,7 +119,7 @@ def test_a_splat_needs_no_points(room: Path, output: Path, tmp_path: Path) -> No
 
 
 def test_attach_takes_the_folder(room: Path, output: Path, tmp_path: Path) -> None:
-    field = make_field(room, tmp_path / "field")
+    field = make_field(room, tmp_path / "field.kfgs")
     out = tmp_path / "labelled.ply"
     assert main(["attach", str(field), str(output), "--scene", str(room), "--by", "distance", "--out", str(out)]) == 0
     assert (read_splats(out).gaussians.labels >= 0).float().mean() > 0.9

@@ -16,7 +16,7 @@ from cases_splat import a_camera, gaussians_before
 from messages import tells
 
 from kfgs.cameras.camera import Camera
-from kfgs.fields import SemanticField
+from kfgs.fields import Identity, SemanticField
 from kfgs.gaussians import Gaussians
 from kfgs.splat import accumulate_pixels, available_engines, bin_tiles, composite, project, rasterize
 from kfgs.splat.engines import ops
@@ -303,7 +303,7 @@ def test_compiled_accumulation_equals_eager():
 
 def test_compiled_semantic_field_renders():
     gaussians, camera = _scene()
-    field = SemanticField(gaussians)
+    field = SemanticField(gaussians, Identity(gaussians.features.shape[1]))
     compiled = torch.compile(lambda camera: field.render(camera).map, fullgraph=True, backend="aot_eager")
     torch.testing.assert_close(compiled(camera), field.render(camera).map, rtol=0, atol=0)
 

@@ -19,7 +19,7 @@ from cases_explorer import (
 )
 from messages import tells
 
-from kfgs.fields import SemanticField, answers, semantic_field
+from kfgs.fields import answers, fuse_views, semantic_field
 from kfgs.viewer.meaning import FieldMeaning, SplatMeaning
 from kfgs.viewer.state import Exploration
 
@@ -42,7 +42,7 @@ def asked_and_answering(mode, how):
     made = field(mode)
     if how in ("own", "fused"):
         return (made, ()), made
-    answered = made.with_answers(cameras())
+    answered = fuse_views(made, cameras())
     return ((made, cameras()), answered) if how == "views" else ((answered, cameras(1)), answered)
 
 
@@ -190,7 +190,7 @@ def test_one_pass_over_the_views_answers_every_question(mode, monkeypatch):
 
 @pytest.mark.parametrize("mode", MODES)
 def test_a_field_that_has_its_answers_renders_nothing(mode, monkeypatch):
-    made = field(mode).with_answers(cameras())
+    made = fuse_views(field(mode), cameras())
     count = drawn(monkeypatch)
     opened = FieldMeaning(made, classes(), cameras=cameras(), embed=embed)
     for words in (*NAMES, "a red thing"):
@@ -203,13 +203,13 @@ def test_a_field_without_answers_finds_them_from_its_own_cameras():
     made = replace(field(), cameras=tuple(cameras()))
     opened = FieldMeaning(made, classes())
     assert opened.by == BY["views"]
-    same_answer(opened.ask("chair"), field().with_answers(cameras()).query("chair", classes()))
+    same_answer(opened.ask("chair"), fuse_views(field(), cameras()).query("chair", classes()))
 
 
 def test_all_views_that_are_given_are_asked():
     views = cameras(35)
     made = FieldMeaning(field(), classes(), cameras=views)
-    assert torch.equal(made.scores, field().with_answers(views).classify(classes()).scores)
+    assert torch.equal(made.scores, fuse_views(field(), views).classify(classes()).scores)
 
 
 @pytest.mark.parametrize("mode", ["adc+sc", "fused"])
@@ -250,8 +250,7 @@ def test_classes_of_another_teacher(monkeypatch):
     with pytest.raises(ValueError, match=tells("classes:", "[C, 16]", "got (4, 17)")):
         FieldMeaning(field(), wide, cameras=cameras())
     assert not count  # refused before the views are rendered
-    ours = SemanticField(*[getattr(field("decouple"), part) for part in ("gaussians", "codebook", "autoencoder")])
-    ours.info["teacher"] = {"name": "lseg"}
+    ours = replace(field("decouple"), info={"teacher": {"name": "lseg"}})
     with pytest.warns(UserWarning, match=tells("classes:", "'lseg'", "'clip'")) as warned:
         FieldMeaning(ours, replace(classes(), info={"teacher": {"name": "clip"}})).ask("chair")
     assert len(warned) == 1  # not again at every question
@@ -259,7 +258,7 @@ def test_classes_of_another_teacher(monkeypatch):
 
 def test_scores_that_are_all_the_same_still_have_a_range():
     same = field("decouple")
-    alike = SemanticField(same.gaussians.replace(features=torch.ones(80, DIM)))
+    alike = replace(same, gaussians=same.gaussians.replace(features=torch.ones(80, DIM)))
     asked = FieldMeaning(alike, classes(1, negatives=False)).ask("wall")
     assert asked.low < asked.high
     assert asked.low <= asked.selection.threshold <= asked.high

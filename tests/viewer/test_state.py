@@ -9,6 +9,7 @@ from cases_explorer import classes as some_classes
 from messages import tells
 
 from kfgs.cameras import Distortion
+from kfgs.fields import fuse_views
 from kfgs.labels import transfer_labels
 from kfgs.viewer.meaning import FieldMeaning, SplatMeaning
 from kfgs.viewer.state import Exploration
@@ -83,7 +84,7 @@ def test_gamma_selects_on_both_sides():
 @pytest.mark.parametrize("views", [(), tuple(cameras())], ids=["own", "views"])
 def test_any_gamma_of_a_field_is_that_of_query(mode, views):
     given = some_classes(1, negatives=False)
-    answering = field(mode).with_answers(views) if views else field(mode)
+    answering = fuse_views(field(mode), views) if views else field(mode)
     state = Exploration(FieldMeaning(field(mode), given, cameras=views))
     state.ask("wall")
     low, high = state.gamma_range

@@ -7,8 +7,7 @@ import torch
 from cases_splat import a_camera, gaussians_before
 from messages import tells
 
-from kfgs.fields import SemanticField, score_pixels
-from kfgs.fields.views import _votes
+from kfgs.fields import Autoencoded, Identity, Linear, SemanticField
 from kfgs.quant import Autoencoder, Codebook, LinearLatents
 from kfgs.splat import rasterize
 
@@ -29,11 +28,11 @@ def fused(unknown=20, latents=6):
     features = cloud.features.clone()
     features[:unknown] = 0
     basis = torch.linalg.qr(torch.randn(DIM, latents, generator=torch.Generator().manual_seed(3))).Q
-    return SemanticField(cloud.replace(features=features), linear=LinearLatents(basis))
+    return SemanticField(cloud.replace(features=features), Linear(LinearLatents(basis)))
 
 
 def uncompressed():
-    return SemanticField(gaussians_before(camera(), 200, seed=2, channels=DIM, sigma=(0.02, 0.08)))
+    return SemanticField(gaussians_before(camera(), 200, seed=2, channels=DIM, sigma=(0.02, 0.08)), Identity(DIM))
 
 
 def quantised():
@@ -43,7 +42,7 @@ def quantised():
     out = (torch.randn(20, 4, generator=g), torch.zeros(20)), (torch.randn(DIM, 20, generator=g), torch.zeros(DIM))
     autoencoder = Autoencoder(into, out, -1.0, 1.0)
     cloud = gaussians_before(camera(), 200, seed=2, channels=4, sigma=(0.02, 0.08))
-    return SemanticField(cloud, Codebook(autoencoder.decode(torch.randn(9, 4, generator=g))), autoencoder)
+    return SemanticField(cloud, Autoencoded(Codebook(autoencoder.decode(torch.randn(9, 4, generator=g))), autoencoder))
 
 
 def voted(field, rows):
@@ -73,7 +72,7 @@ def test_the_paper_s_labels_are_those_of_the_decoded_pixels(make):
     similarity = field.decode(rendering.map) @ torch.nn.functional.normalize(texts()).T
     best = similarity.sort(dim=-1, descending=True).values
     clear = best[..., 0] - best[..., 1] > 1e-5
-    labels = field.segment(camera(), texts(), rule="paper")
+    labels = field.paper.segment(camera(), texts())
     assert clear.float().mean() > 0.8
     assert labels[clear].equal(similarity.argmax(dim=-1)[clear])
     assert (labels == -1).equal(~field.decode(rendering.map).any(dim=-1))
@@ -107,26 +106,24 @@ def test_classes_beyond_those_with_votes_are_none():
 @pytest.mark.parametrize("rule", ["fused", "paper"])
 def test_best_classes_of_codewords(rule):
     field = quantised()
-    found = field.rank(camera(), texts(), top=3, rule=rule)
-    assert found.labels[..., 0].equal(field.segment(camera(), texts(), rule=rule))
-    similarity = field.codebook.unit @ torch.nn.functional.normalize(texts()).T
+    field = field.paper if rule == "paper" else field
+    found = field.rank(camera(), texts(), top=3)
+    assert found.labels[..., 0].equal(field.segment(camera(), texts()))
+    similarity = field.decoder.codebook.unit @ torch.nn.functional.normalize(texts()).T
     drawn = found.alphas > 0
     assert drawn.any()
     assert (found.labels[~drawn] == -1).all()
     rows = {tuple(row) for row in similarity.argsort(dim=1, descending=True)[:, :3].tolist()}
     assert {tuple(row) for row in found.labels[drawn].tolist()} <= rows
     if rule == "paper":
-        index = field.codebook.quantize(field.decode(field.render(camera()).map))
+        index = field.decoder.codebook.quantize(field.decode(field.render(camera()).map))
         torch.testing.assert_close(
             found.scores[drawn], similarity.sort(dim=1, descending=True).values[index][drawn][:, :3]
         )
 
 
-def test_votes_are_kept_for_the_last_text_only():
+def test_kept_votes_are_those_of_the_text():
     field = fused()
-    first = _votes(field, texts(), "fused")
-    assert _votes(field, texts().clone(), "fused") is first  # equal rows, not the same tensor
-    assert _votes(field, texts(), "paper") is not first
     expected = {seed: fused().segment(camera(), texts(seed)) for seed in (1, 2)}
     for seed in (1, 2, 2, 1):
         assert field.segment(camera(), texts(seed)).equal(expected[seed])
@@ -147,7 +144,7 @@ def test_votes_follow_features_that_are_changed_in_place():
 @pytest.mark.parametrize("make", [fused, uncompressed, quantised])
 def test_scores_of_one_text_are_means_of_the_gaussians_scores(make):
     field = make()
-    found = score_pixels(field, camera(), texts()[0], negatives=texts(5))
+    found = field.score_pixels(camera(), texts()[0], negatives=texts(5))
     scores = field.query(texts()[0], threshold=0.5, negatives=texts(5)).scores
     seen = rasterize(field.gaussians.replace(features=scores[:, None]), camera())
     drawn = seen.alpha > 0
@@ -161,7 +158,5 @@ def test_scores_of_one_text_are_means_of_the_gaussians_scores(make):
 def test_wrong_arguments():
     with pytest.raises(ValueError, match=tells("top:", "7", "8")):
         fused().rank(camera(), texts(), top=8)
-    with pytest.raises(ValueError, match=tells("rule:", "fused", "paper", "mine")):
-        fused().rank(camera(), texts(), rule="mine")
     with pytest.raises(ValueError, match=tells("embeddings:", "all zeros")):
-        fused().segment(camera(), torch.zeros(2, DIM), rule="paper")
+        fused().paper.segment(camera(), torch.zeros(2, DIM))

@@ -6,10 +6,9 @@ import oracles_uplift
 import pytest
 import torch
 from cases_splat import a_camera, gaussians_before
-from messages import tells
 
 from kfgs import Camera, Gaussians
-from kfgs.fields import answers, fused_answers
+from kfgs.fields import Autoencoded, Codewords, Identity, SemanticField, fuse_views
 from kfgs.quant import Autoencoder, Codebook
 
 DIM = 6
@@ -29,8 +28,10 @@ def autoencoder():
     return Autoencoder(encoder=((into, torch.zeros(4)),), decoder=layers, low=0.0, high=1.0)
 
 
-def parts(mode):
-    return codebook() if "adc" in mode else None, autoencoder() if mode == "adc+sc" else None
+def fuse(cloud, mode, cameras):
+    book = Codewords(codebook()) if mode == "adc" else Autoencoded(codebook(), autoencoder())
+    field = SemanticField(cloud, Identity(DIM) if mode == "decouple" else book)
+    return fuse_views(field, cameras).fused
 
 
 def views(n=3):
@@ -65,7 +66,8 @@ def blend_weights(cloud, cameras):
 
 @pytest.mark.parametrize("mode", ["decouple", "adc", "adc+sc"])
 def test_answers_are_those_of_the_slow_oracle(mode):
-    cloud, (book, coder) = trained(mode), parts(mode)
+    cloud, book = trained(mode), None if mode == "decouple" else codebook()
+    coder = autoencoder() if mode == "adc+sc" else None
     codewords = codebook().codewords.double().numpy()
     centres = None if coder is None else coder.encode(codebook().codewords).detach().double().numpy()
 
@@ -77,8 +79,8 @@ def test_answers_are_those_of_the_slow_oracle(mode):
         )
 
     expected, pixels = oracles_answers.fused(blend_weights(cloud, views()), cloud.features.double().numpy(), shown)
-    found = fused_answers(cloud, book, coder, views())
-    features = found.linear.decode(found.latents)
+    found = fuse(cloud, mode, views())
+    features = found.decode(found.features)
     np.testing.assert_allclose(found.seen.pixels.numpy(), pixels, atol=1e-4)
     # KEEP drops what is below 0.001 of the variation between features: at most sqrt(0.001) of each.
     np.testing.assert_allclose(features.numpy(), expected, atol=2e-5 if book is not None else 0.03)
@@ -90,8 +92,8 @@ def test_answers_are_those_of_the_slow_oracle(mode):
 
 @pytest.mark.parametrize("mode", ["decouple", "adc", "adc+sc"])
 def test_what_no_view_shows_answers_nothing(mode):
-    found = fused_answers(trained(mode), *parts(mode), views())
-    assert (found.latents[-2:] == 0).all()
+    found = fuse(trained(mode), mode, views())
+    assert (found.features[-2:] == 0).all()
     assert found.seen.pixels[-2:].tolist() == found.seen.agreement[-2:].tolist() == [0, 0]
 
 
@@ -100,10 +102,9 @@ def test_what_learnt_nothing_answers_nothing(mode):
     """Its pixels show all-zero features, which are no codeword, not even the first."""
     cloud = trained(mode)
     cloud = cloud.replace(features=torch.zeros_like(cloud.features))
-    book, _ = parts(mode)
     features = torch.cat([torch.zeros(9, DIM), codebook().unit[:1]])  # the last, far away, has some
-    found = fused_answers(cloud.replace(features=features), book, None, views())
-    assert (found.latents == 0).all()
+    found = fuse(cloud.replace(features=features), mode, views())
+    assert (found.features == 0).all()
 
 
 def test_one_gaussian_answers_with_what_its_pixels_show():
@@ -115,27 +116,14 @@ def test_one_gaussian_answers_with_what_its_pixels_show():
         torch.tensor([0.9]),
         codebook().unit[1:2] * 3,
     )
-    found = fused_answers(ball, codebook(), None, [Camera(torch.eye(4), K, 8, 8)])
-    torch.testing.assert_close(found.linear.decode(found.latents), codebook().unit[1:2])
+    found = fuse(ball, "adc", [Camera(torch.eye(4), K, 8, 8)])
+    torch.testing.assert_close(found.decode(found.features), codebook().unit[1:2])
     torch.testing.assert_close(found.seen.agreement, torch.ones(1))
 
 
 def test_large_views_are_rendered_small_and_counted_in_their_own_pixels(monkeypatch):
     cloud, large = trained("adc"), [view.resized(40, 52) for view in views()]
-    monkeypatch.setattr(answers, "PIXELS", 130)
-    small, found = fused_answers(cloud, codebook(), None, views()), fused_answers(cloud, codebook(), None, large)
-    torch.testing.assert_close(found.latents, small.latents)
+    monkeypatch.setattr("kfgs.fields.fused.PIXELS", 130)
+    small, found = fuse(cloud, "adc", views()), fuse(cloud, "adc", large)
+    torch.testing.assert_close(found.features, small.features)
     torch.testing.assert_close(found.seen.pixels, 16 * small.seen.pixels)
-
-
-def test_chunks_change_nothing(monkeypatch):
-    for mode in ("decouple", "adc", "adc+sc"):
-        whole = fused_answers(trained(mode), *parts(mode), views())
-        with monkeypatch.context() as patch:
-            patch.setattr(answers, "CHUNK", 7)
-            torch.testing.assert_close(fused_answers(trained(mode), *parts(mode), views()).latents, whole.latents)
-
-
-def test_no_camera_is_named():
-    with pytest.raises(ValueError, match=tells("views:", "got none")):
-        fused_answers(trained("adc"), codebook(), None, [])

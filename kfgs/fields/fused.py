@@ -1,0 +1,109 @@
+"""Fused features of a trained field: the mean of the rendered features at the pixels that show a Gaussian; and joined fields.
+
+Training constrains only blends of Gaussians, so the latent of a single Gaussian may decode to something that no view shows.
+The mean over its pixels, weighted by w = T alpha, does not have this problem. It is computed once, when a field is finished;
+later no camera is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from .._rows import EPS, row_norms, unit_rows
+from ..cameras import Camera
+from ..gaussians import Gaussians
+from ..labels import nearest_codeword
+from ..labels.views import average_shown
+from ..quant import fit_linear_latents
+from ..splat import rasterize
+from .decoders import Autoencoded, Codewords, Linear
+from .semantic_field import Seen, SemanticField
+
+KEEP, MOST = 0.999, 64  # share of the codewords' variation to keep, with at most this many latents
+CHUNK = 8192  # pixels quantised at once
+PIXELS = 80_000  # most pixels of a view that are rendered
+
+
+def fuse_views(field: SemanticField, cameras: Sequence[Camera]) -> SemanticField:
+    """Render a trained field from each camera, quantise the pixels, and average them onto the Gaussians that they show.
+
+    The result is the field with these `cameras` and the averages as `fused`. A field with a `Linear` decoder is fused
+    already, and gets the cameras alone.
+
+    Args:
+        field: a trained field; without a codebook, rendered features are averaged without quantising.
+        cameras: at least one; the training cameras.
+    """
+    if not cameras:
+        raise ValueError("cameras: expected at least one, got none; pass those that the field was trained with")
+    decoder = field.decoder
+    if isinstance(decoder, Linear):
+        return replace(field, cameras=tuple(cameras))
+    gaussians, table, centres = field.gaussians, None, None
+    with torch.no_grad():
+        if isinstance(decoder, Codewords | Autoencoded):
+            latents = fit_linear_latents(decoder.codebook.unit, keep=KEEP, maximum=MOST)
+            table = latents.encode(decoder.codebook.unit).to(gaussians.means)
+        else:
+            latents = fit_linear_latents(unit_rows(field.features), gaussians.opacities, keep=KEEP, maximum=MOST)
+        if isinstance(decoder, Autoencoded):
+            centres = decoder.autoencoder.encode(decoder.codebook.codewords).to(gaussians.means)
+
+        def encode(pixels: Tensor) -> Tensor:  # [n, d] -> [n, e]
+            if table is None:
+                return latents.encode(unit_rows(pixels))
+            if centres is not None:
+                return table[nearest_codeword(pixels, centres)]
+            assert isinstance(decoder, Codewords)
+            return table[decoder.codebook.quantize(pixels)]
+
+        def show(camera: Camera) -> tuple[Camera, Tensor]:  # [H, W, e]
+            rendering = rasterize(gaussians, camera)
+            pixels = rendering.map.flatten(0, 1)
+            rows = torch.cat([encode(part) for part in pixels.split(CHUNK)])
+            something = rendering.alpha > 0 if centres is not None else row_norms(pixels).view(camera.size) > EPS
+            return camera, rows.view(*camera.size, -1) * something[..., None]
+
+        small = [_shrunk(camera) for camera in cameras]
+        mean = average_shown(gaussians, small, show)
+        scale = sum(a.width * a.height for a in cameras) / max(1, sum(b.width * b.height for b in small))
+        seen = Seen(mean.weights * scale, row_norms(mean.values).clamp_max(1))
+    fused = SemanticField(gaussians.replace(features=mean.values), Linear(latents), seen=seen)
+    return replace(field, cameras=tuple(cameras), seen=seen, fused=fused)
+
+
+def _shrunk(camera: Camera) -> Camera:
+    factor = min(1.0, (PIXELS / (camera.width * camera.height)) ** 0.5)
+    return camera.resized(max(1, round(camera.height * factor)), max(1, round(camera.width * factor)))
+
+
+def join_fields(fields: Sequence[SemanticField]) -> SemanticField:
+    """Fused fields with the same linear latents as one field; views that several fields have are kept once.
+
+    Raises:
+        ValueError: if there is no field, or one was not fused, or has other latents than the first.
+    """
+    if not fields:
+        raise ValueError("fields: expected at least one, got none")
+    first = fields[0]
+    bases = [part.decoder.to_tensors().get("linear.basis") for part in fields]
+    for i, (part, basis) in enumerate(zip(fields, bases, strict=True)):
+        if basis is None or bases[0] is None or part.seen is None:
+            raise ValueError(f"fields[{i}]: expected a fused field, got {part!r}; fit it with the default method")
+        if not torch.equal(basis, bases[0]):
+            raise ValueError(
+                f"fields[{i}]: expected the latents of fields[0], got others; fit both with the same ones (`sample_latents`)"
+            )
+    cameras = {camera.name: camera for part in fields for camera in part.cameras}
+    views = list(dict.fromkeys(name for part in fields for name in part.info.get("views", ())))
+    return replace(
+        first,
+        gaussians=Gaussians.cat([part.gaussians.with_origin(first.gaussians.origin) for part in fields]),
+        seen=Seen(*(torch.cat(values) for values in zip(*(part.seen for part in fields if part.seen), strict=True))),
+        cameras=tuple(cameras.values()),
+        info=first.info | {"views": views},
+    )

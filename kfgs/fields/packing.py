@@ -1,0 +1,347 @@
+"""Round the tensors of a field to whole steps and compress them: 0.6 MB for 50,000 Gaussians.
+
+A tensor becomes an *entry* (its coding, shape and numbers, as JSON) and a stream of bytes. Means are steps along a Morton curve;
+latents are differences to the nearest of the Gaussians that come shortly before on this curve.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+import zstandard
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from .._arrays import most_unpacked
+from .._check import check_choice, check_range
+from ..formats.order import morton_cells, morton_codes
+from ..formats.values import unit_quats
+
+Array = NDArray[Any]
+Entry = dict[str, Any]
+LEVEL = 19  # of zstd: the best compression that takes only seconds
+LARGEST = 1 << 22  # most steps from zero: they stay exact in float32
+CELLS = (1 << 21) - 1  # most steps along an axis: three fill a Morton code
+HUGE = 1e37  # largest number that is rounded: a step away from it, float32 does not overflow yet
+EDGE = 1e-4  # unpacked opacities keep this distance from 0 and 1, as everywhere in kfgs
+WINDOW = 16
+"""Predecessors on the curve that a latent is predicted from. 32 save 1 % more and take twice the time (measured on room_0)."""
+TURN = 2.1
+"""Radians of a rotation per step of its x, y and z. Half a step of each moves (x, y, z) by sqrt(3) / 2 steps and w, which is at
+least 0.85 after `_nearest_turn`, by 0.61 times as much: the quaternion by 1.02 steps, the rotation by twice that."""
+QR_MOST = 1 << 31
+"""Most rows x columns^2 of a basis that is rounded: its QR decomposition takes a second."""
+PER_GAUSSIAN = ("gaussians.", "fused.latents", "seen.")
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """The errors that packing may make. The file states the bound of each attribute in its own units."""
+
+    means: float
+    """Of each coordinate, as a share of the median radius of the cloud's Gaussians."""
+    scales: float
+    """Share of a scale, plus the same share of twice the largest error of a coordinate. Thinner Gaussians look no different."""
+    degrees: float
+    """Angle between a rotation and its stored one. Axes may change their order: the ellipsoid is the same."""
+    opacities: float
+    """Of an opacity, and of the agreement of the training views."""
+    latents: float
+    """Root mean square error of a fused latent, as a share of the median length. Trained latents get half of it."""
+    decoder: float
+    """Root mean square error of a row of basis, codebook or text table, as a share of the row. Weights of an
+    autoencoder get a quarter: their errors add up from layer to layer."""
+    pixels: float
+    """Share of a count of pixels (`SemanticField.seen`), plus as much of one pixel."""
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            check_range(name, value, 0, 30 if name == "degrees" else 1, closed=(False, True))
+
+
+FINE = Rounding(1 / 128, 0.02, 0.5, 1 / 512, 0.02, 0.004, 0.05)
+SMALL = Rounding(1 / 24, 0.08, 3.0, 1 / 40, 0.07, 0.02, 0.25)
+TINY = Rounding(1 / 8, 0.15, 8.0, 1 / 30, 0.2, 0.04, 0.5)
+PRECISIONS = {"fine": FINE, "small": SMALL, "tiny": TINY}
+Precision = Literal["fine", "small", "tiny"] | Rounding
+
+
+class Packed(NamedTuple):
+    """What a file holds of a packed field."""
+
+    streams: dict[str, Tensor]  # uint8
+    entries: dict[str, Entry]
+    errors: dict[str, float]  # the largest, by tensor
+
+
+class _Place(NamedTuple):
+    """Where the Gaussians are on the grid of the means; what is predicted from neighbours needs it."""
+
+    cells: Array  # [N, 3] int64
+    before: Array  # [N] int64: the row that each one is predicted from; N for none
+
+
+def pack(tensors: dict[str, Tensor], precision: Precision) -> Packed:
+    """Round and compress; Gaussians are sorted along a Morton curve. What has no coding (labels, cameras) stays exact.
+
+    Raises:
+        ValueError: if a number is not finite or too large to be rounded, an opacity lies outside [0, 1], or a scale is negative.
+    """
+    if isinstance(precision, str):
+        check_choice("precision", precision, PRECISIONS)
+    chosen = PRECISIONS[precision] if isinstance(precision, str) else precision
+    arrays = {name: value.double().numpy() for name, value in tensors.items() if value.is_floating_point()}
+    for name, array in arrays.items():
+        low, high = {"gaussians.opacities": (0, 1), "gaussians.scales": (0, HUGE)}.get(name, (-HUGE, HUGE))
+        if not (np.isfinite(array) & (array >= low) & (array <= high)).all():
+            raise ValueError(
+                f"{name}: expected finite numbers from {low:g} to {high:g} to round, got others; fit it again"
+            )
+    means, scales = arrays["gaussians.means"], arrays["gaussians.scales"]
+    radius = float(np.median(np.sort(scales, axis=1)[:, 1:])) if len(means) else 1.0
+    extent = float(np.ptp(means, axis=0).max()) if len(means) else 0.0
+    step = max(2 * chosen.means * radius, extent / CELLS) or 1.0
+    origin = means.min(0) if len(means) else np.zeros(3)
+    order = np.argsort(morton_codes(np.round((means - origin) / step).astype(np.uint64)), kind="stable")
+    quats = unit_quats(torch.from_numpy(arrays["gaussians.quats"])).numpy()
+    arrays["gaussians.quats"], arrays["gaussians.scales"] = _nearest_turn(quats, scales)
+    cells = np.round((means[order] - origin) / step).astype(np.int64)
+    place = _Place(cells, _find_before(cells))
+    streams, entries, errors, fused = {}, {}, {}, "linear.basis" in tensors
+    for name, value in tensors.items():
+        per_gaussian = name.startswith(PER_GAUSSIAN)
+        array = arrays.get(name)
+        array = array[order] if array is not None and per_gaussian else array
+        entry, plain = _encode(name, value[order] if per_gaussian else value, array, chosen, place, step, origin, fused)
+        packed = zstandard.ZstdCompressor(level=LEVEL).compress(plain)
+        streams[name] = _bytes(packed if len(packed) < len(plain) else plain)
+        errors |= {name: entry.pop("error")} if "error" in entry else {}
+        entries[name] = entry | {"shape": list(value.shape)}
+    return Packed(streams, entries, errors)
+
+
+def unpack(streams: dict[str, Tensor], entries: dict[str, Entry]) -> dict[str, Tensor]:
+    """The tensors of `pack`. Sizes are checked before memory is taken; a ValueError for what is damaged."""
+    if set(entries) != set(streams):
+        raise ValueError(f"expected a description of {sorted(streams)}, got {sorted(entries)!r:.200}")
+    shapes = {name: tuple(int(size) for size in entry["shape"]) for name, entry in entries.items()}
+    sizes = {name: _plain_size(entry, shapes[name]) for name, entry in entries.items()}
+    total = sum(max(sizes[name], 8 * math.prod(shape)) for name, shape in shapes.items())
+    if total > most_unpacked(sum(stream.numel() for stream in streams.values())):
+        raise ValueError(f"it would unpack to {total} bytes, more than a packed field has")
+    tensors: dict[str, Tensor] = {}
+    place = None
+    for name in sorted(entries, key=lambda name: entries[name]["coding"] != "curve"):  # others may need the means
+        plain = streams[name].numpy().tobytes()
+        if len(plain) != sizes[name]:
+            if zstandard.get_frame_parameters(plain).content_size != sizes[name]:
+                raise ValueError(f"{name}: expected a stream of {sizes[name]} bytes, got another")
+            plain = zstandard.ZstdDecompressor().decompress(plain, max_output_size=sizes[name])
+        tensors[name], place = _decode(entries[name], shapes[name], plain, place)
+    if entries["gaussians.opacities"]["coding"] != "exact":
+        tensors["gaussians.opacities"].clamp_(EDGE, 1 - EDGE)
+    scales = entries["gaussians.scales"]
+    if scales["coding"] != "exact":
+        tensors["gaussians.scales"].clamp_min_(math.expm1(scales["step"] / 2) * scales["least"] / 2)
+    return tensors
+
+
+def _encode(
+    name: str,
+    value: Tensor,
+    array: Array | None,
+    chosen: Rounding,
+    place: _Place,
+    step: float,
+    origin: Array,
+    fused: bool,
+) -> tuple[Entry, bytes]:
+    """One tensor, whose float64 values are `array` if it has real numbers."""
+    if array is None or not array.size:
+        return _exact(value)
+    match name.split("."):
+        case ["gaussians", "means"]:
+            codes = morton_codes(place.cells.astype(np.uint64))
+            entry = {"coding": "curve", "step": step, "origin": origin.tolist(), "error": step / 2}
+            return _planes(entry, np.diff(codes, prepend=np.uint64(0)).astype(np.int64)[:, None])
+        case ["gaussians", "quats"]:
+            turn = math.radians(chosen.degrees) / TURN
+            return _planes({"coding": "turns", "step": turn, "error": chosen.degrees}, np.round(array[:, 1:] / turn))
+        case ["gaussians", "scales"]:
+            return _logs(array, chosen.scales, step)
+        case ["seen", "pixels"]:
+            return _logs(array, chosen.pixels, 1.0)
+        case ["gaussians", "opacities"] | ["seen", "agreement"]:
+            size = 2 * chosen.opacities
+            return _planes({"coding": "steps", "step": size, "error": size / 2}, np.round(array[:, None] / size))
+        case ["gaussians", "features"]:
+            return _near(array, chosen.latents if fused else chosen.latents / 2, place)
+        case ["fused", "latents"]:
+            return _near(array, chosen.latents, place)
+        case ["linear" | "fused", "basis"] if math.prod(value.shape) * value.shape[1] <= QR_MOST:
+            return _rows(array, chosen.decoder, "basis")
+        case ["codebook", "codewords"] | ["classes", _]:
+            return _rows(array, chosen.decoder)
+        case ["autoencoder", _, _, "weight"]:
+            return _rows(array, chosen.decoder / 4)
+    return _exact(value)
+
+
+def _exact(value: Tensor) -> tuple[Entry, bytes]:
+    rows = value.contiguous().reshape(-1)
+    planes = rows.view(torch.uint8).reshape(-1, rows.element_size()).T.contiguous() if len(rows) else torch.zeros(0)
+    return {"coding": "exact", "dtype": str(value.dtype).removeprefix("torch.")}, planes.numpy().tobytes()
+
+
+def _planes(entry: Entry, whole: Array) -> tuple[Entry, bytes]:  # [n, c] whole numbers
+    """Column by column, and in a column byte by byte, the lowest first."""
+    whole = whole.astype(np.int64)
+    reach = int(np.abs(whole).max(initial=0))
+    width = next(size for size in (1, 2, 4, 8) if reach < 1 << (8 * size - 1))
+    columns = np.ascontiguousarray(whole.T).astype(f"<i{width}").view(np.uint8).reshape(whole.shape[1], -1, width)
+    return {**entry, "width": width}, columns.transpose(0, 2, 1).tobytes()
+
+
+def _logs(values: Array, share: float, least: float) -> tuple[Entry, bytes]:  # [N] or [N, 3], >= 0
+    """Steps of log(1 + x / least): each x within a share of x + least."""
+    step = 2 * math.log1p(share)
+    whole = np.round(np.log1p(values.reshape(len(values), -1) / least) / step)
+    return _planes({"coding": "logs", "step": step, "least": least, "error": share}, whole)
+
+
+def _near(values: Array, share: float, place: _Place) -> tuple[Entry, bytes]:  # [N, d]
+    """Multiples of a step, as differences to the row before. No row becomes zero that was not."""
+    lengths = np.linalg.norm(values, axis=1)
+    known = lengths > 0
+    typical = float(np.median(lengths[known])) if known.any() else 1.0
+    step = max(share * typical * math.sqrt(12 / values.shape[1]), float(np.abs(values).max(initial=0)) / LARGEST)
+    whole = np.round(values / step).astype(np.int64)
+    lost = np.flatnonzero(known & ~whole.any(1))
+    largest = np.abs(values[lost]).argmax(1)
+    whole[lost, largest] = np.sign(values[lost, largest])
+    entry = {"coding": "near", "step": step, "error": step if len(lost) else step / 2}
+    return _planes(entry, whole - np.concatenate([whole, np.zeros_like(whole[:1])])[place.before])
+
+
+def _rows(values: Array, share: float, coding: str = "rows") -> tuple[Entry, bytes]:  # [K, D]
+    """Each row has its own step, and holds multiples of it. The coding "basis" treats columns so."""
+    values = values.T if coding == "basis" else values
+    rms = np.sqrt(np.square(values).mean(1))
+    steps = np.maximum(share * math.sqrt(12) * rms, np.abs(values).max(1) / LARGEST).astype("<f4")
+    steps = np.where(steps > 0, steps, np.float32(1)).astype("<f4")
+    entry, plain = _planes({"coding": coding, "error": share * math.sqrt(3)}, np.round(values / steps[:, None]))
+    return entry, steps.tobytes() + plain
+
+
+def _plain_size(entry: Entry, shape: tuple[int, ...]) -> int:
+    """The bytes that a coded tensor must have; a ValueError if the entry makes no sense. No memory is taken."""
+    coding, numbers = entry["coding"], math.prod(shape)
+    if len(shape) > 3 or any(size < 0 for size in shape):
+        raise ValueError(f"shape: expected at most three sizes, got {shape!r:.80}")
+    if coding == "exact":
+        return numbers * getattr(torch, entry["dtype"]).itemsize
+    columns = {"curve": 3, "turns": 4}.get(coding, shape[-1])
+    if coding not in _CODINGS or entry["width"] not in (1, 2, 4, 8) or not 1 <= len(shape) <= 2 or shape[-1] != columns:
+        raise ValueError(f"expected a coding of kfgs, got {entry!r:.80} of shape {shape}")
+    if coding in ("curve", "turns", "near", "rows", "basis") and len(shape) != 2:
+        raise ValueError(f"shape: expected that of rows for {coding}, got {shape}")
+    if coding == "basis" and (numbers * shape[1] > QR_MOST or shape[0] < shape[1]):
+        raise ValueError(f"shape: expected a basis that is quickly made orthonormal, got {shape}")
+    stored = {"curve": numbers // 3, "turns": numbers // 4 * 3}.get(coding, numbers)
+    return stored * int(entry["width"]) + 4 * {"rows": shape[0], "basis": shape[-1]}.get(coding, 0)
+
+
+_CODINGS = ("curve", "turns", "logs", "steps", "near", "rows", "basis")
+
+
+def _decode(entry: Entry, shape: tuple[int, ...], plain: bytes, place: _Place | None) -> tuple[Tensor, _Place | None]:
+    """The tensor of an entry and its plain bytes; and the place, if these are the means."""
+    coding = entry["coding"]
+    if coding == "exact":
+        dtype = getattr(torch, entry["dtype"])
+        planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
+        whole = torch.from_numpy(np.array(planes.T, order="C")).reshape(-1)
+        return (whole.view(dtype) if len(whole) else torch.zeros(0, dtype=dtype)).reshape(shape), place
+    rows, columns = shape[0], math.prod(shape[1:])
+    if coding in ("rows", "basis"):
+        rows, columns = (columns, rows) if coding == "basis" else (rows, columns)
+        steps = np.frombuffer(plain, "<f4", rows)[:, None].astype(np.float64)
+        values = _whole(plain[4 * rows :], entry, rows, columns) * steps
+        if coding == "basis":  # rounded columns are not quite orthonormal: the nearest such, with their signs
+            Q, R = np.linalg.qr(values.T)
+            values = Q * np.sign(np.diagonal(R))
+    elif coding == "curve":
+        codes = np.cumsum(_whole(plain, entry, rows, 1)[:, 0].astype(np.uint64), dtype=np.uint64)
+        cells = morton_cells(codes).astype(np.int64)
+        place = _Place(cells, _find_before(cells))
+        values = np.array(entry["origin"], np.float64) + cells * float(entry["step"])
+    elif coding == "turns":
+        small = _whole(plain, entry, rows, 3) * float(entry["step"])
+        squares = np.square(small).sum(1, keepdims=True)
+        small = small / np.sqrt(np.maximum(squares, 1))
+        values = np.concatenate([np.sqrt(np.maximum(0, 1 - squares)), small], axis=1)
+    elif coding == "near":
+        if place is None or len(place.before) != rows:
+            raise ValueError(f"expected as many latents as there are means, got {rows}")
+        values = _sum_up(_whole(plain, entry, rows, columns), place.before) * np.float32(entry["step"])
+    else:
+        steps = _whole(plain, entry, rows, columns) * float(entry["step"])
+        values = steps if coding == "steps" else np.expm1(np.clip(steps, 0, 700)) * float(entry["least"])
+    return torch.from_numpy(np.ascontiguousarray(values.reshape(shape), dtype=np.float32)), place
+
+
+def _whole(plain: bytes, entry: Entry, rows: int, columns: int) -> Array:  # [rows, columns] integers
+    width = entry["width"]
+    planes = np.frombuffer(plain, np.uint8).reshape(columns, width, rows).transpose(0, 2, 1)
+    return np.ascontiguousarray(planes).view(f"<i{width}").reshape(columns, rows).T
+
+
+def _sum_up(steps: Array, before: Array) -> Array:  # [N, d]
+    """The sum of each row and of all rows that it is predicted from."""
+    rows = len(steps)
+    whole = np.zeros((rows + 1, steps.shape[1]), np.int32)  # the last row is before those that have none
+    whole[:rows] = steps
+    up, part = np.append(before, rows), np.empty_like(whole)
+    while (up < rows).any():  # each round adds twice as many rows before it
+        whole += np.take(whole, up, axis=0, out=part)
+        up = up[up]
+    return whole[:rows]
+
+
+def _find_before(cells: Array) -> Array:  # [N, 3] int64 -> [N]
+    """The nearest of the `WINDOW` rows before each row, N for none; of equally near ones the latest. The same everywhere."""
+    N = len(cells)
+    cells, best = np.ascontiguousarray(cells.T), np.full(N, np.iinfo(np.int64).max)
+    before = np.full(N, N)
+    for back in range(1, min(WINDOW, N - 1) + 1):
+        apart = cells[:, back:] - cells[:, :-back]
+        distance = (apart * apart).sum(0)
+        nearer = distance < best[back:]
+        best[back:][nearer] = distance[nearer]
+        before[back:][nearer] = np.flatnonzero(nearer)
+    return before
+
+
+def _nearest_turn(quats: Array, scales: Array) -> tuple[Array, Array]:  # [N, 4] of length 1, [N, 3]
+    """The same ellipsoids with the rotation that is nearest to the identity: w > 0.85, and x, y and z within 0.39.
+
+    R diag(s)^2 R^T does not change if R becomes R C and s is permuted likewise, for any of the 24 rotations C of a cube.
+    """
+    if not len(quats):
+        return quats, scales
+    group = Rotation.create_group("O")
+    turns = np.roll(group.as_quat(), 1, axis=1)  # [24, 4] wxyz
+    axes = np.abs(group.as_matrix()).argmax(axis=1)  # [24, 3]: the old axis that becomes axis 0, 1 and 2
+    best = np.abs(quats @ (turns * [1, -1, -1, -1]).T).argmax(1)  # the largest w of q C
+    both = Rotation.from_quat(np.roll(quats, -1, axis=1)) * Rotation.from_quat(np.roll(turns[best], -1, axis=1))
+    turned = np.roll(both.as_quat(), 1, axis=1)
+    return turned * np.where(turned[:, :1] < 0, -1, 1), np.take_along_axis(scales, axes[best], axis=1)
+
+
+def _bytes(data: bytes) -> Tensor:  # [n] uint8
+    return torch.from_numpy(np.frombuffer(data, np.uint8).copy())
