@@ -32,7 +32,6 @@ _WHERE = {
     "ToyConfig": ".toy",
     "make_toy_room": ".toy",
     "Similarity": ".cameras",
-    "SplatFile": ".formats",
     "read_splats": ".formats",
     "write_splats": ".formats",
     "EditList": ".labels",
@@ -47,7 +46,6 @@ _WHERE = {
     "fit_color": ".pipeline",
     "score_views": ".evaluation",
     "transfer_labels": ".labels",
-    "label_splats": ".labels",
     "FeatureFolder": ".scenes",
     "load_teacher": ".teachers",
     "extract_features": ".scenes",
@@ -85,7 +83,6 @@ if TYPE_CHECKING:
     from .fields import UpliftConfig as UpliftConfig
     from .fields import fit_field as fit_field
     from .fields import label_set_from_examples as label_set_from_examples
-    from .formats import SplatFile as SplatFile
     from .formats import read_splats as read_splats
     from .formats import write_splats as write_splats
     from .gaussians import Gaussians as Gaussians
@@ -96,7 +93,6 @@ if TYPE_CHECKING:
     from .labels import Remove as Remove
     from .labels import Selection as Selection
     from .labels import connected_parts as connected_parts
-    from .labels import label_splats as label_splats
     from .labels import load_label_set as load_label_set
     from .labels import transfer_labels as transfer_labels
     from .pipeline import ColorConfig as ColorConfig

@@ -1,10 +1,12 @@
 """What a reader did about content that it could not use as it is: it leaves it out and notes it, or it refuses the file.
 
-Readers call `tell`. The command line listens with `hear`: it prints notes, and its `--strict` makes them errors.
+Readers call `tell`. The command line listens with `hear`: it prints notes, and its `--strict` makes them errors. If nobody
+listens, each note is logged once, as a warning of the logger "kfgs".
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 
@@ -15,6 +17,7 @@ class Repair(str):
 
 _listeners: list[Callable[[str], None]] = []
 _strict: list[bool] = []
+_logged: set[str] = set()
 
 
 @contextmanager
@@ -37,9 +40,12 @@ def hear(say: Callable[[str], None], *, strict: bool = False) -> Iterator[None]:
 
 
 def tell(note: str) -> None:
-    """Pass a note to the command that listens, if there is one."""
+    """Pass a note to the command that listens; if there is none, log it."""
     if _listeners:
         _listeners[-1](note)
+    elif note not in _logged:
+        _logged.add(note)
+        logging.getLogger("kfgs").warning(note)
 
 
 def is_strict() -> bool:

@@ -22,7 +22,6 @@ MADE = {
     "SemanticField": "SemanticField.load(path) reads one",
     "LabelSet": "load_label_set(path) reads one",
     "Gaussians": "read_splats(path).gaussians are some",
-    "SplatFile": "read_splats(path) reads one",
     "Camera": "a Scene has .cameras",
 }
 """How to make what `typed` misses."""

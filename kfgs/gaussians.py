@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ._card import LINE, cut, short_value
 from ._check import ORIGIN, as_array, as_origin, as_tensor, check_shapes, moved_to
 
 Array = np.ndarray[Any, Any]
-TENSORS = ("means", "quats", "scales", "opacities", "features", "sh", "labels")
-FACTS = {"origin": "with_origin()", "antialiased": "replace()"}
-"""What a cloud knows besides its tensors, and how to change it."""
-ELSEWHERE = {
-    "save": "write_splats(path, gaussians) writes every splat format",
-    "load": "read_splats(path).gaussians reads every splat format",
-    "render": "rasterize(gaussians, camera) draws them",
-    "to_pyvista": "kfgs.viz.to_pyvista(gaussians) makes a point cloud for pyvista",
-}
-"""What is often looked for on `Gaussians`, and where it is: those packages build on this one."""
+TENSORS = ("means", "quats", "scales", "opacities", "features", "sh", "labels", "scores")
+SHAPES = ("N 3", "N 4", "N 3", "N", "N D", "N K 3", "N", "N")
+FACTS = ("origin", "antialiased")  # what says how the tensors are drawn
 
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N 3-D Gaussians. Values are **activated** (opacities from 0 to 1, scales as lengths); `fields.GaussianParams` has raw ones.
+    """N 3-D Gaussians with all that belongs to them: shape, colour or features, classes, and the other columns of a file.
+
+    Values are **activated** (opacities from 0 to 1, scales as lengths); raw ones live only where training happens.
 
     **Convention**: quaternions are (w, x, y, z) and need not be unit (they are normalised where used); scales are
     standard deviations in world units; labels are class indices with -1 = none, and become int64. A semantic field carries
@@ -51,34 +47,32 @@ class Gaussians:
     features: Tensor | None = None  # [N, D]
     sh: Tensor | None = None  # [N, K, 3], K = (degree + 1)^2
     labels: Tensor | None = None  # [N] int64, -1 = none
-    origin: tuple[float, float, float] = (
-        ORIGIN  # where the cloud's (0, 0, 0) lies in the world; means + origin in float64
-    )
+    scores: Tensor | None = None  # [N] how sure each label is, from 0 to 1
+    names: tuple[str, ...] = ()  # the name of each class index in `labels`; empty if they have none
+    extra: Mapping[str, Array] = field(default_factory=dict)  # other columns of a file by name, one value per Gaussian
+    origin: tuple[float, float, float] = ORIGIN  # where (0, 0, 0) lies in the world: add it to `means` in float64
     antialiased: bool = False  # trained with Mip-Splatting's filter: drawn with opacity compensation
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "origin", as_origin(self.origin))
+        object.__setattr__(self, "names", tuple(self.names))
         for name in TENSORS:
             value = getattr(self, name)
-            if not isinstance(value, Tensor | None):
+            if value is not None:
                 object.__setattr__(self, name, as_tensor(name, value, floating=name != "labels"))
-        for name, value in self._tensors().items():
-            as_tensor(name, value, floating=name != "labels")
-        if self.labels is not None and (self.labels.is_floating_point() or self.labels.dtype == torch.bool):
-            raise TypeError(f"labels: expected whole numbers, got {self.labels.dtype}; convert them with .long()")
-        if self.labels is not None:  # unsigned ones have no -1
-            object.__setattr__(self, "labels", self.labels.long())
-        check_shapes(
-            ("means", self.means, "N 3"),
-            ("quats", self.quats, "N 4"),
-            ("scales", self.scales, "N 3"),
-            ("opacities", self.opacities, "N"),
-            ("features", self.features, "N D"),
-            ("sh", self.sh, "N K 3"),
-            ("labels", self.labels, "N"),
-        )
+        if self.labels is not None:
+            if self.labels.is_floating_point() or self.labels.dtype == torch.bool:
+                raise TypeError(f"labels: expected whole numbers, got {self.labels.dtype}; convert them with .long()")
+            object.__setattr__(self, "labels", self.labels.long())  # unsigned ones have no -1
+        check_shapes(*((name, getattr(self, name), shape) for name, shape in zip(TENSORS, SHAPES, strict=True)))
         if self.sh is not None and self.sh.shape[1] not in (1, 4, 9, 16):
             raise ValueError(f"sh: expected 1, 4, 9 or 16 coefficients (degree 0 to 3), got {self.sh.shape[1]}")
+        for name, column in self.extra.items():
+            if np.shape(column) != (len(self),):
+                raise ValueError(
+                    f"extra[{name!r}]: expected [N] with N = {len(self)} (from means), got {np.shape(column)}; give one "
+                    "value per Gaussian"
+                )
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
@@ -90,7 +84,9 @@ class Gaussians:
         if self.sh is not None:
             parts.append(f"SH degree {int(self.sh.shape[1] ** 0.5) - 1}")
         parts += ["labelled"] * (self.labels is not None) + ["antialiased"] * self.antialiased
-        return f"Gaussians({', '.join(parts)}, {self.means.dtype}, {self.means.device})"
+        parts += [f"{len(self.names)} classes"] if self.names else []
+        parts += [f"columns {short_value(list(self.extra))}"] if self.extra else []
+        return cut(f"Gaussians({', '.join(parts)}, {self.means.dtype}, {self.means.device})", LINE)
 
     def __getitem__(self, which: Any) -> Gaussians:
         return self.select(which)
@@ -101,18 +97,12 @@ class Gaussians:
             "gaussians: expected an array, got Gaussians, which hold several; to_numpy() gives them by name"
         )
 
-    if not TYPE_CHECKING:  # so that a type checker still finds misspelt names
-
-        def __getattr__(self, name: str) -> Any:
-            hint = f"; {ELSEWHERE[name]}" if name in ELSEWHERE else ""
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}{hint}")
-
     def _tensors(self) -> dict[str, Tensor]:
         values = {name: getattr(self, name) for name in TENSORS}
         return {name: value for name, value in values.items() if value is not None}
 
     def replace(self, **changes: Any) -> Gaussians:
-        """A copy with some tensors exchanged."""
+        """A copy with some parts exchanged."""
         return replace(self, **changes)
 
     def with_origin(self, origin: Sequence[float]) -> Gaussians:  # [3]
@@ -133,7 +123,19 @@ class Gaussians:
             IndexError: if there is no such Gaussian.
         """
         index = as_rows("which", which, len(self)).to(self.means.device)
-        return self.replace(**{name: value[index] for name, value in self._tensors().items()})
+        rows = index.cpu().numpy() if self.extra else None
+        extra = {name: np.asarray(column)[rows] for name, column in self.extra.items()}
+        return self.replace(**{name: value[index] for name, value in self._tensors().items()}, extra=extra)
+
+    def by_class(self) -> dict[int, Gaussians]:
+        """One cloud for each label that occurs, ascending; -1 is the cloud without a class.
+
+        Raises:
+            ValueError: if there are no labels.
+        """
+        if self.labels is None:
+            raise ValueError("gaussians: expected labels, got none; `kfgs.attach` or `transfer_labels` gives them some")
+        return {label: self.select(self.labels == label) for label in self.labels.unique().tolist()}
 
     def to(self, *args: Any, **kwargs: Any) -> Gaussians:
         """Move or convert the floating tensors as `Tensor.to` does; labels keep their integer type."""
@@ -152,28 +154,30 @@ class Gaussians:
 
     @staticmethod
     def cat(parts: Sequence[Gaussians]) -> Gaussians:
-        """Concatenate clouds that carry the same tensors.
+        """Concatenate clouds that carry the same tensors and columns; `labels.join` joins others.
 
         Raises:
             ValueError: if there is nothing to join, or one cloud carries what another lacks.
         """
         if not parts:
             raise ValueError("parts: expected at least one Gaussians, got none")
-        names = set(parts[0]._tensors())
+        first, names = parts[0], list(parts[0]._tensors())
         for i, part in enumerate(parts):
-            if set(part._tensors()) != names:
-                raise ValueError(
-                    f"parts[{i}]: expected the tensors {sorted(names)} as in parts[0], got {sorted(part._tensors())}; "
-                    "add or drop them with replace()"
-                )
-        for name in ("origin", "antialiased"):
-            for i, part in enumerate(parts):
-                if getattr(part, name) != getattr(parts[0], name):
+            for what, expected, got in (
+                ("tensors", names, list(part._tensors())),
+                ("columns", sorted(first.extra), sorted(part.extra)),
+                ("class names", first.names, part.names),
+                ("origin", first.origin, part.origin),
+                ("antialiased", first.antialiased, part.antialiased),
+            ):
+                if got != expected:
                     raise ValueError(
-                        f"parts[{i}]: expected the {name} {getattr(parts[0], name)} as in parts[0], got "
-                        f"{getattr(part, name)}; bring them to one with {FACTS[name]}"
+                        f"parts[{i}]: expected the {what} {expected} as in parts[0], got {got}; bring them to one with "
+                        f"{'with_origin()' if what == 'origin' else 'replace()'}"
                     )
-        return parts[0].replace(**{name: torch.cat([part._tensors()[name] for part in parts]) for name in names})
+        tensors = {name: torch.cat([part._tensors()[name] for part in parts]) for name in names}
+        extra = {name: np.concatenate([part.extra[name] for part in parts]) for name in first.extra}
+        return first.replace(**tensors, extra=extra)
 
 
 def as_rows(name: str, which: Any, count: int) -> Tensor:  # [count] bool, or [n] whole numbers

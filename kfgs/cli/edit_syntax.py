@@ -57,7 +57,7 @@ def parse_edits(asked: Edits, names: Sequence[str] = ()) -> list[tuple[str, Any]
             there is a distance but no part.
     """
     edits = list(_parse(asked, partial(_where, asked.distance, {name.casefold() for name in names})))
-    if asked.distance is not None and not any(_parts(getattr(edit, "where", None)) for _, edit in edits):
+    if asked.distance is not None and not any(_parts(edit) for _, edit in edits):
         raise ValueError(
             f"distance: expected an edit of a part with it (--remove chair/2), got {asked.distance} and none; name a part, or "
             "leave it out"
@@ -67,9 +67,8 @@ def parse_edits(asked: Edits, names: Sequence[str] = ()) -> list[tuple[str, Any]
 
 def _parse(asked: Edits, where_of: Callable[[str, str], Any]) -> Iterator[tuple[str, Any]]:
     from ..labels.color import parse_color
-    from ..labels.edits import Duplicate, Extract, Move, Opacity, Recolor, Remove, Turn
+    from ..labels.edits import Duplicate, Extract, Move, Opacity, Recolor, Remove
     from ..labels.edits.motion import AXES
-    from ..labels.where import Either
 
     for words in asked.recolor:
         name, value = _split("recolor", words, "plant:#c04040")
@@ -94,7 +93,7 @@ def _parse(asked: Edits, where_of: Callable[[str, str], Any]) -> Iterator[tuple[
                 f"rotate: expected an axis (x, y or z) and degrees, got {words!r}; write it as 'table:z,90'"
             )
         (angle,) = _numbers("rotate", words, degrees, "an axis (x, y or z) and degrees", 1)
-        yield f"--rotate {words}", Move(where_of("rotate", name), rotation=Turn(AXES[axis], angle))
+        yield f"--rotate {words}", Move(where_of("rotate", name), rotation=(axis, angle))
     for words in asked.move:
         name, value = _split("move", words, "table:0.5,0,0")
         yield f"--move {words}", Move(where_of("move", name), _numbers("move", words, value, _THREE, 3))
@@ -105,9 +104,9 @@ def _parse(asked: Edits, where_of: Callable[[str, str], Any]) -> Iterator[tuple[
             Duplicate(where_of("duplicate", name), _numbers("duplicate", words, value, _THREE, 3)),
         )
     for removed, parts in _together(asked.remove, where_of):
-        yield f"--remove {' '.join(removed)}", Remove(parts[0] if len(parts) == 1 else Either(tuple(parts)))
+        yield f"--remove {' '.join(removed)}", Remove(parts)
     if asked.extract:
-        where = Either(tuple(where_of("extract", words) for words in asked.extract))
+        where = tuple(where_of("extract", words) for words in asked.extract)
         yield f"--extract {' '.join(asked.extract)}", Extract(where)
     for words in asked.insert:
         yield f"--insert {words}", _insertion(words)
@@ -125,17 +124,7 @@ def classes_of(edits: Iterable[Any]) -> Iterator[str | int]:
     for edit in edits:
         if edit.op == "insert":
             return
-        yield from _classes(edit.where)
-
-
-def _classes(where: Any) -> Iterator[str | int]:
-    from ..labels.where import OfClass
-
-    if isinstance(where, OfClass):
-        yield where.name
-    for one in (*getattr(where, "parts", ()), getattr(where, "where", None)):
-        if one is not None:
-            yield from _classes(one)
+        yield from (rule.name for rule in edit.where if rule.kind == "class")
 
 
 def check_parts(splats: Any, edits: Iterable[Any]) -> None:
@@ -147,45 +136,41 @@ def check_parts(splats: Any, edits: Iterable[Any]) -> None:
     """
     import torch
 
-    from ..labels import component_numbers
+    from ..labels import OfClass, component_numbers
     from ..labels.parts import SPECK
 
-    for part in (part for edit in edits for part in _parts(getattr(edit, "where", None))):
-        name = part.where.name
-        mask = part.where.mask(splats)
-        numbers = component_numbers(splats.gaussians.means, mask, part.distance)
+    for rule in (rule for edit in edits for rule in _parts(edit)):
+        name = rule.name
+        mask = OfClass(name).select(splats).mask
+        numbers = component_numbers(splats.means, mask, rule.distance)
         sizes = torch.bincount(numbers[mask])
         count = int((sizes >= SPECK * sizes[0]).sum()) if len(sizes) else 0
-        far = "" if part.distance is None else f" --distance {part.distance}"
-        if part.rank >= count:
+        far = "" if rule.distance is None else f" --distance {rule.distance}"
+        if rule.part >= count:
             raise ValueError(
-                f"{name}/{part.rank + 1}: expected a part from {name}/1 to {name}/{count}, got no part of that number; "
+                f"{name}/{rule.part + 1}: expected a part from {name}/1 to {name}/{count}, got no part of that number; "
                 f"`kfgs select {name} SPLAT{far}` lists them"
                 if count
-                else f"{name}/{part.rank + 1}: expected Gaussians of class {name!r}, got none in this splat; "
+                else f"{name}/{rule.part + 1}: expected Gaussians of class {name!r}, got none in this splat; "
                 "`kfgs info SPLAT` lists what it holds"
             )
 
 
-def _parts(where: Any) -> list[Any]:
-    """The parts of classes that a selection names."""
-    from ..labels.where import Component, Either
-
-    if isinstance(where, Either):
-        return [part for one in where.parts for part in _parts(one)]
-    return [where] if isinstance(where, Component) else []
+def _parts(edit: Any) -> list[Any]:
+    """The rules of an edit that name a part of a class."""
+    return [rule for rule in getattr(edit, "where", ()) if getattr(rule, "part", None) is not None]
 
 
 def _where(distance: float | None, names: set[str], option: str, words: str) -> Any:
     """A class, or one of its connected parts, as in `chair/2`."""
-    from ..labels.where import Component, OfClass
+    from ..labels import OfClass
 
     name, _, part = words.rpartition("/")
     if words.casefold() in names or not (name and part.isdecimal()):
         return OfClass(words)
     if int(part) == 0:
         raise ValueError(f"{option}: expected parts counted from 1, got {words!r}; '{name}/1' is the largest")
-    return Component(OfClass(name), distance, int(part) - 1)
+    return OfClass(name, int(part) - 1, distance)
 
 
 def _together(remove: Sequence[str], where_of: Callable[[str, str], Any]) -> list[tuple[list[str], list[Any]]]:
@@ -193,8 +178,7 @@ def _together(remove: Sequence[str], where_of: Callable[[str, str], Any]) -> lis
     found: dict[str, tuple[list[str], list[Any]]] = {}
     for words in dict.fromkeys(remove):
         where = where_of("remove", words)
-        of_class = getattr(where, "where", where)
-        said, parts = found.setdefault(of_class.name.casefold(), ([], []))
+        said, parts = found.setdefault(where.name.casefold(), ([], []))
         said.append(words)
         parts.append(where)
     return list(found.values())

@@ -81,11 +81,11 @@ def open_splats(name: str, path: Path, *, labelled: bool = False, named: bool = 
             "`kfgs color` writes"
         )
     splats = read_splats(path)
-    if labelled and splats.gaussians.labels is None:
+    if labelled and splats.labels is None:
         raise ValueError(
             f"{name}: expected a splat with classes, got {path} without; run `kfgs attach FIELD {path} --out labelled.ply`"
         )
-    if named and splats.gaussians.labels is not None and not splats.classes:
+    if named and splats.labels is not None and not splats.names:
         raise ValueError(
             f"{name}: expected the names of its classes beside {path}, got no file {names_path(path)}; copy it, too, from "
             "where the splat was, or run `kfgs attach` again"

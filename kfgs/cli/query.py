@@ -56,7 +56,6 @@ def select(
             auto: relevancy, or cosine with --negatives none.
     """
     from .._check import check_range
-    from ..formats import SplatFile
     from ..labels import connected_parts
     from ..labels.components import component_distance
     from ..pipeline.apply import select_labelled
@@ -76,7 +75,7 @@ def select(
         query = target if isinstance(target, str) else query
         how = None if score == "auto" else score
         found = field.query(target, label_set, threshold, negatives=_negatives(negatives, score), score=how)
-        cloud, cameras = SplatFile(field.gaussians, {"score": found.scores.numpy()}), field.cameras or None
+        cloud, cameras = field.gaussians.replace(scores=found.scores), field.cameras or None
         scene = classes.scene_of(field) if out is not None else None
     else:
         given = {"classes": classes.classes, "text": classes.text, "negatives": negatives, "score": score}
@@ -92,13 +91,13 @@ def select(
         raise ValueError(f"query: expected Gaussians to save, got none of {query!r}; lower the threshold or drop --out")
     joined = distance
     if joined is None and len(found):
-        joined = component_distance(cloud.gaussians.means, found.mask)
-    things = connected_parts(cloud.gaussians, found, cameras, distance=joined, smallest=smallest)
+        joined = component_distance(cloud.means, found.mask)
+    things = connected_parts(cloud, found, cameras, distance=joined, smallest=smallest)
     written: list[str] = []
     if out is not None:  # before anything is printed, whose reader may have ended
         with atomic_folder(out) as new:
             _save(new, query, cloud, found, things)
-            _draw(new / "parts.png", query, cloud.gaussians, things, cameras, scene)
+            _draw(new / "parts.png", query, cloud, things, cameras, scene)
             written += sorted(path.name for path in new.iterdir())
         for name in {"parts.png", "selection.ply.classes.json"} - set(written):
             (out / name).unlink(missing_ok=True)  # of an older selection
@@ -220,7 +219,7 @@ def _save(folder: Path, query: str, cloud: Any, found: Any, things: list[Any]) -
     parts = [thing.to_json() for thing in things]
     facts = {"query": query, "threshold": found.threshold, "how": found.how, "count": len(found), "parts": parts}
     write_json(folder / "selection.json", facts)
-    write_splats(folder / "selection.ply", cloud.select(found.mask))
+    write_splats(cloud.select(found.mask), folder / "selection.ply")
 
 
 def _draw(path: Path, query: str, gaussians: Any, things: list[Any], cameras: Any, scene: Any) -> None:

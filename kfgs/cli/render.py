@@ -110,7 +110,7 @@ def _opened(names: Any, semantic: Any, colors: Any) -> tuple[Any, Any]:
         if label is None:
             return cloud.select(inside)
         own = cloud is semantic
-        labels = semantic.labels if own else transfer_labels(semantic, semantic.labels, cloud).labels
+        labels = semantic.labels if own else transfer_labels(semantic, cloud).labels
         return cloud.select(inside & (labels != label))
 
     shown = kept(semantic)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from .._files import Names, check_output, real_path
 from .edit_syntax import Edits, check_parts, classes_of, inserted_files, parse_edits
@@ -25,7 +25,6 @@ def attach(
     out: Path,
     *,
     by: GivenBy = None,
-    method: Literal["nearest", "vote", "mahalanobis"] = "nearest",
     distance: Given[float] = None,
     splat_scene: Given[Path] = None,
     same_frame: Flag = False,
@@ -45,9 +44,7 @@ def attach(
         splats: A splat of the same scene in any format, by any program.
         out: The labelled splat to write; its ending chooses the format.
         by: views (the default): the field segments its training views, and each Gaussian takes the class of the pixels that
-            it fills. distance: labelled Gaussians of the field within lambda decide, as in the paper (Sec. 3.4).
-        method: For --by distance: the nearest labelled Gaussian (as in the paper), a vote of those around, or their overlap
-            (mahalanobis), which is the best of the three for a field with noisy labels.
+            it fills. distance: the nearest labelled Gaussian of the field within lambda decides, as in the paper (Sec. 3.4).
         distance: The paper's lambda: the distance within which a label is carried over, in the splat's world units; by
             default from the clouds' spacing.
         splat_scene: Scene folder of the splat's own cameras, if its frame differs: cameras of the same names align the two.
@@ -76,13 +73,13 @@ def attach(
     same = Similarity.identity() if same_frame else None
     frame = same if splat_scene is None else load_scene(splat_scene).undistorted().cameras
     try:
-        found = attach_field(loaded, cloud, label_set, frame=frame, distance=distance, by=by, method=method)
+        found = attach_field(loaded, cloud, label_set, frame=frame, distance=distance, by=by)
     except SceneError as error:
         raise SceneError(
             f"splats: no frame found in which field and splat agree: {error} (--splat-scene gives the splat's cameras, "
             "--same-frame says that there is nothing to find)"
         ) from error
-    written = write_splats(out, found.splats)
+    written = write_splats(found.gaussians, out, facts=found.facts)
     for note in found.notes:
         say(note)
     say_counts(found.labels, label_set.names)
@@ -137,19 +134,19 @@ def edit(
     named = any(isinstance(one, str) for one in by_class)
     before = open_splats("splats", splats, labelled=bool(by_class), named=named)
     start, listed = replayed.apply(before), replayed
-    asked = parse_edits(edits, start.classes)
+    asked = parse_edits(edits, start.names)
     check_parts(start, [edit for _, edit in asked])
     for _, edit in asked:
         listed = listed.then(edit)
     cameras = [] if scene.scene is None else _cameras_to_show(before, scene, views)
     after = _apply(listed, before, [words for words, _ in asked])
-    states = (cloud.gaussians for cloud in accumulate(listed, lambda cloud, one: one.apply(cloud), initial=before))
+    states = accumulate(listed, lambda cloud, one: one.apply(cloud), initial=before)
     shown = cameras if views or not cameras else [cameras[i] for i in views_of_edits(states, cameras, pictures)]
-    written = write_splats(out, after)
+    written = write_splats(after, out)
     paths = [*written.paths, listed.save(saved)]
     if shown:
         picture = out.with_name(f"{out.name}.png")
-        paths.append(write_comparison(picture, before.gaussians, after.gaussians, shown, titles=TITLES))
+        paths.append(write_comparison(picture, before, after, shown, titles=TITLES))
     say(f"{len(before)} Gaussians before, {len(after)} after {len(listed)} edit(s)")
     if len(after) == 0:
         say("note: nothing is left")
@@ -193,7 +190,7 @@ def convert(
     check_target("target", target)
     splats = open_splats("source", source)
     shown = repr(splats)
-    written = write_splats(target, splats, plain=plain)
+    written = write_splats(splats, target, plain=plain)
     say(shown)
     say_lost(written)
     say(f"{_bytes_of(source) / 2**10:,.1f} KiB -> {_bytes_of(target) / 2**10:,.1f} KiB")
@@ -204,7 +201,6 @@ def _convert_by_class(source: Path, folder: Path) -> None:
     """One plain PLY for each class of a splat. The class is in the name of its file, so there is nothing beside it."""
     from .._files import atomic_folder
     from ..formats import formats, write_splats
-    from ..formats.splat_file import SCORE
 
     endings = *(ending for one in formats().values() for ending in one.SUFFIXES), ".zip"
     if folder.name.lower().endswith(endings) and not folder.is_dir():
@@ -215,8 +211,7 @@ def _convert_by_class(source: Path, folder: Path) -> None:
     splats = open_splats("source", source, labelled=True)
     if len(splats) == 0:
         raise ValueError(f"source: expected Gaussians to divide by class, got none in {source}; name another splat")
-    extra = {name: values for name, values in splats.extra.items() if name != SCORE}
-    parts = {_file_name(label, splats.classes): part for label, part in splats.replace(extra=extra).by_class().items()}
+    parts = {_file_name(label, splats.names): part for label, part in splats.by_class().items()}
     for name in parts:
         if real_path(folder / name) == real_path(source):
             raise ValueError(
@@ -224,7 +219,7 @@ def _convert_by_class(source: Path, folder: Path) -> None:
             )
     with atomic_folder(folder) as new:
         for name, part in parts.items():
-            written = write_splats(new / name, part.replace(gaussians=part.gaussians.replace(labels=None)), plain=True)
+            written = write_splats(part.replace(labels=None, scores=None), new / name, plain=True)
     for name, part in parts.items():
         say(f"{name}: {len(part)} Gaussians")
     say_lost(written)
@@ -268,7 +263,7 @@ def _edits_beside(out: Path, replay: Path | None) -> Path:
 
 def _cameras_to_show(splats: Any, scene: SceneOption, views: Sequence[str]) -> list[Any]:
     """The undistorted cameras of a scene, or of some of its views."""
-    if splats.gaussians.sh is None:
+    if splats.sh is None:
         raise ValueError(f"scene: expected a splat with colours to show in it, got {splats!r}; leave --scene out")
     loaded = scene.load_scene()
     return list((_choose_views(loaded, views) if views else loaded).undistorted().cameras)

@@ -166,7 +166,7 @@ def open_colors(field: Path | None, color: Path | None, meaning: Any) -> Any:
     from ..fields.store import read_description
 
     if color is not None:
-        return open_splats("color", color).gaussians
+        return open_splats("color", color)
     if meaning.gaussians.sh is not None:
         return meaning.gaussians
     if field is None:
@@ -175,7 +175,7 @@ def open_colors(field: Path | None, color: Path | None, meaning: Any) -> Any:
     for place in (field.parent / "color.ply", Path(str(geometry))):
         if place.is_file() and not is_field(place):
             say(f"colours: {place}")
-            return open_splats("color", place).gaussians
+            return open_splats("color", place)
     return None
 
 

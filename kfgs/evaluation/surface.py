@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_shapes
-from ..labels import Transfer, transfer_labels
+from ..labels import Transfer, nearest_labels
 
 SURFACE_PROTOCOL = (
     "kfgs-surface/1: share of the ground-truth surface points, each seen by some training view, that receive their true "
@@ -59,6 +59,6 @@ def score_surface(
     scored = truth >= 0
     if not bool(scored.any()):
         raise ValueError(f"truth: expected some point with a class, got none among {len(truth)}; are these its labels?")
-    moved = transfer_labels(means, labels, points)
+    moved = nearest_labels(means, labels, points)
     right = moved.labels.to(truth.device) == truth
     return SurfaceReport(float(right[scored].to(torch.float32).mean()), moved, int(scored.sum()))

@@ -190,8 +190,11 @@ class SemanticField:
         return Classification(labels.masked_fill(~self.known, -1), scores.masked_fill(~self.known, 0))
 
     def label(self, classes: Classes | None = None) -> Gaussians:
-        """The Gaussians with the labels of `classify`."""
-        return self.gaussians.replace(labels=self.classify(classes).labels)
+        """The Gaussians with the labels and scores of `classify`, and the names of the classes, if they are known."""
+        classes = self.classes if classes is None else classes
+        labels, scores = self.classify(classes)
+        names = classes.names if isinstance(classes, LabelSet) else ()
+        return self.gaussians.replace(labels=labels, scores=scores, names=names)
 
     def query(
         self,

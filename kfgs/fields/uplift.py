@@ -21,7 +21,6 @@ from .._progress import as_bar
 from .._rows import row_norms, unit_rows
 from .._typed import typed
 from ..cameras import Camera
-from ..formats import SplatFile
 from ..formats.values import check_splats
 from ..gaussians import Gaussians
 from ..quant import FeatureMaps
@@ -177,8 +176,8 @@ def _checked(gaussians: Gaussians, cameras: Sequence[Camera], maps: FeatureMaps)
         raise ValueError(
             f"maps: expected one per camera ({len(cameras)}, at least one), got {len(maps)}; pass the views that have maps"
         )
-    cloud = gaussians.replace(sh=None, features=None, labels=None).detach()
-    check_splats(SplatFile(cloud))
+    cloud = gaussians.replace(sh=None, features=None, labels=None, scores=None, names=(), extra={}).detach()
+    check_splats(cloud)
     return cloud.to(torch.promote_types(cloud.means.dtype, torch.float32))
 
 

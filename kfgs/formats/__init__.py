@@ -1,15 +1,6 @@
 """Read and write the splat files of other programs, with labels: 3DGS PLY, compressed PLY, .splat, SPZ, SOG, .ksplat, glTF."""
 
-from .splat_file import SplatFile, Written
 from .spz import write_spz
-from .table import find_format, formats, read_splats, write_splats
+from .table import Written, find_format, formats, read_splats, write_splats
 
-__all__ = [
-    "SplatFile",
-    "Written",
-    "find_format",
-    "formats",
-    "read_splats",
-    "write_splats",
-    "write_spz",
-]
+__all__ = ["Written", "find_format", "formats", "read_splats", "write_splats", "write_spz"]

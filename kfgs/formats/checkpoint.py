@@ -21,12 +21,12 @@ import torch
 from torch import Tensor
 
 from .._files import read_json
+from .._notes import tell
 from .._torch_files import plain_tensor, read_torch
 from ..cameras.similarity import Similarity
 from ..gaussians import Gaussians
 from ..splat.transform import transform_gaussians
 from .render_mode import Mode, with_mode
-from .splat_file import SplatFile
 from .values import NO_DEGREE_4, SH_C0, positive_scales
 
 NAME = "checkpoint"
@@ -45,10 +45,10 @@ def matches(head: bytes) -> bool:
     )
 
 
-def read(path: Path) -> SplatFile:
+def read(path: Path) -> Gaussians:
     """Read the Gaussians of a checkpoint; optimisers and networks in it are skipped.
 
-    Of gsplat, the files of all ranks of the step are joined. `info` has `step`, and `frame` in words.
+    Of gsplat, the files of all ranks of the step are joined.
 
     Raises:
         ValueError: if it is something else, damaged, or its colours come from a network (gsplat's `app_opt`); or if
@@ -56,17 +56,14 @@ def read(path: Path) -> SplatFile:
     """
     top = read_torch(path, _EXPECTED)
     found = top if isinstance(top, dict) else {}
-    info: dict[str, Any] = {"format": NAME, **({"step": found["step"]} if isinstance(found.get("step"), int) else {})}
     if isinstance(found.get("splats"), dict):
         files = _ranks(path)
         parts = [_gsplat(file, found if file == path else read_torch(file, _EXPECTED)) for file in files]
-        info |= {"program": "gsplat", "frame": "that of gsplat's trainer, which normalises the scene by default"}
-        info |= {"ranks": len(files)} if len(files) > 1 else {}
-        return with_mode(SplatFile(Gaussians.cat(parts), info=info, notes=_dropped(found["splats"])), _mode(path))
+        _tell_dropped(path, found["splats"])
+        return with_mode(path, Gaussians.cat(parts), _mode(path))
     if isinstance(found.get("pipeline"), dict):
-        cloud, frame = _undo_frame(path, _splatfacto(path, found["pipeline"]))
-        info |= {"program": "nerfstudio", "frame": frame}
-        return with_mode(SplatFile(cloud, info=info, notes=_dropped(found["pipeline"])), _mode(path))
+        _tell_dropped(path, found["pipeline"])
+        return with_mode(path, _undo_frame(path, _splatfacto(path, found["pipeline"])), _mode(path))
     got = f"one with {', '.join(map(str, list(found)[:5]))}" if found else type(top).__name__
     raise ValueError(f"{path}: expected {_EXPECTED}, got {got:.200}; name another file")
 
@@ -159,13 +156,14 @@ def _cloud(path: Path, raw: dict[str, Tensor], dc: Tensor, rest: Tensor) -> Gaus
     )
 
 
-def _dropped(values: dict[Any, Any]) -> tuple[str, ...]:
+def _tell_dropped(path: Path, values: dict[Any, Any]) -> None:
     rest = [value for name, value in values.items() if str(name).endswith(("shN", "features_rest"))]
-    return (NO_DEGREE_4,) if any(getattr(value, "shape", ())[1:] == (24, 3) for value in rest) else ()
+    if any(getattr(value, "shape", ())[1:] == (24, 3) for value in rest):
+        tell(f"{path.name}: {NO_DEGREE_4}")
 
 
-def _undo_frame(path: Path, cloud: Gaussians) -> tuple[Gaussians, str]:
-    """The Gaussians in the frame of the data, and that in words."""
+def _undo_frame(path: Path, cloud: Gaussians) -> Gaussians:
+    """The Gaussians in the frame of the data, before its `applied_transform`; in nerfstudio's own if its file is missing."""
     file = next((place / FRAME for place in (path.parent.parent, path.parent) if (place / FRAME).is_file()), None)
     if file is None:
         warnings.warn(
@@ -173,7 +171,7 @@ def _undo_frame(path: Path, cloud: Gaussians) -> tuple[Gaussians, str]:
             "scene; copy that file from the run to its place",
             stacklevel=4,
         )
-        return cloud, "nerfstudio's own"
+        return cloud
     content = read_json(file)
     try:
         rows, scale = torch.tensor(content["transform"], dtype=torch.float64), float(content["scale"])
@@ -184,4 +182,4 @@ def _undo_frame(path: Path, cloud: Gaussians) -> tuple[Gaussians, str]:
         raise ValueError(
             f"{file}: expected a rigid 'transform' [3][4] and a 'scale' above 0, got something else ({error}); copy it again"
         ) from error
-    return transform_gaussians(cloud, data_from_run), "that of the data, before applied_transform"
+    return transform_gaussians(cloud, data_from_run)

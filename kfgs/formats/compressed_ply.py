@@ -22,13 +22,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from .._notes import tell
 from ..gaussians import Gaussians
 from .order import morton_order
 from .ply import Columns, read_comments, read_ply_elements, write_ply_elements
 from .render_mode import comments_of_mode, mode_from_comments, with_mode
 from .smallest_three import pack_smallest_three, rotation_error, unpack_smallest_three
-from .splat_file import Precision, SplatFile
-from .values import NO_DEGREE_4, SH_C0, colours_to_write, describe_coarse, describe_loss, positive_scales
+from .values import NO_DEGREE_4, SH_C0, Precision, colours_to_write, describe_coarse, describe_loss, positive_scales
 
 NAME = "compressed_ply"
 SUFFIXES = (".compressed.ply",)
@@ -63,7 +63,7 @@ def matches(head: bytes) -> bool:
     return head.startswith(MAGIC) and b"element chunk" in header and b"packed_position" in header
 
 
-def read(path: Path) -> SplatFile:
+def read(path: Path) -> Gaussians:
     """Read a compressed PLY file with harmonics of degree 0 to 4 (4 is dropped); opacities of 0 and 1 stay 0 and 1.
 
     Raises:
@@ -92,19 +92,18 @@ def read(path: Path) -> SplatFile:
         opacities=torch.from_numpy(rgba[:, 3].copy()),
         sh=torch.from_numpy(sh[:, :16]),
     )
-    comments = read_comments(path)
-    notes = (NO_DEGREE_4,) if sh.shape[1] > 16 else ()
-    info = {"format": NAME, "comments": comments}
-    return with_mode(SplatFile(gaussians, info=info, notes=notes), mode_from_comments(comments))
+    if sh.shape[1] > 16:
+        tell(f"{path.name}: {NO_DEGREE_4}")
+    return with_mode(path, gaussians, mode_from_comments(read_comments(path)))
 
 
-def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
+def write(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
     """Write a compressed PLY file in the given order; precision is best if each 256 Gaussians lie close together.
 
     Raises:
         ValueError: if the cloud has no colours.
     """
-    g = colours_to_write(splats.gaussians, ".compressed.ply")
+    g = colours_to_write(gaussians, ".compressed.ply")
     assert g.sh is not None
     values = _quantities(g)
     bounds = [_chunk_bounds(value) for value in values]
@@ -132,9 +131,9 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
         rest = g.sh[:, 1:].transpose(1, 2).flatten(1).numpy()  # channel by channel
         steps_of_rest = np.clip(np.floor((rest / (2 * SH_LIMIT) + 0.5) * 256), 0, 255).astype(np.uint8)
         elements["sh"] = {f"f_rest_{i}": np.ascontiguousarray(column) for i, column in enumerate(steps_of_rest.T)}
-    write_ply_elements(path, elements, comments=("written by kfgs", *comments_of_mode(splats)))
+    write_ply_elements(path, elements, comments=("written by kfgs", *comments_of_mode(gaussians)))
     return (
-        describe_loss(splats, ".compressed.ply", 3)
+        describe_loss(gaussians, ".compressed.ply", 3)
         + describe_coarse(g, _half_steps(values[0], _STEPS), ".compressed.ply")
         + _words_of_clipping(g, _half_steps(values[2], _COLOR_STEPS))
     )

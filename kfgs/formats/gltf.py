@@ -22,13 +22,14 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from .._notes import tell
 from ..gaussians import Gaussians
 from .gltf_accessors import AccessorWriter, read_accessor
 from .gltf_container import MAGIC as GLB
@@ -36,12 +37,13 @@ from .gltf_container import Document, open_document, write_document
 from .gltf_nodes import place, placed_meshes
 from .ply import Columns
 from .render_mode import describe_lost_mode
-from .splat_file import SCORE, Precision, SplatFile
 from .values import (
     EXACT,
     NO_DEGREE_4,
+    SCORE,
     SH_C0,
     UP_AND_BACK,
+    Precision,
     colours_to_write,
     describe_loss,
     flip_axes,
@@ -61,13 +63,6 @@ _POINTS = 0
 _LEAST_BYTES = 8  # bytes per Gaussian: with fewer, the file shows one buffer many times
 
 
-class _Part(NamedTuple):
-    gaussians: Gaussians
-    extra: Columns
-    classes: tuple[str, ...]
-    notes: tuple[str, ...]
-
-
 def matches(head: bytes) -> bool:
     """A .glb, or JSON that mentions accessors or the extension."""
     if head.startswith(GLB):
@@ -75,13 +70,11 @@ def matches(head: bytes) -> bool:
     return head.lstrip()[:1] == b"{" and (EXTENSION.encode() in head or b'"accessors"' in head)
 
 
-def read(path: Path) -> SplatFile:
+def read(path: Path) -> Gaussians:
     """Read all splat primitives of the default scene, moved by their nodes, in the axes of the 3DGS PLY.
 
     Files of older drafts are read too: scales as logarithms (recognised by negative values, which the ratified text
     forbids), `_ROTATION` and `_SCALE`, and colour and opacity from COLOR_0 if their attributes are missing.
-
-    `info` has `color_space`, `primitives`, and `ignored`, the number of primitives that hold no splats.
 
     Raises:
         ValueError: if it is damaged, holds no splats, needs an extension that kfgs does not know (compressed splats), or
@@ -95,8 +88,8 @@ def read(path: Path) -> SplatFile:
             f"{path}: expected a file that needs {EXTENSION} alone, got one that needs {', '.join(map(str, unknown))}; "
             "write it again without compression"
         )
-    parts: list[_Part] = []
-    ignored, total, spaces, notes = 0, 0, set(), set()
+    parts: list[Gaussians] = []
+    ignored, total = 0, 0
     for where, mesh, matrix in placed_meshes(document):
         for primitive in document.list_of(document.item("meshes", mesh), "primitives", f"meshes[{mesh}].primitives"):
             extension = _extension(document, primitive, mesh)
@@ -104,35 +97,31 @@ def read(path: Path) -> SplatFile:
                 ignored += 1
                 continue
             part = _read_primitive(document, primitive, f"meshes[{mesh}]")
-            total += len(part.gaussians)
+            total += len(part)
             if total * _LEAST_BYTES > path.stat().st_size + document.fetched:
                 raise ValueError(
                     f"{path}: expected {total} Gaussians in more bytes; one buffer is shown too many times"
                 )
-            parts.append(part._replace(gaussians=place(document, where, part.gaussians, matrix)))
-            spaces.add(str(extension.get("colorSpace", COLOR_SPACE)))
+            parts.append(place(document, where, part, matrix))
             for key, drawn in (("colorSpace", COLOR_SPACE), ("projection", PROJECTION)):
                 if extension.get(key, drawn) != drawn:
-                    notes.add(f"the file says {key} {extension[key]!r:.80}: drawn as if it were {drawn!r}")
+                    tell(f"{path.name}: the file says {key} {extension[key]!r:.80}: drawn as if it were {drawn!r}")
     if not parts:
         raise ValueError(
             f"{path}: expected a primitive with {EXTENSION}, got {ignored} primitives without; it holds no splats"
         )
-    info = {"format": NAME, "color_space": ", ".join(sorted(spaces)), "primitives": len(parts), "ignored": ignored}
-    whole = _join(parts)
-    all_notes = (*sorted(notes), *whole.notes)
-    return SplatFile(flip_axes(whole.gaussians, UP_AND_BACK), whole.extra, whole.classes, info, all_notes)
+    return flip_axes(_join(parts), UP_AND_BACK)
 
 
-def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
+def write(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
     """Write one primitive with float32 values, with labels, score, class names and extra columns.
 
     Raises:
         ValueError: if the cloud is empty, has no colours or labels beyond 2^24, or is too large for a .glb.
     """
-    g = flip_axes(colours_to_write(splats.gaussians, ".glb"), UP_AND_BACK)
+    g = flip_axes(colours_to_write(gaussians, ".glb"), UP_AND_BACK)
     if len(g) == 0:
-        raise ValueError("splats: expected at least one Gaussian, got none; glTF has no empty accessors, write .ply")
+        raise ValueError("gaussians: expected at least one Gaussian, got none; glTF has no empty accessors, write .ply")
     assert g.sh is not None
     writer = AccessorWriter()
     quats = unit_quats(g.quats)[:, [1, 2, 3, 0]]
@@ -145,7 +134,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
     for k in range(g.sh.shape[1]):
         attributes[_coefficient(k)] = writer.add(g.sh[:, k].numpy())
     attributes["COLOR_0"] = writer.add(_fallback(g))
-    extras, kept = _write_columns(splats, writer, attributes)
+    extras, kept = _write_columns(g, writer, attributes)
     extension = {"kernel": KERNEL, "colorSpace": COLOR_SPACE, "projection": PROJECTION, "sortingMethod": SORTING}
     primitive = {
         "mode": _POINTS,
@@ -164,8 +153,9 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
         "bufferViews": writer.views,
     }
     write_document(path, root, writer.binary())
-    left = {name: values for name, values in splats.extra.items() if name not in kept}
-    return describe_loss(splats.replace(extra=left), path.suffix, 3) + describe_lost_mode(splats, path.suffix)
+    left = {name: values for name, values in g.extra.items() if name not in kept}
+    lost = describe_loss(gaussians.replace(scores=None, extra=left), path.suffix, 3)
+    return lost + describe_lost_mode(gaussians, path.suffix)
 
 
 def precision(gaussians: Gaussians) -> Precision:
@@ -192,7 +182,7 @@ def _extension(document: Document, primitive: object, mesh: int) -> dict[str, An
     return extension
 
 
-def _read_primitive(document: Document, primitive: dict[str, Any], where: str) -> _Part:
+def _read_primitive(document: Document, primitive: dict[str, Any], where: str) -> Gaussians:
     attributes = document.table(primitive, "attributes", f"{where}.attributes")
 
     def values(width: int, *names: str) -> NDArray[np.float32] | None:
@@ -249,7 +239,7 @@ def _higher(
 
 def _read_columns(
     document: Document, primitive: dict[str, Any], attributes: dict[str, Any], gaussians: Gaussians, where: str
-) -> _Part:
+) -> Gaussians:
     """Labels, score and other columns: attributes of one number whose name begins with an underscore."""
     extras = primitive.get("extras")
     ours = extras.get("kfgs") if isinstance(extras, dict) else None
@@ -264,7 +254,8 @@ def _read_columns(
         name = names.get(attribute)
         name = name if isinstance(name, str) else attribute[1:].lower()
         extra[name] = read_accessor(document, index, 1, len(gaussians))[:, 0].copy()
-    notes = (NO_DEGREE_4,) if _coefficient(16) in attributes else ()
+    if _coefficient(16) in attributes:
+        tell(f"{document.path.name}: {NO_DEGREE_4}")
     labels = extra.pop("class_id", None)
     if labels is not None:
         if (labels != np.trunc(labels))[np.isfinite(labels)].any() or (labels < -1).any() or (labels > EXACT).any():
@@ -272,29 +263,31 @@ def _read_columns(
         gaussians = gaussians.replace(labels=whole_labels(labels))
     if labels is None or not isinstance(classes, list) or not all(isinstance(name, str) for name in classes):
         classes = []
-    return _Part(gaussians, extra, tuple(classes), notes)
+    score = extra.pop(SCORE, None)
+    scores = None if score is None else torch.from_numpy(score)
+    return gaussians.replace(scores=scores, names=tuple(classes), extra=extra)
 
 
-def _join(parts: list[_Part]) -> _Part:
+def _join(parts: list[Gaussians]) -> Gaussians:
     """Join primitives to one cloud: harmonics are padded to the highest degree; columns stay if all have them."""
     if len(parts) == 1:
         return parts[0]
-    clouds = [part.gaussians.with_origin(parts[0].gaussians.origin) for part in parts]
+    clouds = [part.with_origin(parts[0].origin) for part in parts]
     most = max(cloud.sh.shape[1] for cloud in clouds if cloud.sh is not None)
-    same_names = len({part.classes for part in parts if part.gaussians.labels is not None}) <= 1
+    same_names = len({cloud.names for cloud in clouds if cloud.labels is not None}) <= 1
     labelled = same_names and any(cloud.labels is not None for cloud in clouds)
+    scored = all(cloud.scores is not None for cloud in clouds)
+    names = max((cloud.names for cloud in clouds), key=len) if labelled else ()
     padded = []
     for cloud in clouds:
         assert cloud.sh is not None
         sh: Tensor = torch.nn.functional.pad(cloud.sh, (0, 0, 0, most - cloud.sh.shape[1]))
         none = torch.full((len(cloud),), -1)
         labels = (none if cloud.labels is None else cloud.labels) if labelled else None
-        padded.append(cloud.replace(sh=sh, labels=labels))
-    shared = [name for name in parts[0].extra if all(name in part.extra for part in parts)]
-    extra = {name: np.concatenate([part.extra[name] for part in parts]) for name in shared}
-    classes = max((part.classes for part in parts), key=len) if labelled else ()
-    notes = tuple(dict.fromkeys(note for part in parts for note in part.notes))
-    return _Part(Gaussians.cat(padded), extra, classes, notes)
+        extra = {name: values for name, values in cloud.extra.items() if all(name in other.extra for other in clouds)}
+        scores = cloud.scores if scored else None
+        padded.append(cloud.replace(sh=sh, labels=labels, scores=scores, names=names, extra=extra))
+    return Gaussians.cat(padded)
 
 
 def _fallback(g: Gaussians) -> NDArray[np.uint8]:  # [N, 4]
@@ -304,19 +297,18 @@ def _fallback(g: Gaussians) -> NDArray[np.uint8]:  # [N, 4]
     return (color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 
 
-def _write_columns(
-    splats: SplatFile, writer: AccessorWriter, attributes: dict[str, int]
-) -> tuple[dict[str, Any], set[str]]:
-    """Add labels and extra columns; returns their entry in `extras`, and the names of the columns that fit."""
+def _write_columns(g: Gaussians, writer: AccessorWriter, attributes: dict[str, int]) -> tuple[dict[str, Any], set[str]]:
+    """Add labels and other columns; returns their entry in `extras`, and the names of the columns that fit."""
     columns: Columns = {}
-    labels = splats.gaussians.labels
-    if labels is not None:
-        columns["class_id"] = labels.detach().cpu().numpy()
+    if g.labels is not None:
+        columns["class_id"] = g.labels.numpy()
         if (high := int(columns["class_id"].max())) > EXACT:
             raise ValueError(f"labels: expected -1 to {EXACT} for glTF, got {high}; number the classes from 0")
-    for name, values in splats.extra.items():
+    if g.scores is not None:
+        columns[SCORE] = g.scores.numpy().astype(np.float32)
+    for name, values in g.extra.items():
         as_written = values.astype(np.float32)
-        if name == SCORE or np.array_equal(as_written.astype(values.dtype), values):  # float32 holds them
+        if np.array_equal(as_written.astype(values.dtype), values):  # float32 holds them
             columns[name] = as_written
     extras: dict[str, Any] = {"columns": {}}
     for name, values in columns.items():
@@ -326,6 +318,6 @@ def _write_columns(
         if np.isfinite(values).all():  # glTF forbids NaN and infinity
             attributes[attribute] = writer.add(values.astype(np.float32))
             extras["columns"][attribute] = name
-    if labels is not None and splats.classes:
-        extras["classes"] = list(splats.classes)
+    if g.labels is not None and g.names:
+        extras["classes"] = list(g.names)
     return extras, set(extras["columns"].values())

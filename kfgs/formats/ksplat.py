@@ -17,7 +17,6 @@ import torch
 from numpy.typing import NDArray
 
 from ..gaussians import Gaussians
-from .splat_file import SplatFile
 from .values import SH_C0, positive_scales
 
 NAME = "ksplat"
@@ -58,7 +57,7 @@ def matches(head: bytes) -> bool:
     )
 
 
-def read(path: Path) -> SplatFile:
+def read(path: Path) -> Gaussians:
     """Read a .ksplat file of compression level 0, 1 or 2 and harmonics of degree 0 to 2.
 
     Raises:
@@ -90,7 +89,7 @@ def read(path: Path) -> SplatFile:
             f"{path}: expected {count} Gaussians in {len(data)} bytes, got {0 if gaussians is None else len(gaussians)} in "
             f"{start}; the file is damaged"
         )
-    return SplatFile(gaussians, info={"format": NAME, "version": f"{major}.{minor}", "level": level})
+    return gaussians
 
 
 def _section(path: Path, data: bytes, index: int) -> _Section:

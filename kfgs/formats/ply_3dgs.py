@@ -16,12 +16,22 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .._check import ORIGIN
+from .._notes import tell
 from .._origin import to_world
 from ..gaussians import Gaussians
-from .ply import points_from_columns, read_comments, read_ply, stack_columns, write_ply
+from .ply import Columns, points_from_columns, read_comments, read_ply, stack_columns, write_ply
 from .render_mode import comments_of_mode, mode_from_comments, with_mode
-from .splat_file import Columns, Precision, SplatFile
-from .values import EXACT, NO_DEGREE_4, SH_C0, colours_to_write, describe_loss, positive_scales, whole_labels
+from .values import (
+    EXACT,
+    NO_DEGREE_4,
+    SCORE,
+    SH_C0,
+    Precision,
+    colours_to_write,
+    describe_loss,
+    positive_scales,
+    whole_labels,
+)
 
 NAME = "ply"
 SUFFIXES = (".ply",)
@@ -39,7 +49,7 @@ def matches(head: bytes) -> bool:
     return head.startswith(MAGIC)
 
 
-def read(path: Path) -> SplatFile:
+def read(path: Path) -> Gaussians:
     """Read a 3DGS PLY with spherical harmonics of degree 0 to 4 (4 is dropped); unknown columns go to `extra`.
 
     The comments, or columns, say whether it is antialiased or has surfels (`render_mode`).
@@ -52,41 +62,42 @@ def read(path: Path) -> SplatFile:
         gaussians = gaussians_from_columns(columns)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    gaussians = gaussians.replace(scales=positive_scales(path, gaussians.scales.numpy()))
     used = () if gaussians.sh is None or "f_dc_0" in columns else RGB
     extra = {name: values for name, values in columns.items() if not _is_ours(name) and name not in used}
-    notes = (NO_DEGREE_4,) if "f_rest_45" in columns else ()
+    gaussians = gaussians.replace(scales=positive_scales(path, gaussians.scales.numpy()), extra=extra)
+    if "f_rest_45" in columns:
+        tell(f"{path.name}: {NO_DEGREE_4}")
     mode = mode_from_comments(read_comments(path))
     mode = mode._replace(
         surfels=mode.surfels or "scale_2" not in columns, antialiased=mode.antialiased or FILTER in columns
     )
-    return with_mode(SplatFile(gaussians, extra, info={"format": NAME}, notes=notes), mode)
+    return with_mode(path, gaussians, mode)
 
 
-def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
+def write(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
     """Write the 3DGS layout, labels and extra columns included; x, y, z are double if it has an origin.
 
     Nothing is lost but columns whose name PLY cannot have.
     """
-    comments = ("written by kfgs", *comments_of_mode(splats))
-    columns = columns_from_gaussians(splats.gaussians)
-    own = {name: values for name, values in splats.extra.items() if name.split() == [name] and name not in columns}
+    comments = ("written by kfgs", *comments_of_mode(gaussians))
+    columns, extra = columns_from_gaussians(gaussians), gaussians.extra
+    own = {name: values for name, values in extra.items() if name.split() == [name] and name not in columns}
     write_ply(path, columns | own, comments=comments)
-    left = {name: values for name, values in splats.extra.items() if name not in own}
-    return describe_loss(splats.replace(gaussians=splats.gaussians.replace(features=None), extra=left), ".ply", 3)
+    left = {name: values for name, values in extra.items() if name not in own}
+    return describe_loss(gaussians.replace(features=None, scores=None, extra=left), ".ply", 3)
 
 
-def write_plain(path: Path, splats: SplatFile) -> tuple[str, ...]:
+def write_plain(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
     """Write the 62 properties of the files of Inria's script, no more and no fewer: harmonics up to degree 3, zero if unknown.
 
     Some importers count properties, or cannot skip those that they do not know.
     """
     what = "a plain PLY"
-    g = colours_to_write(splats.gaussians, what)
+    g = colours_to_write(gaussians, what)
     assert g.sh is not None
     whole = torch.nn.functional.pad(g.sh, (0, 0, 0, COEFFICIENTS - g.sh.shape[1]))
-    write(path, SplatFile(g.replace(sh=whole, features=None, labels=None, origin=ORIGIN), info=splats.info))
-    return describe_loss(splats, what, 3)
+    write(path, g.replace(sh=whole, features=None, labels=None, scores=None, extra={}, origin=ORIGIN))
+    return describe_loss(gaussians, what, 3)
 
 
 def precision(gaussians: Gaussians) -> Precision:
@@ -95,7 +106,7 @@ def precision(gaussians: Gaussians) -> Precision:
 
 
 def _is_ours(name: str) -> bool:
-    known = {"x", "y", "z", "opacity", "class_id", FILTER, *NORMALS}
+    known = {"x", "y", "z", "opacity", "class_id", SCORE, FILTER, *NORMALS}
     return name in known or name.startswith(("f_dc_", "f_rest_", "scale_", "rot_", "semantic_"))
 
 
@@ -155,6 +166,7 @@ def gaussians_from_columns(columns: Columns) -> Gaussians:
         features=stack_columns(columns, features) if features else None,
         sh=sh,
         labels=whole_labels(columns["class_id"]) if "class_id" in columns else None,
+        scores=stack_columns(columns, [SCORE])[:, 0] if SCORE in columns else None,
     )
 
 
@@ -167,7 +179,7 @@ def _dc_from_rgb(columns: Columns) -> Tensor:  # [N, 3]
 
 
 def columns_from_gaussians(gaussians: Gaussians) -> Columns:
-    """The 3DGS vertex table of a cloud: places in the world, logits, logarithms, zero normals, `semantic_*`, `class_id`."""
+    """The 3DGS vertex table of a cloud: places in the world, logits, logarithms, features, labels and scores."""
     g = gaussians.detach().to("cpu", torch.float32)
     opacity = g.opacities.clamp(1e-7, 1 - 1e-7)
     groups: list[tuple[str, Tensor]] = []
@@ -184,6 +196,8 @@ def columns_from_gaussians(gaussians: Gaussians) -> Columns:
             columns[group if group == "opacity" else f"{group}_{i}"] = values[:, i].contiguous().numpy()
     if g.labels is not None:
         columns["class_id"] = label_column(g.labels)
+    if g.scores is not None:
+        columns[SCORE] = g.scores.numpy()
     return columns
 
 

@@ -1,7 +1,7 @@
 """The kind of rendering that a cloud was trained for, as its file says: antialiased, as flat surfels, or unknown to kfgs.
 
 `Gaussians.antialiased`: trained with the filter of Mip-Splatting, so what a renderer widens on the screen must become fainter;
-kfgs draws it so. `info["surfels"]` (true): trained as 2-D Gaussians, which kfgs draws as flat 3-D ones, and says so.
+kfgs draws it so. Surfels were trained as 2-D Gaussians: kfgs reads them as flat 3-D ones, and says so.
 
 - PLY and compressed PLY, in comments: `SplatRenderMode: default`, `mip` or `2dgs` (Brush), `antialiased 1` or `0` and
   `postshot.anti_aliasing=1` or `0` (Postshot). A PLY without `scale_2` has surfels, one with `filter_3D` is Mip-Splatting's;
@@ -15,14 +15,14 @@ Other formats store neither.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 
+from .._notes import tell
 from ..gaussians import Gaussians
-from .splat_file import SplatFile
 
-SURFELS = "surfels"
 FLAT = 1e-3  # a surfel's thickness, times its shorter side: far below a pixel where the side is one
 AS_FLAT = (
     "2-D Gaussians (2DGS): drawn as flat 3-D ones, which differ if seen nearly from their edge, or from nearer than ten times "
@@ -30,7 +30,6 @@ AS_FLAT = (
 )
 """Against the intersection of rays with them (a standard deviation of 17 pixels, 1/30 of the depth): alpha differs by at most
 0.02 at 30 degrees, 0.04 at 75, 0.5 at 89; with 1/6 of the depth by 0.1 at 30 degrees and 0.18 at 75."""
-_ANTIALIASED = "antialiased rendering"
 
 
 class Mode(NamedTuple):
@@ -82,16 +81,14 @@ def mode_from_meta(meta: Mapping[str, Any]) -> Mode:
     return Mode(antialias is True, unknown=unknown)
 
 
-def with_mode(splats: SplatFile, mode: Mode) -> SplatFile:
+def with_mode(path: Path, gaussians: Gaussians, mode: Mode) -> Gaussians:
     """A cloud that is drawn as its file says, with notes where that is not quite possible."""
-    notes = tuple(
-        f"the file says {words!r}, which kfgs does not know: drawn as 3-D Gaussians" for words in mode.unknown
-    )
-    gaussians = splats.gaussians.replace(antialiased=mode.antialiased)
-    if not mode.surfels:
-        return splats.replace(gaussians=gaussians, notes=splats.notes + notes)
-    info = splats.info | {SURFELS: True}
-    return splats.replace(gaussians=flattened(gaussians), info=info, notes=(*splats.notes, AS_FLAT, *notes))
+    for words in mode.unknown:
+        tell(f"{path.name}: the file says {words!r}, which kfgs does not know: drawn as 3-D Gaussians")
+    if mode.surfels:
+        tell(f"{path.name}: {AS_FLAT}")
+        gaussians = flattened(gaussians)
+    return gaussians.replace(antialiased=mode.antialiased)
 
 
 def flattened(gaussians: Gaussians) -> Gaussians:
@@ -101,22 +98,16 @@ def flattened(gaussians: Gaussians) -> Gaussians:
     return gaussians.replace(scales=torch.cat([sides, depth[:, None]], dim=1))
 
 
-def comments_of_mode(splats: SplatFile) -> tuple[str, ...]:
+def comments_of_mode(gaussians: Gaussians) -> tuple[str, ...]:
     """Comments for a PLY header, in the words of Brush and of Postshot; none for an ordinary cloud."""
-    if splats.info.get(SURFELS):
-        return ("SplatRenderMode: 2dgs",)
-    return ("SplatRenderMode: mip", "antialiased 1") if splats.gaussians.antialiased else ()
+    return ("SplatRenderMode: mip", "antialiased 1") if gaussians.antialiased else ()
 
 
-def meta_of_mode(splats: SplatFile) -> dict[str, Any]:
+def meta_of_mode(gaussians: Gaussians) -> dict[str, Any]:
     """Keys for the `meta.json` of a SOG scene; none for an ordinary cloud."""
-    if splats.info.get(SURFELS):
-        return {"model": "2dgs"}
-    return {"antialias": True, "model": "antialiased"} if splats.gaussians.antialiased else {}
+    return {"antialias": True, "model": "antialiased"} if gaussians.antialiased else {}
 
 
-def describe_lost_mode(splats: SplatFile, name: str, *, antialiased: bool = False) -> tuple[str, ...]:
-    """Describe the parts of the mode that a format cannot store, which may hold `antialiased`."""
-    lost = [_ANTIALIASED] if splats.gaussians.antialiased and not antialiased else []
-    lost += ["rendering as surfels (2DGS)"] if splats.info.get(SURFELS) else []
-    return tuple(f"{words}: {name} has no place for it" for words in lost)
+def describe_lost_mode(gaussians: Gaussians, name: str) -> tuple[str, ...]:
+    """Describe the mode of a cloud if a format cannot store it."""
+    return (f"antialiased rendering: {name} has no place for it",) if gaussians.antialiased else ()

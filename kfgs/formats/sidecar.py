@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,8 @@ from .._arrays import read_arrays
 from .._check import ORIGIN, as_origin
 from .._files import as_path, atomic_path, digest_file, read_json, real_path, write_json
 from .._origin import Origin
-from .splat_file import SCORE, SplatFile
+from ..gaussians import Gaussians
+from .values import SCORE
 
 _NPZ_HEADERS = 1 << 16  # bytes of headers in an .npz file of three arrays
 
@@ -44,36 +45,37 @@ def write_names(path: str | Path, classes: tuple[str, ...], **facts: Any) -> Pat
     return target
 
 
-def write_sidecar(path: Path, splats: SplatFile, *, holds_labels: bool, holds_origin: bool) -> list[Path]:
+def write_sidecar(
+    path: Path, gaussians: Gaussians, facts: Mapping[str, Any], *, holds_labels: bool, holds_origin: bool
+) -> list[Path]:
     """Write the labels, names and origin that the format cannot store, and delete those of an older `path`.
 
     Names are written for every labelled file, even if the format stores them, so that people can read them.
     """
-    labels, written = splats.gaussians.labels, []
+    labels, written = gaussians.labels, []
     beside = labels_path(path)
     if labels is not None and not holds_labels:
         arrays = {"class_id": labels.to(torch.int32).cpu().numpy(), "of": np.array(_digest(path))}
-        if SCORE in splats.extra:
-            arrays[SCORE] = splats.extra[SCORE].astype(np.float32)
+        if gaussians.scores is not None:
+            arrays[SCORE] = gaussians.scores.detach().to("cpu", torch.float32).numpy()
         with atomic_path(beside) as temporary, temporary.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
         written.append(beside)
     else:
         beside.unlink(missing_ok=True)
-    if splats.gaussians.origin != ORIGIN and not holds_origin:
-        write_json(origin_path(path), {"origin": splats.gaussians.origin, "of": _digest(path)})
+    if gaussians.origin != ORIGIN and not holds_origin:
+        write_json(origin_path(path), {"origin": gaussians.origin, "of": _digest(path)})
         written.append(origin_path(path))
     else:
         origin_path(path).unlink(missing_ok=True)
-    if labels is not None and splats.classes:
-        facts = splats.info.get("labels", {})
-        written.append(write_names(path, splats.classes, **facts))
+    if labels is not None and gaussians.names:
+        written.append(write_names(path, gaussians.names, **facts))
     else:
         names_path(path).unlink(missing_ok=True)
     return written
 
 
-def read_sidecar(path: Path, splats: SplatFile) -> SplatFile:
+def read_sidecar(path: Path, gaussians: Gaussians) -> Gaussians:
     """Add labels, names and the origin from the files next to a splat file; those in the splat file have priority.
 
     If `path` is a link, files next to the link come first, then those next to the file that it leads to.
@@ -82,15 +84,15 @@ def read_sidecar(path: Path, splats: SplatFile) -> SplatFile:
         ValueError: if such a file is damaged, or its labels belong to another version of the splat file.
     """
     beside = _first(labels_path(place) for place in _places(path))
-    if splats.gaussians.labels is None and beside is not None:
-        splats = _with_labels(beside, path, splats)
+    if gaussians.labels is None and beside is not None:
+        gaussians = _with_labels(beside, path, gaussians)
     far = _first(origin_path(place) for place in _places(path))
     if far is not None:
-        splats = splats.replace(gaussians=splats.gaussians.replace(origin=_read_origin(far, path)))
+        gaussians = gaussians.replace(origin=_read_origin(far, path))
     names = find_names(path)
-    if splats.gaussians.labels is not None and not splats.classes and names is not None:
-        splats = splats.replace(classes=read_names(names))
-    return splats
+    if gaussians.labels is not None and not gaussians.names and names is not None:
+        gaussians = gaussians.replace(names=read_names(names))
+    return gaussians
 
 
 def find_names(path: str | Path) -> Path | None:
@@ -123,18 +125,17 @@ def read_names(path: Path) -> tuple[str, ...]:
     return names
 
 
-def _with_labels(beside: Path, path: Path, splats: SplatFile) -> SplatFile:
-    labels, score, of = _load_labels(beside, path, len(splats))
-    if of != _digest(path) or labels.shape != (len(splats),):
+def _with_labels(beside: Path, path: Path, gaussians: Gaussians) -> Gaussians:
+    labels, score, of = _load_labels(beside, path, len(gaussians))
+    if of != _digest(path) or labels.shape != (len(gaussians),):
         raise ValueError(
             f"{beside}: expected the labels of this version of {path.name}, got those of another version; delete it, or write "
             "both again"
         )
     if (labels < -1).any() or (score is not None and score.shape != labels.shape):
         raise ValueError(f"{beside}: expected class_id of -1 or more and as many scores, got others; delete it")
-    extra = splats.extra if score is None else splats.extra | {SCORE: score}
-    gaussians = splats.gaussians.replace(labels=torch.from_numpy(labels.astype(np.int64)))
-    return splats.replace(gaussians=gaussians, extra=extra)
+    scores = None if score is None else torch.from_numpy(score)
+    return gaussians.replace(labels=torch.from_numpy(labels.astype(np.int64)), scores=scores)
 
 
 def _read_origin(far: Path, path: Path) -> Origin:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .._files import atomic_folder, atomic_path
+from .._notes import tell
 from ..gaussians import Gaussians
 from .order import morton_order
 from .palette import Palette, fit_codebook, fit_palette, nearest_codes
@@ -32,8 +33,7 @@ from .sidecar import read_sidecar
 from .smallest_three import pack_smallest_three, rotation_error, unpack_smallest_three
 from .sog_images import META, SogFiles, encode_image, write_zip
 from .sog_meta import SogMeta, parse_meta
-from .splat_file import Precision, SplatFile
-from .values import NO_DEGREE_4, colours_to_write, describe_coarse, describe_loss, positive_scales
+from .values import NO_DEGREE_4, Precision, colours_to_write, describe_coarse, describe_loss, positive_scales
 
 NAME = "sog"
 SUFFIXES = (".sog",)
@@ -59,10 +59,8 @@ def matches(head: bytes) -> bool:
     return head.startswith(MAGIC) or (head.lstrip()[:1] == b"{" and b'"means"' in head and b'"quats"' in head)
 
 
-def read(path: Path) -> SplatFile:
+def read(path: Path) -> Gaussians:
     """Read a .sog file, a folder with `meta.json`, or that `meta.json`; opacities of 0 and 1 stay 0 and 1.
-
-    `info` has `version`, and if the scene gives them `generator` and `surfels` (`render_mode`).
 
     Raises:
         ValueError: if it is neither, a file is missing or damaged, or sizes and indices disagree.
@@ -87,19 +85,20 @@ def read(path: Path) -> SplatFile:
         opacities=_opacities(meta, rgba[:, 3]),
         sh=torch.from_numpy(sh[:, :16]),
     )
-    notes = (NO_DEGREE_4,) if sh.shape[1] > 16 else ()
-    splats = with_mode(SplatFile(gaussians, info={"format": NAME, **meta.facts}, notes=notes), meta.mode)
-    return read_sidecar(path.parent, splats) if path.name == META else splats  # labels are next to the folder
+    if sh.shape[1] > 16:
+        tell(f"{path.name}: {NO_DEGREE_4}")
+    gaussians = with_mode(path, gaussians, meta.mode)
+    return read_sidecar(path.parent, gaussians) if path.name == META else gaussians  # labels are next to the folder
 
 
-def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
+def write(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
     """Write version 2 in the given order: a zip file if the name ends in .sog, else a folder.
 
     Raises:
         ValueError: if the cloud has no colours, or there is a folder of that name with files that do not belong to a SOG scene.
     """
-    g = colours_to_write(splats.gaussians, ".sog")
-    files = _encode(g, meta_of_mode(splats))
+    g = colours_to_write(gaussians, ".sog")
+    files = _encode(g, meta_of_mode(gaussians))
     if path.name.lower().endswith(SUFFIXES):
         with atomic_path(path) as temporary:
             write_zip(temporary, files)
@@ -110,7 +109,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
                 (folder / name).write_bytes(data)
         for name in set(REST_FILES) - set(files):  # of an older scene with more harmonics
             (path / name).unlink(missing_ok=True)
-    return describe_loss(splats, ".sog", 3) + describe_coarse(g, _errors(g.means.numpy()), ".sog")
+    return describe_loss(gaussians, ".sog", 3) + describe_coarse(g, _errors(g.means.numpy()), ".sog")
 
 
 def precision(gaussians: Gaussians) -> Precision:

@@ -24,7 +24,6 @@ class SogMeta(NamedTuple):
     logits: tuple[float, float] | None  # version 1: bounds of the opacity's logit
     palette: int | None  # rows of shN; None in version 1
     degree: int | None  # of shN; None in version 1
-    facts: dict[str, Any]  # for `SplatFile.info`
     mode: Mode
 
     def __repr__(self) -> str:
@@ -62,12 +61,8 @@ def parse_meta(path: Path, meta: dict[str, Any], size: int) -> SogMeta:
     if version == 1:
         ends = [_numbers(path, _get(path, meta, "sh0", key), f"sh0.{key}", 4)[3] for key in ("mins", "maxs")]
         logits = (ends[0], ends[1])
-    asset = meta.get("asset")
-    facts: dict[str, Any] = {"version": version}
-    if isinstance(asset, dict) and isinstance(asset.get("generator"), str):
-        facts["generator"] = asset["generator"]
     low, high = (_numbers(path, _get(path, meta, "means", key), f"means.{key}", 3) for key in ("mins", "maxs"))
-    return SogMeta(count, (low, high), tables, files, logits, palette, degree, facts, mode_from_meta(meta))
+    return SogMeta(count, (low, high), tables, files, logits, palette, degree, mode_from_meta(meta))
 
 
 def _get(path: Path, meta: dict[str, Any], group: str, key: str) -> Any:

@@ -16,9 +16,9 @@ import torch
 from .._files import atomic_path
 from ..gaussians import Gaussians
 from .render_mode import describe_lost_mode
-from .splat_file import Precision, SplatFile
 from .values import (
     SH_C0,
+    Precision,
     byte_error,
     colours_to_write,
     describe_cut,
@@ -39,7 +39,7 @@ def matches(head: bytes) -> bool:
     return False
 
 
-def read(path: Path) -> SplatFile:
+def read(path: Path) -> Gaussians:
     """Read a .splat file: colours of degree 0, opacities as stored (0 and 1 included).
 
     Raises:
@@ -55,23 +55,22 @@ def read(path: Path) -> SplatFile:
     rgba = torch.from_numpy(rows["rgba"].astype(np.float32)) / 255
     quats = (torch.from_numpy(rows["quats"].astype(np.float32)) - 128) / 128
     quats[torch.from_numpy(rows.view(np.uint8).reshape(-1, RECORD.itemsize) == 0).all(1)] = 0  # a row of zeros
-    gaussians = Gaussians(
+    return Gaussians(
         means=torch.from_numpy(rows["means"].copy()),
         quats=quats / quats.norm(dim=1, keepdim=True).clamp(min=1e-12),  # 0 stays 0
         scales=positive_scales(path, rows["scales"]),
         opacities=rgba[:, 3].contiguous(),
         sh=((rgba[:, :3] - 0.5) / SH_C0)[:, None],
     )
-    return SplatFile(gaussians, info={"format": NAME})
 
 
-def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
+def write(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
     """Write the base colours; a quaternion is stored with its largest component negative, since -1 fits and +1 does not.
 
     Raises:
         ValueError: if the cloud has no colours.
     """
-    g = colours_to_write(splats.gaussians, ".splat")
+    g = colours_to_write(gaussians, ".splat")
     assert g.sh is not None
     quats = unit_quats(g.quats)
     largest = quats.gather(1, quats.abs().argmax(1, keepdim=True))
@@ -84,7 +83,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
     with atomic_path(path) as temporary:
         rows.tofile(temporary)
     cut = describe_cut(rgba[:, :3], 0.0, 1.0, "colours", ".splat")
-    return describe_loss(splats, ".splat", 0) + cut + describe_lost_mode(splats, ".splat")
+    return describe_loss(gaussians, ".splat", 0) + cut + describe_lost_mode(gaussians, ".splat")
 
 
 def precision(gaussians: Gaussians) -> Precision:

@@ -22,7 +22,7 @@ import struct
 import zlib
 from math import exp
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -31,10 +31,8 @@ from numpy.typing import NDArray
 
 from .._check import check_choice, check_whole
 from .._files import as_path, parse_json
-from .._typed import typed
-from ..gaussians import Gaussians
-from .render_mode import Mode, describe_lost_mode, with_mode
-from .splat_file import SCORE, Precision, SplatFile
+from .._notes import tell
+from ..gaussians import Gaussians, check_gaussians
 from .spz_codec import (
     DC,
     LOG_SCALES,
@@ -48,6 +46,7 @@ from .spz_streams import ANTIALIASED, GZIP, MAGIC, MAX_FRACTIONAL_BITS, Containe
 from .values import (
     NO_DEGREE_4,
     UP_AND_BACK,
+    Precision,
     check_splats,
     colours_to_write,
     describe_coarse,
@@ -75,10 +74,9 @@ def matches(head: bytes) -> bool:
         return False
 
 
-def read(path: Path) -> SplatFile:
+def read(path: Path) -> Gaussians:
     """Read an SPZ file of version 1, 2, 3 or 4, gzipped or plain, into the axes of the 3DGS PLY.
 
-    `info` has `version`, `fractional_bits`, and `extensions` (types of records that were not understood, in hexadecimal).
     Harmonics of degree 4 are dropped.
 
     Raises:
@@ -88,27 +86,25 @@ def read(path: Path) -> SplatFile:
     records: dict[int, bytes] = dict(c.extensions)
     axes = _axes(path, records.pop(_COORDINATES, None))
     label_record = records.pop(LABELS, None)
-    info: dict[str, Any] = {"format": NAME, "version": c.version}
-    info |= {"fractional_bits": c.fractional_bits, "extensions": [f"{kind:#010x}" for kind in records]}
-    splats = SplatFile(unpack(c, axes), info=info, notes=(NO_DEGREE_4,) if c.degree > 3 else ())
-    splats = with_mode(splats, Mode(bool(c.flags & ANTIALIASED)))
+    if c.degree > 3:
+        tell(f"{path.name}: {NO_DEGREE_4}")
+    gaussians = unpack(c, axes).replace(antialiased=bool(c.flags & ANTIALIASED))
     if label_record is None:
-        return splats
-    labels = _unpack_labels(path, label_record, c.count)
-    gaussians = splats.gaussians.replace(labels=torch.from_numpy(labels.class_id.astype(np.int64)))
-    extra = {} if labels.score is None else {SCORE: labels.score}
-    return splats.replace(gaussians=gaussians, extra=extra, classes=labels.classes)
+        return gaussians
+    record = _unpack_labels(path, label_record, c.count)
+    labels = torch.from_numpy(record.class_id.astype(np.int64))
+    scores = None if record.score is None else torch.from_numpy(record.score)
+    return gaussians.replace(labels=labels, scores=scores, names=record.classes)
 
 
-def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
+def write(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
     """Write version 4 with the finest positions that the cloud's extent allows; see `write_spz`."""
-    return write_spz(path, splats)
+    return write_spz(gaussians, path)
 
 
-@typed
 def write_spz(
+    gaussians: Gaussians,
     path: str | Path,
-    splats: SplatFile,
     *,
     version: int = 4,
     fractional_bits: int | None = None,
@@ -117,8 +113,8 @@ def write_spz(
     """Write an SPZ file, labels, scores and class names included.
 
     Args:
+        gaussians: a cloud with colours.
         path: the file, whole or absent.
-        splats: a cloud with colours.
         version: 4 (Zstandard streams), or 3 or 2 (gzip) for older readers; 2 keeps rotations as three bytes.
         fractional_bits: bits after the point of positions, 0 to 24: a step is 2^-bits world units. By default 12, fewer
             for a cloud that reaches beyond 2048 units, more for a small one.
@@ -135,8 +131,9 @@ def write_spz(
     check_choice("version", version, (2, 3, 4))
     for bits in sh_bits:
         check_whole("sh_bits", bits, 1, 8)
-    check_splats(splats)
-    g = colours_to_write(splats.gaussians, ".spz")
+    check_gaussians(gaussians)
+    check_splats(gaussians)
+    g = colours_to_write(gaussians, ".spz")
     if fractional_bits is None:
         fractional_bits = max(choose_fractional_bits(g.means), 0)
     else:
@@ -149,11 +146,11 @@ def write_spz(
         )
     assert g.sh is not None
     degree = int(g.sh.shape[1] ** 0.5) - 1
-    flags = ANTIALIASED if splats.gaussians.antialiased else 0
-    records = [] if g.labels is None else [(LABELS, _pack_labels(_record(splats)))]
+    flags = ANTIALIASED if g.antialiased else 0
+    records = [] if g.labels is None else [(LABELS, _pack_labels(_record(g)))]
     streams = pack(g, version, fractional_bits, sh_bits)
     write_container(as_path(path), Container(version, len(g), degree, fractional_bits, flags, streams, records))
-    return _lost(splats, g, fractional_bits)
+    return _lost(gaussians, g, fractional_bits)
 
 
 def precision(gaussians: Gaussians) -> Precision:
@@ -217,12 +214,10 @@ def _unpack_labels(path: Path, payload: bytes, count: int) -> _LabelRecord:
     return _LabelRecord(class_id, score, tuple(classes))
 
 
-def _record(splats: SplatFile) -> _LabelRecord:
-    labels = splats.gaussians.labels
-    assert labels is not None
-    class_id = labels.detach().cpu().numpy()
-    score = splats.extra.get(SCORE)
-    return _LabelRecord(class_id.astype(np.int32), None if score is None else score.astype(np.float32), splats.classes)
+def _record(g: Gaussians) -> _LabelRecord:
+    assert g.labels is not None
+    score = None if g.scores is None else g.scores.numpy().astype(np.float32)
+    return _LabelRecord(g.labels.numpy().astype(np.int32), score, g.names)
 
 
 def _axes(path: Path, record: bytes | None) -> tuple[int, int, int]:
@@ -241,8 +236,8 @@ def _axes(path: Path, record: bytes | None) -> tuple[int, int, int]:
     return (1 if right else -1, -1 if up else 1, 1 if front else -1)
 
 
-def _lost(splats: SplatFile, g: Gaussians, fractional_bits: int) -> tuple[str, ...]:
-    lost = list(describe_loss(splats, ".spz", 3) + describe_lost_mode(splats, ".spz", antialiased=True))
+def _lost(gaussians: Gaussians, g: Gaussians, fractional_bits: int) -> tuple[str, ...]:
+    lost = list(describe_loss(gaussians, ".spz", 3))
     lost += describe_coarse(g, 0.5 * 2.0**-fractional_bits, ".spz")
     assert g.sh is not None
     lost += describe_cut(g.sh[:, :1], -DC, DC, "colours", ".spz")

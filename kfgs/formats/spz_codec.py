@@ -18,9 +18,8 @@ from torch import Tensor
 
 from ..gaussians import Gaussians
 from .smallest_three import join_largest, split_largest
-from .splat_file import Precision
 from .spz_streams import MAX_FRACTIONAL_BITS, Container
-from .values import UP_AND_BACK, byte_error, flip_axes, unit_quats
+from .values import UP_AND_BACK, Precision, byte_error, flip_axes, unit_quats
 
 Bytes = NDArray[np.uint8]
 DC = 0.5 / 0.15  # the degree-0 coefficient of byte 255

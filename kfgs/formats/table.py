@@ -5,8 +5,8 @@ A format is one module of this package with
 - `NAME`, `SUFFIXES`: its name, and the endings of its files;
 - `MAGIC`, if all files begin with the same bytes: then the ending of a name alone never chooses this format;
 - `matches(head)`: whether a file that begins with these bytes (up to 64 KiB) has this format;
-- `read(path) -> SplatFile`;
-- `write(path, splats) -> tuple[str, ...]`: write the file, whole or not at all, and describe what it could not store
+- `read(path) -> Gaussians`;
+- `write(path, gaussians) -> tuple[str, ...]`: write the file, whole or not at all, and describe what it could not store
   (formats that are only read have no `write`);
 - `precision(gaussians) -> Precision`: the largest errors of a written cloud;
 - `HOLDS_ORIGIN = True`, if the file holds coordinates in double; `write` then puts the cloud's origin back. Other files hold
@@ -24,19 +24,22 @@ from __future__ import annotations
 
 import os
 from codecs import BOM_UTF8
+from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+from typing import Any, NamedTuple
 
+from torch import Tensor
+
+from .._card import short_repr
 from .._files import as_path
-from .._notes import is_strict, tell
+from .._notes import is_strict
 from .._origin import describe_origin
-from .._typed import typed
-from ..gaussians import Gaussians
+from ..gaussians import Gaussians, check_gaussians
 from .folders import PATTERNS, splat_file_of
 from .order import morton_order
 from .sidecar import find_names, names_path, read_sidecar, write_sidecar
-from .splat_file import SplatFile, Written
 from .values import check_splats, leave_out_broken, near_zero
 
 MODULES = (  # tried in this order: compressed PLY before PLY, because both end in .ply
@@ -50,6 +53,17 @@ MODULES = (  # tried in this order: compressed PLY before PLY, because both end 
     "splat",
 )
 _HEAD_BYTES = 1 << 16
+
+
+class Written(NamedTuple):
+    """The result of `write_splats`."""
+
+    paths: list[Path]  # the splat file, and extra files next to it
+    lost: tuple[str, ...]  # descriptions of what the format could not store
+    order: Tensor | None  # [N] int64: row i of the file is Gaussian order[i] of the cloud; None: the same order
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def formats() -> dict[str, ModuleType]:
@@ -90,11 +104,14 @@ def find_format(path: str | Path) -> ModuleType:
     raise ValueError(f"{path}: expected a splat file of a known format, got something else; known are {known}")
 
 
-def read_splats(path: str | Path, *, strict: bool = False) -> SplatFile:
+def read_splats(path: str | Path, *, strict: bool = False) -> Gaussians:
     """Read a splat file of any known format, with labels and class names from it or from the files next to it.
 
     Gaussians with NaN or infinity, and rows of zeros, are left out, with their labels and columns. A quaternion of length 0
-    is read as no rotation, (1, 0, 0, 0): rasterisers do the same. `notes` of the result says how many, and where.
+    is read as no rotation, (1, 0, 0, 0): rasterisers do the same. A logged note says how many, and where; also what is not
+    drawn as the file says.
+
+    **Convention**: axes are those of the 3DGS PLY (COLMAP's frame: x right, y down, z forward), whatever the file has.
 
     Args:
         path: the file; or the output folder of 3DGS, gsplat or nerfstudio, whose newest step is then read.
@@ -105,26 +122,33 @@ def read_splats(path: str | Path, *, strict: bool = False) -> SplatFile:
         ValueError: if it is of no known format, or damaged: truncated, with counts that disagree, no Gaussian with finite
             numbers, or labels without a name in its classes.
     """
+    return read_rows(path, strict=strict)[0]
+
+
+def read_rows(path: str | Path, *, strict: bool = False) -> tuple[Gaussians, Tensor]:  # and [rows of the file] bool
+    """`read_splats`, and which rows of the file its Gaussians are: for values of each row in another file."""
     path = splat_file_of(path)
     module = find_format(path)
-    splats = leave_out_broken(path, read_sidecar(path, module.read(path)), strict=strict or is_strict())
-    splats = splats.replace(gaussians=near_zero(splats.gaussians))
-    labels = splats.gaussians.labels
+    gaussians, kept = leave_out_broken(path, read_sidecar(path, module.read(path)), strict=strict or is_strict())
+    gaussians = near_zero(gaussians)
+    labels, names = gaussians.labels, gaussians.names
     if labels is not None and len(labels):
         low, high = int(labels.min()), int(labels.max())
-        if low < -1 or (splats.classes and high >= len(splats.classes)):
+        if low < -1 or (names and high >= len(names)):
             raise ValueError(
-                f"{path}: expected labels from -1 to {len(splats.classes) - 1} (the named classes), got {low} to {high}; "
+                f"{path}: expected labels from -1 to {len(names) - 1} (the named classes), got {low} to {high}; "
                 f"correct the labels, or the names in {(find_names(path) or names_path(path)).name}"
             )
-    for note in splats.notes:
-        tell(f"{path.name}: {note}")
-    return splats
+    return gaussians, kept
 
 
-@typed
 def write_splats(
-    path: str | Path, splats: SplatFile | Gaussians, *, format: str | None = None, plain: bool = False
+    gaussians: Gaussians,
+    path: str | Path,
+    *,
+    format: str | None = None,
+    plain: bool = False,
+    facts: Mapping[str, Any] | None = None,
 ) -> Written:
     """Write a cloud in the format of the file's ending.
 
@@ -133,11 +157,12 @@ def write_splats(
     work on the cloud as read back. All other formats keep the order.
 
     Args:
+        gaussians: a cloud with colours; its labels, scores, class names and other columns are written too.
         path: the file; it is whole or absent. Its ending chooses the format.
-        splats: a cloud with colours; its `labels`, `score` and class names are written too.
         format: a format's name, if the ending does not say it.
         plain: write a PLY with exactly the 62 properties of Inria's 3DGS, for importers that fail on others. Classes and
-            `score` go to a file beside it, which `read_splats` finds; other columns and features are lost.
+            scores go to a file next to it, which `read_splats` finds; other columns and features are lost.
+        facts: how the labels were made, for the file with the class names.
 
     Returns:
         The files written, what the format could not store, and the order.
@@ -145,28 +170,25 @@ def write_splats(
     Raises:
         ValueError: if no format has this ending, or the format cannot be written or cannot store this cloud, or a value is
             NaN or infinite, a quaternion 0, a scale not positive, an opacity outside [0, 1] (both ends are allowed), or a
-            label has no name in `classes`; or if `plain` is asked of another format, or of a cloud without colours. Nothing
+            label has no name in `names`; or if `plain` is asked of another format, or of a cloud without colours. Nothing
             is written then.
     """
+    check_gaussians(gaussians)
     path = as_path(path)
-    if isinstance(splats, Gaussians):
-        splats = SplatFile(splats)
     module = _format_to_write(path, format)
     if plain and not hasattr(module, "write_plain"):
         raise ValueError(f"plain: expected it for a file that ends in .ply, got {path}; leave it out")
-    check_splats(splats)
-    order = morton_order(splats.gaussians.means) if getattr(module, "SORTS", False) else None
+    check_splats(gaussians)
+    order = morton_order(gaussians.means) if getattr(module, "SORTS", False) else None
     if order is not None:
-        splats = splats.select(order)
-    lost = module.write_plain(path, splats) if plain else module.write(path, splats)
+        gaussians = gaussians.select(order)
+    lost = module.write_plain(path, gaussians) if plain else module.write(path, gaussians)
     holds_origin = getattr(module, "HOLDS_ORIGIN", False) and not plain
-    beside = write_sidecar(path, splats, holds_labels=module.HOLDS_LABELS and not plain, holds_origin=holds_origin)
+    holds_labels = module.HOLDS_LABELS and not plain
+    beside = write_sidecar(path, gaussians, facts or {}, holds_labels=holds_labels, holds_origin=holds_origin)
     if not holds_origin:
-        lost = (*lost, *describe_origin(splats.gaussians.origin, f"{path.name}"))
+        lost = (*lost, *describe_origin(gaussians.origin, f"{path.name}"))
     return Written([path, *beside], tuple(lost), order)
-
-
-SplatFile._writer = staticmethod(write_splats)
 
 
 def _format_to_write(path: Path, name: str | None) -> ModuleType:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .._arrays import most_unpacked
+from .._card import short_repr
 from .._check import ORIGIN, as_origin
+from .._notes import tell
 from .._origin import choose_origin, to_local
 from ..gaussians import Gaussians
-from .splat_file import SCORE, SplatFile
 
+SCORE = "score"  # the column with `Gaussians.scores`
 SH_C0 = 0.28209479177387814  # the constant harmonic: rgb = 0.5 + SH_C0 * coefficient
 UP_AND_BACK = (1, -1, -1)  # x right, y up, z back (RUB) against x right, y down, z forward (RDF) of the 3DGS PLY
 # Signs of the coefficients under a flip of axes: which of x, y, z each harmonic is odd in, degrees 1 to 3.
@@ -43,6 +45,21 @@ _RAW = {
 """What to do if most values are out of range."""
 
 
+class Precision(NamedTuple):
+    """The largest error of a value that was written and read again. Each format states it, and the tests check it."""
+
+    means: float | Tensor  # world units, per axis: one number, or [N, 3]
+    scales: float  # relative, of each standard deviation
+    rotation: float  # radians between the rotations
+    opacities: float  # absolute
+    sh0: float  # absolute, of the degree-0 coefficients
+    sh_rest: float  # absolute, of the higher coefficients
+    degree: int = 3  # highest degree of spherical harmonics
+
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+
 def check_count(path: Path, count: int, degree: int, packed: int) -> None:
     """Raise a ValueError if a compressed file of `packed` bytes promises more Gaussians than `most_unpacked` allows.
 
@@ -56,16 +73,19 @@ def check_count(path: Path, count: int, degree: int, packed: int) -> None:
         )
 
 
-def leave_out_broken(path: Path, splats: SplatFile, *, strict: bool) -> SplatFile:
+def leave_out_broken(path: Path, g: Gaussians, *, strict: bool) -> tuple[Gaussians, Tensor]:  # and [N] bool
     """Leave out the Gaussians that cannot be drawn, with their labels and columns: NaN, infinity, and rows of zeros.
 
     Rows of zeros, which truncated exports have, have no rotation and repeat each other. Another quaternion of length 0 is
-    read as no rotation: rasterisers do the same. Each is noted; `info["left_out"]` has the rows of the file.
+    read as no rotation: rasterisers do the same. Each kind is noted.
+
+    Returns:
+        The others, and which rows of the file they are.
 
     Raises:
         ValueError: if nothing is left, or `strict` and something is broken.
     """
-    g, N = splats.gaussians, len(splats)
+    N = len(g)
     bad = {
         name: ~value.float().isfinite().reshape(N, -1).all(1)
         for name in _EXPECTED
@@ -97,16 +117,14 @@ def leave_out_broken(path: Path, splats: SplatFile, *, strict: bool) -> SplatFil
         unknown = g.labels == _UNKNOWN
         notes += [f"{words}: read as no class" for words in _count(unknown & kept, "have no number as class_id")]
         g = g.replace(labels=g.labels.masked_fill(unknown, -1))
-        score = torch.from_numpy(np.asarray(splats.extra.get(SCORE, np.zeros(N)), np.float32))
-        if words := _count(~score.isfinite() & kept, "have no number as score"):
-            notes.append(f"{words[0]}: read as 0")
-            splats = splats.replace(extra=splats.extra | {SCORE: score.nan_to_num(0.0, 0.0, 0.0).numpy()})
-    if not notes:
-        return splats
-    splats = splats.replace(gaussians=g.replace(quats=known_quats(g.quats)), notes=(*splats.notes, *notes))
-    if left_out:
-        splats = splats.select(kept).replace(info=splats.info | {"left_out": (~kept).nonzero()[:, 0].tolist()})
-    return splats
+    if g.scores is not None and (words := _count(~g.scores.isfinite() & kept, "have no number as score")):
+        notes.append(f"{words[0]}: read as 0")
+        g = g.replace(scores=g.scores.nan_to_num(0.0, 0.0, 0.0))
+    if notes:
+        g = g.replace(quats=known_quats(g.quats))
+    for note in notes:
+        tell(f"{path.name}: {note}")
+    return (g.select(kept) if left_out else g), kept
 
 
 def _count(rows: Tensor, what: str) -> list[str]:  # rows: [N] bool
@@ -177,7 +195,7 @@ def unit_quats(quats: Tensor) -> Tensor:  # [N, 4] wxyz -> [N, 4] of length 1
     return known / known.norm(dim=1, keepdim=True)
 
 
-def check_splats(splats: SplatFile) -> None:
+def check_splats(gaussians: Gaussians) -> None:
     """Check a cloud before it is written, for the values that readers refuse. They are checked as float32, as stored.
 
     A quaternion of length 0 is refused, too: other programs divide by its length. In a file, it is read as no rotation.
@@ -185,9 +203,9 @@ def check_splats(splats: SplatFile) -> None:
 
     Raises:
         ValueError: if a value is NaN or infinite, a quaternion is 0, a scale is not positive, an opacity lies outside [0, 1],
-            a label is below -1 or none of the named classes, or a labelled Gaussian's score is not finite.
+            a label is below -1 or none of the named classes, or a score is not finite.
     """
-    g = splats.gaussians.detach()
+    g = gaussians.detach()
     for name, expected in _EXPECTED.items():
         values = getattr(g, name)
         if values is None:
@@ -201,23 +219,22 @@ def check_splats(splats: SplatFile) -> None:
         elif name == "opacities":
             good &= (values >= 0) & (values <= 1)
         _check_rows(name, expected, values, good)
-    for name, column in splats.extra.items():
+    for name, column in g.extra.items():
         if np.asarray(column).dtype.kind not in "biuf":
             raise ValueError(
                 f"extra[{name!r:.80}]: expected numbers, got {np.asarray(column).dtype}; number them, or leave the column out"
             )
+    if g.scores is not None:
+        _check_rows("scores", "finite numbers", g.scores, g.scores.isfinite())
     if g.labels is None:
         return
-    most = len(splats.classes) - 1 if splats.classes else _LABELS
-    expected = f"-1 (none) to {most}" + (" (the named classes)" if splats.classes else "")
-    if "class_id" in splats.extra:
+    most = len(g.names) - 1 if g.names else _LABELS
+    expected = f"-1 (none) to {most}" + (" (the named classes)" if g.names else "")
+    if "class_id" in g.extra:
         raise ValueError(
             "extra['class_id']: expected no such column beside labels, which are stored under that name, got both; leave it out"
         )
     _check_rows("labels", expected, g.labels, (g.labels >= -1) & (g.labels <= most))
-    if SCORE in splats.extra:
-        score = torch.from_numpy(np.asarray(splats.extra[SCORE], np.float32))
-        _check_rows(SCORE, "finite numbers", score, score.isfinite())
 
 
 def _check_rows(name: str, expected: str, values: Tensor, good: Tensor) -> None:  # [N, ...] twice
@@ -237,21 +254,21 @@ def colours_to_write(gaussians: Gaussians, name: str) -> Gaussians:
     """The cloud in float64 on the CPU, detached; a ValueError if it has no spherical harmonics."""
     if gaussians.sh is None:
         raise ValueError(
-            f"splats: expected a cloud with colours (sh [N, K, 3]) for {name}, got {gaussians!r}; write a field without "
+            f"gaussians: expected a cloud with colours (sh [N, K, 3]) for {name}, got {gaussians!r}; write a field without "
             "colours as .ply"
         )
     return gaussians.detach().to("cpu", torch.float64)
 
 
-def describe_loss(splats: SplatFile, name: str, degree: int) -> tuple[str, ...]:
-    """Describe the losses of a format without features, extra columns, and harmonics above a degree."""
-    g, lost = splats.gaussians, []
+def describe_loss(g: Gaussians, name: str, degree: int) -> tuple[str, ...]:
+    """Describe the losses of a format without features, other columns, and harmonics above a degree."""
+    lost = []
     if g.sh is not None and (have := int(g.sh.shape[1] ** 0.5) - 1) > degree:
         kept = "the base colour only" if degree == 0 else f"degree {degree}"
         lost.append(f"spherical harmonics of degree {have}: {name} holds {kept}")
     if g.features is not None:
         lost.append(f"{g.features.shape[1]} features per Gaussian: {name} has no place for them")
-    columns = [key for key in splats.extra if not (key == SCORE and g.labels is not None)]
+    columns = [*([SCORE] if g.labels is None and g.scores is not None else []), *g.extra]
     if columns:
         lost.append(f"the columns {', '.join(columns)}: {name} has no place for them")
     return tuple(lost)

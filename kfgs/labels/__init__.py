@@ -1,5 +1,6 @@
 """Labels: classes of codewords, pixels and Gaussians, their transfer to the colour field, and edits (Sec. 3.4)."""
 
+from .._names import class_index, class_indices
 from .boxes import OrientedBox
 from .classify import (
     Classification,
@@ -13,40 +14,31 @@ from .classify import (
 )
 from .color import parse_color, recolor
 from .components import component_numbers
-from .edits import Duplicate, Edit, EditList, Extract, Insert, Move, Opacity, Recolor, Remove, Turn, join
+from .edits import Duplicate, Edit, EditList, Extract, Insert, Move, Opacity, Recolor, Remove, join
 from .label_set import LabelSet, load_label_set
-from .meshes import LabelledMesh, label_mesh
-from .names import class_index, class_indices
-from .nearest import default_distance
+from .nearest import Transfer, default_distance, nearest_labels
 from .parts import Part, connected_parts, describe_selection
 from .scores import CANONICAL, LOGIT_SCALES, Score, relevancy, select_by_similarity
 from .segment import label_pixels, nearest_codeword
 from .selection import Selection
-from .transfer import Transfer, label_splats, transfer_labels
+from .transfer import transfer_labels
 from .views import average_views, vote_labels
-from .where import AboveScore, Both, Component, Either, Everything, InBox, InSphere, Not, OfClass, OfIndex, Where
+from .where import InBox, InSphere, OfClass, OfIndex, Where
 
 __all__ = [
     "CANONICAL",
     "LOGIT_SCALES",
-    "AboveScore",
-    "Both",
     "Classification",
     "CodewordLabels",
-    "Component",
     "Duplicate",
     "Edit",
     "EditList",
-    "Either",
-    "Everything",
     "Extract",
     "InBox",
     "InSphere",
     "Insert",
     "LabelSet",
-    "LabelledMesh",
     "Move",
-    "Not",
     "OfClass",
     "OfIndex",
     "Opacity",
@@ -57,7 +49,6 @@ __all__ = [
     "Score",
     "Selection",
     "Transfer",
-    "Turn",
     "Where",
     "average_views",
     "class_index",
@@ -69,11 +60,10 @@ __all__ = [
     "describe_selection",
     "join",
     "label_codewords",
-    "label_mesh",
     "label_pixels",
-    "label_splats",
     "load_label_set",
     "nearest_codeword",
+    "nearest_labels",
     "parse_color",
     "recolor",
     "relevancy",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,13 +9,11 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.spatial import ConvexHull, QhullError
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from .._card import short_repr
 from .._check import as_tensor, check_shapes
 from .._rows import check_finite
-from ._json import numbers_of
 
 ROUNDS = 3  # over the three axes; the boxes of room_0's objects stop changing after two
 
@@ -110,28 +107,6 @@ class OrientedBox:
     def to_json(self) -> dict[str, Any]:
         """Plain lists: center, axes (rows) and half edges."""
         return {name: getattr(self, name).tolist() for name in ("center", "axes", "half")}
-
-
-def quaternion_of(name: str, values: Any) -> tuple[float, ...]:
-    """Four numbers (w, x, y, z) that are not all zero."""
-    quaternion = numbers_of(name, values, 4)
-    if not any(quaternion):
-        raise ValueError(f"{name}: expected a quaternion (w, x, y, z), got zeros; (1, 0, 0, 0) is no rotation")
-    return quaternion
-
-
-def rotation_matrix(quaternion: Sequence[float]) -> Any:  # (w, x, y, z) -> [3, 3]
-    """The rotation matrix of a quaternion of any length; scipy's order is (x, y, z, w)."""
-    w, x, y, z = unit(quaternion)
-    return Rotation.from_quat([x, y, z, w]).as_matrix()
-
-
-def unit(values: Sequence[float]) -> list[float]:
-    """Divide a vector by its length, without overflow for huge or tiny numbers. It must not be all zeros."""
-    largest = max(abs(value) for value in values)
-    scaled = [value / largest for value in values]
-    length = math.hypot(*scaled)
-    return [value / length for value in scaled]
 
 
 def _local(points: Tensor, center: Tensor, axes: Tensor) -> Tensor:  # [N, 3], [3], [3, 3] -> [N, 3]

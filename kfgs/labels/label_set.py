@@ -17,8 +17,8 @@ from .._arrays import read_array, read_safetensors, reading
 from .._card import cut, html_card
 from .._check import as_tensor
 from .._files import as_path, atomic_path, parse_json, read_json
+from .._names import class_index, class_indices
 from .._tensors import save_tensors
-from .names import class_index, class_indices
 
 KIND, VERSION = "label set", "1"  # of the metadata's "kfgs" and "version"
 SUFFIX = ".safetensors"

@@ -2,43 +2,128 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from .._card import short_repr
-from .._check import as_tensor, check_shapes
-from .._origin import recounted, to_world
+from .._check import as_tensor, check_range, check_shapes
 from .._rows import check_finite
-from ..formats.splat_file import SplatFile
-from ..gaussians import Gaussians
 
-SAMPLE = 20_000  # Gaussians measured
+NEIGHBOURS = 4  # sources that are checked for ambiguity; 8 take half as long again
+CHUNK = 16_384  # destinations at a time
+SAMPLE = 20_000  # Gaussians measured for lambda
 COVERAGE = 0.995  # lambda reaches this share of the destinations ...
 NEAREST = 2.0  # ... but is at least this many median spacings of the sources ...
 FARTHEST = 10.0  # ... and at most this many wide spacings,
 WIDE = 0.9  # which are this quantile of the spacings
 
 Array = np.ndarray[Any, Any]
-Cloud = Tensor | Array | Gaussians | SplatFile
-"""Positions [N, 3], Gaussians, or a splat. Positions are counted from the origin of the Gaussians that they meet."""
 
 
-class Near(NamedTuple):
-    """The nearest sources of n destinations, by distance, then by index."""
+@dataclass(frozen=True, eq=False)
+class Transfer:
+    """Labels carried from S source positions to N destinations."""
 
-    distance: Array  # [n, k] float64, infinite after the last source in range
-    source: Array  # [n, k] int64, an index into `Sources`; 0 if there is none
-
-    def __repr__(self) -> str:
-        return short_repr(self)
+    labels: Tensor  # [N] int64, -1 = none
+    distances: Tensor  # [N] world units, to the source that gave the label; infinite if there is none
+    sources: Tensor  # [N] int64, index of that source; -1 if there is none
+    disagree: Tensor  # [N] bool, labelled, but with another label among the 4 nearest sources in range
+    distance: float  # lambda, the distance within which a label is carried over, world units
+    how: str  # how lambda was found
 
     @property
-    def hit(self) -> Array:  # [n, k] bool
-        """Which columns hold a source."""
-        return np.isfinite(self.distance)
+    def labelled(self) -> int:
+        """The number of destinations with a label."""
+        return int((self.labels >= 0).sum())
+
+    @property
+    def orphaned(self) -> int:
+        """The number of destinations without a label: no labelled source in range."""
+        return len(self.labels) - self.labelled
+
+    @property
+    def ambiguous(self) -> int:
+        """The number of labelled destinations with another label among the sources near them."""
+        return int(self.disagree.sum())
+
+    @property
+    def scores(self) -> Tensor:  # [N] in [0, 1]
+        """How sure each label is: 1 - distance / lambda; 0 without a label."""
+        reach = max(self.distance, torch.finfo(self.distances.dtype).tiny)
+        return (1 - self.distances / reach).clamp_min(0.0)
+
+    def __repr__(self) -> str:
+        return (
+            f"Transfer({self.labelled:,} of {len(self.labels):,} labelled (nearest within {self.distance:.4g}), "
+            f"{self.orphaned:,} orphaned, {self.ambiguous:,} ambiguous; lambda: {self.how})"
+        )
+
+
+def nearest_labels(
+    src_means: Tensor | Array,  # [S, 3]
+    src_labels: Tensor | Array,  # [S] int64, -1 = none
+    dst_means: Tensor | Array,  # [N, 3]
+    distance: float | None = None,
+) -> Transfer:
+    """Give each destination the label of the nearest labelled source **strictly** closer than `distance`.
+
+    The rule of Sec. 3.4; `distance` is its lambda. The paper does not say which label wins if several are in range: here
+    the nearest does. Of equally near sources (as float64 distances), the one with the lowest index gives its label.
+
+    Args:
+        src_means: positions with labels. Both clouds are counted from the same origin.
+        src_labels: their labels; sources with -1 take no part.
+        dst_means: positions that receive labels.
+        distance: lambda in world units; None: `default_distance`.
+
+    Returns:
+        Labels, distances and sources on the destinations' device. Without any labelled source no destination has a label.
+
+    Raises:
+        ValueError: if shapes disagree, a position is not finite, a label is below -1, or the distance is not positive.
+        TypeError: if the labels are not integers.
+    """
+    src_means, dst_means = as_tensor("src_means", src_means), as_tensor("dst_means", dst_means)
+    src_labels = as_tensor("src_labels", src_labels)
+    check_shapes(("src_means", src_means, "S 3"), ("src_labels", src_labels, "S"), ("dst_means", dst_means, "N 3"))
+    if src_labels.is_floating_point() or src_labels.dtype == torch.bool:
+        raise TypeError(f"src_labels: expected integer labels, got {src_labels.dtype}; convert them with .long()")
+    if distance is not None:
+        check_range("distance", distance, 0, closed=(False, False))
+    given: Array = src_labels.detach().cpu().numpy().astype(np.int64)
+    if given.size and given.min() < -1:
+        raise ValueError(f"src_labels: expected class indices or -1, got {given.min()}; map other codes to -1 first")
+    points, targets = positions("src_means", src_means), positions("dst_means", dst_means)
+    n, kept = len(targets), np.flatnonzero(given >= 0)
+    labels, winners, distances = np.full(n, -1), np.full(n, -1), np.full(n, np.inf)
+    disagree = np.zeros(n, dtype=np.bool_)
+    chosen, how = (0.0, "no labelled source") if distance is None else (float(distance), "given")
+    if kept.size:
+        sources = Sources(points[kept], given[kept])
+        if distance is None:
+            chosen, how = explained_distance(sources.tree, targets)
+        order = neighbours_together(targets)
+        for rows in (order[start : start + CHUNK] for start in range(0, n, CHUNK)):
+            near, index = sources.near(targets[rows], NEIGHBOURS, chosen)
+            hit, label = np.isfinite(near), sources.labels[index]
+            winner, some = index[:, 0], hit[:, 0]
+            distances[rows] = near[:, 0]
+            labels[rows] = np.where(some, label[:, 0], -1)
+            winners[rows] = np.where(some, kept[sources.first[winner]], -1)
+            disagree[rows] = (hit & ((label != label[:, :1]) | sources.mixed[index])).any(axis=1)
+    device = dst_means.device
+    return Transfer(
+        torch.from_numpy(labels).to(device),
+        torch.from_numpy(distances).to(dst_means),
+        torch.from_numpy(winners).to(device),
+        torch.from_numpy(disagree).to(device),
+        chosen,
+        how,
+    )
 
 
 class Sources:
@@ -56,8 +141,11 @@ class Sources:
     def __len__(self) -> int:
         return int(self.tree.n)
 
-    def near(self, points: Array, k: int, distance: float) -> Near:
-        """The k nearest sources **strictly** closer than `distance`; of equally near ones the lowest indices."""
+    def near(self, points: Array, k: int, distance: float) -> tuple[Array, Array]:  # [n, k] float64, [n, k] int64
+        """Distance and index of the k nearest sources **strictly** closer than `distance`; of equals the lowest indices.
+
+        After the last source in range, distances are infinite and indices 0.
+        """
         k = min(k, len(self))
         near, index = self._query(points, min(k + 1, len(self)), distance)  # one more shows whether the last is tied
         tied = np.flatnonzero(((near[:, 1:] == near[:, :-1]) & np.isfinite(near[:, 1:])).any(axis=1))
@@ -70,7 +158,7 @@ class Sources:
             last = more[:, -1]
             open_ = (last == near[tied, k - 1]) & np.isfinite(last) & (more.shape[1] < len(self))
             tied, wanted = tied[open_], 2 * wanted
-        return Near(near[:, columns], np.where(np.isfinite(near), index, 0)[:, columns])
+        return near[:, columns], np.where(np.isfinite(near), index, 0)[:, columns]
 
     def _query(self, points: Array, k: int, distance: float) -> tuple[Array, Array]:
         near, index = self.tree.query(points, k=k, distance_upper_bound=distance, workers=-1)
@@ -101,8 +189,8 @@ def neighbours_together(points: Array) -> Array:  # [N, 3] -> [N] int64
 
 
 def default_distance(
-    src: Cloud,  # [S, 3] means, Gaussians or a splat
-    dst: Cloud,  # [N, 3] means, Gaussians or a splat
+    src_means: Tensor,  # [S, 3]
+    dst_means: Tensor,  # [N, 3] counted from the same origin
 ) -> float:
     """Lambda for two clouds, in world units. The paper gives no value for it.
 
@@ -116,7 +204,6 @@ def default_distance(
     Raises:
         ValueError: if a cloud is empty or a position is not finite.
     """
-    src_means, dst_means = means_of("src", src), means_of("dst", dst, src)
     check_shapes(("src_means", src_means, "S 3"), ("dst_means", dst_means, "N 3"))
     places, targets = positions("src_means", src_means), positions("dst_means", dst_means)
     for name, points in (("src_means", places), ("dst_means", targets)):
@@ -149,22 +236,6 @@ def explained_distance(tree: cKDTree, dst: Array) -> tuple[float, str]:
 
 def _sample(points: Array) -> Array:
     return points[:: max(1, -(-len(points) // SAMPLE))]
-
-
-def places_of(name: str, cloud: Cloud) -> Tensor:  # [N, 3] in the world
-    """The positions of a splat or of Gaussians in the world, or positions as given."""
-    gaussians = cloud.gaussians if isinstance(cloud, SplatFile) else cloud
-    means = means_of(name, gaussians)
-    return to_world(means, gaussians.origin) if isinstance(gaussians, Gaussians) else means
-
-
-def means_of(name: str, cloud: Cloud, like: Cloud | None = None) -> Tensor:  # [N, 3]
-    """The positions of a splat or of Gaussians, counted from the origin of `like` if both have one; or positions as given."""
-    gaussians, other = (one.gaussians if isinstance(one, SplatFile) else one for one in (cloud, like))
-    if not isinstance(gaussians, Gaussians):
-        return as_tensor(name, gaussians)
-    origin = other.origin if isinstance(other, Gaussians) else gaussians.origin
-    return recounted(gaussians.means, gaussians.origin, origin)
 
 
 def positions(name: str, means: Tensor) -> Array:  # [N, 3] float64

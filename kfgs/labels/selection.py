@@ -9,9 +9,11 @@ from torch import Tensor
 
 from .._card import cut, html_card
 from .._check import as_tensor, check_shapes
+from .._origin import to_world
 from .._rows import check_finite
+from ..gaussians import Gaussians
 from .boxes import OrientedBox
-from .nearest import Array, Cloud, places_of
+from .nearest import Array, positions
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,7 +22,7 @@ class Selection:
 
     `a & b`, `a | b`, `a ^ b`, `a - b` and `~a` combine selections of the same Gaussians. Scores follow Zadeh's rules:
     `&` takes the smaller, `|` the larger, `~a` has 1 - score; `a - b` is `a & ~b`, and `a ^ b` is `(a - b) | (b - a)`.
-    `len` is the number selected, so an empty selection is false in an `if`. `OfClass("chair").select(splats)`,
+    `len` is the number selected, so an empty selection is false in an `if`. `OfClass("chair").select(gaussians)`,
     `SemanticField.query` and `Selection.of(mask)` make selections.
 
     Example:
@@ -77,21 +79,20 @@ class Selection:
         """How it was made and its threshold, in words."""
         return self.how if self.threshold is None else f"score > {self.threshold:.4g} ({self.how})"
 
-    def points(self, cloud: Cloud) -> Array:  # [n, 3] float64
+    def points(self, cloud: Gaussians | Tensor) -> Array:  # [n, 3] float64
         """The centres of the selected Gaussians as a numpy array, in world units.
 
         Args:
-            cloud: the selection's cloud: a splat, Gaussians, or positions [N, 3].
+            cloud: the selection's Gaussians, or their positions [N, 3].
 
         Raises:
             ValueError: if the cloud has another number of Gaussians.
         """
-        means = places_of("cloud", cloud)
+        means = to_world(cloud.means, cloud.origin) if isinstance(cloud, Gaussians) else as_tensor("cloud", cloud)
         check_shapes(("selection.mask", self.mask, "N"), ("cloud", means, "N 3"))
-        points: Array = means[self.mask].detach().cpu().double().numpy()
-        return points
+        return positions("cloud", means[self.mask])
 
-    def box(self, cloud: Cloud) -> OrientedBox:
+    def box(self, cloud: Gaussians | Tensor) -> OrientedBox:
         """A small box around the centres of the selected Gaussians; `cloud` as in `points`.
 
         Raises:

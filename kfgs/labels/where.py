@@ -1,118 +1,59 @@
-"""Rules that select Gaussians by class, place, index or score, and combinations of them. They can be saved as JSON.
+"""Rules that select Gaussians by class, index, box or sphere, for any cloud: edits hold them, and JSON can.
 
-A `Where` can be applied to any cloud and gives a `Selection`: `OfClass("chair").select(splats)`.
+`OfClass("chair").select(gaussians)` is a `Selection`; combine several with its operators.
 """
 
 from __future__ import annotations
 
-import operator
+import math
+import numbers
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import reduce
-from typing import Any, ClassVar
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, TypeVar
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from .._card import say_coordinate
 from .._check import check_range, check_whole
+from .._names import class_indices
 from .._origin import to_world
 from .._rows import check_finite
-from ..formats.splat_file import SplatFile
 from ..gaussians import Gaussians
-from ._json import NESTED, build, checked_object, members_of, number_of, numbers_of, set_fields
-from .boxes import quaternion_of, rotation_matrix
 from .components import component_numbers
-from .label_set import LabelSet
-from .names import class_of, labelled
 from .selection import Selection
+
+T = TypeVar("T")
 
 
 class Where(ABC):
-    """A rule that selects some Gaussians of a cloud.
-
-    `a & b`, `a | b`, `a - b` and `~a` combine rules as they combine selections. `to_json` gives plain values,
-    `Where.from_json` reads them, and equal rules compare equal.
-
-    Example:
-        >>> (OfClass("chair") - InSphere((0, 0, 0), 1.0)).to_json()["kind"]
-        'both'
-    """
+    """A rule that selects some Gaussians of a cloud. Rules are plain data: equal ones compare equal."""
 
     kind: ClassVar[str]
 
-    def select(self, cloud: SplatFile | Gaussians, classes: Sequence[str] | LabelSet = ()) -> Selection:
+    @abstractmethod
+    def select(self, gaussians: Gaussians) -> Selection:
         """Apply the rule to a cloud.
 
-        Args:
-            cloud: a splat with its class names and columns, or Gaussians.
-            classes: only for Gaussians: the name of each class index in their labels.
-
         Raises:
-            ValueError: if the cloud lacks the labels, class, column or index that the rule needs.
-            TypeError: if it is neither a splat nor Gaussians.
+            ValueError: if the cloud lacks the labels, class or index that the rule needs.
         """
-        if isinstance(cloud, Gaussians):
-            cloud = SplatFile(cloud, classes=classes.names if isinstance(classes, LabelSet) else tuple(classes))
-        if not isinstance(cloud, SplatFile):
-            raise TypeError(
-                f"cloud: expected a SplatFile or Gaussians, got {type(cloud).__name__}; pass the cloud itself"
-            )
-        return self._ask(cloud)
-
-    def mask(self, cloud: SplatFile | Gaussians, classes: Sequence[str] | LabelSet = ()) -> Tensor:  # [N] bool
-        """`select(...).mask` alone."""
-        return self.select(cloud, classes).mask
-
-    @abstractmethod
-    def _ask(self, cloud: SplatFile) -> Selection:
-        """The selection; each kind of rule defines it."""
-
-    def __and__(self, other: Where) -> Where:
-        return Both(_parts(Both, self) + _parts(Both, other)) if isinstance(other, Where) else NotImplemented
-
-    def __or__(self, other: Where) -> Where:
-        return Either(_parts(Either, self) + _parts(Either, other)) if isinstance(other, Where) else NotImplemented
-
-    def __sub__(self, other: Where) -> Where:
-        return self & ~other if isinstance(other, Where) else NotImplemented
-
-    def __invert__(self) -> Where:
-        return self.where if isinstance(self, Not) else Not(self)
 
     def to_json(self) -> dict[str, Any]:
         """Plain values that JSON can hold: `kind`, and the fields."""
-        return {"kind": self.kind} | {name: value for name, value in members_of(self).items() if value is not None}
+        return {"kind": self.kind} | plain_fields(self)
 
     @staticmethod
     def from_json(value: Any, name: str = "where") -> Where:
-        """Read what `to_json` gave.
-
-        Args:
-            value: plain values, from a file that anyone may have written.
-            name: their place in the file; errors begin with it.
-
-        Raises:
-            ValueError: if the kind is unknown, a member is missing, unknown or of a wrong type, or it nests too deep.
-        """
-        return _read(value, name, 0)
-
-
-@dataclass(frozen=True)
-class Everything(Where):
-    """Every Gaussian."""
-
-    kind: ClassVar[str] = "everything"
-
-    def _ask(self, cloud: SplatFile) -> Selection:
-        mask = torch.ones(len(cloud), dtype=torch.bool, device=cloud.gaussians.means.device)
-        return Selection.of(mask, "everything")
+        """Read what `to_json` gave, from a file that anyone may have written; a ValueError begins with its place, `name`."""
+        return read_object(name, value, KINDS, "kind")
 
 
 @dataclass(frozen=True)
 class OfClass(Where):
-    """The Gaussians labelled with one class."""
+    """The Gaussians labelled with one class, or one connected part of them."""
 
     kind: ClassVar[str] = "class"
     name: str | int
@@ -120,17 +61,34 @@ class OfClass(Where):
 
     A name selects all classes with that name. An unknown name is an error; an index that no Gaussian has selects nothing.
     """
+    part: int | None = None
+    """Which connected part: 0 is the largest, 1 the next; one past the last selects nothing. None: all of the class."""
+    distance: float | None = None
+    """Gaussians at most this far apart are in one part, world units; None takes `component_distance`."""
 
     def __post_init__(self) -> None:
-        set_fields(self, name=class_of("name", self.name))
+        if not isinstance(self.name, str):
+            check_whole("name", self.name, -1, 2**31 - 1)
+        if self.part is not None:
+            check_whole("part", self.part, 0)
+        if self.distance is not None:
+            check_range("distance", self.distance, 0, closed=(False, False))
 
-    def _ask(self, cloud: SplatFile) -> Selection:
-        if cloud.gaussians.labels is None:
+    def select(self, gaussians: Gaussians) -> Selection:
+        """See `Where.select`."""
+        labels = gaussians.labels
+        if labels is None:
             raise ValueError(
                 f"gaussians.labels: expected labels to find class {self.name!r} by, got None; attach a semantic field "
                 "first, or select by a box or a sphere"
             )
-        return Selection.of(labelled(cloud.gaussians.labels, self.name, cloud.classes), f"label {self.name}")
+        indices = class_indices(self.name, gaussians.names) if isinstance(self.name, str) else (self.name,)
+        mask = torch.isin(labels, torch.tensor(indices, dtype=torch.int64, device=labels.device))
+        selected = Selection.of(mask, f"label {self.name}")
+        if self.part is None or len(selected) == 0:
+            return selected
+        parts = component_numbers(gaussians.means, mask, self.distance)
+        return selected.within(parts == self.part, f"part {self.part + 1} of {int(parts.max()) + 1}")
 
 
 @dataclass(frozen=True)
@@ -156,13 +114,13 @@ class InBox(Where):
         if self.rotation is not None:
             set_fields(self, rotation=quaternion_of("rotation", self.rotation))
 
-    def _ask(self, cloud: SplatFile) -> Selection:
-        points = _points(cloud)
+    def select(self, gaussians: Gaussians) -> Selection:
+        """See `Where.select`."""
+        points = _points(gaussians)
         low, high = points.new_tensor(self.min), points.new_tensor(self.max)
         if self.rotation is not None:
             center = (low + high) / 2
-            R = points.new_tensor(rotation_matrix(self.rotation).tolist())
-            points = (points - center) @ R + center  # rows: R^T (x - c)
+            points = (points - center) @ rotation_matrix(self.rotation).to(points) + center  # rows: R^T (x - c)
         size = " x ".join(f"{b - a:.4g}" for a, b in zip(self.min, self.max, strict=True))
         return Selection.of(((points >= low) & (points <= high)).all(dim=1), f"in a box of {size}")
 
@@ -176,15 +134,15 @@ class InSphere(Where):
     radius: float
 
     def __post_init__(self) -> None:
-        set_fields(self, center=numbers_of("center", self.center, 3), radius=number_of("radius", self.radius))
+        set_fields(self, center=numbers_of("center", self.center, 3))
         check_range("radius", self.radius, 0, closed=(False, False))
 
-    def _ask(self, cloud: SplatFile) -> Selection:
-        points = _points(cloud)
+    def select(self, gaussians: Gaussians) -> Selection:
+        """See `Where.select`."""
+        points = _points(gaussians)
         inside = (points - points.new_tensor(self.center)).norm(dim=1) <= self.radius
-        return Selection.of(
-            inside, f"within {self.radius:.4g} of ({', '.join(say_coordinate(x, 4) for x in self.center)})"
-        )
+        center = ", ".join(say_coordinate(x, 4) for x in self.center)
+        return Selection.of(inside, f"within {self.radius:.4g} of ({center})")
 
 
 @dataclass(frozen=True)
@@ -197,149 +155,90 @@ class OfIndex(Where):
 
     def __post_init__(self) -> None:
         given: Any = self.indices
-        if isinstance(given, Tensor) and given.dtype == torch.bool and given.ndim == 1:
+        if isinstance(given, Tensor) and given.dtype == torch.bool:
             given = given.nonzero()[:, 0]
-        plain = given.tolist() if hasattr(given, "tolist") else given
-        if isinstance(plain, str) or not isinstance(plain, Sequence):
-            raise TypeError(f"indices: expected a list of whole numbers, got {plain!r:.80}; write it as [4, 7]")
-        for index in plain:
+        given = given.tolist() if hasattr(given, "tolist") else given
+        if isinstance(given, str) or not isinstance(given, Sequence):
+            raise TypeError(f"indices: expected a list of whole numbers, got {given!r:.80}; write it as [4, 7]")
+        for index in given:
             check_whole("indices", index, 0, 2**62)
-        set_fields(self, indices=tuple(sorted({int(index) for index in plain})))
+        set_fields(self, indices=tuple(sorted(set(given))))
 
-    def _ask(self, cloud: SplatFile) -> Selection:
-        if self.indices and self.indices[-1] >= len(cloud.gaussians):
+    def select(self, gaussians: Gaussians) -> Selection:
+        """See `Where.select`."""
+        if self.indices and self.indices[-1] >= len(gaussians):
             raise ValueError(
-                f"indices: expected indices below {len(cloud.gaussians)} (the number of Gaussians), got {self.indices[-1]}; "
+                f"indices: expected indices below {len(gaussians)} (the number of Gaussians), got {self.indices[-1]}; "
                 "were they taken from another cloud, or before an edit that removed some?"
             )
-        mask = torch.zeros(len(cloud.gaussians), dtype=torch.bool, device=cloud.gaussians.means.device)
-        mask[torch.tensor(self.indices, dtype=torch.int64, device=mask.device)] = True
+        mask = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+        mask[list(self.indices)] = True
         return Selection.of(mask, "by index")
 
 
-@dataclass(frozen=True)
-class AboveScore(Where):
-    """The Gaussians with more than `threshold` in a column of the splat; `score` is the confidence of their label."""
-
-    kind: ClassVar[str] = "score"
-    threshold: float
-    column: str = "score"
-
-    def __post_init__(self) -> None:
-        set_fields(self, threshold=number_of("threshold", self.threshold))
-        if not isinstance(self.column, str):
-            raise TypeError(f"column: expected the name of a column, got {self.column!r:.80}; write it as a string")
-
-    def _ask(self, cloud: SplatFile) -> Selection:
-        if self.column not in cloud.extra:
-            has = ", ".join(cloud.extra) or "none"
-            raise ValueError(f"column: expected one of the cloud's columns ({has}), got {self.column!r}; name another")
-        values = torch.as_tensor(cloud.extra[self.column]).to(cloud.gaussians.means.device)
-        scores = values.to(torch.promote_types(values.dtype, torch.float32)).nan_to_num()
-        return Selection(values > self.threshold, scores, self.threshold, f"column {self.column}")
+KINDS: dict[str, type[Where]] = {kind.kind: kind for kind in (OfClass, InBox, InSphere, OfIndex)}
 
 
-@dataclass(frozen=True)
-class Component(Where):
-    """One connected part of another rule's selection: the largest, or a smaller one by `rank`."""
-
-    kind: ClassVar[str] = "component"
-    where: Where
-    distance: float | None = None
-    """Gaussians at most this far apart are connected, world units; None takes `component_distance`."""
-    rank: int = 0
-    """0 is the largest part, 1 the next; a rank past the last part selects nothing."""
-
-    def __post_init__(self) -> None:
-        _check_where("where", self.where)
-        check_whole("rank", self.rank, 0)
-        if self.distance is not None:
-            set_fields(self, distance=number_of("distance", self.distance))
-            check_range("distance", self.distance, 0, closed=(False, False))
-
-    def _ask(self, cloud: SplatFile) -> Selection:
-        found = self.where._ask(cloud)
-        if len(found) == 0:
-            return found
-        numbers = component_numbers(cloud.gaussians.means, found.mask, self.distance)
-        return found.within(numbers == self.rank, f"part {self.rank + 1} of {int(numbers.max()) + 1}")
+def _points(gaussians: Gaussians) -> Tensor:  # [N, 3] float64, in the world
+    check_finite("gaussians.means", gaussians.means)
+    return to_world(gaussians.means.detach().double(), gaussians.origin)
 
 
-@dataclass(frozen=True)
-class Not(Where):
-    """The Gaussians that another rule does not select."""
+def numbers_of(name: str, values: Any, count: int) -> tuple[float, ...]:
+    """`count` finite numbers from a list, tuple, array or tensor, as a tuple.
 
-    kind: ClassVar[str] = "not"
-    where: Where
-
-    def __post_init__(self) -> None:
-        _check_where("where", self.where)
-
-    def _ask(self, cloud: SplatFile) -> Selection:
-        return ~self.where._ask(cloud)
-
-
-@dataclass(frozen=True)
-class _Several(Where):
-    parts: tuple[Where, ...]
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.parts, Sequence) or not self.parts:
-            raise ValueError(f"parts: expected at least one Where, got {self.parts!r:.80}; use Everything() for all")
-        for part in self.parts:
-            _check_where("parts", part)
-        set_fields(self, parts=tuple(self.parts))
+    Raises:
+        TypeError: if a value is not a number.
+        ValueError: if there are more or fewer, or one is not finite.
+    """
+    plain = values.tolist() if hasattr(values, "tolist") else values
+    real = isinstance(plain, Sequence) and all(isinstance(x, numbers.Real) and not isinstance(x, bool) for x in plain)
+    if not real:
+        raise TypeError(f"{name}: expected {count} numbers, got {values!r:.80}; write them as [x, y, ...]")
+    if len(plain) != count or not all(math.isfinite(value) for value in plain):
+        raise ValueError(f"{name}: expected {count} finite numbers, got {values!r:.80}; give one number per axis")
+    return tuple(float(value) for value in plain)
 
 
-@dataclass(frozen=True)
-class Both(_Several):
-    """The Gaussians that all of several rules select."""
-
-    kind: ClassVar[str] = "both"
-
-    def _ask(self, cloud: SplatFile) -> Selection:
-        return reduce(operator.and_, (part._ask(cloud) for part in self.parts))
+def quaternion_of(name: str, values: Any) -> tuple[float, ...]:
+    """Four numbers (w, x, y, z) that are not all zero."""
+    quaternion = numbers_of(name, values, 4)
+    if not any(quaternion):
+        raise ValueError(f"{name}: expected a quaternion (w, x, y, z), got zeros; (1, 0, 0, 0) is no rotation")
+    return quaternion
 
 
-@dataclass(frozen=True)
-class Either(_Several):
-    """The Gaussians that at least one of several rules selects."""
-
-    kind: ClassVar[str] = "either"
-
-    def _ask(self, cloud: SplatFile) -> Selection:
-        return reduce(operator.or_, (part._ask(cloud) for part in self.parts))
+def rotation_matrix(quaternion: Sequence[float]) -> Tensor:  # (w, x, y, z) of any length -> [3, 3] float64
+    """The rotation matrix of a quaternion; scipy's order is (x, y, z, w)."""
+    largest = max(abs(value) for value in quaternion)  # scipy squares: no overflow
+    w, x, y, z = (value / largest for value in quaternion)
+    return torch.from_numpy(Rotation.from_quat([x, y, z, w]).as_matrix())
 
 
-KINDS: dict[str, type[Where]] = {
-    kind.kind: kind
-    for kind in (Everything, OfClass, InBox, InSphere, OfIndex, AboveScore, Component, Not, Both, Either)
-}
+def set_fields(frozen: Any, **values: Any) -> None:
+    """Replace fields of a frozen dataclass by their checked form; called in its `__post_init__`."""
+    for name, value in values.items():
+        object.__setattr__(frozen, name, value)
 
 
-def _check_where(name: str, value: Any) -> None:
-    if not isinstance(value, Where):
-        raise TypeError(f"{name}: expected a Where like OfClass('chair'), got {value!r:.80}; build one")
+def plain_fields(value: Any) -> dict[str, Any]:
+    """The fields of a rule or an edit by name, as values for JSON; `read_object` reads them."""
+    values = {member.name: getattr(value, member.name) for member in fields(value) if member.init}
+    return {name: _plain(member) for name, member in values.items() if member is not None}
 
 
-def _parts(kind: type[Both] | type[Either], where: Where) -> tuple[Where, ...]:
-    return where.parts if isinstance(where, kind) else (where,)  # a & b & c is one Both of three
+def _plain(value: Any) -> Any:
+    if hasattr(value, "to_json"):
+        return value.to_json()
+    return [_plain(part) for part in value] if isinstance(value, tuple) else value
 
 
-def _points(cloud: SplatFile) -> Tensor:  # [N, 3] float64, in the world
-    check_finite("gaussians.means", cloud.gaussians.means)
-    return to_world(cloud.gaussians.means.detach().double(), cloud.gaussians.origin)
-
-
-def _read(value: Any, name: str, depth: int) -> Where:
-    kind = value.get("kind") if isinstance(value, dict) else None
-    if not isinstance(kind, str) or kind not in KINDS:
-        raise ValueError(f"{name}: expected a selection whose 'kind' is one of {', '.join(KINDS)}, got {value!r:.80}")
-    if depth > NESTED:
-        raise ValueError(f"{name}: expected at most {NESTED} levels of nesting, got more; write it flatter")
-    members = checked_object(name, value, KINDS[kind], "kind")
-    if "where" in members:
-        members["where"] = _read(members["where"], f"{name}.where", depth + 1)
-    if isinstance(members.get("parts"), list):
-        members["parts"] = tuple(_read(p, f"{name}.parts[{i}]", depth + 1) for i, p in enumerate(members["parts"]))
-    return build(name, KINDS[kind], members)
+def read_object(name: str, value: Any, kinds: Mapping[str, type[T]], tag: str) -> T:
+    """Make the rule or the edit that a JSON object names by `tag`; a ValueError begins with `name`, its place in the file."""
+    kind = value.get(tag) if isinstance(value, dict) else None
+    if not isinstance(kind, str) or kind not in kinds:
+        raise ValueError(f"{name}: expected an object whose {tag!r} is one of {', '.join(kinds)}, got {value!r:.80}")
+    try:
+        return kinds[kind](**{key: part for key, part in value.items() if key != tag})
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: {error}") from error

@@ -26,9 +26,8 @@ from ..formats.ply import Columns, other_elements, points_from_columns, read_ply
 from ..formats.ply_3dgs import columns_from_gaussians, label_column
 from ..formats.render_mode import comments_of_mode
 from ..formats.sidecar import write_names
-from ..formats.splat_file import SCORE, SplatFile
 from ..gaussians import Gaussians
-from ..labels import LabelSet, OfClass, Selection, Transfer, classify, transfer_labels
+from ..labels import LabelSet, OfClass, Selection, Transfer, classify, nearest_labels
 from ..labels.questions import class_rows
 from ..scenes import Scene, list_images
 from ..viz import FeatureColors, overlay_labels, palette, plot_history, save_picture
@@ -187,7 +186,7 @@ def score_teacher(
 
 
 @typed
-def select_labelled(splats: SplatFile, name: str, threshold: float | None = None) -> Selection:
+def select_labelled(splats: Gaussians, name: str, threshold: float | None = None) -> Selection:
     """The Gaussians of a labelled splat that have one class.
 
     Args:
@@ -198,15 +197,13 @@ def select_labelled(splats: SplatFile, name: str, threshold: float | None = None
     Raises:
         ValueError: if the splat has no labels or no such class, or there are no scores to compare with a threshold.
     """
-    score = splats.extra.get(SCORE)
-    found = OfClass(name).select(splats)
-    if score is None:
+    selected = OfClass(name).select(splats)
+    if splats.scores is None:
         if threshold is not None:
-            raise ValueError(f"threshold: expected a splat with the column {SCORE!r}, got none; leave it out")
-        return found
-    scores = torch.from_numpy(score).to(splats.gaussians.means)
-    mask = found.mask if threshold is None else found.mask & (scores > threshold)
-    return Selection(mask, scores, threshold, found.how)
+            raise ValueError("threshold: expected a splat with scores, got none; leave it out")
+        return selected
+    mask = selected.mask if threshold is None else selected.mask & (splats.scores > threshold)
+    return Selection(mask, splats.scores, threshold, selected.how)
 
 
 @typed
@@ -225,7 +222,7 @@ def save_labelled(
     path = as_path(path)
     assert gaussians.labels is not None
     columns = columns_from_gaussians(gaussians) | label_columns(gaussians.labels, classes.names, scores)
-    write_ply(path, columns, comments=(COMMENTS["gaussians.ply"], *comments_of_mode(SplatFile(gaussians))))
+    write_ply(path, columns, comments=(COMMENTS["gaussians.ply"], *comments_of_mode(gaussians)))
     return [path, write_names(path, classes.names, **{"labelled by": rule})]
 
 
@@ -287,7 +284,7 @@ def label_cloud(
     """
     assert gaussians.labels is not None
     points = recounted(points_from_columns(cloud), ORIGIN, gaussians.origin)
-    moved = transfer_labels(gaussians.means, gaussians.labels, points, distance)
+    moved = nearest_labels(gaussians.means, gaussians.labels, points, distance)
     added = label_columns(moved.labels, classes.names)
     if {"red", "green", "blue"} & set(cloud):
         added = {"class_id": added["class_id"]}

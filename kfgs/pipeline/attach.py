@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -19,15 +19,14 @@ from ..cameras import Camera
 from ..cameras.similarity import Similarity
 from ..fields import SemanticField, fuse_views
 from ..formats import read_splats
-from ..formats.splat_file import SCORE, SplatFile
 from ..gaussians import Gaussians
-from ..labels import LabelSet, Transfer, transfer_labels, vote_labels
-from ..labels.transfer import Method
+from ..labels import LabelSet, Transfer, nearest_labels, vote_labels
 from ..scenes import Alignment, SceneError, align_by_cameras, frames_agree
 from ..splat.transform import transform_gaussians
 
 By = Literal["distance", "views"]
 WAYS: tuple[By, ...] = ("distance", "views")
+NEARNESS = "1 - distance / lambda"  # the meaning of a score
 SOLID = 0.05  # fainter Gaussians are not used to find the frame: they can be anywhere
 
 
@@ -35,8 +34,8 @@ SOLID = 0.05  # fainter Gaussians are not used to find the frame: they can be an
 class Attached:
     """A splat with classes, and how they were found."""
 
-    splats: SplatFile
-    """The splat in its own frame, with `labels`, the extra column `score`, class names and `info["labels"]`."""
+    gaussians: Gaussians
+    """The splat in its own frame, with labels, scores and class names."""
     transfer: Transfer
     """The labels decided by distance: of every Gaussian (`by="distance"`), or of those without a label by views."""
     similarity: Similarity
@@ -45,33 +44,35 @@ class Attached:
     """How the similarity was found; None if the frames agreed or it was given."""
     notes: tuple[str, ...]
     """Sentences for people: what was done, and the results."""
+    facts: dict[str, Any]
+    """The same as JSON; `write_splats(..., facts=)` keeps them with the class names."""
 
     def __repr__(self) -> str:
-        labelled, names = int((self.labels >= 0).sum()), len(self.splats.classes)
+        labelled, names = int((self.labels >= 0).sum()), len(self.gaussians.names)
         frame = "" if self.alignment is None else f"; {self.alignment!r}"
         within = f"lambda {self.transfer.distance:.4g}"
         return cut(
-            f"Attached({labelled:,} of {len(self.splats):,} Gaussians labelled, {names} classes, {within}{frame})", LINE
+            f"Attached({labelled:,} of {len(self.gaussians):,} Gaussians labelled, {names} classes, {within}{frame})",
+            LINE,
         )
 
     @property
     def labels(self) -> Tensor:  # [N] int64
         """The class of each Gaussian, -1 = none."""
-        assert self.splats.gaussians.labels is not None
-        return self.splats.gaussians.labels
+        assert self.gaussians.labels is not None
+        return self.gaussians.labels
 
 
 @typed
 def attach(
     field: SemanticField,
-    splats: SplatFile | Gaussians | str | Path,
+    splats: Gaussians | str | Path,
     classes: LabelSet | None = None,
     *,
     cameras: Sequence[Camera] | None = None,
     frame: Similarity | Sequence[Camera] | None = None,
     distance: float | None = None,
     by: By | None = None,
-    method: Method = "nearest",
 ) -> Attached:
     """Give every Gaussian of a splat the class that the semantic field has at its position.
 
@@ -81,22 +82,21 @@ def attach(
     Classes, `by="views"`: the field segments its training views, and each Gaussian of the splat takes the class of most of
     the pixels that it fills in them (the score is the winner's share of its votes). A Gaussian that no view shows takes the
     label of labelled ones of the splat within lambda (the distance within which a label is carried over). `by="distance"`,
-    the paper's Sec. 3.4: the field's own Gaussians are classified, and those within lambda decide. With distances, the
-    score is 1 - d / lambda for `method` "nearest", and the winner's share of the weights for "vote" and "mahalanobis".
+    the paper's Sec. 3.4: the field's own Gaussians are classified, and those within lambda decide; the score
+    is 1 - d / lambda.
 
     Args:
         field: a finished field.
-        splats: any splat of the same scene, its Gaussians, or the path of a splat file; old labels are replaced.
+        splats: any splat of the same scene, or the path of its file; old labels are replaced.
         classes: names and embeddings in the teacher's space.
         cameras: undistorted views in the field's frame, usually the training views.
         frame: the similarity from the field's frame to the splat's (`Similarity.identity()` if they are the same), or views
             in the splat's frame, some with the same names as `cameras`. None compares the clouds.
         distance: lambda in the splat's world units; None: `default_distance`.
         by: None: "views", which follows the borders of objects much better, or "distance" for a field without cameras.
-        method: which label wins by distance, see `transfer_labels`; "nearest" is the paper's.
 
     Raises:
-        ValueError: if `by` or `method` is unknown, cameras are missing, the splat is empty, the words have another D than
+        ValueError: if `by` is unknown, cameras are missing, the splat is empty, the words have another D than
             the field, or (SceneError) no similarity fits.
         TypeError: if `frame` is neither.
 
@@ -108,8 +108,6 @@ def attach(
     """
     if isinstance(splats, str | Path):
         splats = read_splats(splats)
-    elif isinstance(splats, Gaussians):
-        splats = SplatFile(splats)
     classes = field.classes if classes is None else classes
     cameras = cameras or field.cameras or None
     if field.fused is None and cameras:
@@ -117,7 +115,6 @@ def attach(
     by = by or ("distance" if cameras is None else "views")
     check_choice("by", by, WAYS)
     _check_frame(frame)
-    check_choice("method", method, get_args(Method))
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
     if len(splats) == 0:
@@ -127,7 +124,7 @@ def attach(
             raise ValueError(f"cameras: expected views in the field's frame (for {name}), got none; pass them as well")
     semantic = field.label(classes)  # checks the classes before the frames are compared
     similarity, alignment, frame_note = _common_frame(field, splats, cameras, frame)
-    carry = partial(transfer_labels, distance=distance, method=method)
+    carry = partial(_carry, distance=distance)
     if by == "distance":
         labels, scores, transfer, found = _by_distance(semantic, splats, similarity, carry)
     else:
@@ -144,15 +141,10 @@ def attach(
         "similarity": similarity.matrix().tolist(),
         "counts": {"none": counts[0], **dict(zip(classes.names, counts[1:], strict=True))},
     }
-    labelled = splats.replace(
-        gaussians=splats.gaussians.replace(labels=labels),
-        extra=splats.extra | {SCORE: scores.to(torch.float32).cpu().numpy()},
-        classes=classes.names,
-        info=splats.info | {"labels": details},
-    )
+    labelled = splats.replace(labels=labels, scores=scores.float(), names=classes.names)
     labelled_by = f"{details['labelled by']}: {len(splats) - counts[0]} of {len(splats)} Gaussians have a class"
     notes = frame_note, labelled_by, _about(transfer, len(splats), by)
-    return Attached(labelled, transfer, similarity, alignment, notes)
+    return Attached(labelled, transfer, similarity, alignment, notes, details)
 
 
 def _check_frame(frame: Any) -> None:
@@ -167,7 +159,7 @@ def _check_frame(frame: Any) -> None:
 
 def _common_frame(
     field: SemanticField,
-    splats: SplatFile,
+    splats: Gaussians,
     cameras: Sequence[Camera] | None,
     frame: Similarity | Sequence[Camera] | None,
 ) -> tuple[Similarity, Alignment | None, str]:
@@ -178,7 +170,7 @@ def _common_frame(
         assert cameras is not None
         alignment = align_by_cameras(cameras, frame)
         return alignment.similarity, alignment, f"aligned by {alignment.summary}"
-    a, b = field.gaussians, splats.gaussians
+    a, b = field.gaussians, splats
     places = a.means, recounted(b.means, b.origin, a.origin)
     clouds = [_solid(means, cloud.opacities) for means, cloud in zip(places, (a, b), strict=True)]
     check = frames_agree(*clouds)
@@ -198,17 +190,15 @@ def _solid(means: Tensor, opacities: Tensor) -> Tensor:  # [N, 3], [N] -> [n, 3]
 
 def _by_distance(
     semantic: Gaussians,
-    splats: SplatFile,
+    splats: Gaussians,
     similarity: Similarity,
-    carry: Callable[[Gaussians, Tensor, Gaussians], Transfer],
+    carry: Callable[[Gaussians, Gaussians], Transfer],
 ) -> tuple[Tensor, Tensor, Transfer, dict[str, Any]]:
     """Labels [N], scores [N], the transfer and details, by the rule of Sec. 3.4."""
-    assert semantic.labels is not None
-    transfer = carry(transform_gaussians(semantic, similarity), semantic.labels, splats.gaussians)
+    transfer = carry(transform_gaussians(semantic, similarity), splats)
     details = {
         "labelled by": "distance to the field's Gaussians",
-        "method": transfer.method,
-        "score": transfer.score_meaning,
+        "score": NEARNESS,
         "ambiguous": transfer.ambiguous,
     }
     return transfer.labels, transfer.scores, transfer, details
@@ -216,11 +206,11 @@ def _by_distance(
 
 def _by_views(
     field: SemanticField,
-    splats: SplatFile,
+    splats: Gaussians,
     classes: LabelSet,
     cameras: Sequence[Camera],
     similarity: Similarity,
-    carry: Callable[[Gaussians, Tensor, Gaussians], Transfer],
+    carry: Callable[[Gaussians, Gaussians], Transfer],
 ) -> tuple[Tensor, Tensor, Transfer, dict[str, Any]]:
     """Labels [N], scores [N], the transfer and details: each Gaussian takes the class of most pixels that it fills."""
 
@@ -228,20 +218,25 @@ def _by_views(
         for camera in cameras:
             yield similarity.apply_to_camera(camera), field.segment(camera, classes.embeddings)
 
-    colour = splats.gaussians
-    votes = vote_labels(colour, segmented(), len(classes), min_share=0.0)
+    votes = vote_labels(splats, segmented(), len(classes), min_share=0.0)
     open_ = votes.labels < 0
-    carried = carry(colour, votes.labels, colour.select(open_))
+    carried = carry(splats.replace(labels=votes.labels), splats.select(open_))
     labels, scores = votes.labels.clone(), votes.shares.clone()
     labels[open_], scores[open_] = carried.labels, carried.scores.to(scores)
     details = {
         "labelled by": f"votes of {len(cameras)} segmented views",
-        "method": carried.method,
-        "score": f"share of the votes; where no view shows a Gaussian, {carried.score_meaning}, to those that have a class",
+        "score": f"share of the votes; where no view shows a Gaussian, {NEARNESS}, to those that have a class",
         "shown": int((~open_).sum()),
         "not shown": int(open_.sum()),
     }
     return labels, scores, carried, details
+
+
+def _carry(source: Gaussians, target: Gaussians, distance: float | None) -> Transfer:
+    """`transfer_labels`, and where each label came from."""
+    assert source.labels is not None
+    means = recounted(target.means, target.origin, source.origin)
+    return nearest_labels(source.means, source.labels, means, distance)
 
 
 def _about(transfer: Transfer, total: int, by: By) -> str:

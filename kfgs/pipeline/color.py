@@ -240,7 +240,7 @@ def make_color(
     params = _color_stage(run, scene, scene.views(config.split), config, device, progress)
     result = ColorResult(params.activated().detach(), path, run.stages)
     if overwrite or not os.path.lexists(path):
-        write_splats(path, result.gaussians)
+        write_splats(result.gaussians, path)
     return result
 
 

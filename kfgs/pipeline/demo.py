@@ -11,7 +11,7 @@ from .._files import check_output
 from .._origin import recounted
 from ..evaluation import find_points, score_surface, score_views
 from ..evaluation.surface import SurfaceReport
-from ..formats import SplatFile, write_splats
+from ..formats import write_splats
 from ..formats.ply import write_ply
 from ..gaussians import Gaussians
 from ..labels import (
@@ -150,18 +150,18 @@ def _edit_colors(
     say: Callable[[str], None],
 ) -> list[Path]:
     """Attach the classes to the colours, remove the chairs and recolour the plants; returns the files."""
-    splats = attach(fitted.field, SplatFile(colors), classes).splats
-    written = write_splats(out / "color.ply", splats).paths
-    for part in connected_parts(splats.gaussians, OfClass(REMOVED).select(splats), fitted.field.cameras):
+    before = attach(fitted.field, colors, classes).gaussians
+    written = write_splats(before, out / "color.ply").paths
+    for part in connected_parts(before, OfClass(REMOVED).select(before), fitted.field.cameras):
         say(f"  {REMOVED}: {part!r}")
     edits = {
         "removed": EditList((Remove(OfClass(REMOVED)),)),
         "recolored": EditList((Recolor(OfClass(PAINTED), parse_color(PAINT)),)),
     }
-    after = {name: edit.apply(splats) for name, edit in edits.items()}
+    after = {name: edit.apply(before) for name, edit in edits.items()}
     for name, edit in edits.items():
-        written += [*write_splats(out / f"{name}.ply", after[name]).paths, edit.save(edits_path(out / f"{name}.ply"))]
-        before_after = splats.gaussians, after[name].gaussians
+        written += [*write_splats(after[name], out / f"{name}.ply").paths, edit.save(edits_path(out / f"{name}.ply"))]
+        before_after = before, after[name]
         views = views_of_change(*before_after, scene.cameras)
         picture = out / f"{name}.png"
         written.append(write_comparison(picture, *before_after, [scene.cameras[i] for i in views], titles=TITLES))

@@ -13,9 +13,10 @@ from .._files import as_path, bytes_in_words
 from .._origin import to_world
 from ..fields import SemanticField
 from ..fields.store import find_field
-from ..formats import SplatFile, find_format, read_splats
+from ..formats import find_format, read_splats
 from ..formats.folders import splat_file_of
 from ..formats.ply import read_ply
+from ..gaussians import Gaussians
 from ..scenes import FeatureFolder, SceneError, is_scene, list_images, load_scene
 from ..scenes.extract import MANIFEST
 from ..scenes.files import IMAGE_SUFFIXES, natural_key, some
@@ -124,16 +125,16 @@ def _describe_maps(path: Path) -> str:
     return "\n".join(lines)
 
 
-def _describe_splats(path: Path, splats: SplatFile) -> str:
+def _describe_splats(path: Path, splats: Gaussians) -> str:
     lines = [f"{path}: {splats!r}"]
     if len(splats):
-        corners = to_world(torch.stack(splats.gaussians.means.aminmax(dim=0)), splats.gaussians.origin)
+        corners = to_world(torch.stack(splats.means.aminmax(dim=0)), splats.origin)
         ends = [[say_coordinate(value, 4) for value in corner] for corner in corners.tolist()]
         lines += [f"  {axis}: {low} to {high}" for axis, low, high in zip("xyz", *ends, strict=True)]
-    lines += [f"  {name}: {value}" for name, value in splats.info.items() if not isinstance(value, dict | list)]
-    labels = splats.gaussians.labels
+    lines.append(f"  format: {find_format(path).NAME}")
+    labels = splats.labels
     if labels is not None:
-        for i, name in enumerate(splats.classes):
+        for i, name in enumerate(splats.names):
             lines.append(f"  {name:<16s} {int((labels == i).sum()):8d} Gaussians")
         lines.append(f"  {'(none)':<16s} {int((labels < 0).sum()):8d} Gaussians")
     return "\n".join(lines)

@@ -163,7 +163,7 @@ def open_result(path: str | Path, question: Question) -> Method | Gaussians:
         splat = path if path.is_file() else (path.parent if folder == path else path) / "color.ply"
         if not splat.is_file():
             raise FileNotFoundError(f"{splat}: no such file; expected a colour splat for {question.protocol.name}")
-        return read_splats(splat).gaussians
+        return read_splats(splat)
     if folder is not None:
         return FieldMethod(SemanticField.load(folder))
     if is_maps(path):

@@ -30,7 +30,6 @@ from ..fields import (
 )
 from ..fields.decoders import Autoencoded, Codewords, Decoder, Identity
 from ..fields.store import NAME, check_place, holds_field
-from ..formats import SplatFile
 from ..gaussians import Gaussians
 from ..quant import (
     Autoencoder,
@@ -201,7 +200,7 @@ def fit_scene(
     folder: str | Path,
     config: FitConfig | None = None,
     *,
-    splat: Gaussians | SplatFile | str | Path | None = None,
+    splat: Gaussians | str | Path | None = None,
     latents: LinearLatents | None = None,
     report: Callable[[str], None] | None = None,
     progress: Progress = False,
@@ -217,7 +216,7 @@ def fit_scene(
         folder: the run folder; the finished field goes to `folder/field.kfgs`. It replaces a field that other options made there,
             and the report of that one. The stages stay, so going back to the old options is quick.
         config: the method and its options.
-        splat: of method `fuse`, the Gaussians to fuse onto, in the scene's frame: a splat file or its content. None takes
+        splat: of method `fuse`, the Gaussians to fuse onto, in the scene's frame, or a splat file. None takes
             `scene.splat`; if the scene has none, it trains them on the pictures with `config.color` and writes them to
             `folder/color.ply`, unless that file exists. If `fit_color` trained for longer in the same folder, its Gaussians are
             taken instead.
@@ -279,7 +278,7 @@ def _facts(job: _Job, teacher: Any) -> dict[str, Any]:
 
 
 def _make_field(
-    job: _Job, splat: Gaussians | SplatFile | str | Path | None, latents: LinearLatents | None = None
+    job: _Job, splat: Gaussians | str | Path | None, latents: LinearLatents | None = None
 ) -> tuple[SemanticField, dict[str, Any]]:
     """All stages of a method: the field, and what decided it, for its `info`."""
     config = job.config

@@ -17,7 +17,7 @@ from .._typed import typed
 from ..cameras import Camera
 from ..fields import SemanticField, UpliftConfig, fuse_views, scene_classes, uplift_maps
 from ..fields.store import NAME
-from ..formats import SplatFile, read_splats
+from ..formats import read_splats
 from ..formats.folders import splat_file_of
 from ..gaussians import Gaussians
 from ..quant import LinearLatents
@@ -31,7 +31,7 @@ from .stages import Run, digest_cameras, digest_shape, stage_generator
 def find_geometry(
     run: Run,
     scene: Scene,
-    splat: Gaussians | SplatFile | str | Path | None,
+    splat: Gaussians | str | Path | None,
     config: ColorConfig,
     device: torch.device,
     progress: Progress,
@@ -45,10 +45,8 @@ def find_geometry(
     splat = scene.splat if splat is None else splat
     if isinstance(splat, Gaussians):
         return splat, {"geometry": "given"}
-    if isinstance(splat, SplatFile):
-        return splat.gaussians, {"geometry": "given"}
     if splat is not None:
-        return read_splats(splat).gaussians, {"geometry": str(splat_file_of(splat))}
+        return read_splats(splat), {"geometry": str(splat_file_of(splat))}
     found = find_color(run, scene, config)
     if found is None:
         found = make_color(run, scene, config, device, progress, overwrite=False).gaussians, config.field.steps
@@ -93,7 +91,7 @@ def uplift_stage(
 def uplift(
     scene: Scene,
     maps: Maps,  # teacher maps of the views of `config.split`, in their order
-    splat: Gaussians | SplatFile | SemanticField | str | Path,
+    splat: Gaussians | SemanticField | str | Path,
     config: FitConfig | None = None,
     *,
     progress: bool = False,
@@ -104,7 +102,7 @@ def uplift(
     Args:
         scene: posed, undistorted views in the splat's frame.
         maps: one teacher map per view, of the original pictures; read one at a time.
-        splat: the Gaussians, a splat file or its content, or a field.
+        splat: the Gaussians, a splat file, or a field.
         config: only `uplift`, `split`, `undistorted_features` and `seed` are used. None: the training views, and every
             Gaussian stays unchanged.
         progress: show a bar.

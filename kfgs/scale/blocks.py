@@ -29,14 +29,14 @@ from .._files import (
     real_path,
     write_json,
 )
+from .._origin import to_world
 from .._rows import unit_rows
 from ..features import FeatureFolder
 from ..fields import SemanticField, sample_latents
 from ..fields.store import NAME
-from ..formats import SplatFile, read_splats, write_splats
+from ..formats import read_splats, write_splats
 from ..formats.folders import splat_file_of
 from ..gaussians import Gaussians
-from ..labels.nearest import places_of
 from ..pipeline import FitConfig, fit_scene
 from ..pipeline.maps import maps_of_views
 from ..pipeline.stages import digest_tensors
@@ -157,7 +157,7 @@ def _held(latents: LinearLatents, maps: list[torch.Tensor]) -> float:
     return float(latents.encode(known).square().sum() / len(known))
 
 
-def _write_block(folder: Path, block: Block, whole: Scene, maps_folder: Path, cloud: SplatFile | None) -> None:
+def _write_block(folder: Path, block: Block, whole: Scene, maps_folder: Path, cloud: Gaussians | None) -> None:
     """Make the scene folder of a block, which has its model already."""
     assert whole.folder is not None
     _link(folder / "images", picture_folder(whole.cameras[0].name, whole.image_paths[0]))
@@ -168,7 +168,7 @@ def _write_block(folder: Path, block: Block, whole: Scene, maps_folder: Path, cl
     write_json(folder / "split.json", _splits(whole, block))
     if cloud is not None:
         means, radii = _places(cloud.gaussians), REACH * as_array(cloud.gaussians.scales).max(1)
-        write_splats(folder / SPLAT, cloud.select(torch.from_numpy(block.needs(means, radii))))
+        write_splats(cloud.select(torch.from_numpy(block.needs(means, radii))), folder / SPLAT)
     write_json(folder / "block.json", block.to_json())
 
 
@@ -203,7 +203,7 @@ def fit_block(
     options = {name: value for name, value in asdict(config).items() if name not in IDLE}
     facts: dict[str, Any] = {"gaussians": 0, "of": 0, "box": None, "seconds": 0.0, "options": digest_value(options)}
     core = None
-    if splat is None or block.holds(_places(splat.gaussians)).any():
+    if splat is None or block.holds(_places(splat)).any():
         latents = LinearLatents.load(folder.parent / LATENTS)
         result = fit_scene(
             as_taken.undistorted(),
@@ -292,7 +292,7 @@ def _box(field: SemanticField) -> tuple[list[float], list[float]]:
 
 def _places(gaussians: Gaussians) -> Any:  # [N, 3]
     """Where Gaussians are in the world, as the boxes of blocks are."""
-    return as_array(places_of("gaussians", gaussians))
+    return as_array(to_world(gaussians.means, gaussians.origin))
 
 
 def _splits(scene: Scene, block: Block) -> dict[str, list[str]]:

@@ -16,11 +16,11 @@ from .._arrays import reading
 from .._card import say_coordinate
 from .._check import as_array, check_range
 from .._files import as_path, read_json, real_path
+from .._origin import to_world
 from ..cameras import Camera
 from ..fields import SemanticField, join_fields, scene_classes
 from ..gaussians import Gaussians
 from ..labels import LabelSet, Selection, transfer_labels
-from ..labels.nearest import places_of
 from ..scenes.blocks import Array, Block
 
 BLOCKS, CORE, FACTS, FORMAT = "blocks.json", "core", "core.json", "kfgs.blocks"
@@ -141,7 +141,7 @@ class FieldInBlocks:
         for block, box in zip(self.blocks, self.boxes, strict=True):
             if (low <= box[1]).all() and (high >= box[0]).all():
                 field = self.field(block.name)
-                means = as_array(places_of("gaussians", field.gaussians))
+                means = as_array(to_world(field.gaussians.means, field.gaussians.origin))
                 inside = ((means >= low) & (means <= high)).all(1)
                 if inside.any():
                     parts.append(field.select(torch.from_numpy(inside)))
@@ -158,28 +158,24 @@ class FieldInBlocks:
         """As `SemanticField.segment`; only the blocks that the camera may see are read."""
         return self.seen_from(camera).segment(camera, *args, **options)
 
-    def transfer(
-        self, dst: Gaussians, distance: float, classes: LabelSet | None = None, **options: Any
-    ) -> Tensor:  # [N] int64
+    def transfer(self, dst: Gaussians, distance: float, classes: LabelSet | None = None) -> Tensor:  # [N] int64
         """Labels for a cloud, as `transfer_labels` gives them from the joined field, one block's surroundings at a time.
 
         Args:
             dst: N Gaussians in the field's frame.
             distance: lambda, world units.
             classes: to label with; None: those that the field remembers.
-            options: of `transfer_labels`.
         """
         check_range("distance", distance, 0, closed=(False, False))
-        means = as_array(places_of("dst", dst))
+        means = as_array(to_world(dst.means, dst.origin))
         labels = torch.full((len(means),), -1, dtype=torch.int64)
         for block in self.blocks:
             rows = np.flatnonzero(block.holds(means))
             near = self._touching(means[rows].min(0) - distance, means[rows].max(0) + distance) if len(rows) else []
             if near:
                 field = join_fields(near)
-                known = field.classify(classes).labels
                 own = torch.from_numpy(rows)
-                labels[own] = transfer_labels(field.gaussians, known, dst.select(own), distance, **options).labels
+                labels[own] = transfer_labels(field.label(classes), dst.select(own), distance).labels
         return labels
 
 

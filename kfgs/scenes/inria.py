@@ -189,7 +189,7 @@ def _points(folder: Path) -> tuple[Tensor, Tensor, list[str]]:
     try:
         if (folder / POINTS).is_file():
             return read_points(folder / POINTS)
-        cloud = read_splats(folder).gaussians
+        cloud = read_splats(folder)
     except ValueError as error:
         raise SceneError(str(error)) from error
     shades = torch.full((len(cloud), 3), 0.5) if cloud.sh is None else 0.5 + SH_C0 * cloud.sh[:, 0]

@@ -6,15 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple, Protocol
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from .._card import short_repr
 from ..cameras import Camera
 from ..fields import Linear, SemanticField, fuse_views
-from ..formats import SplatFile
-from ..formats.splat_file import SCORE
 from ..gaussians import Gaussians
 from ..labels import LabelSet, OfClass, Selection, class_index, class_indices
 from ..labels.questions import class_rows, make_question
@@ -176,19 +173,19 @@ class SplatMeaning:
 
     phrases = examples = False
 
-    def __init__(self, splats: SplatFile) -> None:
-        labels = splats.gaussians.labels
+    def __init__(self, splats: Gaussians) -> None:
+        labels = splats.labels
         if labels is None:
             raise ValueError(
-                "splats.gaussians.labels: expected labels [N] to ask for, got None; label the splat first, with `kfgs attach` "
+                "splats.labels: expected labels [N] to ask for, got None; label the splat first, with `kfgs attach` "
                 "or transfer_labels, or pass a field"
             )
-        self.gaussians = splats.gaussians
-        count = max(len(splats.classes), int(labels.max()) + 1 if len(labels) else 0)
-        self.names = splats.classes + tuple(f"class {i}" for i in range(len(splats.classes), count))
+        self.gaussians = splats
+        count = max(len(splats.names), int(labels.max()) + 1 if len(labels) else 0)
+        self.names = splats.names + tuple(f"class {i}" for i in range(len(splats.names), count))
         self.scores, self.by = torch.ones_like(self.gaussians.opacities), "the file's classes"
-        if SCORE in splats.extra:  # scores that are not finite become the lowest finite one
-            values = torch.from_numpy(np.asarray(splats.extra[SCORE])).to(self.gaussians.means)
+        if splats.scores is not None:  # scores that are not finite become the lowest finite one
+            values = splats.scores.to(self.gaussians.means)
             finite = torch.isfinite(values)
             self.scores = torch.where(finite, values, values[finite].min() if bool(finite.any()) else 1.0)
             self.by += " and scores"
@@ -202,7 +199,7 @@ class SplatMeaning:
         """
         words = self.names[class_indices(words if words in self.names else words.strip(), self.names)[0]]
         if words not in self._answers:
-            member = OfClass(words).mask(self.gaussians, self.names)
+            member = OfClass(words).select(self.gaussians.replace(names=self.names)).mask
             scores = torch.where(member, self.scores, 0)
             own = scores[member]
             low, high = (float(own.min()), float(own.max())) if len(own) else UNIT

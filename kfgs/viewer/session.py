@@ -19,10 +19,10 @@ from torch import Tensor
 
 from .._check import check_choice
 from .._files import as_path, write_json
-from ..formats import SplatFile, write_splats
-from ..formats.splat_file import SCORE
+from ..formats import write_splats
+from ..gaussians import Gaussians
 from ..labels import EditList, Selection, connected_parts
-from ..labels.edits.edit_list import FORMAT, VERSION
+from ..labels.edits.edit_list import read_edits
 from ..viz.linked import evenly
 from .meaning import Asked
 from .picking import views_seeing
@@ -101,7 +101,7 @@ class Session:
 
     def _parts(self, args: dict[str, Any], attached: bytes) -> Answer:
         side = _side(args["side"])
-        cloud = self._edited(side, args).gaussians
+        cloud = self._edited(side, args)
         (mask,) = _masks({side: len(cloud)}, attached).values()
         parts = connected_parts(cloud, Selection.of(mask, "in the viewer"), most=MOST_PARTS)
         numbers = np.full(len(mask), -1, "<i2")
@@ -131,17 +131,17 @@ class Session:
         folder, paths = next_folder(self.out, "edited"), []
         for side, edits in made.items():
             paths += [edits.save(folder / f"{side}.json"), folder / f"{side}.ply"]
-            write_splats(paths[-1], results[side].replace(extra={}))
+            write_splats(results[side].replace(scores=None), paths[-1])
         return _wrote(paths)
 
-    def _edited(self, side: Side, args: dict[str, Any]) -> SplatFile:
+    def _edited(self, side: Side, args: dict[str, Any]) -> Gaussians:
         """A side with what was done to it, but nothing removed: masks are of these Gaussians."""
         kept = tuple(edit for edit in _edit_list(args, side) if edit.op != "remove")
         return EditList(kept).apply(labelled(self.state, side))
 
 
 def save_selection(
-    state: Exploration, clouds: Mapping[Side, SplatFile], masks: Mapping[Side, Tensor], out: Path
+    state: Exploration, clouds: Mapping[Side, Gaussians], masks: Mapping[Side, Tensor], out: Path
 ) -> list[Path]:
     """Write a selection into the next numbered folder: numbers as selection.json, Gaussians as selection_<side>.ply.
 
@@ -160,9 +160,11 @@ def save_selection(
     places = evenly(len(state.cameras), MOST_VIEWS).tolist() if state.cameras else []
     views = [state.cameras[place] for place in places] or None
     for side in chosen:
-        scores = torch.from_numpy(np.nan_to_num(clouds[side].extra[SCORE]))
+        known = clouds[side].scores
+        assert known is not None
+        scores = torch.nan_to_num(known)
         selection = Selection(masks[side], scores, state.gamma, state.gamma_how or "in the viewer")
-        parts = [part.to_json() for part in connected_parts(clouds[side].gaussians, selection, views, most=MOST_PARTS)]
+        parts = [part.to_json() for part in connected_parts(clouds[side], selection, views, most=MOST_PARTS)]
         for part in parts:
             if part["best_view"] is not None:
                 part["best_view"]["index"] = places[part["best_view"]["index"]]
@@ -172,18 +174,18 @@ def save_selection(
     write_json(paths[0], details)
     for side in chosen:
         splats = clouds[side].select(masks[side])
-        if not np.isfinite(splats.extra[SCORE]).all():
-            splats = splats.replace(extra={})
+        if splats.scores is not None and not bool(splats.scores.isfinite().all()):
+            splats = splats.replace(scores=None)
         paths.append(folder / f"selection_{side}.ply")
-        write_splats(paths[-1], splats)
+        write_splats(splats, paths[-1])
     return paths
 
 
-def labelled(state: Exploration, side: Side) -> SplatFile:
+def labelled(state: Exploration, side: Side) -> Gaussians:
     """A side with its labels and scores at the present lambda."""
     cloud = state.cloud(side).replace(labels=torch.from_numpy(state.labels(side)))
-    scores = state.scores(side).astype(np.float32)
-    return SplatFile(cloud.detach().to("cpu"), {SCORE: scores}, tuple(state.meaning.names))
+    scores = torch.from_numpy(state.scores(side).astype(np.float32))
+    return cloud.detach().to("cpu").replace(scores=scores, names=tuple(state.meaning.names))
 
 
 def next_folder(out: Path, stem: str) -> Path:
@@ -229,7 +231,7 @@ def _edit_list(args: dict[str, Any], side: str) -> EditList:
     for edit in given:
         check_choice("edits: op", edit["op"], EDITS)
         check_choice("edits: where", edit["where"]["kind"], ("index",))
-    return EditList.from_json({"format": FORMAT, "version": VERSION, "edits": given}, "edits")
+    return EditList(read_edits(given))
 
 
 def _wrote(paths: list[Path]) -> Answer:

@@ -243,7 +243,7 @@ class Exploration:
     def _find_sources(self) -> tuple[Array, Array, float, str]:
         """For each colour Gaussian the nearest labelled semantic one (-1: none is labelled), its distance; and lambda.
 
-        The same as `transfer_labels(..., method="nearest")`, for all lambdas at once. Ties go to the lowest index.
+        The same as `nearest_labels`, for all lambdas at once. Ties go to the lowest index.
         """
         if "color" not in self._clouds:
             return np.zeros(0, np.int64), np.zeros(0), 1.0, "no colour side"
@@ -254,8 +254,8 @@ class Exploration:
             return source, far, 1.0, "no labelled source"
         sources = Sources(points[kept], self._own_labels[kept])
         order = neighbours_together(targets)
-        near = sources.near(targets[order], 1, np.inf)
-        source[order], far[order] = kept[sources.first][near.source[:, 0]], near.distance[:, 0]
+        distances, near = sources.near(targets[order], 1, np.inf)
+        source[order], far[order] = kept[sources.first][near[:, 0]], distances[:, 0]
         return source, far, *explained_distance(sources.tree, targets)
 
     def _on(self, side: Side, own: Array, nothing: Any) -> Array:

@@ -17,7 +17,6 @@ from torch import Tensor
 from .._check import check_choice
 from ..cameras import Camera
 from ..fields import SemanticField
-from ..formats import SplatFile
 from ..gaussians import Gaussians
 from ..labels import LabelSet
 from ..scenes import Scene
@@ -63,8 +62,8 @@ export default {
 
 
 def explore(
-    source: SemanticField | SplatFile,
-    color: Gaussians | SplatFile | None = None,
+    source: SemanticField | Gaussians,
+    color: Gaussians | None = None,
     *,
     classes: LabelSet | None = None,
     cameras: Sequence[Camera] = (),
@@ -106,7 +105,7 @@ def explore(
     if where == "notebook":
         require_widget()
     meaning: Meaning
-    if isinstance(source, SplatFile):
+    if isinstance(source, Gaussians):
         if classes is not None or embed is not None:
             raise ValueError(
                 "classes, embed: expected none with a splat, which has its own classes, got one; leave it out"
@@ -116,9 +115,8 @@ def explore(
         cameras = cameras or source.cameras
         meaning = FieldMeaning(source, classes, cameras=cameras, embed=embed)
     else:
-        raise TypeError(f"source: expected a SemanticField or a SplatFile, got {type(source).__name__}; pass one")
-    cloud = color.gaussians if isinstance(color, SplatFile) else color
-    state = Exploration(meaning, cloud, cameras=cameras, distance=distance)
+        raise TypeError(f"source: expected a SemanticField or Gaussians, got {type(source).__name__}; pass one")
+    state = Exploration(meaning, color, cameras=cameras, distance=distance)
     if where in ("browser", "notebook"):
         state.set_show(state.first_show)
         viewer = Viewer(state, out=out, height=height)

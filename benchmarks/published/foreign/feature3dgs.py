@@ -44,7 +44,7 @@ def load_feature3dgs(run: str | Path, step: int | None = None, *, decoder: str |
     run = as_path(run)
     what = "a point cloud of Feature 3DGS"
     ply = run if run.is_file() else find_numbered(run, "point_cloud/iteration_*/point_cloud.ply", step, what)
-    gaussians = read_splats(ply).gaussians
+    gaussians = read_splats(ply)
     if gaussians.features is None:
         raise ValueError(
             f"{ply}: expected the columns semantic_0, semantic_1, ... of Feature 3DGS, got none; was this run trained with "

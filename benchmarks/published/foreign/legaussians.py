@@ -84,4 +84,4 @@ def _read_gaussians(run: Path, step: int) -> Gaussians:
         raise ValueError(
             f"{ply}: expected the columns {COLUMN}0, {COLUMN}1, ... of LEGaussians, got none in that order"
         )
-    return splats.gaussians.replace(features=torch.stack([torch.from_numpy(splats.extra[n]).float() for n in names], 1))
+    return splats.replace(features=torch.stack([torch.from_numpy(splats.extra[n]).float() for n in names], 1))

@@ -16,7 +16,7 @@ from torch import Tensor
 from kfgs._arrays import read_array
 from kfgs._files import as_path
 from kfgs._torch_files import plain_tensor, read_torch
-from kfgs.formats import read_splats
+from kfgs.formats.table import read_rows
 
 from .splatted import Level, SplattedMethod
 
@@ -41,13 +41,11 @@ def load_splat_features(
         ValueError: if there are no features, or not one row per Gaussian.
     """
     path = as_path(splats)
-    file = read_splats(path)
-    gaussians = file.gaussians
+    gaussians, kept = read_rows(path)
     if features is not None:
         values = _read_rows(as_path(features))
-        left_out = file.info.get("left_out", [])  # rows of the file
-        if left_out and len(values) == len(gaussians) + len(left_out):
-            values = torch.from_numpy(np.delete(values.numpy(), left_out, axis=0))
+        if len(values) == len(kept):
+            values = values[kept]
         if len(values) != len(gaussians):
             raise ValueError(
                 f"{features}: expected [{len(gaussians)}, D], a row for each Gaussian of {path}, got {list(values.shape)}; some "
@@ -56,14 +54,14 @@ def load_splat_features(
     elif column == "semantic_" and gaussians.features is not None:
         values = gaussians.features
     else:
-        names = [f"{column}{i}" for i in range(sum(key.startswith(column) for key in file.extra))]
-        if not names or any(key not in file.extra for key in names):
-            others = ", ".join(list(file.extra)[:6]) or "none but its own"
+        names = [f"{column}{i}" for i in range(sum(key.startswith(column) for key in gaussians.extra))]
+        if not names or any(key not in gaussians.extra for key in names):
+            others = ", ".join(list(gaussians.extra)[:6]) or "none but its own"
             raise ValueError(
                 f"{path}: expected columns {column}0, {column}1, ..., got other columns ({others}); pass column=, or "
                 "features=FILE"
             )
-        values = torch.from_numpy(np.stack([file.extra[key] for key in names], 1)).float()
+        values = torch.from_numpy(np.stack([gaussians.extra[key] for key in names], 1)).float()
     return SplattedMethod(path.stem if name is None else name, [Level(gaussians.replace(features=values.contiguous()))])
 
 

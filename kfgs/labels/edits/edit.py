@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
+from functools import reduce
+from operator import or_
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,13 +16,11 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..._check import check_choice, check_range
-from ..._rows import check_finite
-from ...formats.splat_file import SplatFile
-from .._json import members_of, number_of, set_fields
+from ...gaussians import Gaussians
 from ..color import MODES, Mode, parse_color, recolor
+from ..nearest import positions
 from ..selection import Selection
-from ..where import OfClass, OfIndex, Where
-from .merge import class_name
+from ..where import OfClass, OfIndex, Where, plain_fields, set_fields
 
 SHOWN = 12  # classes listed in a message
 HIDDEN = 1e-6  # an opacity that every renderer skips (alpha < 1/255) and every file can hold
@@ -34,7 +35,7 @@ class Edit(ABC):
     op: ClassVar[str]
 
     @abstractmethod
-    def apply(self, splats: SplatFile) -> SplatFile:
+    def apply(self, gaussians: Gaussians) -> Gaussians:
         """The edited cloud.
 
         Raises:
@@ -43,49 +44,54 @@ class Edit(ABC):
 
     def to_json(self) -> dict[str, Any]:
         """Plain values that JSON can hold: `op`, and the fields."""
-        return {"op": self.op} | members_of(self)
+        return {"op": self.op} | plain_fields(self)
 
 
 @dataclass(frozen=True)
 class OnSelection(Edit):
-    """An edit of the Gaussians that a `Where` selects."""
+    """An edit of the Gaussians that rules select."""
 
-    where: Where
-    """Which Gaussians; a class name becomes `OfClass(name)`, a `Selection` becomes the `OfIndex` of its Gaussians."""
+    where: tuple[Where, ...]
+    """Which Gaussians: those that any of these rules selects. Also made from one rule, a class name or a `Selection`."""
     _: KW_ONLY
     allow_empty: bool = False
     """False: it is an error if nothing is selected."""
 
     def __post_init__(self) -> None:
         where: Any = self.where
-        if isinstance(where, str):
-            where = OfClass(where)
-        elif isinstance(where, Selection):
-            where = OfIndex(tuple(where.indices.tolist()))
-        elif not isinstance(where, Where):
-            raise TypeError(
-                f"where: expected a Where like OfClass('chair'), a Selection or a class name, got {where!r:.80}; "
-                "build one"
-            )
-        set_fields(self, where=where)
-        if not isinstance(self.allow_empty, bool):
-            raise TypeError(
-                f"allow_empty: expected true or false, got {self.allow_empty!r:.80}; write it without quotes"
-            )
+        rules = where if isinstance(where, list | tuple) else [where]
+        set_fields(self, where=tuple(_rule(rule) for rule in rules))
+        if not self.where:
+            raise ValueError("where: expected at least one rule, got none; name a class, or give OfClass('chair')")
 
-    def selected(self, splats: SplatFile) -> Tensor:  # [N] bool
+    def selected(self, gaussians: Gaussians) -> Tensor:  # [N] bool
         """The mask of the selected Gaussians.
 
         Raises:
             ValueError: if nothing is selected and `allow_empty` is false; the message lists the classes present.
         """
-        mask = self.where.mask(splats)
+        mask = reduce(or_, (rule.select(gaussians).mask for rule in self.where))
         if not self.allow_empty and not bool(mask.any()):
+            rules = ", ".join(map(repr, self.where))
             raise ValueError(
-                f"where: expected a selection of some of {len(splats)} Gaussians, got none from {self.where!r:.120}; "
-                f"{_present(splats)} (in Python: or pass allow_empty=True)"
+                f"where: expected a selection of some of {len(gaussians)} Gaussians, got none from {rules:.120}; "
+                f"{_present(gaussians)} (in Python: or pass allow_empty=True)"
             )
         return mask
+
+
+def _rule(where: Any) -> Where:
+    if isinstance(where, str):
+        return OfClass(where)
+    if isinstance(where, Selection):
+        return OfIndex(tuple(where.indices.tolist()))
+    if isinstance(where, dict):
+        return Where.from_json(where)
+    if not isinstance(where, Where):
+        raise TypeError(
+            f"where: expected a class name, a Selection or a rule like OfClass('chair'), got {where!r:.80}; build one"
+        )
+    return where
 
 
 @dataclass(frozen=True)
@@ -103,13 +109,12 @@ class Remove(OnSelection):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        set_fields(self, grow=number_of("grow", self.grow))
         check_range("grow", self.grow, 0)
 
-    def apply(self, splats: SplatFile) -> SplatFile:
+    def apply(self, gaussians: Gaussians) -> Gaussians:
         """See `Edit.apply`."""
-        mask = self.selected(splats)
-        return splats.select(~(mask | _orphans_near(splats, mask, self.grow)))
+        mask = self.selected(gaussians)
+        return gaussians.select(~(mask | _orphans_near(gaussians, mask, self.grow)))
 
 
 @dataclass(frozen=True)
@@ -118,9 +123,9 @@ class Extract(OnSelection):
 
     op: ClassVar[str] = "extract"
 
-    def apply(self, splats: SplatFile) -> SplatFile:
+    def apply(self, gaussians: Gaussians) -> Gaussians:
         """See `Edit.apply`."""
-        return splats.select(self.selected(splats))
+        return gaussians.select(self.selected(gaussians))
 
 
 @dataclass(frozen=True)
@@ -138,9 +143,9 @@ class Recolor(OnSelection):
         set_fields(self, rgb=parse_color(self.rgb))
         check_choice("mode", self.mode, MODES)
 
-    def apply(self, splats: SplatFile) -> SplatFile:
+    def apply(self, gaussians: Gaussians) -> Gaussians:
         """See `Edit.apply`."""
-        return splats.replace(gaussians=recolor(splats.gaussians, self.selected(splats), self.rgb, self.mode))
+        return recolor(gaussians, self.selected(gaussians), self.rgb, self.mode)
 
 
 @dataclass(frozen=True)
@@ -157,45 +162,42 @@ class Opacity(OnSelection):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        set_fields(self, factor=number_of("factor", self.factor))
         check_range("factor", self.factor, 0, 1)
 
-    def apply(self, splats: SplatFile) -> SplatFile:
+    def apply(self, gaussians: Gaussians) -> Gaussians:
         """See `Edit.apply`."""
-        mask = self.selected(splats)
-        opacities = splats.gaussians.opacities.clone()
-        old = opacities[mask]
-        opacities[mask] = torch.maximum(old * self.factor, old.clamp(max=HIDDEN))
-        return splats.replace(gaussians=splats.gaussians.replace(opacities=opacities))
+        mask, old = self.selected(gaussians), gaussians.opacities
+        changed = torch.maximum(old * self.factor, old.clamp(max=HIDDEN))
+        return gaussians.replace(opacities=torch.where(mask, changed, old))
 
 
-def _present(splats: SplatFile) -> str:
-    labels = splats.gaussians.labels
+def class_name(names: Sequence[str], index: int) -> str:
+    """The name of a class; one without a name is called `class 7`."""
+    return names[index] if index < len(names) else f"class {index}"
+
+
+def _present(gaussians: Gaussians) -> str:
+    labels = gaussians.labels
     if labels is None:
         return "the cloud carries no labels: widen the box or sphere"
-    found, counts = torch.unique(labels[labels >= 0], return_counts=True)
-    sizes: Counter[str] = Counter()
-    for label, count in zip(found.tolist(), counts.tolist(), strict=True):
-        sizes[class_name(splats.classes, label)] += count
+    sizes: Counter[str] = Counter(class_name(gaussians.names, label) for label in labels[labels >= 0].tolist())
     named = [f"{name} ({count})" for name, count in sizes.most_common()]
     more = f" and {len(named) - SHOWN} more" if len(named) > SHOWN else ""
     return f"classes present are {', '.join(named[:SHOWN]) or 'none'}{more}: select one of them"
 
 
-def _orphans_near(splats: SplatFile, mask: Tensor, distance: float) -> Tensor:  # [N] bool -> [N] bool
+def _orphans_near(gaussians: Gaussians, mask: Tensor, distance: float) -> Tensor:  # [N] bool -> [N] bool
     """The unlabelled Gaussians closer than `distance` to the mask, and no farther from it than from other labels."""
-    labels = splats.gaussians.labels
+    labels, out = gaussians.labels, torch.zeros_like(mask)
     free = ~mask if labels is None else ~mask & (labels < 0)
     if distance == 0 or not bool(mask.any()) or not bool(free.any()):
-        return torch.zeros_like(mask)
-    check_finite("gaussians.means", splats.gaussians.means)
-    means = splats.gaussians.means.detach().double().cpu().numpy()
+        return out
+    means = positions("gaussians.means", gaussians.means)
     taken, candidates, rivals = (means[rows.cpu().numpy()] for rows in (mask, free, ~(mask | free)))
     to_taken = np.asarray(cKDTree(taken).query(candidates, distance_upper_bound=distance)[0])  # infinite beyond
     near = to_taken < distance
     if len(rivals) and near.any():
         to_rival = np.asarray(cKDTree(rivals).query(candidates[near], distance_upper_bound=distance)[0])
         near[near] = to_taken[near] <= to_rival
-    out = torch.zeros_like(mask)
     out[free] = torch.from_numpy(near).to(mask.device)
     return out

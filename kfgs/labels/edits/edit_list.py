@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ..._card import cut
 from ..._files import as_path, read_json, write_json
-from ...formats.splat_file import SplatFile
-from .._json import build, checked_object
-from ..where import Where
+from ...gaussians import Gaussians
+from ..where import read_object
 from .edit import Edit, Extract, Opacity, Recolor, Remove
-from .insert import Insert, read_similarity, read_source
-from .motion import Duplicate, Move, Turn
+from .insert import Insert
+from .motion import Duplicate, Move
 
 FORMAT, VERSION = "kfgs.edits", 1
 OPS: dict[str, type[Edit]] = {op.op: op for op in (Remove, Extract, Recolor, Opacity, Move, Duplicate, Insert)}
@@ -54,23 +53,15 @@ class EditList:
 
     def __post_init__(self) -> None:
         for name in ("edits", "undone"):
-            given = getattr(self, name)
-            if isinstance(given, Edit) or not isinstance(given, Iterable):
-                raise TypeError(f"{name}: expected a list of edits, got {given!r:.80}; write it as [Remove('chair')]")
-            edits = tuple(given)
-            for i, edit in enumerate(edits):
-                if not isinstance(edit, Edit):
-                    raise TypeError(f"{name}[{i}]: expected an edit, got {edit!r:.80}; use one of {_names()}")
-            object.__setattr__(self, name, edits)
+            edits = getattr(self, name)
+            if not isinstance(edits, list | tuple) or not all(isinstance(edit, Edit) for edit in edits):
+                raise TypeError(f"{name}: expected a list of edits, got {edits!r:.80}; write it as [Remove('chair')]")
+            object.__setattr__(self, name, tuple(edits))
 
     def __repr__(self) -> str:
         undone = f"; {len(self.undone)} undone" if self.undone else ""
-        shown = (
-            f": {cut(', '.join(map(repr, self.edits[:9])) + (', ...' if len(self) > 9 else ''), 140)}"
-            if self.edits
-            else ""
-        )
-        return f"EditList({len(self)} edits{shown}{undone})"
+        edits = ", ".join(map(repr, self.edits[:9])) + (", ..." if len(self) > 9 else "")
+        return f"EditList({len(self)} edits{': ' + cut(edits, 140) if edits else ''}{undone})"
 
     def __len__(self) -> int:
         return len(self.edits)
@@ -102,7 +93,7 @@ class EditList:
             raise ValueError("undone: expected an edit to redo, got none; undo() one first, and then() forgets them")
         return EditList((*self.edits, self.undone[-1]), self.undone[:-1])
 
-    def apply(self, splats: SplatFile) -> SplatFile:
+    def apply(self, gaussians: Gaussians) -> Gaussians:
         """The cloud after all edits.
 
         Raises:
@@ -111,10 +102,10 @@ class EditList:
         """
         for i, edit in enumerate(self.edits):
             try:
-                splats = edit.apply(splats)
+                gaussians = edit.apply(gaussians)
             except ValueError as error:
                 raise EditError(i, edit, error) from error
-        return splats
+        return gaussians
 
     def save(self, path: str | Path) -> Path:
         """Write the list as JSON, undone edits included.
@@ -126,14 +117,9 @@ class EditList:
             ValueError: if an insert holds a cloud in memory.
         """
         path = as_path(path)
-        write_json(
-            path,
-            {"format": FORMAT, "version": VERSION}
-            | {
-                name: [_written(edit, f"{name}[{i}]", path.parent) for i, edit in enumerate(edits)]
-                for name, edits in (("edits", self.edits), ("undone", self.undone))
-            },
-        )
+        lists = {"edits": self.edits, "undone": self.undone}
+        content = {name: [_written(edit, path.parent) for edit in edits] for name, edits in lists.items()}
+        write_json(path, {"format": FORMAT, "version": VERSION, **content})
         return path
 
     @staticmethod
@@ -150,76 +136,33 @@ class EditList:
                 message names the place in the file.
         """
         path = as_path(path)
-        return EditList.from_json(read_json(path), str(path), path.parent, anywhere=anywhere)
-
-    @staticmethod
-    def from_json(content: Any, name: str, folder: str | Path = ".", *, anywhere: bool = False) -> EditList:
-        """The list from what `save` wrote, already parsed.
-
-        Args:
-            content: the JSON object.
-            name: of its file or argument, for messages.
-            folder: paths of files to insert are relative to it.
-            anywhere: as in `load`.
-
-        Raises:
-            FileNotFoundError: if a file to insert is missing.
-            ValueError: as in `load`.
-        """
-        if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise ValueError(f"{name}: expected edits that kfgs saved ('format': {FORMAT!r}), got something else")
-        if type(content.get("version")) is not int or content["version"] != VERSION:  # True and 1.0 equal 1
+        content = read_json(path)
+        if not isinstance(content, dict) or content.get("format") != FORMAT or content.get("version") != VERSION:
             raise ValueError(
-                f"{name}: expected version {VERSION} of {FORMAT}, got {content.get('version')!r:.80}; install the kfgs "
-                "that wrote it"
+                f"{path}: expected edits that kfgs saved ('format': {FORMAT!r}, 'version': {VERSION}), got something else"
             )
-        unknown = sorted(set(content) - {"format", "version", "edits", "undone"})
-        if unknown:
-            raise ValueError(f"{name}: expected 'edits' and 'undone', got {unknown[0]!r:.80}; correct or delete it")
-        lists = {}
-        for key in ("edits", "undone"):
-            values = content.get(key, [])
-            if not isinstance(values, list) or (key == "edits" and key not in content):
-                raise ValueError(f"{name}: {key}: expected a list of edits, got {values!r:.80}; write it as [...]")
-            try:
-                lists[key] = tuple(_read(v, f"{key}[{i}]", as_path(folder), anywhere) for i, v in enumerate(values))
-            except FileNotFoundError as error:
-                raise FileNotFoundError(f"{name}: {error}") from error
-            except ValueError as error:
-                raise ValueError(f"{name}: {error}") from error
-        return EditList(**lists)
+        try:
+            lists = {name: read_edits(content.get(name, []), name) for name in ("edits", "undone")}
+            return EditList(**{
+                name: tuple(_located(edit, f"{name}[{i}]", path.parent, anywhere) for i, edit in enumerate(edits))
+                for name, edits in lists.items()
+            })  # fmt: skip
+        except FileNotFoundError as error:
+            raise FileNotFoundError(f"{path}: {error}") from error
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
 
 
-def _names() -> str:
-    return ", ".join(kind.__name__ for kind in OPS.values())
+def read_edits(values: Any, name: str = "edits") -> tuple[Edit, ...]:
+    """Edits from plain values (`Edit.to_json`) that anyone may have written; a ValueError begins with their place, `name`."""
+    if not isinstance(values, list):
+        raise ValueError(f"{name}: expected a list of edits, got {values!r:.80}; write it as [...]")
+    return tuple(read_object(f"{name}[{i}]", value, OPS, "op") for i, value in enumerate(values))
 
 
-def _written(edit: Edit, name: str, folder: Path) -> dict[str, Any]:
-    try:
-        return (edit.seen_from(folder) if isinstance(edit, Insert) else edit).to_json()
-    except ValueError as error:
-        raise ValueError(f"{name}.{error}") from error
+def _written(edit: Edit, folder: Path) -> dict[str, Any]:
+    return (edit.seen_from(folder) if isinstance(edit, Insert) else edit).to_json()
 
 
-def _read(value: Any, name: str, folder: Path, anywhere: bool) -> Edit:
-    op = value.get("op") if isinstance(value, dict) else None
-    if not isinstance(op, str) or op not in OPS:
-        raise ValueError(
-            f"{name}: expected an edit whose 'op' is one of {', '.join(OPS)}, got {value!r:.80}; correct it"
-        )
-    members = checked_object(name, value, OPS[op], "op")
-    if isinstance(members.get("where"), dict):
-        members["where"] = Where.from_json(members["where"], f"{name}.where")
-    if isinstance(members.get("rotation"), dict):
-        members["rotation"] = _read_turn(members["rotation"], f"{name}.rotation")
-    if "source" in members:
-        members["source"] = read_source(members["source"], f"{name}.source", folder, anywhere)
-    if "similarity" in members:
-        members["similarity"] = read_similarity(members["similarity"], f"{name}.similarity")
-    return build(name, OPS[op], members)
-
-
-def _read_turn(value: dict[str, Any], name: str) -> Turn:
-    if set(value) != {"axis", "degrees"}:
-        raise ValueError(f"{name}: expected axis and degrees, got {', '.join(value) or 'nothing'}; write both")
-    return build(name, Turn, value)
+def _located(edit: Edit, name: str, folder: Path, anywhere: bool) -> Edit:
+    return edit.found_in(folder, name, anywhere=anywhere) if isinstance(edit, Insert) else edit

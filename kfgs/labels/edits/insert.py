@@ -1,23 +1,25 @@
-"""The edit that adds the Gaussians of another splat file."""
+"""The edit that adds the Gaussians of another splat file, and how two clouds are joined."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
+from torch import Tensor
 
+from ..._check import as_tensor
 from ..._files import real_path
 from ...cameras.similarity import Similarity
-from ...formats.splat_file import SplatFile
 from ...formats.table import read_splats
-from .._json import number_of, numbers_of
-from .edit import Edit
-from .merge import join
-from .motion import transformed
+from ...gaussians import Gaussians
+from ..where import set_fields
+from .edit import Edit, class_name
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,23 +31,17 @@ class Insert(Edit):
     """
 
     op: ClassVar[str] = "insert"
-    source: str | Path | SplatFile
+    source: str | Path | Gaussians
     """A splat file of any known format, or a cloud in memory (which JSON cannot hold)."""
     similarity: Similarity | None = None
-    """From the axes of the source to those of the scene; None: both have the same axes."""
+    """From the axes of the source to those of the scene, also as a matrix [4, 4]; None: both have the same axes."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.source, str | Path | SplatFile) or self.source == "":
-            raise TypeError(
-                f"source: expected a path or a SplatFile, got {self.source!r:.80}; wrap Gaussians in SplatFile(...)"
-            )
-        if not isinstance(self.source, SplatFile):
-            _check_path("source", os.fspath(self.source))
+        if not isinstance(self.source, str | Path | Gaussians) or self.source == "":
+            raise TypeError(f"source: expected a path or Gaussians, got {self.source!r:.80}; pass one of them")
         if self.similarity is not None and not isinstance(self.similarity, Similarity):
-            raise TypeError(
-                f"similarity: expected a Similarity, got {type(self.similarity).__name__}; build one with "
-                "Similarity(scale, rotation, translation) or Similarity.from_matrix"
-            )
+            matrix = as_tensor("similarity", self.similarity, floating=True).double()
+            set_fields(self, similarity=Similarity.from_matrix(matrix))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Insert) and self._key() == other._key()
@@ -54,101 +50,139 @@ class Insert(Edit):
         return hash(self._key()[0])
 
     def _key(self) -> tuple[Any, Any]:
-        source = id(self.source) if isinstance(self.source, SplatFile) else os.path.realpath(self.source)
-        return source, _similarity_json(self.similarity)
+        source = id(self.source) if isinstance(self.source, Gaussians) else os.path.realpath(self.source)
+        return source, None if self.similarity is None else self.similarity.matrix().tolist()
 
-    def apply(self, splats: SplatFile) -> SplatFile:
+    def apply(self, gaussians: Gaussians) -> Gaussians:
         """See `Edit.apply`; reads the file if it is one."""
-        part = self.source if isinstance(self.source, SplatFile) else read_splats(self.source)
+        from .motion import transformed
+
+        part = self.source if isinstance(self.source, Gaussians) else read_splats(self.source)
         if self.similarity is not None:
-            part = part.replace(gaussians=transformed(part.gaussians, self.similarity, splats.gaussians.origin))
-        return join(splats, part)
+            part = transformed(part, self.similarity, gaussians.origin)
+        return join(gaussians, part)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values that JSON can hold; see `Edit.to_json`.
+        """See `Edit.to_json`.
 
         Raises:
             ValueError: if the source is a cloud in memory.
         """
-        if isinstance(self.source, SplatFile):
+        if isinstance(self.source, Gaussians):
             raise ValueError(
-                "source: expected a path to save this edit, got a SplatFile in memory; write it with write_splats and "
+                "source: expected a path to save this edit, got Gaussians in memory; write them with write_splats and "
                 "insert the file"
             )
-        return {"op": self.op, "source": os.fspath(self.source), "similarity": _similarity_json(self.similarity)}
+        matrix = {} if self.similarity is None else {"similarity": self.similarity.matrix().tolist()}
+        return {"op": self.op, "source": os.fspath(self.source), **matrix}
 
     def seen_from(self, folder: Path) -> Insert:
         """The same edit with its path relative to the folder if it lies in it, else in full."""
-        if isinstance(self.source, SplatFile):
+        if isinstance(self.source, Gaussians):
             return self
         path, folder = real_path(self.source), real_path(folder)
         inside = path.is_relative_to(folder)
         return replace(self, source=path.relative_to(folder).as_posix() if inside else str(path))
 
+    def found_in(self, folder: Path, name: str, *, anywhere: bool) -> Insert:
+        """The same edit of a saved list, with its path completed by the folder of the list.
 
-def read_similarity(value: Any, name: str) -> Similarity | None:
-    """Read what `Insert.to_json` wrote. Raises a ValueError if it is something else, or not a similarity."""
-    if value is None:
-        return None
-    needed = {"scale", "rotation", "translation"}
-    if not isinstance(value, Mapping) or set(value) != needed or not _is_matrix(value["rotation"]):
-        raise ValueError(
-            f"{name}: expected scale, rotation [[3], [3], [3]] and translation [3], got {value!r:.80}; write all three"
-        )
-    try:
-        rotation = torch.tensor([numbers_of("rotation", row, 3) for row in value["rotation"]], dtype=torch.float64)
-        translation = torch.tensor(numbers_of("translation", value["translation"], 3), dtype=torch.float64)
-        return Similarity(number_of("scale", value["scale"]), rotation, translation)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}.{error}") from error
+        Raises:
+            ValueError: if the file lies outside that folder (an absolute path, `..`, a link), unless `anywhere`.
+            FileNotFoundError: if there is no such file.
+        """
+        assert not isinstance(self.source, Gaussians)
+        path = folder / self.source
+        if not anywhere and not Path(os.path.realpath(path)).is_relative_to(real_path(folder)):
+            raise ValueError(
+                f"{name}.source: expected a file in {folder} or below, got {str(self.source)!r:.200}; copy it there, or load "
+                "with anywhere=True if you trust these edits"
+            )
+        if not os.path.exists(path):
+            raise FileNotFoundError(f"{name}.source: expected a splat file at {path!s:.400}, got none; put it there")
+        return replace(self, source=path)
 
 
-def read_source(value: Any, name: str, folder: Path, anywhere: bool) -> Path:
-    """The file that a saved edit names. Unless `anywhere`, it must lie in the folder of the edits or below.
+def join(first: Gaussians, second: Gaussians) -> Gaussians:
+    """The Gaussians of two clouds, the first before the second; dtype, device, origin and rendering are those of the first.
+
+    - Spherical harmonics: the lower degree is padded with zeros, which changes no colour.
+    - Labels: classes with the same name are the same class. If the first cloud has the name twice, the lowest label is
+      used. New names that occur are added after those of the first. A class without a name is called `class 7` if the
+      other cloud has names; if neither has names, indices are kept.
+    - If one cloud lacks them: labels become -1 (none); scores, features and other columns 0.
 
     Raises:
-        ValueError: if it is not a path, leads out of the folder (an absolute path, `..`, a link), or is a folder without a
-            `meta.json` (an unpacked SOG).
-        FileNotFoundError: if there is no such file.
+        ValueError: if one has colours and the other has none, or their features have different channels.
     """
-    if not isinstance(value, str) or not value:
-        raise ValueError(f"{name}: expected the path of a splat file, got {value!r:.80}; write it as a string")
-    _check_path(name, value)
-    parts = PurePosixPath(value).parts + PureWindowsPath(value).parts
-    rooted = PurePosixPath(value).is_absolute() or bool(PureWindowsPath(value).drive or PureWindowsPath(value).root)
-    path = folder / value
-    real = Path(os.path.realpath(path))  # unlike resolve(), also of a name that no file system takes
-    if not anywhere and (rooted or ".." in parts or not real.is_relative_to(real_path(folder))):
+    second = second.with_origin(first.origin)
+    if (first.sh is None) != (second.sh is None):
+        which = "the scene" if first.sh is None else "what is inserted"
         raise ValueError(
-            f"{name}: expected a file in {folder} or below, got {value!r:.200}; copy it there, or load with "
-            "anywhere=True if you trust these edits"
+            f"sh: expected colours in both clouds, got none in {which}; choose one with colours (in Python: or add them with "
+            "gaussians.replace())"
         )
-    if not os.path.exists(path):
-        raise FileNotFoundError(f"{name}: expected a splat file at {path!s:.400}, got none; put it there")
-    if path.is_dir() and not (path / "meta.json").is_file():
-        raise ValueError(f"{name}: expected a splat file at {path!s:.400}, got a folder; name the file in it")
-    return path
+    if (
+        first.features is not None
+        and second.features is not None
+        and first.features.shape[1] != second.features.shape[1]
+    ):
+        raise ValueError(
+            f"features: expected as many channels in both clouds, got {first.features.shape[1]} and "
+            f"{second.features.shape[1]}; insert a splat without features"
+        )
+    if first.antialiased != second.antialiased:
+        how = ("fainter", "with") if first.antialiased else ("more opaque", "without")
+        warnings.warn(
+            f"insert: what is smaller than a pixel looks {how[0]} than in its own file: all is drawn {how[1]} antialiasing, as "
+            "the scene is",
+            stacklevel=2,
+        )
+    labels, names = _joined_labels(first, second)
+    rows = {name: _padded(getattr(first, name), getattr(second, name), first, second) for name in JOINED}
+    extra = {}
+    for name in {**first.extra, **second.extra}:
+        columns = [cloud.extra.get(name) for cloud in (first, second)]
+        dtype = np.result_type(*[column for column in columns if column is not None])
+        filled = [
+            np.zeros(len(cloud), dtype) if column is None else column
+            for cloud, column in zip((first, second), columns, strict=True)
+        ]
+        extra[name] = np.concatenate(filled)
+    return first.replace(**rows, labels=labels, names=names, extra=extra)
 
 
-def _check_path(name: str, value: str) -> None:
-    """Raise a ValueError if no file system could hold a file of that name."""
-    try:
-        usable = b"\0" not in os.fsencode(value)
-    except UnicodeEncodeError:  # half a surrogate pair, which JSON can write
-        usable = False
-    if not usable:
-        raise ValueError(f"{name}: expected the path of a splat file, got {value!r:.80}; rename the file")
+JOINED = ("means", "quats", "scales", "opacities", "sh", "features", "scores")
 
 
-def _is_matrix(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 3
-
-
-def _similarity_json(similarity: Similarity | None) -> dict[str, Any] | None:
-    if similarity is None:
+def _padded(a: Tensor | None, b: Tensor | None, first: Gaussians, second: Gaussians) -> Tensor | None:
+    """One tensor of both clouds; zeros where a cloud has none, or has fewer harmonics."""
+    if a is None and b is None:
         return None
-    return {
-        "scale": similarity.scale,
-        "rotation": similarity.rotation.tolist(),
-        "translation": similarity.translation.tolist(),
-    }
+    like = b if a is None else a
+    parts = [
+        torch.zeros(len(cloud), *like.shape[1:]) if part is None else part for cloud, part in ((first, a), (second, b))
+    ]
+    if like.ndim == 3:
+        most = max(part.shape[1] for part in parts)
+        parts = [torch.nn.functional.pad(part, (0, 0, 0, most - part.shape[1])) for part in parts]
+    return torch.cat([part.to(first.means) for part in parts])
+
+
+def _joined_labels(first: Gaussians, second: Gaussians) -> tuple[Tensor | None, Sequence[str]]:
+    if first.labels is None and second.labels is None:
+        return None, first.names
+    device = first.means.device
+    old, new = (torch.full((len(cloud),), -1) if cloud.labels is None else cloud.labels for cloud in (first, second))
+    old, new = old.to(device), new.to(device)
+    if not first.names and not second.names:
+        return torch.cat([old, new]), ()
+    highest = int(old.max()) if len(old) else -1
+    names = [class_name(first.names, i) for i in range(max(len(first.names), highest + 1))]
+    renamed = new.clone()
+    for label in torch.unique(new[new >= 0]).tolist():
+        name = class_name(second.names, label)
+        if name not in names:
+            names.append(name)
+        renamed[new == label] = names.index(name)
+    return torch.cat([old, renamed]), tuple(names)
