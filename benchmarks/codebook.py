@@ -59,7 +59,7 @@ def main() -> None:
     cameras, stems = {scene.stem(i): scene.cameras[i] for i in test}, [scene.stem(i) for i in test]
     maps = MapsOn(FeatureFolder(args.maps).of(scene, "train"), args.device)
     truth = true_labels(scene, args.scene / args.truth, "test")
-    splat = None if args.splat is None else read_splats(args.splat).gaussians.to(args.device)
+    splat = None if args.splat is None else read_splats(args.splat).to(args.device)
     seen_in_2d = all(any(args.maps.glob(f"{stem}[._]*")) for stem in stems)
     test_maps = MapsOn(FeatureFolder(args.maps).of(scene, "test"), args.device) if seen_in_2d else None
 

@@ -14,7 +14,6 @@ import torch
 from PIL import Image
 
 from kfgs import read_splats
-from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
 from kfgs.labels import EditList, InBox, OfClass, Recolor, Remove, Where, connected_parts
 from kfgs.pipeline.compare import render_color
@@ -39,10 +38,10 @@ def draw(path: Path, scene: Scene, views: list[str], clouds: dict[str, Gaussians
     print(f"wrote {path} ({sheet.width}x{sheet.height})")
 
 
-def removals(before: SplatFile) -> dict[str, Gaussians]:
+def removals(before: Gaussians) -> dict[str, Gaussians]:
     """The chairs by name, then all else in their boxes: cushions, and specks of them that carry another label."""
     chairs = connected_parts(before.gaussians, OfClass("chair").select(before))
-    rug = before.gaussians.means[before.gaussians.labels == before.classes.index("rug")]  # the chairs stand on it
+    rug = before.gaussians.means[before.gaussians.labels == before.names.index("rug")]  # the chairs stand on it
     lowest = float(rug[:, 2].median()) + ABOVE_RUG  # z points up; feet reach below their chair's Gaussians
     boxes: list[Where] = []
     for chair in chairs:
@@ -63,7 +62,7 @@ def removals(before: SplatFile) -> dict[str, Gaussians]:
     }
 
 
-def recolors(before: SplatFile) -> dict[str, Gaussians]:
+def recolors(before: Gaussians) -> dict[str, Gaussians]:
     """The plant by name, then with the petals in its box that carry another label."""
     plant = connected_parts(before.gaussians, OfClass("plant").select(before))[0]
     print(plant)

@@ -22,7 +22,6 @@ from torch import Tensor
 from kfgs import SemanticField, attach, load_label_set, load_scene, read_splats
 from kfgs.cameras import Camera, undistort_labels
 from kfgs.evaluation import load_label_map
-from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
 from kfgs.labels import EditList, LabelSet, Recolor, Remove, average_views, transfer_labels, vote_labels
 from kfgs.scenes import Scene
@@ -46,39 +45,40 @@ def miou(labels: Tensor, truth: Tensor, classes: int, weights: Tensor) -> float:
 def compare_rules(
     field: SemanticField, cloud: Gaussians, truth: Tensor, weights: Tensor, classes: LabelSet, cameras: list[Camera]
 ) -> None:
-    """Print how well each rule of `transfer_labels` carries the semantic Gaussians' classes."""
+    """Print how well `transfer_labels` carries the semantic Gaussians' classes."""
     print(f"{'semantic Gaussians by':24s} {'rule':12s}  mIoU  weighted  without label")
     sources = {
         "what the views show": field.classify(classes).labels,
         "own latents (Sec. 3.4)": field.paper.classify(classes).labels,
     }
     for who, labels in sources.items():
-        for method in ("nearest", "vote", "mahalanobis"):
-            found = transfer_labels(field.gaussians, labels, cloud, method=method)
-            scores = [miou(found.labels, truth, len(classes), w) for w in (torch.ones_like(weights), weights)]
-            print(f"{who:24s} {method:12s} {scores[0]:5.1f}  {scores[1]:8.1f}  {found.orphaned / len(cloud):8.1%}")
+        carried = transfer_labels(field.gaussians.replace(labels=labels), cloud).labels
+        assert carried is not None
+        scores = [miou(carried, truth, len(classes), w) for w in (torch.ones_like(weights), weights)]
+        without = float((carried < 0).float().mean())
+        print(f"{who:24s} {'nearest':12s} {scores[0]:5.1f}  {scores[1]:8.1f}  {without:8.1%}")
 
 
 def compare_views(
-    field: SemanticField, splats: SplatFile, truth: Tensor, weights: Tensor, classes: LabelSet, cameras: list[Camera]
-) -> SplatFile:
+    field: SemanticField, splats: Gaussians, truth: Tensor, weights: Tensor, classes: LabelSet, cameras: list[Camera]
+) -> Gaussians:
     """The same for `attach(by="views")`; the labelled splat."""
     found = attach(field, splats, classes, cameras=cameras, by="views")
     scores = [miou(found.labels, truth, len(classes), w) for w in (torch.ones_like(weights), weights)]
     none = float((found.labels < 0).float().mean())
     print(f"{'attach by views':24s} {'-':12s} {scores[0]:5.1f}  {scores[1]:8.1f}  {none:8.1%}")
-    return found.splats
+    return found.gaussians
 
 
-def edit_every_class(splats: SplatFile, folder: Path) -> None:
+def edit_every_class(splats: Gaussians, folder: Path) -> None:
     """Print the removal and the recolouring of each class of the toy room."""
     print(
         "\nclass      gone: pixels surface | kept: pixels (off border) surface | pass | recolour: dB outside, hue inside"
     )
-    before = splats.gaussians
-    for name in splats.classes:
-        removed = score_removal(before, EditList().then(Remove(name)).apply(splats).gaussians, folder, name)
-        painted = EditList().then(Recolor(name, BLUE)).apply(splats).gaussians
+    before = splats
+    for name in splats.names:
+        removed = score_removal(before, EditList().then(Remove(name)).apply(splats), folder, name)
+        painted = EditList().then(Recolor(name, BLUE)).apply(splats)
         colored = score_recolor(before, painted, folder, name, BLUE)
         print(
             f"{name:10s}       {removed.gone_pixels:.3f}   {removed.gone_points:.3f} |       {removed.untouched_pixels:.3f} "
@@ -101,10 +101,10 @@ def toy(demo: Path) -> None:
     field, splats = SemanticField.load(demo / "run" / "field.kfgs"), read_splats(demo / "run" / "color.ply")
     cameras = [scene.cameras[i] for i in scene.views("train")]
     with np.load(folder / "surface.npz") as surface:
-        distance, nearest = cKDTree(surface["points"]).query(splats.gaussians.means.numpy())
+        distance, nearest = cKDTree(surface["points"]).query(splats.means.numpy())
         truth = torch.from_numpy(np.where(distance < REACH, surface["labels"][nearest].astype(np.int64), -1))
-    weights = splats.gaussians.opacities
-    compare_rules(field, splats.gaussians, truth, weights, classes, cameras)
+    weights = splats.opacities
+    compare_rules(field, splats, truth, weights, classes, cameras)
     edit_every_class(compare_views(field, splats, truth, weights, classes, cameras), folder)
 
 
@@ -114,9 +114,9 @@ def real(folder: Path, field_path: Path, color: Path) -> None:
     classes = load_label_set(folder / "classes.json", folder / "text.npy")
     field, splats = SemanticField.load(field_path), read_splats(color)
     cameras = [scene.cameras[i] for i in scene.views("train")]
-    truth = vote_labels(splats.gaussians, labelled_views(scene, folder / "labels"), len(classes), min_share=0.0).labels
-    shown = average_views(splats.gaussians, ((camera, torch.ones(*camera.size, 1)) for camera in cameras)).weights
-    compare_rules(field, splats.gaussians, truth, shown, classes, cameras)
+    truth = vote_labels(splats, labelled_views(scene, folder / "labels"), len(classes), min_share=0.0).labels
+    shown = average_views(splats, ((camera, torch.ones(*camera.size, 1)) for camera in cameras)).weights
+    compare_rules(field, splats, truth, shown, classes, cameras)
     compare_views(field, splats, truth, shown, classes, cameras)
 
 

@@ -145,7 +145,7 @@ def main() -> None:
     except (FileNotFoundError, ValueError) as error:
         print(f"teacher: not scored ({str(error).splitlines()[0][:80]})")
     if args.uplift and args.splat is not None:
-        splat = read_splats(args.splat).gaussians.to(args.device)
+        splat = read_splats(args.splat).to(args.device)
         for corrections in (0, 1):
             field, seconds = uplifted(room, splat, corrections)
             miou, accuracy = room.score(field)

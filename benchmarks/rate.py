@@ -28,7 +28,6 @@ from kfgs.evaluation.method import View, label_view
 from kfgs.fields import Linear
 from kfgs.fields.packing import SMALL, Rounding
 from kfgs.fields.store import SUFFIX
-from kfgs.formats import SplatFile
 from kfgs.pipeline import true_labels
 from kfgs.quant import LinearLatents
 
@@ -128,9 +127,9 @@ def carried(room: Room, field: SemanticField, out: Path) -> list[Point]:
     for ending in ("ply", "spz", "sog"):
         path = out / f"field.{ending}"
         held = cloud if ending == "ply" else cloud.replace(features=None)
-        written = write_splats(path, SplatFile(held, classes=tuple(room.classes.names)))
+        written = write_splats(held.replace(names=tuple(room.classes.names)), path)
         splats, took = quickest(lambda path=path: read_splats(path))
-        back, order = splats.gaussians, written.order
+        back, order = splats, written.order
         own = [one for one in written.paths if not one.name.endswith(".classes.json")]
         bare = out / "basis.safetensors"
         if ending == "ply":

@@ -149,7 +149,7 @@ def uplift(args: argparse.Namespace) -> str:
     """Maps and Gaussians to a field."""
     scene, maps = load_scene(args.scene).undistorted(), FeatureFolder(args.folder / "maps")
     cameras = [scene.cameras[i % len(scene.cameras)] for i in range(len(maps))]
-    splat, config = read_splats(args.splat).gaussians, UpliftConfig.field()
+    splat, config = read_splats(args.splat), UpliftConfig.field()
     if args.device.type == "cuda":  # the stage of `kfgs fit` fuses on the CPU
         gaussians = uplift_maps(
             splat.to(args.device), cameras, maps, config, progress=True, report=print_line

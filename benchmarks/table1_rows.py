@@ -219,7 +219,7 @@ def peak_memory() -> int:
 def make_baseline(row: Row, room: Room, request: dict[str, Any], folder: Path) -> Made:
     """Fit a baseline on the frozen splat, and keep what it needs in a file."""
     cameras = [room.scene.cameras[i] for i in room.scene.views("train")]
-    geometry = read_splats(request["splat"]).gaussians
+    geometry = read_splats(request["splat"])
     task = Task(geometry, cameras, room.maps, seed=request["seed"])
     fitted: Fitted = row.module.fit(task, baseline_config(row, request["preset"]))
     file = folder / "semantics.safetensors"

@@ -65,9 +65,9 @@ def main() -> None:
     folder = args.out / f"blocks{args.seed}"
     blocks = split_scene(town, folder, args.blocks, splat=splat)
     began, facts = time.perf_counter(), []
-    everything = len(read_splats(splat).gaussians)
+    everything = len(read_splats(splat))
     for block in blocks:
-        share = len(read_splats(folder / block.name / "splat.ply").gaussians) / everything
+        share = len(read_splats(folder / block.name / "splat.ply")) / everything
         facts.append(
             _apart(_fit_block, folder / block.name, FitConfig(uplift=UpliftConfig(max_gaussians=int(total * share))))
         )

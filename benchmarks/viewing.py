@@ -27,7 +27,6 @@ from pathlib import Path  # noqa: E402
 import torch  # noqa: E402
 from transfer import room  # noqa: E402
 
-from kfgs.formats import SplatFile  # noqa: E402
 from kfgs.viewer import Exploration, ExploreOptions, Explorer, SplatMeaning  # noqa: E402
 
 SEMANTIC = 20_000
@@ -76,7 +75,7 @@ def measure(size: int, turns: int, out: Path) -> tuple[list[str], str]:
     semantic = semantic.replace(labels=patches % len(NAMES))
     scores = torch.rand(SEMANTIC, generator=torch.Generator().manual_seed(2)).numpy()
     began = time.perf_counter()
-    state = Exploration(SplatMeaning(SplatFile(semantic, {"score": scores}, NAMES)), color)
+    state = Exploration(SplatMeaning(semantic.replace(scores=scores, names=NAMES)), color)
     explorer = Explorer(state, ExploreOptions(out=out), off_screen=True)
     explorer.screenshot()
     opened = time.perf_counter() - began

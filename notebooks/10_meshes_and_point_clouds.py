@@ -47,7 +47,7 @@ quick = kfgs.ColorConfig.quick()
 quick = replace(quick, field=replace(quick.field.with_steps(800), max_gaussians=60_000))
 color = kfgs.fit_color(scene, run, quick).gaussians  # the same fields as in notebooks 4 to 6
 field = kfgs.fit_scene(scene, maps, run, kfgs.FitConfig.cpu(), splat=color).field
-splat = kfgs.attach(field, kfgs.SplatFile(color), classes).splats  # the colour splat with a class for each Gaussian
+splat = kfgs.attach(field, color, classes).splats  # the colour splat with a class for each Gaussian
 print(splat)
 
 # %% [markdown]

@@ -84,7 +84,7 @@ print(field.summary())
 k = 2
 camera, image = scene.cameras[test[k]], scene.image(test[k])
 test_maps = kfgs.FeatureFolder(features).of(scene, "test")
-colored = kfgs.read_splats(run / "color.ply").gaussians
+colored = kfgs.read_splats(run / "color.ply")
 print(f"{len(colored):,} Gaussians, PSNR on unseen views: {kfgs.score_views(colored, scene).psnr.value:.1f} dB")
 drawn = viz.show_cloud(colored, background="black", color_by="rgb")(camera)
 row = [image, drawn, colors(unit(field.feature_map(camera))), colors(unit(test_maps[k]))]

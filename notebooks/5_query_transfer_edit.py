@@ -152,7 +152,7 @@ one = kfgs.EditList().then(kfgs.Recolor(OfClass(thing) & InBox(low, high), "teal
 states = {"before": one.undo(), f"one {thing} painted": one}
 view = cameras[things[0].best_view.index]
 row = [viz.show_cloud(edit.apply(labelled).gaussians, **picture)(view) for edit in states.values()]
-written = kfgs.write_splats(out / "edited.ply", edited)
+written = kfgs.write_splats(edited, out / "edited.ply")
 print([path.name for path in written.paths])
 Image.fromarray(viz.picture_grid([row], list(states), width=320))
 

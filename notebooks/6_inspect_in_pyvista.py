@@ -41,7 +41,7 @@ maps = kfgs.FeatureFolder(features).of(scene, "train")
 quick = kfgs.ColorConfig.quick()
 quick = replace(quick, field=replace(quick.field.with_steps(800), max_gaussians=60_000))
 field = kfgs.fit_scene(scene, maps, run, kfgs.FitConfig.cpu(color=quick)).field  # notebook 4 explains it
-color = kfgs.read_splats(run / "color.ply").gaussians
+color = kfgs.read_splats(run / "color.ply")
 semantic = field.label(classes)
 print(f"{len(semantic):,} semantic Gaussians, {len(color):,} of colour")
 

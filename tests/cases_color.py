@@ -39,5 +39,5 @@ def make_splat(room: Path, path: Path) -> Path:
     cloud, labels = surface(room)
     shade = 1 - 0.3 * torch.rand(len(labels), 1, generator=torch.Generator().manual_seed(0))
     rgb = torch.from_numpy(palette(labels)).float() / 255 * shade
-    write_splats(path, cloud.replace(sh=((rgb - 0.5) / SH0)[:, None]))
+    write_splats(cloud.replace(sh=((rgb - 0.5) / SH0)[:, None]), path)
     return path

@@ -9,7 +9,6 @@ import torch
 from kfgs._rows import unit_rows
 from kfgs.cameras import Camera
 from kfgs.fields import Autoencoded, Codewords, Identity, Linear, SemanticField
-from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
 from kfgs.labels import LabelSet
 from kfgs.quant.autoencoder import Autoencoder
@@ -137,7 +136,7 @@ def grid_clouds(seed=0, sources=150, targets=400):
 
 
 def splat_file(gaussians, score=None):
-    return SplatFile(gaussians, {} if score is None else {"score": score}, NAMES)
+    return gaussians.replace(extra={} if score is None else {"score": score}, names=NAMES)
 
 
 def grid(score=None, **options):

@@ -5,8 +5,8 @@ import struct
 
 import torch
 
+from kfgs import Gaussians
 from kfgs.formats import write_splats
-from kfgs.gaussians import Gaussians
 
 KHR = "KHR_gaussian_splatting"
 
@@ -33,7 +33,7 @@ def json_of_glb(path) -> dict:
 def bent_gltf(tmp_path, cloud=None, **changes):
     """A .gltf of ours with parts of its JSON exchanged: `changes` maps a dotted path to a value (None deletes)."""
     path = tmp_path / "bent.gltf"
-    write_splats(path, random_cloud(5, 1) if cloud is None else cloud)
+    write_splats(random_cloud(5, 1) if cloud is None else cloud, path)
     root = json.loads(path.read_text())
     for dotted, value in changes.items():
         *above, last = [int(word) if word.isdigit() else word for word in dotted.split("/")]

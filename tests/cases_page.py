@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
 from kfgs.viewer import Exploration, ExploreOptions, Explorer, SplatMeaning
 
@@ -34,7 +33,7 @@ def exploration(names=NAMES):
     """Semantic Gaussians on spheres of radius 0.3, colour ones on spheres of 0.6: some are within 0.32, all within 1."""
     semantic = _cloud(60, 0.3, 1, labels=True)
     score = np.linspace(0.05, 0.95, len(semantic), dtype=np.float32)
-    file = SplatFile(semantic, extra={"score": score}, classes=names)
+    file = semantic.replace(scores=score, names=names)
     return Exploration(SplatMeaning(file), _cloud(150, 0.6, 2), distance=0.4)
 
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
 from kfgs.scenes import load_scene
 from kfgs.splat import rgb_to_sh0
@@ -152,6 +151,6 @@ def room_state(room: Path):
     semantic = surface[some].replace(labels=known)
     score = rand(len(semantic)).numpy().astype(np.float32)
     names = tuple(json.loads((room / "classes.json").read_text()))
-    file = SplatFile(semantic, {"score": score}, names)
+    file = semantic.replace(scores=score, names=names)
     cameras = load_scene(room).cameras
     return Exploration(SplatMeaning(file), color, cameras=cameras, distance=0.2)

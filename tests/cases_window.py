@@ -5,7 +5,6 @@ import math
 import torch
 from cases_viz import some_camera, some_gaussians
 
-from kfgs.formats import SplatFile
 from kfgs.splat.rasterize import rasterize
 from kfgs.viewer import ExploreOptions, Explorer
 from kfgs.viewer.meaning import SplatMeaning
@@ -21,7 +20,7 @@ def a_state(sides=2, **options):
     semantic = semantic.replace(sh=None)
     color = color.replace(features=None, labels=None)
     scores = torch.linspace(0.2, 1, len(semantic)).numpy()
-    meaning = SplatMeaning(SplatFile(semantic, {"score": scores}, NAMES))
+    meaning = SplatMeaning(semantic.replace(scores=scores, names=NAMES))
     return Exploration(meaning, color if sides == 2 else None, **options)
 
 

@@ -54,6 +54,16 @@ def a_crash_says_where(pytestconfig):
         faulthandler.enable(pytestconfig.kfgs_crashes)
 
 
+@pytest.fixture
+def notes():
+    """What readers note ("a.ply: 3 of 5 Gaussians ..."), as a list that grows."""
+    from kfgs._notes import hear
+
+    heard = []
+    with hear(heard.append):
+        yield heard
+
+
 def pytest_unconfigure():
     """Libraries that count their objects at the end find none left over."""
     gc.unfreeze()

@@ -5,7 +5,7 @@ import torch
 
 from kfgs import Gaussians
 from kfgs._files import read_json
-from kfgs.formats import SplatFile, write_splats
+from kfgs.formats import write_splats
 from kfgs.labels import load_label_set
 from kfgs.splat.sh import SH_C0
 
@@ -34,7 +34,7 @@ def save_splats(room, folder):
     red = ((torch.tensor([0.9, 0.1, 0.1]) - 0.5) / SH_C0).expand_as(cloud.sh)
     painted = cloud.replace(sh=torch.where(mine[:, None, None], red, cloud.sh))
     for name, one in (("before", cloud), ("removed", cloud.select(~mine)), ("painted", painted)):
-        write_splats(folder / f"{name}.ply", SplatFile(one.replace(labels=None)))
+        write_splats(one.replace(labels=None), folder / f"{name}.ply")
     text = load_label_set(room / "classes.json", room / "text.npy").embeddings
     np.save(folder / "features.npy", text[cloud.labels].numpy())
     return folder

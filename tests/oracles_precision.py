@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from kfgs.formats.splat_file import Precision
+from kfgs.formats.values import Precision
 from kfgs.gaussians import Gaussians
 
 

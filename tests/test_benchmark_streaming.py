@@ -35,7 +35,7 @@ def test_each_stage_is_measured_and_the_maps_stay_only_where_asked(tmp_path, mon
     scene, table = make_room(tmp_path / "scene"), tmp_path / "table.json"
     read = load_scene(scene)
     splat = GaussianParams.from_points(read.points, colors=read.colors, sh_degree=0).activated()
-    write_splats(tmp_path / "splat.ply", splat)
+    write_splats(splat, tmp_path / "splat.ply")
     options = [
         "--splat",
         str(tmp_path / "splat.ply"),

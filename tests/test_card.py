@@ -19,7 +19,6 @@ import kfgs
 from kfgs import Autoencoder, Camera, Codebook, Gaussians, SemanticField, rasterize
 from kfgs._card import LONGEST, html_card, short_repr, short_value
 from kfgs.fields import Autoencoded
-from kfgs.formats import SplatFile
 from kfgs.labels import LabelSet, Selection
 from kfgs.labels.edits import EditList, Remove
 from kfgs.quant import CodebookFit, LinearLatents, Nearest
@@ -84,7 +83,7 @@ def test_paths_and_rows_say_what_they_are():
 
 def test_long_content_makes_no_long_line():
     long = "a long name " * 40
-    splats = SplatFile(Gaussians(torch.rand(50, 3), torch.rand(50, 4), torch.rand(50, 3), torch.rand(50)))
+    splats = Gaussians(torch.rand(50, 3), torch.rand(50, 4), torch.rand(50, 3), torch.rand(50))
     engine = [
         Cloud(torch.rand(50, 3), torch.rand(50, 4), torch.rand(50, 3), torch.rand(50)),
         Pinhole(torch.eye(4), torch.eye(3), 4, 3, 0.2, 0.3),

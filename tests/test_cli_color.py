@@ -68,7 +68,7 @@ def colored(room, tmp_path_factory):
 
 
 def test_color_scores_the_views_held_out(colored, room):
-    gaussians = read_splats(colored / "color.ply").gaussians
+    gaussians = read_splats(colored / "color.ply")
     assert 500 < len(gaussians) <= 2000
     assert gaussians.sh.shape[1:] == (9, 3)
     scores = json.loads((colored / "scores.json").read_text())["color"]
@@ -133,7 +133,7 @@ def test_attach_by_distance_gives_each_gaussian_the_class_at_its_place(labelled,
     scene = load_scene(room).select("train")
     classes = load_label_set(room / "classes.json", room / "text.npy")
     semantic = fuse_views(SemanticField.load(field), scene.cameras).classify(classes).labels
-    assert torch.equal(torch.from_numpy(found.extra["score"] == 1), semantic >= 0)  # the same place: no distance
+    assert torch.equal(found.scores == 1, semantic >= 0)  # the same place: no distance
     assert torch.equal(found.gaussians.labels[semantic >= 0], semantic[semantic >= 0])
     assert found.classes == tuple(json.loads((room / "classes.json").read_text()))
     for name in ("means", "quats", "scales", "opacities", "sh"):
@@ -147,7 +147,7 @@ def test_attach_by_views_is_what_a_scene_does(field, splat, truth, room, tmp_pat
     assert "the frames agree" in said
     assert "votes of 6 segmented views" in said
     assert "got a class by the views" in said
-    found = read_splats(out).gaussians.labels
+    found = read_splats(out).labels
     counts = [
         f"  {name:<16s} {int((found == i).sum()):8d} Gaussians" for i, name in enumerate(read_splats(out).classes)
     ]
@@ -173,7 +173,7 @@ def test_select_counts_places_and_saves(labelled, room, tmp_path, capsys):
     out = tmp_path / "o"
     assert main(["select", "sofa", str(labelled), "--scene", str(room), "--out", str(out)]) == 0
     cloud = read_splats(labelled)
-    index = cloud.classes.index("sofa")
+    index = cloud.names.index("sofa")
     mask = cloud.gaussians.labels == index
     said = capsys.readouterr().out
     assert f"sofa: {int(mask.sum())} of 4000 Gaussians, label sofa" in said
@@ -209,16 +209,16 @@ def test_select_asks_a_field_by_text(field, truth, room, capsys):
 def test_select_by_score(labelled, tmp_path, capsys):
     cloud = read_splats(labelled)
     score = np.linspace(0, 1, len(cloud), dtype=np.float32)
-    write_splats(tmp_path / "a.ply", cloud.replace(extra={"score": score}))
+    write_splats(cloud.replace(scores=score), tmp_path / "a.ply")
     assert main(["select", "floor", str(tmp_path / "a.ply"), "--threshold", "0.5"]) == 0
-    expected = (cloud.gaussians.labels.numpy() == cloud.classes.index("floor")) & (score > 0.5)
+    expected = (cloud.gaussians.labels.numpy() == cloud.names.index("floor")) & (score > 0.5)
     assert f"floor: {expected.sum()} of 4000 Gaussians" in capsys.readouterr().out
 
 
 def by_name(path):
     """The cloud, and a mask for each class."""
     cloud = read_splats(path)
-    return cloud, {name: cloud.gaussians.labels == i for i, name in enumerate(cloud.classes)}
+    return cloud, {name: cloud.gaussians.labels == i for i, name in enumerate(cloud.names)}
 
 
 def test_edit_does_each_of_its_options(labelled, tmp_path, capsys):
@@ -376,7 +376,7 @@ def test_an_edit_that_no_view_shows_gets_no_picture(labelled, room, tmp_path, ca
 def test_everything_may_be_removed(labelled, room, tmp_path, capsys):
     cloud = read_splats(labelled)
     few = cloud.select(cloud.gaussians.labels == 5)
-    write_splats(tmp_path / "chairs.ply", few)
+    write_splats(few, tmp_path / "chairs.ply")
     arguments = ["edit", str(tmp_path / "chairs.ply"), "--out", str(tmp_path / "e.ply"), "--remove", "chair"]
     assert main([*arguments, "--scene", str(room), "--pictures", "1"]) == 0
     assert "nothing is left" in capsys.readouterr().out
@@ -389,7 +389,7 @@ def test_convert_keeps_classes(labelled, tmp_path, name, capsys):
     said = capsys.readouterr().out
     assert "KiB -> " in said
     before, after = read_splats(labelled), read_splats(tmp_path / "new" / name)
-    assert after.classes == before.classes
+    assert after.names == before.names
     counts = [torch.bincount(one.gaussians.labels + 1, minlength=14).tolist() for one in (before, after)]
     assert counts[0] == counts[1]
     for path in (tmp_path / "new").iterdir():
@@ -402,7 +402,7 @@ def test_convert_writes_a_plain_ply_with_the_classes_beside_it(labelled, tmp_pat
     assert f"{out}.labels.npz" in capsys.readouterr().out
     assert "class_id" not in read_ply(out)
     before, after = read_splats(labelled), read_splats(out)
-    assert after.classes == before.classes
+    assert after.names == before.names
     assert torch.equal(after.gaussians.labels, before.gaussians.labels)
 
 
@@ -421,7 +421,7 @@ def test_convert_writes_usd_with_an_object_for_each_class(labelled, tmp_path, wo
     prims = {one.GetAttribute("kfgs:class").Get(): one for one in stage.GetDefaultPrim().GetChildren()}
     assert {one.GetTypeName() for one in prims.values()} == {kind}
     counts = {name: len(one.GetAttribute("primvars:class_id").Get()) for name, one in prims.items()}
-    names = ["", *cloud.classes]
+    names = ["", *cloud.names]
     assert counts == {names[label + 1]: len(part) for label, part in cloud.by_class().items()}
 
 
@@ -448,7 +448,7 @@ def test_convert_by_class_writes_a_plain_file_for_each_class(labelled, tmp_path,
     counts = {path.name: len(read_splats(path)) for path in out.iterdir()}
     labels = cloud.gaussians.labels
     assert counts.pop("unlabelled.ply", 0) == int((labels < 0).sum())
-    assert counts[f"05_{cloud.classes[5]}.ply"] == int((labels == 5).sum())
+    assert counts[f"05_{cloud.names[5]}.ply"] == int((labels == 5).sum())
     assert sum(counts.values()) == int((labels >= 0).sum())
     for name in counts:
         assert {"class_id", "score"}.isdisjoint(read_ply(out / name))

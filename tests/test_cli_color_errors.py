@@ -10,7 +10,7 @@ from messages import tells
 from small_room import make_room
 
 from kfgs.cli import main
-from kfgs.formats import SplatFile, read_splats, write_splats
+from kfgs.formats import read_splats, write_splats
 from kfgs.labels.edits import EditList, Remove
 
 TWICE = ["--views", "view_001", "--views", "view_001.png"]
@@ -216,10 +216,10 @@ def places(tmp_path_factory):
     arguments = ["attach", str(field), str(splat), "--scene", str(room), "--by", "distance", "--same-frame"]
     assert main([*arguments, "--out", str(labelled)]) == 0
     cloud = read_splats(labelled)
-    write_splats(folder / "plain.ply", SplatFile(cloud.gaussians.replace(sh=None), {}, cloud.classes))
+    write_splats(cloud.gaussians.replace(sh=None).replace(names=cloud.names), folder / "plain.ply")
     (folder / "alone.ply").write_bytes(labelled.read_bytes())
-    four = read_splats(splat).gaussians.select(torch.arange(4))
-    write_splats(folder / "four.ply", four.replace(means=four.means + 100))
+    four = read_splats(splat).select(torch.arange(4))
+    write_splats(four.replace(means=four.means + 100), folder / "four.ply")
     same = EditList((Remove("rug"),)).save(folder / "same.ply.edits.json")
     (folder / "taken.ply.edits.json").mkdir()
     paths = {"room": room, "field": field, "run": field.parent, "splat": splat, "labelled": labelled, "saved": same}

@@ -11,7 +11,7 @@ import torch
 from kfgs import cli
 from kfgs.cli import _in_options, main
 from kfgs.cli.output import END, LINE, say
-from kfgs.formats import SplatFile, write_splats
+from kfgs.formats import write_splats
 from kfgs.gaussians import Gaussians
 
 ESCAPES = "a\x1b[31m\x07\x9b\u202eb\udc80\r"
@@ -28,7 +28,7 @@ def splat(path, classes):
         sh=torch.zeros(n, 1, 3),
         labels=torch.arange(n) % 2,
     )
-    write_splats(path, SplatFile(cloud, {}, classes))
+    write_splats(cloud.replace(names=classes), path)
     return path
 
 

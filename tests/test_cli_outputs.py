@@ -39,7 +39,7 @@ def splat(tmp_path):
         sh=torch.rand(count, 1, 3),
         labels=torch.zeros(count, dtype=torch.int64),
     )
-    write_splats(tmp_path / "a.ply", cloud)
+    write_splats(cloud, tmp_path / "a.ply")
     return tmp_path / "a.ply"
 
 
@@ -148,7 +148,7 @@ def test_home_is_no_folder_named_tilde(splat, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["convert", str(splat), "~/b.ply"]) == 0
     assert main(["convert", "~/b.ply", "c.splat"]) == 0
-    write_splats("~/d.ply", Gaussians(*(torch.rand(2, n) for n in (3, 4, 3)), torch.rand(2), sh=torch.rand(2, 1, 3)))
+    write_splats(Gaussians(*(torch.rand(2, n) for n in (3, 4, 3)), torch.rand(2), sh=torch.rand(2, 1, 3)), "~/d.ply")
     assert (tmp_path / "home" / "d.ply").is_file()
     assert not (tmp_path / "~").exists()
 

@@ -45,7 +45,7 @@ def splat(tmp_path):
         sh=torch.rand(count, 1, 3),
         labels=torch.arange(count) % 2,
     )
-    write_splats(tmp_path / "a.ply", cloud)
+    write_splats(cloud, tmp_path / "a.ply")
     (tmp_path / "a.ply.classes.json").write_text('{"class_id": {"0": "chair", "1": "table"}}')
     return tmp_path / "a.ply"
 

@@ -79,7 +79,7 @@ def test_other_commands_take_the_file(place, tmp_path, capsys):
     assert "rounded: precision small" in said
     assert "one file of 0.0" in said
     assert main(["label", str(packed), "--out", str(tmp_path / "labelled")]) == 0
-    labels = read_splats(tmp_path / "labelled" / "gaussians.ply").gaussians.labels
+    labels = read_splats(tmp_path / "labelled" / "gaussians.ply").labels
     assert torch.equal(labels, SemanticField.load(packed).classify().labels)
     assert main(["convert", str(packed), str(tmp_path / "a.ply")]) == 1
     assert "a semantic field" in capsys.readouterr().err

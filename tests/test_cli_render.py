@@ -10,7 +10,7 @@ from PIL import Image, ImageSequence
 from small_room import make_room
 
 from kfgs.cli import main
-from kfgs.formats import SplatFile, read_splats, write_splats
+from kfgs.formats import read_splats, write_splats
 from kfgs.pipeline import FitConfig, fit_color, fit_scene
 from kfgs.pipeline.color import ColorConfig
 from kfgs.scenes import FeatureFolder, load_scene
@@ -63,8 +63,8 @@ def test_a_labelled_splat(run, tmp_path):
     scene = load_scene(run.parent / "scene")
     colors = read_splats(run / "color.ply")
     labels = (colors.gaussians.means[:, 2] > 1).long()
-    labelled = SplatFile(colors.gaussians.replace(labels=labels), classes=("low", "high"))
-    write_splats(tmp_path / "l.ply", labelled)
+    labelled = colors.gaussians.replace(labels=labels).replace(names=("low", "high"))
+    write_splats(labelled, tmp_path / "l.ply")
     assert film(tmp_path / "l.ply", "--out", tmp_path / "a.gif", "--show", "photo,labels,query=high") == 0
     assert film(tmp_path / "l.ply", "--out", tmp_path / "b.gif", "--path", "spiral", "--scene", scene.folder) == 0
 

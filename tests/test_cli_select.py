@@ -10,7 +10,7 @@ from small_room import make_desk
 from kfgs import Gaussians, SemanticField, connected_parts
 from kfgs.cli import main
 from kfgs.cli.output import lengths_odd
-from kfgs.formats import SplatFile, write_splats
+from kfgs.formats import write_splats
 from kfgs.labels.components import component_distance
 
 
@@ -58,7 +58,7 @@ def test_a_part_that_may_be_two_things_is_marked(tmp_path, capsys):
     means = torch.stack([x, torch.zeros(44), torch.zeros(44)], dim=1)
     many = Gaussians(means, torch.tensor([[1.0, 0, 0, 0]]).repeat(44, 1), torch.full((44, 3), 0.1), torch.ones(44))
     many = many.replace(labels=torch.zeros(44, dtype=torch.int64), sh=torch.zeros(44, 1, 3))
-    write_splats(tmp_path / "a.ply", SplatFile(many, classes=("chair",)))
+    write_splats(many.replace(names=("chair",)), tmp_path / "a.ply")
     words = ["select", "chair", str(tmp_path / "a.ply"), "--distance", "1"]
     assert main(words) == 0
     parts = [line for line in capsys.readouterr().out.splitlines() if "Part(" in line]

@@ -14,7 +14,7 @@ from small_room import make_room
 
 from kfgs.cli import main
 from kfgs.fields import Identity, SemanticField
-from kfgs.formats import SplatFile, write_splats
+from kfgs.formats import write_splats
 from kfgs.scenes import load_scene
 from kfgs.splat import rgb_to_sh0
 from kfgs.teachers.prompts import make_label_set
@@ -40,9 +40,9 @@ def files(room, tmp_path_factory):
     SemanticField(cloud.replace(features=table.embeddings[truth]), Identity(table.dim), info=info).save(
         folder / "field.kfgs"
     )
-    write_splats(folder / "labelled.ply", SplatFile(cloud.replace(labels=truth), classes=tuple(names)))
+    write_splats(cloud.replace(labels=truth, names=tuple(names)), folder / "labelled.ply")
     colored = cloud.replace(sh=rgb_to_sh0(torch.full((len(cloud), 3), 0.5))[:, None], labels=None)
-    write_splats(folder / "color.ply", SplatFile(colored))
+    write_splats(colored, folder / "color.ply")
     return folder
 
 
@@ -107,8 +107,8 @@ def test_clouds_in_different_frames_are_noted(files, tmp_path, capsys):
     from kfgs.formats import read_splats
 
     splats = read_splats(files / "color.ply")
-    moved = splats.gaussians.replace(means=splats.gaussians.means + 1000)
-    write_splats(tmp_path / "far.ply", splats.replace(gaussians=moved))
+    moved = splats.replace(means=splats.means + 1000)
+    write_splats(moved, tmp_path / "far.ply")
     arguments = ["--color", tmp_path / "far.ply", "--distance", 0.1, "--where", "picture", "--out", tmp_path]
     said = drawn([files / "labelled.ply", *arguments], capsys)
     assert "note: only 0 of" in said

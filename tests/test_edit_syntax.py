@@ -5,7 +5,6 @@ import torch
 from messages import tells
 
 from kfgs.cli.edit_syntax import Edits, check_parts, inserted_files, parse_edits
-from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
 from kfgs.labels import connected_parts
 from kfgs.labels.edits import Duplicate, Extract, Insert, Move, Opacity, Recolor, Remove, Turn
@@ -83,7 +82,7 @@ def rows(*sizes):
     n = len(means)
     labels = (torch.arange(n) < sum(sizes)).long()
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1)
-    return SplatFile(Gaussians(means, quats, torch.ones(n, 3), torch.ones(n), labels=labels), {}, ("wall", "chair"))
+    return Gaussians(means, quats, torch.ones(n, 3), torch.ones(n), labels=labels).replace(names=("wall", "chair"))
 
 
 def test_parts_are_numbered_as_select_lists_them():
@@ -110,7 +109,7 @@ def test_parts_are_those_within_a_distance():
     cloud = rows(20, 60, 40)
     shifted = cloud.gaussians.means.clone()
     shifted[50:80, 0] += 0.15  # a gap in the row of 60: 30 and 30
-    cloud = cloud.replace(gaussians=cloud.gaussians.replace(means=shifted))
+    cloud = cloud.replace(means=shifted)
     things = connected_parts(cloud.gaussians, OfClass("chair").select(cloud), distance=0.12)
     assert [thing.count for thing in things] == [40, 30, 30, 20]
     (edit,) = read(remove=["chair/3"], distance=0.12)

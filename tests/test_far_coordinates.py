@@ -7,7 +7,7 @@ import pytest
 import torch
 from kfgs.evaluation.surface_density import surface_density
 
-from kfgs import Camera, Gaussians, SplatFile, rasterize, read_splats, transfer_labels, write_splats
+from kfgs import Camera, Gaussians, rasterize, read_splats, transfer_labels, write_splats
 from kfgs._origin import choose_origin, to_world
 from kfgs.cameras import Orbit, orbit_cameras, path_cameras, spiral_cameras
 from kfgs.cameras.similarity import Similarity
@@ -33,7 +33,7 @@ def cloud(count=60, seed=0):
 def far_file(path, offset=UTM, count=60, seed=0):
     """A PLY in double, moved by an offset, without help of the reader's code; and the places in it."""
     near, places = cloud(count, seed)
-    write_splats(path, near)
+    write_splats(near, path)
     table = read_ply(path)
     world = places.numpy() + offset
     write_ply(path, table | {name: world[:, i].copy() for i, name in enumerate("xyz")})
@@ -63,20 +63,20 @@ def test_origin_lies_near_what_is_far(size):
 def test_ply_in_double_is_read_and_written_to_the_millimetre(tmp_path):
     world = far_file(tmp_path / "far.ply")
     splats = read_splats(tmp_path / "far.ply")
-    assert splats.gaussians.means.dtype == torch.float32
-    assert np.abs(world_of(splats.gaussians) - world).max() < 1e-5
+    assert splats.means.dtype == torch.float32
+    assert np.abs(world_of(splats) - world).max() < 1e-5
     splats.save(tmp_path / "again.ply")
     assert {read_ply(tmp_path / "again.ply")[name].dtype.str for name in "xyz"} == {"<f8"}
-    again = read_splats(tmp_path / "again.ply").gaussians
-    assert again.origin == splats.gaussians.origin
-    assert torch.equal(again.means, splats.gaussians.means)
+    again = read_splats(tmp_path / "again.ply")
+    assert again.origin == splats.origin
+    assert torch.equal(again.means, splats.means)
 
 
 def test_a_near_cloud_is_written_as_before(tmp_path):
     near, _ = cloud()
-    write_splats(tmp_path / "near.ply", near)
+    write_splats(near, tmp_path / "near.ply")
     assert read_ply(tmp_path / "near.ply")["x"].dtype == np.float32
-    assert torch.equal(read_splats(tmp_path / "near.ply").gaussians.means, near.means)
+    assert torch.equal(read_splats(tmp_path / "near.ply").means, near.means)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["near.ply"]
 
 
@@ -84,7 +84,7 @@ def test_a_near_cloud_is_written_as_before(tmp_path):
 def test_other_formats_keep_the_place(tmp_path, ending):
     world = far_file(tmp_path / "far.ply")
     written = read_splats(tmp_path / "far.ply").save(tmp_path / f"far.{ending}")
-    back = read_splats(tmp_path / f"far.{ending}").gaussians
+    back = read_splats(tmp_path / f"far.{ending}")
     order = np.arange(len(world)) if written.order is None else written.order.numpy()
     assert np.abs(world_of(back) - world[order]).max() < 2e-3
     assert any("origin" in lost for lost in written.lost) == (ending != "glb")
@@ -102,13 +102,13 @@ def test_plain_ply_keeps_its_62_floats_and_the_place(tmp_path):
     assert len(table) == 62
     assert {column.dtype for column in table.values()} == {np.dtype(np.float32)}
     assert any("origin" in lost for lost in written.lost)
-    assert np.abs(world_of(read_splats(tmp_path / "plain.ply").gaussians) - world).max() < 1e-5
+    assert np.abs(world_of(read_splats(tmp_path / "plain.ply")) - world).max() < 1e-5
 
 
 def test_origin_of_another_version_is_refused_and_its_advice_works(tmp_path):
     far_file(tmp_path / "far.ply")
     splats = read_splats(tmp_path / "far.ply")
-    write_splats(tmp_path / "far.splat", splats.gaussians.replace(labels=None))
+    write_splats(splats.replace(labels=None), tmp_path / "far.splat")
     with (tmp_path / "far.splat").open("r+b") as file:
         file.truncate(32)
     with pytest.raises(ValueError, match=r"far.splat.origin.json: expected the origin of this version .*; delete it"):
@@ -120,9 +120,9 @@ def test_origin_of_another_version_is_refused_and_its_advice_works(tmp_path):
 def test_a_written_near_cloud_removes_an_old_origin(tmp_path):
     far_file(tmp_path / "far.ply")
     read_splats(tmp_path / "far.ply").save(tmp_path / "a.splat")
-    write_splats(tmp_path / "a.splat", cloud()[0])
+    write_splats(cloud()[0], tmp_path / "a.splat")
     assert not (tmp_path / "a.splat.origin.json").exists()
-    assert read_splats(tmp_path / "a.splat").gaussians.origin == (0, 0, 0)
+    assert read_splats(tmp_path / "a.splat").origin == (0, 0, 0)
 
 
 def test_a_camera_with_another_origin_draws_the_same_picture(tmp_path):
@@ -149,7 +149,7 @@ def test_places_of_a_rule_are_those_of_the_world(tmp_path):
 
 def test_parts_and_selections_answer_in_the_world(tmp_path):
     world = far_file(tmp_path / "far.ply")
-    gaussians = read_splats(tmp_path / "far.ply").gaussians
+    gaussians = read_splats(tmp_path / "far.ply")
     chosen = Selection.of(torch.ones(len(gaussians), dtype=torch.bool))
     (part,) = connected_parts(gaussians, chosen, distance=5.0)
     np.testing.assert_allclose(part.centroid.numpy(), world.mean(0), atol=1e-4, rtol=0)
@@ -171,12 +171,12 @@ def test_labels_pass_between_clouds_of_different_origins():
 
 def test_edits_and_joins_stay_in_the_world(tmp_path):
     world = far_file(tmp_path / "far.ply")
-    splats = read_splats(tmp_path / "far.ply").replace(classes=("a", "b", "c"))
+    splats = read_splats(tmp_path / "far.ply").replace(names=("a", "b", "c"))
     moved = Move(OfClass("b"), translation=(0.5, 0, 0), rotation=("z", 90), pivot=tuple(UTM)).apply(splats)
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     want = np.where((np.arange(60) % 3 == 1)[:, None], (world - UTM) @ quarter.T + UTM + [0.5, 0, 0], world)
     assert np.abs(world_of(moved.gaussians) - want).max() < 1e-4
-    other = splats.replace(gaussians=splats.gaussians.with_origin(tuple(UTM + 40)))
+    other = splats.with_origin(tuple(UTM + 40))
     both = join(splats, other).gaussians
     assert np.abs(world_of(both) - np.concatenate([world, world])).max() < 1e-4
 
@@ -200,8 +200,8 @@ def test_a_splat_file_says_its_origin_and_keeps_it(tmp_path):
     far_file(tmp_path / "far.ply")
     splats = read_splats(tmp_path / "far.ply")
     part = splats.select(torch.arange(5))
-    assert part.gaussians.origin == splats.gaussians.origin != (0, 0, 0)
-    assert SplatFile(part.gaussians).gaussians.detach().to(torch.float64).origin == splats.gaussians.origin
+    assert part.gaussians.origin == splats.origin != (0, 0, 0)
+    assert part.gaussians.gaussians.detach().to(torch.float64).origin == splats.origin
 
 
 def test_pictures_of_two_clouds_share_an_origin(tmp_path):
@@ -211,7 +211,7 @@ def test_pictures_of_two_clouds_share_an_origin(tmp_path):
     from kfgs.viz import add_boxes, add_cameras, add_cloud, look_through, to_pyvista, to_trimesh
 
     world = far_file(tmp_path / "far.ply")
-    gaussians = read_splats(tmp_path / "far.ply").gaussians
+    gaussians = read_splats(tmp_path / "far.ply")
     for points in (to_pyvista(gaussians).points, to_trimesh(gaussians).vertices):
         np.testing.assert_allclose(points, world, rtol=0, atol=1e-4)
     plotter = pv.Plotter(off_screen=True, window_size=(32, 24))
@@ -254,7 +254,7 @@ def test_usd_has_the_origin_as_a_translation(tmp_path):
     splats = read_splats(tmp_path / "far.ply")
     save_usd(tmp_path / "far.usda", splats)
     stage = pxr.Stage.Open(str(tmp_path / "far.usda"))
-    assert tuple(stage.GetDefaultPrim().GetAttribute("xformOp:translate").Get()) == splats.gaussians.origin
+    assert tuple(stage.GetDefaultPrim().GetAttribute("xformOp:translate").Get()) == splats.origin
 
 
 def test_a_checkpoint_in_double_keeps_its_place(tmp_path):
@@ -262,7 +262,7 @@ def test_a_checkpoint_in_double_keeps_its_place(tmp_path):
     raw = {"means": places + torch.from_numpy(UTM), "scales": near.scales.log(), "quats": near.quats}
     raw |= {"opacities": near.opacities.logit(), "sh0": near.sh[:, :1], "shN": near.sh[:, 1:]}
     torch.save({"step": 1, "splats": raw}, tmp_path / "ckpt_1.pt")
-    back = read_splats(tmp_path / "ckpt_1.pt").gaussians
+    back = read_splats(tmp_path / "ckpt_1.pt")
     assert np.abs(world_of(back) - places.numpy() - UTM).max() < 1e-5
 
 

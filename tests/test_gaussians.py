@@ -189,8 +189,8 @@ def test_labels_of_any_whole_type_become_int64(dtype, tmp_path):
     labelled = cloud(degree=0).replace(labels=torch.tensor([0, 3, 1, 2], dtype=dtype))
     assert labelled.labels.dtype == torch.int64
     for name in ("a.ply", "a.spz", "a.splat"):
-        write_splats(tmp_path / name, labelled)
-        assert read_splats(tmp_path / name).gaussians.labels.tolist() == [0, 3, 1, 2]
+        write_splats(labelled, tmp_path / name)
+        assert read_splats(tmp_path / name).labels.tolist() == [0, 3, 1, 2]
     assert cloud().replace(labels=np.array([0, 1, 2, 3], dtype=np.uint16)).labels.dtype == torch.int64
 
 
@@ -224,8 +224,8 @@ MIXED += [(short, (name,)) for short in ("float16", "bfloat16") for name in NUMB
 
 
 def _written(cloud, path):
-    write_splats(path, cloud.replace(features=None))
-    return read_splats(path).gaussians.means
+    write_splats(cloud.replace(features=None), path)
+    return read_splats(path).means
 
 
 @pytest.mark.parametrize(

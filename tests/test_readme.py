@@ -54,7 +54,7 @@ def test_examples_run_one_after_the_other(examples, desk, monkeypatch):
     monkeypatch.chdir(desk)
     _, fitting, editing, looking = examples
     assert fitting.count("FitConfig.cpu()") == 1
-    known = {"SHORT": SHORT, "other_points": read_splats("my.spz").gaussians.means}
+    known = {"SHORT": SHORT, "other_points": read_splats("my.spz").means}
     exec(fitting.replace("FitConfig.cpu()", "SHORT"), known)
     assert known["chair"].mask.shape == (len(known["field"]),)
     assert len(known["carried"].labels) == len(known["other_points"])
@@ -64,7 +64,7 @@ def test_examples_run_one_after_the_other(examples, desk, monkeypatch):
     fuse_views(made, [scene.cameras[i] for i in scene.views("train")]).save("run/field.kfgs")
     exec(editing, known)
     before, after = known["found"].splats, read_splats("edited.ply")
-    chairs = before.gaussians.labels == before.classes.index("chair")
+    chairs = before.gaussians.labels == before.names.index("chair")
     assert 0 < int(chairs.sum()) == len(before) - len(after)
     assert len(kfgs.EditList.load("edits.json")) == 1
     pytest.importorskip("anywidget")
@@ -104,12 +104,12 @@ def test_the_ten_lines_of_the_readme_run(examples, desk, tmp_path, monkeypatch):
         (scene / part).symlink_to(desk / "scene" / part)
     maps = FeatureFolder(desk / "features").of(room, "train")
     fit_scene(load_scene(scene), maps, run, SHORT, splat=desk / "my.spz")
-    write_splats(run / "color.ply", read_splats(desk / "my.spz"))  # `kfgs fit` trains it where there is no splat
+    write_splats(read_splats(desk / "my.spz"), run / "color.ply")  # `kfgs fit` trains it where there is no splat
     monkeypatch.chdir(tmp_path)
     known = {}
     exec(code, known)
     assert known["labels"].shape == room.cameras[0].size
     assert 0 < len(known["parts"]) <= len(known["chair"])
     before, after = known["splat"], read_splats("edited.ply")
-    chairs = before.gaussians.labels == before.classes.index("chair")
+    chairs = before.gaussians.labels == before.names.index("chair")
     assert 0 < int(chairs.sum()) == len(before) - len(after)

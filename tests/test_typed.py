@@ -37,7 +37,7 @@ FIELD = SemanticField(CLOUD, Identity(3))
         (lambda: attach("R/field", "L.ply"), ("field", "SemanticField", "str", "SemanticField.load(path)")),
         (lambda: attach(FIELD, "L.ply", "words"), ("classes", "LabelSet or None", "str", "load_label_set")),
         (lambda: FIELD.segment("view_1"), ("camera", "Camera", "str", ".cameras")),
-        (lambda: write_splats("a.ply", {"means": 1}), ("splats", "SplatFile", "dict", "read_splats")),
+        (lambda: write_splats({"means": 1}, "a.ply"), ("splats", "SplatFile", "dict", "read_splats")),
     ],
 )
 def test_a_path_or_dict_instead_of_an_object_is_named(call, parts):

@@ -12,7 +12,7 @@ from messages import tells
 from test_public import PACKAGES
 
 import kfgs
-from kfgs import Camera, CodebookConfig, SplatFile
+from kfgs import Camera, CodebookConfig
 from kfgs.scenes import pictures_of
 
 FIELD = scene([("chair", 0.0)])
@@ -21,7 +21,6 @@ GOOD = {
     "SemanticField": FIELD,
     "Camera": Camera.look_at((0, -4, 0), (0, 0, 0)),
     "LabelSet": FIELD.classes,
-    "SplatFile": SplatFile(FIELD.gaussians),
 }
 """What is passed for a first parameter of this type, so that the second one is looked at, too."""
 WRONG = (None, "x", 1.5, [], torch.zeros(0), object())
@@ -77,7 +76,6 @@ def test_every_public_name_is_called():
 @pytest.mark.parametrize(
     ("call", "parts"),
     [
-        (lambda: SplatFile(FIELD.gaussians, extra=None), ("extra: expected", "dict")),
         (lambda: kfgs.label_set_from_examples(FIELD, [1]), ("examples: expected", "dict", "list")),
         (lambda: kfgs.evaluate_segmentation(len, [1], "ab"), ("truth: expected", "dict", "list")),
         (lambda: kfgs.evaluate_segmentation(len, torch.zeros(2), ["a"]), ("truth: expected", "dict", "Tensor")),
@@ -94,15 +92,15 @@ def test_every_public_name_is_called():
         (lambda: kfgs.load_teacher([]), ("teacher: expected a name", "list")),
         (lambda: kfgs.score_views(None, None), ("gaussians: expected", "NoneType")),
         (
-            lambda: kfgs.attach(FIELD, GOOD["SplatFile"], FIELD.classes, cameras="x"),
+            lambda: kfgs.attach(FIELD, FIELD.gaussians, FIELD.classes, cameras="x"),
             ("cameras: expected", "Sequence", "str"),
         ),
         (
-            lambda: kfgs.attach(FIELD, GOOD["SplatFile"], FIELD.classes, cameras=torch.zeros(3)),
+            lambda: kfgs.attach(FIELD, FIELD.gaussians, FIELD.classes, cameras=torch.zeros(3)),
             ("cameras: expected", "Tensor"),
         ),
         (
-            lambda: kfgs.attach(FIELD, GOOD["SplatFile"], FIELD.classes, cameras=["a"]),
+            lambda: kfgs.attach(FIELD, FIELD.gaussians, FIELD.classes, cameras=["a"]),
             ("cameras[0]: expected a Camera", "str"),
         ),
         (lambda: CodebookConfig(grid_step=torch.zeros(0)), ("grid_step: expected", "Tensor")),

@@ -112,7 +112,7 @@ def _parts(place: Path, add: Add) -> None:
 
 def _edits(place: Path, add: Add) -> None:
     place.mkdir()
-    write_splats(place / "lamp.ply", cloud(5))
+    write_splats(cloud(5), place / "lamp.ply")
     plant = OfClass("plant") - InBox((0, 0, 0), (0.1, 0.1, 0.1))
     edits = EditList([
         Recolor(plant, "#c04040", "hue"), Opacity("wall", 0.3), Move("chair", (0.5, 0, 0), Turn("z", 30), 1.5),

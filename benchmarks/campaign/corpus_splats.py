@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from kfgs.formats import SplatFile, formats, write_splats, write_spz
+from kfgs.formats import formats, write_splats, write_spz
 from kfgs.formats.ply import write_ply
 from kfgs.gaussians import Gaussians
 
 from .corpus import SEED, Add
 
 
-def cloud(n: int = 12, degree: int = 1, labels: bool = True) -> SplatFile:
+def cloud(n: int = 12, degree: int = 1, labels: bool = True) -> Gaussians:
     """Random Gaussians of three classes."""
     g = torch.Generator().manual_seed(SEED)
     gaussians = Gaussians(
@@ -26,7 +26,7 @@ def cloud(n: int = 12, degree: int = 1, labels: bool = True) -> SplatFile:
         sh=torch.randn(n, (degree + 1) ** 2, 3, generator=g) * 0.3,
         labels=torch.arange(n) % 3 if labels else None,
     )
-    return SplatFile(gaussians, classes=("wall", "chair", "plant") if labels else ())
+    return gaussians.replace(names=("wall", "chair", "plant") if labels else ())
 
 
 def make(folder: Path, add: Add) -> None:
@@ -37,20 +37,20 @@ def make(folder: Path, add: Add) -> None:
         place = folder / name
         place.mkdir(parents=True)
         path = place / f"a{module.SUFFIXES[0]}"
-        for file in write_splats(path, cloud()).paths[0 if module.HOLDS_LABELS else 1 :]:
+        for file in write_splats(cloud(), path).paths[0 if module.HOLDS_LABELS else 1 :]:
             add("splats", place, file.name, opens=path.name)
         if not module.HOLDS_LABELS:  # their digest would refuse every mutant
             alone = folder / f"{name}-alone"
             alone.mkdir()
-            write_splats(alone / path.name, cloud(labels=False))
+            write_splats(cloud(labels=False), alone / path.name)
             add("splats", alone, path.name)
     _others(folder / "others", add)
 
 
 def _others(place: Path, add: Add) -> None:
     place.mkdir()
-    write_splats(place / "a.gltf", cloud(labels=False))
-    write_spz(place / "two.spz", cloud(labels=False), version=2)
+    write_splats(cloud(labels=False), place / "a.gltf")
+    write_spz(cloud(labels=False), place / "two.spz", version=2)
     (place / "a.ksplat").write_bytes(_ksplat())
     (place / "ascii.ply").write_bytes(_ascii_ply())
     add("splats", place, "a.gltf", "two.spz", "a.ksplat", "ascii.ply")

@@ -49,8 +49,8 @@ def make_fixture(folder: Path) -> None:
         from kfgs.toy import make_toy_room
 
         make_toy_room("room", ROOM)
-        write_splats("labelled.ply", cloud(40))
-        write_splats("other.ply", cloud(30))
+        write_splats(cloud(40), "labelled.ply")
+        write_splats(cloud(30), "other.ply")
         Path("clicks.json").write_text(json.dumps({"chair": [{"gaussians": [3, 4]}], "wall": [{"gaussians": [7]}]}))
 
     steps = [

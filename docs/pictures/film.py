@@ -41,7 +41,7 @@ def main() -> None:
     edited = EditList().then(Remove(given.remove)).then(Recolor(thing, paint)).apply(labelled)
     train = scene.views("train")
     keys = [scene.cameras[train[i]] for i in given.views or range(0, len(train), max(len(train) // 6, 1))]
-    cloud, names = labelled.gaussians, labelled.classes
+    cloud, names = labelled.gaussians, labelled.names
     colors = show_cloud(cloud, background="black", color_by="rgb")
     parts = [
         ("an ordinary colour scene", colors),

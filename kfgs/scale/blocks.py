@@ -167,7 +167,7 @@ def _write_block(folder: Path, block: Block, whole: Scene, maps_folder: Path, cl
             _link(folder / name, whole.folder / name)
     write_json(folder / "split.json", _splits(whole, block))
     if cloud is not None:
-        means, radii = _places(cloud.gaussians), REACH * as_array(cloud.gaussians.scales).max(1)
+        means, radii = _places(cloud), REACH * as_array(cloud.scales).max(1)
         write_splats(cloud.select(torch.from_numpy(block.needs(means, radii))), folder / SPLAT)
     write_json(folder / "block.json", block.to_json())
 

@@ -175,7 +175,9 @@ class FieldInBlocks:
             if near:
                 field = join_fields(near)
                 own = torch.from_numpy(rows)
-                labels[own] = transfer_labels(field.label(classes), dst.select(own), distance).labels
+                carried = transfer_labels(field.label(classes), dst.select(own), distance)
+                assert carried.labels is not None
+                labels[own] = carried.labels
         return labels
 
 

@@ -103,7 +103,7 @@ def test_a_run_writes_table_and_pictures_and_resumes(tmp_path, monkeypatch, caps
     room = make_toy_room(tmp_path / "room", ROOM)
     splat = tmp_path / "splat.ply"
     means = cloud(300).means * 2
-    write_splats(splat, cloud(300).replace(means=means, sh=means[:, None, :].clone()))
+    write_splats(cloud(300).replace(means=means, sh=means[:, None, :].clone()), splat)
     out = tmp_path / "out"
     monkeypatch.setattr(
         sys, "argv",

@@ -224,7 +224,7 @@ def test_the_python_of_other_pages_runs(page, inside):
     if page == "howto/export":
         pytest.importorskip("trimesh")
     Path("kfgs_demo").symlink_to(".")
-    kfgs.write_splats("labelled.ply", kfgs.attach(kfgs.SemanticField.load("run/field.kfgs"), "my.ply").splats)
+    kfgs.write_splats(kfgs.attach(kfgs.SemanticField.load("run/field.kfgs"), "my.ply").gaussians, "labelled.ply")
     known = {}
     for block in blocks_of(page):
         exec(block, known)

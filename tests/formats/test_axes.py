@@ -1,9 +1,9 @@
 import pytest
 import torch
 
+from kfgs import Gaussians
 from kfgs.cameras import Similarity
 from kfgs.formats.values import flip_axes
-from kfgs.gaussians import Gaussians
 from kfgs.splat import evaluate_sh, transform_gaussians
 
 

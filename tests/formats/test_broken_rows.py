@@ -12,17 +12,18 @@ from cases_ksplat import ksplat_file, ksplat_section
 from messages import tells
 from oracles_spz import legacy_payload
 
+from kfgs import Gaussians
 from kfgs.cli import main
-from kfgs.formats import SplatFile, read_splats, write_splats
+from kfgs.formats import read_splats, write_splats
 from kfgs.formats.ply import read_ply, read_ply_elements, write_ply, write_ply_elements
 from kfgs.formats.sidecar import labels_path
-from kfgs.gaussians import Gaussians
+from kfgs.formats.table import read_rows
 
 N, BAD = 600, (7, 8, 400)
 KEPT = [row for row in range(N) if row not in BAD]
 
 
-def _cloud(degree: int = 1) -> SplatFile:
+def _cloud(degree: int = 1) -> Gaussians:
     g = torch.Generator().manual_seed(4)
     cloud = Gaussians(
         means=torch.randn(N, 3, generator=g),
@@ -32,24 +33,23 @@ def _cloud(degree: int = 1) -> SplatFile:
         sh=torch.randn(N, (degree + 1) ** 2, 3, generator=g) * 0.3,
         labels=torch.arange(N) % 3 - 1,
     )
-    return SplatFile(cloud, {"score": np.arange(N, dtype=np.float32)}, ("rug", "sofa"))
+    return cloud.replace(scores=np.arange(N, dtype=np.float32), names=("rug", "sofa"))
 
 
 def _ply(path, column, value):
-    write_splats(path, _cloud())
+    write_splats(_cloud(), path)
     columns = read_ply(path)
     columns[column][list(BAD)] = value
     write_ply(path, columns)
     return path
 
 
-def _same(splats, expected):
-    assert (splats.gaussians.labels == expected.gaussians.labels[KEPT]).all()
-    assert splats.extra["score"].tolist() == KEPT
-    torch.testing.assert_close(splats.gaussians.means, expected.gaussians.means[KEPT])
-    assert splats.info["left_out"] == list(BAD)
-    assert splats.notes[0].startswith("3 of 600 Gaussians have NaN or infinity in ")
-    assert splats.notes[0].endswith(" (rows 7, 8, 400): left out")
+def _same(splats, expected, notes):
+    assert (splats.labels == expected.labels[KEPT]).all()
+    assert splats.scores.tolist() == KEPT
+    torch.testing.assert_close(splats.means, expected.means[KEPT])
+    assert "3 of 600 Gaussians have NaN or infinity in " in notes[0]
+    assert notes[0].endswith(" (rows 7, 8, 400): left out")
 
 
 @pytest.mark.parametrize(
@@ -62,25 +62,25 @@ def _same(splats, expected):
         ("opacity", np.nan, "opacities"),
     ],
 )
-def test_in_a_ply(tmp_path, column, value, what):
+def test_in_a_ply(tmp_path, notes, column, value, what):
     path = _ply(tmp_path / "a.ply", column, value)
     splats = read_splats(path)
-    _same(splats, _cloud())
-    assert f"in {what} " in splats.notes[0]
+    _same(splats, _cloud(), notes)
+    assert f"in {what} " in notes[0]
     with pytest.raises(ValueError, match=tells("a.ply:", "3 of 600", "without --strict")):
         read_splats(path, strict=True)
 
 
-def test_infinite_logits_and_scales_of_zero_are_values(tmp_path):
+def test_infinite_logits_and_scales_of_zero_are_values(tmp_path, notes):
     """sigmoid(inf) = 1, and exp(-inf) = 0: some exports write them."""
     cloud = read_splats(_ply(tmp_path / "a.ply", "opacity", np.inf))
-    assert cloud.notes == ()
-    assert cloud.gaussians.opacities[list(BAD)].tolist() == [1, 1, 1]
-    assert read_splats(_ply(tmp_path / "b.ply", "scale_0", -np.inf)).notes == ()
+    assert cloud.opacities[list(BAD)].tolist() == [1, 1, 1]
+    read_splats(_ply(tmp_path / "b.ply", "scale_0", -np.inf))
+    assert notes == []
 
 
 def _splat(path):
-    write_splats(path, _cloud(0))
+    write_splats(_cloud(0), path)
     rows = np.fromfile(path, "<f4").reshape(N, 8)
     rows[BAD[0], 0], rows[BAD[1], 4], rows[BAD[2], 3] = np.nan, np.inf, -1  # a position, a scale, a negative scale
     rows.tofile(path)
@@ -91,7 +91,7 @@ def _splat(path):
 
 
 def _gltf(path):
-    write_splats(path, _cloud())
+    write_splats(_cloud(), path)
     root, data = json_of_glb(path), bytearray(path.read_bytes())
     attributes = root["meshes"][0]["primitives"][0]["attributes"]
     start = data.index(b"BIN\0") + 4
@@ -106,23 +106,23 @@ def _gltf(path):
 
 
 @pytest.mark.parametrize(("make", "name"), [(_splat, "a.splat"), (_gltf, "a.glb")])
-def test_in_other_formats_labels_and_scores_keep_step(tmp_path, make, name):
+def test_in_other_formats_labels_and_scores_keep_step(tmp_path, notes, make, name):
     make(tmp_path / name)
-    _same(read_splats(tmp_path / name), _cloud())
+    _same(read_splats(tmp_path / name), _cloud(), notes)
 
 
 def test_in_a_compressed_ply_a_chunk_is_left_out(tmp_path):
-    write_splats(tmp_path / "a.compressed.ply", _cloud())
+    write_splats(_cloud(), tmp_path / "a.compressed.ply")
     elements = read_ply_elements(tmp_path / "a.compressed.ply")
     elements["chunk"]["max_y"][1] = np.inf
     write_ply_elements(tmp_path / "bad.ply", elements)
-    splats = read_splats(tmp_path / "bad.ply")
+    splats, kept = read_rows(tmp_path / "bad.ply")
     assert len(splats) == N - 256
-    assert splats.info["left_out"] == list(range(256, 512))
+    assert (~kept).nonzero()[:, 0].tolist() == list(range(256, 512))
 
 
 def test_in_a_sog_a_code_that_is_missing(tmp_path):
-    write_splats(tmp_path / "a.sog", _cloud())
+    write_splats(_cloud(), tmp_path / "a.sog")
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         files = {name: archive.read(name) for name in archive.namelist()}
     meta = json.loads(files["meta.json"])
@@ -130,11 +130,10 @@ def test_in_a_sog_a_code_that_is_missing(tmp_path):
     with zipfile.ZipFile(tmp_path / "b.sog", "w") as archive:
         for name, data in (files | {"meta.json": json.dumps(meta).encode()}).items():
             archive.writestr(name, data)
-    whole, part = read_splats(tmp_path / "a.sog"), read_splats(tmp_path / "b.sog")
-    small = torch.tensor([row not in part.info["left_out"] for row in range(N)])
+    whole, (part, small) = read_splats(tmp_path / "a.sog"), read_rows(tmp_path / "b.sog")
     assert 0 < len(part) == int(small.sum()) < N
-    torch.testing.assert_close(part.gaussians.means, whole.gaussians.means[small])
-    assert whole.gaussians.scales[~small].amax(1).min() > whole.gaussians.scales[small].median()
+    torch.testing.assert_close(part.means, whole.means[small])
+    assert whole.scales[~small].amax(1).min() > whole.scales[small].median()
 
 
 def test_in_spz_ksplat_and_a_checkpoint(tmp_path):
@@ -154,13 +153,13 @@ def test_in_spz_ksplat_and_a_checkpoint(tmp_path):
     values["means"][1, 2] = torch.nan
     torch.save({"splats": values | {"sh0": torch.zeros(3, 1, 3)}}, tmp_path / "a.pt")
     for name, left_out in (("a.spz", [1]), ("a.ksplat", [2]), ("a.pt", [1])):
-        splats = read_splats(tmp_path / name)
-        assert splats.info["left_out"] == left_out, name
+        splats, kept = read_rows(tmp_path / name)
+        assert (~kept).nonzero()[:, 0].tolist() == left_out, name
         assert len(splats) == 2
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.splat", "a.pt"])
-def test_rows_of_zeros_are_left_out(tmp_path, name):
+def test_rows_of_zeros_are_left_out(tmp_path, notes, name):
     columns = [
         "x",
         "y",
@@ -191,18 +190,18 @@ def test_rows_of_zeros_are_left_out(tmp_path, name):
         torch.save({"splats": {key: value.contiguous() for key, value in splats.items()}}, tmp_path / name)
     splats = read_splats(tmp_path / name)
     assert len(splats) == 1
-    assert splats.notes == ("999 of 1,000 Gaussians are rows of zeros (rows 1, 2, 3, 4, 5, ...): left out",)
+    assert notes == [f"{name}: 999 of 1,000 Gaussians are rows of zeros (rows 1, 2, 3, 4, 5, ...): left out"]
 
 
-def test_one_rotation_of_length_0_is_no_rotation_and_noted(tmp_path):
+def test_one_rotation_of_length_0_is_no_rotation_and_noted(tmp_path, notes):
     path = _ply(tmp_path / "a.ply", "rot_0", 0)
     columns = read_ply(path)
     for axis in range(1, 4):
         columns[f"rot_{axis}"][list(BAD)] = 0
     write_ply(path, columns)
     splats = read_splats(path)
-    assert splats.notes == ("3 of 600 Gaussians have a rotation of length 0 (rows 7, 8, 400): read as not turned",)
-    assert splats.gaussians.quats[list(BAD)].tolist() == [[1, 0, 0, 0]] * 3
+    assert notes == ["a.ply: 3 of 600 Gaussians have a rotation of length 0 (rows 7, 8, 400): read as not turned"]
+    assert splats.quats[list(BAD)].tolist() == [[1, 0, 0, 0]] * 3
 
 
 def test_nothing_usable_is_an_error(tmp_path):
@@ -214,10 +213,10 @@ def test_nothing_usable_is_an_error(tmp_path):
         read_splats(path)
 
 
-def test_a_label_that_is_no_number_is_no_label(tmp_path):
+def test_a_label_that_is_no_number_is_no_label(tmp_path, notes):
     splats = read_splats(_ply(tmp_path / "a.ply", "class_id", np.nan))
-    assert splats.notes == ("3 of 600 Gaussians have no number as class_id (rows 7, 8, 400): read as no class",)
-    assert splats.gaussians.labels[list(BAD)].tolist() == [-1] * 3
+    assert notes == ["a.ply: 3 of 600 Gaussians have no number as class_id (rows 7, 8, 400): read as no class"]
+    assert splats.labels[list(BAD)].tolist() == [-1] * 3
 
 
 def test_every_command_tells_it_once_and_strict_refuses(tmp_path, capsys):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from kfgs.formats import SplatFile, read_splats, write_splats
+from kfgs import Gaussians
+from kfgs.formats import read_splats, write_splats
 from kfgs.formats.ply import read_comments, read_ply_elements, write_ply, write_ply_elements
-from kfgs.gaussians import Gaussians
 
 C0 = 0.28209479177387814
 
@@ -30,9 +30,9 @@ def test_red_green_and_blue_are_colours(tmp_path, kind, largest):
     columns = _columns(base="") | {name: rgb[:, i].astype(kind) for i, name in enumerate(("red", "green", "blue"))}
     write_ply(tmp_path / "a.ply", columns)
     splats = read_splats(tmp_path / "a.ply")
-    np.testing.assert_allclose(splats.gaussians.sh[:, 0] * C0 + 0.5, rgb / largest, atol=1e-6)
+    np.testing.assert_allclose(splats.sh[:, 0] * C0 + 0.5, rgb / largest, atol=1e-6)
     assert splats.extra == {}
-    assert write_splats(tmp_path / "b.spz", splats).lost == ()
+    assert write_splats(splats, tmp_path / "b.spz").lost == ()
 
 
 def test_where_there_are_both_harmonics_count_and_the_others_are_kept(tmp_path):
@@ -40,7 +40,7 @@ def test_where_there_are_both_harmonics_count_and_the_others_are_kept(tmp_path):
     columns = _columns() | {"red": red, "green": red, "blue": red}
     write_ply(tmp_path / "a.ply", columns)
     splats = read_splats(tmp_path / "a.ply")
-    np.testing.assert_array_equal(splats.gaussians.sh[:, 0, 1], columns["f_dc_1"])
+    np.testing.assert_array_equal(splats.sh[:, 0, 1], columns["f_dc_1"])
     assert sorted(splats.extra) == ["blue", "green", "red"]
     write_ply(
         tmp_path / "b.ply", {name: values for name, values in columns.items() if name != "green" and name[:2] != "f_"}
@@ -48,19 +48,19 @@ def test_where_there_are_both_harmonics_count_and_the_others_are_kept(tmp_path):
     assert sorted(read_splats(tmp_path / "b.ply").extra) == ["blue", "red"]  # no colour
 
 
-NOTE = ("spherical harmonics of degree 4: read up to degree 3",)
+NOTE = "spherical harmonics of degree 4: read up to degree 3"
 
 
-def test_degree_4_is_read_up_to_degree_3_and_noted(tmp_path):
+def test_degree_4_is_read_up_to_degree_3_and_noted(tmp_path, notes):
     columns = _columns(higher=72)
     write_ply(tmp_path / "a.ply", columns)
     splats = read_splats(tmp_path / "a.ply")
-    assert splats.notes == NOTE
+    assert notes[-1] == "a.ply: " + NOTE
     for channel in range(3):
         for k in range(15):
-            np.testing.assert_array_equal(splats.gaussians.sh[:, 1 + k, channel], columns[f"f_rest_{24 * channel + k}"])
+            np.testing.assert_array_equal(splats.sh[:, 1 + k, channel], columns[f"f_rest_{24 * channel + k}"])
 
-    write_splats(tmp_path / "a.gltf", splats)
+    write_splats(splats, tmp_path / "a.gltf")
     root = json.loads((tmp_path / "a.gltf").read_text())
     attributes = root["meshes"][0]["primitives"][0]["attributes"]
     for i in range(9):
@@ -69,20 +69,20 @@ def test_degree_4_is_read_up_to_degree_3_and_noted(tmp_path):
         ]
     (tmp_path / "b.gltf").write_text(json.dumps(root))
     back = read_splats(tmp_path / "b.gltf")
-    assert back.notes == NOTE
-    assert torch.equal(back.gaussians.sh, read_splats(tmp_path / "a.gltf").gaussians.sh)
+    assert notes[-1] == "b.gltf: " + NOTE
+    assert torch.equal(back.sh, read_splats(tmp_path / "a.gltf").sh)
 
-    write_splats(tmp_path / "a.compressed.ply", splats)
+    write_splats(splats, tmp_path / "a.compressed.ply")
     elements = read_ply_elements(tmp_path / "a.compressed.ply")
     sh = [elements["sh"][f"f_rest_{i}"] for i in range(45)]
     wide = [sh[15 * channel + k] if k < 15 else sh[0] for channel in range(3) for k in range(24)]
     elements["sh"] = {f"f_rest_{i}": values for i, values in enumerate(wide)}
     write_ply_elements(tmp_path / "b.compressed.ply", elements)
     back = read_splats(tmp_path / "b.compressed.ply")
-    assert back.notes == NOTE
-    assert torch.equal(back.gaussians.sh, read_splats(tmp_path / "a.compressed.ply").gaussians.sh)
+    assert notes[-1] == "b.compressed.ply: " + NOTE
+    assert torch.equal(back.sh, read_splats(tmp_path / "a.compressed.ply").sh)
 
-    g = splats.gaussians
+    g = splats
     values = {
         "means": g.means,
         "scales": g.scales.log(),
@@ -92,8 +92,8 @@ def test_degree_4_is_read_up_to_degree_3_and_noted(tmp_path):
     }
     torch.save({"splats": values | {"shN": torch.cat([g.sh[:, 1:], torch.ones(50, 9, 3)], 1)}}, tmp_path / "a.pt")
     back = read_splats(tmp_path / "a.pt")
-    assert back.notes == NOTE
-    assert torch.equal(back.gaussians.sh, g.sh)
+    assert notes[-1] == "a.pt: " + NOTE
+    assert torch.equal(back.sh, g.sh)
 
 
 @pytest.mark.parametrize("coding", ["utf-8", "latin-1", "utf-8-sig"])
@@ -112,9 +112,9 @@ def test_names_and_comments_that_are_not_ascii(tmp_path, coding):
     splats = read_splats(tmp_path / "b.ply")
     assert list(splats.extra) == ["größe"]
     for name in ("c.ply", "c.glb"):
-        assert write_splats(tmp_path / name, splats).lost == ()
+        assert write_splats(splats, tmp_path / name).lost == ()
         assert read_splats(tmp_path / name).extra["größe"].tolist() == list(range(50))
-    assert "größe" in " ".join(write_splats(tmp_path / "c.splat", splats).lost)
+    assert "größe" in " ".join(write_splats(splats, tmp_path / "c.splat").lost)
 
 
 def test_names_that_a_ply_cannot_have_are_dropped_in_words(tmp_path):
@@ -123,10 +123,10 @@ def test_names_that_a_ply_cannot_have_are_dropped_in_words(tmp_path):
     splats = splats.replace(
         extra={"my column": splats.extra["mine"], "x": splats.extra["mine"], "ok": splats.extra["mine"]}
     )
-    assert write_splats(tmp_path / "b.ply", splats).lost == ("the columns my column, x: .ply has no place for them",)
+    assert write_splats(splats, tmp_path / "b.ply").lost == ("the columns my column, x: .ply has no place for them",)
     back = read_splats(tmp_path / "b.ply")
     assert list(back.extra) == ["ok"]
-    assert torch.equal(back.gaussians.means, splats.gaussians.means)
+    assert torch.equal(back.means, splats.means)
 
 
 def _wide(far):
@@ -139,29 +139,29 @@ def _wide(far):
         sh=torch.zeros(600, 1, 3),
     )
     cloud.means[77] = far
-    return SplatFile(cloud)
+    return cloud
 
 
 @pytest.mark.parametrize(("name", "far"), [("a.compressed.ply", 1e4), ("a.spz", 1e6)])
 def test_a_far_gaussian_that_makes_the_others_coarse_is_told(tmp_path, name, far):
-    assert write_splats(tmp_path / name, _wide(1.0)).lost == ()
+    assert write_splats(_wide(1.0), tmp_path / name).lost == ()
     splats = _wide(far)
-    written = write_splats(tmp_path / name, splats)
+    written = write_splats(splats, tmp_path / name)
     (lost,) = written.lost
     order = torch.arange(600) if written.order is None else written.order
-    off = (read_splats(tmp_path / name).gaussians.means - splats.gaussians.means[order]).norm(dim=1)
+    off = (read_splats(tmp_path / name).means - splats.means[order]).norm(dim=1)
     off[order == 77] = 0
     moved = int((off > 2 * 0.02).sum())
     assert moved > 50
     assert int(lost.split()[2].replace(",", "")) >= moved  # what may move, of which most do
     for exact in (".ply", ".glb"):  # the advice
         assert exact in lost
-        assert write_splats(tmp_path / f"b{exact}", splats).lost == ()
-        assert (read_splats(tmp_path / f"b{exact}").gaussians.means - splats.gaussians.means).abs().max() == 0
+        assert write_splats(splats, tmp_path / f"b{exact}").lost == ()
+        assert (read_splats(tmp_path / f"b{exact}").means - splats.means).abs().max() == 0
 
 
 def test_one_bright_colour_that_makes_the_others_coarse_is_told(tmp_path):
     splats = _wide(1.0)
-    splats.gaussians.sh[77] = 1e3  # in the last chunk: 600 - 2 * 256 = 88
-    (lost,) = write_splats(tmp_path / "a.compressed.ply", splats).lost
+    splats.sh[77] = 1e3  # in the last chunk: 600 - 2 * 256 = 88
+    (lost,) = write_splats(splats, tmp_path / "a.compressed.ply").lost
     assert lost.startswith("base colours of 88 Gaussians")

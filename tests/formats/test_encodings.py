@@ -46,7 +46,7 @@ def _write(path, columns, layout, kind, spelling, newline, normals, backwards):
 def test_48_encodings_of_ply_are_one_splat(tmp_path, layout, kind, spelling, newline, normals):
     columns = _columns()
     _write(tmp_path / "a.ply", columns, layout, kind, spelling, newline, normals, backwards=normals and spelling == 1)
-    cloud = read_splats(tmp_path / "a.ply").gaussians
+    cloud = read_splats(tmp_path / "a.ply")
     wide = {name: values.astype(float) for name, values in columns.items()}
 
     def stacked(*names: str) -> np.ndarray:
@@ -112,7 +112,7 @@ def test_quantised_gltf_is_read_to_half_a_step(tmp_path, bits):
     )
     document.set_binary_blob(blob)
     document.save_binary(str(tmp_path / "a.glb"))
-    cloud = read_splats(tmp_path / "a.glb").gaussians
+    cloud = read_splats(tmp_path / "a.glb")
     np.testing.assert_allclose(cloud.opacities.numpy(), opacity, atol=0.51 / all_ones)
     quats = cloud.quats.numpy() / np.linalg.norm(cloud.quats.numpy(), axis=1, keepdims=True)
     wanted = turns[:, [3, 0, 1, 2]] * [1, 1, -1, -1]  # w x y z, with y and z flipped as the axes are

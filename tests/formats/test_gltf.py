@@ -11,8 +11,8 @@ from cases_gltf import KHR, bent_gltf, json_of_glb, random_cloud
 from messages import tells
 from scipy.spatial.transform import Rotation
 
-from kfgs.formats import SplatFile, read_splats, write_splats
 from kfgs.formats import gltf as format_gltf
+from kfgs.formats import read_splats, write_splats
 from kfgs.splat import evaluate_sh
 
 
@@ -32,19 +32,18 @@ def _values(document: pygltflib.GLTF2, attribute: str) -> np.ndarray:
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_values_survive_exactly(tmp_path, name, degree):
     cloud = random_cloud(degree=degree)
-    assert write_splats(tmp_path / name, cloud).lost == ()
+    assert write_splats(cloud, tmp_path / name).lost == ()
     back = read_splats(tmp_path / name)
-    assert back.info["format"] == "gltf"
     for key in ("means", "sh", "opacities"):
-        assert torch.equal(getattr(back.gaussians, key), getattr(cloud, key)), key
-    torch.testing.assert_close(back.gaussians.scales, cloud.scales, rtol=1e-6, atol=0)
-    turn = (back.gaussians.quats * cloud.quats).sum(1).abs()
+        assert torch.equal(getattr(back, key), getattr(cloud, key)), key
+    torch.testing.assert_close(back.scales, cloud.scales, rtol=1e-6, atol=0)
+    turn = (back.quats * cloud.quats).sum(1).abs()
     torch.testing.assert_close(turn, torch.ones(7), rtol=0, atol=1e-6)
 
 
 def test_pygltflib_reads_what_the_extension_asks_for(tmp_path):
     cloud = random_cloud()
-    write_splats(tmp_path / "a.glb", cloud)
+    write_splats(cloud, tmp_path / "a.glb")
     document = pygltflib.GLTF2().load(str(tmp_path / "a.glb"))
     primitive = document.meshes[0].primitives[0]
     assert (document.asset.version, primitive.mode, document.extensionsUsed) == ("2.0", 0, [KHR])
@@ -72,7 +71,7 @@ def test_pygltflib_reads_what_the_extension_asks_for(tmp_path):
 
 def test_harmonics_turn_with_the_axes(tmp_path):
     cloud = random_cloud(6)
-    write_splats(tmp_path / "a.glb", cloud)
+    write_splats(cloud, tmp_path / "a.glb")
     document = pygltflib.GLTF2().load(str(tmp_path / "a.glb"))
     names = [(d, n) for d in range(4) for n in range(2 * d + 1)]
     stored = torch.from_numpy(np.stack([_values(document, f"{KHR}:SH_DEGREE_{d}_COEF_{n}") for d, n in names], 1))
@@ -81,7 +80,7 @@ def test_harmonics_turn_with_the_axes(tmp_path):
     torch.testing.assert_close(evaluate_sh(stored, turned), evaluate_sh(cloud.sh, directions))
 
 
-def test_a_file_that_pygltflib_wrote_opens(tmp_path):
+def test_a_file_that_pygltflib_wrote_opens(tmp_path, notes):
     n = 4
     rng = np.random.default_rng(0)
     arrays = {
@@ -121,13 +120,13 @@ def test_a_file_that_pygltflib_wrote_opens(tmp_path):
     document.set_binary_blob(blob)
     document.save(str(tmp_path / "theirs.glb"))
     splats = read_splats(tmp_path / "theirs.glb")
-    g = splats.gaussians
+    g = splats
     np.testing.assert_array_equal(g.means.numpy(), arrays["POSITION"] * np.float32([1, -1, -1]))
     np.testing.assert_allclose(g.opacities.numpy(), [0, 1, 0.2, 0.4], atol=1e-7)
     assert g.quats.abs().argmax(1).tolist() == [3] * n  # z of w, x, y, z: the axis stays, its sense may turn
     assert g.sh.shape == (n, 1, 3)
-    assert splats.info["color_space"] == "lin_rec709_display"
-    assert splats.notes == ("the file says colorSpace 'lin_rec709_display': drawn as if it were 'srgb_rec709_display'",)
+    note = "the file says colorSpace 'lin_rec709_display': drawn as if it were 'srgb_rec709_display'"
+    assert note in notes[0]
 
 
 def test_labels_names_and_columns_travel(tmp_path):
@@ -135,13 +134,14 @@ def test_labels_names_and_columns_travel(tmp_path):
     extra = {"score": np.linspace(0, 1, 7, dtype=np.float32), "filter 3D": np.arange(7, dtype=np.uint8)}
     extra["huge"] = np.full(7, 2**31 - 1, np.int64)
     classes = ("wall", "Stuhl ä", "plant")
-    written = write_splats(tmp_path / "a.glb", SplatFile(cloud, extra, classes))
+    scores = extra.pop("score")
+    written = write_splats(cloud.replace(scores=scores, extra=extra, names=classes), tmp_path / "a.glb")
     assert written.lost == ("the columns huge: .glb has no place for them",)
     back = read_splats(tmp_path / "a.glb")
-    assert back.gaussians.labels.tolist() == cloud.labels.tolist()
-    assert back.classes == classes
-    assert set(back.extra) == {"score", "filter 3D"}
-    np.testing.assert_array_equal(back.extra["score"], extra["score"])
+    assert back.labels.tolist() == cloud.labels.tolist()
+    assert back.names == classes
+    assert set(back.extra) == {"filter 3D"}
+    np.testing.assert_array_equal(back.scores, scores)
     np.testing.assert_array_equal(back.extra["filter 3D"], np.arange(7))
     assert {"_CLASS_ID", "_SCORE", "_FILTER_3D"} < set(
         json_of_glb(tmp_path / "a.glb")["meshes"][0]["primitives"][0]["attributes"]
@@ -150,8 +150,8 @@ def test_labels_names_and_columns_travel(tmp_path):
 
 def test_labels_without_names_may_be_large(tmp_path):
     cloud = random_cloud(2).replace(labels=torch.tensor([300, 1 << 24]))
-    write_splats(tmp_path / "a.glb", cloud)
-    assert read_splats(tmp_path / "a.glb").gaussians.labels.tolist() == [300, 1 << 24]
+    write_splats(cloud, tmp_path / "a.glb")
+    assert read_splats(tmp_path / "a.glb").labels.tolist() == [300, 1 << 24]
 
 
 def test_primitives_join(tmp_path):
@@ -165,9 +165,9 @@ def test_primitives_join(tmp_path):
     root["meshes"][0]["primitives"] = [primitive, plain, mesh]
     path.write_text(json.dumps(root))
     splats = read_splats(path)
-    assert (splats.info["primitives"], splats.info["ignored"], len(splats)) == (2, 1, 10)
-    assert bool((splats.gaussians.sh[5:, 1:] == 0).all())
-    assert bool((splats.gaussians.sh[:5, 1:] != 0).all())
+    assert len(splats) == 10
+    assert bool((splats.sh[5:, 1:] == 0).all())
+    assert bool((splats.sh[:5, 1:] != 0).all())
 
 
 def test_drafts_are_read(tmp_path):
@@ -185,7 +185,7 @@ def test_drafts_are_read(tmp_path):
     blob[start : start + 60] = (cloud.scales * 0.3).log().numpy().astype("<f4").tobytes()
     root["buffers"][0]["uri"] = "data:;base64," + base64.b64encode(blob).decode()
     path.write_text(json.dumps(root))
-    g = read_splats(path).gaussians
+    g = read_splats(path)
     torch.testing.assert_close(g.scales, cloud.scales * 0.3)
     torch.testing.assert_close(g.opacities, cloud.opacities, rtol=0, atol=0.5 / 255 + 1e-6)
     rgb = (cloud.sh[:, 0] * 0.28209479 + 0.5).clamp(0, 1)
@@ -193,12 +193,12 @@ def test_drafts_are_read(tmp_path):
 
 
 def test_what_cannot_be_written_is_named(tmp_path):
-    with pytest.raises(ValueError, match=tells("splats:", "colours", ".glb")):
-        write_splats(tmp_path / "a.glb", random_cloud().replace(sh=None))
-    with pytest.raises(ValueError, match=tells("splats:", "got none", ".ply")):
-        write_splats(tmp_path / "a.glb", random_cloud(0))
+    with pytest.raises(ValueError, match=tells("gaussians:", "colours", ".glb")):
+        write_splats(random_cloud().replace(sh=None), tmp_path / "a.glb")
+    with pytest.raises(ValueError, match=tells("gaussians:", "got none", ".ply")):
+        write_splats(random_cloud(0), tmp_path / "a.glb")
     with pytest.raises(ValueError, match=tells("labels:", "expected -1 to 16777216", "glTF", "got 99999999")):
-        write_splats(tmp_path / "a.glb", random_cloud(2).replace(labels=torch.tensor([0, 99_999_999])))
+        write_splats(random_cloud(2).replace(labels=torch.tensor([0, 99_999_999])), tmp_path / "a.glb")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -22,7 +22,7 @@ def test_a_buffer_beside_the_document_is_read(tmp_path):
     (tmp_path / "my data.bin").write_bytes(blob)
     root["buffers"][0]["uri"] = "my%20data.bin"
     path.write_text(json.dumps(root))
-    assert torch.equal(read_splats(path).gaussians.means, cloud.means)
+    assert torch.equal(read_splats(path).means, cloud.means)
     (tmp_path / "my data.bin").write_bytes(blob[:-9])
     with pytest.raises(ValueError, match=tells("bent.gltf:", "buffers[0]:", "bytes", "damaged")):
         read_splats(path)
@@ -135,7 +135,7 @@ def test_json_of_millions_of_values_is_not_parsed(tmp_path):
 )
 def test_bad_values_are_named(tmp_path, attribute, values, message):
     path = tmp_path / "bad.glb"
-    write_splats(path, random_cloud(5, 1).replace(labels=torch.arange(5)))
+    write_splats(random_cloud(5, 1).replace(labels=torch.arange(5)), path)
     root = json_of_glb(path)
     view = root["bufferViews"][root["meshes"][0]["primitives"][0]["attributes"][attribute]]
     data = bytearray(path.read_bytes())

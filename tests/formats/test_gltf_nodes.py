@@ -20,7 +20,7 @@ def test_a_node_moves_resizes_and_turns(tmp_path):
     node = {"mesh": 0, "rotation": R.as_quat().tolist(), "scale": [2, 2, 2], "translation": [1, 2, 3]}
     above = {"children": [1], "translation": [10, 0, 0]}
     path = bent_gltf(tmp_path, cloud, **{"nodes": [above, node]})
-    g = read_splats(path).gaussians
+    g = read_splats(path)
     S = np.array([1.0, -1.0, -1.0])
     expected = (2 * R.apply(cloud.means.double().numpy() * S) + [11, 2, 3]) * S
     np.testing.assert_allclose(g.means.numpy(), expected, atol=1e-5)
@@ -42,7 +42,7 @@ def test_a_turned_node_looks_the_same_from_a_moved_camera(tmp_path, degree):
         "scale": [1.5] * 3,
         "rotation": Rotation.from_matrix(R).as_quat().tolist(),
     }
-    moved = read_splats(bent_gltf(tmp_path, cloud, **{"nodes": [node]})).gaussians
+    moved = read_splats(bent_gltf(tmp_path, cloud, **{"nodes": [node]}))
     S = np.diag([1.0, -1.0, -1.0])  # glTF's axes against ours
     motion = Similarity(1.5, torch.from_numpy(S @ R @ S), torch.tensor([1.0, -2.0, -3.0]))
     viewmat = torch.eye(4)
@@ -55,7 +55,7 @@ def test_a_turned_node_looks_the_same_from_a_moved_camera(tmp_path, degree):
 
 def test_a_node_that_moves_beyond_float32_is_named(tmp_path):
     path = bent_gltf(tmp_path, random_cloud(5, 0), **{"nodes/0/scale": [1e25] * 3, "nodes/0/translation": [1e29, 0, 0]})
-    assert read_splats(path).gaussians.means.isfinite().all()
+    assert read_splats(path).means.isfinite().all()
     root = json.loads(path.read_text())
     root["nodes"] = [{"children": [1], "scale": [1e25] * 3}, root["nodes"][0]]
     root["scenes"][0]["nodes"] = [0]
@@ -69,7 +69,7 @@ def test_half_turns_take_all_degrees_along(tmp_path):
     matrix = np.diag([-1.0, 1.0, -1.0, 1.0])
     matrix[:3, 3] = [1, 2, 3]
     path = bent_gltf(tmp_path, cloud, **{"nodes/0/matrix": matrix.T.ravel().tolist()})
-    g = read_splats(path).gaussians
+    g = read_splats(path)
     turn = torch.tensor([-1.0, 1.0, -1.0])
     torch.testing.assert_close(g.means, cloud.means * turn + torch.tensor([1.0, -2.0, -3.0]))
     directions = torch.randn(5, 3, generator=torch.Generator().manual_seed(1))

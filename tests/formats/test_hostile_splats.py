@@ -15,9 +15,9 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.formats import SplatFile, formats, read_splats, write_splats
+from kfgs import Gaussians
+from kfgs.formats import formats, read_splats, write_splats
 from kfgs.formats.spz import write_spz
-from kfgs.gaussians import Gaussians
 
 MOST_MEMORY = 48 << 20  # bytes, for files of a few kB
 MOST_SECONDS = 5.0
@@ -26,7 +26,7 @@ FORMATS = [name for name, module in formats().items() if hasattr(module, "write"
 KINDS = [*FORMATS, "gltf-text", "ascii", "spz-2", "ksplat"]
 
 
-def _cloud(n: int = 40) -> SplatFile:
+def _cloud(n: int = 40) -> Gaussians:
     g = torch.Generator().manual_seed(2)
     cloud = Gaussians(
         means=torch.randn(n, 3, generator=g),
@@ -36,7 +36,7 @@ def _cloud(n: int = 40) -> SplatFile:
         sh=torch.randn(n, 4, 3, generator=g) * 0.3,
         labels=torch.arange(n) % 3,
     )
-    return SplatFile(cloud, classes=("a", "b", "c"))
+    return cloud.replace(names=("a", "b", "c"))
 
 
 @pytest.fixture(scope="module")
@@ -54,10 +54,10 @@ def sound(tmp_path_factory, request):
             rows = "\n".join(" ".join(f"{i + j / 8:g}" for j in range(len(names))) for i in range(6))
             return ".ply", f"ply\nformat ascii 1.0\nelement vertex 6\n{head}end_header\n{rows}\n".encode()
         if kind == "spz-2":
-            write_spz(folder / "two.spz", _cloud(), version=2)
+            write_spz(_cloud(), folder / "two.spz", version=2)
             return ".spz", (folder / "two.spz").read_bytes()
         suffix = ".gltf" if kind == "gltf-text" else formats()[kind].SUFFIXES[0]
-        write_splats(folder / f"a{suffix}", _cloud())
+        write_splats(_cloud(), folder / f"a{suffix}")
         return suffix, (folder / f"a{suffix}").read_bytes()
 
     return make
@@ -81,7 +81,7 @@ def _read(path, content: bytes) -> str:
     if splats is None:
         assert str(path) in message, f"the message does not name the file: {message}"
     else:
-        g = splats.gaussians
+        g = splats
         assert len(g) <= 8 * len(content)
         assert all(bool(getattr(g, key).isfinite().all()) for key in ("means", "scales", "opacities", "quats"))
         assert bool((g.scales > 0).all())

@@ -3,7 +3,8 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.formats import SplatFile, read_splats, write_splats
+from kfgs import Gaussians
+from kfgs.formats import read_splats, write_splats
 from kfgs.formats.ply import (
     other_elements,
     points_from_columns,
@@ -14,7 +15,6 @@ from kfgs.formats.ply import (
     write_ply_elements,
 )
 from kfgs.formats.ply_3dgs import columns_from_gaussians, gaussians_from_columns
-from kfgs.gaussians import Gaussians
 
 
 def _cloud(n: int = 7, degree: int = 3) -> Gaussians:
@@ -33,7 +33,7 @@ def _cloud(n: int = 7, degree: int = 3) -> Gaussians:
 def test_gaussians_survive_the_file(tmp_path):
     cloud = _cloud()
     write_ply(tmp_path / "a.ply", columns_from_gaussians(cloud))
-    back = read_splats(tmp_path / "a.ply").gaussians
+    back = read_splats(tmp_path / "a.ply")
     for name in ("means", "quats", "scales", "opacities", "features", "sh", "labels"):
         torch.testing.assert_close(getattr(back, name), getattr(cloud, name), rtol=1e-5, atol=1e-6)
 
@@ -257,7 +257,7 @@ def test_labels_that_are_no_whole_numbers_are_named(tmp_path, label):
     columns = columns_from_gaussians(_cloud())
     count = len(columns["x"])
     write_ply(path, columns | {"class_id": np.full(count, 2.0)})
-    assert read_splats(path).gaussians.labels.tolist() == [2] * count
+    assert read_splats(path).labels.tolist() == [2] * count
     write_ply(path, columns | {"class_id": np.array([0.0] * (count - 1) + [label])})
     with pytest.raises(ValueError, match=tells("a.ply:", "class_id:", "whole numbers", f"at Gaussian {count - 1}")):
         read_splats(path)
@@ -266,8 +266,8 @@ def test_labels_that_are_no_whole_numbers_are_named(tmp_path, label):
 def test_scales_far_below_the_smallest_that_is_needed_come_back(tmp_path):
     scales = torch.tensor([[1e-12, 1e-20, 3e-30], [1.0, 1e-9, 1e-38]])
     cloud = _cloud()[:2].replace(scales=scales, labels=None)
-    write_splats(tmp_path / "a.ply", cloud)
-    assert torch.allclose(read_splats(tmp_path / "a.ply").gaussians.scales, scales, rtol=1e-4, atol=0)
+    write_splats(cloud, tmp_path / "a.ply")
+    assert torch.allclose(read_splats(tmp_path / "a.ply").scales, scales, rtol=1e-4, atol=0)
 
 
 STANDARD = [
@@ -279,35 +279,36 @@ STANDARD = [
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_a_plain_file_has_the_62_properties_of_inrias_files_and_its_classes_are_found_again(tmp_path, degree):
     cloud, path = _cloud(degree=degree), tmp_path / "a.ply"
-    classes, extra = ("a", "b", "c", "d", "e", "f"), {"score": np.linspace(0, 1, 7), "id": np.arange(7)}
-    written = write_splats(path, SplatFile(cloud, extra, classes), plain=True)
+    classes, extra = ("a", "b", "c", "d", "e", "f"), {"id": np.arange(7)}
+    scores = np.linspace(0, 1, 7)
+    written = write_splats(cloud.replace(scores=scores, extra=extra, names=classes), path, plain=True)
     columns = read_ply(path)
     assert list(columns) == STANDARD
     assert {values.dtype.str for values in columns.values()} == {"<f4"}
     assert [one.name for one in written.paths] == ["a.ply", "a.ply.labels.npz", "a.ply.classes.json"]
     assert [word.split(":")[0] for word in written.lost] == ["9 features per Gaussian", "the columns id"]
     back = read_splats(path)
-    assert back.classes == classes
-    assert torch.equal(back.gaussians.labels, cloud.labels)
-    np.testing.assert_allclose(back.extra["score"], extra["score"], rtol=1e-6)
+    assert back.names == classes
+    assert torch.equal(back.labels, cloud.labels)
+    np.testing.assert_allclose(back.scores, scores, rtol=1e-6)
     K = cloud.sh.shape[1]
-    assert torch.equal(back.gaussians.sh[:, :K], cloud.sh)
-    assert not back.gaussians.sh[:, K:].any()
+    assert torch.equal(back.sh[:, :K], cloud.sh)
+    assert not back.sh[:, K:].any()
 
 
 def test_a_full_file_at_the_place_of_a_plain_one_leaves_nothing_beside_it(tmp_path):
     path = tmp_path / "a.ply"
-    write_splats(path, _cloud(), plain=True)
-    write_splats(path, _cloud())
+    write_splats(_cloud(), path, plain=True)
+    write_splats(_cloud(), path)
     assert [one.name for one in tmp_path.iterdir()] == ["a.ply"]
-    assert torch.equal(read_splats(path).gaussians.labels, _cloud().labels)
+    assert torch.equal(read_splats(path).labels, _cloud().labels)
 
 
 def test_plain_is_for_ply_files_with_colours(tmp_path):
     with pytest.raises(ValueError, match=tells("plain:", "ends in .ply", "a.spz")):
-        write_splats(tmp_path / "a.spz", _cloud(), plain=True)
-    with pytest.raises(ValueError, match=tells("splats:", "colours", "a plain PLY")):
-        write_splats(tmp_path / "a.ply", _cloud().replace(sh=None), plain=True)
+        write_splats(_cloud(), tmp_path / "a.spz", plain=True)
+    with pytest.raises(ValueError, match=tells("gaussians:", "colours", "a plain PLY")):
+        write_splats(_cloud().replace(sh=None), tmp_path / "a.ply", plain=True)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -318,12 +319,12 @@ def test_labels_are_float_where_float_holds_them_and_files_with_int_are_read(tmp
     labels = torch.arange(len(cloud)) - 1
     labels[-1] = high
     score = np.linspace(0, 1, len(cloud), dtype=np.float32)
-    write_splats(tmp_path / "a.ply", SplatFile(cloud.replace(labels=labels), {"score": score}))
+    write_splats(cloud.replace(labels=labels).replace(scores=score), tmp_path / "a.ply")
     header = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0].decode()
     kinds = dict(reversed(line.split()[1:]) for line in header.splitlines() if line.startswith("property"))
     assert kinds.pop("class_id") == kind
     assert kinds.pop("score") == "float"
     assert set(kinds.values()) == {"float"}
-    assert torch.equal(read_splats(tmp_path / "a.ply").gaussians.labels, labels)
+    assert torch.equal(read_splats(tmp_path / "a.ply").labels, labels)
     write_ply(tmp_path / "old.ply", columns_from_gaussians(cloud) | {"class_id": labels.numpy().astype(np.int32)})
-    assert torch.equal(read_splats(tmp_path / "old.ply").gaussians.labels, labels)
+    assert torch.equal(read_splats(tmp_path / "old.ply").labels, labels)

@@ -8,7 +8,7 @@ from messages import tells
 from kfgs import Gaussians
 from kfgs.cameras import Camera
 from kfgs.fields import uplift_maps
-from kfgs.formats import SplatFile, read_splats, write_splats
+from kfgs.formats import read_splats, write_splats
 from kfgs.formats.ply import write_ply
 from kfgs.formats.ply_3dgs import columns_from_gaussians
 from kfgs.splat.covariance import covariance_3d
@@ -46,7 +46,7 @@ WRONG = {
 def test_writers_and_fusing_refuse_the_same_values(name, tmp_path):
     changes, parts = WRONG[name]
     with pytest.raises(ValueError, match=tells(*parts)):
-        write_splats(tmp_path / "a.ply", cloud(**changes))
+        write_splats(cloud(**changes), tmp_path / "a.ply")
     camera = Camera.look_at((0, -4, 0), (0, 0, 0), width=32, height=24)
     with pytest.raises(ValueError, match=tells(*parts)):
         uplift_maps(cloud(**changes), [camera], [torch.rand(6, 8, 4)])
@@ -58,7 +58,7 @@ def test_a_rotation_of_length_0_in_a_file_is_read_as_none(tmp_path):
     for i in range(4):
         columns[f"rot_{i}"][2] = 0
     write_ply(tmp_path / "a.ply", columns)
-    quats = read_splats(tmp_path / "a.ply").gaussians.quats
+    quats = read_splats(tmp_path / "a.ply").quats
     assert quats.tolist() == [[1, 1, 1, 1]] * 2 + [[1, 0, 0, 0]] + [[1, 1, 1, 1]] * 2
     assert covariance_3d(quats, torch.ones(5, 3)).equal(
         covariance_3d(quats * (quats.norm(dim=1) > 1)[:, None], torch.ones(5, 3))
@@ -74,18 +74,18 @@ def test_maps_without_features_are_named_not_the_frame():
 @pytest.mark.parametrize(("ending", "limit"), [(".splat", 0.5 / 0.28209479177387814), (".spz", 0.5 / 0.15)])
 def test_colours_that_are_cut_off_are_told(ending, limit, tmp_path):
     inside = cloud(sh=torch.full((5, 1, 3), 0.999 * limit))
-    assert write_splats(tmp_path / f"a{ending}", inside).lost == ()
+    assert write_splats(inside, tmp_path / f"a{ending}").lost == ()
     sh = torch.zeros(5, 1, 3)
     sh[3, 0, 1], sh[1, 0, 0] = -50, 2 * limit
-    told = write_splats(tmp_path / f"b{ending}", cloud(sh=sh)).lost
+    told = write_splats(cloud(sh=sh), tmp_path / f"b{ending}").lost
     assert told == (f"colours of 2 of 5 Gaussians beyond what {ending} holds: cut off",)
-    assert (read_splats(tmp_path / f"b{ending}").gaussians.sh[3, 0, 1] + limit).abs() < 0.1  # what the note is about
+    assert (read_splats(tmp_path / f"b{ending}").sh[3, 0, 1] + limit).abs() < 0.1  # what the note is about
 
 
 def test_higher_harmonics_that_are_cut_off_are_told(tmp_path):
     sh = torch.zeros(5, 4, 3)
     sh[2, 3, 0] = 1.5
-    assert write_splats(tmp_path / "a.spz", cloud(sh=sh)).lost == (
+    assert write_splats(cloud(sh=sh), tmp_path / "a.spz").lost == (
         "higher harmonics of 1 of 5 Gaussians beyond what .spz holds: cut off",
     )
 
@@ -93,17 +93,17 @@ def test_higher_harmonics_that_are_cut_off_are_told(tmp_path):
 @pytest.mark.parametrize("ending", [".glb", ".ply", ".spz"])
 def test_a_column_that_would_take_the_labels_place_is_refused(ending, tmp_path):
     labelled = cloud(labels=torch.arange(5))
-    splats = SplatFile(labelled, {"class_id": np.linspace(0, 1, 5)}, tuple("abcde"))
+    splats = labelled.replace(extra={"class_id": np.linspace(0, 1, 5)}, names=tuple("abcde"))
     with pytest.raises(ValueError, match=tells("extra['class_id']", "labels", "leave it out")):
-        write_splats(tmp_path / f"a{ending}", splats)
+        write_splats(splats, tmp_path / f"a{ending}")
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("ending", [".glb", ".ply"])
 def test_columns_of_text_are_refused(ending, tmp_path):
-    splats = SplatFile(cloud(), {"name": np.array(list("abcde"))})
+    splats = cloud().replace(extra={"name": np.array(list("abcde"))})
     with pytest.raises(ValueError, match=tells("extra['name']", "numbers", "leave the column out")):
-        write_splats(tmp_path / f"a{ending}", splats)
+        write_splats(splats, tmp_path / f"a{ending}")
 
 
 def test_a_file_that_cannot_be_read_is_named(tmp_path):

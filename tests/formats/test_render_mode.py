@@ -8,19 +8,18 @@ import oracles_splat as oracle
 import pytest
 import torch
 
+from kfgs import Gaussians
 from kfgs.cameras import Camera
-from kfgs.formats import SplatFile, formats, read_splats, write_splats
+from kfgs.formats import formats, read_splats, write_splats
 from kfgs.formats.ply import read_comments, write_ply
 from kfgs.formats.render_mode import AS_FLAT, Mode, flattened, mode_from_comments, mode_from_meta
-from kfgs.gaussians import Gaussians
 from kfgs.splat import rasterize
 
 WRITABLE = [name for name, module in formats().items() if hasattr(module, "write")]
 HOLD_ANTIALIASED = ("compressed_ply", "ply", "spz", "sog")
-HOLD_SURFELS = ("compressed_ply", "ply", "sog")
 
 
-def _splats(antialiased: bool = False, **info) -> SplatFile:
+def _splats(antialiased: bool = False) -> Gaussians:
     g = torch.Generator().manual_seed(2)
     cloud = Gaussians(
         means=torch.randn(5, 3, generator=g),
@@ -30,13 +29,13 @@ def _splats(antialiased: bool = False, **info) -> SplatFile:
         sh=torch.randn(5, 1, 3, generator=g) * 0.3,
         antialiased=antialiased,
     )
-    return SplatFile(cloud, info=info)
+    return cloud
 
 
 def _through(folder, to, splats):
     """Written and read again: (what the words of loss are, what came back)."""
     suffix = formats()[to].SUFFIXES[0]
-    written = write_splats(folder / f"a{suffix}", splats)
+    written = write_splats(splats, folder / f"a{suffix}")
     return suffix, written.lost, read_splats(written.paths[0])
 
 
@@ -44,33 +43,22 @@ def _through(folder, to, splats):
 def test_antialiased_is_kept_or_named(tmp_path, to):
     suffix, lost, back = _through(tmp_path, to, _splats(antialiased=True))
     kept = to in HOLD_ANTIALIASED
-    assert back.gaussians.antialiased is kept
+    assert back.antialiased is kept
     assert lost == (() if kept else (f"antialiased rendering: {suffix} has no place for it",))
 
 
 @pytest.mark.parametrize("to", WRITABLE)
-def test_surfels_are_kept_or_named(tmp_path, to):
-    suffix, lost, back = _through(tmp_path, to, _splats(surfels=True))
-    assert not back.gaussians.antialiased
-    if to in HOLD_SURFELS:
-        assert (lost, back.info["surfels"], back.notes) == ((), True, (AS_FLAT,))
-    else:
-        assert lost == (f"rendering as surfels (2DGS): {suffix} has no place for it",)
-        assert ("surfels" in back.info, back.notes) == (False, ())
-
-
-@pytest.mark.parametrize("to", WRITABLE)
-def test_a_plain_cloud_stays_plain(tmp_path, to):
+def test_a_plain_cloud_stays_plain(tmp_path, notes, to):
     _, lost, back = _through(tmp_path, to, _splats())
-    assert (lost, back.gaussians.antialiased, "surfels" in back.info, back.notes) == ((), False, False, ())
+    assert (lost, back.antialiased, notes) == ((), False, [])
 
 
 def test_antialiased_goes_all_the_way_round(tmp_path):
     splats = _splats(antialiased=True)
     for i, suffix in enumerate((".spz", ".sog", ".compressed.ply", ".ply", ".spz")):
-        write_splats(tmp_path / f"{i}{suffix}", splats)
+        write_splats(splats, tmp_path / f"{i}{suffix}")
         splats = read_splats(tmp_path / f"{i}{suffix}")
-    assert splats.gaussians.antialiased
+    assert splats.antialiased
     assert (tmp_path / "4.spz").read_bytes()[14] == 1  # the header's flags
 
 
@@ -78,20 +66,18 @@ def test_antialiased_goes_all_the_way_round(tmp_path):
 def test_comments_are_those_that_others_look_for(tmp_path, suffix):
     for mode, comments in (
         ({"antialiased": True}, ["SplatRenderMode: mip", "antialiased 1"]),
-        ({"surfels": True}, ["SplatRenderMode: 2dgs"]),
         ({}, []),
     ):
-        write_splats(tmp_path / f"a{suffix}", _splats(**mode))
+        write_splats(_splats(**mode), tmp_path / f"a{suffix}")
         assert read_comments(tmp_path / f"a{suffix}") == ["written by kfgs", *comments]
 
 
 def test_meta_has_the_keys_that_others_look_for(tmp_path):
     for mode, keys in (
         ({"antialiased": True}, {"antialias": True, "model": "antialiased"}),
-        ({"surfels": True}, {"model": "2dgs"}),
         ({}, {}),
     ):
-        write_splats(tmp_path / "a.sog", _splats(**mode))
+        write_splats(_splats(**mode), tmp_path / "a.sog")
         with zipfile.ZipFile(tmp_path / "a.sog") as archive:
             meta = json.loads(archive.read("meta.json"))
         assert {key: meta[key] for key in ("antialias", "model") if key in meta} == keys
@@ -143,29 +129,28 @@ def _columns(count=4):
     return {name: g.normal(size=count).astype(np.float32) for name in names}
 
 
-def test_unknown_modes_are_told(tmp_path):
+def test_unknown_modes_are_told(tmp_path, notes):
     columns = _columns() | {f"scale_{i}": np.full(4, -3.0, np.float32) for i in range(3)}
     write_ply(tmp_path / "a.ply", columns, comments=("SplatRenderMode: 3dgut",))
     splats = read_splats(tmp_path / "a.ply")
-    assert not splats.gaussians.antialiased
-    assert len(splats.notes) == 1
-    assert "'SplatRenderMode: 3dgut'" in splats.notes[0]
+    assert not splats.antialiased
+    assert len(notes) == 1
+    assert "'SplatRenderMode: 3dgut'" in notes[0]
 
 
 @pytest.mark.parametrize("comments", [(), ("SplatRenderMode: 2dgs",)])
-def test_two_scales_are_surfels_without_thickness(tmp_path, comments):
+def test_two_scales_are_surfels_without_thickness(tmp_path, notes, comments):
     columns = _columns() | {"scale_0": np.full(4, -3.0, np.float32), "scale_1": np.full(4, -2.0, np.float32)}
     if comments:  # some trainers keep a third scale that 2DGS does not use
         columns["scale_2"] = np.full(4, -1.0, np.float32)
     write_ply(tmp_path / "a.ply", columns, comments=comments)
     splats = read_splats(tmp_path / "a.ply")
     expected = np.exp([-3.0, -2.0, -3.0]) * [1, 1, 0.001]
-    np.testing.assert_allclose(splats.gaussians.scales.numpy(), np.tile(expected, (4, 1)), rtol=1e-6)
-    assert splats.notes == (AS_FLAT,)
-    write_splats(tmp_path / "b.ply", splats)
+    np.testing.assert_allclose(splats.scales.numpy(), np.tile(expected, (4, 1)), rtol=1e-6)
+    assert notes == [f"a.ply: {AS_FLAT}"]
+    write_splats(splats, tmp_path / "b.ply")
     again = read_splats(tmp_path / "b.ply")
-    assert (again.info["surfels"], again.notes) == (True, (AS_FLAT,))
-    torch.testing.assert_close(again.gaussians.scales, splats.gaussians.scales)
+    torch.testing.assert_close(again.scales, splats.scales)
 
 
 @pytest.mark.parametrize(("tilt", "most"), [(0, 0.01), (30, 0.025), (75, 0.05)])
@@ -188,10 +173,10 @@ def test_the_3d_filter_of_mip_splatting_is_applied_once(tmp_path):
     columns |= {"opacity": np.zeros(2, np.float32), "filter_3D": np.array([0.4, 0.0], np.float32)}
     write_ply(tmp_path / "a.ply", columns)
     splats = read_splats(tmp_path / "a.ply")
-    torch.testing.assert_close(splats.gaussians.scales[:, 0], torch.tensor([0.5, 0.4]))  # 3, 4, 5
-    torch.testing.assert_close(splats.gaussians.opacities, torch.tensor([0.5 * 0.6**3, 0.5]))
-    assert splats.gaussians.antialiased
-    write_splats(tmp_path / "b.ply", splats)
+    torch.testing.assert_close(splats.scales[:, 0], torch.tensor([0.5, 0.4]))  # 3, 4, 5
+    torch.testing.assert_close(splats.opacities, torch.tensor([0.5 * 0.6**3, 0.5]))
+    assert splats.antialiased
+    write_splats(splats, tmp_path / "b.ply")
     again = read_splats(tmp_path / "b.ply")
-    assert (again.gaussians.antialiased, again.extra) == (True, {})
-    torch.testing.assert_close(again.gaussians.scales, splats.gaussians.scales)
+    assert (again.antialiased, again.extra) == (True, {})
+    torch.testing.assert_close(again.scales, splats.scales)

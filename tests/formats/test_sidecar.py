@@ -7,14 +7,14 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.formats import SplatFile, read_splats, write_splats
+from kfgs import Gaussians
+from kfgs.formats import read_splats, write_splats
 from kfgs.formats.sidecar import labels_path, names_path, read_names, write_names
-from kfgs.gaussians import Gaussians
 
 CLASSES = ("wall", "Stuhl ä", "plant")
 
 
-def _splats(n: int = 6) -> SplatFile:
+def _splats(n: int = 6) -> Gaussians:
     g = torch.Generator().manual_seed(1)
     cloud = Gaussians(
         means=torch.randn(n, 3, generator=g),
@@ -24,14 +24,14 @@ def _splats(n: int = 6) -> SplatFile:
         sh=torch.randn(n, 1, 3, generator=g),
         labels=torch.arange(n) % 4 - 1,
     )
-    return SplatFile(cloud, {"score": np.linspace(0, 1, n)}, CLASSES)
+    return cloud.replace(scores=np.linspace(0, 1, n), names=CLASSES)
 
 
 @pytest.fixture
 def path(tmp_path):
     """A .splat file, which has no place for labels, with its labels beside it."""
-    assert write_splats(tmp_path / "a.splat", _splats()).paths == [
-        tmp_path / "a.splat", tmp_path / "a.splat.labels.npz", tmp_path / "a.splat.classes.json"
+    assert write_splats(_splats(), tmp_path / "a.splat").paths == [
+        tmp_path / "a.splat", tmp_path / "a.splat.labels.npz", tmp_path / "a.splat.names.json"
     ]  # fmt: skip
     return tmp_path / "a.splat"
 
@@ -44,34 +44,34 @@ def _bend(path, **changes):
 
 def test_labels_scores_and_names_come_back(path):
     back = read_splats(path)
-    assert back.gaussians.labels.tolist() == [-1, 0, 1, 2, -1, 0]
-    assert back.gaussians.labels.dtype == torch.int64
-    np.testing.assert_allclose(back.extra["score"], np.linspace(0, 1, 6), atol=1e-7)
-    assert back.classes == CLASSES
+    assert back.labels.tolist() == [-1, 0, 1, 2, -1, 0]
+    assert back.labels.dtype == torch.int64
+    np.testing.assert_allclose(back.scores, np.linspace(0, 1, 6), atol=1e-7)
+    assert back.names == CLASSES
 
 
 def test_without_them_the_file_still_opens(path):
     labels_path(path).unlink()
     names_path(path).unlink()
     back = read_splats(path)
-    assert back.gaussians.labels is None
-    assert (back.classes, back.extra) == ((), {})
+    assert back.labels is None
+    assert (back.names, back.extra) == ((), {})
 
 
 def test_labels_without_names_and_scores(path):
     names_path(path).unlink()
     _bend(path, score=None)
     back = read_splats(path)
-    assert back.gaussians.labels.tolist() == [-1, 0, 1, 2, -1, 0]
-    assert (back.classes, back.extra) == ((), {})
+    assert back.labels.tolist() == [-1, 0, 1, 2, -1, 0]
+    assert (back.names, back.extra) == ((), {})
 
 
-def test_scores_that_are_no_numbers_are_0_as_in_a_ply(path):
+def test_scores_that_are_no_numbers_are_0_as_in_a_ply(path, notes):
     _bend(path, score=np.array([0.5, np.nan, 0.5, np.inf, 0.5, 0.5]))
     back = read_splats(path)
-    assert back.extra["score"].tolist() == [0.5, 0, 0.5, 0, 0.5, 0.5]
-    assert back.gaussians.labels.tolist() == [-1, 0, 1, 2, -1, 0]
-    assert back.notes == ("2 of 6 Gaussians have no number as score (rows 1, 3): read as 0",)
+    assert back.scores.tolist() == [0.5, 0, 0.5, 0, 0.5, 0.5]
+    assert back.labels.tolist() == [-1, 0, 1, 2, -1, 0]
+    assert "2 of 6 Gaussians have no number as score (rows 1, 3): read as 0" in notes[-1]
 
 
 def test_labels_of_another_version_are_refused(path):
@@ -136,7 +136,7 @@ def test_labels_that_state_gigabytes_in_a_small_array_are_named(path):
 
 def test_names_that_nest_too_deep_are_named(path):
     names_path(path).write_text('{"class_id": ' + "[" * 100_000 + "]" * 100_000 + "}")
-    with pytest.raises(ValueError, match=tells("a.splat.classes.json:", "nest more than 200 deep")):
+    with pytest.raises(ValueError, match=tells("a.splat.names.json:", "nest more than 200 deep")):
         read_splats(path)
 
 
@@ -166,18 +166,18 @@ def test_names_survive(tmp_path):
 )
 def test_damaged_names_are_named(path, content, message):
     names_path(path).write_text(content)
-    with pytest.raises(ValueError, match=tells("a.splat.classes.json:", *message)):
+    with pytest.raises(ValueError, match=tells("a.splat.names.json:", *message)):
         read_splats(path)
 
 
 def test_names_of_files_that_share_a_stem_stay_apart(tmp_path):
-    write_splats(tmp_path / "scene.ply", _splats())
-    write_splats(tmp_path / "scene.spz", _splats().replace(classes=("a", "b", "c", "d")))
-    write_splats(tmp_path / "scene.splat", _splats().replace(classes=()))
-    write_splats(tmp_path / "scene.compressed.ply", _splats().gaussians.replace(labels=None))
-    assert read_splats(tmp_path / "scene.ply").classes == CLASSES
-    assert read_splats(tmp_path / "scene.spz").classes == ("a", "b", "c", "d")
-    assert read_splats(tmp_path / "scene.splat").classes == ()
+    write_splats(_splats(), tmp_path / "scene.ply")
+    write_splats(_splats().replace(names=("a", "b", "c", "d")), tmp_path / "scene.spz")
+    write_splats(_splats().replace(names=()), tmp_path / "scene.splat")
+    write_splats(_splats().replace(labels=None), tmp_path / "scene.compressed.ply")
+    assert read_splats(tmp_path / "scene.ply").names == CLASSES
+    assert read_splats(tmp_path / "scene.spz").names == ("a", "b", "c", "d")
+    assert read_splats(tmp_path / "scene.splat").names == ()
 
 
 def test_labels_and_names_are_found_through_a_link(path):
@@ -188,17 +188,17 @@ def test_labels_and_names_are_found_through_a_link(path):
     again.symlink_to(link)
     for place in (link, again):
         found = read_splats(place)
-        assert found.classes == CLASSES
-        assert torch.equal(found.gaussians.labels, read_splats(path).gaussians.labels)
-        assert found.extra["score"].tolist() == read_splats(path).extra["score"].tolist()
+        assert found.names == CLASSES
+        assert torch.equal(found.labels, read_splats(path).labels)
+        assert found.scores.tolist() == read_splats(path).scores.tolist()
     write_names(link, ("of", "the", "link"))  # what is next to the link comes first
-    assert read_splats(link).classes == ("of", "the", "link")
-    assert read_splats(path).classes == CLASSES
+    assert read_splats(link).names == ("of", "the", "link")
+    assert read_splats(path).names == CLASSES
 
 
 def test_writing_to_a_link_leaves_the_file_it_led_to(path):
     link = path.parent / "b.splat"
     link.symlink_to(path)
-    write_splats(link, _splats().gaussians.replace(labels=None))
-    assert read_splats(link).gaussians.labels is None
-    assert read_splats(path).classes == CLASSES
+    write_splats(_splats().replace(labels=None), link)
+    assert read_splats(link).labels is None
+    assert read_splats(path).names == CLASSES

@@ -11,13 +11,12 @@ from oracles_packed import smallest_three
 from oracles_precision import assert_within, rotation_angles
 from oracles_sog import decode, encode, pack, sog_gaussian, unpack, version_1
 
-from kfgs import rasterize
+from kfgs import Gaussians, rasterize
 from kfgs.cameras.camera import Camera
-from kfgs.formats import SplatFile, find_format, read_splats, write_splats
+from kfgs.formats import find_format, read_splats, write_splats
 from kfgs.formats.order import morton_order
 from kfgs.formats.smallest_three import pack_smallest_three, rotation_error, unpack_smallest_three
 from kfgs.formats.sog import precision, read, write
-from kfgs.gaussians import Gaussians
 
 
 def _cloud(n: int = 700, degree: int = 3) -> Gaussians:
@@ -35,7 +34,7 @@ def _cloud(n: int = 700, degree: int = 3) -> Gaussians:
 def scene(tmp_path_factory):
     """A small scene of degree 1 as its files, to be damaged."""
     path = tmp_path_factory.mktemp("scene") / "a.sog"
-    write(path, SplatFile(_cloud(70, 1)))
+    write(path, _cloud(70, 1))
     return unpack(path)
 
 
@@ -49,12 +48,11 @@ def _gsply_reads(path, monkeypatch):
 
 @pytest.mark.parametrize("name", ["guitar.compressed.ply", "inria_9080.ply"])
 def test_real_files_survive(tmp_path, shared_data, name):
-    cloud = read_splats(shared_data / "splats" / name).gaussians
-    assert write_splats(tmp_path / "a.sog", cloud).lost == ()
+    cloud = read_splats(shared_data / "splats" / name)
+    assert write_splats(cloud, tmp_path / "a.sog").lost == ()
     order, stated = morton_order(cloud.means), precision(cloud)
     back = read_splats(tmp_path / "a.sog")
-    assert back.info == {"format": "sog", "version": 2, "generator": "kfgs"}
-    assert_within(back.gaussians, cloud.select(order), stated._replace(means=stated.means[order]))
+    assert_within(back, cloud.select(order), stated._replace(means=stated.means[order]))
     assert stated.scales < 0.12
     assert stated.sh0 < 0.06
     assert stated.sh_rest < 0.03
@@ -65,8 +63,8 @@ def test_real_files_survive(tmp_path, shared_data, name):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_made_clouds_survive_and_others_read_them(tmp_path, monkeypatch, degree):
     cloud, path = _cloud(1500, degree), tmp_path / "a.sog"
-    written = write_splats(path, cloud)
-    order, stated, back = written.order, precision(cloud), read(path).gaussians
+    written = write_splats(cloud, path)
+    order, stated, back = written.order, precision(cloud), read(path)
     assert written.lost == ()
     assert_within(back, cloud.select(order), stated._replace(means=stated.means[order]))
     files = unpack(path)
@@ -86,11 +84,10 @@ def test_made_clouds_survive_and_others_read_them(tmp_path, monkeypatch, degree)
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_version_1_is_read_as_others_do(tmp_path, monkeypatch, degree):
-    write(tmp_path / "a.sog", SplatFile(_cloud(150, degree)))
+    write(tmp_path / "a.sog", _cloud(150, degree))
     old = version_1(unpack(tmp_path / "a.sog"), degree)
     splats, other = read(pack(tmp_path / "old.sog", old)), _gsply_reads(tmp_path / "old.sog", monkeypatch)
-    cloud = splats.gaussians
-    assert splats.info == {"format": "sog", "version": 1}
+    cloud = splats
     assert cloud.sh.shape == (150, (degree + 1) ** 2, 3)
     np.testing.assert_allclose(other.means, cloud.means.numpy(), rtol=2e-5, atol=1e-6)
     np.testing.assert_allclose(np.exp(other.scales), cloud.scales.numpy(), rtol=1e-5)
@@ -105,36 +102,36 @@ def test_version_1_is_read_as_others_do(tmp_path, monkeypatch, degree):
 
 def test_a_folder_and_its_meta_are_read_like_the_zip(tmp_path):
     cloud = _cloud(100).replace(labels=torch.arange(100) % 3)
-    written = write_splats(tmp_path / "scene", SplatFile(cloud, {}, ("a", "b", "c")), format="sog")
+    written = write_splats(cloud.replace(names=("a", "b", "c")), tmp_path / "scene", format="sog")
     assert [path.name for path in written.paths] == ["scene", "scene.labels.npz", "scene.classes.json"]
-    write_splats(tmp_path / "scene.sog", SplatFile(cloud))
+    write_splats(cloud, tmp_path / "scene.sog")
     order, stated = written.order, precision(cloud)
-    zipped = read_splats(tmp_path / "scene.sog").gaussians
+    zipped = read_splats(tmp_path / "scene.sog")
     for path in (tmp_path / "scene", tmp_path / "scene" / "meta.json"):
         assert find_format(path).NAME == "sog"
         back = read_splats(path)
-        assert torch.equal(back.gaussians.labels, cloud.labels[order])
+        assert torch.equal(back.labels, cloud.labels[order])
         for name in ("means", "quats", "scales", "opacities", "sh"):
-            assert torch.equal(getattr(back.gaussians, name), getattr(zipped, name))
-        assert_within(back.gaussians, cloud.select(order), stated._replace(means=stated.means[order]))
-    write_splats(tmp_path / "scene", cloud, format="sog")  # over a scene, as a whole
+            assert torch.equal(getattr(back, name), getattr(zipped, name))
+        assert_within(back, cloud.select(order), stated._replace(means=stated.means[order]))
+    write_splats(cloud, tmp_path / "scene", format="sog")  # over a scene, as a whole
     (tmp_path / "scene" / "notes.txt").write_text("mine")
     with pytest.raises(ValueError, match=tells("path:", "notes.txt", ".sog")):
-        write_splats(tmp_path / "scene", cloud, format="sog")
+        write_splats(cloud, tmp_path / "scene", format="sog")
     assert (tmp_path / "scene" / "notes.txt").read_text() == "mine"
 
 
 def test_equal_clouds_give_equal_files(tmp_path):
     for name in "ab":
-        write(tmp_path / f"{name}.sog", SplatFile(_cloud(2100, 2)))
+        write(tmp_path / f"{name}.sog", _cloud(2100, 2))
     assert (tmp_path / "a.sog").read_bytes() == (tmp_path / "b.sog").read_bytes()
 
 
 @pytest.mark.parametrize("n", [0, 1, 65])
 def test_few_gaussians_survive(tmp_path, n):
     cloud = _cloud(n, 3)
-    order = write_splats(tmp_path / "a.sog", cloud).order
-    back = read(tmp_path / "a.sog").gaussians
+    order = write_splats(cloud, tmp_path / "a.sog").order
+    back = read(tmp_path / "a.sog")
     if n:
         stated = precision(cloud)
         assert_within(back, cloud.select(order), stated._replace(means=stated.means[order]))
@@ -157,10 +154,10 @@ def test_rotations_by_their_three_smaller_components():
 
 
 def test_the_picture_stays_the_same(tmp_path, shared_data):
-    cloud = read_splats(shared_data / "splats" / "inria_9080.ply").gaussians
-    write(tmp_path / "a.sog", SplatFile(cloud))
+    cloud = read_splats(shared_data / "splats" / "inria_9080.ply")
+    write(tmp_path / "a.sog", cloud)
     camera = Camera(torch.eye(4), torch.tensor([[90.0, 0, 64], [0, 90, 48], [0, 0, 1]]), 128, 96)
-    pictures = [rasterize(g, camera).map.clamp(0, 1) for g in (cloud, read_splats(tmp_path / "a.sog").gaussians)]
+    pictures = [rasterize(g, camera).map.clamp(0, 1) for g in (cloud, read_splats(tmp_path / "a.sog"))]
     assert pictures[0].std() > 0.1
     assert -10 * (pictures[0] - pictures[1]).square().mean().log10() > 40
 
@@ -173,18 +170,18 @@ def test_images_of_other_kinds_and_a_missing_first_code(tmp_path, scene):
     pixels = decode(scene["scales.webp"])
     pixels[0, 0, :3] = 0
     files = scene | {"meta.json": json.dumps(meta).encode(), "size.png": encode(pixels[..., :3], "PNG")}
-    back = read(pack(tmp_path / "a.sog", files)).gaussians
+    back = read(pack(tmp_path / "a.sog", files))
     torch.testing.assert_close(back.scales[0], torch.full((3,), math.exp(lowest)))
 
 
 def test_what_is_lost_is_told(tmp_path):
-    splats = SplatFile(_cloud(10).replace(features=torch.zeros(10, 4)), {"id": np.arange(10)})
+    splats = _cloud(10).replace(features=torch.zeros(10, 4)).replace(extra={"id": np.arange(10)})
     assert write(tmp_path / "a.sog", splats) == (
         "4 features per Gaussian: .sog has no place for them",
         "the columns id: .sog has no place for them",
     )
-    with pytest.raises(ValueError, match=tells("splats:", "colours", "got Gaussians")):
-        write(tmp_path / "b.sog", SplatFile(_cloud(10).replace(sh=None)))
+    with pytest.raises(ValueError, match=tells("gaussians:", "colours", "got Gaussians")):
+        write(tmp_path / "b.sog", _cloud(10).replace(sh=None))
     assert not (tmp_path / "b.sog").exists()
 
 

@@ -4,9 +4,9 @@ import torch
 from messages import tells
 from oracles_precision import assert_within, rotation_angles
 
-from kfgs.formats import SplatFile, read_splats, write_splats
+from kfgs import Gaussians
+from kfgs.formats import read_splats, write_splats
 from kfgs.formats.splat import precision, read, write
-from kfgs.gaussians import Gaussians
 
 
 def _cloud(n: int = 500, degree: int = 0) -> Gaussians:
@@ -23,7 +23,7 @@ def _cloud(n: int = 500, degree: int = 0) -> Gaussians:
 def test_a_record_by_hand(tmp_path):
     bytes_ = np.float32([1.5, -2, 3, 0.1, 0.2, 0.4]).tobytes() + bytes([0, 255, 102, 51, 128, 192, 64, 0])
     (tmp_path / "a.splat").write_bytes(bytes_)
-    g = read(tmp_path / "a.splat").gaussians
+    g = read(tmp_path / "a.splat")
     np.testing.assert_array_equal(g.means, np.float32([[1.5, -2, 3]]))
     np.testing.assert_array_equal(g.scales, np.float32([[0.1, 0.2, 0.4]]))
     np.testing.assert_allclose(0.5 + 0.28209479177387814 * g.sh[0, 0], [0, 1, 0.4], atol=1e-6)
@@ -35,9 +35,9 @@ def test_a_record_by_hand(tmp_path):
 
 def test_a_cloud_comes_back_as_exactly_as_stated(tmp_path):
     cloud = _cloud()
-    assert write(tmp_path / "a.splat", SplatFile(cloud)) == ()
+    assert write(tmp_path / "a.splat", cloud) == ()
     assert (tmp_path / "a.splat").stat().st_size == 500 * 32
-    back, stated = read(tmp_path / "a.splat").gaussians, precision(cloud)
+    back, stated = read(tmp_path / "a.splat"), precision(cloud)
     assert_within(back, cloud, stated)
     assert (back.sh - cloud.sh).abs().max() > 0.9 * stated.sh0
     assert (back.opacities - cloud.opacities).abs().max() > 0.9 * stated.opacities
@@ -46,17 +46,17 @@ def test_a_cloud_comes_back_as_exactly_as_stated(tmp_path):
 
 def test_rotations_about_an_axis_are_exact(tmp_path):
     cloud = _cloud(8).replace(quats=torch.cat([torch.eye(4), -torch.eye(4)]) * 3)
-    write(tmp_path / "a.splat", SplatFile(cloud))
-    assert rotation_angles(read(tmp_path / "a.splat").gaussians.quats.numpy(), cloud.quats.numpy()).max() == 0
+    write(tmp_path / "a.splat", cloud)
+    assert rotation_angles(read(tmp_path / "a.splat").quats.numpy(), cloud.quats.numpy()).max() == 0
     stored = np.fromfile(tmp_path / "a.splat", np.uint8).reshape(8, 32)[:, 28:]
     assert set(stored.ravel()) == {0, 128}  # -1 has a byte, +1 has none: a viewer that does not normalise is right too
 
 
 @pytest.mark.parametrize("name", ["inria_9080.ply", "minimal.splat", "biker.spz"])
 def test_real_files_survive(tmp_path, shared_data, name):
-    cloud = read_splats(shared_data / "splats" / name).gaussians
-    written = write_splats(tmp_path / "a.splat", cloud)
-    back = read_splats(tmp_path / "a.splat").gaussians
+    cloud = read_splats(shared_data / "splats" / name)
+    written = write_splats(cloud, tmp_path / "a.splat")
+    back = read_splats(tmp_path / "a.splat")
     assert_within(back, cloud, precision(cloud))
     lost = {"inria_9080.ply": ["spherical harmonics of degree 3: .splat holds the base colour only"]}.get(name, [])
     beyond = ((0.28209479177387814 * cloud.sh[:, 0].double()).abs() > 0.5 + 1 / 255).any(1).sum()
@@ -66,32 +66,32 @@ def test_real_files_survive(tmp_path, shared_data, name):
 
 
 def test_labels_go_beside(tmp_path):
-    splats = SplatFile(_cloud().replace(labels=torch.arange(500) % 3 - 1), {"score": np.ones(500)}, ("rug", "sofa"))
-    written = write_splats(tmp_path / "a.splat", splats)
+    splats = _cloud().replace(labels=torch.arange(500) % 3 - 1).replace(scores=np.ones(500), names=("rug", "sofa"))
+    written = write_splats(splats, tmp_path / "a.splat")
     assert len(written.paths) == 3
     assert written.lost == ()
     back = read_splats(tmp_path / "a.splat")
-    assert back.gaussians.labels.tolist() == splats.gaussians.labels.tolist()
-    assert back.classes == ("rug", "sofa")
+    assert back.labels.tolist() == splats.labels.tolist()
+    assert back.names == ("rug", "sofa")
 
 
 def test_what_is_cut_off_is_in_the_precision(tmp_path):
     cloud = _cloud(3)
     cloud.sh[1, 0, 2] = 4.0
-    write(tmp_path / "a.splat", SplatFile(cloud))
+    write(tmp_path / "a.splat", cloud)
     assert precision(cloud).sh0 == pytest.approx(4 - 0.5 / 0.28209479177387814, rel=1e-3)
-    assert_within(read(tmp_path / "a.splat").gaussians, cloud, precision(cloud))
+    assert_within(read(tmp_path / "a.splat"), cloud, precision(cloud))
 
 
 def test_an_empty_file_is_an_empty_cloud(tmp_path):
-    write(tmp_path / "a.splat", SplatFile(_cloud(0)))
+    write(tmp_path / "a.splat", _cloud(0))
     assert (tmp_path / "a.splat").read_bytes() == b""
-    assert read(tmp_path / "a.splat").gaussians.sh.shape == (0, 1, 3)
+    assert read(tmp_path / "a.splat").sh.shape == (0, 1, 3)
 
 
 def test_degenerate_values_are_mended(tmp_path):
     (tmp_path / "a.splat").write_bytes(bytes(24) + bytes([9, 9, 9, 9]) + b"\x80" * 4)
-    g = read_splats(tmp_path / "a.splat").gaussians
+    g = read_splats(tmp_path / "a.splat")
     assert g.quats.tolist() == [[1, 0, 0, 0]]
     assert bool((g.scales == 1e-10).all())
 
@@ -118,6 +118,6 @@ def test_damage_is_named(tmp_path, content, message):
 
 def test_a_field_without_colours_is_refused(tmp_path):
     cloud = _cloud().replace(sh=None, features=torch.zeros(500, 9))
-    with pytest.raises(ValueError, match=tells("splats:", "colours", ".splat", ".ply")):
-        write(tmp_path / "a.splat", SplatFile(cloud))
+    with pytest.raises(ValueError, match=tells("gaussians:", "colours", ".splat", ".ply")):
+        write(tmp_path / "a.splat", cloud)
     assert list(tmp_path.iterdir()) == []

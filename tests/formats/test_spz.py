@@ -9,14 +9,14 @@ from messages import tells
 from oracles_precision import assert_within, rotation_angles
 from oracles_spz import legacy_payload, smallest_three
 
+from kfgs import Gaussians
 from kfgs.cameras import Camera
-from kfgs.formats import SplatFile, read_splats, write_splats
+from kfgs.formats import read_splats, write_splats
 from kfgs.formats import spz as module
 from kfgs.formats.spz import precision, read, write, write_spz
 from kfgs.formats.spz_codec import choose_fractional_bits
 from kfgs.formats.spz_streams import read_container
 from kfgs.formats.values import flip_axes
-from kfgs.gaussians import Gaussians
 from kfgs.splat import rasterize
 
 ROW = {"position": (256, -512, 768), "alpha": 51, "color": (0, 128, 255), "scale": (160, 128, 96)}
@@ -35,9 +35,9 @@ def _cloud(n: int = 40, degree: int = 3, seed: int = 3) -> Gaussians:
     )
 
 
-def _labelled(n: int = 40) -> SplatFile:
+def _labelled(n: int = 40) -> Gaussians:
     score = np.linspace(0, 1, n, dtype=np.float32)
-    return SplatFile(_cloud(n).replace(labels=torch.arange(n) % 4 - 1), {"score": score}, ("rug", "sofa", "Tür"))
+    return _cloud(n).replace(labels=torch.arange(n) % 4 - 1).replace(scores=score, names=("rug", "sofa", "Tür"))
 
 
 def _legacy(path, rows, packed=True, **options):
@@ -50,16 +50,15 @@ def _legacy(path, rows, packed=True, **options):
 @pytest.mark.parametrize("version", [3, 4])
 def test_a_cloud_comes_back_as_exactly_as_stated(tmp_path, degree, version):
     cloud = _cloud(degree=degree)
-    assert write_spz(tmp_path / "a.spz", SplatFile(cloud), version=version) == ()
+    assert write_spz(cloud, tmp_path / "a.spz", version=version) == ()
     back = read(tmp_path / "a.spz")
-    assert back.info["version"] == version
-    assert_within(back.gaussians, cloud, precision(cloud))
+    assert_within(back, cloud, precision(cloud))
 
 
 def test_the_stated_precision_is_not_idle(tmp_path):
     cloud = _cloud(2000, 1)
-    write(tmp_path / "a.spz", SplatFile(cloud))
-    back, stated = read(tmp_path / "a.spz").gaussians, precision(cloud)
+    write(tmp_path / "a.spz", cloud)
+    back, stated = read(tmp_path / "a.spz"), precision(cloud)
     assert (back.means - cloud.means).abs().max() > 0.9 * stated.means
     assert (back.scales / cloud.scales - 1).abs().max() > 0.9 * stated.scales
     assert rotation_angles(back.quats.numpy(), cloud.quats.numpy()).max() > 0.5 * stated.rotation
@@ -71,10 +70,9 @@ def test_the_stated_precision_is_not_idle(tmp_path):
 def test_version_2_keeps_rotations_as_three_bytes(tmp_path):
     cloud = _cloud()
     cloud = cloud.replace(quats=cloud.quats + torch.tensor([6.0, 0, 0, 0]))  # w well away from 0, where xyz say little
-    write_spz(tmp_path / "a.spz", SplatFile(cloud), version=2)
+    write_spz(cloud, tmp_path / "a.spz", version=2)
     back = read(tmp_path / "a.spz")
-    assert back.info["version"] == 2
-    assert_within(back.gaussians, cloud, precision(cloud)._replace(rotation=0.02))
+    assert_within(back, cloud, precision(cloud)._replace(rotation=0.02))
 
 
 @pytest.mark.parametrize("packed", [True, False])
@@ -84,7 +82,7 @@ def test_old_versions_by_hand(tmp_path, version, packed):
     position = (1.5, -0.25, 1000.0) if version == 1 else ROW["position"]
     sh = list(range(0, 72, 8))  # degree 1: y, z, x, each red, green, blue
     rows = [ROW | {"position": position, "rotation": rotation, "sh": sh}] * 2
-    g = read(_legacy(tmp_path / "a.spz", rows, packed, version=version, degree=1, bits=8)).gaussians
+    g = read(_legacy(tmp_path / "a.spz", rows, packed, version=version, degree=1, bits=8))
     raw = position if version == 1 else [value / 256 for value in position]
     np.testing.assert_allclose(g.means[1], [raw[0], -raw[1], -raw[2]])
     np.testing.assert_allclose(g.opacities[1], 0.2)
@@ -106,8 +104,8 @@ def test_old_versions_by_hand(tmp_path, version, packed):
 @pytest.mark.parametrize("degree", [0, 3])
 def test_gsply_reads_what_is_written(tmp_path, version, degree):
     cloud = _cloud(degree=degree)
-    write_spz(tmp_path / "a.spz", SplatFile(_labelled().gaussians.replace(sh=cloud.sh)), version=version)
-    other, ours = gsply.read_spz(str(tmp_path / "a.spz")), read(tmp_path / "a.spz").gaussians
+    write_spz(_labelled().replace(sh=cloud.sh), tmp_path / "a.spz", version=version)
+    other, ours = gsply.read_spz(str(tmp_path / "a.spz")), read(tmp_path / "a.spz")
     np.testing.assert_allclose(other.means, ours.means * TURN, atol=1e-6)
     np.testing.assert_allclose(np.exp(other.scales), ours.scales, rtol=1e-5)
     quats = ours.quats * torch.tensor([1.0, 1, -1, -1])
@@ -134,12 +132,11 @@ def test_what_gsply_writes_is_read(tmp_path, version):
     )
     gsply.write_spz(str(tmp_path / "a.spz"), data, version=version)
     back = read(tmp_path / "a.spz")
-    assert back.info["fractional_bits"] == 12
-    assert_within(back.gaussians, cloud, precision(cloud)._replace(means=2.0**-13 + 1e-6))
+    assert_within(back, cloud, precision(cloud)._replace(means=2.0**-13 + 1e-6))
 
 
 def test_biker_agrees_with_the_compressed_ply_of_the_same_scene(shared_data):
-    ours = read_splats(shared_data / "splats" / "biker.spz").gaussians
+    ours = read_splats(shared_data / "splats" / "biker.spz")
     other = gsply.plyread(str(shared_data / "splats" / "biker.compressed.ply"))  # axes of the PLY
     assert len(ours) == len(other.means) == 152746
     assert np.abs(ours.means.numpy() - other.means).max() < 4e-3  # 11 bits over a chunk against 12 after the point
@@ -152,26 +149,26 @@ def test_biker_agrees_with_the_compressed_ply_of_the_same_scene(shared_data):
 
 
 def test_fixtures_hold_four_splats(shared_data):
-    expected = read_splats(shared_data / "splats" / "minimal.splat").gaussians
+    expected = read_splats(shared_data / "splats" / "minimal.splat")
     for name in ("minimal-v3.spz", "minimal-v4.spz"):
-        g = read_splats(shared_data / "splats" / name).gaussians
+        g = read_splats(shared_data / "splats" / name)
         torch.testing.assert_close(g.means, expected.means)
         torch.testing.assert_close(g.scales, expected.scales, rtol=0.02, atol=0)
         torch.testing.assert_close(g.opacities, expected.opacities)
         torch.testing.assert_close(g.sh, expected.sh, rtol=0, atol=0.02)
     plain, packed = (read(shared_data / "splats" / name) for name in ("minimal-raw.spz", "minimal-v2.spz"))
     for name in ("means", "quats", "scales", "opacities", "sh"):
-        torch.testing.assert_close(getattr(plain.gaussians, name), getattr(packed.gaussians, name), rtol=0, atol=0)
-    torch.testing.assert_close(packed.gaussians.means * TURN, expected.means)  # made without turning the axes
+        torch.testing.assert_close(getattr(plain, name), getattr(packed, name), rtol=0, atol=0)
+    torch.testing.assert_close(packed.means * TURN, expected.means)  # made without turning the axes
 
 
 @pytest.mark.parametrize("name", ["biker.spz", "inria_9080.ply", "minimal-v4.spz"])
 def test_real_files_survive(tmp_path, shared_data, name):
-    cloud = read_splats(shared_data / "splats" / name).gaussians
-    write_splats(tmp_path / "a.spz", cloud)
-    back = read_splats(tmp_path / "a.spz").gaussians
+    cloud = read_splats(shared_data / "splats" / name)
+    write_splats(cloud, tmp_path / "a.spz")
+    back = read_splats(tmp_path / "a.spz")
     assert_within(back, cloud, precision(cloud))
-    write_splats(tmp_path / "b.spz", back)
+    write_splats(back, tmp_path / "b.spz")
     once, twice = (read_container(tmp_path / f"{letter}.spz").streams for letter in "ab")
     for stream in ("positions", "alphas", "colors", "scales", "sh"):
         assert np.array_equal(once[stream], twice[stream]), stream  # rounding twice is rounding once
@@ -180,22 +177,22 @@ def test_real_files_survive(tmp_path, shared_data, name):
 
 @pytest.mark.parametrize(("sh_bits", "at_least"), [((8, 8), 45), ((5, 5), 40)])
 def test_a_picture_of_the_written_cloud_is_the_same(tmp_path, shared_data, sh_bits, at_least):
-    cloud = read_splats(shared_data / "splats" / "inria_9080.ply").gaussians
-    write_spz(tmp_path / "a.spz", SplatFile(cloud), sh_bits=sh_bits)
+    cloud = read_splats(shared_data / "splats" / "inria_9080.ply")
+    write_spz(cloud, tmp_path / "a.spz", sh_bits=sh_bits)
     camera = Camera(torch.eye(4), torch.tensor([[90.0, 0, 64], [0, 90, 48], [0, 0, 1]]), 128, 96)
     before = rasterize(cloud, camera).map.clamp(0, 1)
-    after = rasterize(read(tmp_path / "a.spz").gaussians, camera).map.clamp(0, 1)
+    after = rasterize(read(tmp_path / "a.spz"), camera).map.clamp(0, 1)
     assert before.std() > 0.1
     assert -10 * (before - after).square().mean().log10() > at_least
 
 
 def test_fewer_bits_of_harmonics_make_a_smaller_file(tmp_path, shared_data):
     splats = read_splats(shared_data / "splats" / "inria_9080.ply")
-    write_spz(tmp_path / "a.spz", splats)
-    write_spz(tmp_path / "b.spz", splats, sh_bits=(5, 4))
+    write_spz(splats, tmp_path / "a.spz")
+    write_spz(splats, tmp_path / "b.spz", sh_bits=(5, 4))
     small, large = ((tmp_path / name).stat().st_size for name in ("b.spz", "a.spz"))
     assert small < 0.75 * large
-    error = (read(tmp_path / "b.spz").gaussians.sh - splats.gaussians.sh).abs()
+    error = (read(tmp_path / "b.spz").sh - splats.sh).abs()
     assert error[:, 1:4].max() <= 1 / 32 + 1e-5
     assert 1 / 32 < error[:, 4:].max() <= 1 / 16 + 1e-5
 
@@ -203,33 +200,31 @@ def test_fewer_bits_of_harmonics_make_a_smaller_file(tmp_path, shared_data):
 @pytest.mark.parametrize("version", [2, 3, 4])
 def test_labels_travel_inside(tmp_path, version):
     splats = _labelled()
-    write_spz(tmp_path / "a.spz", splats, version=version)
+    write_spz(splats, tmp_path / "a.spz", version=version)
     back = read(tmp_path / "a.spz")
-    assert back.gaussians.labels.tolist() == splats.gaussians.labels.tolist()
-    np.testing.assert_array_equal(back.extra["score"], splats.extra["score"])
-    assert back.classes == ("rug", "sofa", "Tür")
-    assert back.info["extensions"] == []
+    assert back.labels.tolist() == splats.labels.tolist()
+    np.testing.assert_array_equal(back.scores, splats.scores)
+    assert back.names == ("rug", "sofa", "Tür")
 
 
 def test_labels_through_the_table_need_no_file_beside(tmp_path):
     splats = _labelled()
-    written = write_splats(tmp_path / "a.spz", splats)
+    written = write_splats(splats, tmp_path / "a.spz")
     assert not (tmp_path / "a.spz.labels.npz").exists()
     for path in written.paths[1:]:
-        path.unlink()  # a.classes.json
+        path.unlink()  # a.names.json
     back = read_splats(tmp_path / "a.spz")
-    assert back.classes == splats.classes
-    assert back.gaussians.labels.tolist() == splats.gaussians.labels.tolist()
+    assert back.names == splats.names
+    assert back.labels.tolist() == splats.labels.tolist()
 
 
 @pytest.mark.parametrize("version", [3, 4])
 def test_unknown_extensions_are_skipped_and_listed(tmp_path, version, monkeypatch):
     monkeypatch.setattr(module, "LABELS", 0x12340007)  # written by a program that kfgs does not know
-    write_spz(tmp_path / "a.spz", _labelled(), version=version)
+    write_spz(_labelled(), tmp_path / "a.spz", version=version)
     monkeypatch.undo()
     back = read(tmp_path / "a.spz")
-    assert back.gaussians.labels is None
-    assert back.info["extensions"] == ["0x12340007"]
+    assert back.labels is None
 
 
 @pytest.mark.parametrize(("value", "signs"), [(0, (1, -1, -1)), (4, (1, -1, -1)), (6, (1, 1, 1)), (7, (-1, -1, 1))])
@@ -237,32 +232,32 @@ def test_the_axes_of_adobes_record_are_obeyed(tmp_path, value, signs):
     record = struct.pack("<III", 0xADBE0003, 4, value)
     rows = [ROW | {"rotation": 0xC0000000}]
     path = _legacy(tmp_path / "a.spz", rows, version=3, bits=8, flags=2, extensions=record)
-    np.testing.assert_array_equal(read(path).gaussians.means[0], np.array([1, -2, 3]) * signs)
+    np.testing.assert_array_equal(read(path).means[0], np.array([1, -2, 3]) * signs)
 
 
 def test_antialiasing_is_kept(tmp_path):
-    splats = SplatFile(_cloud().replace(antialiased=True))
-    write_spz(tmp_path / "a.spz", splats, version=3)
+    splats = _cloud().replace(antialiased=True)
+    write_spz(splats, tmp_path / "a.spz", version=3)
     again = read(tmp_path / "a.spz")
     write(tmp_path / "b.spz", again)
-    assert read(tmp_path / "b.spz").gaussians.antialiased
+    assert read(tmp_path / "b.spz").antialiased
     assert (tmp_path / "b.spz").read_bytes()[14] == 1
 
 
-def test_harmonics_of_degree_4_are_cut_and_told(tmp_path):
+def test_harmonics_of_degree_4_are_cut_and_told(tmp_path, notes):
     rows = [ROW | {"rotation": 0xC0000000, "sh": [128 + i for i in range(72)]}]
     splats = read(_legacy(tmp_path / "a.spz", rows, version=3, degree=4))
-    assert splats.gaussians.sh.shape == (1, 16, 3)
-    assert splats.gaussians.sh[0, 15, 2] == 44 / 128  # x (x^2 - 3 y^2) keeps its sign
-    assert splats.notes == ("spherical harmonics of degree 4: read up to degree 3",)
+    assert splats.sh.shape == (1, 16, 3)
+    assert splats.sh[0, 15, 2] == 44 / 128  # x (x^2 - 3 y^2) keeps its sign
+    assert "spherical harmonics of degree 4: read up to degree 3" in notes[0]
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])
 def test_empty_clouds_survive(tmp_path, version):
     for degree in (0, 3):
         empty = _cloud(0, degree).replace(labels=torch.zeros(0, dtype=torch.int64))
-        write_spz(tmp_path / "a.spz", SplatFile(empty), version=version)
-        back = read(tmp_path / "a.spz").gaussians
+        write_spz(empty, tmp_path / "a.spz", version=version)
+        back = read(tmp_path / "a.spz")
         assert back.sh.shape == (0, (degree + 1) ** 2, 3)
         assert len(back.labels) == 0
 
@@ -278,10 +273,9 @@ def test_positions_get_the_bits_that_their_extent_leaves():
 @pytest.mark.parametrize(("bits", "step"), [(20, 2.0**-20), (2, 0.25)])
 def test_bits_of_positions_can_be_chosen(tmp_path, bits, step):
     cloud = _cloud()
-    write_spz(tmp_path / "a.spz", SplatFile(cloud), fractional_bits=bits)
+    write_spz(cloud, tmp_path / "a.spz", fractional_bits=bits)
     back = read(tmp_path / "a.spz")
-    assert back.info["fractional_bits"] == bits
-    error = (back.gaussians.means - cloud.means).abs().max()
+    error = (back.means - cloud.means).abs().max()
     assert 0.4 * step < error <= 0.5 * step + 1e-6
 
 
@@ -289,21 +283,21 @@ def test_a_far_outlier_costs_precision_and_says_so(tmp_path):
     cloud = _cloud()
     cloud.means[7] = torch.tensor([3e5, 0, 0])
     cloud.scales.mul_(0.05)  # half a step of 1/16 is more than their size
-    lost = write(tmp_path / "a.spz", SplatFile(cloud))
+    lost = write(tmp_path / "a.spz", cloud)
     assert any("positions of 40 of 40 Gaussians, which move by up to 0.0541 units" in words for words in lost)
-    assert_within(read(tmp_path / "a.spz").gaussians, cloud, precision(cloud))
+    assert_within(read(tmp_path / "a.spz"), cloud, precision(cloud))
 
 
 def test_what_is_lost_is_said(tmp_path):
     cloud = _cloud().replace(features=torch.zeros(40, 9))
     cloud.scales[3, 0] = 1e-7
     cloud.sh[5, 0, 1] = 5.0
-    splats = SplatFile(cloud, {"height": np.zeros(40), "score": np.zeros(40)})
+    splats = cloud.replace(extra={"height": np.zeros(40), "score": np.zeros(40)})
     lost = write(tmp_path / "a.spz", splats)
     assert any("9 features per Gaussian: .spz has no place" in words for words in lost)
     assert any("the columns height, score" in words for words in lost)  # a score without labels is a column
     assert any("the extent of 1 Gaussians: .spz holds 4.5e-05 to 379 units" in words for words in lost)
-    back, stated = read(tmp_path / "a.spz").gaussians, precision(cloud)
+    back, stated = read(tmp_path / "a.spz"), precision(cloud)
     assert stated.scales > 400
     assert stated.sh0 == pytest.approx(5 - 0.5 / 0.15, rel=1e-3)
     assert_within(back, cloud, stated)
@@ -324,13 +318,13 @@ def test_bad_requests_are_named(tmp_path):
             ("means:", "39", "40", "got [nan, nan, nan]"),
         ),
         ({}, {"scales": cloud.scales - 0.2}, ("scales:", "above 0")),
-        ({}, {"sh": None}, ("splats:", "colours", "got Gaussians(40", ".ply")),
+        ({}, {"sh": None}, ("gaussians:", "colours", "got Gaussians(40", ".ply")),
         ({}, {"labels": torch.full((40,), -3)}, ("labels:", "-1", "2147483647", "got [-3]")),
     ]
     for options, changes, message in cases:
         with pytest.raises(ValueError, match=tells(*message)):
-            write_spz(path, SplatFile(cloud.replace(**changes)), **options)
-    names = SplatFile(cloud.replace(labels=torch.zeros(40, dtype=torch.int64)), classes=("a" * (1 << 20),))
+            write_spz(cloud.replace(**changes), path, **options)
+    names = cloud.replace(labels=torch.zeros(40, dtype=torch.int64)).replace(names=("a" * (1 << 20),))
     with pytest.raises(ValueError, match=tells("classes:", "1048576", "got 1048580")):
         write(path, names)
     assert list(tmp_path.iterdir()) == []

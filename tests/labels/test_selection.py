@@ -6,7 +6,6 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
 from kfgs.labels import AboveScore, InBox, InSphere, OfClass, OrientedBox, Selection
 
@@ -93,7 +92,7 @@ def test_of_a_class_by_index_or_name():
     assert OfClass(-1).select(gaussians).indices.tolist() == [2]
     assert OfClass("CHAIR").select(gaussians, names).indices.tolist() == [1, 4]
     assert OfClass("chair").select(gaussians, ("wall", "chair", "chair")).indices.tolist() == [1, 3, 4]
-    found = OfClass("chair").select(SplatFile(gaussians, classes=names))
+    found = OfClass("chair").select(gaussians.replace(names=names))
     assert (found.indices.tolist(), found.scores.tolist()) == ([1, 4], [0, 1, 0, 0, 1])
     assert (found.threshold, found.how) == (None, "label chair")
     for one in (np.int64(1), torch.tensor(1)):
@@ -114,7 +113,7 @@ def test_box_and_sphere_hold_their_faces():
 
 
 def test_a_question_gives_the_same_as_its_parts_combined():
-    splats = SplatFile(cloud([0, 1, -1, 2, 1]), {"score": np.array([0.1, 0.9, 0.2, np.nan, 0.3])}, ("a", "b", "c"))
+    splats = cloud([0, 1, -1, 2, 1]).replace(scores=np.array([0.1, 0.9, 0.2, np.nan, 0.3]), names=("a", "b", "c"))
     box, sure = InBox((0, 0, 0), (8, 8, 8)), AboveScore(0.25)
     asked, combined = (
         ((OfClass("b") & sure) - box).select(splats),
@@ -128,14 +127,14 @@ def test_a_question_gives_the_same_as_its_parts_combined():
 
 
 def test_points_and_box_of_a_class_in_two_lines():
-    splats = SplatFile(cloud([0, 1, -1, 2, 1]), classes=("wall", "chair", "lamp"))
+    splats = cloud([0, 1, -1, 2, 1]).replace(names=("wall", "chair", "lamp"))
     chair = OfClass("chair").select(splats)
     points, box = chair.points(splats), chair.box(splats)
     assert isinstance(points, np.ndarray)
     assert points.tolist() == [[3, 4, 5], [12, 13, 14]]
     assert box.center.tolist() == pytest.approx([7.5, 8.5, 9.5])
     assert box.half.tolist() == pytest.approx([4.5 * math.sqrt(3), 0, 0], abs=1e-6)
-    for same in (splats.gaussians, splats.gaussians.means, splats.gaussians.means.numpy()):
+    for same in (splats, splats.means, splats.means.numpy()):
         assert np.array_equal(chair.points(same), points)
     with pytest.raises(ValueError, match=tells("cloud", "N = 5", "(4, 3)")):
         chair.points(torch.zeros(4, 3))

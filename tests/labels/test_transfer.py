@@ -6,7 +6,6 @@ import torch
 from messages import tells
 from oracles_labels import transfer as oracle
 
-from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
 from kfgs.labels import LabelSet, default_distance, label_splats, transfer_labels
 
@@ -190,7 +189,7 @@ def test_arrays_gaussians_and_splats_give_the_same():
     src, dst = points(30, 4), points(20, 5)
     labels = torch.arange(30) % 3
     expected = transfer_labels(src, labels, dst, 0.3)
-    for one, other in ((src.numpy(), dst.numpy()), (gaussians(src), SplatFile(gaussians(dst)))):
+    for one, other in ((src.numpy(), dst.numpy()), (gaussians(src), gaussians(dst))):
         found = transfer_labels(one, labels.numpy(), other, 0.3)
         assert found.labels.equal(expected.labels)
         assert found.distances.equal(expected.distances)
@@ -203,17 +202,17 @@ def test_a_splat_is_labelled_in_one_call():
     """Sources at 0 and 1; destinations 0.1 and 0.25 from the first, and one out of reach."""
     field = gaussians(torch.tensor([[0.0, 0, 0], [1, 0, 0]]), torch.tensor([1, 0]))
     mine = gaussians(torch.tensor([[0.1, 0, 0], [0.25, 0, 0], [9, 0, 0]]), torch.tensor([7, 7, 7]))
-    splats = SplatFile(mine, {"age": np.arange(3)}, ("old",), {"format": "ply"})
+    splats = mine.replace(extra={"age": np.arange(3)}, names=("old",))
     made = label_splats(splats, field, LabelSet(("wall", "chair"), torch.eye(2)), 0.5)
     assert made.gaussians.labels.tolist() == [1, 1, -1]
-    assert made.extra["score"].tolist() == pytest.approx([0.8, 0.5, 0.0])
+    assert made.scores.tolist() == pytest.approx([0.8, 0.5, 0.0])
     assert made.extra["age"].tolist() == [0, 1, 2]
     assert (made.classes, made.info["format"]) == (("wall", "chair"), "ply")
     assert (made.info["labels"]["lambda"], made.info["labels"]["method"]) == (0.5, "nearest")
-    assert splats.gaussians.labels.tolist() == [7, 7, 7]
-    again = label_splats(mine, SplatFile(field, classes=("wall", "chair")), distance=0.5, method="vote")
-    assert again.classes == ("wall", "chair")
-    assert again.extra["score"].tolist() == [1.0, 1.0, 0.0]
+    assert splats.labels.tolist() == [7, 7, 7]
+    again = label_splats(mine, field.replace(names=("wall", "chair")), distance=0.5, method="vote")
+    assert again.names == ("wall", "chair")
+    assert again.scores.tolist() == [1.0, 1.0, 0.0]
     with pytest.raises(ValueError, match=tells("labelled", "label")):
         label_splats(splats, gaussians(points(3, 0)))
     assert label_splats(mine, field, distance=0.5).classes == ()

@@ -6,7 +6,6 @@ import torch
 from messages import tells
 from scipy.spatial.transform import Rotation
 
-from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
 from kfgs.labels import (
     AboveScore,
@@ -37,7 +36,7 @@ def cloud(n=60, seed=0):
 
 
 def ask(where, gaussians, extra=None):
-    return where.mask(SplatFile(gaussians, extra or {}, CLASSES)).tolist()
+    return where.mask(gaussians.replace(extra=extra or {}, names=CLASSES)).tolist()
 
 
 def test_class_by_name_by_index_and_none():

@@ -15,13 +15,11 @@ from kfgs.cameras import Camera
 from kfgs.cameras.similarity import Similarity
 from kfgs.fields import Identity, SemanticField
 from kfgs.formats.sidecar import names_path
-from kfgs.formats.splat_file import SplatFile
 from kfgs.formats.table import read_splats, write_splats
 from kfgs.gaussians import Gaussians
-from kfgs.labels import LabelSet, transfer_labels
+from kfgs.labels import LabelSet
 from kfgs.pipeline.attach import attach
 from kfgs.scenes import SceneError
-from kfgs.splat.transform import transform_gaussians
 
 CLASSES = LabelSet(("wall", "box", "table"), torch.eye(4)[:3])
 
@@ -49,9 +47,7 @@ def a_field(count=4_000):
 def a_splat(count=6_000):
     gaussians = cloud(count, 1)
     sh = torch.rand(len(gaussians), 1, 3, generator=torch.Generator().manual_seed(0))
-    return SplatFile(
-        gaussians.replace(sh=sh), {"warmth": np.arange(len(gaussians), dtype=np.float32)}, (), {"format": "test"}
-    )
+    return gaussians.replace(sh=sh).replace(extra={"warmth": np.arange(len(gaussians), dtype=np.float32)})
 
 
 def look(place, name, target=(1.6, 1.2, 0.6)):
@@ -79,13 +75,13 @@ def a_similarity(seed=3):
 
 
 def moved(splats, similarity):
-    gaussians = splats.gaussians
+    gaussians = splats
     turned = gaussians.replace(means=similarity.apply(gaussians.means), scales=gaussians.scales * similarity.scale)
-    return splats.replace(gaussians=turned)  # the Gaussians are round: no rotation to turn
+    return turned  # the Gaussians are round: no rotation to turn
 
 
 def accuracy(labels, splats):
-    return float((labels == true_labels(splats.gaussians.means)).float().mean())
+    return float((labels == true_labels(splats.means)).float().mean())
 
 
 def test_words_of_another_teacher_are_refused_before_any_work():
@@ -101,68 +97,27 @@ def test_distance_in_one_frame():
     assert attached.alignment is None
     assert "the frames agree" in attached.notes[0]
     labelled = attached.labels >= 0
-    score = torch.from_numpy(attached.splats.extra["score"])
+    score = attached.gaussians.scores
     expected = 1 - attached.transfer.distances / attached.transfer.distance
     torch.testing.assert_close(score[labelled], expected[labelled].float())
     assert (score[~labelled] == 0).all()
 
 
-@pytest.mark.parametrize("method", ["vote", "mahalanobis"])
-def test_other_rules_of_distance_outvote_mistakes_and_score_by_the_share_of_weights(method):
-    semantic, splats, similarity = a_field(2_000).gaussians, a_splat(2_000), a_similarity()
-    said = true_labels(semantic.means)
-    said[::8] = (said[::8] + 1) % 3  # an eighth is wrong
-    semantic = semantic.replace(
-        scales=semantic.scales * torch.tensor([2.0, 1.0, 0.2]),  # long ones, so that a turn shows
-        opacities=torch.linspace(0.2, 0.9, len(semantic)),
-        features=CLASSES.embeddings[said],
-    )
-    there = splats.replace(gaussians=transform_gaussians(splats.gaussians, similarity))
-    given = {"distance": 0.5, "method": method}
-    attached = attach(
-        SemanticField(semantic, Identity(semantic.features.shape[1])), there, CLASSES, frame=similarity, **given
-    )
-    expected = transfer_labels(transform_gaussians(semantic, similarity), said, there.gaussians, **given)
-    assert attached.transfer.method == method
-    assert torch.equal(attached.labels, expected.labels)
-    torch.testing.assert_close(torch.from_numpy(attached.splats.extra["score"]), expected.shares.float())
-    assert float(expected.shares[expected.labels >= 0].min()) < 0.6  # some are not sure
-    nearest = attach(
-        SemanticField(semantic, Identity(semantic.features.shape[1])), there, CLASSES, frame=similarity, distance=0.5
-    )
-    assert accuracy(attached.labels, splats) > accuracy(nearest.labels, splats) + 0.02
-    assert "share of the weights" in attached.splats.info["labels"]["score"]
-    assert attached.splats.info["labels"]["method"] == method
-
-
-def test_the_rule_of_distance_also_decides_on_what_no_view_shows():
-    splats = a_splat(2_000)
-    facts = {}
-    for method in ("nearest", "mahalanobis"):
-        attached = attach(a_field(2_000), splats, CLASSES, cameras=CAMERAS, by="views", method=method)
-        assert attached.transfer.method == method
-        assert len(attached.transfer.labels) == attached.splats.info["labels"]["not shown"] > 0
-        facts[method] = attached
-    shown = facts["nearest"].splats.extra["score"] != facts["mahalanobis"].splats.extra["score"]
-    assert 0 < shown.sum() <= facts["nearest"].splats.info["labels"]["not shown"]
-
-
 def test_nothing_else_of_the_splat_changes():
     splats = a_splat(1_500)
-    attached = attach(a_field(1_500), splats, CLASSES).splats
+    attached = attach(a_field(1_500), splats, CLASSES).gaussians
     assert attached.classes == CLASSES.names
     assert set(attached.extra) == {"warmth", "score"}
-    assert attached.info["format"] == "test"
     for name in ("means", "quats", "scales", "opacities", "sh"):
-        assert torch.equal(getattr(attached.gaussians, name), getattr(splats.gaussians, name))
-    assert splats.gaussians.labels is None
+        assert torch.equal(getattr(attached.gaussians, name), getattr(splats, name))
+    assert splats.labels is None
 
 
 def test_views_label_what_they_show_and_their_neighbours():
     splats = a_splat()
     hidden = torch.tensor([[1.2, 1.8, 0.62], [50.0, 50.0, 50.0]])  # below the table's top; out of every view and reach
-    gaussians = Gaussians.cat([splats.gaussians, splats.gaussians.select(torch.tensor([0, 1])).replace(means=hidden)])
-    splats = SplatFile(gaussians)
+    gaussians = Gaussians.cat([splats, splats.select(torch.tensor([0, 1])).replace(means=hidden)])
+    splats = gaussians
     attached = attach(a_field(), splats, CLASSES, cameras=CAMERAS, by="views")
     labelled = int((attached.labels >= 0).sum())  # by views and by distance
     assert repr(attached).startswith(f"Attached({labelled:,} of {len(splats):,} Gaussians labelled, 3 classes, lambda ")
@@ -170,8 +125,8 @@ def test_views_label_what_they_show_and_their_neighbours():
     assert accuracy(attached.labels, splats) > 0.95
     assert attached.labels[-2] == 2
     assert attached.labels[-1] == -1
-    assert attached.splats.extra["score"][-1] == 0
-    facts = attached.splats.info["labels"]
+    assert attached.gaussians.scores[-1] == 0
+    facts = attached.facts
     assert facts["shown"] + facts["not shown"] == len(splats)
     assert 0 < facts["not shown"] < 0.2 * len(splats)
 
@@ -196,7 +151,7 @@ def test_views_label_as_well_where_the_splats_frame_is_small():
         similarity = replace(turn, scale=scale)
         there = moved(a_splat(3_000), similarity)
         found = attach(a_field(), there, CLASSES, cameras=CAMERAS, frame=similarity, by="views")
-        shares[scale] = accuracy(found.labels, a_splat(3_000)), found.splats.info["labels"]["shown"]
+        shares[scale] = accuracy(found.labels, a_splat(3_000)), found.facts["shown"]
     assert shares[1.0][0] > 0.95
     assert shares[0.01] == pytest.approx(shares[1.0], rel=2e-3)  # borders round differently
 
@@ -209,7 +164,7 @@ def test_a_splat_in_another_frame_is_refused_with_what_to_give():
 def test_a_sparse_splat_turned_by_half_a_turn_is_found_out():
     """Its walls lie near walls: the clouds are not taken for one frame, whatever their spacing."""
     few = a_splat(6_000).select(torch.arange(0, 6_000, 12))
-    middle = few.gaussians.means.median(0).values
+    middle = few.means.median(0).values
     turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
     with pytest.raises(SceneError, match="frames disagree"):
         attach(a_field(), moved(few, Similarity(1.0, turn, middle - turn @ middle)), CLASSES)
@@ -217,11 +172,11 @@ def test_a_sparse_splat_turned_by_half_a_turn_is_found_out():
 
 def test_where_the_views_show_everything_distance_has_no_lambda():
     splats = a_splat(1_500)
-    top = splats.gaussians.select(torch.arange(3))
+    top = splats.select(torch.arange(3))
     table = torch.tensor([[1.2, 1.8, 0.72], [1.4, 1.7, 0.72], [1.0, 1.9, 0.72]])
-    seen = SplatFile(top.replace(means=table))
+    seen = top.replace(means=table)
     attached = attach(a_field(1_500), seen, CLASSES, cameras=CAMERAS, frame=Similarity.identity(), by="views")
-    facts = attached.splats.info["labels"]
+    facts = attached.facts
     assert facts["not shown"] == 0
     assert facts["lambda"] is None
     assert facts["lambda from"] is None
@@ -238,7 +193,7 @@ def test_a_given_similarity_is_taken_as_it_is():
 def test_a_given_distance_is_lambda():
     attached = attach(a_field(1_500), a_splat(1_500), CLASSES, distance=0.02)
     assert attached.transfer.distance == 0.02
-    assert attached.splats.info["labels"]["lambda"] == 0.02
+    assert attached.facts["lambda"] == 0.02
     assert 0 < attached.transfer.orphaned == int((attached.labels == -1).sum())
     labelled, none = attached.transfer.labelled, attached.transfer.orphaned
     assert (
@@ -248,15 +203,15 @@ def test_a_given_distance_is_lambda():
 
 def test_the_facts_survive_a_file(tmp_path):
     attached = attach(a_field(1_500), a_splat(1_500), CLASSES, cameras=CAMERAS, by="views")
-    facts = json.loads(json.dumps(attached.splats.info["labels"], allow_nan=False))
+    facts = json.loads(json.dumps(attached.facts, allow_nan=False))
     by_distance = f"{attached.transfer.labelled} that no view shows by distance (lambda {facts['lambda']:.3g})"
     counts = f"{facts['shown']:,} got a class by the views, {by_distance}, {facts['counts']['none']} got none"
     assert attached.notes[2] == f"1,500 Gaussians: {counts}"
-    assert sum(facts["counts"].values()) == len(attached.splats)
-    write_splats(tmp_path / "a.ply", attached.splats)
+    assert sum(facts["counts"].values()) == len(attached.gaussians)
+    write_splats(attached.gaussians, tmp_path / "a.ply", facts=attached.facts)
     back = read_splats(tmp_path / "a.ply")
     assert torch.equal(back.gaussians.labels, attached.labels)
-    assert back.classes == CLASSES.names
+    assert back.names == CLASSES.names
     written = json.loads(names_path(tmp_path / "a.ply").read_text())
     assert written["labelled by"] == "votes of 6 segmented views"
 
@@ -269,8 +224,6 @@ def test_what_cannot_be_done_is_refused():
         attach(field, splats, CLASSES, by="views")
     with pytest.raises(ValueError, match=tells("cameras:", "for frame", "got none")):
         attach(field, splats, CLASSES, frame=CAMERAS)
-    with pytest.raises(ValueError, match=tells("method:", "'nearest', 'vote', 'mahalanobis'", "got 'guess'")):
-        attach(field, splats, CLASSES, method="guess")
     with pytest.raises(ValueError, match=tells("distance:", "got 0.0")):
         attach(field, splats, CLASSES, distance=0.0)
     nothing = splats.select(torch.zeros(len(splats), dtype=torch.bool))

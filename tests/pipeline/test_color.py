@@ -64,7 +64,7 @@ def test_the_unit_of_the_world_does_not_matter(fitted, scene, tmp_path):
 
 
 def test_the_splat_file_holds_the_field(fitted):
-    read = read_splats(fitted.path).gaussians
+    read = read_splats(fitted.path)
     for name in ("means", "quats", "sh"):
         assert torch.equal(getattr(read, name), getattr(fitted.gaussians, name))
     torch.testing.assert_close(read.scales, fitted.gaussians.scales)
@@ -73,7 +73,7 @@ def test_the_splat_file_holds_the_field(fitted):
 
 def test_a_second_run_redoes_nothing(fitted, scene):
     labels = torch.arange(len(fitted.gaussians)) % 3
-    write_splats(fitted.path, fitted.gaussians.replace(labels=labels))
+    write_splats(fitted.gaussians.replace(labels=labels), fitted.path)
     written = fitted.path.stat().st_mtime_ns
     again = fit_color(scene, fitted.path.parent, CONFIG)
     assert [stage.reused for stage in again.stages] == [True]

@@ -15,7 +15,7 @@ from small_room import make_room
 import kfgs
 from kfgs.cli import main
 from kfgs.fields import Clicks, SemanticField, UpliftConfig
-from kfgs.formats import SplatFile, read_splats, write_splats
+from kfgs.formats import read_splats, write_splats
 from kfgs.gaussians import Gaussians
 from kfgs.labels import load_label_set
 from kfgs.pipeline import FitConfig, fit_color, fit_scene, score_scene, segment_scene, true_labels, uplift
@@ -102,7 +102,7 @@ def test_a_splat_becomes_a_small_field_that_is_right_on_unseen_views(fitted, sce
 
 
 def test_a_second_run_reuses_the_stage_and_another_splat_makes_another(fitted, scene, maps, splat):
-    again = fit_scene(scene, maps, fitted.folder, CONFIG, splat=SplatFile(splat))
+    again = fit_scene(scene, maps, fitted.folder, CONFIG, splat=splat)
     assert [(stage.name, stage.reused) for stage in again.stages] == [("uplift", True)]
     assert torch.equal(again.field.features, fitted.field.features)
     moved = splat.replace(means=splat.means + 0.01)
@@ -193,7 +193,7 @@ def test_a_color_ply_of_another_hand_is_never_replaced(scene, maps, tmp_path):
 
     made = fit_color(scene, tmp_path, config)
     labels = torch.zeros(len(made.gaussians), dtype=torch.int64)
-    write_splats(path, made.gaussians.replace(labels=labels))  # as `kfgs attach --out run/color.ply` does
+    write_splats(made.gaussians.replace(labels=labels), path)  # as `kfgs attach --out run/color.ply` does
     labelled = path.read_bytes()
     assert fit_color(scene, tmp_path, config).stages[-1].reused
     refused(4)
@@ -243,10 +243,10 @@ def test_python_command_line_and_explorer_select_the_same_gaussians(name, fitted
     assert torch.equal(field.classify(classes).labels == classes.index(name), python.mask)
     assert main(["select", name, str(fitted.field_path), "--out", str(tmp_path)]) == 0
     assert f"{name}: {len(python)} of {len(field)} Gaussians" in capsys.readouterr().out
-    chosen = read_splats(tmp_path / "selection.ply").gaussians.means
+    chosen = read_splats(tmp_path / "selection.ply").means
     assert torch.equal(chosen, field.gaussians.means[python.mask])
     assert main(["label", str(fitted.field_path), "--out", str(tmp_path / "l"), "--query", name]) == 0
-    labels = read_splats(tmp_path / "l" / "gaussians.ply").gaussians.labels
+    labels = read_splats(tmp_path / "l" / "gaussians.ply").labels
     assert torch.equal(labels == classes.index(name), python.mask)
     with explore(field, where="picture") as view:
         view.ask(name)
@@ -254,7 +254,7 @@ def test_python_command_line_and_explorer_select_the_same_gaussians(name, fitted
 
 
 def test_the_command_line_needs_the_field_alone(fitted, splat, scene, tmp_path, capsys):
-    write_splats(tmp_path / "splat.ply", SplatFile(splat))
+    write_splats(splat, tmp_path / "splat.ply")
     field = str(fitted.field_path)
     assert main(["attach", field, str(tmp_path / "splat.ply"), "--out", str(tmp_path / "labelled.ply")]) == 0
     assert f"votes of {len(scene.views('train'))} segmented views" in capsys.readouterr().out
@@ -276,7 +276,7 @@ def test_a_moved_scene_is_told(fitted, room, tmp_path, capsys):
 
 
 def test_fit_and_uplift_from_the_command_line(room, splat, scene, tmp_path, capsys):
-    write_splats(tmp_path / "splat.ply", SplatFile(splat))
+    write_splats(splat, tmp_path / "splat.ply")
     features = tmp_path / "features"
     shutil.copytree(room / "features", features)
     arguments = ["fit", str(room), "--features", str(features), "--out", str(tmp_path / "run")]

@@ -2,6 +2,7 @@ import dataclasses
 
 import numpy as np
 import torch
+from kfgs.viz.shows import Photos
 from PIL import Image
 from small_room import make_room
 
@@ -10,7 +11,6 @@ from kfgs.gaussians import Gaussians
 from kfgs.labels import Selection, connected_parts
 from kfgs.pipeline.part_pictures import WIDTH, write_parts
 from kfgs.scenes import load_scene
-from kfgs.viz.shows import Photos
 
 K = torch.tensor([[40.0, 0, 40], [0, 40, 30], [0, 0, 1]])
 

@@ -26,7 +26,7 @@ from kfgs.fields import (
     sample_latents,
     uplift_maps,
 )
-from kfgs.formats import SplatFile, read_splats, write_splats
+from kfgs.formats import read_splats, write_splats
 from kfgs.gaussians import Gaussians
 from kfgs.labels import transfer_labels
 from kfgs.pipeline import FitConfig
@@ -55,7 +55,7 @@ def splat(town):
     n = len(points)
     quats, scales = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1), torch.full((n, 3), 0.04)
     cloud = Gaussians(points, quats, scales, torch.full((n,), 0.95), sh=torch.zeros(n, 1, 3))
-    write_splats(town.parent / "splat.ply", SplatFile(cloud))
+    write_splats(cloud, town.parent / "splat.ply")
     return town.parent / "splat.ply"
 
 
@@ -75,7 +75,7 @@ def whole(town, splat, fitted):
         FeatureFolder(town / "features").of(scene, "train"),
     )
     latents = LinearLatents.load(fitted.folder / "latents.safetensors")
-    return uplift_maps(read_splats(splat).gaussians, cameras, maps, EVERY.uplift, latents=latents)
+    return uplift_maps(read_splats(splat), cameras, maps, EVERY.uplift, latents=latents)
 
 
 def ordered(means):
@@ -135,7 +135,7 @@ def test_a_view_needs_the_blocks_in_its_picture(fitted, town):
 
 @pytest.mark.parametrize("distance", [0.05, 0.5])
 def test_labels_are_those_of_the_joined_field(fitted, splat, distance):
-    joined, dst = fitted.joined(), read_splats(splat).gaussians
+    joined, dst = fitted.joined(), read_splats(splat)
     dst = dst.replace(means=dst.means + 0.03 * torch.randn(dst.means.shape, generator=torch.Generator().manual_seed(0)))
     expected = transfer_labels(joined.gaussians, joined.classify().labels, dst, distance).labels
     assert int((expected >= 0).sum()) > 1000
@@ -295,7 +295,7 @@ def test_other_inputs_are_refused_also_after_a_kill(town, splat, tmp_path):
 def test_a_part_of_space_may_be_empty(town, splat, tmp_path):
     half = read_splats(splat)
     half = half.select(half.gaussians.means[:, 0] < 4)  # the first room
-    write_splats(tmp_path / "half.ply", half)
+    write_splats(half, tmp_path / "half.ply")
     split_scene(town, tmp_path / "city", 4, splat=tmp_path / "half.ply", latents=4)
     made = fit_blocks(tmp_path / "city", EVERY)
     assert 0 < len(made.blocks) < 4
@@ -376,8 +376,8 @@ def test_two_cities_with_the_same_latents_join(fitted, town, splat, tmp_path, ca
 
 
 def test_a_splat_of_another_scene_is_said(town, splat, tmp_path):
-    cloud = read_splats(splat).gaussians
-    write_splats(tmp_path / "far.ply", SplatFile(cloud.replace(means=cloud.means + 900)))
+    cloud = read_splats(splat)
+    write_splats(cloud.replace(means=cloud.means + 900), tmp_path / "far.ply")
     split_scene(town, tmp_path / "city", 2, splat=tmp_path / "far.ply", latents=4)
     for block in ("block00", "block01"):
         (tmp_path / "city" / block / "core").mkdir()

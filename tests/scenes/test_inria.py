@@ -60,11 +60,11 @@ def write_inria(folder: Path, scene: Scene, source: Path, *, tests: int = 0, end
 
 def write_iterations(folder: Path, splat: Path) -> None:
     """The splat as iteration 30000, and its first five Gaussians as iteration 7000, which has the later name."""
-    cloud = read_splats(splat).gaussians
+    cloud = read_splats(splat)
     for step, kept in ((7000, cloud[:5]), (30000, cloud)):
         place = folder / f"point_cloud/iteration_{step}/point_cloud.ply"
         place.parent.mkdir(parents=True)
-        write_splats(place, kept)
+        write_splats(kept, place)
 
 
 @pytest.fixture(scope="module")
@@ -91,8 +91,8 @@ def test_an_output_folder_is_a_scene(room: Path, output: Path) -> None:
 
 
 def test_it_is_a_splat_too(output: Path) -> None:
-    newest = read_splats(output / "point_cloud/iteration_30000/point_cloud.ply").gaussians
-    assert torch.equal(read_splats(output).gaussians.means, newest.means)
+    newest = read_splats(output / "point_cloud/iteration_30000/point_cloud.ply")
+    assert torch.equal(read_splats(output).means, newest.means)
     assert len(newest) > 5
     with pytest.raises(ValueError, match=tells("known format", "point_cloud/iteration_*")):
         read_splats(output / "point_cloud")
@@ -122,7 +122,7 @@ def test_attach_takes_the_folder(room: Path, output: Path, tmp_path: Path) -> No
     field = make_field(room, tmp_path / "field.kfgs")
     out = tmp_path / "labelled.ply"
     assert main(["attach", str(field), str(output), "--scene", str(room), "--by", "distance", "--out", str(out)]) == 0
-    assert (read_splats(out).gaussians.labels >= 0).float().mean() > 0.9
+    assert (read_splats(out).labels >= 0).float().mean() > 0.9
     assert main(["info", str(output)]) == 0
 
 
@@ -139,7 +139,7 @@ def test_pictures_beside_the_output_or_named(room: Path, output: Path, tmp_path:
     assert (folder / "input.ply").is_file()
     (folder / "input.ply").unlink()
     scene = load_scene(folder)
-    cloud = read_splats(output).gaussians
+    cloud = read_splats(output)
     assert torch.equal(scene.points, cloud.means)
     expected = ((0.5 + 0.28209479177387814 * cloud.sh[:, 0]).clamp(0, 1) * 255).round().to(torch.uint8)
     assert torch.equal(scene.colors, expected)

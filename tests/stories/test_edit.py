@@ -4,13 +4,13 @@ import pytest
 import torch
 
 import kfgs
-from kfgs.labels import OfClass
+from kfgs.labels import OfClass, nearest_labels
 
 
 @pytest.fixture(scope="module")
 def labelled(fused, color, room):
     """The colour field with the semantic field's classes."""
-    return kfgs.attach(fused, kfgs.SplatFile(color), room.classes, by="distance").splats
+    return kfgs.attach(fused, color, room.classes, by="distance").gaussians
 
 
 def test_query(fused, room, recorded):
@@ -29,7 +29,7 @@ def test_query(fused, room, recorded):
 def test_transfer(fused, color, labelled, room, recorded):
     """A colour Gaussian takes the label of the nearest semantic one that is closer than lambda; checked by brute force."""
     semantic = fused.label(room.classes)
-    carried = kfgs.transfer_labels(semantic, semantic.labels, color)
+    carried = nearest_labels(semantic.means, semantic.labels, color.means)
     assert carried.distance == pytest.approx(recorded["lambda"], rel=0.02)
     assert carried.orphaned / len(color) == pytest.approx(recorded["share without a label"], abs=0.01)
     known = semantic.labels >= 0
@@ -39,7 +39,8 @@ def test_transfer(fused, color, labelled, room, recorded):
     expected = torch.where(nearest < carried.distance, semantic.labels[known][source], -1)
     clear = apart.topk(2, largest=False).values.diff(dim=1)[:, 0] > 1e-6  # not two equally near
     assert torch.equal(carried.labels[some][clear], expected[clear])
-    assert torch.equal(labelled.gaussians.labels, carried.labels)
+    assert torch.equal(labelled.labels, carried.labels)
+    assert torch.equal(kfgs.transfer_labels(semantic, color).labels, carried.labels)
 
 
 def test_remove_and_recolor(labelled, room, recorded):
@@ -48,7 +49,7 @@ def test_remove_and_recolor(labelled, room, recorded):
     removed = len(labelled) - len(edited)
     assert removed == pytest.approx(recorded["Gaussians removed"], rel=0.03)
     chair, plant = (room.classes.index(name) for name in ("chair", "plant"))
-    before, after = labelled.gaussians, edited.gaussians
+    before, after = labelled, edited
     left = before.select(before.labels != chair)
     assert 0 < len(left) == len(after)
     assert torch.equal(after.means, left.means)
@@ -64,11 +65,10 @@ def test_remove_and_recolor(labelled, room, recorded):
 
 def test_ply_round_trip(labelled, room, tmp_path):
     """Labels, class names and every value come back from the file."""
-    kfgs.write_splats(tmp_path / "room.ply", labelled)
-    again = kfgs.read_splats(tmp_path / "room.ply")
-    before, after = labelled.gaussians, again.gaussians
+    kfgs.write_splats(labelled, tmp_path / "room.ply")
+    before, after = labelled, kfgs.read_splats(tmp_path / "room.ply")
     assert torch.equal(after.labels, before.labels)
-    assert tuple(again.classes) == tuple(room.classes.names)
+    assert after.names == tuple(room.classes.names)
     torch.testing.assert_close(after.means, before.means, rtol=0, atol=0)
     for name in ("scales", "opacities", "sh"):
         torch.testing.assert_close(getattr(after, name), getattr(before, name), rtol=1e-5, atol=1e-6)

@@ -3,13 +3,13 @@
 import numpy as np
 import torch
 
-import kfgs
 from kfgs import viz
+from kfgs.labels import nearest_labels
 
 
 def test_linked_clouds_and_their_transfer(fused, color, room):
     semantic = fused.label(room.classes)
-    carried = kfgs.transfer_labels(semantic, semantic.labels, color)
+    carried = nearest_labels(semantic.means, semantic.labels, color.means)
     names = room.classes.names
     plotter = viz.linked_clouds(semantic, color, names=names, camera=room.unseen[0], height=300, off_screen=True)
     left, right = np.split(plotter.screenshot(return_img=True), 2, axis=1)

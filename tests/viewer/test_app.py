@@ -15,7 +15,6 @@ import torch
 from cases_web import SECONDS, needs_chromium, software_chromium
 from PIL import Image
 
-from kfgs.formats import SplatFile
 from kfgs.labels import EditList
 from kfgs.viewer import Exploration, FieldMeaning, html, save_html
 from kfgs.viz import available
@@ -340,7 +339,7 @@ def test_edits_are_those_of_python(page, state, tmp_path):
     assert (saved["edits"][1]["factor"], saved["edits"][3]["translation"]) == (0.5, [0, 0.5, 2])
     made = EditList.from_json({"format": "kfgs.edits", "version": 1, "edits": saved["edits"]}, "saved")
     cloud = state.cloud("color").replace(labels=torch.from_numpy(state.labels("color")))
-    edited = made.apply(SplatFile(cloud, {}, cases_page.NAMES)).gaussians
+    edited = made.apply(cloud.replace(names=cases_page.NAMES)).gaussians
     kept = np.flatnonzero(mask(page, "color", "drawn"))
     here = np.array(page.evaluate("[...viewer.model.clouds.color.means]")).reshape(-1, 3)[kept]
     np.testing.assert_allclose(here, edited.means, atol=1e-4)

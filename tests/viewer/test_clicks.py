@@ -5,7 +5,6 @@ from cases_viz import some_camera, some_gaussians
 from cases_window import LEGEND, NAMES, TITLE, an_explorer, panes
 from messages import tells
 
-from kfgs.formats import SplatFile
 from kfgs.splat.rasterize import rasterize
 from kfgs.viewer import drawing, gaussian_at
 from kfgs.viewer.meaning import SplatMeaning
@@ -78,7 +77,7 @@ def test_points_that_are_not_drawn_are_not_picked():
     """Style "points" leaves Gaussians of opacity 0.1 and less out, asked for or not."""
     semantic = some_gaussians().replace(sh=None)
     semantic.opacities[::2] = 0.09
-    with an_explorer(Exploration(SplatMeaning(SplatFile(semantic, {}, NAMES)))) as explorer:
+    with an_explorer(Exploration(SplatMeaning(semantic.replace(names=NAMES)))) as explorer:
         assert any(index is not None and index % 2 == 0 for index in picked_at(explorer).values())
         explorer.set_style("points")
         for words in (None, "chair"):

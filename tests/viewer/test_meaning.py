@@ -299,22 +299,22 @@ def test_cosines_below_zero_and_missing_scores_still_select_the_whole_class():
 
 
 def test_splats_without_labels_or_names():
-    with pytest.raises(ValueError, match=tells("splats.gaussians.labels:", "[N]", "got None", "`kfgs attach`")):
+    with pytest.raises(ValueError, match=tells("splats.labels:", "[N]", "got None", "`kfgs attach`")):
         SplatMeaning(splat_file(cloud(LINE)))
     with pytest.raises(ValueError, match=tells("class:", "got 'zebra'; take one of these classes")):
         SplatMeaning(splat_file(cloud(LINE, LABELS))).ask("zebra")
-    made = SplatMeaning(splat_file(cloud(LINE, LABELS)).replace(classes=("wall",)))
+    made = SplatMeaning(splat_file(cloud(LINE, LABELS)).replace(names=("wall",)))
     assert made.names == ("wall", "class 1", "class 2", "class 3")
     assert made.ask("class 3").selection.indices.tolist() == [2]
 
 
 def test_classes_of_one_name_are_one():
-    made = SplatMeaning(splat_file(cloud(LINE, LABELS)).replace(classes=("wall", "chair", "rug", "chair")))
+    made = SplatMeaning(splat_file(cloud(LINE, LABELS)).replace(names=("wall", "chair", "rug", "chair")))
     assert made.ask("chair").selection.indices.tolist() == [0, 1, 2]
 
 
 def test_a_name_may_begin_with_a_space():
-    made = SplatMeaning(splat_file(cloud(LINE, LABELS)).replace(classes=("wall", " chair", "rug", "lamp")))
+    made = SplatMeaning(splat_file(cloud(LINE, LABELS)).replace(names=("wall", " chair", "rug", "lamp")))
     assert made.ask(" chair").words == " chair"
     assert made.ask(" lamp ").words == "lamp"
 

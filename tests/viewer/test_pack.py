@@ -9,7 +9,6 @@ from cases_web import room_state
 from messages import tells
 from small_room import make_room
 
-from kfgs.formats import SplatFile
 from kfgs.viewer import Exploration, FieldMeaning, SplatMeaning, inline_script, read_text
 from kfgs.viewer.pack import pack_scene, rounded_far
 
@@ -76,14 +75,14 @@ def test_colours_are_within_half_a_step(room):
 def test_far_means_keep_their_direction():
     means = torch.tensor([[0.0, 0, 0]]).repeat(500, 1) + torch.randn(500, 3, generator=torch.Generator().manual_seed(0))
     means[0] = torch.tensor([1000.0, -2000, 50])
-    made = SplatFile(cloud(means, torch.zeros(500)), {}, ("wall",))
+    made = cloud(means, torch.zeros(500)).replace(names=("wall",))
     packed = pack_scene(Exploration(SplatMeaning(made)))
     assert decoded(packed, "semantic")[0][0] == pytest.approx([1000, -2000, 50], rel=1e-3)
 
 
 def test_tiny_scales_do_not_spoil_the_steps():
     own = cloud([[0.0, 0, 5], [1, 0, 5]], [0, 0], scales=torch.tensor([[1.0, 1, 1e-20], [0.5, 0.25, 0.1]]))
-    scales = decoded(pack_scene(Exploration(SplatMeaning(SplatFile(own, {}, ("wall",))))), "semantic")[2]
+    scales = decoded(pack_scene(Exploration(SplatMeaning(own.replace(names=("wall",))))), "semantic")[2]
     assert scales[1] == pytest.approx([0.5, 0.25, 0.1], rel=0.03)
     assert scales[0, 2] == pytest.approx(np.exp(-12.0), rel=1e-6)
 
@@ -142,7 +141,7 @@ def test_scores_select_what_python_selects(meaning):
 
 def test_no_source_and_no_harmonics():
     own = cloud([[0.0, 0, 5]], [-1])
-    packed = pack_scene(Exploration(SplatMeaning(SplatFile(own, {}, ("wall",))), cloud([[1.0, 0, 5]])))
+    packed = pack_scene(Exploration(SplatMeaning(own.replace(names=("wall",))), cloud([[1.0, 0, 5]])))
     assert buffer(packed, "color/source").tolist() == [-1]
     assert np.isinf(buffer(packed, "color/far")).all()
     assert packed.header["sides"]["color"]["sh_degree"] is None
@@ -153,7 +152,7 @@ def test_no_source_and_no_harmonics():
 def test_the_page_knows_where_a_far_scene_lies():
     """What is picked there is told in the world."""
     own, colors = cloud([[0.0, 0, 5]], [0]), cloud([[500001.0, 7, 5]])
-    far = SplatMeaning(SplatFile(own.replace(origin=(5e5, 0, 0)), {}, ("wall",)))
+    far = SplatMeaning(own.replace(origin=(5e5, 0, 0)).replace(names=("wall",)))
     packed = pack_scene(Exploration(far, colors))
     assert packed.header["origin"] == [5e5, 0, 0]
     assert packed.header["sides"]["color"]["center"][0] == pytest.approx(1)
@@ -193,6 +192,6 @@ def test_numbers_that_are_not_finite_are_refused(name, value):
     own = own.replace(sh=torch.zeros(3, 1, 3))
     values = getattr(own, name).clone()
     values[1].fill_(value)
-    state = Exploration(SplatMeaning(SplatFile(own.replace(**{name: values}), {}, ("wall",))))
+    state = Exploration(SplatMeaning(own.replace(**{name: values}).replace(names=("wall",))))
     with pytest.raises(ValueError, match=tells(f"semantic.{name}", "finite", "at 1")):
         pack_scene(state)

@@ -8,7 +8,7 @@ from cases_web import PAPER, as_json, needs_chromium, numbers, psnr
 from small_room import make_room
 
 from kfgs.cameras import Camera
-from kfgs.formats import SplatFile, read_splats
+from kfgs.formats import read_splats
 from kfgs.labels import EditList, OfIndex, Opacity, Recolor, Remove
 from kfgs.labels.edits import Duplicate, Move
 from kfgs.splat import rasterize
@@ -208,7 +208,7 @@ def test_an_edit_is_that_of_python(viewer, state, edits):
     camera, cloud = state.cameras[0], state.cloud("color")
     rows = every(len(cloud), 3)
     viewer.run(EDIT, [{"op": kind.op, "rows": rows, **values}])
-    edited = kind(OfIndex(tuple(rows)), **values).apply(SplatFile(cloud)).gaussians
+    edited = kind(OfIndex(tuple(rows)), **values).apply(cloud).gaussians
     truth = rasterize(edited, camera, background=PAPER).map.clamp(0, 1).numpy()
     before = rasterize(cloud, camera, background=PAPER).map.clamp(0, 1).numpy()
     picture = viewer.picture(camera)
@@ -232,7 +232,7 @@ def test_edits_follow_each_other(viewer, state):
         (Remove, copies[1::2] + rows[::2], {}),
     ]
     viewer.run(EDIT, [{"op": kind.op, "rows": own, **values} for kind, own, values in steps])
-    edited = EditList(tuple(kind(OfIndex(tuple(own)), **values) for kind, own, values in steps)).apply(SplatFile(cloud))
+    edited = EditList(tuple(kind(OfIndex(tuple(own)), **values) for kind, own, values in steps)).apply(cloud)
     truth = rasterize(edited.gaussians, camera, background=PAPER).map.clamp(0, 1).numpy()
     assert psnr(viewer.picture(camera), truth) > ENOUGH
     viewer.run(EDIT, [])
@@ -321,8 +321,8 @@ def test_coarse_frames_show_the_same_room(viewer, state):
 
 
 def test_a_trained_splat(browser, shared_data):
-    cloud = read_splats(shared_data / "splats" / "inria_9080.ply").gaussians
-    state = Exploration(SplatMeaning(SplatFile(cloud.replace(labels=torch.zeros(len(cloud)).long()), {}, ("all",))))
+    cloud = read_splats(shared_data / "splats" / "inria_9080.ply")
+    state = Exploration(SplatMeaning(cloud.replace(labels=torch.zeros(len(cloud)).long()).replace(names=("all",))))
     viewer = cases_web.Viewer(browser, pack_scene(state))
     center = cloud.means.median(dim=0).values
     size = float((cloud.means - center).norm(dim=1).quantile(0.8))

@@ -26,10 +26,10 @@ def test_a_selection_is_saved_and_read_again(tmp_path):
     assert sorted((tmp_path / "new" / "folder").iterdir()) == paths
     for side in made.sides:
         read, mask = read_splats(tmp_path / "new" / "folder" / f"selection_{side}.ply"), made.selected(side)
-        assert read.classes == NAMES
+        assert read.names == NAMES
         assert read.gaussians.labels.tolist() == made.labels(side)[mask].tolist()
         torch.testing.assert_close(read.gaussians.means, made.cloud(side).means[mask])
-        np.testing.assert_allclose(read.extra["score"], made.scores(side)[mask], rtol=1e-6)
+        np.testing.assert_allclose(read.scores, made.scores(side)[mask], rtol=1e-6)
     facts = json.loads(paths[0].read_text())
     assert {key: value for key, value in facts.items() if key != "parts"} == made.details()
     expected = connected_parts(made.cloud("color"), made.selection("color"), cameras())

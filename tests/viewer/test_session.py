@@ -74,7 +74,7 @@ def test_a_selection_by_hand_is_written(session):
     details = json.loads((folder / "selection.json").read_text())
     for side, mask in masks.items():
         assert details[side]["selected"] == int(mask.sum())
-        assert len(read_splats(folder / f"selection_{side}.ply").gaussians) == int(mask.sum())
+        assert len(read_splats(folder / f"selection_{side}.ply")) == int(mask.sum())
     assert details["lambda"] == 0.5
 
 
@@ -86,7 +86,7 @@ def test_edits_are_written_and_can_be_replayed(session):
     ]
     session.call("save_edits", {"edits": {"color": edits, "semantic": []}})
     folder = session.out / "edited_001"
-    made, before = read_splats(folder / "color.ply").gaussians, session.state.cloud("color")
+    made, before = read_splats(folder / "color.ply"), session.state.cloud("color")
     assert len(made) == len(before) - 2
     torch.testing.assert_close(made.opacities[2], 0.5 * before.opacities[2])
     assert [edit.op for edit in EditList.load(folder / "color.json")] == ["recolor", "opacity", "remove"]
@@ -103,7 +103,7 @@ def test_copies_are_saved_and_split_as_they_are_in_the_viewer(session):
     mask = torch.arange(64) >= 60
     args = {"words": "chair", "gamma": 0.4, "lambda": 0.5, "sides": ["color"], "edits": edits}
     session.call("save_selection", args, bits_of(mask))
-    made = read_splats(session.out / "selection_001" / "selection_color.ply").gaussians
+    made = read_splats(session.out / "selection_001" / "selection_color.ply")
     cloud = session.state.cloud("color")
     torch.testing.assert_close(made.means, cloud.means[copied] + torch.tensor([100.0, 0, 0]))
     torch.testing.assert_close(made.opacities, cloud.opacities[copied] * torch.tensor([0.5, 0.5, 1, 1]))

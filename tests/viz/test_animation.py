@@ -6,13 +6,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from kfgs.viz.animation import _few_colors, _indexed, save_animation, save_frames
 from messages import tells
 from PIL import Image
 
 from kfgs.cameras import Camera
 from kfgs.gaussians import Gaussians
 from kfgs.viz import legend_strip, palette
-from kfgs.viz.animation import _few_colors, _indexed, save_animation, save_frames
 
 
 def cameras(count=3, height=8, width=12):

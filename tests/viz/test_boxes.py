@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 import torch
 from cases_viz import data, some_gaussians, some_plotter
+from kfgs.viz.boxes import add_boxes, add_names, add_selections
 from messages import tells
 
 from kfgs.labels import OrientedBox, Selection
 from kfgs.viz import palette
-from kfgs.viz.boxes import add_boxes, add_names, add_selections
 
 
 @pytest.fixture

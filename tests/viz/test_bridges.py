@@ -8,7 +8,6 @@ import torch
 from cases_viz import some_gaussians
 from messages import tells
 
-from kfgs.formats import SplatFile
 from kfgs.labels import Selection
 from kfgs.viz import palette, to_open3d, to_pyvista, to_trimesh
 
@@ -16,7 +15,7 @@ from kfgs.viz import palette, to_open3d, to_pyvista, to_trimesh
 def some_splat():
     cloud = some_gaussians()
     names = tuple(f"class {i}" for i in range(int(cloud.labels.max()) + 1))
-    return SplatFile(cloud, {"score": np.linspace(0, 1, len(cloud))}, names)
+    return cloud.replace(scores=np.linspace(0, 1, len(cloud)), names=names)
 
 
 def test_a_point_cloud_of_trimesh_has_colours_and_classes(tmp_path):
@@ -26,9 +25,9 @@ def test_a_point_cloud_of_trimesh_has_colours_and_classes(tmp_path):
     assert isinstance(points, trimesh.PointCloud)
     np.testing.assert_allclose(points.vertices, splat.gaussians.means, rtol=1e-6)
     np.testing.assert_array_equal(points.colors[:, :3], palette(splat.gaussians.labels))
-    assert points.metadata["classes"] == list(splat.classes)
+    assert points.metadata["classes"] == list(splat.names)
     np.testing.assert_array_equal(points.metadata["label"], splat.gaussians.labels)
-    np.testing.assert_allclose(points.metadata["score"], splat.extra["score"], rtol=1e-6)
+    np.testing.assert_allclose(points.metadata["score"], splat.scores, rtol=1e-6)
     np.testing.assert_allclose(points.metadata["scale"], splat.gaussians.scales, rtol=1e-6)
     points.export(tmp_path / "a.ply")
     assert len(trimesh.load(tmp_path / "a.ply").vertices) == len(splat)

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 import torch
 from cases_viz import some_camera, some_gaussians, some_plotter
+from kfgs.viz.camera_view import camera_of
 from messages import tells
 
 from kfgs.viz import add_cloud, draw_view, look_through, make_plotter
-from kfgs.viz.camera_view import camera_of
 
 
 def test_camera_of_is_look_through_backwards():

@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
 import torch
+from kfgs.viz.film_frames import as_shows, draw_frame, legend_under, show_cloud
 from messages import tells
 
 from kfgs.cameras import Camera
 from kfgs.gaussians import Gaussians
 from kfgs.splat import rasterize
 from kfgs.viz import FeatureColors, palette
-from kfgs.viz.film_frames import as_shows, draw_frame, legend_under, show_cloud
 from kfgs.viz.pictures import GAP
 
 C0 = 0.28209479177387814

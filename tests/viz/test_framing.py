@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 import torch
 from cases_viz import some_gaussians, some_plotter
+from kfgs.viz.framing import middle_box
 
 from kfgs.viz import add_cloud
-from kfgs.viz.framing import middle_box
 
 STYLES = ("points", "gaussians", "ellipsoids")
 

@@ -202,7 +202,6 @@ def test_a_missing_driver_is_told_by_every_entry():
         pytest.skip("drivers are hidden by variables of Linux's EGL")
     program = f"""
 import numpy
-from kfgs.formats import SplatFile
 from kfgs.viz import available, linked_clouds, make_plotter
 from kfgs.viewer import explore
 from kfgs.viewer.state import Exploration

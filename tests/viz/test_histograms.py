@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
 import torch
+from kfgs.viz.histograms import score_bins
 from matplotlib.axes import Axes
 from messages import tells
 from PIL import Image
 
 from kfgs.labels import Selection, select_by_similarity
 from kfgs.viz import palette, plot_distances, plot_scores
-from kfgs.viz.histograms import score_bins
 
 
 def heaps(n=2000, share=0.05):

@@ -2,14 +2,13 @@ import numpy as np
 import pytest
 import torch
 from cases_viz import some_gaussians, some_plotter
+from kfgs.viz.cloud_colors import cloud_colors
 from matplotlib import colormaps
 from messages import tells
 from oracles_palette import linear
 
-from kfgs.formats import SplatFile
 from kfgs.labels import LabelSet
 from kfgs.viz import add_cloud, add_legend, add_scalar_bar, palette
-from kfgs.viz.cloud_colors import cloud_colors
 from kfgs.viz.legends import bar_picture, letter_size, pin_picture, round_numbers
 from kfgs.viz.pictures import legend_column
 
@@ -116,7 +115,7 @@ def test_scalar_bar_stands_in_the_lower_right_corner_with_the_colours_of_its_sca
 
 
 def test_what_holds_gaussians_is_not_taken_for_them(plotter):
-    splats = SplatFile(some_gaussians())
+    splats = some_gaussians()
     with pytest.raises(TypeError, match=tells("gaussians:", "got SplatFile", ".gaussians")):
         cloud_colors(splats, "label")
 

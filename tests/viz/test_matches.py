@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 import torch
 from cases_viz import data, some_gaussians, some_plotter
+from kfgs.viz.matches import STATE_COLORS, add_matches, match_states
 from messages import tells
 from oracles_palette import worst_distance
 
 from kfgs.labels import transfer_labels
 from kfgs.viz import add_transfer, palette
-from kfgs.viz.matches import STATE_COLORS, add_matches, match_states
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from kfgs.viz.figures import new_figure
 from messages import tells
 from PIL import Image
 
@@ -21,7 +22,6 @@ from kfgs.viz import (
     plot_scores,
     plot_training,
 )
-from kfgs.viz.figures import new_figure
 
 HISTORY = [{"epoch": i, "size": 8 + 2 * i, "loss": 1 / (i + 1), "coverage": i / 9, "note": "text"} for i in range(10)]
 

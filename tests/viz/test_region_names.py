@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
-from messages import tells
-
 from kfgs.viz.region_names import write_region_names
+from messages import tells
 
 
 def test_names_are_written_inside_large_regions_only():

@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 import torch
+from kfgs.viz.reports import codebook_rows, plot_codebook_growth, plot_codebook_report
 from messages import tells
 from PIL import Image
 
 from kfgs.quant import fit_codebook
 from kfgs.viz import palette, reports
-from kfgs.viz.reports import codebook_rows, plot_codebook_growth, plot_codebook_report
 
 WORDS = torch.eye(3)
 NAMES = ["wall", "chair", "lamp"]

@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 import torch
+from kfgs.viz.shows import ALPHA, OUTLINE, show_classes, show_selection
 from messages import tells
 
 from kfgs.cameras import Camera
 from kfgs.gaussians import Gaussians
 from kfgs.viz import palette
-from kfgs.viz.shows import ALPHA, OUTLINE, show_classes, show_selection
 
 NAMES = ["wall", "chair", "rug"]
 CAMERA = Camera(torch.eye(4), torch.tensor([[20.0, 0, 20], [0, 20, 10], [0, 0, 1]]), 40, 20)

@@ -8,7 +8,6 @@ import torch
 from cases_viz import some_gaussians
 from messages import tells
 
-from kfgs.formats import SplatFile
 from kfgs.viz import save_usd
 
 pxr = pytest.importorskip("pxr")
@@ -27,7 +26,7 @@ def opened(path):
 def test_each_class_is_an_object_with_its_gaussians(tmp_path, ending):
     cloud, path = some_gaussians(K=4), tmp_path / f"a.{ending}"
     score = np.linspace(0, 1, len(cloud), dtype=np.float32)
-    written = save_usd(path, SplatFile(cloud, {"score": score, "other": score}, NAMES))
+    written = save_usd(path, cloud.replace(extra={"score": score, "other": score}, names=NAMES))
     assert written.paths == [path]
     assert written.lost == (
         f"4 features per Gaussian: .{ending} has no place for them",
@@ -57,7 +56,7 @@ def test_each_class_is_an_object_with_its_gaussians(tmp_path, ending):
 def test_names_that_collide_or_say_nothing_get_the_number_of_their_class(tmp_path):
     cloud = some_gaussians()
     names = ("tv set", "tv-set", "unlabelled", "\u6905\u5b50", "")
-    save_usd(tmp_path / "a.usda", SplatFile(cloud, {}, names))
+    save_usd(tmp_path / "a.usda", cloud.replace(names=names))
     _, prims = opened(tmp_path / "a.usda")
     expected = {"unlabelled": -1, "tv_set": 0, "tv_set_1": 1, "unlabelled_2": 2, "class_3": 3, "class_4": 4}
     assert {name: prim.GetAttribute("primvars:class_id").Get()[0] for name, prim in prims.items()} == expected

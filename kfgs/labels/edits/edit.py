@@ -26,6 +26,10 @@ SHOWN = 12  # classes listed in a message
 HIDDEN = 1e-6  # an opacity that every renderer skips (alpha < 1/255) and every file can hold
 
 
+Rules = str | Selection | Where | Sequence[str | Selection | Where]
+"""Which Gaussians an edit changes: a class name, a selection or a rule; or several, for all that any of them selects."""
+
+
 class Edit(ABC):
     """One edit: frozen plain data that can be compared, saved and replayed.
 
@@ -51,8 +55,8 @@ class Edit(ABC):
 class OnSelection(Edit):
     """An edit of the Gaussians that rules select."""
 
-    where: tuple[Where, ...]
-    """Which Gaussians: those that any of these rules selects. Also made from one rule, a class name or a `Selection`."""
+    where: Rules
+    """Which Gaussians; becomes a tuple of rules (`Where`)."""
     _: KW_ONLY
     allow_empty: bool = False
     """False: it is an error if nothing is selected."""
@@ -60,9 +64,14 @@ class OnSelection(Edit):
     def __post_init__(self) -> None:
         where: Any = self.where
         rules = where if isinstance(where, list | tuple) else [where]
-        set_fields(self, where=tuple(_rule(rule) for rule in rules))
-        if not self.where:
+        if not rules:
             raise ValueError("where: expected at least one rule, got none; name a class, or give OfClass('chair')")
+        set_fields(self, where=tuple(_rule(rule) for rule in rules))
+
+    @property
+    def rules(self) -> tuple[Where, ...]:
+        """`where` as a tuple of rules."""
+        return self.where  # type: ignore[return-value]  # since __post_init__
 
     def selected(self, gaussians: Gaussians) -> Tensor:  # [N] bool
         """The mask of the selected Gaussians.
@@ -70,9 +79,9 @@ class OnSelection(Edit):
         Raises:
             ValueError: if nothing is selected and `allow_empty` is false; the message lists the classes present.
         """
-        mask = reduce(or_, (rule.select(gaussians).mask for rule in self.where))
+        mask = reduce(or_, (rule.select(gaussians).mask for rule in self.rules))
         if not self.allow_empty and not bool(mask.any()):
-            rules = ", ".join(map(repr, self.where))
+            rules = ", ".join(map(repr, self.rules))
             raise ValueError(
                 f"where: expected a selection of some of {len(gaussians)} Gaussians, got none from {rules:.120}; "
                 f"{_present(gaussians)} (in Python: or pass allow_empty=True)"

@@ -157,9 +157,9 @@ JOINED = ("means", "quats", "scales", "opacities", "sh", "features", "scores")
 
 def _padded(a: Tensor | None, b: Tensor | None, first: Gaussians, second: Gaussians) -> Tensor | None:
     """One tensor of both clouds; zeros where a cloud has none, or has fewer harmonics."""
-    if a is None and b is None:
-        return None
     like = b if a is None else a
+    if like is None:
+        return None
     parts = [
         torch.zeros(len(cloud), *like.shape[1:]) if part is None else part for cloud, part in ((first, a), (second, b))
     ]

@@ -3,8 +3,7 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.formats import SplatFile
-from kfgs.gaussians import Gaussians
+from kfgs import Gaussians
 from kfgs.labels import Everything, Extract, OfClass, OfIndex, Opacity, Recolor, Remove, recolor
 from kfgs.splat import rgb_to_sh0
 
@@ -23,12 +22,12 @@ def scene(positions=range(9), labels=(0, 0, 0, 1, 1, -1, -1, 0, -1)):
         sh=rgb_to_sh0(torch.rand(n, 1, 3, generator=torch.Generator().manual_seed(0))),
         labels=torch.tensor(labels),
     )
-    return SplatFile(gaussians, {"score": np.arange(n, dtype=np.float32)}, CLASSES, {"format": "ply"})
+    return gaussians.replace(scores=np.arange(n, dtype=np.float32), names=CLASSES)
 
 
 def places(splats):
-    assert splats.extra["score"].tolist() == splats.gaussians.means[:, 0].tolist()  # columns stay with their rows
-    return splats.gaussians.means[:, 0].tolist()
+    assert splats.scores.tolist() == splats.means[:, 0].tolist()  # columns stay with their rows
+    return splats.means[:, 0].tolist()
 
 
 def test_remove_and_extract_divide_the_cloud():
@@ -53,48 +52,48 @@ def test_grow_against_loops():
     labels = rng.integers(-1, 2, 200)
     splats = scene(range(200), labels)
     points = rng.uniform(0, 1, (200, 3))
-    splats = splats.replace(gaussians=splats.gaussians.replace(means=torch.from_numpy(points)))
+    splats = splats.replace(means=torch.from_numpy(points))
     gone = []
     for i in range(200):
         to = {label: min(np.linalg.norm(points[i] - p) for p in points[labels == label]) for label in (0, 1)}
         if labels[i] == 1 or (labels[i] == -1 and to[1] < 0.1 and to[1] <= to[0]):
             gone.append(i)
     assert (labels == 1).sum() < len(gone) < (labels != 0).sum()
-    left = Remove("chair", grow=0.1).apply(splats).extra["score"].astype(int).tolist()
+    left = Remove("chair", grow=0.1).apply(splats).scores.astype(int).tolist()
     assert left == sorted(set(range(200)) - set(gone))
 
 
 def test_grow_without_labels_takes_every_neighbour():
     splats = scene()
-    splats = splats.replace(gaussians=splats.gaussians.replace(labels=None))
+    splats = splats.replace(labels=None)
     assert places(Remove(OfIndex([3, 4]), grow=1.5).apply(splats)) == [0, 1, 6, 7, 8]
 
 
 def test_opacity_multiplies_and_nought_hides():
     splats = scene()
-    before = splats.gaussians.opacities.clone()
+    before = splats.opacities.clone()
     half, hidden = Opacity("chair", 0.5).apply(splats), Opacity("chair", 0).apply(splats)
     expected = [0.5 if i in (3, 4) else 1.0 for i in range(9)]
-    torch.testing.assert_close(half.gaussians.opacities / before, torch.tensor(expected))
-    assert (hidden.gaussians.opacities[3:5] < 1 / 255).all()
-    assert (hidden.gaussians.opacities > 0).all()
+    torch.testing.assert_close(half.opacities / before, torch.tensor(expected))
+    assert (hidden.opacities[3:5] < 1 / 255).all()
+    assert (hidden.opacities > 0).all()
     assert len(hidden) == 9
     faint = torch.tensor([0.5, 0.5, 0.5, 1e-9, 0.0, 0.5, 0.5, 0.5, 0.5])
-    faint = splats.replace(gaussians=splats.gaussians.replace(opacities=faint))
+    faint = splats.replace(opacities=faint)
     for factor in (1, 0.5, 0):  # what is fainter than hidden gets no stronger
-        assert Opacity("chair", factor).apply(faint).gaussians.opacities.equal(faint.gaussians.opacities)
-    assert Opacity("chair", 1).apply(splats).gaussians.opacities.equal(before)
-    assert splats.gaussians.opacities.equal(before)
+        assert Opacity("chair", factor).apply(faint).opacities.equal(faint.opacities)
+    assert Opacity("chair", 1).apply(splats).opacities.equal(before)
+    assert splats.opacities.equal(before)
 
 
 def test_recolor_is_the_function_on_the_class():
     splats = scene()
-    mask = splats.gaussians.labels == 1
+    mask = splats.labels == 1
     for mode in ("tint", "hue"):
-        painted = Recolor("chair", "#c04040", mode).apply(splats).gaussians
-        assert painted.sh.equal(recolor(splats.gaussians, mask, "#c04040", mode).sh)
-        assert painted.sh[~mask].equal(splats.gaussians.sh[~mask])
-        assert not painted.sh[mask].equal(splats.gaussians.sh[mask])
+        painted = Recolor("chair", "#c04040", mode).apply(splats)
+        assert painted.sh.equal(recolor(splats, mask, "#c04040", mode).sh)
+        assert painted.sh[~mask].equal(splats.sh[~mask])
+        assert not painted.sh[mask].equal(splats.sh[mask])
 
 
 @pytest.mark.parametrize(
@@ -113,7 +112,7 @@ def test_nothing_selected_is_an_error_unless_allowed(edit):
 
 def test_nothing_selected_in_a_cloud_without_labels():
     splats = scene()
-    splats = splats.replace(gaussians=splats.gaussians.replace(labels=None))
+    splats = splats.replace(labels=None)
     with pytest.raises(ValueError, match=tells("where:", "got none", "no labels", "box")):
         Remove(OfIndex([])).apply(splats)
 
@@ -138,21 +137,21 @@ def test_wrong_input_is_named(make, error, message):
 def test_a_cloud_without_colours_cannot_be_painted():
     splats = scene()
     with pytest.raises(ValueError, match=tells("gaussians.sh:", "got None")):
-        Recolor(Everything(), "red").apply(splats.replace(gaussians=splats.gaussians.replace(sh=None)))
+        Recolor(Everything(), "red").apply(splats.replace(sh=None))
 
 
 def test_grow_names_a_position_that_is_none():
     splats = scene()
-    means = splats.gaussians.means.clone()
+    means = splats.means.clone()
     means[5] = torch.nan
-    broken = splats.replace(gaussians=splats.gaussians.replace(means=means))
+    broken = splats.replace(means=means)
     with pytest.raises(ValueError, match=tells("gaussians.means:", "got NaN", "row 5")):
         Remove("chair", grow=0.5).apply(broken)
     assert len(Remove("chair").apply(broken)) == 7
 
 
 def test_classes_of_one_name_are_counted_together():
-    splats = scene().replace(classes=("wall", "wall", "plant"))
+    splats = scene().replace(names=("wall", "wall", "plant"))
     assert len(Remove("wall").apply(splats)) == 3
     with pytest.raises(ValueError, match=tells("where:", "got none", "wall (6)")):
         Remove("plant").apply(splats)

@@ -6,9 +6,9 @@ import pytest
 import torch
 from messages import tells
 
+from kfgs import Gaussians
 from kfgs.cameras import Similarity
-from kfgs.formats import SplatFile, write_splats
-from kfgs.gaussians import Gaussians
+from kfgs.formats import write_splats
 from kfgs.labels import (
     Component,
     Duplicate,
@@ -33,11 +33,11 @@ def scene(n=12, seed=0):
     rng = np.random.default_rng(seed)
     draw = lambda *shape: torch.from_numpy(rng.uniform(0.1, 0.9, shape)).float()  # noqa: E731
     gaussians = Gaussians(draw(n, 3), draw(n, 4), draw(n, 3), draw(n), sh=draw(n, 4, 3), labels=torch.arange(n) % 3)
-    return SplatFile(gaussians, {"score": rng.uniform(size=n)}, ("wall", "chair", "plant"), {"format": "ply"})
+    return gaussians.replace(scores=rng.uniform(size=n), names=("wall", "chair", "plant"))
 
 
 def every_edit(folder):
-    write_splats(folder / "parts" / "vase.ply", scene(3, 1).replace(classes=("vase", "wall", "chair")))
+    write_splats(scene(3, 1).replace(names=("vase", "wall", "chair")), folder / "parts" / "vase.ply")
     return EditList(
         [
             Recolor(OfClass("plant") - InBox((0, 0, 0), (0.1, 0.1, 0.1)), "#c04040", "hue"),
@@ -53,10 +53,10 @@ def every_edit(folder):
 
 
 def same(a, b):
-    assert a.classes == b.classes
-    for name, value in vars(a.gaussians).items():
+    assert a.names == b.names
+    for name, value in vars(a).items():
         if value is not None:
-            torch.testing.assert_close(getattr(b.gaussians, name), value)
+            torch.testing.assert_close(getattr(b, name), value)
     for name, column in a.extra.items():
         np.testing.assert_array_equal(column, b.extra[name])
 
@@ -110,7 +110,7 @@ def test_saved_and_replayed(tmp_path):
 
 def test_a_relative_path_comes_back_as_the_same_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    write_splats("sub.ply", scene(3))
+    write_splats(scene(3), "sub.ply")
     edits = EditList([Insert("sub.ply"), Insert(tmp_path / "sub.ply", PLACE)])
     for path in ("edits.json", tmp_path / "other.json"):
         assert EditList.load(edits.save(path)) == edits
@@ -138,7 +138,7 @@ def test_hand_written_json_may_be_short(tmp_path):
 
 
 def test_files_elsewhere_need_a_word(tmp_path):
-    write_splats(tmp_path / "vase.ply", scene(3))
+    write_splats(scene(3), tmp_path / "vase.ply")
     path = EditList([Insert(tmp_path / "vase.ply")]).save(tmp_path / "sub" / "edits.json")
     message = ("edits.json:", "edits[0].source:", "sub", "vase.ply'", "copy")
     with pytest.raises(ValueError, match=tells(*message)):

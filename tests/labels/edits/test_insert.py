@@ -6,8 +6,8 @@ import torch
 from messages import tells
 
 from kfgs.cameras import Similarity
-from kfgs.formats import SplatFile, read_splats, write_splats
-from kfgs.gaussians import Gaussians
+from kfgs.formats import read_splats, write_splats
+from kfgs import Gaussians
 from kfgs.labels import Insert, OfClass, join
 from kfgs.splat import evaluate_sh, transform_gaussians
 
@@ -24,31 +24,31 @@ def splats(n, coefficients=1, labels=None, classes=(), extra=None, seed=0, featu
         sh=random(n, coefficients, 3) if coefficients else None,
         labels=None if labels is None else torch.tensor(labels),
     )
-    return SplatFile(gaussians, extra or {}, tuple(classes), {"seed": seed})
+    return gaussians.replace(extra=extra or {}, names=tuple(classes))
 
 
 @pytest.mark.parametrize(("first", "second"), [(16, 4), (1, 16), (4, 4)])
 def test_the_lower_degree_is_filled_up_and_looks_as_before(first, second):
     a, b = splats(3, first), splats(2, second, seed=1)
     both = join(a, b)
-    assert both.gaussians.sh.shape == (5, max(first, second), 3)
+    assert both.sh.shape == (5, max(first, second), 3)
     directions = torch.randn(5, 3, generator=torch.Generator().manual_seed(0))
-    shown = evaluate_sh(both.gaussians.sh, directions)
-    torch.testing.assert_close(shown[:3], evaluate_sh(a.gaussians.sh, directions[:3]))
-    torch.testing.assert_close(shown[3:], evaluate_sh(b.gaussians.sh, directions[3:]))
-    assert both.gaussians.means.equal(torch.cat([a.gaussians.means, b.gaussians.means]))
+    shown = evaluate_sh(both.sh, directions)
+    torch.testing.assert_close(shown[:3], evaluate_sh(a.sh, directions[:3]))
+    torch.testing.assert_close(shown[3:], evaluate_sh(b.sh, directions[3:]))
+    assert both.means.equal(torch.cat([a.means, b.means]))
     assert both.info == a.info
 
 
 @pytest.mark.parametrize(("scene", "part"), [(True, False), (False, True)])
 def test_what_is_inserted_is_drawn_as_the_scene_is(scene, part):
     a, b = (
-        one.replace(gaussians=one.gaussians.replace(antialiased=flag))
+        one.replace(antialiased=flag)
         for one, flag in ((splats(2), scene), (splats(1), part))
     )
     with pytest.warns(UserWarning, match=f"insert: .* {'fainter' if scene else 'more opaque'} than in its own file"):
         both = join(a, b)
-    assert both.gaussians.antialiased is scene
+    assert both.antialiased is scene
 
 
 def test_classes_are_the_same_when_their_names_are():
@@ -56,7 +56,7 @@ def test_classes_are_the_same_when_their_names_are():
     b = splats(4, labels=[2, 0, -1, 1], classes=("chair", "wall", "vase", "never used"), seed=1)
     both = join(a, b)
     assert both.classes == ("wall", "chair", "vase")
-    assert both.gaussians.labels.tolist() == [0, 1, -1, 2, 1, -1, 0]
+    assert both.labels.tolist() == [0, 1, -1, 2, 1, -1, 0]
 
 
 def test_classes_of_one_name_become_one_where_they_are_joined():
@@ -64,9 +64,9 @@ def test_classes_of_one_name_become_one_where_they_are_joined():
     plain = splats(2, labels=[0, 1], classes=("wall", "chair"), seed=1)
     into_plain, into_twice = join(plain, twice), join(twice, plain)
     assert into_plain.classes == ("wall", "chair")
-    assert into_plain.gaussians.labels.tolist() == [0, 1, 1, 0, 1]
+    assert into_plain.labels.tolist() == [0, 1, 1, 0, 1]
     assert into_twice.classes == ("chair", "wall", "chair")  # labels of the first stay what they were
-    assert into_twice.gaussians.labels.tolist() == [0, 1, 2, 1, 0]
+    assert into_twice.labels.tolist() == [0, 1, 2, 1, 0]
     for both in (into_plain, into_twice):
         assert len(OfClass("chair").select(both)) == 3
 
@@ -74,26 +74,26 @@ def test_classes_of_one_name_become_one_where_they_are_joined():
 def test_classes_without_names():
     named, bare = splats(2, labels=[0, 1], classes=("wall", "chair")), splats(2, labels=[3, 0], seed=1)
     assert join(bare, bare).classes == ()
-    assert join(bare, bare).gaussians.labels.tolist() == [3, 0, 3, 0]
+    assert join(bare, bare).labels.tolist() == [3, 0, 3, 0]
     into_named, into_bare = join(named, bare), join(bare, named)
     assert into_named.classes == ("wall", "chair", "class 0", "class 3")
-    assert into_named.gaussians.labels.tolist() == [0, 1, 3, 2]
+    assert into_named.labels.tolist() == [0, 1, 3, 2]
     assert into_bare.classes == ("class 0", "class 1", "class 2", "class 3", "wall", "chair")
-    assert into_bare.gaussians.labels.tolist() == [3, 0, 4, 5]
+    assert into_bare.labels.tolist() == [3, 0, 4, 5]
 
 
 def test_what_one_cloud_lacks_is_filled():
     a = splats(2, extra={"score": np.array([0.5, 0.6], np.float32), "id": np.array([7, 8], np.int32)}, features=4)
     b = splats(1, labels=[0], classes=("vase",), extra={"score": np.array([0.25]), "heat": np.array([3.0])}, seed=1)
     both = join(a, b)
-    assert both.gaussians.labels.tolist() == [-1, -1, 0]
-    assert both.extra["score"].tolist() == [np.float32(0.5), np.float32(0.6), 0.25]
+    assert both.labels.tolist() == [-1, -1, 0]
+    assert both.scores.tolist() == [np.float32(0.5), np.float32(0.6), 0.25]
     assert both.extra["id"].tolist() == [7, 8, 0]
     assert both.extra["id"].dtype == np.int32
     assert both.extra["heat"].tolist() == [0, 0, 3]
-    assert both.gaussians.features[2].tolist() == [0, 0, 0, 0]
-    assert join(splats(2), splats(1)).gaussians.labels is None
-    assert join(splats(2, dtype=torch.float64), splats(1)).gaussians.sh.dtype == torch.float64
+    assert both.features[2].tolist() == [0, 0, 0, 0]
+    assert join(splats(2), splats(1)).labels is None
+    assert join(splats(2, dtype=torch.float64), splats(1)).sh.dtype == torch.float64
 
 
 def test_clouds_that_cannot_be_joined_are_refused():
@@ -107,23 +107,23 @@ def test_clouds_that_cannot_be_joined_are_refused():
 
 def test_insert_reads_the_file_and_places_it(tmp_path):
     scene, object_ = splats(4, 9, labels=[0, 0, 1, 1], classes=("wall", "chair")), splats(3, 4, seed=1)
-    object_ = object_.replace(gaussians=object_.gaussians.replace(labels=torch.tensor([0, 0, 0])), classes=("vase",))
-    write_splats(tmp_path / "vase.ply", object_)
+    object_ = object_.replace(labels=torch.tensor([0, 0, 0])), classes=("vase",)
+    write_splats(object_, tmp_path / "vase.ply")
     quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     place = Similarity(2.0, quarter, torch.tensor([1.0, 2.0, 3.0]))
     from_file = Insert(tmp_path / "vase.ply", place).apply(scene)
     in_memory = Insert(read_splats(tmp_path / "vase.ply"), place).apply(scene)
     assert from_file.classes == ("wall", "chair", "vase")
-    assert from_file.gaussians.labels.tolist() == [0, 0, 1, 1, 2, 2, 2]
-    x, y, z = object_.gaussians.means.unbind(1)
-    torch.testing.assert_close(from_file.gaussians.means[4:], torch.stack([1 - 2 * y, 2 + 2 * x, 3 + 2 * z], dim=1))
-    moved = transform_gaussians(object_.gaussians, place)
-    torch.testing.assert_close(from_file.gaussians.sh[4:, :4], moved.sh)
-    assert not from_file.gaussians.sh[4:, 4:].any()
-    torch.testing.assert_close(in_memory.gaussians.means, from_file.gaussians.means)
+    assert from_file.labels.tolist() == [0, 0, 1, 1, 2, 2, 2]
+    x, y, z = object_.means.unbind(1)
+    torch.testing.assert_close(from_file.means[4:], torch.stack([1 - 2 * y, 2 + 2 * x, 3 + 2 * z], dim=1))
+    moved = transform_gaussians(object_, place)
+    torch.testing.assert_close(from_file.sh[4:, :4], moved.sh)
+    assert not from_file.sh[4:, 4:].any()
+    torch.testing.assert_close(in_memory.means, from_file.means)
     assert len(scene) == 4
     stays = Insert(tmp_path / "vase.ply").apply(scene)
-    torch.testing.assert_close(stays.gaussians.means[4:], object_.gaussians.means)
+    torch.testing.assert_close(stays.means[4:], object_.means)
 
 
 def test_inserts_are_equal_when_file_and_place_are():
@@ -140,7 +140,7 @@ def test_inserts_are_equal_when_file_and_place_are():
 
 def test_wrong_input_is_named(tmp_path):
     with pytest.raises(TypeError, match=tells("source:", "SplatFile", "got Gaussians", "SplatFile(...)")):
-        Insert(splats(1).gaussians)
+        Insert(splats(1))
     with pytest.raises(TypeError, match=tells("source:", "SplatFile", "got ''")):
         Insert("")
     for impossible in ("a\0b", "\ud800"):

@@ -4,9 +4,8 @@ import torch
 from messages import tells
 from scipy.spatial.transform import Rotation
 
+from kfgs import Gaussians
 from kfgs.cameras import Camera
-from kfgs.formats import SplatFile
-from kfgs.gaussians import Gaussians
 from kfgs.labels import Duplicate, Everything, Move, OfClass, OfIndex, Turn
 from kfgs.splat import covariance_3d, evaluate_sh, rasterize
 
@@ -29,7 +28,7 @@ def scene(n=10, seed=1):
         sh=draw(n, 16, 3) - 0.5,
         labels=torch.arange(n) % 2,
     )
-    return SplatFile(gaussians, {"score": rng.uniform(size=n)}, ("wall", "chair"), {"format": "ply"})
+    return gaussians.replace(scores=rng.uniform(size=n), names=("wall", "chair"))
 
 
 def oracle_matrix(motion):
@@ -55,8 +54,8 @@ def oracle_matrix(motion):
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_move_against_the_equation(motion):
     splats = scene()
-    g, mask = splats.gaussians, splats.gaussians.labels == 1
-    moved = Move("chair", **motion).apply(splats).gaussians
+    g, mask = splats, splats.labels == 1
+    moved = Move("chair", **motion).apply(splats)
     R, s = oracle_matrix(motion), motion.get("scale", 1.0)
     x, o = g.means[mask].numpy(), g.opacities[mask].numpy()
     pivot = motion.get("pivot", (o[:, None] * x).sum(0) / o.sum())
@@ -74,35 +73,35 @@ def test_move_against_the_equation(motion):
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_move_leaves_the_rest_the_order_and_the_input(motion):
     splats = scene()
-    copy = splats.gaussians.means.clone()
+    copy = splats.means.clone()
     moved = Move("chair", **motion).apply(splats)
-    rest = splats.gaussians.labels == 0
+    rest = splats.labels == 0
     for name in ("means", "quats", "scales", "sh", "opacities"):
-        assert getattr(moved.gaussians, name)[rest].equal(getattr(splats.gaussians, name)[rest])
-    assert moved.gaussians.labels.equal(splats.gaussians.labels)
-    assert moved.gaussians.opacities.equal(splats.gaussians.opacities)
-    assert splats.gaussians.means.equal(copy)
+        assert getattr(moved, name)[rest].equal(getattr(splats, name)[rest])
+    assert moved.labels.equal(splats.labels)
+    assert moved.opacities.equal(splats.opacities)
+    assert splats.means.equal(copy)
 
 
 def test_turning_about_the_centroid_keeps_it_and_going_back_undoes():
     splats, turn = scene(), Turn("y", 70)
     there = Move("chair", rotation=turn).apply(splats)
-    mask = splats.gaussians.labels == 1
-    o = splats.gaussians.opacities[mask]
-    torch.testing.assert_close(o @ there.gaussians.means[mask], o @ splats.gaussians.means[mask])
+    mask = splats.labels == 1
+    o = splats.opacities[mask]
+    torch.testing.assert_close(o @ there.means[mask], o @ splats.means[mask])
     back = Move("chair", rotation=Turn("y", -70)).apply(there)
-    torch.testing.assert_close(back.gaussians.means, splats.gaussians.means)
-    torch.testing.assert_close(back.gaussians.sh, splats.gaussians.sh, atol=1e-6, rtol=0)
+    torch.testing.assert_close(back.means, splats.means)
+    torch.testing.assert_close(back.sh, splats.sh, atol=1e-6, rtol=0)
 
 
 def test_a_quarter_turn_about_z_takes_x_to_y():
     splats = scene(1)
-    splats = splats.replace(gaussians=splats.gaussians.replace(means=torch.tensor([[1.0, 0, 0]]).double()))
+    splats = splats.replace(means=torch.tensor([[1.0, 0, 0]]).double())
     moved = Move(Everything(), rotation=("z", 90), pivot=(0, 0, 0)).apply(splats)
-    torch.testing.assert_close(moved.gaussians.means, torch.tensor([[0.0, 1.0, 0.0]]).double())
+    torch.testing.assert_close(moved.means, torch.tensor([[0.0, 1.0, 0.0]]).double())
     xyzw = Rotation.from_euler("z", 90, degrees=True).as_quat()
     same = Move(Everything(), rotation=tuple(xyzw[[3, 0, 1, 2]]), pivot=(0, 0, 0)).apply(splats)
-    torch.testing.assert_close(same.gaussians.means, moved.gaussians.means)
+    torch.testing.assert_close(same.means, moved.means)
 
 
 def test_moved_object_is_drawn_where_it_stands():
@@ -117,7 +116,7 @@ def test_moved_object_is_drawn_where_it_stands():
         opacities=torch.tensor([0.8, 0.6]),
         sh=torch.rand(2, 1, 3, generator=torch.Generator().manual_seed(0)),
     )
-    moved = Move(Everything(), (8 * 4 / 40, 0.0, 0.0)).apply(SplatFile(gaussians)).gaussians
+    moved = Move(Everything(), (8 * 4 / 40, 0.0, 0.0)).apply(gaussians)
     before, after = (rasterize(g, camera).map for g in (gaussians, moved))
     assert before.max() > 0.3
     torch.testing.assert_close(after[:, 8:], before[:, :-8], atol=5e-3, rtol=0)  # EWA's Jacobian differs off-axis
@@ -126,15 +125,15 @@ def test_moved_object_is_drawn_where_it_stands():
 def test_duplicates_follow_the_originals_with_their_labels_and_columns():
     splats = scene()
     doubled = Duplicate("chair", (0, 0, 5), ("x", 30), 0.5).apply(splats)
-    mask = splats.gaussians.labels == 1
+    mask = splats.labels == 1
     assert len(doubled) == 15
     for name in ("means", "quats", "scales", "sh", "opacities", "labels"):
-        assert getattr(doubled.gaussians, name)[:10].equal(getattr(splats.gaussians, name))
-    moved = Move("chair", (0, 0, 5), ("x", 30), 0.5).apply(splats).gaussians.select(mask)
+        assert getattr(doubled, name)[:10].equal(getattr(splats, name))
+    moved = Move("chair", (0, 0, 5), ("x", 30), 0.5).apply(splats).select(mask)
     for name in ("means", "quats", "scales", "sh", "opacities", "labels"):
-        torch.testing.assert_close(getattr(doubled.gaussians, name)[10:], getattr(moved, name))
-    assert doubled.extra["score"][10:].tolist() == splats.extra["score"][mask.numpy()].tolist()
-    assert doubled.classes == splats.classes
+        torch.testing.assert_close(getattr(doubled, name)[10:], getattr(moved, name))
+    assert doubled.scores[10:].tolist() == splats.scores[mask.numpy()].tolist()
+    assert doubled.classes == splats.names
     assert doubled.info == splats.info
 
 
@@ -176,17 +175,17 @@ def test_rotations_of_the_smallest_and_largest_floats(tiny):
         (Turn((tiny, tiny, 0), 90), Turn((1, 1, 0), 90)),
         (Turn((tiny, 0, 0), 90), Turn("x", 90)),
     ):
-        moved, expected = (Move("chair", rotation=r).apply(splats).gaussians for r in (small, plain))
+        moved, expected = (Move("chair", rotation=r).apply(splats) for r in (small, plain))
         torch.testing.assert_close(moved.means, expected.means)
 
 
 def test_the_centroid_of_what_is_invisible_is_the_plain_mean():
     splats = scene()
     for opacity in (0.0, 1e-320):  # 1e-320: as weights they would vanish beside the positions
-        faint = splats.replace(gaussians=splats.gaussians.replace(opacities=torch.full((10,), opacity).double()))
-        moved = Move("chair", rotation=("z", 90), scale=2.0).apply(faint).gaussians
-        chair = splats.gaussians.labels == 1
-        torch.testing.assert_close(moved.means[chair].mean(dim=0), splats.gaussians.means[chair].mean(dim=0))
+        faint = splats.replace(gaussians=splats.replace(opacities=torch.full((10,), opacity).double()))
+        moved = Move("chair", rotation=("z", 90), scale=2.0).apply(faint)
+        chair = splats.labels == 1
+        torch.testing.assert_close(moved.means[chair].mean(dim=0), splats.means[chair].mean(dim=0))
 
 
 @pytest.mark.parametrize(
@@ -205,14 +204,14 @@ def test_the_centroid_of_what_is_invisible_is_the_plain_mean():
 )
 def test_what_leaves_the_range_of_float32_is_an_error(edit):
     splats = scene()
-    splats = splats.replace(gaussians=splats.gaussians.to(torch.float32))
+    splats = splats.to(torch.float32)
     with pytest.raises(ValueError, match=tells("expected positions and scales that", "float32", "after scale", "less")):
         edit.apply(splats)
 
 
 def test_a_kilometre_is_not_too_far():
     splats = scene()
-    splats = splats.replace(gaussians=splats.gaussians.to(torch.float32))
-    chair = splats.gaussians.labels == 1
-    moved = Move("chair", (1000, 0, 0)).apply(splats).gaussians.means[chair] - splats.gaussians.means[chair]
+    splats = splats.to(torch.float32)
+    chair = splats.labels == 1
+    moved = Move("chair", (1000, 0, 0)).apply(splats).means[chair] - splats.means[chair]
     torch.testing.assert_close(moved, torch.tensor([1000.0, 0, 0]).expand_as(moved), rtol=0, atol=1e-4)
