@@ -47,7 +47,7 @@ def a_field(count=4_000):
 def a_splat(count=6_000):
     gaussians = cloud(count, 1)
     sh = torch.rand(len(gaussians), 1, 3, generator=torch.Generator().manual_seed(0))
-    return gaussians.replace(sh=sh).replace(extra={"warmth": np.arange(len(gaussians), dtype=np.float32)})
+    return gaussians.replace(sh=sh, extra={"warmth": np.arange(len(gaussians), dtype=np.float32)})
 
 
 def look(place, name, target=(1.6, 1.2, 0.6)):
@@ -106,10 +106,10 @@ def test_distance_in_one_frame():
 def test_nothing_else_of_the_splat_changes():
     splats = a_splat(1_500)
     attached = attach(a_field(1_500), splats, CLASSES).gaussians
-    assert attached.classes == CLASSES.names
-    assert set(attached.extra) == {"warmth", "score"}
+    assert attached.names == CLASSES.names
+    assert set(attached.extra) == {"warmth"}
     for name in ("means", "quats", "scales", "opacities", "sh"):
-        assert torch.equal(getattr(attached.gaussians, name), getattr(splats, name))
+        assert torch.equal(getattr(attached, name), getattr(splats, name))
     assert splats.labels is None
 
 
@@ -210,7 +210,7 @@ def test_the_facts_survive_a_file(tmp_path):
     assert sum(facts["counts"].values()) == len(attached.gaussians)
     write_splats(attached.gaussians, tmp_path / "a.ply", facts=attached.facts)
     back = read_splats(tmp_path / "a.ply")
-    assert torch.equal(back.gaussians.labels, attached.labels)
+    assert torch.equal(back.labels, attached.labels)
     assert back.names == CLASSES.names
     written = json.loads(names_path(tmp_path / "a.ply").read_text())
     assert written["labelled by"] == "votes of 6 segmented views"

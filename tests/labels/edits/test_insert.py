@@ -5,9 +5,9 @@ import pytest
 import torch
 from messages import tells
 
+from kfgs import Gaussians
 from kfgs.cameras import Similarity
 from kfgs.formats import read_splats, write_splats
-from kfgs import Gaussians
 from kfgs.labels import Insert, OfClass, join
 from kfgs.splat import evaluate_sh, transform_gaussians
 
@@ -42,10 +42,7 @@ def test_the_lower_degree_is_filled_up_and_looks_as_before(first, second):
 
 @pytest.mark.parametrize(("scene", "part"), [(True, False), (False, True)])
 def test_what_is_inserted_is_drawn_as_the_scene_is(scene, part):
-    a, b = (
-        one.replace(antialiased=flag)
-        for one, flag in ((splats(2), scene), (splats(1), part))
-    )
+    a, b = (one.replace(antialiased=flag) for one, flag in ((splats(2), scene), (splats(1), part)))
     with pytest.warns(UserWarning, match=f"insert: .* {'fainter' if scene else 'more opaque'} than in its own file"):
         both = join(a, b)
     assert both.antialiased is scene
@@ -107,7 +104,7 @@ def test_clouds_that_cannot_be_joined_are_refused():
 
 def test_insert_reads_the_file_and_places_it(tmp_path):
     scene, object_ = splats(4, 9, labels=[0, 0, 1, 1], classes=("wall", "chair")), splats(3, 4, seed=1)
-    object_ = object_.replace(labels=torch.tensor([0, 0, 0])), classes=("vase",)
+    object_ = object_.replace(labels=torch.tensor([0, 0, 0]), names=("vase",))
     write_splats(object_, tmp_path / "vase.ply")
     quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     place = Similarity(2.0, quarter, torch.tensor([1.0, 2.0, 3.0]))
