@@ -21,7 +21,8 @@ _WHERE = {
     "Autoencoder": ".quant",
     "AutoencoderConfig": ".quant",
     "Codebook": ".quant",
-    "CodebookConfig": ".quant",
+    "GrownCodebook": ".quant",
+    "PaperCodebook": ".quant",
     "fit_autoencoder": ".quant",
     "fit_codebook": ".quant",
     "quantize_maps": ".quant",
@@ -106,7 +107,8 @@ if TYPE_CHECKING:
     from .quant import Autoencoder as Autoencoder
     from .quant import AutoencoderConfig as AutoencoderConfig
     from .quant import Codebook as Codebook
-    from .quant import CodebookConfig as CodebookConfig
+    from .quant import GrownCodebook as GrownCodebook
+    from .quant import PaperCodebook as PaperCodebook
     from .quant import fit_autoencoder as fit_autoencoder
     from .quant import fit_codebook as fit_codebook
     from .quant import quantize_maps as quantize_maps

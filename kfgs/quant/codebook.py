@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from .._arrays import reading
 from .._card import html_card, short_repr, short_value
-from .._check import as_array, as_tensor, check_range, check_shapes, moved_to
+from .._check import as_tensor, check_shapes
 from .._rows import EPS, row_norms, unit_rows
-from ._store import read_tensors, write_tensors
+from .store import Stored
 
 CHUNK = 1024  # features at a time: 2 MB of 512 channels stay in a core's cache, a third faster than 65,536 (measured)
 
@@ -31,76 +27,54 @@ class Nearest(NamedTuple):
         return short_repr(self)
 
 
-class Compared(NamedTuple):
-    """The best codeword of each feature, before the division by the feature's length."""
+@dataclass(frozen=True, eq=False)
+class CodebookReport:
+    """How a codebook was fitted, and how well it represents the sampled features."""
 
-    codeword: Tensor  # [...] int64, of the largest product
-    product: Tensor  # [...] of the feature with that unit row, in the rows' precision
-    length: Tensor  # [...] of the feature, in at least single precision
+    history: list[dict[str, Any]] = field(repr=False)
+    """Per round of growth (`PaperCodebook`: per epoch): epoch (from 0), size, added, pruned, and coverage and
+    mean_similarity before the round's growth; with `PaperCodebook` also loss (Eq. 6, mean over images)."""
+    usage: Tensor  # [K] int64
+    """Sampled features of each codeword; unused codewords are kept, as in the paper."""
+    coverage: float
+    """Share of the sampled features whose similarity to their codeword is at least `alpha`."""
+    mean_similarity: float
+    """Mean similarity of the sampled features to their codeword."""
+    alpha: float
+    """The similarity for `coverage`: `expand_below`, or the one that the data reached."""
+    note: str | None
+    """One line of advice if the book is full or covers too little; None if all is well."""
 
-    def __repr__(self) -> str:
-        return short_repr(self)
-
-
-def compare(
-    features: Tensor,  # [..., D]
-    unit: Tensor,  # [K, D] unit rows
-    *,
-    chunk: int = CHUNK,
-) -> Compared:
-    """Eq. 5, at most `chunk` features at a time. The length of a feature changes no argmax, so no feature is divided by it.
-
-    Note:
-        Ties go to the lowest index. Products of bfloat16 are three times faster on AVX-512 BF16, but to prove the same
-        argmax, every feature would be computed again whose two best are nearer than their error: too many to gain.
-    """
-    check_range("chunk", chunk, 1)
-    index = torch.empty(features.shape[:-1], dtype=torch.int64, device=features.device)
-    product = torch.empty(features.shape[:-1], dtype=unit.dtype, device=features.device)
-    wide = torch.promote_types(torch.promote_types(features.dtype, torch.float32), unit.dtype)
-    length = torch.empty(features.shape[:-1], dtype=wide, device=features.device)
-    rows, flat = features.reshape(-1, unit.shape[1]), (index.view(-1), product.view(-1), length.view(-1))
-    K = unit.shape[0]
-    with torch.no_grad():
-        padded = torch.nn.functional.pad(
-            unit, (0, 0, 0, -K % 16)
-        ).T  # a product with 256 columns is quicker than with 255
-        for start in range(0, rows.shape[0], chunk):
-            here = slice(start, start + chunk)
-            part = rows[here].to(wide)
-            best, where = (part.to(unit.dtype) @ padded)[:, :K].max(dim=-1)  # the first of equal ones
-            flat[0][here], flat[1][here], flat[2][here] = where, best, row_norms(part)
-    return Compared(index, product, length)
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, eq=False)
-class Codebook:
-    """K codewords of D channels, S = {f_e} in Sec. 3.3.1. Their lengths carry no meaning: only directions are compared,
-    in the codewords' precision (features of another one are converted).
+class Codebook(Stored):
+    """K features of a teacher that stand for all others, compared by cosine similarity.
+
+    Args:
+        codewords: their length does not matter: only directions are compared.
+        report: set by `fit_codebook`; it is not saved.
 
     Raises:
         ValueError: if there is no codeword, or one is all-zero or not finite.
 
     Example:
-        >>> import torch
         >>> book = Codebook(torch.tensor([[2.0, 0.0], [0.0, 3.0]]))
         >>> book.quantize(torch.tensor([[1.0, 0.2], [0.1, 5.0], [1.0, 1.0]]))
         tensor([0, 1, 0])
     """
 
     codewords: Tensor  # [K, D]
+    report: CodebookReport | None = field(default=None, repr=False)
+    kind = "codebook"
 
     def __post_init__(self) -> None:
-        object.__setattr__(
-            self, "codewords", as_tensor("codewords", self.codewords, floating=isinstance(self.codewords, list | tuple))
-        )
+        object.__setattr__(self, "codewords", as_tensor("codewords", self.codewords, floating=True))
         check_shapes(("codewords", self.codewords, "K D"))
-        if self.size < 1 or not self.codewords.is_floating_point():
-            raise ValueError(
-                f"codewords: expected at least one row of floating-point numbers, got {tuple(self.codewords.shape)} "
-                f"of {self.codewords.dtype}; fit one with fit_codebook"
-            )
-        norms = row_norms(self.codewords.detach())  # K is small: this look at the values is cheap
+        if self.size < 1:
+            raise ValueError("codewords: expected at least one row, got none; fit a codebook with fit_codebook")
+        norms = row_norms(self.codewords.detach())
         bad = (~(torch.isfinite(norms) & (norms > EPS))).nonzero()[:, 0].tolist()
         if bad:
             raise ValueError(
@@ -118,7 +92,7 @@ class Codebook:
 
     @property
     def size(self) -> int:
-        """Number of codewords, K; `len` is the same."""
+        """The number of codewords, K; `len` is the same."""
         return len(self)
 
     @property
@@ -131,76 +105,23 @@ class Codebook:
         """The codewords with unit length."""
         return unit_rows(self.codewords)
 
-    def similarity(
-        self,
-        features: Tensor,  # [..., D]
-    ) -> Tensor:  # [..., K]
+    def similarity(self, features: Tensor) -> Tensor:  # [..., D] -> [..., K]
         """Cosine similarity of each feature with each codeword; 0 for an all-zero feature. Differentiable."""
         return unit_rows(self._checked(features).to(self.unit.dtype)) @ self.unit.T
 
-    def nearest(
-        self,
-        features: Tensor,  # [..., D]
-        *,
-        chunk: int = CHUNK,
-    ) -> Nearest:
-        """The most similar codeword of each feature and how similar it is (Eq. 5), at most `chunk` features at a time.
+    def nearest(self, features: Tensor) -> Nearest:  # [..., D] -> [...], [...]
+        """The most similar codeword of each feature and how similar it is (Eq. 5).
 
         Note:
-            Ties go to the lowest index. An all-zero feature is equally (0) similar to all, and so gets index 0 with
-            similarity 0; the similarity shows which features were zero.
+            Ties go to the lowest index. An all-zero feature gets index 0 with similarity 0.
         """
-        index, best, length = compare(self._checked(features), self.unit, chunk=chunk)
-        shortest = max(EPS, torch.finfo(best.dtype).tiny)  # as in unit_rows
-        return Nearest(index, (best / length.clamp_min(shortest)).to(best.dtype))
+        index, product, length = compare(self._checked(features), self.unit)
+        shortest = max(EPS, torch.finfo(product.dtype).tiny)  # as in unit_rows
+        return Nearest(index, (product / length.clamp_min(shortest)).to(product.dtype))
 
-    def quantize(
-        self,
-        features: Tensor,  # [..., D]
-        *,
-        chunk: int = CHUNK,
-    ) -> Tensor:  # [...] int64
+    def quantize(self, features: Tensor) -> Tensor:  # [..., D] -> [...] int64
         """The index map M of Eq. 5: for each feature, t = argmax_e cos(f, f_e). Ties as in `nearest`."""
-        return compare(self._checked(features), self.unit, chunk=chunk).codeword
-
-    def to_numpy(self) -> np.ndarray[Any, Any]:  # [K, D]
-        """The codewords as a NumPy array."""
-        return as_array(self.codewords)
-
-    def to(self, *args: Any, **kwargs: Any) -> Codebook:
-        """Move or convert the codewords as `Tensor.to` does."""
-        return Codebook(moved_to(self.codewords, *args, **kwargs))
-
-    def to_tensors(self) -> dict[str, Tensor]:
-        """The tensors that `from_tensors` reads."""
-        return {"codewords": self.codewords}
-
-    @staticmethod
-    def from_tensors(tensors: Mapping[str, Tensor]) -> Codebook:
-        """A codebook from the tensors of `to_tensors`; other names are ignored.
-
-        Raises:
-            ValueError: if "codewords" is missing.
-        """
-        if "codewords" not in tensors:
-            raise ValueError(f"tensors: expected the name 'codewords', got {sorted(tensors)}; use Codebook.to_tensors")
-        return Codebook(tensors["codewords"])
-
-    def save(self, path: str | Path) -> None:
-        """Write the codewords to a .safetensors file."""
-        write_tensors(path, self.to_tensors(), kind="codebook")
-
-    @staticmethod
-    def load(path: str | Path) -> Codebook:
-        """Read what `save` wrote.
-
-        Raises:
-            FileNotFoundError: if there is no such file.
-            ValueError: if the file is not a codebook of kfgs.
-        """
-        tensors = read_tensors(path, kind="codebook")
-        with reading(path, "a codebook of kfgs"):
-            return Codebook.from_tensors(tensors)
+        return compare(self._checked(features), self.unit)[0]
 
     def _checked(self, features: Tensor) -> Tensor:
         features = as_tensor("features", features)
@@ -210,3 +131,61 @@ class Codebook:
                 "pass features of the teacher that the codebook was fitted to"
             )
         return features
+
+
+def share_above(similarity: Tensor, alpha: float) -> float:
+    """The share of features that are at least `alpha` similar."""
+    return float((similarity >= alpha).double().mean())
+
+
+def fitted(
+    codewords: Tensor,  # [K, D]
+    history: list[dict[str, Any]],
+    nearest: Nearest,  # of the sampled features [n]
+    alpha: float,
+    *,
+    asked: bool,
+    full: bool,
+    enough: float,
+) -> Codebook:
+    """A codebook with its report. `asked`: alpha is an option; `enough`: the share of features that should reach it."""
+    size, coverage = len(codewords), share_above(nearest.similarity, alpha)
+    note = f"{100 * coverage:.0f} % of the features are {alpha:.2f} similar to their codeword"
+    if full and not (asked and coverage >= enough):
+        note = f"the codebook is full ({size} codewords): {note}; raise maximum for finer codewords"
+        note += ", or lower expand_below" if asked else ""
+    else:
+        note = f"{size} codewords, low coverage: {note}; lower expand_below" if asked and coverage < enough else ""
+    usage = torch.bincount(nearest.codeword, minlength=size).cpu()
+    mean = float(nearest.similarity.mean(dtype=torch.float64))
+    return Codebook(codewords, CodebookReport(history, usage, coverage, mean, alpha, note or None))
+
+
+def compare(
+    features: Tensor,  # [..., D]
+    unit: Tensor,  # [K, D] unit rows
+) -> tuple[Tensor, Tensor, Tensor]:  # [...] int64, [...], [...]
+    """Eq. 5: the best row of each feature, its product with the feature, and the feature's length.
+
+    The length changes no argmax, so no feature is divided by it. Ties go to the lowest index. The product has the dtype of
+    `unit`, the length at least single precision.
+
+    Note:
+        Products of bfloat16 are three times faster on AVX-512 BF16, but features whose two best are closer than their
+        error would have to be computed again: too many to gain.
+    """
+    K, D = unit.shape
+    rows = features.reshape(-1, D)
+    wide = torch.promote_types(torch.promote_types(features.dtype, torch.float32), unit.dtype)
+    index = torch.empty(len(rows), dtype=torch.int64, device=features.device)
+    product = torch.empty(len(rows), dtype=unit.dtype, device=features.device)
+    length = torch.empty(len(rows), dtype=wide, device=features.device)
+    with torch.no_grad():
+        padded = torch.nn.functional.pad(unit, (0, 0, 0, -K % 16)).T  # 256 columns are quicker than 255
+        for start in range(0, len(rows), CHUNK):
+            here = slice(start, start + CHUNK)
+            part = rows[here].to(wide)
+            product[here], index[here] = (part.to(unit.dtype) @ padded)[:, :K].max(dim=-1)  # the first of equal ones
+            length[here] = row_norms(part)
+    shape = features.shape[:-1]
+    return index.view(shape), product.view(shape), length.view(shape)

@@ -4,26 +4,25 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from itertools import pairwise
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from tqdm import tqdm
 
-from .._card import short_repr
 from .._check import check_range, check_whole
 from .._progress import Progress, as_progress
 from .._rows import row_norms, unit_rows
-from .autoencoder import Autoencoder, Layer, mlp, unit_latents
+from .autoencoder import Autoencoder, AutoencoderReport, mlp, unit_latents
 from .codebook import Codebook
 
 BLENDED = 4  # codewords per blend: pixels at borders and noisy Gaussians mix a few
 LAST_RATE = 0.02  # of the learning rate, at the last step
 NORM_EPS = 1e-5  # added to the variance in batch normalisation, torch's default
+SMALLEST = 1e-6  # range of the latents of one codeword with one channel
 
 
 @dataclass(frozen=True)
@@ -69,42 +68,19 @@ class AutoencoderConfig:
         return AutoencoderConfig(**({"steps": 5000, "learning_rate": 1e-4, "decay": False, "blends": 0} | changes))
 
 
-@dataclass(frozen=True, eq=False)
-class AutoencoderFit:
-    """A fitted autoencoder, and how well it keeps the codebook apart."""
-
-    autoencoder: Autoencoder
-    history: list[dict[str, Any]] = field(repr=False)
-    """Every `record_every` steps: step (from 1), loss (Eq. 10, mean over codewords and blends)."""
-    latents: Tensor  # [K, d]
-    """S' of Sec. 3.3.2: the codewords' latents in [0, 1]."""
-    recovered: float
-    """Share of codewords whose decoded latent is quantised to that codeword again; below 1, some classes are lost
-    whatever the field does: fit longer, or with more latent channels."""
-    loss: float
-    """Eq. 10 of the finished autoencoder, mean over codewords."""
-    min_latent_distance: float
-    """Smallest Euclidean distance between two codewords' latents (infinite for one codeword)."""
-
-    __repr__ = short_repr
-
-
 def fit_autoencoder(
     codebook: Codebook,
     config: AutoencoderConfig = AutoencoderConfig(),
     *,
     generator: torch.Generator | None = None,
     progress: Progress = False,
-) -> AutoencoderFit:
+) -> Autoencoder:
     """Fit the scene's autoencoder, which compresses codewords from D to d numbers (Eq. 10).
 
-    The loss is the mean over codewords of |Psi(E(f)) - f|_2.
-
-    With blends, the mean also goes over rows |Psi(sum_j w_j E(f_j)) - f|_2, f the direction of sum_j w_j f_j: `BLENDED`
-    codewords drawn at random with weights from the flat Dirichlet distribution, other ones in every step.
-
-    All codewords are one batch, so batch normalisation and the range of the latents are functions of the weights alone.
-    When training ends, both are frozen exactly as the decoder saw them last.
+    The loss is the mean over codewords of |Psi(E(f)) - f|_2. With blends, the mean also goes over rows
+    |Psi(sum_j w_j E(f_j)) - f|_2, f the direction of sum_j w_j f_j: `BLENDED` codewords drawn at random with weights from
+    the flat Dirichlet distribution, other ones in every step. All codewords are one batch, so batch normalisation and the
+    range of the latents are functions of the weights alone. When training ends, both are frozen as the decoder saw them last.
 
     Args:
         codebook: its K codewords, K >= 1; targets are their unit directions.
@@ -113,10 +89,7 @@ def fit_autoencoder(
         progress: True shows a bar; a function is called with each record as it is written to the history.
 
     Returns:
-        The autoencoder, the history, the latents, and how many codewords are recovered.
-
-    Raises:
-        TypeError: if `codebook` is something else.
+        The autoencoder; its `report` says how many codewords are recovered.
 
     Note:
         The released script compares unit outputs with codewords of any length (an error that cannot vanish), and uses
@@ -128,24 +101,27 @@ def fit_autoencoder(
         )
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     target = codebook.unit.detach()
-    encoder = _linears((codebook.dim, *config.encoder, config.latent), generator, target)
-    decoder = _linears((config.latent, *config.decoder, codebook.dim), generator, target)
-    norms = [(torch.ones_like(bias), torch.zeros_like(bias)) for _, bias in encoder[:-1]]
-    weights = [tensor.requires_grad_() for layer in (*encoder, *norms, *decoder) for tensor in layer]
+    made = Autoencoder(
+        (codebook.dim, *config.encoder, config.latent), (config.latent, *config.decoder, codebook.dim)
+    ).to(target)
+    _initialise(made, generator)
+    norms = [(torch.ones_like(layer.bias), torch.zeros_like(layer.bias)) for layer in made.encoder[:-1]]
+    weights = [*made.parameters(), *(tensor.requires_grad_() for norm in norms for tensor in norm)]
     optimizer = torch.optim.Adam(weights, lr=config.learning_rate, weight_decay=config.weight_decay, fused=True)
     history: list[dict[str, Any]] = []
     progress = as_progress(progress)
-    with quick_on_a_cpu():
+    with denormals_as_zero():
         for step in tqdm(range(1, config.steps + 1), desc="autoencoder", disable=progress is not True):
-            latents = unit_latents(_normalised_mlp(encoder, norms, target))
+            latents = unit_latents(_normalised_mlp(made.encoder, norms, target))
             low, high = latents.detach().amin(), latents.detach().amax()
-            rows, wanted = (latents - low) / (high - low).clamp_min(_SMALLEST), target
+            rows, wanted = (latents - low) / (high - low).clamp_min(SMALLEST), target
             if config.blends:
-                weights_of = _blends(config.blends, codebook.size, generator, target)
-                rows, wanted = torch.cat([rows, weights_of @ rows]), torch.cat([target, unit_rows(weights_of @ target)])
-            loss = row_norms(unit_rows(mlp(decoder, rows)) - wanted).mean()
+                shares = _blends(config.blends, codebook.size, generator, target)
+                rows, wanted = torch.cat([rows, shares @ rows]), torch.cat([target, unit_rows(shares @ target)])
+            loss = row_norms(unit_rows(mlp(made.decoder, rows)) - wanted).mean()
             if config.decay:
-                optimizer.param_groups[0]["lr"] = config.learning_rate * _cosine((step - 1) / config.steps)
+                falling = 0.5 * (1 + math.cos(math.pi * (step - 1) / config.steps))
+                optimizer.param_groups[0]["lr"] = config.learning_rate * (LAST_RATE + (1 - LAST_RATE) * falling)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             optimizer.step()
@@ -153,27 +129,32 @@ def fit_autoencoder(
                 history.append({"step": step, "loss": float(loss.detach())})
                 if callable(progress):
                     progress(dict(history[-1]))
+    made.requires_grad_(False)
     with torch.no_grad():
-        autoencoder = _freeze(encoder, norms, decoder, target)
-        return _report(codebook, autoencoder, history)
+        _freeze(made, norms, target)
+        made.report = _report(codebook, made, history)
+    return made
 
 
 @contextmanager
-def quick_on_a_cpu() -> Iterator[None]:
-    """One torch thread, and denormal numbers taken as zero, for a while.
-
-    The weights of dead units shrink to denormal numbers, which a CPU multiplies some ten times slower. And at most some hundred
-    rows leave a second thread little to do, and with other busy programs its waiting slows every step (measured).
-    """
-    smallest = sys.float_info.min  # its half is a denormal number
-    threads, flushed = torch.get_num_threads(), smallest / 2 == 0
-    torch.set_num_threads(1)  # the denormal mode is a property of this thread alone
+def denormals_as_zero() -> Iterator[None]:
+    """Take denormal numbers as zero in this thread: weights of dead units become such, and slow a CPU down ten times."""
+    flushed = sys.float_info.min / 2 == 0
     torch.set_flush_denormal(True)
     try:
         yield
     finally:
         torch.set_flush_denormal(flushed)
-        torch.set_num_threads(threads)
+
+
+def _initialise(made: Autoencoder, generator: torch.Generator) -> None:
+    """torch.nn.Linear's initial distribution, uniform within 1 / sqrt(inputs), from our own generator."""
+    for layer in (*made.encoder, *made.decoder):
+        outputs, inputs = layer.weight.shape
+        drawn = torch.rand(outputs, inputs + 1, generator=generator, device=generator.device, dtype=torch.float64)
+        both = (2 * drawn - 1) / inputs**0.5
+        layer.weight.data.copy_(both[:, 1:])
+        layer.bias.data.copy_(both[:, 0])
 
 
 def _blends(count: int, K: int, generator: torch.Generator, like: Tensor) -> Tensor:  # [count, K], rows sum to 1
@@ -185,63 +166,41 @@ def _blends(count: int, K: int, generator: torch.Generator, like: Tensor) -> Ten
     return like.new_zeros(count, K).scatter_add_(1, which, share)
 
 
-def _cosine(done: float) -> float:
-    """From 1 to `LAST_RATE` as `done` goes from 0 to 1."""
-    return LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(math.pi * done))
-
-
-_SMALLEST = 1e-6  # range of the latents of one codeword with one channel
-
-
-def _linears(widths: Sequence[int], generator: torch.Generator, like: Tensor) -> list[Layer]:
-    """Layers with torch.nn.Linear's initial distribution, uniform within 1 / sqrt(inputs), from our own generator."""
-    layers = []
-    for inputs, outputs in pairwise(widths):
-        drawn = torch.rand(outputs, inputs + 1, generator=generator, device=generator.device, dtype=torch.float64)
-        both = ((2 * drawn - 1) / inputs**0.5).to(like)
-        layers.append((both[:, 1:].contiguous(), both[:, 0].contiguous()))
-    return layers
-
-
 def _statistics(rows: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation that batch normalisation divides by (the variance is the biased one)."""
     return rows.mean(dim=0), (rows.var(dim=0, correction=0) + NORM_EPS).sqrt()
 
 
-def _normalised_mlp(layers: Sequence[Layer], norms: Sequence[Layer], rows: Tensor) -> Tensor:
+def _normalised_mlp(layers: nn.ModuleList, norms: list[tuple[Tensor, Tensor]], rows: Tensor) -> Tensor:
     """`mlp` with batch normalisation before each ReLU; written out because torch's refuses a single row."""
-    for (weight, bias), (scale, shift) in zip(layers[:-1], norms, strict=True):
-        rows = torch.nn.functional.linear(rows, weight, bias)
+    for layer, (scale, shift) in zip(layers[:-1], norms, strict=True):
+        rows = layer(rows)
         mean, deviation = _statistics(rows)
         rows = torch.relu((rows - mean) / deviation * scale + shift)
-    return torch.nn.functional.linear(rows, *layers[-1])
+    return layers[-1](rows)  # type: ignore[no-any-return]
 
 
-def _freeze(encoder: list[Layer], norms: list[Layer], decoder: list[Layer], target: Tensor) -> Autoencoder:
+def _freeze(made: Autoencoder, norms: list[tuple[Tensor, Tensor]], target: Tensor) -> None:
     """Fold batch normalisation, with its statistics over the codebook, into the encoder, and fix the latents' range."""
-    folded: list[Layer] = []
     rows = target
-    for (weight, bias), (scale, shift) in zip(encoder[:-1], norms, strict=True):
-        mean, deviation = _statistics(torch.nn.functional.linear(rows, weight, bias))
+    for layer, (scale, shift) in zip(made.encoder[:-1], norms, strict=True):
+        mean, deviation = _statistics(layer(rows))
         gain = scale / deviation
-        folded.append((gain[:, None] * weight, gain * (bias - mean) + shift))
-        rows = torch.nn.functional.linear(rows, *folded[-1]).relu()
-    folded.append((encoder[-1][0].detach().clone(), encoder[-1][1].detach().clone()))
-    latents = unit_latents(mlp(folded, target))
+        layer.weight.copy_(gain[:, None] * layer.weight)
+        layer.bias.copy_(gain * (layer.bias - mean) + shift)
+        rows = layer(rows).relu()
+    latents = unit_latents(mlp(made.encoder, target))
     low = float(latents.min())
-    high = max(float(latents.max()), low + _SMALLEST)
-    return Autoencoder(tuple(folded), tuple((w.detach().clone(), b.detach().clone()) for w, b in decoder), low, high)
+    made.range = torch.tensor([low, max(float(latents.max()), low + SMALLEST)], dtype=torch.float64).to(target.device)
 
 
-def _report(codebook: Codebook, autoencoder: Autoencoder, history: list[dict[str, Any]]) -> AutoencoderFit:
-    latents = autoencoder.encode(codebook.codewords)
-    decoded = autoencoder.decode(latents)
+def _report(codebook: Codebook, made: Autoencoder, history: list[dict[str, Any]]) -> AutoencoderReport:
+    latents = made.encode(codebook.codewords)
+    decoded = made.decode(latents)
     own = torch.arange(codebook.size, device=latents.device)
     distances = torch.cdist(latents, latents, compute_mode="donot_use_mm_for_euclid_dist").fill_diagonal_(torch.inf)
-    return AutoencoderFit(
-        autoencoder,
+    return AutoencoderReport(
         history,
-        latents,
         recovered=float((codebook.quantize(decoded) == own).double().mean()),
         loss=float(row_norms(decoded - codebook.unit).mean()),
         min_latent_distance=float(distances.min()),

@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from .._arrays import reading
 from .._card import short_repr
-from .._check import as_tensor, check_range, check_shapes, check_whole, moved_to
+from .._check import as_tensor, check_range, check_shapes, check_whole
 from .._rows import unit_rows
-from .._typed import typed
-from ._store import read_tensors, write_tensors
+from .store import Stored
 
-NOISE = 1e-10  # of the first eigenvalue: rounding in float32 gives so much to directions that are not in the data
+NOISE = 1e-10  # of the first eigenvalue: rounding in float32 gives this much to directions that are not in the data
 
 
-@typed
 @dataclass(frozen=True, eq=False)
-class LinearLatents:
+class LinearLatents(Stored):
     """Features f of D channels as d numbers z, with f = B z and orthonormal columns of B.
 
     Rendering blends latents, and B of a blend is the blend of the features. A cosine needs no feature either:
@@ -30,6 +24,7 @@ class LinearLatents:
     """
 
     basis: Tensor  # B [D, d]
+    kind = "linear latents"
 
     def __post_init__(self) -> None:
         sizes = check_shapes(("basis", self.basis, "D d"))
@@ -53,64 +48,20 @@ class LinearLatents:
         """Channels of a latent, d."""
         return int(self.basis.shape[1])
 
-    def encode(
-        self,
-        features: Tensor,  # [..., D]
-    ) -> Tensor:  # [..., d]
+    def encode(self, features: Tensor) -> Tensor:  # [..., D] -> [..., d]
         """The latents of features: Bᵀ f, the least-squares ones."""
-        features = _checked("features", features, self.dim)
         return features @ self.basis.to(features)
 
-    def decode(
-        self,
-        latents: Tensor,  # [..., d]
-    ) -> Tensor:  # [..., D]
+    def decode(self, latents: Tensor) -> Tensor:  # [..., d] -> [..., D]
         """The features of latents, B z, as long as the latents are."""
-        latents = _checked("latents", latents, self.latent)
         return latents @ self.basis.T.to(latents)
 
-    def cosines(
-        self,
-        latents: Tensor,  # [..., d]
-        rows: Tensor,  # [C, D] unit rows
-    ) -> Tensor:  # [..., C]
-        """The cosine of each decoded feature with some unit rows; 0 for an all-zero latent. No feature is made."""
-        latents = _checked("latents", latents, self.latent)
+    def cosines(self, latents: Tensor, rows: Tensor) -> Tensor:  # [..., d], [C, D] unit rows -> [..., C]
+        """The cosine of each decoded feature with unit rows; 0 for an all-zero latent. No feature is made."""
         return unit_rows(latents) @ (rows.to(latents) @ self.basis.to(latents)).T
 
-    def to(self, *args: Any, **kwargs: Any) -> LinearLatents:
-        """Move or convert the basis as `Tensor.to` does."""
-        return LinearLatents(moved_to(self.basis, *args, **kwargs))
 
-    def to_tensors(self) -> dict[str, Tensor]:
-        """The tensors that `from_tensors` reads."""
-        return {"basis": self.basis}
-
-    @staticmethod
-    def from_tensors(tensors: Mapping[str, Tensor]) -> LinearLatents:
-        """Latents from the tensors of `to_tensors`; other names are ignored."""
-        return LinearLatents(tensors["basis"])
-
-    def save(self, path: str | Path) -> None:
-        """Write the basis to a .safetensors file."""
-        write_tensors(path, self.to_tensors(), kind="linear latents")
-
-    @staticmethod
-    def load(path: str | Path) -> LinearLatents:
-        """Read what `save` wrote.
-
-        Raises:
-            FileNotFoundError: if there is no such file.
-            ValueError: if the file is another one.
-        """
-        tensors = read_tensors(path, kind="linear latents")
-        with reading(path, "linear latents of kfgs"):
-            return LinearLatents.from_tensors(tensors)
-
-
-def principal_directions(
-    moment: Tensor,  # [D, D] sum of w f fᵀ
-) -> tuple[Tensor, Tensor]:  # [D], [D, D]
+def principal_directions(moment: Tensor) -> tuple[Tensor, Tensor]:  # [D, D] sum of w f fᵀ -> [D], [D, D]
     """Eigenvalues of a second moment, the largest first, and their directions as columns.
 
     The sign of a column makes its entry of largest magnitude positive, so that the same data give the same latents.
@@ -136,8 +87,8 @@ def fit_linear_latents(
         features: longer rows have more weight; normalise rows for equal weights.
         weights: of the rows; 1 if None.
         keep: share in (0, 1] of the energy beyond the first direction that the other latents must hold.
-        minimum: fewest latents.
-        maximum: most latents, even if `minimum` is larger; None: D.
+        minimum: the fewest latents.
+        maximum: the most latents, even if `minimum` is larger; None: D.
 
     Raises:
         ValueError: if shapes disagree, an option is out of range, a number is not finite, or there is nothing but zeros.
@@ -146,9 +97,7 @@ def fit_linear_latents(
     sizes = check_shapes(("features", features, "n D"), ("weights", weights, "n"))
     check_range("keep", keep, 0, 1, closed=(False, True))
     check_whole("minimum", minimum, 1)
-    if maximum is not None:
-        check_whole("maximum", maximum, 1)
-    maximum = sizes["D"] if maximum is None else min(sizes["D"], maximum)
+    check_whole("maximum", sizes["D"] if maximum is None else maximum, 1)
     rows = features.double()
     moment = rows.T @ (rows if weights is None else rows * weights.double()[:, None])
     if not bool(torch.isfinite(moment).all()):
@@ -157,17 +106,9 @@ def fit_linear_latents(
     values = values * (values > NOISE * values[0])
     if not float(values[0]) > 0:
         raise ValueError(f"features: expected a nonzero row, got {sizes['n']} all-zero rows; check the teacher")
-    beyond = values[1:].cumsum(0)
-    enough = 1 + int((beyond < keep * beyond[-1]).sum()) + 1 if len(beyond) and float(beyond[-1]) > 0 else 1
-    count = max(1, min(maximum, max(minimum, enough)))
-    return LinearLatents(vectors[:, :count].to(features))
-
-
-def _checked(name: str, values: Tensor, channels: int) -> Tensor:
-    values = as_tensor(name, values, floating=True)
-    if values.ndim < 1 or values.shape[-1] != channels:
-        raise ValueError(
-            f"{name}: expected [..., {channels}] (from the basis), got {tuple(values.shape)}; pass what belongs to the same "
-            "field"
-        )
-    return values
+    beyond = values[1:].cumsum(0)  # what the first 1, 2, ... further directions hold
+    further = 0
+    if len(beyond) and float(beyond[-1]) > 0:
+        further = int((beyond < keep * beyond[-1]).sum()) + 1  # the first that hold enough
+    most = sizes["D"] if maximum is None else min(sizes["D"], maximum)
+    return LinearLatents(vectors[:, : min(most, max(minimum, 1 + further))].to(features))

@@ -1,56 +1,70 @@
-"""Choose features of a map: a regular grid of pixels, and farthest-point sampling by cosine."""
+"""Choose features: a regular grid of a map's pixels, farthest-point sampling by cosine, and maps read a part at a time."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from .._check import check_range, check_shapes, check_size
+from .._check import as_tensor, check_range, check_shapes
 from .._rows import EPS, row_norms, unit_rows
-from .._typed import typed
 
 SAMPLES = 28_800  # rows 1::2 and columns 1::3 of a 360 x 480 map, as in the paper's experiments
+BLOCK = 2048  # rows of a similarity matrix in memory at a time
 
 
-@typed
-def choose_grid_step(height: int, width: int, samples: int = SAMPLES) -> tuple[int, int]:
-    """The finest grid (row step, column step) that leaves at most `samples` pixels of a map.
+class FeatureMaps(Protocol):
+    """Feature maps of many images, one in memory at a time: `len(maps)` and `maps[i]`, a map [h, w, D].
 
-    Steps grow in turn, columns first: (1, 1), (1, 2), (2, 2), (2, 3), ...; a map that is small enough keeps all pixels.
-
-    Example:
-        >>> choose_grid_step(360, 480), choose_grid_step(90, 120)
-        ((2, 3), (1, 1))
+    A list of tensors is enough. Maps on disk may have two more members, so that less is read or in memory:
+    `grid(i, step, samples)`, equal to `sample_grid(maps[i], step, samples=samples)`; and `blocks(i)`, the map a few rows
+    at a time.
     """
-    check_size((height, width), low=0)
-    check_range("samples", samples, 1)
-    rows, columns = 1, 1
-    while len(_grid(height, rows)) * len(_grid(width, columns)) > samples:
-        rows, columns = (rows, columns + 1) if rows == columns else (rows + 1, columns)
-    return rows, columns
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, i: int, /) -> Tensor:  # [h, w, D]
+        ...
 
 
-@typed
+def read_blocks(maps: FeatureMaps, i: int) -> Iterator[Tensor]:  # each [at most 32, w, D]
+    """A map, a few rows at a time: from `maps.blocks(i)` if there is such a member."""
+    blocks = getattr(maps, "blocks", None)
+    yield from as_tensor(f"maps[{i}]", maps[i]).split(32) if blocks is None else blocks(i)
+
+
+def read_grid(maps: FeatureMaps, i: int, samples: int) -> Tensor:  # [n, D]
+    """At most `samples` features of a map on the finest grid: from `maps.grid` if there is such a member."""
+    grid = getattr(maps, "grid", None)
+    if grid is not None:
+        features: Tensor = grid(i, None, samples)
+        check_shapes((f"maps.grid({i})", features, "n D"))
+        return features
+    feature_map = as_tensor(f"maps[{i}]", maps[i])
+    check_shapes((f"maps[{i}]", feature_map, "h w D"))
+    return sample_grid(feature_map, samples=samples)
+
+
 def grid_slices(
     height: int, width: int, step: tuple[int, int] | None = None, *, samples: int = SAMPLES
 ) -> tuple[slice, slice]:
     """The rows and columns of a map that `sample_grid` uses, so that only these are read from disk.
 
-    Raises:
-        ValueError: if a step is not positive.
-
     Example:
-        >>> grid_slices(360, 480)
-        (slice(1, 360, 2), slice(1, 480, 3))
+        >>> grid_slices(360, 480), grid_slices(90, 120)
+        ((slice(1, 360, 2), slice(1, 480, 3)), (slice(0, 90, 1), slice(0, 120, 1)))
     """
-    rows, columns = choose_grid_step(height, width, samples) if step is None else step
+    check_range("samples", samples, 1)
+    rows, columns = step or (1, 1)
     check_range("step[0]", rows, 1)
     check_range("step[1]", columns, 1)
-    i, j = _grid(height, rows), _grid(width, columns)
-    return slice(i.start, height, rows), slice(j.start, width, columns)
+    while step is None and len(_grid(height, rows)) * len(_grid(width, columns)) > samples:
+        rows, columns = (rows, columns + 1) if rows == columns else (rows + 1, columns)
+    return slice(_grid(height, rows).start, height, rows), slice(_grid(width, columns).start, width, columns)
 
 
-@typed
 def sample_grid(
     feature_map: Tensor,  # [h, w, D]
     step: tuple[int, int] | None = None,
@@ -61,62 +75,16 @@ def sample_grid(
 
     Args:
         feature_map: features of one view.
-        step: every how many rows and columns; the first one taken is step // 2, so (2, 3) is rows 1::2, columns 1::3.
-            None chooses the finest step that leaves at most `samples` features.
-        samples: most features to take when `step` is None.
+        step: take every N-th row and column, from step // 2, so (2, 3) is rows 1::2, columns 1::3. None: the finest step
+            that leaves at most `samples` features. Steps grow in turn, columns first: (1, 1), (1, 2), (2, 2), (2, 3), ...
+        samples: the most features to take if `step` is None.
 
     Raises:
         ValueError: if the map is not [h, w, D], or a step is not positive.
     """
-    check_shapes(("feature_map", feature_map, "h w D"))
-    height, width, dim = feature_map.shape
-    rows, columns = grid_slices(height, width, step, samples=samples)
-    return feature_map[rows, columns].reshape(-1, dim)
-
-
-def farthest_points(
-    features: Tensor,  # [n, D]
-    count: int,
-    *,
-    block: int = 2048,
-) -> Tensor:  # [min(count, nonzero rows)] int64
-    """Pick the `count` most diverse features: farthest-point sampling with cosine similarity as the measure.
-
-    The first two are the least similar pair of all (the earlier one first); each further one is the feature whose
-    largest similarity to those already picked is smallest.
-
-    Args:
-        features: candidates; all-zero rows are never picked.
-        count: how many (the paper's rho).
-        block: rows of the n x n similarity matrix that are in memory at a time: block * n numbers.
-
-    Returns:
-        Row numbers in the order of picking; fewer than `count` if there are not so many nonzero rows.
-
-    Raises:
-        ValueError: if `features` is not [n, D], `count` is below 1, or every row is zero.
-
-    Note:
-        Ties go to the lowest row number. A feature may be picked although an equal one already was, when nothing else
-        is left; pruning (Eq. 9) takes it out again.
-    """
-    check_shapes(("features", features, "n D"))
-    check_range("count", count, 1)
-    rows = (row_norms(features) > EPS).nonzero()[:, 0]
-    if rows.numel() == 0:
-        raise ValueError(
-            f"features: expected a nonzero row (longer than {EPS:g}), got {features.shape[0]} others; check the teacher"
-        )
-    unit = unit_rows(features[rows])
-    if rows.numel() == 1:
-        return rows
-    picked = list(_least_similar_pair(unit, block))[:count]
-    largest = (unit @ unit[picked].T).amax(dim=1)  # similarity to the nearest picked one
-    while len(picked) < min(count, rows.numel()):
-        largest[picked] = torch.inf  # never twice
-        picked.append(int(largest.argmin()))
-        largest = torch.maximum(largest, unit @ unit[picked[-1]])
-    return rows[torch.tensor(picked, device=rows.device)]
+    sizes = check_shapes(("feature_map", feature_map, "h w D"))
+    rows, columns = grid_slices(sizes["h"], sizes["w"], step, samples=samples)
+    return feature_map[rows, columns].reshape(-1, sizes["D"])
 
 
 def _grid(size: int, step: int) -> range:
@@ -124,17 +92,34 @@ def _grid(size: int, step: int) -> range:
     return range(min(step // 2, max(size - 1, 0)), size, step)
 
 
-def _least_similar_pair(unit: Tensor, block: int) -> tuple[int, int]:  # unit: [n, D]
-    """Row numbers i < j of the smallest inner product, looking at the upper triangle one block of rows at a time."""
-    n = unit.shape[0]
-    least, pair = float("inf"), (0, min(1, n - 1))
-    for start in range(0, n - 1, block):
-        similarity = unit[start : start + block] @ unit[start:].T  # [b, n - start], starts on the diagonal
-        lower = torch.ones_like(similarity[:, : similarity.shape[0]], dtype=torch.bool).tril()
-        similarity[:, : similarity.shape[0]].masked_fill_(lower, torch.inf)
-        where = int(similarity.argmin())
-        row, column = divmod(where, similarity.shape[1])
-        value = float(similarity[row, column])
-        if value < least:
-            least, pair = value, (start + row, start + column)
+def farthest_points(features: Tensor, count: int) -> Tensor:  # [n, D] -> [min(count, nonzero rows)] int64
+    """Pick the `count` most diverse features: farthest-point sampling with cosine similarity as the measure.
+
+    The first two are the least similar pair of all (the earlier one first); each further one is the feature whose largest
+    similarity to those already picked is smallest. Ties go to the lowest row; all-zero rows are never picked. When nothing
+    else is left, a feature may be picked although an equal one was; pruning (Eq. 9) takes it out again.
+    """
+    rows = (row_norms(features) > EPS).nonzero()[:, 0]
+    unit = unit_rows(features[rows])
+    if len(rows) < 2:
+        return rows
+    picked = list(_least_similar_pair(unit))[:count]
+    largest = (unit @ unit[picked].T).amax(dim=1)  # similarity to the nearest picked one
+    while len(picked) < min(count, len(rows)):
+        largest[picked] = torch.inf  # never twice
+        picked.append(int(largest.argmin()))
+        largest = torch.maximum(largest, unit @ unit[picked[-1]])
+    return rows[torch.tensor(picked, device=rows.device)]
+
+
+def _least_similar_pair(unit: Tensor) -> tuple[int, int]:  # [n, D], n >= 2
+    """Rows i < j of the smallest inner product: the upper triangle, one block of rows at a time."""
+    least, pair = float("inf"), (0, 1)
+    for start in range(0, len(unit) - 1, BLOCK):
+        similarity = unit[start : start + BLOCK] @ unit[start:].T  # [b, n - start], starts on the diagonal
+        square = similarity[:, : len(similarity)]
+        square.masked_fill_(torch.ones_like(square, dtype=torch.bool).tril(), torch.inf)
+        row, column = divmod(int(similarity.argmin()), similarity.shape[1])
+        if float(similarity[row, column]) < least:
+            least, pair = float(similarity[row, column]), (start + row, start + column)
     return pair

@@ -1,0 +1,78 @@
+"""Spherical k-means (Dhillon & Modha 2001): groups of features that point the same way."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .._card import short_repr
+from .._check import check_shapes, check_whole
+from .._rows import EPS, row_norms, unit_rows
+
+
+class Cells(NamedTuple):
+    """Centres, and the nearest centre of each feature."""
+
+    centres: Tensor  # [K, D] unit rows
+    index: Tensor  # type: ignore[assignment]  # [n] int64
+    similarity: Tensor  # [n]
+
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+
+def spherical_kmeans(
+    features: Tensor,  # [n, D]
+    weights: Tensor,  # [n] >= 0
+    clusters: int,
+    *,
+    rounds: int = 10,
+    generator: torch.Generator | None = None,
+) -> Cells:
+    """Group features by direction: each joins the centre of largest cosine; a centre is the mean direction of its features.
+
+    Args:
+        features: of any length; an all-zero one goes to group 0 and moves no centre.
+        weights: how much each counts. The first centres are drawn in proportion to them, capped at their 0.99 quantile, so
+            that one huge weight does not draw all of them.
+        clusters: the most groups, K; fewer if there are fewer features. A centre that loses all features stays.
+        rounds: of assignment and averaging; later ones move few features.
+        generator: draws the first centres; None stands for seed 0.
+
+    Raises:
+        ValueError: if shapes disagree, or every weighted feature is zero.
+    """
+    check_shapes(("features", features, "n D"), ("weights", weights, "n"))
+    check_whole("clusters", clusters, 1)
+    generator = generator or torch.Generator().manual_seed(0)
+    rows = unit_rows(features)
+    counted = (weights > 0) & (row_norms(features) > EPS)
+    candidates = int(counted.sum())
+    if candidates == 0:
+        raise ValueError(
+            f"features: expected a nonzero row with a weight, got {len(features)} without; check the teacher"
+        )
+    some = weights[counted]
+    some = some[:: max(1, len(some) // 100_000)]  # torch.quantile refuses more than 16 million
+    capped = weights.clamp_max(torch.quantile(some.double(), 0.99)) * counted
+    first = torch.multinomial(capped.cpu().double(), min(clusters, candidates), generator=generator)
+    return refine(rows, rows[first.to(rows.device)], rounds, weights=capped)
+
+
+def refine(unit: Tensor, centres: Tensor, rounds: int, *, weights: Tensor | None = None) -> Cells:
+    """Rounds of averaging and assignment, from given centres; a centre that loses all its features stays where it is."""
+    cells = nearest_cells(unit, centres)
+    for _ in range(rounds):
+        rows = unit if weights is None else unit * weights[:, None].to(unit)
+        sums = torch.zeros_like(centres).index_add_(0, cells.index, rows)  # repeatable on a CPU
+        centres = torch.where(row_norms(sums)[:, None] > EPS, unit_rows(sums), cells.centres)
+        cells = nearest_cells(unit, centres)
+    return cells
+
+
+def nearest_cells(unit: Tensor, centres: Tensor, *, chunk: int = 16_384) -> Cells:
+    """Eq. 5 for unit rows. Ties go to the lowest index."""
+    best = [(part @ centres.T).max(dim=1) for part in unit.split(chunk)]
+    return Cells(centres, torch.cat([b.indices for b in best]), torch.cat([b.values for b in best]))
