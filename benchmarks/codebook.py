@@ -25,18 +25,18 @@ from kfgs.cameras import resize_map
 from kfgs.formats import read_splats
 from kfgs.labels import average_views, classify, load_label_set
 from kfgs.pipeline import score_scene, score_teacher, true_labels
-from kfgs.quant import Codebook, CodebookConfig, LatentMaps, fit_codebook, quantize_maps
+from kfgs.quant import Codebook, GrownCodebook, LatentMaps, PaperCodebook, fit_codebook, quantize_maps
 from kfgs.scenes import FeatureFolder, load_scene
 from kfgs.splat import rasterize
 
 HEIGHT = 120  # of the maps that are averaged onto the splat
 VARIANTS = {
-    "paper": CodebookConfig.paper(),
-    "paper-10-epochs": CodebookConfig.paper(epochs=10, step_every=2),
-    "adaptive": CodebookConfig(),
-    "adaptive-100": CodebookConfig(maximum=100),
-    "adaptive-512": CodebookConfig(maximum=512),
-    "adaptive-1024": CodebookConfig(maximum=1024),
+    "paper": PaperCodebook(),
+    "paper-10-epochs": PaperCodebook(epochs=10, step_every=2),
+    "adaptive": GrownCodebook(),
+    "adaptive-100": GrownCodebook(maximum=100),
+    "adaptive-512": GrownCodebook(maximum=512),
+    "adaptive-1024": GrownCodebook(maximum=1024),
 }
 
 
@@ -100,10 +100,10 @@ def main() -> None:
         for seed in args.seeds:
             wait()
             start = time.perf_counter()
-            fit = fit_codebook(maps, VARIANTS[name], generator=torch.Generator().manual_seed(seed))
+            book = fit_codebook(maps, VARIANTS[name], generator=torch.Generator().manual_seed(seed))
             wait()
             fitted = time.perf_counter()
-            book = fit.codebook
+            fit = book.report
             index_maps = quantize_maps(maps, book)  # on the CPU when it returns
             seconds = fitted - start, time.perf_counter() - fitted
             flat: float | str = "-"

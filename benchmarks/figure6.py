@@ -16,7 +16,7 @@ import torch
 from devices import MapsOn, add_device
 
 from kfgs._files import write_json
-from kfgs.quant import CodebookConfig, fit_codebook
+from kfgs.quant import GrownCodebook, PaperCodebook, fit_codebook
 from kfgs.scenes import FeatureFolder, load_scene
 from kfgs.viz.plots import finish, new_figure
 
@@ -24,13 +24,13 @@ from kfgs.viz.plots import finish, new_figure
 def history_of(scene: Path, features: Path, epochs: int | None, device: torch.device) -> dict[str, Any]:
     """Codewords after each epoch of the paper's rule, and after each round of the default one."""
     maps = MapsOn(FeatureFolder(features).of(load_scene(scene).undistorted(), "train"), device)
-    paper = CodebookConfig.paper() if epochs is None else CodebookConfig.paper(epochs=epochs)
+    paper = PaperCodebook() if epochs is None else PaperCodebook(epochs=epochs)
     found = {}
-    for name, config in (("paper", paper), ("default", CodebookConfig())):
-        fit = fit_codebook(maps, config, generator=torch.Generator().manual_seed(0))
-        found[name] = [row["size"] for row in fit.history]
-        print(f"{scene.name}, {name}: {fit.codebook.size} codewords", flush=True)
-    return {"scene": scene.name, "limit": {"paper": paper.maximum, "default": CodebookConfig().maximum}, **found}
+    for name, config in (("paper", paper), ("default", GrownCodebook())):
+        book = fit_codebook(maps, config, generator=torch.Generator().manual_seed(0))
+        found[name] = [row["size"] for row in book.report.history]
+        print(f"{scene.name}, {name}: {book.size} codewords", flush=True)
+    return {"scene": scene.name, "limit": {"paper": paper.maximum, "default": GrownCodebook().maximum}, **found}
 
 
 def draw(path: Path, scenes: list[dict[str, Any]]) -> None:

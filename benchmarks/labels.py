@@ -121,14 +121,12 @@ def boxes(means: Tensor) -> Tensor:
 
 def random_decoded(count: int, g: torch.Generator) -> SemanticField:
     """A field of the paper's method: Gaussians near random latents, and codewords that are their decoded features."""
-
-    def layers(widths: tuple[int, ...]) -> tuple[tuple[Tensor, Tensor], ...]:
-        return tuple(
-            (torch.randn(out, into, generator=g) * (2 / into) ** 0.5, 0.1 * torch.randn(out, generator=g))
-            for into, out in pairwise(widths)
-        )
-
-    autoencoder = Autoencoder(layers(DECODER[::-1]), layers(DECODER), -1.0, 1.0)
+    state = {"range": torch.tensor([-1.0, 1.0], dtype=torch.float64)}
+    for name, widths in (("encoder", DECODER[::-1]), ("decoder", DECODER)):
+        for i, (into, out) in enumerate(pairwise(widths)):
+            state[f"{name}.{i}.weight"] = torch.randn(out, into, generator=g) * (2 / into) ** 0.5
+            state[f"{name}.{i}.bias"] = 0.1 * torch.randn(out, generator=g)
+    autoencoder = Autoencoder.from_state_dict(state)
     latents = torch.rand(CODEWORDS, LATENTS, generator=g)
     cloud = room(count, LATENTS)
     cloud = cloud.replace(

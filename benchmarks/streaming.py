@@ -34,7 +34,7 @@ from kfgs.formats import read_splats
 from kfgs.pipeline.fuse import uplift_stage
 from kfgs.pipeline.maps import map_digests
 from kfgs.pipeline.stages import Run
-from kfgs.quant import Codebook, CodebookConfig, fit_codebook, quantize_maps
+from kfgs.quant import Codebook, GrownCodebook, PaperCodebook, fit_codebook, quantize_maps
 from kfgs.scenes import FeatureFolder, Picture, extract_features, load_scene, pictures_of
 
 STAGES = ("start", "extract", "codebook", "index maps", "uplift")
@@ -131,10 +131,10 @@ def extract(args: argparse.Namespace) -> str:
 
 def codebook(args: argparse.Namespace) -> str:
     """Maps to a codebook."""
-    config = CodebookConfig() if args.epochs is None else CodebookConfig.paper(epochs=args.epochs)
-    fit = fit_codebook(MapsOn(FeatureFolder(args.folder / "maps"), args.device), config, progress=True)
-    fit.codebook.save(args.folder / "codebook.safetensors")
-    return f"K = {fit.codebook.size}, coverage {fit.coverage:.3f}, maps looked at: {config.passes} x"
+    options = GrownCodebook() if args.epochs is None else PaperCodebook(epochs=args.epochs)
+    book = fit_codebook(MapsOn(FeatureFolder(args.folder / "maps"), args.device), options, progress=True)
+    book.save(args.folder / "codebook.safetensors")
+    return f"K = {book.size}, coverage {book.report.coverage:.3f}"
 
 
 def index_maps(args: argparse.Namespace) -> str:

@@ -45,14 +45,14 @@ pictures.mkdir(exist_ok=True)
 # %%
 from IPython.display import Image as Shown
 
-from kfgs import CodebookConfig, fit_codebook
+from kfgs import PaperCodebook, fit_codebook
 from kfgs.viz import plot_codebook_growth
 
-fits = {}
+books = {}
 for alpha in (0.9, 0.7):
-    config = CodebookConfig.paper(epochs=4, step_every=2, joins_per_image=1, expand_below=alpha)
-    fits[f"alpha = {alpha}"] = fit_codebook(maps, config)
-plot_codebook_growth({name: fit.history for name, fit in fits.items()}, pictures / "growth.png")
+    config = PaperCodebook(epochs=4, step_every=2, joins_per_image=1, expand_below=alpha)
+    books[f"alpha = {alpha}"] = fit_codebook(maps, config)
+plot_codebook_growth(books, pictures / "growth.png")
 Shown(pictures / "growth.png", width=900)
 
 # %% [markdown]
@@ -63,10 +63,11 @@ Shown(pictures / "growth.png", width=900)
 # nearer to their codewords.
 
 # %%
-for name, fit in fits.items():
-    print(f"{name}: K = {fit.codebook.size:3d}, coverage {fit.coverage:.3f}, mean similarity {fit.mean_similarity:.3f}")
-fit = fits["alpha = 0.7"]
-codebook = fit.codebook
+for name, book in books.items():
+    print(
+        f"{name}: K = {book.size:3d}, coverage {book.report.coverage:.3f}, mean similarity {book.report.mean_similarity:.3f}"
+    )
+codebook = books["alpha = 0.7"]
 
 # %% [markdown]
 # ## What the codewords mean
@@ -78,7 +79,9 @@ codebook = fit.codebook
 # %%
 from kfgs.viz import plot_codebook_report
 
-plot_codebook_report(codebook.codewords, words.names, words.embeddings, pictures / "codebook.png", usage=fit.usage)
+plot_codebook_report(
+    codebook.codewords, words.names, words.embeddings, pictures / "codebook.png", usage=codebook.report.usage
+)
 Shown(pictures / "codebook.png", width=900)
 
 # %% [markdown]
@@ -130,12 +133,13 @@ import matplotlib.pyplot as plt
 
 from kfgs import AutoencoderConfig, fit_autoencoder
 
-squeezed = fit_autoencoder(codebook, AutoencoderConfig(steps=800))
-decoded = squeezed.autoencoder.decode(squeezed.latents)
-print(f"{codebook.dim} -> {squeezed.autoencoder.latent} channels, recovered {squeezed.recovered:.0%}")
+autoencoder = fit_autoencoder(codebook, AutoencoderConfig(steps=800))
+latents = autoencoder.encode(codebook.codewords)
+decoded = autoencoder.decode(latents)
+print(f"{codebook.dim} -> {autoencoder.latent} channels, recovered {autoencoder.report.recovered:.0%}")
 order = classes.argsort(stable=True)
 figure, (left, right) = plt.subplots(1, 2, figsize=(8.5, 3.6), layout="constrained", width_ratios=(1, 2))
-first = left.imshow(squeezed.latents[order], cmap="cividis", vmin=0, vmax=1, aspect="auto", interpolation="nearest")
+first = left.imshow(latents[order], cmap="cividis", vmin=0, vmax=1, aspect="auto", interpolation="nearest")
 left.set(title="latents", xlabel="channel", ylabel="codeword")
 second = right.imshow(codebook.similarity(decoded)[order][:, order], cmap="cividis", interpolation="nearest")
 right.set(title="decoded against original", xlabel="codeword", ylabel="decoded")
@@ -152,12 +156,12 @@ plt.show()
 # %%
 from kfgs.quant import LatentMaps
 
-latent_maps = LatentMaps(index_maps, squeezed.latents)
+latent_maps = LatentMaps(index_maps, latents)
 before = len(maps) * 2 * torch.tensor(maps.shape).prod().item()  # in half precision
 sizes = {
     "index maps": index_maps.nbytes,
     "codebook": 4 * codebook.codewords.numel(),
-    "decoder": 4 * squeezed.autoencoder.decoder_parameters,
+    "decoder": 4 * autoencoder.decoder_parameters,
 }
 for name, size in {"the teacher's maps": before, **sizes}.items():
     print(f"{name:20s}{size / 1e6:8.2f} MB")

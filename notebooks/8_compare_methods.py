@@ -48,7 +48,7 @@ maps = kfgs.FeatureFolder(features).of(scene, "train")
 # %%
 quick = kfgs.ColorConfig.quick()
 quick = replace(quick, field=replace(quick.field.with_steps(800), max_gaussians=60_000))
-trained = {"codebook": kfgs.CodebookConfig(), "autoencoder": kfgs.AutoencoderConfig(steps=500)}
+trained = {"codebook": kfgs.GrownCodebook(), "autoencoder": kfgs.AutoencoderConfig(steps=500)}
 configs = {
     "fused": kfgs.FitConfig.cpu(color=quick),
     "paper": kfgs.FitConfig.cpu(method="paper", **trained, field=kfgs.FieldConfig.cpu().with_steps(400)),

@@ -5,13 +5,13 @@ from functools import cache
 
 import numpy as np
 import torch
+from cases_quant import made_autoencoder
 
 from kfgs._rows import unit_rows
 from kfgs.cameras import Camera
 from kfgs.fields import Autoencoded, Codewords, Identity, Linear, SemanticField
 from kfgs.gaussians import Gaussians
 from kfgs.labels import LabelSet
-from kfgs.quant.autoencoder import Autoencoder
 from kfgs.quant.codebook import Codebook
 from kfgs.quant.linear import fit_linear_latents
 from kfgs.splat import rgb_to_sh0
@@ -37,7 +37,7 @@ def codebook():
 def autoencoder():
     """Written down, not fitted: the first twelve channels and back."""
     into, out = torch.eye(WORDS, DIM), torch.eye(DIM, WORDS)
-    return Autoencoder(
+    return made_autoencoder(
         encoder=((into, torch.zeros(WORDS)),),
         decoder=((out, torch.zeros(DIM)), (torch.eye(DIM), torch.zeros(DIM))),
         low=0.0,

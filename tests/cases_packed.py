@@ -4,12 +4,13 @@ import math
 
 import numpy as np
 import torch
+from cases_quant import made_autoencoder
 from scipy.spatial.transform import Rotation
 
 from kfgs import Camera, Gaussians
 from kfgs.fields import Autoencoded, Codewords, Identity, Linear, Seen, SemanticField
 from kfgs.labels import LabelSet
-from kfgs.quant import Autoencoder, Codebook, LinearLatents
+from kfgs.quant import Codebook, LinearLatents
 
 DIM = 24
 METHODS = ["fused", "decouple", "adc", "adc+sc"]
@@ -43,7 +44,7 @@ def field(method="fused", n=300, seed=0, **changes):
     if method == "adc+sc":
         layers = [[(torch.randn(o, i, generator=g), torch.randn(o, generator=g)) for i, o in pairs]
                   for pairs in (((DIM, 8), (8, 4)), ((4, 8), (8, DIM)))]  # fmt: skip
-        decoder = Autoencoded(codebook, Autoencoder(*(tuple(pairs) for pairs in layers), low=-0.5, high=0.75))
+        decoder = Autoencoded(codebook, made_autoencoder(*(tuple(pairs) for pairs in layers), low=-0.5, high=0.75))
     if method == "fused":
         decoder = Linear(_basis(d, g))
     gaussians = Gaussians(**cloud | changes)

@@ -9,7 +9,7 @@ from kfgs import FeatureFolder, UpliftConfig, fit_scene, load_scene
 from kfgs.cli import main
 from kfgs.fields import FieldConfig
 from kfgs.pipeline import FitConfig
-from kfgs.quant import AutoencoderConfig, CodebookConfig
+from kfgs.quant import AutoencoderConfig, PaperCodebook
 from kfgs.toy.room_folder import ToyConfig, make_toy_room
 
 ROOM = ToyConfig(
@@ -31,7 +31,7 @@ FIELD = FieldConfig.cpu(
     checkpoint_every=7,
 )
 CONFIG = FitConfig.paper(
-    codebook=CodebookConfig.paper(initial=4, maximum=24, epochs=4, step_every=1, learning_rate=0.02),
+    codebook=PaperCodebook(initial=4, maximum=24, epochs=4, step_every=1, learning_rate=0.02),
     autoencoder=AutoencoderConfig.paper(latent=4, encoder=(24, 16), decoder=(16, 24), steps=400, learning_rate=3e-3),
     field=FIELD,
 )

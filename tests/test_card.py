@@ -13,15 +13,17 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
+from cases_quant import made_autoencoder
 from torch import Tensor
 
 import kfgs
-from kfgs import Autoencoder, Camera, Codebook, Gaussians, SemanticField, rasterize
+from kfgs import Camera, Codebook, Gaussians, SemanticField, rasterize
 from kfgs._card import LONGEST, html_card, short_repr, short_value
 from kfgs.fields import Autoencoded
 from kfgs.labels import LabelSet, Selection
 from kfgs.labels.edits import EditList, Remove
-from kfgs.quant import CodebookFit, LinearLatents, Nearest
+from kfgs.quant import LinearLatents
+from kfgs.quant.codebook import CodebookReport, Nearest
 from kfgs.splat.engines.contract import Cloud, Composited, Pinhole, Splats
 
 
@@ -129,7 +131,7 @@ def test_lines_stay_short_and_cards_are_tables():
     book = Codebook(torch.rand(300, 512))
     widths = [(512, 64), (64, 9), (9, 64), (64, 512)]
     layers = [(torch.rand(out, width), torch.rand(out)) for width, out in widths]
-    autoencoder = Autoencoder(tuple(layers[:2]), tuple(layers[2:]), 0.0, 1.0)
+    autoencoder = made_autoencoder(tuple(layers[:2]), tuple(layers[2:]), 0.0, 1.0)
     cloud = Gaussians(torch.rand(50, 3), torch.rand(50, 4), torch.rand(50, 3), torch.rand(50), torch.rand(50, 9))
     field = SemanticField(cloud, Autoencoded(book, autoencoder), info={"teacher": {"name": "<lseg>"}})
     viewmat = torch.eye(4)
@@ -138,7 +140,7 @@ def test_lines_stay_short_and_cards_are_tables():
     rendering = rasterize(cloud, camera, engine="reference")
     results = [
         Nearest(torch.rand(900), torch.rand(900)),
-        CodebookFit(book, [{"a": 1.0}] * 99, torch.rand(9), 1, 1, 1, None),
+        CodebookReport([{"a": 1.0}] * 99, torch.rand(9), 1, 1, 1, None),
     ]
     for thing in (
         book,

@@ -68,8 +68,8 @@ def test_labels_for_a_splat_of_another_program(scripts):
 
 
 def test_how_the_codebook_grew(scripts):
-    fit = run(scripts[3])["fit"]
-    assert fit.history[-1]["size"] == fit.codebook.size
+    book = run(scripts[3])["book"]
+    assert book.report.history[-1]["size"] == book.size
     assert np.asarray(Image.open("growth.png")).shape[1] > 600
 
 

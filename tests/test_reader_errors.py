@@ -10,6 +10,7 @@ import torch
 from messages import tells
 from PIL import Image
 
+from kfgs._tensors import save_tensors
 from kfgs.evaluation.coco import load_coco_labels
 from kfgs.evaluation.replica import load_replica_points
 from kfgs.evaluation.scannet import load_scannet_points
@@ -20,7 +21,6 @@ from kfgs.formats.ply_mesh import read_mesh
 from kfgs.labels import load_label_set
 from kfgs.pipeline.describe import describe
 from kfgs.quant import Autoencoder, Codebook, IndexMaps
-from kfgs.quant._store import write_tensors
 from kfgs.scenes import SceneError, load_scene, read_image
 from kfgs.scenes.files import natural_key
 from kfgs.scenes.replica import _cam_params
@@ -115,7 +115,7 @@ def test_a_camera_of_whole_numbers_beyond_int64(tmp_path):
 )
 def test_tensors_that_do_not_fit_name_the_file(tmp_path, kind, reader, tensors):
     file = tmp_path / "a.safetensors"
-    write_tensors(file, tensors, kind=kind)
+    save_tensors(file, tensors, {"kfgs": kind, "version": "1"})
     with pytest.raises(ValueError, match=tells(file, kind)):
         reader(file)
 

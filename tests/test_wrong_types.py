@@ -12,7 +12,7 @@ from messages import tells
 from test_public import PACKAGES
 
 import kfgs
-from kfgs import Camera, CodebookConfig
+from kfgs import Camera
 from kfgs.scenes import pictures_of
 
 FIELD = scene([("chair", 0.0)])
@@ -103,8 +103,6 @@ def test_every_public_name_is_called():
             lambda: kfgs.attach(FIELD, FIELD.gaussians, FIELD.classes, cameras=["a"]),
             ("cameras[0]: expected a Camera", "str"),
         ),
-        (lambda: CodebookConfig(grid_step=torch.zeros(0)), ("grid_step: expected", "Tensor")),
-        (lambda: CodebookConfig(adaptive=torch.zeros(0)), ("adaptive: expected True or False", "Tensor")),
     ],
 )
 def test_the_argument_is_named(call, parts):

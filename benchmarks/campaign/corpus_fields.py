@@ -50,8 +50,11 @@ def tiny_field(method: str = "fused", n: int = 16) -> SemanticField:
     linear, book, fused = Linear(LinearLatents(torch.linalg.qr(random(DIM, 3)).Q)), Codebook(random(5, DIM)), None
     decoder: Linear | Codewords | Autoencoded = linear if method == "fused" else Codewords(book)
     if method == "adc+sc":
-        layers = (((random(2, DIM), random(2)),), ((random(DIM, 2), random(DIM)),))
-        decoder = Autoencoded(book, Autoencoder(*layers, low=-0.5, high=0.75))
+        layers = {"encoder.0": (random(2, DIM), random(2)), "decoder.0": (random(DIM, 2), random(DIM))}
+        state = {"range": torch.tensor([-0.5, 0.75], dtype=torch.float64)}
+        for name, (weight, bias) in layers.items():
+            state |= {f"{name}.weight": weight, f"{name}.bias": bias}
+        decoder = Autoencoded(book, Autoencoder.from_state_dict(state))
     if method != "fused":
         fused = SemanticField(gaussians.replace(features=random(n, 3)), linear)
     words = LabelSet(("wall", "chair"), random(2, DIM), random(1, DIM), ("object",), {"teacher": {"name": "toy"}})

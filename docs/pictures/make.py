@@ -110,7 +110,7 @@ def draw_uplift(demo: Demo) -> None:
 def draw_codebook(demo: Demo) -> None:
     """A feature map in colours, before and after each pixel takes its nearest codeword."""
     maps = FeatureFolder(demo.folder / "features").of(demo.scene, "train")
-    book = fit_codebook(maps, generator=torch.Generator().manual_seed(0)).codebook
+    book = fit_codebook(maps, generator=torch.Generator().manual_seed(0))
     features = FeatureFolder(demo.folder / "features", [demo.stem])[0].float()
     words = book.codewords[book.quantize(features)]
     both = torch.cat([features.flatten(0, 1), words.flatten(0, 1)])

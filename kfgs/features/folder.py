@@ -14,7 +14,7 @@ from torch import Tensor
 from .._check import check_whole
 from .._files import digest_file
 from .._typed import typed
-from ..quant import grid_slices
+from ..quant.sampling import grid_slices
 from ..scenes import Scene
 from .check import FeatureReport, check_maps
 from .finder import MapFinder

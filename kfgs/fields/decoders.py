@@ -207,7 +207,7 @@ class Codewords:
         return Codewords(self.codebook.to(*args, **kwargs), self.paper)
 
     def to_tensors(self) -> dict[str, Tensor]:
-        return {f"codebook.{name}": value for name, value in self.codebook.to_tensors().items()}
+        return {f"codebook.{name}": value for name, value in self.codebook.state_dict().items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,7 +268,7 @@ class Autoencoded:
         return Autoencoded(self.codebook.to(*args, **kwargs), self.autoencoder.to(*args, **kwargs), self.paper)
 
     def to_tensors(self) -> dict[str, Tensor]:
-        weights = {f"autoencoder.{name}": value for name, value in self.autoencoder.to_tensors().items()}
+        weights = {f"autoencoder.{name}": value for name, value in self.autoencoder.state_dict().items()}
         return {"codebook.codewords": self.codebook.codewords, **weights}
 
 
@@ -280,13 +280,13 @@ def make_decoder(tensors: Mapping[str, Tensor], channels: int) -> Decoder:
         if kind in parts:
             parts[kind][rest] = value
     if parts["linear"]:
-        return Linear(LinearLatents.from_tensors(parts["linear"]))
+        return Linear(LinearLatents.from_state_dict(parts["linear"]))
     if not parts["codebook"]:
         return Identity(channels)
-    codebook = Codebook.from_tensors(parts["codebook"])
+    codebook = Codebook.from_state_dict(parts["codebook"])
     if not parts["autoencoder"]:
         return Codewords(codebook)
-    return Autoencoded(codebook, Autoencoder.from_tensors(parts["autoencoder"]))
+    return Autoencoded(codebook, Autoencoder.from_state_dict(parts["autoencoder"]))
 
 
 def _quantised_cosines(decoder: Decoder, codebook: Codebook, latents: Tensor, rows: Tensor) -> Tensor:  # [N, M]

@@ -86,7 +86,7 @@ def merge_gaussians(
     if len(rows) <= maximum:
         source[rows] = torch.arange(len(rows), device=rows.device)
         return Merged(kept.replace(labels=None, sh=None), worth, source)
-    kinds = spherical_kmeans(kept.features, worth, clusters, generator=generator).group
+    kinds = spherical_kmeans(kept.features, worth, clusters, generator=generator).index
     group, count = _smallest_voxels(kept.means, kinds, worth, maximum)
     source[rows] = group
     return Merged(_match_moments(kept, worth, group, count), _sum(worth, group, count), source)

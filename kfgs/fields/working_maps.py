@@ -19,8 +19,7 @@ from ..cameras import Camera
 from ..cameras.resample import from_bchw, to_bchw
 from ..quant import FeatureMaps
 from ..quant.linear import principal_directions
-from ..quant.maps import read_blocks
-from ..quant.sampling import sample_grid
+from ..quant.sampling import read_blocks, sample_grid
 
 WORKING = 64
 """Number of working directions. For room_0's maps they keep 98.8 % of the energy; the rest is noise of single pixels. The

@@ -114,11 +114,12 @@ def _score_layers(
         squares = centres.square().sum(dim=-1)
         return ((2 * centres, 2 * squares.max() - squares),)
     decoder = getattr(autoencoder, "decoder", ())
-    if not decoder or decoder[0][0].dtype != rows.dtype:
+    layers = [(layer.weight.detach(), layer.bias.detach()) for layer in decoder]
+    if not layers or layers[0][0].dtype != rows.dtype:
         return None
-    weight, bias = decoder[-1]
+    weight, bias = layers[-1]
     unit = codebook.unit.to(rows)
-    return *decoder[:-1], (unit @ weight, unit @ bias)
+    return *layers[:-1], (unit @ weight, unit @ bias)
 
 
 def _decide(rows: Tensor, table: Tensor, layers: Layers) -> tuple[Tensor, Tensor]:

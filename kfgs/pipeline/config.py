@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from .._check import check_choice, check_whole
 from ..fields import FieldConfig, UpliftConfig
-from ..quant import AutoencoderConfig, CodebookConfig
+from ..quant import AutoencoderConfig, GrownCodebook, PaperCodebook
 from .color import ColorConfig
 
 Method = Literal["fuse", "paper"]
@@ -39,7 +39,7 @@ class FitConfig:
     """Of method `fuse`."""
     color: ColorConfig = default(default_factory=ColorConfig.geometry)
     """For method `fuse` without a splat: how to train Gaussians to fuse onto."""
-    codebook: CodebookConfig = default(default_factory=CodebookConfig)
+    codebook: GrownCodebook | PaperCodebook = default(default_factory=GrownCodebook)
     """This and the rest: of method `paper`."""
     autoencoder: AutoencoderConfig = default(default_factory=AutoencoderConfig)
     field: FieldConfig = default(default_factory=FieldConfig)
@@ -57,7 +57,7 @@ class FitConfig:
     @staticmethod
     def paper(**changes: Any) -> FitConfig:
         """The paper's method and schedule: 28 epochs, 5,000 autoencoder steps, 30,000 field steps. For a workstation."""
-        options: dict[str, Any] = {"codebook": CodebookConfig.paper(), "autoencoder": AutoencoderConfig.paper()}
+        options: dict[str, Any] = {"codebook": PaperCodebook(), "autoencoder": AutoencoderConfig.paper()}
         return FitConfig(**{"method": "paper", **options, **changes})
 
     @staticmethod

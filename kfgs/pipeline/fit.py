@@ -6,7 +6,6 @@ also resumes from its last checkpoint.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
@@ -105,11 +104,12 @@ def _codebook_stage(job: _Job) -> tuple[Codebook, Stage]:
 
     def make(folder: Path) -> None:
         check_readable(job.maps, "the codebook")
-        fit = fit_codebook(job.maps, config.codebook, generator=job.generator("codebook"), progress=job.progress)
-        fit.codebook.save(folder / "codebook.safetensors")
-        if fit.note is not None:
-            run.say(f"note: {fit.note}")
-        write_json(folder / "history.json", fit.history)
+        book = fit_codebook(job.maps, config.codebook, generator=job.generator("codebook"), progress=job.progress)
+        book.save(folder / "codebook.safetensors")
+        assert book.report is not None
+        if book.report.note is not None:
+            run.say(f"note: {book.report.note}")
+        write_json(folder / "history.json", book.report.history)
 
     inputs = {"features": job.features, "config": asdict(config.codebook), "seed": config.seed}
     stage = run.stage("codebook", inputs, make)
@@ -117,16 +117,15 @@ def _codebook_stage(job: _Job) -> tuple[Codebook, Stage]:
 
 
 def _index_stage(job: _Job, codebook: Codebook, upstream: Stage) -> tuple[IndexMaps, Stage]:
-    """Quantisation, Eq. 5: the index map M of every view; after a kill it continues with the next view."""
+    """Quantisation, Eq. 5: the index map M of every view."""
     inputs = {"features": job.features, "codebook": upstream.key}
-    scratch, progress = job.run.scratch("index_maps", inputs), job.progress is True
 
     def make(folder: Path) -> None:
         check_readable(job.maps, "quantisation")
-        quantize_maps(job.maps, codebook, progress=progress, scratch=scratch).save(folder / "index_maps.safetensors")
+        maps = quantize_maps(job.maps, codebook, progress=job.progress is True)
+        maps.save(folder / "index_maps.safetensors")
 
     stage = job.run.stage("index_maps", inputs, make)
-    shutil.rmtree(scratch, ignore_errors=True)
     return IndexMaps.load(stage.folder / "index_maps.safetensors"), stage
 
 
@@ -135,11 +134,12 @@ def _autoencoder_stage(job: _Job, codebook: Codebook, upstream: Stage) -> tuple[
     config = job.config
 
     def make(folder: Path) -> None:
-        fit = fit_autoencoder(
+        made = fit_autoencoder(
             codebook, config.autoencoder, generator=job.generator("autoencoder"), progress=job.progress
         )
-        fit.autoencoder.save(folder / "autoencoder.safetensors")
-        write_json(folder / "history.json", fit.history)
+        made.save(folder / "autoencoder.safetensors")
+        assert made.report is not None
+        write_json(folder / "history.json", made.report.history)
 
     inputs = {"codebook": upstream.key, "config": asdict(config.autoencoder), "seed": config.seed}
     stage = job.run.stage("autoencoder", inputs, make)

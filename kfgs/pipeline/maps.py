@@ -15,8 +15,7 @@ from .._check import as_tensor
 from .._files import digest_file, digest_value
 from .._rows import EPS, row_norms
 from ..cameras import undistort
-from ..quant.maps import read_blocks
-from ..quant.sampling import SAMPLES, sample_grid
+from ..quant.sampling import SAMPLES, read_blocks, sample_grid
 from ..scenes import Scene
 from ..scenes.files import has_alpha
 from .stages import Run, describe_lens, digest_tensors

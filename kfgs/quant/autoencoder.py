@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -15,7 +16,7 @@ from .._check import as_tensor
 from .._rows import unit_rows
 from .store import Stored
 
-CHUNK = 16_384  # rows at a time: the decoder's widest layer then takes 64 MB
+CHUNK = 8192  # rows at a time: the decoder's widest layer then takes 32 MB
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +102,10 @@ class Autoencoder(nn.Module, Stored):
     def forward(self, features: Tensor) -> Tensor:  # [..., D] -> [..., D]
         """Psi(E(f))."""
         return self.decode(self.encode(features))
+
+    def to(self, *args: Any, **kwargs: Any) -> Autoencoder:
+        """A copy, moved or converted, as all objects of kfgs have it; `torch.nn.Module.to` would change this one."""
+        return nn.Module.to(deepcopy(self), *args, **kwargs)
 
     @classmethod
     def from_state_dict(cls, tensors: Mapping[str, Tensor]) -> Autoencoder:

@@ -16,7 +16,7 @@ from .sampling import FeatureMaps, read_grid
 
 def fit_codebook(
     maps: FeatureMaps,  # each [h, w, D]
-    options: GrownCodebook | PaperCodebook = GrownCodebook(),
+    options: GrownCodebook | PaperCodebook | None = None,
     *,
     generator: torch.Generator | None = None,
     progress: Progress = False,
@@ -26,7 +26,7 @@ def fit_codebook(
     Args:
         maps: one map per image, read one at a time. Sizes may differ, D may not. All-zero features are left out everywhere;
             half precision is computed in float32.
-        options: `GrownCodebook`, kfgs's own, reads each map once; `PaperCodebook` (Eq. 5-9) once per epoch.
+        options: `GrownCodebook` (also if None), kfgs's own, reads each map once; `PaperCodebook` (Eq. 5-9) once per epoch.
         generator: draws the first directions of splits, or the order of the images; None stands for a fresh one with seed
             0. On a CPU the same generator state gives the same bits.
         progress: True shows a bar; a function is called with each record as it is written to the history.
@@ -37,7 +37,7 @@ def fit_codebook(
     Raises:
         ValueError: if there is no map, a map has another shape or is not finite, or every feature is zero.
     """
-    count = len(maps)
+    options, count = options or GrownCodebook(), len(maps)
     if count == 0:
         raise ValueError("maps: expected at least one feature map, got none; encode the training images first")
     samples = options.samples if isinstance(options, PaperCodebook) else min(options.samples, -(-POOL // count))

@@ -11,7 +11,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._card import short_repr
-from .._check import check_range, check_shapes, check_whole
+from .._check import check_range, check_whole
 from .._progress import Progress
 from .._rows import EPS, unit_rows
 from .codebook import Codebook, Nearest, fitted, share_above

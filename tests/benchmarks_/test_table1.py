@@ -10,7 +10,7 @@ from small_task import MIB, cloud
 
 from kfgs.fields import FieldConfig
 from kfgs.formats import write_splats
-from kfgs.quant import AutoencoderConfig, CodebookConfig
+from kfgs.quant import AutoencoderConfig, GrownCodebook, PaperCodebook
 from kfgs.toy.room_folder import make_toy_room
 
 
@@ -79,10 +79,10 @@ def test_the_paper_s_rows_have_the_paper_s_codebook_and_autoencoder():
     for preset in ("quick", "cpu", "paper"):
         for key in ("adc", "adc+sc"):
             config = table1_rows.kfgs_config(table1_rows.ROWS[key], key, preset, None, 0)
-            assert config.codebook == CodebookConfig.paper()
+            assert config.codebook == PaperCodebook()
             assert config.autoencoder == AutoencoderConfig.paper()
     own = table1_rows.kfgs_config(table1_rows.ROWS["own-adc+sc"], "own-adc+sc", "quick", None, 0)
-    assert (own.codebook, own.autoencoder) == (CodebookConfig(), AutoencoderConfig())
+    assert (own.codebook, own.autoencoder) == (GrownCodebook(), AutoencoderConfig())
 
 
 def test_answers_are_not_counted_as_fitting():

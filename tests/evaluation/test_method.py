@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from cases_quant import made_autoencoder
 
 from kfgs import Camera, Gaussians
 from kfgs.evaluation import (
@@ -36,7 +37,7 @@ def _field(mode: str) -> SemanticField:
     if mode in ("codebook", "autoencoder"):
         decoder = Codewords(Codebook(torch.eye(3, DIM) * 3))
     if mode == "autoencoder":
-        autoencoder = Autoencoder(
+        autoencoder = made_autoencoder(
             encoder=((torch.eye(4, DIM), torch.zeros(4)),),
             decoder=((torch.eye(DIM, 4), torch.zeros(DIM)), (torch.eye(DIM), torch.zeros(DIM))),
             low=0.0,

@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 from kfgs._files import digest_file
 from kfgs.features import FeatureFolder, save_feature_map, write_npy_map
 from kfgs.features.manifest import Manifest, MapRecord
-from kfgs.quant import CodebookConfig, fit_codebook, sample_grid
+from kfgs.quant import PaperCodebook, fit_codebook, sample_grid
 
 
 def features(seed: int, size: tuple[int, int, int] = (3, 4, 8)) -> torch.Tensor:  # [h, w, D]
@@ -415,7 +415,7 @@ def test_a_codebook_is_the_same_with_grids_and_with_whole_maps(tmp_path, layout)
     for i in range(3):
         save_any(tmp_path, f"view_{i}", layout, features(i, (40, 30, 8)).half())
     maps = FeatureFolder(tmp_path)
-    config = CodebookConfig(initial=3, maximum=9, epochs=2, samples=200)
+    config = PaperCodebook(initial=3, maximum=9, epochs=2, samples=200)
     disk, memory = fit_codebook(maps, config), fit_codebook([maps[i] for i in range(3)], config)
     assert torch.equal(disk.codebook.codewords, memory.codebook.codewords)
     assert disk.history == memory.history
@@ -427,7 +427,7 @@ def test_masks_of_three_things_make_a_codebook_of_three(tmp_path):
     for i in range(4):  # each view has its own masks of the same things, and pixels in none
         save_masks(tmp_path, f"view_{i}", (30, 40), seed=i)
         np.save(tmp_path / f"view_{i}_f.npy", things[[(i + m) % 3 for m in range(5)]])
-    fit = fit_codebook(FeatureFolder(tmp_path, level="m"), CodebookConfig(initial=2, epochs=2))
+    fit = fit_codebook(FeatureFolder(tmp_path, level="m"), PaperCodebook(initial=2, epochs=2))
     assert fit.codebook.size == 3
     assert np.abs(fit.codebook.unit.numpy() @ things.T).max(axis=1).tolist() == pytest.approx([1.0] * 3, abs=1e-3)
     masked = sum(int((np.load(tmp_path / f"view_{i}_s.npy")[2] >= 0).sum()) for i in range(4))

@@ -7,10 +7,10 @@ from PIL import Image
 
 from kfgs.cameras import Camera
 from kfgs.features import FeatureFolder, RecomputedMaps, extract_features, pictures_of
-from kfgs.quant import CodebookConfig, fit_codebook, quantize_maps, sample_grid
+from kfgs.quant import PaperCodebook, fit_codebook, quantize_maps, sample_grid
 from kfgs.scenes import Scene
 
-CONFIG = CodebookConfig(initial=3, maximum=12, epochs=3, learning_rate=0.02, samples=40, expand_below=0.95)
+CONFIG = PaperCodebook(initial=3, maximum=12, epochs=3, learning_rate=0.02, samples=40, expand_below=0.95)
 VIEWS = 4
 
 
@@ -136,14 +136,14 @@ def test_maps_that_are_changed_on_their_way_keep_their_samples_exactly(scene, tm
 
 def test_cleared_samples_are_gone_and_the_size_is_still_known(scene, tmp_path):
     maps = RecomputedMaps(Mixer(), scene, range(VIEWS), tmp_path / "store")
-    before = fit_codebook(maps, CONFIG).codebook.codewords
+    before = fit_codebook(maps, CONFIG).codewords
     maps.clear()
     assert not list((tmp_path / "store").rglob("*.npy"))
     teacher = Mixer()
     again = RecomputedMaps(teacher, scene, range(VIEWS), tmp_path / "store")
     assert again.shape == (8, 10, 6)
     assert teacher.calls == 0
-    assert torch.equal(fit_codebook(again, CONFIG).codebook.codewords, before)
+    assert torch.equal(fit_codebook(again, CONFIG).codewords, before)
     assert RecomputedMaps(teacher, scene, [3], tmp_path / "new").shape == (8, 10, 6)
 
 

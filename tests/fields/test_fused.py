@@ -5,11 +5,17 @@ import oracles_answers
 import oracles_uplift
 import pytest
 import torch
+from cases_quant import made_autoencoder
 from cases_splat import a_camera, gaussians_before
 
 from kfgs import Camera, Gaussians
+<<<<<<< HEAD:tests/fields/test_fused.py
 from kfgs.fields import Autoencoded, Codewords, Identity, SemanticField, fuse_views
 from kfgs.quant import Autoencoder, Codebook
+=======
+from kfgs.fields import answers, fused_answers
+from kfgs.quant import Codebook
+>>>>>>> c6a563bb (quant: two codebooks as classes, an nn.Module autoencoder):tests/fields/test_answers.py
 
 DIM = 6
 
@@ -25,7 +31,7 @@ def autoencoder():
     """Written down, not fitted: latents are the first four channels, held to 0 and more."""
     into, out = torch.eye(4, DIM), torch.eye(DIM, 4)
     layers = ((out, torch.zeros(DIM)), (torch.eye(DIM), torch.zeros(DIM)))
-    return Autoencoder(encoder=((into, torch.zeros(4)),), decoder=layers, low=0.0, high=1.0)
+    return made_autoencoder(encoder=((into, torch.zeros(4)),), decoder=layers, low=0.0, high=1.0)
 
 
 def fuse(cloud, mode, cameras):

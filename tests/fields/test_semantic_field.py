@@ -6,6 +6,7 @@ import numpy as np
 import oracles_uplift
 import pytest
 import torch
+from cases_quant import made_autoencoder
 from cases_splat import a_camera, gaussians_before
 from messages import tells
 
@@ -40,7 +41,7 @@ def embeddings():
 def autoencoder() -> Autoencoder:
     """Written down, not fitted: codeword i's latent is the i-th unit vector of four, and decodes to its direction."""
     into, out = torch.eye(4, DIM), torch.eye(DIM, 4)
-    return Autoencoder(
+    return made_autoencoder(
         encoder=((into, torch.zeros(4)),),
         decoder=((out, torch.zeros(DIM)), (torch.eye(DIM), torch.zeros(DIM))),
         low=0.0,

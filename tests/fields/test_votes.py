@@ -4,11 +4,18 @@ from dataclasses import replace
 
 import pytest
 import torch
+from cases_quant import made_autoencoder
 from cases_splat import a_camera, gaussians_before
 from messages import tells
 
+<<<<<<< HEAD:tests/fields/test_votes.py
 from kfgs.fields import Autoencoded, Identity, Linear, SemanticField
 from kfgs.quant import Autoencoder, Codebook, LinearLatents
+=======
+from kfgs.fields import SemanticField, score_pixels
+from kfgs.fields.views import _votes
+from kfgs.quant import Codebook, LinearLatents
+>>>>>>> c6a563bb (quant: two codebooks as classes, an nn.Module autoencoder):tests/fields/test_views.py
 from kfgs.splat import rasterize
 
 DIM, CLASSES = 16, 7
@@ -40,7 +47,7 @@ def quantised():
     g = torch.Generator().manual_seed(4)
     into = ((torch.randn(4, DIM, generator=g), torch.zeros(4)),)
     out = (torch.randn(20, 4, generator=g), torch.zeros(20)), (torch.randn(DIM, 20, generator=g), torch.zeros(DIM))
-    autoencoder = Autoencoder(into, out, -1.0, 1.0)
+    autoencoder = made_autoencoder(into, out, -1.0, 1.0)
     cloud = gaussians_before(camera(), 200, seed=2, channels=4, sigma=(0.02, 0.08))
     return SemanticField(cloud, Autoencoded(Codebook(autoencoder.decode(torch.randn(9, 4, generator=g))), autoencoder))
 

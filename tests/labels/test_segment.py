@@ -3,6 +3,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+from cases_quant import made_autoencoder
 from messages import tells
 from oracles_labels import most_similar
 
@@ -128,7 +129,7 @@ def decoder(bias=0.1, seed=0):
         (torch.randn(out, into, generator=g) * (2 / into) ** 0.5, bias * torch.randn(out, generator=g))
         for into, out in pairwise(widths)
     )
-    return Autoencoder(((torch.randn(d, D, generator=g), torch.zeros(d)),), layers, -1.0, 1.0)
+    return made_autoencoder(((torch.randn(d, D, generator=g), torch.zeros(d)),), layers, -1.0, 1.0)
 
 
 def plainly(latents, codebook, table, autoencoder):

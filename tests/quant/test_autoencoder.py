@@ -4,6 +4,7 @@ import numpy as np
 import oracles_quant as oracle
 import pytest
 import torch
+from cases_quant import made_autoencoder
 from messages import tells
 
 from kfgs.quant import Autoencoder, Codebook
@@ -17,8 +18,11 @@ def network(widths, seed):
     )
 
 
+ENCODER, DECODER = network((6, 5, 3), 0), network((3, 4, 6), 1)
+
+
 def example():
-    return Autoencoder(network((6, 5, 3), 0), network((3, 4, 6), 1), -0.5, 0.75)
+    return made_autoencoder(ENCODER, DECODER, -0.5, 0.75)
 
 
 def rows(n, dim, seed=2):
@@ -28,13 +32,11 @@ def rows(n, dim, seed=2):
 def test_encode_and_decode_against_loops():
     features, latents = rows(9, 6), rows(9, 3)
     found = example()
-    unit = oracle.unit(oracle.mlp(found.encoder, oracle.unit(features.numpy())))
+    unit = oracle.unit(oracle.mlp(ENCODER, oracle.unit(features.numpy())))
     expected = np.clip((unit + 0.5) / 1.25, 0, 1)
     assert (expected == 0).any()
     np.testing.assert_allclose(found.encode(features).numpy(), expected, atol=1e-12)
-    np.testing.assert_allclose(
-        found.decode(latents).numpy(), oracle.unit(oracle.mlp(found.decoder, latents)), atol=1e-12
-    )
+    np.testing.assert_allclose(found.decode(latents).numpy(), oracle.unit(oracle.mlp(DECODER, latents)), atol=1e-12)
 
 
 def test_each_row_is_treated_alone_and_shapes_are_kept():
@@ -42,8 +44,6 @@ def test_each_row_is_treated_alone_and_shapes_are_kept():
     latents = found.encode(features)
     assert latents.shape == (2, 3, 4, 3)
     torch.testing.assert_close(found.encode(features[1, 2, 3]), latents[1, 2, 3])
-    torch.testing.assert_close(found.encode(features, chunk=5), latents)
-    torch.testing.assert_close(found.decode(latents, chunk=7), found.decode(latents))
     torch.testing.assert_close(found.encode(40 * features), latents)
 
 
@@ -59,11 +59,13 @@ def test_decode_is_differentiable():
 def test_save_then_load_is_the_same(tmp_path):
     found, features = example(), rows(5, 6)
     found.save(tmp_path / "ae.safetensors")
-    for again in (Autoencoder.load(tmp_path / "ae.safetensors"), Autoencoder.from_tensors(found.to_tensors())):
+    for again in (Autoencoder.load(tmp_path / "ae.safetensors"), Autoencoder.from_state_dict(found.state_dict())):
         assert torch.equal(again.encode(features), found.encode(features))
         assert torch.equal(again.decode(again.encode(features)), found.decode(found.encode(features)))
         assert (again.dim, again.latent, again.decoder_parameters) == (6, 3, (3 * 4 + 4) + (4 * 6 + 6))
     assert found.to(torch.float32).encode(features.float()).dtype == torch.float32
+    assert found.encode(features).dtype == torch.float64  # `to` gives a copy
+    torch.testing.assert_close(found(features), found.decode(found.encode(features)))
 
 
 def test_bad_input(tmp_path):
@@ -72,18 +74,17 @@ def test_bad_input(tmp_path):
         found.encode(torch.zeros(2, 3))
     with pytest.raises(ValueError, match=tells("latents:", "[..., 3]", "got (2, 6)")):
         found.decode(torch.zeros(2, 6))
-    with pytest.raises(ValueError, match=tells("decoder:", "expected 6", "got 5")):
-        Autoencoder(found.encoder, network((3, 5), 0), 0.0, 1.0)
-    with pytest.raises(ValueError, match=tells("decoder[0] weight:", "[out, 3]", "got (6, 2)")):
-        Autoencoder(found.encoder, network((2, 6), 0), 0.0, 1.0)
-    with pytest.raises(ValueError, match=tells("high:", "(0.5, inf)", "got 0.5")):
-        Autoencoder(found.encoder, found.decoder, 0.5, 0.5)
-    with pytest.raises(ValueError, match=tells("tensors:", "'decoder.1.bias'", "Autoencoder.to_tensors")):
-        Autoencoder.from_tensors({k: v for k, v in found.to_tensors().items() if k != "decoder.1.bias"})
-    with pytest.raises(ValueError, match=tells("tensors:", "'range'", "got []")):
-        Autoencoder.from_tensors({})
-    with pytest.raises(ValueError, match=tells("tensors:", "'encoder.0.weight'", "got ['range']")):
-        Autoencoder.from_tensors({"range": torch.tensor([0.0, 1.0])})
+    with pytest.raises(ValueError, match=tells("decoder:", "from 3 to 6", "got (3, 5)")):
+        made_autoencoder(ENCODER, network((3, 5), 0))
+    with pytest.raises(ValueError, match=tells("range:", "low < high", "0.5")):
+        made_autoencoder(ENCODER, DECODER, 0.5, 0.5)
+    state = found.state_dict()
+    with pytest.raises(ValueError, match=tells("tensors:", "'decoder.1.bias'")):
+        Autoencoder.from_state_dict({name: value for name, value in state.items() if name != "decoder.1.bias"})
+    with pytest.raises(ValueError, match=tells("tensors:", "got others")):
+        Autoencoder.from_state_dict(state | {"encoder.1.weight": torch.zeros(3, 4)})
+    with pytest.raises(ValueError, match=tells("tensors:", "encoder.0.weight", "['range']")):
+        Autoencoder.from_state_dict({"range": torch.tensor([0.0, 1.0])})
     Codebook(torch.eye(3)).save(tmp_path / "book.safetensors")
     with pytest.raises(ValueError, match=tells("book.safetensors:", "got codebook")):
         Autoencoder.load(tmp_path / "book.safetensors")

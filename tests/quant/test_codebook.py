@@ -12,13 +12,6 @@ def random_rows(n, dim, seed=0, dtype=torch.float64):
     return torch.randn(n, dim, generator=torch.Generator().manual_seed(seed), dtype=dtype)
 
 
-def test_unit_rows_closed_form_and_zero_stays_zero():
-    assert unit_rows(torch.tensor([[3.0, 4.0], [0.0, 0.0]])).tolist() == [
-        [0.6000000238418579, 0.800000011920929],
-        [0, 0],
-    ]
-
-
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
 def test_zero_rows_have_no_nan_in_any_precision(dtype):
     assert unit_rows(torch.zeros(2, 3, dtype=dtype)).eq(0).all()
@@ -30,7 +23,7 @@ def test_rows_shorter_than_the_epsilon_shrink_towards_zero():
 
 def test_nearest_against_loops():
     features, codewords = random_rows(40, 6), random_rows(7, 6, seed=1)
-    found = Codebook(codewords).nearest(features, chunk=11)
+    found = Codebook(codewords).nearest(features)
     expected = oracle.quantize(features.numpy(), codewords.numpy())
     assert found.codeword.tolist() == expected.tolist()
     cosines = [oracle.cosine(f, codewords.numpy()[t]) for f, t in zip(features.numpy(), expected, strict=True)]
@@ -49,11 +42,6 @@ def test_quantize_is_idempotent_and_keeps_the_shape():
     assert index.shape == (2, 3, 4)
     assert index.dtype == torch.int64
     assert torch.equal(book.quantize(book.codewords[index]), index)
-
-
-def test_chunks_do_not_matter():
-    features, book = random_rows(50, 8), Codebook(random_rows(9, 8, seed=3))
-    assert torch.equal(book.quantize(features, chunk=1), book.quantize(features))
 
 
 def test_tie_goes_to_lowest_index():
@@ -80,37 +68,29 @@ def test_similarity_is_the_cosine_and_differentiable():
     assert torch.autograd.gradcheck(book.similarity, features)
 
 
-def test_no_features_give_no_indices():
-    assert Codebook(torch.eye(3)).quantize(torch.zeros(0, 3)).shape == (0,)
-
-
 def test_save_then_load_is_the_same(tmp_path):
     book = Codebook(random_rows(4, 3, dtype=torch.float32))
     book.save(tmp_path / "book.safetensors")
     assert torch.equal(Codebook.load(tmp_path / "book.safetensors").codewords, book.codewords)
-    assert torch.equal(Codebook.from_tensors(book.to_tensors()).codewords, book.codewords)
+    assert torch.equal(Codebook.from_state_dict(book.state_dict()).codewords, book.codewords)
     assert book.to(torch.float64).codewords.dtype == torch.float64
 
 
 def test_bad_codewords():
     with pytest.raises(ValueError, match=tells("codewords:", "[K, D]", "got (3,)")):
         Codebook(torch.ones(3))
-    with pytest.raises(ValueError, match=tells("codewords:", "got (0, 3)")):
+    with pytest.raises(ValueError, match=tells("codewords:", "got none", "fit_codebook")):
         Codebook(torch.ones(0, 3))
-    with pytest.raises(ValueError, match=tells("codewords:", "got (2, 3)", "torch.int64", "fit_codebook")):
+    with pytest.raises(TypeError, match=tells("codewords:", "torch.int64")):
         Codebook(torch.ones(2, 3, dtype=torch.int64))
     rows = torch.tensor([[1.0, 0.0], [0.0, 0.0], [float("nan"), 1.0]])
     with pytest.raises(ValueError, match=tells("codewords:", "[1, 2]")):
         Codebook(rows)
-    with pytest.raises(ValueError, match=tells("tensors:", "'codewords'", "got ['words']")):
-        Codebook.from_tensors({"words": rows})
 
 
 def test_bad_features():
     with pytest.raises(ValueError, match=tells("features:", "[..., D]", "D = 3", "got (2, 4)")):
         Codebook(torch.eye(3)).quantize(torch.ones(2, 4))
-    with pytest.raises(ValueError, match=tells("chunk:", "[1, inf)", "got 0")):
-        Codebook(torch.eye(3)).quantize(torch.ones(2, 3), chunk=0)
 
 
 def test_bad_files(tmp_path):
@@ -141,20 +121,19 @@ def test_every_feature_gets_the_first_largest_product_whatever_the_size(size):
     features = torch.randint(-3, 4, (3_000, 8), generator=generator).half()  # many chunks
     features[0] = torch.tensor([-5.0, 0, 0, 0, 0, 0, 0, 0])
     unit = torch.cat([codewords, codewords])  # each codeword twice
-    found = compare(features, unit)
+    codeword, product, length = compare(features, unit)
     products = (features.double()[:, None] * unit).sum(dim=2)
-    assert torch.equal(found.product, products.amax(dim=1))
-    assert torch.equal(found.codeword, (products == found.product[:, None]).int().argmax(dim=1))
-    assert found.codeword.max() < size
-    torch.testing.assert_close(found.length, features.double().square().sum(dim=1).sqrt())
-    assert found.product[0] < 0
+    assert torch.equal(product, products.amax(dim=1))
+    assert torch.equal(codeword, (products == product[:, None]).int().argmax(dim=1))
+    assert codeword.max() < size
+    torch.testing.assert_close(length, features.double().square().sum(dim=1).sqrt())
+    assert product[0] < 0
 
 
 def test_arrays_are_accepted_and_names_refused():
     rows = random_rows(6, 4)
     book, same = Codebook(rows[:3]), Codebook(rows[:3].numpy())
     assert len(book) == book.size == 3
-    assert torch.equal(torch.from_numpy(book.to_numpy()), rows[:3])
     assert torch.equal(same.quantize(rows.numpy()), book.quantize(rows))
     assert torch.equal(same.similarity(rows.numpy()), book.similarity(rows))
     with pytest.raises(TypeError, match=tells("features", "'chair'", "embedding")):

@@ -3,7 +3,8 @@ import pytest
 import torch
 
 from kfgs._rows import unit_rows
-from kfgs.quant.grow import grow, kmeans, nearest_cells
+from kfgs.quant.grow import grow
+from kfgs.quant.kmeans import nearest_cells
 
 
 def mixture(counts, dim=32, noise=0.05, seed=0):
@@ -75,9 +76,3 @@ def test_noise_alone_and_equal_features_are_one_cell():
     assert len(run(noise).cells.centres) == 1
     assert len(run(torch.eye(8)[:1].expand(50, 8)).cells.centres) == 1
     assert len(run(torch.eye(8)[:1]).cells.centres) == 1
-
-
-def test_a_centre_without_features_stays():
-    unit, _ = mixture([20, 20])
-    far = -torch.eye(32)[:1]
-    assert torch.equal(kmeans(unit, torch.cat([torch.eye(32)[:2], far]), 3).centres[2:], far)

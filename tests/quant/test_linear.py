@@ -55,7 +55,7 @@ def test_latents_follow_the_dtype_of_what_is_passed_and_survive_a_dict():
     assert latents.encode(random(2, 9).float()).dtype == torch.float32
     assert latents.decode(random(2, 4).float()).dtype == torch.float32
     assert latents.to(torch.float32).basis.dtype == torch.float32
-    again = LinearLatents.from_tensors(latents.to_tensors() | {"other": torch.zeros(1)})
+    again = LinearLatents.from_state_dict(latents.state_dict() | {"other": torch.zeros(1)})
     assert torch.equal(again.basis, latents.basis)
 
 
@@ -69,17 +69,6 @@ def test_a_basis_must_be_orthonormal():
     for shape in ((2, 4), (4, 0)):
         with pytest.raises(ValueError, match=tells("basis:", "[D, d]")):
             LinearLatents(torch.zeros(shape))
-
-
-def test_wrong_channels_are_named():
-    latents = LinearLatents(torch.eye(4, 2))
-    with pytest.raises(ValueError, match=tells("features:", "[..., 4]", "got (3, 2)")):
-        latents.encode(torch.zeros(3, 2))
-    for ask in (latents.decode, lambda z: latents.cosines(z, torch.eye(4))):
-        with pytest.raises(ValueError, match=tells("latents:", "[..., 2]", "got (3, 4)")):
-            ask(torch.zeros(3, 4))
-    with pytest.raises(ValueError, match=tells("latents:", "[..., 2]", "got ()")):
-        latents.decode(torch.tensor(1.0))
 
 
 def test_principal_directions_of_a_known_moment():
@@ -129,12 +118,6 @@ def test_a_weight_is_a_repetition():
     repeated = fit_linear_latents(features.repeat_interleave(times, dim=0), keep=0.9)
     torch.testing.assert_close(weighted.basis, repeated.basis)
     assert not torch.allclose(weighted.basis[:, 0], fit_linear_latents(features).basis[:, 0])
-
-
-def test_the_same_rows_in_another_order_and_sign_give_the_same_latents():
-    features = random(40, 6) * torch.tensor([5.0, 3, 2, 1, 0.5, 0.1])
-    made = fit_linear_latents(features, keep=1.0)
-    torch.testing.assert_close(fit_linear_latents(-features.flip(0), keep=1.0).basis, made.basis)
 
 
 def test_wrong_input_to_the_fit_is_named():

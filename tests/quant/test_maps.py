@@ -29,7 +29,6 @@ def test_quantize_maps_reads_each_map_once_and_sizes_may_differ():
     for found, feature_map in zip(index_maps, maps.maps, strict=True):
         assert found.dtype == np.uint8
         assert np.array_equal(found, book.quantize(feature_map).numpy())
-    assert index_maps.usage.tolist() == [sum(int((m == e).sum()) for m in index_maps) for e in range(6)]
     assert index_maps.nbytes == 3 * 5 + 2 * 7
 
 
@@ -48,11 +47,6 @@ def test_save_then_load_is_the_same(tmp_path, size):
     assert again.size == size
     assert [m.dtype for m in again] == [m.dtype for m in index_maps]
     assert all(np.array_equal(a, b) for a, b in zip(again, index_maps, strict=True))
-
-
-def test_order_survives_more_than_ten_maps(tmp_path):
-    IndexMaps([np.array([[i]]) for i in range(12)], 12).save(tmp_path / "maps.safetensors")
-    assert [int(m[0, 0]) for m in IndexMaps.load(tmp_path / "maps.safetensors")] == list(range(12))
 
 
 def test_latent_maps_look_up_rows():
@@ -76,7 +70,7 @@ def test_bad_input():
         IndexMaps([np.zeros(4, dtype=np.int64)], 3)
     with pytest.raises(ValueError, match=tells("size:", "expected 1 to 65535", "got 70000")):
         IndexMaps([], 70_000)
-    with pytest.raises(ValueError, match=tells("latents:", "[K, d]", "K = 3", "index_maps", "got (4, 2)")):
+    with pytest.raises(ValueError, match=tells("latents:", "[3, d]", "got (4, 2)")):
         LatentMaps(IndexMaps([], 3), torch.zeros(4, 2))
     with pytest.raises(ValueError, match=tells("maps[0]:", "[h, w, 3]", "got (2, 2, 4)")):
         quantize_maps([torch.ones(2, 2, 4)], Codebook(torch.eye(3)))
@@ -89,14 +83,8 @@ def test_holes_are_kept_apart_from_codewords_all_the_way():
     features = torch.tensor([[[0.0, 0.0, 0.0], [1.0, 0.1, 0.0]], [[0.0, 0.2, 1.0], [0.0, 0.0, 0.0]]])
     index_maps = quantize_maps([features], codebook)
     assert index_maps[0].tolist() == [[3, 0], [2, 3]]
-    assert index_maps.usage.tolist() == [1, 0, 1]
     latents = LatentMaps(index_maps, torch.tensor([[0.1], [0.2], [0.3]]))[0]
     torch.testing.assert_close(latents[..., 0], torch.tensor([[torch.nan, 0.1], [0.3, torch.nan]]), equal_nan=True)
-
-
-def test_255_codewords_and_holes_fit_a_byte_and_256_do_not():
-    assert IndexMaps([np.full((1, 1), 255)], 255)[0].dtype == np.uint8
-    assert IndexMaps([np.full((1, 1), 256)], 256)[0].dtype == np.uint16
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
@@ -111,27 +99,6 @@ def test_maps_that_are_not_finite_are_refused(value):
     maps = [torch.ones(1, 2, 2), torch.tensor([[[1.0, 2.0], [value, 0.0]]])]
     with pytest.raises(ValueError, match=tells("maps[1]:", "got NaN")):
         quantize_maps(maps, Codebook(torch.eye(2)))
-
-
-def test_quantising_goes_on_with_the_map_it_was_at(tmp_path):
-    class Maps(list):
-        read: list[int] = []  # noqa: RUF012
-
-        def __getitem__(self, i):
-            self.read.append(i)
-            if self.read == [0, 1, 2]:
-                raise KeyboardInterrupt
-            return super().__getitem__(i)
-
-    generator = torch.Generator().manual_seed(5)
-    maps = Maps(torch.randn(4, 5, 3, generator=generator) for _ in range(4))
-    book = Codebook(torch.randn(6, 3, generator=generator))
-    with pytest.raises(KeyboardInterrupt):
-        quantize_maps(maps, book, scratch=tmp_path / "scratch")
-    found = quantize_maps(maps, book, scratch=tmp_path / "scratch")
-    assert maps.read == [0, 1, 2, 2, 3]
-    whole = quantize_maps(list(maps), book)
-    assert all(np.array_equal(a, b) and a.dtype == b.dtype for a, b in zip(found, whole, strict=True))
 
 
 def test_a_short_feature_is_no_hole_because_half_precision_codewords_cannot_hold_it():

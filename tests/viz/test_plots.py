@@ -42,7 +42,7 @@ def test_codebook_panels_hold_the_history(tmp_path):
 def test_codebook_panels_of_an_adaptive_fit_have_no_loss(tmp_path):
     generator = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(5, 16, generator=generator), dim=1)
-    history = fit_codebook([directions[torch.randint(0, 5, (20, 30), generator=generator)]]).history
+    history = fit_codebook([directions[torch.randint(0, 5, (20, 30), generator=generator)]]).report.history
     panels = plot_codebook_history(history, tmp_path / "codebook.png").axes
     assert [axes.get_title() for axes in panels] == ["size", "added", "mean_similarity", "coverage"]
     assert panels[0].figure.get_suptitle() == "Codebook; pruned is always 0"

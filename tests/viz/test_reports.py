@@ -88,8 +88,10 @@ def test_growth_has_a_curve_per_scene(tmp_path):
 
 
 def test_growth_of_a_fit_is_that_of_its_history():
-    fit = fit_codebook([torch.eye(3)[None]])
-    drawn = [plot_codebook_growth(one).axes[0].lines[0].get_xydata() for one in (fit, {"room": fit}, fit.history)]
+    book = fit_codebook([torch.eye(3)[None]])
+    drawn = [
+        plot_codebook_growth(one).axes[0].lines[0].get_xydata() for one in (book, {"room": book}, book.report.history)
+    ]
     np.testing.assert_array_equal(drawn[0], drawn[2])
     np.testing.assert_array_equal(drawn[1], drawn[2])
 

@@ -1,10 +1,18 @@
 import oracles_quant as oracle
 import pytest
 import torch
-from messages import tells
 
-from kfgs.quant import expand, prune
-from kfgs.quant.evolve import RowAdam
+from kfgs.quant import Codebook, PaperCodebook, paper
+from kfgs.quant.paper import EvolvingCodebook, class_balanced_loss
+
+
+def expand(codewords, features, *, threshold=0.9, maximum=100):
+    similarity = Codebook(codewords).nearest(features).similarity
+    return paper.expand(features, similarity, threshold=threshold, room=maximum - len(codewords))
+
+
+def prune(codewords, threshold=0.99):
+    return paper.prune(codewords, threshold=threshold)
 
 
 def rows_at(*degrees):
@@ -49,14 +57,6 @@ def test_expand_never_passes_the_maximum_and_admits_only_below_alpha(seed, maxim
         assert all(max(oracle.cosine(f, c) for c in book.numpy()) >= 0.7 for f in features.numpy())
 
 
-def test_a_book_over_the_maximum_takes_nothing():
-    assert expand(torch.eye(3), -torch.eye(3), maximum=2).numel() == 0
-
-
-def test_similarity_at_the_threshold_is_enough():
-    assert expand(torch.tensor([[1.0, 0.0]]), torch.tensor([[0.0, 1.0]]), threshold=0.0).numel() == 0
-
-
 def test_expand_tie_goes_to_lowest_row():
     assert expand(torch.eye(3)[:1], torch.eye(3)[[2, 1, 2]], maximum=2).tolist() == [0]
 
@@ -84,22 +84,6 @@ def test_prune_against_loops_and_twice_is_once(seed):
     assert prune(codewords[stays], threshold=0.97).tolist() == list(range(stays.numel()))
 
 
-def test_one_codeword_stays():
-    assert prune(torch.ones(1, 3)).tolist() == [0]
-    assert prune(torch.ones(4, 3)).tolist() == [0]
-
-
-def test_bad_input():
-    with pytest.raises(ValueError, match=tells("features:", "[n, D]", "D = 2", "got (4, 3)")):
-        expand(torch.ones(1, 2), torch.ones(4, 3))
-    with pytest.raises(ValueError, match=tells("threshold:", "[-1, 1]", "got 90")):
-        expand(torch.ones(1, 2), torch.ones(4, 2), threshold=90)
-    with pytest.raises(ValueError, match=tells("threshold:", "[-1, 1]", "got nan")):
-        prune(torch.ones(1, 2), threshold=float("nan"))
-    with pytest.raises(ValueError, match=tells("codewords:", "[K, D]", "got (2,)")):
-        prune(torch.ones(2))
-
-
 def gradients(steps, K, dim):
     return torch.randn(steps, K, dim, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
@@ -113,27 +97,68 @@ def run_torch(rows, gradients):
     return leaf.detach()
 
 
-def test_agrees_with_torch_when_rows_stay():
-    rows = torch.ones(3, 4, dtype=torch.float64)
-    adam = RowAdam(rows, learning_rate=8e-4, eps=1e-9)
-    for gradient in gradients(20, 3, 4):
-        adam.step(gradient)
-    torch.testing.assert_close(adam.rows, run_torch(rows, gradients(20, 3, 4)), rtol=0, atol=1e-12)
-    assert rows.eq(1).all()
-
-
-def test_each_row_runs_as_if_it_were_alone():
+def test_each_row_runs_as_if_it_were_alone(monkeypatch):
     """Rows 0 and 2 stay for 20 steps, row 1 leaves after 8 and a new row joins: each is torch's Adam on its own."""
     steps = gradients(20, 4, 5)
-    rows = torch.arange(20, dtype=torch.float64).reshape(4, 5)
-    adam = RowAdam(rows[:3], learning_rate=8e-4, eps=1e-9)
-    for gradient in steps[:8]:
-        adam.step(gradient[:3])
-    adam.keep(torch.tensor([0, 2]))
-    adam.append(rows[3:])
-    for gradient in steps[8:]:
-        adam.step(gradient[[0, 2, 3]])
-    expected = torch.cat(
-        [run_torch(rows[[0, 2]], steps[:, [0, 2]]), run_torch(rows[3:], steps[8:, 3:])],
-    )
-    torch.testing.assert_close(adam.rows, expected, rtol=0, atol=1e-12)
+    rows = 0.1 + torch.arange(20, dtype=torch.float64).reshape(4, 5) ** 2
+    book = EvolvingCodebook(rows[:3], PaperCodebook(initial=1, maximum=4, expand_below=1.0, prune_above=1.0), joins=1)
+    present, stays = [0, 1, 2], [0, 1, 2]
+    monkeypatch.setattr(paper, "prune", lambda rows, threshold: torch.tensor(stays))
+    for number, gradient in enumerate(steps):
+        if number == 8:
+            monkeypatch.setattr(paper, "class_balanced_loss", lambda _, rows, __: (torch.zeros(()), 0 * rows))
+            book.learn_from(rows[3:])
+            present, stays = [0, 2, 3], [0, 1, 2]
+        book.gradient, book.gathered = gradient[present], 1
+        if number == 7:
+            stays = [0, 2]
+        book.step()
+    expected = torch.cat([run_torch(rows[[0, 2]], steps[:, [0, 2]]), run_torch(rows[3:], steps[8:, 3:])])
+    torch.testing.assert_close(book.rows, expected, rtol=0, atol=1e-12)
+
+
+def example(seed=0, n=30, K=6, dim=5):
+    generator = torch.Generator().manual_seed(seed)
+    features = torch.randn(n, dim, generator=generator, dtype=torch.float64)
+    codewords = 3 * torch.randn(K, dim, generator=generator, dtype=torch.float64)
+    index = torch.randint(0, K - 1, (n,), generator=generator)  # the last codeword has no features
+    return features, codewords, index
+
+
+def test_closed_form_of_two_unequal_classes():
+    features = torch.tensor([[2.0, 0.0], [0.0, 5.0], [1.0, 0.0], [0.0, -1.0]])
+    codewords = torch.tensor([[1.0, 0.0], [0.0, 4.0], [7.0, 7.0]])
+    loss, _ = class_balanced_loss(features, codewords, torch.tensor([0, 0, 0, 1]))
+    # class 0: (0 + 1 + 0) / 3; class 1: 2; class 2 is absent, so T = 2
+    assert loss.item() == pytest.approx((1 / 3 + 2) / 2)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_loss_against_loops(seed):
+    features, codewords, index = example(seed)
+    expected = oracle.balanced_loss(features.numpy(), codewords.numpy(), index.numpy())
+    assert class_balanced_loss(features, codewords, index)[0].item() == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_gradient_against_autograd(seed):
+    features, codewords, index = example(seed)
+    leaf = codewords.clone().requires_grad_()
+    distance = 1 - torch.nn.functional.cosine_similarity(features, leaf[index], dim=1)
+    classes = index.unique()
+    torch.stack([distance[index == tau].mean() for tau in classes]).mean().backward()
+    torch.testing.assert_close(class_balanced_loss(features, codewords, index)[1], leaf.grad)
+
+
+def test_repeating_a_class_changes_nothing():
+    features, codewords, index = example()
+    more = torch.cat([features, features[index == 2]]), torch.cat([index, index[index == 2]])
+    once, twice = class_balanced_loss(features, codewords, index), class_balanced_loss(more[0], codewords, more[1])
+    torch.testing.assert_close(twice[0], once[0])
+    torch.testing.assert_close(twice[1], once[1])
+
+
+def test_the_gradient_is_orthogonal_to_each_codeword():
+    features, codewords, index = example()
+    inner = (class_balanced_loss(features, codewords, index)[1] * codewords).sum(dim=1)
+    torch.testing.assert_close(inner, torch.zeros(6, dtype=torch.float64))

@@ -1,0 +1,16 @@
+"""Autoencoders with given weights, for tests."""
+
+from __future__ import annotations
+
+import torch
+
+from kfgs.quant import Autoencoder
+
+
+def made_autoencoder(encoder, decoder, low=0.0, high=1.0) -> Autoencoder:
+    """The autoencoder of some layers, pairs of a weight [out, in] and a bias [out], with a range of its latents."""
+    state = {"range": torch.tensor([low, high], dtype=torch.float64)}
+    for name, layers in (("encoder", encoder), ("decoder", decoder)):
+        for i, (weight, bias) in enumerate(layers):
+            state |= {f"{name}.{i}.weight": weight, f"{name}.{i}.bias": bias}
+    return Autoencoder.from_state_dict(state)
