@@ -101,9 +101,11 @@ def fit_autoencoder(
         )
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     target = codebook.unit.detach()
-    made = Autoencoder(
-        (codebook.dim, *config.encoder, config.latent), (config.latent, *config.decoder, codebook.dim)
-    ).to(target)
+    with torch.device("meta"):  # nothing is drawn from the global generator
+        made = Autoencoder(
+            (codebook.dim, *config.encoder, config.latent), (config.latent, *config.decoder, codebook.dim)
+        )
+    made = made.to_empty(device=target.device).to(target.dtype)
     _initialise(made, generator)
     norms = [(torch.ones_like(layer.bias), torch.zeros_like(layer.bias)) for layer in made.encoder[:-1]]
     weights = [*made.parameters(), *(tensor.requires_grad_() for norm in norms for tensor in norm)]
