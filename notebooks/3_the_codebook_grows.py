@@ -46,13 +46,13 @@ pictures.mkdir(exist_ok=True)
 from IPython.display import Image as Shown
 
 from kfgs import PaperCodebook, fit_codebook
-from kfgs.viz import plot_codebook_growth
+from kfgs.viz import plot_history
 
 books = {}
 for alpha in (0.9, 0.7):
     config = PaperCodebook(epochs=4, step_every=2, joins_per_image=1, expand_below=alpha)
     books[f"alpha = {alpha}"] = fit_codebook(maps, config)
-plot_codebook_growth(books, pictures / "growth.png")
+plot_history({name: book.report.history for name, book in books.items()}, pictures / "growth.png")
 Shown(pictures / "growth.png", width=900)
 
 # %% [markdown]

@@ -417,8 +417,8 @@ def test_a_codebook_is_the_same_with_grids_and_with_whole_maps(tmp_path, layout)
     maps = FeatureFolder(tmp_path)
     config = PaperCodebook(initial=3, maximum=9, epochs=2, samples=200)
     disk, memory = fit_codebook(maps, config), fit_codebook([maps[i] for i in range(3)], config)
-    assert torch.equal(disk.codebook.codewords, memory.codebook.codewords)
-    assert disk.history == memory.history
+    assert torch.equal(disk.codewords, memory.codewords)
+    assert disk.report.history == memory.report.history
 
 
 def test_masks_of_three_things_make_a_codebook_of_three(tmp_path):
@@ -428,10 +428,10 @@ def test_masks_of_three_things_make_a_codebook_of_three(tmp_path):
         save_masks(tmp_path, f"view_{i}", (30, 40), seed=i)
         np.save(tmp_path / f"view_{i}_f.npy", things[[(i + m) % 3 for m in range(5)]])
     fit = fit_codebook(FeatureFolder(tmp_path, level="m"), PaperCodebook(initial=2, epochs=2))
-    assert fit.codebook.size == 3
-    assert np.abs(fit.codebook.unit.numpy() @ things.T).max(axis=1).tolist() == pytest.approx([1.0] * 3, abs=1e-3)
+    assert fit.size == 3
+    assert np.abs(fit.unit.numpy() @ things.T).max(axis=1).tolist() == pytest.approx([1.0] * 3, abs=1e-3)
     masked = sum(int((np.load(tmp_path / f"view_{i}_s.npy")[2] >= 0).sum()) for i in range(4))
-    assert int(fit.usage.sum()) == masked
+    assert int(fit.report.usage.sum()) == masked
 
 
 def test_a_map_among_kfgss_own_that_the_manifest_does_not_tell_of_is_refused(tmp_path):

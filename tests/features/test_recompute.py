@@ -55,11 +55,11 @@ def test_codebook_and_index_maps_are_those_of_stored_maps_bit_for_bit(scene, tmp
     assert all(torch.equal(a, b) for a, b in zip(anew, stored, strict=True))
     teacher.calls = 0
     one, other = (fit_codebook(maps, CONFIG, generator=torch.Generator().manual_seed(3)) for maps in (stored, anew))
-    assert torch.equal(one.codebook.codewords, other.codebook.codewords)
-    assert one.codebook.size > CONFIG.initial
-    assert one.history == other.history
+    assert torch.equal(one.codewords, other.codewords)
+    assert one.size > CONFIG.initial
+    assert one.report.history == other.report.history
     assert teacher.calls == VIEWS  # three epochs and the first and last look: once per picture
-    a, b = (quantize_maps(maps, one.codebook) for maps in (stored, anew))
+    a, b = (quantize_maps(maps, one) for maps in (stored, anew))
     assert all((x == y).all() for x, y in zip(a, b, strict=True))
     assert teacher.calls == 2 * VIEWS
     assert len(set(a[0].ravel().tolist())) > 3
@@ -83,7 +83,7 @@ def test_what_a_killed_process_sampled_is_used(scene, tmp_path):
     resumed = fit_codebook(RecomputedMaps(teacher, scene, range(VIEWS), tmp_path / "store"), CONFIG)
     assert teacher.calls == VIEWS - 2
     whole = fit_codebook(RecomputedMaps(Mixer(), scene, range(VIEWS), tmp_path / "other"), CONFIG)
-    assert torch.equal(resumed.codebook.codewords, whole.codebook.codewords)
+    assert torch.equal(resumed.codewords, whole.codewords)
 
 
 def test_samples_of_another_teacher_picture_or_grid_are_not_taken_for_these(scene, tmp_path):

@@ -8,7 +8,7 @@ import torch
 from messages import tells
 from safetensors.torch import save_file
 
-from kfgs.quant import CodebookConfig, fit_codebook, sample_grid
+from kfgs.quant import PaperCodebook, fit_codebook, sample_grid
 from kfgs.scenes import FeatureFolder, save_feature_map
 
 FILES = ("pt", "npy", "safetensors")
@@ -248,6 +248,6 @@ def test_a_codebook_is_the_same_with_grids_and_with_whole_maps(tmp_path, kind):
     for i in range(3):
         save_any(tmp_path, f"view_{i}", kind, features(i, (40, 30, 8)).half())
     maps = FeatureFolder(tmp_path)
-    config = CodebookConfig(initial=3, maximum=9, epochs=2, samples=200)
+    config = PaperCodebook(initial=3, maximum=9, epochs=2, samples=200)
     disk, memory = fit_codebook(maps, config), fit_codebook([maps[i] for i in range(3)], config)
-    assert torch.equal(disk.codebook.codewords, memory.codebook.codewords)
+    assert torch.equal(disk.codewords, memory.codewords)

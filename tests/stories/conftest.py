@@ -8,12 +8,12 @@ from types import SimpleNamespace
 import pytest
 
 import kfgs
-from kfgs.quant import AutoencoderConfig, CodebookConfig
+from kfgs.quant import AutoencoderConfig, PaperCodebook
 
 ROOM = kfgs.ToyConfig(
     train_views=16, test_views=4, size=(120, 160), feature_size=(60, 80), feature_dim=64, sparse_points=6_000
 )
-CODEBOOK = CodebookConfig.paper(epochs=6, step_every=2, learning_rate=0.02, expand_below=0.8, joins_per_image=1)
+CODEBOOK = PaperCodebook(epochs=6, step_every=2, learning_rate=0.02, expand_below=0.8, joins_per_image=1)
 AUTOENCODER = AutoencoderConfig.paper(latent=8, encoder=(48, 32), decoder=(32, 48), steps=1_500, learning_rate=3e-3)
 TRAINING = kfgs.FieldConfig.cpu(
     steps=400,

@@ -8,12 +8,12 @@ from kfgs.metrics import MIB, semantic_storage_bytes
 
 
 def test_the_codebook_grows(room, codebook_options, recorded):
-    fit = kfgs.fit_codebook(room.maps, codebook_options, generator=torch.Generator().manual_seed(0))
-    sizes = [epoch["size"] for epoch in fit.history]
+    book = kfgs.fit_codebook(room.maps, codebook_options, generator=torch.Generator().manual_seed(0))
+    sizes = [epoch["size"] for epoch in book.report.history]
     assert sizes[0] < sizes[-1] <= 100
-    assert fit.codebook.size == pytest.approx(recorded["codewords"], abs=2)
-    assert fit.coverage == pytest.approx(recorded["coverage of the codebook"], abs=0.01)
-    similarity = fit.codebook.similarity(fit.codebook.codewords).fill_diagonal_(-1)
+    assert book.size == pytest.approx(recorded["codewords"], abs=2)
+    assert book.report.coverage == pytest.approx(recorded["coverage of the codebook"], abs=0.01)
+    similarity = book.similarity(book.codewords).fill_diagonal_(-1)
     assert similarity.max() <= codebook_options.prune_above  # Eq. 9
 
 
