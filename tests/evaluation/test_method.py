@@ -17,7 +17,7 @@ from kfgs.evaluation import (
     label_view,
 )
 from kfgs.fields import Autoencoded, Codewords, Identity, Linear, SemanticField
-from kfgs.quant import Autoencoder, Codebook, LinearLatents
+from kfgs.quant import Codebook, LinearLatents
 from kfgs.scenes import FeatureFolder, save_feature_map
 
 DIM = 6

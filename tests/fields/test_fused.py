@@ -9,13 +9,8 @@ from cases_quant import made_autoencoder
 from cases_splat import a_camera, gaussians_before
 
 from kfgs import Camera, Gaussians
-<<<<<<< HEAD:tests/fields/test_fused.py
 from kfgs.fields import Autoencoded, Codewords, Identity, SemanticField, fuse_views
-from kfgs.quant import Autoencoder, Codebook
-=======
-from kfgs.fields import answers, fused_answers
 from kfgs.quant import Codebook
->>>>>>> c6a563bb (quant: two codebooks as classes, an nn.Module autoencoder):tests/fields/test_answers.py
 
 DIM = 6
 

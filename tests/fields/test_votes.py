@@ -8,14 +8,8 @@ from cases_quant import made_autoencoder
 from cases_splat import a_camera, gaussians_before
 from messages import tells
 
-<<<<<<< HEAD:tests/fields/test_votes.py
 from kfgs.fields import Autoencoded, Identity, Linear, SemanticField
-from kfgs.quant import Autoencoder, Codebook, LinearLatents
-=======
-from kfgs.fields import SemanticField, score_pixels
-from kfgs.fields.views import _votes
 from kfgs.quant import Codebook, LinearLatents
->>>>>>> c6a563bb (quant: two codebooks as classes, an nn.Module autoencoder):tests/fields/test_views.py
 from kfgs.splat import rasterize
 
 DIM, CLASSES = 16, 7
