@@ -243,7 +243,7 @@ class Autoencoded:
         return self.autoencoder.decoder_parameters + self.codebook.codewords.numel()
 
     def decode(self, latents: Tensor) -> Tensor:
-        return self.autoencoder.decode(latents, chunk=CHUNK)
+        return self.autoencoder.decode(latents)
 
     def cosines(self, latents: Tensor, rows: Tensor) -> Tensor:
         return _quantised_cosines(self, self.codebook, latents, rows)
