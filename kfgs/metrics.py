@@ -1,6 +1,6 @@
 """Scores with their definitions: mIoU, accuracy, cosine, PSNR, SSIM, and bytes.
 
-`kornia.metrics` counts and compares. What it leaves open is settled here: labels to ignore, pooling over views, classes
+`kornia.metrics` compares pictures. What it leaves open is settled here: labels to ignore, pooling over views, classes
 that do not occur, and which SSIM.
 """
 
@@ -18,27 +18,14 @@ from ._check import as_tensor, check_range, check_shapes
 from ._rows import unit_rows
 from .cameras.resample import to_bchw
 
-__all__ = [
-    "MIB",
-    "ConfusionMatrix",
-    "Score",
-    "confusion_matrix",
-    "feature_cosine",
-    "psnr",
-    "semantic_storage_bytes",
-    "ssim",
-]
+__all__ = ["MIB", "ConfusionMatrix", "Score", "feature_cosine", "psnr", "semantic_storage_bytes", "ssim"]
 
 MIB = 2**20
 """Bytes in the "MB" of Table 1."""
-
-PSNR_PROTOCOL = "kornia.metrics.psnr, mean squared error over all pixels and channels"
 SSIM_WINDOW = 11
 SSIM_PROTOCOL = (
     "kornia.metrics.ssim, Gaussian window 11x11 with sigma 1.5, padding='valid', mean over all pixels and channels"
 )
-
-_EXACT_COUNT = 2**24  # kornia returns counts as float32, exact up to here
 _ATTRIBUTES = 3 + 3 + 1 + 3 + 4  # means, normals (always zero), opacity, scales, rotation
 
 
@@ -61,13 +48,6 @@ class Score:
     protocol: str
     """What was measured and how. Of "name/version: long text" only the name and the version are printed."""
 
-    def __post_init__(self) -> None:
-        for field, text in (("name", self.name), ("protocol", self.protocol)):
-            if not isinstance(text, str):
-                raise TypeError(f"{field}: expected a text, got {type(text).__name__}; say what was measured and how")
-            if not text.strip():
-                raise ValueError(f"{field}: expected a text, got {text!r}; say what was measured and how")
-
     def __str__(self) -> str:
         named = re.match(r"[\w.-]+/\d+(?=:)", self.protocol)
         return f"{self.name} {self.value:.3f} ({named[0]})" if named else self.text
@@ -78,44 +58,14 @@ class Score:
         return f"{self.name} {self.value:.4f} ({self.protocol})"
 
 
-def confusion_matrix(
-    pred: Tensor,  # [...] integer
-    target: Tensor,  # [...] integer
-    classes: int,
-    ignore: int | Sequence[int] = -1,
-) -> Tensor:  # [C, C] int64
-    """Count how often target class r was predicted as class c, at row r and column c.
-
-    Args:
-        pred: predicted classes in [0, classes).
-        target: true classes in [0, classes), of the same shape.
-        classes: number of classes C.
-        ignore: targets that are not scored, besides -1, which never is.
-
-    Raises:
-        TypeError: if labels are not integers.
-        ValueError: if shapes differ, or a scored label lies outside [0, classes). That includes a
-            prediction of -1 ("none"), which `ConfusionMatrix` counts as a miss.
-
-    Note:
-        kornia counts. It has no ignored label, needs two classes, and returns float32, which is exact up to 2^24
-        counts: so labels are filtered first and counted in parts.
-
-    Example:
-        >>> confusion_matrix(torch.tensor([0, 1, 1, 0]), torch.tensor([0, 1, 0, -1]), 2)
-        tensor([[1, 1],
-                [0, 1]])
-    """
-    pred, target = _scored_labels(pred, target, classes, ignore)
-    _check_labels("pred", pred, classes, "use ConfusionMatrix, which counts a prediction of -1 as a miss")
-    return _count(pred, target, classes)
-
-
 class ConfusionMatrix:
     """One confusion matrix, pooled over all views of an evaluation.
 
     **Convention**: rows are the truth. Where the truth is known and the prediction is -1 ("none"), the pixel is a miss
     of its class: it lowers that class's IoU and the accuracy, so that abstaining never pays.
+
+    kornia's confusion matrix is not used: it has no ignored label, needs two classes, and returns float32, which is exact
+    up to 2^24 counts.
 
     Args:
         classes: number of classes C.
@@ -134,7 +84,7 @@ class ConfusionMatrix:
     def __init__(self, classes: int, *, ignore: int | Sequence[int] = -1) -> None:
         check_range("classes", classes, 1)
         self.classes = classes
-        self.ignore = ignore
+        self.ignore = {-1, ignore} if isinstance(ignore, int) else {-1, *ignore}
         self._counts = torch.zeros(classes, classes + 1, dtype=torch.int64)  # the last column: no prediction
 
     def __repr__(self) -> str:
@@ -157,11 +107,26 @@ class ConfusionMatrix:
             TypeError: if labels are not integers.
             ValueError: if shapes differ, or a label lies outside [0, classes) and is neither -1 nor ignored.
         """
-        pred, target = _scored_labels(pred, target, self.classes, self.ignore)
+        pred, target = _alike("pred", pred, target)
+        for name, labels in (("pred", pred), ("target", target)):
+            if labels.is_floating_point() or labels.is_complex() or labels.dtype == torch.bool:
+                raise TypeError(f"{name}: expected integer labels, got {labels.dtype}; convert with .long()")
+        pred, target = pred.flatten().long(), target.flatten().long()
+        known = torch.ones_like(target, dtype=torch.bool)
+        for label in self.ignore:
+            known &= target != label
+        pred, target = pred[known], target[known]
         pred = pred.where(pred != -1, self.classes)
-        _check_labels("pred", pred, self.classes + 1, "pass class indices, or -1 for none")
-        # one class more than there are, so that the predicted "none" has a column
-        self._counts += _count(pred, target, self.classes + 1)[: self.classes].cpu()
+        self._check("pred", pred, self.classes + 1, "pass class indices, or -1 for none")
+        self._check("target", target, self.classes, "pass other labels as `ignore`, or a larger `classes`")
+        cells = target * (self.classes + 1) + pred
+        self._counts += torch.bincount(cells, minlength=self._counts.numel()).view_as(self._counts).cpu()
+
+    def _check(self, name: str, labels: Tensor, count: int, advice: str) -> None:
+        if labels.numel() and not (labels.min() >= 0 and labels.max() < count):
+            raise ValueError(
+                f"{name}: expected labels in [0, {self.classes}), got {int(labels.min())} to {int(labels.max())}; {advice}"
+            )
 
     def iou(self) -> Tensor:  # [C] float64
         """Intersection over union of each class; NaN for a class that occurs in neither truth nor prediction."""
@@ -186,7 +151,7 @@ def feature_cosine(
     """Mean cosine between corresponding feature vectors.
 
     Each vector is divided by max(|x|, 1e-8) (`unit_rows`), so an all-zero vector counts as cosine 0, on either side.
-    Half precision is computed in float32.
+    Half precision is computed in float32, where this epsilon does not become 0.
 
     Raises:
         ValueError: if shapes differ, or there is nothing to compare.
@@ -197,12 +162,8 @@ def feature_cosine(
     """
     features, target = _alike("features", features, target)
     if features.numel() == 0:
-        raise ValueError(
-            f"features: expected at least one vector, got shape {tuple(features.shape)}; compare something"
-        )
-    # in half precision the epsilon would underflow to 0, and 0 / 0 is NaN
-    wide = (x.to(torch.promote_types(x.dtype, torch.float32)) for x in (features, target))
-    rows = [unit_rows(x) for x in wide]
+        raise ValueError(f"features: expected at least one vector, got {tuple(features.shape)}; compare something")
+    rows = [unit_rows(x.to(torch.promote_types(x.dtype, torch.float32))) for x in (features, target)]
     return (rows[0] * rows[1]).sum(dim=-1).mean()
 
 
@@ -212,7 +173,7 @@ def psnr(
     *,
     peak: float = 1.0,
 ) -> Tensor:  # scalar
-    """Peak signal-to-noise ratio in decibels, 10 log10(peak^2 / MSE); infinite for equal pictures (`PSNR_PROTOCOL`).
+    """Peak signal-to-noise ratio in decibels, 10 log10(peak^2 / MSE) over all pixels and channels; infinite for equal pictures.
 
     Raises:
         ValueError: if shapes differ, or `peak` is not positive.
@@ -244,9 +205,7 @@ def ssim(
     check_shapes(("image", image, "H W C"), ("target", target, "H W C"))
     check_range("peak", peak, 0, closed=(False, False))
     if min(image.shape[:2]) < SSIM_WINDOW:
-        raise ValueError(
-            f"image: expected at least {SSIM_WINDOW} pixels on each side, got {tuple(image.shape)}; use a larger picture"
-        )
+        raise ValueError(f"image: expected at least {SSIM_WINDOW} pixels on each side, got {tuple(image.shape)}")
     similarity = kornia.metrics.ssim(
         to_bchw(image), to_bchw(target), SSIM_WINDOW, max_val=float(peak), eps=0.0, padding="valid"
     )
@@ -262,7 +221,7 @@ def semantic_storage_bytes(
     """Bytes of a semantic field as the paper's Table 1 counts them; divide by `MIB` for its "MB".
 
     All in float32: per Gaussian 14 + d numbers (3 means, 3 normals that are always zero, opacity, 3 scales, 4 rotation,
-    d latent channels), plus the decoder and the codebook.
+    d latent channels), plus the decoder and the codebook. What kfgs writes to disk is smaller, and is measured on disk.
 
     Args:
         gaussians: number of Gaussians.
@@ -270,63 +229,11 @@ def semantic_storage_bytes(
         decoder_parameters: weights and biases of Psi (831,744 for the paper's 9-32-64-128-256-1024-512).
         codebook_values: K times D.
 
-    Raises:
-        ValueError: if a count is negative.
-
-    Note:
-        This is for comparing with the table; what kfgs writes to disk is smaller and is measured on disk.
-
     Example:
         >>> semantic_storage_bytes(1, 9)  # 23 float32
         92
     """
-    for name, count in (
-        ("gaussians", gaussians),
-        ("channels", channels),
-        ("decoder_parameters", decoder_parameters),
-        ("codebook_values", codebook_values),
-    ):
-        check_range(name, count, 0)
     return 4 * (gaussians * (_ATTRIBUTES + channels) + decoder_parameters + codebook_values)
-
-
-def _scored_labels(
-    pred: Tensor, target: Tensor, classes: int, ignore: int | Sequence[int]
-) -> tuple[Tensor, Tensor]:  # [n], [n] int64
-    """The pixels whose truth is known, flattened."""
-    pred, target = _alike("pred", pred, target)
-    check_range("classes", classes, 1)
-    for name, labels in (("pred", pred), ("target", target)):
-        if labels.is_floating_point() or labels.is_complex() or labels.dtype == torch.bool:
-            raise TypeError(
-                f"{name}: expected integer labels, got {labels.dtype}; take an argmax, or convert with .long()"
-            )
-    ignored = {-1, ignore} if isinstance(ignore, int) else {-1, *ignore}
-    target = target.flatten().long()
-    pred = pred.flatten().long()
-    known = torch.ones_like(target, dtype=torch.bool)
-    for label in ignored:
-        known &= target != label
-    if not known.all():
-        target, pred = target[known], pred[known]
-    _check_labels("target", target, classes, "pass other labels as `ignore`, or a larger `classes`")
-    return pred, target
-
-
-def _count(pred: Tensor, target: Tensor, classes: int) -> Tensor:  # [n], [n] -> [C, C] int64
-    counted = max(classes, 2)  # kornia's least
-    matrix = torch.zeros(counted, counted, dtype=torch.int64, device=target.device)
-    for p, t in zip(pred.split(_EXACT_COUNT), target.split(_EXACT_COUNT), strict=True):
-        matrix += kornia.metrics.confusion_matrix(p[None], t[None], counted)[0].long()
-    return matrix[:classes, :classes]
-
-
-def _check_labels(name: str, labels: Tensor, classes: int, advice: str) -> None:
-    """Reads the values, which costs a device synchronisation (kornia's own check does so too)."""
-    if labels.numel() and not (labels.min() >= 0 and labels.max() < classes):
-        raise ValueError(
-            f"{name}: expected labels in [0, {classes}), got {int(labels.min())} to {int(labels.max())}; {advice}"
-        )
 
 
 def _alike(name: str, value: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,6 @@ from kfgs.metrics import (
     SSIM_PROTOCOL,
     ConfusionMatrix,
     Score,
-    confusion_matrix,
     feature_cosine,
     psnr,
     semantic_storage_bytes,
@@ -40,8 +39,12 @@ def pooled(classes, *views, ignore=-1):
 # confusion matrix
 
 
+def counts(pred, target, classes, ignore=-1):
+    return pooled(classes, (pred, target), ignore=ignore).matrix
+
+
 def test_rows_are_the_truth():
-    matrix = confusion_matrix(torch.tensor([1, 1, 0]), torch.tensor([0, 0, 2]), 3)
+    matrix = counts(torch.tensor([1, 1, 0]), torch.tensor([0, 0, 2]), 3)
     assert matrix.tolist() == [[0, 2, 0], [0, 0, 0], [1, 0, 0]]
     assert matrix.dtype == torch.int64
 
@@ -51,13 +54,13 @@ def test_ignored_labels_and_minus_one_are_not_scored(ignore):
     target = torch.tensor([0, 1, -1, 255, 3, 7])
     ignored = {-1, 255, 3, 7} & ({-1, ignore} if isinstance(ignore, int) else {-1, *ignore})
     target = target[torch.tensor([int(t) in ignored or t < 3 for t in target.tolist()])]
-    matrix = confusion_matrix(torch.zeros_like(target), target, 3, ignore)
+    matrix = counts(torch.zeros_like(target), target, 3, ignore)
     assert matrix.sum() == 2
 
 
 def test_uint8_maps_with_void_255():
     target = torch.tensor([[0, 255], [1, 1]], dtype=torch.uint8)
-    assert confusion_matrix(torch.ones(2, 2, dtype=torch.uint8), target, 2, ignore=255).tolist() == [[0, 1], [0, 2]]
+    assert counts(torch.ones(2, 2, dtype=torch.uint8), target, 2, ignore=255).tolist() == [[0, 1], [0, 2]]
 
 
 def test_counts_past_float32():
@@ -65,11 +68,11 @@ def test_counts_past_float32():
     count = 2**24 + 1
     zeros = torch.zeros(count, dtype=torch.uint8)
     assert int(kornia.metrics.confusion_matrix(zeros[None], zeros[None], 2)[0, 0, 0]) == 2**24
-    assert int(confusion_matrix(zeros, zeros, 2)[0, 0]) == count
+    assert int(counts(zeros, zeros, 2)[0, 0]) == count
 
 
 def test_one_class_is_enough():
-    assert confusion_matrix(torch.tensor([0, 0]), torch.tensor([0, -1]), 1).tolist() == [[1]]
+    assert counts(torch.tensor([0, 0]), torch.tensor([0, -1]), 1).tolist() == [[1]]
 
 
 def test_nothing_to_score():
@@ -93,7 +96,7 @@ def test_scores_agree_with_sets_of_pixels(seed):
 
 def test_pooled_matrix_is_the_sum_of_the_views():
     views = [(labels(0, 4, (5, 6), v), labels(-1, 4, (5, 6), 50 + v)) for v in range(4)]
-    total = sum(confusion_matrix(p, t, 4) for p, t in views)
+    total = sum(counts(p, t, 4) for p, t in views)
     assert torch.equal(pooled(4, *views).matrix, total)
     assert torch.equal(pooled(4, *views[::-1]).matrix, total)
 
@@ -150,17 +153,15 @@ def test_permuting_the_classes_permutes_the_iou():
 def test_label_refusals():
     good = torch.tensor([0, 1])
     with pytest.raises(ValueError, match=tells("target:", "(2,)", "got (1, 2)")):
-        confusion_matrix(good, good[None], 2)
+        counts(good, good[None], 2)
     with pytest.raises(TypeError, match=tells("pred:", "got torch.float32", ".long()")):
-        confusion_matrix(good.float(), good, 2)
+        counts(good.float(), good, 2)
     with pytest.raises(TypeError, match=tells("target:", "got torch.bool")):
-        confusion_matrix(good, good.bool(), 2)
+        counts(good, good.bool(), 2)
     with pytest.raises(ValueError, match=tells("target:", "[0, 2)", "got 0 to 255", "`ignore`")):
-        confusion_matrix(good, torch.tensor([0, 255]), 2)
-    with pytest.raises(ValueError, match=tells("pred:", "[0, 2)", "got -1 to 1", "ConfusionMatrix")):
-        confusion_matrix(torch.tensor([-1, 1]), good, 2)
-    with pytest.raises(ValueError, match=tells("pred:", "[0, 3)", "got -2 to 1", "-1")):
-        ConfusionMatrix(2).update(torch.tensor([-2, 1]), good)
+        counts(good, torch.tensor([0, 255]), 2)
+    with pytest.raises(ValueError, match=tells("pred:", "[0, 2)", "got -2 to 1", "-1 for none")):
+        counts(torch.tensor([-2, 1]), good, 2)
     with pytest.raises(ValueError, match=tells("classes:", "got 0")):
         ConfusionMatrix(0)
 
@@ -172,14 +173,6 @@ def test_score_prints_its_protocol():
     score = Score("SSIM", 0.91234, SSIM_PROTOCOL)
     assert str(score) == f"SSIM 0.9123 ({SSIM_PROTOCOL})"
     assert "padding='valid'" in str(score)
-
-
-@pytest.mark.parametrize("field", ["name", "protocol"])
-def test_score_refuses_to_be_anonymous(field):
-    with pytest.raises(ValueError, match=tells(f"{field}:", "got ' '")):
-        Score(**{"name": "mIoU", "value": 1.0, "protocol": "p"} | {field: " "})
-    with pytest.raises(TypeError, match=tells(f"{field}:", "expected a text", "got int")):
-        Score(**{"name": "mIoU", "value": 1.0, "protocol": "p"} | {field: 3})
 
 
 # features
@@ -297,11 +290,6 @@ def test_other_readings_of_table_1_fail():
         "without the decoder": semantic_storage_bytes(110_500, 9, 0, 100 * 512) / MIB,
     }
     assert all(abs(value - 13.0) > 0.5 for value in readings.values()), readings
-
-
-def test_storage_refuses_negative_counts():
-    with pytest.raises(ValueError, match=tells("codebook_values:", "got -1")):
-        semantic_storage_bytes(1, 1, 0, -1)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
