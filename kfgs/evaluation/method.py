@@ -85,10 +85,7 @@ def label_view(method: Method, view: View, text: Tensor, level: int = 0) -> Tens
         method: what is scored.
         view: the picture.
         text: one unit row per class, [K, D].
-        level: of a method with several.
-
-    Raises:
-        ValueError: if the method has no such level.
+        level: the map of a method with several.
     """
     check_level(method, level)
     if isinstance(method, Labeller):
@@ -103,14 +100,14 @@ def annotated(views: Sequence[View], stems: Iterable[str]) -> list[View]:
         ValueError: if a picture with ground truth has no view.
     """
     wanted = set(stems)
-    found = [view for view in views if view.stem in wanted]
-    missing = sorted(wanted - {view.stem for view in found})
-    if missing or not found:
+    scored = [view for view in views if view.stem in wanted]
+    missing = sorted(wanted - {view.stem for view in scored})
+    if missing or not scored:
         raise ValueError(
             f"views: expected one for each of {len(wanted)} pictures with ground truth, got none for "
             f"{', '.join(missing[:3]) or 'any'}{' ...' if len(missing) > 3 else ''}; pass views with these stems"
         )
-    return found
+    return scored
 
 
 class FieldMethod:
@@ -131,9 +128,6 @@ class FieldMethod:
         self.field = field
         self.name = f"kfgs {field.decoder.name}" if name is None else name
         self.own_labels = own_labels
-
-    def __repr__(self) -> str:
-        return f"FieldMethod({self.name!r}, {self.field!r})"
 
     @property
     def gaussians(self) -> Gaussians:
@@ -178,49 +172,34 @@ class TeacherMethod:
     ) -> None:
         self.maps, self.name, self.align_corners = maps, name, align_corners
 
-    def __repr__(self) -> str:
-        return f"TeacherMethod({self.name!r}, {len(self.maps)} maps)"
-
-    def feature_map(self, stem: str) -> Tensor:  # [h, w, D]
-        """The map of one picture, as large as it is.
-
-        Raises:
-            KeyError: if there is no map of that name.
-        """
-        maps = self.maps
-        if stem not in (maps.stems if isinstance(maps, FeatureFolder) else maps):
-            raise KeyError(f"view: expected a picture that has a map, got {stem!r}; choose views of the maps' folder")
-        return maps[maps.stems.index(stem)] if isinstance(maps, FeatureFolder) else maps[stem]
-
     def cosines(self, view: View, text: Tensor) -> Tensor:  # [K, D] -> [1, H, W, K]
         """The cosine of each pixel's feature with each text; NaN where the map says nothing.
 
         Raises:
             KeyError: if the view has no map.
         """
-        features = self.feature_map(view.stem)
+        maps, stem = self.maps, view.stem
+        if stem not in (maps.stems if isinstance(maps, FeatureFolder) else maps):
+            raise KeyError(f"view: expected a picture that has a map, got {stem!r}; choose views of the maps' folder")
+        features = maps[maps.stems.index(stem)] if isinstance(maps, FeatureFolder) else maps[stem]
         wide = torch.promote_types(features.dtype, torch.float32)  # half precision is computed in float32
         unit = unit_embeddings(text, "text").to(features.device, wide)
         height, width = view.camera.size
         upper, lower, down = _taps(height, int(features.shape[0]), self.align_corners)
         left, right, across = _taps(width, int(features.shape[1]), self.align_corners)
         down, across = down.to(unit)[:, None, None], across.to(unit)[:, None]
-        found = torch.empty(height, width, len(unit)).to(unit)
+        cosines = torch.empty(height, width, len(unit)).to(unit)
         rows = max(1, CHUNK // width)
         for start in range(0, height, rows):
-            some = slice(start, start + rows)
-            band = torch.lerp(features[upper[some]].to(wide), features[lower[some]].to(wide), down[some])
+            part = slice(start, start + rows)
+            band = torch.lerp(features[upper[part]].to(wide), features[lower[part]].to(wide), down[part])
             band = torch.lerp(band[:, left], band[:, right], across)
             unknown = row_norms(band) <= EPS
-            found[some] = (unit_rows(band) @ unit.T).masked_fill(unknown[..., None], torch.nan)
-        return found[None]
+            cosines[part] = (unit_rows(band) @ unit.T).masked_fill(unknown[..., None], torch.nan)
+        return cosines[None]
 
     def gaussian_cosines(self, text: Tensor) -> Tensor:
-        """A teacher has no Gaussians.
-
-        Raises:
-            TypeError: always.
-        """
+        """Raise a TypeError: a teacher has no Gaussians."""
         raise TypeError(f"method: expected one with Gaussians, got the teacher {self.name!r}; use a protocol of views")
 
 

@@ -31,13 +31,7 @@ def test_scannet_points(tmp_path: Path) -> None:
     truth = load_scannet_points(_scannet(tmp_path, [0, 1, 1, 5, 28, 40]))
     assert truth.points.tolist() == XYZ.tolist()
     assert truth.labels.tolist() == [0, 1, 1, 5, 28, 40]
-    assert (truth.names[1], truth.names[28], truth.instances) == ("wall", "showercurtain", None)
-    (tmp_path / "scene0000_00_vh_clean_2.0.010000.segs.json").write_text(json.dumps({"segIndices": [7, 7, 9, 9, 3, 5]}))
-    groups = [{"id": 0, "objectId": 0, "segments": [7], "label": "wall"}, {"objectId": 1, "segments": [3, 9]}]
-    (tmp_path / "scene0000_00.aggregation.json").write_text(json.dumps({"segGroups": groups}))
-    truth = load_scannet_points(tmp_path / "scene0000_00_vh_clean_2.labels.ply")
-    assert truth.instances is not None
-    assert truth.instances.tolist() == [0, 0, 1, 1, 1, -1]
+    assert (truth.names[1], truth.names[28]) == ("wall", "showercurtain")
 
 
 def test_scannet_points_that_are_not_whole(tmp_path: Path) -> None:
@@ -49,14 +43,6 @@ def test_scannet_points_that_are_not_whole(tmp_path: Path) -> None:
     write_ply(tmp_path / "mesh.ply", _vertices())
     with pytest.raises(ValueError, match=tells("mesh.ply", "'label'", "x, y, z")):
         load_scannet_points(tmp_path / "mesh.ply")
-    _scannet(tmp_path, [1] * 6)
-    (tmp_path / "scene0000_00_vh_clean_2.0.010000.segs.json").write_text(json.dumps({"segIndices": [7, 7]}))
-    (tmp_path / "scene0000_00.aggregation.json").write_text(json.dumps({"segGroups": []}))
-    with pytest.raises(ValueError, match=tells("segs.json", "6 vertices", "(2,)")):
-        load_scannet_points(tmp_path)
-    (tmp_path / "scene0000_00.aggregation.json").write_text(json.dumps({"segGroups": [{"id": 1}]}))
-    with pytest.raises(ValueError, match=tells("aggregation.json", "objectId")):
-        load_scannet_points(tmp_path)
 
 
 INFO = {
