@@ -22,8 +22,7 @@ from kfgs._check import ORIGIN
 from kfgs._files import as_path, read_json
 from kfgs._origin import recounted
 from kfgs.cameras import Camera
-from kfgs.evaluation.label_pictures import load_label_map
-from kfgs.evaluation.surface_points import load_surface_points
+from kfgs.evaluation import find_points, load_label_map
 from kfgs.gaussians import Gaussians
 from kfgs.scenes import Scene, load_scene
 from kfgs.splat import rasterize
@@ -157,7 +156,7 @@ def score_removal(
         ValueError: if the scene has no such class, no view of the split shows it, or a field has no `sh`.
     """
     truth = ClassTruth(as_path(scene), name, split)
-    surface = load_surface_points(truth.folder)
+    surface = find_points(truth.folder)
     points, of_class = surface.points, surface.labels == truth.label
     owned = [_is_nearest(cloud, points, of_class) for cloud in (before, after)]
     gone, changed, shown, untouched, off_border = (_Share() for _ in range(5))

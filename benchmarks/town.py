@@ -120,7 +120,7 @@ def _print(name: str, field: Any, scene: Any, town: Path, blocks: Any, facts: di
     labelled = field.label(classes)
     row = {"miou": round(float(report.miou.value), 4), "gaussians": len(field), **facts}
     for what, rows in _places(points, blocks).items():
-        row[what] = round(score_surface(labelled.means, labelled.labels, points[rows], labels[rows]).agreement, 4)
+        row[what] = round(score_surface(labelled.means, labelled.labels, points[rows], labels[rows]).value, 4)
     print(name, json.dumps(row))
 
 

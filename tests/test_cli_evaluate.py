@@ -60,7 +60,9 @@ def scored(capsys, *words):
 def test_a_run_remembers_its_scene_and_its_score_is_the_protocols(run, words, asked, tmp_path, capsys):
     capsys.readouterr()
     said = scored(capsys, run, "--out", tmp_path / "s.json").splitlines()[0]
-    expected = KfgsPooled().score(FieldMethod(SemanticField.load(run / "field")), *asked, lambda _: words.embeddings)
+    expected = KfgsPooled().score(
+        FieldMethod(SemanticField.load(run / "field.kfgs")), *asked, lambda _: words.embeddings
+    )
     assert said == str(expected)
     kept = json.loads((tmp_path / "s.json").read_text())
     assert kept["scores"] == dict(expected.scores)

@@ -21,12 +21,10 @@ FARTHEST = 100_000  # pixels: a corner that lies farther away is damage
 
 
 class CocoPicture(NamedTuple):
-    """A picture of the file."""
+    """A picture of the file, and its objects in the order of the file."""
 
-    size: tuple[int, int]
-    """(height, width)"""
+    size: tuple[int, int]  # (height, width)
     annotations: list[dict[str, Any]]
-    """Of its objects, in the order of the file."""
 
 
 def load_coco_labels(path: str | Path) -> LabelTruth:

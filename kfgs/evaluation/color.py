@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,12 +23,12 @@ COLOR_PROTOCOL = (
 )
 
 
-@dataclass(frozen=True)
-class ViewScore:
-    """One view: its stem, PSNR in decibels, SSIM."""
+class ViewScore(NamedTuple):
+    """The scores of one view."""
 
     name: str
     psnr: float
+    """Decibels."""
     ssim: float
 
 

@@ -6,11 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from .._files import as_path
+import numpy as np
+import torch
+
+from .._arrays import read_arrays
+from .._files import as_path, read_json
 from .label_pictures import load_labels
 from .replica import load_replica_points, load_semantic_nerf_labels
 from .scannet import load_scannet_points
-from .surface_points import load_surface_points
 from .truth import LabelTruth, PointTruth
 
 Place = tuple[str, Callable[[Path], Any]]
@@ -48,7 +51,7 @@ def find_points(path: str | Path) -> PointTruth:
         ("habitat/mesh_semantic.ply", load_replica_points),
         ("mesh_semantic.ply", load_replica_points),
         ("*_vh_clean_2.labels.ply", load_scannet_points),
-        ("surface.npz", load_surface_points),
+        ("surface.npz", _read_surface),
     ]
     as_file = load_scannet_points if path.name.endswith(".labels.ply") else load_replica_points
     return read_first(path, places, "labelled points", as_file)
@@ -64,3 +67,16 @@ def read_first(path: Path, places: list[Place], what: str, as_file: Callable[[Pa
     tried = ", ".join(pattern for pattern, _ in places)
     problem = "found none" if path.is_dir() else "which is not a folder"
     raise FileNotFoundError(f"truth: expected {what} in {path} ({tried}), {problem}; name the folder that has them")
+
+
+def _read_surface(folder: Path) -> PointTruth:
+    """The labelled surfaces of a toy room: `surface.npz` and `classes.json`, as `make_toy_room` writes them."""
+    file = folder / "surface.npz"
+    expected, advice = "the arrays 'points' and 'labels', points of all surfaces", "make the room again"
+    arrays = read_arrays(file, expected, advice)
+    names = read_json(folder / "classes.json")
+    try:
+        points, labels = arrays["points"], arrays["labels"].astype(np.int64)
+        return PointTruth(torch.from_numpy(points), torch.from_numpy(labels), dict(enumerate(names)))
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{file}: expected {expected}, but it cannot be read ({error}); {advice}") from error

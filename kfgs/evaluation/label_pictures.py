@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -13,13 +12,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .._files import as_path, file_stem, read_json, read_text, real_path
+from .._files import as_path, file_stem, read_json, real_path
 from ..scenes.files import list_images, open_picture, some
 from .coco import load_coco_labels
 from .truth import LabelTruth, ReadWhenAsked, is_void
 
 VOID = 255
-TABLES = ("classes.json", "classes.csv", "colors.json", "colors.csv")
+TABLES = ("classes.json", "colors.json")
 
 Entry = int | tuple[int, int, int]
 Ids = NDArray[np.int64]
@@ -45,12 +44,12 @@ def load_labels(path: str | Path, table: str | Path | None = None, void: int = V
     """Read the label pictures of a folder, or a COCO JSON.
 
     The pictures have class ids in one channel, or colours. The table names them: `["wall", "floor"]` (ids 0, 1, ...),
-    `{"wall": 1, "floor": 2}` or `{"wall": [255, 0, 0], ...}`, a list of `{"name": ..., "id" or "color": ...}`, or CSV lines
-    `wall,1` or `wall,255,0,0`. Names in `VOID_NAMES` are void.
+    `{"wall": 1, "floor": 2}` or `{"wall": [255, 0, 0], ...}`, or a list of `{"name": ..., "id" or "color": ...}`. Names in
+    `VOID_NAMES` are void.
 
     Args:
         path: a folder of PNGs named as the pictures, or `annotations.json` (see `load_coco_labels`).
-        table: the table; None: `classes.json`, `classes.csv`, `colors.json` or `colors.csv` in the folder or the one above.
+        table: the table; None: `classes.json` or `colors.json` in the folder or the one above.
         void: the id that is void unless the table names it.
 
     Returns:
@@ -98,7 +97,7 @@ def _find_table(folder: Path) -> Path:
     if table is None:
         raise FileNotFoundError(
             f'{places[0]}: no such file; expected the names of the labels there, such as ["wall", "floor"], or in '
-            f"{', '.join(TABLES[1:])}, or one folder above; pass table=PATH"
+            f"{TABLES[1]}, or one folder above; pass table=PATH"
         )
     return table
 
@@ -111,7 +110,7 @@ def read_table(path: Path) -> dict[str, Entry]:
         ValueError: if it is not a table, mixes ids and colours, or has a name or an entry twice.
     """
     table: dict[str, Entry] = {}
-    for name, value in _csv_pairs(path) if path.suffix == ".csv" else _json_pairs(path):
+    for name, value in _pairs(path):
         entry: Any = tuple(value) if isinstance(value, list) else value
         colour = isinstance(entry, tuple) and len(entry) == 3 and all(type(v) is int and 0 <= v <= 255 for v in entry)
         whole = type(entry) is int and entry >= 0
@@ -128,7 +127,7 @@ def read_table(path: Path) -> dict[str, Entry]:
     return table
 
 
-def _json_pairs(path: Path) -> list[tuple[Any, Any]]:
+def _pairs(path: Path) -> list[tuple[Any, Any]]:
     top = read_json(path)
     if isinstance(top, dict):
         return list(top.items())
@@ -137,15 +136,6 @@ def _json_pairs(path: Path) -> list[tuple[Any, Any]]:
     if isinstance(top, list) and all(isinstance(entry, dict) for entry in top):
         return [(entry.get("name"), entry.get("id", entry.get("color"))) for entry in top]
     raise ValueError(f"{path}: expected a list of names or an object of ids or colours, got {str(top)[:80]}")
-
-
-def _csv_pairs(path: Path) -> list[tuple[Any, Any]]:
-    lines = read_text(path, "a table of names with ids or colours").splitlines(keepends=True)
-    rows = [[cell.strip() for cell in row] for row in csv.reader(lines) if any(cell.strip() for cell in row)]
-    if rows and not rows[0][-1].isdecimal():
-        rows = rows[1:]  # a line of titles
-    numbers = [[int(cell) if cell.isascii() and cell.isdecimal() else -1 for cell in row[1:]] for row in rows]
-    return [(row[0], each[0] if len(each) == 1 else each) for row, each in zip(rows, numbers, strict=True)]
 
 
 def read_ids(file: Path, advice: str) -> Ids:

@@ -94,11 +94,7 @@ def label_view(method: Method, view: View, text: Tensor, level: int = 0) -> Tens
 
 
 def annotated(views: Sequence[View], stems: Iterable[str]) -> list[View]:
-    """The views that have ground truth, in their order.
-
-    Raises:
-        ValueError: if a picture with ground truth has no view.
-    """
+    """The views that have ground truth, in their order; a ValueError if a picture with ground truth has no view."""
     wanted = set(stems)
     scored = [view for view in views if view.stem in wanted]
     missing = sorted(wanted - {view.stem for view in scored})
@@ -173,11 +169,7 @@ class TeacherMethod:
         self.maps, self.name, self.align_corners = maps, name, align_corners
 
     def cosines(self, view: View, text: Tensor) -> Tensor:  # [K, D] -> [1, H, W, K]
-        """The cosine of each pixel's feature with each text; NaN where the map says nothing.
-
-        Raises:
-            KeyError: if the view has no map.
-        """
+        """The cosine of each pixel's feature with each text, NaN where the map says nothing; a KeyError without a map."""
         maps, stem = self.maps, view.stem
         if stem not in (maps.stems if isinstance(maps, FeatureFolder) else maps):
             raise KeyError(f"view: expected a picture that has a map, got {stem!r}; choose views of the maps' folder")

@@ -23,7 +23,7 @@ from .find import find_points
 from .method import Method, View, annotated, best_labels, check_level, label_view
 from .report import Report, Row, make_report
 from .segmentation import PROTOCOL, evaluate_segmentation
-from .surface import SURFACE_PROTOCOL, score_surface
+from .surface import ABOUT, NAME, score_surface
 from .teacher_agreement import TeacherAgreement
 from .texts import Encode, encode_unit
 from .truth import LabelTruth, PointTruth, is_void
@@ -44,11 +44,7 @@ class KfgsPooled:
     """The map of a method with several."""
 
     def score(self, method: Method, truth: LabelTruth, views: Sequence[View], encode: Encode) -> Report:
-        """Segment each view that has a label picture.
-
-        Raises:
-            ValueError: if a label picture has no view, or the truth holds nothing that can be scored.
-        """
+        """Segment each view that has a label picture."""
         text = encode_unit(encode, truth.names)
         cameras = {view.stem: view for view in annotated(views, truth.maps)}
         scored = evaluate_segmentation(
@@ -61,10 +57,13 @@ class KfgsPooled:
 
 @dataclass(frozen=True)
 class KfgsSurface:
-    """Classes of surface points, carried over from the nearest labelled Gaussian: `score_surface` as a protocol."""
+    """Classes of surface points, carried over from the nearest labelled Gaussian: `score_surface` as a protocol.
 
-    name: ClassVar[str] = "kfgs-surface/1"
-    about: ClassVar[str] = SURFACE_PROTOCOL.partition(": ")[2]
+    A name that means "no class" (`VOID_NAMES`) is not asked, and its points are not scored; a note counts them.
+    """
+
+    name: ClassVar[str] = NAME
+    about: ClassVar[str] = ABOUT
 
     level: int = 0
     """The map of a method with several."""
@@ -77,21 +76,13 @@ class KfgsSurface:
         return find_points(truth or folder), []
 
     def score(self, method: Method, truth: PointTruth, views: Sequence[View], encode: Encode) -> Report:
-        """Label the Gaussians with the truth's names, and carry the labels to its points; `views` are not used.
-
-        A name that means "no class" (`VOID_NAMES`) is not asked, and its points are not scored; a note counts them.
-
-        Raises:
-            TypeError: if the method has no Gaussians.
-            ValueError: if no point has a class, or the truth names none.
-        """
+        """Label the Gaussians with the truth's names, and carry the labels to its points; `views` are not used."""
         if method.gaussians is None:
             raise TypeError(f"method: expected one with Gaussians, got {method.name!r}; use a protocol of views")
         check_level(method, self.level)
         names = tuple(dict.fromkeys(name for name in truth.names.values() if not is_void(name)))
         if not names:
-            got = ", ".join(truth.names.values()) or "none"
-            raise ValueError(f"truth: expected names of classes, got {got}; give the names of the points' labels")
+            raise ValueError(f"truth: expected names of classes, got {', '.join(truth.names.values()) or 'none'}")
         cosines = method.gaussian_cosines(encode_unit(encode, names))[self.level]
         points = recounted(truth.points, ORIGIN, method.gaussians.origin).to(method.gaussians.means)
         target, left_out = torch.full_like(truth.labels, -1), list[str]()
@@ -102,10 +93,8 @@ class KfgsSurface:
             elif bool(same.any()):
                 left_out.append(f"{name} ({int(same.sum())} points)")
         scored = score_surface(method.gaussians.means, best_labels(cosines), points, target)
-        carried = scored.transfer
-        row = {"lambda": carried.distance, "labelled": carried.labelled, "points": scored.points}
         notes = [f"not scored, no class: {', '.join(left_out)}"] if left_out else []
-        return make_report(self, method.name, {"agreement": scored.agreement}, [row], notes)
+        return make_report(self, method.name, scored.scores, scored.rows, notes)
 
 
 @dataclass(frozen=True)
@@ -121,11 +110,7 @@ class KfgsColor:
     def open(
         scene: Scene, folder: Path, truth: Path | None = None, split: str | None = None
     ) -> tuple[Scene, list[View]]:
-        """The scene with the views of the split (None: the test views).
-
-        Raises:
-            ValueError: if another truth is named.
-        """
+        """The scene with the views of the split (None: the test views); a ValueError if another truth is named."""
         if truth is not None:
             raise ValueError(f"truth: expected none with kfgs-color/1 (the photos are), got {truth}; leave it out")
         chosen = scene.select(scene.views(split or "test"))

@@ -2,44 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-import torch
 from torch import Tensor
 
 from .._check import check_shapes
-from ..labels import Transfer, nearest_labels
+from ..labels import nearest_labels
+from .report import Report
 
-SURFACE_PROTOCOL = (
-    "kfgs-surface/1: share of the ground-truth surface points, each seen by some training view, that receive their true "
-    "class from the nearest labelled Gaussian within lambda; points out of reach count as wrong"
+NAME, ABOUT = (
+    "kfgs-surface/1",
+    "share of the ground-truth surface points, each seen by some training view, that receive their true class from the "
+    "nearest labelled Gaussian within lambda; points out of reach count as wrong",
 )
-
-
-@dataclass(frozen=True, eq=False)
-class SurfaceReport:
-    """What the points received."""
-
-    agreement: float
-    """Share of the points with a true class that received it."""
-    transfer: Transfer
-    """The label of each point, and lambda."""
-    points: int
-    """How many points have a true class."""
-
-    def __str__(self) -> str:
-        return f"agreement {self.agreement:.3f} ({SURFACE_PROTOCOL.split(':')[0]}, {self.points:,} points)"
-
-    def to_json(self) -> dict[str, object]:
-        """The report as plain values."""
-        return {
-            "protocol": SURFACE_PROTOCOL,
-            "agreement": self.agreement,
-            "distance": self.transfer.distance,
-            "distance from": self.transfer.how,
-            "labelled": self.transfer.labelled,
-            "points": self.points,
-        }
 
 
 def score_surface(
@@ -47,7 +20,7 @@ def score_surface(
     labels: Tensor,  # [N] int64, -1 = none
     points: Tensor,  # [P, 3]
     truth: Tensor,  # [P] int64, -1 = not scored
-) -> SurfaceReport:
+) -> Report:
     """Carry the labels of Gaussians to surface points, and compare (protocol `kfgs-surface/1`).
 
     If no Gaussian has a label, no point receives one, and the agreement is 0.
@@ -60,5 +33,6 @@ def score_surface(
     if not bool(scored.any()):
         raise ValueError(f"truth: expected some point with a class, got none among {len(truth)}; are these its labels?")
     moved = nearest_labels(means, labels, points)
-    right = moved.labels.to(truth.device) == truth
-    return SurfaceReport(float(right[scored].to(torch.float32).mean()), moved, int(scored.sum()))
+    agreement = float((moved.labels.to(truth.device) == truth)[scored].float().mean())
+    row = {"lambda": moved.distance, "labelled": moved.labelled, "points": int(scored.sum())}
+    return Report(NAME, {"agreement": agreement}, (row,), about=ABOUT)

@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -23,20 +23,11 @@ SIZE = (119, 159)  # (height, width) to which both label maps are brought, "as i
 MOST = 7  # classes whose IoU is averaged
 
 
-class Agreement(NamedTuple):
-    """How far two label maps agree."""
-
-    accuracy: float
-    """Share of equal pixels."""
-    iou: float
-    """Mean IoU of the classes that are most frequent in both maps together."""
-
-
 def teacher_agreement(
     teacher: Tensor,  # [H, W] int64, -1 = the teacher says nothing
     student: Tensor,  # [H, W] int64, -1 = the field knows nothing
     most: int = MOST,
-) -> Agreement:
+) -> tuple[float, float]:
     """Accuracy and "IoU7": labels of both maps are counted together, the IoU of the `most` most frequent ones is averaged.
 
     Pixels where the teacher says nothing are left out; where only the student says nothing, it is wrong. Of equally
@@ -44,17 +35,17 @@ def teacher_agreement(
 
     Example:
         >>> teacher_agreement(torch.tensor([[1, 1, 2, 2]]), torch.tensor([[1, 2, 2, 2]]))
-        Agreement(accuracy=0.75, iou=0.5833333333333333)
+        (0.75, 0.5833333333333333)
     """
     known = teacher >= 0
     teacher, student = teacher[known], student[known]
     if len(teacher) == 0:
-        return Agreement(float("nan"), float("nan"))
+        return float("nan"), float("nan")
     labels, counts = torch.cat([teacher, student[student >= 0]]).unique(return_counts=True)
     frequent = labels[counts.sort(descending=True, stable=True).indices[:most]]
     pairs = ((teacher == label, student == label) for label in frequent)
     ious = [int((a & b).sum()) / int((a | b).sum()) for a, b in pairs]
-    return Agreement(float((teacher == student).double().mean()), sum(ious) / len(ious))
+    return float((teacher == student).double().mean()), sum(ious) / len(ious)
 
 
 @dataclass(frozen=True)
@@ -86,13 +77,7 @@ class TeacherAgreement:
     """The map of a method with several."""
 
     def score(self, method: Method, truth: Method, views: Sequence[View], encode: Encode) -> Report:
-        """Compare a method with its teacher.
-
-        Args:
-            method: the field.
-            truth: the teacher, a `TeacherMethod` or any other method.
-            views: all views of the scene; `split` chooses some, and a note says how many.
-            encode: the teacher's text encoder.
+        """Compare a method with its teacher, the method `truth`; `split` chooses some of the views.
 
         Raises:
             ValueError: if the split holds no view.

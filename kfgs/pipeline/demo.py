@@ -9,8 +9,7 @@ from pathlib import Path
 from .._check import ORIGIN
 from .._files import check_output
 from .._origin import recounted
-from ..evaluation import find_points, score_surface, score_views
-from ..evaluation.surface import SurfaceReport
+from ..evaluation import Report, find_points, score_surface, score_views
 from ..formats import write_splats
 from ..formats.ply import write_ply
 from ..gaussians import Gaussians
@@ -22,6 +21,7 @@ from ..labels import (
     Remove,
     connected_parts,
     load_label_set,
+    nearest_labels,
     parse_color,
 )
 from ..labels.edits.edit_list import edits_path
@@ -168,13 +168,14 @@ def _edit_colors(
     return written
 
 
-def _label_surface(gaussians: Gaussians, folder: Path, out: Path, classes: LabelSet) -> SurfaceReport:
+def _label_surface(gaussians: Gaussians, folder: Path, out: Path, classes: LabelSet) -> Report:
     """Carry the Gaussians' labels to the room's true surface points and score them (protocol `kfgs-surface/1`)."""
     assert gaussians.labels is not None
     truth = find_points(folder)
     points, true = truth.points.float(), truth.labels
     local = recounted(points, ORIGIN, gaussians.origin)
     report = score_surface(gaussians.means, gaussians.labels, local, true)
+    carried = nearest_labels(gaussians.means, gaussians.labels, local).labels
     columns = {name: points[:, i].contiguous().numpy() for i, name in enumerate("xyz")}
-    write_ply(out, columns | label_columns(report.transfer.labels, classes.names), comments=("labels carried by kfgs",))
+    write_ply(out, columns | label_columns(carried, classes.names), comments=("labels carried by kfgs",))
     return report

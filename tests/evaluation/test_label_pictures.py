@@ -30,7 +30,7 @@ def test_ids_with_a_list_of_names(tmp_path: Path) -> None:
 
 def test_ids_of_sixteen_bits_with_gaps(tmp_path: Path) -> None:
     Image.fromarray(np.array([[1000, 3]], np.uint16)).save(tmp_path / "a.png")
-    (tmp_path / "classes.csv").write_text("name,id\nwall,1000\nvoid,3\n")
+    (tmp_path / "classes.json").write_text(json.dumps({"wall": 1000, "void": 3}))
     truth = load_labels(tmp_path)
     assert (truth.names, truth.maps["a"].tolist()) == (("wall",), [[0, -1]])
 
@@ -43,8 +43,6 @@ def test_ids_of_sixteen_bits_with_gaps(tmp_path: Path) -> None:
             "colors.json",
             json.dumps([{"name": n, "color": c} for n, c in (("wall", RED), ("void", BLACK), ("floor", GREEN))]),
         ),
-        ("colors.csv", "wall,255,0,0\nVoid,0,0,0\n\nfloor,0,255,0\n"),
-        ("colors.csv", "\ufeffname,r,g,b\nwall, 255, 0, 0\nignore,0,0,0\nfloor,0,255,0\n"),
     ],
 )
 def test_coloured_pictures(tmp_path: Path, name: str, text: str) -> None:
@@ -98,8 +96,6 @@ def test_labels_that_are_not_whole(tmp_path: Path) -> None:
         ("t.json", '["a", "a"]', ("'a'",)),
         ("t.json", "7", ("list of names",)),
         ("t.json", "[]", ("none",)),
-        ("t.csv", "a,1\nb,1,2\n", ("'b'", "[1, 2]")),
-        ("t.csv", "a,1\nb,x\n", ("'b'", "-1")),
     ],
 )
 def test_bad_tables(tmp_path: Path, name: str, text: str, parts: tuple[str, ...]) -> None:

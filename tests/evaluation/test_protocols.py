@@ -17,7 +17,7 @@ from kfgs.evaluation import (
     score_surface,
     score_views,
 )
-from kfgs.labels import load_label_set, transfer_labels
+from kfgs.labels import load_label_set, nearest_labels
 from kfgs.pipeline.apply import score_teacher, true_labels
 from kfgs.scenes import FeatureFolder, load_scene
 from kfgs.splat import rgb_to_sh0
@@ -103,15 +103,15 @@ def test_surface_carries_labels_to_points():
     report = KfgsSurface().score(method, PointTruth(points, ids, {2: "a", 5: "b", 9: "c"}), (), method.encode)
     labels = np.argmax([own[n][0] for n in NAMES], 0)
     labels[:5] = -1
-    moved = transfer_labels(method.gaussians.means, torch.from_numpy(labels), points)
+    moved = nearest_labels(method.gaussians.means, torch.from_numpy(labels), points)
     right = [moved.labels[i] == {2: 0, 5: 1, 9: 2}[int(t)] for i, t in enumerate(ids) if t > 0]
     assert report["agreement"] == pytest.approx(np.mean(right))
     assert str(report).endswith("(kfgs-surface/1)")
     with pytest.raises(TypeError, match="expected one with Gaussians"):
         KfgsSurface().score(TeacherMethod({}), PointTruth(points, ids, {2: "a"}), (), method.encode)
     found = score_surface(method.gaussians.means, torch.from_numpy(labels), points, torch.zeros(80).long())
-    assert "kfgs-surface/1, 80 points" in str(found)
-    assert found.to_json()["points"] == 80
+    assert str(found).endswith("(kfgs-surface/1)")
+    assert found.rows[0]["points"] == 80
     with pytest.raises(ValueError, match="expected some point with a class"):
         score_surface(method.gaussians.means, torch.from_numpy(labels), points, torch.full((80,), -1))
 
@@ -149,4 +149,4 @@ def test_a_named_score_is_short_and_its_text_long():
 @pytest.mark.parametrize("count", [0, 3])
 def test_surface_without_a_label_has_no_agreement(count):
     found = score_surface(torch.zeros(count, 3), torch.full((count,), -1), torch.zeros(2, 3), torch.tensor([0, 1]))
-    assert (found.agreement, found.transfer.labelled, found.points) == (0, 0, 2)
+    assert (found.value, found.rows[0]["labelled"], found.rows[0]["points"]) == (0, 0, 2)
