@@ -34,8 +34,6 @@ class Score:
     """A number that does not travel without the protocol it was measured under.
 
     Example:
-        >>> print(Score("mIoU", 0.7661, "10 classes, one confusion matrix over 90 views"))
-        mIoU 0.7661 (10 classes, one confusion matrix over 90 views)
         >>> named = Score("mIoU", 0.7661, "kfgs-pooled/1: one confusion matrix over all views")
         >>> print(named)
         mIoU 0.766 (kfgs-pooled/1)

@@ -1,4 +1,7 @@
-"""COCO's JSON of objects (polygons or run lengths), as annotation programs export it; `pycocotools` fills the masks."""
+"""COCO's JSON of objects (polygons or run lengths), as annotation programs export it; `pycocotools` fills the masks.
+
+Readers raise a FileNotFoundError without the file, and a ValueError that names the annotation if it is damaged.
+"""
 
 from __future__ import annotations
 
@@ -31,10 +34,6 @@ def load_coco_labels(path: str | Path) -> LabelTruth:
     """Read a COCO JSON as labels: one class per pixel, -1 where no object is; a later object covers an earlier one.
 
     Classes are the categories of the file, in its order, without those in `VOID_NAMES`: their objects are void.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is damaged; the message names the annotation.
     """
     path = as_path(path)
     names, pictures = read_coco(path)
@@ -54,10 +53,6 @@ def load_coco_examples(path: str | Path) -> dict[str, list[Mask]]:
     """Read a COCO JSON as examples of classes (`fields.label_set_from_examples`): one mask per category and picture.
 
     Pictures must be views of the field, in their size. Categories in `VOID_NAMES` are left out.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is damaged, or has no objects.
     """
     path = as_path(path)
     names, pictures = read_coco(path)
@@ -88,9 +83,6 @@ def save_coco(
         path: the file.
         labels: the label map of each picture, by the name of its file.
         names: the name of each class.
-
-    Raises:
-        ValueError: if a label has no name.
     """
     from pycocotools import mask as coco
 
@@ -121,12 +113,7 @@ def save_coco(
 
 
 def read_coco(path: Path) -> tuple[dict[int, str], dict[str, CocoPicture]]:
-    """The categories by id, and the pictures by stem.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is something else, or repeats a name.
-    """
+    """The categories by id, and the pictures by stem; a ValueError if it is not COCO's JSON, or repeats a name."""
     top = read_json(path)
     try:
         names = {int(entry["id"]): str(entry["name"]) for entry in top["categories"]}

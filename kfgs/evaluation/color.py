@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import inf
 from typing import Any, NamedTuple
 
 import torch
@@ -14,6 +13,7 @@ from ..gaussians import Gaussians
 from ..metrics import Score, psnr, ssim
 from ..scenes import Scene
 from ..splat import rasterize
+from .report import plain
 
 COLOR_PROTOCOL = (
     "kfgs-color/1: each view rendered at its picture's full size on black and clipped to [0, 1], not rounded; PSNR of the "
@@ -51,13 +51,9 @@ class ColorReport:
 
     def to_json(self) -> dict[str, Any]:
         """The scores as plain numbers; an infinite PSNR (equal pictures) is null."""
-        views = {view.name: {"psnr": _finite(view.psnr), "ssim": view.ssim} for view in self.views}
-        return {
-            "protocol": self.psnr.protocol,
-            "psnr": _finite(self.psnr.value),
-            "ssim": self.ssim.value,
-            "views": views,
-        }
+        views = {view.name: {"psnr": view.psnr, "ssim": view.ssim} for view in self.views}
+        scores = {"protocol": self.psnr.protocol, "psnr": self.psnr.value, "ssim": self.ssim.value}
+        return {name: plain(value) for name, value in {**scores, "views": views}.items()}
 
 
 @torch.no_grad()
@@ -66,7 +62,6 @@ def score_views(
     scene: Scene,
     split: str = "test",
     *,
-    engine: str = "auto",
     show: Callable[[str, Tensor, Tensor], None] | None = None,
 ) -> ColorReport:
     """Render the views of a split and compare them with the pictures that were taken (protocol `kfgs-color/1`).
@@ -75,7 +70,6 @@ def score_views(
         gaussians: with colours (`sh`).
         scene: without lens distortion; its pictures are read one at a time.
         split: which views; those held out say how well the field generalises.
-        engine: as in `kfgs.splat.rasterize`.
         show: called with the stem, the rendering [H, W, 3] and the picture [H, W, 3] of each view.
 
     Raises:
@@ -89,7 +83,7 @@ def score_views(
     scores = []
     for i in scene.views(split):
         taken, known = scene.image(i).to(colors.means), scene.mask(i).to(colors.means.device)
-        rendered = rasterize(colors, scene.cameras[i], engine=engine).map.clamp(0, 1)
+        rendered = rasterize(colors, scene.cameras[i]).map.clamp(0, 1)
         if show is not None:
             show(scene.stem(i), rendered, taken)
         if not bool(known.any()):  # masked as a whole
@@ -108,7 +102,3 @@ def score_views(
         psnr=Score("PSNR", sum(view.psnr for view in scores) / count, COLOR_PROTOCOL),
         ssim=Score("SSIM", sum(view.ssim for view in scores) / count, COLOR_PROTOCOL),
     )
-
-
-def _finite(value: float) -> float | None:
-    return value if value < inf else None

@@ -24,10 +24,7 @@ def find_labels(path: str | Path) -> LabelTruth:
     """The label pictures of a scene, a folder of them, or a COCO JSON.
 
     Looked for in this order: `labels_scored/`, `labels/`, `semantic_class/`, `annotations.json`, PNGs in the folder itself.
-
-    Raises:
-        FileNotFoundError: if there are none.
-        ValueError: if a file is damaged.
+    If there are none, a FileNotFoundError lists these.
     """
     places: list[Place] = [
         ("labels_scored/*.png", lambda at: load_labels(at / "labels_scored")),
@@ -42,9 +39,7 @@ def find_labels(path: str | Path) -> LabelTruth:
 def find_points(path: str | Path) -> PointTruth:
     """The labelled points of a scene: of Replica, of ScanNet, or of kfgs's toy room; or the file of a mesh.
 
-    Raises:
-        FileNotFoundError: if there are none.
-        ValueError: if a file is damaged.
+    If there are none, a FileNotFoundError lists the files.
     """
     path = as_path(path)
     places: list[Place] = [

@@ -103,12 +103,7 @@ def _find_table(folder: Path) -> Path:
 
 
 def read_table(path: Path) -> dict[str, Entry]:
-    """The id or the colour of each name, in the order of the file.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is not a table, mixes ids and colours, or has a name or an entry twice.
-    """
+    """The id or the colour of each name, in the order of the file."""
     table: dict[str, Entry] = {}
     for name, value in _pairs(path):
         entry: Any = tuple(value) if isinstance(value, list) else value
@@ -139,11 +134,7 @@ def _pairs(path: Path) -> list[tuple[Any, Any]]:
 
 
 def read_ids(file: Path, advice: str) -> Ids:
-    """The class ids of a picture with one channel.
-
-    Raises:
-        ValueError: if it has several; the message ends with `advice`.
-    """
+    """The class ids of a picture with one channel; the error about another one ends with `advice`."""
     with open_picture(file, "a picture of class ids", "copy it again") as picture:
         ids = np.asarray(picture)
     if ids.ndim != 2:

@@ -104,12 +104,7 @@ def load_semantic_nerf_labels(path: str | Path, info: str | Path | None = None) 
 
 
 def read_replica_info(path: Path) -> tuple[dict[int, str], dict[int, int]]:
-    """The classes by id, and the class of each object (-1 = none).
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is something else.
-    """
+    """The classes by id, and the class of each object (-1 = none)."""
     top = read_json(path)
     try:
         names = {int(entry["id"]): str(entry["name"]) for entry in top["classes"]}

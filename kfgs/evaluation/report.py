@@ -66,8 +66,7 @@ class Report:
         lines += [f"  {self.about}"] if self.about else []
         lines += [f"  {name} = {value}" for name, value in self.options.items()]
         lines += [f"  note: {note}" for note in self.notes]
-        lines += [f"  command: {self.command}"] if self.command else []
-        lines += [f"  machine: {self.machine}"] if self.machine else []
+        lines += [f"  {name}: {value}" for name in ("command", "machine") if (value := getattr(self, name))]
         for row in self.rows:
             parts = (f"{k} {v:.3f}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items())
             lines.append("    " + ", ".join(parts))

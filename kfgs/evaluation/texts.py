@@ -16,11 +16,7 @@ Encode = Callable[[Sequence[str]], Tensor]
 
 
 def as_encoder(encode: Encode | LabelSet | None) -> Encode:
-    """A text encoder as it is; a label set as an encoder that knows its classes and negatives.
-
-    Raises:
-        ValueError: if there is none. The encoder of a label set raises one for a text that the set lacks.
-    """
+    """A text encoder as it is; a label set as an encoder of its classes and negatives. A ValueError if there is none."""
     if encode is None:
         raise ValueError("text: expected text embeddings, got none; pass a label set or a teacher's text encoder")
     if not isinstance(encode, LabelSet):
@@ -42,11 +38,7 @@ def as_encoder(encode: Encode | LabelSet | None) -> Encode:
 
 
 def encode_unit(encode: Encode, texts: Sequence[str]) -> Tensor:  # [K, D]
-    """Unit rows of some texts.
-
-    Raises:
-        ValueError: if there is no text, or `encode` gives another number of rows, zeros, or NaN.
-    """
+    """Unit rows of some texts; a ValueError if `encode` gives another number of rows, zeros, or NaN."""
     if len(texts) == 0:
         raise ValueError("texts: expected at least one, got none; is the ground truth empty?")
     rows = encode(list(texts))

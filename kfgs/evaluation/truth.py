@@ -66,12 +66,7 @@ class ReadWhenAsked(Mapping[str, T]):
 
 
 def name_key(name: str) -> str:
-    """The form in which class names are compared: no case, spaces, hyphens or underscores.
-
-    Example:
-        >>> name_key("Shower-Curtain") == name_key("showercurtain")
-        True
-    """
+    """The form in which class names are compared: "Shower-Curtain" is "showercurtain"."""
     return name.casefold().translate(str.maketrans("", "", " -_"))
 
 

@@ -42,8 +42,8 @@ def label_views(
         return labels_of_view(scene, chosen[stem], stored if isinstance(stored, Tensor) else load_label_map(stored))
 
     maps = ReadWhenAsked({scene.stem(i): partial(read, stem) for stem, i in chosen.items()})
-    sizes = ((scene.stem(i), i, tuple(maps[scene.stem(i)].shape)) for i in chosen.values())
-    return LabelTruth(labels.names, maps), [sized_view(scene, i, (size[0], size[1])) for _, i, size in sizes]
+    sizes = ((i, maps[scene.stem(i)].shape) for i in chosen.values())
+    return LabelTruth(labels.names, maps), [sized_view(scene, i, (int(h), int(w))) for i, (h, w) in sizes]
 
 
 def match_views(scene: Scene, stems: Iterable[str], split: str | None, preferred: str = "") -> dict[str, int]:
@@ -82,11 +82,7 @@ def match_views(scene: Scene, stems: Iterable[str], split: str | None, preferred
 
 
 def sized_view(scene: Scene, i: int, size: tuple[int, int]) -> View:
-    """A view with a camera of the truth's (height, width).
-
-    Raises:
-        ValueError: if the shape differs by more than a pixel.
-    """
+    """A view with a camera of the truth's (height, width); a ValueError if its shape differs by more than a pixel."""
     camera, (height, width) = scene.cameras[i], size
     if abs(camera.width * height - camera.height * width) > max(camera.width + height, camera.height + width):
         raise ValueError(
