@@ -62,7 +62,7 @@ def write_pictures(
         encode: the text encoder of the scores; not needed for colours.
         count: how many views.
     """
-    scene, views = question.scene, list(getattr(question.protocol, "chosen", list)(question.views))
+    scene, views = question.scene, question.scored
     index = {scene.stem(i): i for i in range(len(scene))}
     places = sorted({int(i) for i in np.linspace(0, len(views) - 1, min(count, len(views))).round()})
     written = []

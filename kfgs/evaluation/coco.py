@@ -148,7 +148,8 @@ def masks_of(
 
     height, width = picture.size
     for annotation in picture.annotations:
-        category, outline = annotation.get("category_id"), annotation.get("segmentation")
+        category: Any = annotation.get("category_id")
+        outline: Any = annotation.get("segmentation")
         where = f"{path}, annotation {annotation.get('id')}"
         if not isinstance(category, int) or category not in names:
             raise ValueError(f"{where}: expected a category of the file ({len(names)} ids), got {category!r:.40}")

@@ -88,8 +88,8 @@ class TeacherAgreement:
         for view in chosen:
             if view.camera.width > LARGEST[1]:
                 view = view._replace(camera=view.camera.resized(*LARGEST))
-            maps = (label_view(truth, view, text), label_view(method, view, text, self.level))
-            accuracy, iou = teacher_agreement(*(self._as_scored(labels.cpu()) for labels in maps))
+            taught = self._as_scored(label_view(truth, view, text).cpu())
+            accuracy, iou = teacher_agreement(taught, self._as_scored(label_view(method, view, text, self.level).cpu()))
             rows.append({"view": view.stem, "mIoU": iou, "accuracy": accuracy})
         scores = {name: mean(row[name] for row in rows) for name in ("mIoU", "accuracy")}
         step, first = self.split or (1, 0)

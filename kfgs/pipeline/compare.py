@@ -11,7 +11,6 @@ from torch import Tensor
 
 from .._check import check_whole
 from .._files import as_path
-from .._typed import typed
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..splat import rasterize
@@ -31,7 +30,6 @@ def render_color(gaussians: Gaussians, camera: Camera) -> Tensor:  # [H, W, 3] i
         return rasterize(gaussians.replace(features=None), camera).map.clamp(0, 1)
 
 
-@typed
 def views_of_change(before: Gaussians, after: Gaussians, cameras: Sequence[Camera], count: int = 2) -> list[int]:
     """The viewpoints that show an edit best. Each looks in a different direction than those before it, if possible.
 
@@ -101,7 +99,6 @@ def _share(before: Tensor, after: Tensor) -> float:  # [H, W, 3] each
     return float(((before - after).abs().amax(-1) > VISIBLE).float().mean())
 
 
-@typed
 def write_comparison(
     path: str | Path, before: Gaussians, after: Gaussians, cameras: Sequence[Camera], *, titles: tuple[str, str]
 ) -> Path:

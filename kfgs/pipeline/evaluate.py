@@ -15,17 +15,8 @@ import torch
 
 from .._card import short_repr
 from .._files import as_path, file_stem
-from ..evaluation import (
-    Encode,
-    FieldMethod,
-    Labeller,
-    Method,
-    Report,
-    TeacherAgreement,
-    TeacherMethod,
-    View,
-    get_protocol,
-)
+from ..evaluation import Encode, FieldMethod, Labeller, Method, Report, TeacherAgreement, TeacherMethod, View
+from ..evaluation.protocols import get_protocol
 from ..evaluation.texts import as_encoder
 from ..evaluation.truth import ReadWhenAsked
 from ..fields import SemanticField
@@ -36,23 +27,25 @@ from ..labels import LabelSet
 from ..scenes import FeatureFolder, Scene, load_scene
 from .maps import maps_of_views
 
+MAPS = ("features.json", "*_fmap_CxHxW.pt", "*.npy")  # files in a folder of feature maps
 LabelRule = Literal["own", "nearest"]
 
 
 class Question(NamedTuple):
     """What a method is asked: the same for every method that is compared."""
 
-    protocol: Any
-    """Of `kfgs.evaluation.PROTOCOLS`, or an object with the same members."""
-    scene: Scene
-    """Without distortion."""
-    truth: Any
-    """What the protocol compares with."""
-    views: Sequence[View]
-    """The views that are scored; empty if points are."""
+    protocol: Any  # of `kfgs.evaluation.PROTOCOLS`, or an object with the same members
+    scene: Scene  # without distortion
+    truth: Any  # what the protocol compares with
+    views: Sequence[View]  # none if points are scored
 
     def __repr__(self) -> str:
         return short_repr(self)
+
+    @property
+    def scored(self) -> Sequence[View]:
+        """The views that the protocol chooses."""
+        return getattr(self.protocol, "chosen", list)(self.views)  # type: ignore[no-any-return]
 
 
 def open_question(
@@ -87,7 +80,7 @@ def open_question(
     if not maps.is_dir():
         raise FileNotFoundError(f"truth: expected a folder of the teacher's feature maps, got {maps}; name another")
     views = [View(loaded.stem(i), loaded.cameras[i]) for i in loaded.views(split or "all")]
-    return Question(protocol, loaded, read_teacher(maps, loaded, protocol.chosen(views), align_corners=True), views)
+    return Question(protocol, loaded, _read_teacher(maps, loaded, protocol.chosen(views), align_corners=True), views)
 
 
 def evaluate(
@@ -114,28 +107,22 @@ def evaluate(
         command: kept in the report.
         **asked: `truth`, `split` and `images`, as in `open_question`; not with a question.
 
-    Returns:
-        Scores, and notes on what decides how they are to be read.
-
     Raises:
         FileNotFoundError: if the result, the scene or its truth is missing.
         ValueError: if something does not fit, such as an unknown protocol, or texts without embeddings.
-        TypeError: if a protocol of Gaussians is asked about a teacher, or a question and something that belongs to it are given.
+        TypeError: if a protocol of Gaussians is asked about a teacher, or options of a question that is open.
     """
     if isinstance(scene, Question) and asked:
         raise TypeError(f"scene: expected a folder with {', '.join(asked)}, got a question; pass them to open_question")
     question = scene if isinstance(scene, Question) else open_question(scene, protocol, **asked)
-    scorer = question.protocol
-    of_colors = getattr(scorer, "of_colors", False)
-    rule = getattr(scorer, "own_labels", None)
+    scorer, rule = question.protocol, getattr(question.protocol, "own_labels", None)
     if labels is not None and rule is None:
         raise ValueError(f"labels: expected none with {scorer.name}, which takes no class per pixel, got {labels!r}")
     method: Any = open_result(field, question) if isinstance(field, str | Path) else field
-    if of_colors:
-        cloud = method if isinstance(method, Gaussians) else method.gaussians
-        if cloud is None or cloud.sh is None:
+    if getattr(scorer, "of_colors", False):
+        if not isinstance(method, Gaussians) or method.sh is None:
             raise ValueError(f"field: expected Gaussians with colours for {scorer.name}, got none; name a colour splat")
-        report: Report = scorer.score(cloud.replace(sh=cloud.sh.to(torch.float32)), question.truth)
+        report: Report = scorer.score(method.replace(sh=method.sh.to(torch.float32)), question.truth)
     else:
         if isinstance(method, FieldMethod) and rule is not None and (labels is not None or method is not field):
             method = FieldMethod(method.field, method.name, own_labels=rule if labels is None else labels == "own")
@@ -146,7 +133,7 @@ def evaluate(
         own = getattr(method, "own_labels", True)
         changed = (*report.changed, "labels") if own != rule else report.changed
         report = replace(report, options={**report.options, "labels": "own" if own else "nearest"}, changed=changed)
-    notes = (*report.notes, *_notes(question, method, encode))
+    notes = (*report.notes, *_notes(question.scored, method, encode))
     return replace(report, notes=notes, command=command, machine=this_machine())
 
 
@@ -155,41 +142,29 @@ def open_result(path: str | Path, question: Question) -> Method | Gaussians:
 
     Raises:
         FileNotFoundError: if it is missing.
+        TypeError: if the protocol needs Gaussians, and it is a folder of maps.
         ValueError: if it is of no known kind.
     """
     path = as_path(path)
-    folder = find_field(path)
+    folder, name = find_field(path), question.protocol.name
     if getattr(question.protocol, "of_colors", False):
-        splat = path if path.is_file() else (path.parent if folder == path else path) / "color.ply"
+        splat = path if path.is_file() and folder != path else (path.parent if folder == path else path) / "color.ply"
         if not splat.is_file():
-            raise FileNotFoundError(f"{splat}: no such file; expected a colour splat for {question.protocol.name}")
+            raise FileNotFoundError(f"{splat}: no such file; expected a colour splat for {name}")
         return read_splats(splat)
     if folder is not None:
         return FieldMethod(SemanticField.load(folder))
-    if is_maps(path):
-        if not question.views:
-            raise TypeError(
-                f"field: expected one with Gaussians for {question.protocol.name}, got maps of a teacher: {path}"
-            )
-        return read_teacher(path, question.scene, question.views)
-    raise ValueError(
-        f"field: expected a field or a finished run of kfgs, or a folder of feature maps, got {path}; results of other "
-        "programs are scored by benchmarks/protocols.py"
-    )
+    if not path.is_dir() or (path / "images").is_dir() or not any(any(path.glob(pattern)) for pattern in MAPS):
+        raise ValueError(
+            f"field: expected a field or a finished run of kfgs, or a folder of feature maps, got {path}; results of other "
+            "programs are scored by benchmarks/protocols.py"
+        )
+    if not question.views:
+        raise TypeError(f"field: expected one with Gaussians for {name}, got maps of a teacher: {path}")
+    return _read_teacher(path, question.scene, question.scored)
 
 
-def is_maps(path: Path) -> bool:
-    """Whether a folder has feature maps, and is not a scene."""
-    patterns = ("features.json", "*_fmap_CxHxW.pt", "*_s.npy", "*.npy")
-    return path.is_dir() and not (path / "images").is_dir() and any(any(path.glob(name)) for name in patterns)
-
-
-def read_teacher(folder: Path, scene: Scene, views: Sequence[View], *, align_corners: bool = False) -> TeacherMethod:
-    """The maps of some views as a method, see `maps_of_views`.
-
-    Raises:
-        FileNotFoundError: if a view has no map.
-    """
+def _read_teacher(folder: Path, scene: Scene, views: Sequence[View], *, align_corners: bool = False) -> TeacherMethod:
     index = {scene.stem(i): i for i in range(len(scene))}
     places = [index[view.stem] for view in views]
     maps = maps_of_views(scene, places, FeatureFolder(folder).of(scene, places))
@@ -197,17 +172,9 @@ def read_teacher(folder: Path, scene: Scene, views: Sequence[View], *, align_cor
     return TeacherMethod(by_stem, f"teacher ({folder.name})", align_corners=align_corners)
 
 
-def teacher_name(info: dict[str, Any]) -> str | None:
-    """The name of the teacher in the `info` of a field or label set; None if unknown."""
-    teacher = info.get("teacher")
-    return str(teacher.get("name")) if isinstance(teacher, dict) else None
-
-
-def _notes(question: Question, method: Any, encode: Any) -> list[str]:
+def _notes(views: Sequence[View], method: Any, encode: Any) -> list[str]:
     """Facts that decide how a score is to be read; what is not known is left out."""
     field = method.field if isinstance(method, FieldMethod) else None
-    chosen = getattr(question.protocol, "chosen", None)
-    views = question.views if chosen is None else chosen(question.views)
     notes = []
     if field is not None and views:
         names = field.info.get("views") or [camera.name for camera in field.cameras]
@@ -217,12 +184,10 @@ def _notes(question: Question, method: Any, encode: Any) -> list[str]:
     if sizes:
         several = [f"{height}x{width}" for height, width in dict.fromkeys((sizes[0], sizes[-1]))]
         notes.append(f"scored pictures: {len(views)} of {' to '.join(several)} (height x width)")
-    teacher = None if field is None else teacher_name(field.info)
-    if teacher is None and isinstance(encode, LabelSet):
-        teacher = teacher_name(encode.info)
-    if teacher is None:
-        teacher = getattr(getattr(encode, "__self__", None), "name", None)  # of a teacher's method `encode_text`
-    return notes if teacher is None else [*notes, f"teacher: {teacher}"]
+    known = [source.info.get("teacher") for source in (field, encode) if isinstance(source, SemanticField | LabelSet)]
+    teachers = [teacher.get("name") for teacher in known if isinstance(teacher, dict)]
+    teachers.append(getattr(getattr(encode, "__self__", None), "name", None))  # of a teacher's method `encode_text`
+    return notes + [f"teacher: {name}" for name in teachers if name is not None][:1]
 
 
 def this_machine() -> str:
