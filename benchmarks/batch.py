@@ -30,7 +30,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
 from small_batch import results
 
 from kfgs._files import digest_file, write_json
-from kfgs.pipeline import ColorConfig, FitConfig
+from kfgs.pipeline import ColorConfig, Uplift
 from kfgs.scale import BatchOptions, SceneEntry, open_client, run_batch
 from kfgs.scale.board import event_line, table
 from kfgs.teachers import Teacher
@@ -135,13 +135,13 @@ def main() -> None:
     scenes = [SceneEntry(folder.name, str(folder)) for folder in folders]
     if given.room_0 is not None:
         scenes.append(SceneEntry("real", str(given.room_0.absolute())))
-    color = dataclasses.replace(ColorConfig.quick(), field=ColorConfig.quick().field.with_steps(given.steps))
+    color = dataclasses.replace(ColorConfig.quick(), training=ColorConfig.quick().training.with_steps(given.steps))
     os.environ["PYTHONPATH"] = os.pathsep.join(
         [str(Path(__file__).parent), *sys.path[:1], os.environ.get("PYTHONPATH", "")]
     )
     network = None if given.weights is None else str(given.weights.absolute())
     teacher = {"teacher": "batch:LookedUp", "teacher_options": {"rooms": str(base), "real": network}}
-    options = BatchOptions(fit=FitConfig.cpu(color=color, device="cpu"), pictures=1, **teacher)
+    options = BatchOptions(method=Uplift(color=color), device="cpu", pictures=1, **teacher)
     found = {}
     for name, workers, kills in (("one worker", 1, 0), ("two workers", 2, 0), ("two workers, killed", 2, given.kills)):
         print(f"{name}:", flush=True)

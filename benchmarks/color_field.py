@@ -21,7 +21,7 @@ from torch import Tensor
 
 from kfgs._files import write_json
 from kfgs.evaluation.color import score_views
-from kfgs.pipeline.color import ColorConfig, fit_color
+from kfgs.pipeline import ColorConfig, Run, fit_color
 from kfgs.scenes import load_scene
 
 
@@ -38,7 +38,7 @@ def main() -> None:
     scene = load_scene(args.scene).undistorted()
     config: ColorConfig = getattr(ColorConfig, args.preset)()
     if args.steps:
-        config = replace(config, field=config.field.with_steps(args.steps))
+        config = replace(config, training=config.training.with_steps(args.steps))
     loads: list[float] = []
 
     def tell(row: dict[str, float]) -> None:
@@ -46,7 +46,8 @@ def main() -> None:
         if row["step"] % 250 == 0:
             print(f"{row}, load {loads[-1]:.1f}", flush=True)
 
-    result = fit_color(scene, args.out, config, report=print, progress=tell, device=args.device)
+    trained = fit_color(scene, args.out, config, report=print, progress=tell, device=args.device)
+    took = sum(stage.seconds for stage in Run(args.out).finished("color"))
     chosen = [scene.stem(i) for i in scene.views("test")]
     chosen = chosen[:: max(1, len(chosen) // max(1, args.pictures))][: args.pictures]
 
@@ -56,15 +57,15 @@ def main() -> None:
             path.parent.mkdir(parents=True, exist_ok=True)
             Image.fromarray((torch.cat([rendered, taken], dim=1) * 255).round().byte().cpu().numpy()).save(path)
 
-    gaussians, reports = result.gaussians.to(args.device), []
+    gaussians, reports = trained.to(args.device), []
     seconds = clock(lambda: reports.append(score_views(gaussians, scene, show=draw)))
     report = reports[0]
     load = sum(loads) / len(loads) if loads else None
     facts = {
         "preset": args.preset,
-        "steps": config.field.steps,
-        "gaussians": len(result.gaussians),
-        "seconds": result.seconds,
+        "steps": config.training.steps,
+        "gaussians": len(trained),
+        "seconds": took,
         "device": device_name(args.device),
         "threads": torch.get_num_threads(),
         "mean load of the machine": load,
@@ -73,9 +74,7 @@ def main() -> None:
     }
     write_json(args.out / "scores.json", facts)
     print(report)
-    print(
-        f"{len(result.gaussians)} Gaussians, {result.seconds / 60:.1f} minutes, {config.field.steps} steps, load {load}"
-    )
+    print(f"{len(trained)} Gaussians, {took / 60:.1f} minutes, {config.training.steps} steps, load {load}")
 
 
 if __name__ == "__main__":

@@ -24,11 +24,11 @@ from devices import add_device, device_name, wait
 
 from kfgs import (
     FeatureFolder,
-    FitConfig,
     Gaussians,
     SemanticField,
+    Uplift,
     UpliftConfig,
-    fit_scene,
+    fit,
     load_label_set,
     load_scene,
     read_splats,
@@ -38,7 +38,7 @@ from kfgs.evaluation import load_label_map
 from kfgs.fields import uplift_maps
 from kfgs.labels import vote_labels
 from kfgs.pipeline import score_scene, score_teacher, true_labels
-from kfgs.pipeline.fuse import without_lens
+from kfgs.pipeline.maps import maps_of_views
 
 
 class Room:
@@ -74,10 +74,10 @@ class Room:
 
 
 def uplifted(room: Room, splat: Gaussians, corrections: int) -> tuple[SemanticField, float]:
-    """The field of `kfgs.uplift`, on the CPU, and the seconds that fusing took on the splat's device."""
+    """The field of `kfgs.fit`, on the CPU, and the seconds that fusing took on the splat's device."""
     scene = room.scene
     cameras = [scene.cameras[i] for i in scene.views("train")]
-    maps = without_lens(scene, room.maps, FitConfig())
+    maps = maps_of_views(scene, scene.views("train"), room.maps)
     wait()
     start = time.perf_counter()
     field = uplift_maps(splat, cameras, maps, UpliftConfig(corrections=corrections))
@@ -154,9 +154,9 @@ def main() -> None:
                 f"mIoU {miou:.2f}, accuracy {accuracy:.2f}, queries {room.queries(field):.3f}"
             )
     for seed in args.seeds:
-        config = FitConfig(seed=seed, device=str(args.device))
-        result = fit_scene(room.scene, room.maps, args.out / str(seed), config, splat=args.splat, report=print)
-        field, small = result.field, args.out / f"{seed}.kfgs"
+        place = {"folder": args.out / str(seed), "seed": seed, "device": args.device}
+        field = fit(room.scene, room.maps, Uplift(args.splat), **place, report=print)
+        small = args.out / f"{seed}.kfgs"
         field.save(small, "small")
         packed = SemanticField.load(small)
         miou, accuracy = room.score(field)
@@ -169,7 +169,7 @@ def main() -> None:
             "latents": field.decoder.latent,
             "packed_mib": small.stat().st_size / 2**20,
             "miou_packed": room.score(packed)[0],
-            "seconds": {stage.name: round(stage.seconds, 1) for stage in result.stages},
+            "seconds": field.info["seconds"],
             **({} if args.words is None or seed != args.seeds[0] else open_vocabulary(room, packed, args.words)),
         }
         rows.append(row)

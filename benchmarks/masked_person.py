@@ -48,11 +48,11 @@ def main() -> None:
     if not crowded.exists():
         paste(Path(shutil.copytree(clean, crowded)), np.random.default_rng(0))
     config = ColorConfig.quick()
-    config = replace(config, field=config.field.with_steps(args.steps))
+    config = replace(config, training=config.training.with_steps(args.steps))
     truth, masked = load_scene(clean), load_scene(crowded)
     stood = replace(truth, splits={**truth.splits, "stood": truth.views("train")[::3]})
     for name, scene in (("no person", truth), ("masks", masked), ("no masks", replace(masked, masks=None))):
-        found = fit_color(scene, args.out / name.replace(" ", "_"), config, report=print).gaussians
+        found = fit_color(scene, args.out / name.replace(" ", "_"), config, report=print)
         scores = (score_views(found, stood, split).psnr.value for split in ("test", "stood"))
         print(name, *(f"{score:.2f} dB" for score in scores), flush=True)
 

@@ -31,9 +31,6 @@ from devices import CPU, MapsOn, add_device, wait
 from kfgs.cameras import resize_map
 from kfgs.fields import UpliftConfig, uplift_maps
 from kfgs.formats import read_splats
-from kfgs.pipeline.fuse import uplift_stage
-from kfgs.pipeline.maps import map_digests
-from kfgs.pipeline.stages import Run
 from kfgs.quant import Codebook, GrownCodebook, PaperCodebook, fit_codebook, quantize_maps
 from kfgs.scenes import FeatureFolder, Picture, extract_features, load_scene, pictures_of
 
@@ -150,15 +147,7 @@ def uplift(args: argparse.Namespace) -> str:
     scene, maps = load_scene(args.scene).undistorted(), FeatureFolder(args.folder / "maps")
     cameras = [scene.cameras[i % len(scene.cameras)] for i in range(len(maps))]
     splat, config = read_splats(args.splat), UpliftConfig.field()
-    if args.device.type == "cuda":  # the stage of `kfgs fit` fuses on the CPU
-        gaussians = uplift_maps(
-            splat.to(args.device), cameras, maps, config, progress=True, report=print_line
-        ).gaussians
-    else:
-        with tempfile.TemporaryDirectory(prefix="kfgs_streaming_") as folder:  # a finished stage would be found again
-            run = Run(Path(folder), print_line)
-            inputs = {"features": {"files": map_digests(run, maps)}, "config": {}, "seed": 0}
-            gaussians = uplift_stage(run, splat, cameras, maps, config, inputs, True).gaussians
+    gaussians = uplift_maps(splat.to(args.device), cameras, maps, config, progress=True, report=print_line).gaussians
     return f"{len(gaussians)} Gaussians, {gaussians.features.shape[1]} latents"
 
 

@@ -30,7 +30,7 @@ from table1_rows import REQUEST, RESULT, ROWS, config_of
 import kfgs
 from kfgs._files import digest_file, digest_value, read_json, write_json
 from kfgs.labels import load_label_set
-from kfgs.pipeline import ColorConfig, fit_color, score_teacher, true_labels
+from kfgs.pipeline import ColorConfig, Run, fit_color, score_teacher, true_labels
 from kfgs.pipeline.evaluate import this_machine
 from kfgs.scenes import FeatureFolder, load_scene
 
@@ -83,10 +83,8 @@ def find_splat(args: argparse.Namespace) -> tuple[Path, float | None]:
     config = (
         ColorConfig.geometry() if args.quick else ColorConfig.paper() if args.preset == "paper" else ColorConfig.cpu()
     )
-    result = fit_color(
-        load_scene(args.scene).undistorted(), args.out / "color", config, report=print, device=args.device
-    )
-    return result.path, result.seconds
+    fit_color(load_scene(args.scene).undistorted(), args.out / "color", config, report=print, device=args.device)
+    return args.out / "color" / "color.ply", sum(stage.seconds for stage in Run(args.out / "color").finished("color"))
 
 
 def read_teacher(args: argparse.Namespace) -> dict[str, Any] | None:

@@ -31,7 +31,7 @@ from kfgs.evaluation.teacher_agreement import TeacherAgreement
 from kfgs.fields import FieldConfig, Linear, SemanticField
 from kfgs.formats import read_splats
 from kfgs.labels import LabelSet, load_label_set
-from kfgs.pipeline import FitConfig, fit_scene, true_labels
+from kfgs.pipeline import Paper, Uplift, fit, true_labels
 from kfgs.pipeline.apply import save_label_map
 from kfgs.pipeline.maps import Maps
 from kfgs.scenes import FeatureFolder, Scene, load_scene
@@ -96,26 +96,28 @@ def baseline_config(row: Row, preset: str) -> Any:
     return make(*row.options)
 
 
-def kfgs_config(row: Row, key: str, preset: str, steps: int | None, seed: int, device: str = "cpu") -> FitConfig:
+def kfgs_config(row: Row, key: str, preset: str, steps: int | None) -> Uplift | Paper:
     """The configuration of one of kfgs's own rows.
 
     Codebook and autoencoder of the paper's rows are the paper's; only `--preset paper` has its schedule of the field, too.
     """
     if row.mode is None:
-        return FitConfig(seed=seed)  # nothing is trained
-    options: dict[str, Any] = {"mode": row.mode, "seed": seed, "device": device}
-    config = FitConfig(method="paper", **options) if row.own else FitConfig.paper(**options)
-    if preset != "paper":
-        config = replace(config, field=FieldConfig.cpu())
+        return Uplift()  # nothing is trained
+    method = Paper() if row.own else Paper.paper()
+    training = FieldConfig.paper() if preset == "paper" else FieldConfig.cpu()
     steps = QUICK_STEPS[key] if preset == "quick" and steps is None else steps
-    return config if steps is None else replace(config, field=config.field.with_steps(steps))
+    method = replace(method, training=training if steps is None else training.with_steps(steps))
+    if row.mode == "decouple":
+        return replace(method, codebook=None, autoencoder=None)
+    return replace(method, autoencoder=None) if row.mode == "adc" else method
 
 
 def config_of(key: str, preset: str, steps: int | None, seed: int, device: str = "cpu") -> dict[str, Any]:
     """What decides a row, as JSON."""
     row = ROWS[key]
-    config = baseline_config(row, preset) if row.module else kfgs_config(row, key, preset, steps, seed, device)
-    return asdict(config)
+    if row.module:
+        return asdict(baseline_config(row, preset))
+    return kfgs_config(row, key, preset, steps).options() | {"seed": seed, "device": device}
 
 
 @dataclass(frozen=True)
@@ -239,17 +241,15 @@ def make_baseline(row: Row, room: Room, request: dict[str, Any], folder: Path) -
 
 def make_kfgs(row: Row, room: Room, request: dict[str, Any], folder: Path) -> Made:
     """Fit one of kfgs's own rows."""
-    config = kfgs_config(row, *(request[name] for name in ("row", "preset", "steps", "seed", "device")))
-    splat = request["splat"] if row.mode is None else None
+    method = kfgs_config(row, *(request[name] for name in ("row", "preset", "steps")))
+    if isinstance(method, Uplift):
+        method = replace(method, splat=request["splat"])
     shutil.rmtree(folder / "run", ignore_errors=True)  # stages of a killed run would count too few seconds
-    result = fit_scene(room.scene, room.maps, folder / "run", config, splat=splat, report=print)
-    field: SemanticField = result.field
-    stages: dict[str, float] = {}
-    for stage in result.stages:
-        stages[stage.name] = stages.get(stage.name, 0.0) + stage.seconds
+    place = {"folder": folder / "run", "seed": request["seed"], "device": request["device"]}
+    field = fit(room.scene, room.maps, method, **place, report=print)
     facts = {
         "dim": str(field.decoder.latent), "gaussians": len(field), "storage": field.storage(),
-        "disk": result.field_path.stat().st_size, "stages": stages,
+        "disk": (folder / "run" / "field.kfgs").stat().st_size, "stages": field.info["seconds"],
     }  # fmt: skip
     if row.mode is None:
         field.save(folder / "packed.kfgs", "small")

@@ -24,7 +24,7 @@ from kfgs._files import atomic_path, digest_value, read_json, write_json
 from kfgs.evaluation import FieldMethod
 from kfgs.fields import FieldConfig
 from kfgs.metrics import MIB
-from kfgs.pipeline import FitConfig, fit_scene
+from kfgs.pipeline import Paper, fit
 from kfgs.viz.plots import finish, new_figure
 
 FULL = 512
@@ -34,23 +34,22 @@ PAPER = {  # mIoU, minutes, thousand Gaussians, MB, FPS
 }  # fmt: skip
 
 
-def config_of(dim: int, args: argparse.Namespace) -> FitConfig:
+def config_of(dim: int, args: argparse.Namespace) -> Paper:
     """Of one row: `adc+sc` with so many latents, or `adc`."""
-    config = FitConfig.paper(mode="adc" if dim == FULL else "adc+sc", seed=args.seed, device=str(args.device))
-    if args.preset != "paper":
-        config = replace(config, field=FieldConfig.cpu())
-    if dim != FULL:
-        config = replace(config, autoencoder=replace(config.autoencoder, latent=dim))
-    steps = args.steps or (QUICK_STEPS[config.mode] if args.quick else None)
-    return config if steps is None else replace(config, field=config.field.with_steps(steps))
+    method = Paper.paper() if args.preset == "paper" else Paper.paper(training=FieldConfig.cpu())
+    latents = None if dim == FULL else replace(method.autoencoder, latent=dim)
+    steps = args.steps or (QUICK_STEPS["adc" if dim == FULL else "adc+sc"] if args.quick else None)
+    training = method.training if steps is None else method.training.with_steps(steps)
+    return replace(method, autoencoder=latents, training=training)
 
 
 def run(dim: int, room: Room, args: argparse.Namespace) -> dict[str, Any]:
     """One row, fitted and scored, or read back."""
-    config = config_of(dim, args)
-    result = fit_scene(room.scene, room.maps, args.out / "run", config, report=print)
+    method = config_of(dim, args)
+    place = {"folder": args.out / "run", "seed": args.seed, "device": args.device}
+    field = fit(room.scene, room.maps, method, **place, report=print)
     asked = {
-        "stages": [stage.key for stage in result.stages],
+        "stages": field.info["stages"],
         "views": [view.stem for view in room.views],
         "truth": args.truth,
         "device": str(args.device),
@@ -59,15 +58,14 @@ def run(dim: int, room: Room, args: argparse.Namespace) -> dict[str, Any]:
     file = args.out / "rows" / f"{dim}-{digest_value(asked)[:12]}.json"
     if file.is_file():
         return dict(read_json(file))
-    field = result.field
-    method, nearest = FieldMethod(field), FieldMethod(field, own_labels=False)
-    seconds = {stage.name: stage.seconds for stage in result.stages}
+    scored, nearest = FieldMethod(field), FieldMethod(field, own_labels=False)
+    seconds = field.info["seconds"]
     moved, shown = field.to(args.device), views_on(room.views[:FPS_VIEWS], args.device)
     row = {
-        "dim": dim, **room.score(method, nearest), **room.codec_scores(field_codec(field), args.seed), "stages": seconds,
+        "dim": dim, **room.score(scored, nearest), **room.codec_scores(field_codec(field), args.seed), "stages": seconds,
         "gaussians": len(field), "storage": field.storage(),
         "fps_maps": frames_per_second(lambda view: moved.render(view.camera), shown),
-        "device": str(args.device), "steps": config.field.steps,
+        "device": str(args.device), "steps": method.training.steps,
     }  # fmt: skip
     write_json(file, row)
     return row

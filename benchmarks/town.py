@@ -27,7 +27,7 @@ def main() -> None:
 
     from kfgs.fields import SemanticField, UpliftConfig
     from kfgs.formats import read_splats
-    from kfgs.pipeline import ColorConfig, FitConfig, fit_color
+    from kfgs.pipeline import ColorConfig, Uplift, fit_color
     from kfgs.scale import FieldInBlocks, split_scene
     from kfgs.scenes import load_scene
     from kfgs.toy.room_folder import ToyConfig
@@ -54,12 +54,13 @@ def main() -> None:
         f"town {args.seed}: {nx * ny} rooms, {len(scene.views('train'))} training views, {len(scene.views('test'))} test views"
     )
     colors = ColorConfig.geometry()
-    colors = replace(colors, field=replace(colors.field.with_steps(args.steps), max_gaussians=20_000 * nx * ny))
-    splat = fit_color(scene, args.out / f"run{args.seed}", colors, progress=True).path
+    colors = replace(colors, training=replace(colors.training.with_steps(args.steps), max_gaussians=20_000 * nx * ny))
+    fit_color(scene, args.out / f"run{args.seed}", colors, progress=True)
+    splat = args.out / f"run{args.seed}" / "color.ply"
     total = args.gaussians * nx * ny
-    config = FitConfig(uplift=UpliftConfig(max_gaussians=total))
+    method = Uplift(splat, UpliftConfig(max_gaussians=total))
     began = time.perf_counter()
-    whole = _apart(_fit_whole, town, args.out / f"run{args.seed}", config, splat)
+    whole = _apart(_fit_whole, town, args.out / f"run{args.seed}", method)
     whole["seconds"] = time.perf_counter() - began
     _print("whole", SemanticField.load(args.out / f"run{args.seed}" / "field.kfgs"), scene, town, None, whole)
     folder = args.out / f"blocks{args.seed}"
@@ -69,7 +70,7 @@ def main() -> None:
     for block in blocks:
         share = len(read_splats(folder / block.name / "splat.ply")) / everything
         facts.append(
-            _apart(_fit_block, folder / block.name, FitConfig(uplift=UpliftConfig(max_gaussians=int(total * share))))
+            _apart(_fit_block, folder / block.name, Uplift(None, UpliftConfig(max_gaussians=int(total * share))))
         )
         print(f"  {block.name}: {len(block.views)} views, {share:.0%} of the Gaussians, {facts[-1]}")
     took = {"seconds": time.perf_counter() - began, "peak_mib": max(fact["peak_mib"] for fact in facts)}
@@ -77,12 +78,12 @@ def main() -> None:
     _print("whole", SemanticField.load(args.out / f"run{args.seed}" / "field.kfgs"), scene, town, blocks, whole)
 
 
-def _fit_whole(town: Path, run: Path, config: Any, splat: Path) -> None:
-    from kfgs.pipeline import fit_scene
+def _fit_whole(town: Path, run: Path, method: Any) -> None:
+    from kfgs.pipeline import fit
     from kfgs.scenes import FeatureFolder, load_scene
 
     scene = load_scene(town)
-    fit_scene(scene, FeatureFolder(town / "features").of(scene, "train"), run, config, splat=splat)
+    fit(scene, FeatureFolder(town / "features").of(scene, "train"), method, folder=run)
 
 
 def _fit_block(folder: Path, config: Any) -> None:

@@ -52,14 +52,14 @@ _WHERE = {
     "extract_features": ".scenes",
     "make_label_set": ".teachers",
     "Teacher": ".teachers",
-    "uplift": ".pipeline",
+    "Uplift": ".pipeline",
+    "Paper": ".pipeline",
     "UpliftConfig": ".fields",
     "FieldConfig": ".fields",
     "GaussianParams": ".fields",
     "SemanticField": ".fields",
     "fit_field": ".fields",
-    "FitConfig": ".pipeline",
-    "fit_scene": ".pipeline",
+    "fit": ".pipeline",
     "segment_scene": ".pipeline",
     "score_scene": ".pipeline",
     "LabelSet": ".labels",
@@ -97,13 +97,13 @@ if TYPE_CHECKING:
     from .labels import load_label_set as load_label_set
     from .labels import transfer_labels as transfer_labels
     from .pipeline import ColorConfig as ColorConfig
-    from .pipeline import FitConfig as FitConfig
+    from .pipeline import Paper as Paper
+    from .pipeline import Uplift as Uplift
     from .pipeline import attach as attach
+    from .pipeline import fit as fit
     from .pipeline import fit_color as fit_color
-    from .pipeline import fit_scene as fit_scene
     from .pipeline import score_scene as score_scene
     from .pipeline import segment_scene as segment_scene
-    from .pipeline import uplift as uplift
     from .quant import Autoencoder as Autoencoder
     from .quant import AutoencoderConfig as AutoencoderConfig
     from .quant import Codebook as Codebook

@@ -25,6 +25,7 @@ from ._stems import folded_name as folded_name
 ASIDE = ".kfgs-new-"  # begins the name of the folder in which a file is written; one that a killed process left may be deleted
 LARGEST = 1 << 29  # most bytes of a JSON file: COCO's own annotations have 470 MB
 DIGITS = 300  # most digits of a whole number in JSON, so that it fits into a float
+UNNAMED = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)  # errors that Python raises without a file
 BLOCK = 4096  # a disk with fewer free bytes is full
 
 
@@ -131,7 +132,11 @@ def _aside(target: Path) -> Iterator[Path]:
     try:
         yield place
     except OSError as error:
-        if error.filename is not None and str(place) not in str(error.filename):
+        named = error.filename is not None and str(place) in str(error.filename)
+        unnamed = error.filename is None and (
+            error.errno in UNNAMED or "requested and" in str(error)
+        )  # the last: numpy's
+        if not (named or unnamed):
             raise
         raise OSError(error.errno or errno.ENOSPC, error.strerror or str(error), str(target)) from error
     except SafetensorError as error:

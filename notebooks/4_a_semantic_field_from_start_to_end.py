@@ -56,7 +56,7 @@ Image.fromarray(viz.picture_grid(rows, width=256))
 # %% [markdown]
 # ## Gaussians, then features
 #
-# Features are only as sharp as the Gaussians that carry them. So `fit_scene` first trains Gaussians on the photographs,
+# Features are only as sharp as the Gaussians that carry them. So `fit` first trains Gaussians on the photographs,
 # as 3DGS does. Then each Gaussian $i$ takes the mean of the teacher's features $\mathbf{F}$ at the pixels $x$ that show
 # it, weighted by how much of the pixel it fills:
 #
@@ -69,9 +69,8 @@ Image.fromarray(viz.picture_grid(rows, width=256))
 
 # %%
 quick = kfgs.ColorConfig.quick()
-quick = replace(quick, field=replace(quick.field.with_steps(800), max_gaussians=60_000))
-fitted = kfgs.fit_scene(scene, maps, run, kfgs.FitConfig.cpu(color=quick), report=print)
-field = fitted.field
+quick = replace(quick, training=replace(quick.training.with_steps(800), max_gaussians=60_000))
+field = kfgs.fit(scene, maps, kfgs.Uplift(color=quick), folder=run, report=print)
 print(field.summary())
 
 # %% [markdown]
@@ -121,7 +120,7 @@ Shown(pictures / "iou.png", width=700)
 # %% [markdown]
 # ## Save and load
 #
-# `fit_scene` has saved the field already, in `field/` of the run folder: Gaussians, latents, the decoder $B$, the training
+# `fit` has saved the field already, in `field/` of the run folder: Gaussians, latents, the decoder $B$, the training
 # cameras, and how they came about. What is loaded answers exactly as before.
 
 # %%

@@ -39,8 +39,8 @@ scene = kfgs.load_scene(folder).undistorted()
 classes = kfgs.load_label_set(names, text)
 maps = kfgs.FeatureFolder(features).of(scene, "train")
 quick = kfgs.ColorConfig.quick()
-quick = replace(quick, field=replace(quick.field.with_steps(800), max_gaussians=60_000))
-field = kfgs.fit_scene(scene, maps, run, kfgs.FitConfig.cpu(color=quick)).field  # notebook 4 explains it
+quick = replace(quick, training=replace(quick.training.with_steps(800), max_gaussians=60_000))
+field = kfgs.fit(scene, maps, kfgs.Uplift(color=quick), folder=run)  # notebook 4 explains it
 colors = kfgs.read_splats(run / "color.ply")
 print(field)
 print(colors)

@@ -130,16 +130,16 @@ Image.fromarray(viz.picture_grid([row], ["photo", "features", question], width=3
 # %% [markdown]
 # ## The field
 #
-# The teacher sees every training picture, and `fit_scene` makes the field (notebook 4). Its Gaussians are trained on pictures
+# The teacher sees every training picture, and `fit` makes the field (notebook 4). Its Gaussians are trained on pictures
 # made 320 pixels wide, which is quick. A killed run goes on where it stopped: run this notebook twice, and the second time
 # takes seconds.
 
 # %%
 quick = kfgs.ColorConfig.quick()
-quick = replace(quick, field=replace(quick.field.with_steps(600), max_gaussians=60_000))
-config = kfgs.FitConfig.cpu(color=replace(quick, picture_scale=min(1.0, 320 / scene.cameras[0].width)))
+quick = replace(quick, training=replace(quick.training.with_steps(600), max_gaussians=60_000))
+method = kfgs.Uplift(color=replace(quick, picture_scale=min(1.0, 320 / scene.cameras[0].width)))
 kfgs.extract_features(teacher, scene, out / "features", split="train")
-field = kfgs.fit_scene(scene, kfgs.FeatureFolder(out / "features").of(scene, "train"), out / "run", config).field
+field = kfgs.fit(scene, kfgs.FeatureFolder(out / "features").of(scene, "train"), method, folder=out / "run")
 print(field.summary())
 
 # %% [markdown]

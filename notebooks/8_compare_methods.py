@@ -43,25 +43,22 @@ maps = kfgs.FeatureFolder(features).of(scene, "train")
 # - **raw**: the same training with all 512 channels, which the paper calls *just decouple*.
 #
 # The two that are trained get about the same time, not the same number of steps: that is the use of compression. All
-# schedules are short, so that you need not wait. `FitConfig.paper()` is the published one, with 30,000 steps.
+# schedules are short, so that you need not wait. `Paper.paper()` is the published one, with 30,000 steps.
 
 # %%
 quick = kfgs.ColorConfig.quick()
-quick = replace(quick, field=replace(quick.field.with_steps(800), max_gaussians=60_000))
+quick = replace(quick, training=replace(quick.training.with_steps(800), max_gaussians=60_000))
 trained = {"codebook": kfgs.GrownCodebook(), "autoencoder": kfgs.AutoencoderConfig(steps=500)}
-configs = {
-    "fused": kfgs.FitConfig.cpu(color=quick),
-    "paper": kfgs.FitConfig.cpu(method="paper", **trained, field=kfgs.FieldConfig.cpu().with_steps(400)),
-    "raw": kfgs.FitConfig.cpu(
-        method="paper", mode="decouple", field=kfgs.FieldConfig.cpu(render_scale=1.0).with_steps(60)
-    ),
+methods = {
+    "fused": kfgs.Uplift(color=quick),
+    "paper": kfgs.Paper(**trained, training=kfgs.FieldConfig.cpu().with_steps(400)),
+    "raw": kfgs.Paper(None, None, kfgs.FieldConfig.cpu(render_scale=1.0).with_steps(60)),
 }
 runs = {"fused": data / "run", "paper": data / "run_paper", "raw": data / "run_raw"}
 fields = {}
-for name, config in configs.items():
-    fitted = kfgs.fit_scene(scene, maps, runs[name], config)
-    fields[name] = fitted.field
-    stages = ", ".join(f"{stage.name} {stage.seconds:.0f} s" for stage in fitted.stages)
+for name, method in methods.items():
+    fields[name] = kfgs.fit(scene, maps, method, folder=runs[name])
+    stages = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in fields[name].info["seconds"].items())
     print(f"{name:6s} {fields[name].channels:3d} channels, {len(fields[name]):6,} Gaussians; {stages}")
 
 # %% [markdown]

@@ -9,7 +9,7 @@ from tiny_teacher import Tiny
 
 from kfgs.fields import SemanticField
 from kfgs.labels import load_label_set
-from kfgs.pipeline import ColorConfig, FitConfig, evaluate, fit_scene, segment_scene, true_labels
+from kfgs.pipeline import ColorConfig, Uplift, evaluate, fit, segment_scene, true_labels
 from kfgs.scale import BatchOptions
 from kfgs.scenes import FeatureFolder, extract_features, load_scene
 from kfgs.toy.room_folder import make_toy_room
@@ -17,10 +17,10 @@ from kfgs.toy.room_folder import make_toy_room
 COLOR = dataclasses.replace(
     ColorConfig.quick(),
     max_points=600,
-    field=dataclasses.replace(ColorConfig.quick().field.with_steps(24), max_gaussians=800, checkpoint_every=8),
+    training=dataclasses.replace(ColorConfig.quick().training.with_steps(24), max_gaussians=800, checkpoint_every=8),
 )
-FIT = FitConfig.cpu(color=COLOR, device="cpu")
-OPTIONS = BatchOptions(teacher="tiny_teacher:Tiny", fit=FIT, share=2, pictures=0)
+METHOD = Uplift(color=COLOR)
+OPTIONS = BatchOptions(teacher="tiny_teacher:Tiny", method=METHOD, device="cpu", share=2, pictures=0)
 TIMES = ("seconds", "mtime_ns", "command", "machine", "history.json")  # the last: its size, in a list of files
 NOT_RESULTS = ("log.txt", "state.json", "digests.json", "done/")
 
@@ -34,7 +34,7 @@ def one_process(room: Path, out: Path) -> Path:
     """The stages one after the other, as a person calls them."""
     scene = load_scene(room)
     extract_features(Tiny(), scene, out / "features")
-    fit_scene(scene.undistorted(), FeatureFolder(out / "features").of(scene), out, FIT)
+    fit(scene.undistorted(), FeatureFolder(out / "features").of(scene), METHOD, folder=out, device="cpu")
     classes = load_label_set(room / "classes.json", room / "text.npy")
     truth = true_labels(scene, room / "labels", "test")
     segment_scene(SemanticField.load(out / "field.kfgs"), scene, classes, out / "segmented", pictures=0, truth=truth)

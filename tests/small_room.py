@@ -5,10 +5,9 @@ from pathlib import Path
 
 from cases_color import make_splat
 
-from kfgs import FeatureFolder, UpliftConfig, fit_scene, load_scene
+from kfgs import FeatureFolder, Paper, Uplift, UpliftConfig, fit, load_scene
 from kfgs.cli import main
 from kfgs.fields import FieldConfig
-from kfgs.pipeline import FitConfig
 from kfgs.quant import AutoencoderConfig, PaperCodebook
 from kfgs.toy.room_folder import ToyConfig, make_toy_room
 
@@ -30,10 +29,10 @@ FIELD = FieldConfig.cpu(
     reset_every=0,
     checkpoint_every=7,
 )
-CONFIG = FitConfig.paper(
+PAPER = Paper.paper(
     codebook=PaperCodebook(initial=4, maximum=24, epochs=4, step_every=1, learning_rate=0.02),
     autoencoder=AutoencoderConfig.paper(latent=4, encoder=(24, 16), decoder=(16, 24), steps=400, learning_rate=3e-3),
-    field=FIELD,
+    training=FIELD,
 )
 
 
@@ -46,13 +45,18 @@ def make_desk(folder: Path) -> Path:
     make_splat(make_room(folder / "scene"), folder / "my.ply")
     scene = load_scene(folder / "scene")
     maps = FeatureFolder(folder / "scene" / "features", [scene.stem(i) for i in scene.views("train")])
-    short = FitConfig(uplift=UpliftConfig.field(max_gaussians=2_000))
-    fit_scene(scene, maps, folder / "run", short, splat=folder / "my.ply")
+    fit(scene, maps, Uplift(folder / "my.ply", UpliftConfig.field(max_gaussians=2_000)), folder=folder / "run")
     return folder
 
 
-def config(**changes):
-    return dataclasses.replace(CONFIG, **changes)
+def paper(**changes):
+    return dataclasses.replace(PAPER, **changes)
+
+
+def stages(lines: list[str]) -> dict[str, str]:
+    """The stages that a fit reported, and whether each was "found" or "done"."""
+    words = ((line.partition(": ")[0], line.partition(": ")[2]) for line in lines)
+    return {name: rest.split()[0] for name, rest in words if rest.startswith(("found in", "done in"))}
 
 
 def fit_run(room: Path, out: Path) -> Path:

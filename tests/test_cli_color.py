@@ -23,7 +23,7 @@ from kfgs.formats.ply import read_ply
 from kfgs.formats.sidecar import names_path
 from kfgs.labels import load_label_set
 from kfgs.labels.edits import EditList
-from kfgs.pipeline.color import Photos
+from kfgs.pipeline.color import TrainingPictures
 from kfgs.pipeline.compare import views_of_edits
 from kfgs.scenes import load_scene
 from kfgs.splat import rasterize
@@ -93,7 +93,7 @@ def test_color_run_again_does_nothing_and_says_so(colored, room, capsys):
 
 
 def test_color_interrupted_goes_on_to_the_same_field(colored, room, tmp_path, monkeypatch, capsys):
-    fit, look, looks = color_module.fit_field, Photos.__getitem__, []
+    fit, look, looks = color_module.fit_field, TrainingPictures.__getitem__, []
 
     def often(start, cameras, photos, config, **options):
         return fit(start, cameras, photos, dataclasses.replace(config, checkpoint_every=10), **options)
@@ -105,7 +105,7 @@ def test_color_interrupted_goes_on_to_the_same_field(colored, room, tmp_path, mo
         return look(photos, i)
 
     monkeypatch.setattr(color_module, "fit_field", often)
-    monkeypatch.setattr(Photos, "__getitem__", stopping)
+    monkeypatch.setattr(TrainingPictures, "__getitem__", stopping)
     arguments = ["color", str(room), "--out", str(tmp_path), *COLOR, "--pictures", "0"]
     assert main(arguments) == 130
     assert "goes on where it stopped" in capsys.readouterr().err

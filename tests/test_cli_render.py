@@ -11,8 +11,7 @@ from small_room import make_room
 
 from kfgs.cli import main
 from kfgs.formats import read_splats, write_splats
-from kfgs.pipeline import FitConfig, fit_color, fit_scene
-from kfgs.pipeline.color import ColorConfig
+from kfgs.pipeline import ColorConfig, Uplift, fit, fit_color
 from kfgs.scenes import FeatureFolder, load_scene
 
 
@@ -21,10 +20,10 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("render")
     scene = load_scene(make_room(folder / "scene"))
     config = ColorConfig.quick()
-    config = dataclasses.replace(config, field=config.field.with_steps(60))
+    config = dataclasses.replace(config, training=config.training.with_steps(60))
     colors = fit_color(scene, folder / "run", config)
     maps = FeatureFolder(scene.folder / "features").of(scene, "train")
-    fit_scene(scene, maps, folder / "run", FitConfig.cpu(), splat=colors.gaussians)
+    fit(scene, maps, Uplift(colors), folder=folder / "run")
     return folder / "run"
 
 

@@ -204,7 +204,7 @@ def test_a_breach_is_found(file, source, message):
         ),
         ("kfgs/viz/clouds.py", "if typing.TYPE_CHECKING:\n    from ..fields import SemanticField\nimport pyvista"),
         ("kfgs/splat/engines/cpu/engine.py", "import numba\nfrom ...tiles import Tiles"),
-        ("kfgs/cli.py", "from .pipeline import fit_scene"),
+        ("kfgs/cli.py", "from .pipeline import fit"),
         ("kfgs/__main__.py", "from . import __version__\nfrom .cli import main"),
         ("kfgs/pipeline/fit.py", "from ..evaluation import PROTOCOL"),
     ],

@@ -13,10 +13,10 @@ from small_room import make_room
 import kfgs
 from kfgs import (
     FeatureFolder,
-    FitConfig,
     SemanticField,
+    Uplift,
     UpliftConfig,
-    fit_scene,
+    fit,
     load_label_set,
     load_scene,
     read_splats,
@@ -24,7 +24,7 @@ from kfgs import (
 )
 from kfgs.fields import fuse_views, scene_classes
 
-SHORT = FitConfig(uplift=UpliftConfig.field(max_gaussians=2_000))
+SHORT = UpliftConfig.field(max_gaussians=2_000)
 ROOT = Path(kfgs.__file__).parents[1]
 README, GUIDE = ROOT / "README.md", ROOT / "docs" / "guide.md"
 
@@ -53,9 +53,9 @@ def desk(tmp_path_factory):
 def test_examples_run_one_after_the_other(examples, desk, monkeypatch):
     monkeypatch.chdir(desk)
     _, fitting, editing, looking = examples
-    assert fitting.count("FitConfig.cpu()") == 1
+    assert fitting.count('Uplift("my.spz")') == 1
     known = {"SHORT": SHORT, "other_points": read_splats("my.spz").means}
-    exec(fitting.replace("FitConfig.cpu()", "SHORT"), known)
+    exec(fitting.replace('Uplift("my.spz")', 'Uplift("my.spz", SHORT)'), known)
     assert known["chair"].mask.shape == (len(known["field"]),)
     assert len(known["carried"].labels) == len(known["other_points"])
     make_field(Path("scene"), Path("run/field.kfgs"))  # a few small maps know no plant: this one knows the truth
@@ -103,7 +103,7 @@ def test_the_ten_lines_of_the_readme_run(examples, desk, tmp_path, monkeypatch):
     for part in ("images", "sparse", "split.json"):
         (scene / part).symlink_to(desk / "scene" / part)
     maps = FeatureFolder(desk / "features").of(room, "train")
-    fit_scene(load_scene(scene), maps, run, SHORT, splat=desk / "my.spz")
+    fit(load_scene(scene), maps, Uplift(desk / "my.spz", SHORT), folder=run)
     write_splats(read_splats(desk / "my.spz"), run / "color.ply")  # `kfgs fit` trains it where there is no splat
     monkeypatch.chdir(tmp_path)
     known = {}

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from kfgs.pipeline.fuse import uplift
 from messages import tells
 
 from kfgs import Gaussians
@@ -17,7 +18,6 @@ from kfgs.labels import transfer_labels
 from kfgs.labels.scores import select_by_similarity
 from kfgs.pipeline import FitConfig, attach, fit_scene
 from kfgs.pipeline.color import ColorConfig, fit_color
-from kfgs.pipeline.fuse import uplift
 from kfgs.scenes import Scene
 
 SCENE = Scene([], [], torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))

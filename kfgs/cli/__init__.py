@@ -27,7 +27,7 @@ from .batch import batch
 from .blocks import blocks, join
 from .evaluate import evaluate
 from .features import features
-from .fit import color, demo, fit, sfm, uplift
+from .fit import color, demo, fit, sfm
 from .output import called, open_streams, said_on_stderr, said_whole, say, warnings_as_notes
 from .pack import pack
 from .places import checked
@@ -40,7 +40,7 @@ from .view import view
 
 GROUPS: dict[str, tuple[Any, ...]] = {
     "Start here": (demo, info),
-    "Make a semantic field": (sfm, features, text, fit, uplift),
+    "Make a semantic field": (sfm, features, text, fit),
     "More than one machine": (batch, blocks, join),
     "Ask it": (select, segment, label, view, render),
     "Store it": (pack,),

@@ -13,7 +13,7 @@ import tyro
 
 from .features import teacher_options
 from .files import check_alone
-from .options import FieldMethod, Flag, Given, MapTeacher, Name, Positional, Training, fit_config
+from .options import FieldMethod, Flag, Given, MapTeacher, Name, Positional, Training, fit_method
 from .output import say
 
 # Heavy imports happen inside the command, so that `kfgs --help` answers at once.
@@ -87,18 +87,13 @@ def batch(
     else:
         check_teacher_name(teacher.teacher)
         given = teacher_options(teacher.teacher, teacher.fast, teacher.size)
-    config = fit_config(
-        method,
-        seed=training.seed,
-        steps=training.steps,
-        max_gaussians=training.max_gaussians,
-        views_per_step=training.views_per_step,
-    )
     options = BatchOptions(
         teacher=teacher.teacher,
         weights=teacher.weights,
         teacher_options=given,
-        fit=dataclasses.replace(config, device=training.device),
+        method=fit_method(method, training=training),
+        seed=training.seed,
+        device=training.device,
         text=None if text is None else str(text),
         share=share,
         pictures=pictures,

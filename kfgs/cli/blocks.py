@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from .._files import check_output, real_path
-from .options import FieldMethod, Given, Maps, Positional, SceneFolder, Training, fit_config
+from .options import FieldMethod, Given, Maps, Positional, SceneFolder, Training, fit_method
 from .output import say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -52,17 +51,15 @@ def blocks(
     from ..scale.in_blocks import in_numbers
 
     check_output("out", out, "a folder")
-    config = fit_config(
-        FieldMethod(),
-        seed=training.seed,
-        steps=training.steps,
-        max_gaussians=training.max_gaussians,
-        views_per_step=training.views_per_step,
-    )
-    config = dataclasses.replace(config, undistorted_features=maps.undistorted_features, device=training.device)
+    method = fit_method(FieldMethod(), training=training)
+    options = {
+        "seed": training.seed,
+        "device": training.device,
+        "undistorted_features": maps.undistorted_features,
+    }
     with nullcontext() if workers is None else open_client(workers=workers) as client:  # a wrong number is said at once
         split_scene(scene, out, count, features=maps.folder(scene), splat=splat, latents=latents, report=say)
-        done = fit_blocks(out, config, client=client, report=say)
+        done = fit_blocks(out, method, **options, client=client, report=say)
     say(f"{len(done):,} Gaussians in {len(done.blocks)} blocks; all lie in the box {in_numbers(done.extent)}")
     say(f"next: kfgs join {out} --out field, or with --box a part of it")
     wrote([out / "blocks.json", *(out / block.name / "core" for block in done.blocks)])

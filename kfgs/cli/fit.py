@@ -1,4 +1,4 @@
-"""Commands that make fields and what they need: demo, sfm, fit, uplift, color."""
+"""Commands that make fields and what they need: demo, sfm, fit, color."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Literal
 
 from .._files import check_output, real_path
 from .features import choose_teacher, stored_maps
-from .files import check_alone, is_field, open_field, open_splats
+from .files import check_alone
 from .options import (
     CameraSearch,
     FieldMethod,
@@ -25,7 +25,8 @@ from .options import (
     SceneFolder,
     Training,
     Views,
-    fit_config,
+    fit_method,
+    trained,
 )
 from .output import called, say, wrote
 
@@ -52,7 +53,7 @@ def demo(out: Path = Path("kfgs_demo"), seed: int = 0) -> None:
 
     check_output("out", out, "a folder")
     room = ToyConfig(train_views=36, test_views=9, seed=seed)
-    wrote(run_demo.run(out, fit_config(FieldMethod(), seed=seed), room=room, report=say, progress=True))
+    wrote(run_demo.run(out, seed=seed, room=room, report=say, progress=True))
     look = ["view", str(out / "run" / "field.kfgs"), "--scene", str(out / "scene"), "--color", str(out / "color.ply")]
     say(f'6. Look. Type "chair" there, select, edit: kfgs {shlex.join(look)}')
     if has_display() and sys.stdin.isatty() and sys.stdout.isatty():
@@ -176,35 +177,26 @@ def fit(
     The features are averaged onto Gaussians in 3-D and then compressed. The Gaussians are those of --splat, or of the
     newest splat in the scene's folder (an output folder of 3DGS has one). Without both they are trained on the pictures
     first; `kfgs color` with the same --out makes better ones, which are then used if it took more steps. A
-    color.ply that is there already is never replaced.
+    color.ply that is there already is not replaced.
 
     Examples:
         kfgs fit scene/ --out run/ --splat my.ply
         kfgs fit scene/ --out run/ --features maps/
         kfgs fit scene/ --out run/ --teacher lseg --weights demo_e200.ckpt    # maps in run/features
+        kfgs fit scene/ --out run/ --splat my.ply --max-gaussians 0            # keeps every Gaussian of the splat
         kfgs fit scene/ --out run/ --method paper --preset paper
 
     Args:
         out: Run folder; OUT/field.kfgs receives the field, OUT/report.html what was made. Running again continues.
         splat: Any splat file of the scene, in its frame: the Gaussians to average onto.
     """
-    from ..pipeline import fit_scene, write_run_report
+    from ..pipeline import fit as fit_field
+    from ..pipeline import write_run_report
     from ..pipeline.train import check_scene
-    from ..scenes import extract_features
 
-    config = fit_config(
-        method,
-        seed=training.seed,
-        steps=training.steps,
-        max_gaussians=training.max_gaussians,
-        views_per_step=training.views_per_step,
-        split=views.split,
-    )
-    config = dataclasses.replace(config, undistorted_features=maps.undistorted_features, device=training.device)
+    made_by = fit_method(method, splat, training=training)
     check_output("out", out, "a folder")
-    if method.method == "paper":
-        check_alone("splat", splat, "with --method paper, which trains its own Gaussians")
-    elif splat is not None:
+    if splat is not None:
         check_alone("steps", training.steps, "with --splat, which needs no training")
     as_taken = views.load(scene)
     if splat is None and as_taken.splat is not None and method.method != "paper":
@@ -219,59 +211,28 @@ def fit(
         check_alone(
             "undistorted_features", maps.undistorted_features, "with --teacher, which sees the original pictures"
         )
-        network = choose_teacher(teacher.teacher, teacher.weights, teacher.fast, teacher.size, training.device)
-        extract_features(network, as_taken, out / "features", views.split, overwrite=True, progress=True)
-        found = stored_maps(as_taken, chosen, out / "features")
+        source = choose_teacher(teacher.teacher, teacher.weights, teacher.fast, teacher.size, training.device)
     else:
         teacher.check_weights()
         check_alone("size", teacher.size or None, "without --teacher, whose option it is")
         check_alone("fast", teacher.fast, "without --teacher, whose option it is")
-        found = stored_maps(as_taken, chosen, maps.folder(scene))
-    result = fit_scene(loaded, found, out, config, splat=splat, report=say, progress=True)
-
+        source = stored_maps(as_taken, chosen, maps.folder(scene))
+    field = fit_field(
+        loaded,
+        source,
+        made_by,
+        folder=out,
+        split=views.split,
+        seed=training.seed,
+        device=training.device,
+        undistorted_features=maps.undistorted_features,
+        report=say,
+        progress=True,
+    )
     command = f"cd {shlex.quote(os.getcwd())}\n{shlex.join(called)}"
-    written = [result.field_path, *write_run_report(result, loaded, config, command=command)]
-    say(result.field.summary())
-    wrote(written)
-
-
-def uplift(
-    scene: SceneFolder,
-    splat: Positional[Path],
-    out: Path,
-    *,
-    max_gaussians: Given[int] = None,
-    views: Views,
-    maps: Maps,
-) -> None:
-    """Give every Gaussian of a splat the teacher's features, without training: `kfgs fit` without merging.
-
-    Examples:
-        kfgs uplift scene/ my.ply --out my.kfgs
-        kfgs uplift scene/ my.ply --out my.kfgs --features maps/ --max-gaussians 100000
-
-    Args:
-        splat: Any splat file of the scene, or a field, in the scene's frame.
-        out: The file to write (*.kfgs).
-        max_gaussians: Prune and merge to at most this many; every Gaussian is kept when not given.
-    """
-    from ..fields import UpliftConfig
-    from ..fields.store import check_place
-    from ..pipeline import FitConfig
-    from ..pipeline.fuse import uplift as uplift_scene
-
-    check_output("out", out, "a file")
-    check_place(out)
-    as_taken = views.load(scene)
-    loaded = as_taken.undistorted()
-    found = stored_maps(as_taken, loaded.views(views.split), maps.folder(scene))
-    cloud = (open_field if is_field(splat) else open_splats)("splat", splat).gaussians
-    fused = UpliftConfig(max_gaussians=max_gaussians)
-    config = FitConfig(uplift=fused, split=views.split, undistorted_features=maps.undistorted_features)
-    field = uplift_scene(loaded, found, cloud, config, progress=True, report=say)
-    field.save(out)
+    report = write_run_report(out, field, loaded, made_by, split=views.split, command=command)
     say(field.summary())
-    wrote([out])
+    wrote([out / "field.kfgs", *report])
 
 
 def color(
@@ -304,23 +265,18 @@ def color(
     check_whole("pictures", pictures, 0)
     check_output("out", out, "a folder")
     config = {"quick": ColorConfig.quick, "cpu": ColorConfig.cpu, "paper": ColorConfig.paper}[preset]()
-    fields = config.field if training.steps is None else config.field.with_steps(training.steps)
-    fields = dataclasses.replace(fields, views_per_step=training.views_per_step)
-    if training.max_gaussians is not None:
-        fields = dataclasses.replace(fields, max_gaussians=training.max_gaussians)
-    config = dataclasses.replace(config, seed=training.seed, split=views.split, field=fields)
+    config = dataclasses.replace(config, training=trained(config.training, training))
     loaded = views.load(scene).undistorted()
     held_out = loaded.splits.get("test", [])
     tested = [] if set(held_out) & set(loaded.views(views.split)) else [loaded.stem(i) for i in held_out]
     if tested:
         beside = PhotoPictures(out / "views", tested, pictures)
-    result = fit_color(loaded, out, config, report=say, progress=True, device=training.device)
-    took = f"{result.seconds / 60:.1f} min" if result.seconds >= 60 else f"{result.seconds:.0f} s"
-    say(f"{result.gaussians!r} in {took}")
-
-    written = [result.path]
+    where = {"split": views.split, "seed": training.seed, "device": training.device}
+    gaussians = fit_color(loaded, out, config, **where, report=say, progress=True)
+    say(repr(gaussians))
+    written = [out / "color.ply"]
     if tested:
-        scores = score_views(result.gaussians, loaded, "test", show=beside)
+        scores = score_views(gaussians, loaded, "test", show=beside)
         write_report(out / "scores.json", color=scores)
         say(str(scores))
         written += [*beside.written, out / "scores.json"]

@@ -145,8 +145,8 @@ class MapTeacher(Teacher):
 class FieldMethod:
     """How a field is made."""
 
-    method: Literal["fuse", "paper"] = "fuse"
-    """fuse: average the features in 3-D, then compress; paper: compress each map, then train Gaussians on it (DF-3DGS)."""
+    method: Literal["uplift", "paper"] = "uplift"
+    """uplift: average the features in 3-D, then compress; paper: compress each map, then train Gaussians on it (DF-3DGS)."""
     preset: Literal["cpu", "paper"] = "cpu"
     """cpu (minutes on two cores) or paper (30,000 steps of training)."""
     mode: GivenMode = None
@@ -159,10 +159,8 @@ class Training:
 
     steps: Given[int] = None
     """Training steps; the preset's when not given."""
-    views_per_step: int = 1
-    """Views whose gradients are averaged in a step."""
     max_gaussians: Given[int] = None
-    """At most this many Gaussians (training begins with one per point, even if these are more); the preset's when not given."""
+    """At most this many Gaussians in the result, 0: all of the splat; the preset's when not given."""
     seed: int = 0
     """Every random choice follows from it."""
     device: Device = "auto"
@@ -292,32 +290,30 @@ def remembered_scene(field: Any) -> Path | None:
         return None
 
 
-def fit_config(
-    given: FieldMethod,
-    *,
-    seed: int = 0,
-    steps: int | None = None,
-    max_gaussians: int | None = None,
-    views_per_step: int = 1,
-    split: str = "train",
-) -> Any:
-    """The options of a fit, from a preset and the given options."""
-    from ..pipeline import FitConfig
-    from ..pipeline.color import ColorConfig
+def fit_method(given: FieldMethod, splat: Path | None = None, *, training: Training | None = None) -> Any:
+    """The method of a fit, from a preset and the given options."""
+    from ..fields import UpliftConfig
+    from ..pipeline import Paper, Uplift
 
-    method, mode = given.method, given.mode
-    if mode is not None and method != "paper":
-        raise ValueError(f"mode: expected none for method {method!r}, got {mode!r}; pass --method paper as well")
-    config = FitConfig.cpu() if given.preset == "cpu" else FitConfig.paper(method=method, color=ColorConfig.paper())
-    config = replace(config, method=method, mode=mode or config.mode, seed=seed, split=split)
-    if steps is not None:
-        color = replace(config.color, field=config.color.field.with_steps(steps))
-        config = replace(config, color=color, field=config.field.with_steps(steps))
-    if views_per_step != 1:
-        color = replace(config.color, field=replace(config.color.field, views_per_step=views_per_step))
-        config = replace(config, color=color, field=replace(config.field, views_per_step=views_per_step))
-    if max_gaussians is not None:
-        fields = replace(config.field, max_gaussians=max_gaussians)
-        uplift = replace(config.uplift, max_gaussians=max_gaussians)
-        config = replace(config, field=fields, uplift=uplift)
-    return config
+    training = training or Training()
+    if given.mode is not None and given.method != "paper":
+        raise ValueError(f"mode: expected none for method uplift, got {given.mode!r}; pass --method paper as well")
+    if given.method == "paper":
+        check_alone("splat", splat, "with --method paper, which trains its own Gaussians")
+        paper = Paper.paper() if given.preset == "paper" else Paper()
+        paper = replace(paper, training=trained(paper.training, training))
+        if given.mode == "decouple":
+            return replace(paper, codebook=None, autoencoder=None)
+        return replace(paper, autoencoder=None) if given.mode == "adc" else paper
+    uplift = Uplift.paper() if given.preset == "paper" else Uplift()
+    color = replace(uplift.color, training=trained(uplift.color.training, replace(training, max_gaussians=None)))
+    options = uplift.uplift
+    if training.max_gaussians is not None:
+        options = UpliftConfig(max_gaussians=training.max_gaussians or None)
+    return replace(uplift, splat=splat, color=color, uplift=options)
+
+
+def trained(options: Any, training: Training) -> Any:
+    """The options of a training with the given number of steps and Gaussians."""
+    options = options if training.steps is None else options.with_steps(training.steps)
+    return options if not training.max_gaussians else replace(options, max_gaussians=training.max_gaussians)

@@ -10,30 +10,29 @@ from .apply import (
     select_labelled,
     true_labels,
     write_report,
-    write_training_pictures,
 )
 from .attach import attach
 from .color import ColorConfig, fit_color
 from .compare import views_of_change, write_comparison
-from .config import FitConfig
 from .describe import describe
 from .evaluate import Question, evaluate, open_question
-from .fit import fit_scene
-from .fuse import uplift
+from .fit import fit
 from .label_pictures import segment_cameras, write_coco
+from .methods import Paper, Uplift
 from .run_report import write_run_report
 from .stages import Run
 
 __all__ = [
     "ColorConfig",
-    "FitConfig",
+    "Paper",
     "Question",
     "Run",
+    "Uplift",
     "attach",
     "describe",
     "evaluate",
+    "fit",
     "fit_color",
-    "fit_scene",
     "label_cloud",
     "open_question",
     "read_cloud",
@@ -44,11 +43,9 @@ __all__ = [
     "segment_scene",
     "select_labelled",
     "true_labels",
-    "uplift",
     "views_of_change",
     "write_coco",
     "write_comparison",
     "write_report",
     "write_run_report",
-    "write_training_pictures",
 ]

@@ -30,10 +30,9 @@ from ..gaussians import Gaussians
 from ..labels import LabelSet, OfClass, Selection, Transfer, classify, nearest_labels
 from ..labels.questions import class_rows
 from ..scenes import Scene, list_images
-from ..viz import FeatureColors, overlay_labels, palette, plot_history, save_picture
+from ..viz import FeatureColors, overlay_labels, palette, save_picture
 from ..viz.palette import UNLABELLED
 from ..viz.pictures import Array, write_png
-from .fit import FitResult, load_history
 from .sheets import segmentation_sheet, teacher_labels
 
 SEGMENTED = ("predicted", "colored", "sheets", "overlay", "features")
@@ -298,14 +297,3 @@ def label_cloud(
 def write_report(path: Path, **parts: Any) -> None:
     """Write scores and details of a run as one JSON file; reports become plain numbers."""
     write_json(path, {name: part.to_json() if hasattr(part, "to_json") else part for name, part in parts.items()})
-
-
-@typed
-def write_training_pictures(result: FitResult) -> list[Path]:
-    """Plot the histories of a run's codebook and field into its folder; return the pictures written."""
-    written = []
-    for stage in result.stages:
-        if stage.name in ("codebook", "field"):  # `decouple` has no codebook
-            written.append(result.folder / f"{stage.name}.png")
-            plot_history(load_history(stage), written[-1])
-    return written

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 from .._check import ORIGIN
 from .._files import check_output
 from .._origin import recounted
 from ..evaluation import Report, find_points, score_surface, score_views
+from ..fields import SemanticField
+from ..fields.store import NAME
 from ..formats import write_splats
 from ..formats.ply import write_ply
 from ..gaussians import Gaussians
@@ -39,8 +40,8 @@ from .apply import (
 from .attach import attach
 from .color import ColorConfig, fit_color
 from .compare import views_of_change, write_comparison
-from .config import FitConfig
-from .fit import FitResult, fit_scene
+from .fit import fit
+from .methods import Uplift
 from .run_report import write_run_report
 
 REMOVED, PAINTED, PAINT = "chair", "plant", "#c04040"  # the edits of the paper's Figures 5 and 4
@@ -49,8 +50,8 @@ TITLES = ("before", "after")
 
 def run(
     out: str | Path,
-    config: FitConfig | None = None,
     *,
+    seed: int = 0,
     room: ToyConfig | None = None,
     report: Callable[[str], None] | None = None,
     progress: bool = False,
@@ -59,13 +60,12 @@ def run(
 
     Args:
         out: the folder for `scene/`, `run/`, `segmentation/`, labelled and edited clouds, pictures and `scores.json`.
-        config: how to fit; None: the CPU preset.
+        seed: every random choice follows from it.
         room: the room to build; None: the default room.
         report: called with one line per step.
         progress: show progress bars.
     """
     out, say = check_output("out", out, "a folder"), report or (lambda text: None)
-    config = config or FitConfig.cpu()
     say(
         "1. A room. The demo makes a small furnished room, so that the truth is known exactly: photos, cameras, and for each "
         "photo what a 2-D network would say about its pixels, with the errors of such networks."
@@ -79,16 +79,16 @@ def run(
         "your own, kfgs takes that."
     )
     maps = FeatureFolder(folder / "features").of(scene, "train")
-    colors = replace(ColorConfig.quick(), seed=config.seed)
-    colored = fit_color(scene, out / "run", colors, report=say, progress=progress)
-    quality = score_views(colored.gaussians, scene)
+    colors = fit_color(scene, out / "run", ColorConfig.quick(), seed=seed, report=say, progress=progress)
+    quality = score_views(colors, scene)
     say(f"colours of unseen views: {quality}")
     say(
         "3. Meaning. Each Gaussian gets the mean of what the network says about the pixels that show it; errors of single photos "
         "cancel. Then the features are compressed: a few numbers instead of 512, and neighbours that mean the same become one."
     )
-    fitted = fit_scene(scene, maps, out / "run", config, splat=colored.gaussians, report=say, progress=progress)
-    say(fitted.field.summary())
+    method = Uplift(colors)
+    field = fit(scene, maps, method, folder=out / "run", seed=seed, report=say, progress=progress)
+    say(field.summary())
 
     say(
         "4. Segmentation. Views that no photo shows are drawn from the field, a class for each pixel, and compared with the "
@@ -96,7 +96,7 @@ def run(
     )
     truth = true_labels(scene, folder / "labels", "test")
     found = segment_scene(
-        fitted.field,
+        field,
         scene,
         classes,
         out / "segmentation",
@@ -111,8 +111,8 @@ def run(
     say(f"unseen views: {scores}")
     say(f"the 2-D network alone, on the same views: {teacher.miou}")
 
-    labels, cosines = fitted.field.classify(classes)
-    gaussians = fitted.field.gaussians.replace(labels=labels)
+    labels, cosines = field.classify(classes)
+    gaussians = field.gaussians.replace(labels=labels)
     written = save_labelled(out / "gaussians.ply", gaussians, cosines, classes, rule="fused features; score = cosine")
     surface = _label_surface(gaussians, folder, out / "surface.ply", classes)
     say(f"surface points: {surface}")
@@ -120,22 +120,21 @@ def run(
         f'5. Edits. The classes are carried over to the splat with the colours, and then "{REMOVED}" is a name for Gaussians: '
         f"the {REMOVED}s are removed, and the {PAINTED}s are painted red. Pictures show the views that change most."
     )
-    edited = _edit_colors(out, scene, fitted, colored.gaussians, classes, say)
+    edited = _edit_colors(out, scene, field, colors, classes, say)
     write_report(
         out / "scores.json",
         unseen_views=scores,
         teacher=teacher,
         surface=surface,
         color=quality,
-        seconds=colored.seconds + fitted.seconds,
     )
     segmentation = out / "segmentation"
     return [
-        fitted.field_path,
+        out / "run" / NAME,
         *(segmentation / name for name in ("predicted", "colored", "sheets", "overlay", "features")),
         *written,
         out / "surface.ply",
-        *write_run_report(fitted, scene, config, command="kfgs demo"),
+        *write_run_report(out / "run", field, scene, method, command="kfgs demo"),
         *edited,
         out / "scores.json",
     ]
@@ -144,15 +143,15 @@ def run(
 def _edit_colors(
     out: Path,
     scene: Scene,
-    fitted: FitResult,
+    field: SemanticField,
     colors: Gaussians,
     classes: LabelSet,
     say: Callable[[str], None],
 ) -> list[Path]:
     """Attach the classes to the colours, remove the chairs and recolour the plants; returns the files."""
-    before = attach(fitted.field, colors, classes).gaussians
+    before = attach(field, colors, classes).gaussians
     written = write_splats(before, out / "color.ply").paths
-    for part in connected_parts(before, OfClass(REMOVED).select(before), fitted.field.cameras):
+    for part in connected_parts(before, OfClass(REMOVED).select(before), field.cameras):
         say(f"  {REMOVED}: {part!r}")
     edits = {
         "removed": EditList((Remove(OfClass(REMOVED)),)),

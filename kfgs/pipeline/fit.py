@@ -1,90 +1,159 @@
-"""Make a semantic field from teacher maps and posed images: fuse in 3-D, then compress; or the paper's Figure 2.
+"""Make a semantic field from posed images and teacher maps: fuse in 3-D, then compress; or the paper's Figure 2.
 
-Each step is a stage in the run folder. A finished stage is found again by the hash of its inputs. The longest one (the field)
-also resumes from its last checkpoint.
+Each step is a stage in the run folder and is found again by the digest of its inputs. Training also resumes from its last
+checkpoint.
 """
 
 from __future__ import annotations
 
+import math
+import shutil
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from .._card import short_repr
-from .._files import check_output, folded_name, read_json, real_path, write_json
+from .._check import check_whole
+from .._files import check_output, folded_name, real_path, write_json
 from .._progress import Progress, as_progress
-from .._typed import typed
 from ..cameras import Camera
 from ..fields import (
+    Autoencoded,
+    Codewords,
+    Decoder,
     FieldFit,
     GaussianParams,
+    Identity,
     SemanticField,
     fit_field,
+    fuse_views,
     scene_classes,
+    uplift_maps,
 )
-from ..fields.decoders import Autoencoded, Codewords, Decoder, Identity
-from ..fields.store import NAME, check_place, holds_field
+from ..fields.store import NAME, check_place
+from ..formats import read_splats, write_splats
+from ..formats.folders import splat_file_of
 from ..gaussians import Gaussians
 from ..quant import (
     Autoencoder,
     Codebook,
     IndexMaps,
     LatentMaps,
-    LinearLatents,
     fit_autoencoder,
     fit_codebook,
     quantize_maps,
 )
-from ..scenes import Scene
-from .color import ColorConfig
-from .config import FitConfig
-from .fuse import answers_stage, find_geometry, uplift_stage
-from .maps import KnownFeatures, Maps, as_maps, check_readable, digest_changes, map_digests, map_shape, maps_of_views
-from .points import with_points
-from .stages import Run, Stage, digest_scene, digest_tensors, stage_generator
-from .train import check_scene, field_stage, training_device, with_extent
+from ..scenes import FeatureFolder, Scene, extract_features
+from .color import color_stage, find_color
+from .maps import KnownFeatures, Maps, as_maps, as_taken, check_readable, describe_maps, map_shape, maps_of_views
+from .methods import Paper, Uplift
+from .stages import Run, Stage, digest_cameras, digest_scene, digest_shape, digest_tensors, stage_generator
+from .train import check_scene, field_stage, training_device, with_extent, with_points
 
-REPORT, TITLE = "report.html", "<title>kfgs: "
-PICTURES = ("preview.png", "codebook.png", "field.png")  # with the report, what `write_run_report` writes
+REPORT = ("report.html", "preview.png", "codebook.png", "field.png")  # what `write_run_report` writes
 
 
-@dataclass(frozen=True, eq=False)
-class FitResult:
-    """A finished run."""
+def fit(
+    scene: Scene,
+    maps: Any,
+    method: Uplift | Paper | None = None,
+    *,
+    folder: str | Path | None = None,
+    split: str = "train",
+    seed: int = 0,
+    device: str | torch.device = "auto",
+    undistorted_features: bool = False,
+    report: Callable[[str], None] | None = None,
+    progress: Progress = False,
+) -> SemanticField:
+    """Make a semantic field of a scene; finished stages in the run folder are reused.
 
-    field: SemanticField
-    folder: Path
-    stages: list[Stage]
+    Args:
+        scene: posed, undistorted views. If it has too few points and training needs them, they are triangulated first.
+        maps: one teacher map [h, w, D] for each view of the split, in their order: a `FeatureFolder`, or tensors in memory.
+            Or a teacher, whose maps are then stored in `folder/features`. When the stages that read them are finished,
+            maps may be deleted, except for `Paper(codebook=None, autoencoder=None)`.
+        method: `Uplift()`, the default, or `Paper()`, with their options.
+        folder: the run folder; it receives the stages and `field.kfgs`, in place of a field that other options made. Going
+            back to the old options is quick, because stages stay. None keeps nothing.
+        split: the training views; "all" trains on all views.
+        seed: every random choice follows from it.
+        device: where to train, see `training_device`; the other stages and the result stay on the CPU.
+        undistorted_features: the teacher saw undistorted pictures. If not, its maps are undistorted like the pictures.
+        report: receives one line per stage.
+        progress: True shows bars; a function receives the history rows of every trained stage as they appear.
 
-    __repr__ = short_repr
+    Returns:
+        The field; its `info` says how it was made, with the seconds of each stage.
 
-    @property
-    def field_path(self) -> Path:
-        """The file of the saved field."""
-        return self.folder / NAME
-
-    @property
-    def seconds(self) -> float:
-        """Total time of the stages; reused ones count with their original time."""
-        return sum(stage.seconds for stage in self.stages)
+    Raises:
+        TypeError: if `maps` are neither maps nor a teacher, or `progress` is neither a bool nor a function.
+        ValueError: if the counts of views and maps differ, a camera has distortion, there is no such device, a map's file is
+            damaged, or another process works in the folder.
+        FileNotFoundError: if a stage needs maps that were deleted, or a picture is missing.
+    """
+    method, progress, target = method or Uplift(), as_progress(progress), training_device(device)
+    if not isinstance(method, Uplift | Paper):
+        raise TypeError(f"method: expected Uplift() or Paper(), got {type(method).__name__}; pass one of them")
+    check_whole("seed", seed, -math.inf)
+    views = scene.views(split)
+    check_scene(scene, views)
+    kept = None if folder is None else check_output("folder", folder, "a folder")
+    if kept is not None:
+        check_place(kept / NAME)
+    with nullcontext(kept) if kept is not None else TemporaryDirectory(prefix="kfgs-") as place:
+        run = Run(Path(place), report)
+        if hasattr(maps, "encode_image"):
+            extract_features(
+                maps, as_taken(scene), run.folder / "features", split=split, overwrite=True, progress=progress is True
+            )
+            maps = FeatureFolder(run.folder / "features").of(scene, split)
+        maps = as_maps(maps)
+        _check_maps(scene, split, maps, method)
+        with run.locked():
+            if isinstance(method, Paper) or (method.splat is None and scene.splat is None):  # else nothing is trained
+                scene = with_points(run, scene, views, seed, progress)
+            seen = maps_of_views(scene, views, maps, undistorted=undistorted_features)
+            job = _Job(run, scene, views, seen, describe_maps(run, seen), seed, target, progress)
+            field, about = _uplift(job, method) if isinstance(method, Uplift) else _paper(job, method)
+            teacher = getattr(maps, "identity", None)
+            about |= {
+                "seed": seed,
+                "views": [camera.name for camera in job.cameras],
+                "teacher_map": list(map_shape(seen)),
+                **({"teacher": teacher} if teacher else {}),
+                **({} if scene.folder is None else {"scene": str(real_path(scene.folder))}),
+                "seconds": {stage.name: round(stage.seconds, 3) for stage in run.stages},
+                "stages": [stage.folder.name for stage in run.stages],
+                "kfgs": version("kfgs"),
+            }
+            field = replace(
+                field, info=about, classes=None if scene.folder is None else scene_classes(scene.folder, field.dim)
+            )
+            if kept is not None:
+                for name in REPORT:  # of an older field: a kill leaves no wrong report
+                    (kept / name).unlink(missing_ok=True)
+                field.save(kept / NAME)
+    return field
 
 
 @dataclass(frozen=True)
 class _Job:
-    """One call of `fit_scene`: the values that all of its stages need."""
+    """The values that all stages of a fit need."""
 
     run: Run
     scene: Scene
     views: list[int]
     maps: Maps
     features: dict[str, Any]
-    """Identity of the maps, as JSON."""
-    config: FitConfig
+    """What decides the maps, as JSON."""
+    seed: int
     device: torch.device
     progress: Progress
 
@@ -95,238 +164,170 @@ class _Job:
 
     def generator(self, stage: str) -> torch.Generator:
         """The random numbers of a stage."""
-        return stage_generator(self.config.seed, stage)
+        return stage_generator(self.seed, stage)
 
 
-def _codebook_stage(job: _Job) -> tuple[Codebook, Stage]:
-    """Adaptive Data Compression, Sec. 3.3.1: the codebook S."""
-    run, config = job.run, job.config
-
-    def make(folder: Path) -> None:
-        check_readable(job.maps, "the codebook")
-        book = fit_codebook(job.maps, config.codebook, generator=job.generator("codebook"), progress=job.progress)
-        book.save(folder / "codebook.safetensors")
-        assert book.report is not None
-        if book.report.note is not None:
-            run.say(f"note: {book.report.note}")
-        write_json(folder / "history.json", book.report.history)
-
-    inputs = {"features": job.features, "config": asdict(config.codebook), "seed": config.seed}
-    stage = run.stage("codebook", inputs, make)
-    return Codebook.load(stage.folder / "codebook.safetensors"), stage
-
-
-def _index_stage(job: _Job, codebook: Codebook, upstream: Stage) -> tuple[IndexMaps, Stage]:
-    """Quantisation, Eq. 5: the index map M of every view."""
-    inputs = {"features": job.features, "codebook": upstream.key}
-
-    def make(folder: Path) -> None:
-        check_readable(job.maps, "quantisation")
-        maps = quantize_maps(job.maps, codebook, progress=job.progress is True)
-        maps.save(folder / "index_maps.safetensors")
-
-    stage = job.run.stage("index_maps", inputs, make)
-    return IndexMaps.load(stage.folder / "index_maps.safetensors"), stage
-
-
-def _autoencoder_stage(job: _Job, codebook: Codebook, upstream: Stage) -> tuple[Autoencoder, Stage]:
-    """Semantic Compression, Sec. 3.3.2: encoder E and decoder Psi."""
-    config = job.config
-
-    def make(folder: Path) -> None:
-        made = fit_autoencoder(
-            codebook, config.autoencoder, generator=job.generator("autoencoder"), progress=job.progress
-        )
-        made.save(folder / "autoencoder.safetensors")
-        assert made.report is not None
-        write_json(folder / "history.json", made.report.history)
-
-    inputs = {"codebook": upstream.key, "config": asdict(config.autoencoder), "seed": config.seed}
-    stage = job.run.stage("autoencoder", inputs, make)
-    return Autoencoder.load(stage.folder / "autoencoder.safetensors"), stage
-
-
-def _field_stage(job: _Job, targets: Sequence[Tensor], inputs: dict[str, Any]) -> GaussianParams:
-    """The decoupled field, Sec. 3.2: Gaussians whose rendered latents follow the targets (Eq. 4)."""
-    scene, config = job.scene, job.config
-    field = with_extent(config.field, scene)
-    options = field.identity()
-    extent = options.pop("extent")
-    inputs = inputs | {
-        "scene": digest_scene(scene, job.views),
-        "extent": extent,
-        "config": options,
-        "seed": config.seed,
-    }
-
-    def train(checkpoint: Path) -> FieldFit:
-        generator = job.generator("field")
-        start = GaussianParams.from_points(scene.points, int(targets[0].shape[-1]), generator=generator)
-        start = start.map(lambda value: value.to(job.device))
-        return fit_field(
-            start, job.cameras, targets, field, generator=generator, progress=job.progress, checkpoint=checkpoint
-        )
-
-    return field_stage(job.run, "field", inputs, train)[0]
-
-
-def _check_inputs(scene: Scene, views: Sequence[int], maps: Maps, config: FitConfig) -> None:
-    """Check inputs that would otherwise fail only after the first stages."""
-    split = config.split
-    if config.needs_maps:
-        check_readable(maps, "mode 'decouple'")
+def _check_maps(scene: Scene, split: str, maps: Maps, method: Uplift | Paper) -> None:
+    """Check what would otherwise fail only after the first stages."""
+    views = scene.views(split)
+    if isinstance(method, Paper) and method.codebook is None:
+        check_readable(maps, "training without a codebook")
+    advice = f"read them with FeatureFolder(path).of(scene, {split!r})"
     if len(views) != len(maps):
         raise ValueError(
-            f"maps: expected one teacher map per view of split {split!r} ({len(views)}), got {len(maps)}; "
-            f"read them with FeatureFolder(path).of(scene, {split!r})"
+            f"maps: expected one teacher map per view of split {split!r} ({len(views)}), got {len(maps)}; {advice}"
         )
-    check_scene(scene, views)
     stems = getattr(maps, "stems", None)
-    if stems is not None and [Path(folded_name(stem)).name for stem in stems] != [
-        Path(folded_name(scene.stem(i))).name for i in views
-    ]:
-        raise ValueError(
-            f"maps: expected the maps of the views of split {split!r} in their order ({scene.stem(views[0])}, "
-            f"...), got {stems[0]}, ...; read them with FeatureFolder(path).of(scene, {split!r})"
-        )
+    if stems is not None:
+        given, wanted = ([Path(folded_name(stem)).name for stem in names] for names in (stems, map(scene.stem, views)))
+        if given != wanted:
+            raise ValueError(
+                f"maps: expected the maps of the views of split {split!r} in their order ({wanted[0]}, ...), got {given[0]}, "
+                f"...; {advice}"
+            )
     if hasattr(maps, "check_files"):
         maps.check_files()
 
 
-@typed
-def fit_scene(
-    scene: Scene,
-    maps: Maps | Sequence[Tensor],  # teacher maps of the views of config.split, in their order
-    folder: str | Path,
-    config: FitConfig | None = None,
-    *,
-    splat: Gaussians | str | Path | None = None,
-    latents: LinearLatents | None = None,
-    report: Callable[[str], None] | None = None,
-    progress: Progress = False,
-) -> FitResult:
-    """Make a semantic field of a scene; finished stages in the run folder are reused.
-
-    Args:
-        scene: posed, undistorted views with their sparse points; if it has none and training needs them, they are
-            triangulated first.
-        maps: one teacher map [h, w, D] per training view; read one at a time; a `FeatureFolder`, or a list in memory. When
-            the stages that read them are finished, the maps may be deleted (`discard_maps`), except for the paper's mode
-            `decouple`.
-        folder: the run folder; the finished field goes to `folder/field.kfgs`. It replaces a field that other options made there,
-            and the report of that one. The stages stay, so going back to the old options is quick.
-        config: the method and its options.
-        splat: of method `fuse`, the Gaussians to fuse onto, in the scene's frame, or a splat file. None takes
-            `scene.splat`; if the scene has none, it trains them on the pictures with `config.color` and writes them to
-            `folder/color.ply`, unless that file exists. If `fit_color` trained for longer in the same folder, its Gaussians are
-            taken instead.
-        latents: of method `fuse`, those of other fields (`fields.sample_latents`), with which this one shall agree.
-        report: receives one line per stage.
-        progress: True shows bars; a function receives the history rows of every trained stage as they appear.
-
-    Raises:
-        TypeError: if `maps` is neither, or `progress` neither a bool nor a function.
-        ValueError: if the counts of views and maps differ, a camera has distortion, there is no such device, a splat is given
-            to the paper's method, or its mode `decouple` gets `RecomputedMaps`; if a map's file is damaged; if `folder` is a
-            file, or another process works in it.
-        FileExistsError: if `folder/field.kfgs` is not a field.
-        FileNotFoundError: if a stage needs maps that were discarded, or a picture is missing.
-    """
-    config, progress, maps = config or FitConfig(), as_progress(progress), as_maps(maps)
-    target_device = training_device(config.device)
-    _check_inputs(scene, scene.views(config.split), maps, config)
-    if splat is not None and config.method == "paper":
-        raise ValueError("splat: expected none for method 'paper', which trains its own Gaussians; leave it out")
-    if latents is not None and config.method == "paper":
-        raise ValueError("latents: expected none for method 'paper', whose autoencoder makes them; leave it out")
-    run = Run(check_output("folder", folder, "a folder"), report)
-    with run.locked():
-        check_place(run.folder / NAME)
-        if config.method == "paper" or (splat is None and scene.splat is None):  # else nothing is trained
-            scene = with_points(run, scene, scene.views(config.split), config.seed, progress)
-        job = _job(run, scene, maps, config, target_device, progress)
-        found, about = _make_field(job, splat, latents)
-        done = FitResult(found, run.folder, run.stages)
-        about |= _facts(job, getattr(maps, "identity", None))
-        folder = scene.folder
-        classes = None if folder is None else scene_classes(folder, found.dim)
-        done = replace(done, field=replace(found, info=about, classes=classes))
-        replace_field(run.folder, done.field)
-    return done
+# Uplift: fuse first, compress after.
 
 
-def replace_field(folder: Path, field: SemanticField) -> None:
-    """Write the field of a run folder in one step. The report of an older one is deleted first: a kill leaves no wrong report."""
-    if not holds_field(folder / NAME, vars(field)):
-        for name in (REPORT, *PICTURES):
-            (folder / name).unlink(missing_ok=True)
+def _uplift(job: _Job, method: Uplift) -> tuple[SemanticField, dict[str, Any]]:
+    """The maps' features on the Gaussians of a splat, merged and compressed; and facts about the geometry."""
+    geometry, origin = _geometry(job, method)
+    cameras, options = digest_cameras(job.cameras), method.uplift
+    latents = None if method.latents is None else digest_tensors(method.latents.basis)
+    seen = {"features": job.features, "cameras": cameras, "latents": latents}
+    inputs = seen | {"geometry": digest_shape(geometry), "config": asdict(options), "seed": job.seed}
+    scratch = job.run.scratch("uplift", seen | {"pixels": options.pixels})
+
+    def make(folder: Path) -> None:
+        check_readable(job.maps, "the uplift")
+        field = uplift_maps(
+            geometry.to("cpu"),
+            job.cameras,
+            job.maps,
+            options,
+            latents=method.latents,
+            generator=job.generator("uplift"),
+            scratch=scratch,
+            progress=job.progress is True,
+            report=job.run.report,
+        )
         field.save(folder / NAME)
 
-
-def _facts(job: _Job, teacher: Any) -> dict[str, Any]:
-    """The `info` of a field about its origin."""
-    scene, stages = job.scene, job.run.stages
-    return {
-        "seed": job.config.seed,
-        "views": [camera.name for camera in job.cameras],
-        "teacher_map": list(map_shape(job.maps)),
-        **({"teacher": teacher} if teacher else {}),
-        **({} if scene.folder is None else {"scene": str(real_path(scene.folder))}),
-        "seconds": {stage.name: round(stage.seconds, 3) for stage in stages},
-        "kfgs": version("kfgs"),
-    }
+    stage = job.run.stage("uplift", inputs, make)
+    shutil.rmtree(scratch, ignore_errors=True)
+    return SemanticField.load(stage.folder), {"method": "uplift", **origin}
 
 
-def _make_field(
-    job: _Job, splat: Gaussians | str | Path | None, latents: LinearLatents | None = None
-) -> tuple[SemanticField, dict[str, Any]]:
-    """All stages of a method: the field, and what decided it, for its `info`."""
-    config = job.config
-    if config.method == "paper":
-        about = {"method": config.method, "mode": config.mode, "steps": {"field": config.field.steps}}
-        return answers_stage(job.run, _paper_stages(job), job.cameras), about
-    inputs = {"features": job.features, "config": asdict(config.uplift), "seed": config.seed}
-    if latents is not None:
-        inputs["latents"] = digest_tensors(latents.basis)
-    given = job.run, job.scene, splat, _color_config(config), job.device, job.progress
-    geometry, origin = find_geometry(*given)
-    options = config.uplift, inputs, job.progress is True, latents
-    found = uplift_stage(job.run, geometry, job.cameras, job.maps, *options)
-    return found, {"method": config.method, **origin}
+def _geometry(job: _Job, method: Uplift) -> tuple[Gaussians, dict[str, Any]]:
+    """The Gaussians to fuse onto, and where they are from."""
+    splat = job.scene.splat if method.splat is None else method.splat
+    if isinstance(splat, Gaussians):
+        return splat, {"geometry": "given"}
+    if splat is not None:
+        return read_splats(splat), {"geometry": str(splat_file_of(splat))}
+    longer = find_color(job.run, job.scene, job.views, method.color)
+    if longer is not None:
+        gaussians, steps = longer
+    else:
+        options = method.color, job.seed, job.device, job.progress
+        gaussians, steps = color_stage(job.run, job.scene, job.views, *options), method.color.training.steps
+        if not (job.run.folder / "color.ply").exists():
+            write_splats(gaussians, job.run.folder / "color.ply")
+    return gaussians, {"geometry": "trained on the pictures", "steps": {"color": steps}}
 
 
-def _paper_stages(job: _Job) -> SemanticField:
-    """Figure 2: codebook, index maps, autoencoder, and Gaussians trained on the latent maps."""
-    mode = job.config.mode
+# Paper: compress each map, then train Gaussians on the compressed maps (Figure 2).
+
+
+def _paper(job: _Job, method: Paper) -> tuple[SemanticField, dict[str, Any]]:
+    """Codebook, index maps, autoencoder, Gaussians trained on the latent maps, and what the views show of each Gaussian."""
     targets: Sequence[Tensor] = KnownFeatures(job.maps)
     decoder: Decoder = Identity(map_shape(job.maps)[-1])
-    if mode == "decouple":
-        inputs: dict[str, Any] = {"mode": mode, "features": job.features}
-    else:
-        codebook, made = _codebook_stage(job)
-        index_maps, indexed = _index_stage(job, codebook, made)
-        inputs = {"mode": mode, "index_maps": indexed.key}
-        targets, decoder = LatentMaps(index_maps, codebook.codewords), Codewords(codebook)
-        if mode == "adc+sc":
-            autoencoder, compressed = _autoencoder_stage(job, codebook, made)
-            inputs["autoencoder"], decoder = compressed.key, Autoencoded(codebook, autoencoder)
+    inputs: dict[str, Any] = {"features": job.features}
+    if method.codebook is not None:
+        codebook, book = _codebook(job, method)
+        index_maps, indexed = _index_maps(job, codebook, book)
+        inputs, latents, decoder = {"index_maps": indexed.key}, codebook.codewords, Codewords(codebook)
+        if method.autoencoder is not None:
+            autoencoder, coder = _autoencoder(job, method, codebook, book)
+            inputs["autoencoder"], decoder = coder.key, Autoencoded(codebook, autoencoder)
             with torch.no_grad():
-                targets = LatentMaps(index_maps, autoencoder.encode(codebook.codewords))
-    return SemanticField(_field_stage(job, targets, inputs).activated().detach(), decoder)
+                latents = autoencoder.encode(codebook.codewords)
+        targets = LatentMaps(index_maps, latents)
+    params, trained = _train(job, method, targets, inputs)
+    field = SemanticField(params.activated().detach(), decoder)
+
+    def fuse(folder: Path) -> None:
+        fuse_views(field, job.cameras).save(folder / NAME)
+
+    answers = job.run.stage("answers", {"field": trained.key}, fuse)
+    return SemanticField.load(answers.folder), {"method": "paper", "steps": {"field": method.training.steps}}
 
 
-def _job(run: Run, scene: Scene, maps: Maps, config: FitConfig, device: torch.device, progress: Progress) -> _Job:
-    views = scene.views(config.split)
-    seen = maps_of_views(scene, views, maps, undistorted=config.undistorted_features)
-    features = {"files": map_digests(run, seen), "lenses": digest_changes(seen)}
-    return _Job(run, scene, views, seen, features, config, device, progress)
+def _codebook(job: _Job, method: Paper) -> tuple[Codebook, Stage]:
+    """Adaptive Data Compression, Sec. 3.3.1: the codebook S."""
+    options = method.codebook
+    assert options is not None
+
+    def make(folder: Path) -> None:
+        check_readable(job.maps, "the codebook")
+        made = fit_codebook(job.maps, options, generator=job.generator("codebook"), progress=job.progress)
+        made.save(folder / "codebook.safetensors")
+        assert made.report is not None
+        if made.report.note is not None:
+            job.run.say(f"note: {made.report.note}")
+        write_json(folder / "history.json", made.report.history)
+
+    stage = job.run.stage("codebook", {"features": job.features, "config": asdict(options), "seed": job.seed}, make)
+    return Codebook.load(stage.folder / "codebook.safetensors"), stage
 
 
-def _color_config(config: FitConfig) -> ColorConfig:
-    return replace(config.color, seed=config.seed, split=config.split)
+def _index_maps(job: _Job, codebook: Codebook, book: Stage) -> tuple[IndexMaps, Stage]:
+    """Quantisation, Eq. 5: the index map M of every view."""
+
+    def make(folder: Path) -> None:
+        check_readable(job.maps, "quantisation")
+        quantize_maps(job.maps, codebook, progress=job.progress is True).save(folder / "index_maps.safetensors")
+
+    stage = job.run.stage("index_maps", {"features": job.features, "codebook": book.key}, make)
+    return IndexMaps.load(stage.folder / "index_maps.safetensors"), stage
 
 
-def load_history(stage: Stage) -> list[dict[str, Any]]:
-    """The history rows of a finished stage; empty if it has none."""
-    path = stage.folder / "history.json"
-    return list(read_json(path)) if path.is_file() else []
+def _autoencoder(job: _Job, method: Paper, codebook: Codebook, book: Stage) -> tuple[Autoencoder, Stage]:
+    """Semantic Compression, Sec. 3.3.2: encoder E and decoder Psi."""
+    options = method.autoencoder
+    assert options is not None
+
+    def make(folder: Path) -> None:
+        made = fit_autoencoder(codebook, options, generator=job.generator("autoencoder"), progress=job.progress)
+        made.save(folder / "autoencoder.safetensors")
+        assert made.report is not None
+        write_json(folder / "history.json", made.report.history)
+
+    stage = job.run.stage("autoencoder", {"codebook": book.key, "config": asdict(options), "seed": job.seed}, make)
+    return Autoencoder.load(stage.folder / "autoencoder.safetensors"), stage
+
+
+def _train(job: _Job, method: Paper, targets: Sequence[Tensor], inputs: dict[str, Any]) -> tuple[GaussianParams, Stage]:
+    """The decoupled field, Sec. 3.2: Gaussians whose rendered latents follow the targets (Eq. 4)."""
+    options = with_extent(method.training, job.scene)
+    inputs |= {"scene": digest_scene(job.scene, job.views), "config": options.identity(), "seed": job.seed}
+
+    def train(checkpoint: Path) -> FieldFit:
+        generator = job.generator("field")
+        start = GaussianParams.from_points(job.scene.points, int(targets[0].shape[-1]), generator=generator)
+        start = start.map(lambda value: value.to(job.device))
+        return fit_field(
+            start,
+            job.cameras,
+            targets,
+            options,
+            generator=generator,
+            progress=job.progress,
+            checkpoint=checkpoint,
+        )
+
+    return field_stage(job.run, "field", inputs, train)

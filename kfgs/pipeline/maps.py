@@ -41,73 +41,59 @@ class Maps(Protocol):
         ...
 
 
-def maps_of_views(scene: Scene, views: Sequence[int], maps: Maps, *, undistorted: bool = False) -> Maps:
-    """Maps of some views' pictures as `ViewMaps`; unchanged if no view has a lens, a mask or transparent pixels.
+class MapsInMemory(Sequence[Tensor]):
+    """Maps that are tensors or arrays: they have no files, and their values are digested."""
 
-    Args:
-        scene: as it is rendered.
-        views: indices of the views.
-        maps: one per view, of the pictures on disk.
-        undistorted: the maps are of undistorted pictures.
+    files: Sequence[Path] = ()
 
-    Raises:
-        ValueError: if the counts differ.
-    """
-    if len(maps) != len(views):
-        raise ValueError(f"maps: expected {len(views)} (one per view), got {len(maps)}; give one for each")
-    chosen, lens = scene.select(views), scene.lenses is not None and not undistorted
-    changed = lens or any(changing_files(chosen, i) for i in range(len(chosen)))
-    return ViewMaps(maps, _as_taken(chosen) if lens else chosen, lens) if changed else maps
+    def __init__(self, maps: Sequence[Any]) -> None:
+        self._maps = [as_tensor(f"maps[{i}]", value, floating=True) for i, value in enumerate(maps)]
 
+    def __len__(self) -> int:
+        return len(self._maps)
 
-def changing_files(scene: Scene, i: int) -> list[Path]:
-    """The mask of a view, and its picture if that may have transparent pixels."""
-    mask, picture = None if scene.masks is None else scene.masks[i], scene.image_paths[i]
-    return [*([] if mask is None else [mask]), *([picture] if has_alpha(picture) else [])]
+    def __getitem__(self, i: int) -> Tensor:  # type: ignore[override]  # [h, w, D]
+        return self._maps[i]
 
-
-def _as_taken(scene: Scene) -> Scene:
-    """The scene with its lenses."""
-    return scene if scene.lenses is None else replace(scene, cameras=scene.lenses, lenses=None)
+    def digests(self) -> list[list[str]]:
+        """A number and the SHA-256 of the values of each map."""
+        plain = (value.float() if value.dtype == torch.bfloat16 else value for value in self._maps)
+        return [[f"map {i}", digest_tensors(value)] for i, value in enumerate(plain)]
 
 
 class ViewMaps:
     """Maps of the views of a scene: without the lens, and all-zero outside the picture, where it is masked or transparent.
 
     Args:
-        maps: one per view.
+        maps: one per view, of the pictures on disk.
         taken: the views in the frame of the maps.
         straighten: whether the lenses of `taken` are removed.
     """
 
     def __init__(self, maps: Maps, taken: Scene, straighten: bool) -> None:
         self.maps, self._taken, self._straighten = maps, taken, straighten
-
-    @property
-    def files(self) -> Sequence[Path]:
-        """The files of the original maps."""
-        return self.maps.files
-
-    def __len__(self) -> int:
-        return len(self.maps)
+        self.files = maps.files
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """(h, w, D) of the first map, which does not change."""
         return map_shape(self.maps)
 
+    def __len__(self) -> int:
+        return len(self.maps)
+
+    def __getitem__(self, i: int, /) -> Tensor:  # [h, w, D]
+        return self._change(i, self.maps[i])
+
     def digests(self) -> list[list[str]] | None:
         """The digests of the original maps; None if unknown."""
-        return _own_digests(self.maps)
+        return _known_digests(self.maps)
 
     def describe(self, i: int) -> list[Any] | None:
         """What decides the change of a map: the lens, and the files of mask and transparent picture; None: nothing."""
         lens = describe_lens(self._taken.cameras[i]) if self._straighten else None
         files = changing_files(self._taken, i)
         return [lens, *map(digest_file, files)] if files else lens
-
-    def __getitem__(self, i: int, /) -> Tensor:  # [h, w, D]
-        return self._change(i, self.maps[i])
 
     def grid(self, i: int, step: tuple[int, int] | None = None, samples: int = SAMPLES) -> Tensor:  # [n, D]
         """`sample_grid(self[i], step, samples=samples)`; if the view's map does not change, only these pixels are read."""
@@ -134,44 +120,8 @@ class ViewMaps:
         return straight * inside[..., None]
 
 
-class MapsInMemory(Sequence[Tensor]):
-    """Maps that are tensors or arrays: they have no files, and their values are digested."""
-
-    files: Sequence[Path] = ()
-
-    def __init__(self, maps: Sequence[Any]) -> None:
-        self._maps = [as_tensor(f"maps[{i}]", one, floating=True) for i, one in enumerate(maps)]
-
-    def __len__(self) -> int:
-        return len(self._maps)
-
-    def __getitem__(self, i: int) -> Tensor:  # type: ignore[override]  # [h, w, D]
-        return self._maps[i]
-
-    def digests(self) -> list[list[str]]:
-        """A number and the SHA-256 of the values of each map."""
-        numbers = (one.float() if one.dtype == torch.bfloat16 else one for one in self._maps)
-        return [[f"map {i}", digest_tensors(one)] for i, one in enumerate(numbers)]
-
-
-def as_maps(maps: Any) -> Maps:
-    """Maps as they are; a list of tensors or arrays, or one array of all maps, as `MapsInMemory`.
-
-    Raises:
-        TypeError: if it is something else.
-    """
-    if isinstance(maps, list | tuple) or (isinstance(maps, Tensor | np.ndarray) and maps.ndim == 4):
-        return MapsInMemory(maps)  # type: ignore[return-value, arg-type]
-    if not (hasattr(maps, "files") and hasattr(maps, "__getitem__")):
-        raise TypeError(
-            f"maps: expected teacher maps, got {type(maps).__name__}; read them with FeatureFolder(path).of(scene), or pass a "
-            "list of tensors [h, w, D]"
-        )
-    return maps  # type: ignore[no-any-return]
-
-
 class KnownFeatures(Sequence[Tensor]):
-    """Raw maps as targets of a field (`decouple`): unknown pixels are NaN, which the loss ignores."""
+    """Raw maps as targets of a field: unknown pixels are NaN, which the loss ignores."""
 
     def __init__(self, maps: Maps) -> None:
         self.maps = maps
@@ -184,10 +134,51 @@ class KnownFeatures(Sequence[Tensor]):
         return features.masked_fill(row_norms(features.float())[..., None] <= EPS, torch.nan)
 
 
-def map_digests(run: Run, maps: Maps) -> list[list[str]]:
-    """[file name, SHA-256] of each map: from the maps if they know (they may have been discarded), else from the files."""
-    known = _own_digests(maps)
-    return run.digests(maps.files) if known is None else known
+def as_maps(maps: Any) -> Maps:
+    """Maps as they are; a list of tensors or arrays, or one array of all maps, as `MapsInMemory`; else a TypeError."""
+    if isinstance(maps, list | tuple) or (isinstance(maps, Tensor | np.ndarray) and maps.ndim == 4):
+        return MapsInMemory(maps)  # type: ignore[return-value, arg-type]
+    if not (hasattr(maps, "files") and hasattr(maps, "__getitem__")):
+        raise TypeError(
+            f"maps: expected teacher maps, got {type(maps).__name__}; read them with FeatureFolder(path).of(scene), or pass a "
+            "list of tensors [h, w, D], or a teacher"
+        )
+    return maps  # type: ignore[no-any-return]
+
+
+def maps_of_views(scene: Scene, views: Sequence[int], maps: Maps, *, undistorted: bool = False) -> Maps:
+    """Maps of some views' pictures as `ViewMaps`; unchanged if no view has a lens, a mask or transparent pixels.
+
+    Args:
+        scene: as it is rendered.
+        views: indices of the views.
+        maps: one per view, of the pictures on disk.
+        undistorted: the maps are of undistorted pictures.
+    """
+    assert len(maps) == len(views)
+    chosen, lens = scene.select(views), scene.lenses is not None and not undistorted
+    changed = lens or any(changing_files(chosen, i) for i in range(len(chosen)))
+    return ViewMaps(maps, as_taken(chosen) if lens else chosen, lens) if changed else maps
+
+
+def as_taken(scene: Scene) -> Scene:
+    """The scene with its lenses."""
+    return scene if scene.lenses is None else replace(scene, cameras=scene.lenses, lenses=None)
+
+
+def changing_files(scene: Scene, i: int) -> list[Path]:
+    """The mask of a view, and its picture if that may have transparent pixels."""
+    mask, picture = None if scene.masks is None else scene.masks[i], scene.image_paths[i]
+    return [*([] if mask is None else [mask]), *([picture] if has_alpha(picture) else [])]
+
+
+def describe_maps(run: Run, maps: Maps) -> dict[str, Any]:
+    """What decides the maps, as JSON: their digests (of files only if the maps do not know them), and how they are changed."""
+    known = _known_digests(maps)
+    changes = [maps.describe(i) for i in range(len(maps))] if isinstance(maps, ViewMaps) else []
+    changed = any(change is not None for change in changes)
+    files = run.digests(maps.files) if known is None else known
+    return {"files": files, "changes": digest_value(changes) if changed else None}
 
 
 def map_shape(maps: Maps) -> tuple[int, int, int]:
@@ -202,17 +193,9 @@ def check_readable(maps: Maps, stage: str) -> None:
     if gone:
         raise FileNotFoundError(
             f"maps: expected the maps of all views, which {stage} reads, got {len(gone)} of {len(maps)} missing "
-            f"({gone[0]}, ...); make them again with `kfgs features` (extract_features)"
+            f"({gone[0]}, ...); make them again with extract_features"
         )
 
 
-def _own_digests(maps: Maps) -> list[list[str]] | None:
+def _known_digests(maps: Maps) -> list[list[str]] | None:
     return maps.digests() if hasattr(maps, "digests") else None  # type: ignore[no-any-return]
-
-
-def digest_changes(maps: Maps) -> str | None:
-    """SHA-256 of the lenses and masks that change the maps; None if there are none."""
-    if not isinstance(maps, ViewMaps):
-        return None
-    changes = [maps.describe(i) for i in range(len(maps))]
-    return digest_value(changes) if any(change is not None for change in changes) else None

@@ -7,22 +7,19 @@ import html
 import json
 import shlex
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from .._files import atomic_path, bytes_in_words, real_path, seconds_in_words
-from .._typed import typed
+from .._files import as_path, atomic_path, bytes_in_words, real_path, seconds_in_words
 from ..fields import SemanticField
-from ..labels import LabelSet
+from ..fields.store import NAME
 from ..scenes import Scene
-from ..viz import FeatureColors, overlay_labels, save_picture
+from ..viz import FeatureColors, overlay_labels, plot_history, save_picture
 from ..viz.pictures import as_bytes, legend_strip, picture_grid, resize_photo
-from .apply import write_training_pictures
-from .config import FitConfig
-from .fit import REPORT, TITLE, FitResult
+from .methods import Paper, Uplift
+from .stages import read_stage
 
 WIDTH = 400  # pixels of a picture
 STYLE = """
@@ -48,7 +45,7 @@ def write_preview(
     chosen = [
         views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)
     ]  # not the ends, which often are alike
-    classes, colors = _classes(field), FeatureColors.fit(field.features)
+    classes, colors = field.classes, FeatureColors.fit(field.features)
     titles = ["photograph", "features as colours"] + ([] if classes is None else ["labels"])
     rows, seen = [], []
     for view in chosen:
@@ -69,82 +66,83 @@ def write_preview(
     return path
 
 
-@typed
 def write_run_report(
-    result: FitResult,
+    folder: Path,
+    field: SemanticField,
     scene: Scene,
-    config: FitConfig,
+    method: Uplift | Paper,
     *,
+    split: str = "train",
     command: str | None = None,
 ) -> list[Path]:
-    """Write pictures of a run and `report.html` into its folder: one file without scripts, which loads nothing.
+    """Write pictures of a fit and `report.html` into its run folder: one file without scripts, which loads nothing.
 
     Args:
-        result: the run.
+        folder: the run folder.
+        field: what `fit` returned.
         scene: its scene.
-        config: its options.
-        command: the command that made it; None: the page shows the call of `fit_scene`.
+        method: its method.
+        split: its training views.
+        command: the command that made it; None: the page shows the call of `fit`.
 
     Returns:
         The pictures (`preview.png`, and of trained stages `<stage>.png`) and the page.
     """
-    preview = write_preview(result.folder / "preview.png", result.field, scene, config.split)
-    training = write_training_pictures(result)
-    field, info = result.field, result.field.info
-    size = result.field_path.stat().st_size
-    teacher, codebook = info.get("teacher") or {}, getattr(field.decoder, "codebook", None)
+    folder, info = as_path(folder), field.info
+    title = real_path(folder).name
+    preview = write_preview(folder / "preview.png", field, scene, split)
+    training = _training_pictures(folder, info["stages"])
     facts = {
-        "scene": f"{scene.folder or 'in memory'}: {len(scene)} views, {len(info.get('views', ()))} of them used",
-        "teacher": teacher.get("name", "not known"),
-        "teacher's maps": " x ".join(map(str, info.get("teacher_map", ()))),
-        "method": field.decoder.name,
+        "scene": f"{scene.folder or 'in memory'}: {len(scene)} views, {len(info['views'])} of them used",
+        "teacher": (info.get("teacher") or {}).get("name", "not known"),
+        "teacher's maps": " x ".join(map(str, info["teacher_map"])),
+        "method": info["method"],
         "geometry": info.get("geometry", "trained with the field"),
         "Gaussians": f"{len(field):,}",
         "numbers for each Gaussian's meaning": f"{field.features.shape[1]}, for {field.dim} channels of the teacher",
-        "codewords": None if codebook is None else codebook.size,
-        "size on disk": bytes_in_words(size),
+        "size on disk": bytes_in_words((folder / NAME).stat().st_size),
         "size as the paper's Table 1 counts it": bytes_in_words(field.storage()),
-        "seed": info.get("seed"),
-        "kfgs, torch, device": f"{info.get('kfgs')}, {torch.__version__}, {config.device}",
+        "seed": info["seed"],
+        "kfgs, torch": f"{info['kfgs']}, {torch.__version__}",
     }
-    stages = [(one.name, seconds_in_words(one.seconds), "found" if one.reused else "made") for one in result.stages]
-    stages.append(("all", seconds_in_words(result.seconds), ""))
-    repeat = command or f"kfgs.pipeline.fit_scene(scene, maps, {str(result.folder)!r}, config)"
-    title = real_path(result.folder).name
-    unused = ("codebook", "autoencoder", "field", "mode") if config.method == "fuse" else ("uplift", "color")
-    options = json.dumps({name: value for name, value in asdict(config).items() if name not in unused}, indent=1)
+    seconds = info["seconds"] | {"all": sum(info["seconds"].values())}
+    repeat = command or f"kfgs.fit(scene, maps, method, folder={str(folder)!r})"
+    options = json.dumps(method.options(), indent=1)
     parts = [
         f"<h1>kfgs: {_text(title)}</h1>",
         *([] if preview is None else [_image(preview, "three views of the field")]),
         "<h2>What was fitted</h2>",
-        _table((name, value) for name, value in facts.items() if value not in (None, "")),
+        _table(facts.items()),
         "<h2>Time of each stage</h2>",
-        _table(stages, numbers=1),
-        "<p>A stage that was found had been made by an earlier run with the same inputs; its time is that of the run that made "
-        "it.</p>",
+        _table(((name, seconds_in_words(value)) for name, value in seconds.items()), numbers=1),
         *(f"<h2>Training: {_text(file.stem)}</h2>\n{_image(file, file.stem)}" for file in training),
         "<h2>How to repeat it</h2>",
         f"<pre>{_text(repeat)}</pre>",
         f"<details><summary>All options</summary><pre>{_text(options)}</pre></details>",
         "<h2>What to do next</h2>",
-        f"<pre>{_text(_next(result.field_path, field))}</pre>",
+        f"<pre>{_text(_next(folder / NAME, field))}</pre>",
     ]
-    head = f'<meta charset="utf-8">{TITLE}{_text(title)}</title><style>{STYLE}</style>'
+    head = f'<meta charset="utf-8"><title>kfgs: {_text(title)}</title><style>{STYLE}</style>'
     page = f'<!doctype html>\n<html lang="en"><head>{head}</head><body>\n' + "\n".join(parts) + "\n</body></html>\n"
-    path = result.folder / REPORT
-    with atomic_path(path) as temporary:
+    with atomic_path(folder / "report.html") as temporary:
         temporary.write_text(page, encoding="utf-8")
-    return [*([] if preview is None else [preview]), *training, path]
+    return [*([] if preview is None else [preview]), *training, folder / "report.html"]
 
 
-def _classes(field: SemanticField) -> LabelSet | None:
-    return field.classes
+def _training_pictures(folder: Path, stages: Sequence[str]) -> list[Path]:
+    """Plot the histories of a run's codebook and field; return the pictures."""
+    written = []
+    for stage in (read_stage(folder / "stages" / name) for name in stages):
+        if stage.name in ("codebook", "field"):
+            written.append(folder / f"{stage.name}.png")
+            plot_history(stage.history, written[-1])
+    return written
 
 
 def _next(path: Path, field: SemanticField) -> str:
-    classes = _classes(field)
-    asked = "" if classes is None else shlex.join(["kfgs", "select", classes.names[-1], str(path)]) + "\n"
-    return f"kfgs view {path}\n{asked}kfgs segment {path} --out segmented/"
+    classes = field.classes
+    select = "" if classes is None else shlex.join(["kfgs", "select", classes.names[-1], str(path)]) + "\n"
+    return f"kfgs view {path}\n{select}kfgs segment {path} --out segmented/"
 
 
 def _text(value: object) -> str:

@@ -1,4 +1,4 @@
-"""Helpers for training semantic and colour fields: the device, checks of the scene, and a fit that can be resumed."""
+"""What training a semantic and a colour field share: the device, checks of the scene, points, and a stage that resumes."""
 
 from __future__ import annotations
 
@@ -13,15 +13,14 @@ import torch
 from .._arrays import read_safetensors
 from .._check import ORIGIN, as_origin
 from .._files import write_json
+from .._progress import Progress
 from .._tensors import save_tensors
 from ..cameras.projection import project_points
 from ..fields import FieldConfig, FieldFit, GaussianParams
 from ..fields.config import check_extent
-from ..scenes import Scene
+from ..scenes import Scene, SceneError, SfmConfig, find_points
 from ..splat import available_engines
-from .stages import Run, Stage, origin_tensors
-
-PARAMS = "params.safetensors"
+from .stages import Run, Stage, digest_pictures, digest_scene, origin_tensors
 
 FEW_POINTS = 100
 """A scene with fewer points has lost them (a deleted or cut points file): a single photo gives COLMAP hundreds. 2 points start
@@ -29,7 +28,7 @@ a field that is 9 dB worse than one from triangulated points, since Gaussians as
 
 
 def training_device(device: str | torch.device = "auto") -> torch.device:
-    """The device of a name; a ValueError if it is no device, or there is no such GPU.
+    """The device of a name; a ValueError if it is not one, or there is no such GPU.
 
     Args:
         device: `auto` takes CUDA if torch sees it and an engine runs on it, else the CPU; `cpu`, `cuda`, `cuda:1`.
@@ -62,7 +61,7 @@ def check_scene(scene: Scene, views: Sequence[int], few: int = FEW_POINTS) -> No
     if bool((scene.points == scene.points[0]).all()):
         raise ValueError(
             f"scene: expected sparse points at different positions, got {len(scene.points)} at one; estimate the scene again "
-            "(`kfgs sfm`)"
+            "(run_sfm)"
         )
     if not any(bool(project_points(scene.cameras[i], scene.points)[2].any()) for i in views):
         raise ValueError(
@@ -71,16 +70,49 @@ def check_scene(scene: Scene, views: Sequence[int], few: int = FEW_POINTS) -> No
         )
 
 
-def with_extent(config: FieldConfig, scene: Scene) -> FieldConfig:
+def with_points(run: Run, scene: Scene, views: Sequence[int], seed: int, progress: Progress) -> Scene:
+    """The scene, with points if it had fewer than `FEW_POINTS`: triangulated from the known poses of some of its views.
+
+    If `find_points` finds no more than there are, these stay.
+
+    Raises:
+        SceneError: if there are no points, and pictures and poses do not fit together.
+        ValueError: if no view shows the points.
+    """
+    if len(scene.points) >= FEW_POINTS:
+        return scene
+    seen, everything = scene.select(views), range(len(views))
+    inputs = {"pictures": digest_pictures(run, seen, everything), "scene": digest_scene(seen, everything), "seed": seed}
+
+    def make(folder: Path) -> None:
+        count = f"only {len(scene.points)} points" if len(scene.points) else "none"
+        run.say(
+            f"points: the scene has {count}, and training starts from points; they are triangulated from {len(seen)} pictures "
+            "and their poses (write_known_poses does the same once for all runs)"
+        )
+        made = scene
+        try:
+            made = find_points(seen, config=SfmConfig(seed=seed), progress=progress is True)
+        except (SceneError, ImportError) as error:
+            if len(scene.points) == 0:
+                raise
+            run.say(f"points: the few points of the scene are used: {error}")
+        made = made if len(made.points) > len(scene.points) else scene
+        save_tensors(folder / "points.safetensors", {"points": made.points, "colors": made.colors})
+
+    tensors = read_safetensors(run.stage("points", inputs, make).folder / "points.safetensors")[0]
+    scene = replace(scene, points=tensors["points"], colors=tensors["colors"])
+    check_scene(scene, views, few=1)
+    return scene
+
+
+def with_extent(options: FieldConfig, scene: Scene) -> FieldConfig:
     """The options with the scene's extent, unless they have one of their own."""
-    return replace(config, extent=float(check_extent(scene.extent) if config.extent is None else config.extent))
+    return replace(options, extent=float(check_extent(scene.extent) if options.extent is None else options.extent))
 
 
 def field_stage(
-    run: Run,
-    name: str,
-    inputs: dict[str, Any],
-    train: Callable[[Path], FieldFit],
+    run: Run, name: str, inputs: dict[str, Any], train: Callable[[Path], FieldFit]
 ) -> tuple[GaussianParams, Stage]:
     """Train a field as a stage of a run; after a kill it resumes from its checkpoint.
 
@@ -90,23 +122,23 @@ def field_stage(
         inputs: everything that decides the result.
         train: fits the field, with the given file for its checkpoint.
     """
-    scratch = run.scratch(name, inputs)
+    checkpoint = run.scratch(name, inputs)
 
     def make(folder: Path) -> float:
         started = time.perf_counter()
-        fit = train(scratch)
+        fit = train(checkpoint)
         origin = dict(zip(("origin",), origin_tensors(fit.params.origin), strict=False))
-        save_tensors(folder / PARAMS, fit.params.to_tensors() | origin)
+        save_tensors(folder / "params.safetensors", fit.params.to_tensors() | origin)
         write_json(folder / "history.json", fit.history)
         return max(0.0, fit.history[-1]["seconds"] - (time.perf_counter() - started))  # before it was killed
 
     stage = run.stage(name, inputs, make)
-    scratch.unlink(missing_ok=True)
-    return stage_params(stage.folder), stage
+    checkpoint.unlink(missing_ok=True)
+    return stage_params(stage), stage
 
 
-def stage_params(folder: Path) -> GaussianParams:
+def stage_params(stage: Stage) -> GaussianParams:
     """The parameters that a finished stage of `field_stage` has."""
-    tensors = read_safetensors(folder / PARAMS)[0]
+    tensors = read_safetensors(stage.folder / "params.safetensors")[0]
     origin = as_origin(tensors["origin"].tolist()) if "origin" in tensors else ORIGIN
     return replace(GaussianParams.from_tensors(tensors), origin=origin)

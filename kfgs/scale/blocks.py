@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ from ..fields.store import NAME
 from ..formats import read_splats, write_splats
 from ..formats.folders import splat_file_of
 from ..gaussians import Gaussians
-from ..pipeline import FitConfig, fit_scene
+from ..pipeline import Uplift, fit
 from ..pipeline.maps import maps_of_views
 from ..pipeline.stages import digest_tensors
 from ..quant import FeatureMaps, LinearLatents
@@ -53,7 +53,6 @@ LATENTS, SPLAT = "latents.safetensors", "splat.ply"
 RUN = ".run"  # hidden: its field has the Gaussians of the reach, too
 BESIDE = ("classes.json", "text.npy", "text.safetensors", "labels", "labels_scored", "masks")
 """Files and folders of a scene that belong to each of its blocks, too."""
-IDLE = ("device",)
 """Options of a fit that do not change what its field means."""
 LOOKED_AT = 8  # maps, to say how well given latents fit
 REACH = 3.0  # standard deviations: farther out, a Gaussian is below 1/255 of any pixel
@@ -82,6 +81,7 @@ def split_scene(
         latents: numbers per Gaussian, in all blocks; or latents that exist, or their file (`latents.safetensors` of other
             blocks): then the fields of both scenes mean the same, and can be joined. The teacher must be the same.
         report: called with a line per block.
+        options: others of `fit_block`.
 
     Returns:
         The blocks.
@@ -174,10 +174,11 @@ def _write_block(folder: Path, block: Block, whole: Scene, maps_folder: Path, cl
 
 def fit_block(
     folder: str | Path,
-    config: FitConfig | None = None,
+    method: Uplift | None = None,
     *,
+    split: str = "train",
     report: Callable[[str], None] | None = None,
-    progress: bool = False,
+    **options: Any,
 ) -> dict[str, Any]:
     """Fit the field of one block, and keep its core in `folder/core`. Finished stages in `folder/.run` are reused.
 
@@ -185,40 +186,34 @@ def fit_block(
 
     Args:
         folder: what `split_scene` made.
-        config: of method `fuse`.
+        method: how.
+        split: the training views.
         report: called with a line per stage.
-        progress: show bars.
+        options: others of `fit`: seed, device, undistorted_features, progress.
 
     Returns:
         Counts, the box of the core's Gaussians (None if there is none), seconds, and a digest of the options, as JSON.
 
     Raises:
-        ValueError: as `fit_scene`.
+        ValueError: as `fit`.
     """
-    folder, config = as_path(folder), config or FitConfig()
+    folder, method = as_path(folder), method or Uplift()
     block = Block.from_json(read_json(folder / "block.json"))
     as_taken = load_scene(folder)
-    maps = FeatureFolder(folder / "features").of(as_taken, config.split)
+    maps = FeatureFolder(folder / "features").of(as_taken, split)
     splat = read_splats(folder / SPLAT) if (folder / SPLAT).is_file() else None
-    options = {name: value for name, value in asdict(config).items() if name not in IDLE}
-    facts: dict[str, Any] = {"gaussians": 0, "of": 0, "box": None, "seconds": 0.0, "options": digest_value(options)}
+    decides = [method.options(), split, options.get("seed", 0), options.get("undistorted_features", False)]
+    facts: dict[str, Any] = {"gaussians": 0, "of": 0, "box": None, "seconds": 0.0, "options": digest_value(decides)}
     core = None
     if splat is None or block.holds(_places(splat)).any():
         latents = LinearLatents.load(folder.parent / LATENTS)
-        result = fit_scene(
-            as_taken.undistorted(),
-            maps,
-            folder / RUN,
-            config,
-            splat=splat,
-            latents=latents,
-            report=report,
-            progress=progress,
-        )
-        own = torch.from_numpy(block.holds(_places(result.field.gaussians)))
-        facts |= {"gaussians": int(own.sum()), "of": len(own), "seconds": round(result.seconds, 1)}
+        method = replace(method, splat=splat, latents=latents)
+        field = fit(as_taken.undistorted(), maps, method, folder=folder / RUN, split=split, report=report, **options)
+        own = torch.from_numpy(block.holds(_places(field.gaussians)))
+        seconds = round(sum(field.info["seconds"].values()), 1)
+        facts |= {"gaussians": int(own.sum()), "of": len(own), "seconds": seconds}
         if bool(own.any()):
-            core = result.field.select(own)
+            core = field.select(own)
             facts["box"] = _box(core)
     _put(folder / CORE, core, facts)
     return facts
@@ -236,18 +231,20 @@ def _put(place: Path, core: SemanticField | None, facts: dict[str, Any]) -> None
 
 def fit_blocks(
     out: str | Path,
-    config: FitConfig | None = None,
+    method: Uplift | None = None,
     *,
     client: Any = None,
     report: Callable[[str], None] | None = None,
+    **options: Any,
 ) -> FieldInBlocks:
     """Fit all blocks of `split_scene`, one after the other or on the workers of a client.
 
     Args:
         out: the folder of the blocks.
-        config: of method `fuse`; `max_gaussians` is per block.
+        method: how; `max_gaussians` is per block.
         client: where blocks are fitted, as in `map_scenes`; None: here.
         report: called with a line per block.
+        options: others of `fit_block`.
 
     Raises:
         ValueError: if a block failed; the others are finished then.
@@ -258,11 +255,13 @@ def fit_blocks(
     if client is None:
         for name, folder in folders.items():
             try:
-                facts[name] = fit_block(folder, config)
+                facts[name] = fit_block(folder, method, **options)
             except (ValueError, OSError) as error:
                 failed.append(f"{folder}: {error}")
     else:
-        for result in map_scenes(functools.partial(fit_block, config=config), folders.values(), client=client):
+        for result in map_scenes(
+            functools.partial(fit_block, method=method, **options), folders.values(), client=client
+        ):
             if result.failure is None:
                 facts[result.name] = result.value
             else:

@@ -11,7 +11,7 @@ from typing import Any
 from .._check import check_whole
 from .._files import as_path
 from .._notes import is_strict
-from ..pipeline import FitConfig
+from ..pipeline import Paper, Uplift
 from ..scenes import SfmConfig
 
 
@@ -27,8 +27,14 @@ class BatchOptions:
     """Of the teacher."""
     sfm: SfmConfig = default(default_factory=SfmConfig)
     """For folders of photos without poses; `num_threads` follows `threads`."""
-    fit: FitConfig = default(default_factory=FitConfig.cpu)
-    """Of the field."""
+    method: Uplift | Paper = default(default_factory=Uplift)
+    """How fields are made."""
+    split: str = "train"
+    """The split of training views."""
+    seed: int = 0
+    """Every random choice follows from it."""
+    device: str = "auto"
+    """Where to train, see `fit`."""
     text: str | None = None
     """Text table of `kfgs text` for all scenes; None: each scene's `classes.json` and `text.npy` or `text.safetensors`."""
     pictures: int = 4
@@ -50,7 +56,7 @@ class BatchOptions:
             given = getattr(self, name)
             if given is not None and as_path(given).exists():
                 object.__setattr__(self, name, str(as_path(given).absolute()))
-        if self.discard_features and self.fit.needs_maps:
+        if self.discard_features and isinstance(self.method, Paper) and self.method.codebook is None:
             raise ValueError(
                 "discard_features: expected False for mode 'decouple', which learns from the maps, got True; leave out"
             )

@@ -26,7 +26,8 @@ from .._notes import hear
 from ..features import FeatureFolder, Picture, discard_maps, extract_features, join_features, pictures_of
 from ..fields import SemanticField
 from ..fields.store import NAME
-from ..pipeline import fit_scene, segment_scene, true_labels
+from ..pipeline import fit as fit_field
+from ..pipeline import segment_scene, true_labels
 from ..pipeline.evaluate import evaluate
 from ..pipeline.train import training_device
 from ..scenes import SceneError, link_images, run_sfm
@@ -77,11 +78,11 @@ def find_scene(job: Job, *, report: Report) -> dict[str, Any]:
         for note in scene.notes:
             report(f"note: {note}")
         views = {name: len(scene.views(name)) for name in ("train", "test") if scene.splits.get(name)}
-        pictures = [[one.stem, relative(one.path, source)] for one in pictures_of(scene, job.options.fit.split)]
+        pictures = [[one.stem, relative(one.path, source)] for one in pictures_of(scene, job.options.split)]
         return {
             "views": views,
             "pictures": pictures,
-            "split": "test" if views.get("test") else job.options.fit.split,
+            "split": "test" if views.get("test") else job.options.split,
             "classes": class_files(job, source) is not None,
             "labels": truth_of(source) is not None and counts_alike(job, source, report),
             **_keys_of(job, keys, listing, pictures, source, out),
@@ -113,7 +114,15 @@ def _keys_of(
         keys["features"] = _key(identify(_teacher(options)), source.marks(names, listing))
     else:
         keys["features"] = _key(source.marks(filter(inside("features"), listing), listing))
-    keys["fit"] = _key(keys["photos"], keys.get("sfm"), keys["features"], asdict(options.fit), version("kfgs"))
+    keys["fit"] = _key(
+        keys["photos"],
+        keys.get("sfm"),
+        keys["features"],
+        options.method.options(),
+        options.split,
+        options.seed,
+        version("kfgs"),
+    )
     words = class_files(job, source) or []
     table = [[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in words] if options.text else []
     keys["segment"] = _key(keys["fit"], table, options.pictures)
@@ -168,10 +177,18 @@ def fit(job: Job, key: str, *, report: Report) -> dict[str, Any]:
                 raise SceneError(
                     f"{job.source}: expected feature maps in features/, got none; name a teacher (--teacher)"
                 )
-            maps = FeatureFolder(folder).of(scene, options.fit.split)
-            made = fit_scene(scene.undistorted(), maps, out.path, options.fit, report=report)
-            earlier = sum(stage.seconds for stage in made.stages if stage.reused)
-            return {"gaussians": len(made.field), "latents": made.field.features.shape[1], "seconds": earlier}
+            maps = FeatureFolder(folder).of(scene, options.split)
+            made = fit_field(
+                scene.undistorted(),
+                maps,
+                options.method,
+                folder=out.path,
+                split=options.split,
+                seed=options.seed,
+                device=options.device,
+                report=report,
+            )
+            return {"gaussians": len(made), "latents": made.features.shape[1], "seconds": 0.0}
 
         result = _stage(out, "fit", key, (NAME,), ("features", "scene", "stages", NAME, "color.ply"), make)
         if options.discard_features and options.teacher is not None and (out.path / "features").is_dir():
@@ -309,7 +326,7 @@ def _patiently(make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 def _teacher(options: BatchOptions) -> Teacher:
     """The teacher of this process, loaded once."""
     assert options.teacher is not None
-    device = training_device(options.fit.device)
+    device = training_device(options.device)
     weights = [] if options.weights is None else [options.weights, *_stamp(Path(options.weights))]
     key = _key(options.teacher, weights, dict(options.teacher_options), str(device))
     with _loading:

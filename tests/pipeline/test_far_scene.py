@@ -10,23 +10,22 @@ import torch
 from cases_color import make_splat
 from small_room import FIELD, make_room
 
-from kfgs import FeatureFolder, SemanticField, UpliftConfig, attach, fit_scene, load_scene, read_splats
+from kfgs import FeatureFolder, SemanticField, Uplift, UpliftConfig, attach, load_scene, read_splats
+from kfgs import fit as fit_field
 from kfgs.cli import main
 from kfgs.fields import GaussianParams, join_fields
 from kfgs.formats.ply import read_ply, write_ply
-from kfgs.pipeline import FitConfig
 from kfgs.pipeline.color import ColorConfig, fit_color
 
 UTM = np.array([448262.0, 5411932.0, 200.0])
-COLOR = ColorConfig(sh_degree=1, field=dataclasses.replace(FIELD, steps=4, densify_from=5, densify_until=6))
+COLOR = ColorConfig(sh_degree=1, training=dataclasses.replace(FIELD, steps=4, densify_from=5, densify_until=6))
 
 
 def fit(folder):
     scene = load_scene(folder / "scene")
     maps = FeatureFolder(folder / "scene" / "features", [scene.stem(i) for i in scene.views("train")])
-    config = FitConfig(uplift=UpliftConfig.field(max_gaussians=1_500))
-    fit_scene(scene, maps, folder / "run", config, splat=folder / "my.ply")
-    return SemanticField.load(folder / "run" / "field.kfgs"), scene
+    fit_field(scene, maps, Uplift(folder / "my.ply", UpliftConfig.field(max_gaussians=1_500)), folder=folder / "run")
+    return SemanticField.load(folder / "run"), scene
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +90,7 @@ def test_colours_are_trained_where_the_scene_is(rooms):
     clouds = {}
     for name, (folder, _, scene) in rooms.items():
         fit_color(scene, folder / "colors", COLOR)
-        clouds[name] = fit_color(load_scene(folder / "scene"), folder / "colors", COLOR).gaussians  # from its stage
+        clouds[name] = fit_color(load_scene(folder / "scene"), folder / "colors", COLOR)  # from its stage
         saved = read_splats(folder / "colors" / "color.ply")
         np.testing.assert_allclose(
             saved.means.double() + torch.tensor(saved.origin), clouds[name].means.double() + torch.tensor(clouds[name].origin),

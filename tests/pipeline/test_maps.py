@@ -1,15 +1,12 @@
 import dataclasses
 from pathlib import Path
 
-import pytest
 import torch
-from messages import tells
-from small_room import CONFIG, make_room
 
 from kfgs.cameras import Camera, Distortion, undistort
-from kfgs.pipeline import fit_scene
-from kfgs.pipeline.maps import KnownFeatures, maps_of_views
-from kfgs.scenes import FeatureFolder, Scene, load_scene
+from kfgs.pipeline.maps import KnownFeatures, map_shape, maps_of_views
+from kfgs.quant import sample_grid
+from kfgs.scenes import Scene
 
 LENS = Distortion("brown_conrady", (0.3, 0.05, 0.001, -0.002))
 
@@ -67,28 +64,24 @@ def test_unknown_pixels_become_nan_and_nothing_else_changes():
     assert torch.equal(known[1], features[1])
 
 
-def test_counts_must_agree():
-    with pytest.raises(ValueError, match=tells("maps:", "expected 1", "got 2")):
-        _straight(_Maps([torch.ones(2, 2, 1)] * 2), [_lens(4, 4)])
+class _Grid(_Maps):
+    shape = (6, 8, 3)
+
+    def grid(self, i, step, samples):
+        return torch.full((1, 3), float(i))
+
+    def digests(self):
+        return [["a", "1"]]
 
 
-def test_a_distorted_scene_is_fitted_through_its_lens(tmp_path):
-    """A field of a scene whose cameras are said to be distorted differs from one of the same scene without a lens."""
-    room = make_room(tmp_path / "scene")
-    scene = load_scene(room)
-    maps = FeatureFolder(room / "features", [scene.stem(i) for i in scene.views("train")])
-    quick = dataclasses.replace(CONFIG, field=dataclasses.replace(CONFIG.field, steps=3), mode="adc")
-    bent = dataclasses.replace(scene, cameras=[dataclasses.replace(c, distortion=LENS) for c in scene.cameras])
-    with pytest.raises(ValueError, match=tells("scene:", "distortion", "scene.undistorted()")):
-        fit_scene(bent, maps, tmp_path / "run", quick)
-    straightened = fit_scene(bent.undistorted(), maps, tmp_path / "run", quick)
-    as_is = fit_scene(bent.undistorted(), maps, tmp_path / "run", dataclasses.replace(quick, undistorted_features=True))
-    assert straightened.stages[0].key != as_is.stages[0].key  # the lens is part of what the maps are
-    larger = [
-        lens.resized(2 * lens.height, 2 * lens.width) for lens in bent.cameras
-    ]  # the same K would be another lens
-    larger = [dataclasses.replace(big, K=lens.K) for big, lens in zip(larger, bent.cameras, strict=True)]
-    other = fit_scene(dataclasses.replace(bent.undistorted(), lenses=larger), maps, tmp_path / "run", quick)
-    assert other.stages[0].key != straightened.stages[0].key
-    plain = fit_scene(scene, maps, tmp_path / "run", quick)
-    assert plain.stages[0].key == as_is.stages[0].key
+def test_a_lens_passes_on_what_the_maps_offer_where_it_may():
+    features = torch.rand(6, 8, 3, generator=torch.Generator().manual_seed(0)) + 0.5
+    lenses = [_lens(8, 6, None), _lens(8, 6)]
+    offered = _straight(_Grid([features, features]), lenses)
+    assert (offered.shape, offered.digests()) == ((6, 8, 3), [["a", "1"]])
+    assert offered.grid(0, None, 10).tolist() == [[0.0, 0.0, 0.0]]
+    assert torch.equal(offered.grid(1, (2, 3)), sample_grid(offered[1], (2, 3)))
+    assert not torch.equal(offered[1], features)
+    bare = _straight(_Maps([features]), lenses[:1])
+    assert (bare.shape, bare.digests(), map_shape(bare)) == ((6, 8, 3), None, (6, 8, 3))
+    assert torch.equal(bare.grid(0, None, 12), sample_grid(features, samples=12))

@@ -1,14 +1,11 @@
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from messages import tells
-from PIL import Image
 
 from kfgs.cameras import Camera
-from kfgs.pipeline.stages import Run, digest_pictures, digest_scene, digest_tensors
+from kfgs.pipeline.stages import Run, digest_scene
 from kfgs.scenes import Scene
 
 
@@ -57,23 +54,6 @@ def test_a_killed_stage_leaves_nothing_and_is_made_again(tmp_path):
     assert sorted(path.name for path in stage.folder.iterdir()) == ["stage.json", "value"]
 
 
-def test_a_stage_of_other_inputs_under_the_same_key_is_refused(tmp_path):
-    run = Run(tmp_path)
-    stage = run.stage("a", {"x": 1}, lambda folder: None)
-    about = json.loads((stage.folder / "stage.json").read_text())
-    (stage.folder / "stage.json").write_text(json.dumps(about | {"inputs": {"x": 2}}))
-    with pytest.raises(ValueError, match=tells("inputs", "delete")):
-        run.stage("a", {"x": 1}, lambda folder: None)
-
-
-def test_a_damaged_stage_is_named(tmp_path):
-    run = Run(tmp_path)
-    stage = run.stage("a", {"x": 1}, _maker([], "whole"))
-    (stage.folder / "value").write_text("")
-    with pytest.raises(ValueError, match=tells("damaged:", "delete")):
-        run.stage("a", {"x": 1}, _maker([], "whole"))
-
-
 def test_digests_follow_content_and_order_and_tell_equal_names_apart(tmp_path):
     run = Run(tmp_path / "run")
     path, twin = tmp_path / "f.bin", tmp_path / "sub" / "f.bin"
@@ -119,44 +99,16 @@ def test_a_scene_is_told_by_all_that_a_rendering_depends_on() -> None:
         replace(scene, points=scene.points + 1),
     ]
     digests = [digest_scene(one, [0, 1]) for one in (scene, *others)]
-    assert len(set(digests)) == 6
+    assert len({tuple(one.values()) for one in digests}) == 6
     assert digest_scene(others[3], [0]) == digest_scene(scene, [0])  # of these views alone
     assert digest_scene(with_camera(scene, name="c.png"), [0, 1]) == digests[0]
 
 
-def test_runs_from_before_cameras_had_a_near_plane_stay_valid() -> None:
-    scene = a_scene()
-    poses = torch.stack([camera.viewmat for camera in scene.cameras])
-    intrinsics = torch.stack([camera.K for camera in scene.cameras])
-    sizes = torch.tensor([[48, 64], [48, 64]])
-    assert digest_scene(scene, [0, 1]) == digest_tensors(poses, intrinsics, sizes, scene.points)
-
-
-@pytest.mark.parametrize("text", ["[]", "{}", "{", "", '{"a": 1}', "null"])
+@pytest.mark.parametrize("text", ["[]", "{}", "{", "", "null", "[1]"])
 def test_a_damaged_cache_of_digests_is_made_again(tmp_path, text):
     (tmp_path / "a.npy").write_text("a")
     whole = Run(tmp_path / "run").digests([tmp_path / "a.npy"])
     kept = (tmp_path / "run" / "digests.json").read_text()
     (tmp_path / "run" / "digests.json").write_text(text)
     assert Run(tmp_path / "run").digests([tmp_path / "a.npy"]) == whole
-    assert (tmp_path / "run" / "digests.json").read_text() == kept or text == '{"a": 1}'
-
-
-@pytest.mark.parametrize("entry", ["1", "[]", "[1, 2, 3]", "null"])
-def test_damaged_entries_of_the_cache_are_made_again(tmp_path, entry):
-    (tmp_path / "a.npy").write_text("a")
-    whole = Run(tmp_path / "run").digests([tmp_path / "a.npy"])
-    cache = tmp_path / "run" / "digests.json"
-    (name,) = json.loads(cache.read_text())
-    cache.write_text(json.dumps({name: json.loads(entry)}))
-    assert Run(tmp_path / "run").digests([tmp_path / "a.npy"]) == whole
-
-
-def test_only_transparent_pictures_have_another_key_than_before_they_were_on_black(tmp_path):
-    for name, mode in (("a.png", "RGB"), ("b.png", "RGBA")):
-        Image.new(mode, (4, 3)).save(tmp_path / name)
-    camera = Camera(torch.eye(4), torch.tensor([[4.0, 0, 2], [0, 4, 1.5], [0, 0, 1]]), 4, 3)
-    cameras, paths = [replace(camera, name=name) for name in "ab"], [tmp_path / "a.png", tmp_path / "b.png"]
-    scene, run = Scene(cameras, paths, torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)), Run(tmp_path)
-    before = run.digests(paths)
-    assert digest_pictures(run, scene, [0, 1]) == [before[0], [*before[1], "on black"]]
+    assert (tmp_path / "run" / "digests.json").read_text() == kept

@@ -52,5 +52,5 @@ def test_a_colour_field_of_points_out_of_sight_is_refused_before_training(tmp_pa
 @pytest.mark.parametrize(("count", "got"), [(1, "got 1 at one"), (9, "got 9 at one")])
 def test_a_scene_without_different_points_is_refused_before_the_work(count, got):
     points = torch.ones(count, 3)
-    with pytest.raises(ValueError, match=tells("scene:", got, "kfgs sfm")):
+    with pytest.raises(ValueError, match=tells("scene:", got, "run_sfm")):
         check_scene(Scene([], [], points, torch.zeros(count, 3, dtype=torch.uint8)), [], few=1)

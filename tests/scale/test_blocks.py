@@ -29,7 +29,7 @@ from kfgs.fields import (
 from kfgs.formats import read_splats, write_splats
 from kfgs.gaussians import Gaussians
 from kfgs.labels import transfer_labels
-from kfgs.pipeline import FitConfig
+from kfgs.pipeline import Uplift
 from kfgs.quant import LinearLatents
 from kfgs.scale import FieldInBlocks, fit_block, fit_blocks, split_scene
 from kfgs.scale.blocks import _put
@@ -40,7 +40,7 @@ from kfgs.toy.room_folder import ToyConfig
 ROOM = ToyConfig(
     train_views=8, test_views=2, size=(60, 80), feature_size=(30, 40), feature_dim=24, surface_points=3_000, sparse_points=800
 )  # fmt: skip
-EVERY = FitConfig(uplift=UpliftConfig(corrections=0))
+EVERY = Uplift(uplift=UpliftConfig(corrections=0))
 
 
 @pytest.fixture(scope="module")
@@ -412,7 +412,7 @@ def test_files_of_somebody_else_are_not_replaced(town, splat, tmp_path, name, ca
 
 def test_a_fit_that_ends_early_leaves_the_old_core(fitted, monkeypatch):
     before = fitted.joined().gaussians.means
-    monkeypatch.setattr("kfgs.scale.blocks.fit_scene", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr("kfgs.scale.blocks.fit", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         fit_block(fitted.folder / "block00", EVERY)
     city = FieldInBlocks.open(fitted.folder)

@@ -51,18 +51,18 @@ def codebook_options():
 def color(room) -> kfgs.Gaussians:
     """A colour field of the room: a short training."""
     quick = kfgs.ColorConfig.quick()
-    short = replace(quick.field.with_steps(400), max_gaussians=12_000)
-    return kfgs.fit_color(room.scene, room.out / "color", replace(quick, field=short)).gaussians
+    short = replace(quick.training.with_steps(400), max_gaussians=12_000)
+    return kfgs.fit_color(room.scene, room.out / "color", replace(quick, training=short))
 
 
 @pytest.fixture(scope="session")
 def fused(room, color) -> kfgs.SemanticField:
     """The room's field by kfgs's method: features averaged onto the colour field's Gaussians."""
-    return kfgs.fit_scene(room.scene, room.maps, room.out / "fused", kfgs.FitConfig.cpu(), splat=color).field
+    return kfgs.fit(room.scene, room.maps, kfgs.Uplift(color), folder=room.out / "fused")
 
 
 @pytest.fixture(scope="session")
 def paper(room) -> kfgs.SemanticField:
     """The room's field by the paper's method: codebook, autoencoder, and Gaussians trained on latent maps."""
-    options = kfgs.FitConfig.paper(codebook=CODEBOOK, autoencoder=AUTOENCODER, field=TRAINING)
-    return kfgs.fit_scene(room.scene, room.maps, room.out / "paper", options).field
+    method = kfgs.Paper.paper(codebook=CODEBOOK, autoencoder=AUTOENCODER, training=TRAINING)
+    return kfgs.fit(room.scene, room.maps, method, folder=room.out / "paper")
