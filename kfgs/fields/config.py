@@ -27,7 +27,7 @@ class FieldConfig:
     multiple of their number; the result does not depend on that number."""
     extent: float | None = None
     """Size of the scene in world units; it scales the means' learning rate and what counts as a large Gaussian. None computes
-    it: `fit_scene` and `fit_color` take `Scene.extent`, `fit_field` the same formula for its own cameras."""
+    it: `fit` and `fit_color` take `Scene.extent`, `fit_field` the same formula for its own cameras."""
     means_lr: float = 1.6e-4
     """Learning rate of the means at step 0, in units of the scene extent."""
     means_lr_final: float = 1.6e-6

@@ -51,7 +51,7 @@ from ..quant import (
 )
 from ..scenes import FeatureFolder, Scene, extract_features
 from .color import color_stage, find_color
-from .maps import KnownFeatures, Maps, as_maps, as_taken, check_readable, describe_maps, map_shape, maps_of_views
+from .maps import KnownFeatures, Maps, as_maps, as_taken, describe_maps, map_shape, maps_of_views
 from .methods import Paper, Uplift
 from .stages import Run, Stage, digest_cameras, digest_scene, digest_shape, digest_tensors, stage_generator
 from .train import check_scene, field_stage, training_device, with_extent, with_points
@@ -77,8 +77,7 @@ def fit(
     Args:
         scene: posed, undistorted views. If it has too few points and training needs them, they are triangulated first.
         maps: one teacher map [h, w, D] for each view of the split, in their order: a `FeatureFolder`, or tensors in memory.
-            Or a teacher, whose maps are then stored in `folder/features`. When the stages that read them are finished,
-            maps may be deleted, except for `Paper(codebook=None, autoencoder=None)`.
+            Or a teacher, whose maps are then stored in `folder/features`.
         method: `Uplift()`, the default, or `Paper()`, with their options.
         folder: the run folder; it receives the stages and `field.kfgs`, in place of a field that other options made. Going
             back to the old options is quick, because stages stay. None keeps nothing.
@@ -96,7 +95,7 @@ def fit(
         TypeError: if `maps` are neither maps nor a teacher, or `progress` is neither a bool nor a function.
         ValueError: if the counts of views and maps differ, a camera has distortion, there is no such device, a map's file is
             damaged, or another process works in the folder.
-        FileNotFoundError: if a stage needs maps that were deleted, or a picture is missing.
+        FileNotFoundError: if a picture is missing.
     """
     method, progress, target = method or Uplift(), as_progress(progress), training_device(device)
     if not isinstance(method, Uplift | Paper):
@@ -115,7 +114,7 @@ def fit(
             )
             maps = FeatureFolder(run.folder / "features").of(scene, split)
         maps = as_maps(maps)
-        _check_maps(scene, split, maps, method)
+        _check_maps(scene, split, maps)
         with run.locked():
             if isinstance(method, Paper) or (method.splat is None and scene.splat is None):  # else nothing is trained
                 scene = with_points(run, scene, views, seed, progress)
@@ -167,11 +166,9 @@ class _Job:
         return stage_generator(self.seed, stage)
 
 
-def _check_maps(scene: Scene, split: str, maps: Maps, method: Uplift | Paper) -> None:
+def _check_maps(scene: Scene, split: str, maps: Maps) -> None:
     """Check what would otherwise fail only after the first stages."""
     views = scene.views(split)
-    if isinstance(method, Paper) and method.codebook is None:
-        check_readable(maps, "training without a codebook")
     advice = f"read them with FeatureFolder(path).of(scene, {split!r})"
     if len(views) != len(maps):
         raise ValueError(
@@ -202,7 +199,6 @@ def _uplift(job: _Job, method: Uplift) -> tuple[SemanticField, dict[str, Any]]:
     scratch = job.run.scratch("uplift", seen | {"pixels": options.pixels})
 
     def make(folder: Path) -> None:
-        check_readable(job.maps, "the uplift")
         field = uplift_maps(
             geometry.to("cpu"),
             job.cameras,
@@ -273,7 +269,6 @@ def _codebook(job: _Job, method: Paper) -> tuple[Codebook, Stage]:
     assert options is not None
 
     def make(folder: Path) -> None:
-        check_readable(job.maps, "the codebook")
         made = fit_codebook(job.maps, options, generator=job.generator("codebook"), progress=job.progress)
         made.save(folder / "codebook.safetensors")
         assert made.report is not None
@@ -289,7 +284,6 @@ def _index_maps(job: _Job, codebook: Codebook, book: Stage) -> tuple[IndexMaps, 
     """Quantisation, Eq. 5: the index map M of every view."""
 
     def make(folder: Path) -> None:
-        check_readable(job.maps, "quantisation")
         quantize_maps(job.maps, codebook, progress=job.progress is True).save(folder / "index_maps.safetensors")
 
     stage = job.run.stage("index_maps", {"features": job.features, "codebook": book.key}, make)

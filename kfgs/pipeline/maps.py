@@ -187,15 +187,5 @@ def map_shape(maps: Maps) -> tuple[int, int, int]:
     return int(h), int(w), int(D)
 
 
-def check_readable(maps: Maps, stage: str) -> None:
-    """Raise a FileNotFoundError before a stage that reads maps, if some of them were discarded."""
-    gone = [file for file in maps.files if not file.is_file()]
-    if gone:
-        raise FileNotFoundError(
-            f"maps: expected the maps of all views, which {stage} reads, got {len(gone)} of {len(maps)} missing "
-            f"({gone[0]}, ...); make them again with extract_features"
-        )
-
-
 def _known_digests(maps: Maps) -> list[list[str]] | None:
     return maps.digests() if hasattr(maps, "digests") else None  # type: ignore[no-any-return]

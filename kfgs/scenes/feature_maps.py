@@ -54,7 +54,7 @@ class FeatureReport:
 class FeatureFolder(Sequence[Tensor]):
     """The teacher's feature maps of some views: item i is view i's map, [h, w, D] float32, read from disk at each access.
 
-    `FeatureFolder(path).of(scene, "train")` has the maps of a scene's split, for `fit_scene`.
+    `FeatureFolder(path).of(scene, "train")` has the maps of a scene's split, for `fit`.
 
     Known files, which may be mixed: `<stem>_fmap_CxHxW.pt` (Feature 3DGS and DF-3DGS: a tensor [D, h, w]), `<stem>.npy` and
     `<stem>.safetensors` (an array [h, w, D]; [D, h, w] is recognised by `channels` or the picture's aspect), in half, single

@@ -52,7 +52,7 @@ class Scene:
     folder: Path | None = None
     """The path that the scene was loaded from."""
     splat: Path | None = None
-    """A trained splat in the frame of the cameras, found in the scene's folder. `fit_scene` averages features onto it."""
+    """A trained splat in the frame of the cameras, found in the scene's folder. `fit` averages features onto it."""
     masks: list[Path | None] | None = None
     """V masks of the pictures on disk, None for a view without one: what is black in it is ignored by everything."""
 

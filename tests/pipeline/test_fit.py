@@ -310,25 +310,11 @@ class Mixer:
         raise NotImplementedError
 
 
-def test_maps_may_be_deleted_once_index_maps_are_made(scene, tmp_path):
-    extract_features(Mixer(), scene, tmp_path / "maps", split="train")
-    maps = FeatureFolder(tmp_path / "maps").of(scene, "train")
-    first = fit(scene, maps, QUICK, folder=tmp_path / "run")
-    for file in (tmp_path / "maps").glob("*.npy"):
-        file.unlink()
-    gone = FeatureFolder(tmp_path / "maps").of(scene, "train")
-    again, seen = refit(scene, gone, QUICK, folder=tmp_path / "run")
-    assert set(seen.values()) == {"found"}
-    assert again.info["teacher_map"] == [15, 20, 16]
+def test_another_autoencoder_shares_the_index_maps(scene, maps, tmp_path):
+    fit(scene, maps, QUICK, folder=tmp_path)
     smaller = dataclasses.replace(QUICK, autoencoder=dataclasses.replace(QUICK.autoencoder, latent=3))
-    _, seen = refit(scene, gone, smaller, folder=tmp_path / "run")
+    _, seen = refit(scene, maps, smaller, folder=tmp_path)
     assert list(seen.values()) == ["found", "found", "done", "done", "done"]
-    raw = dataclasses.replace(QUICK, codebook=None, autoencoder=None)
-    with pytest.raises(FileNotFoundError, match=tells("maps:", "without a codebook", "got 6 of 6", "extract_features")):
-        fit(scene, gone, raw, folder=tmp_path / "run")
-    with pytest.raises(FileNotFoundError, match=tells("maps:", "codebook", "got 6 of 6")):
-        fit(scene, gone, QUICK, folder=tmp_path / "run", seed=5)
-    assert same(fit(scene, Mixer(), QUICK, folder=tmp_path / "other"), first)
 
 
 # What is refused
