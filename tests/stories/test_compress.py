@@ -27,8 +27,8 @@ def test_bytes_of_table_1():
 
 def test_bytes_of_the_fields(fused, paper, tmp_path, recorded):
     """What the paper counts, and the file of a packed field: never more than was recorded."""
-    autoencoder, codebook = paper.autoencoder, paper.codebook
-    learnt = semantic_storage_bytes(len(paper), 8, autoencoder.decoder_parameters, codebook.codewords.numel())
+    decoder = sum(i * o + o for i, o in [(8, 32), (32, 48), (48, 64)])
+    learnt = semantic_storage_bytes(len(paper), 8, decoder, paper.decoder.codebook.codewords.numel())
     assert paper.storage() == learnt
     for name, field in (("fused", fused), ("paper's", paper)):
         field.save(tmp_path / "field.kfgs", precision="small")
