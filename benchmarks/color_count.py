@@ -14,7 +14,7 @@ import torch
 from devices import add_device
 
 from kfgs.cameras import resize_map
-from kfgs.fields import FieldConfig, GaussianParams, fit_field
+from kfgs.fields import Densify, GaussianParams, Rates, Training, fit_field
 from kfgs.scenes import load_scene
 
 
@@ -31,16 +31,13 @@ def main() -> None:
     pictures = [resize_map(scene.image(i), tuple(args.size), antialias=True) for i in views]
     start = GaussianParams.from_points(scene.points, 3, generator=torch.Generator().manual_seed(0))
     start = start.map(lambda value: value.to(args.device))
-    config = FieldConfig(
+    config = Training(
         steps=args.steps,
+        rates=Rates(features=0.01),
+        densify=Densify(200, 2500, reset_every=0, maximum=400_000),
         extent=scene.extent,
         render_scale=1.0,
-        densify_from=200,
-        densify_until=2500,
-        reset_every=0,
         report_every=250,
-        max_gaussians=400_000,
-        features_lr=0.01,
     )
     cameras = [scene.cameras[i] for i in views]
     fit_field(start, cameras, pictures, config, progress=lambda row: print(row, flush=True))

@@ -26,7 +26,7 @@ HEAD = (
 )  # fmt: skip
 PRESETS = {
     "quick": "baselines by their `short()`, few steps of the paper's rows",
-    "cpu": "baselines by their `medium()`, fields of the paper's rows by `FieldConfig.cpu()`",
+    "cpu": "baselines by their `medium()`, fields of the paper's rows by `Training.cpu()`",
     "paper": "`published()` of every baseline, the paper's schedule",
 }
 

@@ -28,7 +28,7 @@ from kfgs.cameras import Camera
 from kfgs.evaluation import FieldMethod, LabelTruth, Method, TeacherMethod, View, label_view
 from kfgs.evaluation.segmentation import SegmentationReport, evaluate_segmentation
 from kfgs.evaluation.teacher_agreement import TeacherAgreement
-from kfgs.fields import FieldConfig, Linear, SemanticField
+from kfgs.fields import Linear, SemanticField, Training
 from kfgs.formats import read_splats
 from kfgs.labels import LabelSet, load_label_set
 from kfgs.pipeline import Paper, Uplift, fit, true_labels
@@ -104,7 +104,7 @@ def kfgs_config(row: Row, key: str, preset: str, steps: int | None) -> Uplift | 
     if row.mode is None:
         return Uplift()  # nothing is trained
     method = Paper() if row.own else Paper.paper()
-    training = FieldConfig.paper() if preset == "paper" else FieldConfig.cpu()
+    training = Training.paper() if preset == "paper" else Training.cpu()
     steps = QUICK_STEPS[key] if preset == "quick" and steps is None else steps
     method = replace(method, training=training if steps is None else training.with_steps(steps))
     if row.mode == "decouple":

@@ -54,7 +54,7 @@ def main() -> None:
         f"town {args.seed}: {nx * ny} rooms, {len(scene.views('train'))} training views, {len(scene.views('test'))} test views"
     )
     colors = ColorConfig.geometry()
-    colors = replace(colors, training=replace(colors.training.with_steps(args.steps), max_gaussians=20_000 * nx * ny))
+    colors = replace(colors, training=colors.training.with_steps(args.steps).with_maximum(20_000 * nx * ny))
     fit_color(scene, args.out / f"run{args.seed}", colors, progress=True)
     splat = args.out / f"run{args.seed}" / "color.ply"
     total = args.gaussians * nx * ny

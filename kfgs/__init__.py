@@ -55,7 +55,7 @@ _WHERE = {
     "Uplift": ".pipeline",
     "Paper": ".pipeline",
     "UpliftConfig": ".fields",
-    "FieldConfig": ".fields",
+    "Training": ".fields",
     "GaussianParams": ".fields",
     "SemanticField": ".fields",
     "fit_field": ".fields",
@@ -78,9 +78,9 @@ if TYPE_CHECKING:
     from .cameras import resize_map as resize_map
     from .evaluation import evaluate_segmentation as evaluate_segmentation
     from .evaluation import score_views as score_views
-    from .fields import FieldConfig as FieldConfig
     from .fields import GaussianParams as GaussianParams
     from .fields import SemanticField as SemanticField
+    from .fields import Training as Training
     from .fields import UpliftConfig as UpliftConfig
     from .fields import fit_field as fit_field
     from .fields import label_set_from_examples as label_set_from_examples

@@ -44,7 +44,7 @@ scene = kfgs.load_scene(folder).undistorted()
 classes = kfgs.load_label_set(names, text)
 maps = kfgs.FeatureFolder(features).of(scene, "train")
 quick = kfgs.ColorConfig.quick()
-quick = replace(quick, training=replace(quick.training.with_steps(800), max_gaussians=60_000))
+quick = replace(quick, training=quick.training.with_steps(800).with_maximum(60_000))
 color = kfgs.fit_color(scene, run, quick)  # the same fields as in notebooks 4 to 6
 field = kfgs.fit(scene, maps, kfgs.Uplift(color), folder=run)
 splat = kfgs.attach(field, color, classes).splats  # the colour splat with a class for each Gaussian

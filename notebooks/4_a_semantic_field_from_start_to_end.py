@@ -69,7 +69,7 @@ Image.fromarray(viz.picture_grid(rows, width=256))
 
 # %%
 quick = kfgs.ColorConfig.quick()
-quick = replace(quick, training=replace(quick.training.with_steps(800), max_gaussians=60_000))
+quick = replace(quick, training=quick.training.with_steps(800).with_maximum(60_000))
 field = kfgs.fit(scene, maps, kfgs.Uplift(color=quick), folder=run, report=print)
 print(field.summary())
 

@@ -39,7 +39,7 @@ scene = kfgs.load_scene(folder).undistorted()
 classes = kfgs.load_label_set(names, text)
 maps = kfgs.FeatureFolder(features).of(scene, "train")
 quick = kfgs.ColorConfig.quick()
-quick = replace(quick, training=replace(quick.training.with_steps(800), max_gaussians=60_000))
+quick = replace(quick, training=quick.training.with_steps(800).with_maximum(60_000))
 field = kfgs.fit(scene, maps, kfgs.Uplift(color=quick), folder=run)  # notebook 4 explains it
 colors = kfgs.read_splats(run / "color.ply")
 print(field)

@@ -136,7 +136,7 @@ Image.fromarray(viz.picture_grid([row], ["photo", "features", question], width=3
 
 # %%
 quick = kfgs.ColorConfig.quick()
-quick = replace(quick, training=replace(quick.training.with_steps(600), max_gaussians=60_000))
+quick = replace(quick, training=quick.training.with_steps(600).with_maximum(60_000))
 method = kfgs.Uplift(color=replace(quick, picture_scale=min(1.0, 320 / scene.cameras[0].width)))
 kfgs.extract_features(teacher, scene, out / "features", split="train")
 field = kfgs.fit(scene, kfgs.FeatureFolder(out / "features").of(scene, "train"), method, folder=out / "run")

@@ -4,6 +4,7 @@ import dataclasses
 import json
 from pathlib import Path
 
+from cases_training import changed
 from small_room import ROOM
 from tiny_teacher import Tiny
 
@@ -17,7 +18,7 @@ from kfgs.toy.room_folder import make_toy_room
 COLOR = dataclasses.replace(
     ColorConfig.quick(),
     max_points=600,
-    training=dataclasses.replace(ColorConfig.quick().training.with_steps(24), max_gaussians=800, checkpoint_every=8),
+    training=changed(ColorConfig.quick().training.with_steps(24), maximum=800, checkpoint_every=8),
 )
 METHOD = Uplift(color=COLOR)
 OPTIONS = BatchOptions(teacher="tiny_teacher:Tiny", method=METHOD, device="cpu", share=2, pictures=0)

@@ -4,10 +4,11 @@ import dataclasses
 from pathlib import Path
 
 from cases_color import make_splat
+from cases_training import changed
 
 from kfgs import FeatureFolder, Paper, Uplift, UpliftConfig, fit, load_scene
 from kfgs.cli import main
-from kfgs.fields import FieldConfig
+from kfgs.fields import Training
 from kfgs.quant import AutoencoderConfig, PaperCodebook
 from kfgs.toy.room_folder import ToyConfig, make_toy_room
 
@@ -20,12 +21,13 @@ ROOM = ToyConfig(
     surface_points=4_000,
     sparse_points=1_500,
 )
-FIELD = FieldConfig.cpu(
+FIELD = changed(
+    Training.cpu(),
     steps=120,
-    features_lr=0.05,
-    densify_from=20,
-    densify_until=80,
-    densify_every=20,
+    features_rate=0.05,
+    start=20,
+    stop=80,
+    every=20,
     reset_every=0,
     checkpoint_every=7,
 )

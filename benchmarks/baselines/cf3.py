@@ -18,7 +18,7 @@ from torch.nn.functional import mse_loss
 
 from kfgs._rows import unit_rows
 from kfgs.cameras import Camera
-from kfgs.fields import FieldConfig, GaussianParams, UpliftConfig, fit_field, uplift_maps
+from kfgs.fields import GaussianParams, Training, UpliftConfig, fit_field, uplift_maps
 from kfgs.gaussians import Gaussians
 from kfgs.labels.views import sum_pixels
 from kfgs.metrics import semantic_storage_bytes
@@ -212,9 +212,7 @@ def fit(task: Task, config: CF3Config) -> Fitted:
         with clock.stage("train"):
             fitted = fit_field(
                 GaussianParams.from_gaussians(cloud), cameras, targets,
-                FieldConfig(
-                    steps=max(1, config.steps // config.rounds), densify_until=0, reset_every=0, extent=extent
-                ),
+                Training(steps=max(1, config.steps // config.rounds), densify=None, extent=extent),
                 generator=torch.Generator().manual_seed(task.seed + turn), progress=task.progress,
             )  # fmt: skip
             cloud = fitted.params.activated().detach()

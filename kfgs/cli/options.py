@@ -316,4 +316,4 @@ def fit_method(given: FieldMethod, splat: Path | None = None, *, training: Train
 def trained(options: Any, training: Training) -> Any:
     """The options of a training with the given number of steps and Gaussians."""
     options = options if training.steps is None else options.with_steps(training.steps)
-    return options if not training.max_gaussians else replace(options, max_gaussians=training.max_gaussians)
+    return options.with_maximum(training.max_gaussians or None)

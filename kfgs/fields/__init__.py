@@ -1,9 +1,7 @@
 """Fields of Gaussians: raw parameters, their training, and the finished semantic field (Sec. 3.2)."""
 
-from .config import FieldConfig
 from .decoders import Autoencoded, Codewords, Decoder, Identity, Linear
 from .examples import Box, Clicks, Mask, Picked, label_set_from_examples, read_examples
-from .fit import FieldFit, fit_field
 from .fused import fuse_views, join_fields
 from .loss import ColorLoss, Loss, l1_loss
 from .merge import merge_gaussians
@@ -11,6 +9,8 @@ from .notes import recall_scene, scene_classes
 from .packing import Rounding
 from .params import GaussianParams
 from .semantic_field import Seen, SemanticField
+from .train import FieldFit, fit_field
+from .training import Densify, Rates, Training
 from .uplift import UpliftConfig, sample_latents, uplift_maps
 
 __all__ = [
@@ -20,7 +20,7 @@ __all__ = [
     "Codewords",
     "ColorLoss",
     "Decoder",
-    "FieldConfig",
+    "Densify",
     "FieldFit",
     "GaussianParams",
     "Identity",
@@ -28,9 +28,11 @@ __all__ = [
     "Loss",
     "Mask",
     "Picked",
+    "Rates",
     "Rounding",
     "Seen",
     "SemanticField",
+    "Training",
     "UpliftConfig",
     "fit_field",
     "fuse_views",

@@ -9,9 +9,8 @@ import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
 
-from .._card import short_repr
-from .config import FieldConfig
 from .params import GaussianParams
+from .training import Densify
 
 SPLIT_CHILDREN = 2
 SPLIT_SHRINK = 1.6  # 0.8 times the number of children (3DGS)
@@ -22,9 +21,6 @@ class GradientStatistics(NamedTuple):
 
     total: Tensor  # [N]
     views: Tensor  # [N], number of views that saw it
-
-    def __repr__(self) -> str:
-        return short_repr(self)
 
     @staticmethod
     def zeros(params: GaussianParams) -> GradientStatistics:
@@ -55,14 +51,11 @@ class Densified(NamedTuple):
     source: Tensor  # [N'] int64: row of the old cloud
     fresh: Tensor  # [N'] bool: a new Gaussian
 
-    def __repr__(self) -> str:
-        return short_repr(self)
-
 
 def densify(
     params: GaussianParams,
     gradient: Tensor,  # [N] mean norm, NDC units
-    config: FieldConfig,
+    options: Densify,
     *,
     extent: float,
     prune_large: bool = False,
@@ -70,16 +63,16 @@ def densify(
 ) -> Densified:
     """One round of adaptive density control.
 
-    A Gaussian with a gradient of at least `config.densify_gradient` is cloned (an exact copy is added) if its largest scale
+    A Gaussian with a gradient of at least `options.gradient` is cloned (an exact copy is added) if its largest scale
     is at most `percent_dense * extent`; otherwise two Gaussians of 1/1.6 its scales, drawn from its distribution, replace
     it. Then Gaussians below `prune_opacity`, and with `prune_large` those larger than `prune_extent * extent`, are dropped.
-    Order of the result: old ones, clones, children. With `max_gaussians` the strongest gradients grow first (ties in order
+    Order of the result: old ones, clones, children. With a `maximum` the strongest gradients grow first (ties in order
     of index).
 
     Args:
         params: the cloud; not changed.
         gradient: `GradientStatistics.mean()`.
-        config: thresholds.
+        options: thresholds.
         extent: size of the scene, world units.
         prune_large: in 3DGS true only after the first reset of opacities.
         generator: draws the children's positions (on its own device); None draws the same ones each time.
@@ -90,8 +83,8 @@ def densify(
     """
     values = params.map(torch.Tensor.detach)
     scales = values.log_scales.exp().amax(dim=1)
-    growing = _within_budget(gradient >= config.densify_gradient, gradient, config.max_gaussians)
-    large = scales > config.percent_dense * extent
+    growing = _within_budget(gradient >= options.gradient, gradient, options.maximum)
+    large = scales > options.percent_dense * extent
     kept = (~(growing & large)).nonzero()[:, 0]
     cloned = (growing & ~large).nonzero()[:, 0]
     parents = (growing & large).nonzero()[:, 0].repeat_interleave(SPLIT_CHILDREN)
@@ -104,9 +97,9 @@ def densify(
         grown.means[first:] = _sample(values, parents, generator)
         grown.log_scales[first:] -= math.log(SPLIT_SHRINK)
 
-    stays = grown.logit_opacities.sigmoid() >= config.prune_opacity
+    stays = grown.logit_opacities.sigmoid() >= options.prune_opacity
     if prune_large:
-        stays &= grown.log_scales.exp().amax(dim=1) <= config.prune_extent * extent
+        stays &= grown.log_scales.exp().amax(dim=1) <= options.prune_extent * extent
     return Densified(grown.map(lambda value: value[stays]), source[stays], fresh[stays])
 
 

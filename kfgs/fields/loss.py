@@ -70,7 +70,7 @@ class ColorLoss:
     ssim_weight: float = 0.2
     """Lambda of 3DGS, in [0, 1]; 0 = L1 only."""
     engine: str = field(default="auto", repr=False)
-    """Whose SSIM is used, as `FieldConfig.engine`. Engines that have none use kornia's."""
+    """Whose SSIM is used, as `Training.engine`. Engines that have none use kornia's."""
 
     def __post_init__(self) -> None:
         check_range("ssim_weight", self.ssim_weight, 0, 1)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
-from .config import FieldConfig
 from .params import GaussianParams
+from .training import Training
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 
@@ -18,35 +20,32 @@ class FieldOptimizer:
     stays; new ones start at 0 (as in 3DGS). torch's Adam does the arithmetic, fused.
     """
 
-    def __init__(self, params: GaussianParams, config: FieldConfig, *, extent: float) -> None:
+    def __init__(self, params: GaussianParams, training: Training, *, extent: float) -> None:
         """Copy `params` and prepare Adam; the learning rate of the means is in units of `extent`."""
         self.params = params.map(_leaf)
-        self._config, self._extent = config, extent
-        rates = {
-            "means": config.means_lr * extent,
-            "quats": config.quats_lr,
-            "log_scales": config.scales_lr,
-            "logit_opacities": config.opacities_lr,
-            "features": config.features_lr,
-            "sh0": config.sh0_lr,
-            "sh_rest": config.sh_rest_lr,
+        self._training, self._extent, rates = training, extent, training.rates
+        self._rates = {
+            "means": rates.means * extent,
+            "quats": rates.quats,
+            "log_scales": rates.scales,
+            "logit_opacities": rates.opacities,
+            "features": rates.features,
+            "sh0": rates.sh0,
+            "sh_rest": rates.sh_rest,
         }
-        groups = [
-            {"params": [value], "lr": rates[name], "name": name} for name, value in self.params.to_tensors().items()
-        ]
-        self._adam = torch.optim.Adam(groups, eps=config.adam_eps, fused=True)
+        tensors = self.params.to_tensors().items()
+        groups = [{"params": [value], "lr": self._rates[name], "name": name} for name, value in tensors]
+        self._adam = torch.optim.Adam(groups, eps=rates.adam_eps, fused=True)
         self._groups = {group["name"]: group for group in self._adam.param_groups}
-        self._rates = rates
 
     def means_lr(self, step: int) -> float:
-        """Learning rate of the means: from `means_lr` to `means_lr_final` times the extent, exponentially in the step."""
-        config, t = self._config, step / self._config.steps
-        return config.means_lr ** (1 - t) * config.means_lr_final**t * self._extent
+        """Learning rate of the means: from `rates.means` to `means_final` times the extent, exponentially in the step."""
+        rates, t = self._training.rates, step / self._training.steps
+        return rates.means ** (1 - t) * rates.means_final**t * self._extent
 
     def step_(self, step: int) -> None:
         """Apply the gradients of step number `step`, then forget them."""
-        config = self._config
-        factor = config.rates_final ** max(0.0, 2 * step / config.steps - 1)
+        factor = self._training.rates.final ** max(0.0, 2 * step / self._training.steps - 1)
         for name, group in self._groups.items():
             group["lr"] = self.means_lr(step) if name == "means" else self._rates[name] * factor
         self._adam.step()
@@ -65,8 +64,7 @@ class FieldOptimizer:
         """Train `params` from now on: row i takes the moments of old row `source[i]`, or zeros where `fresh[i]`."""
         self.params = params.map(_leaf)
         for name, value in self.params.to_tensors().items():
-            old = self._groups[name]["params"][0]
-            state = self._adam.state.pop(old, {})
+            state = self._adam.state.pop(self._groups[name]["params"][0], {})
             for moment in _MOMENTS:
                 if moment in state:
                     state[moment] = state[moment][source]
@@ -79,24 +77,19 @@ class FieldOptimizer:
         """Exchange the opacities and forget their moments, which belong to the old values."""
         leaf = self.params.logit_opacities
         leaf.data.copy_(logit_opacities)
-        state = self._adam.state.get(leaf, {})
-        for moment in _MOMENTS:
-            if moment in state:
-                state[moment].zero_()
+        for name, value in self._adam.state.get(leaf, {}).items():
+            if name in _MOMENTS:
+                value.zero_()
 
-    def state_tensors(self) -> dict[str, Tensor]:
-        """Moments and step counts by name, e.g. `means.exp_avg`; empty before the first step."""
-        found = {}
-        for name, value in self.params.to_tensors().items():
-            for key, entry in self._adam.state.get(value, {}).items():
-                found[f"{name}.{key}"] = entry
-        return found
+    def state(self) -> dict[str, Any]:
+        """Moments and step counts of Adam; empty before the first step."""
+        return dict(self._adam.state_dict()["state"])
 
-    def load_state_(self, state: dict[str, Tensor]) -> None:
-        """Continue from the result of `state_tensors`."""
-        for key, entry in state.items():
-            name, moment = key.split(".")
-            self._adam.state[self.params.to_tensors()[name]][moment] = entry.clone()
+    def load_state_(self, state: dict[str, Any]) -> None:
+        """Continue from the result of `state`, for these `params`."""
+        copied = {i: {name: value.clone() for name, value in part.items()} for i, part in state.items()}
+        self._adam.load_state_dict(self._adam.state_dict() | {"state": copied})
+        self._groups = {group["name"]: group for group in self._adam.param_groups}  # Adam makes new ones
 
 
 def _leaf(value: Tensor) -> Tensor:

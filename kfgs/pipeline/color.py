@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from .._check import check_range, check_whole
 from .._files import check_output
 from .._progress import Progress, as_progress
 from ..cameras import Camera, resize_map
-from ..fields import ColorLoss, FieldConfig, FieldFit, GaussianParams, fit_field
+from ..fields import ColorLoss, Densify, FieldFit, GaussianParams, Rates, Training, fit_field
 from ..formats import write_splats
 from ..gaussians import Gaussians
 from ..scenes import Scene
@@ -35,7 +35,7 @@ class ColorConfig:
     """Lambda of 3DGS: the share of 1 - SSIM in the loss, the rest being L1."""
     max_points: int | None = None
     """Start from at most this many of the scene's points, drawn at random; None = all."""
-    training: FieldConfig = field(default_factory=FieldConfig)
+    training: Training = field(default_factory=Training)
 
     def __post_init__(self) -> None:
         check_whole("sh_degree", self.sh_degree, 0, 3)
@@ -57,11 +57,10 @@ class ColorConfig:
         detail, with rates that fall to a tenth (without that, 1 dB less on room_0). Growing ends early, is limited, and
         has a higher threshold. Opacities are not reset: there are too few steps to recover.
         """
-        schedule: dict[str, Any] = {"steps": 3_600, "coarse": ((1_800, 2),), "sh_degree_every": 720}
-        schedule |= {"densify_from": 80, "densify_until": 1_800, "densify_every": 50, "densify_gradient": 3e-4}
-        schedule |= {"means_lr": 5e-4, "means_lr_final": 5e-6, "quats_lr": 0.003, "scales_lr": 0.015}
-        schedule |= {"sh0_lr": 0.008, "sh_rest_lr": 4e-4, "rates_final": 0.1}
-        return ColorConfig(sh_degree=2, training=replace(_CPU_FIELD, **schedule))
+        rates = Rates(5e-4, 5e-6, quats=0.003, scales=0.015, sh0=0.008, sh_rest=4e-4, final=0.1)
+        densify = Densify(80, 1_800, 50, 3e-4, reset_every=0, maximum=150_000)
+        training = Training(3_600, rates, densify, half_until=1_800, sh_degree_every=720, checkpoint_every=500)
+        return ColorConfig(sh_degree=2, training=training)
 
     @staticmethod
     def geometry() -> ColorConfig:
@@ -70,13 +69,8 @@ class ColorConfig:
         Pictures stay at half size, so colours are soft, but positions and sizes of Gaussians are right within a few pixels
         of a teacher's map. (room_0: 100,000 Gaussians; `docs/results.md` compares the mIoU with the `cpu` schedule.)
         """
-        schedule: dict[str, Any] = {
-            "densify_from": 100,
-            "densify_until": 1_200,
-            "densify_every": 50,
-            "sh_degree_every": 700,
-        }
-        training = replace(_CPU_FIELD, steps=2_000, coarse=((2_000, 2),), max_gaussians=100_000, **schedule)
+        densify = Densify(100, 1_200, 50, 4e-4, reset_every=0, maximum=100_000)
+        training = Training(2_000, _RATES, densify, half_until=2_000, sh_degree_every=700, checkpoint_every=500)
         return ColorConfig(sh_degree=1, training=training)
 
     @staticmethod
@@ -85,35 +79,12 @@ class ColorConfig:
 
         It has many Gaussians for its few pixels, because small Gaussians reach less across the border of a removed object.
         """
-        schedule: dict[str, Any] = {
-            "densify_from": 80,
-            "densify_until": 1_000,
-            "densify_every": 50,
-            "densify_gradient": 4e-4,
-            "sh_degree_every": 320,
-        }
-        training = replace(_CPU_FIELD, steps=1_600, coarse=((400, 2),), max_gaussians=100_000, **schedule)
+        densify = Densify(80, 1_000, 50, 4e-4, reset_every=0, maximum=100_000)
+        training = Training(1_600, _RATES, densify, half_until=400, sh_degree_every=320, checkpoint_every=500)
         return ColorConfig(sh_degree=1, training=training)
 
 
-_CPU_FIELD = FieldConfig(
-    steps=5_000,
-    means_lr=3.2e-4,
-    means_lr_final=3.2e-6,
-    quats_lr=0.002,
-    scales_lr=0.01,
-    sh0_lr=0.005,
-    sh_rest_lr=0.005 / 20,
-    sh_degree_every=1_000,
-    coarse=((3_000, 2),),
-    densify_from=200,
-    densify_until=2_500,
-    densify_every=100,
-    densify_gradient=4e-4,
-    reset_every=0,
-    max_gaussians=150_000,
-    checkpoint_every=500,
-)
+_RATES = Rates(3.2e-4, 3.2e-6, quats=0.002, scales=0.01, sh0=0.005, sh_rest=0.005 / 20)
 
 
 class TrainingPictures(Sequence[Tensor]):
@@ -257,7 +228,7 @@ def _steps(stage: Stage) -> int:
 
 def _inputs(run: Run, scene: Scene, views: Sequence[int], config: ColorConfig, seed: int) -> dict[str, Any]:
     """What decides the colour stage."""
-    training = with_extent(config.training, scene).identity()
+    training = asdict(with_extent(config.training, scene))
     extent = training.pop("extent")
     return {
         "pictures": digest_pictures(run, scene, views),

@@ -308,7 +308,7 @@ def _autoencoder(job: _Job, method: Paper, codebook: Codebook, book: Stage) -> t
 def _train(job: _Job, method: Paper, targets: Sequence[Tensor], inputs: dict[str, Any]) -> tuple[GaussianParams, Stage]:
     """The decoupled field, Sec. 3.2: Gaussians whose rendered latents follow the targets (Eq. 4)."""
     options = with_extent(method.training, job.scene)
-    inputs |= {"scene": digest_scene(job.scene, job.views), "config": options.identity(), "seed": job.seed}
+    inputs |= {"scene": digest_scene(job.scene, job.views), "config": asdict(options), "seed": job.seed}
 
     def train(checkpoint: Path) -> FieldFit:
         generator = job.generator("field")

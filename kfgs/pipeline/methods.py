@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..fields import FieldConfig, UpliftConfig
+from ..fields import Training, UpliftConfig
 from ..gaussians import Gaussians
 from ..quant import AutoencoderConfig, GrownCodebook, LinearLatents, PaperCodebook
 from .color import ColorConfig
@@ -49,7 +49,7 @@ class Paper:
     row "just decouple" of Table 1."""
     autoencoder: AutoencoderConfig | None = field(default_factory=AutoencoderConfig)
     """Semantic Compression (Sec. 3.3.2). None: a Gaussian has all D channels, the row "decouple+ADC" of Table 1."""
-    training: FieldConfig = field(default_factory=FieldConfig.cpu)
+    training: Training = field(default_factory=Training.cpu)
     """Training of the decoupled field (Eq. 4)."""
 
     def __post_init__(self) -> None:
@@ -64,7 +64,7 @@ class Paper:
         options = {
             "codebook": PaperCodebook(),
             "autoencoder": AutoencoderConfig.paper(),
-            "training": FieldConfig.paper(),
+            "training": Training.paper(),
         }
         return Paper(**(options | changes))
 

@@ -16,8 +16,8 @@ from .._files import write_json
 from .._progress import Progress
 from .._tensors import save_tensors
 from ..cameras.projection import project_points
-from ..fields import FieldConfig, FieldFit, GaussianParams
-from ..fields.config import check_extent
+from ..fields import FieldFit, GaussianParams, Training
+from ..fields.training import check_extent
 from ..scenes import Scene, SceneError, SfmConfig, find_points
 from ..splat import available_engines
 from .stages import Run, Stage, digest_pictures, digest_scene, origin_tensors
@@ -106,7 +106,7 @@ def with_points(run: Run, scene: Scene, views: Sequence[int], seed: int, progres
     return scene
 
 
-def with_extent(options: FieldConfig, scene: Scene) -> FieldConfig:
+def with_extent(options: Training, scene: Scene) -> Training:
     """The options with the scene's extent, unless they have one of their own."""
     return replace(options, extent=float(check_extent(scene.extent) if options.extent is None else options.extent))
 

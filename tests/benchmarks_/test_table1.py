@@ -8,7 +8,7 @@ import table1_rows
 from small_room import ROOM
 from small_task import MIB, cloud
 
-from kfgs.fields import FieldConfig
+from kfgs.fields import Training
 from kfgs.formats import write_splats
 from kfgs.quant import AutoencoderConfig, GrownCodebook, PaperCodebook
 from kfgs.toy.room_folder import make_toy_room
@@ -133,4 +133,4 @@ def test_a_run_writes_table_and_pictures_and_resumes(tmp_path, monkeypatch, caps
 
 
 def test_quick_steps_are_fewer_than_the_preset():
-    assert max(table1_rows.QUICK_STEPS.values()) < FieldConfig.cpu().steps
+    assert max(table1_rows.QUICK_STEPS.values()) < Training.cpu().steps

@@ -1,28 +1,28 @@
 """Colours through the same `fit_field`: harmonics on schedule, small pictures first, checkpoints to the bit."""
 
-from dataclasses import replace
-
 import pytest
 import torch
+from cases_training import changed
 from messages import tells
 
 from kfgs import Camera, Gaussians, rasterize
-from kfgs.fields import ColorLoss, FieldConfig, GaussianParams, fit_field
+from kfgs.fields import ColorLoss, GaussianParams, Training, fit_field
 
-SHORT = FieldConfig(
+SHORT = changed(
+    Training(),
     steps=60,
     extent=2.0,
-    sh0_lr=0.05,
-    sh_rest_lr=0.01,
+    sh0_rate=0.05,
+    sh_rest_rate=0.01,
     sh_degree_every=20,
-    coarse=((25, 2),),
-    scales_lr=0.01,
-    means_lr=1e-3,
-    means_lr_final=1e-4,
-    densify_from=5,
-    densify_until=45,
-    densify_every=10,
-    densify_gradient=5e-4,
+    half_until=25,
+    scales_rate=0.01,
+    means_rate=1e-3,
+    means_final_rate=1e-4,
+    start=5,
+    stop=45,
+    every=10,
+    gradient=5e-4,
     reset_every=30,
     report_every=10,
     checkpoint_every=20,
@@ -71,18 +71,18 @@ def same(a, b):
 
 def test_colours_that_change_with_the_view_are_recovered():
     cameras, targets = scene()
-    config = replace(
+    config = changed(
         SHORT,
         steps=200,
-        means_lr=5e-3,
-        quats_lr=0.01,
-        scales_lr=0.02,
-        sh0_lr=0.03,
-        densify_until=120,
-        densify_every=20,
-        densify_gradient=2e-3,
+        means_rate=5e-3,
+        quats_rate=0.01,
+        scales_rate=0.02,
+        sh0_rate=0.03,
+        stop=120,
+        every=20,
+        gradient=2e-3,
         reset_every=0,
-        coarse=((40, 2),),
+        half_until=40,
         sh_degree_every=40,
     )
 
@@ -101,7 +101,7 @@ def test_degrees_come_on_schedule():
     cameras, targets = scene(3)
     moved = []
     for steps in (19, 20, 39, 40):
-        config = replace(SHORT, steps=steps, densify_from=100, coarse=())
+        config = changed(SHORT, steps=steps, start=100, half_until=0)
         rest = fit_field(start(), cameras, targets, config).params.sh_rest
         moved.append((bool(rest[:, :3].any()), bool(rest[:, 3:].any())))
     assert moved == [(False, False), (True, False), (True, False), (True, True)]
@@ -115,9 +115,9 @@ def test_pictures_are_small_at_first():
         sizes.append((tuple(rendered.shape), tuple(target.shape)))
         return ColorLoss()(rendered, alpha, target)
 
-    config = replace(SHORT, steps=4, coarse=((1, 4), (3, 2)))
+    config = changed(SHORT, steps=4, half_until=3)
     fit_field(start(), cameras, targets, config, loss=recorded)
-    expected = [(6, 8, 3), (12, 16, 3), (12, 16, 3), (24, 32, 3)]
+    expected = [(12, 16, 3)] * 3 + [(24, 32, 3)]
     assert sizes == [(size, size) for size in expected]
 
 
@@ -147,7 +147,7 @@ def test_a_resumed_colour_fit_equals_an_undisturbed_one_bit_for_bit(tmp_path, st
 def test_a_checkpoint_knows_the_loss(tmp_path):
     cameras, targets = scene(2)
     path = tmp_path / "fit.safetensors"
-    config = replace(SHORT, steps=2)
+    config = changed(SHORT, steps=2)
     fit_field(start(), cameras, targets, config, loss=ColorLoss(0.2), checkpoint=path)
     fit_field(start(), cameras, targets, config, loss=ColorLoss(0.2), checkpoint=path)
     with pytest.raises(ValueError, match=tells("checkpoint:", "loss", "delete")):
@@ -157,7 +157,7 @@ def test_a_checkpoint_knows_the_loss(tmp_path):
 def test_an_existing_splat_can_be_trained_on():
     cameras, targets = scene(3)
     begin = GaussianParams.from_gaussians(blobs())
-    config = replace(SHORT, steps=2, sh_degree_every=0)
+    config = changed(SHORT, steps=2, sh_degree_every=0)
     fit = fit_field(begin, cameras, targets, config)
     scratch = fit_field(start(), cameras, targets, config)
     assert fit.history[0]["loss"] < 0.1 * scratch.history[0]["loss"]  # it was right already
@@ -175,7 +175,7 @@ def test_a_perfect_splat_stays_perfect():
     """Its own renderings leave nothing to learn, as long as all its harmonics are used from the first step."""
     begin, cameras = shiny(), [look_at_origin(0.5 * i) for i in range(3)]
     targets = [rasterize(begin.activated(), camera).map for camera in cameras]
-    config = replace(SHORT, steps=30, sh_degree_every=1_000, coarse=(), densify_from=100, reset_every=0)
+    config = changed(SHORT, steps=30, sh_degree_every=1_000, half_until=0, start=100, reset_every=0)
     fit = fit_field(begin, cameras, targets, config, loss=ColorLoss(0.0))
     assert [row["loss"] for row in fit.history] == [0.0, 0.0, 0.0]
     assert same(fit.params, begin)
@@ -187,7 +187,7 @@ def test_degrees_start_where_the_splat_is_and_go_on():
     cameras, targets = scene(3)
     begin, moved = shiny(filled=1), []
     for steps in (19, 20, 39, 40):
-        config = replace(SHORT, steps=steps, densify_from=100, coarse=())
+        config = changed(SHORT, steps=steps, start=100, half_until=0)
         rest = fit_field(begin, cameras, targets, config).params.sh_rest
         moved.append([not torch.equal(rest[:, part], begin.sh_rest[:, part]) for part in DEGREES])
     assert moved == [[True, False, False], [True, True, False], [True, True, False], [True, True, True]]
@@ -198,7 +198,7 @@ def test_a_resumed_fit_of_a_splat_uses_the_same_degrees(tmp_path, stop_at):
     """At step 20 training has filled degree 2, which must not count as the start's."""
     cameras, targets = scene(3)
     begin, path = shiny(filled=1), tmp_path / "fit.safetensors"
-    config = replace(SHORT, steps=40, checkpoint_every=5)
+    config = changed(SHORT, steps=40, checkpoint_every=5)
     whole = fit_field(begin, cameras, targets, config)
 
     def interrupt(row):
@@ -208,19 +208,6 @@ def test_a_resumed_fit_of_a_splat_uses_the_same_degrees(tmp_path, stop_at):
     with pytest.raises(StopHereError):
         fit_field(begin, cameras, targets, config, progress=interrupt, checkpoint=path)
     assert same(fit_field(begin, cameras, targets, config, checkpoint=path).params, whole.params)
-
-
-def test_a_divisor_larger_than_the_picture_leaves_one_row():
-    cameras, targets = scene(2)
-    sizes = []
-
-    def recorded(rendered, alpha, target):
-        sizes.append((tuple(rendered.shape), tuple(target.shape)))
-        return ColorLoss()(rendered, alpha, target)
-
-    config = replace(SHORT, steps=2, coarse=((1, 100),))
-    fit_field(start(), cameras, targets, config, loss=recorded)
-    assert sizes == [((1, 1, 3), (1, 1, 3)), ((24, 32, 3), (24, 32, 3))]
 
 
 def test_unknown_pixels_teach_nothing():
@@ -235,14 +222,14 @@ def test_unknown_pixels_teach_nothing():
     )
     target = torch.ones(24, 32, 3)
     target[:, 16:] = torch.nan
-    config = replace(SHORT, steps=5, densify_from=100, coarse=())
+    config = changed(SHORT, steps=5, start=100, half_until=0)
     fit = fit_field(GaussianParams.from_gaussians(right), [camera], [target], config, loss=ColorLoss())
     before = GaussianParams.from_gaussians(right)
     assert torch.equal(fit.params.sh0[0], before.sh0[0])
     assert (fit.params.sh0[1] > before.sh0[1]).all()
 
 
-def test_coarse_pictures_must_have_the_cameras_size():
+def test_small_pictures_must_have_the_cameras_size():
     cameras, targets = scene(2)
     with pytest.raises(ValueError, match=tells("targets[", "(24, 32)", "got (12, 16)")):
         fit_field(start(), cameras, [target[::2, ::2] for target in targets], SHORT)

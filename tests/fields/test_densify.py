@@ -4,10 +4,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from kfgs.fields import FieldConfig, GaussianParams
+from kfgs.fields import Densify, GaussianParams
 from kfgs.fields.densify import GradientStatistics, densify, lowered_opacities
 
-CONFIG = FieldConfig()
+CONFIG = Densify()
 EXTENT = 10.0  # cloned up to scale 0.1, pruned beyond scale 1
 HOT, COLD = 3e-4, 1e-4
 
@@ -111,11 +111,11 @@ def test_oversized_ones_are_dropped_only_when_asked():
 def test_a_limit_lets_the_strongest_grow_first():
     start = params([0.05, 0.05, 0.5, 0.5])
     gradient = torch.tensor([3e-4, 5e-4, 4e-4, 6e-4])
-    limited = replace(CONFIG, max_gaussians=6)
+    limited = replace(CONFIG, maximum=6)
     grown = densify(start, gradient, limited, extent=EXTENT)
     assert grown.source.tolist() == [0, 1, 2, 1, 3, 3]
-    assert len(densify(start, gradient, replace(CONFIG, max_gaussians=3), extent=EXTENT).params) == 4
-    assert len(densify(start, gradient, replace(CONFIG, max_gaussians=8), extent=EXTENT).params) == 8
+    assert len(densify(start, gradient, replace(CONFIG, maximum=3), extent=EXTENT).params) == 4
+    assert len(densify(start, gradient, replace(CONFIG, maximum=8), extent=EXTENT).params) == 8
 
 
 def test_the_given_params_are_not_changed():

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 import torch
 
-from kfgs.fields import FieldConfig, GaussianParams
+from kfgs.fields import GaussianParams, Rates, Training
 from kfgs.fields.optimizer import FieldOptimizer
 
-CONFIG = FieldConfig(steps=100)
+CONFIG = Training(steps=100)
 RATES = {"quats": 0.001, "log_scales": 0.005, "logit_opacities": 0.05, "features": 0.005}
 
 
@@ -24,6 +24,11 @@ def gradient(name, step, shape):
 def give_gradients(optimizer, step):
     for name, value in optimizer.params.to_tensors().items():
         value.grad = gradient(name, step, value.shape)
+
+
+def state_tensors(optimizer):
+    groups = zip(optimizer.params.to_tensors(), optimizer.state().values(), strict=True)
+    return {f"{name}.{key}": value for name, group in groups for key, value in group.items()}
 
 
 def adam_by_hand(start, gradients, rates, eps):
@@ -88,10 +93,10 @@ def test_new_gaussians_start_without_moments():
     optimizer = FieldOptimizer(params(), CONFIG, extent=1.0)
     give_gradients(optimizer, 1)
     optimizer.step_(1)
-    before = {name: value.clone() for name, value in optimizer.state_tensors().items()}
+    before = {name: value.clone() for name, value in state_tensors(optimizer).items()}
     source, fresh = torch.tensor([0, 1, 1]), torch.tensor([False, False, True])
     optimizer.replace_(optimizer.params.map(lambda value: value[source]), source, fresh)
-    after = optimizer.state_tensors()
+    after = state_tensors(optimizer)
     assert torch.equal(after["features.exp_avg"][:2], before["features.exp_avg"][:2])
     assert torch.equal(after["features.exp_avg"][2], torch.zeros(6, dtype=torch.float64))
     assert torch.equal(after["features.exp_avg_sq"][2], torch.zeros(6, dtype=torch.float64))
@@ -102,7 +107,7 @@ def test_setting_opacities_forgets_only_their_moments():
     give_gradients(optimizer, 1)
     optimizer.step_(1)
     optimizer.set_opacities_(torch.full((5,), -4.0, dtype=torch.float64))
-    state = optimizer.state_tensors()
+    state = state_tensors(optimizer)
     assert (optimizer.params.logit_opacities == -4).all()
     assert not state["logit_opacities.exp_avg"].any()
     assert not state["logit_opacities.exp_avg_sq"].any()
@@ -120,7 +125,7 @@ def test_state_round_trip_continues_bit_for_bit():
     for step in (1, 2):
         advance(one, step)
     other = FieldOptimizer(one.params, CONFIG, extent=1.0)
-    other.load_state_(one.state_tensors())
+    other.load_state_(one.state())
     for step in (3, 4):
         advance(one, step)
         advance(other, step)
@@ -128,13 +133,13 @@ def test_state_round_trip_continues_bit_for_bit():
 
 
 def test_rates_fall_in_the_second_half_to_their_final_share():
-    config = FieldConfig(steps=100, rates_final=0.1)
+    config = Training(steps=100, rates=Rates(final=0.1))
     optimizer = FieldOptimizer(params(), config, extent=1.0)
     found = {}
     for step in (1, 50, 75, 100):
         optimizer.step_(step)
         found[step] = {group["name"]: group["lr"] for group in optimizer._adam.param_groups}
     assert found[1] | {"means": None} == found[50] | {"means": None}
-    assert found[75]["quats"] == pytest.approx(0.1**0.5 * config.quats_lr)
-    assert found[100]["log_scales"] == pytest.approx(0.1 * config.scales_lr)
-    assert found[100]["means"] == pytest.approx(config.means_lr_final)
+    assert found[75]["quats"] == pytest.approx(0.1**0.5 * config.rates.quats)
+    assert found[100]["log_scales"] == pytest.approx(0.1 * config.rates.scales)
+    assert found[100]["means"] == pytest.approx(config.rates.means_final)

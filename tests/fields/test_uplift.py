@@ -14,8 +14,9 @@ from kfgs import Camera, Gaussians
 from kfgs._rows import unit_rows
 from kfgs.cameras import resize_map
 from kfgs.fields import (
-    FieldConfig,
     GaussianParams,
+    Rates,
+    Training,
     UpliftConfig,
     fit_field,
     uplift,
@@ -63,7 +64,7 @@ def balls(means, scale=0.15, opacity=0.9):
 
 
 def decoded(uplifted):
-    return uplifted.latents.decode(uplifted.gaussians.features)
+    return uplifted.decoder.latents.decode(uplifted.gaussians.features)
 
 
 # Against the equations
@@ -87,7 +88,7 @@ def test_features_are_those_of_the_slow_oracle(monkeypatch, corrections):
     assert (pixels > 1).sum() >= 8
     # Corrections read maps in half precision: 5e-4 of a unit feature, and they are at most 1 per pass.
     np.testing.assert_allclose(decoded(found).numpy(), expected, atol=1e-5 if corrections == 0 else 1e-3 * corrections)
-    np.testing.assert_allclose(found.pixels.numpy(), pixels, atol=1e-5)
+    np.testing.assert_allclose(found.seen.pixels.numpy(), pixels, atol=1e-5)
 
 
 def test_without_corrections_it_is_the_average_of_unit_features():
@@ -98,17 +99,17 @@ def test_without_corrections_it_is_the_average_of_unit_features():
     average = average_views(gaussians, resized)
     found = uplift_maps(gaussians, views, maps, PLAIN)
     torch.testing.assert_close(decoded(found), average.values, atol=1e-5, rtol=0)
-    torch.testing.assert_close(found.pixels, average.weights * 13 * 10 / (12 * 10), atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(found.seen.pixels, average.weights * 13 * 10 / (12 * 10), atol=1e-5, rtol=1e-5)
     length = torch.linalg.vector_norm(average.values, dim=1)
-    torch.testing.assert_close(found.agreement, length, atol=1e-5, rtol=0)
+    torch.testing.assert_close(found.seen.agreement, length, atol=1e-5, rtol=0)
 
 
 def test_latents_are_a_projection_of_the_same_average():
     views, gaussians, maps = cameras(), cloud(), random_maps(cameras(), channels=9)
     whole = decoded(uplift_maps(gaussians, views, maps, PLAIN))
     few = uplift_maps(gaussians, views, maps, replace(PLAIN, max_latents=3))
-    assert few.latents.latent == 3
-    torch.testing.assert_close(few.gaussians.features, few.latents.encode(whole), atol=1e-5, rtol=0)
+    assert few.decoder.latents.latent == 3
+    torch.testing.assert_close(few.gaussians.features, few.decoder.latents.encode(whole), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("shares", [([1.0], [1.0], 1.0), ([1.0], [-1.0], 0.0), ([1.0], [0.0], 0.0)])
@@ -157,13 +158,13 @@ def test_uniform_maps_give_their_feature_to_every_gaussian_that_is_shown(correct
     found = uplift_maps(
         gaussians, views, [feature.expand(*v.size, 5) for v in views], UpliftConfig(corrections=corrections)
     )
-    shown = found.pixels > 0
+    shown = found.seen.pixels > 0
     assert shown.sum() >= 8
-    assert found.latents.latent == 1
+    assert found.decoder.latents.latent == 1
     expected = (feature / 3).double() * shown[:, None]
     # Corrections read maps in half precision: 5e-4 of a unit feature.
     torch.testing.assert_close(decoded(found), expected, atol=1e-5 if corrections == 0 else 1e-3, rtol=0)
-    torch.testing.assert_close(found.agreement, shown.double(), atol=1e-5, rtol=0)
+    torch.testing.assert_close(found.seen.agreement, shown.double(), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("config", [PLAIN, UpliftConfig(max_gaussians=5)])
@@ -174,8 +175,8 @@ def test_only_the_directions_of_features_count(config):
     one = uplift_maps(gaussians, views, maps, config)
     other = uplift_maps(gaussians, views, [m * f for m, f in zip(maps, factors, strict=True)], config)
     torch.testing.assert_close(decoded(other), decoded(one), atol=2e-3, rtol=0)  # rounded to half precision elsewhere
-    torch.testing.assert_close(other.pixels, one.pixels)
-    torch.testing.assert_close(other.agreement, one.agreement, atol=1e-5, rtol=0)
+    torch.testing.assert_close(other.seen.pixels, one.seen.pixels)
+    torch.testing.assert_close(other.seen.agreement, one.seen.agreement, atol=1e-5, rtol=0)
 
 
 def test_all_zero_pixels_are_holes():
@@ -185,10 +186,10 @@ def test_all_zero_pixels_are_holes():
     holes[:, 4:] = torch.tensor([0.0, 3.0])
     found = uplift_maps(gaussians, ahead(), [holes], PLAIN)
     torch.testing.assert_close(decoded(found), torch.tensor([[0.0, 0], [0, 1]]))
-    assert found.agreement.tolist() == pytest.approx([0, 1])
-    assert found.pixels[0] == 0
+    assert found.seen.agreement.tolist() == pytest.approx([0, 1])
+    assert found.seen.pixels[0] == 0
     whole = uplift_maps(gaussians, ahead(), [torch.ones(8, 8, 2)], PLAIN)
-    assert 0 < found.pixels[1] < whole.pixels[1]
+    assert 0 < found.seen.pixels[1] < whole.seen.pixels[1]
 
 
 @pytest.mark.parametrize("corrections", [0, 1])
@@ -196,15 +197,15 @@ def test_what_no_view_shows_knows_nothing(corrections):
     gaussians = balls([[0.0, 0.0, 2.0], [0.0, 0.0, -2.0], [50.0, 0.0, 2.0], [0.2, 0.0, 2.5]])
     found = uplift_maps(gaussians, ahead(3), random_maps(ahead(3)), UpliftConfig(corrections=corrections))
     assert (found.gaussians.features != 0).any(dim=1).tolist() == [True, False, False, True]
-    assert (found.pixels > 0).tolist() == [True, False, False, True]
-    assert (found.agreement > 0).tolist() == [True, False, False, True]
+    assert (found.seen.pixels > 0).tolist() == [True, False, False, True]
+    assert (found.seen.agreement > 0).tolist() == [True, False, False, True]
 
 
 def test_disagreement_of_views_is_seen():
     """Half of the pixels say x and half say y: the mean (1/2, 1/2) has length sqrt(1/2)."""
     x, y = torch.tensor([1.0, 0.0]).expand(8, 8, 2), torch.tensor([0.0, 1.0]).expand(8, 8, 2)
     found = uplift_maps(balls([[0.0, 0.0, 2.0]]), ahead(2), [x, y], PLAIN)
-    torch.testing.assert_close(found.agreement, torch.tensor([0.5**0.5]))
+    torch.testing.assert_close(found.seen.agreement, torch.tensor([0.5**0.5]))
     torch.testing.assert_close(decoded(found), torch.tensor([[0.5, 0.5]]))
 
 
@@ -213,9 +214,9 @@ def test_weights_of_an_antialiased_cloud_are_those_that_are_drawn():
     fused = uplift_maps(tiny, ahead(2), random_maps(ahead(2)), PLAIN)
     drawn = [rasterize(tiny[i].replace(features=torch.ones(1, 1)), ahead()[0], engine="reference") for i in range(2)]
     assert fused.gaussians.antialiased
-    assert fused.pixels.tolist() == pytest.approx([2 * float(one.alpha.sum()) for one in drawn], rel=0.02)
+    assert fused.seen.pixels.tolist() == pytest.approx([2 * float(one.alpha.sum()) for one in drawn], rel=0.02)
     plain = uplift_maps(tiny.replace(antialiased=False), ahead(2), random_maps(ahead(2)), PLAIN)
-    assert (plain.pixels > 5 * fused.pixels).all()
+    assert (plain.seen.pixels > 5 * fused.seen.pixels).all()
 
 
 def test_the_cloud_keeps_its_shape_and_loses_colours():
@@ -292,7 +293,7 @@ def test_large_maps_are_shrunk_to_the_working_size():
     config = UpliftConfig(corrections=1, keep=1.0, pixels=130)
     one, other = (uplift_maps(gaussians, views, maps, config) for maps in (small, large))
     torch.testing.assert_close(decoded(one), decoded(other), atol=2e-3, rtol=0)  # half precision
-    torch.testing.assert_close(one.pixels, other.pixels)
+    torch.testing.assert_close(one.seen.pixels, other.seen.pixels)
 
 
 def test_a_shrunk_pixel_is_the_mean_of_the_known_ones_if_these_are_most():
@@ -306,7 +307,7 @@ def test_a_shrunk_pixel_is_the_mean_of_the_known_ones_if_these_are_most():
     config = replace(PLAIN, pixels=130)
     one, other = (uplift_maps(gaussians, views, maps, config) for maps in (small, large))
     torch.testing.assert_close(decoded(one), decoded(other), atol=1e-5, rtol=0)
-    torch.testing.assert_close(one.pixels, other.pixels)
+    torch.testing.assert_close(one.seen.pixels, other.seen.pixels)
 
 
 def test_pixels_left_over_by_shrinking_move_nothing():
@@ -320,7 +321,7 @@ def test_pixels_left_over_by_shrinking_move_nothing():
     cut = [replace(view, width=24, height=20) for view in views]
     one, other = uplift_maps(gaussians, cut, small, config), uplift_maps(gaussians, views, large, config)
     torch.testing.assert_close(decoded(one), decoded(other), atol=1e-5, rtol=0)
-    torch.testing.assert_close(one.pixels, other.pixels)
+    torch.testing.assert_close(one.seen.pixels, other.seen.pixels)
 
 
 def test_pixels_are_those_of_the_pictures_at_any_working_size():
@@ -389,13 +390,13 @@ def test_merging_leaves_at_most_what_was_asked_for():
     lines = []
     found = uplift_maps(gaussians, views, maps, UpliftConfig(max_gaussians=40, faint=0.0), report=lines.append)
     assert 20 < len(found.gaussians) <= 40
-    assert found.pixels.shape == found.agreement.shape == (len(found.gaussians),)
-    fill = kept.pixels > 0
-    torch.testing.assert_close(found.pixels.sum(), kept.pixels[fill].sum())
-    mean = (kept.agreement * kept.pixels)[fill].sum() / kept.pixels[fill].sum()
-    torch.testing.assert_close((found.agreement * found.pixels).sum() / found.pixels.sum(), mean)
+    assert found.seen.pixels.shape == found.seen.agreement.shape == (len(found.gaussians),)
+    fill = kept.seen.pixels > 0
+    torch.testing.assert_close(found.seen.pixels.sum(), kept.seen.pixels[fill].sum())
+    mean = (kept.seen.agreement * kept.seen.pixels)[fill].sum() / kept.seen.pixels[fill].sum()
+    torch.testing.assert_close((found.seen.agreement * found.seen.pixels).sum() / found.seen.pixels.sum(), mean)
     assert lines == [
-        f"fused 4 maps of 8 channels as {found.latents.latent} latents",
+        f"fused 4 maps of 8 channels as {found.decoder.latents.latent} latents",
         f"{len(found.gaussians)} of 200 Gaussians left",
     ]
 
@@ -481,18 +482,18 @@ def test_a_killed_uplift_reads_no_map_twice_and_gives_the_same_bits(tmp_path, mo
     assert reads == [0, 1, *range(2, len(maps))]
     whole = uplift_maps(cloud(), cameras(), Maps())
     assert torch.equal(resumed.gaussians.features, whole.gaussians.features)
-    assert torch.equal(resumed.latents.basis, whole.latents.basis)
+    assert torch.equal(resumed.decoder.latents.basis, whole.decoder.latents.basis)
 
 
 def test_an_uplifted_cloud_is_a_start_for_training():
     views = cameras()
     maps = [torch.nn.functional.normalize(one, dim=-1) for one in random_maps(views)]
     found = uplift_maps(cloud(), views, maps)
-    targets = [found.latents.encode(one) for one in maps]
-    config = FieldConfig(steps=30, extent=1.0, densify_until=0, reset_every=0, features_lr=0.02, report_every=10)
+    targets = [found.decoder.latents.encode(one) for one in maps]
+    config = Training(steps=30, extent=1.0, densify=None, rates=Rates(features=0.02), report_every=10)
     trained = fit_field(GaussianParams.from_gaussians(found.gaussians), views, targets, config)
     assert trained.history[-1]["loss"] < trained.history[0]["loss"]
-    assert trained.params.channels == found.latents.latent
+    assert trained.params.channels == found.decoder.latents.latent
 
 
 def test_gaussians_that_fill_little_of_the_views_are_pointed_out():

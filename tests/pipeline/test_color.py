@@ -4,21 +4,22 @@ import dataclasses
 
 import pytest
 import torch
+from cases_training import changed
 from messages import tells
 from safetensors.torch import load_file
 from small_room import make_room, stages
 
 from kfgs.cameras import Distortion, Similarity
 from kfgs.evaluation.color import score_views
-from kfgs.fields import FieldConfig
+from kfgs.fields import Training
 from kfgs.formats import read_splats
 from kfgs.pipeline.color import ColorConfig, TrainingPictures, fit_color
 from kfgs.scenes import load_scene
 
-FIELD = dataclasses.replace(
+FIELD = changed(
     ColorConfig.quick().training.with_steps(120),
-    densify_every=10,
-    max_gaussians=3_000,
+    every=10,
+    maximum=3_000,
     report_every=20,
     checkpoint_every=25,
 )
@@ -181,5 +182,5 @@ def test_wrong_options(change, message):
 
 def test_the_published_schedule_is_the_default():
     assert ColorConfig.paper() == ColorConfig()
-    assert ColorConfig().training == FieldConfig()
+    assert ColorConfig().training == Training()
     assert (ColorConfig().sh_degree, ColorConfig().ssim_weight, ColorConfig().picture_scale) == (3, 0.2, 1.0)

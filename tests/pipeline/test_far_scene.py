@@ -8,6 +8,7 @@ import pycolmap
 import pytest
 import torch
 from cases_color import make_splat
+from cases_training import changed
 from small_room import FIELD, make_room
 
 from kfgs import FeatureFolder, SemanticField, Uplift, UpliftConfig, attach, load_scene, read_splats
@@ -18,7 +19,7 @@ from kfgs.formats.ply import read_ply, write_ply
 from kfgs.pipeline.color import ColorConfig, fit_color
 
 UTM = np.array([448262.0, 5411932.0, 200.0])
-COLOR = ColorConfig(sh_degree=1, training=dataclasses.replace(FIELD, steps=4, densify_from=5, densify_until=6))
+COLOR = ColorConfig(sh_degree=1, training=changed(FIELD, steps=4, start=5, stop=6))
 
 
 def fit(folder):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from cases_color import make_splat, surface
+from cases_training import changed
 from PIL import Image
 from small_room import ROOM, stages
 
@@ -18,7 +19,7 @@ from kfgs.pipeline.color import ColorConfig, TrainingPictures, fit_color
 from kfgs.scenes import Scene
 from kfgs.toy.room_folder import make_toy_room
 
-FIELD = replace(ColorConfig.quick().training.with_steps(150), densify_every=10, max_gaussians=3_000)
+FIELD = changed(ColorConfig.quick().training.with_steps(150), every=10, maximum=3_000)
 QUICK = replace(ColorConfig.quick(), training=FIELD)
 PERSON = slice(8, 56), slice(24, 60)  # rows and columns of 60x80 pixels
 CELLS = slice(4, 28), slice(12, 30)  # the same of 30x40 features

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 import kfgs
+from kfgs.fields import Densify
 from kfgs.quant import AutoencoderConfig, PaperCodebook
 
 ROOM = kfgs.ToyConfig(
@@ -15,14 +16,11 @@ ROOM = kfgs.ToyConfig(
 )
 CODEBOOK = PaperCodebook(epochs=6, step_every=2, learning_rate=0.02, expand_below=0.8, joins_per_image=1)
 AUTOENCODER = AutoencoderConfig.paper(latent=8, encoder=(48, 32), decoder=(32, 48), steps=1_500, learning_rate=3e-3)
-TRAINING = kfgs.FieldConfig.cpu(
+TRAINING = replace(
+    kfgs.Training.cpu(),
     steps=400,
-    features_lr=0.03,
-    densify_from=50,
-    densify_until=250,
-    densify_every=50,
-    reset_every=0,
-    max_gaussians=8_000,
+    rates=replace(kfgs.Training.cpu().rates, features=0.03),
+    densify=Densify(50, 250, 50, 8e-4, reset_every=0, maximum=8_000),
 )
 
 
@@ -51,7 +49,7 @@ def codebook_options():
 def color(room) -> kfgs.Gaussians:
     """A colour field of the room: a short training."""
     quick = kfgs.ColorConfig.quick()
-    short = replace(quick.training.with_steps(400), max_gaussians=12_000)
+    short = quick.training.with_steps(400).with_maximum(12_000)
     return kfgs.fit_color(room.scene, room.out / "color", replace(quick, training=short))
 
 

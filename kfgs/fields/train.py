@@ -1,0 +1,293 @@
+"""Fit a cloud of Gaussians to posed maps: render a view, compare, step, densify (Sec. 3.2 on top of 3DGS)."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from .._card import short_repr
+from .._check import ORIGIN, as_tensor
+from .._files import as_path
+from .._progress import Progress, as_progress
+from ..cameras import Camera
+from ..cameras.bounds import camera_extent
+from ..gaussians import FACTS
+from ..splat import rasterize
+from .checkpoint import identify_fit, read_checkpoint, write_checkpoint
+from .densify import GradientStatistics, densify, lowered_opacities
+from .loss import ColorLoss, Loss, l1_loss
+from .optimizer import FieldOptimizer
+from .params import GaussianParams
+from .training import Training, check_extent
+from .working_maps import shrink_camera, shrink_map
+
+WARM_UP_SIZE = 16  # pixels: more than a window of SSIM
+
+
+@dataclass(frozen=True, eq=False)
+class FieldFit:
+    """A fitted cloud, and the history of its training.
+
+    Each row of `history` holds `step`, `loss` (the mean since the row before), `count` (Gaussians) and `seconds`
+    (training time so far, earlier runs of a resumed fit included).
+    """
+
+    params: GaussianParams
+    history: list[dict[str, Any]]
+
+    __repr__ = short_repr
+
+
+def fit_field(
+    params: GaussianParams,
+    cameras: Sequence[Camera],
+    targets: Sequence[Tensor],  # C maps [h, w, D]
+    training: Training | None = None,
+    *,
+    loss: Loss = l1_loss,
+    generator: torch.Generator | None = None,
+    progress: Progress = False,
+    checkpoint: str | Path | None = None,
+) -> FieldFit:
+    """Train Gaussians until their renderings match the targets (Eq. 4), growing and pruning them on the way.
+
+    Each step uses one view, in random order; each view is used once before any is repeated.
+
+    Args:
+        params: the start; not changed. They decide dtype and device of the fit. Without an origin they are counted from that
+            of the cameras, as the points of a scene are.
+        cameras: C posed cameras without distortion.
+        targets: one map per camera, of any size, NaN where nothing is known (`l1_loss`); read one at a time
+            and only by `len` and index, so they may live on disk.
+        training: the paper's values when not given. If its `extent` is None, the extent of `cameras` takes its place, which is
+            1.1 times their largest distance from their mean.
+        loss: compares a rendered map, its alpha and the target. For colours, `ColorLoss`.
+        generator: draws the views' order and the places of split Gaussians; None stands for seed 0.
+        progress: True shows a bar with loss, number of Gaussians and time left. A function is called with each new row of
+            the history. To stop early, raise from it; a checkpoint stays behind.
+        checkpoint: a file that is written every `checkpoint_every` steps and at the end. If it exists, the fit
+            continues from it, and its result is bit for bit that of an undisturbed run (on one machine's CPU; a GPU adds
+            gradients up in no fixed order).
+
+    Raises:
+        TypeError: if `params`, a target or `progress` has another type.
+        ValueError: if the cameras' extent is 0 or not finite, counts or shapes disagree, a camera has distortion, the
+            checkpoint belongs to another fit, or no Gaussian is left.
+        FloatingPointError: if the loss is no longer finite.
+        FileNotFoundError: if something else deletes the checkpoint's folder meanwhile; noticed at the next checkpoint.
+    """
+    training, progress = training or Training(), as_progress(progress)
+    generator = generator or torch.Generator().manual_seed(0)
+    _check_views(params, cameras, targets)
+    if params.origin == ORIGIN:
+        params = replace(params, origin=cameras[0].origin)
+    cameras = [camera.with_origin(params.origin) for camera in cameras]
+    if training.extent is None:
+        training = replace(training, extent=float(check_extent(camera_extent(cameras, params.means))))
+    trainer = Trainer(params, cameras, targets, training, loss, generator)
+    path = as_path(checkpoint) if checkpoint is not None else None
+    identity = {} if path is None else identify_fit(params, cameras, targets, training, loss, generator)
+    if path is not None and path.exists():
+        trainer.restore_(read_checkpoint(path, identity))
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    if trainer.step < training.steps:
+        trainer.warm_up()
+    with tqdm(
+        total=training.steps, initial=trainer.step, disable=progress is not True, desc="field", unit="step"
+    ) as bar:
+        while trainer.step < training.steps:
+            row = trainer.advance_()
+            bar.update()
+            if row is not None:
+                bar.set_postfix(loss=f"{row['loss']:.4f}", Gaussians=row["count"], refresh=False)
+                if callable(progress):
+                    progress(dict(row))
+            last = trainer.step == training.steps
+            if path is not None and (last or trainer.step % training.checkpoint_every == 0):
+                write_checkpoint(path, trainer.state() | {"identity": identity})
+    return FieldFit(trainer.optimizer.params.map(torch.Tensor.detach), trainer.history)
+
+
+class Trainer:
+    """Gaussians in training, with everything that the next step depends on."""
+
+    def __init__(
+        self,
+        params: GaussianParams,
+        cameras: Sequence[Camera],
+        targets: Sequence[Tensor],
+        training: Training,
+        loss: Loss,
+        generator: torch.Generator,
+    ) -> None:
+        """Prepare step 1; the arguments are those of `fit_field`, checked, and the extent is known."""
+        assert training.extent is not None
+        self._cameras, self._targets, self._loss = cameras, targets, loss
+        self._training, self._extent, self._generator = training, training.extent, generator
+        self._render_cameras: dict[tuple[int, bool], Camera] = {}
+        self._sh_start = params.used_sh_degree()  # of the start, so a resumed fit finds the same
+        self.optimizer = FieldOptimizer(params, training, extent=self._extent)
+        self.statistics = GradientStatistics.zeros(params)
+        self.history: list[dict[str, Any]] = []
+        self.step = 0
+        self._queue: list[int] = []  # views still to come in this epoch, last first
+        self._losses, self._seconds = 0.0, 0.0
+
+    def advance_(self) -> dict[str, Any] | None:
+        """One step of the optimisation; returns the new row of the history, if there is one."""
+        started = time.perf_counter()
+        self.step += 1
+        densify = self._training.densify
+        self._learn_()
+        if densify is not None and self.step < densify.stop:
+            if self.step > densify.start and self.step % densify.every == 0:
+                self._densify_()
+            if densify.reset_every and self.step % densify.reset_every == 0:
+                logits = self.optimizer.params.logit_opacities
+                self.optimizer.set_opacities_(lowered_opacities(logits, densify.reset_opacity))
+        self._seconds += time.perf_counter() - started
+        if self.step % self._training.report_every and self.step != self._training.steps:
+            return None
+        since = self.step - (self.history[-1]["step"] if self.history else 0)
+        count = len(self.optimizer.params)
+        row = {"step": self.step, "loss": self._losses / since, "count": count, "seconds": round(self._seconds, 3)}
+        self.history.append(row)
+        self._losses = 0.0
+        return row
+
+    def warm_up(self) -> None:
+        """Compute the gradients of a tiny view and forget them: kernels are compiled or loaded now, not in step 1."""
+        params = self.optimizer.params
+        camera = self._cameras[0].to(params.means).resized(WARM_UP_SIZE, WARM_UP_SIZE)
+        rendering = rasterize(params.activated(), camera, engine=self._training.engine)
+        loss = self._loss if isinstance(self._loss, ColorLoss) else l1_loss  # not a caller's own one: it may keep count
+        value = loss(rendering.map, rendering.alpha, torch.zeros_like(rendering.map))
+        if value.requires_grad:
+            value.backward()
+        self.optimizer.forget_()
+
+    def _learn_(self) -> None:
+        """Follow the gradients of the next view; keep those of the places in the picture, which densifying needs."""
+        if not self._queue:
+            device = self._generator.device
+            self._queue = torch.randperm(len(self._cameras), generator=self._generator, device=device).tolist()
+        view = self._queue.pop()
+        target, half = self._target(view)
+        camera = self._camera(view, target, half)
+        every = self._training.sh_degree_every
+        gaussians = self.optimizer.params.activated(self._sh_start + self.step // every if every else 3)
+        rendering = rasterize(gaussians, camera, engine=self._training.engine)
+        means2d = rendering.projected.means2d
+        if means2d.requires_grad:
+            means2d.retain_grad()
+        loss = self._loss(rendering.map, rendering.alpha, target)
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            raise FloatingPointError(
+                f"loss: expected a finite number at step {self.step}, got {value} (view {camera.name!r}); "
+                "check the targets for infinities, or lower the learning rates"
+            )
+        self._losses += value
+        if loss.requires_grad:  # not so when the view shows no Gaussian
+            loss.backward()
+            if means2d.grad is not None and self._training.densify and self.step < self._training.densify.stop:
+                self.statistics.add_(rendering.projected.index, means2d.grad, camera.size)
+        self.optimizer.step_(self.step)
+
+    def _densify_(self) -> None:
+        options = self._training.densify
+        assert options is not None
+        grown = densify(
+            self.optimizer.params,
+            self.statistics.mean(),
+            options,
+            extent=self._extent,
+            prune_large=0 < options.reset_every < self.step,
+            generator=self._generator,
+        )
+        if len(grown.params) == 0:
+            raise ValueError(
+                f"training: expected some Gaussian to outlast pruning, got none at step {self.step}; raise prune_extent "
+                f"(now {options.prune_extent}) or lower prune_opacity ({options.prune_opacity}), or check extent"
+            )
+        self.optimizer.replace_(*grown)
+        self.statistics = GradientStatistics.zeros(grown.params)
+
+    def _target(self, view: int) -> tuple[Tensor, bool]:  # [h, w, D]
+        """The map of a view, and whether it was halved."""
+        target = as_tensor(f"targets[{view}]", self._targets[view], floating=True)
+        channels = self.optimizer.params.channels
+        clear = isinstance(self._loss, ColorLoss) and target.ndim == 3 and target.shape[2] == channels + 1
+        if target.ndim != 3 or (target.shape[2] != channels and not clear):
+            raise ValueError(
+                f"targets[{view}]: expected [h, w, D] with D = {channels} (from params), got {tuple(target.shape)}; "
+                "start from GaussianParams.from_points(points, D)"
+            )
+        target = target.to(self.optimizer.params.means)
+        if self.step > self._training.half_until or min(self._cameras[view].size) < 2:
+            return target, False
+        if tuple(target.shape[:2]) != self._cameras[view].size:
+            raise ValueError(
+                f"targets[{view}]: expected {self._cameras[view].size} pixels as the camera has (half_until asks "
+                f"for it), got {tuple(target.shape[:2])}; resize the camera, or leave half_until at 0"
+            )
+        return shrink_map(target, 2), True
+
+    def _camera(self, view: int, target: Tensor, half: bool) -> Camera:
+        """The camera to render with; cached, because checking a new camera takes longer than using it."""
+        if (view, half) not in self._render_cameras:
+            camera, scale = self._cameras[view].to(self.optimizer.params.means), self._training.render_scale
+            if scale is not None:
+                height, width = (max(1, round(n * scale)) for n in target.shape[:2])
+                camera = camera.resized(min(height, camera.height), min(width, camera.width))
+            self._render_cameras[view, half] = shrink_camera(camera, 2) if half else camera
+        return self._render_cameras[view, half]
+
+    def state(self) -> dict[str, Any]:
+        """Everything that `restore_` needs: tensors, numbers, lists and dictionaries."""
+        return {
+            "params": {name: value.detach() for name, value in self.optimizer.params.to_tensors().items()},
+            "adam": self.optimizer.state(),
+            "statistics": self.statistics._asdict(),
+            "generator": self._generator.get_state(),
+            "progress": [self.step, self._queue, self.history, self._losses, self._seconds],
+        }
+
+    def restore_(self, state: dict[str, Any]) -> None:
+        """Continue from a `state`; also restores that of the fit's generator."""
+        now = self.optimizer.params
+        facts: dict[str, Any] = {name: getattr(now, name) for name in FACTS}
+        params = replace(GaussianParams.from_tensors(state["params"]).map(lambda value: value.to(now.means)), **facts)
+        self.optimizer = FieldOptimizer(params, self._training, extent=self._extent)
+        self.optimizer.load_state_(state["adam"])
+        self.statistics = GradientStatistics(*(value.to(now.means) for value in state["statistics"].values()))
+        self._generator.set_state(state["generator"])
+        self.step, self._queue, self.history, self._losses, self._seconds = state["progress"]
+
+
+def _check_views(params: GaussianParams, cameras: Sequence[Camera], targets: Sequence[Tensor]) -> None:
+    if not isinstance(params, GaussianParams):
+        hint = "GaussianParams.from_gaussians or GaussianParams.from_points makes them"
+        raise TypeError(f"params: expected GaussianParams, got {type(params).__name__}; {hint}")
+    if len(params) == 0:
+        raise ValueError("params: expected at least one Gaussian, got none; start from GaussianParams.from_points")
+    if len(cameras) == 0 or len(cameras) != len(targets):
+        raise ValueError(
+            f"targets: expected one map per camera ({len(cameras)}, at least one), got {len(targets)}; "
+            "pass the views that have maps"
+        )
+    for camera in cameras:
+        if camera.distortion is not None:
+            raise ValueError(
+                f"cameras: expected cameras without distortion, got {camera.distortion.model} (camera {camera.name!r}); "
+                "undistort the images first with kfgs.cameras.undistort, which returns the camera to use"
+            )
