@@ -12,13 +12,14 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from classes import show_classes
 from PIL import Image, ImageDraw, ImageFont
 
 from kfgs import EditList, Recolor, Remove, SemanticField, attach, load_scene, read_splats
 from kfgs.cameras import path_cameras
 from kfgs.labels import OfClass
 from kfgs.viz import show_cloud
-from kfgs.viz.films import show_classes, show_selection
+from kfgs.viz.films import show_selection
 
 SIZE = (345, 460)  # height and width of the film
 FRAMES, BLEND = 96, 5  # in all; of the change from one part to the next

@@ -14,6 +14,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from classes import show_classes
 from PIL import Image
 
 from kfgs import (
@@ -31,7 +32,7 @@ from kfgs import (
 )
 from kfgs.pipeline import true_labels
 from kfgs.viz import FeatureColors
-from kfgs.viz.films import show_classes, show_cloud, show_selection
+from kfgs.viz.films import show_cloud, show_selection
 from kfgs.viz.palette import palette
 
 HERE = Path(__file__).resolve().parent

@@ -226,10 +226,10 @@ def _draw(path: Path, query: str, gaussians: Any, things: list[Any], cameras: An
     """Draw the parts over photographs; without them over the cloud's own colours, if it has some."""
     from ..pipeline.part_pictures import write_parts
     from ..viz import show_cloud
-    from ..viz.films import Photos
+    from ..viz.films import show_photos
 
     under = None if gaussians.sh is None else show_cloud(gaussians, color_by="rgb")
-    under = under if scene is None else Photos(scene)
+    under = under if scene is None else show_photos(scene)
     write_parts(path, gaussians, things, cameras or (), under, query)
 
 

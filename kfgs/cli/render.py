@@ -235,7 +235,7 @@ def _title(word: str) -> str:
 
 def _show(word: str, meaning: Any, semantic: Any, colors: Any) -> Any:
     from ..viz import show_cloud
-    from ..viz.films import show_classes, show_selection
+    from ..viz.films import show_selection
 
     under = None if colors is None else show_cloud(colors, color_by="rgb")
     if word == "photo":
@@ -243,7 +243,7 @@ def _show(word: str, meaning: Any, semantic: Any, colors: Any) -> Any:
             raise ValueError("show: expected --color for photo, got none; name the colour splat of the scene")
         return under
     if word == "labels":
-        return show_classes(semantic, meaning.names, under)
+        return show_cloud(semantic, color_by="label", names=meaning.names)
     if word == "features":
         if semantic.features is None:
             raise ValueError("show: expected a field for features, got a splat without; leave it out")

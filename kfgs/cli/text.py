@@ -86,7 +86,7 @@ def _text_of_examples(out: Path, field: Any, examples: dict[str, Any]) -> None:
     """Write a table of examples and, if the photographs of their views are at hand, a picture of what was shown."""
     from ..fields import label_set_from_examples
     from ..viz import draw_examples, save_picture
-    from ..viz.films import Photos
+    from ..viz.films import show_photos
 
     scene = Classes().scene_of(field)
     drawn = scene is not None and any(hasattr(one, "view") for shown in examples.values() for one in shown)
@@ -95,7 +95,7 @@ def _text_of_examples(out: Path, field: Any, examples: dict[str, Any]) -> None:
     written = [out]
     if drawn:
         written.append(out.with_name(f"{out.name}.png"))
-        save_picture(written[-1], draw_examples(field.cameras, examples, Photos(scene)))
+        save_picture(written[-1], draw_examples(field.cameras, examples, show_photos(scene)))
     say(f"{len(made)} classes, {made.dim} channels each, by examples: {', '.join(made.names)}")
     wrote(written)
 

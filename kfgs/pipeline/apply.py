@@ -13,7 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._check import ORIGIN, check_range
-from .._files import Names, as_path, check_output, write_json
+from .._files import Names, as_path, atomic_path, check_output, write_json
 from .._origin import recounted
 from .._typed import typed
 from ..cameras import resize_labels
@@ -32,7 +32,7 @@ from ..labels.questions import class_rows
 from ..scenes import Scene, list_images
 from ..viz import FeatureColors, overlay_labels, palette, save_picture
 from ..viz.palette import UNLABELLED
-from ..viz.pictures import Array, write_png
+from ..viz.pictures import Array
 from .sheets import segmentation_sheet, teacher_labels
 
 SEGMENTED = ("predicted", "colored", "sheets", "overlay", "features")
@@ -68,7 +68,8 @@ def _save_bytes(path: Path, labels: Tensor, colors: Array | None = None) -> None
     picture = Image.fromarray(torch.where(labels < 0, VOID, labels).to(torch.uint8).cpu().numpy())
     if colors is not None:
         picture.putpalette(colors.tobytes())  # mode P
-    write_png(path, picture)
+    with atomic_path(path) as temporary:
+        picture.save(temporary, format="PNG")
 
 
 @typed

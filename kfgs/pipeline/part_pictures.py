@@ -28,7 +28,7 @@ def write_parts(
         gaussians: the cloud that was selected in.
         parts: from `connected_parts`, with these cameras.
         cameras: the views.
-        under: draws the picture below, for instance `Photos(scene)`.
+        under: draws the picture below, for instance `show_photos(scene)`.
         name: of the selection; parts are named name/1, name/2.
     """
     pictures, titles = [], []

@@ -23,7 +23,7 @@ from ..gaussians import Gaussians
 from ..scenes import Scene
 from ..splat import SH_C0
 from ..viz.colors import COLORMAP, Array
-from ..viz.films import Photos
+from ..viz.films import show_photos
 from ..viz.linked import upwards
 from ..viz.palette import palette
 from .state import GREY, Exploration, Side
@@ -279,12 +279,13 @@ def _add_scores(buffers: _Buffers, state: Exploration, questions: Iterable[str])
 
 def _add_cameras(buffers: _Buffers, state: Exploration, scene: Scene | None) -> list[dict[str, Any]]:
     """Add the photos of the cameras that have one, and describe all cameras."""
-    photos, packed = None if scene is None else Photos(scene), []
+    paths = [] if scene is None else zip(scene.cameras, scene.image_paths, strict=True)
+    there, packed = {camera.name for camera, path in paths if path.is_file()}, []
     for index, camera in enumerate(state.cameras):
         name = None
-        if photos is not None and camera in photos:
+        if scene is not None and camera.name in there:
             name = f"thumbnails/{index}"
-            buffers.add(name, np.frombuffer(as_jpeg(photos(camera.fitted(PHOTO))), dtype=np.uint8))
+            buffers.add(name, np.frombuffer(as_jpeg(show_photos(scene)(camera.fitted(PHOTO))), dtype=np.uint8))
         packed.append(
             {
                 "name": camera.name,

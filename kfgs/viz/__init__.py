@@ -1,28 +1,26 @@
 """Pictures: clouds in pyvista, label overlays, plots and films, all in one palette."""
 
+from .boxes import add_boxes
 from .clouds import add_cloud, to_pyvista
 from .colors import FeatureColors
 from .examples import draw_examples
 from .films import save_animation, show_cloud
-from .frusta import add_camera_images, add_cameras
+from .frusta import add_cameras
 from .legends import add_legend, add_scalar_bar
 from .linked import add_matches, add_transfer, linked_clouds
 from .palette import palette
 from .pictures import legend_strip, overlay_labels, picture_grid, save_picture
 from .plots import plot_history, plot_iou, plot_quality_storage, plot_scores
 from .plotter import available, draw_view, look_through, make_plotter
-from .selections import add_boxes, add_selections
 
 __all__ = [
     "FeatureColors",
     "add_boxes",
-    "add_camera_images",
     "add_cameras",
     "add_cloud",
     "add_legend",
     "add_matches",
     "add_scalar_bar",
-    "add_selections",
     "add_transfer",
     "available",
     "draw_examples",

@@ -14,7 +14,7 @@ import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
 
-from .._check import as_array, check_choice, check_range, check_shapes
+from .._check import as_array, check_choice, check_range
 from .._origin import to_world
 from ..cameras.camera import NEAR
 from ..gaussians import Gaussians
@@ -40,15 +40,14 @@ def add_cloud(
     style: Style = "points",
     feature_colors: FeatureColors | None = None,
     clim: tuple[float, float] | None = None,
-    opacity: float = 1.0,
     point_size: float = 4.0,
     near: float = NEAR,
 ) -> pv.Actor:
     """Draw a cloud as points, as anisotropic Gaussians, or as ellipsoids.
 
     The mesh carries `index` (which Gaussian), `opacity`, `rgb` (the colours drawn, uint8) and, if present, `label` and the
-    values of `color_by` (`score`). If colours mean numbers, its field data carry `clim`, which `add_scalar_bar` reads. A view
-    of everything shows the middle 98 % of the points in each axis, with a margin: floaters do not set the camera.
+    values of `color_by` (`score`). A view of everything shows the middle 98 % of the points in each axis, with a margin:
+    floaters do not set the camera.
 
     Args:
         plotter: where to draw, in the active subplot.
@@ -61,7 +60,6 @@ def add_cloud(
             to an opacity of 0.5 are left out.
         feature_colors: the scene's projection of features to colours; None: one for this cloud alone.
         clim: scores of the darkest and the brightest colour; None: their 1st and 99th percentile (opacity: 0, 1).
-        opacity: of everything drawn, in (0, 1]; it multiplies the opacities of Gaussians.
         point_size: in pixels.
         near: Gaussians up to this depth, in world units, are not drawn, as with `Camera.near`; they would be a haze.
 
@@ -70,11 +68,9 @@ def add_cloud(
         TypeError: if values to colour by are neither integers nor floats.
 
     Note:
-        VTK draws one cloud after the other, so Gaussians of two clouds do not mix: join the clouds first
-        (`Gaussians.cat`). Gaussians turn off order-independent translucency for their subplot.
+        VTK draws one cloud after the other, so Gaussians of two clouds do not mix: join the clouds first (`Gaussians.cat`).
     """
     check_choice("style", style, get_args(Style))
-    check_range("opacity", opacity, 0, 1, closed=(False, True))
     check_range("point_size", point_size, 0, closed=(False, False))
     gaussians = placed(plotter, gaussians)
     if len(gaussians) == 0:
@@ -89,14 +85,13 @@ def add_cloud(
     _fill(mesh, gaussians, colors)
     mesh.field_data["box"] = middle_box(np.asarray(mesh.points))
     _frame_middle(plotter.renderer)
-    shared: dict[str, Any] = {"scalars": "rgb", "rgb": True, "opacity": opacity}
+    shared: dict[str, Any] = {"scalars": "rgb", "rgb": True}
     if style == "points":
         return draw_mesh(plotter, mesh, style="points", point_size=point_size, lighting=False, **shared)
     if style == "ellipsoids":
         actor = draw_mesh(plotter, mesh, ambient=0.45, diffuse=0.6, **shared)
         actor.prop.interpolation = "Phong"
         return actor
-    mesh["opacity"] *= np.float32(opacity)
     _add_shapes(mesh, gaussians)
     follow = partial(seen_from, gaussians) if by_view else None
     return as_gaussians(plotter, mesh, near=near, antialiased=gaussians.antialiased, colors_from=follow)
@@ -112,11 +107,7 @@ def to_pyvista(
 
     Points are in the world: in float64 if the cloud has an origin. The arrays are `index`, `rgb` (uint8), `opacity`,
     `scale` (standard deviations), `quat` (w, x, y, z), and, if present, `label` and the values of `color_by` (`score`).
-    `to_pyvista(cloud).plot(scalars="rgb", rgb=True)` shows it; `add_cloud` draws true Gaussians. Arguments as there.
-
-    Raises:
-        ValueError: if the cloud lacks what to colour by.
-        TypeError: if these are not Gaussians, or values to colour by are neither integers nor floats.
+    `to_pyvista(cloud).plot(scalars="rgb", rgb=True)` shows it. Arguments as in `add_cloud`.
 
     Example:
         >>> points = to_pyvista(cloud)  # doctest: +SKIP
@@ -136,15 +127,9 @@ def recolor_cloud(
     colors: Array,  # [N, 3] uint8
     opacities: Array | None = None,  # [N] in [0, 1]
 ) -> None:
-    """Change the colours, and with style `gaussians` the opacities, of a cloud that `add_cloud` drew; the next frame shows them.
-
-    Raises:
-        ValueError: if colours or opacities are not one for each Gaussian, or colours are not uint8.
-    """
+    """Change the colours, and with style `gaussians` the opacities, of a cloud that `add_cloud` drew, from the next frame on."""
     mesh = actor.mapper.dataset
-    check_shapes(("colors", colors, (int(mesh.field_data["count"][0]), 3)), ("opacities", opacities, (len(colors),)))
-    if colors.dtype != np.uint8:
-        raise ValueError(f"colors: expected uint8, got {colors.dtype}; use palette(labels)")
+    assert len(colors) == mesh.field_data["count"][0]
     index = np.asarray(mesh["index"])
     if opacities is not None:
         mesh.point_data["opacity"] = opacities.astype(np.float32)[index]

@@ -51,10 +51,7 @@ class FeatureColors:
         check_shapes(("features", features, "N D"))
         rows = features.detach().double()
         if len(rows) == 0 or not bool(torch.isfinite(rows).all()):
-            raise ValueError(
-                f"features: expected at least one row of finite numbers, got {tuple(features.shape)} with "
-                f"{int((~torch.isfinite(rows)).sum())} not finite; remove such rows first"
-            )
+            raise ValueError(f"features: expected finite numbers, got {features!r:.200}; remove rows that are not")
         learnt = rows.any(dim=1)
         rows = rows[learnt] if bool(learnt.any()) else rows
         mean = rows.mean(dim=0)
@@ -68,11 +65,7 @@ class FeatureColors:
         return FeatureColors(mean, axes, torch.where(flat, -1, low), torch.where(flat, 1, high))
 
     def __call__(self, features: Tensor) -> Array:  # [..., D], usually a map [H, W, D] -> [..., 3] uint8
-        """Colour features; projections outside the fitted range are clipped.
-
-        Raises:
-            ValueError: if D is not the fitted number of channels.
-        """
+        """Colour features with the fitted number of channels; projections outside the fitted range are clipped."""
         features = as_tensor("features", features, floating=True)
         if features.shape[-1:] != self.mean.shape:
             raise ValueError(
@@ -102,12 +95,7 @@ def cloud_colors(
     feature_colors: FeatureColors | None = None,
     clim: tuple[float, float] | None = None,
 ) -> CloudColors:
-    """Colour a cloud; the arguments are those of `add_cloud`.
-
-    Raises:
-        ValueError: if what to colour by is missing or has the wrong size.
-        TypeError: if an array holds neither integers nor floats, or `gaussians` is something else.
-    """
+    """Colour a cloud; arguments and errors are those of `add_cloud`."""
     check_gaussians(gaussians)
     if color_by is None:
         color_by = color_by_default(gaussians)

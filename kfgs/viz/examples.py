@@ -43,7 +43,6 @@ def draw_examples(
 
     Raises:
         ValueError: if no example lies in a view, or a view is unknown.
-        TypeError: if something is not an example.
     """
     check_whole("width", width, 16)
     shown: dict[int, tuple[Camera, list[tuple[Any, Color]]]] = {}
@@ -52,13 +51,7 @@ def draw_examples(
         for i, example in enumerate(given if isinstance(given, Sequence) else [given]):
             if hasattr(example, "indices"):
                 continue
-            view = getattr(example, "view", None)
-            if not isinstance(view, str | Camera):
-                raise TypeError(
-                    f"examples[{name!r}][{i}]: expected Clicks, a Box or a Mask, got {type(example).__name__}; "
-                    "kfgs.fields has them"
-                )
-            camera = view_named(cameras, view, f"examples[{name!r}][{i}]")
+            camera = view_named(cameras, example.view, f"examples[{name!r}][{i}]")
             shown.setdefault(id(camera), (camera, []))[1].append((example, color))
     if not shown:
         raise ValueError("examples: expected at least one in a view, got none; pass Clicks, a Box or a Mask")
@@ -74,6 +67,8 @@ def draw_examples(
 
 def _marked(camera: Camera, photo: Tensor | Array, marks: list[tuple[Any, Color]], width: int) -> Array:
     """The photo at a width, with its marks."""
+    from skimage.segmentation import find_boundaries
+
     check_shapes(("photo", photo, "H W 3"))
     size = width, max(1, round(camera.height * width / camera.width))  # Pillow's order
     picture = Image.fromarray(np.ascontiguousarray(as_bytes(photo))).resize(size, Resampling.BOX)
@@ -82,23 +77,15 @@ def _marked(camera: Camera, photo: Tensor | Array, marks: list[tuple[Any, Color]
         rim = LEGEND_INK if sum(color) > 3 * BRIGHT else LEGEND_PAPER
         if hasattr(example, "mask"):
             check_shapes(("mask", example.mask, camera.size))
-            _outline(picture, as_array(example.mask, "mask").astype(bool), color, rim)
+            mask = Image.fromarray(as_array(example.mask, "mask").astype(bool)).resize(size, Resampling.NEAREST)
+            border = find_boundaries(np.pad(np.asarray(mask), 1), mode="inner")[1:-1, 1:-1]
+            for wide, ink in ((2 * LINE + 1, rim), (LINE + 1, color)):
+                picture.paste(ink, mask=Image.fromarray(border).convert("L").filter(ImageFilter.MaxFilter(wide)))
         elif hasattr(example, "corners"):
             x0, y0, x1, y1 = example.corners
-            box = x0 * across, y0 * down, x1 * across, y1 * down
-            pen.rectangle(box, outline=rim, width=2 * LINE)
-            pen.rectangle(box, outline=color, width=LINE)
+            for wide, ink in ((2 * LINE, rim), (LINE, color)):
+                pen.rectangle((x0 * across, y0 * down, x1 * across, y1 * down), outline=ink, width=wide)
         else:
             for x, y in ((x * across, y * down) for x, y in example.points):
                 pen.ellipse((x - DOT, y - DOT, x + DOT, y + DOT), fill=color, outline=rim, width=LINE // 2)
     return np.asarray(picture)
-
-
-def _outline(picture: Image.Image, mask: Array, color: Color, rim: Color) -> None:
-    """Draw the border of a mask into a picture of any size."""
-    from skimage.segmentation import find_boundaries
-
-    scaled = np.asarray(Image.fromarray(mask).resize(picture.size, Resampling.NEAREST))
-    border = Image.fromarray(find_boundaries(np.pad(scaled, 1), mode="inner")[1:-1, 1:-1]).convert("L")
-    picture.paste(rim, mask=border.filter(ImageFilter.MaxFilter(2 * LINE + 1)))
-    picture.paste(color, mask=border.filter(ImageFilter.MaxFilter(LINE + 1)))

@@ -22,18 +22,15 @@ from ..cameras import Camera
 from ..gaussians import Gaussians, check_gaussians
 from ..labels.color import parse_color
 from ..scenes import Scene
-from ..splat import rasterize, rasterize_labels
+from ..splat import rasterize
 from .colors import Array, FeatureColors, cloud_colors, color_by_default
 from .palette import palette
-from .pictures import as_bytes, legend_strip, overlay_labels, picture_grid, resize_photo
+from .pictures import as_bytes, legend_strip, picture_grid, resize_photo
 
 Show = Callable[[Camera], Any]
 ColorBy = Literal["label", "rgb", "feature", "opacity"]
-GIF_FPS = 50.0  # browsers slow down films with shorter frames than 0.02 s
 SUFFIXES = (".gif", ".mp4")
-COVERED = 0.5  # opacity from which a pixel has a class
 OUTLINE = (213, 94, 0)  # vermilion of Okabe and Ito
-ALPHA = 0.65  # of classes over a picture
 FADED = 0.7  # share of white in what is not selected
 
 
@@ -48,14 +45,8 @@ def show_cloud(
     """Make a function camera -> picture [H, W, 3] uint8 that draws a cloud with `rasterize`.
 
     Labels and features become one colour per Gaussian, and the colours are composited (Eq. 3 with three channels), so they
-    blend at borders. `rgb` is the colour of the harmonics, which depends on the direction.
-
-    Args:
-        gaussians: what to draw; on any device.
-        color_by: `label` (the palette), `rgb`, `feature` (through `feature_colors`) or `opacity`; None: as `add_cloud`.
-        feature_colors: the scene's projection of features to colours; None: one for this cloud alone.
-        background: a colour by name or three numbers in [0, 1].
-        names: class names: they decide the colours of labels, as in `palette`.
+    blend at borders. `rgb` is the colour of the harmonics, which depends on the direction. `background` is a colour by name
+    or three numbers in [0, 1]; with class `names`, labels have their colours in `palette`; other arguments as in `add_cloud`.
 
     Raises:
         ValueError: if the cloud is empty or lacks what to colour by.
@@ -80,43 +71,10 @@ def show_cloud(
     return show
 
 
-def show_classes(gaussians: Gaussians, names: Sequence[str], under: Show | None = None) -> Show:
-    """Make a function camera -> picture that gives each pixel the colour of its class, over another picture if given.
-
-    A pixel has the class that most of its Gaussians have, weighted as in a rendering; none if nothing covers it.
-
-    Args:
-        gaussians: with labels.
-        names: class names by index, which decide the colours.
-        under: draws the picture below, for instance `show_cloud(colors)`; None: white paper.
-    """
-    if gaussians.labels is None:
-        raise ValueError("gaussians: expected labels, got None; classify them first")
-    labels = gaussians.labels.long()
-    count = max(int(labels.max()) + 1, 1) if len(labels) else 1
-    votes = torch.nn.functional.one_hot(labels.clamp_min(0), count).to(gaussians.means) * (labels >= 0)[:, None]
-    voting = gaussians.detach().replace(features=votes, sh=None, labels=None)
-
-    def show(camera: Camera) -> Array:
-        ranked = rasterize_labels(voting, camera.to(voting.means))
-        known = (ranked.alphas >= COVERED) & (ranked.scores[..., 0] > 0)
-        classes = torch.where(known, ranked.labels[..., 0], -1).cpu().numpy()
-        if under is None:
-            return np.where((classes >= 0)[..., None], palette(classes, names), 255).astype(np.uint8)
-        photo = as_bytes(under(camera))
-        drawn = overlay_labels(photo / 255, classes, names, alpha=ALPHA, legend=False)
-        return np.where((classes >= 0)[..., None], drawn, photo)
-
-    return show
-
-
-def show_selection(gaussians: Gaussians, mask: Tensor, under: Show | None = None) -> Show:
+def show_selection(gaussians: Gaussians, mask: Tensor, under: Show | None = None) -> Show:  # mask: [N] bool
     """Make a function camera -> picture in which a selection keeps its colours, with an outline, and the rest fades.
 
-    Args:
-        gaussians: what was selected from.
-        mask: which are selected, [N] bool.
-        under: draws the picture, for instance `show_cloud(colors)`; None: the selection is dark on white paper.
+    `under` draws the picture, for instance `show_cloud(colors)`; None: the selection is dark on white paper.
     """
     check_shapes(("gaussians.opacities", gaussians.opacities, "N"), ("mask", mask, "N"))
     marked = gaussians.detach().replace(features=mask[:, None].to(gaussians.means), sh=None, labels=None)
@@ -135,22 +93,16 @@ def show_selection(gaussians: Gaussians, mask: Tensor, under: Show | None = None
     return show
 
 
-class Photos:
-    """The photographs of an undistorted scene by the names of its views: a show; grey where there is no photograph."""
+def show_photos(scene: Scene) -> Show:
+    """Make a function camera -> photograph of an undistorted scene, found by the view's name; grey where there is none."""
+    places = {camera.name: i for i, camera in enumerate(scene.cameras) if scene.image_paths[i].is_file()}
 
-    def __init__(self, scene: Scene) -> None:
-        self._scene = scene
-        self._places = {camera.name: i for i, camera in enumerate(scene.cameras) if scene.image_paths[i].is_file()}
+    def show(camera: Camera) -> Array:
+        if camera.name not in places:
+            return np.full((*camera.size, 3), 200, np.uint8)
+        return as_bytes(resize_photo(scene.image(places[camera.name]), camera.size))
 
-    def __contains__(self, camera: Camera) -> bool:
-        """Whether there is a photograph of this view."""
-        return camera.name in self._places
-
-    def __call__(self, camera: Camera) -> Array:  # [H, W, 3] uint8
-        """The photograph at the camera's size."""
-        if camera not in self:
-            return np.full((camera.height, camera.width, 3), 200, np.uint8)
-        return as_bytes(resize_photo(self._scene.image(self._places[camera.name]), camera.size))
+    return show
 
 
 def save_animation(
@@ -169,7 +121,7 @@ def save_animation(
         path: a name that ends in .gif or .mp4. The file appears whole or not at all.
         shows: Gaussians, a function camera -> picture (`show_cloud`), or several of these by title, shown side by side.
         cameras: one per frame, all of one size (`kfgs.cameras.orbit_cameras`, `path_cameras`).
-        fps: frames per second, at least 0.01, and at most 50 in a GIF, which counts hundredths of a second.
+        fps: frames per second; at most 50 in a GIF, because browsers slow down films with shorter frames.
         names: class names: they decide the colours of labelled Gaussians.
         listed: the labels in a legend below every frame, with these names; None: no legend.
         progress: called after each frame with (done, all).
@@ -206,11 +158,10 @@ def save_animation(
 
 def check_target(path: str | Path, fps: float) -> Path:
     """Check the target before the first frame is drawn."""
-    target = as_path(path)
-    suffix = target.suffix.lower()
+    target, suffix = as_path(path), as_path(path).suffix.lower()
     if suffix not in SUFFIXES:
         raise ValueError(f"path: expected a name that ends in .gif or .mp4, got {target.name!r}; rename it")
-    check_range("fps", fps, 0.01, GIF_FPS if suffix == ".gif" else 240)  # a GIF counts to 655 seconds
+    check_range("fps", fps, 0.01, 50 if suffix == ".gif" else 240)  # a GIF counts to 655 seconds
     if suffix == ".mp4":
         _ffmpeg()
     return target

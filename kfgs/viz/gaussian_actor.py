@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,10 +18,6 @@ if TYPE_CHECKING:
 Array = np.ndarray[Any, Any]
 LOW_PASS = 0.3  # pixels squared, added to each projected covariance as 3DGS does
 BOUND = 3.0  # standard deviations at which VTK stops drawing; 3.3, where ALPHA_MIN stops, agrees no better
-FAINT = 0.1  # opacity up to which no point is drawn: points are opaque and would hide what is behind
-MOVING_POINTS = 50_000  # 0.14 s a frame of 1024 x 768 in software on two busy cores; 100,000 took 0.25 s
-STILL = 1.0  # frames per second: VTK requests more while the mouse moves the camera, and 0.0001 when it rests
-SLOW = 0.1  # seconds per frame; above it, points are drawn while the camera moves
 
 # VTK drops a Gaussian if its centre is farther out than 1.3 times half the picture. 3DGS draws it, with the projection
 # linearised at that border. Here half the picture is 1: normalised device coordinates have no principal point
@@ -87,18 +82,12 @@ def as_gaussians(
         )
     actor.GetShaderProperty().AddFragmentShaderReplacement(DENSITY, False, FRAGMENT, False)
     plotter.renderer.SetUseOIT(False)  # VTK would average translucency instead of drawing back to front
-    frame = _Frame(plotter.renderer, actor, cloud, colors_from)
-    plotter.renderer.AddObserver("StartEvent", frame.start)
-    plotter.renderer.AddObserver("EndEvent", frame.end)
+    plotter.renderer.AddObserver("StartEvent", _Frame(plotter.renderer, actor, cloud, colors_from).start)
     return actor
 
 
 class _Frame:
-    """Prepares each frame: low-pass filter for the window's size, order and colours for the camera.
-
-    While the mouse moves the camera and a frame of Gaussians takes longer than 0.1 s (in software, from about 20,000
-    Gaussians), at most 50,000 points are drawn instead.
-    """
+    """Prepares each frame: low-pass filter for the window's size, order and colours for the camera."""
 
     def __init__(
         self, renderer: Any, actor: pv.Actor, cloud: pv.PolyData, colors_from: Callable[[Array], Array] | None
@@ -108,20 +97,9 @@ class _Frame:
         self.order = np.arange(len(self.points))  # the Gaussian in each row of the cloud
         self.forward: tuple[float, ...] | None = None
         self.center: tuple[float, ...] | None = None
-        self.seconds, self.began = 0.0, 0.0
-        self.moving: Any = None  # the points, while the camera moves
 
     def start(self, *_: Any) -> None:
-        self.began = perf_counter()
-        moves = self.renderer.GetRenderWindow().GetDesiredUpdateRate() >= STILL
-        if moves and self.seconds > SLOW and self._drawn():
-            self._show_points()
-            return
-        if self.moving is not None:
-            self.renderer.RemoveActor(self.moving)
-            self.actor.SetVisibility(True)
-            self.moving = None
-        if not self._drawn():
+        if not (self.renderer.HasViewProp(self.actor) and self.actor.GetVisibility()):
             return
         width, height = self.renderer.GetSize()
         # VTK wants the covariance in normalised device coordinates, where the picture is 2 x 2
@@ -131,14 +109,6 @@ class _Frame:
         if self.colors_from is not None and camera.GetPosition() != self.center:
             self.center = camera.GetPosition()
             self.cloud.point_data["rgb"] = self.colors_from(np.asarray(self.center))[self.order]
-
-    def end(self, *_: Any) -> None:
-        if self.moving is None and self._drawn():
-            self.renderer.GetRenderWindow().WaitForCompletion()  # OpenGL draws asynchronously
-            self.seconds = perf_counter() - self.began
-
-    def _drawn(self) -> bool:
-        return bool(self.renderer.HasViewProp(self.actor) and (self.moving is not None or self.actor.GetVisibility()))
 
     def _sort(self, forward: tuple[float, ...]) -> None:
         if self.forward == forward:  # the order depends on the direction, not on the camera's position
@@ -151,21 +121,3 @@ class _Frame:
         for name in self.cloud.point_data:
             self.cloud.point_data[name] = np.asarray(self.cloud.point_data[name])[row[order]]
         self.order = order
-
-    def _show_points(self) -> None:
-        import pyvista as pv
-
-        rows = np.flatnonzero(np.asarray(self.cloud.point_data["opacity"]) > FAINT)
-        if self.moving is not None or len(rows) == 0:
-            return
-        rows = rows[:: -(-len(rows) // MOVING_POINTS)]
-        points = pv.PolyData(np.asarray(self.cloud.points)[rows])
-        points["rgb"] = np.asarray(self.cloud.point_data["rgb"])[rows]
-        mapper = pv.DataSetMapper(points)
-        mapper.set_scalars(points["rgb"], "rgb", rgb=True)
-        self.moving = pv.Actor(mapper=mapper)
-        prop = self.moving.prop
-        prop.style, prop.point_size, prop.lighting = "points", 3, False
-        self.moving.SetPickable(False)
-        self.renderer.AddActor(self.moving)
-        self.actor.SetVisibility(False)

@@ -38,7 +38,6 @@ def add_legend(
 
     Raises:
         ValueError: if there is no label, or one has no name.
-        TypeError: if `names` is not a list of names.
     """
     import pyvista as pv
     from vtkmodules.vtkRenderingCore import vtkActor2D, vtkImageMapper
@@ -71,11 +70,8 @@ def add_legend(
 def add_scalar_bar(plotter: pv.Plotter, cloud: pv.Actor | tuple[float, float], title: str = "score") -> Any:
     """Draw a colour bar with numbers at the right of the active subplot.
 
-    Args:
-        plotter: where the cloud is.
-        cloud: the actor from `add_cloud`, coloured by scores or opacity; or the numbers of the darkest and the brightest
-            colour.
-        title: over the bar; another one for each bar of a plotter.
+    `cloud` is the actor from `add_cloud`, coloured by scores or opacity, or the numbers of the darkest and the brightest
+    colour. Each bar of a plotter needs a title of its own.
 
     Raises:
         ValueError: if the cloud is not coloured by numbers, or two numbers do not ascend.

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from .._check import as_array, check_choice, check_shapes, check_whole
+from .._check import as_array, check_choice, check_shapes
 from ..cameras import Camera, estimate_up
 from ..gaussians import Gaussians
 from ..labels import Transfer
@@ -46,7 +46,7 @@ def linked_clouds(
         color: Gaussians with `sh`, in the same frame; if they have labels (`transfer_labels`), these can be shown.
         names: class names; the legend lists those present. None: no legend.
         color_by: what the colours mean, left and right: `label`, `rgb`, `view` or `opacity`.
-        style: of both clouds.
+        style: as in `add_cloud`.
         camera: the first view, with its proportions; None: everything but floaters.
         height: of the window, pixels.
         off_screen: as in `make_plotter`.
@@ -58,7 +58,6 @@ def linked_clouds(
         ValueError: if a cloud is empty or lacks what it is coloured by, a label has no name, or the lens distorts.
         RuntimeError: if nothing can be drawn here.
     """
-    check_whole("height", height, 1)
     wide = 4 / 3 if camera is None else camera.width / camera.height
     plotter = make_plotter(height, 2 * round(height * wide), shape=(1, 2), off_screen=off_screen)
     try:
@@ -105,7 +104,7 @@ def add_transfer(
         src: the Gaussians that labels came from.
         dst: the Gaussians that received them.
         transfer: the result of `transfer_labels` for these two.
-        color_by: the palette of labels, or `state`: 0 matched, 1 ambiguous (its sources disagree).
+        color_by: `label`, or `state`: 0 matched, 1 ambiguous (its sources disagree).
         names: class names, for the colours of labels as in `palette`.
         shift: added to the destinations' positions, world units.
         sample: the most lines, evenly chosen among the labelled destinations.
@@ -118,7 +117,6 @@ def add_transfer(
 
     check_choice("color_by", color_by, ("label", "state"))
     check_shapes(("dst.means", dst.means, "N 3"), ("transfer.labels", transfer.labels, "N"))
-    check_whole("sample", sample, 1)
     src, dst = placed(plotter, src), placed(plotter, dst)
     labelled = np.flatnonzero(as_array(transfer.labels) >= 0)
     if labelled.size == 0:

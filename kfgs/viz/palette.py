@@ -39,30 +39,15 @@ a5c34b b4a54b 783c5a 4b962d a50f78 8787f0 c33ce1 b42d87 5a0f96 b45a5a c3695a 0f1
 PALETTE = np.frombuffer(bytes.fromhex("".join(_HEX.split())), dtype=np.uint8).reshape(-1, 3)  # [256, 3], read-only
 
 TIERS = (20, 64, 256)  # of PALETTE: the first colours differ most
-_WORDS = """
-cushion, pillow
-desk, counter, countertop, stool, bench
-floor
-ceiling
-chair, armchair, swivel chair
-sofa, couch
-window, windowpane, glass
-picture, painting, poster, mirror
-door
-curtain, blind, blinds, window blind, shower curtain
-cabinet, wardrobe, dresser, chest of drawers
-sink, basin, toilet, bathtub, vase, bottle
-television, tv, monitor, screen, computer
-plant, flower, tree
-table, coffee table, dining table, night table
-rug, carpet, mat
-wall
-bed, blanket, bedding
-shelf, bookshelf, bookcase, book, books
-lamp, light, ceiling light
-"""
-"""Words of indoor scenes, one row for each of the first 20 colours."""
-_ROWS = [row.split(", ") for row in _WORDS.split("\n")[1:-1]]
+_WORDS = (  # of indoor scenes, for each of the first 20 colours
+    "cushion, pillow | desk, counter, countertop, stool, bench | floor | ceiling | chair, armchair, swivel chair "
+    "| sofa, couch | window, windowpane, glass | picture, painting, poster, mirror | door | curtain, blind, "
+    "blinds, window blind, shower curtain | cabinet, wardrobe, dresser, chest of drawers | sink, basin, toilet, "
+    "bathtub, vase, bottle | television, tv, monitor, screen, computer | plant, flower, tree | table, coffee "
+    "table, dining table, night table | rug, carpet, mat | wall | bed, blanket, bedding | shelf, bookshelf, "
+    "bookcase, book, books | lamp, light, ceiling light"
+)
+_ROWS = [row.split(", ") for row in _WORDS.split(" | ")]
 _HOMES = {word: slot for slot, row in enumerate(_ROWS) for word in row}
 _RANKS = {word: rank for row in _ROWS for rank, word in enumerate(row)}
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from PIL.Image import Resampling
-from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -18,8 +17,6 @@ from .._files import as_path, atomic_path
 from .palette import palette
 
 Array = np.ndarray[Any, Any]
-DRAWN = {"Software": "kfgs"}  # in the header of each picture
-HEAD = 4096  # bytes at the beginning of a file, in which a PNG file has its header
 GAP = 6  # pixels between pictures of a grid
 LEGEND_INK, LEGEND_PAPER = (20, 20, 20), (255, 255, 255)
 
@@ -35,8 +32,7 @@ def overlay_labels(
     """Blend label colours over a photograph, draw the borders between labels, and add a legend below.
 
     Colours come from `palette`, so a class has the same colour in every view, and with `names` in every scene. (skimage's
-    `label2rgb` colours by the order of the labels present, which changes between views.) Pixels without a label are blended
-    with grey.
+    `label2rgb` colours by the order of the labels present, which changes between views.) No label is grey.
 
     Args:
         image: the photograph or a rendering; values outside [0, 1] are clipped.
@@ -83,10 +79,9 @@ def draw_legend(
     height: int | None = None,
     colors: Array | None = None,  # [C, 3] uint8
 ) -> Array:  # [h, w, 3] uint8
-    """A legend of the classes present, with letters of `size` pixels.
+    """A legend of the classes present, with letters of `size` pixels, in `colors` or else those of `palette`.
 
     With a width, entries go from left to right and wrap. Without, there is one per line, in columns of at most `height`.
-    `colors` are those of each class; None: `palette` with these names.
     """
     present = [int(label) for label in np.unique(as_array(labels, "labels"))]
     check_names(present, names)
@@ -129,21 +124,11 @@ def save_picture(
     if target.suffix.lower() != ".png":
         raise ValueError(f"path: expected a name that ends in .png, got {target.name!r}; rename it")
     if values.dtype != np.uint8 and not np.issubdtype(values.dtype, np.floating):
-        raise ValueError(
-            f"picture: expected uint8 or floats in [0, 1], got {values.dtype}; colour labels with palette()"
-        )
+        raise ValueError(f"picture: expected uint8 or floats, got {values.dtype}; colour labels with palette()")
     if values.ndim not in (2, 3) or (values.ndim == 3 and values.shape[2] not in (3, 4)) or 0 in values.shape:
         raise ValueError(f"picture: expected [H, W], [H, W, 3] or [H, W, 4], got {values.shape}; move channels last")
-    write_png(target, Image.fromarray(np.ascontiguousarray(as_bytes(values))))
-
-
-def write_png(path: Path, picture: Image.Image) -> None:
-    """Write a picture whole or not at all; it says that kfgs drew it."""
-    note = PngInfo()
-    for key, value in DRAWN.items():
-        note.add_text(key, value)
-    with atomic_path(path) as temporary:
-        picture.save(temporary, format="PNG", pnginfo=note)
+    with atomic_path(target) as temporary:
+        Image.fromarray(np.ascontiguousarray(as_bytes(values))).save(temporary, format="PNG")
 
 
 def picture_grid(
@@ -168,12 +153,9 @@ def picture_grid(
         >>> picture_grid([[photo, coarse]], width=40).shape  # two of 30 x 40, and 6 pixels around each
         (42, 98, 3)
     """
-    if not rows or not rows[0] or len({len(row) for row in rows}) != 1:
-        raise ValueError(
-            f"rows: expected rows of equally many pictures, got {[len(row) for row in rows]}; fill them up"
-        )
-    if titles and len(titles) != len(rows[0]):
-        raise ValueError(f"titles: expected {len(rows[0])} (one per column), got {len(titles)}; give one for each")
+    counts = [len(row) for row in (*rows, titles or rows[0])] if rows else [0]
+    if 0 in counts or len(set(counts)) != 1:
+        raise ValueError(f"rows, titles: expected equally many in each row, got {counts}; fill them up")
     for i, j in np.ndindex(len(rows), len(rows[0])):
         check_shapes((f"rows[{i}][{j}]", rows[i][j], "H W 3"))
     pictures = [[as_bytes(picture) for picture in row] for row in rows]
@@ -212,10 +194,7 @@ def as_bytes(picture: Tensor | Array) -> Array:
 
 
 def check_names(labels: Sequence[int], names: Sequence[str]) -> None:
-    """Raise a ValueError if a label has no name, a TypeError if `names` is not a list of names."""
-    if isinstance(names, str) or not isinstance(names, Sequence):
-        hint = "its .names" if hasattr(names, "names") else "a list"
-        raise TypeError(f"names: expected a list of class names, got {type(names).__name__}; pass {hint}")
+    """Raise a ValueError if a label has no name."""
     if labels and max(labels) >= len(names):
         raise ValueError(
             f"names: expected a name for every label up to {max(labels)}, got {len(names)} names; pass all class names"
@@ -224,8 +203,6 @@ def check_names(labels: Sequence[int], names: Sequence[str]) -> None:
 
 def _resize_alike(pictures: list[Array], width: int) -> list[Array]:
     """All pictures of a row `width` pixels wide and in the proportions of the first."""
-    if not all(picture.size for picture in pictures):
-        raise ValueError("rows: expected pictures of at least one pixel, got an empty one; leave it out")
     high, wide = pictures[0].shape[:2]
     size = int(width), max(1, round(high * int(width) / wide))  # Pillow's order
     # a box filter takes the mean of the pixels covered; when enlarging, the pixel itself

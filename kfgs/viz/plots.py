@@ -1,6 +1,6 @@
 """Four plots with matplotlib: histories, IoU by class, scores of a query, quality against storage.
 
-Every function returns its figure, and writes a PNG file only if given a path.
+Every function returns its figure, and writes it as a PNG file if given a path that ends in .png.
 """
 
 from __future__ import annotations
@@ -18,15 +18,14 @@ from .._files import as_path, atomic_path
 from ..labels import Selection
 from .colors import Array
 from .palette import palette
-from .pictures import DRAWN
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Row = Mapping[str, Any]  # of a recorded history: numbers by name
+# Okabe and Ito's darker colours, which are readable as lines
 LINES = np.array([[0, 114, 178], [213, 94, 0], [0, 158, 115], [204, 121, 167], [86, 180, 233], [230, 159, 0]]) / 255
-"""Okabe and Ito's darker colours, which are readable as lines."""
 INK, REST = (0.08, 0.08, 0.08), (0.75, 0.75, 0.75)
 STEPS = ("step", "iteration", "epoch")  # keys for the x axis
 COUNTS = {"size", "added", "pruned", "count", "gaussians"}  # whole numbers, drawn from zero
@@ -41,7 +40,7 @@ def plot_history(history: Sequence[Row] | Mapping[str, Sequence[Row]], path: str
     Args:
         history: rows with `step` (or `iteration`, or `epoch`) and numbers: `FieldFit.history`, `Codebook.report.history`; or
             several histories by name, which get a line each.
-        path: a .png file to write; None writes none.
+        path: the file.
 
     Raises:
         ValueError: if there are no rows with numbers.
@@ -84,13 +83,13 @@ def plot_iou(
 ) -> Figure:
     """Draw the IoU of each class as a bar in its colour, best first, with the mean as a line; in per cent.
 
-    Classes that do not occur (NaN) are left out of the bars and the mean, as in `ConfusionMatrix.miou`; the axis label says
-    how many. Ties stay in class order.
+    Classes that do not occur (NaN) are left out of the bars and the mean, as in `ConfusionMatrix.miou`. Ties stay in class
+    order.
 
     Args:
         iou: for instance `ConfusionMatrix.iou()` or `SegmentationReport.iou`.
         names: class names.
-        path: a .png file to write; None writes none.
+        path: the file.
         reference: IoU to compare with, marked on each bar: of the 2-D teacher, or of another method.
         reference_name: its name in the legend.
 
@@ -116,10 +115,8 @@ def plot_iou(
         label = f"{reference_name} (mIoU {np.nanmean(theirs):.1f})" if (~np.isnan(theirs)).any() else reference_name
         axes.scatter(theirs[shown], rows, marker="D", s=26, color="white", edgecolor=INK, zorder=3, label=label)
     axes.set_yticks(rows, [names[int(i)] for i in shown])
-    absent = len(values) - len(shown)
-    note = f" (classes that do not occur: {absent} of {len(values)})" if absent else ""
-    axes.set(xlim=(0, 107), ylim=(len(shown) - 0.4, -0.6), xlabel=f"IoU in %{note}", xticks=range(0, 101, 20))
-    axes.set_title("Intersection over union by class (%)")
+    axes.set(xlim=(0, 107), ylim=(len(shown) - 0.4, -0.6), xticks=range(0, 101, 20))
+    axes.set(title="Intersection over union by class", xlabel=f"IoU in % ({len(shown)} of {len(values)} classes occur)")
     axes.grid(axis="x", alpha=0.3)
     axes.set_axisbelow(True)
     _legend_below(axes)
@@ -132,12 +129,8 @@ def plot_scores(selection: Selection, path: str | Path | None = None) -> Figure:
     The title says how many are selected and where gamma comes from. Counts are logarithmic if the highest bin of the
     selected is less than a fifth of the highest bin of the rest.
 
-    Args:
-        selection: the result of a query; without a threshold there is no gamma.
-        path: a .png file to write; None writes none.
-
     Raises:
-        ValueError: if there are no Gaussians, or the file's name does not end in .png.
+        ValueError: if there are no Gaussians.
     """
     scores, mask = as_array(selection.scores.double()), as_array(selection.mask)
     if scores.size == 0:
@@ -176,22 +169,18 @@ def plot_quality_storage(
 
     Args:
         points: name to (storage in MiB, mIoU in [0, 1]).
-        path: a .png file to write; None writes none.
+        path: the file.
         reference: published points, drawn hollow: for instance rows of Table 1, whose "MB" are MiB.
 
     Raises:
-        ValueError: if there is no point, a size is not positive and finite, or an mIoU lies outside [0, 1].
+        ValueError: if there is no point, a size is not positive, or an mIoU lies outside [0, 1].
     """
-    groups = [(points, LINES[0], "o", "measured"), (reference or {}, "none", "s", "reference")]
-    rows = [(name, *pair) for group, *_ in groups for name, pair in group.items()]
-    for name, mib, miou in rows:
-        if not (0 < mib < float("inf") and 0 <= miou <= 1):
-            raise ValueError(f"points[{name!r}]: expected (MiB above 0, mIoU in [0, 1]), got ({mib!r}, {miou!r})")
-    if not rows:
-        raise ValueError("points: expected at least one name with (MiB, mIoU), got none; pass what was measured")
+    rows = [*points.items(), *(reference or {}).items()]
+    if not rows or not all(mib > 0 and 0 <= miou <= 1 for _, (mib, miou) in rows):
+        raise ValueError(f"points: expected names with (MiB above 0, mIoU in [0, 1]), got {dict(rows)}; correct them")
     figure = new_figure(7.6, 5.2)
     axes = figure.add_subplot()
-    for group, color, marker, label in groups:
+    for group, color, marker, label in ((points, LINES[0], "o", "measured"), (reference, "none", "s", "reference")):
         if group:
             x, y = zip(*group.values(), strict=True)
             axes.scatter(x, 100 * np.array(y), s=55, color=color, edgecolor=INK, marker=marker, label=label, zorder=3)
@@ -200,10 +189,9 @@ def plot_quality_storage(
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.set(xlabel="storage in MiB", ylabel="mIoU in %", title="Quality against storage")
     axes.grid(alpha=0.3, which="both")
-    if points and reference:
-        _legend_below(axes)
-    for name, mib, miou in rows:
-        close = sum(abs(np.log10(x / mib)) < 0.35 and 0 < 100 * (y - miou) < 4 for _, x, y in rows)
+    _legend_below(axes)
+    for name, (mib, miou) in rows:  # to the left of its point if the next one to the right is close
+        close = any(0 < np.log10(x / mib) < 0.5 and abs(y - miou) < 0.03 for _, (x, y) in rows)
         shift, side = (-8, "right") if close else (8, "left")
         axes.annotate(name, (mib, 100 * miou), (shift, 0), textcoords="offset points", ha=side, va="center", fontsize=9)
     return finish(figure, path)
@@ -226,7 +214,7 @@ def finish(figure: Figure, path: str | Path | None) -> Figure:
             raise ValueError(f"path: expected a name that ends in .png, got {as_path(path).name!r}; rename it")
         with atomic_path(path) as temporary:
             # tight: otherwise labels next to square pictures are cut
-            figure.savefig(temporary, format="png", bbox_inches="tight", metadata=DRAWN)
+            figure.savefig(temporary, format="png", bbox_inches="tight")
     return figure
 
 

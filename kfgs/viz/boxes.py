@@ -1,20 +1,16 @@
-"""Draw selections in the scene: Gaussians in a colour per selection, oriented boxes, names."""
+"""Draw oriented boxes with names, for instance of the parts of a selection."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
-from .._check import check_shapes
 from .._origin import choose_origin
-from ..gaussians import Gaussians
-from ..labels import OrientedBox, Selection
-from ..labels.color import LUMINANCE
-from .clouds import Style, add_cloud
-from .colors import Array, cloud_colors
+from ..labels import OrientedBox
+from .colors import Array
 from .legends import letters
 from .palette import palette
 from .plotter import draw_mesh, origin_of
@@ -23,7 +19,6 @@ if TYPE_CHECKING:
     import pyvista as pv
 
 LETTERS = 16  # pixels
-GRAYS = (70, 225)  # black and white become these greys, paler than the selections
 EDGES = ((0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7))
 """Pairs of `OrientedBox.corners` that differ along one axis: the third, the second, the first."""
 
@@ -59,9 +54,7 @@ def add_boxes(
         raise ValueError("boxes: expected at least one, got none; OrientedBox.around(means) makes one")
     classes = np.arange(len(boxes)) if labels is None else np.asarray(labels)
     if classes.shape != (len(boxes),) or len(names) not in (0, len(boxes)):
-        raise ValueError(
-            f"labels, names: expected {len(boxes)} (one per box), got {classes.size} and {len(names)}; give one for each"
-        )
+        raise ValueError(f"labels, names: expected {len(boxes)} (one per box), got {classes.size} and {len(names)}")
     corners = torch.stack([box.corners.double().cpu() for box in boxes])  # [B, 8, 3] in the world
     places = corners.numpy() - origin_of(plotter, choose_origin(corners.flatten(0, 1)))
     mesh = pv.line_segments_from_points(places[:, np.array(EDGES)].reshape(-1, 3).astype(np.float32))
@@ -71,51 +64,6 @@ def add_boxes(
     if names:
         _write_names(plotter, places, names, np.asarray(up, dtype=np.float64))
     return draw_mesh(plotter, mesh, scalars="rgb", rgb=True, line_width=line_width, lighting=False)
-
-
-def add_selections(
-    plotter: pv.Plotter,
-    gaussians: Gaussians,
-    selections: Mapping[str, Selection],
-    *,
-    style: Style = "points",
-    up: Sequence[float] = (0.0, 0.0, 1.0),
-) -> pv.Actor:
-    """Draw each selection in its colour, with its oriented box and its name, and all other Gaussians in grey.
-
-    A Gaussian in several selections has the colour of the last one. Greys have the brightness of the cloud's colours, if it
-    has some.
-
-    Args:
-        plotter: where to draw.
-        gaussians: the cloud of the selections.
-        selections: by name, in the order of their colours.
-        style: as in `add_cloud`.
-        up: the world's up: names are on this side.
-
-    Returns:
-        The actor of the cloud; its `label` is the number of the selection, -1 = none.
-
-    Raises:
-        ValueError: if there is no selection, one is empty, or it is of another cloud.
-    """
-    if not selections:
-        raise ValueError("selections: expected at least one, got none; pass {name: selection}")
-    labels = torch.full((len(gaussians),), -1, dtype=torch.int64)
-    for number, (name, selection) in enumerate(selections.items()):
-        check_shapes(("gaussians.means", gaussians.means, "N 3"), (f"selections[{name!r}].mask", selection.mask, "N"))
-        if not selection:
-            raise ValueError(f"selections[{name!r}]: expected at least one Gaussian, got none; lower the threshold")
-        labels[selection.mask.cpu()] = number
-    origin_of(plotter, gaussians.origin)
-    colors = palette(labels)
-    if gaussians.sh is not None:
-        gray = GRAYS[0] + (GRAYS[1] - GRAYS[0]) / 255 * (cloud_colors(gaussians, "rgb").rgb @ np.array(LUMINANCE))
-        colors = np.where(labels.numpy()[:, None] < 0, np.rint(gray)[:, None], colors).astype(np.uint8)
-    shown = gaussians.replace(labels=labels.to(gaussians.means.device))
-    cloud = add_cloud(plotter, shown, color_by=colors, style=style)
-    add_boxes(plotter, [one.box(gaussians) for one in selections.values()], names=list(selections), up=up)
-    return cloud
 
 
 def _write_names(plotter: pv.Plotter, corners: Array, names: Sequence[str], up: Array) -> None:
