@@ -51,7 +51,9 @@ class FeatureColors:
         check_shapes(("features", features, "N D"))
         rows = features.detach().double()
         if len(rows) == 0 or not bool(torch.isfinite(rows).all()):
-            raise ValueError(f"features: expected finite numbers, got {features!r:.200}; remove rows that are not")
+            raise ValueError(
+                f"features: expected finite numbers, got {tuple(features.shape)} with others; remove such rows"
+            )
         learnt = rows.any(dim=1)
         rows = rows[learnt] if bool(learnt.any()) else rows
         mean = rows.mean(dim=0)

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import torch
 from cases_viz import some_camera, some_gaussians, some_plotter
-from messages import tells
 
 from kfgs.splat.rasterize import rasterize
 from kfgs.viz import FeatureColors, add_cloud, look_through, palette
-from kfgs.viz.clouds import CloudOptions, recolor_cloud
+from kfgs.viz.clouds import recolor_cloud
 
 
 def psnr(seen, expected):
@@ -83,7 +82,7 @@ def test_what_is_nearer_than_the_near_plane_is_not_drawn(near, drawn):
     means[7] = center + 0.1 * R[2]  # a haze 0.1 before the camera
     gaussians = gaussians.replace(means=means)
     with some_plotter() as plotter:
-        add_cloud(plotter, gaussians, color_by="rgb", style="gaussians", options=CloudOptions(near=near))
+        add_cloud(plotter, gaussians, color_by="rgb", style="gaussians", near=near)
         seen = seen_by(plotter, camera)
     assert psnr(seen, rendered(gaussians, camera)) > 40
     without = rendered(gaussians.select(torch.arange(60) != 7), camera)
@@ -113,39 +112,3 @@ def test_new_colours_travel_with_their_gaussians():
         plotter.screenshot(return_img=True)
         cloud = actor.mapper.dataset
         np.testing.assert_array_equal(cloud["rgb"], colors[cloud["index"]])
-        with pytest.raises(ValueError, match=tells("colors:", "[60, 3]", "got uint8", "(59, 3)")):
-            recolor_cloud(actor, colors[1:])
-
-
-def test_opacity_of_a_cloud_multiplies_that_of_its_gaussians():
-    gaussians, camera = some_gaussians(), some_camera()
-    with some_plotter() as plotter:
-        add_cloud(plotter, gaussians, color_by="rgb", style="gaussians", options=CloudOptions(opacity=0.4))
-        seen = seen_by(plotter, camera)
-    assert psnr(seen, rendered(gaussians.replace(opacities=gaussians.opacities * 0.4), camera)) > 48
-
-
-@pytest.mark.parametrize(("moving", "points"), [("points", True), ("gaussians", False), ("auto", False)])
-def test_points_stand_for_gaussians_while_the_camera_moves(moving, points):
-    gaussians, camera = some_gaussians(), some_camera()
-    with some_plotter() as plotter:
-        actor = add_cloud(plotter, gaussians, style="gaussians", options=CloudOptions(moving=moving))
-        still = seen_by(plotter, camera)
-        plotter.show(auto_close=False)  # off screen, it returns at once
-        mouse = plotter.iren.interactor
-        mouse.SetEventInformation(80, 60, 0, 0, "\0", 0, None)
-        mouse.LeftButtonPressEvent()
-        plotter.render()
-        fast = plotter.screenshot(return_img=True) / 255
-        assert bool(actor.visibility) is not points
-        assert bool(np.abs(fast - still).max() > 0.1) is points
-        if points:
-            drawn = (fast * 255).round().reshape(-1, 3)
-            drawn = drawn[drawn.any(axis=1)]
-            pure = (drawn[:, None] == palette(np.arange(-1, 5))).all(axis=2).any(axis=1)
-            assert pure.mean() > 0.3  # the rest is anti-aliased
-            assert len(drawn) < 60 * 16
-        mouse.LeftButtonReleaseEvent()
-        plotter.render()
-        np.testing.assert_array_equal(plotter.screenshot(return_img=True) / 255, still)
-        assert actor.visibility

@@ -69,7 +69,6 @@ def test_pictures_of_any_size_are_laid_out_three_in_a_row():
             ValueError,
             ("examples['chair'][0]:", "a/one.png", "got 'three.png'"),
         ),
-        ({"chair": [(1, 1)]}, TypeError, ("examples['chair'][0]:", "Clicks", "got tuple")),
         ({"chair": Mask("two", torch.ones(2, 2, dtype=torch.bool))}, ValueError, ("mask:", "got (2, 2)")),
     ],
 )

@@ -1,17 +1,20 @@
 import numpy as np
 import pytest
-from cases_viz import some_camera, some_gaussians
+import torch
+from cases_viz import data, some_camera, some_gaussians, some_plotter
 from messages import tells
+from oracles_palette import worst_distance
 
-from kfgs.viz import available, headless, make_plotter, palette
-from kfgs.viz.linked import linked_clouds, look_over
-from kfgs.viz.pictures import legend_column
+from kfgs.labels import transfer_labels
+from kfgs.viz import add_matches, add_transfer, linked_clouds, make_plotter, palette
+from kfgs.viz.linked import STATE_COLORS, look_over, match_states
+from kfgs.viz.pictures import draw_legend
 
 
 @pytest.fixture(autouse=True)
-def driver():
-    if not available():
-        pytest.skip(headless.probe().reason)
+def plotter():
+    with some_plotter() as plotter:
+        yield plotter
 
 
 NAMES = [f"class {i}" for i in range(5)]
@@ -24,7 +27,7 @@ def test_both_clouds_are_seen_by_the_same_camera():
         assert plotter.renderers[0].camera is plotter.renderers[1].camera
         picture = plotter.screenshot(return_img=True)
         assert picture.shape == (240, 640, 3)
-        legend = legend_column(gaussians.labels, NAMES)
+        legend = draw_legend(gaussians.labels, NAMES, 14)
         height, width, _ = legend.shape
         np.testing.assert_array_equal(picture[230 - height : 230, 10 : 10 + width], legend)
         plotter.camera.azimuth += 90
@@ -83,3 +86,96 @@ def test_the_overview_stands_upright(up):
         assert (middle - camera.position) @ forward > 0
     finally:
         plotter.close()
+
+
+def test_transfer_lines_join_destination_and_source(plotter):
+    src, dst = some_gaussians(80, 1), some_gaussians(50, 2)
+    transfer = transfer_labels(src.means, src.labels, dst.means, 0.3)
+    assert 10 < transfer.labelled < 50
+    lines = data(add_transfer(plotter, src, dst, transfer))
+    assert lines.n_cells == transfer.labelled
+    ends = lines.points.reshape(-1, 2, 3)
+    np.testing.assert_allclose(ends[:, 0], dst.means[lines["destination"]])
+    np.testing.assert_allclose(ends[:, 1], src.means[lines["source"]])
+    np.testing.assert_allclose(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1), lines["distance"], atol=1e-6)
+    np.testing.assert_array_equal(lines["label"], src.labels[lines["source"]])
+    np.testing.assert_array_equal(lines["rgb"], palette(lines["label"]))
+    names = [f"class {i}" for i in range(6)]
+    named = data(add_transfer(plotter, src, dst, transfer, names=names))
+    np.testing.assert_array_equal(named["rgb"], palette(lines["label"], names))
+    few = data(add_transfer(plotter, src, dst, transfer, sample=7))
+    assert few.n_cells == 7
+    assert len(set(few["destination"])) == 7
+
+
+def test_wrong_transfers_are_named(plotter):
+    src, dst = some_gaussians(80, 1), some_gaussians(50, 2)
+    transfer = transfer_labels(src.means, src.labels, dst.means, 0.3)
+    with pytest.raises(ValueError, match=tells("transfer.labels:", "[N]", "N = 80", "got (50,)")):
+        add_transfer(plotter, src, src, transfer)
+    with pytest.raises(ValueError, match=tells("transfer:", "got 75")):
+        add_transfer(plotter, src.select(torch.arange(2)), dst, transfer)
+    with pytest.raises(ValueError, match=tells("transfer:", "got none", "1e-09", "distance")):
+        add_transfer(plotter, src, dst, transfer_labels(src.means, src.labels, dst.means, 1e-9))
+
+
+def line_of_five():
+    """Sources of two classes on a line; destinations between them and far away."""
+    place = lambda xs: torch.tensor([[x, 0.0, 0.0] for x in xs])  # noqa: E731
+    src = some_gaussians(4).replace(means=place([0.0, 1.0, 2.0, 3.0]), labels=torch.tensor([0, 0, 1, -1]))
+    dst = some_gaussians(5).replace(means=place([0.1, 1.4, 2.2, 3.5, 9.0]), labels=None)
+    return src, dst, transfer_labels(src.means, src.labels, dst.means, 0.8)
+
+
+def test_states_follow_the_rule():
+    _, _, transfer = line_of_five()
+    # 1.4 has class 0 at 0.4 and class 1 at 0.6; 3.5 has only an unlabelled source within 0.8
+    assert match_states(transfer).tolist() == [0, 1, 0, 2, 2]
+    src, dst = some_gaussians(80, 1), some_gaussians(50, 2)
+    transfer = transfer_labels(src.means, src.labels, dst.means, 0.3)
+    counts = np.bincount(match_states(transfer), minlength=3)
+    assert counts.tolist() == [transfer.labelled - transfer.ambiguous, transfer.ambiguous, transfer.orphaned]
+    assert counts.min() > 0
+
+
+def test_matches_are_told_apart_and_moved_aside(plotter):
+    src, dst, transfer = line_of_five()
+    points = data(add_matches(plotter, src, dst, transfer, shift=(0, 0, 2)))
+    lines = data(add_transfer(plotter, src, dst, transfer, color_by="state", shift=(0, 0, 2)))
+    np.testing.assert_allclose(points.points, dst.means + torch.tensor([0, 0, 2.0]))
+    assert points["state"].tolist() == [0, 1, 0, 2, 2]
+    assert points["rgb"].tolist() == STATE_COLORS[[0, 1, 0, 2, 2]].tolist()
+    assert lines["destination"].tolist() == [0, 1, 2]
+    assert lines["state"].tolist() == [0, 1, 0]
+    np.testing.assert_array_equal(lines["rgb"], points["rgb"][:3])
+    np.testing.assert_allclose(lines.points[::2, 2], 2)
+    np.testing.assert_allclose(lines.points[1::2], src.means[transfer.sources[:3]])
+    plotter.reset_camera()
+    assert len(np.unique(plotter.screenshot(return_img=True).reshape(-1, 3), axis=0)) > 4
+
+
+def test_states_look_unlike_to_colour_blind_eyes_too():
+    colors = STATE_COLORS
+    apart = worst_distance(colors, np.concatenate([colors, [[255, 255, 255]]]))
+    assert apart[:, :3][~np.eye(3, dtype=bool)].min() > 70
+    assert apart[:, 3].min() > 40  # from paper
+
+
+def test_without_any_match_there_are_only_points(plotter):
+    src, dst, _ = line_of_five()
+    points = add_matches(plotter, src, dst, transfer_labels(src.means, src.labels, dst.means, 1e-9))
+    assert data(points)["state"].tolist() == [2] * 5
+
+
+def test_legend_counts_states_and_says_how_many_lines_are_drawn(monkeypatch, plotter):
+    seen = []
+    monkeypatch.setattr(
+        "kfgs.viz.linked.add_legend", lambda plotter, labels, names, colors: seen.append((labels, names))
+    )
+    src, dst, transfer = line_of_five()
+    add_matches(plotter, src, dst, transfer)
+    add_matches(plotter, src, dst, transfer, sample=2)
+    assert [[names[i] for i in labels] for labels, names in seen] == [
+        ["matched 2", "ambiguous 1", "orphaned 2"],
+        ["matched 2 (1 line in 1.5)", "ambiguous 1 (1 line in 1.5)", "orphaned 2"],
+    ]

@@ -1,0 +1,127 @@
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from cases_viz import some_camera, some_gaussians, some_plotter
+from messages import tells
+
+from kfgs.cameras import Camera
+from kfgs.viz import add_cloud, available, draw_view, look_through, make_plotter, plotter
+from kfgs.viz.plotter import camera_of
+
+
+@pytest.fixture
+def bare(monkeypatch):
+    """A Linux without a display, and nothing probed yet; the environment comes back afterwards."""
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", *plotter.WITHOUT_DISPLAY):
+        monkeypatch.setenv(name, "to be restored")
+        monkeypatch.delenv(name)
+    monkeypatch.setattr(sys, "platform", "linux")
+    plotter.trouble.cache_clear()
+    yield monkeypatch
+    plotter.trouble.cache_clear()
+
+
+def test_egl_is_chosen_only_without_any_display(bare):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        bare.setenv(name, ":0")
+        plotter.prepare()
+        assert plotter.has_display()
+        assert not plotter.WITHOUT_DISPLAY.keys() & os.environ.keys()
+        bare.delenv(name)
+    bare.setenv("VTK_DEFAULT_OPENGL_WINDOW", "vtkOSOpenGLRenderWindow")  # the user's choice stays
+    plotter.prepare()
+    assert os.environ["VTK_DEFAULT_OPENGL_WINDOW"] == "vtkOSOpenGLRenderWindow"
+    bare.setattr(sys, "platform", "darwin")
+    assert plotter.has_display()
+
+
+def test_without_opengl_a_plotter_says_what_to_install(bare):
+    runs = []
+
+    def crash(*args, **kwargs):
+        runs.append(args)
+        return subprocess.CompletedProcess(args, -11, "", "")
+
+    bare.setattr(subprocess, "run", crash)
+    assert not available()
+    for make in (make_plotter, lambda: draw_view(some_camera(), print)):
+        with pytest.raises(RuntimeError, match=tells("OpenGL", "status -11", "crashed", "apt-get install libegl1")):
+            make()
+    assert len(runs) == 1  # asked once
+
+
+def test_camera_of_is_look_through_backwards():
+    camera = some_camera()  # off-centre, two focal lengths, turned
+    with some_plotter() as window:
+        look_through(window, camera)
+        seen = camera_of(window, near=0.05)
+    assert (seen.size, seen.near) == (camera.size, 0.05)
+    torch.testing.assert_close(seen.viewmat, camera.viewmat, rtol=0, atol=1e-12)
+    torch.testing.assert_close(seen.K, camera.K, rtol=1e-12, atol=1e-9)
+
+
+def test_camera_of_projects_as_vtk_does_whatever_turned_the_view():
+    from vtkmodules.vtkRenderingCore import vtkCoordinate
+
+    with some_plotter():
+        window = make_plotter(90, 260, shape=(1, 2), off_screen=True)
+    try:
+        window.subplot(0, 1)
+        window.camera_position = [(3, -4, 2), (0.2, 0.1, -0.3), (0.1, 0.2, 1)]
+        window.camera.azimuth, window.camera.elevation, window.camera.roll = 33, -21, 77
+        window.camera.SetWindowCenter(0.2, -0.3)
+        window.camera.view_angle = 41
+        camera = camera_of(window, (0, 1))
+        assert camera.size == (90, 130)
+        points = np.random.default_rng(0).uniform(-0.8, 0.8, (20, 3))
+        seen = camera.K.numpy() @ (camera.viewmat[:3, :3].numpy() @ points.T + camera.viewmat[:3, 3:].numpy())
+        place = vtkCoordinate()
+        place.SetCoordinateSystemToWorld()
+        for point, (x, y) in zip(points, (seen[:2] / seen[2]).T, strict=True):
+            place.SetValue(*point)
+            expected = place.GetComputedDoubleDisplayValue(window.renderers[1])
+            assert (x + 130, 90 - y) == pytest.approx(expected, abs=1.01)  # VTK numbers pixels, and rounds down
+    finally:
+        window.close()
+
+
+def test_draw_view_is_a_plotter_that_looks_through_the_camera_and_is_closed():
+    camera, cloud, used = some_camera(), some_gaussians(), []
+    with some_plotter() as window:
+        add_cloud(window, cloud)
+        look_through(window, camera)
+        expected = window.screenshot(return_img=True)
+
+    def draw(window):
+        used.append(window)
+        add_cloud(window, cloud)
+
+    assert np.array_equal(draw_view(camera, draw, background="black"), expected)
+    assert expected.any()
+    assert (draw_view(camera, lambda window: None) == 255).all()
+
+    def fail(window):
+        used.append(window)
+        raise KeyError("draw")
+
+    with pytest.raises(KeyError):
+        draw_view(camera, fail)
+    assert [window.render_window for window in used] == [None, None]
+
+
+def test_far_from_zero_everything_is_counted_from_one_origin():
+    cloud, camera = some_gaussians(), some_camera()
+    away = (448262.0, 5411932.0, 200.0)
+    with some_plotter() as window:
+        add_cloud(window, cloud)
+        look_through(window, camera)
+        near = window.screenshot(return_img=True)
+    moved = Camera(camera.viewmat, camera.K, camera.width, camera.height, origin=away)
+    with some_plotter() as window:
+        add_cloud(window, cloud.replace(origin=away))
+        look_through(window, moved)
+        np.testing.assert_array_equal(window.screenshot(return_img=True), near)
