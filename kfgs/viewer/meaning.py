@@ -89,6 +89,8 @@ class FieldMeaning:
         embed: Callable[[str], Tensor] | None = None,
     ) -> None:
         classes = field.classes if classes is None else classes
+        if classes is None:
+            raise ValueError("classes: expected a label set, got none, and the field holds none; pass the classes")
         class_rows(classes, field.dim, field.info)  # checks them before views are rendered
         self._classes = replace(classes, info={})  # the teachers were compared just now: warn once, not per question
         views = list(cameras or field.cameras)

@@ -52,9 +52,10 @@ def add_cloud(
     Args:
         plotter: where to draw, in the active subplot.
         gaussians: what to draw.
-        color_by: `label` (the palette), `rgb` (`sh` without its dependence on the view), `view` (`sh` as the camera sees
-            it; style `gaussians` only), `opacity`, `feature`; or one value for each Gaussian: integers [N] are labels,
-            floats [N] scores (not finite: grey), [N, 3] colours. None: labels if there are any, else rgb, feature, opacity.
+        color_by: `label` (the palette, by the cloud's class names if it has some), `rgb` (`sh` without its dependence on the
+            view), `view` (`sh` as the camera sees it; style `gaussians` only), `opacity`, `feature`; or one value for each
+            Gaussian: integers [N] are labels, floats [N] scores (not finite: grey), [N, 3] colours. None: labels if there
+            are any, else rgb, feature, opacity.
         style: `points` is quick and can be exported to HTML; `gaussians` is VTK's EWA splatting, adjusted to kfgs's
             rasteriser; `ellipsoids` are closed surfaces of one standard deviation, for at most 100,000 Gaussians; those up
             to an opacity of 0.5 are left out.

@@ -127,6 +127,13 @@ def color_by_default(gaussians: Gaussians) -> Literal["label", "rgb", "feature",
     return "opacity" if gaussians.features is None else "feature"
 
 
+def names_of(gaussians: Gaussians) -> tuple[str, ...] | None:
+    """The class names of a cloud, if each label has one."""
+    labels = gaussians.labels
+    highest = -1 if labels is None or len(labels) == 0 else int(labels.max())
+    return gaussians.names if len(gaussians.names) > highest else None
+
+
 def seen_from(gaussians: Gaussians, center: Array) -> Array:  # center: [3] -> [N, 3] uint8
     """The colours of `sh` as a camera at `center` sees them."""
     assert gaussians.sh is not None
@@ -145,7 +152,7 @@ def _named(
             f"gaussians.{source}: expected them, to colour by {color_by}, got None; choose another color_by"
         )
     if color_by == "label":
-        return CloudColors(palette(values), "label", as_array(values).astype(np.int64), None)
+        return CloudColors(palette(values, names_of(gaussians)), "label", as_array(values).astype(np.int64), None)
     if color_by in ("rgb", "view"):
         return CloudColors(as_bytes(sh0_to_rgb(values[:, 0].detach())), "rgb", None, None)
     if color_by == "feature":

@@ -24,7 +24,6 @@ from ..labels.color import parse_color
 from ..scenes import Scene
 from ..splat import rasterize
 from .colors import Array, FeatureColors, cloud_colors, color_by_default
-from .palette import palette
 from .pictures import as_bytes, legend_strip, picture_grid, resize_photo
 
 Show = Callable[[Camera], Any]
@@ -57,10 +56,9 @@ def show_cloud(
     if len(gaussians) == 0:
         raise ValueError("gaussians: expected at least one Gaussian to draw, got none; widen the selection")
     painted = gaussians.detach().replace(features=None)
-    rgb = cloud_colors(gaussians, color_by, feature_colors).rgb
+    named = gaussians if names is None else gaussians.replace(names=tuple(names))
+    rgb = cloud_colors(named, color_by, feature_colors).rgb
     if color_by != "rgb":
-        if color_by == "label" and gaussians.labels is not None:
-            rgb = palette(gaussians.labels, names)
         painted = painted.replace(features=torch.from_numpy(rgb).to(gaussians.means) / 255, sh=None)
     paper = torch.tensor(parse_color(background, "background")).to(gaussians.means)
 

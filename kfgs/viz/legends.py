@@ -33,8 +33,8 @@ def add_legend(
     It is a small picture: pyvista's own legend writes each name in its colour, for instance yellow on white. If the subplot
     is too low for all classes, the letters shrink to at least 9 pixels, then the list gets several columns.
 
-    Colours are those of `palette(labels, names)`: draw the cloud with `color_by=palette(labels, names)`, or pass the `colors`
-    of each class. `plotter.remove_actor` removes what is returned.
+    Colours are those of `palette(labels, names)`, as of a cloud with these names, or the `colors` of each class.
+    `plotter.remove_actor` removes what is returned.
 
     Raises:
         ValueError: if there is no label, or one has no name.

@@ -12,7 +12,7 @@ from ..cameras import Camera, estimate_up
 from ..gaussians import Gaussians
 from ..labels import Transfer
 from .clouds import Style, add_cloud
-from .colors import Array, ColorBy
+from .colors import Array, ColorBy, names_of
 from .legends import add_legend, add_title
 from .palette import palette
 from .plotter import draw_mesh, look_through, make_plotter, placed
@@ -44,7 +44,7 @@ def linked_clouds(
     Args:
         semantic: labelled Gaussians.
         color: Gaussians with `sh`, in the same frame; if they have labels (`transfer_labels`), these can be shown.
-        names: class names; the legend lists those present. None: no legend.
+        names: class names; the legend lists those present. None: the cloud's own; without any there is no legend.
         color_by: what the colours mean, left and right: `label`, `rgb`, `view` or `opacity`.
         style: as in `add_cloud`.
         camera: the first view, with its proportions; None: everything but floaters.
@@ -64,11 +64,10 @@ def linked_clouds(
         for column, (cloud, by) in enumerate(zip((semantic, color), color_by, strict=True)):
             plotter.subplot(0, column)
             add_title(plotter, f"{('semantic', 'colour')[column]} field: {TITLES.get(by, by)}")
-            if names is not None and by == "label" and cloud.labels is not None:
-                add_cloud(plotter, cloud, color_by=palette(cloud.labels, names), style=style)
-                add_legend(plotter, cloud.labels, names)
-            else:
-                add_cloud(plotter, cloud, color_by=by, style=style)
+            named = cloud if names is None else cloud.replace(names=tuple(names))
+            add_cloud(plotter, named, color_by=by, style=style)
+            if by == "label" and cloud.labels is not None and names_of(named):
+                add_legend(plotter, cloud.labels, named.names)
         plotter.subplot(0, 0)
         plotter.link_views()
         if camera is not None:
@@ -105,7 +104,7 @@ def add_transfer(
         dst: the Gaussians that received them.
         transfer: the result of `transfer_labels` for these two.
         color_by: `label`, or `state`: 0 matched, 1 ambiguous (its sources disagree).
-        names: class names, for the colours of labels as in `palette`.
+        names: class names, for the colours of labels as in `palette`; None: those of `src`.
         shift: added to the destinations' positions, world units.
         sample: the most lines, evenly chosen among the labelled destinations.
         line_width: in pixels.
@@ -135,7 +134,7 @@ def add_transfer(
     lines.cell_data["label"], lines.cell_data["state"] = labels, states
     lines.cell_data["source"], lines.cell_data["destination"] = sources, chosen
     lines.cell_data["distance"] = as_array(transfer.distances)[chosen]
-    lines.cell_data["rgb"] = palette(labels, names) if color_by == "label" else STATE_COLORS[states]
+    lines.cell_data["rgb"] = palette(labels, names or names_of(src)) if color_by == "label" else STATE_COLORS[states]
     return draw_mesh(plotter, lines, scalars="rgb", rgb=True, line_width=line_width, lighting=False)
 
 

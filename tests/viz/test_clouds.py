@@ -6,7 +6,7 @@ from messages import tells
 
 from kfgs.cameras import Camera, project_points
 from kfgs.cameras.camera import Distortion
-from kfgs.labels import transfer_labels
+from kfgs.labels import nearest_labels
 from kfgs.splat.covariance import covariance_3d
 from kfgs.viz import (
     FeatureColors,
@@ -178,7 +178,7 @@ def test_look_through_refuses_a_distorting_lens(plotter):
 
 def test_scene_of_everything_is_not_blank(plotter):
     src, dst = some_gaussians(80, 1), some_gaussians(50, 2)
-    transfer = transfer_labels(src.means, src.labels, dst.means)
+    transfer = nearest_labels(src.means, src.labels, dst.means)
     background = plotter.screenshot(return_img=True).reshape(-1, 3)
     add_cloud(plotter, src)
     add_cloud(plotter, dst, color_by="rgb")

@@ -5,7 +5,7 @@ from cases_viz import data, some_camera, some_gaussians, some_plotter
 from messages import tells
 from oracles_palette import worst_distance
 
-from kfgs.labels import transfer_labels
+from kfgs.labels import nearest_labels
 from kfgs.viz import add_matches, add_transfer, linked_clouds, make_plotter, palette
 from kfgs.viz.linked import STATE_COLORS, look_over, match_states
 from kfgs.viz.pictures import draw_legend
@@ -90,7 +90,7 @@ def test_the_overview_stands_upright(up):
 
 def test_transfer_lines_join_destination_and_source(plotter):
     src, dst = some_gaussians(80, 1), some_gaussians(50, 2)
-    transfer = transfer_labels(src.means, src.labels, dst.means, 0.3)
+    transfer = nearest_labels(src.means, src.labels, dst.means, 0.3)
     assert 10 < transfer.labelled < 50
     lines = data(add_transfer(plotter, src, dst, transfer))
     assert lines.n_cells == transfer.labelled
@@ -110,13 +110,13 @@ def test_transfer_lines_join_destination_and_source(plotter):
 
 def test_wrong_transfers_are_named(plotter):
     src, dst = some_gaussians(80, 1), some_gaussians(50, 2)
-    transfer = transfer_labels(src.means, src.labels, dst.means, 0.3)
+    transfer = nearest_labels(src.means, src.labels, dst.means, 0.3)
     with pytest.raises(ValueError, match=tells("transfer.labels:", "[N]", "N = 80", "got (50,)")):
         add_transfer(plotter, src, src, transfer)
     with pytest.raises(ValueError, match=tells("transfer:", "got 75")):
         add_transfer(plotter, src.select(torch.arange(2)), dst, transfer)
     with pytest.raises(ValueError, match=tells("transfer:", "got none", "1e-09", "distance")):
-        add_transfer(plotter, src, dst, transfer_labels(src.means, src.labels, dst.means, 1e-9))
+        add_transfer(plotter, src, dst, nearest_labels(src.means, src.labels, dst.means, 1e-9))
 
 
 def line_of_five():
@@ -124,7 +124,7 @@ def line_of_five():
     place = lambda xs: torch.tensor([[x, 0.0, 0.0] for x in xs])  # noqa: E731
     src = some_gaussians(4).replace(means=place([0.0, 1.0, 2.0, 3.0]), labels=torch.tensor([0, 0, 1, -1]))
     dst = some_gaussians(5).replace(means=place([0.1, 1.4, 2.2, 3.5, 9.0]), labels=None)
-    return src, dst, transfer_labels(src.means, src.labels, dst.means, 0.8)
+    return src, dst, nearest_labels(src.means, src.labels, dst.means, 0.8)
 
 
 def test_states_follow_the_rule():
@@ -132,7 +132,7 @@ def test_states_follow_the_rule():
     # 1.4 has class 0 at 0.4 and class 1 at 0.6; 3.5 has only an unlabelled source within 0.8
     assert match_states(transfer).tolist() == [0, 1, 0, 2, 2]
     src, dst = some_gaussians(80, 1), some_gaussians(50, 2)
-    transfer = transfer_labels(src.means, src.labels, dst.means, 0.3)
+    transfer = nearest_labels(src.means, src.labels, dst.means, 0.3)
     counts = np.bincount(match_states(transfer), minlength=3)
     assert counts.tolist() == [transfer.labelled - transfer.ambiguous, transfer.ambiguous, transfer.orphaned]
     assert counts.min() > 0
@@ -163,7 +163,7 @@ def test_states_look_unlike_to_colour_blind_eyes_too():
 
 def test_without_any_match_there_are_only_points(plotter):
     src, dst, _ = line_of_five()
-    points = add_matches(plotter, src, dst, transfer_labels(src.means, src.labels, dst.means, 1e-9))
+    points = add_matches(plotter, src, dst, nearest_labels(src.means, src.labels, dst.means, 1e-9))
     assert data(points)["state"].tolist() == [2] * 5
 
 
