@@ -7,6 +7,7 @@ import struct
 import numpy as np
 import pytest
 import torch
+from kfgs.scenes.replica import _cam_params
 from messages import tells
 from PIL import Image
 
@@ -23,7 +24,6 @@ from kfgs.pipeline.describe import describe
 from kfgs.quant import Autoencoder, Codebook, IndexMaps
 from kfgs.scenes import SceneError, load_scene, read_image
 from kfgs.scenes.files import natural_key
-from kfgs.scenes.replica import _cam_params
 from kfgs.teachers.bpe import load_tokenizer
 
 HUGE = 10**400  # a whole number that no float holds

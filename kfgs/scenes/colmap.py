@@ -19,7 +19,7 @@ from .scene import Scene
 
 # COLMAP's model: (our lens, its number of coefficients). COLMAP's own order after the intrinsics is ours in each case:
 # brown_conrady k1 k2 p1 p2 [k3 k4 k5 k6], kannala_brandt k1 k2 k3 k4; what COLMAP leaves out at the end is zero.
-_LENSES: dict[str, tuple[str | None, int]] = {
+LENSES: dict[str, tuple[str | None, int]] = {
     "SIMPLE_PINHOLE": (None, 0),
     "PINHOLE": (None, 0),
     "SIMPLE_RADIAL": ("brown_conrady", 4),
@@ -33,7 +33,6 @@ _LENSES: dict[str, tuple[str | None, int]] = {
     "FISHEYE": ("kannala_brandt", 4),
 }
 PANORAMA = "cut perspective views out of the panoramas, and give these with their poses"  # no undistorter flattens them
-SUPPORTED_MODELS = tuple(_LENSES)
 
 
 def convert_intrinsics(model: str, params: Sequence[float]) -> tuple[torch.Tensor, Distortion | None]:
@@ -42,13 +41,13 @@ def convert_intrinsics(model: str, params: Sequence[float]) -> tuple[torch.Tenso
     Raises:
         SceneError: if the model has no exact form here (FOV, THIN_PRISM_FISHEYE, EUCM, ...).
     """
-    if model not in _LENSES:
+    if model not in LENSES:
         advice = "undistort the images first: `kfgs.scenes.undistort_scene(images, model, out)` or `colmap image_undistorter`"
         raise SceneError(
-            f"camera: expected one of the COLMAP models {', '.join(_LENSES)}, got {model}; "
+            f"camera: expected one of the COLMAP models {', '.join(LENSES)}, got {model}; "
             f"{PANORAMA if model == 'EQUIRECTANGULAR' else advice}"
         )
-    kind, length = _LENSES[model]
+    kind, length = LENSES[model]
     fx, fy, cx, cy, *lens = [params[0], *params] if CAMERA_MODELS[model].startswith("f ") else params
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     if kind is None or (kind == "brown_conrady" and not any(lens)):

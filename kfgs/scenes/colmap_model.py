@@ -18,7 +18,7 @@ from .._files import as_path
 from .._notes import Repair
 from .colmap_files import CAMERA_MODELS, open_table, require
 from .files import MAX_NUMBER, MAX_SIDE, SceneError, some
-from .poses import Matrix, is_rotation, mending_notes
+from .posed import Matrix, is_rotation, mending_notes
 
 FILES = ("cameras", "images", "points3D")
 QUATERNION_SLACK = 0.1  # text files are rounded; a norm farther from 1 means a wrong byte

@@ -210,6 +210,16 @@ def open_picture(
         raise SceneError(f"{path}: expected {expected}, but it cannot be decoded ({why}); {advice}") from error
 
 
+def picture_size(path: Path) -> tuple[int, int]:
+    """(width, height) of a picture, from its header.
+
+    Raises:
+        SceneError: if it is no picture.
+    """
+    with open_picture(path, "a picture", "copy it again") as picture:
+        return picture.size
+
+
 def _allow_heic(path: Path) -> None:
     """Let Pillow read HEIC files; an ImportError if pillow-heif is not installed."""
     try:

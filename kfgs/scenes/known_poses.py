@@ -12,19 +12,15 @@ import torch
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
-from .._files import atomic_folder, check_output, real_path
-from .._typed import typed
+from .._files import atomic_folder, real_path
 from ..cameras.camera import Camera
-from .colmap_model import has_model
 from .files import MASKS, SceneError
 from .pycolmap_import import quiet_pycolmap, scene_errors
 from .scene import Scene
-from .sfm import SfmConfig, SfmReport, SfmRun, fill_database, timed
+from .sfm import SfmConfig, SfmReport, SfmRun, check_model_place
 
-MOST_VIEWS = 200
-"""Views that `find_points` looks at, evenly chosen: about 100,000 points of a room in some minutes."""
-NEIGHBOURS = 20
-"""Views that each view is compared with: the nearest ones that look the same way. It is twice what COLMAP takes of a video."""
+MOST_VIEWS = 200  # that `find_points` looks at, evenly chosen: about 100,000 points of a room in some minutes
+NEIGHBOURS = 20  # views that each view is compared with: twice what COLMAP takes of a video
 SAME_WAY = (
     0.3  # cosine of the angle between two viewing directions (73 degrees): beyond it, SIFT finds nothing in common
 )
@@ -34,7 +30,6 @@ AGREEING = 0.2
 1 %, with inverted ones 4 %, with the axes of another convention none."""
 
 
-@typed
 def find_points(
     scene: Scene, *, config: SfmConfig | None = None, most_views: int | None = MOST_VIEWS, progress: bool = False
 ) -> Scene:
@@ -54,6 +49,8 @@ def find_points(
         SceneError: if there are fewer than 2 views, or pictures and poses do not fit together.
         ImportError: if pycolmap is not installed.
     """
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene: expected a Scene, got {type(scene).__name__}; pass load_scene(folder)")
     count = len(scene) if most_views is None else min(most_views, len(scene))
     chosen = np.unique(np.linspace(0, len(scene) - 1, count).round().astype(int)).tolist() if count else []
     with tempfile.TemporaryDirectory(prefix="kfgs-points-") as scratch:
@@ -64,7 +61,6 @@ def find_points(
     return replace(scene, points=places, colors=colors)
 
 
-@typed
 def write_known_poses(
     scene: Scene, out: str | Path, *, config: SfmConfig | None = None, replace: bool = False, progress: bool = False
 ) -> SfmReport:
@@ -81,92 +77,78 @@ def write_known_poses(
 
     Raises:
         FileExistsError: if `out/sparse/0` holds a model, and `replace` is False; or if `out/images` holds other files.
-        SceneError: as for `find_points`.
-        ImportError: if pycolmap is not installed.
+        SceneError, ImportError: as for `find_points`.
     """
-    out = check_output("out", out, "a folder")
-    model, images = out / "sparse" / "0", out / "images"
-    if has_model(model) and not replace:
-        raise FileExistsError(
-            f"out: expected a scene folder without a model, got one in {model}; name another folder, or pass replace=True "
-            "(--replace) to give up that model"
-        )
-    links = {
-        images / camera.name: real_path(path) for camera, path in zip(scene.cameras, scene.image_paths, strict=True)
-    }
-    masks = zip(scene.cameras, scene.masks or (), strict=scene.masks is not None)
-    links |= {
-        out / MASKS / f"{camera.name}{mask.suffix}": real_path(mask) for camera, mask in masks if mask is not None
-    }
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene: expected a Scene, got {type(scene).__name__}; pass load_scene(folder)")
+    model = check_model_place(Path(out), replace)
+    out = model.parents[1]
+    links = {out / "images" / c.name: real_path(path) for c, path in zip(scene.cameras, scene.image_paths, strict=True)}
+    for camera, mask in zip(scene.cameras, scene.masks or [None] * len(scene), strict=True):
+        if mask is not None:
+            links[out / MASKS / f"{camera.name}{mask.suffix}"] = real_path(mask)
     taken = next((place for place, file in links.items() if place.exists() and real_path(place) != file), None)
     if taken is not None:
         raise FileExistsError(
             f"{taken}: expected a link to {links[taken]}, got another file; name another folder (--out)"
         )
     with tempfile.TemporaryDirectory(prefix="kfgs-points-") as scratch:
-        found, seconds = _triangulate(scene, Path(scratch), config or SfmConfig(), progress)
+        known, seconds = _triangulate(scene, Path(scratch), config or SfmConfig(), progress)
         for number, camera in enumerate(scene.cameras, 1):
-            found.images[number].name = camera.name
+            known.images[number].name = camera.name
         with quiet_pycolmap() as pycolmap:
-            found.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array(scene.origin)))
+            known.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array(scene.origin)))
         with atomic_folder(model) as folder:
-            found.write(str(folder))
+            known.write(str(folder))
     for place, file in links.items():
         if not place.exists():
             place.parent.mkdir(parents=True, exist_ok=True)
             place.symlink_to(file)
-    error = float(found.compute_mean_reprojection_error())
-    return SfmReport(len(scene), len(scene), len(found.points3D), error, seconds, (), (len(scene),))
+    error = float(known.compute_mean_reprojection_error())
+    return SfmReport(len(scene), len(scene), len(known.points3D), error, seconds)
 
 
 def _triangulate(scene: Scene, scratch: Path, config: SfmConfig, progress: bool) -> tuple[Any, dict[str, float]]:
     """The reconstruction, with image i + 1 for view i, and the seconds of each part."""
     if len(scene) < 2:
         raise SceneError(f"scene: expected at least 2 views to triangulate points, got {len(scene)}; add pictures")
-    folder = scratch / "images"
+    folder, photos = scratch / "images", {}
     folder.mkdir()
-    names = []
     for i, path in enumerate(scene.image_paths):
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such file; expected a picture of the scene there")
-        names.append(f"{i:06d}{path.suffix.lower()}")  # pycolmap cuts names at blanks in a list of pairs
-        (folder / names[-1]).symlink_to(real_path(path))
+        name = f"{i:06d}{path.suffix.lower()}"  # pycolmap cuts names at blanks in a list of pairs
+        (folder / name).symlink_to(real_path(path))
+        photos[name] = (path, None if scene.masks is None else scene.masks[i])
     advice = "check the pictures, or estimate the poses again (`kfgs sfm --ignore-poses`)"
     with (
         quiet_pycolmap() as pycolmap,
         scene_errors("scene: expected pictures that fit their poses", advice),
         tqdm(disable=not progress, unit="image") as bar,
     ):
-        masks = scene.masks or [None] * len(scene)
-        photos = dict(zip(names, zip(scene.image_paths, masks, strict=True), strict=True))
-        run = SfmRun(pycolmap, folder, names, scratch, config, bar, photos)
-        known = _reconstruction(pycolmap, scene, names)
-        fill_database(pycolmap, run.database, known)
-        seconds = {"features": timed(lambda: run.extract(names, None, False))}
-        pairs = [(names[a], names[b]) for a, b in neighbours(scene.cameras)]
-        seconds["matching"] = timed(lambda: run.match_pairs(pairs))
-        run.begin("points", len(names), "image")
+        names, known = list(photos), _reconstruction(pycolmap, scene, list(photos))
+        run = SfmRun(pycolmap, folder, scratch, config, bar, photos)
+        with pycolmap.Database.open(run.database) as database:
+            for kind in ("camera", "rig", "frame", "image"):
+                for value in getattr(known, f"{kind}s").values():
+                    getattr(database, f"write_{kind}")(value, **{f"use_{kind}_id": True})
+        run.stage("features", lambda: run.extract(known=True))
+        run.stage("matching", lambda: run.match_pairs([(names[a], names[b]) for a, b in neighbours(scene.cameras)]))
         (scratch / "points").mkdir()
         arguments = (known, run.database, str(folder), str(scratch / "points"), True, run.options())
-        seconds["points"] = timed(lambda: pycolmap.triangulate_points(*arguments))
-        bar.update(len(names))
-        _check_fit(pycolmap, run.database, known)
+        run.stage("points", lambda: pycolmap.triangulate_points(*arguments))
+        with pycolmap.Database.open(run.database) as database:
+            matches = sum(len(pair.inlier_matches) for pair in database.read_two_view_geometries()[1])
+        lengths = [len(point.track.elements) for point in known.points3D.values()]
+        agree = sum(n * (n - 1) // 2 for n in lengths)
+        if len(lengths) < FEWEST or agree < AGREEING * matches:
+            raise SceneError(
+                f"scene: expected pictures that fit their poses, got {matches} matches between them of which {agree} agree "
+                f"with the poses ({len(lengths)} points); do the poses belong to these pictures, and is their axis convention "
+                "right? Else estimate them again (`kfgs sfm --ignore-poses`)"
+            )
         known.extract_colors_for_all_images(str(folder))
-        return known, seconds
-
-
-def _check_fit(pycolmap: Any, database: str, known: Any) -> None:
-    """Raise a SceneError if few of the matches of the pictures, which the poses have no part in, agree with the poses."""
-    with pycolmap.Database.open(database) as opened:
-        matches = sum(len(pair.inlier_matches) for pair in opened.read_two_view_geometries()[1])
-    lengths = [len(point.track.elements) for point in known.points3D.values()]
-    agree = sum(n * (n - 1) // 2 for n in lengths)
-    if len(lengths) < FEWEST or agree < AGREEING * matches:
-        raise SceneError(
-            f"scene: expected pictures that fit their poses, got {matches} matches between them of which {agree} agree with the "
-            f"poses ({len(lengths)} points); do the poses belong to these pictures, and is their axis convention right? Else "
-            "estimate them again (`kfgs sfm --ignore-poses`)"
-        )
+        return known, run.seconds
 
 
 def neighbours(cameras: list[Camera]) -> list[tuple[int, int]]:
@@ -204,20 +186,20 @@ def _reconstruction(pycolmap: Any, scene: Scene, names: list[str]) -> Any:
         view = lens.viewmat.double().numpy()
         U, _, Vh = np.linalg.svd(view[:3, :3])  # float32 is not orthonormal enough
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(U @ Vh), view[:3, 3])
-        image = pycolmap.Image(name=name, camera_id=numbers[key], image_id=i)
-        known.add_image_with_trivial_frame(image, pose)
+        known.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=numbers[key], image_id=i), pose)
     return known
 
 
 def _lens(camera: Camera) -> tuple[str, list[float]]:
     """COLMAP's name and parameters of a lens."""
-    K = camera.K.double()
-    intrinsics = [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])]
+    intrinsics = [float(camera.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
+    lens = [] if camera.distortion is None else list(camera.distortion.coefficients)
     if camera.distortion is None:
         return "PINHOLE", intrinsics
-    lens = list(camera.distortion.coefficients)
     if camera.distortion.model == "kannala_brandt":
         return "OPENCV_FISHEYE", intrinsics + lens
-    if len(lens) == 4:
-        return "OPENCV", intrinsics + lens
-    return "FULL_OPENCV", intrinsics + lens + [0.0] * (8 - len(lens))
+    return (
+        ("OPENCV", intrinsics + lens)
+        if len(lens) == 4
+        else ("FULL_OPENCV", intrinsics + lens + [0.0] * (8 - len(lens)))
+    )

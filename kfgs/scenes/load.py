@@ -16,14 +16,22 @@ from .._notes import tell_repairs
 from ..cameras.camera import Camera
 from ..formats.folders import newest_splat
 from .colmap import colmap_cameras, load_colmap
-from .files import SceneError, natural_key, some
+from .files import SceneError, natural_key, picture_size, some
 from .inria import is_inria, load_inria
-from .llff import POSES, is_llff, load_llff
+from .layouts import (
+    is_llff,
+    is_nice_slam,
+    is_polycam,
+    is_scannet,
+    is_semantic_nerf,
+    load_llff,
+    load_nice_slam,
+    load_polycam,
+    load_scannet,
+    load_semantic_nerf,
+)
 from .masks import check_mask, folder_masks, picture_folder
-from .polycam import is_polycam, load_polycam
-from .posed import near_zero, picture_size
-from .replica import is_nice_slam, is_semantic_nerf, load_nice_slam, load_semantic_nerf
-from .scannet import is_scannet, load_scannet
+from .posed import near_zero
 from .scene import Scene
 from .splits import RULES, choose_split, make_split, read_lists, read_split
 from .sub_models import above, choice_note, find_model
@@ -40,17 +48,15 @@ class _Layout(NamedTuple):
     name: str
     files: str  # what it is recognised by
     matches: Callable[[Path], bool]
-    load: Callable[[Path, str | Path | None], Scene]
+    load: Callable[[Path, Path | None], Scene]
 
 
 _LAYOUTS = (
-    _Layout("Replica (NICE-SLAM)", "results/ and traj.txt", is_nice_slam, lambda path, _: load_nice_slam(path)),
-    _Layout(
-        "Replica (Semantic-NeRF)", "rgb/ and traj_w_c.txt", is_semantic_nerf, lambda path, _: load_semantic_nerf(path)
-    ),
-    _Layout("ScanNet", "color/ and pose/", is_scannet, lambda path, _: load_scannet(path)),
-    _Layout("LLFF (3D-OVS)", POSES, is_llff, load_llff),
-    _Layout("Polycam", "keyframes/ with cameras/ and images/", is_polycam, lambda path, _: load_polycam(path)),
+    _Layout("Replica (NICE-SLAM)", "results/ and traj.txt", is_nice_slam, load_nice_slam),
+    _Layout("Replica (Semantic-NeRF)", "rgb/ and traj_w_c.txt", is_semantic_nerf, load_semantic_nerf),
+    _Layout("ScanNet", "color/ and pose/", is_scannet, load_scannet),
+    _Layout("LLFF (3D-OVS)", "poses_bounds.npy", is_llff, load_llff),
+    _Layout("Polycam", "keyframes/ with cameras/ and images/", is_polycam, load_polycam),
     _Layout("3DGS's output", "cameras.json and point_cloud/", is_inria, load_inria),
 )
 """Asked in this order, after COLMAP models and transforms.json: 3D-OVS and Mip-NeRF 360 have both a model and LLFF's poses."""
@@ -63,20 +69,19 @@ def load_scene(
 
     The first of these is read: a COLMAP model in `sparse`, `colmap/sparse`, `dense/sparse`, `distorted/sparse`,
     `colmap_ground_truth` or the folder itself (of several there, as `sparse/0` and `sparse/1`, that with most images; binary
-    before text); `transforms.json`; Blender's `transforms_train.json`; Replica as NICE-SLAM
-    (`results/`, `traj.txt`) or Semantic-NeRF (`rgb/`, `traj_w_c.txt`) rendered it; ScanNet (`color/`, `pose/`); LLFF and
-    3D-OVS (`poses_bounds.npy`); raw captures of Polycam (`keyframes/`); the output of Inria's 3DGS (`cameras.json`,
-    `point_cloud/`). `docs/datasets.md` has them all.
+    before text); `transforms.json`; Blender's `transforms_train.json`; Replica as NICE-SLAM (`results/`, `traj.txt`) or
+    Semantic-NeRF (`rgb/`, `traj_w_c.txt`) rendered it; ScanNet (`color/`, `pose/`); LLFF and 3D-OVS (`poses_bounds.npy`);
+    raw captures of Polycam (`keyframes/`); the output of Inria's 3DGS (`cameras.json`, `point_cloud/`).
 
     Args:
         path: the scene folder, a model folder, or a .json file.
         images: the image folder, also by its name in the scene folder, as in `"images_4"` of Mip-NeRF 360, whose cameras are
-            then resized; None: `images/` beside the model or up to two folders above it, else the first of `images_2`,
+            then resized; None: `images/` next to the model or up to two folders above it, else the first of `images_2`,
             `images_4`, ..., else the scene folder. Replica, ScanNet and Polycam know one place only.
-        split: `"auto"`: split.json if there is one, else lists of names beside the model or in the scene folder (`test.txt`,
-            `train_list.txt`, `train_test_lists.json`, ...: `splits.read_lists`), else the split of the transforms.json if it
-            has one, else `"df3dgs"` for the videos of Replica, `"holdout8"` from 8 images, below 8 `"all"`; `"file"`:
-            split.json; or a rule of `make_split`.
+        split: `"auto"`: split.json if there is one, else lists of names next to the model or in the scene folder (`test.txt`,
+            `train_list.txt`, `train_test_lists.json`, ...), else the split of the transforms.json if it has one, else
+            `"df3dgs"` for the videos of Replica, `"holdout8"` from 8 images, below 8 `"all"`; `"file"`: split.json; or a rule
+            of `make_split`.
         strict: refuse a scene of which something broken was left out or mended (poses of NaN or with a scale, tracks of
             images that are gone); else the notes say it.
 
@@ -95,8 +100,8 @@ def load_scene(
         raise FileNotFoundError(f"{path}: no such folder; expected a scene there")
     root = path if path.is_dir() else path.parent
     try:
-        scene = _with_splat(replace(_load_views(path, _given_folder(root, images)), folder=root), root)
-        scene = _with_masks(scene, root)
+        scene = replace(_load_views(path, _given_folder(root, images)), folder=root)
+        scene = _with_masks(_with_splat(scene, root), root)
     except SceneError as error:  # of cameras that do not fit together
         if str(root) in str(error):
             raise
@@ -195,7 +200,7 @@ def picture_folders(path: str | Path, images: str | Path | None = None) -> list[
     try:
         given, model = _given_folder(root, images), find_model(path)
         if model is not None:
-            found = {as_path(given) if given is not None else find_images(path, model)}
+            found = {given if given is not None else find_images(path, model)}
         else:
             found = {file.parent for file in _load_views(path, given).image_paths}
     except (OSError, ValueError):
@@ -203,29 +208,28 @@ def picture_folders(path: str | Path, images: str | Path | None = None) -> list[
     return sorted(folder for folder in found if real_path(folder) not in (real_path(root), *real_path(root).parents))
 
 
-def _given_folder(root: Path, images: str | Path | None) -> str | Path | None:
+def _given_folder(root: Path, images: str | Path | None) -> Path | None:
     """The image folder that the user named, perhaps by its name in the scene folder."""
-    inside = images is not None and not as_path(images).is_dir() and (root / images).is_dir()
-    return root / images if inside and images is not None else images
+    if images is None:
+        return None
+    return root / images if not as_path(images).is_dir() and (root / images).is_dir() else as_path(images)
 
 
-def _load_views(path: Path, images: str | Path | None) -> Scene:
+def _load_views(path: Path, images: Path | None) -> Scene:
     model = find_model(path)
     if model is not None:
         scene = load_colmap(model, images if images is not None else find_images(path, model))
-        note = choice_note(path, model)
-        scene = scene if note is None else replace(scene, notes=(*scene.notes, note))
-        return scene
+        return replace(scene, notes=(*scene.notes, *choice_note(path, model)))
     if _is_transforms(path):
         return load_transforms(path, images)
     for layout in _LAYOUTS:
         if path.is_dir() and layout.matches(path):
             return layout.load(path, images)
-    others = [
-        name for name in ("results", "color", "pose", "rgb", "traj.txt", "traj_w_c.txt") if (path / name).exists()
+    parts = [name for name in ("results", "color", "pose", "rgb", "traj.txt", "traj_w_c.txt") if (path / name).exists()]
+    whole = [
+        f"{kind.files} of {kind.name}" for kind in _LAYOUTS if set(kind.files.replace("/", "").split()) & set(parts)
     ]
-    whole = [f"{one.files} of {one.name}" for one in _LAYOUTS if set(one.files.replace("/", "").split()) & set(others)]
-    half = f" (there is {' and '.join(others)}, but not what belongs to it: {'; '.join(whole)})" if others else ""
+    half = f" (there is {' and '.join(parts)}, but not what belongs to it: {'; '.join(whole)})" if parts else ""
     raise SceneError(
         f"{path}: expected a COLMAP model, a transforms.json or the layout of a data set (docs/datasets.md), found "
         f"none{half}; {_advice(path)}"
@@ -247,10 +251,8 @@ def is_scene(path: str | Path) -> bool:
 
 
 def _advice(path: Path) -> str:
-    folders = (
-        sorted((f for f in path.iterdir() if f.is_dir()), key=lambda f: natural_key(f.name)) if path.is_dir() else []
-    )
-    inside = [folder.name for folder in folders[:100] if is_scene(folder)]
+    folders = [folder for folder in path.iterdir() if folder.is_dir()] if path.is_dir() else []
+    inside = [f.name for f in sorted(folders, key=lambda f: natural_key(f.name))[:100] if is_scene(f)]
     if inside:
         return f"it holds scenes ({some(inside)}): give one of them, as in {path / inside[0]}"
     if is_scene(real_path(path).parent):

@@ -34,16 +34,16 @@ def find_model(path: Path) -> Path | None:
     return max(models, key=count_images) if len(models) > 1 else next(iter(models), None)  # the first of equal ones
 
 
-def choice_note(path: Path, model: Path) -> str | None:
+def choice_note(path: Path, model: Path) -> list[str]:
     """A note if the scene has other models than the one that was chosen."""
     others = [other for other in models_of(path) if other != model]
     if not others:
-        return None
+        return []
     listed = some([f"{other.relative_to(path)} with {count_images(other)} images" for other in others])
-    return (
+    return [
         f"{model.relative_to(path)} with {count_images(model)} images is used, the largest of several models; there is {listed} "
         f"too: to use another, give its folder as the scene, as in {others[0]}"
-    )
+    ]
 
 
 def above(model: Path) -> list[Path]:

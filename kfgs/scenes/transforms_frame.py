@@ -20,7 +20,7 @@ import torch
 from ..cameras.camera import Camera, Distortion
 from .colmap import PANORAMA
 from .files import MAX_NUMBER, MAX_SIDE, SceneError
-from .poses import Matrix, mend_pose
+from .posed import Matrix, inverse_pose, mend_pose
 
 _PERSPECTIVE = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
@@ -77,11 +77,8 @@ class Frame:
         (pose, scale), lens = mend_pose(self.pose()), self.distortion()
         if pose is None:
             return None, None
-        viewmat = torch.eye(4, dtype=torch.float64)
-        rotation, centre = torch.from_numpy(pose[:3, :3].T), torch.from_numpy(pose[:3, 3])
-        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ centre  # Camera refuses what is not a rotation
         try:
-            return Camera(viewmat, K, int(width), int(height), name, lens), scale
+            return Camera(inverse_pose(pose), K, int(width), int(height), name, lens), scale
         except ValueError as error:
             raise SceneError(f"{self.path}, {self.where} ({name}): {error}") from error
 

@@ -17,7 +17,7 @@ from messages import tells
 from kfgs.cameras.projection import camera_to_pixel
 from kfgs.cli.render import check_walk
 from kfgs.scenes import SceneError
-from kfgs.scenes.colmap import SUPPORTED_MODELS, convert_intrinsics, load_colmap
+from kfgs.scenes.colmap import LENSES, convert_intrinsics, load_colmap
 from kfgs.scenes.load import cameras_and_notes
 
 INTRINSICS = {
@@ -42,7 +42,7 @@ def _scene_folder(tmp_path: Path, names: list[str], **options: object) -> tuple[
     return model, tmp_path / "images"
 
 
-@pytest.mark.parametrize("model", SUPPORTED_MODELS)
+@pytest.mark.parametrize("model", list(LENSES))
 def test_pixels_are_those_of_pycolmap(tmp_path: Path, model: str) -> None:
     scene = load_colmap(*_scene_folder(tmp_path, ["a.png"], model=model, params=INTRINSICS[model]))
     camera = scene.cameras[0].to(torch.float64)

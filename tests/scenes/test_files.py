@@ -15,10 +15,10 @@ import torch
 from messages import tells
 from PIL import Image
 
-from kfgs._files import LARGEST
-from kfgs.scenes import SceneError, file_stem, read_image
-from kfgs.scenes.files import open_picture, read_scene_json
-from kfgs.scenes.posed import picture_size, read_depth
+from kfgs._files import LARGEST, file_stem
+from kfgs.scenes import SceneError, read_image
+from kfgs.scenes.depth import read_depth
+from kfgs.scenes.files import open_picture, picture_size, read_scene_json
 
 RNG = np.random.default_rng(0)
 COLORS = RNG.integers(0, 256, (5, 7, 3), dtype=np.uint8)
@@ -219,5 +219,7 @@ def test_a_json_file_that_would_fill_the_memory_is_refused_unread(tmp_path):
     path = tmp_path / "cameras.json"
     with path.open("wb") as file:
         file.truncate(LARGEST + 1)
-    with pytest.raises(SceneError, match=tells("cameras.json: ", "at most 536.9 MB", "split it; copy it again")):
+    with pytest.raises(
+        SceneError, match=tells("cameras.json: ", "at most 536,870,912 bytes", "split it; copy it again")
+    ):
         read_scene_json(path, "copy it again")

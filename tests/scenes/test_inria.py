@@ -187,7 +187,7 @@ def test_damaged_cameras(room: Path, output: Path, tmp_path: Path) -> None:
     (folder / "point_cloud").symlink_to(output / "point_cloud")
     entries = json.loads((folder / "cameras.json").read_text())
     for change, part in (
-        ({"fx": 0}, "fx and fy above 0"),
+        ({"fx": 0}, "fx, fy, cx, cy as positive numbers"),
         ({"width": 1.5}, "width, height"),
         ({"rotation": [[1, 0], [0, 1]]}, "rotation [3][3]"),
         ({"rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}, "rotation"),

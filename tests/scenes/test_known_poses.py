@@ -177,15 +177,8 @@ def test_neighbours_are_near_and_look_the_same_way() -> None:
 def test_pairs_are_compared_as_given(posed: Scene, tmp_path: Path) -> None:
     pycolmap, names = import_pycolmap(), [camera.name for camera in posed.cameras]
     with tqdm(disable=True) as bar:
-        run = SfmRun(
-            pycolmap,
-            posed.image_paths[0].parent,
-            names,
-            tmp_path,
-            FEW,
-            bar,
-            dict.fromkeys(names, (posed.image_paths[0], None)),
-        )
+        photos = dict.fromkeys(names, (posed.image_paths[0], None))
+        run = SfmRun(pycolmap, posed.image_paths[0].parent, tmp_path, FEW, bar, photos)
         run.extract()
         run.match_pairs([(names[0], names[1]), (names[2], names[4])])
     with pycolmap.Database.open(run.database) as database:
@@ -266,7 +259,7 @@ def test_a_capture_that_is_damaged(tmp_path: Path) -> None:
     file = folder / "corrected_cameras/1001.json"
     values = json.loads(file.read_text())
     for change, part in (
-        ({"t_12": None}, "t_12 = None"),
+        ({"t_12": None}, "t_12"),
         ({"fx": -1}, "fx"),
         ({"width": 0.5}, "width"),
         ({"t_00": 3}, "1001.json"),

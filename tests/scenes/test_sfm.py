@@ -16,14 +16,14 @@ from tqdm import tqdm
 from kfgs.cli import main
 from kfgs.scenes import SceneError, SfmConfig, load_scene, run_sfm
 from kfgs.scenes.pycolmap_import import import_pycolmap
-from kfgs.scenes.sfm import SfmReport, SfmRun, _require_one_model, sequential_pairs
+from kfgs.scenes.sfm import SfmReport, SfmRun, sequential_pairs
 
 
 def test_sfm_finds_the_true_poses(shared_data: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     images = downsized(shared_data / "lund_door/images", tmp_path / "images", 8)
     (images / "notes.txt").write_text("not an image")
     report = run_sfm(images, tmp_path, config=SfmConfig(max_features=3000), progress=True)
-    assert (report.registered, report.total, report.missing, report.model_sizes) == (8, 8, (), (8,))
+    assert (report.registered, report.total, report.missing) == (8, 8, ())
     assert report.points > 500
     assert report.mean_reprojection_error < 0.6
     assert "8 of 8 images registered" in str(report)
@@ -63,17 +63,6 @@ def test_images_that_share_nothing_are_refused(tmp_path: Path) -> None:
     ):
         run_sfm(images, tmp_path / "out", config=SfmConfig(num_threads=1))
     assert not (tmp_path / "out").exists()
-
-
-def test_a_split_scene_is_refused_with_counts_and_advice() -> None:
-    names = [str(i) for i in range(90)]
-    message = ("images:", "81 of 90", "72, 19", "matching='exhaustive'")
-    with pytest.raises(SceneError, match=tells(*message)):
-        _require_one_model(Path("images"), (72, 19), names, SfmConfig(matching="sequential"))
-    _require_one_model(Path("images"), (81, 9), names, SfmConfig())
-    _require_one_model(Path("images"), (72, 19), names, SfmConfig(min_registered=0.8))
-    with pytest.raises(SceneError, match=tells("images:", "got 80", "single_camera=False")):
-        _require_one_model(Path("images"), (80,), names, SfmConfig())
 
 
 def test_a_capture_that_lost_its_poses_gets_them_in_place(
@@ -121,7 +110,7 @@ def test_config_is_checked(values: dict[str, object], message: str) -> None:
 
 
 def test_the_report_reads_well() -> None:
-    report = SfmReport(9, 10, 500, 0.456, {"features": 1.0, "matching": 2.0}, ("x.png",), (9,))
+    report = SfmReport(9, 10, 500, 0.456, {"features": 1.0, "matching": 2.0}, ("x.png",))
     said = "9 of 10 images registered, 500 points, mean reprojection error 0.46 px (features 1.0 s, matching 2.0 s)"
     assert str(report) == said + "; without a pose: x.png"
 
@@ -152,7 +141,7 @@ def test_nothing_is_found_where_a_photo_is_masked_or_transparent(tmp_path: Path)
         "masked.png": (tmp_path / "images/masked.png", tmp_path / "masked.png")
     }
     with tqdm(disable=True) as bar:
-        run = SfmRun(pycolmap, tmp_path / "images", names, tmp_path, SfmConfig(num_threads=1), bar, photos)
+        run = SfmRun(pycolmap, tmp_path / "images", tmp_path, SfmConfig(num_threads=1), bar, photos)
         run.extract()
     with pycolmap.Database.open(run.database) as database:
         leftmost = {
@@ -173,9 +162,9 @@ def _matched(folder: Path, names: list[str]) -> set[frozenset[str]]:
     config = SfmConfig(matching="sequential", max_features=200, num_threads=1)
     with tqdm(disable=True) as bar:
         photos = {name: (folder / "images" / name, None) for name in names}
-        run = SfmRun(pycolmap, folder / "images", names, folder, config, bar, photos)
+        run = SfmRun(pycolmap, folder / "images", folder, config, bar, photos)
         run.extract()
-        run.match()
+        run.match_all()
     with pycolmap.Database.open(run.database) as database:
         pairs = combinations(database.read_all_images(), 2)
         return {frozenset((a.name, b.name)) for a, b in pairs if database.exists_matches(a.image_id, b.image_id)}
@@ -195,7 +184,7 @@ def test_one_camera_for_the_photos_of_each_size(tmp_path: Path) -> None:
         (scratch := tmp_path / str(single)).mkdir()
         with tqdm(disable=True) as bar:
             photos = {name: (tmp_path / name, None) for name in sizes}
-            run = SfmRun(pycolmap, tmp_path, list(sizes), scratch, config, bar, photos)
+            run = SfmRun(pycolmap, tmp_path, scratch, config, bar, photos)
             run.extract()
         with pycolmap.Database.open(run.database) as database:
             lenses = {camera.camera_id: camera for camera in database.read_all_cameras()}
@@ -218,17 +207,23 @@ def test_sequential_matching_of_names_with_blanks(tmp_path: Path) -> None:
 
 
 class _Placed:
-    """A run of pycolmap that places all images."""
+    """A run of pycolmap that finds models of some images."""
+
+    sizes = (3,)
 
     def __init__(self, *_: object) -> None:
-        self.models, self.images, self.points3D = [self], {}, {}
+        self.models, self.seconds = [_Model(size) for size in self.sizes], {}
 
-    def extract(self) -> None: ...
+    def stage(self, name: str, work: object) -> None: ...
 
-    match = map = extract
+    extract = match_all = map = None
 
-    def num_reg_images(self) -> int:
-        return 3
+
+class _Model:
+    images, points3D = {}, {}  # noqa: N815
+
+    def __init__(self, size: int) -> None:
+        self.num_reg_images = lambda: size
 
     def compute_mean_reprojection_error(self) -> float:
         return 0.0
@@ -236,6 +231,17 @@ class _Placed:
     def write(self, folder: str) -> None:
         for name in ("cameras", "images", "points3D"):
             (Path(folder) / f"{name}.bin").write_bytes(b"new")
+
+
+def test_a_split_scene_is_refused_with_counts_and_advice(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("kfgs.scenes.sfm.SfmRun", _Placed)
+    monkeypatch.setattr(_Placed, "sizes", (19, 72))
+    for i in range(90):
+        (tmp_path / f"{i}.png").touch()
+    message = ("81 of 90", "72, 19", "matching='exhaustive'", "single_camera=False")
+    with pytest.raises(SceneError, match=tells(tmp_path, *message)):
+        run_sfm(tmp_path, tmp_path / "out", config=SfmConfig(matching="sequential"))
+    run_sfm(tmp_path, tmp_path / "out", config=SfmConfig(min_registered=0.8))
 
 
 def test_a_model_is_replaced_only_when_asked_and_other_files_stay(tmp_path: Path, monkeypatch) -> None:

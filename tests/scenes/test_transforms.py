@@ -196,7 +196,7 @@ def test_point_clouds_elsewhere_or_broken(tmp_path: Path) -> None:
     for listed in ("../out.ply", "gone.ply", 7, "a\0b"):
         scene = load_transforms(_write(tmp_path / "scene", ply_file_path=listed))
         assert len(scene.points) == 0
-        assert any("is no file inside" in note for note in scene.notes)
+        assert any("is not a file inside" in note for note in scene.notes)
     (tmp_path / "scene/bad.ply").write_bytes(b"ply\nrubbish")
     with pytest.raises(SceneError, match=tells("bad.ply:", "ply_file_path")):
         load_transforms(_write(tmp_path / "scene", ply_file_path="bad.ply"))

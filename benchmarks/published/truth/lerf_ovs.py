@@ -16,8 +16,7 @@ import torch
 
 from kfgs._files import as_path, read_json
 from kfgs.evaluation.truth import ReadWhenAsked
-from kfgs.scenes.files import natural_key, some
-from kfgs.scenes.posed import picture_size
+from kfgs.scenes.files import natural_key, picture_size, some
 
 from ..class_lists import load_classes
 from ..mask_truth import MaskAndBoxes, MaskTruth

@@ -1,0 +1,86 @@
+"""Points of surfaces from depth pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .files import SceneError, is_file, open_picture, read_alpha, read_image
+from .masks import folder_masks, picture_folder, read_mask
+from .posed import Matrix, PosedPicture
+
+MILLIMETRE = 1e-3  # metres: the step of most depth pictures
+DEPTH_VIEWS = 25  # depth pictures that are read: enough to see a room from all sides, a second to decode
+DEPTH_POINTS = 100_000  # points from all of them: what structure from motion gives for a room, and more
+
+
+def read_depth(path: Path) -> NDArray[Any]:  # [H, W]
+    """The whole numbers of a depth PNG; 0 is unknown.
+
+    Raises:
+        SceneError: if it is not a picture with one channel, or its numbers are indices of a palette.
+    """
+    with open_picture(path, "a depth PNG", "copy it again") as picture:
+        depth, mode = np.asarray(picture), picture.mode
+    if depth.ndim != 2 or mode == "P":
+        got = "colours of a palette" if mode == "P" else str(depth.shape)
+        raise SceneError(
+            f"{path}: expected a depth PNG with one channel of numbers, got {got}; is this a picture for people?"
+        )
+    return depth
+
+
+def points_from_depth(
+    views: Sequence[PosedPicture],
+    depths: Sequence[Path],
+    unit: float = MILLIMETRE,
+    K: Matrix | None = None,  # [3, 3]
+) -> tuple[Tensor, Tensor] | None:  # [P, 3] float64, [P, 3] uint8
+    """About `DEPTH_POINTS` points of surfaces with their colours, from `DEPTH_VIEWS` evenly chosen depth pictures.
+
+    Pixels that are masked or transparent in the colour picture give none.
+
+    Args:
+        views: the pictures; those without a pose are left out.
+        depths: their depth pictures; a missing file is left out.
+        unit: world units per step of the depth pictures.
+        K: intrinsics of the depth pictures. None takes those of each view (`lens`), resized: pictures and depth then show
+            the same. A colour is that of the same place in the colour picture.
+
+    Returns:
+        The points, or None if there is no depth.
+    """
+    pairs = [(v, d) for v, d in zip(views, depths, strict=True) if np.isfinite(v.pose).all() and is_file(d)]
+    if not pairs:
+        return None
+    chosen = [pairs[i] for i in np.unique(np.linspace(0, len(pairs) - 1, DEPTH_VIEWS).round().astype(int))]
+    names = [view.name for view, _ in chosen]
+    masks = folder_masks(names, picture_folder(names[0], chosen[0][0].path))[0] or [None] * len(chosen)
+    points, colors = [], []
+    for (view, file), folder_mask in zip(chosen, masks, strict=True):
+        depth, image = read_depth(file).astype(np.float64) * unit, read_image(view.path).numpy()
+        height, width = depth.shape
+        step = max(int(np.sqrt(height * width * len(chosen) / DEPTH_POINTS)), 1)
+        own = K
+        if own is None:
+            assert view.lens is not None
+            own = np.diag([width / view.lens[1][0], height / view.lens[1][1], 1.0]) @ view.lens[0]
+        y, x = (axis.reshape(-1) for axis in np.mgrid[step // 2 : height : step, step // 2 : width : step])
+        rows, columns = y * image.shape[0] // height, x * image.shape[1] // width  # in the colour picture
+        z, mask, alpha = depth[y, x], view.mask or folder_mask, read_alpha(view.path)
+        if mask is not None:
+            z = z * read_mask(mask, image.shape[:2]).numpy()[rows, columns]
+        if alpha is not None:
+            z = z * (alpha > 0.5).numpy()[rows, columns]
+        rows, columns, x, y, z = (values[z > 0] for values in (rows, columns, x, y, z))
+        local = np.stack([(x + 0.5 - own[0, 2]) / own[0, 0] * z, (y + 0.5 - own[1, 2]) / own[1, 1] * z, z], 1)
+        points.append(local @ view.pose[:3, :3].T + view.pose[:3, 3])
+        colors.append(image[rows, columns])
+    shades = torch.from_numpy((np.concatenate(colors) * 255).round().astype(np.uint8))
+    return torch.from_numpy(np.concatenate(points)), shades

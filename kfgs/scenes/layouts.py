@@ -1,0 +1,281 @@
+"""Data sets whose folders have a pose for each picture: Replica (two renderings), ScanNet, LLFF and Polycam.
+
+**Convention**: poses in files are camera to world, x right, y down, z forward, unless a reader says otherwise.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from .._arrays import read_array
+from .._files import as_path, file_stem, real_path
+from ..cameras.resample import fits_aspect
+from .depth import points_from_depth
+from .files import MAX_NUMBER, MAX_SIDE, SceneError, list_images, natural_key, picture_size, read_scene_json, some
+from .posed import Matrix, PosedPicture, read_numbers, read_points, scene_of_poses
+from .scene import Scene
+
+AGAIN = "copy it again from the data set"
+NOWHERE = np.full((4, 4), np.nan)  # the pose of a view that is left out
+MESH = "_vh_clean_2.ply"  # of ScanNet
+_POLYCAM = (("corrected_cameras", "corrected_images"), ("cameras", "images"))  # after and before its bundle adjustment
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def intrinsics(values: Sequence[Any], where: str) -> tuple[Matrix, tuple[int, int]]:
+    """K [3, 3] and the size from width, height, fx, fy, cx, cy; a SceneError if they are not plausible numbers."""
+    numbers = [n if type(n) in (int, float) and abs(n) < MAX_NUMBER else -1 for n in values]
+    width, height, fx, fy, cx, cy = numbers
+    if min(width, height, fx, fy) <= 0 or max(width, height) > MAX_SIDE or width % 1 or height % 1:
+        raise SceneError(
+            f"{where}: expected width, height, fx, fy, cx, cy as positive numbers, got {values!r:.200}; {AGAIN}"
+        )
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64), (int(width), int(height))
+
+
+def is_nice_slam(folder: Path) -> bool:
+    """Whether this is a scene of Replica as NICE-SLAM published it."""
+    return (folder / "results").is_dir() and (folder / "traj.txt").is_file()
+
+
+def load_nice_slam(folder: Path, _: Path | None = None) -> Scene:
+    """Replica by NICE-SLAM: `results/frame000000.jpg`, `results/depth000000.png`, `traj.txt`, `cam_params.json`.
+
+    The last may be one level up. Its intrinsics count pixel centres from 0, so cx and cy grow by 0.5 here.
+    """
+    places = [folder / "cam_params.json", real_path(folder).parent / "cam_params.json"]
+    path = next((place for place in places if place.is_file()), None)
+    if path is None:
+        raise FileNotFoundError(
+            f"{places[1]}: no such file; expected the camera of the Replica scenes there or in {folder}: "
+            '{"camera": {"w": 1200, "h": 680, "fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "scale": 6553.5}}'
+        )
+    top = read_scene_json(path, AGAIN)
+    values = top.get("camera") if isinstance(top, dict) else None
+    values = values if isinstance(values, dict) else {}
+    K, size = intrinsics([values.get(name) for name in ("w", "h", "fx", "fy", "cx", "cy")], str(path))
+    K[:2, 2] += 0.5
+    scale = values.get("scale")
+    if not isinstance(scale, int | float) or not 0 < scale < MAX_NUMBER:
+        raise SceneError(f"{path}: expected a scale of the depth pictures above 0, got {scale!r:.80}; {AGAIN}")
+    views, notes = _numbered(folder / "results", r"frame(\d+)\.(?:jpg|jpeg|png)", folder / "traj.txt")
+    depths = [view.path.with_name(Path(view.name).stem.replace("frame", "depth") + ".png") for view in views]
+    return scene_of_poses(folder, views, (K, size), points_from_depth(views, depths, 1 / scale, K), notes)
+
+
+def is_semantic_nerf(folder: Path) -> bool:
+    """Whether this is a sequence of Replica as Semantic-NeRF rendered it."""
+    return (folder / "rgb").is_dir() and (folder / "traj_w_c.txt").is_file()
+
+
+def load_semantic_nerf(folder: Path, _: Path | None = None) -> Scene:
+    """Replica by Semantic-NeRF: `rgb/rgb_0.png`, `depth/depth_0.png` (millimetres), `traj_w_c.txt`.
+
+    No file has the intrinsics: the field of view is 90 degrees across, the principal point is the middle of the picture.
+    """
+    views, notes = _numbered(folder / "rgb", r"rgb_(\d+)\.(?:png|jpg)", folder / "traj_w_c.txt")
+    for i, view in enumerate(views):
+        width, height = picture_size(view.path)
+        K, size = intrinsics((width, height, width / 2, width / 2, width / 2, height / 2), str(view.path))
+        views[i] = view._replace(lens=(K, size))
+    depths = [folder / "depth" / (Path(view.name).stem.replace("rgb", "depth") + ".png") for view in views]
+    note = (
+        "no file has the intrinsics of Semantic-NeRF's renders: 90 degrees across and a centred principal point assumed"
+    )
+    return scene_of_poses(folder, views, None, points_from_depth(views, depths), [*notes, note])
+
+
+def _numbered(folder: Path, pattern: str, poses: Path) -> tuple[list[PosedPicture], list[str]]:
+    """The pictures of a folder whose number says which line of a file is their pose, and a note about other lines."""
+    expected = "lines of 16 numbers, one camera-to-world matrix per picture"
+    rows = read_numbers(poses, expected)
+    if rows.shape[1] == 12:
+        rows = np.concatenate([rows, np.tile([[0.0, 0, 0, 1]], (len(rows), 1))], 1)
+    if rows.shape[1] != 16:
+        raise SceneError(f"{poses}: expected {expected}, got lines of {rows.shape[1]}; {AGAIN}")
+    matches = [match for name in list_images(folder) if (match := re.fullmatch(pattern, name, re.IGNORECASE))]
+    if not matches:
+        example = pattern.replace(r"(\d+)", "NUMBER").split("\\")[0]
+        raise SceneError(
+            f"{folder}: expected pictures named {example}..., got none; copy the pictures of {poses} there"
+        )
+    numbers = [int(match[1]) for match in matches]
+    if max(numbers) >= len(rows):
+        raise SceneError(
+            f"{poses}: expected a line for each picture of {folder}, got {len(rows)} lines for numbers up to "
+            f"{max(numbers)} (the first line is for number 0); copy the whole folder again"
+        )
+    views = [
+        PosedPicture(match[0], folder / match[0], rows[number].reshape(4, 4), f"{poses}, line {number + 1}")
+        for match, number in zip(matches, numbers, strict=True)
+    ]
+    missing = len(rows) - len(set(numbers))
+    return views, [f"{missing} of {len(rows)} poses in {poses} have no picture"] if missing else []
+
+
+def is_scannet(folder: Path) -> bool:
+    """Whether this is a scene that ScanNet's SensReader exported."""
+    return (folder / "color").is_dir() and (folder / "pose").is_dir()
+
+
+def load_scannet(folder: Path, _: Path | None = None) -> Scene:
+    """ScanNet: `color/0.jpg`, `pose/0.txt`, `intrinsic/intrinsic_color.txt`, whose intrinsics are used as they are.
+
+    Views whose pose is not finite (tracking was lost) are left out and noted. Points are all vertices of
+    `<scene>_vh_clean_2.ply` if there is one, in its order; else they come from `depth/` and `intrinsic/intrinsic_depth.txt`.
+    """
+    names, views, lost = list_images(folder / "color"), [], []
+    for name in names:
+        file = folder / "pose" / f"{file_stem(name)}.txt"
+        if file.is_file():
+            views.append(PosedPicture(name, folder / "color" / name, _square(file), str(file)))
+        else:
+            lost.append(name)
+    if not views:
+        raise SceneError(
+            f"{folder / 'pose'}: expected N.txt for the pictures N.jpg of {folder / 'color'} ({some(names, 3) or 'none'}), "
+            "got none that fits; export the scene again with ScanNet's SensReader"
+        )
+    file = folder / "intrinsic" / "intrinsic_color.txt"
+    K = _square(file)[:3, :3]
+    size, largest = max((picture_size(view.path), view.path) for view in views)  # others may be smaller copies
+    if not (0 < K[0, 2] < size[0] and 0 < K[1, 2] < size[1]):
+        raise SceneError(
+            f"{file}: expected a principal point inside {largest} ({size[0]}x{size[1]} pixels), got ({K[0, 2]:g}, "
+            f"{K[1, 2]:g}); give pictures of the size that was exported"
+        )
+    notes = [f"{len(lost)} pictures have no file in pose/ and were left out: {some(lost)}"] if lost else []
+    points: tuple[Tensor, Tensor] | None = None
+    mesh, depth = next(iter(sorted(folder.glob(f"*{MESH}"))), None), folder / "intrinsic" / "intrinsic_depth.txt"
+    if mesh is not None:
+        try:
+            *points, told = read_points(mesh)  # type: ignore[assignment]
+        except SceneError as error:
+            raise SceneError(f"{error}; copy the mesh again, or remove it to take points from the depth") from error
+        notes += told
+    elif depth.is_file():
+        depths = [folder / "depth" / f"{file_stem(view.name)}.png" for view in views]
+        points = points_from_depth(views, depths, K=_square(depth)[:3, :3])
+    return scene_of_poses(folder, views, (K, size), points, notes)
+
+
+def _square(path: Path) -> Matrix:  # [4, 4]
+    matrix = read_numbers(path, "4 rows of 4 numbers")
+    if matrix.shape != (4, 4):
+        raise SceneError(f"{path}: expected 4 rows of 4 numbers, got {matrix.shape}; export the scene again")
+    return matrix
+
+
+def is_llff(folder: Path) -> bool:
+    """Whether this is a scene with LLFF's file of poses."""
+    return (folder / "poses_bounds.npy").is_file()
+
+
+def load_llff(folder: Path, images: Path | None = None) -> Scene:
+    """LLFF and 3D-OVS: `poses_bounds.npy` and as many pictures in `images/`, or `images_4/` and the like.
+
+    **Convention**: a row has a 3x5 matrix and two depths. The matrix is [down, right, back, centre, (height, width, focal
+    length)], camera to world; the size is that of the pictures the poses were made for.
+    """
+    path = folder / "poses_bounds.npy"
+    try:
+        values = read_array(path, "an array [V, 17]", "copy it again")
+    except ValueError as error:
+        raise SceneError(str(error)) from error
+    if values.ndim != 2 or values.shape[1] != 17 or len(values) == 0 or values.dtype.kind != "f":
+        raise SceneError(
+            f"{path}: expected floats [V, 17] as LLFF writes them, got {values.dtype} {values.shape}; {AGAIN}"
+        )
+    rows = values[:, :15].astype(np.float64).reshape(-1, 3, 5)
+    folders = [p for p in folder.glob("images*") if p.is_dir() and re.fullmatch(r"images(_\d+)?", p.name)]
+    source = as_path(images) if images is not None else min(folders, key=lambda p: natural_key(p.name), default=None)
+    if source is None:
+        raise FileNotFoundError(f"{folder / 'images'}: no such folder; expected the pictures of {path} there")
+    names = sorted(list_images(source), key=natural_key)
+    if len(names) != len(rows):
+        raise SceneError(
+            f"{path}: expected one row per picture in {source} ({len(names)}), got {len(rows)}; give the folder whose "
+            "pictures the poses were made for"
+        )
+    views = []
+    for i, (name, row) in enumerate(zip(names, rows, strict=True)):
+        (height, width, focal), size, where = row[:, 4], picture_size(source / name), f"{path}, row {i}"
+        if not np.isfinite(row).all():
+            views.append(PosedPicture(name, source / name, NOWHERE, where, (np.eye(3), size)))
+            continue
+        if min(height, width, focal) <= 0 or not fits_aspect((size[1], size[0]), (height, width)):
+            raise SceneError(
+                f"{source / name}: expected the shape {width:g}x{height:g} that {where}, says (and a focal length above 0), "
+                f"got {size[0]}x{size[1]}; was the picture cropped or turned? give the one that the poses were made for"
+            )
+        pose = np.eye(4)
+        pose[:3] = np.stack([row[:, 1], row[:, 0], -row[:, 2], row[:, 3]], 1)
+        K = np.diag([focal * size[0] / width, focal * size[1] / height, 1.0])
+        K[:2, 2] = size[0] / 2, size[1] / 2
+        views.append(PosedPicture(name, source / name, pose, where, (K, size)))
+    return scene_of_poses(folder, views)
+
+
+def is_polycam(folder: Path) -> bool:
+    """Whether this is a raw capture of Polycam, or its folder `keyframes`."""
+    return _polycam_folders(folder) is not None
+
+
+def load_polycam(folder: Path, _: Path | None = None) -> Scene:
+    """Polycam's raw captures, which are ARKit's: poses that it corrected (`corrected_cameras/`), else ARKit's (`cameras/`).
+
+    **Convention**: `t_00` to `t_23` of a camera file are the first three rows of a camera-to-world matrix with OpenGL axes
+    (y up, z backward), in metres. Depth pictures (LiDAR) are in millimetres. So programs say that read such captures;
+    none was at hand.
+    """
+    found = _polycam_folders(folder)
+    assert found is not None
+    cameras, images = found
+    names, views, lost = list_images(images), [], []
+    for name in names:
+        file = cameras / f"{file_stem(name)}.json"
+        if not file.is_file():
+            lost.append(name)
+            continue
+        values = read_scene_json(file, "export the capture again (raw data, developer mode)")
+        values = values if isinstance(values, dict) else {}
+        keys = ("width", "height", "fx", "fy", "cx", "cy", *(f"t_{i}{j}" for i in range(3) for j in range(4)))
+        numbers = [values.get(key) for key in keys]
+        if any(type(n) is float and not math.isfinite(n) for n in numbers):
+            views.append(PosedPicture(name, images / name, NOWHERE, str(file), (np.eye(3), (1, 1))))
+            continue
+        odd = [key for key, n in zip(keys, numbers, strict=True) if type(n) not in (int, float) or abs(n) >= MAX_NUMBER]
+        if odd:
+            raise SceneError(
+                f"{file}: expected {', '.join(keys[:6])} and t_00 to t_23 as numbers, got {odd[0]} otherwise; {AGAIN}"
+            )
+        pose = np.eye(4)
+        pose[:3] = np.array(numbers[6:], np.float64).reshape(3, 4)
+        lens = intrinsics(numbers[:6], str(file))
+        views.append(PosedPicture(name, images / name, pose @ _OPENGL, str(file), lens))
+    if not views:
+        raise SceneError(
+            f"{cameras}: expected a file NAME.json for each of {some(names, 3) or 'no pictures'}, got none"
+        )
+    notes = [f"{len(lost)} pictures have no file in {cameras.name}/ and were left out: {some(lost)}"] if lost else []
+    if cameras.name == "cameras":
+        notes.append("poses are ARKit's own: this capture has no corrected_cameras/")
+    depth = next((p for p in (cameras.parent / "corrected_depth", cameras.parent / "depth") if p.is_dir()), None)
+    depths = [(depth or cameras) / f"{file_stem(view.name)}.png" for view in views]
+    return scene_of_poses(folder, views, None, points_from_depth(views, depths), notes)
+
+
+def _polycam_folders(folder: Path) -> tuple[Path, Path] | None:
+    """The folders of camera files and of pictures."""
+    for place in (folder / "keyframes", folder):
+        for cameras, images in _POLYCAM:
+            if next((place / cameras).glob("*.json"), None) is not None and (place / images).is_dir():
+                return place / cameras, place / images
+    return None
