@@ -26,8 +26,12 @@ FAILURES = (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OSError
 
 def import_pycolmap() -> Any:
     """The module, loaded at the first call. Raises an ImportError if it is not installed, with the install line."""
+    came: list[int] = []  # a Ctrl-C inside a C++ module that loads would become an ImportError: it comes afterwards
     main = threading.current_thread() is threading.main_thread()
-    before = signal.getsignal(signal.SIGTERM)
+    # pycolmap's log library prints a stack at SIGTERM: that handler is put back, too
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)} if main else {}
+    if main:
+        signal.signal(signal.SIGINT, lambda number, _: came.append(number))
     try:
         import pycolmap
     except ImportError as error:
@@ -35,8 +39,12 @@ def import_pycolmap() -> Any:
             "pycolmap: needed to estimate cameras and to undistort, but it cannot be imported; "
             f"run `pip install 'pycolmap>=4.0'` ({error})"
         ) from error
-    if before is not None and main:  # pycolmap's log library prints a stack at SIGTERM; put the earlier handler back
-        signal.signal(signal.SIGTERM, before)
+    finally:
+        for number, handler in handlers.items():
+            if handler is not None:
+                signal.signal(number, handler)
+        if came:
+            signal.raise_signal(signal.SIGINT)
     return pycolmap
 
 

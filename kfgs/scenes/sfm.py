@@ -55,6 +55,8 @@ class SfmConfig:
         check_choice("camera_model", self.camera_model, tuple(LENSES))
         check_range("min_registered", self.min_registered, 0, 1, closed=(False, True))
         check_range("max_features", self.max_features, 100)
+        if self.num_threads != -1:
+            check_range("num_threads", self.num_threads, 1)
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,7 @@ def test_a_split_file_lists_stems(tmp_path: Path) -> None:
     ("value", "message"),
     [
         ("{", ("JSON", "repair")),
-        ("[" * 100_000, ("JSON", "nest more than", "repair")),
+        ("[" * 100_000, ("JSON", "nest too deep", "repair")),
         ([], ('{"train": [names], "test": [names]}', "got []")),
         ({"test": ["a"]}, ("'train'", "got {'test': ['a']}")),
         ({"train": [1]}, ("stems", "got {'train': [1]}")),
