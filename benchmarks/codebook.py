@@ -23,11 +23,11 @@ from torch.nn.functional import one_hot
 
 from kfgs.cameras import resize_map
 from kfgs.formats import read_splats
-from kfgs.labels import average_views, classify, load_label_set
+from kfgs.labels import classify, load_label_set
 from kfgs.pipeline import score_scene, score_teacher, true_labels
 from kfgs.quant import Codebook, GrownCodebook, LatentMaps, PaperCodebook, fit_codebook, quantize_maps
 from kfgs.scenes import FeatureFolder, load_scene
-from kfgs.splat import rasterize
+from kfgs.splat import average_views, rasterize
 
 HEIGHT = 120  # of the maps that are averaged onto the splat
 VARIANTS = {

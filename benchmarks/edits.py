@@ -23,8 +23,9 @@ from kfgs import SemanticField, attach, load_label_set, load_scene, read_splats
 from kfgs.cameras import Camera, undistort_labels
 from kfgs.evaluation import load_label_map
 from kfgs.gaussians import Gaussians
-from kfgs.labels import EditList, LabelSet, Recolor, Remove, average_views, transfer_labels, vote_labels
+from kfgs.labels import EditList, LabelSet, Recolor, Remove, transfer_labels
 from kfgs.scenes import Scene
+from kfgs.splat import average_views, vote_labels
 
 REACH = 0.05  # metres: a Gaussian farther from every true surface point has no true class
 BLUE = (0.1, 0.3, 0.9)  # a hue that no class of the toy room has

@@ -36,9 +36,9 @@ from kfgs import (
 from kfgs._files import write_json
 from kfgs.evaluation import load_label_map
 from kfgs.fields import uplift_maps
-from kfgs.labels import vote_labels
 from kfgs.pipeline import score_scene, score_teacher, true_labels
 from kfgs.pipeline.maps import maps_of_views
+from kfgs.splat import vote_labels
 
 
 class Room:

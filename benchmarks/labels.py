@@ -25,7 +25,7 @@ from torch import Tensor
 
 from kfgs import Camera
 from kfgs.fields import Autoencoded, Linear, SemanticField
-from kfgs.labels import LOGIT_SCALES, label_codewords, label_pixels, relevancy
+from kfgs.labels import LOGIT_SCALE, classify, label_pixels, relevancy
 from kfgs.quant import Autoencoder, Codebook, LinearLatents
 from kfgs.scenes import load_scene
 from kfgs.splat import bin_tiles, project, rasterize, rasterize_labels
@@ -172,7 +172,7 @@ def compare(field: SemanticField, camera: Camera, rows: Tensor, repeats: int) ->
     if not isinstance(field.decoder, Autoencoded):
         raise SystemExit("--field: expected one with linear latents or with an autoencoder")
     book, coder = field.decoder.codebook, field.decoder.autoencoder
-    table = label_codewords(book.codewords, rows)
+    table = classify(book.codewords, rows).labels
     rendering = field.render(camera)
     covered = rendering.alpha > 0
     return [
@@ -205,7 +205,7 @@ def blended(field: SemanticField, camera: Camera, rows: Tensor, top: int = 1) ->
     cosines, known = field.cosines(rows), field.known
     with torch.no_grad():
         winners = cosines.argmax(dim=1)[known].unique()
-        votes = torch.softmax(LOGIT_SCALES["clip"] * cosines[:, winners], dim=1) * known[:, None]
+        votes = torch.softmax(LOGIT_SCALE * cosines[:, winners], dim=1) * known[:, None]
         seen = rasterize(field.gaussians.replace(features=votes.contiguous(), sh=None), camera).map
         if top == 1:
             most, index = seen.max(dim=-1)
@@ -244,7 +244,7 @@ def decoded(field: SemanticField, latents: Tensor, table: Tensor, covered: Tenso
 
 def parts(field: SemanticField, camera: Camera, rows: Tensor, repeats: int) -> str:
     """Medians of the parts of a label map, in ms."""
-    votes = torch.softmax(LOGIT_SCALES["clip"] * field.cosines(rows), dim=1)
+    votes = torch.softmax(LOGIT_SCALE * field.cosines(rows), dim=1)
     cloud = field.gaussians.replace(features=votes)
     with torch.no_grad():
         projected = project(cloud, camera)

@@ -20,10 +20,9 @@ from kfgs._rows import unit_rows
 from kfgs.cameras import Camera
 from kfgs.fields import GaussianParams, Training, UpliftConfig, fit_field, uplift_maps
 from kfgs.gaussians import Gaussians
-from kfgs.labels.views import sum_pixels
 from kfgs.metrics import semantic_storage_bytes
 from kfgs.quant.fit_autoencoder import quick_on_a_cpu
-from kfgs.splat import covariance_3d, rasterize
+from kfgs.splat import covariance_3d, rasterize, sum_pixels
 
 from .common import Clock, Fitted, Task, seeded, within
 from .langsplat import Autoencoder

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from kfgs.cameras import Camera
 from kfgs.gaussians import Gaussians
-from kfgs.labels.views import sum_pixels
 from kfgs.quant import FeatureMaps
+from kfgs.splat import sum_pixels
 
 from .methods import RenderedMethod
 

@@ -207,13 +207,12 @@ def note_other_teacher(asked: Any, table: Any) -> None:
 
     `SemanticField.query` checks whether the query fits the field.
     """
-    from ..labels.label_set import teacher_difference
+    from ..labels.label_set import teacher_mismatch
 
-    found = teacher_difference(asked.info, table.info)
-    if found is not None:
-        key, query, classes = found
+    difference = teacher_mismatch(asked.info, table.info)
+    if difference is not None:
         say(
-            f"note: --text: expected a table by the query's teacher ({key} {query!r:.40}, from --teacher and --weights), got "
-            f"one by another ({classes!r:.40}); they cannot be compared: use the table's teacher for the query, or pass a "
+            f"note: --text: expected a table by the query's teacher (from --teacher and --weights), got one by another "
+            f"({difference}); they cannot be compared: use the table's teacher for the query, or pass a "
             "table of the query's teacher as --text"
         )

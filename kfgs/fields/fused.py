@@ -17,9 +17,8 @@ from .._rows import EPS, row_norms, unit_rows
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels import nearest_codeword
-from ..labels.views import average_shown
 from ..quant import fit_linear_latents
-from ..splat import rasterize
+from ..splat import average_views, rasterize
 from .decoders import Autoencoded, Codewords, Linear
 from .semantic_field import Seen, SemanticField
 
@@ -69,7 +68,7 @@ def fuse_views(field: SemanticField, cameras: Sequence[Camera]) -> SemanticField
             return camera, rows.view(*camera.size, -1) * something[..., None]
 
         small = [_shrunk(camera) for camera in cameras]
-        mean = average_shown(gaussians, small, show)
+        mean = average_views(gaussians, map(show, small))
         scale = sum(a.width * a.height for a in cameras) / max(1, sum(b.width * b.height for b in small))
         seen = Seen(mean.weights * scale, row_norms(mean.values).clamp_max(1))
     fused = SemanticField(gaussians.replace(features=mean.values), Linear(latents), seen=seen)

@@ -15,7 +15,7 @@ from .._check import as_tensor, check_shapes, check_whole
 from .._rows import unit_embeddings
 from ..cameras import Camera
 from ..gaussians import Gaussians, as_rows
-from ..labels import Classification, LabelSet, Score, Selection, select_by_similarity
+from ..labels import LOGIT_SCALE, Classification, LabelSet, Score, Selection, select_by_similarity
 from ..labels.questions import Classes, Negatives, check_rows, class_rows, make_question
 from ..metrics import MIB, semantic_storage_bytes
 from ..splat import Ranked, Rendering, rasterize, rasterize_labels
@@ -204,7 +204,7 @@ class SemanticField:
         *,
         negatives: Negatives | Tensor = "auto",
         score: Score | None = None,
-        logit_scale: float | str = "clip",
+        logit_scale: float = LOGIT_SCALE,
     ) -> Selection:
         """The Gaussians of one thing: those with a score above a threshold (gamma of Sec. 3.4).
 
@@ -217,7 +217,7 @@ class SemanticField:
             threshold: gamma. None: 0.5 for a relevancy, else derived from the scores; `how` of the result explains it.
             negatives: "classes", "canonical" (words of the classes' table), "none", rows [M, D], or "auto" as above.
             score: "relevancy", "softmax" over target and negatives, or "cosine". None: relevancy if there are negatives.
-            logit_scale: for the softmax: "raw", "lseg", "clip", or a number that multiplies the cosines.
+            logit_scale: for the softmax: the number that multiplies the cosines.
 
         Raises:
             ValueError: if there is no such class, shapes disagree, a row is all-zero, or an option is unknown.

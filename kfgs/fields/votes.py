@@ -15,7 +15,7 @@ from .._card import short_repr
 from .._rows import row_norms
 from ..cameras import Camera
 from ..gaussians import Gaussians
-from ..labels import LOGIT_SCALES
+from ..labels import LOGIT_SCALE
 from ..splat import Ranked, rasterize_labels
 
 LEAST_SHARE = 1e-30
@@ -38,7 +38,7 @@ def divide_votes(cosines: Tensor, known: Tensor) -> Votes:  # [N, C], [N] bool
     A class that no Gaussian prefers gets no vote: it would win pixels where it is second everywhere.
     """
     classes = cosines.argmax(dim=1)[known].unique()
-    shares = torch.softmax(LOGIT_SCALES["clip"] * cosines[:, classes], dim=1) * known[:, None]
+    shares = torch.softmax(LOGIT_SCALE * cosines[:, classes], dim=1) * known[:, None]
     return Votes(classes, torch.nn.functional.threshold(shares, LEAST_SHARE, 0))
 
 

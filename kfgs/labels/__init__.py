@@ -1,35 +1,22 @@
-"""Labels: classes of codewords, pixels and Gaussians, their transfer to the colour field, and edits (Sec. 3.4)."""
+"""Labels: classes of pixels and Gaussians, their transfer to the colour field, selections and edits (Sec. 3.4)."""
 
-from .._names import class_index, class_indices
 from .boxes import OrientedBox
-from .classify import (
-    Classification,
-    CodewordLabels,
-    classify,
-    label_codewords,
-    select_by_category,
-    select_by_query,
-    select_like,
-    select_near,
-)
+from .classify import Classification, classify, label_pixels, nearest_codeword
 from .color import parse_color, recolor
 from .components import component_numbers
 from .edits import Duplicate, Edit, EditList, Extract, Insert, Move, Opacity, Recolor, Remove, join
 from .label_set import LabelSet, load_label_set
 from .nearest import Transfer, default_distance, nearest_labels
-from .parts import Part, connected_parts, describe_selection
-from .scores import CANONICAL, LOGIT_SCALES, Score, relevancy, select_by_similarity
-from .segment import label_pixels, nearest_codeword
+from .parts import Part, connected_parts
+from .scores import CANONICAL, LOGIT_SCALE, Score, relevancy, select_by_similarity
 from .selection import Selection
 from .transfer import transfer_labels
-from .views import average_views, vote_labels
 from .where import InBox, InSphere, OfClass, OfIndex, Where
 
 __all__ = [
     "CANONICAL",
-    "LOGIT_SCALES",
+    "LOGIT_SCALE",
     "Classification",
-    "CodewordLabels",
     "Duplicate",
     "Edit",
     "EditList",
@@ -50,16 +37,11 @@ __all__ = [
     "Selection",
     "Transfer",
     "Where",
-    "average_views",
-    "class_index",
-    "class_indices",
     "classify",
     "component_numbers",
     "connected_parts",
     "default_distance",
-    "describe_selection",
     "join",
-    "label_codewords",
     "label_pixels",
     "load_label_set",
     "nearest_codeword",
@@ -67,11 +49,6 @@ __all__ = [
     "parse_color",
     "recolor",
     "relevancy",
-    "select_by_category",
-    "select_by_query",
     "select_by_similarity",
-    "select_like",
-    "select_near",
     "transfer_labels",
-    "vote_labels",
 ]

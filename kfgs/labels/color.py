@@ -11,7 +11,6 @@ from torch import Tensor
 
 from .._card import short_repr
 from .._check import as_tensor, check_choice, check_shapes
-from .._typed import typed
 from ..gaussians import Gaussians
 from ..splat.sh import rgb_to_sh0, sh0_to_rgb
 
@@ -25,12 +24,8 @@ def parse_color(color: str | Sequence[float] | Tensor, name: str = "rgb") -> tup
     """A colour as (red, green, blue) in [0, 1].
 
     Args:
-        color: `"#c04040"`, `"#c44"`, a CSS name like `"teal"`, `"rgb(192, 64, 64)"`, `"hsl(0, 50%, 50%)"`; or three numbers
-            in [0, 1].
-        name: the argument's name in errors.
-
-    Raises:
-        ValueError: if it is not a colour, or has an alpha channel.
+        color: `"#c04040"`, a CSS name like `"teal"`, `"rgb(192, 64, 64)"`; or three numbers in [0, 1].
+        name: the argument's name in errors (ValueError).
 
     Example:
         >>> parse_color("#ff0080") == parse_color("rgb(255, 0, 128)") == (1.0, 0.0, 128 / 255)
@@ -54,7 +49,6 @@ def parse_color(color: str | Sequence[float] | Tensor, name: str = "rgb") -> tup
     return float(plain[0]), float(plain[1]), float(plain[2])
 
 
-@typed
 def recolor(
     gaussians: Gaussians,
     mask: Tensor,  # [N] bool
@@ -63,16 +57,14 @@ def recolor(
 ) -> Gaussians:
     """Give the Gaussians under the mask one hue and keep their shading.
 
-    Each Gaussian's luminance L (of its view-independent colour) is replaced by a colour T(L) on a curve from black over
-    the shades of `rgb` to white (`color.Shades`), and its view-dependent luminance follows the curve's slope there:
+    Each Gaussian's luminance L (Rec. 709, of its view-independent colour) is replaced by a colour T(L) on a curve from
+    black over the shades of `rgb` to white (`Shades`), and its view-dependent luminance follows the curve's slope there:
     `color(v) = T(L) + T'(L) (L(v) - L)`. That is linear in the spherical harmonics, so it holds from every direction,
-    and blending keeps it. Alpha, and with it the geometry, stays.
+    and blending keeps it. The paper says only "color modification".
 
     - `"tint"` paints it: the object's middle luminance (the median by visible area) becomes `rgb`, and ratios of
-      luminance stay, as if the albedo changed under the same light. If the middle is below 1/255, there is no shading to
-      keep, and the colour is flat. With white, everything brighter than the middle becomes white too.
-    - `"hue"` keeps luminance from every direction and changes hue and saturation only: a dark plant stays dark. If a
-      channel is outside [0, 1] before or after, the renderer clamps it, and the visible luminance changes.
+      luminance stay, as if the albedo changed under the same light. If the middle is below 1/255, the colour is flat.
+    - `"hue"` keeps luminance from every direction and changes hue and saturation only: a dark plant stays dark.
 
     Args:
         gaussians: a colour field (with `sh`).
@@ -83,10 +75,6 @@ def recolor(
     Raises:
         ValueError: if there is no `sh`, the mask has another length, or `rgb` is not a colour.
         TypeError: if the mask is not boolean.
-
-    Note:
-        The old hues are lost: a red flower on a green stem becomes one hue. To keep two, recolour two selections.
-        Luminance is Rec. 709 luma of display values. The paper says only "color modification".
     """
     mask = as_tensor("mask", mask)
     check_shapes(("gaussians.means", gaussians.means, "N 3"), ("mask", mask, "N"))
@@ -131,8 +119,6 @@ class Shades(NamedTuple):
 
     The old luminance L first becomes a tone t(L): `gain L` up to the bend, then linear to white at L = 1. A tone is its
     luminance in the given hue, as saturated as the display allows: `peak t / knee` up to the knee, then linear to white.
-    Both functions rise, so darker stays darker, and luminance in [0, 1] stays in the display's range. The only exception
-    is `tint` to white, which is flat after the bend.
     """
 
     peak: Tensor  # [3] the brightest colour of the hue and saturation: its largest channel is 1
@@ -140,8 +126,7 @@ class Shades(NamedTuple):
     gain: Tensor  # [] ratio of new to old luminance
     bend: Tensor  # [] old luminance up to which the ratio holds; infinite if it holds throughout
 
-    def __repr__(self) -> str:
-        return short_repr(self)
+    __repr__ = short_repr
 
     def __call__(self, luminance: Tensor) -> tuple[Tensor, Tensor]:  # [n] -> [n, 3], [n, 3]
         """The colour of each luminance, and by how much it changes per unit of luminance."""
@@ -169,8 +154,7 @@ def tint(rgb: Tensor, middle: Tensor) -> Shades:  # [3], []
     """Shades that turn the luminance `middle` (> 0) into `rgb` and keep ratios, as a change of albedo does.
 
     A darker colour than before keeps all ratios. A brighter one could leave the display's range: then ratios hold until
-    the hue is at its brightest, or half-way to white, and brighter values go linearly to white. If `rgb` is white, ratios
-    hold up to `middle`, and all above it is white.
+    the hue is at its brightest, or halfway to white, and brighter values go linearly to white.
     """
     shades = same_luminance(rgb)
     target = rgb @ rgb.new_tensor(LUMINANCE)

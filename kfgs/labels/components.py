@@ -9,8 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from .._check import check_range, check_shapes
-from .._typed import typed
+from .._check import as_tensor, check_range, check_shapes
 from .nearest import Array, positions
 
 NEIGHBOURS = 8  # nearest neighbours of each point that are joined first
@@ -27,22 +26,14 @@ def component_distance(
     """The default distance of `component_numbers`, in world units: it keeps a thing in one piece, and things apart.
 
     1.5 times the distance within which 90 % of the masked Gaussians have their fourth neighbour among themselves, but at
-    most four times that of all Gaussians. Sparse things (bare walls, a sofa) get a larger distance than dense ones. On
-    room_0's colour field (149,213 Gaussians; 0.03 m for the plant, 0.2 m for the door) this finds 2 chairs, 2 stools,
-    2 sofas, 3 tables and 4 heaps of cushions. No constant works: 0.08 m joins the two chairs and still breaks a sofa.
-    Measured on an evenly strided sample of at most 20,000; copies at one position count once.
-
-    Raises:
-        ValueError: if shapes disagree or a position is not finite.
+    most four times that of all Gaussians. No constant works: on room_0 0.08 m joins two chairs and still breaks a sofa.
     """
-    check_shapes(("means", means, "N 3"), ("mask", mask, "N"))
     points = positions("means", means)
-    own, all_of_them = _spacing(points[mask.cpu().numpy()]), _spacing(points)
-    chosen = min(SPACINGS * own, MOST_SPACINGS * all_of_them)
+    own, whole = _spacing(points[mask.cpu().numpy()]), _spacing(points)
+    chosen = min(SPACINGS * own, MOST_SPACINGS * whole)
     return chosen if chosen > 0 else 1.0  # all at one position: any distance joins them
 
 
-@typed
 def component_numbers(
     means: Tensor,  # [N, 3]
     mask: Tensor,  # [N] bool
@@ -51,7 +42,7 @@ def component_numbers(
     """Number the connected parts of the Gaussians under a mask: 0 is the largest, -1 lies outside the mask.
 
     Two Gaussians are connected if their means are at most `distance` apart, directly or through others under the mask. Of
-    equally large parts the one with the lowest index comes first.
+    equally large parts the one with the lowest index comes first. 600,000 Gaussians take about 5 seconds on one core.
 
     Args:
         means: positions, in world units.
@@ -61,20 +52,16 @@ def component_numbers(
     Raises:
         ValueError: if shapes disagree, a position is not finite, or the distance is not positive.
         TypeError: if the mask is not boolean.
-
-    Note:
-        600,000 Gaussians take about 5 seconds on one core and 0.7 GB, however dense they lie.
     """
+    means, mask = as_tensor("means", means), as_tensor("mask", mask)
     check_shapes(("means", means, "N 3"), ("mask", mask, "N"))
     if mask.dtype != torch.bool:
         raise TypeError(f"mask: expected a boolean mask, got {mask.dtype}; compare first, as in labels == 3")
-    points = positions("means", means)
-    numbers = torch.full(mask.shape, -1, dtype=torch.int64, device=mask.device)
-    if distance is None:
-        distance = component_distance(means, mask)
+    distance = component_distance(means, mask) if distance is None else distance
     check_range("distance", distance, 0, closed=(False, False))
-    found = radius_components(points[mask.cpu().numpy()], distance)
-    numbers[mask] = torch.from_numpy(found).to(mask.device)
+    points = positions("means", means)[mask.cpu().numpy()]
+    numbers = torch.full(mask.shape, -1, dtype=torch.int64, device=mask.device)
+    numbers[mask] = torch.from_numpy(radius_components(points, distance)).to(mask.device)
     return numbers
 
 
@@ -82,24 +69,18 @@ def radius_components(
     points: Array,  # [n, 3] float64
     distance: float,
 ) -> Array:  # [n] int64
-    """Number the components of the graph that joins points at most `distance` apart, exactly.
+    """Number the components of the graph that joins points at most `distance` apart, exactly; the largest first.
 
-    `scipy.spatial.cKDTree.query_pairs` would list all near pairs: gigabytes for a dense cloud. Here each point is joined to
-    its 8 nearest. If a pair is left out, both points have more than 8 neighbours in range. So for these points the nearest
-    point of another part is searched, until none is in range. All parts are searched at once: parts are numbered, and
-    each binary digit of the number divides them into two sets. Two different numbers differ in some digit.
-
-    Part 0 is the largest; of equally large parts the one with the lowest point comes first.
-
-    Note:
-        100,000 points with 300 neighbours each: 0.5 s and 64 MB on one core (`query_pairs`: 2.4 s and 600 MB).
+    `cKDTree.query_pairs` would list all near pairs: gigabytes for a dense cloud. Here each point is joined to its 8
+    nearest. If a pair is left out, both points have more than 8 neighbours in range. For these points the nearest point
+    of another part is searched, until none is in range: each binary digit of the parts' numbers divides them into two
+    sets, and two different numbers differ in some digit.
     """
     if len(points) == 0:
         return np.zeros(0, dtype=np.int64)
     places, place = np.unique(points, axis=0, return_inverse=True)  # sorted, so that queries of neighbours follow
-    n = len(places)
-    k = min(NEIGHBOURS + 1, n)
-    near, index = (np.reshape(found, (n, k)) for found in _nearest_within(places, places, distance, k))
+    n, k = len(places), min(NEIGHBOURS + 1, len(places))
+    near, index = (np.reshape(part, (n, k)) for part in _nearest_within(places, places, distance, k))
     hit = near <= distance
     part = _united(n, np.repeat(np.arange(n), k)[hit.ravel()], index[hit])
     crowded = np.flatnonzero(hit.all(axis=1)) if k < n else np.empty(0, dtype=np.int64)
@@ -107,19 +88,27 @@ def radius_components(
         numbers = np.unique(part[crowded], return_inverse=True)[1]
         links = [np.empty((2, 0), dtype=np.int64)]
         for digit in range(int(numbers.max(initial=0)).bit_length()):
-            one = (numbers >> digit) & 1 == 1
-            few, many = sorted((crowded[one], crowded[~one]), key=len)
+            side = (numbers >> digit) & 1 == 1
+            few, many = sorted((crowded[side], crowded[~side]), key=len)
             near, index = _nearest_within(places[few], places[many], distance)
             hit = near <= distance
             links.append(np.stack([many[hit], few[index[hit]]]))
         joined = np.concatenate(links, axis=1)
         if joined.shape[1] == 0:
-            return _by_size(part[place.ravel()])
+            break
         part = _united(int(part.max()) + 1, *part[joined])[part]
+    part = part[place.ravel()]
+    first, count = np.unique(part, return_index=True, return_counts=True)[1:]
+    rank = np.empty(len(count), dtype=np.int64)
+    rank[np.lexsort((first, -count))] = np.arange(len(count))  # by size, then by the lowest point
+    return rank[part]
 
 
 def _spacing(points: Array) -> float:
-    """The distance within which 90 % of the positions have their fourth neighbour (the last, if fewer); 0 for one position."""
+    """The distance within which 90 % of the positions have their fourth neighbour (the last, if fewer); 0 for one position.
+
+    Measured on an evenly strided sample of at most 20,000; copies at one position count once.
+    """
     places = np.unique(points, axis=0)
     if len(places) < 2:
         return 0.0
@@ -129,10 +118,10 @@ def _spacing(points: Array) -> float:
     return float(np.quantile(near[:, k], QUANTILE))
 
 
-def _nearest_within(points: Array, asked: Array, distance: float, k: int = 1) -> tuple[Array, Array]:
+def _nearest_within(points: Array, queries: Array, distance: float, k: int = 1) -> tuple[Array, Array]:
     """Distance and index of the k nearest points; farther than `distance` is infinite."""
     reach = distance * (1 + 1e-9)  # scipy's bound is strict, ours is not
-    near, index = cKDTree(points).query(asked, k=k, distance_upper_bound=reach, workers=-1)
+    near, index = cKDTree(points).query(queries, k=k, distance_upper_bound=reach, workers=-1)
     return np.asarray(near), np.asarray(index)
 
 
@@ -140,11 +129,3 @@ def _united(n: int, a: Array, b: Array) -> Array:
     edges = coo_matrix((np.ones(len(a), dtype=bool), (a, b)), shape=(n, n))
     labels: Array = connected_components(edges, directed=False)[1]
     return labels
-
-
-def _by_size(part: Array) -> Array:
-    """Number the parts by size, then by their lowest point."""
-    first, count = np.unique(part, return_index=True, return_counts=True)[1:]
-    rank = np.empty(len(count), dtype=np.int64)
-    rank[np.lexsort((first, -count))] = np.arange(len(count))
-    return rank[part]

@@ -47,7 +47,7 @@ class Transfer:
 
     @property
     def ambiguous(self) -> int:
-        """The number of labelled destinations with another label among the sources near them."""
+        """The number of labelled destinations whose nearest sources disagree."""
         return int(self.disagree.sum())
 
     @property

@@ -14,17 +14,14 @@ from torch import Tensor
 
 from .._check import check_choice, check_range, check_shapes
 from .._rows import check_finite
-from .._typed import typed
 from .selection import Selection
 
 TEMPERATURE = 10.0  # factor of the cosines in LERF (Kerr 2023)
 CANONICAL = ("object", "things", "stuff", "texture")  # LERF's negatives for a scene without known classes
 EVEN = 0.5  # relevancy of a feature that is equally similar to the query and to its nearest negative
-LOGIT_SCALES = {
-    "raw": 1.0,  # Feature 3DGS's editing: nearly uniform
-    "lseg": 1 / 0.07,  # 14.2857, of LSeg's training
-    "clip": 100.0,  # at the end of CLIP's training
-}
+LOGIT_SCALE = (
+    100.0  # of the softmax: CLIP's at the end of its training (LSeg trains with 14.3, Feature 3DGS edits with 1)
+)
 Array = np.ndarray[Any, Any]
 Score = Literal["cosine", "softmax", "relevancy"]
 
@@ -38,7 +35,6 @@ to three quarters may lie above it (the walls of a room), if it is 5 times spars
 TOP, WAY = 0.999, 0.7  # if no gap is clear: 70 % of the way from the median to the 99.9 % quantile
 
 
-@typed
 def relevancy(
     similarity: Tensor,  # [N]
     negatives: Tensor,  # [N, M]
@@ -57,7 +53,6 @@ def relevancy(
         ValueError: if shapes disagree, there is no negative, or a number is not finite.
 
     Example:
-        >>> import torch
         >>> relevancy(torch.tensor([0.9, 0.3]), torch.tensor([[0.2, 0.9], [0.1, 0.2]])).tolist()
         [0.5, 0.7310585975646973]
     """
@@ -69,45 +64,39 @@ def relevancy(
     return torch.sigmoid(TEMPERATURE * (similarity - negatives.amax(dim=1)))
 
 
-def text_scores(
+def select_by_similarity(
     similarity: Tensor,  # [N]
     negatives: Tensor | None = None,  # [N, M]
+    threshold: float | None = None,
     valid: Tensor | None = None,  # [N] bool
     *,
     score: Score | None = None,
-    logit_scale: float | str = "clip",
-) -> Tensor:  # [N]
-    """How well N features fit a query, from their cosines with it and with negatives (words to exclude).
+    logit_scale: float = LOGIT_SCALE,
+) -> Selection:
+    """Select the Gaussians with a score above gamma; the score is the cosine, or with negatives the relevancy.
 
-    - "cosine": the cosine, in [-1, 1]; negatives do not matter.
-    - "softmax": the query's entry of softmax(l [s, n_1, ..., n_M]), in (0, 1): its share among all words. **Convention**:
-      l multiplies the cosines (CLIP's logit scale, 1 / temperature), so a larger l is sharper.
-    - "relevancy": LERF's `relevancy`, in (0, 1): against the most similar negative only.
-
-    Measured on room_0 (LSeg-like teacher, scores averaged over 30 views, all other classes as negatives, gamma as
-    `select_by_similarity` finds it; mean IoU over 18 classes with the data set's labels): cosine 0.88, relevancy 0.90,
-    softmax 0.84 "raw", 0.86 "lseg", 0.92 "clip".
+    If gamma is not given, `similarity_threshold` finds it in the scores. For a relevancy it is 0.5: more similar to the
+    query than to any negative. On room_0 (scores averaged over 30 views, all other classes as negatives; mean IoU over 18
+    classes with the data set's labels): cosine 0.88, relevancy 0.90, softmax 0.92.
 
     Args:
         similarity: cosine with the query.
-        negatives: cosine with each negative.
-        valid: features that are not all-zero; the others score 0.
-        score: see above; None: the relevancy with negatives, the cosine without.
-        logit_scale: l of the softmax: a positive number, "raw" (1: Feature 3DGS), "lseg" (14.29) or "clip" (100).
+        negatives: cosine with each negative (words to exclude), or None.
+        threshold: gamma; a cosine in [-1, 1], or another score in [0, 1].
+        valid: Gaussians whose feature is not all-zero; the others are not selected, score 0, and do not influence gamma.
+        score: "cosine", in [-1, 1]; "relevancy", in (0, 1); or "softmax": the query's entry of
+            softmax(l [s, n_1, ..., n_M]), its share among all words. None: the relevancy with negatives, else the cosine.
+        logit_scale: l of the softmax; a larger one is sharper.
 
     Raises:
-        ValueError: if shapes disagree, negatives are missing, a number is not finite, or an option is unknown.
-
-    Example:
-        >>> import torch
-        >>> text_scores(torch.tensor([0.9]), torch.tensor([[0.9, 0.9]]), score="softmax").tolist()
-        [0.3333333432674408]
+        ValueError: if shapes disagree, negatives are missing, a number is not finite, or an option is out of range.
     """
     check_shapes(("similarity", similarity, "N"), ("negatives", negatives, "N M"), ("valid", valid, "N"))
     check_finite("similarity", similarity)
-    if score is None:
-        score = "cosine" if negatives is None else "relevancy"
+    score = score or ("cosine" if negatives is None else "relevancy")
     check_choice("score", score, ("cosine", "softmax", "relevancy"))
+    if threshold is not None:
+        check_range("threshold", threshold, -1 if score == "cosine" else 0, 1)
     if score == "cosine":
         scores = similarity
     elif negatives is None:
@@ -116,57 +105,24 @@ def text_scores(
         scores = relevancy(similarity, negatives)
     else:
         check_finite("negatives", negatives)
-        logits = _scale(logit_scale) * torch.cat([similarity[:, None], negatives], dim=1)
-        scores = logits.softmax(dim=1)[:, 0]
-    return scores if valid is None else scores.masked_fill(~valid, 0)
-
-
-def select_by_similarity(
-    similarity: Tensor,  # [N]
-    negatives: Tensor | None = None,  # [N, M]
-    threshold: float | None = None,
-    valid: Tensor | None = None,  # [N] bool
-    *,
-    score: Score | None = None,
-    logit_scale: float | str = "clip",
-) -> Selection:
-    """Select the Gaussians with a score above gamma; the score is the cosine, or with negatives the relevancy.
-
-    If gamma is not given, `similarity_threshold` finds it in the scores. For a relevancy it is 0.5: more similar to the
-    query than to any negative.
-
-    Args:
-        similarity: cosine with the query.
-        negatives: cosine with each negative, or None.
-        threshold: gamma; a cosine in [-1, 1], or another score in [0, 1].
-        valid: Gaussians whose feature is not all-zero; the others are not selected, score 0, and do not influence gamma.
-        score: as in `text_scores`.
-        logit_scale: as in `text_scores`.
-
-    Raises:
-        ValueError: as `text_scores`, or if the threshold is out of range.
-    """
-    scores = text_scores(similarity, negatives, valid, score=score, logit_scale=logit_scale)
+        check_range("logit_scale", logit_scale, 0, closed=(False, True))
+        scores = (logit_scale * torch.cat([similarity[:, None], negatives], dim=1)).softmax(dim=1)[:, 0]
     known = torch.ones_like(similarity, dtype=torch.bool) if valid is None else valid
-    relevant = score == "relevancy" or (score is None and negatives is not None)
-    cosine = not relevant and score != "softmax"
+    scores = scores.masked_fill(~known, 0)
     if threshold is not None:
-        check_range("threshold", threshold, -1 if cosine else 0, 1)
         gamma, how = float(threshold), "given"
-    elif relevant:
+    elif score == "relevancy":
         assert negatives is not None
         gamma, how = EVEN, f"more like the query than like any of {negatives.shape[1]} negatives"
     else:
         gamma, how = similarity_threshold(scores[known])
     if score == "softmax":
         assert negatives is not None
-        how += f"; softmax over {1 + negatives.shape[1]} words, logit scale {_scale(logit_scale):.4g}"
+        how += f"; softmax over {1 + negatives.shape[1]} words, logit scale {logit_scale:.4g}"
     return Selection((scores > gamma) & known, scores, gamma, how)
 
 
-def similarity_threshold(
-    scores: Tensor, times: Tensor | None = None
-) -> tuple[float, str]:  # scores: [N], times: [N] int64
+def similarity_threshold(scores: Tensor) -> tuple[float, str]:  # scores: [N]
     """Choose gamma, a threshold between the highest mode of the scores and the rest, and say how it was found.
 
     A target is often a hundredth of the scene, and the rest has several modes. Otsu's threshold then cuts the rest in two
@@ -176,12 +132,7 @@ def similarity_threshold(
     way from the median to the 99.9 % quantile.
 
     Measured with scores averaged over views, as the mean IoU over classes of the selected Gaussians with those of the
-    true label: room_0 (18 classes) 0.88, and 0.90 with the best threshold in hindsight; without a bound on the share and
-    with Otsu's threshold if no gap is clear, 0.79. On the toy room (13 classes) 0.98.
-
-    Args:
-        scores: of the Gaussians.
-        times: how many Gaussians have each of the scores, all at least 1; None: one each.
+    true label: room_0 (18 classes) 0.88, and 0.90 with the best threshold in hindsight. On the toy room (13 classes) 0.98.
 
     Returns:
         The threshold and one line that says how it was found. No scores give 1.0, all-equal scores their value. Selection
@@ -190,48 +141,31 @@ def similarity_threshold(
     values = scores.detach().double().cpu().numpy()
     if values.size == 0:
         return 1.0, "no scores: nothing to select"
-    weights = None if times is None else times.cpu().numpy()
-    count = values.size if weights is None else int(weights.sum())
     low, high = float(values.min()), float(values.max())
     if high - low < 1e-6:  # float32 cosines differ by this much through rounding alone
-        return high, f"all {count} scores are equal ({high:.3f}): nothing stands out"
-    counts, edges = np.histogram(values, bins=BINS, range=(low, high), weights=weights)
+        return high, f"all {values.size} scores are equal ({high:.3f}): nothing stands out"
+    counts, edges = np.histogram(values, bins=BINS, range=(low, high))
     centres = (edges[1:] + edges[:-1]) / 2
-    density = np.log10(1 + gaussian_filter1d(counts * (PER / count), SMOOTHING, mode="constant"))
+    density = np.log10(1 + gaussian_filter1d(counts * (PER / values.size), SMOOTHING, mode="constant"))
     highest_below = np.maximum.accumulate(density)
     highest_above = np.maximum.accumulate(density[::-1])[::-1]
     depth = np.minimum(highest_below, highest_above) - density
-    above = 1 - np.cumsum(counts) / count
+    above = 1 - np.cumsum(counts) / values.size
     parts = ((np.arange(BINS) >= _past_flank(density, above, share), clear) for share, clear in SHARES)
     candidates = [depth * part for part, clear in parts if (depth * part).max() >= clear]
     if not candidates:
-        median, top = _quantiles(values, weights, (0.5, TOP))
-        threshold = float(median + WAY * (top - median))
-        return threshold, (
+        median, top = np.quantile(values, (0.5, TOP))
+        return float(median + WAY * (top - median)), (
             f"{WAY:.0%} of the way from the median {median:.3f} to the top {top:.3f}: no clear gap between modes of "
-            f"{count} scores; check the scores"
+            f"{values.size} scores; check the scores"
         )
     depth = candidates[0]
     deep = np.flatnonzero(depth >= depth.max() / 2)
     breaks = np.flatnonzero(np.diff(deep) > 1)
     gap = deep[breaks[-1] + 1 :] if breaks.size else deep  # the last run of neighbouring bins
     floor = gap[density[gap] <= density[gap].min() + 1e-9]
-    threshold = float(centres[floor].mean())
-    sparser = 10 ** depth[gap].max()
-    return threshold, f"gap at {threshold:.3f}: {sparser:.0f} x sparser than the modes beside it ({count} scores)"
-
-
-def _quantiles(values: Array, times: Array | None, shares: tuple[float, ...]) -> Array:
-    """`np.quantile`, where each value counts several times."""
-    if times is None:
-        return np.asarray(np.quantile(values, shares))
-    order = np.argsort(values)
-    end = np.cumsum(times[order])  # of the run of equal values, if each were repeated
-    place = np.array(shares) * (end[-1] - 1)
-    below, above = (
-        values[order][np.searchsorted(end, rounded, side="right")] for rounded in (np.floor(place), np.ceil(place))
-    )
-    return np.asarray(below + (place - np.floor(place)) * (above - below))
+    threshold, sparser = float(centres[floor].mean()), 10 ** depth[gap].max()
+    return threshold, f"gap at {threshold:.3f}: {sparser:.0f} x sparser than the modes beside it ({values.size} scores)"
 
 
 def _past_flank(density: Array, above: Array, share: float) -> int:
@@ -240,11 +174,3 @@ def _past_flank(density: Array, above: Array, share: float) -> int:
     while 0 < start < BINS and density[start] > density[start - 1]:
         start += 1
     return start
-
-
-def _scale(logit_scale: float | str) -> float:
-    if isinstance(logit_scale, str):
-        check_choice("logit_scale", logit_scale, LOGIT_SCALES)
-        return LOGIT_SCALES[logit_scale]
-    check_range("logit_scale", logit_scale, 0, closed=(False, True))
-    return float(logit_scale)

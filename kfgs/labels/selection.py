@@ -20,13 +20,11 @@ from .nearest import Array, positions
 class Selection:
     """Some of N Gaussians, with a score for every one of them.
 
-    `a & b`, `a | b`, `a ^ b`, `a - b` and `~a` combine selections of the same Gaussians. Scores follow Zadeh's rules:
-    `&` takes the smaller, `|` the larger, `~a` has 1 - score; `a - b` is `a & ~b`, and `a ^ b` is `(a - b) | (b - a)`.
-    `len` is the number selected, so an empty selection is false in an `if`. `OfClass("chair").select(gaussians)`,
-    `SemanticField.query` and `Selection.of(mask)` make selections.
+    `a & b`, `a | b`, `a - b` and `~a` combine selections of the same Gaussians. Scores follow Zadeh's rules: `&` takes the
+    smaller, `|` the larger, `~a` has 1 - score; `a - b` is `a & ~b`. `len` is the number selected, so an empty selection is
+    false in an `if`. `OfClass("chair").select(gaussians)`, `SemanticField.query` and `Selection.of(mask)` make selections.
 
     Example:
-        >>> import torch
         >>> near = Selection.of(torch.tensor([True, True, False]), "near")
         >>> near.points(torch.tensor([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]])).max(axis=0).tolist()
         [1.0, 0.0, 0.0]
@@ -41,11 +39,7 @@ class Selection:
 
     @classmethod
     def of(cls, mask: Tensor | Array, how: str = "given") -> Selection:  # mask: [N] bool
-        """A selection from a mask alone: scores are 1 inside, 0 outside.
-
-        Raises:
-            TypeError: if the mask is not boolean.
-        """
+        """A selection from a mask alone: scores are 1 inside, 0 outside."""
         mask = as_tensor("mask", mask)
         return cls(mask, mask.to(torch.get_default_dtype()), None, how)
 
@@ -80,24 +74,13 @@ class Selection:
         return self.how if self.threshold is None else f"score > {self.threshold:.4g} ({self.how})"
 
     def points(self, cloud: Gaussians | Tensor) -> Array:  # [n, 3] float64
-        """The centres of the selected Gaussians as a numpy array, in world units.
-
-        Args:
-            cloud: the selection's Gaussians, or their positions [N, 3].
-
-        Raises:
-            ValueError: if the cloud has another number of Gaussians.
-        """
+        """The centres of the selected Gaussians in world units; `cloud` is their cloud, or positions [N, 3]."""
         means = to_world(cloud.means, cloud.origin) if isinstance(cloud, Gaussians) else as_tensor("cloud", cloud)
         check_shapes(("selection.mask", self.mask, "N"), ("cloud", means, "N 3"))
         return positions("cloud", means[self.mask])
 
     def box(self, cloud: Gaussians | Tensor) -> OrientedBox:
-        """A small box around the centres of the selected Gaussians; `cloud` as in `points`.
-
-        Raises:
-            ValueError: if nothing is selected, or as `points`.
-        """
+        """A small box around `points`; a ValueError if nothing is selected."""
         return OrientedBox.around(torch.from_numpy(self.points(cloud)))
 
     def within(self, mask: Tensor, how: str) -> Selection:  # mask: [N] bool
@@ -106,27 +89,21 @@ class Selection:
         return Selection(self.mask & mask, self.scores, self.threshold, f"{self.how}; {how}" if self.how else how)
 
     def __and__(self, other: Selection) -> Selection:
-        scores = self._beside(other)
-        return Selection(
-            self.mask & other.mask, torch.minimum(*scores), None, f"({self.summary}) and ({other.summary})"
-        )
+        scores = torch.minimum(*self._both_scores(other))
+        return Selection(self.mask & other.mask, scores, None, f"({self.summary}) and ({other.summary})")
 
     def __or__(self, other: Selection) -> Selection:
-        scores = self._beside(other)
-        return Selection(self.mask | other.mask, torch.maximum(*scores), None, f"({self.summary}) or ({other.summary})")
+        scores = torch.maximum(*self._both_scores(other))
+        return Selection(self.mask | other.mask, scores, None, f"({self.summary}) or ({other.summary})")
 
     def __invert__(self) -> Selection:
         return Selection(~self.mask, 1 - self.scores, None, f"not ({self.summary})")
 
     def __sub__(self, other: Selection) -> Selection:
-        self._beside(other)
+        self._both_scores(other)
         return self & ~other
 
-    def __xor__(self, other: Selection) -> Selection:
-        self._beside(other)
-        return (self - other) | (other - self)
-
-    def _beside(self, other: Selection) -> tuple[Tensor, Tensor]:
+    def _both_scores(self, other: Selection) -> tuple[Tensor, Tensor]:
         """Both scores in one dtype, after a check that both select among the same Gaussians."""
         if not isinstance(other, Selection):
             raise TypeError(

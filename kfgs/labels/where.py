@@ -6,23 +6,21 @@
 from __future__ import annotations
 
 import math
-import numbers
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, TypeVar
 
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from .._card import say_coordinate
 from .._check import check_range, check_whole
 from .._names import class_indices
 from .._origin import to_world
-from .._rows import check_finite
 from ..gaussians import Gaussians
 from .components import component_numbers
+from .nearest import positions
 from .selection import Selection
 
 T = TypeVar("T")
@@ -35,11 +33,7 @@ class Where(ABC):
 
     @abstractmethod
     def select(self, gaussians: Gaussians) -> Selection:
-        """Apply the rule to a cloud.
-
-        Raises:
-            ValueError: if the cloud lacks the labels, class or index that the rule needs.
-        """
+        """Apply the rule; a ValueError if the cloud lacks the labels, class or index that it needs."""
 
     def to_json(self) -> dict[str, Any]:
         """Plain values that JSON can hold: `kind`, and the fields."""
@@ -93,36 +87,25 @@ class OfClass(Where):
 
 @dataclass(frozen=True)
 class InBox(Where):
-    """The Gaussians whose centres lie in a box, faces included. For an `OrientedBox` see `OrientedBox.contains`.
-
-    With a rotation R the box is first laid out along the axes and then turned about its own centre c: a point x is inside
-    if c + R^T (x - c) lies between `min` and `max`.
-    """
+    """The Gaussians whose centres lie in a box along the world's axes, faces included."""
 
     kind: ClassVar[str] = "box"
     min: tuple[float, ...]
     """The least x, y, z, world units."""
     max: tuple[float, ...]
     """The greatest x, y, z."""
-    rotation: tuple[float, ...] | None = None
-    """A quaternion (w, x, y, z) of any length; None for no rotation."""
 
     def __post_init__(self) -> None:
-        set_fields(self, min=numbers_of("min", self.min, 3), max=numbers_of("max", self.max, 3))
+        set_fields(self, min=three_numbers("min", self.min), max=three_numbers("max", self.max))
         if any(low > high for low, high in zip(self.min, self.max, strict=True)):
             raise ValueError(f"max: expected no less than min {self.min} on every axis, got {self.max}; swap them")
-        if self.rotation is not None:
-            set_fields(self, rotation=quaternion_of("rotation", self.rotation))
 
     def select(self, gaussians: Gaussians) -> Selection:
         """See `Where.select`."""
         points = _points(gaussians)
-        low, high = points.new_tensor(self.min), points.new_tensor(self.max)
-        if self.rotation is not None:
-            center = (low + high) / 2
-            points = (points - center) @ rotation_matrix(self.rotation).to(points) + center  # rows: R^T (x - c)
+        inside = (points >= points.new_tensor(self.min)) & (points <= points.new_tensor(self.max))
         size = " x ".join(f"{b - a:.4g}" for a, b in zip(self.min, self.max, strict=True))
-        return Selection.of(((points >= low) & (points <= high)).all(dim=1), f"in a box of {size}")
+        return Selection.of(inside.all(dim=1), f"in a box of {size}")
 
 
 @dataclass(frozen=True)
@@ -134,7 +117,7 @@ class InSphere(Where):
     radius: float
 
     def __post_init__(self) -> None:
-        set_fields(self, center=numbers_of("center", self.center, 3))
+        set_fields(self, center=three_numbers("center", self.center))
         check_range("radius", self.radius, 0, closed=(False, False))
 
     def select(self, gaussians: Gaussians) -> Selection:
@@ -180,39 +163,17 @@ KINDS: dict[str, type[Where]] = {kind.kind: kind for kind in (OfClass, InBox, In
 
 
 def _points(gaussians: Gaussians) -> Tensor:  # [N, 3] float64, in the world
-    check_finite("gaussians.means", gaussians.means)
-    return to_world(gaussians.means.detach().double(), gaussians.origin)
+    return to_world(torch.from_numpy(positions("gaussians.means", gaussians.means)), gaussians.origin)
 
 
-def numbers_of(name: str, values: Any, count: int) -> tuple[float, ...]:
-    """`count` finite numbers from a list, tuple, array or tensor, as a tuple.
-
-    Raises:
-        TypeError: if a value is not a number.
-        ValueError: if there are more or fewer, or one is not finite.
-    """
+def three_numbers(name: str, values: Any) -> tuple[float, ...]:
+    """Three finite numbers from a list, tuple, array or tensor, as a tuple; else a ValueError."""
     plain = values.tolist() if hasattr(values, "tolist") else values
-    real = isinstance(plain, Sequence) and all(isinstance(x, numbers.Real) and not isinstance(x, bool) for x in plain)
-    if not real:
-        raise TypeError(f"{name}: expected {count} numbers, got {values!r:.80}; write them as [x, y, ...]")
-    if len(plain) != count or not all(math.isfinite(value) for value in plain):
-        raise ValueError(f"{name}: expected {count} finite numbers, got {values!r:.80}; give one number per axis")
+    if not isinstance(plain, list | tuple) or len(plain) != 3:
+        raise ValueError(f"{name}: expected 3 numbers, got {values!r:.80}; write them as [x, y, z]")
+    for value in plain:
+        check_range(name, value, -math.inf, closed=(False, False))
     return tuple(float(value) for value in plain)
-
-
-def quaternion_of(name: str, values: Any) -> tuple[float, ...]:
-    """Four numbers (w, x, y, z) that are not all zero."""
-    quaternion = numbers_of(name, values, 4)
-    if not any(quaternion):
-        raise ValueError(f"{name}: expected a quaternion (w, x, y, z), got zeros; (1, 0, 0, 0) is no rotation")
-    return quaternion
-
-
-def rotation_matrix(quaternion: Sequence[float]) -> Tensor:  # (w, x, y, z) of any length -> [3, 3] float64
-    """The rotation matrix of a quaternion; scipy's order is (x, y, z, w)."""
-    largest = max(abs(value) for value in quaternion)  # scipy squares: no overflow
-    w, x, y, z = (value / largest for value in quaternion)
-    return torch.from_numpy(Rotation.from_quat([x, y, z, w]).as_matrix())
 
 
 def set_fields(frozen: Any, **values: Any) -> None:

@@ -20,9 +20,9 @@ from ..cameras.similarity import Similarity
 from ..fields import SemanticField, fuse_views
 from ..formats import read_splats
 from ..gaussians import Gaussians
-from ..labels import LabelSet, Transfer, nearest_labels, vote_labels
+from ..labels import LabelSet, Transfer, nearest_labels
 from ..scenes import Alignment, SceneError, align_by_cameras, frames_agree
-from ..splat.transform import transform_gaussians
+from ..splat import transform_gaussians, vote_labels
 
 By = Literal["distance", "views"]
 WAYS: tuple[By, ...] = ("distance", "views")

@@ -17,6 +17,7 @@ from .rasterize import Rendering, rasterize, rasterize_labels
 from .sh import SH_C0, evaluate_sh, rgb_to_sh0, rotate_sh, sh0_to_rgb
 from .tiles import Tiles, bin_tiles
 from .transform import transform_gaussians
+from .views import average_views, sum_pixels, vote_labels
 
 __all__ = [
     "ALPHA_MAX",
@@ -29,6 +30,7 @@ __all__ = [
     "Tiles",
     "accumulate_pixels",
     "available_engines",
+    "average_views",
     "bin_tiles",
     "composite",
     "covariance_3d",
@@ -41,5 +43,7 @@ __all__ = [
     "rgb_to_sh0",
     "rotate_sh",
     "sh0_to_rgb",
+    "sum_pixels",
     "transform_gaussians",
+    "vote_labels",
 ]

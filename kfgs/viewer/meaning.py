@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from .._card import short_repr
+from .._names import class_index, class_indices
 from ..cameras import Camera
 from ..fields import Linear, SemanticField, fuse_views
 from ..gaussians import Gaussians
-from ..labels import LabelSet, OfClass, Selection, class_index, class_indices
+from ..labels import LabelSet, OfClass, Selection
 from ..labels.questions import class_rows, make_question
 from ..viz.colors import FeatureColors
 

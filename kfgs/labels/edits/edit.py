@@ -22,25 +22,19 @@ from ..nearest import positions
 from ..selection import Selection
 from ..where import OfClass, OfIndex, Where, plain_fields, set_fields
 
-SHOWN = 12  # classes listed in a message
 HIDDEN = 1e-6  # an opacity that every renderer skips (alpha < 1/255) and every file can hold
-
-
 Rules = str | Selection | Where | Sequence[str | Selection | Where]
 """Which Gaussians an edit changes: a class name, a selection or a rule; or several, for all that any of them selects."""
 
 
 class Edit(ABC):
-    """One edit: frozen plain data that can be compared, saved and replayed.
-
-    `op` is its name in JSON. `apply` returns a new cloud and changes nothing in place.
-    """
+    """One edit: frozen plain data that can be compared, saved and replayed. `op` is its name in JSON."""
 
     op: ClassVar[str]
 
     @abstractmethod
     def apply(self, gaussians: Gaussians) -> Gaussians:
-        """The edited cloud.
+        """The edited cloud; the old one stays.
 
         Raises:
             ValueError: if nothing is selected and `allow_empty` is false, or the cloud lacks what the edit needs.
@@ -68,23 +62,14 @@ class OnSelection(Edit):
             raise ValueError("where: expected at least one rule, got none; name a class, or give OfClass('chair')")
         set_fields(self, where=tuple(_rule(rule) for rule in rules))
 
-    @property
-    def rules(self) -> tuple[Where, ...]:
-        """`where` as a tuple of rules."""
-        return self.where  # type: ignore[return-value]  # since __post_init__
-
     def selected(self, gaussians: Gaussians) -> Tensor:  # [N] bool
-        """The mask of the selected Gaussians.
-
-        Raises:
-            ValueError: if nothing is selected and `allow_empty` is false; the message lists the classes present.
-        """
-        mask = reduce(or_, (rule.select(gaussians).mask for rule in self.rules))
+        """The mask of the selected Gaussians; a ValueError if there is none and `allow_empty` is false."""
+        rules: tuple[Where, ...] = self.where  # type: ignore[assignment]  # since __post_init__
+        mask = reduce(or_, (rule.select(gaussians).mask for rule in rules))
         if not self.allow_empty and not bool(mask.any()):
-            rules = ", ".join(map(repr, self.rules))
             raise ValueError(
-                f"where: expected a selection of some of {len(gaussians)} Gaussians, got none from {rules:.120}; "
-                f"{_present(gaussians)} (in Python: or pass allow_empty=True)"
+                f"where: expected a selection of some of {len(gaussians)} Gaussians, got none from "
+                f"{', '.join(map(repr, rules)):.120}; {_present(gaussians)} (in Python: or pass allow_empty=True)"
             )
         return mask
 
@@ -122,8 +107,19 @@ class Remove(OnSelection):
 
     def apply(self, gaussians: Gaussians) -> Gaussians:
         """See `Edit.apply`."""
-        mask = self.selected(gaussians)
-        return gaussians.select(~(mask | _orphans_near(gaussians, mask, self.grow)))
+        mask, labels = self.selected(gaussians), gaussians.labels
+        free = ~mask if labels is None else ~mask & (labels < 0)
+        if self.grow and bool(mask.any()) and bool(free.any()):
+            means = positions("gaussians.means", gaussians.means)
+            gone, candidates, rivals = (means[rows.cpu().numpy()] for rows in (mask, free, ~(mask | free)))
+            to_gone = np.asarray(cKDTree(gone).query(candidates, distance_upper_bound=self.grow)[0])  # infinite beyond
+            near = to_gone < self.grow
+            if len(rivals) and near.any():
+                to_rival = np.asarray(cKDTree(rivals).query(candidates[near], distance_upper_bound=self.grow)[0])
+                near[near] = to_gone[near] <= to_rival
+            mask = mask.clone()
+            mask[free] = torch.from_numpy(near).to(mask.device)
+        return gaussians.select(~mask)
 
 
 @dataclass(frozen=True)
@@ -161,8 +157,7 @@ class Recolor(OnSelection):
 class Opacity(OnSelection):
     """Multiply opacities: 1 changes nothing, 0 hides.
 
-    Hidden Gaussians stay in the cloud with opacity 1e-6 (or less, if they had less). No renderer draws them, indices stay,
-    and file formats with logits can store them. `Remove` deletes them.
+    Hidden Gaussians stay in the cloud with opacity 1e-6 (or less, if they had less): no renderer draws them.
     """
 
     op: ClassVar[str] = "opacity"
@@ -189,24 +184,6 @@ def _present(gaussians: Gaussians) -> str:
     labels = gaussians.labels
     if labels is None:
         return "the cloud carries no labels: widen the box or sphere"
-    sizes: Counter[str] = Counter(class_name(gaussians.names, label) for label in labels[labels >= 0].tolist())
-    named = [f"{name} ({count})" for name, count in sizes.most_common()]
-    more = f" and {len(named) - SHOWN} more" if len(named) > SHOWN else ""
-    return f"classes present are {', '.join(named[:SHOWN]) or 'none'}{more}: select one of them"
-
-
-def _orphans_near(gaussians: Gaussians, mask: Tensor, distance: float) -> Tensor:  # [N] bool -> [N] bool
-    """The unlabelled Gaussians closer than `distance` to the mask, and no farther from it than from other labels."""
-    labels, out = gaussians.labels, torch.zeros_like(mask)
-    free = ~mask if labels is None else ~mask & (labels < 0)
-    if distance == 0 or not bool(mask.any()) or not bool(free.any()):
-        return out
-    means = positions("gaussians.means", gaussians.means)
-    taken, candidates, rivals = (means[rows.cpu().numpy()] for rows in (mask, free, ~(mask | free)))
-    to_taken = np.asarray(cKDTree(taken).query(candidates, distance_upper_bound=distance)[0])  # infinite beyond
-    near = to_taken < distance
-    if len(rivals) and near.any():
-        to_rival = np.asarray(cKDTree(rivals).query(candidates[near], distance_upper_bound=distance)[0])
-        near[near] = to_taken[near] <= to_rival
-    out[free] = torch.from_numpy(near).to(mask.device)
-    return out
+    sizes = Counter(class_name(gaussians.names, label) for label in labels[labels >= 0].tolist())
+    named = ", ".join(f"{name} ({count})" for name, count in sizes.most_common(12))
+    return f"classes present are {named or 'none'}{', ...' * (len(sizes) > 12)}: select one of them"

@@ -37,8 +37,7 @@ class EditError(ValueError):
 class EditList:
     """Edits that are applied one after the other, each to the result of the one before.
 
-    Nothing is changed in place: `then`, `undo` and `redo` give new lists, `apply` a new cloud. `Remove` after `Insert` can
-    remove inserted Gaussians.
+    Nothing is changed in place: `then`, `undo` and `redo` give new lists, `apply` a new cloud.
 
     Example:
         >>> edits = EditList().then(Recolor("plant", "#c04040")).then(Remove("chair"))
@@ -74,21 +73,13 @@ class EditList:
         return EditList((*self.edits, edit))
 
     def undo(self) -> EditList:
-        """The list without its last edit; `redo` restores it.
-
-        Raises:
-            ValueError: if there is nothing to undo.
-        """
+        """The list without its last edit; `redo` restores it. A ValueError if there is none."""
         if not self.edits:
             raise ValueError("edits: expected an edit to undo, got an empty list; add one with then()")
         return EditList(self.edits[:-1], (*self.undone, self.edits[-1]))
 
     def redo(self) -> EditList:
-        """The list with the edit that was undone last.
-
-        Raises:
-            ValueError: if nothing was undone since the last `then`.
-        """
+        """The list with the edit that was undone last; a ValueError if nothing was undone since the last `then`."""
         if not self.undone:
             raise ValueError("undone: expected an edit to redo, got none; undo() one first, and then() forgets them")
         return EditList((*self.edits, self.undone[-1]), self.undone[:-1])
@@ -108,18 +99,14 @@ class EditList:
         return gaussians
 
     def save(self, path: str | Path) -> Path:
-        """Write the list as JSON, undone edits included.
+        """Write the list as JSON, without undone edits.
 
         Files to insert that lie in the folder of the JSON file or below are named relative to it. Others are named in full,
-        and `load` reads them only with `anywhere=True`.
-
-        Raises:
-            ValueError: if an insert holds a cloud in memory.
+        and `load` reads them only with `anywhere=True`. A ValueError if an insert holds a cloud in memory.
         """
         path = as_path(path)
-        lists = {"edits": self.edits, "undone": self.undone}
-        content = {name: [_written(edit, path.parent) for edit in edits] for name, edits in lists.items()}
-        write_json(path, {"format": FORMAT, "version": VERSION, **content})
+        edits = [edit.seen_from(path.parent) if isinstance(edit, Insert) else edit for edit in self.edits]
+        write_json(path, {"format": FORMAT, "version": VERSION, "edits": [edit.to_json() for edit in edits]})
         return path
 
     @staticmethod
@@ -132,8 +119,7 @@ class EditList:
 
         Raises:
             FileNotFoundError: if there is no such file, or a file to insert is missing.
-            ValueError: if it is another kind of file or of another version, or an edit in it is unknown or wrong; the
-                message names the place in the file.
+            ValueError: if it is another kind of file, or an edit in it is unknown or wrong; the message names its place.
         """
         path = as_path(path)
         content = read_json(path)
@@ -141,16 +127,12 @@ class EditList:
             raise ValueError(
                 f"{path}: expected edits that kfgs saved ('format': {FORMAT!r}, 'version': {VERSION}), got something else"
             )
-        try:
-            lists = {name: read_edits(content.get(name, []), name) for name in ("edits", "undone")}
-            return EditList(**{
-                name: tuple(_located(edit, f"{name}[{i}]", path.parent, anywhere) for i, edit in enumerate(edits))
-                for name, edits in lists.items()
-            })  # fmt: skip
-        except FileNotFoundError as error:
-            raise FileNotFoundError(f"{path}: {error}") from error
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
+        name = f"{path}: edits"
+        edits = [
+            edit.found_in(path.parent, f"{name}[{i}]", anywhere=anywhere) if isinstance(edit, Insert) else edit
+            for i, edit in enumerate(read_edits(content.get("edits"), name))
+        ]
+        return EditList(tuple(edits))
 
 
 def read_edits(values: Any, name: str = "edits") -> tuple[Edit, ...]:
@@ -158,11 +140,3 @@ def read_edits(values: Any, name: str = "edits") -> tuple[Edit, ...]:
     if not isinstance(values, list):
         raise ValueError(f"{name}: expected a list of edits, got {values!r:.80}; write it as [...]")
     return tuple(read_object(f"{name}[{i}]", value, OPS, "op") for i, value in enumerate(values))
-
-
-def _written(edit: Edit, folder: Path) -> dict[str, Any]:
-    return (edit.seen_from(folder) if isinstance(edit, Insert) else edit).to_json()
-
-
-def _located(edit: Edit, name: str, folder: Path, anywhere: bool) -> Edit:
-    return edit.found_in(folder, name, anywhere=anywhere) if isinstance(edit, Insert) else edit

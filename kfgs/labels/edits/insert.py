@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ..._check import as_tensor
 from ..._files import real_path
@@ -20,14 +18,14 @@ from ...formats.table import read_splats
 from ...gaussians import Gaussians
 from ..where import set_fields
 from .edit import Edit, class_name
+from .motion import transformed
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Insert(Edit):
     """Add the Gaussians of another splat file after those of the scene; `join` says what happens to labels and columns.
 
-    The file is read when the edit is applied. Two inserts are equal if they have the same similarity and name the same file,
-    relative to the working folder or in full.
+    The file is read when the edit is applied.
     """
 
     op: ClassVar[str] = "insert"
@@ -43,31 +41,15 @@ class Insert(Edit):
             matrix = as_tensor("similarity", self.similarity, floating=True).double()
             set_fields(self, similarity=Similarity.from_matrix(matrix))
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Insert) and self._key() == other._key()
-
-    def __hash__(self) -> int:
-        return hash(self._key()[0])
-
-    def _key(self) -> tuple[Any, Any]:
-        source = id(self.source) if isinstance(self.source, Gaussians) else os.path.realpath(self.source)
-        return source, None if self.similarity is None else self.similarity.matrix().tolist()
-
     def apply(self, gaussians: Gaussians) -> Gaussians:
         """See `Edit.apply`; reads the file if it is one."""
-        from .motion import transformed
-
         part = self.source if isinstance(self.source, Gaussians) else read_splats(self.source)
         if self.similarity is not None:
             part = transformed(part, self.similarity, gaussians.origin)
         return join(gaussians, part)
 
     def to_json(self) -> dict[str, Any]:
-        """See `Edit.to_json`.
-
-        Raises:
-            ValueError: if the source is a cloud in memory.
-        """
+        """See `Edit.to_json`; a ValueError if the source is a cloud in memory."""
         if isinstance(self.source, Gaussians):
             raise ValueError(
                 "source: expected a path to save this edit, got Gaussians in memory; write them with write_splats and "
@@ -107,30 +89,17 @@ def join(first: Gaussians, second: Gaussians) -> Gaussians:
     """The Gaussians of two clouds, the first before the second; dtype, device, origin and rendering are those of the first.
 
     - Spherical harmonics: the lower degree is padded with zeros, which changes no colour.
-    - Labels: classes with the same name are the same class. If the first cloud has the name twice, the lowest label is
-      used. New names that occur are added after those of the first. A class without a name is called `class 7` if the
-      other cloud has names; if neither has names, indices are kept.
-    - If one cloud lacks them: labels become -1 (none); scores, features and other columns 0.
+    - Labels: classes with the same name are the same class, new ones come after those of the first. A class without a name
+      is called `class 7` if the other cloud has names; if neither has names, indices are kept.
+    - What one of them lacks: labels become -1 (none); scores, features and other columns 0.
 
     Raises:
         ValueError: if one has colours and the other has none, or their features have different channels.
     """
-    second = second.with_origin(first.origin)
+    second = second.to(first.means.device, first.means.dtype).with_origin(first.origin)
     if (first.sh is None) != (second.sh is None):
         which = "the scene" if first.sh is None else "what is inserted"
-        raise ValueError(
-            f"sh: expected colours in both clouds, got none in {which}; choose one with colours (in Python: or add them with "
-            "gaussians.replace())"
-        )
-    if (
-        first.features is not None
-        and second.features is not None
-        and first.features.shape[1] != second.features.shape[1]
-    ):
-        raise ValueError(
-            f"features: expected as many channels in both clouds, got {first.features.shape[1]} and "
-            f"{second.features.shape[1]}; insert a splat without features"
-        )
+        raise ValueError(f"sh: expected colours in both clouds, got none in {which}; choose one with colours")
     if first.antialiased != second.antialiased:
         how = ("fainter", "with") if first.antialiased else ("more opaque", "without")
         warnings.warn(
@@ -138,51 +107,32 @@ def join(first: Gaussians, second: Gaussians) -> Gaussians:
             "the scene is",
             stacklevel=2,
         )
-    labels, names = _joined_labels(first, second)
-    rows = {name: _padded(getattr(first, name), getattr(second, name), first, second) for name in JOINED}
-    extra = {}
-    for name in {**first.extra, **second.extra}:
-        columns = [cloud.extra.get(name) for cloud in (first, second)]
-        dtype = np.result_type(*[column for column in columns if column is not None])
-        filled = [
-            np.zeros(len(cloud), dtype) if column is None else column
-            for cloud, column in zip((first, second), columns, strict=True)
-        ]
-        extra[name] = np.concatenate(filled)
-    return first.replace(**rows, labels=labels, names=names, extra=extra)
+    names = first.names
+    if (first.names or second.names) and second.labels is not None:
+        highest = -1 if first.labels is None or not len(first) else int(first.labels.max())
+        known = [class_name(first.names, i) for i in range(max(len(first.names), highest + 1))]
+        renamed = second.labels.clone()
+        for label in second.labels[second.labels >= 0].unique().tolist():
+            name = class_name(second.names, label)
+            known += [] if name in known else [name]
+            renamed[second.labels == label] = known.index(name)
+        second, names = second.replace(labels=renamed), tuple(known)
+    clouds = (first, second)
+    degrees = max(0 if cloud.sh is None else cloud.sh.shape[1] for cloud in clouds)
+    channels = {cloud.features.shape[1] for cloud in clouds if cloud.features is not None}
+    if len(channels) > 1:
+        raise ValueError(f"features: expected as many channels in both clouds, got {sorted(channels)}; drop one side's")
+    columns = {**first.extra, **second.extra}
 
+    def alike(cloud: Gaussians) -> Gaussians:
+        n, like = len(cloud), cloud.means
+        sh = None if cloud.sh is None else torch.nn.functional.pad(cloud.sh, (0, 0, 0, degrees - cloud.sh.shape[1]))
+        fill = {"labels": torch.full((n,), -1, device=like.device), "scores": like.new_zeros(n)}
+        fill |= {"features": like.new_zeros(n, *channels)}
+        lacks = {name for name in fill if getattr(cloud, name) is None}
+        wanted = {name for name in lacks if any(getattr(other, name) is not None for other in clouds)}
+        extra = {name: cloud.extra.get(name, np.zeros(n, values.dtype)) for name, values in columns.items()}
+        filled = {name: fill[name] for name in wanted}
+        return cloud.replace(**filled, sh=sh, names=names, extra=extra, antialiased=first.antialiased)
 
-JOINED = ("means", "quats", "scales", "opacities", "sh", "features", "scores")
-
-
-def _padded(a: Tensor | None, b: Tensor | None, first: Gaussians, second: Gaussians) -> Tensor | None:
-    """One tensor of both clouds; zeros where a cloud has none, or has fewer harmonics."""
-    like = b if a is None else a
-    if like is None:
-        return None
-    parts = [
-        torch.zeros(len(cloud), *like.shape[1:]) if part is None else part for cloud, part in ((first, a), (second, b))
-    ]
-    if like.ndim == 3:
-        most = max(part.shape[1] for part in parts)
-        parts = [torch.nn.functional.pad(part, (0, 0, 0, most - part.shape[1])) for part in parts]
-    return torch.cat([part.to(first.means) for part in parts])
-
-
-def _joined_labels(first: Gaussians, second: Gaussians) -> tuple[Tensor | None, Sequence[str]]:
-    if first.labels is None and second.labels is None:
-        return None, first.names
-    device = first.means.device
-    old, new = (torch.full((len(cloud),), -1) if cloud.labels is None else cloud.labels for cloud in (first, second))
-    old, new = old.to(device), new.to(device)
-    if not first.names and not second.names:
-        return torch.cat([old, new]), ()
-    highest = int(old.max()) if len(old) else -1
-    names = [class_name(first.names, i) for i in range(max(len(first.names), highest + 1))]
-    renamed = new.clone()
-    for label in torch.unique(new[new >= 0]).tolist():
-        name = class_name(second.names, label)
-        if name not in names:
-            names.append(name)
-        renamed[new == label] = names.index(name)
-    return torch.cat([old, renamed]), tuple(names)
+    return Gaussians.cat([alike(first), alike(second)])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -16,9 +15,8 @@ from ..._origin import Origin, to_world
 from ...cameras.similarity import Similarity
 from ...gaussians import Gaussians
 from ...splat.transform import transform_gaussians
-from ..where import numbers_of, quaternion_of, rotation_matrix, set_fields
+from ..where import set_fields, three_numbers
 from .edit import OnSelection
-from .insert import join
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
@@ -29,8 +27,8 @@ class _Motion(OnSelection):
 
     translation: tuple[float, ...] = (0.0, 0.0, 0.0)
     """World units."""
-    rotation: tuple[Any, ...] | None = None
-    """An axis ("x", "y", "z" or a direction) and degrees by the right hand, like `("z", 90)`; or a quaternion (w, x, y, z)."""
+    rotation: tuple[str | tuple[float, ...], float] | None = None
+    """An axis ("x", "y", "z" or a direction) and degrees by the right hand, like `("z", 90)`."""
     scale: float = 1.0
     """> 0"""
     pivot: str | tuple[float, ...] = "centroid"
@@ -39,10 +37,10 @@ class _Motion(OnSelection):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        set_fields(self, translation=numbers_of("translation", self.translation, 3), rotation=_rotation(self.rotation))
+        set_fields(self, translation=three_numbers("translation", self.translation), rotation=_rotation(self.rotation))
         check_range("scale", self.scale, 0, closed=(False, False))
         if self.pivot != "centroid":
-            set_fields(self, pivot=numbers_of("pivot", self.pivot, 3))
+            set_fields(self, pivot=three_numbers("pivot", self.pivot))
 
     def similarity(self, gaussians: Gaussians) -> Similarity:
         """The motion of the selected Gaussians in world axes."""
@@ -90,7 +88,7 @@ class Duplicate(_Motion):
     def apply(self, gaussians: Gaussians) -> Gaussians:
         """See `Edit.apply`."""
         mask = self.selected(gaussians)
-        return join(gaussians, self.moved(gaussians.select(mask))) if bool(mask.any()) else gaussians
+        return Gaussians.cat([gaussians, self.moved(gaussians.select(mask))]) if bool(mask.any()) else gaussians
 
 
 def transformed(gaussians: Gaussians, similarity: Similarity, origin: Origin) -> Gaussians:
@@ -100,17 +98,14 @@ def transformed(gaussians: Gaussians, similarity: Similarity, origin: Origin) ->
     a tenth of the size of what moves, unless they were before.
     """
     moved = transform_gaussians(gaussians, similarity).with_origin(origin)
+    if len(moved) == 0:
+        return moved
     limits = torch.finfo(moved.means.dtype)
-    before, after = (
-        (cloud.means.abs() <= limits.max**0.25) & (cloud.scales > 0) & (cloud.scales <= limits.max**0.25)
-        for cloud in (gaussians, moved)
-    )
-    good, rows = bool((after | ~before).all()), before.all(dim=1)
-    if good and bool(rows.any()):
-        old, new = gaussians.means[rows].double(), moved.means[rows].double()
-        size = torch.maximum(old.amax(0) - old.amin(0), gaussians.scales[rows].amax(0)).max() * similarity.scale
-        good = bool(new.abs().max() * limits.eps <= max(0.1 * size, 2 * old.abs().max() * limits.eps))
-    if not good:
+    largest = torch.maximum(moved.means.abs().max(), moved.scales.max())
+    size = torch.maximum(gaussians.means.amax(0) - gaussians.means.amin(0), gaussians.scales.amax(0)).max()
+    rounding = limits.eps * moved.means.abs().max()
+    allowed = torch.maximum(0.1 * similarity.scale * size, 2 * limits.eps * gaussians.means.abs().max())
+    if not (largest <= limits.max**0.25 and bool((moved.scales > 0).all()) and rounding <= allowed):
         raise ValueError(
             f"expected positions and scales that {moved.means.dtype} can tell apart, got some beyond after scale "
             f"{similarity.scale:g} and translation {[float(f'{part:.3g}') for part in similarity.translation.tolist()]}; move "
@@ -119,23 +114,23 @@ def transformed(gaussians: Gaussians, similarity: Similarity, origin: Origin) ->
     return moved
 
 
-def _rotation(value: Any) -> tuple[Any, ...] | None:
-    if value is None or not isinstance(value, Sequence) or len(value) != 2:
-        return None if value is None else quaternion_of("rotation", value)
+def _rotation(value: Any) -> tuple[Any, float] | None:
+    if value is None:
+        return None
+    if not isinstance(value, list | tuple) or len(value) != 2:
+        raise ValueError(f"rotation: expected an axis and degrees, got {value!r:.80}; write it as ('z', 90)")
     axis, degrees = value
     if not (isinstance(axis, str) and axis in AXES):
-        axis = numbers_of("rotation axis", axis, 3)
+        axis = three_numbers("rotation axis", axis)
         if not any(axis):
             raise ValueError("rotation: expected an axis, got (0, 0, 0); name 'x', 'y', 'z' or a direction")
     check_range("rotation degrees", degrees, -math.inf, closed=(False, False))
     return axis, float(degrees)
 
 
-def _matrix(rotation: tuple[Any, ...] | None) -> Tensor:  # [3, 3] float64
+def _matrix(rotation: tuple[Any, float] | None) -> Tensor:  # [3, 3] float64
     if rotation is None:
         return torch.eye(3, dtype=torch.float64)
-    if len(rotation) == 4:
-        return rotation_matrix(rotation)
     axis = torch.tensor(AXES.get(rotation[0], rotation[0]), dtype=torch.float64)
     axis = axis / axis.abs().max()  # no overflow
     vector = math.fmod(rotation[1], 360) * axis / axis.norm()

@@ -7,20 +7,20 @@ of Eq. 3.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import NamedTuple, TypeVar
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from .._card import short_repr
 from .._check import check_range
-from .._typed import typed
 from ..cameras import Camera
-from ..gaussians import Gaussians
-from ..splat import accumulate_pixels, bin_tiles, project
+from ..gaussians import Gaussians, check_gaussians
+from .engines import accumulate_pixels
+from .project import project
+from .tiles import bin_tiles
 
-T = TypeVar("T")
 MIN_SHARE = 0.7
 """A class needs 70 % of the votes. Gaussians with less lie across a border: in the toy room about 65 % of those with a
 share below 0.8 had the right class, and about 95 % of the others."""
@@ -32,8 +32,7 @@ class ViewAverage(NamedTuple):
     values: Tensor  # [N, C] mean over the pixels, weighted by how much each shows the Gaussian; 0 if none does
     weights: Tensor  # [N] the number of pixels, in all views, that the Gaussian fills
 
-    def __repr__(self) -> str:
-        return short_repr(self)
+    __repr__ = short_repr
 
 
 class Votes(NamedTuple):
@@ -43,8 +42,7 @@ class Votes(NamedTuple):
     shares: Tensor  # [N] the winner's share of the votes, 0 if there were none
     weights: Tensor  # [N] votes cast: the number of pixels, in all views, that the Gaussian fills
 
-    def __repr__(self) -> str:
-        return short_repr(self)
+    __repr__ = short_repr
 
 
 def sum_pixels(
@@ -61,7 +59,6 @@ def sum_pixels(
     return projected.index, *accumulate_pixels(*shape, signal, tiles, engine=engine)
 
 
-@typed
 def average_views(
     gaussians: Gaussians,
     views: Iterable[tuple[Camera, Tensor]],  # maps [H, W, C] of the cameras' sizes
@@ -78,32 +75,20 @@ def average_views(
     Raises:
         ValueError: if there is no view, or a map has another size than its camera or other channels than the first.
     """
-    return average_shown(gaussians, views, lambda view: view, engine=engine)
-
-
-def average_shown(
-    gaussians: Gaussians, views: Iterable[T], show: Callable[[T], tuple[Camera, Tensor]], *, engine: str = "auto"
-) -> ViewAverage:
-    """`average_views`, with a function that makes the camera and the map of a view."""
+    check_gaussians(gaussians)
     sums, weights = None, torch.zeros(len(gaussians)).to(gaussians.means)
-
-    def look(view: T) -> dict[str, Tensor]:
-        camera, signal = show(view)
-        channels = signal.shape[-1] if sums is None and signal.ndim else 0 if sums is None else sums.shape[1]
-        if tuple(signal.shape) != (*camera.size, channels):
-            raise ValueError(
-                f"views: expected a map {(*camera.size, channels)} for camera {camera.name!r}, got "
-                f"{tuple(signal.shape)}; resize it with resize_map"
-            )
-        index, total, weight = sum_pixels(gaussians, camera, signal.to(gaussians.means), engine=engine)
-        return {"index": index, "total": total, "weight": weight}
-
     with torch.no_grad():
-        for part in map(look, views):
-            if sums is None:
-                sums = torch.zeros(len(gaussians), part["total"].shape[1]).to(gaussians.means)
-            sums.index_add_(0, part["index"], part["total"])
-            weights.index_add_(0, part["index"], part["weight"])
+        for camera, signal in views:
+            channels = signal.shape[-1] if sums is None else sums.shape[1]
+            if tuple(signal.shape) != (*camera.size, channels):
+                raise ValueError(
+                    f"views: expected a map {(*camera.size, channels)} for camera {camera.name!r}, got "
+                    f"{tuple(signal.shape)}; resize it with resize_map"
+                )
+            index, total, weight = sum_pixels(gaussians, camera, signal.to(gaussians.means), engine=engine)
+            sums = torch.zeros(len(gaussians), channels).to(gaussians.means) if sums is None else sums
+            sums.index_add_(0, index, total)
+            weights.index_add_(0, index, weight)
     if sums is None:
         raise ValueError("views: expected at least one camera, got none; pass those that the field was trained on")
     return ViewAverage(_per_weight(sums, weights[:, None]), weights)
@@ -117,7 +102,7 @@ def vote_labels(
     min_share: float = MIN_SHARE,
     engine: str = "auto",
 ) -> Votes:
-    """Label each Gaussian with the class that most of its rendering weight falls on.
+    """Label each Gaussian with the class that most of its rendering weight falls on. Ties go to the lowest class.
 
     Args:
         gaussians: a cloud; only its geometry and opacity are used.
@@ -126,24 +111,20 @@ def vote_labels(
         min_share: a winner with a smaller share of the votes gives no label; 0 labels every Gaussian that is shown.
         engine: compositing engine.
 
-    Returns:
-        Labels, the winner's share, and the weight. Ties go to the lowest class.
-
     Raises:
         ValueError: if a label map has another size than its camera, or a label is not below `classes`.
     """
+    check_gaussians(gaussians)
     check_range("classes", classes, 1)
     check_range("min_share", min_share, 0, 1)
     votes = torch.zeros(len(gaussians), classes).to(gaussians.means)
     with torch.no_grad():
         for camera, labels in views:
-            if tuple(labels.shape) != camera.size:
+            if tuple(labels.shape) != camera.size or int(labels.max()) >= classes:
                 raise ValueError(
-                    f"views: expected a label map of the camera's size {camera.size} ({camera.name!r}), got "
-                    f"{tuple(labels.shape)}; resize it with resize_labels"
+                    f"views: expected labels below {classes} (classes) of the camera's size {camera.size} "
+                    f"({camera.name!r}), got {tuple(labels.shape)} up to {int(labels.max())}; resize_labels resizes them"
                 )
-            if int(labels.max()) >= classes:
-                raise ValueError(f"views: expected labels below {classes} (classes), got {int(labels.max())}")
             ballots = torch.nn.functional.one_hot(labels + 1, classes + 1)[..., 1:].to(votes)
             index, total, _ = sum_pixels(gaussians, camera, ballots, engine=engine)
             votes.index_add_(0, index, total)
