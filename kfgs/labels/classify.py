@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,7 +29,8 @@ class Classification(NamedTuple):
     labels: Tensor  # [N] int64, -1 = none
     scores: Tensor  # [N] cosine with the winning class; 0 if there is none
 
-    __repr__ = short_repr
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def classify(
@@ -145,7 +146,8 @@ def _score_layers(
     if centres is not None:
         squares = centres.square().sum(dim=-1)
         return ((2 * centres, 2 * squares.max() - squares),)
-    decoder = [(layer.weight.detach(), layer.bias.detach()) for layer in autoencoder.decoder]
+    networks: Any = autoencoder.decoder
+    decoder = [(layer.weight.detach(), layer.bias.detach()) for layer in networks]
     weight, bias = decoder[-1]
     if weight.dtype != rows.dtype:
         return None

@@ -126,7 +126,8 @@ class Shades(NamedTuple):
     gain: Tensor  # [] ratio of new to old luminance
     bend: Tensor  # [] old luminance up to which the ratio holds; infinite if it holds throughout
 
-    __repr__ = short_repr
+    def __repr__(self) -> str:
+        return short_repr(self)
 
     def __call__(self, luminance: Tensor) -> tuple[Tensor, Tensor]:  # [n] -> [n, 3], [n, 3]
         """The colour of each luminance, and by how much it changes per unit of luminance."""

@@ -28,7 +28,8 @@ class Question(NamedTuple):
     negatives: Tensor | None  # [M, D]
     words: str
 
-    __repr__ = short_repr
+    def __repr__(self) -> str:
+        return short_repr(self)
 
     @property
     def rows(self) -> Tensor:  # [1 + M, D]

@@ -123,6 +123,7 @@ def attach(
         if needed and not cameras:
             raise ValueError(f"cameras: expected views in the field's frame (for {name}), got none; pass them as well")
     semantic = field.label(classes)  # checks the classes before the frames are compared
+    assert classes is not None
     similarity, alignment, frame_note = _common_frame(field, splats, cameras, frame)
     carry = partial(_carry, distance=distance)
     if by == "distance":

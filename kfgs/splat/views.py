@@ -32,7 +32,8 @@ class ViewAverage(NamedTuple):
     values: Tensor  # [N, C] mean over the pixels, weighted by how much each shows the Gaussian; 0 if none does
     weights: Tensor  # [N] the number of pixels, in all views, that the Gaussian fills
 
-    __repr__ = short_repr
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 class Votes(NamedTuple):
@@ -42,7 +43,8 @@ class Votes(NamedTuple):
     shares: Tensor  # [N] the winner's share of the votes, 0 if there were none
     weights: Tensor  # [N] votes cast: the number of pixels, in all views, that the Gaussian fills
 
-    __repr__ = short_repr
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def sum_pixels(
