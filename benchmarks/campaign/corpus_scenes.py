@@ -105,12 +105,6 @@ def _data_sets(folder: Path, add: Add) -> None:
         (scan / name).parent.mkdir(exist_ok=True)
         np.savetxt(scan / f"{name}.txt", value)
     add("scene", scan, "pose/0.txt", "intrinsic/intrinsic_color.txt", opens=".")
-    llff = folder / "llff"
-    for i in range(2):
-        _picture(llff / f"images/{i}.png")
-    rows = np.concatenate([POSE[:3], [[16.0], [20], [15]]], 1)
-    np.save(llff / "poses_bounds.npy", np.tile(np.r_[rows.reshape(-1), 0.5, 9.0], (2, 1)))
-    add("scene", llff, "poses_bounds.npy", opens=".")
 
 
 def _pictures(place: Path, add: Add) -> None:

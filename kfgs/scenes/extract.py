@@ -34,21 +34,9 @@ class Picture:
     size: Size | None = None
     """(H, W) in pixels."""
 
-    def read(self) -> Tensor:  # [H, W, 3] float32 RGB in [0, 1]
-        """Read the file; raises as `scenes.read_image`."""
-        return read_image(self.path)
-
 
 def pictures_of(scene: Scene, split: Split = "all") -> list[Picture]:
-    """The pictures of some views of a scene, as they are on disk: lens distortion is not removed.
-
-    Args:
-        scene: the views.
-        split: the name of a split, `all`, or a list of view names or indices.
-
-    Raises:
-        ValueError: if the scene has no such split or view, or the split is empty.
-    """
+    """The pictures of some views of a scene (a split, `all`, or a list of view names or indices), as they are on disk."""
     if not isinstance(scene, Scene):
         raise TypeError(f"scene: expected a Scene, got {type(scene).__name__}; pass load_scene(folder)")
     chosen = scene.select(scene.views(split) if isinstance(split, str) else split)
@@ -70,11 +58,7 @@ class Manifest:
 
 
 def read_manifest(folder: str | Path) -> Manifest | None:
-    """The manifest of a folder of maps; None if it has none, because another program wrote the maps.
-
-    Raises:
-        ValueError: if it is damaged.
-    """
+    """The manifest of a folder of maps; None if another program wrote them. A ValueError if it is damaged."""
     path = as_path(folder) / MANIFEST
     if not path.is_file():
         return None
@@ -216,7 +200,7 @@ def _check_folder(folder: Path, identity: dict[str, Any], pictures: list[Picture
 def _encode(encode: Callable[[Tensor], Tensor], name: str, picture: Picture) -> Tensor:  # [h, w, D] float16
     """A teacher's map of one picture as it is stored: channels last, rounded to half precision, on the CPU."""
     with torch.inference_mode():
-        features = encode(picture.read().permute(2, 0, 1).contiguous())
+        features = encode(read_image(picture.path).permute(2, 0, 1).contiguous())
         if not isinstance(features, Tensor) or features.layout != torch.strided:
             raise TypeError(f"teacher {name!r}: expected a dense tensor [D, h, w], got a {type(features).__name__}")
         if features.ndim != 3 or 0 in features.shape or not features.is_floating_point():

@@ -30,10 +30,8 @@ class FeatureReport:
     """What `FeatureFolder.check` says about a folder of maps."""
 
     folder: Path
-    views: int
-    """The number of views checked."""
-    shape: tuple[int, int, int] | None = None
-    """(h, w, D) of most maps; None if none could be opened."""
+    views: int  # checked
+    shape: tuple[int, int, int] | None = None  # (h, w, D) of most maps; None if none could be opened
     problems: dict[str, str] = field(default_factory=dict)
     """Why a map cannot be used, by the file's name (if there is none, by the view's stem)."""
     notes: list[str] = field(default_factory=list)
@@ -61,8 +59,7 @@ class FeatureFolder(Sequence[Tensor]):
     or double precision. The picture's ending may follow the stem. The map of a picture in a subfolder is in a subfolder of
     the same name; if no view has a map there, maps are searched by the last part of their names.
 
-    No map is kept in memory. Maps may differ in size (pictures of several sizes), not in channels; an all-zero feature means
-    "unknown".
+    Maps may differ in size (pictures of several sizes), not in channels; an all-zero feature means "unknown".
 
     Args:
         path: the folder.
@@ -121,15 +118,7 @@ class FeatureFolder(Sequence[Tensor]):
             _ = self.files  # views without a map are an error here, not hours later
 
     def of(self, scene: Scene, split: Split = "train") -> FeatureFolder:
-        """The maps of some views of a scene.
-
-        Args:
-            scene: the views.
-            split: the name of a split, `all`, or a list of view names or indices.
-
-        Raises:
-            FileNotFoundError, ValueError: if the scene has no such views, or as for a `FeatureFolder` of these `stems`.
-        """
+        """The maps of some views of a scene: of a split, of `all`, or of a list of view names or indices."""
         pictures = pictures_of(scene, split)
         stems, sizes = [picture.stem for picture in pictures], [picture.size for picture in pictures]
         return FeatureFolder(self.path, stems, channels=self.channels, sizes=sizes)
@@ -207,17 +196,13 @@ class FeatureFolder(Sequence[Tensor]):
         return torch.cat(list(self.blocks(index)))
 
     def grid(self, i: int, step: tuple[int, int] | None, samples: int) -> Tensor:  # [n, D] float32
-        """`quant.sample_grid(maps[i], step, samples=samples)`, reading no more of the file than these pixels.
-
-        Raises:
-            ValueError: as when the whole map is read, but only the values that are read are checked.
-        """
+        """`quant.sample_grid(maps[i], step, samples=samples)`, reading no more of the file than these pixels."""
         stored = self._checked(i)
         rows, columns = grid_slices(int(stored.shape[0]), int(stored.shape[1]), step, samples=samples)
         return torch.cat(list(self._finite(i, read_rows(stored, rows, columns)))).flatten(0, 1)
 
     def blocks(self, i: int) -> Iterator[Tensor]:  # each [at most 32, w, D] float32
-        """Read a map a few rows at a time, which takes less memory than `maps[i]`; raises as when the whole map is read."""
+        """A map, a few rows at a time, which takes less memory than `maps[i]`."""
         return self._finite(i, read_rows(self._checked(i)))
 
     def _open(self, i: int) -> StoredMap:  # [h, w, D]
@@ -294,11 +279,7 @@ class FeatureFolder(Sequence[Tensor]):
         return report
 
     def check_files(self) -> None:
-        """`check` every map without reading its values, before a long run.
-
-        Raises:
-            ValueError: if one does not fit; the first is named, and the others counted.
-        """
+        """Raise a ValueError if a map does not fit, from shapes and types alone: for use before a long run."""
         problems = self.check(values=False).problems
         for name, text in problems.items():
             more = f" ({len(problems) - 1} more do not fit; `kfgs features SCENE --check {self.path}` names them)"

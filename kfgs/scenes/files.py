@@ -20,26 +20,19 @@ from .._check import one_line
 from .._files import Names, as_path, folded_name, read_json
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
-HEIC_SUFFIXES = (".heic", ".heif")
-"""Of photographs by phones. Pillow reads them with pillow-heif only, and pycolmap never: `convert_heic` makes JPEGs of them."""
+HEIC_SUFFIXES = (".heic", ".heif")  # photographs by phones: Pillow reads them with pillow-heif only, and pycolmap never
 MASKS = "masks"  # the folder of the masks of photos, as in COLMAP, brush and LichtFeld
 ORIENTATION = 0x0112  # EXIF's tag
 PIXELS, SMALL, COLORS, PACKED = 1 << 27, 1 << 24, 9 << 20, 200
 """Most pixels of a picture (4 GB while it is read), and most for each byte of its file, which photos have about 10 of, beyond
-SMALL, or COLORS in colour.
-
-In colour a pixel takes up to 31 bytes while it is read: COLORS, a little more than 4096 x 2160, takes less than 300 MB.
-SMALL, for masks and labels, is more than 4032 x 3024 (3D-OVS), whose masks have 400 pixels a byte."""
+SMALL (masks and labels: 3D-OVS's have 4032 x 3024 pixels, 400 a byte), or COLORS in colour (300 MB while it is read)."""
 LONGEST = 400  # digits of a number in a name: no file's name is so long, a name in a stranger's table may be
 MAX_SIDE = 100_000  # pixels: beyond any sensor, so a larger number is a wrong byte
 MAX_NUMBER = 1e15  # of lengths and intrinsics: still far inside float32
 
 
 class SceneError(ValueError):
-    """A scene that cannot be used as it is.
-
-    The message names the file, what was expected, what was found, and what to do.
-    """
+    """A scene that cannot be used as it is; the message names the file, what was expected, what came, and what to do."""
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
@@ -70,10 +63,6 @@ def list_images(folder: str | Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) 
     """Names of the image files in a folder and its subfolders, relative to it, in natural order.
 
     Hidden files and folders are left out, and so is a folder `masks` of the pictures; links to folders are not followed.
-
-    Args:
-        folder: the folder.
-        suffixes: the endings of the files to list, in lower case.
     """
     root = as_path(folder)
     names: list[str] = []
@@ -103,25 +92,16 @@ def spelling_note(folder: Path, files: Mapping[str, Path]) -> list[str]:
     """A note if pictures have other names than those by which they were found."""
     pairs = [(name, file.relative_to(folder).as_posix()) for name, file in files.items()]
     other = [f"{name} is {file}" for name, file in pairs if name != file]
-    return (
-        [f"{len(other)} images of {folder} were found by a name that is spelled otherwise: {some(other)}"]
-        if other
-        else []
-    )
+    note = f"{len(other)} images of {folder} were found by a name that is spelled otherwise: {some(other)}"
+    return [note] if other else []
 
 
 def read_image(path: str | Path, background: str = "white") -> Tensor:  # [H, W, 3] float32 in [0, 1]
     """Read a PNG, JPEG, TIFF or WebP file. EXIF orientation is ignored, as by COLMAP.
 
-    Transparent pixels are laid on white, as most cut-out objects are shown that networks were trained with. `Scene.image` lays
-    them on black, before which colours are trained.
-
-    Grey, palette, CMYK and 16-bit pictures are converted. Pillow reads them all: kornia's reader gives the same values but
-    refuses some of these, and its decoders panic when memory is short.
-
-    Args:
-        path: the file.
-        background: a colour of Pillow.
+    Transparent pixels are laid on white, as most cut-out objects are shown that networks were trained with; `Scene.image` lays
+    them on black, before which colours are trained. Grey, palette, CMYK and 16-bit pictures are converted. kornia's reader
+    gives the same values but refuses some of these, and its decoders panic when memory is short.
 
     Raises:
         FileNotFoundError: if there is no such file.

@@ -101,14 +101,14 @@ def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
     """
     for name, side in (("src", src), ("dst", dst)):
         if not isinstance(side, Sequence) or not all(isinstance(camera, Camera) for camera in side):
-            raise TypeError(
-                f"{name}: expected a list of cameras, got {type(side).__name__}; load_cameras(folder) gives one"
-            )
+            raise TypeError(f"{name}: expected a list of cameras, got {type(side).__name__}; pass load_cameras(folder)")
     pairs = _common_cameras(src, dst)
     names = [file_stem(a.name) for a, _ in pairs]
     origins = pairs[0][0].origin, pairs[0][1].origin
-    A, B = (np.stack([_center(pair[k], origins[k]) for pair in pairs]) for k in (0, 1))
-    turns = np.stack([_rotation(b).T @ _rotation(a) for a, b in pairs])  # [V, 3, 3] source world to destination world
+    sides = [[pair[k].to(torch.float64).with_origin(origins[k]) for pair in pairs] for k in (0, 1)]
+    A, B = (torch.stack([camera.center for camera in side]).cpu().numpy() for side in sides)  # [V, 3]
+    R, S = (torch.stack([camera.viewmat[:3, :3] for camera in side]).detach().cpu().numpy() for side in sides)
+    turns = S.transpose(0, 2, 1) @ R  # [V, 3, 3] source world to destination world
     sizes = _extents(B)
     if min(sizes[0] / max(1.0, np.abs(B).max()), _extents(A)[0] / max(1.0, np.abs(A).max())) < 1e-9:
         raise SceneError(
@@ -217,22 +217,14 @@ def _angles(similarity: Similarity, turns: Array) -> Array:
 def _extents(centers: Array) -> list[float]:
     """Estimates of the size of the region that the cameras stand in, the likeliest first.
 
-    Usually twice the median distance from the median centre, which wrong poses do not change, then twice the upper quartile.
-    If half of the cameras stand on one tripod, the quartile comes first. If nearly all do, it is twice the largest distance.
+    Twice the median distance from the median centre, which wrong poses do not change, and twice the upper quartile; if half
+    of the cameras stand on one tripod, the quartile first; if nearly all do, twice the largest distance.
     """
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     median, upper, largest = (2 * float(np.quantile(distances, q)) for q in (0.5, 0.75, 1.0))
     if upper <= TRIPOD * largest and median <= TRIPOD * largest:
         return [largest]
     return [upper, median] if median <= TRIPOD * upper else [median, upper]
-
-
-def _center(camera: Camera, origin: tuple[float, float, float]) -> Array:
-    return camera.to(torch.float64).with_origin(origin).center.cpu().numpy()
-
-
-def _rotation(camera: Camera) -> Array:
-    return camera.viewmat[:3, :3].detach().double().cpu().numpy()
 
 
 def _nearest_rotation(matrix: Array) -> Array:  # [3, 3]

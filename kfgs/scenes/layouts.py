@@ -1,4 +1,4 @@
-"""Data sets whose folders have a pose for each picture: Replica (two renderings), ScanNet, LLFF and Polycam.
+"""Folders with a pose for each picture: Replica (two renderings), ScanNet, Polycam, and the output of Inria's 3DGS.
 
 **Convention**: poses in files are camera to world, x right, y down, z forward, unless a reader says otherwise.
 """
@@ -8,17 +8,21 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from .._arrays import read_array
-from .._files import as_path, file_stem, real_path
-from ..cameras.resample import fits_aspect
+from .._files import Names, file_stem, real_path
+from .._origin import to_world
+from ..formats.folders import newest_splat
+from ..formats.table import read_splats
+from ..formats.values import SH_C0
 from .depth import points_from_depth
-from .files import MAX_NUMBER, MAX_SIDE, SceneError, list_images, natural_key, picture_size, read_scene_json, some
+from .files import MAX_NUMBER, MAX_SIDE, SceneError, list_images, picture_size, read_scene_json, some
 from .posed import Matrix, PosedPicture, read_numbers, read_points, scene_of_poses
 from .scene import Scene
 
@@ -173,56 +177,6 @@ def _square(path: Path) -> Matrix:  # [4, 4]
     return matrix
 
 
-def is_llff(folder: Path) -> bool:
-    """Whether this is a scene with LLFF's file of poses."""
-    return (folder / "poses_bounds.npy").is_file()
-
-
-def load_llff(folder: Path, images: Path | None = None) -> Scene:
-    """LLFF and 3D-OVS: `poses_bounds.npy` and as many pictures in `images/`, or `images_4/` and the like.
-
-    **Convention**: a row has a 3x5 matrix and two depths. The matrix is [down, right, back, centre, (height, width, focal
-    length)], camera to world; the size is that of the pictures the poses were made for.
-    """
-    path = folder / "poses_bounds.npy"
-    try:
-        values = read_array(path, "an array [V, 17]", "copy it again")
-    except ValueError as error:
-        raise SceneError(str(error)) from error
-    if values.ndim != 2 or values.shape[1] != 17 or len(values) == 0 or values.dtype.kind != "f":
-        raise SceneError(
-            f"{path}: expected floats [V, 17] as LLFF writes them, got {values.dtype} {values.shape}; {AGAIN}"
-        )
-    rows = values[:, :15].astype(np.float64).reshape(-1, 3, 5)
-    folders = [p for p in folder.glob("images*") if p.is_dir() and re.fullmatch(r"images(_\d+)?", p.name)]
-    source = as_path(images) if images is not None else min(folders, key=lambda p: natural_key(p.name), default=None)
-    if source is None:
-        raise FileNotFoundError(f"{folder / 'images'}: no such folder; expected the pictures of {path} there")
-    names = sorted(list_images(source), key=natural_key)
-    if len(names) != len(rows):
-        raise SceneError(
-            f"{path}: expected one row per picture in {source} ({len(names)}), got {len(rows)}; give the folder whose "
-            "pictures the poses were made for"
-        )
-    views = []
-    for i, (name, row) in enumerate(zip(names, rows, strict=True)):
-        (height, width, focal), size, where = row[:, 4], picture_size(source / name), f"{path}, row {i}"
-        if not np.isfinite(row).all():
-            views.append(PosedPicture(name, source / name, NOWHERE, where, (np.eye(3), size)))
-            continue
-        if min(height, width, focal) <= 0 or not fits_aspect((size[1], size[0]), (height, width)):
-            raise SceneError(
-                f"{source / name}: expected the shape {width:g}x{height:g} that {where}, says (and a focal length above 0), "
-                f"got {size[0]}x{size[1]}; was the picture cropped or turned? give the one that the poses were made for"
-            )
-        pose = np.eye(4)
-        pose[:3] = np.stack([row[:, 1], row[:, 0], -row[:, 2], row[:, 3]], 1)
-        K = np.diag([focal * size[0] / width, focal * size[1] / height, 1.0])
-        K[:2, 2] = size[0] / 2, size[1] / 2
-        views.append(PosedPicture(name, source / name, pose, where, (K, size)))
-    return scene_of_poses(folder, views)
-
-
 def is_polycam(folder: Path) -> bool:
     """Whether this is a raw capture of Polycam, or its folder `keyframes`."""
     return _polycam_folders(folder) is not None
@@ -279,3 +233,78 @@ def _polycam_folders(folder: Path) -> tuple[Path, Path] | None:
             if next((place / cameras).glob("*.json"), None) is not None and (place / images).is_dir():
                 return place / cameras, place / images
     return None
+
+
+def is_inria(folder: Path) -> bool:
+    """Whether this is an output folder of 3DGS."""
+    return (folder / "cameras.json").is_file() and newest_splat(folder) is not None
+
+
+def load_inria(folder: Path, images: Path | None = None) -> Scene:
+    """3DGS and its descendants: `cameras.json` and `point_cloud/`, with the pictures that it was trained on.
+
+    Points are those of `input.ply`, else the centres of the newest splat's Gaussians. The pictures are in `images`, in
+    `source_path` of `cfg_args` (also if that folder was moved next to this one), or in `images/` here. If `cfg_args` says
+    `eval=True`, the views that 3DGS lists before the training views are the `test` split.
+
+    **Convention**: an entry has the centre of the camera (`position`) and a camera-to-world rotation (`rotation`, rows); the
+    principal point is the middle of the picture.
+    """
+    path, settings = folder / "cameras.json", folder / "cfg_args"
+    text = settings.read_text(encoding="utf-8", errors="replace")[:65536] if settings.is_file() else ""
+    entries = read_scene_json(path, AGAIN)
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise SceneError(f"{path}: expected a list of cameras, got {entries!r:.80}; {AGAIN}")
+    source, name = (re.search(rf"\b{key}='([^']*)'", text) for key in ("source_path", "images"))
+    place = Path(source[1].replace("\\", "/")) if source else folder
+    inner = name[1] if name and name[1] else "images"
+    tried = [place / inner, folder / place / inner, folder.parent / place.name / inner, folder / inner]
+    tried = (
+        [images] if images is not None else [*tried, *([place] if (place / "transforms_train.json").is_file() else [])]
+    )
+    pictures = next((place for place in tried if place.is_dir() and list_images(place)), None)
+    if pictures is None:
+        listed = ", ".join(map(str, dict.fromkeys(tried)))
+        raise FileNotFoundError(
+            f"{folder}: expected the pictures of {path.name} in one of {listed}, found none; "
+            "name their folder (images=, or --images)"
+        )
+    known = Names(list_images(pictures), bare=True)
+    views, missing = list[PosedPicture](), list[str]()
+    for i, entry in enumerate(entries):
+        found, where = known.find(str(entry.get("img_name", ""))), f"{path}, camera {i}"
+        if found is None:
+            missing.append(str(entry.get("img_name")))
+            continue
+        numbers, pose = [entry.get(key) for key in ("width", "height", "fx", "fy")], np.eye(4)
+        if any(type(n) is float and not math.isfinite(n) for n in numbers):
+            views.append(PosedPicture(found, pictures / found, NOWHERE, where, (np.eye(3), (1, 1))))
+            continue
+        middle = [n / 2 if isinstance(n, int | float) else n for n in numbers[:2]]
+        try:
+            pose[:3, :3], pose[:3, 3] = np.array(entry["rotation"], np.float64), np.array(entry["position"], np.float64)
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise SceneError(
+                f"{where}: expected a rotation [3][3] and a position [3], got {error!r:.100}; {AGAIN}"
+            ) from error
+        views.append(PosedPicture(found, pictures / found, pose, where, intrinsics([*numbers, *middle], where)))
+    if not views:
+        raise SceneError(
+            f"{pictures}: expected the pictures of {path} ({some(missing, 3)}), found none of them; "
+            "name the folder that has them (images=, or --images)"
+        )
+    notes = (
+        [f"{len(missing)} of {len(entries)} cameras have no picture in {pictures}: {some(missing)}"] if missing else []
+    )
+    if (folder / "input.ply").is_file():
+        points, colors, told = read_points(folder / "input.ply")
+    else:
+        cloud = read_splats(folder)
+        shades = torch.full((len(cloud), 3), 0.5) if cloud.sh is None else 0.5 + SH_C0 * cloud.sh[:, 0]
+        points, colors, told = to_world(cloud.means, cloud.origin), (shades.clamp(0, 1) * 255).round().byte(), []
+    scene = scene_of_poses(folder, views, None, (points, colors), [*notes, *told])
+    order = [view.name for view in views]
+    falls = [i for i in range(1, len(order)) if order[i] < order[i - 1]]  # where the order of names begins again
+    held_out = set(order[: falls[0]]) if "eval=True" in text and len(falls) == 1 else set()
+    test = [i for i, camera in enumerate(scene.cameras) if camera.name in held_out]
+    return replace(scene, splits={"train": [i for i in range(len(scene)) if i not in test], "test": test})

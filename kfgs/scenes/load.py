@@ -17,14 +17,13 @@ from ..cameras.camera import Camera
 from ..formats.folders import newest_splat
 from .colmap import colmap_cameras, load_colmap
 from .files import SceneError, natural_key, picture_size, some
-from .inria import is_inria, load_inria
 from .layouts import (
-    is_llff,
+    is_inria,
     is_nice_slam,
     is_polycam,
     is_scannet,
     is_semantic_nerf,
-    load_llff,
+    load_inria,
     load_nice_slam,
     load_polycam,
     load_scannet,
@@ -55,11 +54,10 @@ _LAYOUTS = (
     _Layout("Replica (NICE-SLAM)", "results/ and traj.txt", is_nice_slam, load_nice_slam),
     _Layout("Replica (Semantic-NeRF)", "rgb/ and traj_w_c.txt", is_semantic_nerf, load_semantic_nerf),
     _Layout("ScanNet", "color/ and pose/", is_scannet, load_scannet),
-    _Layout("LLFF (3D-OVS)", "poses_bounds.npy", is_llff, load_llff),
     _Layout("Polycam", "keyframes/ with cameras/ and images/", is_polycam, load_polycam),
     _Layout("3DGS's output", "cameras.json and point_cloud/", is_inria, load_inria),
 )
-"""Asked in this order, after COLMAP models and transforms.json: 3D-OVS and Mip-NeRF 360 have both a model and LLFF's poses."""
+"""Asked in this order, after COLMAP models and transforms.json."""
 
 
 def load_scene(
@@ -70,8 +68,8 @@ def load_scene(
     The first of these is read: a COLMAP model in `sparse`, `colmap/sparse`, `dense/sparse`, `distorted/sparse`,
     `colmap_ground_truth` or the folder itself (of several there, as `sparse/0` and `sparse/1`, that with most images; binary
     before text); `transforms.json`; Blender's `transforms_train.json`; Replica as NICE-SLAM (`results/`, `traj.txt`) or
-    Semantic-NeRF (`rgb/`, `traj_w_c.txt`) rendered it; ScanNet (`color/`, `pose/`); LLFF and 3D-OVS (`poses_bounds.npy`);
-    raw captures of Polycam (`keyframes/`); the output of Inria's 3DGS (`cameras.json`, `point_cloud/`).
+    Semantic-NeRF (`rgb/`, `traj_w_c.txt`) rendered it; ScanNet (`color/`, `pose/`); raw captures of Polycam (`keyframes/`);
+    the output of Inria's 3DGS (`cameras.json`, `point_cloud/`).
 
     Args:
         path: the scene folder, a model folder, or a .json file.
@@ -191,10 +189,7 @@ def _with_masks(scene: Scene, root: Path) -> Scene:
 
 
 def picture_folders(path: str | Path, images: str | Path | None = None) -> list[Path]:
-    """The folders from which `load_scene` reads the pictures of a scene; a model of COLMAP is not read for it.
-
-    The scene folder itself is left out: everything else of a scene lies there, too. If there is no scene, the list is empty.
-    """
+    """The folders, but for the scene folder itself, from which `load_scene` reads pictures; empty if there is no scene."""
     path = as_path(path)
     root = path if path.is_dir() else path.parent
     try:

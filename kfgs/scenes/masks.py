@@ -11,27 +11,17 @@ from PIL import Image
 from torch import Tensor
 
 from .._files import Names, file_stem, real_path
-from .files import (
-    MASKS,
-    ORIENTATION,
-    SMALL,
-    SceneError,
-    has_alpha,
-    list_images,
-    open_picture,
-    read_alpha,
-    some,
-)
+from .files import MASKS, ORIENTATION, SMALL, SceneError, has_alpha, list_images, open_picture, read_alpha, some
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> Tensor:  # [H, W] bool
     """Which pixels of a photo count: those of its mask that are brighter than half of the brightest one.
 
-    So masks of 0 and 1, of 0 and 255, and JPEG files mean the same. If the mask is larger than the photo, a pixel counts if all
-    of it does.
+    So masks of 0 and 1, of 0 and 255, and JPEG files mean the same; what is transparent is black. If the mask is larger than
+    the photo, a pixel counts if all of it does.
 
     Args:
-        path: the mask, in any mode; what is transparent in it is black.
+        path: the mask, in any mode.
         size: (H, W) of the photo, which has the shape of the mask.
 
     Raises:
@@ -80,7 +70,7 @@ def folder_masks(
 
     Args:
         names: of the photos.
-        pictures: the folder that they are relative to. The masks are in it, or beside it.
+        pictures: the folder that they are relative to. The masks are in it, or next to it.
         root: a folder whose `masks` is preferred.
     """
     places = [pictures] if pictures == root else [pictures, pictures.parent, real_path(pictures).parent]
@@ -93,17 +83,17 @@ def folder_masks(
     heic = [f"{file_stem(name)}.heic" for name in names]  # photos are converted from HEIC
     chosen = [a or b for a, b in zip(known.find_each(names), known.find_each(heic), strict=True)]
     masks = [None if file is None else folder / file for file in chosen]
-    used = {mask for mask in masks if mask is not None}
-    if not used:
+    extra = [file for file in files if folder / file not in masks]
+    if len(extra) == len(files):
         example = f"{file_stem(names[0])}.png" if names else "NAME.png"
-        return None, [
-            f"{folder}: none of {len(files)} masks ({some(files, 3)}) has the name of one photo, such as {example}; none is used"
-        ]
-    note = f"masks: {len(used)} of {len(names)} photos have one in {folder}; black is ignored"
-    extra = [file for file in files if folder / file not in used]
-    return masks, [
-        note + (f"; {len(extra)} more have the name of no photo, or of several: {some(extra, 3)}" if extra else "")
-    ]
+        none = (
+            f"none of {len(files)} masks ({some(files, 3)}) has the name of one photo, such as {example}; none is used"
+        )
+        return None, [f"{folder}: {none}"]
+    used = len({mask for mask in masks if mask is not None})
+    note = f"masks: {used} of {len(names)} photos have one in {folder}; black is ignored"
+    more = f"; {len(extra)} more have the name of no photo, or of several: {some(extra, 3)}"
+    return masks, [note + (more if extra else "")]
 
 
 def write_colmap_masks(

@@ -18,23 +18,14 @@ from tqdm import tqdm
 
 from .._check import check_range, one_line
 from .._files import as_path, atomic_folder, check_output, digest_file, file_stem, read_json, real_path, write_json
-from .files import (
-    HEIC_SUFFIXES,
-    ORIENTATION,
-    PIXELS,
-    SceneError,
-    list_images,
-    open_picture,
-    some,
-)
+from .files import HEIC_SUFFIXES, ORIENTATION, PIXELS, SceneError, list_images, open_picture, some
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 SOURCE = "source.json"  # in the folder of the pictures: what they were made of
 CANDIDATES = 8  # frames of an interval that are compared: 8 of 15 find a moment between two shakes of a hand
 QUALITY = 95  # of JPEG: SIFT finds the same features as in the original
-FFMPEG = "imageio_ffmpeg"
 
-Picture = NDArray[np.uint8]  # [H, W, 3]
+Frame = NDArray[np.uint8]  # [H, W, 3]
 
 
 def is_video(path: str | Path) -> bool:
@@ -59,7 +50,7 @@ def refuse_heic(folder: Path) -> None:
 
 
 def extract_frames(video: str | Path, out: str | Path, *, fps: float = 2.0, progress: bool = False) -> list[Path]:
-    """Write the sharpest frame of each part of a video that is 1 / `fps` seconds long, as JPEG files.
+    """Write the sharpest frame of each part of a video that is 1 / `fps` seconds long, as JPEG files, in order of time.
 
     The sharpest frame is that with the largest variance of the Laplacian of its grey values. Frames stay as they are: no
     resizing; the rotation that a phone notes in the file is applied.
@@ -69,9 +60,6 @@ def extract_frames(video: str | Path, out: str | Path, *, fps: float = 2.0, prog
         out: the folder of the frames `frame_00001.jpg`, .... Frames of the same video and `fps` that are there are kept.
         fps: frames per second of the video that are written, at most those of the video.
         progress: show a bar.
-
-    Returns:
-        The files in order of time.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -85,52 +73,49 @@ def extract_frames(video: str | Path, out: str | Path, *, fps: float = 2.0, prog
     if not video.is_file():
         raise FileNotFoundError(f"{video}: no such file; expected a video there")
     source = {"video": video.name, "sha256": digest_file(video), "fps": fps}
-    if _made_before(out, source):
-        return [out / name for name in list_images(out)]
-    with atomic_folder(out) as folder, tqdm(disable=not progress, unit="frame", desc="frames") as bar:
-        count = 0
-        for count, frame in enumerate(_sharpest(video, fps, bar), 1):
-            Image.fromarray(frame).save(folder / f"frame_{count:05d}.jpg", quality=QUALITY, subsampling=0)
-        if not count:
-            raise SceneError(f"{video}: expected a video with frames, got none; does it play?")
-        write_json(folder / SOURCE, source)
+    if not _made_before(out, source):
+        with atomic_folder(out) as folder, tqdm(disable=not progress, unit="frame", desc="frames") as bar:
+            for count, frame in enumerate(_sharpest(video, fps, bar), 1):
+                Image.fromarray(frame).save(folder / f"frame_{count:05d}.jpg", quality=QUALITY, subsampling=0)
+            if not any(folder.iterdir()):
+                raise SceneError(f"{video}: expected a video with frames, got none; does it play?")
+            write_json(folder / SOURCE, source)
     return [out / name for name in list_images(out)]
 
 
-def sharpness(frame: Picture) -> float:
+def sharpness(frame: Frame) -> float:
     """The variance of the Laplacian of a picture's grey values: larger is sharper, if both show the same."""
     grey = torch.from_numpy(np.array(Image.fromarray(frame).convert("L"))).float()
     return float(laplacian(grey[None, None], kernel_size=3, normalized=False).var())
 
 
-def _sharpest(video: Path, fps: float, bar: Any) -> Iterator[Picture]:
+def _sharpest(video: Path, fps: float, bar: Any) -> Iterator[Frame]:
     """The sharpest frame of each interval, one after the other; two frames are in memory."""
-    best: tuple[int, float, Picture] | None = None
+    best: tuple[int, float, Frame] | None = None
     for number, (frame, rate) in enumerate(_decode(video)):
         bar.update()
         interval = math.floor(number * fps / rate)
         if number % max(1, round(rate / fps / CANDIDATES)) and (best is None or best[0] == interval):
             continue
-        found = sharpness(frame)
+        score = sharpness(frame)
         if best is not None and best[0] != interval:
             yield best[2]
             best = None
-        if best is None or found > best[1]:
-            best = interval, found, frame
+        if best is None or score > best[1]:
+            best = interval, score, frame
     if best is not None:
         yield best[2]
 
 
-def _decode(video: Path) -> Iterator[tuple[Picture, float]]:
+def _decode(video: Path) -> Iterator[tuple[Frame, float]]:
     """Each frame of a video, and the frames per second."""
     try:
-        ffmpeg = importlib.import_module(FFMPEG)
+        ffmpeg = importlib.import_module("imageio_ffmpeg")
     except ImportError as error:
         raise ImportError(
             "video: expected imageio-ffmpeg to decode it, but it is not installed; run: pip install imageio-ffmpeg"
         ) from error
-    # A playlist that is named .mp4 could make ffmpeg fetch pages: files only.
-    safe = ["-protocol_whitelist", "file"]
+    safe = ["-protocol_whitelist", "file"]  # a playlist that is named .mp4 could make ffmpeg fetch pages: files only
     try:
         with closing(ffmpeg.read_frames(str(real_path(video)), pix_fmt="rgb24", input_params=safe)) as frames:
             about = next(frames)
@@ -170,40 +155,38 @@ def convert_heic(images: str | Path, out: str | Path, *, progress: bool = False)
     images, out = as_path(images), as_path(out)
     names, others = _heic_names(images), list_images(images)
     stems = [file_stem(name) for name in names]
-    if len(set(stems)) < len(stems):  # both would be the same JPEG file
-        twice = [name for name, stem in zip(names, stems, strict=True) if stems.count(stem) > 1]
+    twice = [name for name, stem in zip(names, stems, strict=True) if stems.count(stem) > 1]
+    if twice:  # both would be the same JPEG file
         raise SceneError(
             f"{images}: expected HEIC photographs with names that differ before the suffix, got {some(twice)}; rename them"
         )
     source = {"images": [[name, digest_file(images / name)] for name in names], "others": others}
-    if _made_before(out, source):
-        return [out / name for name in list_images(out)]
-    with atomic_folder(out) as folder:
-        for name in tqdm(names, disable=not progress, unit="image", desc="HEIC"):
-            target = folder / f"{file_stem(name)}.jpg"
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with open_picture(images / name, "a HEIC photograph") as picture:
-                exif = picture.getexif()  # with the focal length, from which COLMAP starts
-                exif.pop(ORIENTATION, None)  # pillow-heif has turned the picture
-                if picture.mode == "RGBA" and np.asarray(picture.getchannel("A")).min() < 255:
-                    picture.save(target.with_suffix(".png"), exif=exif)
-                else:
-                    picture.convert("RGB").save(target, quality=QUALITY, subsampling=0, exif=exif)
-        for name in others:
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).symlink_to(real_path(images / name))
-        write_json(folder / SOURCE, source)
+    if not _made_before(out, source):
+        with atomic_folder(out) as folder:
+            for name in tqdm(names, disable=not progress, unit="image", desc="HEIC"):
+                target = folder / f"{file_stem(name)}.jpg"
+                target.parent.mkdir(parents=True, exist_ok=True)
+                with open_picture(images / name, "a HEIC photograph") as picture:
+                    exif = picture.getexif()  # with the focal length, from which COLMAP starts
+                    exif.pop(ORIENTATION, None)  # pillow-heif has turned the picture
+                    if picture.mode == "RGBA" and np.asarray(picture.getchannel("A")).min() < 255:
+                        picture.save(target.with_suffix(".png"), exif=exif)
+                    else:
+                        picture.convert("RGB").save(target, quality=QUALITY, subsampling=0, exif=exif)
+            for name in others:
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                (folder / name).symlink_to(real_path(images / name))
+            write_json(folder / SOURCE, source)
     return [out / name for name in list_images(out)]
 
 
 def _made_before(out: Path, source: dict[str, Any]) -> bool:
     """Whether `out` holds the pictures of this source; a FileExistsError if it holds anything else."""
     check_output("out", out, "a folder")
-    if not out.exists() or not any(out.iterdir()):
-        return False
-    if (out / SOURCE).is_file() and read_json(out / SOURCE) == source:
-        return True
-    held = some(sorted(file.name for file in out.iterdir()), 3)
-    raise FileExistsError(
-        f"{out}: expected a new or empty folder for the pictures, got one with {held}; name another scene folder (--out)"
-    )
+    held = sorted(file.name for file in out.iterdir()) if out.exists() else []
+    if held and (SOURCE not in held or read_json(out / SOURCE) != source):
+        raise FileExistsError(
+            f"{out}: expected a new or empty folder for the pictures, got one with {some(held, 3)}; name another scene folder "
+            "(--out)"
+        )
+    return bool(held)

@@ -70,12 +70,11 @@ class Scene:
                 f"got {twice!r} twice; move one of the two images away, or rename it here and in the file of the poses"
             )
         for name, indices in self.splits.items():
-            wrong = [i for i in indices if not _is_index(i, views)]
+            wrong = [i for i in indices if not hasattr(i, "__index__") or not 0 <= index(i) < views]
             if wrong:
                 raise ValueError(
                     f"splits[{name!r}]: expected whole numbers in [0, {views}), got {wrong[0]!r:.80}; correct the split"
                 )
-
         origins = {camera.origin for camera in [*self.cameras, *(self.lenses or [])]}
         if len(origins) > 1:
             raise ValueError(
@@ -115,11 +114,7 @@ class Scene:
         return file_stem(self.cameras[i].name)
 
     def views(self, split: str) -> list[int]:
-        """The views of a split; "all" are all views, if no split has that name.
-
-        Raises:
-            ValueError: if the scene has no such split, or it is empty.
-        """
+        """The views of a split ("all" are all views); a ValueError if there is no such split, or it is empty."""
         if split == "all" and "all" not in self.splits:
             return list(range(len(self)))
         if not self.splits.get(split):
@@ -131,8 +126,7 @@ class Scene:
         """Read the picture of view `i`; in an undistorted scene the lens is removed on the way. Transparent pixels are black.
 
         Raises:
-            FileNotFoundError: if the file is no longer there.
-            SceneError: if it cannot be decoded, or is not of the camera's size.
+            FileNotFoundError, SceneError: if the file is gone, cannot be decoded, or is not of the camera's size.
         """
         lens = self.cameras[i] if self.lenses is None else self.lenses[i]
         image = read_image(self.image_paths[i], "black")
@@ -162,10 +156,7 @@ class Scene:
         return undistort(alpha[..., None], self.lenses[i])[0][..., 0]
 
     def counted(self, i: int, size: tuple[int, int]) -> Tensor | None:  # [h, w] bool
-        """Where a map of view `i`, of any size, shows something that is neither masked nor mostly transparent.
-
-        None if the view has no mask and no transparent pixel.
-        """
+        """Where a map of view `i` shows something that is neither masked nor mostly transparent; None: everywhere."""
         alpha, masked = self.alpha(i), self.masks is not None and self.masks[i] is not None
         if alpha is None and not masked:
             return None
@@ -201,8 +192,7 @@ class Scene:
     def with_near(self) -> Scene:
         """The same scene with every camera's `near` at 0.2 world units or, if that is less, a tenth of the extent.
 
-        The extent is taken over all views, so the split does not matter. Loaders call this. A scene made by hand keeps the
-        `near` of its cameras until this is called.
+        Loaders call this; a scene made by hand keeps the `near` of its cameras until then.
         """
         if len(self) == 0:
             return self
@@ -214,9 +204,6 @@ class Scene:
 
         Args:
             which: the name of a split, for instance "train"; or names of views (with or without suffix), or their indices.
-
-        Raises:
-            ValueError: if a split or a view is unknown.
         """
         indices = self._resolve(which)
         place = {view: position for position, view in enumerate(indices)}
@@ -251,10 +238,3 @@ class Scene:
         if len(set(indices)) != len(indices):
             raise ValueError("which: expected each view once, got one twice; remove the repetition")
         return indices
-
-
-def _is_index(value: object, views: int) -> bool:
-    try:
-        return 0 <= index(value) < views  # type: ignore[arg-type]
-    except TypeError:
-        return False

@@ -215,48 +215,6 @@ def test_scannet_that_is_not_whole(tmp_path: Path) -> None:
         load_scene(folder)
 
 
-def _llff(folder: Path, count: int = 3, size: tuple[float, float, float] = (96, 128, 100)) -> Path:
-    matrix = np.zeros((3, 5))
-    matrix[:, 0], matrix[:, 1], matrix[:, 2] = -POSE[:3, 1] * -1, POSE[:3, 0], -POSE[:3, 2]
-    matrix[:, 3], matrix[:, 4] = POSE[:3, 3], size
-    for i in range(count):
-        write_picture(folder / f"images_2/{i:02d}.jpg")
-    np.save(folder / "poses_bounds.npy", np.tile(np.concatenate([matrix.reshape(-1), [1, 9]]), (count, 1)))
-    return folder
-
-
-def test_llff_and_its_smaller_pictures(tmp_path: Path) -> None:
-    scene = load_scene(_llff(tmp_path))
-    _looks_along_x(scene, (50, 50, 32, 24))  # f = 100 at 128x96
-    assert (len(scene), len(scene.points)) == (3, 0)
-    assert any("no points" in note for note in scene.notes)
-
-
-def test_llff_that_is_not_whole(tmp_path: Path) -> None:
-    folder = _llff(tmp_path)
-    write_picture(folder / "images_2/99.jpg")
-    with pytest.raises(SceneError, match=tells("poses_bounds.npy", "images_2 (4)", "got 3")):
-        load_scene(folder)
-    (folder / "images_2/99.jpg").unlink()
-    _llff(folder, size=(128, 96, 100))
-    with pytest.raises(SceneError, match=tells("00.jpg", "96x128", "64x48", "turned")):
-        load_scene(folder)
-    np.save(folder / "poses_bounds.npy", np.zeros((3, 17)))
-    with pytest.raises(SceneError, match=tells("poses_bounds.npy", "above 0")):
-        load_scene(folder)
-    np.save(folder / "poses_bounds.npy", np.zeros((3, 16)))
-    with pytest.raises(SceneError, match=tells("poses_bounds.npy", "[V, 17]", "(3, 16)")):
-        load_scene(folder)
-    (folder / "poses_bounds.npy").write_bytes(b"nothing")
-    with pytest.raises(SceneError, match=tells("poses_bounds.npy", "cannot be read")):
-        load_scene(folder)
-    (folder / "images_2").rename(folder / "photos")
-    _llff(folder)
-    (folder / "images_2").rename(folder / "others")
-    with pytest.raises(FileNotFoundError, match=tells("images", "poses_bounds.npy")):
-        load_scene(folder)
-
-
 def test_mip_nerf_360_with_smaller_pictures(tmp_path: Path) -> None:
     write_model(tmp_path / "sparse/0", ["a.png", "b.png"])  # 64x48, f = 50, 55, c = 31, 25
     for name in ("a.png", "b.png"):
@@ -297,7 +255,6 @@ def test_every_picture_has_its_own_size(tmp_path: Path) -> None:
     write_picture(tmp_path / "colmap/images/a.png")
     _nice_slam(tmp_path / "replica")
     _scannet(tmp_path / "scannet")
-    _llff(tmp_path / "llff")  # fx 100 at 128x96
     for i in range(3):
         write_picture(tmp_path / f"nerf/rgb/rgb_{i}.png")
     (tmp_path / "nerf/traj_w_c.txt").write_text("".join(_line(POSE) + "\n" for _ in range(3)))
@@ -305,17 +262,16 @@ def test_every_picture_has_its_own_size(tmp_path: Path) -> None:
         "colmap/images/b.png",
         "replica/room0/results/frame000002.jpg",
         "scannet/color/2.jpg",
-        "llff/images_2/02.jpg",
     )
     for name in (*last, "nerf/rgb/rgb_2.png"):
         write_picture(tmp_path / name, 24, 32)
-    for folder, fx in (("colmap", 50), ("replica/room0", 50), ("scannet", 50), ("llff", 50), ("nerf", 32)):
+    for folder, fx in (("colmap", 50), ("replica/room0", 50), ("scannet", 50), ("nerf", 32)):
         scene = load_scene(tmp_path / folder)
         assert [camera.size for camera in scene.cameras][-2:] == [(48, 64), (24, 32)]
         assert [float(camera.K[0, 0]) for camera in scene.cameras][-2:] == pytest.approx([fx, fx / 2])
         assert scene.image(len(scene) - 1).shape == (24, 32, 3)
         noted = any(f"1 of {len(scene)} pictures are 2 times smaller" in note for note in scene.notes)
-        assert noted == (folder not in ("llff", "nerf"))  # whose files are about no size, or about another for all
+        assert noted == (folder != "nerf")  # whose file says no size
     write_picture(tmp_path / last[1], 64, 48)  # turned
     with pytest.raises(SceneError, match=tells("frame000002.jpg", "64x48", "got 48x64")):
         load_scene(tmp_path / "replica/room0")

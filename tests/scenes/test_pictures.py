@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import sys
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -12,7 +13,6 @@ from cases_sfm import downsized
 from messages import tells
 from PIL import Image, ImageFilter
 
-import kfgs.scenes.pictures as pictures
 from kfgs.cli import main
 from kfgs.scenes import SceneError, SfmConfig, convert_heic, extract_frames, load_scene, read_image, run_sfm
 from kfgs.scenes.pictures import SOURCE, has_heic, is_video, sharpness
@@ -107,7 +107,7 @@ def test_what_is_no_video(tmp_path: Path, video: Path, monkeypatch: pytest.Monke
     with pytest.raises(SceneError, match=tells("list.mp4")):
         extract_frames(tmp_path / "list.mp4", tmp_path / "out")
     assert not (tmp_path / "out").exists()
-    monkeypatch.setattr(pictures, "FFMPEG", "no_such_module")
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(ImportError, match=tells("imageio-ffmpeg", "pip install imageio-ffmpeg")):
         extract_frames(video, tmp_path / "out")
 

@@ -6,7 +6,7 @@ from messages import tells
 
 from kfgs.scenes import SceneError, make_split
 from kfgs.scenes.files import natural_key
-from kfgs.scenes.splits import choose_split, read_lists, read_split, split_every
+from kfgs.scenes.splits import choose_split, read_lists, read_split
 
 
 def test_the_papers_split_takes_every_10th_from_the_1st_and_6th() -> None:
@@ -37,15 +37,7 @@ def test_the_rule_without_a_split_file(count: int, video: bool, rule: str) -> No
     assert choose_split(count, video) == rule
 
 
-def test_split_every_checks_its_numbers() -> None:
-    with pytest.raises(ValueError, match=tells("step:", "got 0")):
-        split_every(10, step=0)
-    with pytest.raises(ValueError, match=tells("train_start:", "[0, 10)", "got 10")):
-        split_every(10, step=10, train_start=10)
-    with pytest.raises(ValueError, match=tells("test_start:", "got -1")):
-        split_every(10, step=10, test_start=-1)
-    with pytest.raises(ValueError, match=tells("train_start:", "test_start", "got 0")):
-        split_every(10, step=10, train_start=0)
+def test_an_unknown_rule_is_refused() -> None:
     with pytest.raises(ValueError, match=tells("split:", "'df3dgs', 'feature3dgs', 'holdout8', 'all'", "got 'llff'")):
         make_split(10, "llff")  # type: ignore[arg-type]
 
