@@ -32,8 +32,8 @@ from kfgs.fields import Linear, SemanticField, Training
 from kfgs.formats import read_splats
 from kfgs.labels import LabelSet, load_label_set
 from kfgs.pipeline import Paper, Uplift, fit, true_labels
-from kfgs.pipeline.apply import save_label_map
 from kfgs.pipeline.maps import Maps
+from kfgs.pipeline.segment import save_label_map
 from kfgs.scenes import FeatureFolder, Scene, load_scene
 
 QUICK_STEPS = {"decouple": 350, "adc": 350, "adc+sc": 800, "own-adc+sc": 800}

@@ -94,11 +94,11 @@ Image.fromarray(viz.picture_grid([row], ("photograph", "colour field", "field's 
 #
 # A class is a text, and a text has a feature too, in the same space. Each Gaussian shares one vote among the classes whose
 # texts $t_c$ its feature is similar to, $\cos(f_i, t_c)$. A pixel blends the votes of its Gaussians like colours, and the
-# largest sum wins. `segment_scene` does so for all unseen views, and draws sheets that compare truth, teacher and field.
+# largest sum wins. `segment_scene` does so for all unseen views, and draws sheets that compare truth and field.
 
 # %% tags=["thumbnail"]
 truth = true_labels(scene, labels, "test")
-found = kfgs.segment_scene(field, scene, classes, run / "segmentation", truth=truth, maps=features)
+found = kfgs.segment_scene(field, scene, classes, run / "segmentation", truth=truth)
 sheet = Image.open(run / "segmentation" / "sheets" / f"{scene.stem(test[-1])}.png").convert("RGB")
 sheet.resize((1024, round(sheet.height * 1024 / sheet.width)))
 
@@ -120,7 +120,7 @@ Shown(pictures / "iou.png", width=700)
 # %% [markdown]
 # ## Save and load
 #
-# `fit` has saved the field already, in `field/` of the run folder: Gaussians, latents, the decoder $B$, the training
+# `fit` has saved the field already, as `field.kfgs` in the run folder: Gaussians, latents, the decoder $B$, the training
 # cameras, and how they came about. What is loaded answers exactly as before.
 
 # %%

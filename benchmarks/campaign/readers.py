@@ -13,9 +13,9 @@ def _splats(path: Path) -> None:
 
 
 def _cloud(path: Path) -> None:
-    from kfgs.pipeline.apply import read_cloud
+    from kfgs.formats.ply import points_from_columns, read_ply
 
-    read_cloud(path)
+    points_from_columns(read_ply(path))
 
 
 def _mesh(path: Path) -> None:

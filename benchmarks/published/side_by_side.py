@@ -15,7 +15,6 @@ from kfgs.evaluation.label_pictures import load_label_map
 from kfgs.evaluation.teacher_agreement import ade20k_words
 from kfgs.evaluation.texts import encode_unit
 from kfgs.pipeline import Question
-from kfgs.pipeline.sheets import draw_errors
 from kfgs.splat import rasterize
 from kfgs.viz import overlay_labels, save_picture
 from kfgs.viz.pictures import legend_strip, picture_grid, resize_photo
@@ -134,3 +133,11 @@ def _truth_of(question: Question, view: View, encode: Encode) -> tuple[Tensor, S
         return labels, texts, [texts.index(text) for text in (texts if closed else truth.frames[view.stem])]
     words = tuple(ade20k_words()) if question.protocol.texts is None else question.protocol.texts
     return label_view(truth, view, encode_unit(encode, words)).cpu(), words, list(range(len(words)))
+
+
+def draw_errors(photo: Tensor, wrong: Tensor, void: Tensor | None = None) -> Tensor:  # [H, W, 3], [H, W] -> [H, W, 3]
+    """The photograph in light grey, errors in vermilion of Okabe and Ito, what is not scored in plain grey."""
+    grey = (0.5 + 0.5 * photo.mean(-1, keepdim=True)).expand_as(photo)
+    share = 0.85 * wrong.clamp(0, 1)[..., None]
+    drawn = (1 - share) * grey + share * torch.tensor((0.835, 0.369, 0.0)).to(photo)
+    return drawn if void is None else drawn.where(~void[..., None], 0.5)

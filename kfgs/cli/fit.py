@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
-from .._files import check_output, real_path
+from .._files import check_output, real_path, write_json
 from .features import choose_teacher, stored_maps
 from .files import check_alone
 from .options import (
@@ -258,7 +258,6 @@ def color(
     """
     from .._check import check_whole
     from ..evaluation.color import score_views
-    from ..pipeline import write_report
     from ..pipeline.color import ColorConfig, fit_color
     from ..pipeline.compare import PhotoPictures
 
@@ -277,7 +276,7 @@ def color(
     written = [out / "color.ply"]
     if tested:
         scores = score_views(gaussians, loaded, "test", show=beside)
-        write_report(out / "scores.json", color=scores)
+        write_json(out / "scores.json", {"color": scores.to_json()})
         say(str(scores))
         written += [*beside.written, out / "scores.json"]
     else:

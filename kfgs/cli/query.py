@@ -58,7 +58,6 @@ def select(
     from .._check import check_range
     from ..labels import connected_parts
     from ..labels.components import component_distance
-    from ..pipeline.apply import select_labelled
 
     if not source.exists() and Path(query).exists():
         raise ValueError(f"query, source: expected a class, then a file, got {query!r}, {str(source)!r}; swap them")
@@ -82,7 +81,7 @@ def select(
         for name, value in (given | dataclasses.asdict(teacher)).items():
             check_alone(name, None if value == "auto" else value, "with a splat, which has its own classes")
         cloud = open_splats("source", source, labelled=True, named=True)
-        found = select_labelled(cloud, query, threshold)
+        found = _of_class(cloud, query, threshold)
         scene = None if classes.scene is None else classes.load_scene().undistorted()
         cameras = None if scene is None else scene.cameras
     headline = f"{query}: {len(found)} of {len(cloud)} Gaussians, {found.summary}"
@@ -146,8 +145,7 @@ def label(
     import torch
 
     from .._check import check_range
-    from ..formats.ply import read_comments
-    from ..pipeline import label_cloud, read_cloud, save_labelled
+    from ..pipeline import label_cloud, save_labelled
 
     for name, value, other, needed in (
         ("threshold", threshold, "query", query),
@@ -163,8 +161,6 @@ def label(
     loaded = classes.open_field("field", field)
     asked = loaded.paper if rule == "paper" else loaded
     label_set = classes.of_field(loaded)
-    carried = None if cloud is None else read_cloud(cloud)
-    said = () if cloud is None else tuple(read_comments(cloud))
     if query is None:
         labels, scores = asked.classify(label_set)
         who = "what the views show of each Gaussian" if rule == "fused" else "each Gaussian's own latent (Sec. 3.4)"
@@ -173,12 +169,12 @@ def label(
         found = asked.query(query, label_set, threshold)
         labels, scores = torch.where(found.mask, label_set.index(query), -1), found.scores
         how = f"{query}: {len(found)} Gaussians above gamma = {found.threshold:.4f} ({found.how})"
-    gaussians = loaded.gaussians.replace(labels=labels)
+    gaussians = loaded.gaussians.replace(labels=labels, scores=scores, names=label_set.names)
     moved = None
     with atomic_folder(out) as new:
-        save_labelled(new / "gaussians.ply", gaussians, scores, label_set, rule=how)
-        if carried is not None:
-            moved, _ = label_cloud(gaussians, carried, new / "cloud.ply", label_set, distance=distance, comments=said)
+        save_labelled(new / "gaussians.ply", gaussians, rule=how)
+        if cloud is not None:
+            moved, _ = label_cloud(gaussians, cloud, new / "cloud.ply", distance=distance)
         written = sorted(path.name for path in new.iterdir())
     say(f"labelled by {how}")
     if query is None:
@@ -205,6 +201,18 @@ def info(path: Positional[Path]) -> None:
     say(describe_batch(path) or describe(path))
 
 
+def _of_class(splats: Any, name: str, threshold: float | None) -> Any:
+    """The Gaussians of a labelled splat that have a class, and a score above the threshold."""
+    from ..labels import OfClass, Selection
+
+    chosen = OfClass(name).select(splats)
+    if splats.scores is None:
+        check_alone("threshold", threshold, "with a splat that has no scores")
+        return chosen
+    mask = chosen.mask if threshold is None else chosen.mask & (splats.scores > threshold)
+    return Selection(mask, splats.scores, threshold, chosen.how)
+
+
 def _times_as_long(things: list[Any]) -> list[str]:
     """What is said of parts that may be two things in one."""
     odd = lengths_odd([2 * float(thing.box.half.max()) for thing in things])
@@ -224,7 +232,7 @@ def _save(folder: Path, query: str, cloud: Any, found: Any, things: list[Any]) -
 
 def _draw(path: Path, query: str, gaussians: Any, things: list[Any], cameras: Any, scene: Any) -> None:
     """Draw the parts over photographs; without them over the cloud's own colours, if it has some."""
-    from ..pipeline.part_pictures import write_parts
+    from ..pipeline.label import write_parts
     from ..viz import show_cloud
     from ..viz.films import show_photos
 

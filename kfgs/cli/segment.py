@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .._files import check_output, read_json
+from .._files import check_output, read_json, write_json
 from .files import check_alone, open_field
 from .options import Classes, Flag, Given, GivenWalk, Positional, Rule, Walk
 from .output import say, wrote
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
-PICTURES = 4  # views with a sheet, an overlay and features
+PICTURES = 4  # views with a sheet
 
 
 def segment(
@@ -32,7 +32,6 @@ def segment(
     color: Given[Path] = None,
     coco: Flag = False,
     labels: Given[Path] = None,
-    features: Given[Path] = None,
     rule: Rule = "fused",
     pictures: Given[int] = None,
     classes: Classes,
@@ -60,21 +59,17 @@ def segment(
         coco: Write coco/annotations.json (COCO's run lengths, areas and boxes; one annotation for each class of each picture)
             and its pictures to coco/images: undistorted photographs, or with --path rendered colours.
         labels: Folder of true label pictures; SCENE/labels_scored or SCENE/labels when not given.
-        features: Folder of the teacher's maps, for the sheets; SCENE/features when not given, if it exists.
         rule: fused: the classes of the field's Gaussians; paper: decode every pixel (Sec. 3.4), seconds a view.
-        pictures: How many views get pictures: a sheet (photo, truth, teacher, field, errors), an overlay and features; by default
-            4.
+        pictures: How many views get a sheet (photograph, truth, field, features); by default 4.
     """
     from ..fields import recall_scene
-    from ..pipeline import score_scene, segment_scene, true_labels, write_coco, write_report
-    from ..pipeline.apply import SEGMENTED
-    from ..pipeline.label_pictures import picture_names
+    from ..pipeline import score_scene, segment_scene, true_labels, write_coco
+    from ..pipeline.segment import picture_names
     from ..viz import plot_iou
 
     check_output("out", out, "a folder")
     if path is not None:
-        for name, value in (("labels", labels), ("features", features)):
-            check_alone(name, value, "with --path, of whose pictures nothing is known")
+        check_alone("labels", labels, "with --path, of whose pictures nothing is known")
         for name, asked in (("split", split), ("pictures", pictures)):
             check_alone(name, asked, "with --path, which segments no views of the scene")
         walk = check_walk(path, frames, width)
@@ -104,9 +99,6 @@ def segment(
     seen = set(loaded_field.info.get("views", ())) & {loaded.cameras[i].name for i in loaded.views(split)}
     if seen:
         say(f"note: the field was trained on {len(seen)} of these views")
-    if features is not None and not features.is_dir():
-        raise ValueError(f"features: expected a folder of feature maps, got {features}, which is none; name another")
-    maps = features or (scene / "features" if (scene / "features").is_dir() else None)
     found = segment_scene(
         loaded_field.paper if rule == "paper" else loaded_field,
         loaded,
@@ -115,16 +107,16 @@ def segment(
         split=split,
         pictures=pictures,
         truth=truth,
-        maps=maps,
         progress=True,
     )
-    written = [out / name for name in SEGMENTED]
+    written = [out / name for name in ("predicted", "colored", "sheets")]
     if coco:
         views = {loaded.stem(i): i for i in loaded.views(split)}
         written.append(write_coco(out, found, label_set.names, lambda stem: loaded.image(views[stem])))
     if truth:
         scores = score_scene(found, truth, label_set)
-        write_report(out / "scores.json", segmentation=scores, truth=str(folder), field=str(field), rule=rule)
+        facts = {"truth": str(folder), "field": str(field), "rule": rule}
+        write_json(out / "scores.json", {"segmentation": scores.to_json(), **facts})
         plot_iou(scores.iou, list(label_set.names), out / "iou.png")
         written += [out / name for name in ("scores.json", "iou.png")]
         say(str(scores))

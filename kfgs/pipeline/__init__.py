@@ -1,25 +1,15 @@
 """The whole job (the paper's Figure 2) as a few resumable calls, and the uses of a finished field."""
 
-from .apply import (
-    label_cloud,
-    read_cloud,
-    save_labelled,
-    score_scene,
-    score_teacher,
-    segment_scene,
-    select_labelled,
-    true_labels,
-    write_report,
-)
 from .attach import attach
 from .color import ColorConfig, fit_color
 from .compare import views_of_change, write_comparison
 from .describe import describe
 from .evaluate import Question, evaluate, open_question
 from .fit import fit
-from .label_pictures import segment_cameras, write_coco
+from .label import label_cloud, save_labelled
 from .methods import Paper, Uplift
 from .run_report import write_run_report
+from .segment import score_scene, score_teacher, segment_cameras, segment_scene, true_labels, write_coco
 from .stages import Run
 
 __all__ = [
@@ -35,17 +25,14 @@ __all__ = [
     "fit_color",
     "label_cloud",
     "open_question",
-    "read_cloud",
     "save_labelled",
     "score_scene",
     "score_teacher",
     "segment_cameras",
     "segment_scene",
-    "select_labelled",
     "true_labels",
     "views_of_change",
     "write_coco",
     "write_comparison",
-    "write_report",
     "write_run_report",
 ]

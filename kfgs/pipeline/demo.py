@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from .._check import ORIGIN
-from .._files import check_output
+from .._files import check_output, write_json
 from .._origin import recounted
 from ..evaluation import Report, find_points, score_surface, score_views
 from ..fields import SemanticField
@@ -22,27 +22,19 @@ from ..labels import (
     Remove,
     connected_parts,
     load_label_set,
-    nearest_labels,
     parse_color,
 )
 from ..labels.edits.edit_list import edits_path
 from ..scenes import FeatureFolder, Scene, load_scene
 from ..toy.room_folder import ToyConfig, make_toy_room
-from .apply import (
-    label_columns,
-    save_labelled,
-    score_scene,
-    score_teacher,
-    segment_scene,
-    true_labels,
-    write_report,
-)
 from .attach import attach
 from .color import ColorConfig, fit_color
 from .compare import views_of_change, write_comparison
 from .fit import fit
+from .label import label_cloud, save_labelled
 from .methods import Uplift
 from .run_report import write_run_report
+from .segment import score_scene, score_teacher, segment_scene, true_labels
 
 REMOVED, PAINTED, PAINT = "chair", "plant", "#c04040"  # the edits of the paper's Figures 5 and 4
 TITLES = ("before", "after")
@@ -95,43 +87,29 @@ def run(
         "truth. mIoU is the mean over classes of overlap divided by union; 1 is perfect."
     )
     truth = true_labels(scene, folder / "labels", "test")
-    found = segment_scene(
-        field,
-        scene,
-        classes,
-        out / "segmentation",
-        truth=truth,
-        maps=folder / "features",
-        progress=progress,
-    )
-    scores = score_scene(found, truth, classes)
-    test_maps = FeatureFolder(folder / "features", list(found))
+    unseen = segment_scene(field, scene, classes, out / "segmentation", truth=truth, progress=progress)
+    scores = score_scene(unseen, truth, classes)
+    test_maps = FeatureFolder(folder / "features", list(unseen))
     size = scene.cameras[scene.views("test")[0]].size
-    teacher = score_teacher(lambda stem: test_maps[list(found).index(stem)], truth, classes, size)
+    teacher = score_teacher(lambda stem: test_maps[list(unseen).index(stem)], truth, classes, size)
     say(f"unseen views: {scores}")
     say(f"the 2-D network alone, on the same views: {teacher.miou}")
 
     labels, cosines = field.classify(classes)
-    gaussians = field.gaussians.replace(labels=labels)
-    written = save_labelled(out / "gaussians.ply", gaussians, cosines, classes, rule="fused features; score = cosine")
-    surface = _label_surface(gaussians, folder, out / "surface.ply", classes)
+    gaussians = field.gaussians.replace(labels=labels, scores=cosines, names=classes.names)
+    written = save_labelled(out / "gaussians.ply", gaussians, rule="fused features; score = cosine")
+    surface = _label_surface(gaussians, folder, out / "surface.ply")
     say(f"surface points: {surface}")
     say(
         f'5. Edits. The classes are carried over to the splat with the colours, and then "{REMOVED}" is a name for Gaussians: '
         f"the {REMOVED}s are removed, and the {PAINTED}s are painted red. Pictures show the views that change most."
     )
     edited = _edit_colors(out, scene, field, colors, classes, say)
-    write_report(
-        out / "scores.json",
-        unseen_views=scores,
-        teacher=teacher,
-        surface=surface,
-        color=quality,
-    )
-    segmentation = out / "segmentation"
+    reports = {"unseen_views": scores, "teacher": teacher, "surface": surface, "color": quality}
+    write_json(out / "scores.json", {name: report.to_json() for name, report in reports.items()})
     return [
         out / "run" / NAME,
-        *(segmentation / name for name in ("predicted", "colored", "sheets", "overlay", "features")),
+        *(out / "segmentation" / name for name in ("predicted", "colored", "sheets")),
         *written,
         out / "surface.ply",
         *write_run_report(out / "run", field, scene, method, command="kfgs demo"),
@@ -167,14 +145,13 @@ def _edit_colors(
     return written
 
 
-def _label_surface(gaussians: Gaussians, folder: Path, out: Path, classes: LabelSet) -> Report:
+def _label_surface(gaussians: Gaussians, folder: Path, out: Path) -> Report:
     """Carry the Gaussians' labels to the room's true surface points and score them (protocol `kfgs-surface/1`)."""
     assert gaussians.labels is not None
     truth = find_points(folder)
     points, true = truth.points.float(), truth.labels
     local = recounted(points, ORIGIN, gaussians.origin)
     report = score_surface(gaussians.means, gaussians.labels, local, true)
-    carried = nearest_labels(gaussians.means, gaussians.labels, local).labels
-    columns = {name: points[:, i].contiguous().numpy() for i, name in enumerate("xyz")}
-    write_ply(out, columns | label_columns(carried, classes.names), comments=("labels carried by kfgs",))
+    write_ply(out, {name: points[:, i].contiguous().numpy() for i, name in enumerate("xyz")})
+    label_cloud(gaussians, out, out)
     return report

@@ -17,16 +17,13 @@ from ..formats import find_format, read_splats
 from ..formats.folders import splat_file_of
 from ..formats.ply import read_ply
 from ..gaussians import Gaussians
-from ..scenes import FeatureFolder, SceneError, is_scene, list_images, load_scene
-from ..scenes.extract import MANIFEST
-from ..scenes.files import IMAGE_SUFFIXES, natural_key, some
-from .stages import read_stage
-
-MOST = 1000  # folders that are looked into
+from ..scenes import FeatureFolder, Scene, SceneError, is_scene, list_images, load_scene
+from ..scenes.files import some
+from .stages import Run
 
 
 def describe(path: str | Path) -> str:
-    """Describe a field, run or scene folder, a folder of feature maps that kfgs made, a splat, or a PLY of points.
+    """Describe a field, run or scene folder, a folder of feature maps, photos or scenes, a splat, or a PLY of points.
 
     A splat is a file, or the output folder of a training program.
 
@@ -47,18 +44,20 @@ def describe(path: str | Path) -> str:
                 count = len(next(iter(columns.values())))
                 return f"{path}: PLY with {count} vertices; columns {', '.join(columns)}"
         return _describe_splats(path, read_splats(path))
-    if (path / MANIFEST).is_file():
-        return _describe_maps(path)
     if (path / "stages").is_dir():
-        done = [read_stage(file) for file in sorted((path / "stages").glob("[!.]*/stage.json"))]
-        lines = [f"  {one_line(about['name'])}: done in {about['seconds']:.1f} s" for about in done]
-        return "\n".join([f"{path}: unfinished run; start `kfgs fit` again to go on", *lines])
+        lines = [f"  {one_line(stage.name)}: done in {stage.seconds:.1f} s" for stage in Run(path).finished("*")]
+        return "\n".join([f"{path}: unfinished run; the same fit again continues", *lines])
     try:
-        scene = load_scene(path)
+        return _describe_scene(path, load_scene(path))
     except SceneError as error:
         if is_scene(path):
             raise
-        return _describe_others(path, error)
+        with suppress(FileNotFoundError, ValueError, TypeError):
+            return _describe_maps(path)
+        return _describe_folder(path, error)
+
+
+def _describe_scene(path: Path, scene: Scene) -> str:
     sizes = sorted({camera.size for camera in scene.cameras})
     splits = ", ".join(f"{name} {len(views)}" for name, views in scene.splits.items())
     lines = [
@@ -72,43 +71,22 @@ def describe(path: str | Path) -> str:
     return "\n".join(lines)
 
 
-def _describe_others(path: Path, error: SceneError) -> str:
-    """A folder that is no scene: photos without poses, a folder of scenes, photos or runs, or maps of another program."""
-    photos = _photos_in(path)
-    if photos == path:
-        with suppress(TypeError, ValueError):  # there may be pictures among maps
-            return _describe_other_maps(path, error)
-    if photos is not None:
-        out = "SCENE" if photos == path else path
-        count = len(list_images(photos))
-        return (
-            f"{path}: {count} photos without camera poses\nnext: kfgs sfm {photos} --out {out}, which finds the cameras"
-        )
-    folders = sorted((one for one in path.iterdir() if one.is_dir()), key=lambda one: natural_key(one.name))[:MOST]
-    scenes = [one for one in folders if is_scene(one)]
-    photos_only = [one for one in folders if one not in scenes and _photos_in(one) is not None]
-    fields = [one for one in folders if one not in scenes and find_field(one) is not None]
-    kinds = {"scenes": scenes, "photos without camera poses": photos_only, "runs or fields": fields}
-    found = {kind: inside for kind, inside in kinds.items() if inside}
-    if not found:
-        return _describe_other_maps(path, error)
-    lines = [f"  {len(inside)} {kind}: {some([one.name for one in inside])}" for kind, inside in found.items()]
-    first = next(iter(found.values()))[0]
-    return "\n".join([f"{path}: a folder of folders", *lines, f"next: give one of them: kfgs info {first}"])
-
-
-def _describe_other_maps(path: Path, error: SceneError) -> str:
-    try:
-        return _describe_maps(path)
-    except (FileNotFoundError, ValueError):
-        raise error from None
-
-
-def _photos_in(path: Path) -> Path | None:
-    """The folder with the photos: images/ in a folder, or the folder itself; None if there are none."""
-    if (path / "images").is_dir() and list_images(path / "images"):
-        return path / "images"
-    return path if any(one.suffix.lower() in IMAGE_SUFFIXES for one in path.iterdir()) else None
+def _describe_folder(path: Path, error: SceneError) -> str:
+    """Photos without poses, or a folder of scenes or runs; else the error of the scene that was expected."""
+    for photos in (path / "images", path):
+        names = [name for name in list_images(photos) if "/" not in name] if photos.is_dir() else []
+        if names:
+            out = "SCENE" if photos == path else path
+            return f"{path}: {len(names)} photos without camera poses\nnext: kfgs sfm {photos} --out {out}, which finds the cameras"
+    folders = sorted(folder for folder in path.iterdir() if folder.is_dir())
+    kinds = {
+        "scenes": [folder for folder in folders if is_scene(folder)],
+        "runs or fields": [folder for folder in folders if find_field(folder) is not None],
+    }
+    lines = [f"  {len(inside)} {kind}: {some([f.name for f in inside])}" for kind, inside in kinds.items() if inside]
+    if not lines:
+        raise error
+    return "\n".join([f"{path}: a folder of folders", *lines, "next: give one of them"])
 
 
 def _describe_maps(path: Path) -> str:

@@ -226,7 +226,7 @@ def test_a_splat_becomes_a_small_field_that_is_right_on_unseen_views(fused, scen
     shuffled = {stem: one.flip(1) for stem, one in labels.items()}
     assert score_scene(shuffled, truth, classes).accuracy.value < 0.6
     assert len(list((tmp_path / "predicted").iterdir())) == 3
-    assert len(list((tmp_path / "overlay").iterdir())) == 1
+    assert len(list((tmp_path / "sheets").iterdir())) == 1
 
 
 def test_every_gaussian_of_a_splat_can_be_kept(scene, maps, splat, classes):

@@ -17,12 +17,12 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     scene = load_scene(make_room(folder / "a <b> scene"))
     maps = FeatureFolder(scene.folder / "features").of(scene, "train")
-    return scene, fit(scene, maps, PAPER, folder=folder / "run")
+    return folder / "run", scene, fit(scene, maps, PAPER, folder=folder / "run")
 
 
 def test_the_page_says_all_and_loads_nothing(run):
-    scene, field = run
-    paths = write_run_report(field, scene, PAPER, command="kfgs fit 'a <b> scene'")
+    folder, scene, field = run
+    paths = write_run_report(folder, field, scene, PAPER, command="kfgs fit 'a <b> scene'")
     assert [path.name for path in paths] == ["preview.png", "codebook.png", "field.png", "report.html"]
     page = paths[-1].read_text()
     shown = [base64.b64decode(data) for data in re.findall(r"data:image/png;base64,([^\"]+)", page)]
@@ -39,7 +39,7 @@ def test_the_page_says_all_and_loads_nothing(run):
 
 
 def test_a_preview_has_a_row_for_each_view(run, tmp_path):
-    scene, field = run
+    folder, scene, field = run
     path = write_preview(tmp_path / "a.png", field, scene)
     picture = np.asarray(Image.open(path))
     height = round(WIDTH * scene.cameras[0].height / scene.cameras[0].width)
@@ -50,9 +50,9 @@ def test_a_preview_has_a_row_for_each_view(run, tmp_path):
 
 
 def test_without_photographs_there_is_a_page_still(run, tmp_path):
-    scene, field = run
+    folder, scene, field = run
     gone = dataclasses.replace(scene, image_paths=[tmp_path / path.name for path in scene.image_paths])
     assert write_preview(tmp_path / "a.png", field, gone) is None
-    paths = write_run_report(field, gone, Uplift())
+    paths = write_run_report(folder, field, gone, Uplift())
     assert "kfgs.fit(scene, maps, " in paths[-1].read_text()
     assert "&quot;uplift&quot;: {" in paths[-1].read_text()

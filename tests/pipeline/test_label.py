@@ -2,15 +2,18 @@ import dataclasses
 
 import numpy as np
 import torch
-from kfgs.viz.shows import Photos
 from PIL import Image
 from small_room import make_room
 
 from kfgs.cameras import Camera
+from kfgs.formats import read_splats
+from kfgs.formats.ply import read_ply, write_ply
 from kfgs.gaussians import Gaussians
 from kfgs.labels import Selection, connected_parts
-from kfgs.pipeline.part_pictures import WIDTH, write_parts
+from kfgs.pipeline import label_cloud, save_labelled
+from kfgs.pipeline.label import WIDTH, write_parts
 from kfgs.scenes import load_scene
+from kfgs.viz import show_photos
 
 K = torch.tensor([[40.0, 0, 40], [0, 40, 30], [0, 0, 1]])
 
@@ -54,5 +57,24 @@ def test_photographs_are_found_by_name(tmp_path):
     scene = load_scene(make_room(tmp_path / "scene"))
     view = scene.views("test")[0]
     camera = scene.cameras[view]
-    np.testing.assert_allclose(Photos(scene)(camera), scene.image(view) * 255, atol=1)
-    assert (Photos(scene)(dataclasses.replace(camera, name="other.png")) == 200).all()
+    np.testing.assert_allclose(show_photos(scene)(camera), scene.image(view) * 255, atol=1)
+    assert (show_photos(scene)(dataclasses.replace(camera, name="other.png")) == 200).all()
+
+
+def test_labels_are_written_and_carried_to_points(tmp_path):
+    cloud = balls((0.0, 0, 0), (5.0, 0, 0)).replace(
+        features=torch.eye(2), labels=torch.tensor([1, 0]), scores=torch.tensor([0.5, 0.75]), names=("wall", "chair")
+    )
+    save_labelled(tmp_path / "a.ply", cloud, rule="by hand")
+    read = read_splats(tmp_path / "a.ply")
+    assert (read.labels.tolist(), read.scores.tolist(), read.names) == ([1, 0], [0.5, 0.75], ("wall", "chair"))
+    assert read.sh is not None  # other programs show the classes
+    points = {"x": np.array([0.1, 5.0, 100.0], np.float32), "mine": np.arange(3, dtype=np.uint8)}
+    points |= {name: np.zeros(3, np.float32) for name in "yz"}
+    write_ply(tmp_path / "points.ply", points)
+    moved, files = label_cloud(cloud, tmp_path / "points.ply", tmp_path / "labelled.ply", distance=1.0)
+    columns = read_ply(tmp_path / "labelled.ply")
+    assert columns["class_id"].tolist() == moved.labels.tolist() == [1, 0, -1]
+    assert columns["mine"].tolist() == [0, 1, 2]
+    assert {"red", "green", "blue"} <= set(columns)
+    assert [file.name for file in files] == ["labelled.ply", "labelled.ply.classes.json"]

@@ -1,0 +1,113 @@
+"""Labels for other programs: a field's Gaussians in the colours of their classes, and any cloud of points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from .._check import ORIGIN
+from .._files import as_path
+from .._origin import recounted
+from ..cameras import Camera
+from ..formats import write_splats
+from ..formats.ply import other_elements, points_from_columns, read_comments, read_ply, write_ply
+from ..formats.ply_3dgs import label_column
+from ..formats.sidecar import write_names
+from ..gaussians import Gaussians
+from ..labels import Part, Transfer, nearest_labels
+from ..splat import rgb_to_sh0
+from ..viz import palette, save_picture
+from ..viz.films import Show, show_selection
+from ..viz.pictures import picture_grid
+
+WIDTH = 360  # pixels of a picture of a part
+MOST = 12  # parts in a sheet
+
+
+def save_labelled(path: str | Path, gaussians: Gaussians, *, rule: str) -> list[Path]:
+    """Write labelled Gaussians as a splat in the colours of their classes, with `class_id` and `score`.
+
+    Args:
+        path: the PLY file to write; a JSON file with the class names is written next to it.
+        gaussians: with labels and class names, perhaps with scores.
+        rule: how labels and scores were found, for the JSON file.
+    """
+    assert gaussians.labels is not None
+    colors = torch.from_numpy(palette(gaussians.labels, gaussians.names)).to(gaussians.means) / 255
+    painted = gaussians.replace(features=None, sh=rgb_to_sh0(colors)[:, None])
+    return list(write_splats(painted, path, facts={"labelled by": rule}).paths)
+
+
+def label_cloud(
+    gaussians: Gaussians, cloud: str | Path, out: str | Path, *, distance: float | None = None
+) -> tuple[Transfer, list[Path]]:
+    """Carry labels to the points or Gaussians of a PLY file by distance (Sec. 3.4), keeping all their other columns.
+
+    Label colours are added if the cloud has no colours; `class_id` is replaced.
+
+    Args:
+        gaussians: with labels and class names.
+        cloud: the file, in the same frame.
+        out: the PLY file to write; a JSON file with the class names is written next to it.
+        distance: lambda of Sec. 3.4, in world units; None: from the clouds' spacing.
+
+    Raises:
+        ValueError: if the file has no x, y, z, or holds more than points (faces would be lost).
+    """
+    assert gaussians.labels is not None
+    columns, others = read_ply(cloud), other_elements(as_path(cloud))
+    if others:
+        raise ValueError(
+            f"{cloud}: expected nothing but points, got {', '.join(others)} too, which labelling would lose; save the "
+            "vertices as a point cloud"
+        )
+    try:
+        points = points_from_columns(columns)
+    except ValueError as error:
+        raise ValueError(f"{cloud}: {error}; give a point cloud or a 3DGS file") from error
+    local = recounted(points, ORIGIN, gaussians.origin)
+    moved = nearest_labels(gaussians.means, gaussians.labels, local, distance)
+    added = {"class_id": label_column(moved.labels)}
+    if not {"red", "green", "blue"} & set(columns):
+        rgb = palette(moved.labels, gaussians.names)
+        added |= {name: np.ascontiguousarray(rgb[:, i]) for i, name in enumerate(("red", "green", "blue"))}
+    write_ply(as_path(out), columns | added, comments=("labels carried by kfgs", *read_comments(as_path(cloud))))
+    names = write_names(out, gaussians.names, **{"distance": moved.distance, "distance from": moved.how})
+    return moved, [as_path(out), names]
+
+
+def write_parts(
+    path: Path, gaussians: Gaussians, parts: Sequence[Part], cameras: Sequence[Camera], under: Show | None, name: str
+) -> Path | None:
+    """Draw the largest parts, each in its best view with an outline, while the rest fades; None if no view shows one.
+
+    Args:
+        path: the PNG file.
+        gaussians: the cloud that was selected in.
+        parts: from `connected_parts`, with these cameras.
+        cameras: the views.
+        under: draws the picture below, for instance `show_photos(scene)`.
+        name: of the selection; parts are named name/1, name/2.
+    """
+    pictures, titles = [], []
+    for number, part in enumerate(parts[:MOST], start=1):
+        if part.best_view is None:
+            continue
+        camera = cameras[part.best_view.index]
+        camera = camera.resized(max(1, round(WIDTH * camera.height / camera.width)), WIDTH)
+        mask = part.selection(len(gaussians)).mask
+        pictures.append(show_selection(gaussians, mask, under)(camera))
+        titles.append(f"{name}/{number} in {camera.name}" if camera.name else f"{name}/{number}")
+    if not pictures:
+        return None
+    columns = min(3, len(pictures))
+    titles += [""] * (-len(pictures) % columns)
+    pictures += [np.full((1, WIDTH, 3), 255, np.uint8)] * (-len(pictures) % columns)
+    rows = [
+        picture_grid([pictures[i : i + columns]], titles[i : i + columns]) for i in range(0, len(pictures), columns)
+    ]
+    save_picture(path, np.concatenate(rows))
+    return path
