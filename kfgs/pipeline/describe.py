@@ -77,7 +77,8 @@ def _describe_folder(path: Path, error: SceneError) -> str:
         names = [name for name in list_images(photos) if "/" not in name] if photos.is_dir() else []
         if names:
             out = "SCENE" if photos == path else path
-            return f"{path}: {len(names)} photos without camera poses\nnext: kfgs sfm {photos} --out {out}, which finds the cameras"
+            words = f"{path}: {len(names)} photos without camera poses"
+            return f"{words}\nnext: kfgs sfm {photos} --out {out}, which finds the cameras"
     folders = sorted(folder for folder in path.iterdir() if folder.is_dir())
     kinds = {
         "scenes": [folder for folder in folders if is_scene(folder)],

@@ -13,7 +13,7 @@ from kfgs.labels import Selection, connected_parts
 from kfgs.pipeline import label_cloud, save_labelled
 from kfgs.pipeline.label import WIDTH, write_parts
 from kfgs.scenes import load_scene
-from kfgs.viz import show_photos
+from kfgs.viz.films import show_photos
 
 K = torch.tensor([[40.0, 0, 40], [0, 40, 30], [0, 0, 1]])
 

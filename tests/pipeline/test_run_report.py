@@ -39,7 +39,7 @@ def test_the_page_says_all_and_loads_nothing(run):
 
 
 def test_a_preview_has_a_row_for_each_view(run, tmp_path):
-    folder, scene, field = run
+    _, scene, field = run
     path = write_preview(tmp_path / "a.png", field, scene)
     picture = np.asarray(Image.open(path))
     height = round(WIDTH * scene.cameras[0].height / scene.cameras[0].width)
