@@ -1,12 +1,10 @@
 """Tables, chairs and an odd class in three heaps, in both clouds, for the tests of the viewer."""
 
-from pathlib import Path
-
 import numpy as np
 import torch
 
 from kfgs.gaussians import Gaussians
-from kfgs.viewer import Exploration, ExploreOptions, Explorer, SplatMeaning
+from kfgs.viewer import Exploration, SplatMeaning
 
 NAMES = ("table", "chair", "<b>{{ 1 + 1 }}</b>")  # the last must stay words
 TABLE, CHAIR, ODD = range(3)
@@ -35,7 +33,3 @@ def exploration(names=NAMES):
     score = np.linspace(0.05, 0.95, len(semantic), dtype=np.float32)
     file = semantic.replace(scores=score, names=names)
     return Exploration(SplatMeaning(file), _cloud(150, 0.6, 2), distance=0.4)
-
-
-def explorer(out):
-    return Explorer(exploration(), ExploreOptions(out=Path(out), style="gaussians"), off_screen=True)

@@ -13,7 +13,8 @@ import torch
 from kfgs.gaussians import Gaussians
 from kfgs.scenes import load_scene
 from kfgs.splat import rgb_to_sh0
-from kfgs.viewer import Exploration, SplatMeaning, inline_script
+from kfgs.viewer import Exploration, SplatMeaning
+from kfgs.viewer.page import inline_script
 from kfgs.viz import palette
 
 CHROMIUM = next((path for path in ("/usr/bin/chromium", "/usr/bin/chromium-browser") if Path(path).exists()), None)

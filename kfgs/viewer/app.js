@@ -87,7 +87,6 @@ class App {
     this.tools = new Tools(this.stage, this.eye, this);
     if (Number.isInteger(this.header.default_view)) this.goTo(this.header.default_view);
     model.addEventListener("change", () => (this.refresh(), this.remember()));
-    this.hold();
     this.watch();
     await this.begin();
     await this.remembered();
@@ -97,24 +96,14 @@ class App {
     this.stage.focus({ preventScroll: true });
   }
 
-  /** Show what Python showed: mode, hidden classes, question, gamma. */
+  /** Show what Python showed: mode, question, gamma. */
   async begin() {
-    const { show, hidden = [], words, gamma } = this.header.start ?? {};
+    const { show, words, gamma } = this.header.start ?? {};
     if (show in this.modes) this.panes.list[0].mode = show;
-    this.model.setHidden(hidden);
     if (words) await this.ask(words);
     if (words && gamma !== this.model.gamma) this.model.setGamma(gamma);
     this.model.past = [];
     this.refreshPanes();
-  }
-
-  /** Take no edits until Python has checked that the scene is not outdated; without Python there is nothing to check. */
-  hold() {
-    const { link, model } = this;
-    if (!link.checked) return;
-    model.unchecked = true;
-    link.checked.then(() => (model.unchecked = false));
-    model.addEventListener("unchecked", () => this.say("Python still checks whether this scene is outdated. Edit it in a few seconds."));
   }
 
   watch() {
@@ -309,7 +298,6 @@ class App {
 
   openFile(file) {
     return file && this.attempt(async () => {
-      await this.link.checked;
       await this.open(await new Response(file).json().catch(() => null));
     });
   }

@@ -37,7 +37,6 @@ export class Model extends EventTarget {
     this.parts = null; // {side, name, parts, numbers}
     this.now = { ...NOTHING, edits: [], clouds: this.original, what: "", id: 0 };
     this.past = [];
-    this.unchecked = false; // whether the scene may be outdated: then it takes no edits, which would be lost with it
     this.future = [];
     this.cache = new Map();
   }
@@ -308,7 +307,6 @@ export class Model extends EventTarget {
     const rows = this.chosen((cloud) => op !== "recolor" || cloud.colored);
     const count = Object.values(rows).reduce((all, own) => all + own.length, 0);
     if (!count) return 0;
-    if (this.unchecked) return this.dispatchEvent(new Event("unchecked")), 0;
     const { edits, what } = this.now;
     const last = edits.at(-1);
     const joins = join !== null && what === op && sameRows(last.rows, rows);

@@ -6,6 +6,8 @@ import json
 import re
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
 
 import cases_explorer
 import cases_page
@@ -16,8 +18,9 @@ from cases_web import SECONDS, needs_chromium, software_chromium
 from PIL import Image
 
 from kfgs.labels import EditList
-from kfgs.viewer import Exploration, FieldMeaning, html, save_html
-from kfgs.viz import available
+from kfgs.labels.edits.edit_list import read_edits
+from kfgs.viewer import Exploration, FieldMeaning, pack
+from kfgs.viewer.page import save_html
 
 pytestmark = needs_chromium
 SIDES = "color", "semantic"
@@ -238,16 +241,14 @@ def test_a_late_answer_does_not_replace_a_later_search(page):
 
 def test_hidden_classes_are_not_drawn_picked_or_selected_by_hand(page, state):
     page.click("button[aria-label='Hide chair']")
-    state.set_hidden(["chair"])
     for side in SIDES:
-        np.testing.assert_array_equal(mask(page, side, "drawn"), state.drawn(side))
+        np.testing.assert_array_equal(mask(page, side, "drawn"), state.labels(side) != 1)
     page.evaluate("viewer.shape([[0, 0], [5000, 0], [5000, 5000], [0, 5000]], 'replace')")
-    assert not (mask(page, "color") & ~state.drawn("color")).any()
+    assert not (mask(page, "color") & (state.labels("color") == 1)).any()
     x, y = np.mean([place_of(page, "color", i) for i in range(150, 300)], axis=0)  # where the chairs are
     page.mouse.click(x, y)
     found = page.evaluate("viewer.model.picked?.index ?? -1")
-    assert found < 0 or state.drawn("color")[found]
-    state.set_hidden([])
+    assert found < 0 or state.labels("color")[found] != 1
     page.hover("li[data-label='0']")
     page.click("button[aria-label='Show only table']")
     assert (page.evaluate("viewer.model.counts('color').classes[0]"), mask(page, "color", "drawn").sum()) == (150, 150)
@@ -261,10 +262,9 @@ def test_a_click_picks_what_is_under_it(page, state):
     page.wait_for_selector(".picked p")
     said = page.locator(".picked").inner_text()
     found = int(re.search(r"colour Gaussian (\d+)", said).group(1))
-    picked = state.pick("color", found)
-    assert picked.name == "chair"
-    assert f"chair, score {picked.score:.3f}" in said
-    assert f"semantic Gaussian {picked.source}, {float(f'{picked.distance:.3g}')}" in said
+    assert state.labels("color")[found] == 1
+    assert f"chair, score {state.scores('color')[found]:.3f}" in said
+    assert f"semantic Gaussian {state.source[found]}, {float(f'{state.far[found]:.3g}')}" in said
     assert np.hypot(*(np.array(place_of(page, "color", found)) - (x, y))) < 30
 
 
@@ -337,9 +337,9 @@ def test_edits_are_those_of_python(page, state, tmp_path):
     saved = json.loads(page.evaluate("JSON.stringify(viewer.model)"))["sides"]["color"]
     assert [edit["op"] for edit in saved["edits"]] == ["recolor", "opacity", "duplicate", "move", "remove"]
     assert (saved["edits"][1]["factor"], saved["edits"][3]["translation"]) == (0.5, [0, 0.5, 2])
-    made = EditList.from_json({"format": "kfgs.edits", "version": 1, "edits": saved["edits"]}, "saved")
+    made = EditList(read_edits(saved["edits"]))
     cloud = state.cloud("color").replace(labels=torch.from_numpy(state.labels("color")))
-    edited = made.apply(cloud.replace(names=cases_page.NAMES)).gaussians
+    edited = made.apply(cloud.replace(names=cases_page.NAMES))
     kept = np.flatnonzero(mask(page, "color", "drawn"))
     here = np.array(page.evaluate("[...viewer.model.clouds.color.means]")).reshape(-1, 3)[kept]
     np.testing.assert_allclose(here, edited.means, atol=1e-4)
@@ -535,9 +535,7 @@ def test_hidden_gaussians_of_a_selection_are_told(page, state):
     ask(page, "chair")
     count = int(mask(page, "color").sum())
     page.evaluate("viewer.model.setHidden([1])")
-    state.set_hidden(["chair"])
-    hidden = int((mask(page, "color") & ~state.drawn("color")).sum())
-    state.set_hidden([])
+    hidden = int((mask(page, "color") & (state.labels("color") == 1)).sum())
     assert 0 < hidden <= count
     assert f"{hidden} of these are hidden, and change with the others." in page.locator(".said").inner_text()
 
@@ -590,9 +588,10 @@ def test_buttons_go_to_the_scenes_views(browser, tmp_path):
 
 
 def test_beside_an_upright_photo_no_wider_angle_is_seen_than_its_own(browser, tmp_path, monkeypatch):
-    monkeypatch.setattr(html, "Photos", BlackPhotos)
+    monkeypatch.setattr(pack, "show_photos", lambda scene: lambda camera: np.zeros((*camera.size, 3), np.uint8))
     upright = [replace(view, width=28, height=60) for view in cases_explorer.cameras()]
-    file = save_html(cases_explorer.line(cameras=upright), tmp_path / "page.html", scene=object())
+    state = cases_explorer.line(cameras=upright)
+    file = save_html(state, tmp_path / "page.html", scene=photographed(state))
     angles = "() => { const { fx, fy, width, height } = viewer.panes.camera; return [width / fx, height / fy]; }"
     for page in show(browser, file):
         page.set_viewport_size({"width": 1400, "height": 600})
@@ -626,22 +625,16 @@ def test_the_photo_is_of_the_view_that_looks_the_same_way(browser, tmp_path):
         assert found == 1
 
 
-class BlackPhotos:
-    def __init__(self, scene):
-        pass
-
-    def __contains__(self, camera):
-        return True
-
-    def __call__(self, camera):
-        return np.zeros((camera.height, camera.width, 3), np.uint8)
+def photographed(state):
+    """A scene that has a photograph of every view."""
+    return SimpleNamespace(cameras=state.cameras, image_paths=[Path(__file__)] * len(state.cameras))
 
 
 def test_the_list_of_views_scrolls_to_the_current_one(browser, tmp_path, monkeypatch):
     """Photos are loaded when they come into sight; their places must not move then."""
-    monkeypatch.setattr(html, "Photos", BlackPhotos)
+    monkeypatch.setattr(pack, "show_photos", lambda scene: lambda camera: np.zeros((*camera.size, 3), np.uint8))
     state = cases_explorer.line(cameras=cases_explorer.cameras(90))
-    for page in show(browser, save_html(state, tmp_path / "page.html", scene=object())):
+    for page in show(browser, save_html(state, tmp_path / "page.html", scene=photographed(state))):
         page.keyboard.press("[")
         until(page, lambda tab: tab.evaluate("viewer.view") == tab.locator(".views button").count() - 1)
         page.wait_for_timeout(500)  # the list scrolls
@@ -682,11 +675,9 @@ def test_the_page_opens_as_python_left_it(browser, tmp_path):
     state = cases_page.exploration()
     state.ask("chair")
     state.set_gamma(0.5)
-    state.set_hidden([-1, "table"])
     state.set_show("rgb")
     for page in show(browser, save_html(state, tmp_path / "page.html"), color_scheme="dark"):
         agree(page, state)
-        np.testing.assert_array_equal(mask(page, "color", "drawn"), state.drawn("color"))
         assert page.get_attribute(".kfgs", "data-theme") == "dark"
         assert page.locator(".top .choice [aria-pressed=true]").inner_text() == "Colour"
         assert page.locator("button[aria-label='Undo']").is_disabled()
@@ -714,18 +705,6 @@ def test_every_control_has_a_name(page):
           .map((one) => one.outerHTML)"""
     )
     assert nameless == []
-
-
-def test_an_explorer_writes_what_it_shows(browser, tmp_path):
-    if not available():
-        pytest.skip("needs a driver that draws")
-    with cases_page.explorer(tmp_path) as opened:
-        opened.ask("table")
-        path = opened.save_html(tmp_path / "made" / "page.html", title="Heaps")
-    for page in show(browser, path):
-        agree(page, opened.state)
-        assert page.title() == "Heaps"
-        assert page.locator("#query").input_value() == "table"
 
 
 def test_other_names_are_refused(state, tmp_path):

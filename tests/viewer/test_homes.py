@@ -11,7 +11,7 @@ import pytest
 from cases_web import SECONDS, needs_chromium, software_chromium
 
 from kfgs.formats import read_splats
-from kfgs.viewer import Exploration, ExploreOptions, FieldMeaning, Viewer, save_html
+from kfgs.viewer import Exploration, FieldMeaning, Viewer
 
 pytestmark = needs_chromium
 
@@ -42,21 +42,21 @@ def browser():
 
 @contextmanager
 def in_page(page, state, out):
-    with Viewer(state, ExploreOptions(out=out)).open_page() as served:
+    with Viewer(state, out=out).open_page() as served:
         page.goto(served.url)
         yield
 
 
 @contextmanager
 def in_file(page, state, out):
-    page.goto(save_html(state, out.parent / "scene.html").as_uri())
+    page.goto(Viewer(state).save_html(out.parent / "scene.html").as_uri())
     yield
 
 
 @contextmanager
 def in_widget(page, state, out):
     pytest.importorskip("anywidget")
-    widget = Viewer(state, ExploreOptions(out=out)).widget
+    widget = Viewer(state, out=out).widget
 
     def python(message, attached):
         sent = []
@@ -175,7 +175,7 @@ def test_the_renderer_has_the_scores_of_the_class_whatever_the_names(browser, tm
 @pytest.mark.parametrize("phrase", ["a soft seat", "1", "null"])
 def test_a_phrase_that_only_python_can_answer(browser, tmp_path, phrase):
     field = cases_explorer.field("fused")
-    words = {phrase: field.linear.decode(field.features[20])}
+    words = {phrase: field.decode(field.features[20])}
     meaning = FieldMeaning(field, cases_explorer.classes(), embed=words.__getitem__)
     state = Exploration(meaning, cases_explorer.cloud(field.gaussians.means[:40] + 0.05), distance=1.0)
     page = browser.new_page(viewport={"width": 800, "height": 600})

@@ -1,4 +1,6 @@
 import json
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,8 +11,9 @@ from cases_web import room_state
 from messages import tells
 from small_room import make_room
 
-from kfgs.viewer import Exploration, FieldMeaning, SplatMeaning, inline_script, read_text
+from kfgs.viewer import Exploration, FieldMeaning, SplatMeaning, pack
 from kfgs.viewer.pack import pack_scene, rounded_far
+from kfgs.viewer.page import inline_script, read_text
 
 
 @pytest.fixture(scope="module")
@@ -111,11 +114,11 @@ def test_labels_and_distances_are_exact(room):
     state, packed = room
     labels, source, far = (buffer(packed, name) for name in ("semantic/labels", "color/source", "color/far"))
     assert labels.tolist() == state.labels("semantic").tolist()
-    distances = np.unique(state.carried.far)
+    distances = np.unique(state.far)
     assert far.dtype == np.float32
     # at the start: a distance, a number next to one that no float32 tells from it, any
     for given in (float(distances[7]), float(distances[9]) * (1 - 1e-9), 0.2):
-        far = rounded_far(state.carried.far, given)
+        far = rounded_far(state.far, given)
         # those that the viewer sets, a distance itself and its neighbours among them, and the one given at the start
         for distance in (*far[np.argsort(far)][::500], *np.nextafter(far[:20], np.float32(9)), np.float32(0.05), given):
             state.set_distance(max(float(distance), 1e-9))
@@ -158,11 +161,12 @@ def test_the_page_knows_where_a_far_scene_lies():
     assert packed.header["sides"]["color"]["center"][0] == pytest.approx(1)
 
 
-def test_cameras_and_thumbnails():
+def test_cameras_and_thumbnails(monkeypatch):
     from cases_explorer import cameras
 
-    picture = np.full((6, 8, 3), 200, np.uint8)
-    packed = pack_scene(line(cameras=cameras(3)), thumbnails=[picture, None])
+    monkeypatch.setattr(pack, "show_photos", lambda scene: lambda camera: np.full((*camera.size, 3), 200, np.uint8))
+    scene = SimpleNamespace(cameras=cameras(2), image_paths=[Path(__file__), Path("missing.png")])
+    packed = pack_scene(line(cameras=cameras(3)), scene=scene)
     first, second, third = packed.header["cameras"]
     assert first["K"] == [40, 44, 21, 13]
     assert first["viewmat"][3] == pytest.approx(-0.3)

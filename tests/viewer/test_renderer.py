@@ -12,8 +12,9 @@ from kfgs.formats import read_splats
 from kfgs.labels import EditList, OfIndex, Opacity, Recolor, Remove
 from kfgs.labels.edits import Duplicate, Move
 from kfgs.splat import rasterize
-from kfgs.viewer import Exploration, SplatMeaning, gaussian_at
+from kfgs.viewer import Exploration, SplatMeaning
 from kfgs.viewer.pack import pack_scene
+from kfgs.viewer.picking import gaussian_at
 
 pytestmark = needs_chromium
 ENOUGH = 40  # dB
@@ -128,11 +129,9 @@ def test_hidden_classes(viewer, state):
     state.set_distance(0.2)
     count = len(state.meaning.names)
     for hidden in ([0, 2], [-1], [-1, 1, 3]):
-        state.set_hidden(hidden)
         flags = [int(label in hidden) for label in (*range(count), -1)]
-        truth = drawn(state, camera, keep=state.drawn("color"))
+        truth = drawn(state, camera, keep=~np.isin(state.labels("color"), hidden))
         assert psnr(viewer.picture(camera, hidden=flags, **{"lambda": 0.2}), truth) > ENOUGH
-    state.set_hidden([])
 
 
 def test_the_semantic_side(viewer, state):
@@ -348,7 +347,7 @@ def test_without_webgl_it_says_what_to_do(viewer):
 
 def test_without_a_worker_it_sorts_in_the_page(browser, state):
     forbidden = "globalThis.Worker = class { constructor() { throw new Error('forbidden'); } };"
-    viewer = cases_web.Viewer(browser, pack_scene(state, questions=()), before=forbidden)
+    viewer = cases_web.Viewer(browser, pack_scene(state), before=forbidden)
     camera = state.cameras[0]
     assert psnr(viewer.picture(camera), drawn(state, camera)) > ENOUGH
     assert viewer.errors == []
@@ -358,7 +357,7 @@ def test_another_file_in_the_same_renderer(viewer, state):
     """Also while an order for the old one is on its way."""
     other = Exploration(state.meaning)
     viewer.run("() => { renderer.setCamera({...renderer.camera}); renderer.draw(); }")
-    viewer.load(pack_scene(other, questions=()))
+    viewer.load(pack_scene(other))
     camera = state.cameras[1]
     state.set_show("labels")
     truth = drawn(state, camera, "semantic", state.colors("semantic"))

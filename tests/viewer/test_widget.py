@@ -13,11 +13,8 @@ from PIL import Image
 
 pytest.importorskip("anywidget")
 
-from kfgs.viewer.widget import make_widget
-
 from kfgs.splat import rasterize, rgb_to_sh0
-from kfgs.viewer import Exploration, FieldMeaning, Viewer, pack
-from kfgs.viz import explore
+from kfgs.viewer import Exploration, FieldMeaning, Viewer, explore, pack
 
 
 def exploration():
@@ -37,7 +34,7 @@ def answers(widget, *messages):
 
 
 def still_of(state):
-    bundle = make_widget(state)._repr_mimebundle_()
+    bundle = Viewer(state).widget._repr_mimebundle_()
     file = base64.b64decode((bundle[0] if isinstance(bundle, tuple) else bundle)["image/jpeg"])
     return np.asarray(Image.open(io.BytesIO(file))).astype(int)
 
@@ -45,16 +42,16 @@ def still_of(state):
 def test_the_scene_is_sent_once(tmp_path):
     state = exploration()
     state.ask("chair")
-    widget = make_widget(state, title="room", out=tmp_path)
-    packed = pack.pack_scene(exploration(), title="room")
-    assert widget.header["buffers"] == packed.header["buffers"]
+    widget = Viewer(state, title="room", out=tmp_path).widget
+    packed = pack.pack_scene(state, title="room")
+    assert widget.header == packed.header
     assert widget.header["start"]["words"] == "chair"
     assert widget.data == packed.compressed()
     assert (widget.question, widget.header["phrases"]) == ("chair", False)
 
 
 def test_calls_are_answered_with_their_number(tmp_path):
-    widget = make_widget(exploration(), out=tmp_path)
+    widget = Viewer(exploration(), out=tmp_path).widget
     (first, scores), (second, _) = answers(
         widget, {"id": 7, "name": "ask", "args": {"words": "chair"}}, {"id": 8, "name": "ask", "args": {"words": "sky"}}
     )
@@ -114,7 +111,7 @@ def test_after_a_question_the_picture_shows_the_answer():
 def test_without_anywidget_the_install_line_is_told():
     code = (
         "import sys; sys.modules['anywidget'] = None\n"
-        "from kfgs.viewer.widget import require_widget\n"
+        "from kfgs.viewer.viewer import require_widget\n"
         "try: require_widget()\nexcept ImportError as error: print(error)"
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout

@@ -1,15 +1,14 @@
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from cases_explorer import cloud
 from cases_viz import some_camera, some_gaussians
-from kfgs.viewer.hit_test import gaussian_at, neighbours_of, views_seeing
 from messages import tells
 
 from kfgs.cameras import Camera, Distortion
 from kfgs.splat import rasterize
+from kfgs.viewer.picking import gaussian_at, views_seeing
 
 
 def straight(shift=0.0, name="front"):
@@ -111,26 +110,8 @@ def test_equally_good_views_keep_their_order():
     assert [s.name for s in views_seeing(made, 0, [straight(name="b"), straight(name="a")])] == ["b", "a"]
 
 
-def test_neighbours_by_distance():
-    means = torch.rand(40, 3, generator=torch.Generator().manual_seed(0))
-    index, distance = neighbours_of(means, 7, 5)
-    far = np.sqrt(((means.double().numpy() - means[7].double().numpy()) ** 2).sum(axis=1))
-    order = np.argsort(far)[1:6]
-    assert index.tolist() == order.tolist()
-    np.testing.assert_allclose(distance.numpy(), far[order], rtol=1e-12)
-    assert len(neighbours_of(means[:3], 0)[0]) == 2
-    assert len(neighbours_of(means[:1], 0)[0]) == 0
-
-
-def test_one_at_the_same_place_is_a_neighbour():
-    index, distance = neighbours_of(torch.zeros(2, 3), 1)
-    assert (index.tolist(), distance.tolist()) == ([0], [0.0])
-
-
 def test_wrong_arguments():
     made = row([3.0], [0.5])
-    with pytest.raises(ValueError, match=tells("x:", "(-inf, inf)", "got nan")):
-        gaussian_at(made, straight(), float("nan"), 1.0)
     with pytest.raises(ValueError, match=tells("mask:", "[N]", "N = 1", "gaussians.means", "got (2,)")):
         gaussian_at(made, straight(), 1.0, 1.0, torch.ones(2, dtype=torch.bool))
     bent = replace(straight(), distortion=Distortion("kannala_brandt", (0.1, 0, 0, 0)))
@@ -138,7 +119,3 @@ def test_wrong_arguments():
         gaussian_at(made, bent, 1.0, 1.0)
     with pytest.raises(ValueError, match=tells("index:", "[0, 0]", "got 1")):
         views_seeing(made, 1, [straight()])
-    with pytest.raises(ValueError, match=tells("index:", "[0, 0]", "got -1")):
-        neighbours_of(made.means, -1)
-    with pytest.raises(ValueError, match=tells("count:", "[1, inf)", "got 0")):
-        neighbours_of(made.means, 0, 0)

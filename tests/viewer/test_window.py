@@ -1,0 +1,173 @@
+"""Both clouds in pyvista, off-screen: what the rasteriser draws, what is picked, and what the window's keys do."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from cases_explorer import cameras, classes, field
+from cases_viz import some_camera, some_gaussians
+from messages import tells
+
+from kfgs.formats import read_splats
+from kfgs.splat import rasterize
+from kfgs.viewer import Exploration, Explorer, SplatMeaning, explore
+from kfgs.viewer.window import REST, _Controls
+from kfgs.viz import available, palette
+from kfgs.viz.plotter import trouble
+
+NAMES = ("wall", "chair", "table", "sofa", "lamp")
+TITLE, LEGEND = 30, 120  # pixels that a title and a legend cover
+CAMERA = some_camera().resized(240, 320)
+
+
+@pytest.fixture
+def explorer(tmp_path):
+    if not available():
+        pytest.skip(trouble())
+    semantic = some_gaussians().replace(sh=None, scores=torch.linspace(0.2, 1, 60), names=NAMES)
+    color = some_gaussians(90, seed=1).replace(features=None, labels=None)
+    state = Exploration(SplatMeaning(semantic), color, cameras=[CAMERA])
+    with Explorer(state, out=tmp_path, height=240, off_screen=True) as opened:
+        opened.plotter.window_size = [640, 240]
+        opened.look_from(CAMERA)
+        yield opened
+
+
+def agreement(explorer, side):
+    """PSNR against what kfgs's own rasteriser makes of a side, on white."""
+    state = explorer.state
+    cloud, colors = state.cloud(side), state.colors(side)
+    if state.asked is not None:
+        rest = torch.from_numpy(~state.selected(side))
+        cloud = cloud.replace(opacities=torch.where(rest, REST * cloud.opacities, cloud.opacities))
+    cloud = cloud.replace(features=torch.from_numpy(colors / 255).float(), sh=None, labels=None, scores=None)
+    truth = rasterize(cloud, CAMERA.to(torch.float32), background=torch.ones(3)).map.numpy()
+    seen = explorer.screenshot()[:, 321 if side == "color" else 0 :][:, :319] / 255
+    area = np.s_[TITLE:, LEGEND:300]
+    return -10 * math.log10(((seen[area] - truth[:, 1 if side == "color" else 0 :][:, :319][area]) ** 2).mean())
+
+
+@pytest.mark.parametrize("words", [None, "chair"])
+@pytest.mark.parametrize("show", ["labels", "latents"])
+def test_both_sides_agree_with_the_rasteriser(explorer, words, show):
+    explorer.set_show(show)
+    explorer.ask(words)
+    for side in explorer.state.sides:
+        assert agreement(explorer, side) > 38
+
+
+def test_each_verb_changes_the_picture_and_the_state(explorer):
+    pictures = [explorer.screenshot()]
+    for act in (
+        lambda: explorer.ask("chair"),
+        lambda: explorer.set_gamma(0.7),
+        lambda: explorer.set_distance(0.05),
+        lambda: explorer.set_show("score"),
+        lambda: explorer.set_show("rgb"),
+        lambda: explorer.look_from(None),
+    ):
+        act()
+        pictures.append(explorer.screenshot())
+        assert (pictures[-1] != pictures[-2]).any(axis=2).mean() > 0.002
+    assert (explorer.state.gamma, explorer.state.distance) == (0.7, 0.05)
+    with pytest.raises(ValueError, match=tells("class:", "'chair'", "got 'chiar'")):
+        explorer.ask("chiar")
+    assert explorer.state.asked.words == "chair"
+
+
+@pytest.mark.parametrize("side", ["semantic", "color"])
+def test_a_click_picks_what_is_seen_there(explorer, side):
+    """The rendering with one channel for each Gaussian says what weighs most at the pixel."""
+    cloud = explorer.state.cloud(side)
+    named = cloud.replace(features=torch.eye(len(cloud)), sh=None, labels=None, scores=None)
+    weights = rasterize(named, CAMERA.to(torch.float32)).map
+    for row, column in ((120, 160), (100, 180), (140, 200), (90, 120)):
+        picked = explorer.pick(column + 0.5 + (320 if side == "color" else 0), row + 0.5)
+        if weights[row, column].sum() < 0.05:
+            assert picked is None
+        else:
+            assert (picked.side, picked.index) == (side, int(weights[row, column].argmax()))
+            label = explorer.state.labels(side)[picked.index]
+            assert picked.name == (NAMES[label] if label >= 0 else "no class")
+            assert f"Gaussian {picked.index}: {picked.name}" in explorer.lines()[-1]
+
+
+def test_what_is_selected_is_picked_first(explorer):
+    explorer.ask("chair")
+    selected = explorer.state.selected("semantic")
+    picks = [explorer.pick(x, y) for x in range(80, 300, 20) for y in range(60, 200, 20)]
+    chosen = [selected[pick.index] for pick in picks if pick is not None]
+    assert 0 < sum(chosen) < len(chosen)
+
+
+def test_a_selection_is_written_with_its_numbers(explorer, tmp_path):
+    with pytest.raises(ValueError, match=tells("selection:", "got none")):
+        explorer.save_selection()
+    explorer.ask("chair")
+    for number in (1, 2):
+        paths = explorer.save_selection()
+        assert {path.parent for path in paths} == {tmp_path / f"selection_00{number}"}
+    details = json.loads(paths[0].read_text())
+    for side in ("semantic", "color"):
+        selected = explorer.state.selected(side)
+        written = read_splats(tmp_path / "selection_002" / f"selection_{side}.ply")
+        assert (details[side]["selected"], len(written)) == (selected.sum(), selected.sum())
+        assert sum(part["count"] for part in details["parts"][side]) <= selected.sum()
+
+
+def test_keys_sliders_and_clicks_call_the_explorer(explorer, tmp_path):
+    window = _Controls(explorer)
+    explorer.plotter.show(interactive=False, auto_close=False)
+    interactor = explorer.plotter.iren.interactor
+
+    def press(*keys):
+        for key in keys:
+            interactor.SetKeyEventInformation(0, 0, key if len(key) == 1 else "\0", 0, key)
+            interactor.InvokeEvent("KeyPressEvent")
+            interactor.InvokeEvent("CharEvent")
+
+    press("n", "n")
+    assert explorer.state.asked.words == "chair"
+    press("N", "3")
+    assert (explorer.state.asked.words, explorer.state.show) == ("wall", explorer.state.show_choices[2])
+    press("s", "p")
+    assert {path.name for path in tmp_path.iterdir()} == {"selection_001", "picture_001.png"}
+    slider = window.sliders["lambda"].GetRepresentation()
+    slider.SetValue(math.log10(0.25))
+    window.sliders["lambda"].InvokeEvent("InteractionEvent")
+    assert explorer.state.distance == pytest.approx(0.25)
+    press("Escape", "s")  # nothing is selected: the window says so
+    assert explorer.state.asked is None
+    assert "selection: expected" in window.text.input
+    explorer.plotter.iren._mouse_left_button_press(170, 130)
+    explorer.plotter.iren._mouse_left_button_release(170, 130)
+    assert "Gaussian" in window.text.input
+
+
+def test_explore_draws_a_field_or_a_splat(tmp_path):
+    if not available():
+        pytest.skip(trouble())
+    with explore(field("fused"), classes=classes(), cameras=cameras(), where="picture", height=60) as view:
+        assert view.ask("chair").words == "chair"
+        assert view.screenshot(tmp_path / "chair.png").shape == (60, 60, 3)  # one cloud: half the width
+    splat = some_gaussians().replace(names=NAMES)
+    with explore(splat, splat, where="picture", height=60) as view:
+        assert view.screenshot().shape == (60, 120, 3)
+        shown = {tuple(color) for color in view.screenshot().reshape(-1, 3).tolist()}
+        assert shown & {tuple(color) for color in palette(np.arange(5), NAMES).tolist()}  # the legend's
+
+
+def test_what_cannot_be_explored_is_named(monkeypatch):
+    with pytest.raises(TypeError, match=tells("source:", "SemanticField", "got str")):
+        explore("field.kfgs", where="picture")
+    with pytest.raises(ValueError, match=tells("classes, embed:", "with a splat")):
+        explore(some_gaussians(), classes=classes(), where="picture")
+    with pytest.raises(ValueError, match=tells("where:", "got 'tv'")):
+        explore(some_gaussians(), where="tv")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    if available():
+        with pytest.raises(RuntimeError, match=tells("where:", "display", "'browser'")):
+            explore(some_gaussians(), where="window")
