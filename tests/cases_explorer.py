@@ -136,7 +136,7 @@ def grid_clouds(seed=0, sources=150, targets=400):
 
 
 def splat_file(gaussians, score=None):
-    return gaussians.replace(extra={} if score is None else {"score": score}, names=NAMES)
+    return gaussians.replace(scores=score, names=NAMES)
 
 
 def grid(score=None, **options):

@@ -170,15 +170,13 @@ def save_selection(
                 part["best_view"]["index"] = places[part["best_view"]["index"]]
         details["parts"][side] = parts
     folder = next_folder(out, "selection")
-    paths = [folder / "selection.json"]
-    write_json(paths[0], details)
+    write_json(folder / "selection.json", details)
     for side in chosen:
         splats = clouds[side].select(masks[side])
         if splats.scores is not None and not bool(splats.scores.isfinite().all()):
             splats = splats.replace(scores=None)
-        paths.append(folder / f"selection_{side}.ply")
-        write_splats(splats, paths[-1])
-    return paths
+        write_splats(splats, folder / f"selection_{side}.ply")
+    return sorted(folder.iterdir())
 
 
 def labelled(state: Exploration, side: Side) -> Gaussians:

@@ -5,9 +5,7 @@ import pytest
 import torch
 from cases_explorer import (
     DIM,
-    MODES,
     NAMES,
-    TRAINED,
     cameras,
     classes,
     cloud,
@@ -19,11 +17,11 @@ from cases_explorer import (
 )
 from messages import tells
 
-from kfgs.fields import answers, fuse_views, semantic_field
+from kfgs.fields import fuse_views
 from kfgs.viewer.meaning import FieldMeaning, SplatMeaning
 from kfgs.viewer.state import Exploration
 
-HOWS = [*((mode, how) for mode in TRAINED for how in ("own", "views", "answered")), ("fused", "fused")]
+HOWS = [*((mode, how) for mode in ("decouple", "adc+sc") for how in ("own", "views", "answered")), ("fused", "fused")]
 KINDS = pytest.mark.parametrize(("mode", "how"), HOWS, ids=[f"{mode}-{how}" for mode, how in HOWS])
 BY = {
     "own": "each Gaussian's own latent (Sec. 3.4)",
@@ -119,35 +117,6 @@ def test_a_phrase_is_told_from_the_canonical_words(mode, how):
     assert (asked.low, asked.high, asked.known, made.phrases) == (0.0, 1.0, False, True)
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.float64])
-def test_an_encoder_of_another_precision_changes_nothing_between_the_two(dtype):
-    row = embed("a red thing").to(dtype)
-    asked = FieldMeaning(field("fused"), classes(), embed=lambda words: row).ask("a red thing")
-    same_answer(asked, field("fused").query(row, classes()))
-    close = field("fused").query(row.float(), classes())
-    torch.testing.assert_close(asked.selection.scores, close.scores, rtol=0, atol=1e-6)
-
-
-@KINDS
-def test_a_canonical_word_is_not_told_from_itself(mode, how):
-    (source, views), answering = asked_and_answering(mode, how)
-    given = classes()
-    stuff = 2 * given.negatives[1] * (1 + 1e-6 * torch.arange(DIM))  # the same words, another length, rounded
-    asked = FieldMeaning(source, given, cameras=views, embed=lambda words: stuff).ask("stuff")
-    same_answer(asked, answering.query(stuff, given))
-    same_answer(asked, answering.query(stuff, given, negatives=given.negatives[:1]))
-    assert len(asked.selection) > 0
-
-
-@KINDS
-def test_without_canonical_words_the_cosine_of_a_phrase_counts(mode, how):
-    (source, views), answering = asked_and_answering(mode, how)
-    given = classes(negatives=False)
-    asked = FieldMeaning(source, given, cameras=views, embed=embed).ask("a red thing")
-    same_answer(asked, answering.query(embed("a red thing"), given))
-    same_answer(asked, answering.query(embed("a red thing"), given, negatives="none"))
-
-
 @KINDS
 def test_without_negatives_the_cosine_counts_and_gamma_comes_from_the_scores(mode, how):
     (source, views), answering = asked_and_answering(mode, how)
@@ -169,47 +138,11 @@ def test_a_single_class_is_told_from_the_canonical_words():
     assert (asked.low, asked.high) == (0.0, 1.0)
 
 
-def drawn(monkeypatch):
-    """Counts the views that are rendered from now on."""
-    count, rasterize = [], answers.rasterize
-    for module in (answers, semantic_field):
-        monkeypatch.setattr(module, "rasterize", lambda *args, **kw: count.append(1) or rasterize(*args, **kw))
-    return count
-
-
-@pytest.mark.parametrize("mode", TRAINED)
-def test_one_pass_over_the_views_answers_every_question(mode, monkeypatch):
-    count = drawn(monkeypatch)
-    made = FieldMeaning(field(mode), classes(), cameras=cameras(), embed=embed)
-    assert len(count) == 3
-    for words in (*NAMES, "a red thing"):
-        made.ask(words)
-    assert len(count) == 3
-    assert made.ask(" a red thing") is made.ask("a red thing")
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_a_field_that_has_its_answers_renders_nothing(mode, monkeypatch):
-    made = fuse_views(field(mode), cameras())
-    count = drawn(monkeypatch)
-    opened = FieldMeaning(made, classes(), cameras=cameras(), embed=embed)
-    for words in (*NAMES, "a red thing"):
-        opened.ask(words)
-    assert len(count) == 0
-    assert opened.by == BY["answered"]
-
-
 def test_a_field_without_answers_finds_them_from_its_own_cameras():
     made = replace(field(), cameras=tuple(cameras()))
     opened = FieldMeaning(made, classes())
     assert opened.by == BY["views"]
     same_answer(opened.ask("chair"), fuse_views(field(), cameras()).query("chair", classes()))
-
-
-def test_all_views_that_are_given_are_asked():
-    views = cameras(35)
-    made = FieldMeaning(field(), classes(), cameras=views)
-    assert torch.equal(made.scores, fuse_views(field(), views).classify(classes()).scores)
 
 
 @pytest.mark.parametrize("mode", ["adc+sc", "fused"])
@@ -223,7 +156,7 @@ def test_a_field_is_asked_by_the_classes_that_it_remembers(mode, tmp_path):
 
 
 def test_a_field_that_remembers_no_classes_needs_some():
-    with pytest.raises(ValueError, match=tells("classes:", "got neither")):
+    with pytest.raises(ValueError, match=tells("classes:", "got none")):
         FieldMeaning(field())
 
 
@@ -244,12 +177,10 @@ def test_words_that_cannot_be_answered():
         short.ask("sofa")
 
 
-def test_classes_of_another_teacher(monkeypatch):
-    count = drawn(monkeypatch)
+def test_classes_of_another_teacher():
     wide = replace(classes(negatives=False), embeddings=torch.ones(4, DIM + 1))
     with pytest.raises(ValueError, match=tells("classes:", "[C, 16]", "got (4, 17)")):
         FieldMeaning(field(), wide, cameras=cameras())
-    assert not count  # refused before the views are rendered
     ours = replace(field("decouple"), info={"teacher": {"name": "lseg"}})
     with pytest.warns(UserWarning, match=tells("classes:", "'lseg'", "'clip'")) as warned:
         FieldMeaning(ours, replace(classes(), info={"teacher": {"name": "clip"}})).ask("chair")
@@ -313,13 +244,7 @@ def test_classes_of_one_name_are_one():
     assert made.ask("chair").selection.indices.tolist() == [0, 1, 2]
 
 
-def test_a_name_may_begin_with_a_space():
-    made = SplatMeaning(splat_file(cloud(LINE, LABELS)).replace(names=("wall", " chair", "rug", "lamp")))
-    assert made.ask(" chair").words == " chair"
-    assert made.ask(" lamp ").words == "lamp"
-
-
-@pytest.mark.parametrize("score", [0.0, 1.0, 100.0, 300.0, 65536.0, 1e30, -5e6])
+@pytest.mark.parametrize("score", [0.0, 300.0, 1e30, -5e6])
 def test_all_of_a_class_answer_where_their_scores_are_equal(score):
     """float32 has no number between 300 and 300 - 1e-5."""
     made = SplatMeaning(splat_file(cloud(torch.rand(50, 3), [1] * 30 + [0] * 20), np.full(50, score, np.float32)))
