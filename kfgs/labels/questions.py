@@ -51,14 +51,16 @@ def class_rows(classes: Classes, dim: int, info: dict[str, Any]) -> Tensor:  # [
     """
     if isinstance(classes, LabelSet):
         difference = teacher_mismatch(info, classes.info)
-        what = f"{'examples' if 'examples' in classes.info else 'text'} of another teacher"
+        what, again = "text of another teacher", AGAIN
+        if "examples" in classes.info:
+            what, again = "examples of another teacher", "make them again: `kfgs text --examples FILE --field FIELD`"
         more = "" if difference is None else f" ({difference})"
         if classes.dim != dim:
             got = f"got {tuple(classes.embeddings.shape)}: {what}?{more}"
-            raise ValueError(f"classes: expected embeddings [C, {dim}] (from the field), {got} If so, {AGAIN}")
+            raise ValueError(f"classes: expected embeddings [C, {dim}] (from the field), {got} If so, {again}")
         if difference is not None:
             warnings.warn(
-                f"classes: expected those of the field's teacher, got {what}{more}; their spaces do not mix: {AGAIN}",
+                f"classes: expected those of the field's teacher, got {what}{more}; their spaces do not mix: {again}",
                 stacklevel=4,
             )
         return classes.embeddings

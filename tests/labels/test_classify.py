@@ -1,13 +1,15 @@
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
+from cases_quant import made_autoencoder
 from messages import tells
 from oracles_labels import cosine, most_similar
 
-from kfgs.labels import classify, label_codewords, select_by_query, select_like
-from kfgs.labels import classify as classify_function
+from kfgs.labels import classify, label_pixels, nearest_codeword
+from kfgs.quant import Autoencoder, Codebook
 
 
 def random_rows(n, d, seed):
@@ -16,10 +18,10 @@ def random_rows(n, d, seed):
 
 def test_labels_and_similarities_agree_with_the_oracle():
     codewords, embeddings = random_rows(40, 12, 0), random_rows(7, 12, 1)
-    result = label_codewords(codewords, embeddings)
+    result = classify(codewords, embeddings)
     assert result.labels.tolist() == most_similar(codewords, embeddings).tolist()
-    expected = [[cosine(a, b) for b in embeddings.double().numpy()] for a in codewords.double().numpy()]
-    np.testing.assert_allclose(result.similarity, expected, atol=1e-6)
+    expected = [max(cosine(a, b) for b in embeddings.double().numpy()) for a in codewords.double().numpy()]
+    np.testing.assert_allclose(result.scores, expected, atol=1e-6)
 
 
 def test_length_of_features_and_embeddings_does_not_matter():
@@ -34,25 +36,12 @@ def test_all_zero_feature_has_no_class_and_score_zero():
     result = classify(torch.tensor([[0.0, 0.0], [-1.0, -1.0]]), torch.eye(2))
     assert result.labels.tolist() == [-1, 0]
     assert result.scores.tolist() == pytest.approx([0.0, -math.sqrt(0.5)])
-    assert label_codewords(torch.zeros(1, 2), torch.eye(2)).labels.tolist() == [-1]
 
 
 def test_tie_goes_to_the_lowest_class():
     assert classify(torch.tensor([[1.0, 1.0]]), torch.tensor([[0.0, 2.0], [2.0, 0.0], [0.0, 1.0]])).labels.tolist() == [
         0
     ]
-
-
-def test_chunks_change_nothing(monkeypatch):
-    import sys
-
-    module = sys.modules[classify_function.__module__]
-    features, embeddings = random_rows(103, 6, 4), random_rows(4, 6, 5)
-    whole = classify(features, embeddings)
-    monkeypatch.setattr(module, "CHUNK", 10)
-    parts = classify(features, embeddings)
-    assert parts.labels.equal(whole.labels)
-    torch.testing.assert_close(parts.scores, whole.scores)
 
 
 def test_no_features_give_no_labels():
@@ -79,93 +68,153 @@ def test_wrong_input_is_named(features, embeddings, message):
         classify(features, embeddings)
 
 
-def at_angles(degrees):
-    angle = torch.deg2rad(torch.as_tensor(degrees, dtype=torch.float64))
-    return torch.stack([angle.cos(), angle.sin()], dim=-1)
-
-
-def test_given_threshold_is_strict_and_reported():
-    result = select_by_query(torch.tensor([[1.0, 0.0], [3.0, 4.0], [0.0, 1.0]]), torch.tensor([1.0, 0.0]), 0.6)
-    assert result.scores.tolist() == pytest.approx([1, 0.6, 0])
-    assert result.mask.tolist() == [True, bool(result.scores[1] > 0.6), False]
-    assert (result.threshold, result.how) == (0.6, "given")
-    exactly = select_by_query(torch.tensor([[1.0, 0.0], [0.0, 1.0]]), torch.tensor([1.0, 0.0]), 1.0)
-    assert not exactly.mask.any()  # a cosine of 1 is not above 1
-
-
-def test_all_zero_features_are_never_selected():
-    result = select_by_query(torch.tensor([[0.0, 0.0], [1.0, 0.0]]), torch.tensor([1.0, 0.0]), -0.5)
-    assert result.mask.tolist() == [False, True]
-
-
-def test_automatic_threshold_finds_the_target():
-    degrees = torch.cat([torch.linspace(10, 14, 20), torch.linspace(55, 65, 500), torch.linspace(75, 90, 1480)])
-    result = select_by_query(at_angles(degrees), at_angles(0.0))
-    assert result.mask.sum() == 20
-    assert result.mask[:20].all()
-    assert math.cos(math.radians(55)) < result.threshold < math.cos(math.radians(14))
-    assert result.how.startswith("gap at")
-
-
-@pytest.mark.parametrize(
-    ("value", "message"), [(1.5, ("threshold:", "[-1, 1]", "got 1.5")), (math.nan, ("threshold:", "got nan"))]
-)
-def test_threshold_that_is_no_cosine_is_refused(value, message):
-    with pytest.raises(ValueError, match=tells(*message)):
-        select_by_query(torch.eye(2), torch.tensor([1.0, 0.0]), value)
-
-
-def test_query_without_a_direction_is_refused():
-    with pytest.raises(ValueError, match=tells("query:", "direction", "row 0")):
-        select_by_query(torch.eye(2), torch.zeros(2))
-
-
-def test_arrays_are_taken_and_a_name_gets_advice():
-    rows, classes = torch.tensor([[2.0, 0.1], [0.1, 0.3]]), torch.eye(2)
-    assert classify(rows.numpy(), classes.numpy()).labels.equal(classify(rows, classes).labels)
-    assert classify(rows, classes.double()).labels.tolist() == [0, 1]
-    expected = select_by_query(rows, classes[0], 0.5)
-    assert select_by_query(rows.numpy(), classes[0].double().numpy(), 0.5).mask.equal(expected.mask)
-    assert select_like(rows, np.array([0]), 0.5).mask.equal(select_like(rows, 0, 0.5).mask)
-    for call in (lambda: select_by_query(rows, "chair"), lambda: classify(rows, "chair")):
-        with pytest.raises(TypeError, match=tells("'chair'", "field.query", "OfClass")):
-            call()
-
-
-WHOLE = torch.eye(3, dtype=torch.int64)
-
-
-@pytest.mark.parametrize(
-    "ask",
-    [
-        lambda whole: classify(torch.eye(3), whole),
-        lambda whole: classify(whole, torch.eye(3)),
-        lambda whole: label_codewords(torch.eye(3), whole),
-        lambda whole: select_by_query(torch.eye(3), whole[0]),
-        lambda whole: select_by_query(torch.eye(3), torch.eye(3)[0], negatives=whole),
-        lambda whole: select_like(whole, 0),
-    ],
-)
-@pytest.mark.parametrize("whole", [WHOLE, WHOLE.numpy()], ids=["torch", "numpy"])
-def test_whole_numbers_in_the_place_of_features_are_named(ask, whole):
-    with pytest.raises(TypeError, match=tells("expected floating-point numbers", "int64", "convert")):
-        ask(whole)
-
-
 @pytest.mark.parametrize("size", [1e20, 1e37])
-def test_numbers_whose_squares_overflow_are_named(size):
-    huge = torch.eye(3) * size
+def test_numbers_that_cannot_be_compared_are_named(size):
     for ask in (
-        lambda: classify(huge, torch.eye(3)),
-        lambda: classify(torch.eye(3), huge),
-        lambda: label_codewords(huge, torch.eye(3)),
-        lambda: select_by_query(huge, torch.eye(3)[0]),
+        lambda: classify(torch.eye(3) * size, torch.eye(3)),
+        lambda: classify(torch.eye(3), torch.eye(3) * size),
     ):
         with pytest.raises(ValueError, match=tells("squares", "float32", f"got {size:.3g}", "divide")):
             ask()
-    assert classify(huge.double(), torch.eye(3).double()).labels.tolist() == [0, 1, 2]
-
-
-def test_a_tiny_embedding_is_not_called_zero():
+    with pytest.raises(TypeError, match=tells("expected floating-point numbers", "int64", "convert")):
+        classify(torch.eye(3), torch.eye(3, dtype=torch.int64))
     with pytest.raises(ValueError, match=tells("embeddings:", "1e-08", "a length of 1e-37 in row 1")):
         classify(torch.eye(2), torch.tensor([[1.0, 0], [0, 1e-37]]))
+
+
+# Pixels
+
+D, d, K = 16, 4, 6
+
+
+def decoder(bias=0.1, seed=0):
+    """A decoder of layers, whose last one and the comparison with codewords are one layer on the CPU."""
+    g = torch.Generator().manual_seed(seed)
+    widths = d, 24, 40, D
+    layers = tuple(
+        (torch.randn(out, into, generator=g) * (2 / into) ** 0.5, bias * torch.randn(out, generator=g))
+        for into, out in pairwise(widths)
+    )
+    return made_autoencoder(((torch.randn(d, D, generator=g), torch.zeros(d)),), layers, -1.0, 1.0)
+
+
+@pytest.fixture
+def setting():
+    """Codewords that the decoder makes of far latents, and a noisy rendered map 5 x 7."""
+    generator = torch.Generator().manual_seed(1)
+    autoencoder = decoder()
+    centres = torch.eye(K, d + 2)[:, :d] + 0.2 * torch.rand(K, d, generator=generator)
+    codebook = Codebook(autoencoder.decode(centres))
+    index = torch.randint(0, K, (5, 7), generator=generator)
+    rendered = centres[index] + 0.001 * torch.randn(5, 7, d, generator=generator)
+    return autoencoder, codebook, torch.randn(3, D, generator=generator), index, rendered
+
+
+def test_exact_path_is_decode_quantise_look_up(setting):
+    autoencoder, codebook, embeddings, index, rendered = setting
+    labels = label_pixels(rendered, codebook, classify(codebook.codewords, embeddings).labels, autoencoder)
+    words = most_similar(autoencoder.decode(rendered).reshape(-1, D), codebook.codewords).reshape(5, 7)
+    assert labels.dtype == torch.int64
+    np.testing.assert_array_equal(labels, most_similar(codebook.codewords, embeddings)[words])
+    np.testing.assert_array_equal(words, index)
+
+
+def test_without_autoencoder_the_map_is_quantised_itself(setting):
+    _, codebook, _, index, _ = setting
+    features = codebook.codewords[index] * 3
+    features[2, 3] = 0
+    expected = index.clone()
+    expected[2, 3] = -1
+    assert label_pixels(features, codebook, torch.arange(K)).equal(expected)
+
+
+def test_uncovered_pixels_have_no_label(setting):
+    autoencoder, codebook, _, index, rendered = setting
+    covered = index % 2 == 0
+    labels = label_pixels(rendered, codebook, torch.arange(K), autoencoder, covered=covered)
+    assert labels.equal(torch.where(covered, index, -1))
+
+
+def test_gaussians_are_labelled_like_pixels(setting):
+    autoencoder, codebook, _, index, rendered = setting
+    assert label_pixels(rendered.reshape(-1, d), codebook, torch.arange(K), autoencoder).equal(index.reshape(-1))
+    assert label_pixels(torch.empty(0, d), codebook, torch.arange(K), autoencoder).shape == (0,)
+
+
+def test_nearest_codeword_is_euclidean_and_ties_go_low():
+    latents = torch.tensor([[0.0, 0.0], [1.0, 0.9], [0.5, 0.5]])
+    centres = torch.tensor([[1.0, 1.0], [0.25, 0.0], [0.0, 0.0]])
+    assert nearest_codeword(latents, centres).tolist() == [2, 0, 1]
+    assert nearest_codeword(torch.tensor([[0.5, 0.0]]), torch.tensor([[1.0, 0.0], [0.0, 0.0]])).tolist() == [0]
+
+
+def test_missing_pieces_are_named(setting):
+    autoencoder, codebook, _, _, rendered = setting
+    with pytest.raises(ValueError, match=tells("labels:", "[K]", "K = 6", "got (5,)")):
+        label_pixels(rendered, codebook, torch.arange(5), autoencoder)
+    with pytest.raises(ValueError, match=tells("decode:", "'exact', 'latent'", "got 'fast'")):
+        label_pixels(rendered, codebook, torch.arange(K), autoencoder, decode="fast")
+    with pytest.raises(ValueError, match=tells("covered:", "(5, 7)", "got (7, 5)")):
+        label_pixels(rendered, codebook, torch.arange(K), autoencoder, covered=torch.ones(7, 5, dtype=torch.bool))
+
+
+def plainly(latents, codebook, table, autoencoder):
+    """Every latent decoded, and the codeword most similar to it: the slow path."""
+    features = autoencoder.decode(latents)
+    return table[codebook.quantize(features)].masked_fill(torch.linalg.vector_norm(features, dim=-1) <= 1e-8, -1)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("classes", [1, 3, 30])
+def test_decoders_of_layers_give_the_labels_of_the_slow_path(classes, dtype):
+    g = torch.Generator().manual_seed(classes)
+    autoencoder = decoder().to(dtype)
+    codebook = Codebook(autoencoder.decode(torch.rand(30, d, generator=g).to(dtype)))
+    table = torch.randint(-1, classes, (30,), generator=g)
+    latents = torch.rand(60, 50, d, generator=g).to(dtype)
+    covered = torch.rand(60, 50, generator=g) > 0.2
+    labels = label_pixels(latents, codebook, table, autoencoder, covered=covered)
+    assert labels.equal(plainly(latents, codebook, table, autoencoder).masked_fill(~covered, -1))
+    assert len(labels.unique()) > min(classes, 15)
+
+
+def test_pixels_between_two_classes_are_decoded_in_full(monkeypatch):
+    """Two codewords that differ by rounding, of two classes: no lead is sure, and the slow path decides."""
+    g = torch.Generator().manual_seed(1)
+    autoencoder, decoded = decoder(), []
+    codewords = autoencoder.decode(torch.rand(6, d, generator=g))
+    codebook = Codebook(torch.cat([codewords, codewords * (1 + 1e-7) + 3e-8]))
+    latents = torch.rand(4000, d, generator=g)
+    expected = plainly(latents, codebook, torch.arange(12), autoencoder)
+    decode = Autoencoder.decode
+    monkeypatch.setattr(Autoencoder, "decode", lambda *a, **k: decoded.append(len(a[1])) or decode(*a, **k))
+    assert label_pixels(latents, codebook, torch.arange(12), autoencoder).equal(expected)
+    assert sum(decoded) == 4000
+    decoded.clear()
+    assert label_pixels(latents, codebook, torch.arange(12) % 6, autoencoder).equal(expected % 6)
+    assert sum(decoded) < 100  # twins of one class need no decision
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("spread", [0.01, 1.0, 1e4])
+def test_nearest_latents_are_those_of_the_plain_comparison(spread, dtype):
+    """Near the codewords, between them, and far outside, where scores are large and nearly equal."""
+    g = torch.Generator().manual_seed(4)
+    autoencoder = decoder().to(dtype)
+    codebook = Codebook(autoencoder.decode(torch.rand(40, d, generator=g).to(dtype)))
+    centres = autoencoder.encode(codebook.codewords)
+    table = torch.arange(40) % 7
+    latents = centres[torch.randint(40, (5000,), generator=g)] + spread * torch.randn(5000, d, generator=g).to(dtype)
+    latents[0], latents[1] = torch.nan, (centres[3] + centres[4]) / 2
+    expected = table[nearest_codeword(latents, centres)]
+    assert label_pixels(latents, codebook, table, autoencoder, decode="latent").equal(expected)
+    assert len(expected.unique()) > 4
+
+
+def test_latents_that_decode_to_nothing_have_no_label():
+    autoencoder = decoder(bias=0.0)
+    codebook = Codebook(torch.eye(K, D))
+    latents = torch.cat([torch.zeros(3, d), torch.rand(5, d, generator=torch.Generator().manual_seed(2))])
+    labels = label_pixels(latents, codebook, torch.arange(K), autoencoder)
+    assert labels[:3].tolist() == [-1] * 3
+    assert labels.equal(plainly(latents, codebook, torch.arange(K), autoencoder))

@@ -3,7 +3,176 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.labels import parse_color
+from kfgs.gaussians import Gaussians
+from kfgs.labels import parse_color, recolor
+
+WEIGHTS = torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
+C0 = 0.28209479177387814  # 1 / (2 sqrt(pi))
+
+
+def field(n=12, coefficients=4, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    random = lambda *shape: torch.rand(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
+    return Gaussians(
+        means=random(n, 3),
+        quats=random(n, 4),
+        scales=random(n, 3) + 0.1,
+        opacities=random(n),
+        sh=(random(n, coefficients, 3) - 0.5) * 0.4,
+        labels=torch.arange(n) % 3,
+    )
+
+
+def luminance(colors):
+    return colors @ WEIGHTS
+
+
+def seen(sh, basis):
+    """The unclamped colour where the harmonics have these values."""
+    return 0.5 + torch.einsum("k,nkc->nc", basis, sh)
+
+
+def bases(coefficients, count=4):
+    for seed in range(count):
+        basis = torch.randn(coefficients, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * 0.3
+        basis[0] = C0
+        yield basis
+
+
+def greys(levels, opacities=None, sides=None):
+    """Gaussians that show these greys, of equal size unless told otherwise."""
+    n = len(levels)
+    levels = torch.tensor(levels, dtype=torch.float64)
+    sh = ((levels - 0.5) / C0)[:, None, None].repeat(1, 1, 3)
+    ones = torch.ones(n, 3, dtype=torch.float64)
+    opacities = torch.full((n,), 0.5) if opacities is None else torch.tensor(opacities)
+    scales = ones if sides is None else ones * torch.tensor(sides, dtype=torch.float64)[:, None]
+    return Gaussians(means=ones, quats=torch.ones(n, 4), scales=scales, opacities=opacities.double(), sh=sh)
+
+
+def paint(gaussians, rgb, mode="tint"):
+    mask = torch.ones(len(gaussians), dtype=torch.bool)
+    return recolor(gaussians, mask, rgb, mode).sh[:, 0] * C0 + 0.5
+
+
+def test_tint_makes_the_middle_the_colour_and_keeps_ratios():
+    shown = paint(greys([0.2, 0.4, 0.8]), [0.5, 0.25, 0.1])
+    rgb = torch.tensor([0.5, 0.25, 0.1], dtype=torch.float64)
+    torch.testing.assert_close(
+        shown, torch.stack([0.5 * rgb, rgb, 2 * rgb])
+    )  # 0.2 / 0.4 and 0.8 / 0.4, as painted dark
+
+
+def test_the_middle_is_of_what_covers_the_picture():
+    many_small = greys([0.1] * 10 + [0.6], sides=[0.01] * 10 + [1.0])
+    torch.testing.assert_close(paint(many_small, [0.3, 0.2, 0.1])[-1], torch.tensor([0.3, 0.2, 0.1]).double())
+    many_faint = greys([0.1] * 10 + [0.6], opacities=[0.01] * 10 + [0.9])
+    torch.testing.assert_close(paint(many_faint, [0.3, 0.2, 0.1])[-1], torch.tensor([0.3, 0.2, 0.1]).double())
+
+
+def test_a_brighter_paint_stays_in_range_and_keeps_the_order():
+    for rgb in ([0.9, 0.1, 0.1], [0.8, 0.8, 0.8], [1.0, 1.0, 0.9], [0.1, 0.1, 1.0]):
+        levels = torch.linspace(0, 1, 21).tolist() + [0.1] * 41  # the middle is 0.1
+        shown = paint(greys(levels), rgb)[:21]
+        assert shown.min() > -1e-9
+        assert shown.max() < 1 + 1e-9
+        assert (luminance(shown).diff() > 0).all()
+        torch.testing.assert_close(shown[2], torch.tensor(rgb, dtype=torch.float64))
+        torch.testing.assert_close(shown[1], torch.tensor(rgb, dtype=torch.float64) / 2)
+        torch.testing.assert_close(shown[20], torch.ones(3, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("rgb", ["#c04040", "#3060c0", "#000000", "#ffffff", "#777777", "#0000ff", "#ffff00"])
+def test_hue_keeps_every_luminance_from_every_direction(rgb):
+    gaussians = field(coefficients=16)
+    mask = gaussians.labels == 0
+    painted = recolor(gaussians, mask, rgb, "hue")
+    for basis in bases(16):
+        torch.testing.assert_close(
+            luminance(seen(painted.sh[mask], basis)), luminance(seen(gaussians.sh[mask], basis)), rtol=0, atol=1e-9
+        )
+
+
+def test_hue_gives_shades_below_the_pure_colour_and_tints_above():
+    """Of luminance L the colour s * rgb, or between the brightest of its hue and white; worked by hand for (1, 0.5, 0)."""
+    knee = 0.2126 + 0.5 * 0.7152
+    shown = paint(greys([knee / 2, knee, (1 + knee) / 2, 1.0]), [0.5, 0.25, 0.0], "hue")
+    expected = [[0.5, 0.25, 0.0], [1.0, 0.5, 0.0], [1.0, 0.75, 0.5], [1.0, 1.0, 1.0]]
+    torch.testing.assert_close(shown, torch.tensor(expected, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("mode", ["tint", "hue"])
+def test_recoloured_field_is_linear_in_what_is_seen(mode):
+    """From any direction the new colour is the one of the mean plus a fixed colour per unit of the old luminance."""
+    gaussians = field(coefficients=16)
+    mask = gaussians.labels == 0
+    painted = recolor(gaussians, mask, [0.1, 0.5, 0.9], mode)
+    straight = seen(painted.sh[mask], torch.eye(16, dtype=torch.float64)[0] * C0)
+    old_straight = luminance(gaussians.sh[mask, 0] * C0 + 0.5)
+    slopes = []
+    for basis in bases(16):
+        change = luminance(seen(gaussians.sh[mask], basis)) - old_straight
+        slopes.append((seen(painted.sh[mask], basis) - straight) / change[:, None])
+    for other in slopes[1:]:
+        torch.testing.assert_close(other, slopes[0])
+    assert (slopes[0] > -1e-9).all()
+    assert (luminance(slopes[0]) > 0.01).all()
+
+
+@pytest.mark.parametrize(
+    ("rgb", "mode"), [("#c04040", "tint"), ("#000000", "tint"), ("#ffffff", "hue"), ("teal", "hue")]
+)
+def test_gradients_pass_through_unbroken(rgb, mode):
+    gaussians = field(coefficients=9)
+    gaussians.sh.requires_grad_()
+    painted = recolor(gaussians, gaussians.labels == 0, rgb, mode)
+    painted.sh.square().sum().backward()
+    assert torch.isfinite(painted.sh).all()
+    assert torch.isfinite(gaussians.sh.grad).all()
+
+
+def test_recolour_leaves_all_else_alone():
+    gaussians = field()
+    before = gaussians.sh.clone()
+    mask = gaussians.labels == 2
+    painted = recolor(gaussians, mask, "teal")
+    assert painted.sh[~mask].equal(before[~mask])
+    assert not painted.sh[mask].equal(before[mask])
+    assert gaussians.sh.equal(before)
+    for name in ("means", "quats", "scales", "opacities", "labels"):
+        assert getattr(painted, name) is getattr(gaussians, name)
+
+
+def test_black_object_becomes_flat():
+    gaussians = field()
+    black = gaussians.replace(sh=torch.full_like(gaussians.sh, 0.0).index_fill_(1, torch.tensor([0]), -0.5 / C0))
+    painted = recolor(black, black.labels == 0, [0.3, 0.6, 0.9])
+    torch.testing.assert_close(painted.sh[0, 0] * C0 + 0.5, torch.tensor([0.3, 0.6, 0.9], dtype=torch.float64))
+    assert not painted.sh[0, 1:].any()
+
+
+def test_empty_mask_changes_nothing():
+    gaussians = field()
+    nothing = torch.zeros(12, dtype=torch.bool)
+    assert recolor(gaussians, nothing, (1.0, 0.0, 0.0)).sh.equal(gaussians.sh)
+
+
+def test_wrong_input_is_named():
+    gaussians = field()
+    mask = gaussians.labels == 0
+    with pytest.raises(TypeError, match=tells("mask:", "got torch.int64")):
+        recolor(gaussians, gaussians.labels, "red")
+    with pytest.raises(ValueError, match=tells("mask:", "[N]", "N = 12", "got (5,)")):
+        recolor(gaussians, mask[:5], "red")
+    with pytest.raises(ValueError, match=tells("gaussians.sh:", "got None")):
+        recolor(gaussians.replace(sh=None), mask, (1.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match=tells("rgb:", "[0, 1]", "got (255, 0, 0)")):
+        recolor(gaussians, mask, (255, 0, 0))
+    with pytest.raises(ValueError, match=tells("rgb:", "got (0.5, 0.5)")):
+        recolor(gaussians, mask, (0.5, 0.5))
+    with pytest.raises(ValueError, match=tells("mode:", "'tint', 'hue'", "got 'paint'")):
+        recolor(gaussians, mask, "red", "paint")
+
 
 RED = (192 / 255, 64 / 255, 64 / 255)
 

@@ -7,8 +7,7 @@ import torch
 from messages import tells
 from oracles_selection import components as oracle
 
-from kfgs.gaussians import Gaussians
-from kfgs.labels import Selection, component_numbers, connected_parts, select_near
+from kfgs.labels import component_numbers
 from kfgs.labels.components import component_distance, radius_components
 
 
@@ -43,11 +42,6 @@ def test_two_dense_heaps_just_in_range_are_one():
     assert np.bincount(radius_components(both, nearest * 0.9999)).tolist() == [50, 50]
 
 
-def test_two_dense_heaps_in_one_cell_are_one():
-    heap = np.random.default_rng(0).uniform(0, 1e-4, (30, 3))
-    assert radius_components(np.concatenate([heap, heap + np.array([0.1, 0, 0])]), 1.0).max() == 0
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_crowded_heaps_that_touch_in_a_chain(seed):
     """Far more than 8 points per heap, heaps in a row: some pairs of heaps join, others stay apart."""
@@ -71,12 +65,6 @@ def test_memory_stays_bounded_where_thousands_lie_in_range():
         tracemalloc.stop()
 
 
-def test_far_outliers_do_not_overflow_the_grid():
-    points = np.array([[0, 0, 0], [0.5, 0, 0], [1e12, 0, 0], [-1e12, 1e12, 3e11], [-1e12, 1e12, 3e11]])
-    assert radius_components(points, 1e-3).tolist() == [1, 2, 3, 0, 0]
-    assert radius_components(points, 0.5).tolist() == [0, 0, 2, 1, 1]
-
-
 def test_order_and_motion_do_not_matter():
     points = torch.from_numpy(clumps(300, 9, 0.05, 1))
     mask = torch.ones(300, dtype=torch.bool)
@@ -92,26 +80,6 @@ def test_order_and_motion_do_not_matter():
 def grid(origin, n=5, step=0.1):
     x, y = torch.meshgrid(torch.arange(n) * step, torch.arange(n) * step, indexing="ij")
     return torch.stack([x, y, torch.zeros_like(x)], dim=-1).reshape(-1, 3) + torch.tensor(origin)
-
-
-def balls(means):
-    n = len(means)
-    return Gaussians(means, torch.ones(n, 4), torch.full((n, 3), 0.1), torch.full((n,), 0.5))
-
-
-def test_parts_of_a_selection_largest_first():
-    means = torch.cat([grid([0.0, 0, 0], n=3), grid([2.0, 0, 0], n=5), grid([4.0, 0, 0], n=4)])
-    mask = torch.ones(9 + 25 + 16, dtype=torch.bool)
-    mask[-1] = False
-    cloud, chosen = balls(means), Selection.of(mask, "all but one")
-    parts = connected_parts(cloud, chosen)
-    assert [part.count for part in parts] == [25, 15, 9]
-    assert parts[0].indices.tolist() == list(range(9, 34))
-    assert parts[1].how == "all but one; part 2 of 3"
-    assert [part.count for part in connected_parts(cloud, chosen, smallest=10)] == [25, 15]
-    assert [part.count for part in connected_parts(cloud, chosen, most=1)] == [25]
-    assert [part.count for part in connected_parts(cloud, chosen, distance=3.0)] == [49]
-    assert connected_parts(cloud, Selection.of(torch.zeros_like(mask))) == []
 
 
 def test_default_distance_follows_the_selection():
@@ -137,19 +105,6 @@ def test_default_distance_parts_things_that_stand_close(gap, parts):
     assert numbers.bincount().tolist() == parts
 
 
-def test_a_click_takes_the_thing_under_it():
-    means = torch.cat([grid([0.0, 0, 0]), grid([2.0, 0, 0]), grid([2.0, 0.5, 0])])
-    labels = torch.tensor([3] * 25 + [3] * 25 + [4] * 25)
-    picked = select_near(means, [2.1, 0.0, 0.05], labels=labels)
-    assert picked.indices.tolist() == list(range(25, 50))  # not its like far away, not its neighbour of another class
-    features = torch.eye(2)[(labels == 4).long()] + 0.05
-    alike = select_near(means, [2.0, 0.9, 0.0], features=features)
-    assert alike.indices.tolist() == list(range(50, 75))
-    assert "connected with Gaussian 54" in alike.how
-    itself = select_near(means, [2.0, 0.9, 0.0], features=features, threshold=1.0)
-    assert bool(itself.mask[54])  # strictly above 1 there is nothing, not even itself
-
-
 def test_wrong_input_is_named():
     means, mask = torch.rand(4, 3), torch.ones(4, dtype=torch.bool)
     broken = means.clone()
@@ -160,15 +115,3 @@ def test_wrong_input_is_named():
         component_numbers(means, mask.long())
     with pytest.raises(ValueError, match=tells("distance:", "(0, inf)", "got 0")):
         component_numbers(means, mask, 0)
-    with pytest.raises(ValueError, match=tells("selection.mask:", "[N]", "N = 4", "gaussians.means", "got (3,)")):
-        connected_parts(balls(means), Selection.of(mask[:3]))
-    with pytest.raises(ValueError, match=tells("smallest:", "got 0")):
-        connected_parts(balls(means), Selection.of(mask), smallest=0)
-    with pytest.raises(ValueError, match=tells("labels, features:", "got none")):
-        select_near(means, [0, 0, 0])
-    with pytest.raises(ValueError, match=tells("labels:", "got -1")):
-        select_near(means, [0, 0, 0], labels=torch.full((4,), -1))
-    with pytest.raises(ValueError, match=tells("point:", "[3]", "got (2,)")):
-        select_near(means, [0, 0], labels=torch.zeros(4).long())
-    with pytest.raises(ValueError, match=tells("means:", "got none")):
-        select_near(means[:0], [0, 0, 0], labels=torch.zeros(0).long())

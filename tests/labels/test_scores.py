@@ -7,9 +7,8 @@ import torch
 from messages import tells
 from oracles_words import softmax_share
 
-from kfgs.labels import LOGIT_SCALES, relevancy, select_by_category, select_by_query, select_by_similarity, select_like
-from kfgs.labels.classify import classify
-from kfgs.labels.scores import similarity_threshold, text_scores
+from kfgs.labels import relevancy, select_by_similarity
+from kfgs.labels.scores import similarity_threshold
 
 
 def oracle(similarity, negatives):
@@ -20,32 +19,11 @@ def oracle(similarity, negatives):
     return result
 
 
-def features(n=200, channels=6, seed=0):
-    return torch.randn(n, channels, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
 def test_relevancy_is_the_least_pairwise_softmax():
     generator = torch.Generator().manual_seed(3)
     similarity = torch.rand(50, generator=generator, dtype=torch.float64) * 2 - 1
     negatives = torch.rand(50, 4, generator=generator, dtype=torch.float64) * 2 - 1
     np.testing.assert_allclose(relevancy(similarity, negatives), oracle(similarity, negatives), rtol=1e-12)
-
-
-def test_all_other_classes_as_negatives_are_the_category():
-    rows, classes = features(), features(5, seed=1)
-    found = classify(rows, classes).labels
-    for k in range(5):
-        others = torch.cat([classes[:k], classes[k + 1 :]])
-        result = select_by_query(rows, classes[k], negatives=others)
-        assert result.mask.equal(found == k)
-        assert result.mask.equal(select_by_category(rows, classes, k).mask)
-        assert (result.threshold, result.how) == (0.5, "more like the query than like any of 4 negatives")
-
-
-def test_category_scores_are_the_winning_cosine():
-    result = select_by_category(torch.tensor([[3.0, 4.0], [4.0, 3.0], [0.0, 0.0]]), torch.eye(2), 1)
-    assert result.mask.tolist() == [True, False, False]
-    assert result.scores.tolist() == pytest.approx([0.8, 0, 0])
 
 
 def test_what_knows_nothing_is_not_selected_and_shapes_no_gamma():
@@ -63,84 +41,23 @@ def test_a_threshold_on_the_relevancy_is_strict():
     assert select_by_similarity(similarity, negatives, 0.1).mask.tolist() == [True, True, True]
 
 
-def test_like_an_example_or_the_mean_of_some():
-    rows = torch.tensor([[2.0, 0.0], [1.0, 1.0], [0.0, 5.0], [-1.0, 0.0]])
-    assert select_like(rows, 0, 0.5).scores.tolist() == pytest.approx([1, math.sqrt(0.5), 0, -1])
-    diagonal = select_like(rows, torch.tensor([0, 2]), 0.9)  # lengths do not count: the mean direction is the diagonal
-    assert diagonal.mask.tolist() == [False, True, False, False]
-    by_mask = select_like(rows, torch.tensor([True, False, True, False]), 0.9)
-    assert by_mask.scores.equal(diagonal.scores)
-
-
-def test_wrong_input_is_named():
-    rows = features(4)
-    with pytest.raises(ValueError, match=tells("negatives:", "got none")):
-        relevancy(torch.ones(3), torch.ones(3, 0))
-    with pytest.raises(ValueError, match=tells("negatives:", "[N, M]", "N = 3", "got (4, 1)")):
-        relevancy(torch.ones(3), torch.ones(4, 1))
-    with pytest.raises(ValueError, match=tells("similarity:", "got NaN", "row 1")):
-        select_by_similarity(torch.tensor([0.0, math.nan]))
-    with pytest.raises(ValueError, match=tells("threshold:", "[0, 1]", "got -0.5")):
-        select_by_similarity(torch.ones(2), torch.ones(2, 1), -0.5)
-    with pytest.raises(ValueError, match=tells("negatives:", "direction", "row 0")):
-        select_by_query(rows, rows[0], negatives=torch.zeros(1, 6))
-    with pytest.raises(ValueError, match=tells("category:", "[0, 1]", "got 2")):
-        select_by_category(rows, rows[:2], 2)
-    with pytest.raises(ValueError, match=tells("like:", "got 4 to 4")):
-        select_like(rows, 4)
-    with pytest.raises(ValueError, match=tells("like:", "index below 4")):
-        select_like(rows, torch.zeros(4, dtype=torch.bool))
-
-
 def cosines(n=40, m=5, seed=0):
     values = torch.rand(n, 1 + m, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * 2 - 1
     return values[:, 0], values[:, 1:]
 
 
-@pytest.mark.parametrize(("named", "scale"), [("raw", 1.0), ("lseg", 1 / 0.07), ("clip", 100.0), (3.5, 3.5)])
-def test_softmax_is_the_share_of_the_query(named, scale):
+@pytest.mark.parametrize("scale", [1.0, 1 / 0.07, 100.0])
+def test_softmax_is_the_share_of_the_query(scale):
     similarity, negatives = cosines()
-    found = text_scores(similarity, negatives, score="softmax", logit_scale=named)
-    np.testing.assert_allclose(found, softmax_share(similarity, negatives, scale), rtol=1e-9)
-
-
-def test_softmax_shares_of_all_words_add_up_and_one_negative_is_a_relevancy():
-    similarity, negatives = cosines()
-    table = torch.cat([similarity[:, None], negatives], dim=1)
-    shares = [
-        text_scores(table[:, i], table[:, [j for j in range(6) if j != i]], score="softmax", logit_scale="raw")
-        for i in range(6)
-    ]
-    torch.testing.assert_close(torch.stack(shares).sum(dim=0), torch.ones(40, dtype=torch.float64))
-    one = text_scores(similarity, negatives[:, :1], score="softmax", logit_scale=10.0)
-    torch.testing.assert_close(one, relevancy(similarity, negatives[:, :1]))
-
-
-def test_a_raw_softmax_is_nearly_uniform_and_keeps_the_order():
-    similarity, negatives = torch.tensor([0.3, 0.25, 0.2]), torch.full((3, 7), 0.2)
-    raw = text_scores(similarity, negatives, score="softmax", logit_scale="raw")
-    assert raw.tolist() == pytest.approx([0.125] * 3, abs=0.015)
-    sharp = text_scores(similarity, negatives, score="softmax", logit_scale="clip")
-    assert sharp[0] > 0.99
-    assert sharp[2].item() == pytest.approx(0.125)
-    assert raw.argsort().equal(sharp.argsort())
+    scores = select_by_similarity(similarity, negatives, score="softmax", logit_scale=scale).scores
+    np.testing.assert_allclose(scores, softmax_share(similarity, negatives, scale), rtol=1e-9)
 
 
 def test_defaults_are_the_relevancy_with_negatives_and_the_cosine_without():
     similarity, negatives = cosines()
-    assert text_scores(similarity).equal(similarity)
-    assert text_scores(similarity, negatives).equal(relevancy(similarity, negatives))
-    assert text_scores(similarity, negatives, score="cosine").equal(similarity)
-
-
-@pytest.mark.parametrize("score", ["cosine", "softmax", "relevancy"])
-def test_zero_rows_score_zero_and_are_never_selected(score):
-    features = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 2.0]])
-    found = select_by_query(features, torch.tensor([1.0, 0.0]), 0.0, torch.tensor([[0.0, 1.0]]), score=score)
-    assert found.scores[0] == 0
-    assert found.scores[1] > found.scores[2] >= 0
-    assert not found.mask[0]
-    assert found.mask[1]
+    assert select_by_similarity(similarity).scores.equal(similarity)
+    assert select_by_similarity(similarity, negatives).scores.equal(relevancy(similarity, negatives))
+    assert select_by_similarity(similarity, negatives, score="cosine").scores.equal(similarity)
 
 
 def test_a_softmax_finds_its_threshold_in_the_scores_and_says_its_scale():
@@ -149,26 +66,9 @@ def test_a_softmax_finds_its_threshold_in_the_scores_and_says_its_scale():
     found = select_by_similarity(similarity, negatives, score="softmax")
     assert found.indices.tolist() == list(range(90, 100))
     assert "softmax over 4 words, logit scale 100" in found.how
-    raw = select_by_similarity(similarity, negatives, score="softmax", logit_scale="raw")
+    raw = select_by_similarity(similarity, negatives, score="softmax", logit_scale=1.0)
     assert raw.mask.equal(found.mask)  # nearly uniform, but its modes are apart all the same
     assert select_by_similarity(similarity, negatives, score="cosine").mask.equal(found.mask)
-
-
-def test_wrong_options_are_named():
-    similarity, negatives = cosines()
-    with pytest.raises(ValueError, match=tells("score:", "'cosine', 'softmax', 'relevancy'", "got 'dot'")):
-        text_scores(similarity, score="dot")
-    with pytest.raises(ValueError, match=tells("negatives", "'softmax'", "got none")):
-        text_scores(similarity, score="softmax")
-    with pytest.raises(ValueError, match=tells("logit_scale:", "'raw', 'lseg', 'clip'", "got 'hot'")):
-        text_scores(similarity, negatives, score="softmax", logit_scale="hot")
-    with pytest.raises(ValueError, match=tells("logit_scale:", "(0, inf)", "got 0")):
-        text_scores(similarity, negatives, score="softmax", logit_scale=0)
-    with pytest.raises(ValueError, match=tells("threshold:", "[0, 1]", "got -0.5")):
-        select_by_similarity(similarity, negatives, -0.5, score="softmax")
-    with pytest.raises(ValueError, match=tells("negatives:", "got NaN")):
-        text_scores(similarity, negatives.masked_fill(negatives < 0, float("nan")), score="softmax")
-    assert set(LOGIT_SCALES) == {"raw", "lseg", "clip"}
 
 
 # Facts about real embeddings: CLIP ViT-B/32 of LVIS's 1203 names ("a {name}"), CLIP ViT-B/16 of COCO-Stuff's 171.
@@ -181,28 +81,38 @@ def lvis(shared_data):
     return names, torch.from_numpy(rows)
 
 
-@pytest.mark.parametrize(
-    ("word", "likest"),
-    [("sofa", "sofa_bed"), ("pillow", "cushion"), ("cushion", "pillow"), ("cat", "kitten"), ("table", "desk")],
-)
-def test_the_nearest_word_of_a_thousand_means_nearly_the_same(lvis, word, likest):
-    names, rows = lvis
-    scores = select_by_query(rows, rows[names.index(word)], 0.5).scores
-    first, second = scores.topk(2).indices.tolist()
-    assert (names[first], names[second]) == (word, likest)
-
-
 def test_a_cosine_alone_tells_little_among_words_and_relevancy_more(lvis):
     """Any two words have cosines near 0.74: 0.5, and every other fixed gamma, means nothing by itself."""
     names, rows = lvis
-    sofa = rows[names.index("sofa")]
-    assert len(select_by_query(rows, sofa, 0.5)) == len(names)
-    against = rows[[names.index(word) for word in ("cat", "table", "lamp", "pillow", "banana")]]
-    found = select_by_query(rows, sofa, negatives=against)
-    kept = {names[i] for i in found.indices.tolist()}
+    rows = torch.nn.functional.normalize(rows, dim=1)
+    sofa = rows @ rows[names.index("sofa")]
+    assert len(select_by_similarity(sofa, threshold=0.5)) == len(names)
+    against = rows @ rows[[names.index(word) for word in ("cat", "table", "lamp", "pillow", "banana")]].T
+    kept = {names[i] for i in select_by_similarity(sofa, against).indices.tolist()}
     assert {"sofa", "sofa_bed", "loveseat", "armchair"} <= kept
     assert not {"cat", "table", "lamp", "pillow", "banana", "dog", "desk", "cushion"} & kept
     assert len(kept) < len(names) / 2
+
+
+def test_wrong_input_is_named():
+    similarity, negatives = cosines()
+    with pytest.raises(ValueError, match=tells("negatives:", "got none")):
+        relevancy(torch.ones(3), torch.ones(3, 0))
+    with pytest.raises(ValueError, match=tells("negatives:", "[N, M]", "N = 3", "got (4, 1)")):
+        relevancy(torch.ones(3), torch.ones(4, 1))
+    with pytest.raises(ValueError, match=tells("similarity:", "got NaN", "row 1")):
+        select_by_similarity(torch.tensor([0.0, math.nan]))
+    for score in (None, "softmax"):
+        with pytest.raises(ValueError, match=tells("threshold:", "[0, 1]", "got -0.5")):
+            select_by_similarity(similarity, negatives, -0.5, score=score)
+    with pytest.raises(ValueError, match=tells("threshold:", "[-1, 1]", "got 1.5")):
+        select_by_similarity(similarity, threshold=1.5)
+    with pytest.raises(ValueError, match=tells("score:", "'cosine', 'softmax', 'relevancy'", "got 'dot'")):
+        select_by_similarity(similarity, score="dot")
+    with pytest.raises(ValueError, match=tells("negatives", "'softmax'", "got none")):
+        select_by_similarity(similarity, score="softmax")
+    with pytest.raises(ValueError, match=tells("logit_scale:", "(0, inf)", "got 0")):
+        select_by_similarity(similarity, negatives, score="softmax", logit_scale=0)
 
 
 def mixture(parts, seed=0):
@@ -255,25 +165,9 @@ def test_copying_the_scores_does_not_move_the_threshold():
     assert similarity_threshold(scores.repeat(7))[0] == pytest.approx(similarity_threshold(scores)[0], abs=1e-12)
 
 
-def test_shift_and_scale_carry_over():
-    scores = mixture([(0.4, 0.05, 900), (0.8, 0.02, 60)])
-    moved = similarity_threshold(scores * 0.5 - 0.2)[0]
-    assert moved == pytest.approx(similarity_threshold(scores)[0] * 0.5 - 0.2, abs=0.005)
-
-
 def test_equal_or_no_scores_select_nothing():
     equal = torch.full((9,), 0.7) + torch.tensor([0, 1e-8] + [0] * 7)
     threshold, how = similarity_threshold(equal)
     assert not (equal > threshold).any()
     assert "nothing stands out" in how
     assert similarity_threshold(torch.empty(0)) == (1.0, "no scores: nothing to select")
-
-
-@pytest.mark.parametrize("parts", [[(0.3, 0.05, 60), (0.85, 0.02, 9)], [(0.6, 0.05, 40)], [(0.6, 0.0, 5)]])
-def test_a_score_that_counts_several_times_is_that_many_scores(parts):
-    scores = mixture(parts)
-    times = torch.randint(1, 30, (len(scores),), generator=torch.Generator().manual_seed(1))
-    threshold, how = similarity_threshold(scores.repeat_interleave(times))
-    found, same = similarity_threshold(scores, times)
-    assert found == pytest.approx(threshold, abs=1e-12)
-    assert same == how

@@ -1,27 +1,18 @@
 import json
+import math
+import operator
 
 import numpy as np
 import pytest
 import torch
 from messages import tells
+from oracles_selection import rotation
 from scipy.spatial.transform import Rotation
 
 from kfgs.gaussians import Gaussians
-from kfgs.labels import (
-    AboveScore,
-    Both,
-    Component,
-    Either,
-    Everything,
-    InBox,
-    InSphere,
-    Not,
-    OfClass,
-    OfIndex,
-    Where,
-)
+from kfgs.labels import InBox, InSphere, OfClass, OfIndex, OrientedBox, Selection, Where
 
-CLASSES = ("wall", "Chair", "plant")
+NAMES = ("wall", "Chair", "plant")
 
 
 def cloud(n=60, seed=0):
@@ -32,11 +23,12 @@ def cloud(n=60, seed=0):
         scales=torch.full((n, 3), 0.1),
         opacities=torch.full((n,), 0.5),
         labels=torch.arange(n) % 4 - 1,
+        names=NAMES,
     )
 
 
-def ask(where, gaussians, extra=None):
-    return where.mask(gaussians.replace(extra=extra or {}, names=CLASSES)).tolist()
+def ask(where, gaussians):
+    return where.select(gaussians).mask.tolist()
 
 
 def test_class_by_name_by_index_and_none():
@@ -45,157 +37,69 @@ def test_class_by_name_by_index_and_none():
     assert ask(OfClass("chair"), g) == ask(OfClass(1), g)  # whatever its case
     assert ask(OfClass(-1), g) == [label == -1 for label in g.labels.tolist()]
     assert not any(ask(OfClass(7), g))
-    assert OfClass(np.int64(2)) == OfClass(torch.tensor(2)) == OfClass(2)
+    twice = g.replace(names=("chair", "wall", "chair"))
+    assert ask(OfClass("Chair"), twice) == [label in (0, 2) for label in g.labels.tolist()]
+    own_case = g.replace(names=("Chair", "chair", "wall"))
+    assert ask(OfClass("chair"), own_case) == ask(OfClass(1), g)
+    chairs = OfClass("chair").select(g)
+    assert (chairs.threshold, chairs.how) == (None, "label chair")
 
 
-def test_all_classes_of_one_name_are_meant():
-    g = cloud()
-    expected = [label in (0, 2) for label in g.labels.tolist()]
-    assert OfClass("chair").mask(g, ("chair", "wall", "chair")).tolist() == expected
-    assert OfClass("Chair").mask(g, ("chair", "wall", "chair")).tolist() == expected
+def test_a_part_of_a_class_is_the_largest_or_the_next():
+    x = torch.tensor([0.0, 0.1, 0.2, 5.0, 5.1, 9.0])
+    means = torch.stack([x, torch.zeros(6), torch.zeros(6)], dim=1)
+    g = cloud(6).replace(means=means, labels=torch.tensor([1, 1, 1, 1, 1, 0]))
+    assert ask(OfClass(1, 0, 0.5), g) == [True, True, True, False, False, False]
+    assert ask(OfClass("chair", part=1, distance=0.5), g) == [False, False, False, True, True, False]
+    assert not any(ask(OfClass(1, 2, 0.5), g))
+    assert not any(ask(OfClass(9, 0, 0.5), g))
 
 
-def test_a_name_in_its_own_case_wins():
-    g = cloud()
-    assert OfClass("chair").mask(g, ("Chair", "chair", "wall")).tolist() == ask(OfClass(1), g)
-
-
-def test_box_against_a_loop():
+def test_box_and_sphere_against_loops_faces_included():
     g, low, high = cloud(), (-1.0, -0.5, -2.0), (0.5, 1.5, 1.0)
     expected = [all(a <= x <= b for a, x, b in zip(low, p, high, strict=True)) for p in g.means.tolist()]
     assert 0 < sum(expected) < 60
     assert ask(InBox(low, high), g) == expected
+    assert ask(InSphere((0.5, 0, 0), 1.5), g) == [math.dist(p, (0.5, 0, 0)) <= 1.5 for p in g.means.tolist()]
+    edge = cloud(2).replace(means=torch.tensor([[1.0, 0, 0], [1.0 + 1e-6, 0, 0]], dtype=torch.float64))
+    assert ask(InBox((-1, -1, -1), (1, 1, 1)), edge) == ask(InSphere((0, 0, 0), 1), edge) == [True, False]
+    far = edge.replace(origin=(5e5, 0.0, 0.0))
+    assert ask(InBox((499999, -1, -1), (500001, 1, 1)), far) == [True, False]
 
 
-def test_turned_box_against_its_definition():
-    g, low, high = cloud(400), np.array([-1.0, -0.2, -2.0]), np.array([1.0, 0.8, 1.0])
-    w, x, y, z = quaternion = (0.9, 0.1, -0.3, 0.4)
-    R, center = Rotation.from_quat([x, y, z, w]).as_matrix(), (low + high) / 2
-    expected = []
-    for point in g.means.numpy():
-        local = center + R.T @ (point - center)
-        expected.append(bool((local >= low).all() and (local <= high).all()))
-    straight = ask(InBox(low, high), g)
-    assert ask(InBox(low, high, quaternion), g) == expected != straight
-    assert ask(InBox(low, high, tuple(-2 * q for q in quaternion)), g) == expected
-    assert ask(InBox(low, high, (1, 0, 0, 0)), g) == straight
-
-
-def test_faces_and_the_sphere_itself_belong_inside():
-    g = cloud(2).replace(means=torch.tensor([[1.0, 0, 0], [1.0 + 1e-6, 0, 0]], dtype=torch.float64))
-    assert ask(InBox((-1, -1, -1), (1, 1, 1)), g) == [True, False]
-    assert ask(InSphere((0, 0, 0), 1), g) == [True, False]
-
-
-def test_index_score_and_everything():
+def test_indices_in_any_form():
     g = cloud(4)
     assert ask(OfIndex([2, 0, 2]), g) == [True, False, True, False]
     assert OfIndex(torch.tensor([True, False, True, False])) == OfIndex([0, 2]) == OfIndex(torch.tensor([2, 0]))
-    score = np.array([0.1, 0.5, 0.6, 0.9], np.float32)
-    assert ask(AboveScore(0.5), g, {"score": score}) == [False, False, True, True]
-    assert ask(AboveScore(0.8, "sure"), g, {"sure": score}) == [False, False, False, True]
-    assert ask(Everything(), g) == [True] * 4
     assert ask(OfIndex([]), g) == [False] * 4
 
 
-def test_algebra_is_that_of_sets():
-    g, a, b, c = cloud(), OfClass("plant"), InSphere((0, 0, 0), 1.5), InBox((0, 0, 0), (2, 2, 2))
-    A, B, C = (set(np.flatnonzero(ask(w, g)).tolist()) for w in (a, b, c))
-    everything = set(range(60))
-    assert A & B
-    assert B - A
-    for where, expected in (
-        (a & b, A & B),
-        (a | b, A | B),
-        (a - b, A - B),
-        (~a, everything - A),
-        (~(a | b) & c, (everything - A - B) & C),
-        (a | b & c, A | (B & C)),
-    ):
-        assert set(np.flatnonzero(ask(where, g)).tolist()) == expected
-    assert ~~a == a
-    assert len((a & b & c).parts) == 3
-    assert (a | b) | c == Either((a, b, c))
-
-
-def test_component_is_the_largest_connected_part_or_the_next():
-    x = torch.tensor([0.0, 0.1, 0.2, 5.0, 5.1, 9.0])
-    means = torch.stack([x, torch.zeros(6), torch.zeros(6)], dim=1)
-    g = cloud(6).replace(means=means, labels=torch.tensor([1, 1, 1, 1, 1, 0]))
-    assert ask(Component(OfClass(1), 0.5), g) == [True, True, True, False, False, False]
-    assert ask(Component(OfClass(1), 0.5, 1), g) == [False, False, False, True, True, False]
-    assert not any(ask(Component(OfClass(1), 0.5, 2), g))
-    assert not any(ask(Component(OfClass(9), 0.5), g))
-
-
-def test_a_part_far_down_the_list_is_found():
-    n = 250  # parts of one Gaussian each, more than `connected_parts` returns
-    g = Gaussians(
-        means=torch.arange(n, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0, 0]),
-        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
-        scales=torch.full((n, 3), 0.1),
-        opacities=torch.full((n,), 0.5),
-        labels=torch.ones(n, dtype=torch.int64),
-    )
-    assert Component(OfClass(1), 0.5, 200).mask(g).nonzero().tolist() == [[200]]  # equally large: by index
-
-
-EVERY_KIND = (
-    (OfClass("plant") | OfClass(-1)) - InBox((0, 0, 0), (1, 1, 1), (1, 0, 0, 0.5)),
-    Component(~InSphere((1, 2, 3), 0.25), 0.1, 1),
-    Both((Everything(), OfIndex([3, 1]), AboveScore(0.5, "sure"), InBox((0, 0, 0), (1, 1, 1)))),
-    Not(Component(OfClass("wall"))),
+@pytest.mark.parametrize(
+    "where",
+    [OfClass("plant"), OfClass(-1, 1, 0.5), InBox((0, 0, 0), (1, 1, 1)), InSphere((1, 2, 3), 0.25), OfIndex([3])],
 )
-
-
-@pytest.mark.parametrize("where", EVERY_KIND, ids=lambda where: where.kind)
 def test_json_there_and_back(where):
-    text = json.dumps(where.to_json(), allow_nan=False)
-    assert Where.from_json(json.loads(text)) == where
-    assert hash(Where.from_json(json.loads(text))) == hash(where)
-
-
-def nested(depth):
-    value = {"kind": "everything"}
-    for _ in range(depth):
-        value = {"kind": "not", "where": value}
-    return value
+    again = Where.from_json(json.loads(json.dumps(where.to_json(), allow_nan=False)))
+    assert again == where
+    assert hash(again) == hash(where)
 
 
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ("chair", ("where:", "everything, class", "'kind'", "got 'chair'")),
-        ({"kind": "klass"}, ("where:", "got {'kind': 'klass'}")),
+        ("chair", ("where:", "class, box", "'kind'", "got 'chair'")),
         ({"kind": ["class"]}, ("where:", "got {'kind': ['class']}")),
-        ({"kind": "class"}, ("where:", "'name'", "'class'", "got none")),
-        ({"kind": "class", "name": "a", "size": 3}, ("where:", "'class'", "got 'size'")),
-        ({"kind": "class", "name": True}, ("where.name:", "got True")),
-        ({"kind": "class", "name": 10**30}, ("where.name:", "got 1000000000000000000000000000000")),
-        ({"kind": "box", "min": [0, 0], "max": [1, 1, 1]}, ("where.min:", "expected 3", "got [0, 0]")),
-        ({"kind": "box", "min": "abc", "max": [1, 1, 1]}, ("where.min:", "expected 3", "got 'abc'")),
-        (
-            {"kind": "box", "min": [0, 0, float("nan")], "max": [1, 1, 1]},
-            ("where.min:", "expected 3", "got [0, 0, nan]"),
-        ),
-        ({"kind": "box", "min": [0, 0, 2], "max": [1, 1, 1]}, ("where.max:", "min", "got (1.0, 1.0, 1.0)")),
-        ({"kind": "box", "min": [0] * 3, "max": [1] * 3, "rotation": [0] * 4}, ("where.rotation:", "got zeros")),
-        ({"kind": "sphere", "center": [0, 0, 0], "radius": "1"}, ("where.radius:", "got '1'")),
-        (
-            {"kind": "sphere", "center": [0, 0, 0], "radius": 10**400},
-            ("where.radius:", "got 10000000000000000000000000000000000000000000000000000000000000000000000000000000"),
-        ),
-        ({"kind": "sphere", "center": [0, 0, 0], "radius": float("inf")}, ("where.radius:", "got inf")),
-        ({"kind": "sphere", "center": [0, 0, 0], "radius": 0}, ("where.radius:", "got 0.0")),
-        ({"kind": "index", "indices": [1.5]}, ("where.indices:", "got 1.5")),
-        ({"kind": "index", "indices": [-1]}, ("where.indices:", "got -1")),
-        ({"kind": "index", "indices": 3}, ("where.indices:", "got 3")),
-        ({"kind": "score", "threshold": 0, "column": 3}, ("where.column:", "got 3")),
-        ({"kind": "not", "where": "chair"}, ("where.where:", "'kind'", "got 'chair'")),
-        ({"kind": "both", "parts": []}, ("where.parts:", "got ()")),
-        ({"kind": "either", "parts": [{"kind": "class", "name": []}]}, ("where.parts[0].name:", "got []")),
-        ({"kind": "component", "where": {"kind": "everything"}, "rank": -1}, ("where.rank:", "got -1")),
-        (nested(40), ("32 levels", "got more")),
+        ({"kind": "class"}, ("where:", "'name'")),
+        ({"kind": "class", "name": "a", "size": 3}, ("where:", "'size'")),
+        ({"kind": "class", "name": True}, ("where: name:", "got True")),
+        ({"kind": "class", "name": "a", "part": -1}, ("where: part:", "got -1")),
+        ({"kind": "box", "min": [0, 0], "max": [1, 1, 1]}, ("where: min:", "3 numbers", "got [0, 0]")),
+        ({"kind": "box", "min": [0, 0, float("nan")], "max": [1, 1, 1]}, ("where: min:", "got nan")),
+        ({"kind": "box", "min": [0, 0, 2], "max": [1, 1, 1]}, ("where: max:", "min", "got (1.0, 1.0, 1.0)")),
+        ({"kind": "sphere", "center": [0, 0, 0], "radius": "1"}, ("where: radius:", "got '1'")),
+        ({"kind": "sphere", "center": [0, 0, 0], "radius": 0}, ("where: radius:", "got 0")),
+        ({"kind": "index", "indices": [1.5]}, ("where: indices:", "got 1.5")),
+        ({"kind": "index", "indices": 3}, ("where: indices:", "got 3")),
     ],
 )
 def test_json_of_others_is_refused_with_the_place(value, message):
@@ -206,22 +110,129 @@ def test_json_of_others_is_refused_with_the_place(value, message):
 def test_what_the_cloud_lacks_is_named():
     g = cloud()
     with pytest.raises(ValueError, match=tells("class:", "wall, Chair, plant", "got 'plnat'", "'plant'")):
-        OfClass("plnat").mask(g, CLASSES)
+        OfClass("plnat").select(g)
     with pytest.raises(ValueError, match=tells("gaussians.labels:", "'plant'", "got None")):
-        OfClass("plant").mask(g.replace(labels=None), CLASSES)
+        OfClass("plant").select(g.replace(labels=None))
     with pytest.raises(ValueError, match=tells("indices:", "got 60")):
-        OfIndex([0, 60]).mask(g)
-    with pytest.raises(ValueError, match=tells("column:", "(none)", "got 'score'")):
-        AboveScore(0.5).mask(g)
-    with pytest.raises(TypeError, match=tells("where:", "OfClass", "got 'plant'")):
-        Not("plant")
-    with pytest.raises(TypeError, match=tells("OfClass", "str")):
-        OfClass("plant") & "wall"
+        OfIndex([0, 60]).select(g)
+    means = g.means.clone()
+    means[1] = math.nan
+    for where in (InSphere([0, 0, 0], 1), InBox([0, 0, 0], [1, 1, 1])):
+        with pytest.raises(ValueError, match=tells("gaussians.means:", "got NaN", "row 1")):
+            where.select(g.replace(means=means))
 
 
-def test_a_rotation_of_the_smallest_floats_is_one():
-    g = cloud(200)
-    for tiny in (1e-320, 1e308):
-        assert ask(InBox((-1, -1, -1), (1, 0, 1), (tiny, 0, 0, tiny)), g) == ask(
-            InBox((-1, -1, -1), (1, 0, 1), (1, 0, 0, 1)), g
-        )
+# Selections
+
+
+def some(seed, n=40):
+    scores = torch.rand(n, generator=torch.Generator().manual_seed(seed))
+    return Selection(scores > 0.5, scores, 0.5, f"seed {seed}")
+
+
+def test_what_a_selection_knows():
+    chosen = Selection(torch.tensor([False, True, True]), torch.tensor([0.1, 0.7, 0.9]), 0.5, "given")
+    assert (len(chosen), chosen.indices.tolist()) == (2, [1, 2])
+    assert repr(chosen) == "Selection(2 of 3 Gaussians: score > 0.5 (given))"
+    assert "2 of 3 Gaussians" in chosen._repr_html_()
+    assert not Selection.of(torch.zeros(3, dtype=torch.bool))  # empty is false
+    part = chosen.within(torch.tensor([True, True, False]), "the first two")
+    assert (part.indices.tolist(), part.threshold, part.how) == ([1], 0.5, "given; the first two")
+
+
+@pytest.mark.parametrize(
+    ("combine", "mask", "scores"),
+    [
+        (operator.and_, [1, 0, 0, 0], [0.6, 0.1, 0.2, 0.3]),
+        (operator.or_, [1, 1, 1, 0], [0.9, 0.8, 0.7, 0.4]),
+        (operator.sub, [0, 1, 0, 0], [0.4, 0.8, 0.2, 0.4]),
+    ],
+)
+def test_algebra_by_hand(combine, mask, scores):
+    a = Selection(torch.tensor([True, True, False, False]), torch.tensor([0.9, 0.8, 0.2, 0.4]), 0.5, "a")
+    b = Selection(torch.tensor([True, False, True, False]), torch.tensor([0.6, 0.1, 0.7, 0.3]), None, "b")
+    result = combine(a, b)
+    assert result.mask.int().tolist() == mask
+    assert result.scores.tolist() == pytest.approx(scores)
+    assert result.threshold is None
+    assert "score > 0.5 (a)" in result.how
+
+
+def test_laws_of_the_algebra():
+    a, b, c = some(0), some(1), some(2)
+    for left, right in (
+        (~(a & b), ~a | ~b),
+        (~(a | b), ~a & ~b),
+        (~~a, a),
+        (a & (b | c), (a & b) | (a & c)),
+    ):
+        assert left.mask.equal(right.mask)
+        torch.testing.assert_close(left.scores, right.scores)
+    assert len(a | ~a) == 40
+
+
+def test_points_and_box_of_a_class_in_two_lines():
+    means = torch.arange(15.0).reshape(5, 3)
+    g = cloud(5).replace(means=means, labels=torch.tensor([0, 1, -1, 2, 1]))
+    chair = OfClass("chair").select(g)
+    points, box = chair.points(g), chair.box(g)
+    assert points.tolist() == [[3, 4, 5], [12, 13, 14]]
+    assert box.center.tolist() == pytest.approx([7.5, 8.5, 9.5])
+    assert box.half.tolist() == pytest.approx([4.5 * math.sqrt(3), 0, 0], abs=1e-6)
+    for same in (means, means.numpy()):
+        assert np.array_equal(chair.points(same), points)
+    with pytest.raises(ValueError, match=tells("cloud", "N = 5", "(4, 3)")):
+        chair.points(torch.zeros(4, 3))
+    with pytest.raises(ValueError, match=tells("points", "at least one")):
+        OfClass(7).select(g).box(g)
+
+
+def test_wrong_selections_are_named():
+    a = some(0)
+    with pytest.raises(ValueError, match=tells("other:", "40 Gaussians", "39")):
+        a & some(1, n=39)
+    with pytest.raises(TypeError, match=tells("other:", "got Tensor", "Selection.of(mask)")):
+        a - a.mask
+    with pytest.raises(TypeError, match=tells("mask:", "got torch.float32")):
+        Selection.of(torch.ones(3))
+    with pytest.raises(ValueError, match=tells("scores:", "N = 3", "got (4,)")):
+        Selection(torch.ones(3, dtype=torch.bool), torch.ones(4))
+    with pytest.raises(ValueError, match=tells("scores:", "got NaN", "row 1")):
+        Selection(torch.ones(2, dtype=torch.bool), torch.tensor([0.0, math.nan]))
+
+
+# Oriented boxes
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_box_of_a_turned_box_is_itself(seed):
+    turn = torch.from_numpy(Rotation.random(rng=seed).as_matrix())
+    signs = torch.cartesian_prod(*([torch.tensor([-0.5, 0.5], dtype=torch.float64)] * 3))
+    points = signs * torch.tensor([3, 2, 0.5])
+    box = OrientedBox.around(points @ turn.T + 4)
+    assert (2 * box.half).tolist() == pytest.approx([3, 2, 0.5])
+    assert box.center.tolist() == pytest.approx([4, 4, 4])
+    torch.testing.assert_close((box.axes @ turn).abs(), torch.eye(3, dtype=torch.float64), atol=1e-6, rtol=0)
+    assert float(torch.linalg.det(box.axes)) == pytest.approx(1)
+    assert box.volume == pytest.approx(3)
+    torch.testing.assert_close(box.corners.mean(0), box.center)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_box_holds_every_point_and_is_no_larger_than_that_along_the_axes(seed):
+    rng = np.random.default_rng(seed)
+    points = torch.from_numpy(rng.normal(size=(200, 3)) @ rng.normal(size=(3, 3)) + rng.gamma(1, 1, (200, 1)))
+    box = OrientedBox.around(points)
+    assert (((points - box.center) @ box.axes.T).abs() <= box.half + 1e-9).all()
+    assert box.volume <= float((points.amax(0) - points.amin(0)).prod()) * (1 + 1e-9)
+
+
+def test_flat_thin_and_single_points():
+    turn = torch.from_numpy(rotation([1, -2, 0.5], 37))
+    flat = torch.tensor([[1.0, 0.5, 0], [-1, 0.5, 0], [1, -0.5, 0], [-1, -0.5, 0]], dtype=torch.float64) @ turn.T
+    assert (2 * OrientedBox.around(flat).half).tolist() == pytest.approx([2, 1, 0], abs=1e-9)
+    point = OrientedBox.around(torch.tensor([[1.0, 2, 3]]).expand(5, 3))
+    assert (point.center.tolist(), point.half.tolist(), point.volume) == ([1, 2, 3], [0, 0, 0], 0)
+    assert set(point.to_json()) == {"center", "axes", "half"}
+    with pytest.raises(ValueError, match=tells("points:", "got NaN", "row 1")):
+        OrientedBox.around(torch.tensor([[0.0, 0, 0], [0, math.inf, 0]]))

@@ -2,18 +2,17 @@ import numpy as np
 import pytest
 import torch
 from messages import tells
-from scipy.spatial.transform import Rotation
 
 from kfgs import Gaussians
 from kfgs.cameras import Camera
-from kfgs.labels import Duplicate, Everything, Move, OfClass, OfIndex, Turn
+from kfgs.labels import Duplicate, Move, OfClass, OfIndex
 from kfgs.splat import covariance_3d, evaluate_sh, rasterize
 
 MOTIONS = (
     {"translation": (1.0, -2.0, 0.5)},
     {"rotation": ("z", 90)},
-    {"rotation": Turn((1.0, 2.0, -1.0), 33.0), "scale": 0.5, "pivot": (1.0, 1.0, 0.0)},
-    {"rotation": (0.2, -0.4, 0.8, 0.4), "scale": 3.0, "translation": (0.1, 0.2, 0.3)},
+    {"rotation": ((1.0, 2.0, -1.0), 33.0), "scale": 0.5, "pivot": (1.0, 1.0, 0.0)},
+    {"rotation": ((0.2, -0.4, 0.8), -200.0), "scale": 3.0, "translation": (0.1, 0.2, 0.3)},
 )
 
 
@@ -32,21 +31,10 @@ def scene(n=10, seed=1):
 
 
 def oracle_matrix(motion):
-    """The 3 x 3 matrix of a motion's rotation, by Rodrigues' formula or from the quaternion, in plain numpy."""
-    rotation = motion.get("rotation")
-    if rotation is None:
-        return np.eye(3)
-    if isinstance(rotation, tuple) and len(rotation) == 4:
-        w, x, y, z = np.array(rotation) / np.linalg.norm(rotation)
-        return np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-    axis, degrees = ((0, 0, 1), 90) if rotation == ("z", 90) else (rotation.axis, rotation.degrees)
-    k, a = np.array(axis) / np.linalg.norm(axis), np.deg2rad(degrees)
+    """The 3 x 3 matrix of a motion's rotation, by Rodrigues' formula in plain numpy."""
+    axis, degrees = motion.get("rotation", ("z", 0))
+    k, a = np.array((0, 0, 1) if axis == "z" else axis, float), np.deg2rad(degrees)
+    k /= np.linalg.norm(k)
     K = np.array([[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]])
     return np.eye(3) + np.sin(a) * K + (1 - np.cos(a)) * K @ K
 
@@ -84,24 +72,14 @@ def test_move_leaves_the_rest_the_order_and_the_input(motion):
 
 
 def test_turning_about_the_centroid_keeps_it_and_going_back_undoes():
-    splats, turn = scene(), Turn("y", 70)
+    splats, turn = scene(), ("y", 70)
     there = Move("chair", rotation=turn).apply(splats)
     mask = splats.labels == 1
     o = splats.opacities[mask]
     torch.testing.assert_close(o @ there.means[mask], o @ splats.means[mask])
-    back = Move("chair", rotation=Turn("y", -70)).apply(there)
+    back = Move("chair", rotation=("y", -70)).apply(there)
     torch.testing.assert_close(back.means, splats.means)
     torch.testing.assert_close(back.sh, splats.sh, atol=1e-6, rtol=0)
-
-
-def test_a_quarter_turn_about_z_takes_x_to_y():
-    splats = scene(1)
-    splats = splats.replace(means=torch.tensor([[1.0, 0, 0]]).double())
-    moved = Move(Everything(), rotation=("z", 90), pivot=(0, 0, 0)).apply(splats)
-    torch.testing.assert_close(moved.means, torch.tensor([[0.0, 1.0, 0.0]]).double())
-    xyzw = Rotation.from_euler("z", 90, degrees=True).as_quat()
-    same = Move(Everything(), rotation=tuple(xyzw[[3, 0, 1, 2]]), pivot=(0, 0, 0)).apply(splats)
-    torch.testing.assert_close(same.means, moved.means)
 
 
 def test_moved_object_is_drawn_where_it_stands():
@@ -116,7 +94,7 @@ def test_moved_object_is_drawn_where_it_stands():
         opacities=torch.tensor([0.8, 0.6]),
         sh=torch.rand(2, 1, 3, generator=torch.Generator().manual_seed(0)),
     )
-    moved = Move(Everything(), (8 * 4 / 40, 0.0, 0.0)).apply(gaussians)
+    moved = Move(OfIndex([0, 1]), (8 * 4 / 40, 0.0, 0.0)).apply(gaussians)
     before, after = (rasterize(g, camera).map for g in (gaussians, moved))
     assert before.max() > 0.3
     torch.testing.assert_close(after[:, 8:], before[:, :-8], atol=5e-3, rtol=0)  # EWA's Jacobian differs off-axis
@@ -132,9 +110,8 @@ def test_duplicates_follow_the_originals_with_their_labels_and_columns():
     moved = Move("chair", (0, 0, 5), ("x", 30), 0.5).apply(splats).select(mask)
     for name in ("means", "quats", "scales", "sh", "opacities", "labels"):
         torch.testing.assert_close(getattr(doubled, name)[10:], getattr(moved, name))
-    assert doubled.scores[10:].tolist() == splats.scores[mask.numpy()].tolist()
-    assert doubled.classes == splats.names
-    assert doubled.info == splats.info
+    assert doubled.scores[10:].tolist() == splats.scores[mask].tolist()
+    assert doubled.names == splats.names
 
 
 @pytest.mark.parametrize("edit", [Move, Duplicate])
@@ -148,18 +125,14 @@ def test_nothing_selected(edit):
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: Move("a", (1, 2)), ValueError, ("translation:", "expected 3", "got (1, 2)")),
-        (lambda: Move("a", scale=0), ValueError, ("scale:", "got 0.0")),
-        (lambda: Move("a", scale=-1), ValueError, ("scale:", "got -1.0")),
-        (lambda: Move("a", rotation=(0, 0, 0, 0)), ValueError, ("rotation:", "got zeros")),
-        (lambda: Move("a", rotation=(1, 2, 3)), ValueError, ("rotation:", "expected 4", "got (1, 2, 3)")),
-        (lambda: Move("a", rotation="z"), TypeError, ("rotation:", "expected 4", "got 'z'")),
-        (lambda: Move("a", rotation=("w", 90)), TypeError, ("axis:", "expected 3", "got 'w'")),
-        (lambda: Move("a", rotation=((0, 0, 0), 90)), ValueError, ("axis:", "got (0, 0, 0)")),
+        (lambda: Move("a", (1, 2)), ValueError, ("translation:", "3 numbers", "got (1, 2)")),
+        (lambda: Move("a", scale=0), ValueError, ("scale:", "got 0")),
+        (lambda: Move("a", rotation=(1, 2, 3)), ValueError, ("rotation:", "('z', 90)", "got (1, 2, 3)")),
+        (lambda: Move("a", rotation="z"), ValueError, ("rotation:", "got 'z'")),
+        (lambda: Move("a", rotation=("w", 90)), ValueError, ("axis:", "3 numbers", "got 'w'")),
+        (lambda: Move("a", rotation=((0, 0, 0), 90)), ValueError, ("axis", "got (0, 0, 0)")),
         (lambda: Move("a", rotation=("z", "90")), TypeError, ("degrees:", "got '90'")),
-        (lambda: Move("a", pivot="corner"), ValueError, ("pivot:", "'centroid'", "[x, y, z]", "got 'corner'")),
-        (lambda: Duplicate("a", pivot=(0, 0)), ValueError, ("pivot:", "expected 3", "got (0, 0)")),
-        (lambda: Duplicate("a", allow_empty="no"), TypeError, ("allow_empty:", "got 'no'")),
+        (lambda: Duplicate("a", pivot="corner"), ValueError, ("pivot:", "3 numbers", "got 'corner'")),
     ],
 )
 def test_wrong_input_is_named(make, error, message):
@@ -167,25 +140,11 @@ def test_wrong_input_is_named(make, error, message):
         make()
 
 
-@pytest.mark.parametrize("tiny", [1e-320, 5e-324, 1e308])
-def test_rotations_of_the_smallest_and_largest_floats(tiny):
-    splats = scene()
-    for small, plain in (
-        ((tiny, 0, 0, tiny), (1, 0, 0, 1)),
-        (Turn((tiny, tiny, 0), 90), Turn((1, 1, 0), 90)),
-        (Turn((tiny, 0, 0), 90), Turn("x", 90)),
-    ):
-        moved, expected = (Move("chair", rotation=r).apply(splats) for r in (small, plain))
-        torch.testing.assert_close(moved.means, expected.means)
-
-
 def test_the_centroid_of_what_is_invisible_is_the_plain_mean():
     splats = scene()
-    for opacity in (0.0, 1e-320):  # 1e-320: as weights they would vanish beside the positions
-        faint = splats.replace(gaussians=splats.replace(opacities=torch.full((10,), opacity).double()))
-        moved = Move("chair", rotation=("z", 90), scale=2.0).apply(faint)
-        chair = splats.labels == 1
-        torch.testing.assert_close(moved.means[chair].mean(dim=0), splats.means[chair].mean(dim=0))
+    moved = Move("chair", rotation=("z", 90), scale=2.0).apply(splats.replace(opacities=torch.zeros(10).double()))
+    chair = splats.labels == 1
+    torch.testing.assert_close(moved.means[chair].mean(dim=0), splats.means[chair].mean(dim=0))
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from messages import tells
 
 from kfgs.cameras import Camera
 from kfgs.gaussians import Gaussians
-from kfgs.labels import average_views, vote_labels
+from kfgs.splat import average_views, vote_labels
 
 
 def camera(size=8, name="front"):
@@ -116,5 +116,5 @@ def test_bad_input_is_named():
     cloud = _cloud((0.0, 0.0, 2.0))
     with pytest.raises(ValueError, match=tells("views:", "(24, 32)", "got (3, 3)")):
         vote_labels(cloud, [(_camera(), torch.zeros(3, 3, dtype=torch.int64))], 2)
-    with pytest.raises(ValueError, match=tells("views:", "got 5")):
+    with pytest.raises(ValueError, match=tells("views:", "below 2", "up to 5")):
         vote_labels(cloud, [(_camera(), torch.full((24, 32), 5))], 2)

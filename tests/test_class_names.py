@@ -1,7 +1,7 @@
 import pytest
 from messages import tells
 
-from kfgs.labels import class_index, class_indices
+from kfgs._names import class_index, class_indices
 
 NAMES = ["wall", "Window blind", "chair", "armchair"]
 
