@@ -4,7 +4,8 @@ import numpy as np
 import torch
 
 from kfgs import Camera, Gaussians
-from kfgs.evaluation import View, best_labels
+from kfgs.evaluation import View
+from kfgs.evaluation.method import best_labels
 
 
 class Numbers:

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from kfgs.cameras import resize_labels
-from kfgs.evaluation import Encode
 from kfgs.evaluation.method import Method, View, annotated, check_level
 from kfgs.evaluation.report import Report, Row, make_report, mean
+from kfgs.evaluation.texts import Encode
 from kfgs.labels.scores import CANONICAL, TEMPERATURE
 
 from .lerf_2d import relevancies

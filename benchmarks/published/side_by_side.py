@@ -10,10 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kfgs.evaluation import Encode, LabelTruth, Report, View, best_labels, label_view
+from kfgs.evaluation import LabelTruth, Report, View, label_view
 from kfgs.evaluation.label_pictures import load_label_map
+from kfgs.evaluation.method import best_labels
 from kfgs.evaluation.teacher_agreement import ade20k_words
-from kfgs.evaluation.texts import encode_unit
+from kfgs.evaluation.texts import Encode, encode_unit
 from kfgs.pipeline import Question
 from kfgs.splat import rasterize
 from kfgs.viz import overlay_labels, save_picture

@@ -2,20 +2,18 @@
 
 from .color import score_views
 from .find import find_labels, find_points
-from .label_pictures import load_label_map, load_labels
-from .method import FieldMethod, Labeller, Method, TeacherMethod, View, best_labels, label_view
+from .label_pictures import load_label_map
+from .method import FieldMethod, Labeller, Method, TeacherMethod, View, label_view
 from .protocols import PROTOCOLS, KfgsColor, KfgsPooled, KfgsSurface, get_protocol
 from .report import Report
 from .segmentation import SegmentationReport, evaluate_segmentation
 from .surface import score_surface
 from .teacher_agreement import TeacherAgreement
-from .texts import Encode
 from .truth import LabelTruth, PointTruth
 from .views import label_views
 
 __all__ = [
     "PROTOCOLS",
-    "Encode",
     "FieldMethod",
     "KfgsColor",
     "KfgsPooled",
@@ -29,7 +27,6 @@ __all__ = [
     "TeacherAgreement",
     "TeacherMethod",
     "View",
-    "best_labels",
     "evaluate_segmentation",
     "find_labels",
     "find_points",
@@ -37,7 +34,6 @@ __all__ = [
     "label_view",
     "label_views",
     "load_label_map",
-    "load_labels",
     "score_surface",
     "score_views",
 ]

@@ -15,9 +15,9 @@ import torch
 
 from .._card import short_repr
 from .._files import as_path, file_stem
-from ..evaluation import Encode, FieldMethod, Labeller, Method, Report, TeacherAgreement, TeacherMethod, View
+from ..evaluation import FieldMethod, Labeller, Method, Report, TeacherAgreement, TeacherMethod, View
 from ..evaluation.protocols import get_protocol
-from ..evaluation.texts import as_encoder
+from ..evaluation.texts import Encode, as_encoder
 from ..evaluation.truth import ReadWhenAsked
 from ..fields import SemanticField
 from ..fields.store import find_field

@@ -216,7 +216,7 @@ AS_THEY_STAND = [
     "quickstart",
 ]
 ELSEWHERE = {"recipes": "test_first_scripts.py", "guide": "test_readme.py"}
-WITH_DATA = {"datasets", "protocols", "engines", "scale/README"}  # the four tests below
+WITH_DATA = {"protocols", "engines", "scale/README"}  # the three tests below
 
 
 @pytest.mark.parametrize("page", AS_THEY_STAND)
@@ -240,20 +240,6 @@ def test_the_python_of_protocols_runs(inside, encode, capsys):
     exec(block, known)
     said = capsys.readouterr().out
     assert re.match(r"mIoU 0\.\d{3}, accuracy 0\.\d{3} \(kfgs-pooled/1\)\n", said)
-
-
-def test_the_python_of_datasets_runs(inside, encode):
-    """With two changes: the scene has another name, because the frames of LERF's own scenes are known, and a square chair."""
-    Path("lerf_ovs/label/desk").mkdir(parents=True)
-    Path("lerf_ovs/desk").symlink_to(Path("scene").resolve())
-    chair = {"category": "chair", "segmentation": [[10, 10], [40, 10], [40, 40], [10, 40]], "bbox": [10, 10, 40, 40]}
-    label = {"info": {"name": "view_001.png", "width": 80, "height": 60}, "objects": [chair]}
-    Path("lerf_ovs/label/desk/view_001.json").write_text(json.dumps(label))
-    known = {"method": FieldMethod(kfgs.SemanticField.load("run/field.kfgs")), "encode": encode}
-    [block] = blocks_of("datasets")
-    exec(block.replace("figurines", "desk"), known)
-    assert known["report"].protocol == "lerf-ovs-2d/1"
-    assert 0 <= known["report"].value <= 1
 
 
 class Renderer(torch.nn.Module):

@@ -7,8 +7,8 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.evaluation import load_labels
 from kfgs.evaluation.coco import load_coco_examples, load_coco_labels, save_coco
+from kfgs.evaluation.label_pictures import load_labels
 
 
 def _coco(path: Path, **changes: object) -> Path:

@@ -9,7 +9,7 @@ import torch
 from messages import tells
 from PIL import Image
 
-from kfgs.evaluation import load_label_map, load_labels
+from kfgs.evaluation.label_pictures import load_label_map, load_labels
 
 RED, GREEN, BLACK = (255, 0, 0), (0, 255, 0), (0, 0, 0)
 

@@ -13,9 +13,9 @@ from kfgs.evaluation import (
     Method,
     TeacherMethod,
     View,
-    best_labels,
     label_view,
 )
+from kfgs.evaluation.method import best_labels
 from kfgs.fields import Autoencoded, Codewords, Identity, Linear, SemanticField
 from kfgs.quant import Codebook, LinearLatents
 from kfgs.scenes import FeatureFolder, save_feature_map
