@@ -27,7 +27,8 @@ from IPython.display import Image as Shown
 
 import kfgs
 from kfgs import viz
-from kfgs.pipeline import Results, evaluate, open_question
+from kfgs.evaluation import TeacherMethod, label_view
+from kfgs.pipeline import evaluate, open_question
 
 scene = kfgs.load_scene(folder).undistorted()
 classes = kfgs.load_label_set(names, text)
@@ -47,19 +48,19 @@ maps = kfgs.FeatureFolder(features).of(scene, "train")
 
 # %%
 quick = kfgs.ColorConfig.quick()
-quick = replace(quick, training=quick.training.with_steps(800).with_maximum(60_000))
+quick = replace(quick, training=replace(quick.training.with_steps(800), max_gaussians=60_000))
 trained = {"codebook": kfgs.GrownCodebook(), "autoencoder": kfgs.AutoencoderConfig(steps=500)}
 methods = {
     "fused": kfgs.Uplift(color=quick),
-    "paper": kfgs.Paper(**trained, training=kfgs.Training.cpu().with_steps(400)),
-    "raw": kfgs.Paper(None, None, replace(kfgs.Training.cpu(), render_scale=1.0).with_steps(60)),
+    "paper": kfgs.Paper(**trained, training=kfgs.FieldConfig.cpu().with_steps(400)),
+    "raw": kfgs.Paper(None, None, kfgs.FieldConfig.cpu(render_scale=1.0).with_steps(60)),
 }
 runs = {"fused": data / "run", "paper": data / "run_paper", "raw": data / "run_raw"}
 fields = {}
 for name, method in methods.items():
     fields[name] = kfgs.fit(scene, maps, method, folder=runs[name])
     stages = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in fields[name].info["seconds"].items())
-    print(f"{name:6s} {fields[name].decoder.latent:3d} channels, {len(fields[name]):6,} Gaussians; {stages}")
+    print(f"{name:6s} {fields[name].features.shape[1]:3d} channels, {len(fields[name]):6,} Gaussians; {stages}")
 
 # %% [markdown]
 # ## One question for all
@@ -71,28 +72,33 @@ for name, method in methods.items():
 
 # %%
 question = open_question(folder, "kfgs-pooled/1")
-compared = Results.read([*runs.values(), features]).score(question, classes)
-print(compared)
-
-# %% [markdown]
-# These two lines are what `kfgs compare` does in a shell. To score one result, `evaluate` (`kfgs evaluate`) gives a report.
-# It also says how the scores were measured.
-
-# %%
-report = evaluate(runs["fused"], question, encode=classes)
-print(report)
+asked = {**fields, "teacher": features}
+reports = {name: evaluate(result, question, encode=classes) for name, result in asked.items()}
+for name, report in sorted(reports.items(), key=lambda pair: -pair[1].value):
+    print(f"{name:8s} {report}")
 print(report.about)
 
 # %% [markdown]
+# In a shell, `kfgs evaluate run/` gives such a report. `benchmarks/protocols.py` compares results of other programs, too.
+#
 # ## What each gets wrong
 #
-# Mistakes are orange, and their share is written above them. The teacher's are whole patches, in other places in every view.
-# A method that compresses each map, before views are compared, keeps some of them. The fused field has outvoted most.
+# A mistake has the colour of the class that was said; all else is grey. The teacher's are whole patches, in other places in
+# every view. A method that compresses each map, before views are compared, keeps some of them. The fused field has outvoted
+# most.
 
 # %% tags=["thumbnail"]
-compared.write(out, question, classes, count=2)
-view = question.scored[-1].stem
-Shown(out / f"{view}.png", width=1000)
+view = question.views[-1]
+truth, photo = question.truth.maps[view.stem], scene.image(scene.splits["test"][-1])
+labels = {name: field.segment(view.camera, classes) for name, field in fields.items()}
+labels["teacher"] = label_view(TeacherMethod(kfgs.FeatureFolder(features)), view, classes.embeddings)
+pictures = {}
+for name, found in labels.items():
+    share = ((found != truth) & (truth >= 0)).float().mean()
+    mistakes = found.where(found != truth, -1)  # a mistake has the colour of the wrong class
+    pictures[f"{name}: {share:.1%} wrong"] = viz.overlay_labels(photo, mistakes, classes.names, legend=False)
+viz.save_picture(out / "errors.png", viz.picture_grid([[*pictures.values()]], [*pictures], width=320))
+Shown(out / "errors.png", width=1000)
 
 # %% [markdown]
 # ## Quality and size
@@ -104,8 +110,7 @@ Shown(out / f"{view}.png", width=1000)
 
 # %%
 sizes = [field.storage() for field in fields.values()] + [len(scene) * maps[0].numel() * 2]
-scores = [compared.reports[title].value for title in compared.methods]
-points = {name: (size / 2**20, score) for name, size, score in zip([*fields, "teacher"], sizes, scores, strict=True)}
+points = {name: (size / 2**20, reports[name].value) for name, size in zip(reports, sizes, strict=True)}
 viz.plot_quality_storage(points, out / "storage.png")
 Shown(out / "storage.png", width=600)
 

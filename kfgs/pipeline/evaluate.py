@@ -84,7 +84,7 @@ def open_question(
 
 
 def evaluate(
-    field: str | Path | Method | Gaussians,
+    field: str | Path | SemanticField | Method | Gaussians,
     scene: str | Path | Question,
     protocol: Any = "kfgs-pooled/1",
     *,
@@ -96,7 +96,7 @@ def evaluate(
     """Score a result in a scene under a protocol.
 
     Args:
-        field: a field or run of kfgs, a folder of a teacher's feature maps, or a `Method`. For `kfgs-color/1` Gaussians with
+        field: a field or run of kfgs, a folder of a teacher's feature maps, or any `Method`. For `kfgs-color/1` Gaussians with
             colours, a splat, or a run that has one.
         scene: its folder; or a question that was opened before (`open_question`), to ask several methods the same.
         protocol: as in `open_question`; a question has its own.
@@ -119,6 +119,8 @@ def evaluate(
     if labels is not None and rule is None:
         raise ValueError(f"labels: expected none with {scorer.name}, which takes no class per pixel, got {labels!r}")
     method: Any = open_result(field, question) if isinstance(field, str | Path) else field
+    if isinstance(method, SemanticField):
+        method = FieldMethod(method)
     if getattr(scorer, "of_colors", False):
         if not isinstance(method, Gaussians) or method.sh is None:
             raise ValueError(f"field: expected Gaussians with colours for {scorer.name}, got none; name a colour splat")
