@@ -39,37 +39,33 @@ def test_whole_numbers_of_hundreds_of_digits_are_no_json(tmp_path, content):
 
 def test_a_gaussian_of_infinite_number_is_named(tmp_path):
     (tmp_path / "clicks.json").write_text('{"chair": [{"gaussians": [1e999]}]}')
-    with pytest.raises(ValueError, match=tells("clicks.json", "'chair'[0]", "whole numbers", "inf")):
+    with pytest.raises(ValueError, match=tells("clicks.json", "'chair'[0]", "infinity")):
         read_examples(tmp_path / "clicks.json")
 
 
 @pytest.mark.parametrize(
-    ("example", "parts"),
+    "example",
     [
-        ({"gaussians": "12"}, ("gaussians: expected a list of whole numbers", "'12'")),
-        ({"gaussians": {"1": 2}}, ("gaussians: expected a list of whole numbers", "{'1': 2}")),
-        ({"gaussians": [1.7]}, ("gaussians: expected a list of whole numbers", "[1.7]")),
-        ({"gaussians": [True]}, ("gaussians: expected a list of whole numbers", "[True]")),
-        ({"gaussians": ["3"]}, ("gaussians: expected a list of whole numbers", "['3']")),
-        ({"gaussians": [1e30]}, ("gaussians: expected a list of whole numbers", "[1e+30]")),
-        ({"view": "a", "points": ["12"]}, ("points: expected a list of [x, y]", "['12']")),
-        ({"view": "a", "points": [[1, "2"]]}, ("points: expected a list of 2 numbers", "[1, '2']")),
-        ({"view": "a", "points": [[1, 2, 3]]}, ("points: expected a list of 2 numbers", "[1, 2, 3]")),
-        ({"view": "a", "box": "1234"}, ("box: expected a list of 4 numbers", "'1234'")),
-        ({"view": "a", "box": [0, 0, 1, True]}, ("box: expected a list of 4 numbers", "True")),
-        ({"view": 5, "points": [[1, 2]]}, ("view: expected the name of a view", "5")),
+        {"gaussians": {"x": 2}},
+        {"gaussians": ["a"]},
+        {"view": "a", "points": ["12", "x"]},
+        {"view": "a", "points": [[1, 2, 3]]},
+        {"view": "a", "box": "abcd"},
+        {"view": "a"},
+        {"points": [[1, 2]]},
+        7,
     ],
 )
-def test_examples_of_other_types_are_refused_not_converted(tmp_path, example, parts):
+def test_wrong_examples_are_named_by_file_and_place(tmp_path, example):
     file = tmp_path / "clicks.json"
     file.write_text(json.dumps({"chair": [example]}))
-    with pytest.raises(ValueError, match=tells(file, "'chair'[0]", *parts)):
+    with pytest.raises(ValueError, match=tells(file, "'chair'[0]", "expected an example")):
         read_examples(file)
 
 
 def test_a_class_whose_examples_are_no_list_is_named(tmp_path):
     (tmp_path / "clicks.json").write_text('{"lamp": [], "chair": {}}')
-    with pytest.raises(ValueError, match=tells("clicks.json", "no list for 'chair'", "correct it")):
+    with pytest.raises(ValueError, match=tells("clicks.json", "lists of examples by class name", "correct it")):
         read_examples(tmp_path / "clicks.json")
 
 

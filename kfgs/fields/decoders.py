@@ -7,8 +7,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Protocol, Self
 
 import torch
 from torch import Tensor
@@ -35,29 +35,24 @@ class Decoder(Protocol):
     @property
     def dim(self) -> int:
         """Channels of a feature, D."""
-        ...
 
     @property
     def latent(self) -> int:
         """Channels of a latent, d."""
-        ...
 
     @property
     def parameters(self) -> int:
         """Numbers that decoding and labelling need, as Table 1 counts them."""
-        ...
 
     def decode(self, latents: Tensor) -> Tensor:  # [..., d] -> [..., D]
         """Features in the teacher's space."""
-        ...
 
     def cosines(self, latents: Tensor, rows: Tensor) -> Tensor:  # [N, d], [M, D] of length 1 -> [N, M]
         """The cosine of each Gaussian with each row; 0 for an all-zero latent."""
-        ...
 
     def votes(self, latents: Tensor, rows: Tensor) -> Votes | None:  # [N, d], [C, D] of length 1
         """What each Gaussian adds to the score of each class at a pixel; None if only `label_pixels` can tell."""
-        ...
+        return None
 
     def label_pixels(
         self,
@@ -67,29 +62,35 @@ class Decoder(Protocol):
         covered: Tensor | None = None,  # [...] bool
     ) -> tuple[Tensor, Tensor]:  # [..., top] int64, [..., top]
         """The most similar classes of each pixel, the best first, and their cosines; -1 and 0 where nothing is known."""
-        ...
-
-    def to(self, *args: Any, **kwargs: Any) -> Decoder:
-        """On another device or in another dtype, as `Tensor.to`."""
-        ...
+        cosines = torch.cat([self.cosines(part, rows) for part in pixels.reshape(-1, self.latent).split(CHUNK)])
+        return _best(pixels, cosines, top, covered)
 
     def to_tensors(self) -> dict[str, Tensor]:
         """What `make_decoder` reads."""
-        ...
+
+    def to(self, *args: Any, **kwargs: Any) -> Self:
+        """On another device or in another dtype, as `Tensor.to`."""
+        moved = {name: part.to(*args, **kwargs) for name, part in vars(self).items() if hasattr(part, "to")}
+        this: Any = self
+        return replace(this, **moved)
 
 
 @dataclass(frozen=True, eq=False)
-class Identity:
+class Identity(Decoder):
     """Latents are the teacher's features themselves. A pixel takes the class most similar to its rendered feature."""
 
-    latent: int
+    channels: int
     paper: bool = False
-    name: ClassVar[str] = "just decouple"
-    parameters: ClassVar[int] = 0
+    name = "just decouple"
+    parameters = 0
 
     @property
     def dim(self) -> int:
-        return self.latent
+        return self.channels
+
+    @property
+    def latent(self) -> int:
+        return self.channels
 
     def decode(self, latents: Tensor) -> Tensor:
         return latents
@@ -101,20 +102,12 @@ class Identity:
     def votes(self, latents: Tensor, rows: Tensor) -> Votes | None:
         return similarity_votes(latents, rows)
 
-    def label_pixels(
-        self, pixels: Tensor, rows: Tensor, top: int = 1, covered: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        return _best(pixels, lambda part: unit_rows(part) @ rows.T, top, covered)
-
-    def to(self, *args: Any, **kwargs: Any) -> Identity:
-        return self
-
     def to_tensors(self) -> dict[str, Tensor]:
         return {}
 
 
 @dataclass(frozen=True, eq=False)
-class Linear:
+class Linear(Decoder):
     """Latents are linear in the feature, f = B z: a cosine is one product of d numbers, and a blend means what it shows.
 
     Each Gaussian divides one vote among the classes (`divide_votes`); a pixel takes the class with most blended votes. With
@@ -123,10 +116,7 @@ class Linear:
 
     latents: LinearLatents
     paper: bool = False
-    name: ClassVar[str] = "fused"
-
-    def __repr__(self) -> str:
-        return f"Linear({self.latent} latents for {self.dim} channels)"
+    name = "fused"
 
     @property
     def dim(self) -> int:
@@ -151,20 +141,12 @@ class Linear:
             return similarity_votes(latents, rows @ self.latents.basis.to(rows))
         return divide_votes(self.cosines(latents, rows), latents.any(dim=1))
 
-    def label_pixels(
-        self, pixels: Tensor, rows: Tensor, top: int = 1, covered: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        return _best(pixels, lambda part: self.cosines(part, rows), top, covered)
-
-    def to(self, *args: Any, **kwargs: Any) -> Linear:
-        return Linear(self.latents.to(*args, **kwargs), self.paper)
-
     def to_tensors(self) -> dict[str, Tensor]:
         return {"linear.basis": self.latents.basis}
 
 
 @dataclass(frozen=True, eq=False)
-class Codewords:
+class Codewords(Decoder):
     """Latents are features near codewords of S (Sec. 3.3.1). A Gaussian has the cosines of its nearest codeword.
 
     A pixel takes the class most similar to its rendered feature; with `paper`, that of the nearest codeword.
@@ -172,7 +154,7 @@ class Codewords:
 
     codebook: Codebook
     paper: bool = False
-    name: ClassVar[str] = "decouple+ADC"
+    name = "decouple+ADC"
 
     @property
     def dim(self) -> int:
@@ -190,7 +172,7 @@ class Codewords:
         return latents
 
     def cosines(self, latents: Tensor, rows: Tensor) -> Tensor:
-        return _quantised_cosines(self, self.codebook, latents, rows)
+        return _quantised_cosines(self, latents, rows)
 
     def votes(self, latents: Tensor, rows: Tensor) -> Votes | None:
         return None if self.paper else similarity_votes(latents, rows)
@@ -199,19 +181,16 @@ class Codewords:
         self, pixels: Tensor, rows: Tensor, top: int = 1, covered: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         if not self.paper:
-            return _best(pixels, lambda part: unit_rows(part) @ rows.T, top, covered)
+            return _best(pixels, unit_rows(pixels).flatten(0, -2) @ rows.T, top, covered)
         index = label_pixels(pixels, self.codebook, torch.arange(self.codebook.size), covered=covered)
         return _look_up(index, self.codebook, rows, top)
 
-    def to(self, *args: Any, **kwargs: Any) -> Codewords:
-        return Codewords(self.codebook.to(*args, **kwargs), self.paper)
-
     def to_tensors(self) -> dict[str, Tensor]:
-        return {f"codebook.{name}": value for name, value in self.codebook.state_dict().items()}
+        return {"codebook.codewords": self.codebook.codewords}
 
 
 @dataclass(frozen=True, eq=False)
-class Autoencoded:
+class Autoencoded(Decoder):
     """Latents are codewords compressed by the autoencoder (Sec. 3.3.2). A Gaussian has the cosines of its nearest codeword.
 
     A pixel takes the codeword with the latent nearest to the rendered one, which is 900 times cheaper than decoding; with
@@ -221,7 +200,7 @@ class Autoencoded:
     codebook: Codebook
     autoencoder: Autoencoder
     paper: bool = False
-    name: ClassVar[str] = "decouple+ADC+SC"
+    name = "decouple+ADC+SC"
 
     def __post_init__(self) -> None:
         if self.autoencoder.dim != self.codebook.dim:
@@ -246,26 +225,15 @@ class Autoencoded:
         return self.autoencoder.decode(latents)
 
     def cosines(self, latents: Tensor, rows: Tensor) -> Tensor:
-        return _quantised_cosines(self, self.codebook, latents, rows)
-
-    def votes(self, latents: Tensor, rows: Tensor) -> Votes | None:
-        return None
+        return _quantised_cosines(self, latents, rows)
 
     def label_pixels(
         self, pixels: Tensor, rows: Tensor, top: int = 1, covered: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        index = label_pixels(
-            pixels,
-            self.codebook,
-            torch.arange(self.codebook.size),
-            self.autoencoder,
-            decode="exact" if self.paper else "latent",
-            covered=covered,
-        )
+        numbers = torch.arange(self.codebook.size)
+        how: Any = "exact" if self.paper else "latent"
+        index = label_pixels(pixels, self.codebook, numbers, self.autoencoder, decode=how, covered=covered)
         return _look_up(index, self.codebook, rows, top)
-
-    def to(self, *args: Any, **kwargs: Any) -> Autoencoded:
-        return Autoencoded(self.codebook.to(*args, **kwargs), self.autoencoder.to(*args, **kwargs), self.paper)
 
     def to_tensors(self) -> dict[str, Tensor]:
         weights = {f"autoencoder.{name}": value for name, value in self.autoencoder.state_dict().items()}
@@ -273,37 +241,31 @@ class Autoencoded:
 
 
 def make_decoder(tensors: Mapping[str, Tensor], channels: int) -> Decoder:
-    """The decoder of `Decoder.to_tensors`, for Gaussians with so many channels. Other names are ignored."""
-    parts: dict[str, dict[str, Tensor]] = {"linear": {}, "codebook": {}, "autoencoder": {}}
-    for name, value in tensors.items():
-        kind, _, rest = name.partition(".")
-        if kind in parts:
-            parts[kind][rest] = value
-    if parts["linear"]:
-        return Linear(LinearLatents.from_state_dict(parts["linear"]))
-    if not parts["codebook"]:
+    """The decoder of `Decoder.to_tensors`, for Gaussians with this many channels. Other names are ignored."""
+    if "linear.basis" in tensors:
+        return Linear(LinearLatents(tensors["linear.basis"]))
+    if "codebook.codewords" not in tensors:
         return Identity(channels)
-    codebook = Codebook.from_state_dict(parts["codebook"])
-    if not parts["autoencoder"]:
-        return Codewords(codebook)
-    return Autoencoded(codebook, Autoencoder.from_state_dict(parts["autoencoder"]))
+    codebook, prefix = Codebook(tensors["codebook.codewords"]), "autoencoder."
+    weights = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+    return Autoencoded(codebook, Autoencoder.from_state_dict(weights)) if weights else Codewords(codebook)
 
 
-def _quantised_cosines(decoder: Decoder, codebook: Codebook, latents: Tensor, rows: Tensor) -> Tensor:  # [N, M]
+def _quantised_cosines(decoder: Codewords | Autoencoded, latents: Tensor, rows: Tensor) -> Tensor:  # [N, M]
     """The cosines of each latent's nearest codeword; 0 for an all-zero latent."""
-    per_codeword = codebook.unit.to(rows) @ rows.T  # [K, M]
-    index = torch.cat([codebook.quantize(decoder.decode(part)) for part in latents.split(CHUNK)])
+    per_codeword = decoder.codebook.unit.to(rows) @ rows.T  # [K, M]
+    index = torch.cat([decoder.codebook.quantize(decoder.decode(part)) for part in latents.split(CHUNK)])
     return per_codeword[index] * latents.any(dim=1)[:, None]
 
 
-def _best(pixels: Tensor, compare: Any, top: int, covered: Tensor | None) -> tuple[Tensor, Tensor]:
-    """The `top` largest cosines of each pixel; ties go to the lowest class."""
-    cosines = torch.cat([compare(part) for part in pixels.reshape(-1, pixels.shape[-1]).split(CHUNK)])
+def _best(pixels: Tensor, cosines: Tensor, top: int, covered: Tensor | None) -> tuple[Tensor, Tensor]:
+    """The `top` largest of the cosines [n, C] of pixels [..., d]; ties go to the lowest class."""
     scores, labels = cosines.sort(dim=1, descending=True, stable=True)
-    empty = (row_norms(pixels) <= EPS) if covered is None else (row_norms(pixels) <= EPS) | ~covered
+    empty = (
+        (row_norms(pixels) <= EPS)[..., None] if covered is None else (~covered | (row_norms(pixels) <= EPS))[..., None]
+    )
     shape = *pixels.shape[:-1], top
-    labels, scores = labels[:, :top].reshape(shape), scores[:, :top].reshape(shape)
-    return labels.masked_fill(empty[..., None], -1), scores.masked_fill(empty[..., None], 0)
+    return labels[:, :top].reshape(shape).masked_fill(empty, -1), scores[:, :top].reshape(shape).masked_fill(empty, 0)
 
 
 def _look_up(index: Tensor, codebook: Codebook, rows: Tensor, top: int) -> tuple[Tensor, Tensor]:

@@ -103,10 +103,7 @@ def densify(
     return Densified(grown.map(lambda value: value[stays]), source[stays], fresh[stays])
 
 
-def lowered_opacities(
-    logit_opacities: Tensor,  # [N]
-    opacity: float,
-) -> Tensor:  # [N]
+def lowered_opacities(logit_opacities: Tensor, opacity: float) -> Tensor:  # [N] -> [N]
     """The opacity reset of 3DGS: logits lowered to at most that of `opacity`."""
     return logit_opacities.detach().clamp(max=math.log(opacity / (1 - opacity)))
 

@@ -13,7 +13,6 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from .._check import check_range
-from .._typed import typed
 from ..cameras import resize_map
 from ..cameras.resample import from_bchw, to_bchw
 from ..splat.engines.table import choose, load, offers
@@ -26,7 +25,6 @@ SSIM_CONSTANTS = 0.01**2, 0.03**2
 """(K1 peak)^2 and (K2 peak)^2 of SSIM, for colours in [0, 1]."""
 
 
-@typed
 def l1_loss(
     rendered: Tensor,  # [H, W, D]
     alpha: Tensor,  # [H, W], not used
@@ -37,12 +35,7 @@ def l1_loss(
     The mean of the absolute differences over pixels and channels. The paper writes a norm, but its released script takes
     the mean, and learning rates and densification threshold of 3DGS are made for a mean. Pixels with NaN in any channel of
     the target are unknown and do not count.
-
-    Raises:
-        ValueError: if the numbers of channels disagree.
-
-    Note:
-        The engine's, if it has an `absolute`, which has no gradient of the gradient. torch's, if the target needs a gradient.
+    A compiled loss of the engine has no gradient of the gradient; torch's is used if the target needs a gradient.
     """
     rendered = _resized(rendered, target)
     channels = target.shape[2]
@@ -81,11 +74,7 @@ class ColorLoss:
         alpha: Tensor,  # [H, W]
         target: Tensor,  # [h, w, D] or [h, w, D + 1]
     ) -> Tensor:  # []
-        """Compare a rendered picture with the photograph.
-
-        Raises:
-            ValueError: if the numbers of channels disagree.
-        """
+        """Compare a rendered picture with the photograph."""
         if target.shape[2] == rendered.shape[2] + 1:
             rendered = torch.cat([rendered, alpha[..., None]], dim=2)
         if self.ssim_weight == 0 or min(target.shape[:2]) < SSIM_WINDOW:
@@ -106,9 +95,7 @@ def mean_similarity(
 ) -> Tensor:  # []
     """Mean SSIM over the windows without a NaN (Gaussian, 11x11, sigma 1.5); 1 if there is none. Differentiable in `picture`.
 
-    Note:
-        The engine's, if it has a `similarity`, else kornia's, as for a target that needs a gradient. numba's compiled code
-        takes 1.2 ms instead of 37 (240x320, two threads). It has no gradient of the gradient.
+    The engine's if it has one (1.2 ms instead of kornia's 37 at 240x320, two threads), else kornia's.
     """
     known = _known(target)
     counted = None
@@ -155,10 +142,7 @@ class _Compiled(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        """The slope times the loss's gradient, which is 1 if nothing follows the loss: then the slope itself, without a copy.
-
-        A slope that is saved for another pass has two owners, so torch adds to a copy.
-        """
+        """The slope times the loss's gradient, which is 1 if nothing follows the loss: then the slope itself, without a copy."""
         (slope,) = ctx.saved_tensors
         return slope if slope.device.type == "cpu" and float(grad) == 1 else grad * slope, None, None
 

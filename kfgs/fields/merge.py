@@ -8,9 +8,7 @@ import torch
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from torch import Tensor
 
-from .._card import short_repr
 from .._check import check_range, check_shapes, check_whole
-from .._typed import typed
 from ..gaussians import Gaussians
 from ..quant import spherical_kmeans
 from ..splat import covariance_3d
@@ -33,11 +31,7 @@ class Merged(NamedTuple):
     weights: Tensor  # [M] sums of their members' weights
     source: Tensor  # [N] int64, the merged Gaussian of each old one; -1 = dropped
 
-    def __repr__(self) -> str:
-        return short_repr(self)
 
-
-@typed
 def merge_gaussians(
     gaussians: Gaussians,
     weights: Tensor,  # [N] >= 0
@@ -69,7 +63,6 @@ def merge_gaussians(
     """
     check_shapes(("gaussians.means", gaussians.means, "N 3"), ("weights", weights, "N"))
     check_whole("maximum", maximum, 1)
-    check_whole("clusters", clusters, 1)
     check_range("faint", faint, 0, 1, closed=(True, False))
     if gaussians.features is None:
         raise ValueError("gaussians: expected features [N, d], got None; uplift some first")
@@ -126,9 +119,8 @@ def _groups(means: Tensor, low: Tensor, edge: float, kinds: Tensor, worth: Tenso
     cells = ((means - low).double() / edge).floor().to(torch.int64)
     sides = cells.amax(0) + 1
     column = torch.unique(cells[:, 0] * sides[1] + cells[:, 1], return_inverse=True)[1]
-    cube = torch.unique(column * sides[2] + cells[:, 2], return_inverse=True)[
-        1
-    ]  # in two steps: three sides overflow int64
+    # in two steps: three sides overflow int64
+    cube = torch.unique(column * sides[2] + cells[:, 2], return_inverse=True)[1]
     pairs, group = torch.unique(cube * (kinds.max() + 1) + kinds, return_inverse=True)
     cube_of = pairs // (kinds.max() + 1)  # [M]
     weight = _sum(worth, group, len(pairs))

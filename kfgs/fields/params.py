@@ -44,26 +44,14 @@ class GaussianParams:
     antialiased: bool = False  # as in `Gaussians`
 
     def __post_init__(self) -> None:
-        for name in _NAMES:
-            value = getattr(self, name)
-            if not isinstance(value, Tensor | None):
-                object.__setattr__(self, name, as_tensor(name, value, floating=True))
-        check_shapes(
-            ("means", self.means, "N 3"),
-            ("quats", self.quats, "N 4"),
-            ("log_scales", self.log_scales, "N 3"),
-            ("logit_opacities", self.logit_opacities, "N"),
-            ("features", self.features, "N D"),
-            ("sh0", self.sh0, "N 3"),
-            ("sh_rest", self.sh_rest, "N R 3"),
-        )
+        shapes = "N 3", "N 4", "N 3", "N", "N D", "N 3", "N R 3"
+        check_shapes(*((name, getattr(self, name), shape) for name, shape in zip(_NAMES, shapes, strict=True)))
         if (self.features is None) == (self.sh0 is None):
             got = "neither" if self.features is None else "both"
             raise ValueError(f"features, sh0: expected one of them, got {got}; a field has features or colours")
         if self.sh_rest is not None and (self.sh0 is None or self.sh_rest.shape[1] not in (3, 8, 15)):
             raise ValueError(
                 f"sh_rest: expected 3, 8 or 15 coefficients (degree 1 to 3) with sh0, got {self.sh_rest.shape[1]}"
-                f"{' without sh0' if self.sh0 is None else ''}; leave it None at degree 0"
             )
 
     def __len__(self) -> int:
@@ -97,14 +85,7 @@ class GaussianParams:
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> GaussianParams:
-        """The inverse of `to_tensors`; other names are ignored, and a missing one is a ValueError."""
-        needed = [*_NAMES[:4], "sh0" if "features" not in tensors and "sh0" in tensors else "features"]
-        missing = [name for name in needed if name not in tensors]
-        if missing:
-            raise ValueError(
-                f"tensors: expected the names {needed}, got {sorted(tensors)} without {missing}; "
-                "pass what GaussianParams.to_tensors gave"
-            )
+        """The inverse of `to_tensors`; other names are ignored."""
         known: dict[str, Any] = {name: tensors[name] for name in _NAMES if name in tensors}
         return cls(**known)
 
@@ -114,28 +95,21 @@ class GaussianParams:
         return replace(self, **mapped)
 
     def activated(self, sh_degree: int | None = None) -> Gaussians:
-        """The Gaussians with these values; differentiable.
-
-        Args:
-            sh_degree: of colours, use the harmonics up to this degree only; None: all.
-        """
+        """The Gaussians with these values; differentiable. Of colours, only harmonics up to `sh_degree` (None: all)."""
         sh = None
         if self.sh0 is not None:
             degree = self.sh_degree if sh_degree is None else min(sh_degree, self.sh_degree)
             rest = [] if degree == 0 or self.sh_rest is None else [self.sh_rest[:, : (degree + 1) ** 2 - 1]]
             sh = torch.cat([self.sh0[:, None], *rest], dim=1)
-        scales, opacities = self.log_scales.exp(), self.logit_opacities.sigmoid()
-        shape = self.means, self.quats, scales, opacities
-        facts: dict[str, Any] = {"origin": self.origin, "antialiased": self.antialiased}
-        return Gaussians(*shape, features=self.features, sh=sh, **facts)
+        shape = self.means, self.quats, self.log_scales.exp(), self.logit_opacities.sigmoid()
+        return Gaussians(*shape, features=self.features, sh=sh, origin=self.origin, antialiased=self.antialiased)
 
     @classmethod
     def from_gaussians(cls, gaussians: Gaussians) -> GaussianParams:
         """The raw values of a cloud with features or colours, to continue training: the inverse of `activated`.
 
         If a cloud has both, features are taken. Scales of 0 become the smallest normal number, and opacities keep eps away
-        from 0 and 1, because logarithm and logit must be finite. `fit_field` starts with the SH degree that the cloud uses
-        (`used_sh_degree`), not with degree 0 as for points.
+        from 0 and 1, because logarithm and logit must be finite.
 
         Raises:
             ValueError: if the Gaussians carry neither.
@@ -146,7 +120,6 @@ class GaussianParams:
             )
         scales, opacities = gaussians.scales.detach(), gaussians.opacities.detach()
         sh = None if gaussians.features is not None else gaussians.sh
-        higher = sh is not None and sh.shape[1] > 1
         return cls(
             means=gaussians.means.detach().clone(),
             quats=gaussians.quats.detach().clone(),
@@ -154,7 +127,7 @@ class GaussianParams:
             logit_opacities=torch.logit(opacities, eps=torch.finfo(opacities.dtype).eps),
             features=None if gaussians.features is None else gaussians.features.detach().clone(),
             sh0=None if sh is None else sh[:, 0].detach().clone(),
-            sh_rest=sh[:, 1:].detach().clone() if sh is not None and higher else None,
+            sh_rest=sh[:, 1:].detach().clone() if sh is not None and sh.shape[1] > 1 else None,
             origin=gaussians.origin,
             antialiased=gaussians.antialiased,
         )
@@ -201,37 +174,32 @@ class GaussianParams:
             tensor([1., 1., 1.])
         """
         if (channels is None) == (colors is None):
-            raise ValueError(
-                f"channels, colors: expected one of them, got {'neither' if channels is None else 'both'}; a field has "
-                "so many features per Gaussian, or colours"
-            )
-        if channels is not None:
-            check_range("channels", channels, 1)
-        points = as_tensor("points", points, floating=isinstance(points, list | tuple))
-        colors = None if colors is None else as_tensor("colors", colors)
+            got = "neither" if channels is None else "both"
+            raise ValueError(f"channels, colors: expected one of them, got {got}; a field has features or colours")
+        points = as_tensor("points", points, floating=True).detach()
+        colors = None if colors is None else as_tensor("colors", colors).to(points.device)
         check_shapes(("points", points, "P 3"), ("colors", colors, "P 3"))
+        check_whole("channels", 1 if channels is None else channels, 1)
         check_whole("sh_degree", sh_degree, 0, 3)
         check_range("initial_opacity", initial_opacity, 0, 1, closed=(False, False))
         if not outlier_range > 0:
             raise ValueError(f"outlier_range: expected a positive number (or infinity), got {outlier_range!r}")
-        if not points.is_floating_point() or not bool(torch.isfinite(points).all()):
-            raise ValueError("points: expected finite floating-point numbers, got others; drop those rows first")
-        inliers = _inliers(points.detach(), outlier_range)
-        points, colors = points.detach()[inliers], None if colors is None else colors.to(points.device)[inliers]
-        if max_points is not None and len(points) > max_points:
-            check_range("max_points", max_points, 2)
+        if not bool(torch.isfinite(points).all()):
+            raise ValueError("points: expected finite numbers, got others; drop those rows first")
+        kept = _inliers(points, outlier_range).nonzero()[:, 0]
+        if max_points is not None and len(kept) > max_points:
+            check_whole("max_points", max_points, 2)
             generator = generator or torch.Generator().manual_seed(0)
-            order = torch.randperm(len(points), generator=generator, device=generator.device)
-            chosen = order[:max_points].sort().values.to(points.device)
-            points, colors = points[chosen], None if colors is None else colors[chosen]
-        n = len(points)
+            order = torch.randperm(len(kept), generator=generator, device=generator.device)
+            kept = kept[order[:max_points].sort().values.to(points.device)]
+        points, n = points[kept], len(kept)
         return cls(
             means=points.clone(),
             quats=points.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
             log_scales=point_spacing(points).log()[:, None].repeat(1, 3),
             logit_opacities=points.new_full((n,), math.log(initial_opacity / (1 - initial_opacity))),
             features=None if channels is None else points.new_zeros(n, channels),
-            sh0=None if colors is None else rgb_to_sh0(_unit_colors(colors).to(points)),
+            sh0=None if colors is None else rgb_to_sh0(_unit_colors(colors[kept]).to(points)),
             sh_rest=points.new_zeros(n, (sh_degree + 1) ** 2 - 1, 3) if colors is not None and sh_degree else None,
         )
 
@@ -247,7 +215,7 @@ def _unit_colors(colors: Tensor) -> Tensor:  # [P, 3] -> [P, 3] in [0, 1]
 
 
 def _inliers(points: Tensor, outlier_range: float) -> Tensor:  # [P, 3] -> [P] bool
-    """Mask of the points within `outlier_range` times the 0.95 quantile of the distances from the median."""
+    """The points within `outlier_range` times the 0.95 quantile of the distances from the median."""
     if len(points) == 0:
         return torch.zeros(0, dtype=torch.bool, device=points.device)
     distance = (points - points.median(dim=0).values).norm(dim=1)

