@@ -27,7 +27,7 @@ from pathlib import Path  # noqa: E402
 import torch  # noqa: E402
 from transfer import room  # noqa: E402
 
-from kfgs.viewer import Exploration, ExploreOptions, Explorer, SplatMeaning  # noqa: E402
+from kfgs.viewer import Exploration, Explorer, SplatMeaning  # noqa: E402
 
 SEMANTIC = 20_000
 MOVING, STILL = 15.0, 0.0001  # frames per second that VTK asks for while the mouse moves the camera, and when it rests
@@ -76,26 +76,22 @@ def measure(size: int, turns: int, out: Path) -> tuple[list[str], str]:
     scores = torch.rand(SEMANTIC, generator=torch.Generator().manual_seed(2)).numpy()
     began = time.perf_counter()
     state = Exploration(SplatMeaning(semantic.replace(scores=scores, names=NAMES)), color)
-    explorer = Explorer(state, ExploreOptions(out=out), off_screen=True)
+    explorer = Explorer(state, out=out, off_screen=True)
     explorer.screenshot()
     opened = time.perf_counter() - began
-    automatic = explorer.style
-    rows = []
-    for style in ("gaussians", "points"):
-        explorer.set_style(style)
-        explorer.ask(None)
-        explorer.screenshot(out / f"viewing_{size}_{style}.png")
-        quick, whole = turning(explorer, MOVING, turns), turning(explorer, STILL, turns)
-        explorer.ask("chair")
-        explorer.screenshot(out / f"viewing_{size}_{style}_asked.png")
-        far, sure = state.distance, iter([0.3 + 0.05 * i for i in range(turns + 1)])
-        distance = least(turns, lambda far=far: moved(explorer, lambda: explorer.set_distance(0.9 * far)))
-        gamma = least(turns, lambda sure=sure: moved(explorer, lambda: explorer.set_gamma(next(sure))))
-        mark = " (auto)" if style == automatic else ""
-        rows.append(
-            f"| {size:,} | {style}{mark} | {opened:.1f} s | {loaded + opened:.1f} s | {quick:.1f} | {whole:.1f} "
-            f"| {distance:.2f} s | {gamma:.2f} s |"
-        )
+    style, rows = explorer.style, []
+    explorer.ask(None)
+    explorer.screenshot(out / f"viewing_{size}_{style}.png")
+    quick, whole = turning(explorer, MOVING, turns), turning(explorer, STILL, turns)
+    explorer.ask("chair")
+    explorer.screenshot(out / f"viewing_{size}_{style}_asked.png")
+    far, sure = state.distance, iter([0.3 + 0.05 * i for i in range(turns + 1)])
+    distance = least(turns, lambda far=far: moved(explorer, lambda: explorer.set_distance(0.9 * far)))
+    gamma = least(turns, lambda sure=sure: moved(explorer, lambda: explorer.set_gamma(next(sure))))
+    rows.append(
+        f"| {size:,} | {style} | {opened:.1f} s | {loaded + opened:.1f} s | {quick:.1f} | {whole:.1f} "
+        f"| {distance:.2f} s | {gamma:.2f} s |"
+    )
     drawn_by = renderer(explorer)
     explorer.close()
     return rows, drawn_by

@@ -53,24 +53,30 @@ print(splat)
 # %% [markdown]
 # ## A point cloud of trimesh
 #
-# One point per Gaussian, in the colours of the classes; what else is known of a Gaussian is in `metadata`. `color_by="rgb"`
-# takes the colours of the splat.
+# `to_pyvista` gives one point per Gaussian with named arrays: its class, colour, opacity and size. trimesh takes positions
+# and colours.
 
 # %%
 found = kfgs.OfClass(thing).select(splat)
-points = viz.to_trimesh(splat.select(found.mask), "rgb")
-print(points, {name: np.shape(values) for name, values in points.metadata.items()})
+arrays = viz.to_pyvista(splat.select(found.mask), "rgb")
+print({name: np.shape(arrays[name]) for name in arrays.array_names})
+points = trimesh.PointCloud(arrays.points, colors=arrays["rgb"])
 box = points.bounding_box_oriented
 print(
     f"the {thing}s lie in a box of {np.round(box.primitive.extents, 2)}, their hull has {points.convex_hull.volume:.2f}"
 )
 
 # %% [markdown]
-# The same for Open3D: its point cloud takes every array along, and selections keep them.
+# The same for Open3D, whose point cloud takes every array along, and selections keep them.
 
 # %%
 if find_spec("open3d"):
-    cloud = viz.to_open3d(splat)
+    import open3d
+
+    arrays = viz.to_pyvista(splat)
+    cloud = open3d.t.geometry.PointCloud(open3d.core.Tensor(np.array(arrays.points)))
+    cloud.point["colors"] = open3d.core.Tensor(np.array(arrays["rgb"]))
+    cloud.point["label"] = open3d.core.Tensor(arrays["label"].astype(np.int32)[:, None])
     print(cloud)
     print(cloud.select_by_index(np.flatnonzero(found.mask)))
 else:

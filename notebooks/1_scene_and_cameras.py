@@ -58,8 +58,7 @@ size = 0.3 * scene.extent
 
 def draw_cameras(plotter):
     plotter.add_points(points, scalars=colors, rgb=True, point_size=3, lighting=False)
-    viz.add_cameras(plotter, scene.cameras, size=size, most=8)
-    viz.add_camera_images(plotter, scene.cameras, scene.image, size=size, most=8)
+    viz.add_cameras(plotter, scene.cameras, images=scene.image, size=size, most=8)
 
 
 orbit = Orbit(frames=8, size=(480, 720), elevation_degrees=40, zoom=1.1)

@@ -72,17 +72,26 @@ codebook = books["alpha = 0.7"]
 # %% [markdown]
 # ## What the codewords mean
 #
-# Each row is a codeword, with its nearest words at the right. The bars count its features, on a logarithmic axis. Most words
-# have one large codeword. The small ones beside it are borders between two things: their two nearest words fit nearly
-# equally well.
+# The matrix shows how similar the codewords are, ordered by their nearest word. Most words have one large codeword. The small
+# ones next to it are borders between two things: their two nearest words fit nearly equally well, as the list of the rarest
+# codewords shows.
 
 # %%
-from kfgs.viz import plot_codebook_report
+import matplotlib.pyplot as plt
+from torch.nn.functional import normalize
 
-plot_codebook_report(
-    codebook.codewords, words.names, words.embeddings, pictures / "codebook.png", usage=codebook.report.usage
-)
-Shown(pictures / "codebook.png", width=900)
+cosines, usage = normalize(codebook.codewords) @ normalize(words.embeddings).T, codebook.report.usage
+classes = cosines.argmax(dim=1)  # the nearest word of each codeword (Sec. 3.4)
+rows = classes.argsort(stable=True)
+plt.imshow(codebook.similarity(codebook.codewords)[rows][:, rows], cmap="cividis", interpolation="nearest")
+plt.yticks(range(len(rows)), [words.names[label] for label in classes[rows]], fontsize=6)
+plt.colorbar(label="cosine")
+plt.title("similarity of the codewords")
+plt.show()
+for row in usage.argsort()[:6].tolist():
+    nearest = cosines[row].topk(2)
+    two = [f"{words.names[i]} {value:.2f}" for value, i in zip(nearest.values, nearest.indices, strict=True)]
+    print(f"codeword {row:3d}: {int(usage[row]):6d} features, {', '.join(two)}")
 
 # %% [markdown]
 # ## Index maps
@@ -96,12 +105,10 @@ import torch
 from PIL import Image
 
 from kfgs import quantize_maps
-from kfgs.labels import label_codewords
 from kfgs.viz import FeatureColors, palette, picture_grid
 
 index_maps = quantize_maps(maps, codebook)
 colors = FeatureColors.fit(codebook.codewords)
-classes = label_codewords(codebook.codewords, words.embeddings).labels
 
 rows = []
 for i in (0, 2 * len(maps) // 3):
@@ -129,8 +136,6 @@ Image.fromarray(picture_grid(rows, titles, width=min(scene.cameras[0].width, 320
 # is so. In the picture a clean diagonal says the same. The paper takes 5,000 steps; 800 are enough here.
 
 # %%
-import matplotlib.pyplot as plt
-
 from kfgs import AutoencoderConfig, fit_autoencoder
 
 autoencoder = fit_autoencoder(codebook, AutoencoderConfig(steps=800))

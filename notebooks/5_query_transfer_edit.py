@@ -32,7 +32,7 @@ from PIL import Image
 import kfgs
 from kfgs import viz
 from kfgs.cameras import Orbit, estimate_up, orbit_cameras
-from kfgs.labels import InBox, OfClass
+from kfgs.labels import InBox, OfClass, nearest_labels
 from kfgs.pipeline import views_of_change
 
 scene = kfgs.load_scene(folder).undistorted()
@@ -94,9 +94,8 @@ orbit = Orbit(frames=1, size=(450, 640), elevation_degrees=50, start_degrees=120
 
 def draw_things(plotter):
     boxes = [one.box for one in things]
-    viz.add_cloud(plotter, inside, color_by=viz.palette(inside.labels, classes.names), style="gaussians")
-    viz.add_boxes(plotter, boxes)
-    viz.add_names(plotter, boxes, [f"{thing} {i}" for i in range(1, len(boxes) + 1)], up=tuple(up.tolist()))
+    viz.add_cloud(plotter, inside, style="gaussians")
+    viz.add_boxes(plotter, boxes, names=[f"{thing} {i}" for i in range(1, len(boxes) + 1)], up=up.tolist())
 
 
 Image.fromarray(viz.draw_view(orbit_cameras(inside.means, orbit, up=up)[0], draw_things))
@@ -110,20 +109,53 @@ Image.fromarray(viz.draw_view(orbit_cameras(inside.means, orbit, up=up)[0], draw
 #
 # $$\|p^1 - p^2\| < \lambda$$
 #
-# If $\lambda$ is too small, Gaussians stay without a label (grey). By default kfgs takes it from the spacing of the clouds.
-# The last picture shows another way, `attach(by="views")`: the field segments its training views, and each colour Gaussian
-# takes the class of most of the pixels that it fills. Its borders are sharper, so we go on with it.
+# By default kfgs takes $\lambda$ from the spacing of the clouds. `linked_clouds` shows the two next to each other with one
+# camera; in a window, turning one turns the other.
 
 # %%
-chosen = kfgs.transfer_labels(semantic, semantic.labels, colors.gaussians)
-print(chosen)
+carried = nearest_labels(semantic.means, semantic.labels, colors.means)
+print(carried)
+plotter = viz.linked_clouds(semantic, colors, camera=camera, height=360, off_screen=True)
+both = plotter.screenshot()
+plotter.close()
+Image.fromarray(both)
+
+# %% [markdown]
+# Who gave a label to whom? From above and without walls, with the colour cloud moved aside: each line joins a colour Gaussian
+# to the semantic one that gave it its class, in the colour of the class. 300 of the lines are drawn.
+
+# %%
+kept = torch.isin(carried.labels, hidden, invert=True)
+sides = torch.linalg.cross(up, torch.tensor([0.6, 0.8, 0.0]).to(up)), 1.3 * scene.extent
+aside = (sides[0] / sides[0].norm() * sides[1]).tolist()
+apart = colors.replace(means=colors.means + torch.tensor(aside).to(colors.means))
+only = replace(carried, labels=torch.where(kept, carried.labels, -1))
+whole = torch.cat([inside.means, apart.means[kept]])
+
+
+def draw_transfer(plotter):
+    viz.add_cloud(plotter, inside, style="gaussians")
+    viz.add_cloud(plotter, apart.select(kept), color_by="rgb", style="gaussians")
+    viz.add_transfer(plotter, semantic, colors, only, shift=aside, sample=300)
+    viz.add_legend(plotter, inside.labels, classes.names)
+
+
+above = Orbit(frames=1, size=(480, 960), elevation_degrees=40, start_degrees=30, zoom=1.5)
+Image.fromarray(viz.draw_view(orbit_cameras(whole, above, up=up)[0], draw_transfer))
+
+# %% [markdown]
+# If $\lambda$ is too small, Gaussians stay without a label (grey). The last picture shows another way, `attach(by="views")`:
+# the field segments its training views, and each colour Gaussian takes the class of most of the pixels that it fills. Its
+# borders are sharper, so we continue with it.
+
+# %%
 row, titles = [], []
-for distance in (0.1 * chosen.distance, chosen.distance):
-    carried = kfgs.transfer_labels(semantic, semantic.labels, colors.gaussians, distance)
-    row.append(viz.show_cloud(colors.gaussians.replace(labels=carried.labels), names=classes.names)(camera))
-    titles.append(f"lambda {distance:.2g}: {carried.orphaned:,} without")
-labelled = kfgs.attach(field, colors, classes, by="views").splats
-row.append(viz.show_cloud(labelled.gaussians, names=classes.names)(camera))
+for distance in (0.1 * carried.distance, carried.distance):
+    near = kfgs.transfer_labels(semantic, colors, distance)
+    row.append(viz.show_cloud(near)(camera))
+    titles.append(f"lambda {distance:.2g}: {int((near.labels < 0).sum()):,} without")
+labelled = kfgs.attach(field, colors, classes, by="views").gaussians
+row.append(viz.show_cloud(labelled)(camera))
 Image.fromarray(viz.picture_grid([row], [*titles, "by views"], width=320))
 
 # %% [markdown]
@@ -138,8 +170,8 @@ edits = kfgs.EditList().then(kfgs.Remove(OfClass(thing))).then(kfgs.Recolor(OfCl
 edited = edits.apply(labelled)
 print(f"{len(labelled)} Gaussians, {len(edited)} after {[edit.op for edit in edits]}")
 unseen = [scene.cameras[i] for i in scene.views("test")]
-views = [unseen[i] for i in views_of_change(labelled.gaussians, edited.gaussians, unseen)]
-rows = [[viz.show_cloud(one.gaussians, **picture)(view) for one in (labelled, edited)] for view in views]
+views = [unseen[i] for i in views_of_change(labelled, edited, unseen)]
+rows = [[viz.show_cloud(cloud, **picture)(view) for cloud in (labelled, edited)] for view in views]
 Image.fromarray(viz.picture_grid(rows, ("before", f"no {thing}, {painted} in red"), width=320))
 
 # %% [markdown]
@@ -151,7 +183,7 @@ low, high = (corner.tolist() for corner in things[0].extent)
 one = kfgs.EditList().then(kfgs.Recolor(OfClass(thing) & InBox(low, high), "teal"))
 states = {"before": one.undo(), f"one {thing} painted": one}
 view = cameras[things[0].best_view.index]
-row = [viz.show_cloud(edit.apply(labelled).gaussians, **picture)(view) for edit in states.values()]
+row = [viz.show_cloud(edit.apply(labelled), **picture)(view) for edit in states.values()]
 written = kfgs.write_splats(edited, out / "edited.ply")
 print([path.name for path in written.paths])
 Image.fromarray(viz.picture_grid([row], list(states), width=320))

@@ -32,7 +32,6 @@ from PIL import Image
 import kfgs
 from kfgs import viz
 from kfgs.cameras import Orbit, estimate_up, orbit_cameras
-from kfgs.labels import Selection
 
 scene = kfgs.load_scene(folder).undistorted()
 classes = kfgs.load_label_set(names, text)
@@ -53,9 +52,8 @@ print(f"{len(semantic):,} semantic Gaussians, {len(color):,} of colour")
 
 # %%
 camera = scene.cameras[scene.views("test")[3]]
-class_colors = viz.palette(semantic.labels, classes.names)
 plotter = viz.make_plotter(2 * camera.height, 2 * camera.width, off_screen=True)
-actor = viz.add_cloud(plotter, semantic, color_by=class_colors, style="gaussians")
+actor = viz.add_cloud(plotter, semantic, style="gaussians")  # coloured by its classes
 viz.add_legend(plotter, semantic.labels, classes.names)
 viz.look_through(plotter, camera)
 print(actor.mapper.dataset.array_names)
@@ -75,7 +73,7 @@ def draw(cloud, scale=1, **how):
 
 
 styles = ("points", "gaussians", "ellipsoids")
-Image.fromarray(viz.picture_grid([[draw(semantic, color_by=class_colors, style=style) for style in styles]], styles))
+Image.fromarray(viz.picture_grid([[draw(semantic, style=style) for style in styles]], styles))
 
 # %% [markdown]
 # ## What colours stand for
@@ -85,7 +83,7 @@ Image.fromarray(viz.picture_grid([[draw(semantic, color_by=class_colors, style=s
 
 # %%
 found = field.query(word, classes)
-latents = draw(semantic, color_by="feature", feature_colors=viz.feature_colors(field), style="gaussians")
+latents = draw(semantic, color_by="feature", style="gaussians")
 scores = draw(semantic, color_by=found.scores, clim=(0, 1), style="gaussians")
 row = [latents, scores, draw(color, color_by="view", style="gaussians")]
 Image.fromarray(viz.picture_grid([row], ["latents", f"score of {word}", "colours"]))
@@ -103,10 +101,9 @@ outside = orbit_cameras(inside.means, orbit, up=estimate_up(cameras).float())[1]
 
 
 def draw_outside(plotter):
-    viz.add_cloud(plotter, inside, color_by=viz.palette(inside.labels, classes.names), style="gaussians")
-    viz.add_cameras(plotter, cameras, size=0.2 * scene.extent, most=10)
+    viz.add_cloud(plotter, inside, style="gaussians")
     photographs = [scene.image(i) for i in scene.views("train")]
-    viz.add_camera_images(plotter, cameras, photographs, size=0.2 * scene.extent, most=10)
+    viz.add_cameras(plotter, cameras, images=photographs, size=0.2 * scene.extent, most=10)
 
 
 Image.fromarray(viz.draw_view(outside, draw_outside))
@@ -115,17 +112,24 @@ Image.fromarray(viz.draw_view(outside, draw_outside))
 # ## Selections
 #
 # The answer to a question is a selection, and `connected_parts` takes it apart. To see the parts in the colour scene, their
-# numbers are carried over like labels (notebook 5). What is not selected turns grey, and each part gets its box.
+# numbers are carried over like labels (notebook 5). What is not selected is grey, and each part has its box.
 
 # %%
-owner = torch.full((len(semantic),), -1)
-for number, part in enumerate(kfgs.connected_parts(semantic, found, cameras, distance=0.15)):
+owner, parts = torch.full((len(semantic),), -1), kfgs.connected_parts(semantic, found, cameras, distance=0.15)
+for number, part in enumerate(parts):
     owner[part.indices] = number
     print(part)
-carried = kfgs.transfer_labels(semantic, owner, color, 0.1).labels
-selections = {f"{word} {k + 1}": Selection.of(carried == k) for k in range(int(owner.max()) + 1)}
+titles = tuple(f"{word} {number}" for number in range(1, len(parts) + 1))
+shown = kfgs.transfer_labels(semantic.replace(labels=owner, names=()), color, 0.1)
 view = camera.resized(2 * camera.height, 2 * camera.width)
-Image.fromarray(viz.draw_view(view, lambda plotter: viz.add_selections(plotter, color, selections, style="gaussians")))
+
+
+def draw_parts(plotter):
+    viz.add_cloud(plotter, shown, style="gaussians")
+    viz.add_boxes(plotter, [part.box for part in parts], names=titles)
+
+
+Image.fromarray(viz.draw_view(view, draw_parts))
 
 # %% [markdown]
 # ## The explorer, driven from cells
@@ -134,9 +138,7 @@ Image.fromarray(viz.draw_view(view, lambda plotter: viz.add_selections(plotter, 
 # every control is a method. A higher $\gamma$ keeps only what is surest.
 
 # %%
-options = kfgs.viewer.ExploreOptions(height=360, width=960)
-with kfgs.explore(field, color, classes=classes, cameras=cameras, where="picture", options=options) as view:
-    view.look_from(camera)
+with kfgs.explore(field, color, classes=classes, cameras=[camera, *cameras], where="picture", height=420) as view:
     view.ask(word)
     view.set_gamma(0.8)
     print("\n".join(view.lines()))

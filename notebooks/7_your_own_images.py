@@ -69,8 +69,7 @@ points, colors = scene.points[inside], scene.colors[inside]
 
 def draw_cameras(plotter):
     plotter.add_points(points.numpy(), scalars=colors.numpy(), rgb=True, point_size=4, lighting=False)
-    viz.add_cameras(plotter, scene.cameras, size=0.25 * scene.extent, most=10)
-    viz.add_camera_images(plotter, scene.cameras, scene.image, size=0.25 * scene.extent, most=10)
+    viz.add_cameras(plotter, scene.cameras, images=scene.image, size=0.25 * scene.extent, most=10)
 
 
 orbit = Orbit(frames=8, size=(420, 640), elevation_degrees=40, zoom=1.1)

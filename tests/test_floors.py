@@ -39,12 +39,9 @@ TYPES_ONLY = {("viz", "fields"), ("viewer", "fields")}  # viz may take a field a
 
 THIRD_PARTY = {
     "pycolmap": "kfgs/scenes/",
-    "pyvista": "kfgs/vi",
+    "pyvista": "kfgs/viz/",
     "vtk": "kfgs/viz/",
-    "vtkmodules": "kfgs/vi",
-    "trimesh": "kfgs/viz/",
-    "open3d": "kfgs/viz/",
-    "pxr": "kfgs/viz/",
+    "vtkmodules": "kfgs/viz/",
     "numba": "kfgs/splat/engines/",
     "llvmlite": "kfgs/splat/engines/",
     "triton": "kfgs/splat/engines/",

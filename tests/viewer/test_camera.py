@@ -2,10 +2,10 @@ import cases_web
 import numpy as np
 import pytest
 from cases_web import needs_chromium
-from kfgs.viz.camera_view import letterboxed
 
 from kfgs.cameras import Camera
-from kfgs.viewer import inline_script
+from kfgs.viewer.page import inline_script
+from kfgs.viewer.window import letterboxed
 
 pytestmark = needs_chromium
 UP = [0.0, -0.6, 0.8]
