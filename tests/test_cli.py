@@ -61,7 +61,7 @@ def test_segment_scores_where_truth_is_known(run, room, tmp_path, capsys):
     scores = json.loads((out / "scores.json").read_text())
     assert scores["segmentation"]["views"] == 3
     assert 0 < scores["segmentation"]["miou"] < 1
-    for name in ("predicted", "colored", "sheets", "overlay", "features", "confusion.png", "iou.png", "scores.json"):
+    for name in ("predicted", "colored", "sheets", "overlay", "features", "iou.png", "scores.json"):
         assert str(out / name) in said
 
 

@@ -4,7 +4,6 @@ import dataclasses
 import json
 import re
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -406,39 +405,6 @@ def test_convert_writes_a_plain_ply_with_the_classes_beside_it(labelled, tmp_pat
     assert torch.equal(after.gaussians.labels, before.gaussians.labels)
 
 
-@pytest.mark.parametrize(("words", "kind"), [([], "ParticleField3DGaussianSplat"), (["--points"], "Points")])
-def test_convert_writes_usd_with_an_object_for_each_class(labelled, tmp_path, words, kind, capsys):
-    pytest.importorskip("pxr")
-    from pxr import Usd
-
-    out = tmp_path / "room.usdc"
-    assert main(["convert", str(labelled), str(out), *words]) == 0
-    said = capsys.readouterr().out
-    assert "KiB -> " in said
-    assert f"wrote:\n  {out}\n" in said
-    assert ("note: shapes" in said) == bool(words)
-    stage, cloud = Usd.Stage.Open(str(out)), read_splats(labelled)
-    prims = {one.GetAttribute("kfgs:class").Get(): one for one in stage.GetDefaultPrim().GetChildren()}
-    assert {one.GetTypeName() for one in prims.values()} == {kind}
-    counts = {name: len(one.GetAttribute("primvars:class_id").Get()) for name, one in prims.items()}
-    names = ["", *cloud.names]
-    assert counts == {names[label + 1]: len(part) for label, part in cloud.by_class().items()}
-
-
-def test_convert_misses_usd_core_before_it_reads(tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pxr", None)
-    assert main(["convert", str(tmp_path / "absent.ply"), str(tmp_path / "a.usdc")]) == 1
-    assert "a.usdc: expected usd-core to write USD" in capsys.readouterr().err
-
-
-def test_info_of_a_usd_file_says_that_kfgs_only_writes_it(labelled, tmp_path, capsys):
-    pytest.importorskip("pxr")
-    assert main(["convert", str(labelled), str(tmp_path / "a.usdz")]) == 0
-    capsys.readouterr()
-    assert main(["info", str(tmp_path / "a.usdz")]) == 1
-    assert "a.usdz: expected a splat file, got USD, which kfgs writes but does not read" in capsys.readouterr().err
-
-
 def test_convert_by_class_writes_a_plain_file_for_each_class(labelled, tmp_path, capsys):
     cloud, out = read_splats(labelled), tmp_path / "objects"
     words = ["convert", str(labelled), str(out), "--by-class"]
@@ -454,13 +420,6 @@ def test_convert_by_class_writes_a_plain_file_for_each_class(labelled, tmp_path,
         assert {"class_id", "score"}.isdisjoint(read_ply(out / name))
         assert name in said
     assert "note:" not in said
-
-
-def test_convert_by_class_into_a_folder_named_like_usd(labelled, tmp_path):
-    out = tmp_path / "objs.usd"
-    out.mkdir()
-    assert main(["convert", str(labelled), str(out), "--by-class"]) == 0
-    assert {path.suffix for path in out.iterdir()} == {".ply"}
 
 
 def test_convert_by_class_replaces_no_file_of_others(labelled, tmp_path, capsys):

@@ -19,7 +19,6 @@ from test_public import PACKAGES
 
 import kfgs
 from kfgs import scale
-from kfgs.evaluation import FieldMethod
 from kfgs.pipeline import true_labels
 from kfgs.scenes import load_cameras
 from kfgs.viz import available

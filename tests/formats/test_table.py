@@ -198,13 +198,3 @@ def test_opacities_of_0_and_1_are_written(tmp_path, file):
     back = read_splats(tmp_path / file).opacities
     expected = cloud.opacities if order is None else cloud.opacities[order]
     torch.testing.assert_close(back, expected, rtol=0, atol=2e-7)
-
-
-@pytest.mark.parametrize(
-    ("name", "head"),
-    [("a.usdc", b"PXR-USDC\0"), ("a.usda", b"#usda 1.0\n"), ("a.usd", b"PXR-USDC\0"), ("A.USDZ", b"PK\3\4")],
-)
-def test_usd_is_only_written(tmp_path, name, head):
-    (tmp_path / name).write_bytes(head + bytes(100))
-    with pytest.raises(ValueError, match=tells(tmp_path / name, "got USD", "does not read", "convert from the splat")):
-        read_splats(tmp_path / name)
