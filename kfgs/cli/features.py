@@ -51,12 +51,14 @@ def features(
     loaded = views.load(scene)
     chosen = "" if views.split == "train" else f" --split {views.split}"
     if check is not None:
-        found = FeatureFolder(check).check(loaded, views.split)
-        say(str(found))
-        if not found.ok:
+        problems, count = FeatureFolder(check).check(loaded, views.split), len(loaded.views(views.split))
+        say(f"{check}: {count - len(problems)} of {count} views have a map that fits")
+        for name, text in problems.items():
+            say(f"{name}: {text}")
+        if problems:
             raise ValueError(
-                f"check: expected a map that fits for each of the {found.views} views of split {views.split!r}, got "
-                f"{len(found.problems)} that are missing or do not fit (named above); make these maps again, or name the "
+                f"check: expected a map that fits for each of the {count} views of split {views.split!r}, got "
+                f"{len(problems)} that are missing or do not fit (named above); make these maps again, or name the "
                 "photos to use in SCENE/split.json"
             )
         say(f"next: kfgs fit {scene} --out run --features {check}{chosen}")

@@ -99,7 +99,6 @@ def _describe_maps(path: Path) -> str:
         f"  {h} x {w} cells, {D} channels",
         f"  {bytes_in_words(sum(file.stat().st_size for file in maps.files))}",
         *(f"  {one_line(name)}: {one_line(value, 200)}" for name, value in about.items() if name != "name"),
-        *(f"  {note}" for note in maps.check(values=False).notes),
     ]
     return "\n".join(lines)
 

@@ -71,9 +71,6 @@ def partition(model: ColmapModel | str | Path, count: int) -> list[Block]:
     """Cut a scene into blocks with about equally many points, at medians along the longest side of each part.
 
     The tracks of the model say which image sees which point.
-
-    Raises:
-        SceneError: if the model has no tracks, or fewer points than blocks, or a block is seen by no image.
     """
     model = model if isinstance(model, ColmapModel) else read_whole_model(model)
     check_whole("count", count, 1)
@@ -113,9 +110,6 @@ def write_parts(model: str | Path, parts: Mapping[Path, Iterable[str]]) -> None:
     Args:
         model: the folder of the model.
         parts: the folder of each new model, with the names of its images.
-
-    Raises:
-        SceneError: if the model is damaged, or has no image of a name.
     """
     model = as_path(model)
     with (

@@ -36,11 +36,7 @@ PANORAMA = "cut perspective views out of the panoramas, and give these with thei
 
 
 def convert_intrinsics(model: str, params: Sequence[float]) -> tuple[torch.Tensor, Distortion | None]:
-    """K [3, 3] float64 and the lens of a COLMAP camera; a perspective lens with all coefficients zero is a pinhole.
-
-    Raises:
-        SceneError: if the model has no exact form here (FOV, THIN_PRISM_FISHEYE, EUCM, ...).
-    """
+    """K [3, 3] float64 and the lens of a COLMAP camera; a perspective lens with all coefficients zero is a pinhole."""
     if model not in LENSES:
         advice = "undistort the images first: `kfgs.scenes.undistort_scene(images, model, out)` or `colmap image_undistorter`"
         raise SceneError(
@@ -63,10 +59,6 @@ def load_colmap(path: Path, images: Path) -> Scene:
         path: the model's folder (cameras, images, points3D; binary or text).
         images: the folder that the model's image names are relative to. Its pictures may have another size than the model
             says, as in `images_2`, `images_4` of Mip-NeRF 360: the cameras are resized to them.
-
-    Raises:
-        FileNotFoundError: if a folder is missing.
-        SceneError: if the model is damaged, a lens has no exact form in kfgs, or no image has both a pose and a file.
     """
     if not images.is_dir():
         raise FileNotFoundError(f"{images}: no such folder; expected the images of {path} there")

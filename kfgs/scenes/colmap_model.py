@@ -82,10 +82,6 @@ def read_model(path: str | Path) -> ColmapModel:
     sizes, names inside the image folder, and ids that are unique and refer to something that exists. Poses without finite
     numbers and a unit quaternion become None; points that are not finite, and entries of tracks that lead to no 2-D point
     (of deleted images), are left out and noted.
-
-    Raises:
-        FileNotFoundError: if there is no such folder.
-        SceneError: if the model is incomplete or damaged. The message names the file and the place in it.
     """
     folder = as_path(path)
     if not folder.is_dir():
@@ -110,12 +106,7 @@ def read_model(path: str | Path) -> ColmapModel:
 
 
 def read_whole_model(path: str | Path) -> ColmapModel:
-    """Read a model for pycolmap, which needs all of it: nothing may be left out.
-
-    Raises:
-        FileNotFoundError: if there is no such folder.
-        SceneError: if the model is damaged or partly broken, or has names in text files that pycolmap would cut at a blank.
-    """
+    """Read a model for pycolmap, which needs all of it: nothing may be left out."""
     model = read_model(path)
     advice = "write a binary model of what is whole, with the same poses: `kfgs sfm SCENE --out OUT`"
     require(not model.notes, str(path), "a model with nothing broken, for pycolmap", "; ".join(model.notes), advice)

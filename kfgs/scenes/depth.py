@@ -21,11 +21,7 @@ DEPTH_POINTS = 100_000  # points from all of them: what structure from motion gi
 
 
 def read_depth(path: Path) -> NDArray[Any]:  # [H, W]
-    """The whole numbers of a depth PNG; 0 is unknown.
-
-    Raises:
-        SceneError: if it is not a picture with one channel, or its numbers are indices of a palette.
-    """
+    """The whole numbers of a depth PNG; 0 is unknown."""
     with open_picture(path, "a depth PNG", "copy it again") as picture:
         depth, mode = np.asarray(picture), picture.mode
     if depth.ndim != 2 or mode == "P":

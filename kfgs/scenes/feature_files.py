@@ -42,10 +42,6 @@ def open_map(
         channels: D, if it is known; it decides the order of the axes, and then the aspect of the picture does.
         size: of the view's picture, if it is known.
         own: kfgs wrote the map, so it is [h, w, D].
-
-    Raises:
-        ValueError: if the file cannot be read, is not a map of floats, or the order of its axes is not clear.
-        TypeError: if it holds anything but one tensor.
     """
     try:
         values = _load(file)
@@ -90,9 +86,6 @@ def find_axes(
     """The order of the axes of a map: [h, w, D], as kfgs writes it, or [D, h, w], as encoders return it.
 
     A known number of channels decides, then the picture's aspect. If both orders fit, or nothing is known, it is [h, w, D].
-
-    Raises:
-        ValueError: if nothing is known, and the sizes look like [D, h, w].
 
     Example:
         >>> find_axes("a.npy", (512, 90, 120), channels=512), find_axes("a.npy", (90, 120, 512))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any, overload
@@ -21,32 +20,6 @@ from .extract import Split, pictures_of, read_manifest
 from .feature_files import AGAIN, ENDINGS, Size, StoredMap, count_bad, open_map, read_rows
 from .files import IMAGE_SUFFIXES, some
 from .scene import Scene
-
-HOLES = 0.5  # share of all-zero features from which a map gets a note
-
-
-@dataclass
-class FeatureReport:
-    """What `FeatureFolder.check` says about a folder of maps."""
-
-    folder: Path
-    views: int  # checked
-    shape: tuple[int, int, int] | None = None  # (h, w, D) of most maps; None if none could be opened
-    problems: dict[str, str] = field(default_factory=dict)
-    """Why a map cannot be used, by the file's name (if there is none, by the view's stem)."""
-    notes: list[str] = field(default_factory=list)
-    """Remarks about maps that can be used."""
-
-    @property
-    def ok(self) -> bool:
-        """Whether every view has a map that fits."""
-        return not self.problems
-
-    def __str__(self) -> str:
-        size = "no map could be opened" if self.shape is None else "{} x {} cells, {} channels".format(*self.shape)
-        lines = [f"{self.folder}: {self.views - len(self.problems)} of {self.views} views have a map that fits; {size}"]
-        lines += [f"{name}: {text}" for name, text in self.problems.items()]
-        return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 
 
 class FeatureFolder(Sequence[Tensor]):
@@ -226,74 +199,51 @@ class FeatureFolder(Sequence[Tensor]):
                 )
             yield block
 
-    def check(self, scene: Scene | None = None, split: Split = "train", *, values: bool = True) -> FeatureReport:
-        """Check the map of every view, and report everything that does not fit.
+    def check(self, scene: Scene | None = None, split: Split = "train", *, values: bool = True) -> dict[str, str]:
+        """Check the map of every view; says why a map cannot be used, by its file (if there is none, by the view).
 
-        Problems: no map; a file that cannot be read or is not a map of floats; other channels than most; a map that looks
-        transposed; NaN or infinite values; a map of zeros only. Notes: maps of several sizes; many all-zero features.
+        There is none; it cannot be read or is not a map of floats; it has other channels than most; it looks transposed; it
+        has NaN or infinite values, or only zeros.
 
         Args:
             scene: whose views to check; None: those of this folder.
             split: of the scene, as in `of`.
             values: False checks only shape and type, in milliseconds.
         """
-        stems, sizes = self.stems, self.sizes or [None] * len(self)
+        views = list(zip(self.stems, self.sizes or [None] * len(self), strict=True))
         if scene is not None:
-            pictures = pictures_of(scene, split)
-            stems, sizes = [picture.stem for picture in pictures], [picture.size for picture in pictures]
-        report = FeatureReport(self.path, len(stems))
-        files = self._find(stems)
-        missing = [stem for stem in stems if stem not in files]
-        report.problems |= dict.fromkeys(missing, "missing")
-        if missing:
-            report.notes.append(self._explain(stems, missing))
+            views = [(picture.stem, picture.size) for picture in pictures_of(scene, split)]
+        files = self._find([stem for stem, _ in views])
+        problems = {stem: "expected its map, got none" for stem, _ in views if stem not in files}
         shapes: dict[str, tuple[int, int, int]] = {}
         turned: dict[str, str] = {}
-        for stem, size in zip(stems, sizes, strict=True):
-            if stem not in files:
-                continue
-            name = files[stem].relative_to(self.path).as_posix()
+        for file, size in ((files[stem], size) for stem, size in views if stem in files):
+            name = file.relative_to(self.path).as_posix()
             try:
-                stored = open_map(files[stem], self.channels, size, own=self.identity is not None)
+                stored = open_map(file, self.channels, size, own=self.identity is not None)
             except (ValueError, TypeError) as error:
-                report.problems[name] = str(error).removeprefix(f"{files[stem]}: ")
+                problems[name] = str(error).removeprefix(f"{file}: ")
                 continue
-            h, w, D = shapes[name] = tuple(map(int, stored.shape))
+            h, w, _ = shapes[name] = tuple(map(int, stored.shape))
             if size is not None and not fits_aspect((h, w), size) and fits_aspect((w, h), size):
                 turned[name] = f"expected the aspect of a picture of {size}, got {h} x {w} cells (transposed?)"
-            if values:
-                _check_values(name, stored, report)
-        if shapes:
-            report.shape = Counter(shapes.values()).most_common(1)[0][0]
-            D = self.channels or report.shape[2]
-            report.problems |= {
-                name: f"expected {D} channels, got {shape[2]}" for name, shape in shapes.items() if shape[2] != D
-            }
-        cells = Counter(shape[:2] for shape in shapes.values()).most_common()
-        if len(cells) > 1 or (self.identity is None and len(turned) == len(shapes)):  # else an encoder with one grid
-            report.problems |= turned
-        if len(cells) > 1:
-            report.notes.append(
-                f"maps of {len(cells)} sizes: {some([f'{h} x {w} ({count})' for (h, w), count in cells])}"
-            )
-        return report
+            counts = [
+                (count_bad(rows), int((row_norms(rows) > EPS).sum())) for rows in (read_rows(stored) if values else ())
+            ]
+            bad, known = sum(n for n, _ in counts), sum(n for _, n in counts)
+            if values and (bad or not known):
+                problems[name] = f"{bad} NaN or infinite values" if bad else "every feature is all-zero"
+        channels = self.channels or Counter(D for _, _, D in shapes.values()).most_common(1)[0][0] if shapes else 0
+        problems |= {
+            name: f"expected {channels} channels, got {D}" for name, (_, _, D) in shapes.items() if channels != D
+        }
+        if len({shape[:2] for shape in shapes.values()}) > 1 or (self.identity is None and len(turned) == len(shapes)):
+            problems |= turned  # else the encoder has one grid for all pictures
+        return problems
 
     def check_files(self) -> None:
         """Raise a ValueError if a map does not fit, from shapes and types alone: for use before a long run."""
-        problems = self.check(values=False).problems
+        problems = self.check(values=False)
         for name, text in problems.items():
             more = f" ({len(problems) - 1} more do not fit; `kfgs features SCENE --check {self.path}` names them)"
             raise ValueError(f"{self.path / name}: {text}; {AGAIN}{more if len(problems) > 1 else ''}")
-
-
-def _check_values(name: str, stored: StoredMap, report: FeatureReport) -> None:
-    """Count values that are not finite, and features that are all-zero, a few rows at a time."""
-    bad = zeros = 0
-    for rows in read_rows(stored):
-        bad += count_bad(rows)
-        zeros += int((row_norms(rows) <= EPS).sum())
-    share = zeros / (int(stored.shape[0]) * int(stored.shape[1]))
-    if bad or share == 1:
-        report.problems[name] = f"{bad} NaN or infinite values" if bad else "every feature is all-zero"
-    elif share >= HOLES:
-        report.notes.append(f"{name}: {100 * share:.0f} % of the features are all-zero: nothing is known there")

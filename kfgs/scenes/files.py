@@ -121,11 +121,7 @@ def read_image(path: str | Path, background: str = "white") -> Tensor:  # [H, W,
 
 
 def read_alpha(path: Path) -> Tensor | None:  # [H, W] float32 in [0, 1]
-    """The opacity of a picture's pixels; None if all are opaque, or there is no such file.
-
-    Raises:
-        SceneError: as `read_image`.
-    """
+    """The opacity of a picture's pixels; None if all are opaque, or there is no such file."""
     if not is_file(path):
         return None
     with open_picture(path, small=COLORS) as picture:
@@ -161,14 +157,7 @@ def open_picture(
     *,
     small: int = SMALL,
 ) -> Iterator[Image.Image]:
-    """Open a picture; its pixels are read when they are used. Whatever fails meanwhile becomes a SceneError.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ImportError: if it is a HEIC file, and pillow-heif is not installed.
-        SceneError: if it cannot be decoded, or states more than `PIXELS` pixels, or more than `small` and than `PACKED` for each
-            of its bytes.
-    """
+    """Open a picture; its pixels are read when they are used. Whatever fails meanwhile becomes a SceneError."""
     path = as_path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected {expected} there")
@@ -191,11 +180,7 @@ def open_picture(
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """(width, height) of a picture, from its header.
-
-    Raises:
-        SceneError: if it is no picture.
-    """
+    """(width, height) of a picture, from its header."""
     with open_picture(path, "a picture", "copy it again") as picture:
         return picture.size
 
@@ -212,12 +197,7 @@ def _allow_heic(path: Path) -> None:
 
 
 def read_scene_json(path: str | Path, advice: str) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        SceneError: if it is no JSON; the message ends with `advice`.
-    """
+    """Read a JSON file."""
     try:
         return read_json(path)
     except ValueError as error:

@@ -23,10 +23,6 @@ def read_mask(path: Path, size: tuple[int, int]) -> Tensor:  # [H, W] bool
     Args:
         path: the mask, in any mode.
         size: (H, W) of the photo, which has the shape of the mask.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        SceneError: if it cannot be decoded, or has another shape.
     """
     with open_picture(path, "a mask of a photo", "write it again", small=max(SMALL, size[0] * size[1])) as picture:
         picture.getexif().pop(ORIENTATION, None)

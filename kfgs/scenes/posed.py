@@ -89,11 +89,7 @@ def mending_notes(lost: list[str], scaled: dict[str, float]) -> list[str]:
 def as_large_as_pictures(
     cameras: Sequence[Camera], paths: Sequence[Path], folder: Path | None = None
 ) -> tuple[list[Camera], list[str]]:
-    """Each camera in the size of its own picture, which may be a resized copy (`images_4`), and a note if some are.
-
-    Raises:
-        SceneError: if a picture has another shape than its camera.
-    """
+    """Each camera in the size of its own picture, which may be a resized copy (`images_4`), and a note if some are."""
     fitting, factors = [], Counter[str]()
     for camera, path in zip(cameras, paths, strict=True):
         width, height = picture_size(path)
@@ -121,11 +117,7 @@ def scene_of_poses(
     points: tuple[Tensor, Tensor] | None = None,  # [P, 3] of the world, [P, 3] uint8
     notes: Sequence[str] = (),
 ) -> Scene:
-    """A scene of pictures with poses; views without a pose (not finite) are left out and noted.
-
-    Raises:
-        SceneError: if no view has a pose, a pose is not a rigid motion, or a picture has another shape than its camera.
-    """
+    """A scene of pictures with poses; views without a pose (not finite) are left out and noted."""
     cameras, paths, lost, scaled = list[Camera](), list[Path](), list[str](), dict[str, float]()
     for view in sorted(views, key=lambda view: natural_key(view.name)):
         pose, scale = mend_pose(view.pose)
@@ -179,12 +171,7 @@ def near_zero(cameras: list[Camera], points: Tensor) -> tuple[list[Camera], Tens
 
 
 def read_numbers(path: Path, expected: str) -> Matrix:  # [rows, columns]
-    """The numbers of a text file, row by row.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        SceneError: if it holds something else, or rows of several lengths.
-    """
+    """The numbers of a text file, row by row."""
     try:
         lines = read_text(path, expected).splitlines()
         rows = [[float(word) for word in line.replace(",", " ").split()] for line in lines if line.strip()]
@@ -196,11 +183,7 @@ def read_numbers(path: Path, expected: str) -> Matrix:  # [rows, columns]
 
 
 def read_points(path: Path) -> tuple[Tensor, Tensor, list[str]]:  # [P, 3] float64, [P, 3] uint8
-    """The vertices of a PLY and their colours, grey if it has none; and a note if some are left out as they are not finite.
-
-    Raises:
-        SceneError: if it is damaged.
-    """
+    """The vertices of a PLY and their colours, grey if it has none; and a note if some are left out as they are not finite."""
     try:
         columns = read_ply(path)
         points = points_from_columns(columns)

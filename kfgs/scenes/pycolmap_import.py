@@ -74,12 +74,7 @@ def scene_errors(what: str, advice: str) -> Iterator[None]:
 
 @contextmanager
 def whole_model(folder: Path) -> Iterator[Path]:
-    """A folder with links to the checked files of a model, for pycolmap; rigs and frames are left out.
-
-    Raises:
-        FileNotFoundError: if there is no such folder.
-        SceneError: as `read_whole_model`.
-    """
+    """A folder with links to the checked files of a model, for pycolmap; rigs and frames are left out."""
     read_whole_model(folder)
     suffix = model_suffix(folder)
     with tempfile.TemporaryDirectory(prefix="kfgs-model-") as scratch:

@@ -123,11 +123,7 @@ class Scene:
         return self.splits[split]
 
     def image(self, i: int) -> Tensor:  # [H, W, 3] in [0, 1]
-        """Read the picture of view `i`; in an undistorted scene the lens is removed on the way. Transparent pixels are black.
-
-        Raises:
-            FileNotFoundError, SceneError: if the file is gone, cannot be decoded, or is not of the camera's size.
-        """
+        """Read the picture of view `i`; in an undistorted scene the lens is removed on the way. Transparent pixels are black."""
         lens = self.cameras[i] if self.lenses is None else self.lenses[i]
         image = read_image(self.image_paths[i], "black")
         if image.shape[:2] != lens.size:

@@ -53,10 +53,6 @@ def read_split(path: Path, names: Sequence[str]) -> Split:
     Args:
         path: the file.
         names: the views of the scene in order; those in the file may lack the suffix.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        SceneError: if the file is something else, no training view is in the scene, or a view is in both train and test.
     """
     value = read_scene_json(path, "repair the file or remove it")
     if not _is_split(value):
@@ -102,9 +98,6 @@ def split_by_lists(where: str, lists: Mapping[str, Sequence[str]], names: Sequen
         where: the place of the lists, for messages.
         lists: names of views by split, with or without their folders and suffixes. Without test, `val` is tested too.
         names: the views of the scene in order.
-
-    Raises:
-        SceneError: if no training view is in the scene, or a view is in both train and test.
     """
     known, place = Names(names, bare=True), {name: i for i, name in enumerate(names)}
     indices = {split: [place.get(known.find(name) or "") for name in listed] for split, listed in lists.items()}

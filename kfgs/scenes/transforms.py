@@ -171,10 +171,6 @@ def load_transforms(path: Path, images: Path | None = None) -> Scene:
     Returns:
         The scene. Splits come from the file (`train_filenames`, `val_filenames`, `test_filenames`; what none of them names is
         in no split) or from Blender's files; without test views, the validation views are tested. Else all views train.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        SceneError: if it is damaged, a number is missing or implausible, a lens is unknown to kfgs, or no frame has a file.
     """
     files = _files(path)
     tops = {split: _read_top(file) for split, file in files.items()}

@@ -59,11 +59,7 @@ class Frame:
         return rows is None or any(isinstance(n, float) and not abs(n) < MAX_NUMBER for n in numbers)
 
     def camera(self, name: str) -> tuple[Camera | None, float | None]:
-        """The camera with its lens (None if its pose is no rotation), and the scale that was removed from the pose, if any.
-
-        Raises:
-            SceneError: if a value is missing or implausible.
-        """
+        """The camera with its lens (None if its pose is no rotation), and the scale that was removed from the pose, if any."""
         width, height = self.number("w"), self.number("h")
         if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE and width % 1 == 0 and height % 1 == 0):
             raise self.fail("", f"w and h of 1 to {MAX_SIDE} whole pixels", (width, height), "correct the size")
