@@ -47,7 +47,7 @@ quick = kfgs.ColorConfig.quick()
 quick = replace(quick, training=quick.training.with_steps(800).with_maximum(60_000))
 color = kfgs.fit_color(scene, run, quick)  # the same fields as in notebooks 4 to 6
 field = kfgs.fit(scene, maps, kfgs.Uplift(color), folder=run)
-splat = kfgs.attach(field, color, classes).splats  # the colour splat with a class for each Gaussian
+splat = kfgs.attach(field, color, classes).gaussians  # the colour splat with a class for each Gaussian
 print(splat)
 
 # %% [markdown]

@@ -37,7 +37,7 @@ def main() -> None:
     parser.add_argument("--paint", default="sofa:#3f7f5f")
     given = parser.parse_args()
     field, scene = SemanticField.load(given.field), load_scene(given.scene).undistorted()
-    labelled = attach(field, read_splats(given.colors)).splats
+    labelled = attach(field, read_splats(given.colors)).gaussians
     thing, paint = given.paint.split(":")
     edited = EditList().then(Remove(given.remove)).then(Recolor(thing, paint)).apply(labelled)
     train = scene.views("train")

@@ -157,7 +157,7 @@ def test_views_label_as_well_where_the_splats_frame_is_small():
 
 
 def test_a_splat_in_another_frame_is_refused_with_what_to_give():
-    with pytest.raises(SceneError, match=tells("frames disagree", "frame=", "same-frame")):
+    with pytest.raises(SceneError, match=tells("frames disagree", "frame=Similarity.identity()")):
         attach(a_field(), moved(a_splat(), a_similarity()), CLASSES)
 
 
