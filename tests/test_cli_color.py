@@ -23,7 +23,7 @@ from kfgs.formats.sidecar import names_path
 from kfgs.labels import load_label_set
 from kfgs.labels.edits import EditList
 from kfgs.pipeline.color import TrainingPictures
-from kfgs.pipeline.compare import views_of_edits
+from kfgs.pipeline.compare import views_of_change
 from kfgs.scenes import load_scene
 from kfgs.splat import rasterize
 
@@ -358,7 +358,7 @@ def test_edit_shows_before_and_after(labelled, room, tmp_path, capsys):
     before, edits = read_splats(labelled), EditList.load(tmp_path / "e.spz.edits.json")
     cameras = load_scene(room).cameras
     states = [before, *(EditList(edits.edits[: i + 1]).apply(before) for i in range(2))]
-    expected = views_of_edits([state.gaussians for state in states], cameras, 2)
+    expected = views_of_change(states[0], states[-1], cameras, 2, between=states[1:-1])
     assert chosen == [cameras[i].name for i in expected]
     (tmp_path / "e.spz.png").unlink()
     assert main([*arguments, "--pictures", "0"]) == 0

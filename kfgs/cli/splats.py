@@ -117,7 +117,7 @@ def edit(
     from .._check import check_whole
     from ..formats import write_splats
     from ..labels.edits import EditList
-    from ..pipeline.compare import views_of_edits, write_comparison
+    from ..pipeline.compare import views_of_change, write_comparison
 
     check_target("out", out)
     saved = _edits_beside(out, replay)
@@ -140,8 +140,10 @@ def edit(
         listed = listed.then(edit)
     cameras = [] if scene.scene is None else _cameras_to_show(before, scene, views)
     after = _apply(listed, before, [words for words, _ in asked])
-    states = accumulate(listed, lambda cloud, one: one.apply(cloud), initial=before)
-    shown = cameras if views or not cameras else [cameras[i] for i in views_of_edits(states, cameras, pictures)]
+    shown = cameras
+    if cameras and not views:
+        states = list(accumulate(listed, lambda cloud, edit: edit.apply(cloud), initial=before))[1:-1]
+        shown = [cameras[i] for i in views_of_change(before, after, cameras, pictures, between=states)]
     written = write_splats(after, out)
     paths = [*written.paths, listed.save(saved)]
     if shown:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +31,9 @@ def render_color(gaussians: Gaussians, camera: Camera) -> Tensor:  # [H, W, 3] i
         return rasterize(gaussians.replace(features=None), camera).map.clamp(0, 1)
 
 
-def views_of_change(before: Gaussians, after: Gaussians, cameras: Sequence[Camera], count: int = 2) -> list[int]:
+def views_of_change(
+    before: Gaussians, after: Gaussians, cameras: Sequence[Camera], count: int = 2, *, between: Sequence[Gaussians] = ()
+) -> list[int]:
     """The viewpoints that show an edit best. Each looks in a different direction than those before it, if possible.
 
     Args:
@@ -39,64 +42,36 @@ def views_of_change(before: Gaussians, after: Gaussians, cameras: Sequence[Camer
         cameras: viewpoints to choose from.
         count: the most to choose. Views without a change are never chosen; views of which more than half changes only if
             there are too few others.
-    """
-    return views_of_edits((before, after), cameras, count)
-
-
-def views_of_edits(states: Iterable[Gaussians], cameras: Sequence[Camera], count: int = 2) -> list[int]:
-    """The viewpoints that show several edits: the best one for each edit, then those that show most of all edits.
-
-    An edit gets no extra view if a chosen view shows it half as well as its best view, or if it is undone later.
-
-    Args:
-        states: the scene before the first edit, and after each of them.
-        cameras: viewpoints to choose from.
-        count: the most to choose, by the rules of `views_of_change`.
+        between: the scene after each of several edits: then each edit gets its best view first, unless a chosen view shows
+            it half as well, or it is undone later.
     """
     check_whole("count", count, 0)
-    if count == 0:
-        return []
-    small = [_small(camera) for camera in cameras]
-    seen = ([render_color(state, camera) for camera in small] for state in states)
-    first = last = next(seen)
-    shares = []  # of every edit, C each
-    for pictures in seen:
-        shares.append([_share(*pair) for pair in zip(last, pictures, strict=True)])
-        last = pictures
-    total = [_share(*pair) for pair in zip(first, last, strict=True)]
+    small = [camera.resized(max(1, round(PREVIEW * camera.height / camera.width)), PREVIEW) for camera in cameras]
+    drawn = [[render_color(state, camera) for camera in small] for state in (before, *between, after)]
+    total = _shares(drawn[0], drawn[-1])
     chosen: list[int] = []
-    for share in shares:
+    for share in map(_shares, drawn[:-1], drawn[1:]):
         best = next((i for i in _ranked(share) if total[i] > 0), None)
         if best is not None and max((share[i] for i in chosen), default=0.0) < SHOWN * share[best]:
             chosen.append(best)
-    return _filled_up(chosen[:count], total, cameras, count)
+    forward = [camera.viewmat[2, :3].double() for camera in cameras]
+    for apart in (math.cos(math.radians(APART)), math.inf):  # first those with another direction, then any
+        for i in _ranked(total):
+            if len(chosen) < count and i not in chosen and all(float(forward[i] @ forward[k]) < apart for k in chosen):
+                chosen.append(i)
+    return chosen[:count]
 
 
-def _filled_up(chosen: list[int], shares: list[float], cameras: Sequence[Camera], count: int) -> list[int]:
-    """Add the best other views to those chosen: first those with another direction, then any."""
-    ranked = _ranked(shares)
-    forward = {i: cameras[i].viewmat[2, :3].double() for i in ranked}
-    limit = torch.cos(torch.deg2rad(torch.tensor(APART, dtype=torch.float64)))
-    for apart in (True, False):
-        for i in ranked:
-            far = all(float(forward[i] @ forward[j]) < float(limit) for j in chosen)
-            if len(chosen) < count and i not in chosen and (far or not apart):
-                chosen = [*chosen, i]
-    return chosen
+def _shares(before: Sequence[Tensor], after: Sequence[Tensor]) -> list[float]:  # C pictures [H, W, 3] each
+    """The share of each picture's pixels that changed."""
+    pairs = zip(before, after, strict=True)
+    return [float(((old - new).abs().amax(-1) > VISIBLE).float().mean()) for old, new in pairs]
 
 
 def _ranked(shares: Sequence[float]) -> list[int]:
     """The viewpoints in which something changes, the best first."""
     order = sorted(range(len(shares)), key=lambda i: (shares[i] > MOST, -shares[i]))
     return [i for i in order if shares[i] > 0]
-
-
-def _small(camera: Camera) -> Camera:
-    return camera.resized(max(1, round(PREVIEW * camera.height / camera.width)), PREVIEW)
-
-
-def _share(before: Tensor, after: Tensor) -> float:  # [H, W, 3] each
-    return float(((before - after).abs().amax(-1) > VISIBLE).float().mean())
 
 
 def write_comparison(

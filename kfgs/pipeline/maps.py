@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,7 +15,6 @@ from .._check import as_tensor
 from .._files import digest_file, digest_value
 from .._rows import EPS, row_norms
 from ..cameras import undistort
-from ..quant.sampling import SAMPLES, read_blocks, sample_grid
 from ..scenes import Scene
 from ..scenes.files import has_alpha
 from .stages import Run, describe_lens, digest_tensors
@@ -82,9 +81,6 @@ class ViewMaps:
     def __len__(self) -> int:
         return len(self.maps)
 
-    def __getitem__(self, i: int, /) -> Tensor:  # [h, w, D]
-        return self._change(i, self.maps[i])
-
     def digests(self) -> list[list[str]] | None:
         """The digests of the original maps; None if unknown."""
         return _known_digests(self.maps)
@@ -95,21 +91,8 @@ class ViewMaps:
         files = changing_files(self._taken, i)
         return [lens, *map(digest_file, files)] if files else lens
 
-    def grid(self, i: int, step: tuple[int, int] | None = None, samples: int = SAMPLES) -> Tensor:  # [n, D]
-        """`sample_grid(self[i], step, samples=samples)`; if the view's map does not change, only these pixels are read."""
-        if self._unchanged(i) and hasattr(self.maps, "grid"):
-            return self.maps.grid(i, step, samples)  # type: ignore[no-any-return]
-        return sample_grid(self[i], step, samples=samples)
-
-    def blocks(self, i: int) -> Iterator[Tensor]:  # each [at most 32, w, D]
-        """The map a few rows at a time; one that changes is whole in memory."""
-        return read_blocks(self.maps, i) if self._unchanged(i) else iter(self[i].split(32))
-
-    def _unchanged(self, i: int) -> bool:
-        distorted = self._straighten and self._taken.cameras[i].distortion is not None
-        return not distorted and not changing_files(self._taken, i)
-
-    def _change(self, i: int, features: Tensor) -> Tensor:  # [h, w, D] -> [h, w, D]
+    def __getitem__(self, i: int, /) -> Tensor:  # [h, w, D]
+        features = self.maps[i]
         size = int(features.shape[0]), int(features.shape[1])
         counted = self._taken.counted(i, size)
         if counted is not None:  # before the lens is removed, which mixes neighbours

@@ -5,69 +5,53 @@ from __future__ import annotations
 import base64
 import html
 import json
-import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
-import numpy as np
 import torch
 
-from .._files import as_path, atomic_path, bytes_in_words, real_path, seconds_in_words
+from .._files import as_path, atomic_path, bytes_in_words, seconds_in_words
 from ..fields import SemanticField
 from ..fields.store import NAME
 from ..scenes import Scene
 from ..viz import FeatureColors, overlay_labels, plot_history, save_picture
-from ..viz.pictures import as_bytes, legend_strip, picture_grid, resize_photo
+from ..viz.pictures import as_bytes, picture_grid, resize_photo
 from .methods import Paper, Uplift
 from .stages import read_stage
 
 WIDTH = 400  # pixels of a picture
 STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 1240px; margin: 2em auto; padding: 0 1em; color: #1b1b1b }
-img { max-width: 100%; height: auto } h2 { margin-top: 2em } code, pre { background: #f3f3f5; border-radius: 4px }
-pre { padding: .8em; overflow-x: auto; white-space: pre-wrap } table { border-collapse: collapse }
-th, td { text-align: left; padding: .2em 1.2em .2em 0; border-bottom: 1px solid #ddd; vertical-align: top }
-td.number { text-align: right; font-variant-numeric: tabular-nums }
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 1240px; margin: 2em auto; padding: 0 1em }
+img { max-width: 100%; height: auto } pre { background: #f3f3f5; padding: .8em; overflow-x: auto }
+td { padding: .2em 1.2em .2em 0; border-bottom: 1px solid #ddd; vertical-align: top }
 """
 
 
-def write_preview(
-    path: Path, field: SemanticField, scene: Scene, split: str = "train", *, count: int = 3
-) -> Path | None:
+def write_preview(path: Path, field: SemanticField, scene: Scene, split: str = "train", *, count: int = 3) -> bool:
     """Draw some views, evenly spread: photograph, features as colours, and labels if the field has classes.
 
-    Views held out (split `test`) are preferred to those of `split`. Without any photograph nothing is drawn.
+    Views held out (split `test`) are preferred to those of `split`. Without any photograph nothing is drawn (False).
     """
     views = [i for i in scene.views("test" if scene.splits.get("test") else split) if scene.image_paths[i].is_file()]
-    if not views:
-        return None
     count = min(count, len(views))
-    chosen = [
-        views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)
-    ]  # not the ends, which often are alike
-    classes, colors = field.classes, FeatureColors.fit(field.features)
-    titles = ["photograph", "features as colours"] + ([] if classes is None else ["labels"])
-    rows, seen = [], []
-    for view in chosen:
+    classes, colors, rows = field.classes, FeatureColors.fit(field.features), []
+    for k in range(count):
+        view = views[(2 * k + 1) * len(views) // (2 * count)]  # not the ends, which often are alike
         camera = scene.cameras[view]
         camera = camera.resized(max(1, round(WIDTH * camera.height / camera.width)), WIDTH)
         photo = resize_photo(scene.image(view), camera.size)
         with torch.no_grad():
-            row = [as_bytes(photo), colors(field.render(camera).map)]
+            rows.append([as_bytes(photo), colors(field.render(camera).map)])
         if classes is not None:
-            labels = field.segment(camera, classes).cpu()
-            row.append(overlay_labels(photo, labels, classes.names, legend=False))
-            seen.append(labels.unique())
-        rows.append(row)
-    sheet = picture_grid(rows, titles, width=WIDTH)
-    if classes is not None:
-        sheet = np.concatenate([sheet, legend_strip(torch.cat(seen), classes.names, sheet.shape[1])])
-    save_picture(path, sheet)
-    return path
+            rows[-1].append(overlay_labels(photo, field.segment(camera, classes).cpu(), classes.names))
+    if rows:
+        titles = ("photograph", "features as colours", "labels")[: len(rows[0])]
+        save_picture(path, picture_grid(rows, titles, width=WIDTH))
+    return bool(rows)
 
 
 def write_run_report(
-    folder: Path,
+    folder: str | Path,
     field: SemanticField,
     scene: Scene,
     method: Uplift | Paper,
@@ -89,9 +73,11 @@ def write_run_report(
         The pictures (`preview.png`, and of trained stages `<stage>.png`) and the page.
     """
     folder, info = as_path(folder), field.info
-    title = real_path(folder).name
-    preview = write_preview(folder / "preview.png", field, scene, split)
-    training = _training_pictures(folder, info["stages"])
+    written = [folder / "preview.png"] if write_preview(folder / "preview.png", field, scene, split) else []
+    for stage in (read_stage(folder / "stages" / name) for name in info["stages"]):
+        if stage.name in ("codebook", "field"):
+            written.append(folder / f"{stage.name}.png")
+            plot_history(stage.history, written[-1])
     facts = {
         "scene": f"{scene.folder or 'in memory'}: {len(scene)} views, {len(info['views'])} of them used",
         "teacher": (info.get("teacher") or {}).get("name", "not known"),
@@ -106,59 +92,30 @@ def write_run_report(
         "kfgs, torch": f"{info['kfgs']}, {torch.__version__}",
     }
     seconds = info["seconds"] | {"all": sum(info["seconds"].values())}
-    repeat = command or f"kfgs.fit(scene, maps, method, folder={str(folder)!r})"
-    options = json.dumps(method.options(), indent=1)
+    title = html.escape(folder.absolute().name)
     parts = [
-        f"<h1>kfgs: {_text(title)}</h1>",
-        *([] if preview is None else [_image(preview, "three views of the field")]),
+        f"<h1>kfgs: {title}</h1>",
+        *(_image(file) for file in written),
         "<h2>What was fitted</h2>",
         _table(facts.items()),
         "<h2>Time of each stage</h2>",
-        _table(((name, seconds_in_words(value)) for name, value in seconds.items()), numbers=1),
-        *(f"<h2>Training: {_text(file.stem)}</h2>\n{_image(file, file.stem)}" for file in training),
+        _table((name, seconds_in_words(value)) for name, value in seconds.items()),
         "<h2>How to repeat it</h2>",
-        f"<pre>{_text(repeat)}</pre>",
-        f"<details><summary>All options</summary><pre>{_text(options)}</pre></details>",
-        "<h2>What to do next</h2>",
-        f"<pre>{_text(_next(folder / NAME, field))}</pre>",
+        f"<pre>{html.escape(command or f'kfgs.fit(scene, maps, method, folder={str(folder)!r})')}</pre>",
+        f"<details><summary>All options</summary><pre>{html.escape(json.dumps(method.options(), indent=1))}</pre></details>",
     ]
-    head = f'<meta charset="utf-8"><title>kfgs: {_text(title)}</title><style>{STYLE}</style>'
+    head = f'<meta charset="utf-8"><title>kfgs: {title}</title><style>{STYLE}</style>'
     page = f'<!doctype html>\n<html lang="en"><head>{head}</head><body>\n' + "\n".join(parts) + "\n</body></html>\n"
     with atomic_path(folder / "report.html") as temporary:
         temporary.write_text(page, encoding="utf-8")
-    return [*([] if preview is None else [preview]), *training, folder / "report.html"]
+    return [*written, folder / "report.html"]
 
 
-def _training_pictures(folder: Path, stages: Sequence[str]) -> list[Path]:
-    """Plot the histories of a run's codebook and field; return the pictures."""
-    written = []
-    for stage in (read_stage(folder / "stages" / name) for name in stages):
-        if stage.name in ("codebook", "field"):
-            written.append(folder / f"{stage.name}.png")
-            plot_history(stage.history, written[-1])
-    return written
+def _table(rows: Iterable[tuple[str, object]]) -> str:
+    cells = (f"<tr><td>{html.escape(name)}</td><td>{html.escape(str(value))}</td></tr>" for name, value in rows)
+    return "<table>\n" + "\n".join(cells) + "\n</table>"
 
 
-def _next(path: Path, field: SemanticField) -> str:
-    classes = field.classes
-    select = "" if classes is None else shlex.join(["kfgs", "select", classes.names[-1], str(path)]) + "\n"
-    return f"kfgs view {path}\n{select}kfgs segment {path} --out segmented/"
-
-
-def _text(value: object) -> str:
-    return html.escape(str(value))
-
-
-def _table(rows: Iterable[Sequence[object]], numbers: int | None = None) -> str:
-    lines = []
-    for row in rows:
-        cells = [
-            f'<td class="number">{_text(v)}</td>' if i == numbers else f"<td>{_text(v)}</td>" for i, v in enumerate(row)
-        ]
-        lines.append(f"<tr>{''.join(cells)}</tr>")
-    return "<table>\n" + "\n".join(lines) + "\n</table>"
-
-
-def _image(file: Path, name: str) -> str:
+def _image(file: Path) -> str:
     data = base64.b64encode(file.read_bytes()).decode("ascii")
-    return f'<img alt="{_text(name)}" src="data:image/png;base64,{data}">'
+    return f'<h2>{file.stem}</h2>\n<img alt="{file.stem}" src="data:image/png;base64,{data}">'

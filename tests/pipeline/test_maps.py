@@ -5,7 +5,6 @@ import torch
 
 from kfgs.cameras import Camera, Distortion, undistort
 from kfgs.pipeline.maps import KnownFeatures, map_shape, maps_of_views
-from kfgs.quant import sample_grid
 from kfgs.scenes import Scene
 
 LENS = Distortion("brown_conrady", (0.3, 0.05, 0.001, -0.002))
@@ -46,15 +45,6 @@ def test_without_distortion_a_map_is_left_alone():
     assert _straight(_Maps([features]), [_lens(160, 120, None)])[0] is features
 
 
-def test_blocks_are_the_undistorted_map():
-    features = torch.rand(70, 40, 5, generator=torch.Generator().manual_seed(0)) + 0.5
-    maps = _straight(_Maps([features, features]), [_lens(160, 280), _lens(160, 280, None)])
-    for i in range(2):
-        blocks = list(maps.blocks(i))
-        assert [len(block) for block in blocks] == [32, 32, 6]
-        assert torch.equal(torch.cat(blocks), maps[i])
-
-
 def test_unknown_pixels_become_nan_and_nothing_else_changes():
     features = torch.ones(2, 2, 3)
     features[0, 1] = 0
@@ -64,24 +54,18 @@ def test_unknown_pixels_become_nan_and_nothing_else_changes():
     assert torch.equal(known[1], features[1])
 
 
-class _Grid(_Maps):
+class _Known(_Maps):
     shape = (6, 8, 3)
-
-    def grid(self, i, step, samples):
-        return torch.full((1, 3), float(i))
 
     def digests(self):
         return [["a", "1"]]
 
 
-def test_a_lens_passes_on_what_the_maps_offer_where_it_may():
+def test_a_lens_passes_on_what_is_known_of_the_maps():
     features = torch.rand(6, 8, 3, generator=torch.Generator().manual_seed(0)) + 0.5
     lenses = [_lens(8, 6, None), _lens(8, 6)]
-    offered = _straight(_Grid([features, features]), lenses)
+    offered = _straight(_Known([features, features]), lenses)
     assert (offered.shape, offered.digests()) == ((6, 8, 3), [["a", "1"]])
-    assert offered.grid(0, None, 10).tolist() == [[0.0, 0.0, 0.0]]
-    assert torch.equal(offered.grid(1, (2, 3)), sample_grid(offered[1], (2, 3)))
     assert not torch.equal(offered[1], features)
     bare = _straight(_Maps([features]), lenses[:1])
     assert (bare.shape, bare.digests(), map_shape(bare)) == ((6, 8, 3), None, (6, 8, 3))
-    assert torch.equal(bare.grid(0, None, 12), sample_grid(features, samples=12))

@@ -40,19 +40,20 @@ def test_the_page_says_all_and_loads_nothing(run):
 
 def test_a_preview_has_a_row_for_each_view(run, tmp_path):
     _, scene, field = run
-    path = write_preview(tmp_path / "a.png", field, scene)
-    picture = np.asarray(Image.open(path))
+    assert write_preview(tmp_path / "a.png", field, scene)
+    picture = np.asarray(Image.open(tmp_path / "a.png"))
     height = round(WIDTH * scene.cameras[0].height / scene.cameras[0].width)
     assert picture.shape[1] == pytest.approx(3 * WIDTH, abs=30)
     assert 3 * height < picture.shape[0] < 3 * height + 150
-    with Image.open(write_preview(tmp_path / "b.png", field, scene, count=1)) as one:
+    assert write_preview(tmp_path / "b.png", field, scene, count=1)
+    with Image.open(tmp_path / "b.png") as one:
         assert one.height < 0.6 * len(picture)
 
 
 def test_without_photographs_there_is_a_page_still(run, tmp_path):
     folder, scene, field = run
     gone = dataclasses.replace(scene, image_paths=[tmp_path / path.name for path in scene.image_paths])
-    assert write_preview(tmp_path / "a.png", field, gone) is None
+    assert write_preview(tmp_path / "a.png", field, gone) is False
     paths = write_run_report(folder, field, gone, Uplift())
     assert "kfgs.fit(scene, maps, " in paths[-1].read_text()
     assert "&quot;uplift&quot;: {" in paths[-1].read_text()
