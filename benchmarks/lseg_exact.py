@@ -61,8 +61,10 @@ def compare_whole(checkpoint: Path, path: Path, options: LSegOptions) -> None:
 
     picture = read_image(path).permute(2, 0, 1)
     height, width = picture.shape[1:]
-    print(f"{path.name}, {height} x {width}: {options.forwards(height, width)} windows")
-    found, seconds = timed(partial(load_lseg(checkpoint, options=options).encode_image, picture))
+    print(f"{path.name}, {height} x {width}: scales {options.scales}")
+    found, seconds = timed(
+        partial(load_lseg(checkpoint, scales=options.scales, flip=options.flip).encode_image, picture)
+    )
     print(f"kfgs:         {seconds:.1f} s, {tuple(found.shape)}, peak {peak_gib():.2f} GiB")
 
     state = torch.load(checkpoint, mmap=True, weights_only=True)["state_dict"]

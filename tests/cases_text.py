@@ -21,5 +21,6 @@ def pixels(image):
     return image[:1, ::4, ::4].expand(DIM, -1, -1)
 
 
-TEACHER = CallableTeacher(pixels, letters, name="letters", identity={"weights": "abc"})
+TEACHER = CallableTeacher(pixels, letters, name="letters")
+TEACHER.identity = {"name": "letters", "weights": "abc"}
 MUTE = CallableTeacher(pixels, name="mute")

@@ -133,11 +133,11 @@ def _vit(config: LSegConfig) -> dict[str, tuple[int, ...]]:
         "cls_token": (1, 1, width),
         "pos_embed": (1, config.position_grid**2 + 1, width),
     }
-    shapes |= _linear("patch_embed.proj", width, 3, config.patch, config.patch)
+    shapes |= _linear("patch_embed.proj", width, 3, 16, 16)
     for i in range(config.depth):
         shapes |= _norm(f"blocks.{i}.norm1", width) | _norm(f"blocks.{i}.norm2", width)
         shapes |= _linear(f"blocks.{i}.attn.qkv", 3 * width, width) | _linear(f"blocks.{i}.attn.proj", width, width)
-        shapes |= _linear(f"blocks.{i}.mlp.fc1", config.mlp, width) | _linear(f"blocks.{i}.mlp.fc2", width, config.mlp)
+        shapes |= _linear(f"blocks.{i}.mlp.fc1", 4 * width, width) | _linear(f"blocks.{i}.mlp.fc2", width, 4 * width)
     shapes |= _norm("norm", width) | _linear("head", _CLASSES, width)
     return {f"pretrained.model.{name}": shape for name, shape in shapes.items()}
 

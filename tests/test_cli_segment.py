@@ -7,6 +7,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
+from kfgs.pipeline.label_pictures import picture_names
 from messages import tells
 from PIL import Image
 from small_room import make_desk
@@ -17,7 +18,6 @@ from kfgs.cli.render import check_walk, walk_of
 from kfgs.evaluation.coco import load_coco_labels
 from kfgs.fields import SemanticField
 from kfgs.pipeline import segment_cameras, write_coco
-from kfgs.pipeline.label_pictures import picture_names
 from kfgs.scenes import load_cameras, load_scene
 
 
@@ -53,7 +53,7 @@ def test_coco_of_the_views_of_a_split_has_their_photographs(desk, tmp_path, caps
         assert np.array_equal(read(tmp_path / "coco" / "images" / f"{stem}.png"), read(scene.image_paths[i])[..., :3])
 
 
-@pytest.mark.parametrize("path", ["orbit", "spiral", "cameras"])
+@pytest.mark.parametrize("path", ["orbit", "cameras"])
 def test_a_path_is_segmented_with_the_colours_that_it_sees(desk, tmp_path, path, capsys):
     words = ["--path", path, "--frames", 3, "--width", 64, "--coco", "--color", desk / "my.ply"]
     assert segment(desk, tmp_path, *words) == 0
@@ -167,9 +167,7 @@ def test_a_path_through_the_cameras_of_a_scene_without_pictures(desk, tmp_path):
     assert read(tmp_path / "out" / "predicted" / "path_0000.png").shape == (24, 32)
 
 
-PLACES = (
-    "expected orbit, spiral, cameras, a transforms.json (a name that ends in .json), or a folder with a COLMAP model,",
-)
+PLACES = ("expected orbit, cameras, a transforms.json (a name that ends in .json), or a folder with a COLMAP model,",)
 
 
 def test_cameras_of_your_own_are_checked_before_the_field_is_opened(tmp_path, capsys):

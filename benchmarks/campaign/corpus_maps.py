@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ MAP = np.random.default_rng(SEED).standard_normal((3, 4, 5)).astype(np.float16)
 
 
 def make(folder: Path, add: Add) -> None:
-    """Folders of maps, checkpoints, and a tokenizer's tables."""
+    """Folders of maps, and checkpoints."""
     place = folder / "others"
     place.mkdir(parents=True)
     np.save(place / "a.npy", MAP)
@@ -38,7 +37,6 @@ def make(folder: Path, add: Add) -> None:
     add("maps", place, "a_s.npy", "a_f.npy", opens=".")
     _written(folder / "written", add)
     _checkpoints(folder / "checkpoints", add)
-    _tokenizer(folder / "tokenizer", add)
 
 
 def _grey(picture: torch.Tensor) -> torch.Tensor:
@@ -68,12 +66,3 @@ def _checkpoints(place: Path, add: Add) -> None:
     torch.save(state, place / "legacy.pth", _use_new_zipfile_serialization=False)
     save_file(state, place / "state.safetensors")
     add("checkpoint", place, "state.pt", "lightning.ckpt", "legacy.pth", "state.safetensors")
-
-
-def _tokenizer(place: Path, add: Add) -> None:
-    place.mkdir()
-    merges = "#version: 0.2\nt h\nth e</w>\n"
-    with gzip.GzipFile(place / "merges.txt.gz", "w", mtime=0) as file:
-        file.write(merges.encode())
-    (place / "merges.txt").write_text(merges)
-    add("tokenizer", place, "merges.txt.gz", "merges.txt")

@@ -158,12 +158,6 @@ def _checkpoint(path: Path) -> None:
         value.sum()
 
 
-def _tokenizer(path: Path) -> None:
-    from kfgs.teachers.bpe import load_tokenizer
-
-    load_tokenizer(path)
-
-
 def _foreign(path: Path) -> None:
     from published.foreign import load_foreign
 
@@ -194,7 +188,6 @@ READERS: dict[str, Callable[[Path], None]] = {
     "maps": _maps,
     "manifest": _manifest,
     "checkpoint": _checkpoint,
-    "tokenizer": _tokenizer,
     "foreign": _foreign,
 }
 MAY_RAISE_TYPE_ERROR = ("maps",)  # documented by FeatureFolder: a file that holds anything but one tensor

@@ -3,12 +3,10 @@
 from .bounds import robust_bounds
 from .camera import Camera, Distortion
 from .kornia_camera import from_kornia, to_kornia
-from .orbits import Orbit, estimate_up, orbit_cameras
-from .paths import path_cameras
+from .paths import Orbit, estimate_up, orbit_cameras, path_cameras
 from .projection import camera_to_pixel, project_points, projection_jacobian, unproject_depth, world_to_camera
 from .resample import resize_labels, resize_map
 from .similarity import Similarity, fit_similarity
-from .spiral import spiral_cameras
 from .undistort import undistort, undistort_labels
 
 __all__ = [
@@ -27,7 +25,6 @@ __all__ = [
     "resize_labels",
     "resize_map",
     "robust_bounds",
-    "spiral_cameras",
     "to_kornia",
     "undistort",
     "undistort_labels",

@@ -16,40 +16,25 @@ from .camera import Camera
 class Bounds(NamedTuple):
     """The box of most points of a cloud, in world units."""
 
-    center: Tensor
-    """[3] median."""
-    low: Tensor
-    """[3] lower corner."""
-    high: Tensor
-    """[3] upper corner."""
-    inside: Tensor
-    """[P] bool, which points lie in the box."""
+    center: Tensor  # [3] median
+    low: Tensor  # [3] lower corner
+    high: Tensor  # [3] upper corner
+    inside: Tensor  # [P] bool, which points lie in the box
 
     def __repr__(self) -> str:
         return short_repr(self)
 
 
-def robust_bounds(
-    points: Tensor,  # [P, 3]
-    *,
-    coverage: float = 0.98,
-    margin: float = 0.1,
-) -> Bounds:
+def robust_bounds(points: Tensor, *, coverage: float = 0.98, margin: float = 0.1) -> Bounds:  # [P, 3]
     """The axis-aligned box of the central `coverage` of the points along each axis, widened by `margin` of its size.
 
     SfM clouds have points far behind every wall (in Replica's room_0, a room of about 8 m, one is 139 m away), so the
     minimum and maximum are useless.
 
-    Args:
-        points: the cloud, P >= 1, finite.
-        coverage: share of the points between the two quantiles of one axis, in (0, 1].
-        margin: added on each side, as a fraction of the box.
-
     Raises:
         ValueError: if there are no points, or a number is out of range.
 
     Example:
-        >>> import torch
         >>> cloud = torch.cat([torch.rand(999, 3), torch.tensor([[-139.0, 0.0, 0.0]])])
         >>> bool(robust_bounds(cloud).low[0] > -1)
         True
@@ -61,24 +46,18 @@ def robust_bounds(
         raise ValueError("points: expected at least one point, got none; give the scene a point cloud first")
     ordered = points.detach().sort(0).values  # torch.quantile refuses more than 16 million values
     last = len(points) - 1
-    low = ordered[int(last * (1 - coverage) / 2)]
-    high = ordered[last - int(last * (1 - coverage) / 2)]
+    left_out = int(last * (1 - coverage) / 2)
+    low, high = ordered[left_out], ordered[last - left_out]
     pad = (high - low) * margin
     low, high = low - pad, high + pad
     inside = ((points.detach() >= low) & (points.detach() <= high)).all(-1)
     return Bounds(ordered[last // 2], low, high, inside)
 
 
-def camera_extent(
-    cameras: Sequence[Camera],
-    points: Tensor,  # [P, 3]
-) -> float:
+def camera_extent(cameras: Sequence[Camera], points: Tensor) -> float:  # [P, 3]
     """1.1 times the largest distance of a camera from the cameras' mean, in world units: the size of a scene in 3DGS.
 
     If all cameras stand in one place, it is the median distance to the points, or 1 without points.
-
-    Raises:
-        ValueError: if there are no cameras.
     """
     if len(cameras) == 0:
         raise ValueError("cameras: expected at least one view, got none; the extent of an empty scene is unknown")

@@ -56,9 +56,8 @@ class Camera:
 
     **Convention** (COLMAP's): `viewmat` maps world to camera, x right, y down, z forward; the centre of the first pixel
     is (0.5, 0.5), so a centred principal point is (width / 2, height / 2). K is in pixels, without skew.
-    A camera with distortion must be undistorted (`undistort`) before anything is rasterised through it.
-    Only what is deeper than `near` is drawn. It is a length in world units and must suit the size of the scene: `load_scene`
-    chooses it, `Similarity.apply_to_camera` scales it. NumPy arrays and lists are accepted as matrices.
+    A camera with distortion must be undistorted (`undistort`) before anything is rasterised through it. Only what is deeper
+    than `near` is drawn; `load_scene` chooses it, `Similarity.apply_to_camera` scales it. Arrays and lists are accepted.
     """
 
     viewmat: Tensor  # [4, 4] world to camera
@@ -71,17 +70,10 @@ class Camera:
     origin: tuple[float, float, float] = ORIGIN  # the world's place of the (0, 0, 0) that viewmat maps from; float64
 
     def __post_init__(self) -> None:
-        for name, matrix in (("viewmat", self.viewmat), ("K", self.K)):  # integers would truncate the points
-            if not isinstance(matrix, Tensor):
-                object.__setattr__(self, name, as_tensor(name, matrix, floating=True))
-            as_tensor(name, getattr(self, name), floating=True)
+        for name in ("viewmat", "K"):  # integers would truncate the points
+            object.__setattr__(self, name, as_tensor(name, getattr(self, name), floating=True))
         check_shapes(("viewmat", self.viewmat, "4 4"), ("K", self.K, "3 3"))
         object.__setattr__(self, "origin", as_origin(self.origin))
-        if not isinstance(self.distortion, Distortion | None):
-            got = type(self.distortion).__name__
-            raise TypeError(
-                f"distortion: expected a Distortion or None, got {got}; pass Distortion(model, coefficients)"
-            )
         for name, size in (("width", self.width), ("height", self.height)):
             whole = isinstance(size, numbers.Real) and math.isfinite(size) and size >= 1 and int(size) == size
             if isinstance(size, bool) or not whole:
@@ -96,9 +88,7 @@ class Camera:
             self._check_values()
 
     def _check_values(self) -> None:
-        if not isinstance(self.near, numbers.Real) or isinstance(self.near, bool):
-            raise TypeError(f"near: expected a number in world units, got {type(self.near).__name__}; pass a float")
-        check_range("near", float(self.near), 0, closed=(False, False))
+        check_range("near", self.near, 0, closed=(False, False))
         object.__setattr__(self, "near", float(self.near))
         K, E = self.K.detach().double().cpu(), self.viewmat.detach().double().cpu()  # cameras are tiny
         if not (torch.isfinite(K).all() and torch.isfinite(E).all()):
@@ -134,16 +124,9 @@ class Camera:
     ) -> Camera:
         """A camera at `eye` with `target` in the middle of its picture, held upright.
 
-        Args:
-            eye: where the camera stands, world units. A floating-point tensor decides dtype and device of the matrices.
-            target: what it looks at.
-            up: the world's up, which is up in the picture too. COLMAP's worlds often have no axis that points up: pass
-                `estimate_up(scene.cameras)`.
-            fov_degrees: vertical field of view, in (0, 180); pixels are square.
-            width: pixels.
-            height: pixels.
-            name: the camera's name.
-            near: the smallest depth that is drawn, world units.
+        A floating-point tensor `eye` decides dtype and device of the matrices. `up` is the world's up, which is up in the
+        picture too; COLMAP's worlds often have no axis that points up: pass `estimate_up(scene.cameras)`. `fov_degrees` is
+        the vertical field of view; pixels are square.
 
         Raises:
             ValueError: if eye and target are at one place, or `up` is the direction of view, which leaves the roll open.
@@ -197,10 +180,9 @@ class Camera:
         return self.K - shift
 
     def resized(self, height: int, width: int) -> Camera:
-        """The same view with another number of pixels; the two axes scale independently.
+        """The same view with another number of pixels; the two axes scale independently (kornia's `scale` does not).
 
         With pixel centres on halves, fx and cx scale by width / self.width, fy and cy by height / self.height, exactly.
-        kornia's `PinholeCamera.scale` scales both axes by the same factor, so it is not used here.
         """
         factors = torch.tensor(
             [width / self.width, height / self.height, 1.0], dtype=self.K.dtype, device=self.K.device
@@ -208,7 +190,7 @@ class Camera:
         return replace(self, K=self.K * factors[:, None], width=width, height=height)
 
     def fitted(self, longest: int) -> Camera:
-        """The same view with at most so many pixels on its longer edge."""
+        """The same view with at most `longest` pixels on its longer edge."""
         scale = min(1.0, longest / max(self.size))
         return self.resized(max(1, round(scale * self.height)), max(1, round(scale * self.width)))
 
@@ -227,14 +209,7 @@ class Camera:
 
 
 def at_one_origin(cameras: Sequence[Camera]) -> list[Camera]:
-    """The cameras, with all viewmats counted from the origin of the first.
-
-    Raises:
-        TypeError: if one is not a camera.
-    """
-    for i, camera in enumerate(cameras):
-        if not isinstance(camera, Camera):
-            raise TypeError(f"cameras[{i}]: expected a Camera, got {type(camera).__name__}; pass a list of cameras")
+    """The cameras, with all viewmats counted from the origin of the first."""
     return [camera.with_origin(cameras[0].origin) for camera in cameras]
 
 
@@ -249,11 +224,7 @@ def unit_vector(name: str, vector: Tensor | Sequence[float]) -> Tensor:  # [3] f
 
 
 def view_named(cameras: Sequence[Camera], view: str | Camera, where: str) -> Camera:
-    """The one camera of a name, with or without its ending; a camera is itself.
-
-    Raises:
-        ValueError: if no camera or several have the name; the message begins with `where`.
-    """
+    """The one camera of a name, with or without its ending; a camera is itself. Errors begin with `where`."""
     if isinstance(view, Camera):
         return view
     names = Names((camera.name for camera in cameras), bare=True)

@@ -9,27 +9,20 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 
 from .._check import check_shapes
-from .._typed import typed
 from .camera import NEAR, Camera, at_one_origin
 
 
-@typed
 def to_kornia(cameras: Sequence[Camera], *, integer_centers: bool = False) -> PinholeCamera:
     """Stack cameras into one kornia `PinholeCamera` of batch B = len(cameras).
 
     **Convention**: both libraries map world to camera with x right, y down, z forward, and both project by K (R X + t):
     K decides where pixel centres are. kfgs's K puts the centre of the first pixel at (0.5, 0.5), so `project` gives the
-    pixels of `project_points`, and `unproject` takes them. Functions of kornia that make their own pixel grid
-    (`create_meshgrid`, `DepthWarper`, `remap`) put that centre at (0, 0). For them, `integer_centers=True` subtracts 0.5 from
-    cx and cy, and `project` then gives pixels smaller by 0.5. kornia's `scale` is only right without it.
-
-    Args:
-        cameras: without distortion, on one device; sizes may differ. The batch gets the widest dtype of all matrices.
-        integer_centers: put pixel centres on integers, as kornia's grids do.
+    pixels of `project_points`. Functions of kornia that make their own pixel grid (`create_meshgrid`, `DepthWarper`,
+    `remap`) put that centre at (0, 0). For them, `integer_centers=True` subtracts 0.5 from cx and cy.
 
     Returns:
-        `intrinsics` and `extrinsics` [B, 4, 4], `height` and `width` [B] int64, counted from the origin of the first
-        camera. Names, `near` and that origin are lost.
+        `intrinsics` and `extrinsics` [B, 4, 4] in the widest dtype, `height` and `width` [B] int64, counted from the origin
+        of the first camera. Names, `near` and that origin are lost.
 
     Raises:
         ValueError: if there is no camera, one has distortion, or they are on several devices.
@@ -44,13 +37,13 @@ def to_kornia(cameras: Sequence[Camera], *, integer_centers: bool = False) -> Pi
     """
     if not len(cameras):
         raise ValueError("cameras: expected at least one Camera, got none; select a view that the scene has")
+    cameras = at_one_origin(cameras)
     for i, camera in enumerate(cameras):
         if camera.distortion is not None:
             raise ValueError(
                 f"cameras[{i}]: expected a pinhole camera, got {camera.distortion.model} distortion (camera "
                 f"{camera.name!r}), which PinholeCamera cannot hold; undistort it first (kfgs.cameras.undistort)"
             )
-    cameras = at_one_origin(cameras)
     matrices = [matrix for camera in cameras for matrix in (camera.K, camera.viewmat)]
     devices = {str(matrix.device) for matrix in matrices}
     if len(devices) > 1:
@@ -67,11 +60,7 @@ def to_kornia(cameras: Sequence[Camera], *, integer_centers: bool = False) -> Pi
 
 
 def from_kornia(
-    pinhole: PinholeCamera,
-    names: Sequence[str] = (),
-    *,
-    near: float = NEAR,
-    integer_centers: bool = False,
+    pinhole: PinholeCamera, names: Sequence[str] = (), *, near: float = NEAR, integer_centers: bool = False
 ) -> list[Camera]:
     """The cameras of a kornia batch, one by one: the inverse of `to_kornia`.
 
@@ -82,11 +71,7 @@ def from_kornia(
         integer_centers: whether its K puts pixel centres on integers, as kornia's documentation says of its cameras; 0.5 is
             then added to cx and cy. A K from COLMAP has them on halves, inside kornia's cameras too.
 
-    Returns:
-        B cameras with copies of the matrices, in the dtype and on the device of the batch.
-
     Raises:
-        TypeError: if `pinhole` is not kornia's.
         ValueError: if it is not [B, 4, 4], the number of names is wrong, or kfgs cannot hold a camera (skew, a pose with
             scale, a size that is not a whole number of pixels).
 
@@ -98,25 +83,16 @@ def from_kornia(
     """
     if not isinstance(pinhole, PinholeCamera):
         raise TypeError(
-            f"pinhole: expected a kornia.geometry.camera.PinholeCamera, got {type(pinhole).__name__}; "
-            "build one from its matrices, or a kfgs.Camera from viewmat and K"
+            f"pinhole: expected a kornia.geometry.camera.PinholeCamera, got {type(pinhole).__name__}; build one"
         )
-    check_shapes(
-        ("pinhole.intrinsics", pinhole.intrinsics, "B 4 4"), ("pinhole.extrinsics", pinhole.extrinsics, "B 4 4")
-    )
-    if names and len(names) != pinhole.batch_size:
-        raise ValueError(f"names: expected {pinhole.batch_size} (one per camera), got {len(names)}; give one for each")
+    count = pinhole.batch_size
+    for name in ("intrinsics", "extrinsics"):
+        check_shapes((f"pinhole.{name}", getattr(pinhole, name), (count, 4, 4)))
+    if names and len(names) != count:
+        raise ValueError(f"names: expected {count} (one per camera), got {len(names)}; give one for each")
     viewmats, Ks = pinhole.extrinsics.clone(), pinhole.camera_matrix.clone()  # kornia's scale_ changes them in place
     if integer_centers:
         Ks[:, :2, 2] += 0.5
-    return [
-        Camera(viewmat, K, width, height, name, near=near)
-        for viewmat, K, width, height, name in zip(
-            viewmats,
-            Ks,
-            pinhole.width.tolist(),
-            pinhole.height.tolist(),
-            names or [""] * pinhole.batch_size,
-            strict=True,
-        )
-    ]
+    sizes, names = (pinhole.width.tolist(), pinhole.height.tolist()), names or [""] * count
+    rows = zip(viewmats, Ks, *sizes, names, strict=True)
+    return [Camera(viewmat, K, width, height, name, near=near) for viewmat, K, width, height, name in rows]

@@ -1,4 +1,8 @@
-"""Convert points between the world, the frame of the camera and its pixels."""
+"""Convert points between the world, the frame of the camera and its pixels.
+
+**Convention** (COLMAP's): x right, y down, z forward; the centre of the first pixel is (0.5, 0.5). The camera's matrices
+follow the dtype and device of the points.
+"""
 
 from __future__ import annotations
 
@@ -8,26 +12,16 @@ from kornia.geometry.conversions import convert_points_from_homogeneous
 from kornia.geometry.depth import depth_to_3d_v2
 from torch import Tensor
 
-from .._check import check_range, check_shapes
-from .._typed import typed
+from .._check import as_tensor, check_range, check_shapes
 from .camera import Camera
 from .distortion import fold_radius, plane_to_pixel
 
 
-@typed
 def world_to_camera(camera: Camera, points: Tensor) -> Tensor:  # points: [N, 3] -> [N, 3]
     """Express world points in the camera's frame: R X + t.
 
-    **Convention** (COLMAP): x right, y down, z forward; `camera.viewmat` is world to camera and follows the dtype and
-    device of `points`.
-
-    Raises:
-        TypeError: if `points` are not floating point.
-        ValueError: if `points` are not [N, 3].
-
-    Note:
-        Written out because kornia's `transform_points` divides by a homogeneous coordinate that is always 1 here, and
-        takes twice as long.
+    Written out because kornia's `transform_points` divides by a homogeneous coordinate that is always 1 here, and takes
+    twice as long.
 
     Example:
         >>> camera = Camera(torch.eye(4), torch.tensor([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]), 64, 48)
@@ -39,17 +33,11 @@ def world_to_camera(camera: Camera, points: Tensor) -> Tensor:  # points: [N, 3]
     return points @ viewmat[:3, :3].T + viewmat[:3, 3]
 
 
-@typed
 def camera_to_pixel(camera: Camera, points_cam: Tensor) -> Tensor:  # points_cam: [N, 3] -> [N, 2]
     """Project points of the camera's frame to pixels (x, y), through the lens if the camera has one.
 
-    **Convention**: the centre of the first pixel is (0.5, 0.5). A point behind the camera gives an ordinary-looking
-    pixel, so mask by depth *before* calling (`project_points` does). At z = 0 the division is skipped: the result is
-    finite, and means nothing.
-
-    Raises:
-        TypeError: if `points_cam` are not floating point.
-        ValueError: if `points_cam` are not [N, 3].
+    A point behind the camera gives an ordinary-looking pixel, so mask by depth *before* calling (`project_points` does). At
+    z = 0 the division is skipped: the result is finite, and means nothing.
 
     Example:
         >>> camera = Camera(torch.eye(4), torch.tensor([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]), 64, 48)
@@ -62,23 +50,19 @@ def camera_to_pixel(camera: Camera, points_cam: Tensor) -> Tensor:  # points_cam
     return plane_to_pixel(plane, camera.K.to(points_cam), camera.distortion)
 
 
-@typed
 def projection_jacobian(camera: Camera, points_cam: Tensor) -> Tensor:  # points_cam: [N, 3] -> [N, 2, 3]
     """Derivative of the pinhole projection, d(u, v) / d(x, y, z), in pixels per world unit (EWA, Zwicker 2001).
 
     The caller masks `z > near` first.
 
     Raises:
-        TypeError: if `points_cam` are not floating point.
         ValueError: if the camera has distortion, or `points_cam` are not [N, 3].
     """
     _check_points("points_cam", points_cam)
-    _refuse_distortion(camera)
-    focal = camera.K.diagonal()[:2].to(points_cam)
-    return dx_project_points_z1(points_cam) * focal[:, None]
+    refuse_distortion(camera)
+    return dx_project_points_z1(points_cam) * camera.K.diagonal()[:2].to(points_cam)[:, None]
 
 
-@typed
 def project_points(
     camera: Camera,
     points: Tensor,  # [N, 3] world
@@ -87,8 +71,8 @@ def project_points(
 ) -> tuple[Tensor, Tensor, Tensor]:  # [N, 2], [N], [N] bool
     """Project world points to pixels and decide which of them the camera sees.
 
-    Depth is tested before projecting, so a point behind the camera never counts as visible. With a
-    lens, a point so far off-axis that the lens model folds it back into the picture (`fold_radius`) is not visible.
+    Depth is tested before projecting, so a point behind the camera never counts as visible. With a lens, a point so far
+    off-axis that the lens model folds it back into the picture (`fold_radius`) is not visible.
 
     Args:
         camera: the camera; its distortion is applied.
@@ -96,13 +80,8 @@ def project_points(
         near: depth that a point must exceed, in world units.
 
     Returns:
-        Pixels (x, y), with (0, 0) for points not in front of the camera; depths along the optical axis, in world
-        units; and the mask of points in front and inside the picture (0 <= x < width, 0 <= y < height). Occlusion is
-        not considered.
-
-    Raises:
-        TypeError: if `points` are not floating point.
-        ValueError: if `points` are not [N, 3], or `near` is negative.
+        Pixels (x, y), with (0, 0) for points not in front of the camera; depths along the optical axis, in world units; and
+        the mask of points in front and inside the picture (0 <= x < width, 0 <= y < height). Occlusion is not considered.
 
     Example:
         >>> camera = Camera(torch.eye(4), torch.tensor([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]), 64, 48)
@@ -124,43 +103,31 @@ def project_points(
     return xy, depth, visible
 
 
-@typed
 def unproject_depth(camera: Camera, depth: Tensor) -> Tensor:  # depth: [H, W] -> [H, W, 3] world
-    """Lift a depth map to one world point per pixel centre.
+    """Lift a depth map (along the optical axis, in world units) to one world point per pixel centre.
 
-    **Convention**: depth is the distance along the optical axis (z), not along the ray, in world units. A pixel of
-    depth 0 (often "unknown") gives the centre of the camera: mask it.
-
-    Raises:
-        TypeError: if `depth` is not floating point.
-        ValueError: if the camera has distortion, or the map is not of the camera's size.
+    A pixel of depth 0 (often "unknown") gives the centre of the camera: mask it.
 
     Example:
         >>> camera = Camera(torch.eye(4), torch.tensor([[2.0, 0, 1], [0, 2, 1], [0, 0, 1]]), 2, 2)
         >>> unproject_depth(camera, torch.full((2, 2), 4.0))[0, 0]  # the ray of the pixel centre (0.5, 0.5)
         tensor([-1., -1.,  4.])
     """
-    check_shapes(("depth", depth, f"{camera.height} {camera.width}"))
-    _check_floating("depth", depth)
-    _refuse_distortion(camera)
+    check_shapes(("depth", as_tensor("depth", depth, floating=True), (camera.height, camera.width)))
+    refuse_distortion(camera)
     K = camera.intrinsics_at_integer_centers.to(depth)  # kornia's pixel grid counts from 0, not from 0.5
     viewmat = camera.viewmat.to(depth)
     return (depth_to_3d_v2(depth, K[None])[0] - viewmat[:3, 3]) @ viewmat[:3, :3]  # R^T (X - t)
 
 
-def _check_points(name: str, points: Tensor) -> None:
-    check_shapes((name, points, "N 3"))
-    _check_floating(name, points)
-
-
-def _check_floating(name: str, values: Tensor) -> None:
-    if not values.is_floating_point():
-        raise TypeError(f"{name}: expected floating point, got {values.dtype}; convert it with .float()")
-
-
-def _refuse_distortion(camera: Camera) -> None:
+def refuse_distortion(camera: Camera) -> None:
+    """Raise a ValueError if a camera has a lens."""
     if camera.distortion is not None:
         raise ValueError(
             f"camera: expected a pinhole camera, got {camera.distortion.model} distortion (camera {camera.name!r}); "
             "undistort its images first (kfgs.cameras.undistort) and use the camera that returns"
         )
+
+
+def _check_points(name: str, points: Tensor) -> None:
+    check_shapes((name, as_tensor(name, points, floating=True), "N 3"))

@@ -8,7 +8,7 @@ import torch
 from kornia.geometry.transform import resize
 from torch import Tensor
 
-from .._check import as_tensor, check_shapes
+from .._check import as_tensor, check_shapes, check_size
 
 
 def to_bchw(map: Tensor) -> Tensor:  # [H, W, D] -> [1, D, H, W]
@@ -39,15 +39,11 @@ def resize_map(
     639x479 -> 480x360.
 
     Args:
-        map: any number of channels.
+        map: any number of channels, floating point (resize labels with `resize_labels`).
         size: (height, width) of the result.
         align_corners: True puts the centres of the corner pixels on each other instead.
         antialias: blur before shrinking (kornia's Gaussian). It changes nothing at the paper's 4/3, and matters from a
             factor of about 2, where plain bilinear sampling skips pixels and leaves them without gradient.
-
-    Raises:
-        TypeError: if `map` is not floating point (resize labels with `resize_labels`).
-        ValueError: if `map` is not [H, W, D], or `size` is not two positive whole numbers.
 
     Example:
         >>> resize_map(torch.tensor([[[0.0], [1.0], [2.0], [3.0]]]), (1, 2))[..., 0]
@@ -57,10 +53,10 @@ def resize_map(
     check_shapes(("map", map, "H W D"))
     if not map.is_floating_point():
         raise TypeError(f"map: expected floating point, got {map.dtype}; use resize_labels for class indices")
-    height, width = _check_size(size)
-    if map.shape[:2] == (height, width):
+    check_size(size)
+    if map.shape[:2] == tuple(size):
         return map
-    resized = resize(to_bchw(map), (height, width), align_corners=align_corners, antialias=antialias)
+    resized = resize(to_bchw(map), tuple(size), align_corners=align_corners, antialias=antialias)
     return from_bchw(resized)
 
 
@@ -70,15 +66,8 @@ def resize_labels(
 ) -> Tensor:  # [h, w], dtype of labels
     """Resize a label map: each new pixel takes the label at its centre; -1 stays -1.
 
-    Row i of the result reads row floor((i + 0.5) H / h), in whole numbers.
-
-    Raises:
-        TypeError: if `labels` are not integers.
-        ValueError: if `labels` are not [H, W], or `size` is not two positive whole numbers.
-
-    Note:
-        kornia's `resize(interpolation="nearest")` takes floor(i H / h), the label at the pixel's corner, and neither
-        it nor "nearest-exact" accepts int64.
+    Row i of the result reads row floor((i + 0.5) H / h), in whole numbers. kornia's `resize(interpolation="nearest")` takes
+    floor(i H / h), the label at the pixel's corner, and neither it nor "nearest-exact" accepts int64.
 
     Example:
         >>> resize_labels(torch.tensor([[0, 1, 2, -1]]), (1, 2))  # centres 1.0 and 3.0 lie in pixels 1 and 3
@@ -88,9 +77,10 @@ def resize_labels(
     check_shapes(("labels", labels, "H W"))
     if labels.is_floating_point():
         raise TypeError(f"labels: expected integers, got {labels.dtype}; use resize_map for continuous values")
+    check_size(size)
     rows, columns = (
         (2 * torch.arange(new, device=labels.device) + 1) * old // (2 * new)
-        for new, old in zip(_check_size(size), labels.shape, strict=True)
+        for new, old in zip(size, labels.shape, strict=True)
     )
     return labels[rows[:, None], columns]
 
@@ -104,9 +94,3 @@ def fits_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """
     (h, w), (H, W) = sorted((size, other), key=math.prod)
     return abs(h - H * w / W) <= 1 or abs(w - W * h / H) <= 1
-
-
-def _check_size(size: tuple[int, int]) -> tuple[int, int]:
-    if len(size) != 2 or any(int(n) != n or n < 1 for n in size):
-        raise ValueError(f"size: expected (height, width) in pixels, got {size!r}; pass two positive whole numbers")
-    return int(size[0]), int(size[1])

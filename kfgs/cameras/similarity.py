@@ -10,7 +10,6 @@ from torch import Tensor
 
 from .._check import ORIGIN, check_range, check_shapes
 from .._origin import FAR_UNITS, Origin
-from .._typed import typed
 from .camera import Camera
 
 ROTATION_TOLERANCE = 1e-3  # as for Camera.viewmat: matrices from text files have few digits
@@ -95,23 +94,16 @@ class Similarity:
         """The inverse: x = R^T (x' - t) / s."""
         return Similarity(1 / self.scale, self.rotation.T, -(self.rotation.T @ self.translation) / self.scale)
 
-    def compose(self, first: Similarity) -> Similarity:
-        """This similarity after another one: `a.compose(b).apply(x)` is `a.apply(b.apply(x))`; also written `a @ b`."""
-        return Similarity(
-            self.scale * first.scale,
-            self.rotation @ first.rotation,
-            self.scale * (self.rotation @ first.translation) + self.translation,
-        )
-
     def __matmul__(self, first: Similarity) -> Similarity:
-        return self.compose(first)
+        """This similarity after another one: `(a @ b).apply(x)` is `a.apply(b.apply(x))`."""
+        translation = self.scale * (self.rotation @ first.translation) + self.translation
+        return Similarity(self.scale * first.scale, self.rotation @ first.rotation, translation)
 
     def between_worlds(self, src: Origin, dst: Origin) -> Similarity:
         """The same motion in the world, of a similarity of coordinates that are counted from an origin on each side."""
         far, near = (torch.tensor(origin, dtype=torch.float64) for origin in (src, dst))
         return replace(self, translation=self.translation + near - self.scale * (self.rotation @ far))
 
-    @typed
     def apply_to_camera(self, camera: Camera) -> Camera:
         """The camera that takes the same picture of the moved scene.
 
@@ -133,60 +125,32 @@ class Similarity:
         return replace(self, translation=torch.zeros(3)), (x, y, z)
 
 
-def fit_similarity(
-    src: Tensor,  # [N, 3]
-    dst: Tensor,  # [N, 3]
-    weights: Tensor | None = None,  # [N] >= 0
-    with_scale: bool = True,
-) -> Similarity:
-    """The similarity with the least sum of w |s R src + t - dst|^2, in closed form (Umeyama 1991).
+def fit_similarity(src: Tensor, dst: Tensor) -> Similarity:  # [N, 3], [N, 3]
+    """The similarity with the least sum of |s R src + t - dst|^2, in closed form (Umeyama 1991, by scikit-image).
 
     Flat clouds are accepted (the result is the rotation, not the mirror image). Points on a line are refused, because the
-    rotation about the line is unknown. Outliers count fully: give weights, or fit to samples.
-
-    Args:
-        src: points in the frame to move.
-        dst: the same points in the frame to reach.
-        weights: how much each pair counts; None counts all alike.
-        with_scale: False keeps the scale at 1 (a rigid motion).
+    rotation about the line is unknown.
 
     Raises:
-        ValueError: if shapes disagree, a number is not finite, a weight is negative, or fewer than three pairs of
-            positive weight span a plane in both frames.
-
-    Note:
-        kornia has no such fit; scipy's `Rotation.align_vectors` is the rotation alone.
+        ValueError: if shapes disagree, a number is not finite, or fewer than three pairs span a plane in both frames.
     """
-    check_shapes(("src", src, "N 3"), ("dst", dst, "N 3"), ("weights", weights, "N"))
-    given = torch.ones(len(src)) if weights is None else weights
-    x, y, w = (value.detach().double().cpu() for value in (src, dst, given))
-    for name, values in (("src", x), ("dst", y), ("weights", w)):
-        if not torch.isfinite(values).all():
-            raise ValueError(f"{name}: expected finite numbers, got NaN or infinity; leave those pairs out")
-    if (w < 0).any():
-        raise ValueError(f"weights: expected numbers >= 0, got {float(w.min()):g}; clamp them first")
-    if int((w > 0).sum()) < 3:
-        raise ValueError(f"src: expected at least 3 pairs of positive weight, got {int((w > 0).sum())}; add pairs")
-    w = w / w.sum()
-    x_mean, y_mean = w @ x, w @ y
-    x, y = (x - x_mean) * w.sqrt()[:, None], (y - y_mean) * w.sqrt()[:, None]
-    for name, values in (("src", x), ("dst", y)):
-        spread = torch.linalg.svdvals(values)
+    from skimage.transform import SimilarityTransform  # slow to import, and seldom needed
+
+    check_shapes(("src", src, "N 3"), ("dst", dst, "N 3"))
+    points = [values.detach().double().cpu().numpy() for values in (src, dst)]
+    for name, values in zip(("src", "dst"), map(torch.from_numpy, points), strict=True):
+        if len(values) < 3 or not torch.isfinite(values).all():
+            raise ValueError(f"{name}: expected at least 3 finite points, got {len(values)}; add pairs, leave NaN out")
+        spread = torch.linalg.svdvals(values - values.mean(0))
         if spread[1] <= STRAIGHT * spread[0]:
             raise ValueError(
                 f"{name}: expected points that span a plane, got points on a line (spreads {spread.tolist()}); "
                 "add pairs next to it"
             )
-    U, d, Vh = torch.linalg.svd(y.T @ x)
-    signs = torch.ones(3).double()
-    signs[2] = torch.sign(torch.linalg.det(U) * torch.linalg.det(Vh))  # a rotation, never a reflection
-    R = U @ (signs[:, None] * Vh)
-    scale = float((d * signs).sum() / (x * x).sum()) if with_scale else 1.0
-    if not scale > 0:
-        raise ValueError(
-            f"dst: expected points that a rotation and a scale can reach, got scale {scale:g}; check pairs"
-        )
-    return Similarity(scale, R, y_mean - scale * (R @ x_mean))
+    fit = SimilarityTransform.from_estimate(*points)
+    if not fit or not fit.scale > 0:
+        raise ValueError("dst: expected points that a rotation and a scale can reach, got others; check the pairs")
+    return Similarity.from_matrix(torch.from_numpy(fit.params))
 
 
 def exact_rotation(name: str, matrix: Tensor) -> Tensor:  # [3, 3] -> [3, 3] float64
@@ -200,8 +164,7 @@ def exact_rotation(name: str, matrix: Tensor) -> Tensor:  # [3, 3] -> [3, 3] flo
     error = (M @ M.T - torch.eye(3, dtype=torch.float64)).abs().max()
     if not error <= ROTATION_TOLERANCE:  # NaN fails every comparison
         raise ValueError(
-            f"{name}: expected a rotation (orthonormal, without scale or shear), got {M.tolist()}; "
-            "divide by the scale first"
+            f"{name}: expected a rotation (orthonormal, without scale or shear), got {M.tolist()}; divide by the scale first"
         )
     if torch.linalg.det(M) < 0:
         raise ValueError(f"{name}: expected a rotation, got a reflection (determinant -1); check the axes' handedness")

@@ -10,13 +10,11 @@ from kornia.geometry.conversions import normalize_points_with_intrinsics
 from torch import Tensor
 
 from .._check import check_shapes
-from .._typed import typed
 from .camera import Camera
 from .distortion import fold_radius, plane_to_pixel
 from .resample import from_bchw, to_bchw
 
 
-@typed
 def undistort(
     image: Tensor,  # [H, W, C]
     camera: Camera,
@@ -26,15 +24,12 @@ def undistort(
     Each pixel of the result looks up, bilinearly, where its ray fell in the distorted picture.
 
     Args:
-        image: any number of channels, as large as the camera says (a smaller feature map: `camera.resized(h, w)`).
+        image: any number of channels, floating point, as large as the camera says (a smaller feature map:
+            `camera.resized(h, w)`).
         camera: the camera that took it. Without distortion the picture is returned unchanged.
 
     Returns:
         The picture, 0 at unrecorded pixels; the camera without distortion; and the mask of recorded pixels.
-
-    Raises:
-        TypeError: if `image` is not floating point.
-        ValueError: if `image` is not of the camera's size.
 
     Note:
         kornia's `undistort_image` does the same two steps (distort the grid, remap), but has no fisheye model and no mask.
@@ -54,31 +49,19 @@ def undistort(
     return result, replace(camera, distortion=None), recorded
 
 
-@typed
 def undistort_labels(
     labels: Tensor,  # [H, W] integer
     camera: Camera,
     fill: int = -1,
 ) -> Tensor:  # [H, W], dtype of labels
-    """Remove the lens from a label map: each pixel takes the label of the nearest distorted pixel.
+    """Remove the lens from a label map: each pixel takes the label of the nearest distorted pixel, unrecorded ones `fill`.
 
-    Args:
-        labels: as large as the camera says.
-        camera: the camera that took it; without distortion the labels are returned unchanged.
-        fill: label of unrecorded pixels.
-
-    Raises:
-        TypeError: if `labels` are not integers.
-        ValueError: if `labels` are not of the camera's size, or their type cannot hold `fill`.
-
-    Note:
-        Indexed directly, because kornia's `remap` takes floating point only.
+    Indexed directly, because kornia's `remap` takes floating point only.
     """
     check_shapes(("labels", labels, f"{camera.height} {camera.width}"))
     if labels.is_floating_point() or labels.dtype == torch.bool:
         raise TypeError(f"labels: expected integers, got {labels.dtype}; convert them with .long()")
-    limits = torch.iinfo(labels.dtype)
-    if not limits.min <= fill <= limits.max:
+    if fill < torch.iinfo(labels.dtype).min:
         raise ValueError(f"fill: expected a value that {labels.dtype} can hold, got {fill}; pass labels.long()")
     if camera.distortion is None:
         return labels

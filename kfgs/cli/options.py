@@ -41,7 +41,7 @@ def _choice(kind: Any) -> PrimitiveConstructorSpec[Any]:
 Mode = Literal["decouple", "adc", "adc+sc"]  # of the paper's Table 1
 By = Literal["views", "distance"]
 LabelRule = Literal["own", "nearest"]  # of `kfgs evaluate`: who says the class of a pixel
-Walk = Literal["orbit", "spiral", "cameras"] | Path  # paths of cameras
+Walk = Literal["orbit", "cameras"] | Path  # paths of cameras
 Rule = Literal["fused", "paper"]
 GivenWalk = Annotated[Walk | None, _quiet]
 GivenMode = Annotated[Mode | None, _choice(Mode), _quiet]

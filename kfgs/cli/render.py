@@ -37,19 +37,19 @@ def render(
     teacher: Teacher,
     classes: Classes,
 ) -> None:
-    """Make a film of a field or a labelled splat: an orbit, a spiral at one view, or a flight along its cameras or your own.
+    """Make a film of a field or a labelled splat: an orbit, or a flight along its cameras or your own.
 
     Examples:
         kfgs render run/ --out tour.gif
         kfgs render run/ --path cameras --show photo,labels,query=chair --out tour.mp4
-        kfgs render labelled.ply --path spiral --scene scene/ --out spiral.gif
+        kfgs render labelled.ply --path cameras --scene scene/ --out flight.gif
         kfgs render run/ --path my_cameras.json --out mine.mp4
 
     Args:
         source: A run folder, a field (RUN/field.kfgs), or a splat with classes.
         out: The film, .gif or .mp4 (which needs imageio-ffmpeg).
         path: orbit goes around the scene and looks in from above: what is in front is cut away, and a class "ceiling" is left
-            out. spiral sways at the camera in the middle. cameras flies along the scene's cameras. A file or folder
+            out. cameras flies along the scene's cameras. A file or folder
             (transforms.json, COLMAP model, scene; without pictures, too) gives cameras of your own: exactly these, in the order
             of their names; or with --frames a smooth path through them.
         show: What stands side by side, with commas between: photo (the colours), labels, features, query=TEXT. By default
@@ -155,7 +155,7 @@ def _check_place(path: Path) -> None:
     elif not path.is_dir():
         got, advice = "another file", "name the file or folder with the cameras"
     raise ValueError(
-        "path: expected orbit, spiral, cameras, a transforms.json (a name that ends in .json), or a folder with a COLMAP model, "
+        "path: expected orbit, cameras, a transforms.json (a name that ends in .json), or a folder with a COLMAP model, "
         f"got {path}, {got}; {advice}"
     )
 
@@ -200,8 +200,8 @@ def _own_walk(path: Path, frames: int | None, width: int | None, film: bool) -> 
 def walk_of(
     path: Walk | list[Camera], cloud: Any, cameras: list[Camera], frames: int | None, width: int | None
 ) -> list[Camera]:
-    """The cameras of a path that `check_walk` gave. Those of the scene are needed for a spiral and a flight along them."""
-    from ..cameras import Orbit, orbit_cameras, path_cameras, spiral_cameras
+    """The cameras of a path that `check_walk` gave. Those of the scene are needed for a flight along them."""
+    from ..cameras import Orbit, orbit_cameras, path_cameras
     from ..viz.linked import upwards
 
     if isinstance(path, list):
@@ -217,16 +217,9 @@ def walk_of(
         raise ValueError(
             f"scene: expected --scene for --path {path}, whose cameras it needs, got none; or take an orbit"
         )
-    import torch
-
     cameras = [camera.with_origin(cloud.origin) for camera in cameras]
-    centers = torch.stack([camera.center for camera in cameras]).double()
-    middle = int((centers - centers.mean(dim=0)).norm(dim=1).argmin())
-    view = cameras[0 if path == "cameras" else middle]
-    size = (max(1, round(width * view.height / view.width)), width)
-    if path == "cameras":
-        return path_cameras(cameras, frames, every=max(1, round(len(cameras) / KEYS)), size=size)
-    return spiral_cameras(view, cloud.means, frames, size=size)
+    size = (max(1, round(width * cameras[0].height / cameras[0].width)), width)
+    return path_cameras(cameras, frames, every=max(1, round(len(cameras) / KEYS)), size=size)
 
 
 def _title(word: str) -> str:

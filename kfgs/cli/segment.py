@@ -42,7 +42,7 @@ def segment(
         kfgs segment run/field.kfgs --out segmented/
         kfgs segment run/field.kfgs --out segmented/ --scene scene/ --text words.safetensors --split train
         kfgs segment run/field.kfgs --out segmented/ --split train --coco
-        kfgs segment run/field.kfgs --out masks/ --path spiral --frames 40 --coco
+        kfgs segment run/field.kfgs --out masks/ --path orbit --frames 40 --coco
         kfgs segment run/field.kfgs --out masks/ --path my_cameras.json --coco
 
     Args:
@@ -50,7 +50,7 @@ def segment(
         out: Folder for label maps (predicted/ has class numbers, colored/ shows them in colours), pictures and scores.json. It
             holds the results; files of the same names are replaced.
         split: Which views: train, test, all, or another split that SCENE/split.json names; by default test.
-        path: Segment the cameras of a path instead of the views of a split: orbit, spiral or cameras, as in `kfgs render`; or a
+        path: Segment the cameras of a path instead of the views of a split: orbit or cameras, as in `kfgs render`; or a
             file or folder with cameras of your own (transforms.json, COLMAP model, scene; without pictures, too): exactly
             these, or with --frames a smooth path through them.
         frames: Number of cameras of the path; by default 72, or your own cameras.

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .._files import bytes_in_words, digest_file
-from ..teachers.protocol import Teacher, check_features
+from ..teachers.protocol import Teacher
 from .finder import MapFinder
 from .layouts import LAYOUTS, OWN, layout_of, map_file
 from .manifest import (
@@ -173,7 +173,7 @@ def encode_half(teacher: Teacher, picture: Tensor, path: Path) -> Tensor:  # [H,
             would mean "unknown"; the message names the picture.
     """
     with torch.inference_mode():
-        features = check_features(teacher.name, teacher.encode_image(picture.permute(2, 0, 1).contiguous()))
+        features = teacher.encode_image(picture.permute(2, 0, 1).contiguous())
         D, h, w = features.shape
         half = torch.empty(h, w, D, dtype=torch.float16, device=features.device)
         finite, lost = torch.ones((), dtype=torch.bool, device=features.device), 0

@@ -146,7 +146,8 @@ def _as_encoder(teacher: Any) -> tuple[Callable[[Tensor], Tensor], dict[str, Any
             f"{teacher.__name__ if inspect.isclass(teacher) else type(teacher).__name__}; load_teacher(name) loads one"
         )
     name = getattr(teacher, "name", None) or getattr(teacher, "__name__", type(teacher).__name__)
-    identity = getattr(teacher, "identity", None) or {}
+    version = getattr(teacher, "version", "")
+    identity = getattr(teacher, "identity", None) or ({"version": str(version)} if version else {})
     try:
         return encode, json.loads(json.dumps({"name": name, **identity}, allow_nan=False))  # tuples become lists
     except (TypeError, ValueError) as error:

@@ -2,21 +2,14 @@
 
 from .checkpoint import read_checkpoint
 from .load import load_teacher, teacher_names
-from .lseg import LSeg, LSegConfig, LSegOptions, load_lseg
 from .prompts import make_label_set
 from .protocol import CallableTeacher, Teacher, as_teacher, identify
-from .transformers_table import TRANSFORMERS
 
 __all__ = [
-    "TRANSFORMERS",
     "CallableTeacher",
-    "LSeg",
-    "LSegConfig",
-    "LSegOptions",
     "Teacher",
     "as_teacher",
     "identify",
-    "load_lseg",
     "load_teacher",
     "make_label_set",
     "read_checkpoint",

@@ -53,12 +53,10 @@ def embed_labels(
     Raises:
         ValueError: if there is no name, one is empty or repeated, synonyms belong to no class, a template has no `{}`, or
             the encoder's rows are not finite.
-        TypeError: if `teacher` is no teacher, or `names` is one text.
         NotImplementedError: if the teacher has no text encoder.
     """
     teacher = as_teacher(teacher)
-    words = _words(names, synonyms)
-    patterns = _templates_of(teacher, templates)
+    words, patterns = _words(names, synonyms), _templates_of(teacher, templates)
     prompts = [[pattern.replace("{}", word) for word in one for pattern in patterns] for one in words.values()]
     distinct = list(dict.fromkeys(prompt for group in prompts for prompt in group))
     rows = _encode(teacher, distinct)

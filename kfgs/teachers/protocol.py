@@ -9,8 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from .._check import check_shapes
-from .identity import code_identity
+from .._check import as_tensor, check_shapes
 
 _ROUNDING = 1e-4  # a resampled picture may exceed [0, 1] by this much
 
@@ -21,16 +20,14 @@ PROMPTS_AT_ONCE = 64  # 60 MB of activations in CLIP ViT-L's text tower
 class Teacher(Protocol):
     """An image encoder, usually with a text encoder into the same space: LSeg, or a dense CLIP.
 
-    Any object with these three members is a teacher; there is no base class. `isinstance` checks that the members exist,
-    not their signatures. Two more are used if they exist: `to(device)` and `identity`, JSON of everything that the features
-    depend on (see `identify`). Without `identity` a cache does not notice other weights; teachers from `load_teacher`
-    always have one.
+    Any object with these three members is a teacher; there is no base class. Three more are used if they exist:
+    `to(device)`; `templates`, the prompts that suit its texts; and `identity`, JSON of what the features depend on, so that
+    maps of other weights are not mixed. Without `identity`, its `name` and its `version` (a text) stand for it.
 
     **Convention**: here, pictures and features have the channels first, as in encoders; kfgs's maps, in memory and on disk,
     have them last ([h, w, D]).
 
     Example:
-        >>> import torch
         >>> class Colour:
         ...     name = "colour"
         ...
@@ -68,12 +65,9 @@ class CallableTeacher:
         images: [3, H, W] RGB in [0, 1] -> [D, h, w].
         text: n prompts -> [n, D]; rows are normalised. None: the teacher has no text encoder.
         name: a short name; None: the function's name.
-        identity: JSON of everything except the name that the features depend on, for example a digest of the weights: if
-            it changes, a cache is made again. None: the place of `images` and a digest of its code, which notices neither
-            globals and closures nor a model's weights; see `identity.code_identity`.
+        version: change it when the features change, so that maps of two versions are not mixed.
 
     Example:
-        >>> import torch
         >>> teacher = CallableTeacher(lambda image: image[:, ::4, ::4], name="thumbnail")
         >>> teacher.encode_image(torch.zeros(3, 8, 8)).shape
         torch.Size([3, 2, 2])
@@ -85,34 +79,27 @@ class CallableTeacher:
         text: Callable[[Sequence[str]], Tensor] | None = None,
         *,
         name: str | None = None,
-        identity: dict[str, Any] | None = None,
+        version: str = "",
     ) -> None:
         if not callable(images):
             raise TypeError(
                 f"images: expected a function from [3, H, W] to [D, h, w], got {type(images).__name__}; pass a callable"
             )
-        self._images, self._text = images, text
+        self._images, self._text, self.version = images, text, version
         self.name = name or getattr(images, "__name__", type(images).__name__).strip("<>")
-        self._identity = code_identity(images) if identity is None else dict(identity)
 
     def __repr__(self) -> str:
         return f"CallableTeacher({self.name!r}, text={self._text is not None})"
 
-    @property
-    def identity(self) -> dict[str, Any]:
-        """JSON of what the features depend on, as far as it is known."""
-        return {"name": self.name, **self._identity}
-
     def encode_image(self, image: Tensor) -> Tensor:  # [3, H, W] -> [D, h, w]
-        """Call the function, and check the result with `check_features`."""
-        return check_features(self.name, self._images(image))
+        """Call the function."""
+        return self._images(image)
 
     def encode_text(self, prompts: Sequence[str]) -> Tensor:  # [n, D]
         """Call the function for text.
 
         Raises:
             NotImplementedError: if there is none.
-            TypeError: if `prompts` is one text, or holds something else than texts.
             ValueError: if there are no prompts, or it does not return one row per prompt.
         """
         if self._text is None:
@@ -132,62 +119,34 @@ def as_teacher(source: Teacher | Callable[[Tensor], Tensor]) -> Teacher:
     Raises:
         TypeError: if it is neither, or a class instead of an object.
     """
-    if inspect.isclass(source):
-        raise TypeError(
-            f"teacher: expected an object or a function, got the class {source.__name__}; make one: {source.__name__}(...)"
-        )
-    if isinstance(source, Teacher):
+    if isinstance(source, Teacher) and not inspect.isclass(source):
         return source
-    if callable(source):
+    if callable(source) and not inspect.isclass(source):
         return CallableTeacher(source)
+    got = f"the class {source.__name__}; make an object of it" if inspect.isclass(source) else type(source).__name__
     raise TypeError(
         f"teacher: expected an object with name, encode_image and encode_text, or a function from [3, H, W] to [D, h, w], "
-        f"got {type(source).__name__}; see kfgs.teachers.Teacher"
+        f"got {got}; see kfgs.teachers.Teacher"
     )
 
 
 def identify(teacher: Teacher) -> dict[str, Any]:
-    """JSON of what a teacher's features depend on: its `identity`, or its name if it has none."""
-    found = getattr(teacher, "identity", None)
-    if isinstance(found, dict):
-        return dict(found)
-    if not hasattr(teacher, "name"):
-        raise TypeError(f"teacher: expected a teacher, got {type(teacher).__name__}; load_teacher(name) loads one")
-    return {"name": teacher.name}
-
-
-def check_features(name: str, features: Any) -> Tensor:  # -> [D, h, w]
-    """Check that a teacher returned a map of floats for a picture, and return it.
-
-    Raises:
-        TypeError: if it is no tensor, or one without values in memory (sparse, nested, on the meta device).
-        ValueError: if it has other axes, no cell, or no floats.
-    """
-    if not isinstance(features, Tensor):
-        hint = "torch.from_numpy(...)" if hasattr(features, "__array__") else "the features alone"
-        raise TypeError(
-            f"teacher {name!r}: expected a tensor [D, h, w], got a {type(features).__name__}; return {hint}"
-        )
-    _check_dense(f"teacher {name!r}", features, "[D, h, w]")
-    if features.ndim != 3 or 0 in features.shape or not features.is_floating_point():
-        raise ValueError(
-            f"teacher {name!r}: expected floats [D, h, w] for one picture, got {features.dtype} "
-            f"{tuple(features.shape)}; leave out the batch axis"
-        )
-    return features
+    """JSON of what a teacher's features depend on: its `identity`, or its name and version."""
+    known = getattr(teacher, "identity", None)
+    if isinstance(known, dict):
+        return dict(known)
+    version = getattr(teacher, "version", "")
+    return {"name": teacher.name, **({"version": str(version)} if version else {})}
 
 
 def check_picture(image: Any) -> None:
     """Raise unless `image` is a picture: [3, H, W], at least one pixel, finite floats in [0, 1]; reads the values.
 
     Raises:
-        TypeError: if it is no tensor with values in memory, or holds no floats.
+        TypeError: if it is not a dense tensor of floats.
         ValueError: if it has another shape, or a value is not finite or not in [0, 1] (1e-4 of rounding is allowed).
     """
-    if not isinstance(image, Tensor):
-        hint = "torch.from_numpy" if hasattr(image, "__array__") else "torch.as_tensor"
-        raise TypeError(f"image: expected a tensor [3, H, W], got {type(image).__name__}; use {hint}")
-    _check_dense("image", image, "[3, H, W]")
+    image = as_tensor("image", image)
     check_shapes(("image", image, "3 H W"))
     if not image.is_floating_point():
         raise TypeError(f"image: expected floats in [0, 1], got {image.dtype}; divide bytes by 255")
@@ -202,27 +161,13 @@ def check_picture(image: Any) -> None:
 
 
 def check_prompts(prompts: Any) -> None:
-    """Raise unless `prompts` is a list of texts, at least one.
-
-    Raises:
-        TypeError: if it is one text or no list, or holds something else than texts.
-        ValueError: if there are none.
-    """
+    """Raise a TypeError unless `prompts` is a list of texts, and a ValueError if it is empty."""
     if isinstance(prompts, str):
         raise TypeError(f"prompts: expected a list of texts, got the text {prompts!r}; put it into a list")
-    if not isinstance(prompts, Sequence):
-        raise TypeError(f"prompts: expected a list of texts, got {type(prompts).__name__}; put them into a list")
-    if not all(isinstance(prompt, str) for prompt in prompts):
-        other = next(prompt for prompt in prompts if not isinstance(prompt, str))
-        raise TypeError(f"prompts: expected texts, got {type(other).__name__} {other!r:.80}; use str")
+    if not isinstance(prompts, Sequence) or not all(isinstance(prompt, str) for prompt in prompts):
+        other = (
+            next((x for x in prompts if not isinstance(x, str)), prompts) if hasattr(prompts, "__iter__") else prompts
+        )
+        raise TypeError(f"prompts: expected a list of texts, got {type(other).__name__} {other!r:.80}; use str")
     if len(prompts) == 0:
         raise ValueError("prompts: expected at least one text, got none; name what to look for")
-
-
-def _check_dense(name: str, tensor: Tensor, shape: str) -> None:
-    """Raise a TypeError for sparse and nested tensors, and for those without values in memory."""
-    nested, meta = tensor.is_nested, tensor.device.type == "meta"
-    if nested or meta or tensor.layout != torch.strided:
-        kind = "nested tensor" if nested else "tensor on the meta device" if meta else f"tensor of {tensor.layout}"
-        hint = "give it a device with memory" if meta else "bring it to the ordinary layout, as to_dense() does"
-        raise TypeError(f"{name}: expected a dense tensor {shape}, got a {kind}; {hint}")

@@ -31,28 +31,43 @@ def load_sam(source: str | Path) -> SamTeacher:
 
     Args:
         source: `sam_vit_b_01ec64.pth`, `sam_vit_l_0b3195.pth`, `sam_vit_h_4b8939.pth` or `mobile_sam.pt` as published by
-            Meta and MobileSAM; no code in it is run.
+            Meta and MobileSAM; nothing in it is run.
 
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is damaged, or no checkpoint of SAM; the message names missing weights.
     """
     path = as_path(source)
-    state = read_checkpoint(path)
-    encoder_state = {
+    state = {
         name.removeprefix(_PREFIX): tensor.float() if tensor.is_floating_point() else tensor
-        for name, tensor in state.items()
+        for name, tensor in read_checkpoint(path).items()
         if name.startswith(_PREFIX)
     }
-    if not encoder_state:
+    if not state:
         raise ValueError(
-            f"{path}: expected a checkpoint of Segment Anything, with weights {_PREFIX}..., got {len(state)} weights, the "
-            f"first {next(iter(state), 'none')!r}; use sam_vit_b_01ec64.pth or another of SAM 1 (not 2 or 3)"
+            f"{path}: expected a checkpoint of Segment Anything, with weights {_PREFIX}..., got none of these; use "
+            "sam_vit_b_01ec64.pth or another of SAM 1 (not 2 or 3)"
         )
-    config = _config_of(path, encoder_state)
-    encoder = _build(config)
-    _check_fit(path, encoder, encoder_state)
-    encoder.load_state_dict(encoder_state, assign=True)
+    config = _config_of(path, state)
+    if config.model_type is not None:  # TinyViT computes a table of indices that no checkpoint holds
+        encoder = Sam.from_config(config).image_encoder
+    else:
+        with torch.device("meta"):  # initialising 637 M weights takes long
+            encoder = Sam.from_config(config).image_encoder
+    expected, got = (
+        {name: tuple(tensor.shape) for name, tensor in tensors.items()} for tensors in (encoder.state_dict(), state)
+    )
+    wrong = [
+        f"{name!r} {got.get(name, 'missing')} instead of {expected.get(name, 'none')}"
+        for name in [*expected, *(name for name in got if name not in expected)]
+        if got.get(name) != expected.get(name)
+    ]
+    if wrong:
+        raise ValueError(
+            f"{path}: expected the weights of SAM's image encoder, {len(wrong)} missing, left over or of another shape, the "
+            f"first {wrong[0]}; use a checkpoint of SAM 1 as it was published"
+        )
+    encoder.load_state_dict(state, assign=True)
     identity = {"name": "sam", "options": {}, "weights": weights_digest(path)}
     return SamTeacher(encoder.eval().requires_grad_(False), identity)
 
@@ -65,7 +80,6 @@ class SamTeacher:
 
     Attributes:
         encoder: kornia's image encoder, in evaluation mode.
-        name: "sam".
         identity: name and a digest of the weights.
     """
 
@@ -84,12 +98,7 @@ class SamTeacher:
 
     @torch.inference_mode()
     def encode_image(self, image: Tensor) -> Tensor:  # [3, H, W] RGB in [0, 1] -> [256, h, w], the longer of h, w is 64
-        """One feature per cell, not normalised.
-
-        Raises:
-            TypeError: if `image` is no tensor of floats.
-            ValueError: if it is not a finite picture [3, H, W] in [0, 1].
-        """
+        """One feature per cell, not normalised."""
         check_picture(image)
         weight = next(self.encoder.parameters())
         height, width = _scaled(image, _SIDE)
@@ -135,27 +144,3 @@ def _config_of(path: Path, state: dict[str, Tensor]) -> SamConfig:
         encoder_num_heads=heads,
         encoder_global_attn_indexes=everywhere,
     )
-
-
-def _build(config: SamConfig) -> nn.Module:
-    """The encoder. If a checkpoint fills all tensors, they have no storage: initialising 637 M weights takes long."""
-    if config.model_type is not None:  # TinyViT computes a table of indices that no checkpoint holds
-        return Sam.from_config(config).image_encoder
-    with torch.device("meta"):
-        return Sam.from_config(config).image_encoder
-
-
-def _check_fit(path: Path, encoder: nn.Module, state: dict[str, Tensor]) -> None:
-    """Raise a ValueError that names the first weight that is missing, left over, or of another shape."""
-    expected = {name: tuple(tensor.shape) for name, tensor in encoder.state_dict().items()}
-    got = {name: tuple(tensor.shape) for name, tensor in state.items()}
-    wrong = [
-        f"{name!r} {got.get(name, 'missing')} instead of {expected.get(name, 'none')}"
-        for name in [*expected, *(name for name in got if name not in expected)]
-        if got.get(name) != expected.get(name)
-    ]
-    if wrong:
-        raise ValueError(
-            f"{path}: expected the weights of SAM's image encoder, {len(wrong)} missing, left over or of another shape, the "
-            f"first {wrong[0]}; use a checkpoint of SAM 1 as it was published"
-        )

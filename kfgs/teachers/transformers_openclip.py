@@ -12,10 +12,12 @@ from torch import Tensor
 
 from .._card import error_line
 from .._files import read_json
+from .checkpoint import read_checkpoint
 from .transformers_source import explained, find_class, quiet, refuse_gaps, require_transformers
 
 _CONFIG = "open_clip_config.json"
 _WEIGHTS = ("open_clip_model.safetensors", "open_clip_pytorch_model.safetensors", "open_clip_pytorch_model.bin")
+_NEEDED = ("visual.conv1.weight", "visual.proj", "visual.positional_embedding", "text_projection", "ln_final.weight")
 _HEAD_WIDTHS = {1280: 80, 1408: 88, 1664: 104}  # image towers of ViT-H, g and bigG by their width; all others have 64
 
 _TOWER = [  # OpenCLIP's names within a tower -> those of transformers; attention's input projection is split apart
@@ -36,12 +38,7 @@ _TOWER = [  # OpenCLIP's names within a tower -> those of transformers; attentio
 
 
 def find_openclip(kind: str, source: Path | str, *, local_only: bool) -> Path | None:
-    """The file with weights in OpenCLIP's layout in `source`; None if there is none, or `source` does not need it.
-
-    Raises:
-        ImportError: if it is a hub id, and transformers is missing or broken.
-        ValueError: if a hub id has them, but they do not come.
-    """
+    """The file with weights in OpenCLIP's layout in `source`; None if there is none, or `source` does not need it."""
     if isinstance(source, str):
         return _fetch(kind, source, local_only=local_only) if kind == "openclip" else None
     if source.is_file():
@@ -78,19 +75,27 @@ def load_openclip(file: Path, *, activation: str) -> Any:
     file, a head has 64 channels (more in ViT-H, g and bigG), and `activation` is used: gelu, or OpenAI's quick_gelu.
 
     Raises:
-        ImportError: if transformers is missing or broken.
-        ValueError: if the file is no CLIP of plain vision and text transformers, is OpenAI's TorchScript archive, or is
+        ValueError: if the file is not a CLIP of plain vision and text transformers, is OpenAI's TorchScript archive, or is
             damaged.
     """
-    from .checkpoint import read_checkpoint
-
     transformers = require_transformers()
     config_class, model_class = (find_class(transformers, name, "clip") for name in ("CLIPConfig", "CLIPModel"))
-    _refuse_torchscript(file)
+    if _is_torchscript(file):
+        raise ValueError(
+            f"{file}: expected the tensors of a CLIP, got a TorchScript archive as OpenAI publishes it, which is a "
+            "program and is not run; use the hub id openai/clip-vit-base-patch16 (the weights of ViT-B-16.pt) or its like, "
+            "a folder of that, or a file of OpenCLIP"
+        )
     state = _unwrapped(read_checkpoint(file))
     known = read_json(file.with_name(_CONFIG)) if file.with_name(_CONFIG).is_file() else {}
     settings = known.get("model_cfg", {}) if isinstance(known, dict) else {}
-    _refuse_others(file, state, settings)
+    missing = [name for name in _NEEDED if name not in state]
+    if missing:
+        raise ValueError(
+            f"{file}: expected a CLIP of two plain transformers in OpenCLIP's layout, got {len(state)} tensors, the first "
+            f"{next(iter(state), 'none')!r} (no {missing[0]!r}); use a ViT model like ViT-B-16, or a folder of "
+            "save_pretrained"
+        )
     try:
         config = _config_of(config_class, state, settings, activation)
         mapped = _mapped(state)
@@ -99,58 +104,27 @@ def load_openclip(file: Path, *, activation: str) -> Any:
                 None, config=config, state_dict=mapped, dtype=torch.float32, output_loading_info=True
             )
     except Exception as error:  # shapes that do not fit, sizes of no model: transformers has its own errors for those
-        first = error_line(error)
         raise ValueError(
-            f"{file}: expected a CLIP in OpenCLIP's layout, but its weights do not fit together ({first}); use the file "
-            "and the config of one model"
+            f"{file}: expected a CLIP in OpenCLIP's layout, but its weights do not fit together ({error_line(error)}); use "
+            "the file and the config of one model"
         ) from error
     refuse_gaps(file, "CLIPModel", info)
     return model.eval()
 
 
-def _unwrapped(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Remove the prefix of training on several devices, and convert to single precision."""
-    floats = {
-        name: tensor.float() for name, tensor in state.items() if tensor.is_floating_point()
-    }  # not the text's mask
-    return {name.removeprefix("module."): tensor for name, tensor in floats.items()}
-
-
-def _refuse_torchscript(file: Path) -> None:
-    """Raise a ValueError with an alternative if the file is OpenAI's TorchScript archive of CLIP."""
-    if not zipfile.is_zipfile(file):
-        return
+def _is_torchscript(file: Path) -> bool:
+    """Whether the file is OpenAI's TorchScript archive of CLIP."""
     try:
         with zipfile.ZipFile(file) as archive:
-            script = any(re.fullmatch(r"[^/]+/(constants\.pkl|code/.*)", name) for name in archive.namelist())
+            return any(re.fullmatch(r"[^/]+/(constants\.pkl|code/.*)", name) for name in archive.namelist())
     except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError):
-        return  # damaged: `read_checkpoint` says how
-    if script:
-        raise ValueError(
-            f"{file}: expected the tensors of a CLIP, got a TorchScript archive as OpenAI publishes it, which is a "
-            "program and is not run; use the hub id openai/clip-vit-base-patch16 (the weights of ViT-B-16.pt) or its like, "
-            "a folder of that, or a file of OpenCLIP"
-        )
+        return False  # not a zip archive; a damaged one is explained by `read_checkpoint`
 
 
-def _refuse_others(file: Path, state: dict[str, Tensor], settings: dict[str, Any]) -> None:
-    needed = ("visual.conv1.weight", "visual.proj", "visual.positional_embedding", "text_projection", "ln_final.weight")
-    missing = [name for name in needed if name not in state]
-    if not missing:
-        return
-    what = f"{len(state)} tensors, the first {next(iter(state), 'none')!r}"
-    if any(name.startswith("visual.trunk.") for name in state):
-        what = "an image tower of timm"
-    elif any(name.startswith("text.transformer.") for name in state):
-        what = "a text tower of another library, as CoCa's or a multilingual one"
-    elif "visual.layer1.0.conv1.weight" in state:
-        what = "a ResNet image tower"
-    elif any(name.startswith("vision_model.") for name in state):
-        what = "weights in the layout of transformers (pass their folder, with config.json)"
-    raise ValueError(
-        f"{file}: expected a CLIP of two plain transformers in OpenCLIP's layout, got {what} (no {missing[0]!r}); use a "
-        "ViT model like ViT-B-16, or a folder of save_pretrained"
-    )
+def _unwrapped(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Remove the prefix of training on several devices, and convert to single precision."""
+    floats = {name: tensor.float() for name, tensor in state.items() if tensor.is_floating_point()}  # no masks
+    return {name.removeprefix("module."): tensor for name, tensor in floats.items()}
 
 
 def _config_of(config_class: Any, state: dict[str, Tensor], settings: dict[str, Any], activation: str) -> Any:

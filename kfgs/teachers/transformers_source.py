@@ -33,21 +33,16 @@ def require_transformers() -> Any:
             importlib.import_module("torchvision")
     except Exception as error:  # RuntimeError: operator torchvision::nms does not exist, OSError, ...
         raise ImportError(
-            f"torchvision: expected none, or the build that belongs to torch {torch.__version__}, got one that is "
-            f"installed but does not import ({error_line(error)}), and transformers fails with it; run "
-            "`pip uninstall torchvision` (kfgs does not need it), or install the build of this torch"
+            f"torchvision: expected none, or the build that belongs to torch {torch.__version__}, got one that does not "
+            f"import ({error_line(error)}), and transformers fails with it; run `pip uninstall torchvision` (kfgs does not "
+            "need it), or install the build of this torch"
         ) from error
     try:
         return importlib.import_module("transformers")
-    except ModuleNotFoundError as error:
+    except Exception as error:  # missing, or broken, which may raise anything
         raise ImportError(
             f"transformers: expected it for the teachers {', '.join(TRANSFORMERS)}, but it cannot be imported "
-            f'({error_line(error)}); install it with `pip install "kfgs[hf]"`'
-        ) from error
-    except Exception as error:  # one that does not go with what else is installed may raise anything
-        raise ImportError(
-            f"transformers: expected it for the teachers {', '.join(TRANSFORMERS)}, got one that is installed but does not "
-            f'import ({error_line(error)}); run `pip install --upgrade --force-reinstall "kfgs[hf]"`'
+            f'({error_line(error)}); run `pip install --upgrade "kfgs[hf]"`'
         ) from error
 
 
@@ -55,16 +50,11 @@ def find_class(transformers: Any, name: str, kind: str) -> Any:
     """A class of transformers; an ImportError if this version lacks it, or its imports fail."""
     try:
         return getattr(transformers, name)
-    except AttributeError as error:
+    except Exception as error:
         version = getattr(transformers, "__version__", "one without a version")
         raise ImportError(
-            f"transformers: expected a version with {name} for teacher {kind!r}, got {version}; run "
-            "`pip install --upgrade transformers`"
-        ) from error
-    except Exception as error:
-        raise ImportError(
-            f"transformers: expected {name} for teacher {kind!r}, got one that does not import ({error_line(error)}); run "
-            '`pip install --upgrade --force-reinstall "kfgs[hf]"`'
+            f"transformers: expected a version with {name} for teacher {kind!r}, got {version} ({error_line(error)}); run "
+            '`pip install --upgrade "kfgs[hf]"`'
         ) from error
 
 
@@ -82,13 +72,7 @@ def find_source(kind: str, source: str | Path) -> Path | str:
 
 
 def read_config(kind: str, source: Path | str, *, local_only: bool) -> tuple[str, str | None]:
-    """The model type in config.json, one of the kind's, and the hub's commit (None for a folder).
-
-    Raises:
-        FileNotFoundError: if the folder has none.
-        ValueError: if it is of another model, cannot be read, or the hub cannot be reached.
-        ImportError: if it is on the hub, and transformers is missing or broken.
-    """
+    """The model type in config.json, one of the kind's, and the hub's commit (None for a folder)."""
     if isinstance(source, Path):
         file = source / "config.json"
         if not file.is_file():
@@ -117,12 +101,7 @@ def read_config(kind: str, source: Path | str, *, local_only: bool) -> tuple[str
 
 
 def load_model(kind: str, source: Path | str, model_type: str, commit: str | None, *, local_only: bool) -> Any:
-    """The model in float32; every weight must come from the files, none from random initialisation.
-
-    Raises:
-        ImportError: if transformers is missing, broken, or too old for this model.
-        ValueError: if the weights are missing, damaged, or do not fit the config.
-    """
+    """The model in float32; every weight must come from the files, none from random initialisation."""
     transformers = require_transformers()
     name = TRANSFORMERS[kind].models[model_type][0]
     model_class = find_class(transformers, name, kind)
@@ -139,12 +118,7 @@ def load_model(kind: str, source: Path | str, model_type: str, commit: str | Non
 
 
 def load_tokenizer_of(kind: str, source: Path | str, commit: str | None, *, local_only: bool) -> Any:
-    """The tokenizer in the folder of the weights.
-
-    Raises:
-        ImportError: if transformers, or a package that the tokenizer needs, is missing or broken.
-        ValueError: if there is none, or it cannot be read.
-    """
+    """The tokenizer in the folder of the weights."""
     transformers = require_transformers()
     with explained(kind, source, "a tokenizer"), quiet(transformers):
         return transformers.AutoTokenizer.from_pretrained(

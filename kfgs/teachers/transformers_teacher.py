@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,11 @@ from torch.nn.functional import interpolate, normalize
 
 from .._check import check_choice, check_whole
 from .protocol import PROMPTS_AT_ONCE, check_picture, check_prompts
+from .tokenizer import tokenize as clip_tokens
 from .transformers_openclip import find_openclip, load_openclip
 from .transformers_patches import Patches, patch_size
 from .transformers_source import find_source, load_model, load_tokenizer_of, read_config, weights_of
-from .transformers_table import TRANSFORMERS, TeacherRow, TextRule
+from .transformers_table import TRANSFORMERS, TeacherRow
 
 _Tokenize = Callable[[list[str]], tuple[Tensor, Tensor]]  # n prompts -> ids [n, T], mask [n, T] (0: padding)
 
@@ -76,18 +78,49 @@ def load_transformers_teacher(
 
 
 def _tokenize_of(kind: str, source: Path | str, commit: str | None, model: Any, *, local_only: bool) -> _Tokenize:
-    """The tokenizer in the folder of the weights; if there is none and the kind uses CLIP's vocabulary, kfgs's copy."""
+    """The tokenizer next to the weights; if there is none and the kind uses CLIP's vocabulary, kfgs's copy.
+
+    It is read at the first prompt; without prompts it is not needed.
+    """
     row = TRANSFORMERS[kind]
     folder = source.parent if isinstance(source, Path) and source.is_file() else source
-    words = model.config.text_config
-    bare = isinstance(folder, Path) and not _has_tokenizer(folder)
-    if bare and row.activation is not None and words.vocab_size == _CLIP_VOCABULARY:
-        return _bpe_tokenize()
-    assert row.text is not None
+    words, rule = model.config.text_config, row.text
     longest = int(words.max_position_embeddings)
-    return _hub_tokenize(
-        kind, folder, row.text, longest, lambda: load_tokenizer_of(kind, folder, commit, local_only=local_only)
-    )
+    assert rule is not None
+
+    def bare() -> bool:
+        return isinstance(folder, Path) and not any((folder / name).is_file() for name in _TOKENIZER_FILES)
+
+    if bare() and row.activation is not None and words.vocab_size == _CLIP_VOCABULARY:
+
+        def plain(prompts: list[str]) -> tuple[Tensor, Tensor]:
+            ids = clip_tokens(prompts)
+            return ids, torch.ones_like(ids)  # never used: CLIP is causal and pools at the end of the text
+
+        return plain
+    load = cache(partial(load_tokenizer_of, kind, folder, commit, local_only=local_only))
+
+    def tokenize(prompts: list[str]) -> tuple[Tensor, Tensor]:
+        if bare():
+            raise ValueError(
+                f"{folder}: expected a tokenizer next to the weights of teacher {kind!r} ({', '.join(_TOKENIZER_FILES[:2])}, "
+                "...), got none; download those files too, or use a text table made elsewhere"
+            )
+        tokens = load()(
+            [prompt.lower() for prompt in prompts] if rule.lower else prompts,
+            **({"padding": "max_length", "max_length": longest} if rule.pad else {"padding": True}),
+            padding_side="right",  # siglip pools at the last position, and the tokenizer of siglip2 would pad in front
+            return_attention_mask=True,
+        )
+        for prompt, mask in zip(prompts, tokens["attention_mask"], strict=True):
+            if sum(mask) > longest:
+                raise ValueError(
+                    f"prompts: expected at most {longest} tokens for teacher {kind!r}, got {sum(mask)} in "
+                    f"{prompt[:40]!r}; shorten it"
+                )
+        return torch.tensor(tokens["input_ids"]), torch.tensor(tokens["attention_mask"])
+
+    return tokenize
 
 
 class TransformersTeacher:
@@ -122,12 +155,7 @@ class TransformersTeacher:
 
     @torch.inference_mode()
     def encode_image(self, image: Tensor) -> Tensor:  # [3, H, W] RGB in [0, 1] -> [D, h, w]
-        """One feature per patch, not normalised.
-
-        Raises:
-            TypeError: if `image` is no tensor of floats.
-            ValueError: if it is not a finite picture [3, H, W] in [0, 1].
-        """
+        """One feature per patch, not normalised."""
         check_picture(image)
         weight = next(self.model.parameters())
         ph, pw = patch_size(self.model)
@@ -148,9 +176,7 @@ class TransformersTeacher:
 
         Raises:
             NotImplementedError: if the model has no text tower in the space of its patches.
-            TypeError: if `prompts` is one text, or holds something else than texts.
-            ValueError: if there are none, one is too long, or there is no tokenizer.
-            ImportError: if a package that the tokenizer needs is missing.
+            ValueError: if there are no prompts, one is too long, or there is no tokenizer.
         """
         rule = self.row.text
         if rule is None or self._tokenize is None:
@@ -188,60 +214,3 @@ def resize_picture(image: Tensor, size: tuple[int, int]) -> Tensor:  # [3, H, W]
     if tuple(image.shape[1:]) == size:
         return image
     return interpolate(image[None], size, mode="bilinear", align_corners=False, antialias=True)[0]
-
-
-def _has_tokenizer(folder: Path) -> bool:
-    """Whether a folder holds the files of a tokenizer."""
-    return any((folder / name).is_file() for name in _TOKENIZER_FILES)
-
-
-def _hub_tokenize(kind: str, source: Path | str, rule: TextRule, longest: int, load: Callable[[], Any]) -> _Tokenize:
-    """A tokenizer of transformers that `load` reads at the first prompt; without prompts it is not needed.
-
-    Args:
-        kind: the teacher's name, for messages.
-        source: the folder or hub id, for messages.
-        rule: how the text tower was trained.
-        longest: tokens of the text tower; a longer prompt is refused, not cut.
-        load: reads the tokenizer.
-    """
-    loaded: list[Any] = []
-
-    def tokenize(prompts: list[str]) -> tuple[Tensor, Tensor]:
-        if isinstance(source, Path) and not _has_tokenizer(source):
-            raise ValueError(
-                f"{source}: expected a tokenizer next to the weights of teacher {kind!r} ({', '.join(_TOKENIZER_FILES[:2])}, "
-                "...), got none; download those files too, or use a text table made elsewhere"
-            )
-        if not loaded:
-            loaded.append(load())
-        found = loaded[0](
-            [prompt.lower() for prompt in prompts] if rule.lower else prompts,
-            **({"padding": "max_length", "max_length": longest} if rule.pad else {"padding": True}),
-            padding_side="right",  # siglip pools at the last position, and the tokenizer of siglip2 would pad in front
-            return_attention_mask=True,
-        )
-        for prompt, mask in zip(prompts, found["attention_mask"], strict=True):
-            if sum(mask) > longest:
-                raise ValueError(
-                    f"prompts: expected at most {longest} tokens for teacher {kind!r}, got {sum(mask)} in "
-                    f"{prompt[:40]!r}; shorten it"
-                )
-        return torch.tensor(found["input_ids"]), torch.tensor(found["attention_mask"])
-
-    return tokenize
-
-
-def _bpe_tokenize() -> _Tokenize:
-    """CLIP's vocabulary, which kfgs contains, for weights without a tokenizer."""
-    loaded: list[Any] = []
-
-    def tokenize(prompts: list[str]) -> tuple[Tensor, Tensor]:
-        from .bpe import load_tokenizer
-
-        if not loaded:
-            loaded.append(load_tokenizer())
-        ids = loaded[0](prompts)
-        return ids, torch.ones_like(ids)  # never used: CLIP is causal and pools at the end of the text
-
-    return tokenize

@@ -103,11 +103,11 @@ def test_gradient_reaches_pose_and_intrinsics():
         ({"viewmat": torch.diag(torch.tensor([2.0, 2, 2, 1]))}, ValueError, ("viewmat:", "rigid", "scale")),
         ({"viewmat": torch.diag(torch.tensor([1.0, 1, -1, 1]))}, ValueError, ("viewmat:", "reflection", "axes")),
         ({"viewmat": changed(torch.eye(4), 3, 0, 1.0)}, ValueError, ("viewmat:", "0 0 0 1")),
-        ({"near": True}, TypeError, ("near:", "got bool")),
+        ({"near": True}, TypeError, ("near:", "got True")),
         ({"near": 0.0}, ValueError, ("near:", "(0, inf)", "got 0.0")),
         ({"near": float("nan")}, ValueError, ("near:", "(0, inf)", "got nan")),
         ({"near": float("inf")}, ValueError, ("near:", "(0, inf)", "got inf")),
-        ({"near": "0.2"}, TypeError, ("near:", "got str")),
+        ({"near": "0.2"}, TypeError, ("near:", "got '0.2'")),
     ],
 )
 def test_refuses(change, error, match):

@@ -150,13 +150,13 @@ def test_other_errors_say_what_to_do():
     object.__setattr__(elsewhere, "K", K.to("meta"))  # a second device without a GPU
     with pytest.raises(ValueError, match=tells("cameras:", "camera.to(device)")):
         to_kornia([CAMERAS[0], elsewhere])
-    with pytest.raises(TypeError, match=tells("pinhole:", "PinholeCamera", "got Camera", "kfgs.Camera")):
+    with pytest.raises(TypeError, match=tells("pinhole:", "PinholeCamera", "got Camera")):
         from_kornia(CAMERAS[0])
     pinhole = to_kornia(CAMERAS)
     with pytest.raises(ValueError, match=tells("names:", "expected 2", "got 1")):
         from_kornia(pinhole, ["a"])
     stacked = PinholeCamera(pinhole.intrinsics[:, None], pinhole.extrinsics[:, None], pinhole.height, pinhole.width)
-    with pytest.raises(ValueError, match=tells("pinhole.intrinsics:", "[B, 4, 4]", "got (2, 1, 4, 4)")):
+    with pytest.raises(ValueError, match=tells("pinhole.intrinsics:", "[2, 4, 4]", "got (2, 1, 4, 4)")):
         from_kornia(stacked)
     with pytest.raises(ValueError, match=tells("width:", "got 28.")):
         from_kornia(to_kornia(CAMERAS[:1]).scale(torch.tensor([0.3], dtype=torch.float64)))

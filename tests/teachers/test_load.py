@@ -1,7 +1,3 @@
-import copy
-import hashlib
-import json
-import pickle
 import sys
 
 import pytest
@@ -10,7 +6,6 @@ from messages import tells
 
 from kfgs.teachers import Teacher, identify
 from kfgs.teachers.load import load_teacher, teacher_names
-from kfgs.teachers.prompts import embed_labels
 
 CLASS = (
     "import torch\n"
@@ -72,34 +67,15 @@ def write(tmp_path, monkeypatch):
     sys.modules.pop("mine", None)
 
 
-def test_identity_holds_source_weights_options_and_code(write, tmp_path):
-    write(CLASS)
-    (tmp_path / "w.pt").write_bytes(b"one")
+def test_identity_holds_version_source_weights_and_options(write):
+    write(CLASS + "    version = '2'\n")
     teacher = load_teacher("mine:Scaled", "w.pt", factor=2.0)
-    found = identify(teacher)
     assert isinstance(teacher, Teacher)
-    assert set(found) == {"name", "source", "code", "weights", "options"}
-    assert (found["name"], found["source"], found["options"]) == ("scaled", "mine:Scaled", {"factor": 2.0})
-    assert found["weights"] == hashlib.sha256(b"one").hexdigest()
-    assert json.loads(json.dumps(found)) == pickle.loads(pickle.dumps(found)) == found
-    assert identify(load_teacher("mine:Scaled", "w.pt", factor=2.0)) == found
-    assert identify(load_teacher("mine:Scaled", "w.pt", factor=3.0)) == {**found, "options": {"factor": 3.0}}
-    (tmp_path / "w.pt").write_bytes(b"two")
-    assert identify(load_teacher("mine:Scaled", "w.pt", factor=2.0))["weights"] == hashlib.sha256(b"two").hexdigest()
-    assert identify(load_teacher("mine:Scaled"))["weights"] is None
-    write(CLASS.replace("* self", "+ self"))
-    assert identify(load_teacher("mine:Scaled", "w.pt"))["code"] != found["code"]
-
-
-def test_identity_of_a_function_of_a_module(write):
-    text = "def one(image):\n    return image[:, ::2]\ndef two(image):\n    return image[:, ::4]\nlast = lambda x: x\n"
-    write(text)
-    one, two = (identify(load_teacher(f"mine:{name}")) for name in ("one", "two"))
-    assert one["source"] == "mine:one"
-    assert one["code"] != two["code"]
-    write(text.replace("::2", "::8"))
-    assert identify(load_teacher("mine:one"))["code"] != one["code"]
-    assert identify(load_teacher("mine:last"))["source"] == "mine:last"
+    assert identify(teacher) == {
+        "name": "scaled", "version": "2", "source": "mine:Scaled", "weights": "w.pt", "options": {"factor": 2.0}
+    }  # fmt: skip
+    write("def one(image):\n    return image[:, ::2]\n")
+    assert identify(load_teacher("mine:one"))["source"] == "mine:one"
 
 
 def test_identity_that_an_object_brings_is_its_own(write):
@@ -107,25 +83,6 @@ def test_identity_that_an_object_brings_is_its_own(write):
     teacher = load_teacher("mine:Scaled")
     assert identify(teacher) == {"version": 3}
     assert type(teacher).__name__ == "Scaled"
-
-
-def test_a_teacher_with_an_identity_stays_what_it_is(write):
-    moving = (
-        "    templates = 'siglip'\n    def to(self, device):\n        self.device = str(device)\n        return self\n"
-    )
-    write(CLASS + moving)
-    teacher = load_teacher("mine:Scaled", factor=2.0)
-    assert teacher.to("meta") is teacher
-    assert teacher.device == "meta"
-    assert float(teacher.encode_image(torch.ones(3, 1, 1)).sum()) == 6
-    assert embed_labels(teacher, ["wall"]).shape == (1, 3)
-    assert teacher.templates == "siglip"
-    assert copy.copy(teacher).factor == 2.0
-    with pytest.raises(AttributeError, match=tells("'absent'")):
-        _ = teacher.absent
-    write(CLASS)
-    still = load_teacher("mine:Scaled")
-    assert still.to("cpu") is still  # one that cannot be moved
 
 
 def test_modules_are_found_beside_the_command_but_the_path_stays(write):

@@ -91,17 +91,6 @@ def test_a_label_set_knows_what_made_it(tmp_path):
     assert make_label_set(TEACHER, ["wall"], negatives=["air"]).negatives.shape == (1, DIM)
 
 
-def test_rows_of_a_teacher_in_inference_mode_can_be_trained_with():
-    @torch.inference_mode()
-    def text(prompts):
-        return letters(prompts)
-
-    found = embed_labels(CallableTeacher(lambda image: image, text), ["wall", "chair"])
-    weight = torch.ones(2, DIM, requires_grad=True)
-    (found * weight).sum().backward()
-    assert weight.grad.equal(found)
-
-
 @pytest.mark.parametrize(
     ("names", "options", "message"),
     [

@@ -1,5 +1,3 @@
-import json
-
 import numpy as np
 import pytest
 import torch
@@ -30,10 +28,6 @@ def test_any_object_with_the_members_is_a_teacher():
     assert as_teacher(teacher) is teacher
 
 
-def test_an_object_that_lacks_text_is_not():
-    assert not isinstance(torch.nn.Linear(3, 3), Teacher)
-
-
 def test_a_function_becomes_a_teacher_of_its_name():
     teacher = as_teacher(halve)
     image = torch.rand(3, 4, 6, generator=torch.Generator().manual_seed(0))
@@ -41,10 +35,6 @@ def test_a_function_becomes_a_teacher_of_its_name():
     assert torch.equal(teacher.encode_image(image), image[:, ::2, ::2])
     with pytest.raises(NotImplementedError, match=tells("teacher 'halve':", "text encoder")):
         teacher.encode_text(["chair"])
-
-
-def test_repr_is_short():
-    assert repr(as_teacher(halve)) == "CallableTeacher('halve', text=False)"
 
 
 def test_text_of_a_function_comes_as_unit_rows():
@@ -55,71 +45,21 @@ def test_text_of_a_function_comes_as_unit_rows():
         few.encode_text(["a", "b"])
 
 
-@pytest.mark.parametrize(
-    ("returned", "error", "words"),
-    [
-        ([1.0], TypeError, ("[D, h, w]", "got a list")),
-        (torch.zeros(1, 3, 2, 2), ValueError, ("[D, h, w]", "got torch.float32 (1, 3, 2, 2)", "batch")),
-        (torch.zeros(3, 2, 0), ValueError, ("[D, h, w]", "got torch.float32 (3, 2, 0)")),
-        (torch.zeros(3, 2, 2, dtype=torch.int64), ValueError, ("[D, h, w]", "got torch.int64")),
-        (np.zeros((3, 2, 2)), TypeError, ("[D, h, w]", "got a ndarray", "torch.from_numpy(...)")),
-        (
-            torch.zeros(3, 2, 2).to_sparse(),
-            TypeError,
-            ("[D, h, w]", "torch.sparse_coo", "to_dense()"),
-        ),
-        (
-            torch.zeros(3, 2, 2, device="meta"),
-            TypeError,
-            ("[D, h, w]", "meta device"),
-        ),
-    ],
-)
-def test_what_is_no_map_is_refused(returned, error, words):
-    with pytest.raises(error, match=tells(*words)):
-        as_teacher(lambda image: returned).encode_image(torch.zeros(3, 4, 4))
-
-
 def test_what_is_neither_object_nor_function_is_refused():
     with pytest.raises(TypeError, match=tells("teacher:", "got int")):
         as_teacher(3)  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match=tells("teacher:", "Colour(...)")):
+    with pytest.raises(TypeError, match=tells("teacher:", "the class Colour")):
         as_teacher(Colour)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match=tells("images:", "got str")):
         CallableTeacher("lseg")  # type: ignore[arg-type]
 
 
-def test_identity_is_the_name_and_what_is_known_beside_it():
-    assert identify(Colour()) == {"name": "colour"}
-    assert identify(CallableTeacher(halve, identity={"weights": "abc"})) == {"name": "halve", "weights": "abc"}
-
-
-def test_functions_are_told_apart_by_place_and_code():
-    one, two = (identify(as_teacher(f)) for f in (lambda image: image, lambda image: 1 - image))
-    assert one["name"] == two["name"] == "lambda"
-    assert one["source"] == f"{__name__}:{test_functions_are_told_apart_by_place_and_code.__name__}.<locals>.<lambda>"
-    assert one["code"] != two["code"]
-    assert identify(as_teacher(halve)) == identify(CallableTeacher(halve))
-    assert json.loads(json.dumps(one)) == one
-
-
-@pytest.mark.filterwarnings("ignore:The PyTorch API of nested tensors:UserWarning")
-def test_nested_tensors_are_refused():
-    nested = torch.nested.nested_tensor([torch.zeros(2, 2), torch.zeros(3, 2)])
-    for layout in (nested, torch.nested.nested_tensor(list(nested.unbind()), layout=torch.jagged)):
-        with pytest.raises(TypeError, match=tells("teacher 'lambda':", "nested", "to_dense()")):
-            as_teacher(lambda image, layout=layout: layout).encode_image(torch.zeros(3, 4, 4))
-        with pytest.raises(TypeError, match=tells("image:", "[3, H, W]", "nested")):
-            check_picture(layout)
-
-
 @pytest.mark.parametrize(
     ("image", "error", "words"),
     [
-        (np.zeros((3, 8, 9)), TypeError, ("image:", "[3, H, W]", "got ndarray", "torch.from_numpy")),
-        ([[0.0]], TypeError, ("image:", "got list", "torch.as_tensor")),
-        (torch.zeros(3, 8, 9).to_sparse(), TypeError, ("image:", "[3, H, W]", "torch.sparse_coo")),
-        (torch.zeros(3, 8, 9, device="meta"), TypeError, ("image:", "[3, H, W]", "meta device")),
+        (np.zeros((8, 9)), ValueError, ("image:", "[3, H, W]", "got (8, 9)")),
+        (torch.zeros(3, 8, 9).to_sparse(), TypeError, ("image:", "sparse")),
+        (torch.zeros(3, 8, 9, device="meta"), TypeError, ("image:", "meta device")),
         (torch.zeros(8, 9, 3), ValueError, ("image:", "[3, H, W]", "got (8, 9, 3)")),
         (torch.zeros(3, 8, 9, dtype=torch.uint8), TypeError, ("image:", "[0, 1]", "got torch.uint8")),
         (torch.zeros(3, 8, 9, dtype=torch.complex64), TypeError, ("image:", "got torch.complex64")),
@@ -159,3 +99,8 @@ def test_text_of_a_function_is_asked_for_with_a_list():
     with pytest.raises(TypeError, match=tells("prompts:", "'wall'")):
         teacher.encode_text("wall")
     assert teacher.encode_text(("wall",)).shape == (1, 3)
+
+
+def test_identity_is_the_name_and_the_version():
+    assert identify(Colour()) == {"name": "colour"}
+    assert identify(CallableTeacher(halve, version="2")) == {"name": "halve", "version": "2"}

@@ -43,10 +43,6 @@ def test_sizes_of_the_encoder_follow_from_its_weights(teacher):
     assert not any(tensor.is_meta for tensor in teacher.encoder.state_dict().values())
 
 
-def test_repr_is_short(teacher):
-    assert repr(teacher) == "SamTeacher(device=cpu)"
-
-
 def test_map_of_a_wide_picture_loses_the_rows_of_the_padding(teacher, sam):
     image = torch.rand(3, 600, 1024)  # as wide as SAM wants it: no resampling
     mean = torch.tensor([123.675, 116.28, 103.53])[:, None, None]
@@ -89,11 +85,6 @@ def test_features_come_from_the_device_of_the_encoder(file):
     assert features.shape == (256, 48, 64)
 
 
-def test_pictures_of_bytes_are_refused(teacher):
-    with pytest.raises(TypeError, match=tells("image:", "[0, 1]", "got torch.uint8")):
-        teacher.encode_image(torch.zeros(3, 8, 8, dtype=torch.uint8))
-
-
 def test_pictures_that_are_not_finite_are_refused(teacher):
     with pytest.raises(ValueError, match=tells("image:", "[0, 1]", "got nan")):
         teacher.encode_image(torch.full((3, 8, 8), torch.nan))
@@ -114,7 +105,7 @@ def test_mobile_sam_is_recognised(tmp_path):
 def test_other_checkpoints_are_named(sam, tmp_path):
     path = tmp_path / "other.pth"
     torch.save({"visual.proj": torch.zeros(2)}, path)
-    with pytest.raises(ValueError, match=tells("other.pth:", "Segment Anything", "got 1 weights", "'visual.p")):
+    with pytest.raises(ValueError, match=tells("other.pth:", "Segment Anything", "got none")):
         load_sam(path)
     torch.save({"image_encoder.trunk.pos_embed": torch.zeros(2)}, path)
     with pytest.raises(ValueError, match=tells("other.pth:", "'patch_embed.proj.weight'")):

@@ -138,7 +138,7 @@ def test_loading_draws_no_bar_and_says_nothing(folder, capfd):
 
 def test_missing_package_names_the_line_to_install_it(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(ImportError, match=tells("transformers:", '`pip install "kfgs[hf]"`')):
+    with pytest.raises(ImportError, match=tells("transformers:", "kfgs[hf]")):
         load_transformers_teacher("clip", folder)
 
 
@@ -152,7 +152,7 @@ def test_package_that_does_not_import_is_named(folder, tmp_path, monkeypatch, er
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.syspath_prepend(str(tmp_path / "site"))
     kind = error.partition("(")[0]
-    with pytest.raises(ImportError, match=tells("transformers:", "import", f"({kind}: ", "--force-reinstall")) as got:
+    with pytest.raises(ImportError, match=tells("transformers:", "import", f"({kind}: ", "--upgrade")) as got:
         load_transformers_teacher("clip", folder)
     assert one_line(got)
 

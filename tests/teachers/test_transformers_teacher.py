@@ -12,7 +12,7 @@ from oracles_transformers import clip_features, siglip_features  # noqa: E402
 from tiny_transformers import CHANNELS, KINDS, write_teacher  # noqa: E402
 
 from kfgs.teachers import identify  # noqa: E402
-from kfgs.teachers.protocol import Teacher, check_features  # noqa: E402
+from kfgs.teachers.protocol import Teacher  # noqa: E402
 from kfgs.teachers.transformers_table import TRANSFORMERS  # noqa: E402
 from kfgs.teachers.transformers_teacher import fit_patches, load_transformers_teacher  # noqa: E402
 
@@ -49,7 +49,7 @@ def test_map_has_one_feature_per_patch(load, name):
     teacher = load(name)
     assert isinstance(teacher, Teacher)
     assert teacher.name == KINDS.get(name, name)
-    features = check_features(teacher.name, teacher.encode_image(picture()))
+    features = teacher.encode_image(picture())
     assert features.shape == (CHANNELS[name], 5, 7)
     assert features.dtype == torch.float32
     assert features.flatten(1).std(dim=1).min() > 1e-3  # it sees the picture
@@ -241,6 +241,7 @@ def test_features_come_from_the_device_of_the_model(load, name):
     teacher = load(name).to("meta")  # a device without values, on which a tensor of the CPU is refused
     features = teacher.encode_image(picture())
     assert features.device.type == "meta"
+    features = teacher.encode_image(picture())
     assert features.shape == (CHANNELS[name], 5, 7)
     if name in TEXT and not teacher.row.text.mask:  # transformers reads the values of masks
         assert teacher.encode_text(["wall", "a red chair"]).device.type == "meta"

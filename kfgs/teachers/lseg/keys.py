@@ -55,12 +55,13 @@ _UNUSED = re.compile(
     r"|scratch\.head_block\.|logit_scale$|.*\.num_batches_tracked$"
 )
 
-# Other networks by prefixes of their tensor names. The first rule that fits counts; LSeg's prefixes are checked before.
-_BY_PREFIX = (
+# Other networks by prefixes of their tensor names. The first rule that fits counts; LSeg's own are checked before.
+_OTHERS = (
+    (("pretrained.layer1",), "LSeg of backbone clip_resnet101, or another without a ViT"),
+    (("pretrained.", "scratch."), None),
     (("student.", "teacher."), "a self-supervised training checkpoint (DINO, iBOT)"),
-    (("image_encoder.", "mask_decoder.", "prompt_encoder.", "vision_encoder."), "a SAM checkpoint"),
-    (("visual.", "transformer.resblocks.", "token_embedding."), "CLIP alone, without LSeg's decoder"),
-    (("vision_model.", "text_model."), "CLIP or SigLIP of transformers, without LSeg's decoder"),
+    (("image_encoder.", "mask_decoder.", "vision_encoder."), "a SAM checkpoint"),
+    (("visual.", "transformer.resblocks.", "vision_model.", "text_model."), "CLIP alone, without LSeg's decoder"),
     (("conv1.", "layer1."), "a ResNet"),
     (("blocks.", "patch_embed.", "encoder.layer.", "embeddings."), "a ViT alone (DINO, timm), without LSeg's decoder"),
 )
@@ -139,34 +140,22 @@ def _shapes(module: nn.Module, names: Mapping[str, str]) -> dict[str, tuple[int,
 def _check(state: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]], source: str) -> None:
     """Raise unless the state holds float tensors of these names and shapes. Tensors known to be unused may be there too."""
     missing = [f"{name} {shape}" for name, shape in shapes.items() if name not in state]
-    unknown = [f"{one_line(name)} {tuple(value.shape)}" for name, value in state.items() if not _known(name, shapes)]
+    unknown = [one_line(name) for name in state if name not in shapes and not _UNUSED.match(name)]
     other = [
-        f"{name}: expected {shape}, got {tuple(state[name].shape)}"
+        f"{name}: expected {shape}, got {tuple(state[name].shape)} of {state[name].dtype}"
         for name, shape in shapes.items()
-        if name in state and tuple(state[name].shape) != shape
-    ]
-    other += [
-        f"{name}: expected floating point, got {state[name].dtype}"
-        for name, shape in shapes.items()
-        if name in state and tuple(state[name].shape) == shape and not state[name].is_floating_point()
+        if name in state and not (tuple(state[name].shape) == shape and state[name].is_floating_point())
     ]
     if not (missing or unknown or other):
         return
-    what = _recognise(state)
-    hint = "pass that file"
+    what = next((what for start, what in _OTHERS if any(name.startswith(start) for name in state)), None)
+    if state.get("scratch.head1.weight", torch.zeros(0)).shape[:1] == (768,) or "scratch.output_conv.0.weight" in state:
+        what = "LSeg or DPT of another backbone or head"
     if what is None:
         lists = ((missing, "missing"), (unknown, "unknown"), (other, "of another shape or type"))
-        parts = [f"{len(names)} {kind} ({_first(names)})" for names, kind in lists if names]
-        what, hint = f"{len(state)} tensors, {', '.join(parts)}", "use the file as its authors published it"
-    raise ValueError(f"{source}: expected {_EXPECTED}, got {what}; {hint}")
-
-
-def _known(name: str, shapes: Mapping[str, tuple[int, ...]]) -> bool:
-    return name in shapes or _UNUSED.match(name) is not None
-
-
-def _first(names: list[str]) -> str:
-    return "; ".join(names[:2]) + ("; ..." if len(names) > 2 else "")
+        what = f"{len(state)} tensors"
+        what += "".join(f", {len(names)} {kind} ({'; '.join(names[:2])})" for names, kind in lists if names)
+    raise ValueError(f"{source}: expected {_EXPECTED}, got {what}; use the file as its authors published it")
 
 
 def _as_float(state: Mapping[str, Tensor], names: Mapping[str, str]) -> dict[str, Tensor]:
@@ -189,33 +178,3 @@ def _fill(module: nn.Module, tensors: dict[str, Tensor]) -> None:
     counters = {name: torch.tensor(0) for name in module.state_dict() if name.endswith(_COUNTER)}
     module.requires_grad_(False).load_state_dict({**tensors, **counters}, assign=True)
     module.eval()
-
-
-def _recognise(state: Mapping[str, Tensor]) -> str | None:  # names without "net."
-    """Name the other network that a state belongs to, by its tensor names; None if it is LSeg's, or unknown."""
-    names = list(state)
-    if not names:
-        return "no tensors of its image network"
-    if any(name.startswith("pretrained.layer1") for name in names):
-        return "LSeg of backbone clip_resnet101, or another without a ViT"
-    if any(name.startswith(("pretrained.", "scratch.")) for name in names):
-        return _other_lseg(state)
-    return next((what for prefixes, what in _BY_PREFIX if any(name.startswith(prefixes) for name in names)), None)
-
-
-def _size(value: Tensor | None, axis: int) -> int | None:
-    """A tensor's size along an axis, if it has that axis."""
-    return value.shape[axis] if value is not None and -value.ndim <= axis < value.ndim else None
-
-
-def _other_lseg(state: Mapping[str, Tensor]) -> str | None:
-    patches, head = state.get("pretrained.model.patch_embed.proj.weight"), state.get("scratch.head1.weight")
-    positions = state.get("pretrained.model.pos_embed")
-    if _size(positions, -1) == 768:
-        size = 16 if _size(patches, -1) == 16 else 32
-        return f"LSeg of backbone clip_vitb{size}_384 (768 channels)"
-    if _size(head, 0) == 768:
-        return "LSeg of backbone clipRN50x16_vitl16_384 (features of 768 channels)"
-    if head is None and any(name.startswith("scratch.output_conv.") for name in state):
-        return "a DPT for depth or closed classes, without LSeg's head"
-    return None

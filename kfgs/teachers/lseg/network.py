@@ -12,23 +12,18 @@ from kornia.models.vit import MultiHeadAttention, VisionTransformer
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..._check import check_shapes, check_whole
+from ..._check import check_shapes
 
 _PATCH = 16  # the decoder enlarges the grid of tokens 8 times, which is half of 16
 
 
 @dataclass(frozen=True)
 class LSegConfig:
-    """Sizes of the network and of its text tower. The defaults are `demo_e200.ckpt`, backbone clip_vitl16_384.
-
-    Raises:
-        ValueError: if sizes contradict each other.
-    """
+    """Sizes of the network and of its text tower. The defaults are `demo_e200.ckpt`, backbone clip_vitl16_384."""
 
     width: int = 1024  # channels of a token
     depth: int = 24  # blocks of the ViT
     heads: int = 16
-    patch: int = 16  # pixels; the decoder works with no other
     position_grid: int = 24  # side of the checkpoint's square of position embeddings (384 pixels)
     window: int = 480  # pixels; side S of the network's input
     hooks: tuple[int, ...] = (5, 11, 17, 23)  # blocks whose outputs are decoded, from 0
@@ -42,39 +37,15 @@ class LSegConfig:
     vocabulary: int = 49408
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            for each in value if name == "neck" else () if name == "hooks" else (value,):
-                check_whole(name, each, 1)
-        if self.patch != _PATCH:
-            raise ValueError(
-                f"patch: expected {_PATCH}, got {self.patch}; the decoder is made for patches of that size"
-            )
-        if self.window % (2 * _PATCH):
-            raise ValueError(f"window: expected a multiple of {2 * _PATCH} pixels, got {self.window}; round it")
-        if len(self.hooks) != 4 or not all(
-            a < b for a, b in zip((-1, *self.hooks), (*self.hooks, self.depth), strict=True)
-        ):
-            raise ValueError(
-                f"hooks: expected four rising block numbers below depth = {self.depth}, got {self.hooks}; count from 0"
-            )
-        if len(self.neck) != 4:
-            raise ValueError(f"neck: expected four channel counts, one per hook, got {self.neck}; pass four")
-        for width, heads in (("width", "heads"), ("text_width", "text_heads")):
-            if getattr(self, width) % getattr(self, heads):
-                raise ValueError(
-                    f"{heads}: expected a divisor of {width} = {getattr(self, width)}, got {getattr(self, heads)}; "
-                    "heads share the channels evenly"
-                )
+        assert self.window % (2 * _PATCH) == 0, "windows are cut into patches, whose grid is halved once"
+        assert len(self.hooks) == len(self.neck) == 4
+        assert list(self.hooks) == sorted(self.hooks) and self.hooks[-1] < self.depth  # noqa: PT018
+        assert self.width % self.heads == self.text_width % self.text_heads == 0
 
     @property
     def grid(self) -> int:
         """Tokens along a side of the window."""
-        return self.window // self.patch
-
-    @property
-    def mlp(self) -> int:
-        """Hidden channels of a ViT block's MLP, fixed by kornia's ViT."""
-        return 4 * self.width
+        return self.window // _PATCH
 
 
 class LSegNetwork(nn.Module):
@@ -87,7 +58,7 @@ class LSegNetwork(nn.Module):
     def __init__(self, config: LSegConfig) -> None:
         super().__init__()
         self.config = config
-        self.vit = VisionTransformer(config.window, config.patch, 3, config.width, config.depth, config.heads)
+        self.vit = VisionTransformer(config.window, _PATCH, 3, config.width, config.depth, config.heads)
         self.vit.norm = nn.Identity()  # LSeg decodes the outputs of blocks; the last norm is unused
         for block in self.vit.encoder.blocks:
             block[0].fn[1] = _Attention(config.width, config.heads, 0.0, 0.0)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -12,16 +13,65 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..bpe import load_tokenizer
+from ..._check import check_choice, check_range, check_size
 from ..checkpoint import read_checkpoint, weights_digest
 from ..protocol import PROMPTS_AT_ONCE, check_picture, check_prompts
+from ..tokenizer import tokenize
 from .keys import network_from_state, text_from_state
 from .network import LSegConfig, LSegNetwork
-from .options import LSegOptions
 from .text import ClipText
-from .windows import multi_scale_features
+from .windows import BASE_OVER_CROP, multi_scale_features
 
-Tokenize = Callable[[list[str]], Tensor]  # n prompts -> [n, 77] int64
+PAPER_SCALES = (0.75, 1.0, 1.25, 1.75)
+Size = Literal["auto"] | tuple[int, int] | None
+
+
+@dataclass(frozen=True)
+class LSegOptions:
+    """How LSeg looks at a picture. The defaults are the paper's, except that pictures that are not 4:3 keep their aspect."""
+
+    scales: tuple[float, ...] = PAPER_SCALES
+    """Scales whose features are summed; 1 is a long side of 520 pixels."""
+    flip: bool = True
+    """Average with the features of the mirrored picture."""
+    size: Size = "auto"
+    """Size of the map, and of the resized picture. "auto": long side 480 pixels, or the picture's if that is smaller, aspect
+    kept, rounded half up. (height, width): this size if the picture is wider than `width`, else the picture's, as in the
+    paper's script, with any aspect; the paper's is (360, 480). None: the picture's size."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Arithmetic of the network; the features are float32 in any case."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "scales", tuple(float(scale) for scale in self.scales))
+        if not self.scales:
+            raise ValueError("scales: expected at least one scale, got none; pass (1.0,)")
+        for scale in self.scales:
+            check_range("scales", scale, 0.0, 16.0, closed=(False, True))  # 8320 pixels; more is a slip
+        check_choice("precision", self.precision, ("float32", "bfloat16"))
+        if self.size is not None and self.size != "auto":
+            check_size(self.size)
+            object.__setattr__(self, "size", tuple(map(int, self.size)))
+
+    @staticmethod
+    def fast() -> LSegOptions:
+        """One scale, one window, no mirroring: the network runs once for a picture, whatever its shape, not 26 times."""
+        return LSegOptions(scales=(1 / BASE_OVER_CROP,), flip=False)
+
+    def map_size(self, height: int, width: int, *, window: int = 480) -> tuple[int, int]:
+        """Size (h, w) of the map of a picture of that size.
+
+        Example:
+            >>> LSegOptions().map_size(480, 640), LSegOptions().map_size(479, 639), LSegOptions().map_size(640, 360)
+            ((360, 480), (360, 480), (480, 270))
+        """
+        if self.size is None or (self.size == "auto" and max(height, width) <= window):
+            return height, width
+        if self.size == "auto":
+            ratio = window / max(height, width)
+            h, w = (max(1, math.floor(side * ratio + 0.5)) for side in (height, width))
+            return h, w
+        assert not isinstance(self.size, str)
+        return self.size if width > self.size[1] else (height, width)
 
 
 class LSeg(nn.Module):
@@ -32,8 +82,8 @@ class LSeg(nn.Module):
     Args:
         network: the image network, in evaluation mode.
         options: how pictures are evaluated.
-        load_text: loads the text tower and its tokenizer at the first prompt; None: the teacher has no text encoder.
-        digest: computes the SHA-256 of the weights; called when `identity` is first read.
+        load_text: loads the text tower at the first prompt; None: the teacher has no text encoder.
+        weights: computes the SHA-256 of the weights; called when `identity` is first read.
     """
 
     name = "lseg"
@@ -43,17 +93,14 @@ class LSeg(nn.Module):
         network: LSegNetwork,
         options: LSegOptions | None = None,
         *,
-        load_text: Callable[[], tuple[ClipText, Tokenize]] | None = None,
-        digest: Callable[[], str] | None = None,
+        load_text: Callable[[], ClipText] | None = None,
+        weights: Callable[[], str | None] = lambda: None,
     ) -> None:
         super().__init__()
         self.network = network
         self.options = LSegOptions() if options is None else options
         self.text: ClipText | None = None
-        self._tokenizer: Tokenize | None = None
-        self._load_text = load_text
-        self._digest = digest
-        self._weights: str | None = None
+        self._load_text, self._digest, self._weights = load_text, weights, None
         self.eval()
 
     def __repr__(self) -> str:
@@ -71,12 +118,9 @@ class LSeg(nn.Module):
     @property
     def identity(self) -> dict[str, Any]:
         """JSON of what decides the features: options, SHA-256 of the checkpoint (taken once), sizes if not LSeg's own."""
-        if self._weights is None and self._digest is not None:
-            self._weights = self._digest()
-        found: dict[str, Any] = {"name": self.name, "options": _plain(self.options), "weights": self._weights}
-        if self.network.config != LSegConfig():
-            found["config"] = _plain(self.network.config)
-        return found
+        self._weights = self._weights or self._digest()
+        known: dict[str, Any] = {"name": self.name, "options": _plain(self.options), "weights": self._weights}
+        return known if self.network.config == LSegConfig() else known | {"config": _plain(self.network.config)}
 
     @torch.no_grad()
     def encode_image(self, image: Tensor) -> Tensor:  # [3, H, W] RGB in [0, 1] -> [D, h, w] float32
@@ -84,10 +128,6 @@ class LSeg(nn.Module):
 
         The picture is resized to it (bilinear, corners aligned, no antialiasing, as in the paper's script), and
         evaluated in windows; see `windows.multi_scale_features`.
-
-        Raises:
-            TypeError: if `image` is no tensor of floats.
-            ValueError: if it is not a finite picture [3, H, W] in [0, 1].
         """
         check_picture(image)
         window = self.network.config.window
@@ -104,27 +144,19 @@ class LSeg(nn.Module):
         """One unit row per prompt, as it stands: LSeg is given bare labels, without a sentence around them.
 
         Raises:
-            TypeError: if `prompts` is one text, or holds something else than texts.
             ValueError: if there are none, or one is too long.
             NotImplementedError: if the teacher was made without text.
-            FileNotFoundError: if the vocabulary of CLIP's tokenizer is not found.
         """
         check_prompts(prompts)
         if self.text is None:
-            self._bring_text()
-        assert self.text is not None
-        assert self._tokenizer is not None
-        ids = self._tokenizer(list(prompts)).to(self.device)  # [n, 77]
+            if self._load_text is None:
+                raise NotImplementedError(
+                    "teacher 'lseg': expected one with a text tower, got one made without; load it with load_lseg"
+                )
+            self.text = self._load_text().to(self.device).eval()
+        ids = tokenize(prompts, self.network.config.context).to(self.device)
         rows = torch.cat([self.text(part) for part in ids.split(PROMPTS_AT_ONCE)])
         return functional.normalize(rows.float(), dim=1)
-
-    def _bring_text(self) -> None:
-        if self._load_text is None:
-            raise NotImplementedError(
-                "teacher 'lseg': expected one with a text tower, got one made without; load it with load_lseg"
-            )
-        text, self._tokenizer = self._load_text()
-        self.text = text.to(self.device).eval()
 
     def _head(self, x: Tensor) -> Tensor:  # [1, 3, S, S] -> [1, D, S/2, S/2] float32
         with torch.autocast(x.device.type, torch.bfloat16, enabled=self.options.precision == "bfloat16"):
@@ -135,12 +167,11 @@ class LSeg(nn.Module):
 def load_lseg(
     weights: str | Path,
     *,
-    options: LSegOptions | None = None,
-    size: Literal["auto"] | tuple[int, int] | None = "auto",
+    fast: bool = False,
+    size: Size = "auto",
     scales: Sequence[float] | None = None,
     flip: bool | None = None,
-    fast: bool = False,
-    bpe: str | Path | None = None,
+    precision: Literal["float32", "bfloat16"] = "float32",
     config: LSegConfig | None = None,
 ) -> LSeg:
     """Load LSeg from the checkpoint its authors published, `demo_e200.ckpt` (backbone clip_vitl16_384).
@@ -149,54 +180,26 @@ def load_lseg(
 
     Args:
         weights: the checkpoint, or its tensors in a .pt or .safetensors file.
-        options: how pictures are evaluated, as a whole; or by the next four.
+        fast: one run of the network per picture (`LSegOptions.fast`) instead of the paper's 26.
         size: see `LSegOptions.size`.
-        scales: see `LSegOptions.scales`; those of the paper, or of `fast`, if None.
-        flip: see `LSegOptions.flip`; True, or False if `fast`, if None.
-        fast: start from `LSegOptions.fast()`, not from the paper's options.
-        bpe: the vocabulary of CLIP's tokenizer; see `load_tokenizer` for where it is looked for if None.
+        scales: see `LSegOptions.scales`; None: the paper's, or those of `fast`.
+        flip: see `LSegOptions.flip`; None: True, or False if `fast`.
+        precision: see `LSegOptions.precision`.
         config: sizes of the network, LSeg's own if None.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if the file is damaged or of another network, or options are given twice.
+        ValueError: if the file is damaged or of another network.
     """
-    config = LSegConfig() if config is None else config
-    options = _options(options, size, scales, flip, fast)
-    network = network_from_state(read_checkpoint(weights), config, source=str(weights))
-    return LSeg(
-        network,
-        options,
-        load_text=partial(_load_text, weights, bpe, config),
-        digest=partial(weights_digest, weights),
-    )
+    config, base = config or LSegConfig(), LSegOptions.fast() if fast else LSegOptions()
+    scales, flip = base.scales if scales is None else tuple(scales), base.flip if flip is None else flip
+    options, source = LSegOptions(scales, flip, size, precision), str(weights)
 
+    def load_text() -> ClipText:
+        return text_from_state(read_checkpoint(weights), config, source=source)
 
-def _options(
-    options: LSegOptions | None,
-    size: Literal["auto"] | tuple[int, int] | None,
-    scales: Sequence[float] | None,
-    flip: bool | None,
-    fast: bool,
-) -> LSegOptions:
-    if options is not None:
-        if size != "auto" or scales is not None or flip is not None or fast:
-            raise ValueError(
-                "options: expected either options or size, scales, flip, fast, got both; use dataclasses.replace"
-            )
-        return options
-    base = LSegOptions.fast() if fast else LSegOptions()
-    return replace(
-        base,
-        size=size,
-        scales=base.scales if scales is None else tuple(scales),
-        flip=base.flip if flip is None else flip,
-    )
-
-
-def _load_text(weights: str | Path, bpe: str | Path | None, config: LSegConfig) -> tuple[ClipText, Tokenize]:
-    tokenizer = load_tokenizer(bpe)  # first, it is the one that may be missing
-    return text_from_state(read_checkpoint(weights), config, source=str(weights)), tokenizer
+    network = network_from_state(read_checkpoint(weights), config, source=source)
+    return LSeg(network, options, load_text=load_text, weights=partial(weights_digest, weights))
 
 
 def _plain(values: LSegOptions | LSegConfig) -> dict[str, Any]:

@@ -14,14 +14,12 @@ float64; the script's own resizing places samples in float32, up to 3e-5 of a pi
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional
-
-from ..._check import check_range, check_shapes
 
 BASE_OVER_CROP = 520 / 480  # a picture at scale 1 has a long side of 520 pixels, where the window has 480
 _PADDING = -1.0  # black, once pictures are brought to [-1, 1]
@@ -53,13 +51,6 @@ def window_starts(length: int, window: int) -> list[int]:
     return [i * stride for i in range(math.ceil(max(0, length - window) / stride) + 1)]
 
 
-def count_forwards(height: int, width: int, *, window: int, scales: Sequence[float], flip: bool) -> int:
-    """How often the network runs for one picture of that size: 26 times for 360 x 480 with the paper's settings."""
-    sizes = [scaled_size(height, width, scale, window) for scale in scales]
-    windows = sum(len(window_starts(h, window)) * len(window_starts(w, window)) for h, w in sizes)
-    return (1 + flip) * windows
-
-
 def multi_scale_features(
     picture: Tensor,  # [3, H, W], -1 (black) to 1
     head: Callable[[Tensor], Tensor],
@@ -83,15 +74,10 @@ def multi_scale_features(
 
     Returns:
         A *sum* over scales, as in the script; not normalised.
-
-    Raises:
-        ValueError: if a scale is not positive, or `head` returns another shape.
     """
-    sizes = check_shapes(("picture", picture, "3 H W"))
-    H, W = sizes["H"], sizes["W"]
+    _, H, W = picture.shape
     result: Tensor | None = None
     for scale in scales:
-        check_range("scales", scale, 0.0, closed=(False, True))
         h, w = scaled_size(H, W, scale, window)
         image = functional.interpolate(picture[None], size=(h, w), mode="bilinear", align_corners=True)
         rows, columns = _parts(h, H, window), _parts(w, W, window)
@@ -101,16 +87,13 @@ def multi_scale_features(
                 if result is None:
                     result = features.new_zeros(features.shape[0], H, W)
                 _add_(result, features, row, column)
-    if result is None:
-        raise ValueError("scales: expected at least one scale, got none; pass (1.0,)")
+    assert result is not None, "at least one scale"
     return result
 
 
 def _features(image: Tensor, head: Callable[[Tensor], Tensor], flip: bool) -> Tensor:  # [D, S/2, S/2]
     """The network's output for a window, averaged with that of the mirrored window."""
-    half = image.shape[-1] // 2
     features = head(image)
-    check_shapes(("head's output", features, (1, "D", half, half)))
     if flip:
         features = features.lerp(head(image.flip(-1)).flip(-1), 0.5)
     return features[0]
@@ -126,13 +109,10 @@ def _cut(image: Tensor, top: int, left: int, window: int) -> Tensor:  # [1, 3, w
 def _add_(result: Tensor, features: Tensor, row: _Part, column: _Part) -> None:
     """Add A G B^T of one window to `result`, in place, some channels at a time."""
     A, B = (part.matrix.to(features.dtype).to(features.device) for part in (row, column))
-    for channels in _chunks(len(features)):
+    for start in range(0, len(features), _CHANNELS):
+        channels = slice(start, start + _CHANNELS)
         across = features[channels] @ B.T  # [c, S/2, columns]
         result[channels, row.low : row.high, column.low : column.high] += A @ across
-
-
-def _chunks(D: int) -> Iterator[slice]:
-    return (slice(start, start + _CHANNELS) for start in range(0, D, _CHANNELS))
 
 
 def _parts(length: int, out: int, window: int) -> list[_Part]:

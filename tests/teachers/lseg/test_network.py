@@ -124,25 +124,7 @@ def test_a_window_of_another_size_is_refused(case):
 
 def test_the_defaults_are_those_of_the_released_checkpoint():
     config = LSegConfig()
-    assert (config.grid, config.mlp) == (30, 4096)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"patch": 14}, ("patch:", "expected 16", "got 14")),
-        ({"window": 72}, ("window:", "32", "got 72")),
-        ({"hooks": (0, 1, 2)}, ("hooks:", "got (0, 1, 2)")),
-        ({"hooks": (0, 1, 2, 5)}, ("hooks:", "got (0, 1, 2, 5)")),
-        ({"neck": (8, 8)}, ("neck:", "got (8, 8)")),
-        ({"heads": 5}, ("heads:", "32", "got 5")),
-        ({"text_heads": 3}, ("text_heads:", "text_width", "16", "got 3")),
-        ({"depth": 0}, ("depth:", "[1, inf)", "got 0")),
-    ],
-)
-def test_sizes_that_contradict_are_refused(change, message):
-    with pytest.raises(ValueError, match=tells(*message)):
-        LSegConfig(**{**SIZES, **change})
+    assert config.grid == 30
 
 
 def test_with_all_channels_it_is_still_transformers_dpt_and_clip():

@@ -5,7 +5,6 @@ import pytest
 import torch
 from lseg_layout import TINY as TINY_LSEG
 from lseg_layout import random_state
-from messages import tells
 from torch.nn import functional
 
 from kfgs.teachers.lseg.keys import text_from_state
@@ -58,11 +57,3 @@ def test_planted_mistakes_are_noticed(state, monkeypatch):
     for block in tower.blocks:
         block.norm1.eps = 1e-6
     assert relative(tower(IDS), expected) > 1e-9
-
-
-def test_tokens_of_another_length_or_kind_are_refused(state):
-    tower = text_from_state(state, TINY, source="tiny")
-    with pytest.raises(ValueError, match=tells("ids:", "[n, 9]", "got (3, 8)")):
-        tower(IDS[:, :8])
-    with pytest.raises(ValueError, match=tells("ids:", "int64", "got torch.float32")):
-        tower(IDS.float())
