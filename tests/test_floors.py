@@ -24,7 +24,7 @@ FLOORS = (
     {"splat", "quant", "metrics"},
     {"formats"},
     {"scenes", "labels"},
-    {"toy", "align"},
+    {"toy"},
     {"teachers", "fields", "viz"},
     {"features", "viewer"},
     {"evaluation"},
