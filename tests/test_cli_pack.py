@@ -76,7 +76,7 @@ def test_other_commands_take_the_file(place, tmp_path, capsys):
     assert main(["info", str(packed)]) == 0
     said = capsys.readouterr().out
     assert "400 Gaussians" in said
-    assert "rounded: precision small" in said
+    assert "rounded: small" in said
     assert "one file of 0.0" in said
     assert main(["label", str(packed), "--out", str(tmp_path / "labelled")]) == 0
     labels = read_splats(tmp_path / "labelled" / "gaussians.ply").labels

@@ -31,6 +31,11 @@ class Merged(NamedTuple):
     weights: Tensor  # [M] sums of their members' weights
     source: Tensor  # [N] int64, the merged Gaussian of each old one; -1 = dropped
 
+    def pool(self, values: Tensor) -> Tensor:  # [N, ...] -> [M, ...]
+        """Sums over the members of each merged Gaussian."""
+        kept = self.source >= 0
+        return _sum(values[kept], self.source[kept], len(self.gaussians))
+
 
 def merge_gaussians(
     gaussians: Gaussians,

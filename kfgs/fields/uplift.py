@@ -19,14 +19,13 @@ from tqdm import tqdm
 from .._check import check_range, check_whole
 from .._progress import as_bar
 from .._rows import row_norms, unit_rows
-from .._typed import typed
 from ..cameras import Camera
 from ..formats.values import check_splats
 from ..gaussians import Gaussians
 from ..quant import FeatureMaps
 from ..quant.linear import LinearLatents, fit_linear_latents
 from .decoders import Linear
-from .merge import FAINT, Merged, merge_gaussians
+from .merge import FAINT, merge_gaussians
 from .semantic_field import Seen, SemanticField
 from .uplift_passes import average, correct, per_weight, some
 from .working_maps import WorkingMaps, working_directions
@@ -68,7 +67,6 @@ class UpliftConfig:
         return UpliftConfig(**({"max_gaussians": 50_000} | changes))
 
 
-@typed
 def uplift_maps(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
@@ -112,46 +110,52 @@ def uplift_maps(
         To continue by training, start `fit_field` with `GaussianParams.from_gaussians(field.gaussians)` and the maps
         `field.decoder.latents.encode(unit features)`.
     """
-    config, progress = config or UpliftConfig(), as_bar(progress)
+    config, progress, count = config or UpliftConfig(), as_bar(progress), len(cameras)
     say = report if report is not None else lambda text: None
-    cloud = _checked(gaussians, cameras, maps)
-    steps = len(cameras) * (1 + config.corrections + (config.max_gaussians is not None and config.corrections > 0))
-    with torch.no_grad(), tqdm(total=steps, desc="uplift", unit="view", disable=not progress) as bar:
+    if count == 0 or count != len(maps):
+        raise ValueError(
+            f"maps: expected one per camera ({count}, at least one), got {len(maps)}; pass the views that have maps"
+        )
+    if len(gaussians) == 0:
+        raise ValueError("gaussians: expected at least one, got none; there is nothing to carry features to")
+    cloud = gaussians.replace(sh=None, features=None, labels=None, scores=None, names=(), extra={}).detach()
+    check_splats(cloud)
+    cloud = cloud.to(torch.promote_types(cloud.means.dtype, torch.float32))
+    passes = 1 + config.corrections + (config.max_gaussians is not None and config.corrections > 0)
+    with torch.no_grad(), tqdm(total=count * passes, desc="uplift", unit="view", disable=not progress) as bar:
         directions = (working_directions(maps) if latents is None else latents.basis).to(cloud.means)
         with WorkingMaps(cameras, maps, directions, config.pixels, scratch) as views:
             sums, shown = average(cloud, views, bar)
-            _check_shown(shown, cameras, say)
-            means = _mean(sums)
+            if not bool((shown > 0).any()):
+                raise ValueError(
+                    "cameras: expected views that show the Gaussians, got none that does; do both share one frame?"
+                )
+            filled = float(shown.sum()) / sum(camera.width * camera.height for camera in cameras)
+            if filled < SPARSE:
+                say(f"note: the Gaussians fill {filled:.0%} of the views; are they in the cameras' frame?")
+            means = per_weight(sums.sum(0))
             agreement = row_norms(means).clamp_max(1)
             if latents is None:
-                fitted = fit_linear_latents(
-                    unit_rows(means), _capped(shown), keep=config.keep, maximum=config.max_latents
-                )
-                views.project(fitted.basis)
-                sums = torch.cat([sums[..., :-1] @ fitted.basis, sums[..., -1:]], dim=-1)
-                latents = LinearLatents((directions.double() @ fitted.basis.double()).to(directions))
-            say(f"fused {len(cameras)} maps of {latents.dim} channels as {latents.latent} latents")
+                options: dict[str, Any] = {"keep": config.keep, "maximum": config.max_latents}
+                fitted = fit_linear_latents(unit_rows(means), _capped(shown), **options).basis
+                views.project(fitted)
+                sums = torch.cat([sums[..., :-1] @ fitted, sums[..., -1:]], dim=-1)
+                latents = LinearLatents((directions.double() @ fitted.double()).to(directions))
+            say(f"fused {count} maps of {latents.dim} channels as {latents.latent} latents")
             for _ in range(config.corrections):
                 sums = correct(cloud, sums, views, bar)
             if config.max_gaussians is not None:
-                merged = merge_gaussians(
-                    cloud.replace(features=_mean(sums)),
-                    shown,
-                    config.max_gaussians,
-                    faint=config.faint,
-                    generator=generator,
-                )
+                cloud = cloud.replace(features=per_weight(sums.sum(0)))
+                merged = merge_gaussians(cloud, shown, config.max_gaussians, faint=config.faint, generator=generator)
                 say(f"{len(merged.gaussians)} of {len(cloud)} Gaussians left")
-                cloud, agreement = merged.gaussians, _pooled(agreement * shown, merged) / some(merged.weights)
-                shown = merged.weights
-                sums = torch.stack([_pooled(half, merged) for half in sums])
+                agreement = merged.pool(agreement * shown) / some(merged.weights)
+                cloud, shown, sums = merged.gaussians, merged.weights, torch.stack([merged.pool(half) for half in sums])
                 if config.corrections:
                     sums = correct(cloud, sums, views, bar)
-    fused = cloud.replace(features=_mean(sums))
+    fused = cloud.replace(features=per_weight(sums.sum(0)))
     return SemanticField(fused, Linear(latents), tuple(cameras), seen=Seen(shown, agreement))
 
 
-@typed
 def sample_latents(maps: FeatureMaps, *, count: int = 32, views: int = 256) -> LinearLatents:
     """Latents for several fields of one teacher: the main directions of features that are sampled from their maps.
 
@@ -163,45 +167,7 @@ def sample_latents(maps: FeatureMaps, *, count: int = 32, views: int = 256) -> L
     Raises:
         ValueError: if a map is not finite, or all are zero.
     """
-    check_whole("count", count, 1)
-    check_whole("views", views, 1)
     return LinearLatents(working_directions(maps, count, views))
-
-
-def _checked(gaussians: Gaussians, cameras: Sequence[Camera], maps: FeatureMaps) -> Gaussians:
-    """The Gaussians without colours and features, after a check of the arguments of `uplift_maps`."""
-    if len(gaussians) == 0:
-        raise ValueError("gaussians: expected at least one, got none; there is nothing to carry features to")
-    if len(cameras) == 0 or len(cameras) != len(maps):
-        raise ValueError(
-            f"maps: expected one per camera ({len(cameras)}, at least one), got {len(maps)}; pass the views that have maps"
-        )
-    cloud = gaussians.replace(sh=None, features=None, labels=None, scores=None, names=(), extra={}).detach()
-    check_splats(cloud)
-    return cloud.to(torch.promote_types(cloud.means.dtype, torch.float32))
-
-
-def _check_shown(shown: Tensor, cameras: Sequence[Camera], say: Callable[[str], None]) -> None:
-    """Refuse views that show no Gaussian, and say if they show few."""
-    if not bool((shown > 0).any()):
-        raise ValueError(
-            "cameras: expected views that show the Gaussians, got none that does; do both share one frame?"
-        )
-    filled = float(shown.sum()) / sum(camera.width * camera.height for camera in cameras)
-    if filled < SPARSE:
-        say(f"note: the Gaussians fill {filled:.0%} of the views; are they in the cameras' frame?")
-
-
-def _mean(sums: Tensor) -> Tensor:  # [2, N, d + 1] -> [N, d]
-    """The mean feature over both halves of the views; 0 if no view shows the Gaussian."""
-    return per_weight(sums.sum(0))
-
-
-def _pooled(values: Tensor, merged: Merged) -> Tensor:  # [N, ...] -> [M, ...]
-    """Sums over the members of each merged Gaussian."""
-    rows = merged.source >= 0
-    sums = values.new_zeros(len(merged.gaussians), *values.shape[1:])
-    return sums.index_add_(0, merged.source[rows], values[rows])
 
 
 def _capped(weights: Tensor) -> Tensor:

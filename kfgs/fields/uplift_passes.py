@@ -20,16 +20,13 @@ NEIGHBOURS = 17  # a Gaussian and its 16 nearest, whose corrections are judged t
 def average(cloud: Gaussians, views: WorkingMaps, bar: Any) -> tuple[Tensor, Tensor]:  # [2, N, d' + 1], [N]
     """Sums of features and weights, over the even and the odd views, and the number of pixels that each Gaussian fills."""
     sums, shown = cloud.means.new_zeros(2, len(cloud), views.channels + 1), torch.zeros_like(cloud.opacities)
-
-    def look(i: int) -> dict[str, Tensor]:
+    for i in range(len(views)):
         camera, features, _, scale = views[i]
-        return _part(cloud, camera, features, scale)
-
-    for i, part in enumerate(map(look, range(len(views)))):
+        index, total = _sum_known(cloud, camera, features)
         half = sums[i % 2]
         before = half[:, -1].clone()
-        half.index_add_(0, part["index"], part["total"])
-        shown += float(part["scale"]) * (half[:, -1] - before)
+        half.index_add_(0, index, total)
+        shown += scale * (half[:, -1] - before)
         bar.update()
     return sums, shown
 
@@ -41,15 +38,12 @@ def correct(cloud: Gaussians, sums: Tensor, views: WorkingMaps, bar: Any) -> Ten
     neighbours (`reliability`); both take the reliable share. Returns the corrected sums.
     """
     halves, lacking = per_weight(sums), torch.zeros_like(sums)
-
-    def look(i: int) -> dict[str, Tensor]:
-        camera, features, factor, scale = views[i]
+    for i in range(len(views)):
+        camera, features, factor, _ = views[i]
         rendered, alpha, _ = rasterize(cloud.replace(features=halves[i % 2]), camera)
         covered = shrink_map(alpha[..., None], factor)  # the rest of the pixel is empty: no Gaussian can explain it
-        return _part(cloud, camera, covered * features - shrink_map(rendered, factor), scale)
-
-    for i, part in enumerate(map(look, range(len(views)))):
-        lacking[i % 2].index_add_(0, part["index"], part["total"])
+        index, total = _sum_known(cloud, camera, covered * features - shrink_map(rendered, factor))
+        lacking[i % 2].index_add_(0, index, total)
         bar.update()
     corrections, weights = per_weight(lacking), sums[..., -1:]
     share = reliability(corrections[0], corrections[1], _neighbours(cloud.means))[:, None]
@@ -86,12 +80,11 @@ def some(weights: Tensor) -> Tensor:
     return weights.clamp_min(torch.finfo(weights.dtype).tiny)
 
 
-def _part(cloud: Gaussians, camera: Camera, signal: Tensor, scale: float) -> dict[str, Tensor]:  # signal [h, w, c]
-    """What one view adds to the rows `index` [M]: `total` [M, c + 1], the sums of the signal by rendering weight and, in the last
-    column, the weight of the known pixels. A weight of 1 stands for `scale` original pixels.
+def _sum_known(cloud: Gaussians, camera: Camera, signal: Tensor) -> tuple[Tensor, Tensor]:  # signal [h, w, c]
+    """What one view adds to some rows [M] of the cloud: the sums of the signal by rendering weight and, in the last column, the
+    weight of the known pixels [M, c + 1].
     """
     known = ~signal[..., :1].isnan()
     both = torch.cat([torch.where(known, signal, 0), known.to(signal)], dim=-1)
-    both = resize_map(both, camera.size).contiguous()
-    index, total, _ = sum_pixels(cloud, camera, both)
-    return {"index": index, "total": total, "scale": torch.tensor(scale, dtype=torch.float64)}
+    index, total, _ = sum_pixels(cloud, camera, resize_map(both, camera.size).contiguous())
+    return index, total

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 from .._arrays import read_arrays
-from .._check import as_tensor, check_shapes
+from .._check import check_shapes
 from .._files import atomic_path
 from .._rows import ENCODE, EPS, check_directions, row_norms, unit_rows
 from ..cameras import Camera
 from ..cameras.resample import from_bchw, to_bchw
 from ..quant import FeatureMaps
 from ..quant.linear import principal_directions
-from ..quant.sampling import read_blocks, sample_grid
+from ..quant.sampling import read_blocks, read_grid
 
 WORKING = 64
 """Number of working directions. For room_0's maps they keep 98.8 % of the energy; the rest is noise of single pixels. The
@@ -27,13 +27,8 @@ latents found in them keep a cosine above 0.99 with the average of all 512 chann
 LOOKED_AT = 32, 2_000  # the working directions are found in so many views, and so many features of each
 
 
-def shrink_map(
-    map: Tensor,  # [H, W, D]
-    divisor: int,
-) -> Tensor:  # [H // divisor, W // divisor, D]
-    """The mean of each block of divisor x divisor pixels; NaN if one is NaN. Incomplete blocks at the bottom and right are
-    dropped.
-    """
+def shrink_map(map: Tensor, divisor: int) -> Tensor:  # [H, W, D] -> [H // divisor, W // divisor, D]
+    """The mean of each block of divisor x divisor pixels; NaN if one is NaN. Incomplete blocks at the ends are dropped."""
     return from_bchw(torch.nn.functional.avg_pool2d(to_bchw(map), divisor))
 
 
@@ -53,13 +48,13 @@ class WorkingMaps:
         self,
         cameras: Sequence[Camera],
         maps: FeatureMaps,
-        directions: Tensor,
+        directions: Tensor,  # [D, d']
         pixels: int,
         scratch: Path | None,
     ) -> None:
         self._cameras, self._maps, self._directions, self._pixels = cameras, maps, directions, pixels
         self._temporary = tempfile.TemporaryDirectory(prefix="kfgs_") if scratch is None else None
-        self._folder = Path(self._temporary.name) if self._temporary is not None else Path(scratch or "")
+        self._folder = Path(self._temporary.name) if scratch is None and self._temporary else Path(scratch or "")
         self._basis: Tensor | None = None
 
     def __enter__(self) -> WorkingMaps:
@@ -103,17 +98,23 @@ class WorkingMaps:
         if not file.is_file():
             rows, shape = self._make(i)
             with atomic_path(file) as path, path.open("wb") as opened:
-                # not rounded, so that a run that goes on gives the same bits
+                # not rounded, so that a run that continues gives the same bits
                 np.savez(opened, rows=rows.cpu().numpy(), shape=np.asarray(shape))
             return rows, torch.tensor(shape, dtype=torch.float64)
-        found = read_arrays(file)
-        rows = torch.from_numpy(found["rows"]).to(self._directions)
-        return rows, torch.from_numpy(found["shape"]).double()
+        arrays = read_arrays(file)
+        return torch.from_numpy(arrays["rows"]).to(self._directions), torch.from_numpy(arrays["shape"]).double()
 
     def _make(self, i: int) -> tuple[Tensor, tuple[int, int]]:  # [h, w, d']
-        """Read a map in the working directions, and shrink it to its working size."""
-        found = [self._to_directions(i, block) for block in read_blocks(self._maps, i)]
-        rows, known = (torch.cat(parts) for parts in zip(*found, strict=True))
+        """Read a map as unit features in the working directions, and shrink it to its working size."""
+        parts, masks = [], []
+        for block in read_blocks(self._maps, i):  # [r, w, D]
+            check_shapes((f"maps[{i}]", block, ("h", "w", len(self._directions))))
+            features = block.to(self._directions)
+            lengths = row_norms(features)
+            check_directions(f"maps[{i}]", features, lengths, ENCODE)
+            masks.append((lengths > EPS)[..., None])
+            parts.append((features @ self._directions) / lengths.clamp_min(EPS)[..., None] * masks[-1])
+        rows, known = torch.cat(parts), torch.cat(masks)
         height, width = rows.shape[:2]
         shrink = 1
         while (height // shrink) * (width // shrink) > self._pixels and shrink < min(height, width):
@@ -123,46 +124,19 @@ class WorkingMaps:
             rows, known = rows / share.clamp_min(EPS), share > 0.5
         return torch.where(known, rows, torch.nan).contiguous(), (height, width)
 
-    def _to_directions(self, i: int, block: Tensor) -> tuple[Tensor, Tensor]:  # [r, w, D] -> [r, w, d'], [r, w, 1]
-        """Some rows of a map as unit features in the working directions, and which of them are known."""
-        check_shapes((f"maps[{i}]", block, ("h", "w", len(self._directions))))
-        features = block.to(self._directions)
-        lengths = row_norms(features)
-        check_directions(f"maps[{i}]", features, lengths, ENCODE)
-        known = (lengths > EPS)[..., None]
-        return (features @ self._directions) / lengths.clamp_min(EPS)[..., None] * known, known
 
-
-def working_directions(
-    maps: FeatureMaps,
-    count: int = WORKING,
-    most: int | None = None,
-) -> Tensor:  # [D, d']
-    """The main `count` directions of unit features, from samples of at most `most` (32) evenly spread maps."""
-    samples = LOOKED_AT[1]
-    views = sorted({round(i) for i in np.linspace(0, len(maps) - 1, min(most or LOOKED_AT[0], len(maps)))})
-    moment: Tensor | float = 0.0
-
-    def look(i: int) -> dict[str, Tensor]:
-        grid: Callable[..., Tensor] | None = getattr(maps, "grid", None)
-        channels = "D" if isinstance(moment, float) else len(moment)
-        if grid is None:
-            whole = as_tensor(f"maps[{i}]", maps[i])
-            check_shapes((f"maps[{i}]", whole, ("h", "w", channels)))
-            rows = sample_grid(whole, samples=samples)
-        else:
-            rows = grid(i, None, samples)
-            check_shapes((f"maps[{i}]", rows, ("n", channels)))
-        rows = rows.float()
+def working_directions(maps: FeatureMaps, count: int = WORKING, most: int = LOOKED_AT[0]) -> Tensor:  # [D, d']
+    """The main `count` directions of unit features, from samples of at most `most` evenly spread maps."""
+    if len(maps) == 0:
+        raise ValueError("maps: expected at least one, got none; pass the maps of the training views")
+    moment = None
+    for i in sorted({round(i) for i in np.linspace(0, len(maps) - 1, min(most, len(maps)))}):
+        rows = read_grid(maps, i, LOOKED_AT[1]).float()
+        check_shapes((f"maps[{i}]", rows, ("n", "D" if moment is None else len(moment))))
         check_directions(f"maps[{i}]", rows, advice=ENCODE)
         rows = unit_rows(rows) * (row_norms(rows) > EPS)[:, None]
-        return {"moment": rows.T @ rows}
-
-    if len(views) == 0:
-        raise ValueError("maps: expected at least one, got none; pass the maps of the training views")
-    for part in map(look, views):
-        moment = moment + part["moment"]
-    assert isinstance(moment, Tensor)
+        moment = rows.T @ rows if moment is None else moment + rows.T @ rows
+    assert moment is not None
     values, directions = principal_directions(moment)
     if not float(values[0]) > 0:
         raise ValueError(
