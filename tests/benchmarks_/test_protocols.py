@@ -1,0 +1,84 @@
+"""`python benchmarks/protocols.py`: results of kfgs and of other programs under one protocol, and pictures of them."""
+
+import json
+import sys
+
+import numpy as np
+import protocols
+import pytest
+from evaluated_room import save_splats
+from PIL import Image
+from small_room import make_room
+
+from kfgs import load_scene
+from kfgs.evaluation import load_label_map
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    return make_room(tmp_path_factory.mktemp("protocols") / "scene")
+
+
+@pytest.fixture(scope="module")
+def splats(room, tmp_path_factory):
+    return save_splats(room, tmp_path_factory.mktemp("splats"))
+
+
+@pytest.fixture
+def said(monkeypatch, capsys):
+    """What the command prints."""
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["benchmarks/protocols.py", *map(str, words)])
+        protocols.main()
+        return capsys.readouterr().out
+
+    return run
+
+
+def test_several_results_are_compared_and_drawn(room, splats, tmp_path, said):
+    foreign, teacher = f"{splats / 'before.ply'}={splats / 'features.npy'}", room / "features"
+    table = said(foreign, teacher, "--scene", room, "--out", tmp_path, "--pictures", 2).splitlines()
+    assert table[-2:] == ["(kfgs-pooled/1)", f"wrote {tmp_path}"]
+    scores = json.loads((tmp_path / "scores.json").read_text())
+    assert set(scores) == {foreign, str(teacher)}
+    assert scores[foreign]["scores"]["mIoU"] > 0.6
+    pictures = sorted(tmp_path.glob("*.png"))
+    assert [path.stem for path in pictures] == ["view_001", "view_007"]
+    assert np.asarray(Image.open(pictures[0])).std() > 10
+
+
+@pytest.mark.parametrize(
+    ("protocol", "options", "score"),
+    [
+        ("kfgs-surface", [], "agreement"),
+        ("feature3dgs-teacher", ["split=null"], "mIoU"),
+    ],
+)
+def test_a_foreign_splat_under_other_protocols(protocol, options, score, room, splats, said):
+    words = [f"{splats / 'before.ply'}={splats / 'features.npy'}", "--scene", room, "--protocol", protocol]
+    words += [word for option in options for word in ("--set", option)]
+    assert score in said(*words)
+
+
+def test_masks_of_a_scene_are_found(room, splats, tmp_path, said):
+    scene, names = load_scene(room), json.loads((room / "classes.json").read_text())
+    folder = tmp_path / "segmentations"
+    folder.mkdir()
+    (folder / "classes.txt").write_text("\n".join(names))
+    for i in scene.views("test"):
+        labels = load_label_map(room / "labels" / f"{scene.stem(i)}.png").numpy()
+        (folder / scene.stem(i)).mkdir()
+        for label in np.unique(labels):
+            Image.fromarray(np.uint8(labels == label) * 255).save(folder / scene.stem(i) / f"{names[label]}.png")
+    words = [f"{splats / 'before.ply'}={splats / 'features.npy'}", "--scene", room, "--protocol", "3dovs-closed"]
+    long = said(*words, "--truth", tmp_path, "--long")
+    assert "3dovs-closed/1" in long
+    assert "each pixel takes the most similar text" in long
+
+
+def test_what_the_command_cannot_do_is_named(room, splats, said):
+    with pytest.raises(SystemExit, match="NAME=VALUE"):
+        said(room / "features", "--scene", room, "--set", "level")
+    with pytest.raises(ValueError, match="expected one of kfgs-pooled/1, .*lerf-ovs-2d/1"):
+        said(room / "features", "--scene", room, "--protocol", "nothing")
