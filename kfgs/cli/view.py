@@ -221,8 +221,8 @@ def _words_of(label_set: Any, teacher: Teacher) -> tuple[Any, Callable[[str], An
 def _note(state: Any) -> None:
     """Print a note if the clouds are probably in different frames."""
     color = state.details().get("color")
-    if color and color["total"] - color["orphaned"] < FEW * color["total"]:
+    if color and color["total"] - color["none"] < FEW * color["total"]:
         say(
-            f"note: only {color['total'] - color['orphaned']:,} of {color['total']:,} colour Gaussians lie within lambda of "
+            f"note: only {color['total'] - color['none']:,} of {color['total']:,} colour Gaussians lie within lambda of "
             "the field; another frame? `kfgs attach` checks and aligns, --distance sets lambda"
         )

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import log10
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,9 +28,6 @@ from .meaning import Asked
 from .picking import gaussian_at
 from .session import labelled, save_selection
 from .state import SIDE_WORDS, Exploration, Show, Side
-
-if TYPE_CHECKING:
-    import pyvista as pv
 
 SIDE_NAMES: dict[Side, str] = {"semantic": "semantic field", "color": "colour field"}
 SHOW_NAMES: dict[Show, str] = {"labels": "classes", "rgb": "colours", "score": "scores", "latents": "latents"}
@@ -81,9 +78,7 @@ class Explorer:
         self._near = exploration.cameras[0].near if exploration.cameras else NEAR
         many = sum(len(exploration.cloud(side)) for side in sides) > MANY
         self.style = "points" if many else "gaussians"
-        self.plotter: pv.Plotter = make_plotter(
-            height, height * len(sides), shape=(1, len(sides)), off_screen=off_screen
-        )
+        self.plotter: Any = make_plotter(height, height * len(sides), shape=(1, len(sides)), off_screen=off_screen)
         self._notes: list[Any] = []
         self._picked: Picked | None = None
         try:
