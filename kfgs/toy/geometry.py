@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
-from .texture import Texture
+from .patterns import Texture
 
 Array = NDArray[np.float64]
 NEAR = 0.02  # metres: hits closer than this to a ray's origin are ignored

@@ -14,8 +14,8 @@ from ..cameras.camera import Camera
 from .geometry import Array, Solid, cast, normals, pixel_rays
 from .light import lamps_seen, light, openness
 from .noise import Noise
+from .patterns import evaluate
 from .room import CLASSES, ROOM
-from .texture import evaluate
 
 _SPLIT = 2  # colour samples per pixel and axis
 _EXPOSURE = 1.4

@@ -11,7 +11,6 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -55,33 +54,16 @@ class ToyConfig:
     """Points of the COLMAP model, outliers included."""
 
     def __post_init__(self) -> None:
-        least = {
-            "seed": 0,
-            "train_views": 2,
-            "test_views": 1,
-            "feature_dim": 16,
-            "surface_points": 100,
-            "sparse_points": 10,
-        }
-        for name, low in least.items():
+        for name, low in (("seed", 0), ("train_views", 2), ("feature_dim", 16), ("surface_points", 100)):
             check_whole(name, getattr(self, name), low)
+        check_whole("test_views", self.test_views, 1, self.train_views)
+        check_whole("sparse_points", self.sparse_points, 10, self.surface_points)
         for name in ("size", "feature_size"):
             check_size(tuple(getattr(self, name)), name, 8)
             object.__setattr__(self, name, tuple(getattr(self, name)))
-        if self.test_views > self.train_views:
-            raise ValueError(
-                f"test_views: expected at most train_views = {self.train_views} (each test camera stands between two "
-                f"training cameras), got {self.test_views}; give more train_views"
-            )
-        if self.sparse_points > self.surface_points:
-            raise ValueError(
-                f"sparse_points: expected at most surface_points = {self.surface_points} (they are drawn from them), "
-                f"got {self.sparse_points}; lower it"
-            )
         if any(f > s for f, s in zip(self.feature_size, self.size, strict=True)):
             raise ValueError(
-                f"feature_size: expected at most size = {self.size}, got {self.feature_size}; features are coarser "
-                "than images"
+                f"feature_size: expected at most size = {self.size}, got {self.feature_size}; make the images larger"
             )
 
 
@@ -117,7 +99,12 @@ def make_toy_room(
     if embeddings_of is not None:
         about["embeddings_of"] = embeddings_of
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        _check_same(path, about)
+        known = read_json(path / "toy.json") if (path / "toy.json").is_file() else None
+        if known != about:
+            raise FileExistsError(
+                f"{path}: expected no folder, an empty one or a toy room made with {about}, got one with "
+                f"{known or 'other files'}; choose another path or delete it"
+            )
         return path
     check_output("path", path, "a folder")
     solids = build_room(config.seed)
@@ -141,19 +128,6 @@ def make_toy_room(
         _write_geometry(folder, solids, noise, cameras, np.array(testing), config)
         write_json(folder / "toy.json", about)
     return path
-
-
-def _check_same(path: Path, about: dict[str, Any]) -> None:
-    """Raise FileExistsError unless `path` is a toy room described by `about`."""
-    found: Any = None
-    if (path / "toy.json").is_file():
-        found = read_json(path / "toy.json")
-    if found != about:
-        what = f"one made with {found}" if found is not None else "other files"
-        raise FileExistsError(
-            f"{path}: expected no folder, an empty one or a toy room made with {about}, got {what}; "
-            "choose another path or delete it"
-        )
 
 
 def _write_view(folder: Path, stem: str, view: View, embeddings: NDArray[np.float32], config: ToyConfig) -> None:

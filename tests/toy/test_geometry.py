@@ -5,7 +5,7 @@ from oracles_toy import first_hit
 
 from kfgs.cameras.camera import Camera
 from kfgs.toy.geometry import Solid, cast, intersect, normals, occluded, pixel_rays, sample_surface, visible
-from kfgs.toy.texture import Texture
+from kfgs.toy.patterns import Texture
 
 SKIN = Texture("plaster", ((0.5, 0.5, 0.5), (0.6, 0.6, 0.6)))
 

@@ -3,7 +3,7 @@ import pytest
 
 from kfgs.toy.geometry import Solid
 from kfgs.toy.light import LAMPS, lamps_seen, openness
-from kfgs.toy.texture import Texture
+from kfgs.toy.patterns import Texture
 
 SKIN = Texture("plaster", ((0.5, 0.5, 0.5), (0.6, 0.6, 0.6)))
 LAMP = LAMPS[0]

@@ -205,13 +205,13 @@ def test_a_failed_run_leaves_nothing(tmp_path, monkeypatch):
     [
         ({"train_views": 1}, ("train_views:", "got 1")),
         ({"test_views": 0}, ("test_views:", "got 0")),
-        ({"test_views": 5}, ("test_views:", "train_views", "got 5")),
+        ({"test_views": 5}, ("test_views:", "[1, 4]", "got 5")),
         ({"size": (72,)}, ("size:", "(height, width)", "got (72,)")),
         ({"size": (72, 4)}, ("size (width):", "got 4")),
         ({"size": (72.0, 96)}, ("size (height):", "got 72.0")),
         ({"feature_size": (80, 24)}, ("feature_size:", "(72, 96)", "got (80, 24)")),
         ({"feature_dim": 8}, ("feature_dim:", "16", "got 8")),
-        ({"sparse_points": 1501}, ("sparse_points:", "surface_points", "1500", "got 1501")),
+        ({"sparse_points": 1501}, ("sparse_points:", "[10, 1500]", "got 1501")),
         ({"seed": -1}, ("seed:", "got -1")),
     ],
 )

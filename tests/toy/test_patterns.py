@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from kfgs.toy.noise import Noise
-from kfgs.toy.patterns import PATTERNS
-from kfgs.toy.texture import Texture, evaluate
+from kfgs.toy.patterns import PATTERNS, Texture, evaluate
 
 COLORS = tuple((0.2 + 0.1 * k, 0.7 - 0.08 * k, 0.5) for k in range(6))
 HALF = np.array([0.5, 0.4, 0.3])
