@@ -18,7 +18,6 @@ from torch import Tensor
 
 from .._files import Names, file_stem, real_path
 from .._origin import to_world
-from ..formats.folders import newest_splat
 from ..formats.table import read_splats
 from ..formats.values import SH_C0
 from .depth import points_from_depth
@@ -29,7 +28,6 @@ from .scene import Scene
 AGAIN = "copy it again from the data set"
 NOWHERE = np.full((4, 4), np.nan)  # the pose of a view that is left out
 MESH = "_vh_clean_2.ply"  # of ScanNet
-_POLYCAM = (("corrected_cameras", "corrected_images"), ("cameras", "images"))  # after and before its bundle adjustment
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -42,11 +40,6 @@ def intrinsics(values: Sequence[Any], where: str) -> tuple[Matrix, tuple[int, in
             f"{where}: expected width, height, fx, fy, cx, cy as positive numbers, got {values!r:.200}; {AGAIN}"
         )
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64), (int(width), int(height))
-
-
-def is_nice_slam(folder: Path) -> bool:
-    """Whether this is a scene of Replica as NICE-SLAM published it."""
-    return (folder / "results").is_dir() and (folder / "traj.txt").is_file()
 
 
 def load_nice_slam(folder: Path, _: Path | None = None) -> Scene:
@@ -72,11 +65,6 @@ def load_nice_slam(folder: Path, _: Path | None = None) -> Scene:
     views, notes = _numbered(folder / "results", r"frame(\d+)\.(?:jpg|jpeg|png)", folder / "traj.txt")
     depths = [view.path.with_name(Path(view.name).stem.replace("frame", "depth") + ".png") for view in views]
     return scene_of_poses(folder, views, (K, size), points_from_depth(views, depths, 1 / scale, K), notes)
-
-
-def is_semantic_nerf(folder: Path) -> bool:
-    """Whether this is a sequence of Replica as Semantic-NeRF rendered it."""
-    return (folder / "rgb").is_dir() and (folder / "traj_w_c.txt").is_file()
 
 
 def load_semantic_nerf(folder: Path, _: Path | None = None) -> Scene:
@@ -122,11 +110,6 @@ def _numbered(folder: Path, pattern: str, poses: Path) -> tuple[list[PosedPictur
     ]
     missing = len(rows) - len(set(numbers))
     return views, [f"{missing} of {len(rows)} poses in {poses} have no picture"] if missing else []
-
-
-def is_scannet(folder: Path) -> bool:
-    """Whether this is a scene that ScanNet's SensReader exported."""
-    return (folder / "color").is_dir() and (folder / "pose").is_dir()
 
 
 def load_scannet(folder: Path, _: Path | None = None) -> Scene:
@@ -177,11 +160,6 @@ def _square(path: Path) -> Matrix:  # [4, 4]
     return matrix
 
 
-def is_polycam(folder: Path) -> bool:
-    """Whether this is a raw capture of Polycam, or its folder `keyframes`."""
-    return _polycam_folders(folder) is not None
-
-
 def load_polycam(folder: Path, _: Path | None = None) -> Scene:
     """Polycam's raw captures, which are ARKit's: poses that it corrected (`corrected_cameras/`), else ARKit's (`cameras/`).
 
@@ -189,9 +167,11 @@ def load_polycam(folder: Path, _: Path | None = None) -> Scene:
     (y up, z backward), in metres. Depth pictures (LiDAR) are in millimetres. So programs say that read such captures;
     none was at hand.
     """
-    found = _polycam_folders(folder)
-    assert found is not None
-    cameras, images = found
+    place = folder / "keyframes"
+    kind = (
+        "corrected_" if (place / "corrected_cameras").is_dir() else ""
+    )  # after Polycam's bundle adjustment, or before
+    cameras, images = place / f"{kind}cameras", place / f"{kind}images"
     names, views, lost = list_images(images), [], []
     for name in names:
         file = cameras / f"{file_stem(name)}.json"
@@ -224,20 +204,6 @@ def load_polycam(folder: Path, _: Path | None = None) -> Scene:
     depth = next((p for p in (cameras.parent / "corrected_depth", cameras.parent / "depth") if p.is_dir()), None)
     depths = [(depth or cameras) / f"{file_stem(view.name)}.png" for view in views]
     return scene_of_poses(folder, views, None, points_from_depth(views, depths), notes)
-
-
-def _polycam_folders(folder: Path) -> tuple[Path, Path] | None:
-    """The folders of camera files and of pictures."""
-    for place in (folder / "keyframes", folder):
-        for cameras, images in _POLYCAM:
-            if next((place / cameras).glob("*.json"), None) is not None and (place / images).is_dir():
-                return place / cameras, place / images
-    return None
-
-
-def is_inria(folder: Path) -> bool:
-    """Whether this is an output folder of 3DGS."""
-    return (folder / "cameras.json").is_file() and newest_splat(folder) is not None
 
 
 def load_inria(folder: Path, images: Path | None = None) -> Scene:
@@ -308,3 +274,20 @@ def load_inria(folder: Path, images: Path | None = None) -> Scene:
     held_out = set(order[: falls[0]]) if "eval=True" in text and len(falls) == 1 else set()
     test = [i for i, camera in enumerate(scene.cameras) if camera.name in held_out]
     return replace(scene, splits={"train": [i for i in range(len(scene)) if i not in test], "test": test})
+
+
+LAYOUTS = (
+    ("Replica (NICE-SLAM)", ("results", "traj.txt"), load_nice_slam),
+    ("Replica (Semantic-NeRF)", ("rgb", "traj_w_c.txt"), load_semantic_nerf),
+    ("ScanNet", ("color", "pose"), load_scannet),
+    ("Polycam", ("keyframes/cameras", "keyframes/images"), load_polycam),
+    ("Polycam", ("keyframes/corrected_cameras", "keyframes/corrected_images"), load_polycam),
+    ("3DGS's output", ("cameras.json", "point_cloud"), load_inria),
+)
+"""Name, what a folder is recognised by, and reader; asked in this order."""
+
+
+def find_layout(folder: Path) -> int | None:
+    """The row of `LAYOUTS` that a folder has; None if it has none."""
+    fits = (i for i, (_, files, _) in enumerate(LAYOUTS) if all((folder / file).exists() for file in files))
+    return next(fits, None)

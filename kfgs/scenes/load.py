@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 
@@ -17,18 +16,7 @@ from ..cameras.camera import Camera
 from ..formats.folders import newest_splat
 from .colmap import colmap_cameras, load_colmap
 from .files import SceneError, natural_key, picture_size, some
-from .layouts import (
-    is_inria,
-    is_nice_slam,
-    is_polycam,
-    is_scannet,
-    is_semantic_nerf,
-    load_inria,
-    load_nice_slam,
-    load_polycam,
-    load_scannet,
-    load_semantic_nerf,
-)
+from .layouts import LAYOUTS, find_layout
 from .masks import check_mask, folder_masks, picture_folder
 from .posed import near_zero
 from .scene import Scene
@@ -39,25 +27,6 @@ from .transforms import load_transforms, transforms_cameras
 _TRANSFORMS = ("transforms.json", "transforms_train.json")
 
 SplitChoice = Literal["auto", "file", "df3dgs", "feature3dgs", "holdout8", "all"]
-
-
-class _Layout(NamedTuple):
-    """A data set's layout of a scene folder."""
-
-    name: str
-    files: str  # what it is recognised by
-    matches: Callable[[Path], bool]
-    load: Callable[[Path, Path | None], Scene]
-
-
-_LAYOUTS = (
-    _Layout("Replica (NICE-SLAM)", "results/ and traj.txt", is_nice_slam, load_nice_slam),
-    _Layout("Replica (Semantic-NeRF)", "rgb/ and traj_w_c.txt", is_semantic_nerf, load_semantic_nerf),
-    _Layout("ScanNet", "color/ and pose/", is_scannet, load_scannet),
-    _Layout("Polycam", "keyframes/ with cameras/ and images/", is_polycam, load_polycam),
-    _Layout("3DGS's output", "cameras.json and point_cloud/", is_inria, load_inria),
-)
-"""Asked in this order, after COLMAP models and transforms.json."""
 
 
 def load_scene(
@@ -169,10 +138,7 @@ def _with_splat(scene: Scene, root: Path) -> Scene:
     if name.startswith("point_cloud/"):
         note = f"{name} is a splat of this scene: a field is made on its Gaussians (--splat names others)"
         return replace(scene, splat=splat, notes=(*scene.notes, note))
-    note = (
-        f"{name} is not used by itself, because its program may train in another frame than that of the cameras; if they "
-        f"agree, name it: --splat {splat}"
-    )
+    note = f"{name} is not used by itself, as its program may train in another frame; if they agree, name it: --splat {splat}"
     return replace(scene, notes=(*scene.notes, note))
 
 
@@ -217,14 +183,13 @@ def _load_views(path: Path, images: Path | None) -> Scene:
         return replace(scene, notes=(*scene.notes, *choice_note(path, model)))
     if _is_transforms(path):
         return load_transforms(path, images)
-    for layout in _LAYOUTS:
-        if path.is_dir() and layout.matches(path):
-            return layout.load(path, images)
-    parts = [name for name in ("results", "color", "pose", "rgb", "traj.txt", "traj_w_c.txt") if (path / name).exists()]
-    whole = [
-        f"{kind.files} of {kind.name}" for kind in _LAYOUTS if set(kind.files.replace("/", "").split()) & set(parts)
-    ]
-    half = f" (there is {' and '.join(parts)}, but not what belongs to it: {'; '.join(whole)})" if parts else ""
+    row = find_layout(path)
+    if row is not None:
+        return LAYOUTS[row][2](path, images)
+    parts = [(file, name, files) for name, files, _ in LAYOUTS for file in files if (path / file).exists()]
+    half = "".join(
+        f" (there is {file}, but not all of {name}: {' and '.join(files)})" for file, name, files in parts[:1]
+    )
     raise SceneError(
         f"{path}: expected a COLMAP model, a transforms.json or the layout of a data set (docs/datasets.md), found "
         f"none{half}; {_advice(path)}"
@@ -238,11 +203,8 @@ def _is_transforms(path: Path) -> bool:
 def is_scene(path: str | Path) -> bool:
     """Whether a folder has poses: a COLMAP model, a transforms.json, or the layout of a data set."""
     path = as_path(path)
-    return (
-        find_model(path) is not None
-        or any((path / name).is_file() for name in _TRANSFORMS)
-        or any(a.matches(path) for a in _LAYOUTS)
-    )
+    transforms = any((path / name).is_file() for name in _TRANSFORMS)
+    return find_model(path) is not None or transforms or find_layout(path) is not None
 
 
 def _advice(path: Path) -> str:
@@ -284,7 +246,7 @@ def _with_split(scene: Scene, path: Path, split: SplitChoice) -> Scene:
         return replace(scene, splits=chosen[0], notes=(*scene.notes, *chosen[1]))
     if split == "auto" and (scene.splits.get("test") or len(scene.splits["train"]) < len(scene)):  # of its own lists
         return scene
-    replica = model is None and (is_nice_slam(root) or is_semantic_nerf(root))
+    replica = model is None and find_layout(root) in (0, 1)
     rule = choose_split(len(scene), replica) if split == "auto" else split
     assert rule != "file"
     splits = make_split(len(scene), rule)

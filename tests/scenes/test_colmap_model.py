@@ -310,30 +310,6 @@ def test_honest_variants_pass(tmp_path: Path) -> None:
         assert len(_read_alike(folder).images) in (1, 2)
 
 
-# A 2-D point that sees nothing; one whose 3-D point was deleted; one that the track of its 3-D point does not name.
-@pytest.mark.parametrize("point_id", [-1, 99, 2])
-def test_the_id_of_a_2d_point_need_not_lead_to_a_3d_point(tmp_path: Path, point_id: int) -> None:
-    text = write_text_model(
-        tmp_path / "text",
-        images=IMAGES.replace("1 2 7 3 4 -1", f"3 4 {point_id} 1 2 7 5 6 {point_id}").replace(
-            "5 6 7", f"5 6 7 8 9 {point_id}"
-        ),
-        points3D=POINTS.replace("1 0 2 0", "1 1 2 0") + "2 4 5 6 1 2 3 0.5\n",
-    )
-    seen = {i: image.observed.tolist() for i, image in _read_alike(text).images.items()}
-    assert seen == {1: [point_id, 7, point_id], 2: [7, point_id]}
-
-    binary = write_model(tmp_path / "binary", ["a.png", "b.png"])
-    data = bytearray((binary / "images.bin").read_bytes())
-    name = 8 + 4 + 7 * 8 + 4  # of the first image, after the count, its id, its pose and its camera
-    last = name + len(b"a.png\0") + 8 + 5 * 24 + 16  # the id of its sixth 2-D point, which sees nothing
-    assert data[last : last + 8] == b"\xff" * 8  # COLMAP writes the largest unsigned number
-    struct.pack_into("<q", data, last, point_id)
-    (binary / "images.bin").write_bytes(data)
-    seen = {i: image.observed.tolist() for i, image in _read_alike(binary).images.items()}
-    assert seen == {1: [1, 2, 3, 4, 5, point_id], 2: [1, 2, 3, 4, 5, -1]}
-
-
 def test_bad_binary_values_are_refused(tmp_path: Path) -> None:
     def refused(name: str, offset: int, layout: str, value: object, *parts: str) -> None:
         folder = write_model(tmp_path / "m", ["a.png", "b.png"])
@@ -349,14 +325,6 @@ def test_bad_binary_values_are_refused(tmp_path: Path) -> None:
     refused("images.bin", 8 + 64, "<B", 0xFF, "UTF-8")
 
 
-def test_nobody_needs_the_error_of_a_point(tmp_path: Path) -> None:
-    folder = write_model(tmp_path / "m", ["a.png"])
-    data = bytearray((folder / "points3D.bin").read_bytes())
-    struct.pack_into("<d", data, 8 + 8 + 24 + 3, float("nan"))  # some programs write no number here
-    (folder / "points3D.bin").write_bytes(data)
-    assert len(_read_alike(folder).points) == 5
-
-
 def test_missing_folder_and_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=tells("nothing:", "no such folder", "COLMAP")):
         read_model(tmp_path / "nothing")
@@ -366,9 +334,3 @@ def test_missing_folder_and_files_are_named(tmp_path: Path) -> None:
     shutil.move(folder / "points3D.bin", tmp_path / "elsewhere.bin")
     with pytest.raises(SceneError, match=tells(".bin", ".txt", "got cameras.bin, images.bin", "copy")):
         read_model(folder)
-
-
-def test_binary_is_read_where_both_are_present(tmp_path: Path) -> None:
-    folder = write_model(tmp_path / "m", ["a.png"])
-    write_text_model(folder, cameras="rubbish")
-    assert len(read_model(folder).points) == 5

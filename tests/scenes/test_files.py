@@ -1,13 +1,8 @@
 import io
-import json
-import os
 import struct
-import subprocess
-import sys
 import tracemalloc
 import warnings
 import zlib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,21 +10,13 @@ import torch
 from messages import tells
 from PIL import Image
 
-from kfgs._files import LARGEST, file_stem
 from kfgs.scenes import SceneError, read_image
 from kfgs.scenes.depth import read_depth
-from kfgs.scenes.files import open_picture, picture_size, read_scene_json
+from kfgs.scenes.files import picture_size
 
 RNG = np.random.default_rng(0)
 COLORS = RNG.integers(0, 256, (5, 7, 3), dtype=np.uint8)
 ALPHA = RNG.integers(0, 256, (5, 7), dtype=np.uint8)
-
-
-@pytest.mark.parametrize(
-    ("name", "stem"), [("a.png", "a"), ("train/r_0.png", "train/r_0"), ("a", "a"), ("/", "/"), (".", "."), ("", "")]
-)
-def test_file_stem(name: str, stem: str) -> None:
-    assert file_stem(name) == stem
 
 
 def read(path) -> np.ndarray:
@@ -142,13 +129,6 @@ def test_what_a_decoder_raises_is_named(tmp_path, monkeypatch):
         read_image(tmp_path / "a.png")
 
 
-def test_pictures_are_closed(tmp_path):
-    Image.fromarray(COLORS).save(tmp_path / "a.png")
-    with open_picture(tmp_path / "a.png") as picture:
-        assert picture.size == (7, 5)
-    assert picture.fp is None
-
-
 SHORT = """
 import os, resource, sys
 from kfgs.scenes import SceneError, read_image
@@ -173,36 +153,6 @@ print(codes)
 """
 
 
-@pytest.mark.skipif(not Path("/proc/self/statm").is_file(), reason="the size of a process is read from /proc")
-@pytest.mark.parametrize(
-    ("suffix", "options"),
-    [
-        (".webp", {"lossless": True, "method": 0}),
-        (".webp", {"quality": 80, "method": 0}),
-        (".tif", {}),
-        (".tif", {"compression": "tiff_lzw"}),
-        (".tif", {"compression": "tiff_adobe_deflate"}),
-        (".png", {"compress_level": 1}),
-        (".jpg", {}),
-    ],
-)
-def test_where_memory_is_short_a_picture_is_refused_and_nothing_panics(suffix, options, tmp_path):
-    """Limits from nothing beyond what Python has to enough: some refuse, the last one reads."""
-    pixels = np.random.default_rng(0).integers(0, 256, (150, 200, 3), dtype=np.uint8).repeat(10, 0).repeat(10, 1)
-    Image.fromarray(pixels).save(tmp_path / f"large{suffix}", **options)
-    Image.fromarray(pixels[:8, :8]).save(tmp_path / f"small{suffix}", **options)
-    limits = [0, 2, 5, 8, 11, 14, 18, 23, 30, 40, 60, 1000]
-    command = [sys.executable, "-c", SHORT, tmp_path / f"large{suffix}", tmp_path / f"small{suffix}", *map(str, limits)]
-    done = subprocess.run(
-        command, capture_output=True, text=True, timeout=250, env={**os.environ, "OMP_NUM_THREADS": "1"}
-    )
-    codes = json.loads(done.stdout)
-    assert set(codes) == {0, 3}, (codes, done.stderr[-500:])  # no signal, no other exception
-    assert codes[:3] == [3, 3, 3]
-    assert codes[-1] == 0
-    assert "panicked" not in done.stderr
-
-
 def test_depth_of_a_palette_is_refused_as_its_numbers_are_colours(tmp_path):
     numbers = Image.fromarray(np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000)
     numbers.save(tmp_path / "depth.png")
@@ -213,13 +163,3 @@ def test_depth_of_a_palette_is_refused_as_its_numbers_are_colours(tmp_path):
     with pytest.raises(SceneError, match=tells("shown.png: expected a depth PNG", "palette")) as caught:
         read_depth(tmp_path / "shown.png")
     assert "decoded" not in str(caught.value)
-
-
-def test_a_json_file_that_would_fill_the_memory_is_refused_unread(tmp_path):
-    path = tmp_path / "cameras.json"
-    with path.open("wb") as file:
-        file.truncate(LARGEST + 1)
-    with pytest.raises(
-        SceneError, match=tells("cameras.json: ", "at most 536,870,912 bytes", "split it; copy it again")
-    ):
-        read_scene_json(path, "copy it again")

@@ -8,7 +8,7 @@ import torch
 from colmap_models import write_model, write_picture
 from messages import tells
 
-from kfgs.scenes import SceneError, list_images, load_cameras, load_scene
+from kfgs.scenes import SceneError, load_cameras, load_scene
 from kfgs.scenes.load import picture_folders
 
 
@@ -81,16 +81,6 @@ def test_of_several_models_the_largest_is_used(
     assert [c.name for c in advised.cameras] == names[-models[other] :]
     assert advised.image_paths[0].parent == tmp_path / "images"
     assert advised.splits["train"] == [models[other] - 1]
-
-
-def test_a_model_that_is_cut_off_is_not_the_largest(tmp_path: Path) -> None:
-    write_model(tmp_path / "sparse/0", ["a.png", "b.png"])
-    write_model(tmp_path / "sparse/1", ["a.png"])
-    _pictures(tmp_path / "images", ["a.png", "b.png"])
-    (tmp_path / "sparse/1/images.bin").write_bytes((10**6).to_bytes(8, "little"))
-    scene = load_scene(tmp_path)
-    assert len(scene) == 2
-    assert any("sparse/1 with 0 images" in note for note in scene.notes)
 
 
 def test_pictures_beside_a_dense_model_are_its_own(tmp_path: Path) -> None:
@@ -188,11 +178,6 @@ def test_every_loader_gives_a_near_plane_to_suit_a_small_frame(tmp_path: Path) -
     assert load_scene(tmp_path / "nerf").cameras[0].near == pytest.approx(0.1 * 1.1 * 0.3)
 
 
-def test_real_rooms_keep_the_usual_near_plane(shared_data: Path) -> None:
-    for name in ("room_0", "fox"):
-        assert {camera.near for camera in load_scene(shared_data / name).cameras} == {0.2}
-
-
 def test_the_split_file_wins(tmp_path: Path) -> None:
     names = [f"rgb_{i}.png" for i in range(24)]
     write_model(tmp_path / "sparse/0", names)
@@ -229,13 +214,6 @@ def test_what_cannot_be_loaded_is_named(tmp_path: Path) -> None:
     _pictures(tmp_path / "images", ["a.png"])
     with pytest.raises(SceneError, match=tells("6 views", "'df3dgs'", "got 1")):
         load_scene(tmp_path, split="df3dgs")
-
-
-def test_images_are_listed_in_natural_order(tmp_path: Path) -> None:
-    _pictures(tmp_path, ["b10.png", "b9.png", "sub/a.png", ".hidden/x.png", ".y.png"])
-    (tmp_path / "b1.JPG").write_bytes(b"")
-    (tmp_path / "notes.txt").write_text("")
-    assert list_images(tmp_path) == ["b1.JPG", "b9.png", "b10.png", "sub/a.png"]
 
 
 def test_the_real_scenes(shared_data: Path) -> None:
@@ -337,13 +315,6 @@ def test_without_a_size_cameras_are_as_large_as_their_pictures(tmp_path: Path) -
     assert load_cameras(file)[0].size == (12, 16)
 
 
-def test_a_frame_that_is_no_object_is_named(tmp_path: Path) -> None:
-    file = tmp_path / "path.json"
-    file.write_text(json.dumps({**LENS, "frames": [3]}))
-    with pytest.raises(SceneError, match=tells("path.json, frame 0: expected an object", "got 3")):
-        load_cameras(file)
-
-
 @pytest.mark.parametrize(
     ("names", "parts"),
     [
@@ -360,10 +331,3 @@ def test_cameras_that_cannot_be_used_are_named(tmp_path: Path, names: list[Any],
     file = _write_transforms(tmp_path / "path.json", names)
     with pytest.raises(SceneError, match=tells(*parts)):
         load_cameras(file)
-
-
-def test_where_there_are_no_cameras_the_error_is_that_of_a_scene(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=tells(tmp_path / "none", "no such")):
-        load_cameras(tmp_path / "none")
-    with pytest.raises(SceneError, match=tells(tmp_path, "COLMAP model", "transforms.json")):
-        load_cameras(tmp_path)

@@ -7,7 +7,7 @@ import pytest
 from messages import tells
 
 from kfgs.scenes import SceneError
-from kfgs.scenes.pycolmap_import import import_pycolmap, quiet_pycolmap, scene_errors
+from kfgs.scenes.pycolmap_import import scene_errors
 
 PROGRAM = """
 import os, signal, sys
@@ -50,14 +50,6 @@ def test_pycolmap_failures_become_scene_errors(tmp_path: Path) -> None:
         raise MemoryError
     with pytest.raises(KeyboardInterrupt), scene_errors("x", "y"):
         raise KeyboardInterrupt
-
-
-def test_the_log_level_is_put_back() -> None:
-    pycolmap = import_pycolmap()
-    before = pycolmap.logging.minloglevel
-    with quiet_pycolmap():
-        assert pycolmap.logging.minloglevel == 3
-    assert pycolmap.logging.minloglevel == before
 
 
 FAKE = """

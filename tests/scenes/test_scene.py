@@ -75,13 +75,6 @@ def test_undistorted_scenes_undistort_lazily(tmp_path: Path) -> None:
     assert torch.equal(straight.select([1]).image(0), expected)
 
 
-def test_a_pinhole_scene_is_undistorted_already(tmp_path: Path) -> None:
-    scene = _scene(tmp_path)
-    assert scene.undistorted() is scene
-    assert scene.mask(0).all()
-    assert scene.mask(0).shape == (48, 64)
-
-
 @pytest.mark.parametrize(("scale", "near"), [(1.0, 0.2), (0.1, 0.1 * 1.1 * 0.4), (1e-3, 0.1 * 1.1 * 4e-3)])
 def test_the_near_plane_follows_a_small_frame_whatever_the_split(tmp_path: Path, scale: float, near: float) -> None:
     scene = _scene(tmp_path, positions=(0, 2 * scale, 7 * scale))  # all views: mean 3, farthest 7

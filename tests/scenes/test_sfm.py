@@ -1,5 +1,4 @@
 import shutil
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -109,12 +108,6 @@ def test_config_is_checked(values: dict[str, object], message: str) -> None:
         SfmConfig(**values)  # type: ignore[arg-type]
 
 
-def test_the_report_reads_well() -> None:
-    report = SfmReport(9, 10, 500, 0.456, {"features": 1.0, "matching": 2.0}, ("x.png",))
-    said = "9 of 10 images registered, 500 points, mean reprojection error 0.46 px (features 1.0 s, matching 2.0 s)"
-    assert str(report) == said + "; without a pose: x.png"
-
-
 def test_pairs_of_a_video_follow_the_natural_order() -> None:
     names = [f"{i}.png" for i in range(1, 41)]
     pairs = sequential_pairs(names)
@@ -151,25 +144,6 @@ def test_nothing_is_found_where_a_photo_is_masked_or_transparent(tmp_path: Path)
     assert min(leftmost["masked.png"], leftmost["clear.png"]) >= 64
 
 
-def _matched(folder: Path, names: list[str]) -> set[frozenset[str]]:
-    """Pairs that sequential matching compares."""
-    pycolmap = import_pycolmap()
-    g = torch.Generator().manual_seed(0)
-    picture = torch.randint(0, 255, (3, 24, 32), generator=g, dtype=torch.uint8).repeat_interleave(4, 1)
-    (folder / "images").mkdir(parents=True)
-    for name in names:
-        write_image(str(folder / "images" / name), picture.repeat_interleave(4, 2))
-    config = SfmConfig(matching="sequential", max_features=200, num_threads=1)
-    with tqdm(disable=True) as bar:
-        photos = {name: (folder / "images" / name, None) for name in names}
-        run = SfmRun(pycolmap, folder / "images", folder, config, bar, photos)
-        run.extract()
-        run.match_all()
-    with pycolmap.Database.open(run.database) as database:
-        pairs = combinations(database.read_all_images(), 2)
-        return {frozenset((a.name, b.name)) for a, b in pairs if database.exists_matches(a.image_id, b.image_id)}
-
-
 def test_one_camera_for_the_photos_of_each_size(tmp_path: Path) -> None:
     """COLMAP alone leaves out what is not as large as the first photo."""
     pycolmap, sizes = (
@@ -191,19 +165,6 @@ def test_one_camera_for_the_photos_of_each_size(tmp_path: Path) -> None:
             of = {image.name: lenses[image.camera_id] for image in database.read_all_images()}
         assert {name: (lens.height, lens.width) for name, lens in of.items()} == sizes
         assert len(lenses) == count
-
-
-def test_sequential_matching_compares_9_with_10_and_not_1_with_12(tmp_path: Path) -> None:
-    matched = _matched(tmp_path / "a", [f"{i}.png" for i in range(1, 14)])
-    assert frozenset(("9.png", "10.png")) in matched
-    assert frozenset(("1.png", "11.png")) in matched
-    assert frozenset(("1.png", "12.png")) not in matched  # 11 apart; letter by letter they are neighbours
-
-
-def test_sequential_matching_of_names_with_blanks(tmp_path: Path) -> None:
-    assert _matched(tmp_path / "a", ["a 1.png", "a 2.png"]) == {frozenset(("a 1.png", "a 2.png"))}
-    with pytest.raises(SceneError, match=tells("images:", "got a 9.png, a 10.png", "rename")):
-        _matched(tmp_path / "b", ["a 9.png", "a 10.png"])
 
 
 class _Placed:
