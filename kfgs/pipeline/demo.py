@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from .._check import ORIGIN
 from .._files import check_output, write_json
@@ -105,7 +106,7 @@ def run(
         f"the {REMOVED}s are removed, and the {PAINTED}s are painted red. Pictures show the views that change most."
     )
     edited = _edit_colors(out, scene, field, colors, classes, say)
-    reports = {"unseen_views": scores, "teacher": teacher, "surface": surface, "color": quality}
+    reports: dict[str, Any] = {"unseen_views": scores, "teacher": teacher, "surface": surface, "color": quality}
     write_json(out / "scores.json", {name: report.to_json() for name, report in reports.items()})
     return [
         out / "run" / NAME,

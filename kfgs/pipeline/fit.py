@@ -108,33 +108,15 @@ def fit(
         check_place(kept / NAME)
     with nullcontext(kept) if kept is not None else TemporaryDirectory(prefix="kfgs-") as place:
         run = Run(Path(place), report)
-        if hasattr(maps, "encode_image"):
-            extract_features(
-                maps, as_taken(scene), run.folder / "features", split=split, overwrite=True, progress=progress is True
-            )
-            maps = FeatureFolder(run.folder / "features").of(scene, split)
-        maps = as_maps(maps)
-        _check_maps(scene, split, maps)
+        maps = _open_maps(maps, scene, split, run.folder / "features", progress is True)
         with run.locked():
             if isinstance(method, Paper) or (method.splat is None and scene.splat is None):  # else nothing is trained
                 scene = with_points(run, scene, views, seed, progress)
             seen = maps_of_views(scene, views, maps, undistorted=undistorted_features)
             job = _Job(run, scene, views, seen, describe_maps(run, seen), seed, target, progress)
             field, about = _uplift(job, method) if isinstance(method, Uplift) else _paper(job, method)
-            teacher = getattr(maps, "identity", None)
-            about |= {
-                "seed": seed,
-                "views": [camera.name for camera in job.cameras],
-                "teacher_map": list(map_shape(seen)),
-                **({"teacher": teacher} if teacher else {}),
-                **({} if scene.folder is None else {"scene": str(real_path(scene.folder))}),
-                "seconds": {stage.name: round(stage.seconds, 3) for stage in run.stages},
-                "stages": [stage.folder.name for stage in run.stages],
-                "kfgs": version("kfgs"),
-            }
-            field = replace(
-                field, info=about, classes=None if scene.folder is None else scene_classes(scene.folder, field.dim)
-            )
+            classes = None if scene.folder is None else scene_classes(scene.folder, field.dim)
+            field = replace(field, info=about | _facts(job, maps), classes=classes)
             if kept is not None:
                 for name in REPORT:  # of an older field: a kill leaves no wrong report
                     (kept / name).unlink(missing_ok=True)
@@ -166,24 +148,43 @@ class _Job:
         return stage_generator(self.seed, stage)
 
 
-def _check_maps(scene: Scene, split: str, maps: Maps) -> None:
-    """Check what would otherwise fail only after the first stages."""
+def _open_maps(maps: Any, scene: Scene, split: str, folder: Path, progress: bool) -> Maps:
+    """The maps of a split's views; a teacher's go to the folder. What would fail only after the first stages is an error."""
     views = scene.views(split)
+    if hasattr(maps, "encode_image"):
+        extract_features(maps, as_taken(scene), folder, split=split, overwrite=True, progress=progress)
+        maps = FeatureFolder(folder).of(scene, split)
+    maps = as_maps(maps)
     advice = f"read them with FeatureFolder(path).of(scene, {split!r})"
     if len(views) != len(maps):
         raise ValueError(
             f"maps: expected one teacher map per view of split {split!r} ({len(views)}), got {len(maps)}; {advice}"
         )
-    stems = getattr(maps, "stems", None)
-    if stems is not None:
-        given, wanted = ([Path(folded_name(stem)).name for stem in names] for names in (stems, map(scene.stem, views)))
-        if given != wanted:
-            raise ValueError(
-                f"maps: expected the maps of the views of split {split!r} in their order ({wanted[0]}, ...), got {given[0]}, "
-                f"...; {advice}"
-            )
+    wanted = [Path(folded_name(scene.stem(i))).name for i in views]
+    given = [Path(folded_name(stem)).name for stem in getattr(maps, "stems", wanted)]
+    if given != wanted:
+        raise ValueError(
+            f"maps: expected the maps of the views of split {split!r} in their order ({wanted[0]}, ...), got {given[0]}, ...; "
+            f"{advice}"
+        )
     if hasattr(maps, "check_files"):
         maps.check_files()
+    return maps
+
+
+def _facts(job: _Job, maps: Maps) -> dict[str, Any]:
+    """The `info` of a field about its origin."""
+    teacher, folder = getattr(maps, "identity", None), job.scene.folder
+    return {
+        "seed": job.seed,
+        "views": [camera.name for camera in job.cameras],
+        "teacher_map": list(map_shape(job.maps)),
+        **({"teacher": teacher} if teacher else {}),
+        **({} if folder is None else {"scene": str(real_path(folder))}),
+        "seconds": {stage.name: round(stage.seconds, 3) for stage in job.run.stages},
+        "stages": [stage.folder.name for stage in job.run.stages],
+        "kfgs": version("kfgs"),
+    }
 
 
 # Uplift: fuse first, compress after.

@@ -61,7 +61,7 @@ class Paper:
     @staticmethod
     def paper(**changes: Any) -> Paper:
         """The paper's values: 28 epochs, 5,000 steps of the autoencoder, 30,000 of the field. For a workstation."""
-        options = {
+        options: dict[str, Any] = {
             "codebook": PaperCodebook(),
             "autoencoder": AutoencoderConfig.paper(),
             "training": Training.paper(),

@@ -70,7 +70,9 @@ def segment_scene(
         maps = {"truth": (truth or {}).get(stem), "field": labels[stem]}
         drawn = {title: value for title, value in maps.items() if value is not None}
         panels = {"photograph": photo} | {
-            title: overlay_labels(photo, resize_labels(value, photo.shape[:2]), classes.names, legend=False)
+            title: overlay_labels(
+                photo, resize_labels(value, (photo.shape[0], photo.shape[1])), classes.names, legend=False
+            )
             for title, value in drawn.items()
         }
         assert colors is not None
