@@ -29,11 +29,6 @@ def test_full_coverage_is_the_plain_box() -> None:
     assert repr(bounds).endswith("inside=[3] bool)")
 
 
-def test_one_point_is_its_own_box() -> None:
-    bounds = robust_bounds(torch.tensor([[1.0, 2.0, 3.0]]))
-    assert bounds.low.tolist() == bounds.high.tolist() == [1, 2, 3]
-
-
 def test_room_0_is_a_room(shared_data: Path) -> None:
     points = load_scene(shared_data / "room_0").points
     bounds = robust_bounds(points)

@@ -84,59 +84,6 @@ def test_round_trip(integer_centers):
     assert shift.tolist() == [[0, 0, 0.5 * integer_centers], [0, 0, 0.5 * integer_centers], [0, 0, 0]]
 
 
-def test_the_batch_is_as_kornia_documents_it():
-    pinhole = to_kornia(CAMERAS)
-    assert pinhole.intrinsics.shape == pinhole.extrinsics.shape == (2, 4, 4)
-    assert pinhole.intrinsics[:, 3].tolist() == pinhole.intrinsics[:, :, 3].tolist() == [[0, 0, 0, 1]] * 2
-    assert (pinhole.height.tolist(), pinhole.width.tolist()) == ([64, 64], [96, 80])
-    assert pinhole.height.dtype == torch.int64
-
-
-def test_the_widest_dtype_is_kept():
-    camera = CAMERAS[0]
-    mixed = replace(camera, K=camera.K.float())
-    assert to_kornia([mixed]).intrinsics.dtype == torch.float64
-    assert to_kornia([mixed.to(torch.float32)]).extrinsics.dtype == torch.float32
-    assert torch.equal(to_kornia([mixed]).extrinsics[0], camera.viewmat)
-
-
-def test_gradients_reach_both_matrices():
-    """Poses can be optimised through kornia: d u / d cx = 1, d u / d t_x = fx / z."""
-    viewmat, matrix = CAMERAS[0].viewmat.clone().requires_grad_(), CAMERAS[0].K.clone().requires_grad_()
-    camera = replace(CAMERAS[0], viewmat=viewmat, K=matrix)
-    world = points_in_front(CAMERAS[0], count=1)
-    to_kornia([camera]).project(world[None])[..., 0].sum().backward()
-    assert float(matrix.grad[0, 2]) == pytest.approx(1, abs=1e-12)
-    depth = float(project_points(CAMERAS[0], world)[1])
-    assert float(viewmat.grad[0, 3]) == pytest.approx(float(K[0, 0]) / depth, abs=1e-9)
-
-
-def test_the_cameras_own_their_matrices():
-    pinhole = to_kornia(CAMERAS)
-    back = from_kornia(pinhole)
-    pinhole.scale_(2.0)
-    pinhole.tx = torch.zeros(2, dtype=torch.float64)
-    assert torch.equal(back[0].K, CAMERAS[0].K)
-    assert torch.equal(back[1].viewmat, CAMERAS[1].viewmat)
-    assert [camera.name for camera in back] == ["", ""]
-
-
-def test_kornias_scale_is_resized():
-    """fx and cx times 0.5 is right with centres on halves."""
-    [half] = from_kornia(to_kornia(CAMERAS[:1]).scale(torch.tensor([0.5], dtype=torch.float64)))
-    expected = CAMERAS[0].resized(32, 48)
-    assert torch.equal(half.K, expected.K)
-    assert half.size == (32, 48)
-
-
-def test_a_zero_padded_matrix_is_read_as_kornia_reads_it():
-    pinhole = to_kornia(CAMERAS[:1])
-    padded = PinholeCamera(
-        pinhole.intrinsics * torch.tensor([1, 1, 1, 0.0]), pinhole.extrinsics, pinhole.height, pinhole.width
-    )
-    assert torch.equal(from_kornia(padded)[0].K, CAMERAS[0].K)
-
-
 def test_distortion_is_refused():
     bent = replace(CAMERAS[1], distortion=Distortion("kannala_brandt", (0.1, 0, 0, 0)))
     with pytest.raises(ValueError, match=tells("cameras[1]:", "got kannala_brandt", "'b.png'")):

@@ -63,15 +63,6 @@ def test_pixels_agree_with_colmap_and_with_loops():
     np.testing.assert_allclose(depth.numpy(), depths, atol=1e-12)
 
 
-def test_principal_point_is_applied():
-    _, world = points_in_front()
-    xy = project_points(posed(), torch.from_numpy(world))[0]
-    centred = K.clone()
-    centred[0, 2], centred[1, 2] = WIDTH / 2, HEIGHT / 2  # what a renderer that knows only the field of view assumes
-    wrong, _ = project_pinhole(centred.numpy(), posed().viewmat.numpy(), world)
-    assert np.abs(xy.numpy() - wrong).min() > 1
-
-
 @pytest.mark.parametrize("model", LENSES)
 def test_lens_agrees_with_colmap(model):
     cam, _ = points_in_front()
@@ -81,17 +72,6 @@ def test_lens_agrees_with_colmap(model):
     assert lens_camera(model).distortion == Distortion(kind, coefficients)
     pinhole = camera_to_pixel(Camera(torch.eye(4), lens_camera(model).K, WIDTH, HEIGHT), torch.from_numpy(cam)).numpy()
     assert np.abs(pinhole - ours).max() > 0.5  # leaving the lens out shows
-
-
-def test_order_of_coefficients_matters():
-    """OpenCV puts p1, p2 before k3: read as k1 k2 k3 p1 p2 the same numbers give other pixels."""
-    camera, (cam, _) = lens_camera("FULL_OPENCV"), points_in_front()
-    k1, k2, p1, p2, k3, *rest = camera.distortion.coefficients
-    swapped = Camera(
-        camera.viewmat, camera.K, WIDTH, HEIGHT, "", Distortion("brown_conrady", (k1, k2, k3, p1, p2, *rest))
-    )
-    points = torch.from_numpy(cam)
-    assert (camera_to_pixel(swapped, points) - camera_to_pixel(camera, points)).abs().max() > 0.1
 
 
 def test_center_of_first_pixel_is_one_half():
@@ -108,13 +88,6 @@ def test_center_of_first_pixel_is_one_half():
     torch.testing.assert_close(camera_to_pixel(camera, wrong[None])[0], torch.zeros(2, dtype=torch.float64))
 
 
-def test_depth_is_along_the_axis_not_the_ray():
-    camera = Camera(torch.eye(4), K.float(), WIDTH, HEIGHT)
-    lifted = unproject_depth(camera, torch.full(camera.size, 2.0))
-    assert (lifted[..., 2] == 2).all()
-    assert lifted[0, 0].norm() > 2.2
-
-
 def test_behind_the_camera_is_culled_by_depth():
     point = torch.tensor([[0.2, 0.1, -2.0], [0.2, 0.1, 2.0]], dtype=torch.float64)
     camera = Camera(torch.eye(4), K, WIDTH, HEIGHT)
@@ -125,13 +98,6 @@ def test_behind_the_camera_is_culled_by_depth():
     assert visible.tolist() == [False, True]
     assert xy[0].tolist() == [0, 0]
     assert depth.tolist() == [-2, 2]
-
-
-def test_near_is_exclusive_and_adjustable():
-    points = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.0, 0.25]])
-    camera = Camera(torch.eye(4), K.float(), WIDTH, HEIGHT)
-    assert project_points(camera, points)[2].tolist() == [True, True]
-    assert project_points(camera, points, near=0.25)[2].tolist() == [True, False]
 
 
 def test_picture_includes_its_left_top_edge_and_excludes_the_others():
@@ -167,20 +133,6 @@ def test_lens_does_not_fold_far_points_into_the_picture():
     assert 0 < folded[0] < WIDTH
     assert 0 < folded[1] < HEIGHT
     assert project_points(camera, points)[2].tolist() == [True, False]
-
-
-def test_empty_input():
-    xy, depth, visible = project_points(posed(), torch.zeros(0, 3, dtype=torch.float64))
-    assert xy.shape == (0, 2)
-    assert depth.shape == visible.shape == (0,)
-    assert projection_jacobian(posed(), torch.zeros(0, 3, dtype=torch.float64)).shape == (0, 2, 3)
-
-
-def test_dtype_follows_the_points():
-    camera, points = posed(dtype=torch.float32), torch.rand(5, 3, generator=torch.Generator().manual_seed(0))
-    for dtype in (torch.float32, torch.float64):
-        xy, depth, _ = project_points(camera, points.to(dtype))
-        assert xy.dtype == depth.dtype == dtype
 
 
 def test_jacobian_is_the_derivative_of_the_projection():

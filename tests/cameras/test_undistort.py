@@ -55,11 +55,6 @@ def test_mask_is_the_area_of_the_distorted_picture(model):
     torch.testing.assert_close(result[..., 0], mask.float())  # never darkened at the border
 
 
-def test_some_lens_leaves_pixels_unrecorded():
-    """So that the mask above is tested on more than all-true."""
-    assert not undistort(torch.ones(HEIGHT, WIDTH, 1), camera_of("FULL_OPENCV"))[2].all()
-
-
 @pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "OPENCV", "FULL_OPENCV"])
 def test_kornia_needs_the_shift_to_integer_centers(model):
     """kornia's own undistort_image equals ours with cx, cy - 0.5, and is visibly off with COLMAP's K."""
@@ -76,34 +71,6 @@ def test_kornia_needs_the_shift_to_integer_centers(model):
     )
     assert (right - ours)[inside].abs().max() < 1e-9
     assert (wrong - ours)[inside].abs().max() > 0.05
-
-
-def test_remap_needs_align_corners():
-    """The trap that `undistort` avoids: an identity map through kornia's default changes the picture (kornia#4504)."""
-    picture = coordinates().permute(2, 0, 1)[None]
-    x, y = coordinates()[None, ..., 0] - 0.5, coordinates()[None, ..., 1] - 0.5
-    assert (kornia.geometry.remap(picture, x, y, align_corners=True) - picture).abs().max() < 1e-9
-    assert (kornia.geometry.remap(picture, x, y) - picture).abs().max() > 0.3
-
-
-@pytest.mark.parametrize("kind", ["brown_conrady", "kannala_brandt"])
-def test_kinds_of_lens_are_not_interchangeable(kind):
-    model = "OPENCV_FISHEYE" if kind == "brown_conrady" else "OPENCV"
-    camera = camera_of(model)
-    other = Camera(camera.viewmat, camera.K, WIDTH, HEIGHT, "", Distortion(kind, camera.distortion.coefficients))
-    inside = between_centers(colmap_positions(model))
-    right, wrong = (undistort(coordinates(), c)[0].numpy()[inside] for c in (camera, other))
-    assert np.abs(right - wrong).max() > 1
-
-
-def test_zero_coefficients_change_nothing():
-    lens = Distortion("brown_conrady", (0.0, 0.0, 0.0, 0.0))
-    camera = Camera(torch.eye(4), camera_of("OPENCV").K.float(), WIDTH, HEIGHT, "", lens)
-    picture = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0))
-    result, straight, mask = undistort(picture, camera)
-    torch.testing.assert_close(result, picture, atol=1e-4, rtol=0)  # float32 positions of about 100 times 1e-6
-    assert mask.all()
-    assert straight.distortion is None
 
 
 def test_pinhole_returns_what_came():
@@ -146,29 +113,6 @@ def test_labels_come_from_the_nearest_pixel(model):
     expected = np.floor(positions[..., 1]) * WIDTH + np.floor(positions[..., 0])
     assert np.array_equal(result.numpy()[mask.numpy()], expected[mask.numpy()])
     assert (result[~mask] == -1).all()
-
-
-def test_labels_keep_their_type_and_take_the_fill():
-    labels = torch.zeros(HEIGHT, WIDTH, dtype=torch.uint8)
-    result = undistort_labels(labels, camera_of("FULL_OPENCV"), fill=255)
-    assert result.dtype == torch.uint8
-    assert set(result.unique().tolist()) == {0, 255}
-
-
-def test_features_of_many_channels_are_differentiable():
-    camera = camera_of("OPENCV").resized(5, 6)
-    features = torch.rand(5, 6, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: undistort(x, camera)[0], features)
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
-def test_dtype_follows_the_picture(dtype):
-    picture = torch.rand(HEIGHT, WIDTH, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).to(dtype)
-    result, _, _ = undistort(picture, camera_of("OPENCV"))
-    assert result.dtype == dtype
-    # positions are never in half precision: there a step at x = 90 is 1/16 pixel, and shows
-    exact, _, _ = undistort(picture.double(), camera_of("OPENCV"))
-    torch.testing.assert_close(result.double(), exact, atol=5e-4 if dtype == torch.float16 else 2e-5, rtol=0)
 
 
 def test_undistort_refusals():

@@ -47,11 +47,6 @@ def test_each_row_is_treated_alone_and_shapes_are_kept():
     torch.testing.assert_close(found.encode(40 * features), latents)
 
 
-def test_no_rows():
-    assert example().encode(torch.zeros(0, 6, dtype=torch.float64)).shape == (0, 3)
-    assert example().decode(torch.zeros(2, 0, 3, dtype=torch.float64)).shape == (2, 0, 6)
-
-
 def test_decode_is_differentiable():
     assert torch.autograd.gradcheck(example().decode, rows(3, 3, seed=5).requires_grad_())
 

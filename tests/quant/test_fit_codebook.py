@@ -6,7 +6,7 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.quant import Codebook, GrownCodebook, PaperCodebook, fit_codebook, sample_grid
+from kfgs.quant import GrownCodebook, PaperCodebook, fit_codebook, sample_grid
 
 
 class Lazy:
@@ -70,13 +70,6 @@ def test_finds_the_classes_of_a_clean_scene_though_the_first_image_lacks_some():
     assert fit.report.usage.tolist() == [sum(int((name[lab] == e).sum()) for lab in labels) for e in range(6)]
 
 
-def test_superfluous_codewords_are_pruned():
-    maps, *_ = scene(classes=3, noise=0.004)
-    fit = fit_codebook(maps, PaperCodebook(initial=8, epochs=1))  # 8 codewords for 3 classes
-    assert fit.size == 3
-    assert fit.report.history[0]["pruned"] == 8 + fit.report.history[0]["added"] - 3
-
-
 def test_one_step_is_the_paper_written_out():
     """Initialisation, Eq. 8, Eq. 5-6 and Adam's first step (lr times the sign of the gradient) on one image."""
     generator = torch.Generator().manual_seed(3)
@@ -118,15 +111,6 @@ def test_same_generator_state_same_bits_and_order_is_random():
     assert one != two
 
 
-def test_layout_in_memory_does_not_matter():
-    """Maps from a file and maps with a lens removed are laid out otherwise; the bits of a run must not tell which."""
-    maps, _, _ = scene(size=(24, 33), dim=33)
-    turned = [each.permute(2, 0, 1).contiguous().permute(1, 2, 0) for each in maps]
-    assert turned[0].stride() != maps[0].stride()
-    found = [fit_codebook(each, PaperCodebook(initial=2, epochs=6)).codewords for each in (maps, turned)]
-    assert torch.equal(*found)
-
-
 @pytest.mark.parametrize("step_every", [1, 8])
 def test_never_more_than_the_maximum(step_every):
     maps, *_ = scene(classes=12, noise=1.0)
@@ -136,13 +120,6 @@ def test_never_more_than_the_maximum(step_every):
     assert sizes == [record["size"] for record in fit.report.history]
     assert max(sizes) == 9
     assert fit.report.coverage < 1
-
-
-def test_loss_falls_and_codewords_move_towards_their_features():
-    maps, *_ = scene(classes=3, noise=0.1)
-    fit = fit_codebook(maps, PaperCodebook(initial=3, maximum=3, epochs=10, step_every=1, learning_rate=0.1))
-    assert fit.report.history[-1]["loss"] < 0.7 * fit.report.history[0]["loss"]
-    assert fit.report.mean_similarity > fit.report.history[0]["mean_similarity"]
 
 
 def test_final_numbers_are_those_of_the_final_codebook():
@@ -165,13 +142,6 @@ def test_zero_features_are_left_out():
     assert all(math.isfinite(value) for value in fit.report.history[0].values())
 
 
-def test_half_precision_maps_are_computed_in_single():
-    maps = [m.half() for m in scene()[0]]
-    config = PaperCodebook(epochs=1)
-    half, single = fit_codebook(maps, config), fit_codebook([m.float() for m in maps], config)
-    assert torch.equal(half.codewords, single.codewords)
-
-
 def test_grids_that_are_none_are_refused():
     class Wrong(OnDisk):
         def grid(self, i, step, samples):
@@ -185,24 +155,10 @@ def test_grids_that_are_none_are_refused():
         fit_codebook(OnDisk(maps))
 
 
-def test_a_constant_scene_has_one_codeword():
-    fit = fit_codebook([torch.full((3, 4, 5), 2.0)] * 2, PaperCodebook(epochs=2))
-    assert isinstance(fit, Codebook)
-    assert fit.size == 1
-    assert fit.report.mean_similarity == pytest.approx(1.0)
-
-
 def test_paper_has_the_papers_values():
     config = PaperCodebook()
     assert (config.initial, config.maximum, config.expand_below, config.prune_above) == (8, 100, 0.9, 0.99)
     assert (config.epochs, config.learning_rate, config.step_every) == (28, 8e-4, 8)
-
-
-def test_progress_bar_is_shown_when_asked_for(capfd):
-    fit_codebook(scene()[0], PaperCodebook(epochs=1), progress=True)
-    assert "codebook" in capfd.readouterr().err
-    fit_codebook(scene()[0], PaperCodebook(epochs=1))
-    assert capfd.readouterr() == ("", "")
 
 
 def test_bad_maps():
@@ -339,14 +295,6 @@ def test_lengths_of_features_do_not_matter(each):
     torch.testing.assert_close(rough.codewords, one.codewords, rtol=1e-3, atol=1e-4)
 
 
-def test_default_is_repeatable_and_reads_every_map_once_through_its_grid():
-    maps, *_ = scene(noise=0.4)
-    disk = OnDisk(maps)
-    one, other = fit_codebook(disk), fit_codebook(Lazy(maps), generator=torch.Generator().manual_seed(0))
-    assert torch.equal(one.codewords, other.codewords)
-    assert [i for i, *_ in disk.asked] == list(range(5))
-
-
 def test_many_maps_share_the_pool(monkeypatch):
     """100 features of 5 maps of 12 x 15: 20 each at most, which are those of rows and columns 1::3."""
     monkeypatch.setattr(fitting, "POOL", 100)
@@ -359,23 +307,6 @@ def test_many_maps_share_the_pool(monkeypatch):
         fit.report.usage.tolist()
         == sum(torch.bincount(fit.quantize(m[1::3, 1::3]).flatten(), minlength=fit.size) for m in maps).tolist()
     )
-
-
-def test_default_leaves_zero_features_out():
-    maps, *_ = scene(classes=3, size=(24, 33))
-    with_zeros = [torch.zeros(9, 12, 24), *(torch.cat([m, torch.zeros(2, 33, 24)]) for m in maps)]
-    fit = fit_codebook(with_zeros)
-    assert fit.size == 3
-    assert int(fit.report.usage.sum()) == 5 * 24 * 33
-    with pytest.raises(ValueError, match=tells("maps:", "zero", "got 2")):
-        fit_codebook([torch.zeros(2, 3, 4)] * 2)
-
-
-def test_default_drops_codewords_that_are_too_similar():
-    maps, *_ = scene(classes=4, size=(24, 33))
-    fit = fit_codebook(maps, GrownCodebook(prune_above=-1.0))  # any two are too similar
-    assert fit.size == 1
-    assert (fit.report.history[-1]["size"], fit.report.history[-1]["pruned"]) == (1, 3)
 
 
 def test_note_says_what_to_do():

@@ -1,4 +1,3 @@
-import numpy as np
 import pytest
 import torch
 
@@ -45,15 +44,6 @@ def test_outliers_do_not_lead():
     grown = run(torch.cat([unit, outliers]), maximum=16)  # a cell needs 4010 / 16 / 16 = 16 features
     assert len(grown.cells.centres) == 2
     assert nearest_cells(torch.eye(32)[:2], grown.cells.centres).similarity.min() > 0.999
-
-
-def test_a_centre_is_the_direction_of_its_features_sum():
-    unit, _ = mixture([100, 80, 60], noise=0.4)
-    cells = run(unit).cells
-    rows, index = unit.double().numpy(), cells.index.numpy()
-    for e, centre in enumerate(cells.centres.double().numpy()):
-        total = sum(rows[i] for i in range(len(rows)) if index[i] == e)
-        assert centre == pytest.approx(total / np.linalg.norm(total), abs=1e-5)
 
 
 def test_never_more_than_the_maximum_and_full_says_that_more_would_pay():

@@ -42,25 +42,6 @@ def test_a_centre_is_the_mean_direction_of_its_features():
     assert found.index.tolist() == nearest
 
 
-def test_lengths_play_no_part():
-    features, weights = groups(), torch.ones(30)
-    one, other = (
-        spherical_kmeans(rows, weights, 4) for rows in (features, features * torch.linspace(0.01, 50, 30)[:, None])
-    )
-    assert torch.equal(one.index, other.index)
-    torch.testing.assert_close(one.centres, other.centres)
-
-
-def test_weights_pull_the_centre():
-    features = torch.tensor([[1.0, 0.0], [0.6, 0.8]])
-    # 300 light rows and 100 heavy ones: below the 0.99 quantile of the weights, where nothing is held
-    rows = features.repeat_interleave(torch.tensor([300, 100]), dim=0)
-    weights = torch.tensor([1.0] * 300 + [9.0] * 100)
-    centre = spherical_kmeans(rows, weights, 1).centres[0]
-    mean = 300 * features[0] + 900 * features[1]
-    torch.testing.assert_close(centre, mean / mean.norm())
-
-
 def test_one_huge_weight_is_held():
     features = torch.tensor([[1.0, 0.0]]).repeat(1000, 1)
     features[0] = torch.tensor([0.0, 1.0])

@@ -31,32 +31,12 @@ def test_decoding_an_encoded_feature_projects_it():
     torch.testing.assert_close(latents.encode(found), latents.encode(features))  # projecting twice changes nothing
 
 
-def test_a_blend_of_latents_is_the_latent_of_the_blend():
-    latents, (one, other) = LinearLatents(orthonormal(7, 3)), random(2, 7, seed=1)
-    blend = 0.3 * latents.encode(one) + 0.7 * latents.encode(other)
-    torch.testing.assert_close(blend, latents.encode(0.3 * one + 0.7 * other))
-
-
 def test_cosines_are_those_of_the_decoded_features():
     latents, z = LinearLatents(orthonormal(9, 4)), random(5, 4, seed=1)
     rows = torch.nn.functional.normalize(random(3, 9, seed=2), dim=1)
     expected = torch.nn.functional.cosine_similarity(latents.decode(z)[:, None], rows[None], dim=-1)
     torch.testing.assert_close(latents.cosines(z, rows), expected)
     torch.testing.assert_close(latents.cosines(100 * z, rows), expected)  # only directions count
-
-
-def test_zero_latents_have_cosine_0():
-    latents = LinearLatents(orthonormal(9, 4))
-    assert latents.cosines(torch.zeros(2, 4, dtype=torch.float64), random(3, 9)).tolist() == [[0.0] * 3] * 2
-
-
-def test_latents_follow_the_dtype_of_what_is_passed_and_survive_a_dict():
-    latents = LinearLatents(orthonormal(9, 4))
-    assert latents.encode(random(2, 9).float()).dtype == torch.float32
-    assert latents.decode(random(2, 4).float()).dtype == torch.float32
-    assert latents.to(torch.float32).basis.dtype == torch.float32
-    again = LinearLatents.from_state_dict(latents.state_dict() | {"other": torch.zeros(1)})
-    assert torch.equal(again.basis, latents.basis)
 
 
 def test_a_basis_must_be_orthonormal():
@@ -104,12 +84,6 @@ def test_latents_are_the_main_directions():
     made = fit_linear_latents(features, maximum=3, keep=1.0)
     lost = (features - made.decode(made.encode(features))).square().sum()
     torch.testing.assert_close(lost, torch.linalg.svdvals(features)[3:].square().sum())
-
-
-def test_one_direction_needs_one_latent_whatever_the_rounding():
-    direction = torch.nn.functional.normalize(random(64), dim=0)
-    features = (torch.rand(500, 1, generator=torch.Generator().manual_seed(1)) * direction).float()
-    assert fit_linear_latents(features, keep=0.999).latent == 1
 
 
 def test_a_weight_is_a_repetition():

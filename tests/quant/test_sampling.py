@@ -36,10 +36,6 @@ def test_slices_of_the_paper_are_rows_1_2_columns_1_3():
         grid_slices(3, 2, (0, 1))
 
 
-def test_a_map_of_one_pixel_keeps_it_whatever_the_step():
-    assert sample_grid(torch.full((1, 1, 2), 3.0), (4, 5)).tolist() == [[3.0, 3.0]]
-
-
 def test_farthest_points_closed_form():
     angles = torch.tensor([0.0, 10.0, 170.0, 90.0, 20.0]).deg2rad()
     points = torch.stack([angles.cos(), angles.sin()], dim=1) * torch.tensor([[1.0], [9.0], [2.0], [0.1], [5.0]])
@@ -54,12 +50,6 @@ def test_farthest_points_against_loops(seed, block, monkeypatch):
     generator = torch.Generator().manual_seed(seed)
     features = torch.randn(17, 4, generator=generator, dtype=torch.float64)
     assert farthest_points(features, 6).tolist() == oracle.farthest_points(features.numpy(), 6)
-
-
-def test_zero_rows_are_never_picked():
-    features = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0], [0.0, 1.0]])
-    assert farthest_points(features, 8).tolist() == [1, 3]
-    assert farthest_points(features[:3], 8).tolist() == [1]
 
 
 def test_first_pair_tie_goes_to_lowest_rows_and_equal_rows_are_picked_once_each():

@@ -116,19 +116,6 @@ def test_a_module_that_does_not_work_is_named_in_one_line(write, text, words):
     assert "\n" not in str(error.value)
 
 
-def test_a_class_that_does_not_take_the_options_is_named(write):
-    write(CLASS.replace("weights=None, factor=1.0", "factor"))
-    with pytest.raises(
-        ValueError, match=tells("weights, options:", "'mine:Scaled'", "(factor)", "got nothing (missing")
-    ):
-        load_teacher("mine:Scaled")
-    words = ("weights, options:", "'factor'", "got weights, factor")
-    with pytest.raises(ValueError, match=tells(*words)):
-        load_teacher("mine:Scaled", "w.pt", factor=2)
-    with pytest.raises(ValueError, match=tells("weights, options:", "got size (")):
-        load_teacher("mine:Scaled", size=2)
-
-
 def test_what_cannot_be_imported_is_refused(own):
     for name in ("nowhere:x", ":x", ".own_teachers:thumbnail", "own_teachers:", "own_teachers:a:b"):
         with pytest.raises(ValueError, match=tells("teacher:", "package.module:name", f"got '{name}'")):

@@ -33,11 +33,6 @@ def test_templates_are_those_of_the_literature():
     assert all(template.count("{}") == 1 for group in TEMPLATES.values() for template in group)
 
 
-def test_bare_words_are_the_teachers_own_rows():
-    found = embed_labels(TEACHER, ["wall", "chair"])
-    torch.testing.assert_close(found, TEACHER.encode_text(["wall", "chair"]))
-
-
 def test_a_teacher_may_say_which_templates_suit_it():
     teacher = CallableTeacher(lambda image: image, letters)
     teacher.templates = "siglip"
@@ -67,11 +62,6 @@ def test_prompts_go_to_the_teacher_in_chunks_each_once():
     assert max(map(len, seen)) == PROMPTS_AT_ONCE
     assert len(asked) == len(set(asked)) == len(names) + 1
     np.testing.assert_allclose(found[70], ensemble(one, ["thing 70", "shared word"], ["{}"]), rtol=0, atol=2e-6)
-
-
-def test_braces_in_a_word_are_letters():
-    found = embed_labels(TEACHER, ["{0}", "a}b"], templates="the {} here")
-    torch.testing.assert_close(found, TEACHER.encode_text(["the {0} here", "the a}b here"]))
 
 
 def test_a_label_set_knows_what_made_it(tmp_path):

@@ -4,9 +4,7 @@ import json
 import os
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 import torch
@@ -18,9 +16,6 @@ from safetensors.torch import load_file, save_file  # noqa: E402
 from tiny_transformers import write_teacher  # noqa: E402
 
 import kfgs  # noqa: E402
-from kfgs._card import error_line as first_line  # noqa: E402
-from kfgs.teachers.transformers_patches import last_patches  # noqa: E402
-from kfgs.teachers.transformers_table import TRANSFORMERS  # noqa: E402
 from kfgs.teachers.transformers_teacher import load_transformers_teacher  # noqa: E402
 
 
@@ -104,18 +99,6 @@ def test_missing_and_damaged_weights_are_refused(folder):
         load_transformers_teacher("clip", folder)
 
 
-def test_weights_as_a_bin_file_run_nothing(folder, tmp_path):
-    class Payload:
-        def __reduce__(self):
-            return os.mkdir, (str(tmp_path / "run"),)
-
-    (folder / "model.safetensors").unlink()
-    torch.save({"weight": Payload()}, folder / "pytorch_model.bin")
-    with pytest.raises(ValueError, match=tells("clip:", "weights", "'clip'", "read")):
-        load_transformers_teacher("clip", folder)
-    assert not (tmp_path / "run").exists()
-
-
 def test_pictures_need_no_tokenizer_but_words_do(tmp_path):
     folder = write_teacher(tmp_path / "siglip", "siglip")
     for file in folder.glob("tokenizer*"):
@@ -127,13 +110,6 @@ def test_pictures_need_no_tokenizer_but_words_do(tmp_path):
     (folder / "tokenizer.json").write_text("{}")
     with pytest.raises(ValueError, match=tells("tokenizer", "'siglip'", "read")):
         teacher.encode_text(["wall"])
-
-
-def test_loading_draws_no_bar_and_says_nothing(folder, capfd):
-    load_transformers_teacher("clip", folder)
-    captured = capfd.readouterr()
-    assert captured.out == ""
-    assert captured.err == ""
 
 
 def test_missing_package_names_the_line_to_install_it(folder, monkeypatch):
@@ -157,33 +133,6 @@ def test_package_that_does_not_import_is_named(folder, tmp_path, monkeypatch, er
     assert one_line(got)
 
 
-def test_class_that_does_not_import_is_named(folder, tmp_path, monkeypatch):
-    class Lazy(ModuleType):  # as transformers is: a class is imported when it is looked at
-        def __getattr__(self, name):
-            if name == "CLIPModel":
-                raise RuntimeError(f"Failed to import {name}\nbecause of the following error")
-            raise AttributeError(name)
-
-    monkeypatch.setitem(sys.modules, "transformers", Lazy("transformers"))
-    words = ("transformers:", "'clip'", "RuntimeError")
-    with pytest.raises(ImportError, match=tells(*words)) as error:
-        load_transformers_teacher("clip", folder)
-    assert one_line(error)
-
-
-def test_error_is_cut_to_one_line_of_200_characters():
-    assert first_line(ValueError("a" * 300 + "\nb")) == "ValueError: " + "a" * 200
-    assert first_line(KeyError()) == "KeyError"
-
-
-def test_old_transformers_is_named(tmp_path, monkeypatch):
-    folder = write_teacher(tmp_path / "dino", "dinov2")
-    row = replace(TRANSFORMERS["dinov2"], models={"dinov2": ("Dinov9Model", last_patches)})
-    monkeypatch.setitem(TRANSFORMERS, "dinov2", row)
-    with pytest.raises(ImportError, match=tells("transformers:", "Dinov9Model", "'dinov2'", "--upgrade")):
-        load_transformers_teacher("dinov2", folder)
-
-
 def test_torchvision_that_does_not_import_is_reported_as_what_it_is(folder, tmp_path):
     package = tmp_path / "site" / "torchvision"
     package.mkdir(parents=True)
@@ -197,11 +146,3 @@ def test_torchvision_that_does_not_import_is_reported_as_what_it_is(folder, tmp_
     assert last.startswith("ImportError: torchvision: expected none, or the build that belongs to torch")
     assert "RuntimeError: operator torchvision::nms does not exist" in last
     assert "`pip uninstall torchvision`" in last
-
-
-def test_table_is_read_without_transformers():
-    code = (
-        "import sys; from kfgs.teachers.transformers_table import TRANSFORMERS; "
-        "assert 'clip' in TRANSFORMERS and 'transformers' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(kfgs.__file__).parents[1], timeout=600)

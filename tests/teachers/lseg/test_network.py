@@ -4,7 +4,6 @@ import oracles_lseg
 import pytest
 import torch
 from lseg_layout import random_state
-from messages import tells
 from torch import nn
 from torch.nn import functional
 
@@ -61,12 +60,6 @@ def test_features_in_float32(position_grid):
     assert relative(network(x), oracles_lseg.features(state, config, x, "eager")) < 1e-5
 
 
-def test_windows_of_a_batch_do_not_see_each_other(case):
-    state, x, _ = case
-    network = network_from_state(state, TINY, source="tiny").double()
-    torch.testing.assert_close(network(x)[1:], network(x[1:]), rtol=1e-12, atol=1e-12)
-
-
 def set_epsilon(network, kind, value):
     for module in network.modules():
         if isinstance(module, kind):
@@ -116,12 +109,6 @@ def test_a_planted_mistake_is_noticed(case, mistake, monkeypatch):
     assert relative(network(x), expected) > 1e-5  # which is more than float32 is granted
 
 
-def test_a_window_of_another_size_is_refused(case):
-    network = network_from_state(case[0], TINY, source="tiny")
-    with pytest.raises(ValueError, match=tells("x:", "[B, 3, 64, 64]", "got (1, 3, 64, 80)")):
-        network(torch.zeros(1, 3, 64, 80))
-
-
 def test_the_defaults_are_those_of_the_released_checkpoint():
     config = LSegConfig()
     assert config.grid == 30
@@ -137,13 +124,3 @@ def test_with_all_channels_it_is_still_transformers_dpt_and_clip():
     network, tower = (build(state, config, source="full") for build in (network_from_state, text_from_state))
     assert relative(network(x), oracles_lseg.features(state, config, x, "eager")) < 1e-5
     assert relative(tower(ids), oracles_lseg.text(state, config, ids, torch.float32, "eager")) < 1e-5
-
-
-def test_with_the_released_window_it_is_still_transformers_dpt():
-    """All 24 blocks with their 16 heads, and 901 tokens; few channels."""
-    few = {"width": 64, "neck": (16, 24, 32, 40), "fusion": 16, "dim": 24, "text_width": 16, "text_layers": 1}
-    config, generator = LSegConfig(**few, vocabulary=60), torch.Generator().manual_seed(13)
-    state = random_state(config, generator)
-    x = 2 * torch.rand(1, 3, 480, 480, generator=generator) - 1
-    network = network_from_state(state, config, source="wide")
-    assert relative(network(x), oracles_lseg.features(state, config, x, "eager")) < 1e-5

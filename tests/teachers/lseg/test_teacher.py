@@ -52,13 +52,6 @@ def test_features_are_those_of_the_windows_of_the_resized_and_normalised_picture
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
 
 
-def test_a_picture_no_larger_than_the_window_is_not_resized() -> None:
-    teacher, image = tiny(LSegOptions.fast()), picture(64, 64)
-    window = teacher.network(image[None] * 2 - 1)
-    expected = functional.interpolate(window, size=(64, 64), mode="bilinear", align_corners=True)[0]
-    torch.testing.assert_close(teacher.encode_image(image), expected, rtol=1e-5, atol=1e-5)
-
-
 @pytest.mark.parametrize(
     ("size", "picture_size", "expected"),
     [
@@ -77,13 +70,6 @@ def test_a_picture_no_larger_than_the_window_is_not_resized() -> None:
 )
 def test_size_of_the_map(size, picture_size: tuple[int, int], expected: tuple[int, int]) -> None:
     assert LSegOptions(size=size).map_size(*picture_size) == expected
-
-
-def test_map_has_the_size_that_was_told() -> None:
-    for size, shape in [("auto", (40, 130)), (None, (40, 130)), ((20, 30), (40, 130)), ((20, 30), (40, 30))]:
-        options = replace(LSegOptions.fast(), size=size)
-        found = tiny(options).encode_image(picture(*shape))
-        assert tuple(found.shape[1:]) == options.map_size(*shape, window=64)
 
 
 def test_paper_runs_26_times_and_fast_once() -> None:
@@ -137,16 +123,6 @@ def test_teacher_protocol_device_and_module() -> None:
     assert not any(part.training for part in teacher.modules())
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_follows_its_device() -> None:
-    image = picture(50, 64)
-    expected = with_text().encode_image(image)
-    teacher = with_text().to("cuda")
-    found = teacher.encode_image(image)
-    assert found.device.type == teacher.encode_text(["a"]).device.type == "cuda"
-    assert functional.cosine_similarity(found.cpu(), expected, dim=0).min() > 0.999  # convolutions in TF32
-
-
 def test_identity_is_json_tells_the_options_and_asks_for_the_digest_once() -> None:
     calls: list[int] = []
     teacher = tiny(LSegOptions(scales=(1.0,), size=(30, 40)), weights=lambda: calls.append(1) or "abc")
@@ -185,16 +161,6 @@ def test_load_lseg_combines_fast_with_single_settings(tmp_path: Path) -> None:
     assert load_lseg(path, config=TINY, fast=True, flip=True, size=None).options == LSegOptions(
         scales=LSegOptions.fast().scales, flip=True, size=None
     )
-
-
-def test_file_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=tells("demo_e200.ckpt:")):
-        load_lseg(tmp_path / "demo_e200.ckpt")
-
-
-def test_without_text_prompts_are_refused() -> None:
-    with pytest.raises(NotImplementedError, match=tells("teacher 'lseg':", "text tower", "load_lseg")):
-        tiny().encode_text(["wall"])
 
 
 @pytest.mark.parametrize(

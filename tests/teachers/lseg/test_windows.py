@@ -71,21 +71,6 @@ def test_equals_it_at_the_released_size_in_single_precision(size, scales, flip: 
     assert (found - expected).abs().max() < 1e-5 * expected.abs().max()
 
 
-def test_more_channels_than_are_finished_at_a_time() -> None:
-    image = picture(40, 60)
-    wide = multi_scale_features(image, network(64, 130), window=64, scales=(1.25,), flip=False)
-    expected = oracle(image, network(64, 130), 64, (1.25,), False)
-    torch.testing.assert_close(wide, expected, rtol=0, atol=1e-9)
-
-
-def test_a_constant_is_summed_over_scales_not_averaged() -> None:
-    def constant(x: Tensor) -> Tensor:
-        return torch.full((1, 2, 32, 32), 3.0, dtype=x.dtype)
-
-    found = multi_scale_features(picture(50, 90), constant, window=64, scales=PAPER, flip=True)
-    torch.testing.assert_close(found, torch.full((2, 50, 90), 12.0, dtype=torch.float64), rtol=0, atol=1e-12)
-
-
 def test_flips_make_the_features_of_a_mirrored_picture_the_mirrored_features() -> None:
     """Where one window holds the whole width, so that padding and overlaps are the same on both sides."""
     image, head = picture(64, 64), network(64, 3)
@@ -95,13 +80,6 @@ def test_flips_make_the_features_of_a_mirrored_picture_the_mirrored_features() -
     torch.testing.assert_close(found, straight.flip(-1), rtol=0, atol=1e-12)
     unflipped = multi_scale_features(image, head, window=64, scales=(scale,), flip=False)
     assert (unflipped - straight).abs().max() > 0.1
-
-
-def test_scale_480_over_520_is_one_window_and_only_the_last_enlargement() -> None:
-    image, head = picture(64, 64), network(64, 3)
-    found = multi_scale_features(image, head, window=64, scales=(480 / 520,), flip=False)
-    expected = functional.interpolate(head(image[None]), size=(64, 64), mode="bilinear", align_corners=True)[0]
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
 
 
 def test_sizes_windows_and_forwards_of_the_released_script() -> None:
