@@ -80,10 +80,8 @@ class Camera:
                 raise ValueError(f"{name}: expected a positive whole number of pixels, got {size!r}; pass an integer")
             object.__setattr__(self, name, int(size))
         if self.width * self.height > PIXELS:
-            raise ValueError(
-                f"width, height: expected at most {PIXELS:,} pixels, got {self.width:,} x {self.height:,}; give a smaller "
-                "size"
-            )
+            got = f"{self.width:,} x {self.height:,}"
+            raise ValueError(f"width, height: expected at most {PIXELS:,} pixels, got {got}; give a smaller size")
         if not torch.compiler.is_compiling():  # a traced matrix has no values yet
             self._check_values()
 

@@ -45,16 +45,14 @@ def path_cameras(
 
     Args:
         cameras: at least two different ones, in the order of the path (pictures of a video by name).
-        frames: how many cameras to return. The first and last stand at the first and last key; a closed path ends one step
-            before its start.
+        frames: the number of cameras to return. The first and last stand at the first and last key.
         every: take only every N-th camera as a key, and the last one. A hand-held video of 200 pictures trembles less with 10.
-        size: (height, width) in pixels of the new cameras; None: that of the first camera. A key of another shape than the
-            first stays complete, in the middle of the picture.
-        closed: come back to the first camera, for a film that repeats.
+        size: (height, width) in pixels; None: that of the first camera. A key of another shape stays complete, in the middle.
+        closed: come back to the first camera, for a film that repeats; the path ends one step before its start.
 
     Returns:
-        Pinhole cameras, `path_0000` and so on. Focal lengths and principal points change linearly between the keys.
-        They have no lens distortion, and the smallest `near` of all.
+        Pinhole cameras, `path_0000` and so on, with the smallest `near` of all. Focal lengths and principal points change
+        linearly between the keys.
 
     Raises:
         TooFewViewsError: if there are fewer than two different views.

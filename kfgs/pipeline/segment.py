@@ -92,8 +92,8 @@ def segment_cameras(
 
     Args:
         field: a finished field.
-        cameras: viewpoints without distortion in its frame, each with a name of its own: `path_cameras`, `orbit_cameras`,
-            `spiral_cameras`, or your own.
+        cameras: viewpoints without distortion in its frame, each with a name of its own: `path_cameras`,
+            `orbit_cameras`, or your own.
         classes: names and embeddings in the teacher's space.
         out: receives `predicted/<name>.png` (class numbers, 255 = none) and `colored/<name>.png` (in the classes' colours).
         progress: show a progress bar.

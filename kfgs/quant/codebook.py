@@ -50,11 +50,7 @@ class CodebookReport:
 
 @dataclass(frozen=True, eq=False)
 class Codebook(Stored):
-    """K features of a teacher that stand for all others, compared by cosine similarity.
-
-    Args:
-        codewords: their length does not matter: only directions are compared.
-        report: set by `fit_codebook`; it is not saved.
+    """K features of a teacher that stand for all others, compared by cosine similarity: only their directions count.
 
     Raises:
         ValueError: if there is no codeword, or one is all-zero or not finite.
@@ -66,7 +62,7 @@ class Codebook(Stored):
     """
 
     codewords: Tensor  # [K, D]
-    report: CodebookReport | None = field(default=None, repr=False)
+    report: CodebookReport | None = field(default=None, repr=False)  # set by `fit_codebook`; not saved
     kind = "codebook"
 
     def __post_init__(self) -> None:
@@ -168,11 +164,8 @@ def compare(
     """Eq. 5: the best row of each feature, its product with the feature, and the feature's length.
 
     The length changes no argmax, so no feature is divided by it. Ties go to the lowest index. The product has the dtype of
-    `unit`, the length at least single precision.
-
-    Note:
-        Products of bfloat16 are three times faster on AVX-512 BF16, but features whose two best are closer than their
-        error would have to be computed again: too many to gain.
+    `unit`, the length at least single precision. (Products of bfloat16 are three times faster on AVX-512 BF16, but too many
+    features would have to be computed again whose two best are closer than their error.)
     """
     K, D = unit.shape
     rows = features.reshape(-1, D)

@@ -53,12 +53,16 @@ class AutoencoderConfig:
     """Steps between two records of the history."""
 
     def __post_init__(self) -> None:
-        for name in ("latent", "steps", "record_every"):
-            check_whole(name, getattr(self, name), 1)
+        widths = [(f"encoder[{i}]", width) for i, width in enumerate(self.encoder)]
+        widths += [(f"decoder[{i}]", width) for i, width in enumerate(self.decoder)]
+        for name, value in [
+            ("latent", self.latent),
+            ("steps", self.steps),
+            ("record_every", self.record_every),
+            *widths,
+        ]:
+            check_whole(name, value, 1)
         check_whole("blends", self.blends, 0)
-        for name in ("encoder", "decoder"):
-            for i, width in enumerate(getattr(self, name)):
-                check_whole(f"{name}[{i}]", width, 1)
         check_range("learning_rate", self.learning_rate, 0, closed=(False, True))
         check_range("weight_decay", self.weight_decay, 0)
 
@@ -81,24 +85,13 @@ def fit_autoencoder(
     |Psi(sum_j w_j E(f_j)) - f|_2, f the direction of sum_j w_j f_j: `BLENDED` codewords drawn at random with weights from
     the flat Dirichlet distribution, other ones in every step. All codewords are one batch, so batch normalisation and the
     range of the latents are functions of the weights alone. When training ends, both are frozen as the decoder saw them last.
-
-    Args:
-        codebook: its K codewords, K >= 1; targets are their unit directions.
-        config: see `AutoencoderConfig`.
-        generator: draws the initial weights and the blends; None stands for a fresh one with seed 0.
-        progress: True shows a bar; a function is called with each record as it is written to the history.
-
-    Returns:
-        The autoencoder; its `report` says how many codewords are recovered.
+    The generator (None: a fresh one with seed 0) draws the initial weights and the blends. The result's `report` says how
+    many codewords are recovered.
 
     Note:
         The released script compares unit outputs with codewords of any length (an error that cannot vanish), and uses
         running statistics that the decoder was not trained with.
     """
-    if not isinstance(codebook, Codebook):
-        raise TypeError(
-            f"codebook: expected a Codebook, got {type(codebook).__name__}; make one with Codebook(codewords)"
-        )
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     target = codebook.unit.detach()
     with torch.device("meta"):  # nothing is drawn from the global generator

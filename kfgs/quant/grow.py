@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from .._card import short_repr
 from .._check import check_range, check_whole
 from .._progress import Progress
 from .._rows import EPS, unit_rows
@@ -102,9 +101,6 @@ class Grown(NamedTuple):
     similarity: list[Tensor]  # [n] of each round, before it grew
     full: bool  # whether a split that pays was left out because the book was full
 
-    def __repr__(self) -> str:
-        return short_repr(self)
-
 
 def grow(
     unit: Tensor,  # [n, D] unit rows
@@ -121,12 +117,6 @@ def grow(
     so that a few outliers never lead; and by a split that lowers its cosine distance by `LEAST_GAIN`, which noise
     without structure does not allow. With `alpha`, only cells split in which less than `coverage` of the features are
     that similar (Eq. 8 for cells instead of single features). At most half of the cells split in one round.
-
-    Returns:
-        Centres with the final assignment, ties to the lowest index, and a record of the rounds.
-
-    Note:
-        Lengths do not matter: the features are unit rows, and a centre is the direction of their sum.
     """
     least = max(2.0, LEAST_SHARE * len(unit) / maximum)
     cells = refine(unit, unit_rows(unit.sum(dim=0, keepdim=True)), 0)

@@ -33,13 +33,9 @@ def spherical_kmeans(
 ) -> Cells:
     """Group features by direction: each joins the centre of largest cosine; a centre is the mean direction of its features.
 
-    Args:
-        features: of any length; an all-zero one goes to group 0 and moves no centre.
-        weights: how much each counts. The first centres are drawn in proportion to them, capped at their 0.99 quantile, so
-            that one huge weight does not draw all of them.
-        clusters: the most groups, K; fewer if there are fewer features. A centre that loses all features stays.
-        rounds: of assignment and averaging; later ones move few features.
-        generator: draws the first centres; None stands for seed 0.
+    The first centres are drawn in proportion to the weights, capped at their 0.99 quantile, so that one huge weight does not
+    draw all of them. An all-zero feature goes to group 0 and moves no centre. K may be smaller than `clusters` if there are
+    fewer features.
 
     Raises:
         ValueError: if shapes disagree, or every weighted feature is zero.

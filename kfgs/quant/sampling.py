@@ -16,11 +16,10 @@ BLOCK = 2048  # rows of a similarity matrix in memory at a time
 
 
 class FeatureMaps(Protocol):
-    """Feature maps of many images, one in memory at a time: `len(maps)` and `maps[i]`, a map [h, w, D].
+    """Feature maps of many images, one in memory at a time; a list of tensors is enough.
 
-    A list of tensors is enough. Maps on disk may have two more members, so that less is read or in memory:
-    `grid(i, step, samples)`, equal to `sample_grid(maps[i], step, samples=samples)`; and `blocks(i)`, the map a few rows
-    at a time.
+    Maps on disk may have two more members, so that less is read or in memory: `grid(i, step, samples)`, equal to
+    `sample_grid(maps[i], step, samples=samples)`; and `blocks(i)`, the map a few rows at a time.
     """
 
     def __len__(self) -> int: ...
@@ -56,10 +55,9 @@ def grid_slices(
         >>> grid_slices(360, 480), grid_slices(90, 120)
         ((slice(1, 360, 2), slice(1, 480, 3)), (slice(0, 90, 1), slice(0, 120, 1)))
     """
-    check_range("samples", samples, 1)
     rows, columns = step or (1, 1)
-    check_range("step[0]", rows, 1)
-    check_range("step[1]", columns, 1)
+    for name, value in (("samples", samples), ("step[0]", rows), ("step[1]", columns)):
+        check_range(name, value, 1)
     while step is None and len(_grid(height, rows)) * len(_grid(width, columns)) > samples:
         rows, columns = (rows, columns + 1) if rows == columns else (rows + 1, columns)
     return slice(_grid(height, rows).start, height, rows), slice(_grid(width, columns).start, width, columns)
@@ -71,16 +69,10 @@ def sample_grid(
     *,
     samples: int = SAMPLES,
 ) -> Tensor:  # [n, D]
-    """The features on a regular grid of pixels, row by row.
+    """The features on a regular grid of pixels, row by row: every N-th row and column, from step // 2.
 
-    Args:
-        feature_map: features of one view.
-        step: take every N-th row and column, from step // 2, so (2, 3) is rows 1::2, columns 1::3. None: the finest step
-            that leaves at most `samples` features. Steps grow in turn, columns first: (1, 1), (1, 2), (2, 2), (2, 3), ...
-        samples: the most features to take if `step` is None.
-
-    Raises:
-        ValueError: if the map is not [h, w, D], or a step is not positive.
+    So (2, 3) is rows 1::2, columns 1::3. A step of None is the finest one that leaves at most `samples` features. Steps grow
+    in turn, columns first: (1, 1), (1, 2), (2, 2), (2, 3), ...
     """
     sizes = check_shapes(("feature_map", feature_map, "h w D"))
     rows, columns = grid_slices(sizes["h"], sizes["w"], step, samples=samples)

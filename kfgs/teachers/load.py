@@ -78,8 +78,13 @@ def _imported(name: str, weights: str | Path | None, options: dict[str, Any]) ->
         found = _find(name)
         given = [] if weights is None else [weights]
         if inspect.isclass(found):
-            _check_signature(name, found, given, options)
-            found = found(*given, **options)
+            try:
+                found = found(*given, **options)
+            except TypeError as error:
+                got = ", ".join([*(["weights"] if given else []), *options]) or "nothing"
+                raise ValueError(
+                    f"weights, options: expected what {name!r} takes, got {got} ({error}); pass just those"
+                ) from error
         elif given or options:
             raise ValueError(
                 f"weights: expected none for {name!r}, which is made already, got {weights or ', '.join(options)}; name a "
@@ -114,19 +119,4 @@ def _find(name: str) -> Any:
         raise ValueError(
             f"teacher: expected package.module:name that can be imported, got {name!r} ({error_line(error)}); check both "
             "names, and that `import` of the module works"
-        ) from error
-
-
-def _check_signature(name: str, made: Callable[..., Any], given: list[Any], options: dict[str, Any]) -> None:
-    """Raise a ValueError if a class does not take these weights and options."""
-    try:
-        signature = inspect.signature(made)
-    except (TypeError, ValueError):  # a class of C has none
-        return
-    try:
-        signature.bind(*given, **options)
-    except TypeError as error:
-        got = ", ".join([*(["weights"] if given else []), *options]) or "nothing"
-        raise ValueError(
-            f"weights, options: expected what {name!r} takes, {signature}, got {got} ({error}); pass just those"
         ) from error

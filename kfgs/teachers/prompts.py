@@ -81,14 +81,10 @@ def make_label_set(
 ) -> LabelSet:
     """Make classes from words: each name with its embedding by the teacher's text encoder, on the CPU.
 
-    Errors are those of `embed_labels`; `info` of the result records teacher and templates.
+    `info` of the result records teacher and templates.
 
-    Args:
-        teacher: a teacher with a text encoder.
-        names: C class names. A name may contain synonyms, "chair;armchair"; the first word names the class.
-        templates: texts such as "a photo of a {}.", or the name of a set of `TEMPLATES`; None: the teacher's, else bare words.
-        synonyms: further words of a class, by its name.
-        negatives: words that a query is compared with if there is no other class (LERF's canonical words), or None.
+    Arguments are those of `embed_labels`; `negatives` are words that a query is compared with if there is no other class
+    (LERF's canonical words), or None.
     """
     teacher = as_teacher(teacher)
     words = _words(names, synonyms)
@@ -125,26 +121,25 @@ def _words(names: Sequence[str], synonyms: Mapping[str, Sequence[str]] | None) -
     """The words of each class, as written in prompts, by the class's name, which is its first word."""
     if isinstance(names, str):
         raise TypeError(f"names: expected a list of class names, got the text {names!r}; put it into a list")
-    split = [[part.strip() for part in name.split(";")] for name in names]
-    if not split or any(not part.replace("_", "").strip() for one in split for part in one):
+    words = [[part.strip() for part in name.split(";")] for name in names]
+    keys, more = [group[0] for group in words], dict(synonyms or {})
+    if not keys or any(not part.replace("_", "").strip() for group in words for part in group):
         raise ValueError(f"names: expected at least one name and no empty word, got {list(names)!r:.200}; leave it out")
-    keys = [one[0] for one in split]
-    twice = sorted({key for key in keys if keys.count(key) > 1})
-    if twice:
-        raise ValueError(f"names: expected different names, got {twice[0]!r} more than once; leave out repeats")
-    more = dict(synonyms or {})
-    unknown = [name for name in more if name not in keys]
-    if unknown:
-        raise ValueError(
-            f"synonyms: expected words of the classes {', '.join(keys[:10])}, got some of {unknown[0]!r}; name a class by "
-            "its first word"
-        )
-    for name, one in more.items():
-        if isinstance(one, str) or not all(isinstance(word, str) and word.strip(" _") for word in one):
-            raise ValueError(f"synonyms: expected a list of words for {name!r}, got {one!r:.80}; write them as [...]")
-    words = {one[0]: [*one, *more.get(one[0], ())] for one in split}
+    twice = next((key for key in keys if keys.count(key) > 1), None)
+    if twice is not None:
+        raise ValueError(f"names: expected different names, got {twice!r} more than once; leave out repeats")
+    for name, others in more.items():
+        if name not in keys:
+            raise ValueError(
+                f"synonyms: expected words of {', '.join(keys[:10])}, got some of {name!r}; name the first word"
+            )
+        if isinstance(others, str) or not all(isinstance(word, str) and word.strip(" _") for word in others):
+            raise ValueError(
+                f"synonyms: expected a list of words for {name!r}, got {others!r:.80}; write them as [...]"
+            )
     return {
-        key: list(dict.fromkeys(" ".join(word.replace("_", " ").split()) for word in one)) for key, one in words.items()
+        key: list(dict.fromkeys(" ".join(word.replace("_", " ").split()) for word in [*group, *more.get(key, ())]))
+        for key, group in zip(keys, words, strict=True)
     }
 
 

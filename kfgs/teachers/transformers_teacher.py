@@ -48,8 +48,7 @@ def load_transformers_teacher(
         local_only: use only the local cache for a hub id.
 
     Raises:
-        ImportError: if transformers is missing (`pip install "kfgs[hf]"`), broken or too old, or torchvision is broken.
-        FileNotFoundError: if there are no weights.
+        ImportError: if transformers is missing (`pip install "kfgs[hf]"`), broken or too old.
         ValueError: if the options do not suit the kind, or the weights are of another model, damaged or incomplete.
     """
     check_choice("kind", kind, TRANSFORMERS)

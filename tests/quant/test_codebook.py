@@ -3,7 +3,7 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.quant import Codebook, IndexMaps, fit_autoencoder
+from kfgs.quant import Codebook, IndexMaps
 from kfgs.quant.codebook import compare
 
 
@@ -123,5 +123,3 @@ def test_arrays_are_accepted_and_names_refused():
     assert torch.equal(same.similarity(rows.numpy()), book.similarity(rows))
     with pytest.raises(TypeError, match=tells("features", "'chair'", "embedding")):
         book.quantize("chair")
-    with pytest.raises(TypeError, match=tells("codebook", "Tensor", "Codebook(codewords)")):
-        fit_autoencoder(rows)
