@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from .._card import short_repr
 from .._names import class_index, class_indices
 from ..cameras import Camera
 from ..fields import Linear, SemanticField, fuse_views
@@ -33,46 +32,15 @@ class Asked(NamedTuple):
     known: bool  # whether it is one of the classes
     valid: Tensor  # [N] bool, whether anything is known about a Gaussian; the others are never selected
 
-    def __repr__(self) -> str:
-        return short_repr(self)
-
-
-class Meaning(Protocol):
-    """A semantic cloud that answers questions."""
-
-    gaussians: Gaussians  # with labels, [N] int64, -1 = none; features [N, d] or None
-    names: tuple[str, ...]  # class names in label order
-    scores: Tensor  # [N] of the labels
-    by: str  # one line: how labels and scores were found
-    phrases: bool  # whether it answers more than class names
-    examples: bool  # whether it answers `similar`
-
-    def ask(self, words: str) -> Asked:
-        """Answer a class name or, if `phrases`, any text; a ValueError that offers similar names if there is no answer."""
-        ...
-
-    def similar(self, mask: Tensor) -> Asked:  # [N] bool
-        """Answer "what is like these Gaussians?"; a ValueError if nothing is known about any of them."""
-        ...
-
-    def feature_colors(self) -> FeatureColors:
-        """The scene's projection of features to colours; called only if there are features."""
-        ...
-
 
 class FieldMeaning:
-    """A semantic field: labels come from `SemanticField.classify`, answers from `SemanticField.query`.
-
-    A class is compared with the other classes, any other text with the canonical words (`classes.negatives`). The score
-    is then a relevancy, with gamma 0.5. If there is nothing to compare with, the score is the cosine, and gamma is
-    derived from the scores.
+    """A semantic field: labels come from `SemanticField.classify`, answers and gamma from `SemanticField.query`.
 
     Args:
         field: a finished field.
         classes: names and embeddings in the teacher's space; None: those that the field remembers.
-        cameras: the training views, used only to compute fused features if the field has none yet
-            (`fields.fuse_views`); empty: the field's own. Without any view, each Gaussian's own latent decides,
-            as in the paper.
+        cameras: the training views, to compute fused features if the field has none (`fields.fuse_views`); empty: the
+            field's own. Without any view, each Gaussian's own latent decides, as in the paper.
         embed: the teacher's text encoder, text -> [D]; without it only classes can be asked.
 
     Raises:
@@ -108,11 +76,7 @@ class FieldMeaning:
         self.gaussians = field.gaussians.replace(labels=labels)
 
     def ask(self, words: str) -> Asked:
-        """Answer a class name or, with an encoder, any text. Answers are cached.
-
-        Raises:
-            ValueError: if it is not a class and there is no encoder, or the encoder belongs to another teacher.
-        """
+        """Answer a class name or, with an encoder, any text. Answers are cached."""
         words = words if words in self.names else words.strip()
         known = self._classes.knows(words)
         if known:
@@ -125,11 +89,7 @@ class FieldMeaning:
         return self._answers[words]
 
     def similar(self, mask: Tensor) -> Asked:  # [N] bool
-        """Compare with the mean direction of some Gaussians' features, by cosine; the suggested gamma keeps nine of ten.
-
-        Raises:
-            ValueError: if nothing is known about any of them.
-        """
+        """Compare with the mean direction of some Gaussians' features, by cosine; the suggested gamma keeps nine of ten."""
         field = self.field
         chosen = mask.to(field.known.device) & field.known
         if not bool(chosen.any()):
@@ -158,8 +118,8 @@ class FieldMeaning:
         target = torch.as_tensor(self._embed(words)).detach()
         if tuple(target.shape) != (self.field.dim,):
             raise ValueError(
-                f"embed: expected [{self.field.dim}] (from the field) for {words!r}, got {tuple(target.shape)}; "
-                "pass the text encoder of the teacher whose features this field was fitted to"
+                f"embed: expected [{self.field.dim}] (from the field) for {words!r}, got {tuple(target.shape)}; pass the "
+                "text encoder of the field's teacher"
             )
         return target
 
@@ -180,8 +140,7 @@ class SplatMeaning:
         labels = splats.labels
         if labels is None:
             raise ValueError(
-                "splats.labels: expected labels [N] to ask for, got None; label the splat first, with `kfgs attach` "
-                "or transfer_labels, or pass a field"
+                "splats.labels: expected labels [N] to ask for, got None; label it first, with `kfgs attach` or transfer_labels"
             )
         self.gaussians = splats
         count = max(len(splats.names), int(labels.max()) + 1 if len(labels) else 0)
@@ -195,11 +154,7 @@ class SplatMeaning:
         self._answers: dict[str, Asked] = {}
 
     def ask(self, words: str) -> Asked:
-        """Answer a class name; the suggested gamma lies below all scores of the class, so that all are selected.
-
-        Raises:
-            ValueError: if there is no such class; the message offers similar names.
-        """
+        """Answer a class name; the suggested gamma lies below all scores of the class, so that all are selected."""
         words = self.names[class_indices(words if words in self.names else words.strip(), self.names)[0]]
         if words not in self._answers:
             member = OfClass(words).select(self.gaussians.replace(names=self.names)).mask
@@ -223,6 +178,11 @@ class SplatMeaning:
         """A projection fitted to the features of the Gaussians that have some."""
         assert self.gaussians.features is not None
         return FeatureColors.fit(self.gaussians.features)
+
+
+Meaning = FieldMeaning | SplatMeaning
+"""What both have: `gaussians` with labels, `names` in label order, `scores` of the labels, `by` (how they were found), `phrases`
+and `examples` (whether they answer other words, and `similar`)."""
 
 
 def _asked(words: str, selection: Selection, valid: Tensor, relevant: bool, known: bool) -> Asked:

@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from .._card import short_repr
 from .._check import as_array
+from .._rows import check_finite
 from ..formats.smallest_three import pack_smallest_three
 from ..gaussians import Gaussians
 from ..scenes import Scene
@@ -44,9 +44,6 @@ class Packed(NamedTuple):
 
     header: dict[str, Any]
     data: bytes
-
-    def __repr__(self) -> str:
-        return short_repr(self)
 
     def compressed(self, level: int = 6) -> bytes:
         """The data as a zlib stream, which JavaScript's `inflate` reads.
@@ -88,15 +85,8 @@ class _Buffers:
 def pack_scene(state: Exploration, *, title: str = "kfgs", scene: Scene | None = None) -> Packed:
     """Pack both sides of an exploration, the classes with their scores, the cameras, and what is asked and shown now.
 
-    Row i of every buffer is Gaussian i of Python. A score is NaN where nothing is known about a Gaussian.
-
-    Args:
-        state: what is packed.
-        title: of the page.
-        scene: has the photos of the exploration's cameras, found by name; None: without photos.
-
-    Raises:
-        ValueError: if a number of a Gaussian is not finite.
+    Row i of every buffer is Gaussian i of Python. A score is NaN where nothing is known about a Gaussian. `scene` has the
+    photos of the cameras, found by name. A ValueError if a number of a Gaussian is not finite.
     """
     from matplotlib import colormaps
 
@@ -185,15 +175,11 @@ def rounded_far(far: Array, given: float) -> Array:  # [N] float64 -> [N] float3
 
 
 def _check_finite(side: Side, cloud: Gaussians) -> None:
-    """JSON has no NaN, and one such number would spoil the steps of all others."""
+    """JSON has no NaN, and a single one would spoil the steps of all others."""
     for name in ("quats", "scales", "opacities", "sh"):
         values = getattr(cloud, name)
-        if values is None or bool(torch.isfinite(values).all()):
-            continue
-        row = int((~torch.isfinite(values.reshape(len(cloud), -1))).any(1).nonzero()[0])
-        raise ValueError(
-            f"{side}.{name}: expected finite numbers, got {values[row].flatten()[:4].tolist()} at {row}; remove this Gaussian"
-        )
+        if values is not None:
+            check_finite(f"{side}.{name}", values)
 
 
 def core_box(means: Array) -> tuple[Array, Array]:  # [N, 3] -> [3], [3]

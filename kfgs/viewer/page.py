@@ -84,16 +84,7 @@ def document(title: str, start: str = PYTHON_START, data: str = "", policy: str 
 def save_html(exploration: Exploration, path: str | Path, *, title: str = "kfgs", scene: Scene | None = None) -> Path:
     """Write one file with the scene and the viewer. It opens with a double click and loads nothing.
 
-    Classes can be searched, gamma and lambda changed, Gaussians selected and edited. New phrases need Python.
-
-    Args:
-        exploration: the page opens with its question, gamma and lambda.
-        path: a name that ends in .html.
-        title: title of the page.
-        scene: has the photos of the exploration's cameras, found by name; None: without photos.
-
-    Raises:
-        ValueError: if the name does not end in .html.
+    The page opens with the question, gamma and lambda of the exploration. `scene` has the photos of its cameras.
     """
     target = as_path(path)
     if target.suffix.lower() != ".html":
@@ -117,15 +108,9 @@ def read_text(name: str) -> str:
 def inline_script(modules: Sequence[str] = RENDERER, name: str = "kfgs") -> str:
     """Join modules to one classic script, which also works from file://, where no module can be imported.
 
-    The script defines one constant with all that the modules export. Modules may use `import {a, b} from "./other.js"`
-    and `export` in front of a function, a class or a constant; nothing else of the module syntax.
-
-    Args:
-        modules: files of this folder; a module comes after those that it imports.
-        name: of the constant.
-
-    Raises:
-        ValueError: if a module imports one that does not come before it, or uses other syntax.
+    The script defines one constant, `name`, with all that the modules export. Modules may use `import {a, b} from
+    "./other.js"` and `export` in front of a function, a class or a constant; nothing else of the module syntax. A module
+    comes after those that it imports.
     """
     parts: list[str] = []
     for position, module in enumerate(modules):

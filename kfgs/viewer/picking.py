@@ -42,16 +42,8 @@ def gaussian_at(
 
     **Convention**: pixels, x to the right and y down; the centre of the first pixel is (0.5, 0.5).
 
-    Args:
-        gaussians: the cloud.
-        camera: the view, without distortion.
-        x: column.
-        y: row.
-        mask: which Gaussians exist here; None: all.
-
-    Returns:
-        Its index; of equal weights, that of the nearest. None if less than 5 % of the pixel is covered (background), or
-        the pixel is outside the picture.
+    The camera has no distortion. `mask` says which Gaussians exist here; None: all. Of equal weights the nearest wins.
+    None if less than 5 % of the pixel is covered (background), or the pixel is outside the picture.
     """
     check_shapes(("gaussians.means", gaussians.means, "N 3"), ("mask", mask, "N"))
     if not (0 <= x < camera.width and 0 <= y < camera.height):
@@ -64,13 +56,7 @@ def gaussian_at(
 def views_seeing(gaussians: Gaussians, index: int, cameras: Sequence[Camera]) -> list[Sight]:
     """The views that see a Gaussian: its weight T alpha at its projected centre is above 0.01. Best views first.
 
-    Args:
-        gaussians: the whole cloud, because Gaussians in front hide others.
-        index: which Gaussian.
-        cameras: views without distortion; equally good ones stay in their order.
-
-    Raises:
-        ValueError: if there is no such Gaussian.
+    It needs the whole cloud, because Gaussians in front hide others. Equally good views stay in their order.
     """
     check_whole("index", index, 0, len(gaussians) - 1)
     sights = []

@@ -24,10 +24,8 @@ from .._card import error_line
 from .._files import parse_json
 
 REFUSED = "This page opens with the whole link that kfgs gave.\n"
-LONGEST_CALL = 16 << 20
-"""Bytes: a selection of many million Gaussians, as bits."""
-PATIENCE = 60.0
-"""Seconds after which a connection that neither sends nor reads is closed."""
+LONGEST_CALL = 16 << 20  # bytes: a selection of many million Gaussians, as bits
+PATIENCE = 60.0  # seconds after which a connection that neither sends nor reads is closed
 POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' blob:; style-src 'unsafe-inline'; img-src 'self' blob: data:; "
     "connect-src 'self'; worker-src blob:; form-action 'none'; base-uri 'none'; frame-ancestors 'self'"
@@ -48,18 +46,12 @@ class PageServer:
         pack: the scene, for `readMessage` of link.js.
         call: answers calls, in several threads at once.
         host: address to listen on. With one that other machines can reach, everyone who has the link can look and save.
-        port: 0 to 65535; 0: a free one.
-
-    Raises:
-        ValueError: if the address is not one of this machine, or the port is taken.
+        port: 0: a free one. A ValueError if it is taken, or the address is not one of this machine.
     """
 
     def __init__(self, document: str, pack: bytes, call: Call, host: str = "127.0.0.1", port: int = 0) -> None:
         if not host.strip():
-            raise ValueError(
-                f"host: expected an address of this machine, got {host!r}; 127.0.0.1 is for this machine alone, 0.0.0.0 "
-                "for everyone"
-            )
+            raise ValueError(f"host: expected an address of this machine, got {host!r}; for instance 127.0.0.1")
         self.secret = secrets.token_urlsafe(24)
         self.files = {"": ("text/html; charset=utf-8", document.encode()), "pack": ("application/octet-stream", pack)}
         self.call, self._host = call, host

@@ -36,11 +36,9 @@ MOST_VIEWS = 30  # views compared, evenly chosen: 0.2 s with 600,000 Gaussians
 
 
 class Session:
-    """Answers the viewer's calls; safe to call from several threads.
+    """Answers the viewer's calls; safe to call from several threads. Files get the next free number in the folder `out`.
 
-    Args:
-        state: the clouds and their answers. Its question, gamma and lambda become those of the last file that was saved.
-        out: folder for saved files, which get the next free number.
+    The question, gamma and lambda of the state become those of the last file that was saved.
     """
 
     def __init__(self, state: Exploration, out: str | Path = "kfgs_view") -> None:
@@ -67,10 +65,7 @@ class Session:
         - `save_edits` {lambda, edits}
 
         `edits` has a list for each side that was edited, in the form of `EditList.save`. Masks are of the cloud with its
-        copies, before Gaussians are removed.
-
-        Raises:
-            ValueError: for an unknown call or wrong arguments.
+        copies, before Gaussians are removed. A ValueError for an unknown call or wrong arguments.
         """
         check_choice("name", name, list(self._calls))
         with self._lock:
@@ -146,10 +141,7 @@ def save_selection(
     """Write a selection into the next numbered folder: numbers as selection.json, Gaussians as selection_<side>.ply.
 
     selection.json lists the connected parts (at most the 16 largest), each with the best of at most 30 evenly chosen views.
-    A side without a selection has no file.
-
-    Raises:
-        ValueError: if nothing is selected on any side.
+    A ValueError if nothing is selected on any side.
     """
     chosen = [side for side, mask in masks.items() if bool(mask.any())]
     if not chosen:

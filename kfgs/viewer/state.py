@@ -62,10 +62,8 @@ class Exploration:
             positions(f"{side}.means", cloud.means)
         for camera in cameras:
             if camera.distortion is not None:
-                raise ValueError(
-                    f"cameras: expected views without distortion, got {camera.distortion.model} ({camera.name!r}); pass "
-                    "those of scene.undistorted()"
-                )
+                got = f"{camera.distortion.model} ({camera.name!r})"
+                raise ValueError(f"cameras: expected views without distortion, got {got}; pass scene.undistorted()'s")
         self.meaning = meaning
         self.cameras = tuple(camera.with_origin(semantic.origin) for camera in cameras)
         self.sides: tuple[Side, ...] = tuple(self._clouds)
@@ -92,8 +90,7 @@ class Exploration:
     def ask(self, words: str | None) -> Asked | None:
         """Ask for a class or a phrase, with the gamma that the answer suggests. None or "" clears the question.
 
-        Raises:
-            ValueError: if there is no answer to these words; the earlier question stays.
+        A ValueError if there is no answer to these words; the earlier question stays.
         """
         if words is None or not words.strip():
             self.asked, self.gamma, self.gamma_how = None, None, ""
@@ -103,11 +100,7 @@ class Exploration:
         return self.asked
 
     def set_gamma(self, gamma: float) -> None:
-        """Select the Gaussians that score above gamma.
-
-        Raises:
-            ValueError: if no question is asked, or gamma is out of `gamma_range`.
-        """
+        """Select the Gaussians that score above gamma; a ValueError without a question, or out of `gamma_range`."""
         if self.asked is None:
             raise ValueError(f"gamma: expected a question that it applies to, got none (gamma {gamma!r}); ask first")
         check_number("gamma", gamma)
@@ -123,11 +116,7 @@ class Exploration:
         self.distance, self.distance_how = float(distance), "given"
 
     def set_show(self, show: Show) -> None:
-        """Choose what the colours mean: classes, own colours, scores or latents.
-
-        Raises:
-            ValueError: if it is unknown, or these clouds do not have it.
-        """
+        """Choose what the colours mean, one of `show_choices`: classes, own colours, latents or scores."""
         check_choice("show", show, self.show_choices)
         self.show = show
 

@@ -7,6 +7,7 @@ import sys
 import webbrowser
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Any, Literal
@@ -76,16 +77,14 @@ def explore(
     """Explore a scene: search by text, change gamma and lambda, pick and select Gaussians, edit, save.
 
     A selection in the semantic cloud also lights up in the colour cloud: each colour Gaussian takes the label of the
-    nearest semantic one within lambda (Sec. 3.4). A window and a picture are drawn by pyvista, with both clouds side by side:
-    the returned `Explorer` has `ask("chair")`, `set_gamma(0.6)`, `screenshot("chair.png")`. A page and a notebook are drawn
-    by the browser: a `Viewer`, with `ask` and `save_html`.
+    nearest semantic one within lambda (Sec. 3.4). A window and a picture are drawn by pyvista (`Explorer`), with both clouds
+    side by side, a page and a notebook by the browser (`Viewer`).
 
     Args:
         source: a semantic field (search by text) or a labelled splat (search by class).
         color: the colour scene, in the same frame; None shows the source alone.
         classes: names and embeddings in the teacher's space; None: those that the field remembers. A splat has its own.
-        cameras: views to search for those that see a picked Gaussian; empty: the field's own. A field without fused
-            features computes them from these views. Without any view, it uses each Gaussian's own latent, which is noisy.
+        cameras: views to look from; empty: the field's own. A field without fused features computes them from these.
         embed: the teacher's text encoder, text -> [D], to search for more than the classes.
         distance: lambda, world units; None: from the clouds' spacing.
         where: `window` (blocks until you close it), `browser` (a page that only this machine can open; blocks until
@@ -107,9 +106,7 @@ def explore(
     meaning: Meaning
     if isinstance(source, Gaussians):
         if classes is not None or embed is not None:
-            raise ValueError(
-                "classes, embed: expected none with a splat, which has its own classes, got one; leave it out"
-            )
+            raise ValueError("classes, embed: expected none with a splat, which has its own, got one; leave it out")
         meaning = SplatMeaning(source)
     elif isinstance(source, SemanticField):
         cameras = cameras or source.cameras
@@ -158,11 +155,7 @@ class Viewer:
         self._widget: Any = None
 
     def ask(self, words: str | None) -> None:
-        """Ask for a class or a phrase, now in an open widget, or at the start of what is shown later.
-
-        Raises:
-            ValueError: if there is no answer to these words.
-        """
+        """Ask for a class or a phrase, now in an open widget, or at the start of what is shown later."""
         self.state.ask(words)
         if self._widget is not None:
             self._widget.question = words or ""
@@ -174,9 +167,6 @@ class Viewer:
             host: address to listen on. With one that other machines can reach, everyone who has the link can look and save.
             port: 0: a free one.
             report: called with the link and hints, line by line; None: standard error.
-
-        Raises:
-            ValueError: if the address is not one of this machine, or the port is taken.
         """
         say = report or (lambda line: sys.stderr.write(line + "\n"))
         with self.open_page(host, port) as page:
@@ -201,9 +191,6 @@ class Viewer:
         """Write one file with the scene and the viewer, which opens in any browser with a double click, offline.
 
         Classes can be searched, gamma and lambda changed, Gaussians selected and edited. New phrases need Python.
-
-        Raises:
-            ValueError: if the name does not end in .html.
         """
         return save_html(self.state, path, title=self.title, scene=self.scene)
 
@@ -265,12 +252,8 @@ class Viewer:
 
 def require_widget() -> None:
     """Raise an ImportError with the install line if anywidget is missing."""
-    try:
-        import anywidget  # noqa: F401
-    except ImportError:
-        raise ImportError(
-            'where: expected the package anywidget for a notebook, got none; pip install "kfgs[notebook]"'
-        ) from None
+    if find_spec("anywidget") is None:
+        raise ImportError('where: expected anywidget for a notebook, got none; pip install "kfgs[notebook]"')
 
 
 def in_notebook() -> bool:

@@ -53,16 +53,8 @@ class Picked:
 class Explorer:
     """The clouds of an exploration in pyvista, with methods that change its question, thresholds and colours, and draw.
 
-    Nothing opens by itself: `plotter` draws with and without a display, and `show` opens a window.
-
-    Args:
-        exploration: the state.
-        out: folder for saved pictures and selections.
-        height: of the window, pixels.
-        off_screen: draw without a window; None: only if there is no display.
-
-    Raises:
-        RuntimeError: if nothing can be drawn here.
+    Nothing opens by itself: `plotter` draws with and without a display, and `show` opens a window. `out` is the folder for
+    saved pictures and selections, `height` is in pixels; a RuntimeError if nothing can be drawn here.
     """
 
     def __init__(
@@ -81,42 +73,34 @@ class Explorer:
         self.plotter: Any = make_plotter(height, height * len(sides), shape=(1, len(sides)), off_screen=off_screen)
         self._notes: list[Any] = []
         self._picked: Picked | None = None
-        try:
-            self._actors = []
-            for column, side in enumerate(sides):
-                self.plotter.subplot(0, column)
-                colors, cloud = exploration.colors(side), exploration.cloud(side)
-                actor = add_cloud(self.plotter, cloud, color_by=colors, style=self.style, near=self._near)  # type: ignore[arg-type]
-                self._actors.append(actor)
-            self.plotter.link_views()
-            self.look_from(exploration.cameras[0] if exploration.cameras else None)
-            self._draw()
-        except BaseException:
-            self.close()
-            raise
+        self._actors = []
+        for column, side in enumerate(sides):
+            self.plotter.subplot(0, column)
+            colors, cloud = exploration.colors(side), exploration.cloud(side)
+            actor = add_cloud(self.plotter, cloud, color_by=colors, style=self.style, near=self._near)  # type: ignore[arg-type]
+            self._actors.append(actor)
+        self.plotter.link_views()
+        self.look_from(exploration.cameras[0] if exploration.cameras else None)
+        self._draw()
 
     def ask(self, words: str | None) -> Asked | None:
-        """Search for a class or a phrase: matching Gaussians stay bright, the rest become faint. None clears the search.
-
-        Raises:
-            ValueError: if there is no answer to these words; the earlier question stays.
-        """
+        """Search for a class or a phrase: matching Gaussians stay bright, the rest become faint. None clears the search."""
         self.state.ask(words)
         self._draw()
         return self.state.asked
 
     def set_gamma(self, gamma: float) -> None:
-        """Select the Gaussians that score above gamma; a ValueError without a question, or out of `state.gamma_range`."""
+        """Select the Gaussians that score above gamma."""
         self.state.set_gamma(gamma)
         self._draw()
 
     def set_distance(self, distance: float) -> None:
-        """Set lambda: colour Gaussians closer than this to a semantic one take its label. In world units, positive."""
+        """Set lambda, in world units: colour Gaussians closer than this to a semantic one take its label."""
         self.state.set_distance(distance)
         self._draw()
 
     def set_show(self, show: Show) -> None:
-        """Choose what the colours mean: `labels`, `rgb`, `score` or `latents`; a ValueError if the clouds lack it."""
+        """Choose what the colours mean: `labels`, `rgb`, `score` or `latents`."""
         self.state.set_show(show)
         self._draw()
 
@@ -142,11 +126,7 @@ class Explorer:
         return self._picked
 
     def look_from(self, camera: Camera | None) -> None:
-        """Look through a posed camera: its whole picture, at its aspect ratio; None: at everything but floaters.
-
-        Raises:
-            ValueError: if its lens distorts.
-        """
+        """Look through a posed camera: its whole picture, at its aspect ratio; None: at everything but floaters."""
         self.plotter.subplot(0, 0)
         if camera is None:
             look_over(self.plotter, self.state.cloud("semantic"), upwards(self.state.cameras))
@@ -169,19 +149,15 @@ class Explorer:
         return picture
 
     def save_selection(self) -> list[Path]:
-        """Write the selection (numbers and Gaussians) into the next numbered folder of `out`.
-
-        Raises:
-            ValueError: if nothing is selected.
-        """
+        """Write the selection (numbers and Gaussians) into the next numbered folder of `out`."""
         masks = {side: torch.from_numpy(self.state.selected(side)) for side in self.state.sides}
         return save_selection(self.state, {side: labelled(self.state, side) for side in masks}, masks, self.out)
 
     def lines(self) -> list[str]:
         """The status as lines of text: question, gamma, lambda, counts, picked Gaussian."""
-        if self._picked is None:
-            return self.state.lines()
         picked = self._picked
+        if picked is None:
+            return self.state.lines()
         place = ", ".join(f"{x:.3f}" for x in picked.position)
         where = f"{SIDE_WORDS[picked.side]} Gaussian {picked.index}"
         return [*self.state.lines(), f"{where}: {picked.name}, score {picked.score:.3f}, at ({place})"]
@@ -189,18 +165,11 @@ class Explorer:
     def show(self) -> None:
         """Open a window until the user closes it: sliders for gamma and lambda, a click picks, a drag turns, keys do the rest.
 
-        To search for a phrase, call `ask` first: pyvista has no text field. Afterwards `state` keeps the answers, and
-        nothing more can be drawn.
-
-        Raises:
-            RuntimeError: if there is no display.
+        pyvista has no text field: to search for a phrase, call `ask` first. A RuntimeError if there is no display.
         """
         if not has_display() or self.plotter.off_screen:
             self.close()
-            raise RuntimeError(
-                "where: expected a display for a window, got none (neither DISPLAY nor WAYLAND_DISPLAY is set); use 'browser' "
-                "or 'picture'"
-            )
+            raise RuntimeError("where: expected a display for a window, got none; use 'browser' or 'picture'")
         _Controls(self)
         self.plotter.show(title="kfgs")
 
@@ -213,9 +182,6 @@ class Explorer:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def __repr__(self) -> str:
-        return f"<Explorer: {'; '.join(self.state.lines())}>"
 
     def _draw(self) -> None:
         """Bring colours, opacities, titles and legends up to date, and render once."""
@@ -245,11 +211,8 @@ class Explorer:
                 add_scalar_bar(plotter, state.clim)
             if self._picked is not None and self._picked.side == side:
                 place = as_array(state.cloud(side).means[self._picked.index])[None]
-                self._notes.append(
-                    plotter.add_point_labels(
-                        place, [self._picked.name], always_visible=True, point_size=10, point_color="red", reset_camera=False
-                    )
-                )  # fmt: skip
+                options = {"always_visible": True, "point_size": 10, "point_color": "red", "reset_camera": False}
+                self._notes.append(plotter.add_point_labels(place, [self._picked.name], **options))
         plotter.subplot(0, 0)
         plotter.suppress_rendering = False
         if not plotter.off_screen:

@@ -4,10 +4,7 @@ import io
 import itertools
 import json
 import re
-from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from types import SimpleNamespace
 
 import cases_explorer
 import cases_page
@@ -19,7 +16,7 @@ from PIL import Image
 
 from kfgs.labels import EditList
 from kfgs.labels.edits.edit_list import read_edits
-from kfgs.viewer import Exploration, FieldMeaning, pack
+from kfgs.viewer import Exploration, FieldMeaning
 from kfgs.viewer.page import save_html
 
 pytestmark = needs_chromium
@@ -179,66 +176,6 @@ def test_a_person_searches_and_moves_gamma_and_lambda(page, state):
     state.ask(None)
 
 
-def test_a_typed_value_that_is_not_possible_is_replaced_by_the_one_that_counts(page):
-    ask(page, "chair")
-    suggested = page.evaluate("[viewer.model.gamma, viewer.model.lambda]")
-    assert page.locator("section:has(#gamma) .note").inner_text().startswith("Suggested: ")
-    for name, typed in (("gamma", ""), ("gamma", "half"), ("lambda", "-1"), ("lambda", "0")):
-        set_slider(page, name, typed)
-    assert page.evaluate("[viewer.model.gamma, viewer.model.lambda]") == suggested
-    assert float(page.locator(".slider:has(#lambda) input.number").input_value()) == pytest.approx(suggested[1])
-    set_slider(page, "gamma", "7")
-    assert page.locator(".slider:has(#gamma) input.number").input_value() == "1"
-
-
-def test_suggestions_show_names_as_words_and_arrow_keys_choose(page):
-    page.click("#query")
-    assert page.locator("[role=option] span").all_inner_texts() == list(cases_page.NAMES)
-    page.keyboard.type("ch")
-    assert page.locator("[role=option] span").all_inner_texts() == ["chair"]
-    page.keyboard.press("ArrowDown")
-    page.keyboard.press("Enter")
-    page.wait_for_selector("h2:has-text('Search: chair')")
-    page.keyboard.press("Escape")
-    page.wait_for_selector("h2:has-text('Search: chair')", state="hidden")
-
-
-def test_letters_of_one_class_only_are_enough(page):
-    ask(page, "HAI")
-    page.wait_for_selector("h2:has-text('Search: chair')")
-    assert page.evaluate("document.activeElement === viewer.stage")  # its keys work now
-    ask(page, "a")  # chair, table
-    assert page.evaluate("document.activeElement === viewer.top.search.input")  # to type other words
-    assert "“a” is none of the classes" in page.locator("[role=alert]:visible").inner_text()
-
-
-def test_other_words_need_python_and_the_page_says_so(page):
-    ask(page, "chairs in the corner")
-    page.wait_for_selector("[role=alert]:visible")
-    said = page.locator("[role=alert]:visible").inner_text()
-    assert "is none of the classes" in said
-    assert "need Python" in said
-    assert page.evaluate("viewer.model.answer") is None
-
-
-def test_a_late_answer_does_not_replace_a_later_search(page):
-    said = page.evaluate("""async () => {
-      const [now, late, said] = [viewer.link.ask.bind(viewer.link), [], []];
-      viewer.link.ask = async (words) => (words === "table" && await new Promise((go) => late.push(go)), now(words));
-      const slow = viewer.ask("table");
-      await viewer.ask("chair");
-      late.pop()();
-      await slow;
-      said.push(viewer.model.answer.words);
-      const given_up = viewer.ask("table");
-      await viewer.ask("");
-      late.pop()();
-      await given_up;
-      return [...said, viewer.model.answer, viewer.toast.hidden, viewer.top.search.element.hasAttribute("aria-busy")];
-    }""")
-    assert said == ["chair", None, True, False]
-
-
 def test_hidden_classes_are_not_drawn_picked_or_selected_by_hand(page, state):
     page.click("button[aria-label='Hide chair']")
     for side in SIDES:
@@ -298,23 +235,6 @@ def test_lasso_selects_remove_removes_and_undo_brings_back(page, state):
     page.keyboard.press("Control+Shift+Z")
     page.keyboard.press("Control+Shift+Z")
     assert page.evaluate("viewer.model.counts('color').removed") == selected.sum()
-
-
-def test_grow_adds_and_shrink_drops_neighbours_and_invert_is_the_rest(page):
-    ask(page, "chair")
-    before = mask(page, "color")
-    page.click("text=Shrink")
-    small = mask(page, "color")
-    assert not (small & ~before).any()
-    ask(page, "table")
-    before = mask(page, "color")
-    page.click("text=Invert")
-    np.testing.assert_array_equal(mask(page, "color"), ~before)
-    page.evaluate("viewer.model.select('color', new Uint8Array(450).fill(1, 0, 1))")
-    page.click("text=Grow")
-    grown = mask(page, "color")
-    assert 1 < grown.sum() <= 150  # one heap of three
-    assert grown[:150].sum() == grown.sum()
 
 
 def test_edits_are_those_of_python(page, state, tmp_path):
@@ -392,23 +312,6 @@ def open_state(page, folder, state):
     page.set_input_files("input[type=file]", folder / "state.json")
 
 
-def test_a_state_without_a_question_ends_the_one_that_is_shown(page, tmp_path):
-    saved = page.evaluate("JSON.stringify(viewer.model)")
-    ask(page, "chair")
-    open_state(page, tmp_path, saved)
-    until(page, lambda tab: tab.evaluate("JSON.stringify(viewer.model)") == saved)
-
-
-def test_a_selection_by_example_is_kept_as_a_selection(page):
-    """Nobody answers "like the selection" when the page is opened again."""
-    ask(page, "chair")
-    selected = mask(page, "color")
-    page.evaluate("viewer.model.ask({...viewer.model.answer, words: 'like the selection', example: true})")
-    page.evaluate("viewer.open(JSON.parse(JSON.stringify(viewer.model)))")
-    np.testing.assert_array_equal(mask(page, "color"), selected)
-    assert page.evaluate("[viewer.model.answer, viewer.toast.hidden]") == [None, True]
-
-
 def test_a_state_that_somebody_changed_is_refused_as_a_whole(page, tmp_path):
     ask(page, "chair")
     page.evaluate("viewer.model.fade(0.5)")
@@ -433,128 +336,6 @@ def test_a_state_that_somebody_changed_is_refused_as_a_whole(page, tmp_path):
         assert re.match("This (state|file) (is|has) ", said)
         assert ("kfgs_view.json" in said) == ("This file" in said)  # which file is wanted instead
         assert page.evaluate("JSON.stringify(viewer.model)") == before
-
-
-def test_a_ball_selects_what_lies_in_it_and_a_drag_moves_it(page):
-    middle = np.mean([place_of(page, "color", i) for i in range(150, 300)], axis=0)
-    page.keyboard.press("5")
-    page.mouse.move(*middle)
-    page.mouse.down()
-    page.mouse.move(middle[0] + 30, middle[1], steps=3)
-    page.mouse.up()
-    selected = np.flatnonzero(mask(page, "color"))
-    assert 0 < len(selected) <= 150
-    assert set(selected) <= set(range(150, 300))
-    before = np.array(place_of(page, "color", int(selected[0])))
-    page.keyboard.press("6")
-    page.mouse.move(*middle)
-    page.mouse.down()
-    page.mouse.move(middle[0] + 40, middle[1] - 20, steps=4)
-    page.mouse.up()
-    assert np.array(place_of(page, "color", int(selected[0]))) - before == pytest.approx([40, -20], abs=8)
-    page.keyboard.press("Control+z")
-    assert place_of(page, "color", int(selected[0])) == pytest.approx(before)
-
-
-def test_undo_and_drags_repeat_no_earlier_edit(page):
-    """The clouds of every step are kept; what an edit did not change is the same array."""
-    ask(page, "table")
-    page.evaluate("viewer.model.recolor([0.1, 0.8, 0.3])")
-    before = page.evaluate_handle("viewer.model.clouds.color")
-    page.evaluate("viewer.model.move([1, 0, 0])")
-    page.evaluate("viewer.model.move([0, 1, 0], true)")
-    moved = page.evaluate_handle("viewer.model.clouds.color")
-    assert page.evaluate("([a, b]) => a.dc === b.dc && a.means !== b.means", [before, moved])
-    offset = page.evaluate(
-        "([a, b]) => { const i = [...viewer.model.selected('color')].indexOf(1); "
-        "return [0, 1, 2].map((axis) => b.means[3 * i + axis] - a.means[3 * i + axis]); }",
-        [before, moved],
-    )
-    assert offset == pytest.approx([1, 1, 0], abs=1e-6)
-    page.keyboard.press("Control+z")  # after Enter in the search box, keys are those of the view
-    assert page.evaluate("cloud => cloud === viewer.model.clouds.color", before)
-    page.keyboard.press("Control+Shift+Z")
-    assert page.evaluate("cloud => cloud === viewer.model.clouds.color", moved)
-
-
-def test_parts_end_when_their_gaussians_go_elsewhere(page):
-    ask(page, "table")
-    parts = "{side: 'color', name: 'table', parts: [{count: 1, corners: Array(8).fill([0, 0, 0])}], numbers: []}"
-    for edit, left in (
-        ("recolor([1, 0, 0])", True),
-        ("move([0, 0, 1])", False),
-        ("undo()", False),
-        ("remove()", False),
-    ):
-        page.evaluate(f"viewer.model.setParts({parts})")
-        page.evaluate(f"viewer.model.{edit}")
-        assert page.locator("section:has-text('Connected parts')").is_visible() == left
-
-
-def test_a_field_alone_has_no_colours_to_change_and_its_gaussians_need_no_adjective(browser, tmp_path):
-    state = Exploration(FieldMeaning(cases_explorer.field("fused"), cases_explorer.classes()))
-    for page in show(browser, save_html(state, tmp_path / "page.html")):
-        ask(page, state.meaning.names[0])
-        assert "score above" in page.locator(".said").inner_text()
-        assert "semantic" not in page.locator(".said, .panel").first.inner_text()
-        assert page.locator("text=Opacity").is_visible()
-        assert not page.locator("text=Recolour").is_visible()
-
-
-def test_a_tooltip_names_what_the_pointer_rests_on(page):
-    middle = np.mean([place_of(page, "color", i) for i in range(150, 300)], axis=0)
-    page.mouse.move(*middle)
-    page.wait_for_selector(".tip:visible")
-    assert page.locator(".tip").inner_text().startswith("chair, 0.")
-    page.mouse.move(middle[0] + 3, middle[1])
-    page.mouse.down()
-    assert not page.locator(".tip").is_visible()
-    page.mouse.up()
-
-
-def test_without_keys_a_selection_can_be_added_to(page):
-    """As on a tablet, which has no Shift."""
-    first, second = (
-        np.mean([place_of(page, "color", i) for i in range(start, start + 150)], axis=0) for start in (150, 0)
-    )
-    page.keyboard.press("5")
-    for how, middle in (("Select anew", first), ("Add to the selection (Shift)", second)):
-        page.click(f"button[title='{how}']")
-        page.mouse.move(*middle)
-        page.mouse.down()
-        page.mouse.move(middle[0] + 30, middle[1], steps=3)
-        page.mouse.up()
-    selected = mask(page, "color")
-    assert selected[:150].any()
-    assert selected[150:300].any()
-    page.keyboard.press("1")
-    assert not page.locator("button[title='Select anew']").is_visible()
-
-
-def test_hidden_gaussians_of_a_selection_are_told(page, state):
-    ask(page, "chair")
-    count = int(mask(page, "color").sum())
-    page.evaluate("viewer.model.setHidden([1])")
-    hidden = int((mask(page, "color") & (state.labels("color") == 1)).sum())
-    assert 0 < hidden <= count
-    assert f"{hidden} of these are hidden, and change with the others." in page.locator(".said").inner_text()
-
-
-def test_keys_fly_and_turn_and_help_lists_them(page):
-    before = page.evaluate("viewer.eye.view.position")
-    page.locator(".stage").focus()
-    page.keyboard.down("w")
-    until(page, lambda tab: tab.evaluate("viewer.eye.view.position") != before)
-    page.keyboard.up("w")
-    page.evaluate("new Promise(requestAnimationFrame)")
-    after = page.evaluate("viewer.eye.view.position")
-    assert before != after
-    page.keyboard.press("ArrowLeft")
-    assert page.evaluate("viewer.eye.view.position") != after
-    page.keyboard.press("?")
-    assert page.locator("dialog dt").count() > 10
-    page.keyboard.press("Escape")
-    assert not page.locator("dialog").is_visible()
 
 
 def looks_at(point, look, farthest, tab):
@@ -587,72 +368,6 @@ def test_buttons_go_to_the_scenes_views(browser, tmp_path):
         until(page, lambda tab: np.allclose(tab.evaluate(VIEWMAT), views[0].viewmat.flatten(), atol=1e-6))
 
 
-def test_beside_an_upright_photo_no_wider_angle_is_seen_than_its_own(browser, tmp_path, monkeypatch):
-    monkeypatch.setattr(pack, "show_photos", lambda scene: lambda camera: np.zeros((*camera.size, 3), np.uint8))
-    upright = [replace(view, width=28, height=60) for view in cases_explorer.cameras()]
-    state = cases_explorer.line(cameras=upright)
-    file = save_html(state, tmp_path / "page.html", scene=photographed(state))
-    angles = "() => { const { fx, fy, width, height } = viewer.panes.camera; return [width / fx, height / fy]; }"
-    for page in show(browser, file):
-        page.set_viewport_size({"width": 1400, "height": 600})
-        until(page, lambda tab: tab.evaluate("viewer.canvas.width > 1000"))
-        page.evaluate("viewer.settled()")
-        wide, high = page.evaluate(angles)
-        assert wide == pytest.approx(60 / 40, rel=0.01)  # K has fx = 40, fy = 44
-        page.locator(".stage").focus()
-        page.keyboard.press("p")
-        until(page, lambda tab: tab.locator(".photo:visible").count())
-        page.evaluate("viewer.settled()")
-        assert page.evaluate(angles)[1] == pytest.approx(60 / 44, rel=0.01)  # all of it
-        photo, stage = page.locator(".photo").bounding_box(), page.locator(".stage").bounding_box()
-        assert photo["height"] == pytest.approx(stage["height"], abs=1)
-        page.keyboard.press("p")
-        page.evaluate("viewer.settled()")
-        assert page.evaluate(angles) == pytest.approx([wide, high])
-
-
-def test_the_photo_is_of_the_view_that_looks_the_same_way(browser, tmp_path):
-    """Of two views, one is in the same place but looks back."""
-    for page in show(browser, save_html(cases_explorer.line(cameras=cases_explorer.cameras()), tmp_path / "page.html")):
-        found = page.evaluate("""() => {
-          const { cameras } = viewer.header;
-          const own = { ...cameras[0], thumbnail: "a photo" };
-          const back = own.viewmat.map((value, i) => (Math.floor(i / 4) % 2 ? value : -value));
-          const beside = own.viewmat.map((value, i) => value + (i === 3 ? 0.2 * viewer.eye.ball.radius : 0));
-          cameras.splice(0, cameras.length, { ...own, viewmat: back }, { ...own, viewmat: beside });
-          return viewer.nearestView();
-        }""")
-        assert found == 1
-
-
-def photographed(state):
-    """A scene that has a photograph of every view."""
-    return SimpleNamespace(cameras=state.cameras, image_paths=[Path(__file__)] * len(state.cameras))
-
-
-def test_the_list_of_views_scrolls_to_the_current_one(browser, tmp_path, monkeypatch):
-    """Photos are loaded when they come into sight; their places must not move then."""
-    monkeypatch.setattr(pack, "show_photos", lambda scene: lambda camera: np.zeros((*camera.size, 3), np.uint8))
-    state = cases_explorer.line(cameras=cases_explorer.cameras(90))
-    for page in show(browser, save_html(state, tmp_path / "page.html", scene=photographed(state))):
-        page.keyboard.press("[")
-        until(page, lambda tab: tab.evaluate("viewer.view") == tab.locator(".views button").count() - 1)
-        page.wait_for_timeout(500)  # the list scrolls
-        box, last = page.locator(".views").bounding_box(), page.locator(".views button").last.bounding_box()
-        assert page.locator(".views [aria-current=true]").count() == 1
-        assert page.evaluate("viewer.view") == page.locator(".views button").count() - 1
-        assert last["x"] + last["width"] <= box["x"] + box["width"]
-
-
-@pytest.mark.parametrize("size", [(300, 300), (360, 640), (640, 360)])
-def test_a_small_tab_still_has_every_button_and_some_view(page, size):
-    page.set_viewport_size(dict(zip(("width", "height"), size, strict=True)))
-    for button in page.locator(".top button:visible").all():
-        box = button.bounding_box()
-        assert 0 <= box["x"] <= size[0] - box["width"]
-    assert page.locator(".stage").bounding_box()["height"] >= 0.3 * size[1]
-
-
 def test_split_slider_and_modes_draw(page):
     def picture():
         page.evaluate("viewer.settled()")
@@ -683,41 +398,7 @@ def test_the_page_opens_as_python_left_it(browser, tmp_path):
         assert page.locator("button[aria-label='Undo']").is_disabled()
 
 
-def test_a_page_that_opens_with_a_question_has_the_suggested_gamma(browser, tmp_path):
-    state = cases_page.exploration()
-    state.ask("chair")
-    for page in show(browser, save_html(state, tmp_path / "page.html")):
-        assert page.locator("section:has(#gamma) .note").inner_text().startswith("Suggested: ")
-
-
-def test_a_pressed_button_can_be_read_while_the_pointer_is_on_it(page):
-    page.click(".choice >> text=Score")
-    color = page.evaluate("getComputedStyle(document.querySelector('.choice [aria-pressed=true]')).backgroundColor")
-    assert page.locator(".choice [aria-pressed=true]:hover").inner_text() == "Score"
-    assert color == page.evaluate("getComputedStyle(viewer.rail.element.firstChild).backgroundColor")
-
-
-def test_every_control_has_a_name(page):
-    ask(page, "chair")
-    nameless = page.evaluate(
-        """[...document.querySelectorAll("button, input, select, [role=listbox]")]
-          .filter((one) => !(one.getAttribute("aria-label") || one.textContent.trim() || one.labels?.length))
-          .map((one) => one.outerHTML)"""
-    )
-    assert nameless == []
-
-
 def test_other_names_are_refused(state, tmp_path):
     with pytest.raises(ValueError, match=r"path: expected a name that ends in .html, got 'scene.ply'"):
         save_html(state, tmp_path / "scene.ply")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_work_that_a_browser_cannot_keep_is_told_once(page):
-    page.evaluate("() => { Storage.prototype.setItem = () => { throw new Error('full'); }; }")
-    ask(page, "chair")
-    page.wait_for_selector("[role=alert]:has-text('Save state')")
-    page.evaluate("viewer.say('')")
-    ask(page, "table")
-    page.wait_for_timeout(800)
-    assert not page.locator("[role=alert]:visible").count()

@@ -155,23 +155,6 @@ def test_one_person_everywhere(browser, tmp_path, home):
     assert errors == []
 
 
-@pytest.mark.parametrize("home", [in_page, in_file], ids=["page", "file"])
-def test_the_renderer_has_the_scores_of_the_class_whatever_the_names(browser, tmp_path, home):
-    """JavaScript sorts names that are numbers; two classes of one name are one question."""
-    state = cases_page.exploration(("10", "10", "2"))
-    page = browser.new_page(viewport={"width": 800, "height": 600})
-    page.set_default_timeout(1000 * SECONDS)
-    with home(page, state, tmp_path / "out"):
-        page.wait_for_selector(".kfgs:not([aria-busy])")
-        for words in ("10", "2"):
-            page.evaluate("words => viewer.ask(words)", words)
-            state.ask(words)
-            agree(page, state)
-            used = "viewer.panes.renderer.scores[viewer.panes.question(viewer.model.answer)]"
-            assert page.evaluate(f"viewer.model.answer.scores.every((score, i) => Object.is(score, {used}[i]))")
-    page.close()
-
-
 @pytest.mark.parametrize("phrase", ["a soft seat", "1", "null"])
 def test_a_phrase_that_only_python_can_answer(browser, tmp_path, phrase):
     field = cases_explorer.field("fused")

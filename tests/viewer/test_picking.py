@@ -45,13 +45,6 @@ def test_of_two_behind_each_other_the_larger_weight_wins(opacities, expected):
         assert found == (None if expected < 0 else order.index(expected))
 
 
-def test_a_large_faint_one_in_front_does_not_hide_an_opaque_one():
-    made = row([2.0, 6.0], [0.2, 0.95])
-    made = made.replace(scales=torch.tensor([[1.0] * 3, [0.1] * 3]))
-    assert gaussian_at(made, straight(), 20.5, 10.5) == 1
-    assert gaussian_at(made, straight(), 30.5, 10.5) == 0  # beside the small one there is only haze
-
-
 def test_background_outside_and_behind_the_camera():
     made = row([3.0, -3.0], [0.5, 0.99])
     assert gaussian_at(made, straight(), 20.5, 10.5) == 0
@@ -103,11 +96,6 @@ def test_views_that_see_a_gaussian_the_best_first():
     hidden = row([3.0, 6.0], [0.995, 0.9])
     assert views_seeing(hidden, 1, [straight()]) == []  # 0.01 x 0.9 is no sight
     assert views_seeing(hidden, 1, []) == []
-
-
-def test_equally_good_views_keep_their_order():
-    made = row([3.0], [0.7])
-    assert [s.name for s in views_seeing(made, 0, [straight(name="b"), straight(name="a")])] == ["b", "a"]
 
 
 def test_wrong_arguments():

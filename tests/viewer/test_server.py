@@ -125,15 +125,6 @@ def test_slow_calls_and_tabs_that_stall_hold_up_no_other(server):
             tab.close()
 
 
-def test_a_tab_that_never_asks_is_given_up(monkeypatch):
-    monkeypatch.setattr("kfgs.viewer.server._Handler.timeout", 0.5)
-    with PageServer(PAGE, PACK, answer) as server:
-        address = urlsplit(server.url)
-        with socket.create_connection((address.hostname, address.port), timeout=30) as tab:
-            tab.sendall(b"GET /")
-            assert tab.recv(100) == b""
-
-
 def test_closing_leaves_no_thread_behind():
     before = threading.active_count()
     server = PageServer(PAGE, PACK, answer)

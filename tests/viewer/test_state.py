@@ -109,19 +109,6 @@ def test_a_question_comes_and_goes():
     assert not made.selected("semantic").any()
 
 
-def test_the_same_splat_on_both_sides():
-    semantic = cloud(LINE, [0, 1, -1, 3], sh=torch.rand(4, 1, 3))
-    made = Exploration(SplatMeaning(splat_file(semantic)), semantic)
-    made.set_distance(0.5)
-    assert made.labels("color").tolist() == [0, 1, -1, 3]
-    made.ask("chair")
-    assert made.selected("color").tolist() == [False, True, False, False]
-    for show in made.show_choices:
-        made.set_show(show)
-        if show != "latents":
-            assert made.colors("color").tolist() == made.colors("semantic").tolist()
-
-
 def test_numbers_out_of_range():
     made = line()
     with pytest.raises(ValueError, match=tells("gamma:", "got none", "0.5")):
@@ -173,14 +160,3 @@ def test_facts_are_json_and_lines_say_them():
     ]
     made.ask(None)
     assert made.lines()[0] == "semantic: 3 Gaussians"
-
-
-@pytest.mark.parametrize("value", ["0,05", None, [], True], ids=str)
-def test_what_is_no_number_is_refused(value):
-    made = line()
-    made.ask("chair")
-    for name, verb in (("gamma", made.set_gamma), ("distance", made.set_distance)):
-        with pytest.raises(TypeError, match=tells(f"{name}:", "number", f"({type(value).__name__})")):
-            verb(value)
-    made.set_gamma(np.float32(0.5))
-    assert made.gamma == 0.5

@@ -92,22 +92,6 @@ def test_a_picture_stands_in_where_widgets_cannot_run(show):
     assert np.abs(picture / 255 - truth.numpy()).mean() < 0.03
 
 
-def test_after_a_question_the_picture_shows_the_answer():
-    state = exploration()
-    state.set_show("rgb")
-    plain = still_of(state)
-    state.ask("chair")
-    asked = still_of(state)
-    selected = state.selected("color")
-    assert 0 < selected.sum() < len(selected)
-    colors = state.colors("color") / 255
-    colors[~selected] = 0.6 + 0.4 * colors[~selected].mean(axis=1, keepdims=True)  # three fifths white, no hue
-    cloud = state.cloud("color").replace(features=torch.from_numpy(colors).float(), sh=None)
-    expected = rasterize(cloud, state.cameras[0], background=torch.ones(3)).map.numpy()
-    error, change = (np.abs(asked - other).mean() for other in (255 * expected, plain))
-    assert 2 * error < change
-
-
 def test_without_anywidget_the_install_line_is_told():
     code = (
         "import sys; sys.modules['anywidget'] = None\n"
