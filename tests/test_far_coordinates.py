@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 import torch
-from kfgs.evaluation.surface_density import surface_density
 
 from kfgs import Camera, Gaussians, rasterize, read_splats, transfer_labels, write_splats
 from kfgs._origin import choose_origin, to_world
@@ -241,8 +240,6 @@ def test_truth_and_meshes_meet_the_field_in_the_world():
     world = places.numpy() + UTM
     mesh = label_mesh((world, np.array([[0, 1, 2]])), far, classes=("a", "b", "c"))
     assert torch.equal(torch.from_numpy(mesh.vertex_labels), near.labels)
-    density = surface_density(far, torch.from_numpy(world))
-    torch.testing.assert_close(density, surface_density(near, places), rtol=1e-4, atol=1e-6)
 
 
 def test_a_checkpoint_in_double_keeps_its_place(tmp_path):

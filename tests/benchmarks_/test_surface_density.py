@@ -53,3 +53,12 @@ def test_nothing_gives_nothing():
 def test_shapes_are_checked():
     with pytest.raises(ValueError, match=tells("points:", "[P, 3]", "got (3, 2)")):
         surface_density(_cloud(), torch.zeros(3, 2))
+
+
+def test_places_far_from_zero_are_counted_from_the_clouds_origin():
+    utm = (448262.25, 5411932.5, 200.0)
+    near = Gaussians(torch.zeros(1, 3), torch.eye(4)[:1], torch.full((1, 3), 0.1), torch.tensor([0.5]))
+    places = torch.tensor([[0.0, 0, 0], [0.1, 0, 0]], dtype=torch.float64)
+    world = places + torch.tensor(utm, dtype=torch.float64)
+    far = near.replace(origin=utm)
+    torch.testing.assert_close(surface_density(far, world), surface_density(near, places))
