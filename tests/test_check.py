@@ -9,7 +9,7 @@ from messages import tells
 
 from kfgs._check import as_array, as_tensor, check_choice, check_range, check_shapes, check_whole
 from kfgs.gaussians import Gaussians
-from kfgs.labels import LabelSet, transfer_labels
+from kfgs.labels import LabelSet, nearest_labels
 
 
 def test_sizes_are_returned_by_name():
@@ -157,10 +157,10 @@ ODD = [
         lambda odd: as_array(odd, "means"),
         lambda odd: check_shapes(("means", odd, "N 3")),
         lambda odd: Gaussians(odd, torch.ones(3, 4), torch.ones(3, 3), torch.ones(3)),
-        lambda odd: transfer_labels(odd, torch.zeros(3, dtype=torch.int64), torch.ones(3, 3), 1.0),
+        lambda odd: nearest_labels(odd, torch.zeros(3, dtype=torch.int64), torch.ones(3, 3), 1.0),
         lambda odd: LabelSet(("a", "b", "c"), odd),
     ],
-    ids=["tensor", "floating", "array", "shapes", "Gaussians", "transfer_labels", "LabelSet"],
+    ids=["tensor", "floating", "array", "shapes", "Gaussians", "nearest_labels", "LabelSet"],
 )
 @pytest.mark.filterwarnings("ignore:.*(beta state|prototype|quantize|deprecat)")  # torch's, when such tensors are made
 def test_a_tensor_that_is_not_dense_is_refused_with_advice(make, advice, enter):
@@ -241,3 +241,14 @@ def test_ranges_and_choices_say_what_to_do_where_it_is_not_plain():
         check_range("opacity", math.nan, 0, 1)
     with pytest.raises(ValueError, match=tells("engine:", "got 'Numba'", "did you mean 'numba'?")):
         check_choice("engine", "Numba", ("auto", "numba"))
+
+
+@pytest.mark.parametrize("wrong", [True, np.True_, torch.tensor(True), "0.5", None, 1j])
+def test_only_numbers_are_numbers(wrong):
+    with pytest.raises(TypeError, match=tells("threshold: expected a number", "pass a float")):
+        check_range("threshold", wrong, 0, 1)
+
+
+@pytest.mark.parametrize("right", [1, 0.5, np.float32(0.5), torch.tensor(0.5), torch.tensor([1])])
+def test_numbers_of_every_library_are_numbers(right):
+    check_range("threshold", right, 0, 1)

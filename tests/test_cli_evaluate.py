@@ -33,9 +33,10 @@ def splats(room, tmp_path_factory):
 @pytest.fixture(scope="module")
 def fused(room, splats, tmp_path_factory):
     """A field whose own rule (votes) is not the nearest text."""
-    out = tmp_path_factory.mktemp("fused") / "field.kfgs"
-    assert main(["uplift", str(room), str(splats / "before.ply"), "--out", str(out)]) == 0
-    return out
+    out = tmp_path_factory.mktemp("fused")
+    words = ["fit", str(room), "--splat", str(splats / "before.ply"), "--max-gaussians", "0", "--out", str(out)]
+    assert main(words) == 0
+    return out / "field.kfgs"
 
 
 @pytest.fixture(scope="module")

@@ -36,7 +36,6 @@ LINES = {  # a command with its output {}; and one of its inputs that could be n
     "select": ("select chair {run}/field.kfgs --out {}", None),
     "sfm": ("sfm {tmp}/photos --out {}", None),
     "text": ("text chair --teacher lseg --weights {table} --out {}.safetensors", "{table}"),
-    "uplift": ("uplift {scene} {run}/field.kfgs --out {}", "{run}/field.kfgs"),
     "view": ("view {run}/field.kfgs --where html --out {}", "{run}/field.kfgs"),
 }
 NO_OUTPUT = {"info"}

@@ -7,7 +7,6 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from kfgs.pipeline.label_pictures import picture_names
 from messages import tells
 from PIL import Image
 from small_room import make_desk
@@ -45,7 +44,7 @@ def test_coco_of_the_views_of_a_split_has_their_photographs(desk, tmp_path, caps
     assert str(tmp_path / "coco") in capsys.readouterr().out
     scene = load_scene(desk / "scene")
     truth = load_coco_labels(tmp_path / "coco" / "annotations.json")
-    assert truth.names == SemanticField.load(desk / "run" / "field.kfgs").label_set().names
+    assert truth.names == SemanticField.load(desk / "run" / "field.kfgs").classes.names
     assert set(truth.maps) == {scene.stem(i) for i in scene.views("test")}
     for i in scene.views("test"):
         stem = scene.stem(i)
@@ -90,31 +89,6 @@ def test_cameras_of_your_own(desk, tmp_path):
     assert [path.name for path in folder.iterdir()] == ["annotations.json"]
     with pytest.raises(ValueError, match=tells("cameras:", "a name of its own")):
         segment_cameras(field, [cameras[0], cameras[0]], field.classes, tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("names", "bad"),
-    [
-        ([".kfgs-unfinished/waiting/x.png", "b"], ".kfgs-unfinished/waiting/x"),
-        (["a.png", "a.png/b.png"], "a"),
-        (["../a.png", "b"], "../a"),
-        (["/a.png", "b"], "/a"),
-        (["a\n.png", "b"], r"a\n"),
-        (["x" * 252 + ".png", "b"], "xxx"),
-    ],
-)
-def test_names_that_cannot_be_those_of_pictures_are_refused(tmp_path, names, bad):
-    camera = orbit_cameras(torch.rand(50, 3))[0]
-    cameras = [dataclasses.replace(camera, name=name) for name in names]
-    with pytest.raises(ValueError, match=tells("path:", "names can be those of pictures", f"got '{bad}", "rename it")):
-        picture_names(cameras, "path")
-
-
-def test_the_longest_name_of_a_picture(tmp_path):
-    camera = dataclasses.replace(orbit_cameras(torch.rand(50, 3))[0], name="x" * 251 + ".png")
-    (name,) = picture_names([camera])
-    (tmp_path / f"{name}.png").touch()
-    assert [path.name for path in tmp_path.iterdir()] == ["x" * 251 + ".png"]
 
 
 def own_cameras(folder, cameras, name="{}"):
@@ -205,7 +179,6 @@ def test_cameras_of_your_own_are_checked_before_the_field_is_opened(tmp_path, ca
         (["--path", "{one}", "--width", "3"], ("--width:", "got 3")),
         (["--path", "orbit", "--width", "10000000"], ("--width:", "[16, 16384]", "got 10000000")),
         (["--path", "orbit", "--frames", "99999999999"], ("--frames:", "[2, 100000]", "got 99999999999")),
-        (["--path", "{folder}"], ("--path:", "names can be those of pictures", "got 'a'; rename it")),
         (["--path", "{large}"], ("--path:", "16384 x 16384", "got 60000 x 2 in {large}", "give a smaller --width")),
         (["--path", "{high}", "--width", "100"], ("--width:", "16384 x 16384", "got 100 x 3000000 in {high}")),
         (["--path", "{huge}"], ("{huge}, frame 0", "got 60,000 x 60,000; give a smaller size")),
@@ -215,9 +188,6 @@ def test_options_that_would_have_no_effect_are_named(desk, tmp_path, words, part
     cameras = load_scene(desk / "scene").cameras[:1]
     known = {"scene": desk / "scene", "one": own_cameras(tmp_path / "in", cameras)}
     known |= {"same": own_cameras(tmp_path / "same", cameras * 3)}
-    listed = own_cameras(tmp_path / "folder", load_scene(desk / "scene").cameras[:2], "a.png{}")
-    listed.write_text(listed.read_text().replace("a.png0", "a.png").replace("a.png1", "a.png/b.png"))
-    known["folder"] = listed
     for name, width, height in (("large", 60_000, 2), ("high", 2, 60_000), ("huge", 60_000, 60_000)):
         known[name] = own_cameras(tmp_path / name, cameras)
         frames = json.loads(known[name].read_text())["frames"]

@@ -91,18 +91,6 @@ def test_every_public_name_is_called():
         ),
         (lambda: kfgs.load_teacher([]), ("teacher: expected a name", "list")),
         (lambda: kfgs.score_views(None, None), ("gaussians: expected", "NoneType")),
-        (
-            lambda: kfgs.attach(FIELD, FIELD.gaussians, FIELD.classes, cameras="x"),
-            ("cameras: expected", "Sequence", "str"),
-        ),
-        (
-            lambda: kfgs.attach(FIELD, FIELD.gaussians, FIELD.classes, cameras=torch.zeros(3)),
-            ("cameras: expected", "Tensor"),
-        ),
-        (
-            lambda: kfgs.attach(FIELD, FIELD.gaussians, FIELD.classes, cameras=["a"]),
-            ("cameras[0]: expected a Camera", "str"),
-        ),
     ],
 )
 def test_the_argument_is_named(call, parts):

@@ -99,6 +99,10 @@ def attach(
         pixels are removed and 0.969 of the others unchanged; by views 0.995 and 0.970 (the same with true label maps).
         A vote of neighbours for border Gaussians, or the class of the nearest rendered surface, was worse.
     """
+    if not isinstance(field, SemanticField):
+        raise TypeError(
+            f"field: expected a SemanticField, got {type(field).__name__}; load it with SemanticField.load(path)"
+        )
     splats = read_splats(splats) if isinstance(splats, str | Path) else splats
     cameras = cameras or field.cameras or None
     by = by or ("distance" if cameras is None else "views")

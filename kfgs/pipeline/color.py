@@ -20,7 +20,7 @@ from ..formats import write_splats
 from ..gaussians import Gaussians
 from ..scenes import Scene
 from .stages import Run, Stage, digest_pictures, digest_scene, digest_tensors, stage_generator
-from .train import check_scene, field_stage, stage_params, training_device, with_extent, with_points
+from .train import field_stage, stage_params, training_device, training_views, with_extent, with_points
 
 
 @dataclass(frozen=True)
@@ -158,8 +158,7 @@ def fit_color(
             split has no views, or another process works in `folder`.
     """
     config, progress, target = config or ColorConfig.paper(), as_progress(progress), training_device(device)
-    views = scene.views(split)
-    check_scene(scene, views)
+    views = training_views(scene, split)
     run = Run(check_output("folder", folder, "a folder"), report)
     with run.locked():
         scene = with_points(run, scene, views, seed, progress)

@@ -54,7 +54,7 @@ from .color import color_stage, find_color
 from .maps import KnownFeatures, Maps, as_maps, as_taken, describe_maps, map_shape, maps_of_views
 from .methods import Paper, Uplift
 from .stages import Run, Stage, digest_cameras, digest_scene, digest_shape, digest_tensors, stage_generator
-from .train import check_scene, field_stage, training_device, with_extent, with_points
+from .train import field_stage, training_device, training_views, with_extent, with_points
 
 REPORT = ("report.html", "preview.png", "codebook.png", "field.png")  # what `write_run_report` writes
 
@@ -101,8 +101,7 @@ def fit(
     if not isinstance(method, Uplift | Paper):
         raise TypeError(f"method: expected Uplift() or Paper(), got {type(method).__name__}; pass one of them")
     check_whole("seed", seed, -math.inf)
-    views = scene.views(split)
-    check_scene(scene, views)
+    views = training_views(scene, split)
     kept = None if folder is None else check_output("folder", folder, "a folder")
     if kept is not None:
         check_place(kept / NAME)

@@ -49,6 +49,15 @@ def training_device(device: str | torch.device = "auto") -> torch.device:
     return chosen
 
 
+def training_views(scene: Scene, split: str) -> list[int]:
+    """The views of a split, checked: see `check_scene`."""
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene: expected a Scene, got {type(scene).__name__}; load it with load_scene")
+    views = scene.views(split)
+    check_scene(scene, views)
+    return views
+
+
 def check_scene(scene: Scene, views: Sequence[int], few: int = FEW_POINTS) -> None:
     """Raise a ValueError if some views cannot be trained on: a camera has a lens, or no different points are in sight.
 

@@ -2,7 +2,6 @@ import cases_methods as cases
 import numpy as np
 import pytest
 import torch
-from kfgs.pipeline.apply import score_teacher, true_labels
 from small_room import make_room
 
 from kfgs.evaluation import (
@@ -19,6 +18,7 @@ from kfgs.evaluation import (
     score_views,
 )
 from kfgs.labels import load_label_set, nearest_labels
+from kfgs.pipeline import score_teacher, true_labels
 from kfgs.scenes import FeatureFolder, load_scene
 from kfgs.splat import rgb_to_sh0
 
