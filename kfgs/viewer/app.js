@@ -17,7 +17,6 @@ const SAID = 9000; // milliseconds that a message stays
 const BRUSH = [6, 24, 120]; // pixels: smallest, first, largest radius
 const NARROW = { narrow: 900, slim: 640, thin: 480 }; // CSS pixels of the width
 const LOW = 420; // of the height
-const HOVER = 120; // milliseconds that the pointer rests before a tooltip
 const REMEMBER = 500; // milliseconds after the last change
 const ASIDE = 1; // how far beside the originals copies appear, of their radius
 
@@ -59,7 +58,6 @@ class App {
     this.loading = h("p", { class: "loading", role: "status" }, "Loading the scene…");
     this.said = h("div", { class: "said card", role: "status", "aria-live": "polite" });
     this.toast = h("p", { class: "toast", role: "alert", hidden: true });
-    this.tip = h("p", { class: "tip card", role: "tooltip", hidden: true });
     this.boxes = svg("svg", { class: "overlay boxes", "aria-hidden": "true" });
     this.help = makeHelp();
     this.top = makeTop(this);
@@ -70,7 +68,7 @@ class App {
     const act = { ask: (words) => this.ask(words), fit: () => this.fit(), duplicate: () => this.duplicate() };
     this.panel = makePanel(model, { ...act, save: () => this.saveState(), open: (file) => this.openFile(file), ...this.files() });
     const foot = h("div", { class: "foot" }, this.said, this.views.element);
-    const over = [...this.photoOver.elements, this.boxes, this.rail.element, this.captions.element, foot, this.tip, this.toast];
+    const over = [...this.photoOver.elements, this.boxes, this.rail.element, this.captions.element, foot, this.toast];
     this.stage.append(this.canvas, this.loading, ...over);
     root.classList.add("kfgs");
     root.setAttribute("aria-busy", "true");
@@ -393,22 +391,6 @@ class App {
     const [right, down, up] = [eye.view.R.slice(0, 3), eye.view.R.slice(3, 6), eye.up];
     const by = [0, 1, 2].map((axis) => step * (upward ? -dy * up[axis] : dx * right[axis] + dy * down[axis]));
     model.move(by, !first);
-  }
-
-  /** A tooltip for the Gaussian under the pointer, when it rests; null hides it. */
-  hover(place) {
-    clearTimeout(this.hovering);
-    this.tip.hidden = true;
-    if (place) this.hovering = setTimeout(() => this.showTip(...place), HOVER);
-  }
-
-  showTip(x, y) {
-    const pane = this.panes.at(x);
-    const found = this.model.describe({ side: pane.side, index: this.panes.under(x, y, pane) });
-    if (!found) return;
-    this.tip.textContent = Number.isFinite(found.score) ? `${found.name}, ${found.score.toFixed(2)}` : found.name;
-    Object.assign(this.tip.style, { left: `${x + 14}px`, top: `${y + 14}px` });
-    this.tip.hidden = false;
   }
 
   brushSize() {

@@ -42,9 +42,6 @@ class FieldMeaning:
         cameras: the training views, to compute fused features if the field has none (`fields.fuse_views`); empty: the
             field's own. Without any view, each Gaussian's own latent decides, as in the paper.
         embed: the teacher's text encoder, text -> [D]; without it only classes can be asked.
-
-    Raises:
-        ValueError: if the embeddings and the field's features differ in channels, or there are no classes.
     """
 
     examples = True
@@ -127,11 +124,7 @@ class FieldMeaning:
 class SplatMeaning:
     """A labelled splat: the answer to a class is its Gaussians, with the scores of the file, or 1 if it has none.
 
-    Args:
-        splats: with labels; classes without a name are called "class 3".
-
-    Raises:
-        ValueError: if the splat has no labels.
+    Classes without a name are called "class 3". A ValueError if there are no labels.
     """
 
     phrases = examples = False

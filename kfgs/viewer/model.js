@@ -1,12 +1,10 @@
 /** The viewer's state and rules: question, gamma, lambda, hidden classes, selection, edits, undo. Uses no DOM. */
 
 import { bufferOf, cloudsOf } from "./clouds.js";
-import { near, spacing, squared } from "./points.js";
 
 const MOST_UNDONE = 50; // steps
 const MOST_KEPT = 2e7; // Gaussians in all steps: a step keeps up to 80 bytes of each
 const BINS = 64; // of the histograms
-const REACH = 3; // grow by so many typical distances between neighbours
 const NOTHING = { answer: null, gamma: null, gammaHow: "", hand: {} }; // asked or selected
 export const SIDE_WORDS = { color: "colour", semantic: "semantic" };
 
@@ -255,19 +253,6 @@ export class Model extends EventTarget {
     if (this.selecting) this.step("clear selection", NOTHING);
   }
 
-  /** Add the neighbours of selected Gaussians (grow) or drop those next to unselected ones (shrink). */
-  grow(side = this.side, shrink = false) {
-    const [mask, drawn] = [this.selected(side), this.drawn(side)];
-    const from = shrink ? mask.map((on, i) => (on ? 0 : drawn[i])) : mask;
-    const close = near(this.clouds[side].means, from, this.reach(side));
-    const made = mask.map((on, i) => (shrink ? (on && !close[i] ? 1 : 0) : on || (close[i] && drawn[i]) ? 1 : 0));
-    this.step(shrink ? "shrink selection" : "grow selection", { hand: { ...this.bySides(), [side]: made } });
-  }
-
-  reach(side) {
-    return this.cached(`reach ${side}`, () => REACH * spacing(this.clouds[side].means));
-  }
-
   /** Remove the selected Gaussians of both sides; the selection ends. Returns how many. */
   remove() {
     return this.edit("remove", {}, NOTHING);
@@ -380,7 +365,7 @@ export class Model extends EventTarget {
     const found = [];
     for (let i = 0; i < points.length / 3; i++) {
       if (i === index || removed[i]) continue;
-      const far = squared(points, index, i);
+      const far = [0, 1, 2].reduce((all, axis) => all + (points[3 * i + axis] - points[3 * index + axis]) ** 2, 0);
       if (found.length < count || far < found[count - 1][1]) {
         found.push([i, far]);
         found.sort((a, b) => a[1] - b[1]);

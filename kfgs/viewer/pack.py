@@ -165,8 +165,8 @@ def _add_side(buffers: _Buffers, state: Exploration, side: Side) -> dict[str, An
 def rounded_far(far: Array, given: float) -> Array:  # [N] float64 -> [N] float32
     """Distances rounded down, so that `rounded < lambda` says what `far < lambda` does for every lambda that is a float32.
 
-    The viewer sets only such lambdas. Between a float32 and the next one lies no other, so a lambda above the lower one is at
-    least the upper one. The lambda that is given at the start may be any number: distances next to it are rounded for it.
+    The viewer sets only such lambdas. The one that is given at the start may be any number: distances next to it are
+    rounded for it.
     """
     nearest = far.astype(np.float32)
     down = np.where(nearest > far, np.nextafter(nearest, np.float32(-np.inf)), nearest)
@@ -183,10 +183,7 @@ def _check_finite(side: Side, cloud: Gaussians) -> None:
 
 
 def core_box(means: Array) -> tuple[Array, Array]:  # [N, 3] -> [3], [3]
-    """Centre and half-size of the box that holds the middle 98 % of the means on each axis, twice as large.
-
-    Inside, positions have equal steps of a millionth of the box; outside, the steps grow with the distance.
-    """
+    """Centre and half-size of twice the box of the middle 98 % of the means; outside it, steps grow with the distance."""
     low, high = np.quantile(means, [0.01, 0.99], axis=0)
     return (low + high) / 2, np.maximum(high - low, 1e-6)
 

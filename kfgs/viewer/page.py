@@ -15,10 +15,10 @@ from ..scenes import Scene
 from .pack import pack_scene
 from .state import Exploration
 
+# a module comes after those that it imports
 RENDERER = ("sorter.js", "camera.js", "tint.js", "clouds.js", "shaders.js", "gl.js", "pick.js", "renderer.js")
-"""The modules of the renderer; a module comes after those that it imports."""
 INTERFACE = (
-    "eye.js", "link.js", "points.js", "model.js", "dom.js", "boxes.js", "panel.js", "tools.js", "panes.js", "chrome.js", "app.js",
+    "eye.js", "link.js", "model.js", "dom.js", "boxes.js", "panel.js", "tools.js", "panes.js", "chrome.js", "app.js",
 )  # fmt: skip
 APP = (*RENDERER, *INTERFACE)
 

@@ -110,8 +110,6 @@ function selectionPart(model, act) {
   const said = h("p", { id: freeId("selection-said") });
   const button = (text, title, run, props = {}) => textButton(text, run, { title, ...props });
   const change = [
-    button("Grow", "Add the neighbours of the selected Gaussians", () => model.grow()),
-    button("Shrink", "Drop the selected Gaussians at the border", () => model.grow(model.side, true)),
     button("Invert", "Select everything else (Ctrl+I)", () => model.invert()),
     button("Fit", "Move the camera to the selection (F)", act.fit),
     button("Clear", "Select nothing (Escape)", () => model.clear()),

@@ -54,10 +54,7 @@ def gaussian_at(
 
 
 def views_seeing(gaussians: Gaussians, index: int, cameras: Sequence[Camera]) -> list[Sight]:
-    """The views that see a Gaussian: its weight T alpha at its projected centre is above 0.01. Best views first.
-
-    It needs the whole cloud, because Gaussians in front hide others. Equally good views stay in their order.
-    """
+    """The views that see a Gaussian of a whole cloud: its weight T alpha at its projected centre is above 0.01. Best first."""
     check_whole("index", index, 0, len(gaussians) - 1)
     sights = []
     with torch.no_grad():

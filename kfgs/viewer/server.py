@@ -36,17 +36,11 @@ Call = Callable[[str, dict[str, Any], bytes], tuple[dict[str, Any], bytes]]
 
 
 class PageServer:
-    """Serves a page from a thread of its own, until `close` or the end of a `with` block.
+    """Serves a page (HTML) and its scene (for `readMessage` of link.js) from a thread of its own, until `close`.
 
     A call is a POST to `call`: 4 bytes with the length of a JSON text (little-endian), the JSON {"name", "args"}, and
-    attached bytes; the answer has the same form.
-
-    Args:
-        document: the page, HTML.
-        pack: the scene, for `readMessage` of link.js.
-        call: answers calls, in several threads at once.
-        host: address to listen on. With one that other machines can reach, everyone who has the link can look and save.
-        port: 0: a free one. A ValueError if it is taken, or the address is not one of this machine.
+    attached bytes; the answer has the same form. With a host that other machines can reach, everyone who has the link can
+    look and save. Port 0 is a free one; a ValueError if it is taken, or the host is not one of this machine.
     """
 
     def __init__(self, document: str, pack: bytes, call: Call, host: str = "127.0.0.1", port: int = 0) -> None:

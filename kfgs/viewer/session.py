@@ -114,7 +114,7 @@ class Session:
             state.set_distance(args["lambda"])
         edited = {side: self._edited(side, args) for side in map(_side, args["sides"])}
         masks = _masks({side: len(splats) for side, splats in edited.items()}, attached)
-        return _wrote(save_selection(state, edited, masks, self.out))
+        return {"paths": [str(path) for path in save_selection(state, edited, masks, self.out)]}, b""
 
     def _save_edits(self, args: dict[str, Any], _: bytes) -> Answer:
         made = {_side(side): edits for side in args["edits"] if len(edits := _edit_list(args, side))}
@@ -127,7 +127,7 @@ class Session:
         for side, edits in made.items():
             paths += [edits.save(folder / f"{side}.json"), folder / f"{side}.ply"]
             write_splats(results[side].replace(scores=None), paths[-1])
-        return _wrote(paths)
+        return {"paths": [str(path) for path in paths]}, b""
 
     def _edited(self, side: Side, args: dict[str, Any]) -> Gaussians:
         """A side with what was done to it, but nothing removed: masks are of these Gaussians."""
@@ -222,7 +222,3 @@ def _edit_list(args: dict[str, Any], side: str) -> EditList:
         check_choice("edits: op", edit["op"], EDITS)
         check_choice("edits: where", edit["where"]["kind"], ("index",))
     return EditList(read_edits(given))
-
-
-def _wrote(paths: list[Path]) -> Answer:
-    return {"paths": [str(path) for path in paths]}, b""

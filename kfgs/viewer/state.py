@@ -34,13 +34,10 @@ class Exploration:
     milliseconds and selects what `transfer_labels` selects.
 
     Args:
-        meaning: the semantic cloud and its answers, a `FieldMeaning` or a `SplatMeaning`.
+        meaning: the semantic cloud and its answers.
         color: the colour cloud, in the same frame; None: the semantic side alone.
         cameras: views without distortion, to find those that see a Gaussian.
         distance: lambda, world units; None: from the clouds' spacing (`labels.default_distance`).
-
-    Raises:
-        ValueError: if a cloud is empty, a position is not finite, lambda is not positive, or a lens distorts.
     """
 
     def __init__(
@@ -69,7 +66,7 @@ class Exploration:
         self.sides: tuple[Side, ...] = tuple(self._clouds)
         self._own_labels = as_array(semantic.labels).astype(np.int64)
         self.source, self.far, suggested, self.distance_how = self._find_sources()
-        self._cache: dict[tuple[str, Side], Array] = {}
+        self._base: dict[Side, Array] = {}
         colored = any(cloud.sh is not None for cloud in self._clouds.values())
         shows: dict[Show, bool] = {
             "labels": True,
@@ -172,24 +169,21 @@ class Exploration:
 
     def base_colors(self, side: Side) -> Array:  # [N, 3] uint8
         """The colours of a side from everywhere; if it has none, those of the nearest Gaussians of the other side."""
-        if ("rgb", side) not in self._cache:
+        if side not in self._base:
             own = self.cloud(side)
             if own.sh is not None:
-                self._cache["rgb", side] = as_bytes(sh0_to_rgb(own.sh[:, 0].detach()))
+                self._base[side] = as_bytes(sh0_to_rgb(own.sh[:, 0].detach()))
             else:
                 other: Side = "color" if side == "semantic" else "semantic"
                 tree = cKDTree(as_array(self.cloud(other).means), balanced_tree=False, compact_nodes=False)
-                self._cache["rgb", side] = self.base_colors(other)[tree.query(as_array(own.means), workers=-1)[1]]
-        return self._cache["rgb", side]
+                self._base[side] = self.base_colors(other)[tree.query(as_array(own.means), workers=-1)[1]]
+        return self._base[side]
 
     def latents(self) -> Array:  # [S, 3] uint8
         """The latents of the semantic side as colours; grey if a latent was never learnt."""
-        if ("latents", "semantic") not in self._cache:
-            features = self._clouds["semantic"].features
-            assert features is not None
-            rgb = self.meaning.feature_colors()(features)
-            self._cache["latents", "semantic"] = np.where(as_array(features.any(dim=1))[:, None], rgb, GREY)
-        return self._cache["latents", "semantic"]
+        features = self._clouds["semantic"].features
+        assert features is not None
+        return np.where(as_array(features.any(dim=1))[:, None], self.meaning.feature_colors()(features), GREY)
 
     def details(self) -> dict[str, Any]:
         """The state as JSON: question, gamma, lambda, and the count of each class on each side.

@@ -11,7 +11,7 @@ export class Tools {
   /**
    * @param {HTMLElement} stage what the pointer works on
    * @param {Eye} eye the camera
-   * @param {{moved(), grab(), click(x, y), twice(x, y), hover(x, y), shape(polygon, how), ball(x, y, radius, how),
+   * @param {{moved(), grab(), click(x, y), twice(x, y), shape(polygon, how), ball(x, y, radius, how),
    *   brush(x, y, how, first), brushSize(), shift(dx, dy, upward, first)}} on places are CSS pixels of the stage; `how`:
    *   replace, add, subtract
    */
@@ -25,7 +25,6 @@ export class Tools {
     listen("pointerup", this.up);
     listen("pointercancel", this.cancel);
     listen("pointerleave", () => {
-      this.on.hover(null);
       if (!this.drag) this.overlay.replaceChildren();
     });
     listen("wheel", this.wheel);
@@ -48,7 +47,6 @@ export class Tools {
     if (event.target.closest("button, input, select, .card")) return;
     if (event.button === 1) event.preventDefault(); // no scrolling by the middle button
     this.stage.focus({ preventScroll: true });
-    this.on.hover(null);
     this.stage.setPointerCapture(event.pointerId);
     const place = this.place(event);
     this.points.set(event.pointerId, place);
@@ -65,7 +63,6 @@ export class Tools {
   move(event) {
     const place = this.place(event);
     if (this.tool === "brush" && !this.points.size) this.circle(place, this.on.brushSize());
-    if (this.tool === "move" && !this.points.size && event.pointerType === "mouse") this.on.hover(place);
     if (!this.points.has(event.pointerId)) return;
     if (this.points.size === 2) return this.pinch(event.pointerId, place);
     this.points.set(event.pointerId, place);

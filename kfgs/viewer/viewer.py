@@ -94,7 +94,6 @@ def explore(
         height: of the window or the widget, pixels.
 
     Raises:
-        ValueError: if there is nothing to show, or arguments contradict each other.
         ImportError: if anywidget is missing for `notebook`.
         RuntimeError: if nothing can be drawn here, or there is no display for a window.
     """
@@ -131,14 +130,8 @@ class Viewer:
 
     The browser draws, and keeps what a person changes; Python answers texts and writes files. It opens with the state's
     question, gamma, lambda and colours. After that, page and state are independent, except that `ask` in Python also asks
-    in an open widget.
-
-    Args:
-        exploration: the state.
-        title: shown above the scene.
-        scene: has the photos of the exploration's cameras, found by name; None: without photos.
-        out: folder for files that are saved, on the machine of this program.
-        height: of the widget, CSS pixels.
+    in an open widget. `scene` has the photos of the cameras, found by name; `out` is the folder for files, on the machine of
+    this program; `height` of the widget is in CSS pixels.
     """
 
     def __init__(
@@ -196,10 +189,7 @@ class Viewer:
 
     @property
     def widget(self) -> AnyWidget:
-        """The notebook widget (anywidget), made when it is first wanted; an ImportError if anywidget is missing.
-
-        Where widgets cannot run, on a page of GitHub for instance, a picture from the first camera is shown.
-        """
+        """The notebook widget (anywidget), made when it is first wanted. Where widgets cannot run, it is a picture."""
         if self._widget is None:
             self._widget = self._make_widget()
         return self._widget
@@ -211,9 +201,6 @@ class Viewer:
 
     def _repr_mimebundle_(self, **options: Any) -> Any:
         return self.widget._repr_mimebundle_(**options)
-
-    def __repr__(self) -> str:
-        return f"<Viewer: {'; '.join(self.state.lines())}>"
 
     def _make_widget(self) -> AnyWidget:
         require_widget()
@@ -264,10 +251,7 @@ def in_notebook() -> bool:
 
 
 def still(state: Exploration) -> str:
-    """What the first camera sees, in the colours that the viewer opens with: a JPEG file in base64, as notebooks hold it.
-
-    After a question, what it did not select is pale.
-    """
+    """What the first camera sees, a JPEG file in base64, as notebooks hold it; what a question did not select is pale."""
     side, camera = state.sides[-1], state.cameras[0].fitted(STILL)
     cloud = state.cloud(side)
     if state.asked is not None or state.show != "rgb" or cloud.sh is None:

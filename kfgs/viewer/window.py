@@ -54,7 +54,7 @@ class Explorer:
     """The clouds of an exploration in pyvista, with methods that change its question, thresholds and colours, and draw.
 
     Nothing opens by itself: `plotter` draws with and without a display, and `show` opens a window. `out` is the folder for
-    saved pictures and selections, `height` is in pixels; a RuntimeError if nothing can be drawn here.
+    saved pictures and selections, `height` is in pixels.
     """
 
     def __init__(
@@ -105,10 +105,7 @@ class Explorer:
         self._draw()
 
     def pick(self, x: float, y: float) -> Picked | None:
-        """Pick the Gaussian seen at a pixel of the window (y from its top) and write its class there; None: background.
-
-        Selected Gaussians come first; the faint rest is picked only if there is none.
-        """
+        """Pick the Gaussian seen at a pixel of the window (y from its top), a selected one first; None: background."""
         state, self._picked = self.state, None
         width = self.plotter.window_size[0] // len(state.sides)
         column = min(int(x // width), len(state.sides) - 1)
@@ -141,7 +138,7 @@ class Explorer:
             renderer.ResetCameraClippingRange()
 
     def screenshot(self, path: str | Path | None = None) -> Array:  # [H, W, 3] uint8
-        """Take a picture of the current view, with a legend; with a path, also write it as a PNG file."""
+        """Take a picture of the current view, with a legend, and write it as a PNG file if there is a path."""
         self.plotter.render()  # pyvista takes its pictures from the last frame
         picture: Array = np.array(self.plotter.screenshot(return_img=True))[..., :3]
         if path is not None:

@@ -47,8 +47,6 @@ def show_cloud(
     blend at borders. `rgb` is the colour of the harmonics, which depends on the direction. `background` is a colour by name
     or three numbers in [0, 1]; with class `names`, labels have their colours in `palette`; other arguments as in `add_cloud`.
 
-    Raises:
-        ValueError: if the cloud is empty or lacks what to colour by.
     """
     check_gaussians(gaussians)
     color_by = color_by or color_by_default(gaussians)
@@ -124,9 +122,6 @@ def save_animation(
         listed: the labels in a legend below every frame, with these names; None: no legend.
         progress: called after each frame with (done, all).
 
-    Raises:
-        ValueError: if there is nothing to show or no camera, sizes differ, or the name ends otherwise.
-        ImportError: for .mp4, if imageio-ffmpeg is not installed.
     """
     named = shows if isinstance(shows, Mapping) else {"": shows}
     if not named or not cameras:

@@ -55,8 +55,7 @@ def linked_clouds(
         The plotter, with the left subplot active: call `.show()`, or add more first.
 
     Raises:
-        ValueError: if a cloud is empty or lacks what it is coloured by, a label has no name, or the lens distorts.
-        RuntimeError: if nothing can be drawn here.
+        ValueError: if a cloud is empty or lacks what it is coloured by, or the lens distorts.
     """
     wide = 4 / 3 if camera is None else camera.width / camera.height
     plotter = make_plotter(height, 2 * round(height * wide), shape=(1, 2), off_screen=off_screen)
@@ -201,7 +200,7 @@ def look_over(plotter: pv.Plotter, gaussians: Gaussians, up: Sequence[float] = (
 
 
 def upwards(cameras: Sequence[Camera]) -> list[float]:
-    """The world's up, estimated from cameras (`estimate_up`); z if there are none or they are not upright."""
+    """The world's up (`estimate_up`); z if there are no cameras or they are not upright."""
     try:
         return [float(x) for x in estimate_up(cameras)]
     except ValueError:

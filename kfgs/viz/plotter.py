@@ -96,9 +96,6 @@ def make_plotter(
         shape: (rows, columns) of subplots.
         off_screen: draw without a window; None: only where there is no display.
         background: a colour that pyvista knows.
-
-    Raises:
-        RuntimeError: if nothing can be drawn here; the message names the packages to install.
     """
     check_whole("height", height, 1)
     check_whole("width", width, 1)
@@ -174,10 +171,6 @@ def draw_view(
 
     `draw` is called with the plotter. For a window that can be turned, make a plotter with `make_plotter` and call
     `look_through` and `show` yourself.
-
-    Raises:
-        RuntimeError: if nothing can be drawn here; the message names the packages to install.
-        ValueError: if the camera's lens distorts.
     """
     plotter = make_plotter(*camera.size, off_screen=True, background=background)
     try:
