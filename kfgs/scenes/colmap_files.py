@@ -12,7 +12,7 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,7 +134,7 @@ class BinaryTable:
         left = len(self.data) - self.position
         require(left == 0, str(self.path), f"the end of the file at byte {self.position}", f"{left} more bytes")
 
-    def _take(self, layout: str) -> tuple[int | float, ...]:
+    def _take(self, layout: str) -> tuple[Any, ...]:
         size = struct.calcsize("<" + layout)
         left = len(self.data) - self.position
         require(
@@ -149,7 +149,7 @@ class BinaryTable:
         require(count * smallest <= left, self.where, f"at most {left // smallest} ({name}) in {left} bytes", count)
         return int(count)
 
-    def _array(self, dtype: np.dtype, what: str) -> NDArray:
+    def _array(self, dtype: np.dtype[Any], what: str) -> NDArray[Any]:
         count = self._count(f"number of {what}", dtype.itemsize)
         self.position += count * dtype.itemsize
         return np.frombuffer(self.data, dtype, count, self.position - count * dtype.itemsize)

@@ -84,8 +84,8 @@ def extract_features(
 ) -> Manifest:
     """Write a teacher's map of each picture to a folder that `FeatureFolder` reads. After a killed call, call it again.
 
-    A map is `<stem>.npy`, float16 [h, w, D]. `features.json` records which teacher made it from which picture. A map is made
-    if there is none, or if its picture has changed. Memory holds one picture and its map at a time.
+    A map is `<stem>.npy`, float16 [h, w, D]; `features.json` records which teacher made it from which picture. A map is made if
+    there is none, or if its picture has changed.
 
     Args:
         teacher: an object with `encode_image`, from [3, H, W] RGB in [0, 1] to [D, h, w], a `name` and perhaps `identity`

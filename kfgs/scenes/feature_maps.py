@@ -224,7 +224,8 @@ class FeatureFolder(Sequence[Tensor]):
             except (ValueError, TypeError) as error:
                 problems[name] = str(error).removeprefix(f"{file}: ")
                 continue
-            h, w, _ = shapes[name] = tuple(map(int, stored.shape))
+            h, w, D = map(int, stored.shape)
+            shapes[name] = h, w, D
             if size is not None and not fits_aspect((h, w), size) and fits_aspect((w, h), size):
                 turned[name] = f"expected the aspect of a picture of {size}, got {h} x {w} cells (transposed?)"
             counts = [

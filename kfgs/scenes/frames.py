@@ -31,15 +31,17 @@ SIGMAS = 4.0  # in the last fits, cameras farther off than this many median dist
 PAIRS = 5_000  # pairs of cameras tried for scale and place
 
 SAMPLE = 20_000  # points of each cloud that are measured
-REACH_SPACINGS, REACH_SIZE, REACH_MOST = 2.0, 0.01, 0.025
-"""Near: closer than 2 spacings of the other cloud or 1 % of the scene's size, at most 2.5 %: else all is near a sparse cloud."""
+REACH_SPACINGS, REACH_SIZE, REACH_MOST = (
+    2.0,
+    0.01,
+    0.025,
+)  # near: spacings of the other cloud; least and most shares of the size
 NEAR_SHARE, LEAST_SHARE = 0.8, 0.3
 """Shares of the points of the better and of the worse cloud that must be near. (Field and colour splat of Replica's room_0: 0.88;
-the toy room turned by half a turn: 0.63.) The second is low because one cloud may be a part of the other, and not 0 because a
-fog of points that fills a room is near everything in it."""
+the toy room turned by half a turn: 0.63.) The second is low because one cloud may be a part of the other."""
 DRIFT_SHARE, DRIFT_SIZE = 0.9, 0.005
-"""The best fit nearby may move 90 % of the surface, along its normals, by at most this share of the size. (Same frame: 0.0007 for
-room_0, up to 0.003 with few points; 5 % larger: 0.007 to 0.018. The shares of near points hardly change then.)"""
+"""The best fit nearby may move 90 % of the surface, along its normals, by at most this share of the size. (Same frame: at most
+0.003; 5 % larger: 0.007 to 0.018.)"""
 NEARBY, FITTED, FEWEST = 0.05, 3_000, 12  # of the size: counterparts; points of the fit; fewer points give no surface
 
 
@@ -83,14 +85,7 @@ def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
 
     Wrong poses are left out as long as half of the common cameras agree. The rotation is the one that most orientations agree
     on; scale and translation come from the pair of centres that fits most cameras; least squares on the cameras that fit, in
-    place and in orientation, refine all (`fit_similarity`, Umeyama 1991).
-
-    Args:
-        src: posed cameras in the source frame; distortion and intrinsics are not used.
-        dst: posed cameras in the destination frame.
-
-    Returns:
-        The similarity from the source frame to the destination frame; `details` names the cameras that fit worst.
+    place and in orientation, refine all (`fit_similarity`, Umeyama 1991). Intrinsics are not used.
 
     Raises:
         SceneError: if fewer than two names are common, all common cameras stand at one place (no scale follows), or
@@ -267,9 +262,9 @@ def frames_agree(
     a, b = _bulk("src", src), _bulk("dst", dst)
     size = min(float(np.linalg.norm(np.ptp(cloud, axis=0))) for cloud in (a, b))
     trees = cKDTree(a), cKDTree(b)
-    spacings = [float(np.median(tree.query(tree.data[:: max(1, tree.n // 5_000)], k=2)[0][:, 1])) for tree in trees]
+    spacings = [float(np.median(_nearest(tree, tree.data[:: max(1, tree.n // 5_000)], 2)[0][:, 1])) for tree in trees]
     to_src, to_dst = (min(max(REACH_SPACINGS * one, REACH_SIZE * size), REACH_MOST * size) for one in spacings)
-    distances = trees[1].query(a)[0], trees[0].query(b)[0]
+    distances = _nearest(trees[1], a)[0], _nearest(trees[0], b)[0]
     near = float((distances[0] < to_dst).mean()), float((distances[1] < to_src).mean())
     drift = _drift(*(cloud[d < NEARBY * size] for cloud, d in zip((a, b), distances, strict=True)))
     agree = max(near) >= NEAR_SHARE and min(near) >= LEAST_SHARE and drift <= DRIFT_SIZE * size
@@ -279,6 +274,11 @@ def frames_agree(
         f"{size:.3g}), and the best fit nearby moves their surface by {drift:.3g}"
     )
     return FrameCheck(agree, summary, near, (to_dst, to_src), drift)
+
+
+def _nearest(tree: cKDTree, places: Array, k: int = 1) -> tuple[Array, Array]:
+    distances, indices = tree.query(places, k=k)
+    return np.asarray(distances), np.asarray(indices)
 
 
 def _bulk(name: str, points: Tensor) -> Array:
@@ -299,19 +299,18 @@ def _bulk(name: str, points: Tensor) -> Array:
 def _drift(a: Array, b: Array) -> float:
     """How far the best fit nearby moves the surface of a; 0 if there are too few points to fit.
 
-    Least squares on the distances to the other cloud's tangent planes, both ways, with weights (Geman-McClure) of a reach
-    that shrinks. Only the motion along the normals counts, because a wall can slide along itself unnoticed; the quantile
-    `DRIFT_SHARE` leaves out edges, where normals are wrong.
+    Least squares on the distances to the other cloud's tangent planes, both ways, with Geman-McClure weights of a reach that
+    shrinks. Only the motion along the normals counts, as walls slide along themselves unnoticed; edges have wrong normals.
     """
     if min(len(a), len(b)) < FEWEST:
         return 0.0
     (a, m, tree_a), (b, n, tree_b) = _with_normals(a), _with_normals(b)
-    spacing = max(float(np.median(tree.query(tree.data, k=2)[0][:, 1])) for tree in (tree_a, tree_b))
+    spacing = max(float(np.median(_nearest(tree, tree.data, 2)[0][:, 1])) for tree in (tree_a, tree_b))
     R, s, t = np.eye(3), 1.0, np.zeros(3)
     for reach in REACH_SPACINGS * spacing * np.geomspace(2, 0.5, 10):
         moved = s * a @ R.T + t
-        d, i = tree_b.query(moved)
-        e, j = tree_a.query((b - t) @ R / s)
+        d, i = _nearest(tree_b, moved)
+        e, j = _nearest(tree_a, (b - t) @ R / s)
         P, Q = np.concatenate([moved, moved[j]]), np.concatenate([b[i], b])
         normals = np.concatenate([n[i], m[j] @ R.T])
         squares, counts = np.concatenate([d**2, (e * s) ** 2]), np.repeat([len(d), len(e)], [len(d), len(e)])
@@ -345,6 +344,6 @@ def _with_normals(points: Array) -> tuple[Array, Array, cKDTree]:
             break
         cell /= 1.1
     tree = cKDTree(thinned)
-    near = thinned[tree.query(thinned, k=min(12, len(thinned)))[1]]  # [n, k, 3]
+    near = thinned[_nearest(tree, thinned, min(12, len(thinned)))[1]]  # [n, k, 3]
     near = near - near.mean(1, keepdims=True)
     return thinned, np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))[1][:, :, 0], tree

@@ -181,7 +181,7 @@ def load_polycam(folder: Path, _: Path | None = None) -> Scene:
         values = read_scene_json(file, "export the capture again (raw data, developer mode)")
         values = values if isinstance(values, dict) else {}
         keys = ("width", "height", "fx", "fy", "cx", "cy", *(f"t_{i}{j}" for i in range(3) for j in range(4)))
-        numbers = [values.get(key) for key in keys]
+        numbers: list[Any] = [values.get(key) for key in keys]
         if any(type(n) is float and not math.isfinite(n) for n in numbers):
             views.append(PosedPicture(name, images / name, NOWHERE, str(file), (np.eye(3), (1, 1))))
             continue
