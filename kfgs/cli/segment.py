@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .._files import check_output, read_json, write_json
+from .._files import check_output, file_stem, read_json, write_json
 from .files import check_alone, open_field
 from .options import Classes, Flag, Given, GivenWalk, Positional, Rule, Walk
 from .output import say, wrote
@@ -138,7 +138,6 @@ def _segment_path(
 ) -> list[Path]:
     """Segment the cameras of a path, and with --coco render the colours that they see; name what was written."""
     from ..pipeline import segment_cameras, write_coco
-    from ..scenes import file_stem
     from ..viz import show_cloud
 
     classes.check_images()
