@@ -52,6 +52,8 @@ class Autoencoder(nn.Module, Stored):
     """
 
     kind = "autoencoder"
+    encoder: Any  # torch.nn.ModuleList of torch.nn.Linear
+    decoder: Any
     range: Tensor  # [2] float64, lowest and highest number in the codewords' unit latents
     report: AutoencoderReport | None = None  # set by `fit_autoencoder`; not saved
 

@@ -92,7 +92,7 @@ class PaperCodebook:
                 if seen % period == 0 or seen == maps:
                     pruned += book.step()
             size, known = len(book.rows), torch.cat(similarities)
-            record = {"epoch": epoch, "size": size, "added": size - before + pruned, "pruned": pruned}
+            record: dict[str, Any] = {"epoch": epoch, "size": size, "added": size - before + pruned, "pruned": pruned}
             record |= {"loss": sum(losses) / len(losses), "coverage": share_above(known, self.expand_below)}
             history.append(record | {"mean_similarity": float(known.mean(dtype=torch.float64))})
             bar.set_postfix(K=size, coverage=f"{record['coverage']:.3f}")

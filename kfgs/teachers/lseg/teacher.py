@@ -100,7 +100,8 @@ class LSeg(nn.Module):
         self.network = network
         self.options = LSegOptions() if options is None else options
         self.text: ClipText | None = None
-        self._load_text, self._digest, self._weights = load_text, weights, None
+        self._load_text, self._digest = load_text, weights
+        self._weights: str | None = None
         self.eval()
 
     def __repr__(self) -> str:
