@@ -96,9 +96,9 @@ def pack(tensors: dict[str, Tensor], precision: Precision) -> Packed:
         check_choice("precision", precision, PRECISIONS)
     chosen = PRECISIONS[precision] if isinstance(precision, str) else precision
     arrays = {name: value.double().numpy() for name, value in tensors.items() if value.is_floating_point()}
-    for name, array in arrays.items():
+    for name, numbers in arrays.items():
         low, high = {"gaussians.opacities": (0, 1), "gaussians.scales": (0, HUGE)}.get(name, (-HUGE, HUGE))
-        if not (np.isfinite(array) & (array >= low) & (array <= high)).all():
+        if not (np.isfinite(numbers) & (numbers >= low) & (numbers <= high)).all():
             raise ValueError(
                 f"{name}: expected finite numbers from {low:g} to {high:g} to round, got others; fit it again"
             )
@@ -112,37 +112,30 @@ def pack(tensors: dict[str, Tensor], precision: Precision) -> Packed:
     arrays["gaussians.quats"], arrays["gaussians.scales"] = _nearest_turn(quats, scales)
     cells = np.round((means[order] - origin) / step).astype(np.int64)
     place = _Place(cells, _find_before(cells))
-    streams, entries, errors, fused = {}, {}, {}, "linear.basis" in tensors
+    streams, entries, fused = dict[str, Tensor](), dict[str, Entry](), "linear.basis" in tensors
+    errors: dict[str, float] = {}
     for name, value in tensors.items():
         per_gaussian = name.startswith(PER_GAUSSIAN)
         array = arrays.get(name)
         array = array[order] if array is not None and per_gaussian else array
         entry, plain = _encode(name, value[order] if per_gaussian else value, array, chosen, place, step, origin, fused)
         packed = zstandard.ZstdCompressor(level=LEVEL).compress(plain)
-        streams[name] = _bytes(packed if len(packed) < len(plain) else plain)
+        shorter = len(packed) < len(plain)
+        streams[name] = torch.from_numpy(np.frombuffer(packed if shorter else plain, np.uint8).copy())
         errors |= {name: entry.pop("error")} if "error" in entry else {}
-        entries[name] = entry | {"shape": list(value.shape)}
+        entries[name] = entry | {"shape": list(value.shape), "compressed": shorter}
     return Packed(streams, entries, errors)
 
 
 def unpack(streams: dict[str, Tensor], entries: dict[str, Entry]) -> dict[str, Tensor]:
-    """The tensors of `pack`. Sizes are checked before memory is taken; a ValueError for what is damaged."""
+    """The tensors of `pack`; a ValueError for what is damaged."""
     if set(entries) != set(streams):
         raise ValueError(f"expected a description of {sorted(streams)}, got {sorted(entries)!r:.200}")
-    shapes = {name: tuple(int(size) for size in entry["shape"]) for name, entry in entries.items()}
-    sizes = {name: _plain_size(entry, shapes[name]) for name, entry in entries.items()}
-    total = sum(max(sizes[name], 8 * math.prod(shape)) for name, shape in shapes.items())
-    if total > most_unpacked(sum(stream.numel() for stream in streams.values())):
-        raise ValueError(f"it would unpack to {total} bytes, more than a packed field has")
+    plain = {name: _plain_bytes(streams[name].numpy().tobytes(), entry) for name, entry in entries.items()}
     tensors: dict[str, Tensor] = {}
     place = None
     for name in sorted(entries, key=lambda name: entries[name]["coding"] != "curve"):  # others may need the means
-        plain = streams[name].numpy().tobytes()
-        if len(plain) != sizes[name]:
-            if zstandard.get_frame_parameters(plain).content_size != sizes[name]:
-                raise ValueError(f"{name}: expected a stream of {sizes[name]} bytes, got another")
-            plain = zstandard.ZstdDecompressor().decompress(plain, max_output_size=sizes[name])
-        tensors[name], place = _decode(entries[name], shapes[name], plain, place)
+        tensors[name], place = _decode(entries[name], tuple(entries[name]["shape"]), plain[name], place)
     if entries["gaussians.opacities"]["coding"] != "exact":
         tensors["gaussians.opacities"].clamp_(EDGE, 1 - EDGE)
     scales = entries["gaussians.scales"]
@@ -238,25 +231,14 @@ def _rows(values: Array, share: float, coding: str = "rows") -> tuple[Entry, byt
     return entry, steps.tobytes() + plain
 
 
-def _plain_size(entry: Entry, shape: tuple[int, ...]) -> int:
-    """The bytes that a coded tensor must have; a ValueError if the entry makes no sense. No memory is taken."""
-    coding, numbers = entry["coding"], math.prod(shape)
-    if len(shape) > 3 or any(size < 0 for size in shape):
-        raise ValueError(f"shape: expected at most three sizes, got {shape!r:.80}")
-    if coding == "exact":
-        return numbers * getattr(torch, entry["dtype"]).itemsize
-    columns = {"curve": 3, "turns": 4}.get(coding, shape[-1])
-    if coding not in _CODINGS or entry["width"] not in (1, 2, 4, 8) or not 1 <= len(shape) <= 2 or shape[-1] != columns:
-        raise ValueError(f"expected a coding of kfgs, got {entry!r:.80} of shape {shape}")
-    if coding in ("curve", "turns", "near", "rows", "basis") and len(shape) != 2:
-        raise ValueError(f"shape: expected that of rows for {coding}, got {shape}")
-    if coding == "basis" and (numbers * shape[1] > QR_MOST or shape[0] < shape[1]):
-        raise ValueError(f"shape: expected a basis that is quickly made orthonormal, got {shape}")
-    stored = {"curve": numbers // 3, "turns": numbers // 4 * 3}.get(coding, numbers)
-    return stored * int(entry["width"]) + 4 * {"rows": shape[0], "basis": shape[-1]}.get(coding, 0)
-
-
-_CODINGS = ("curve", "turns", "logs", "steps", "near", "rows", "basis")
+def _plain_bytes(stream: bytes, entry: Entry) -> bytes:
+    """A stream as it was before compression; a ValueError if it would unpack to more than any packed tensor has."""
+    if not entry["compressed"]:
+        return stream
+    size = zstandard.get_frame_parameters(stream).content_size
+    if size > most_unpacked(len(stream)):
+        raise ValueError(f"a stream of {len(stream)} bytes would unpack to {size}")
+    return zstandard.ZstdDecompressor().decompress(stream, max_output_size=size)
 
 
 def _decode(entry: Entry, shape: tuple[int, ...], plain: bytes, place: _Place | None) -> tuple[Tensor, _Place | None]:
@@ -289,9 +271,11 @@ def _decode(entry: Entry, shape: tuple[int, ...], plain: bytes, place: _Place | 
         if place is None or len(place.before) != rows:
             raise ValueError(f"expected as many latents as there are means, got {rows}")
         values = _sum_up(_whole(plain, entry, rows, columns), place.before) * np.float32(entry["step"])
-    else:
+    elif coding in ("steps", "logs"):
         steps = _whole(plain, entry, rows, columns) * float(entry["step"])
         values = steps if coding == "steps" else np.expm1(np.clip(steps, 0, 700)) * float(entry["least"])
+    else:
+        raise ValueError(f"coding: expected one of kfgs, got {coding!r:.40}")
     return torch.from_numpy(np.ascontiguousarray(values.reshape(shape), dtype=np.float32)), place
 
 
@@ -341,7 +325,3 @@ def _nearest_turn(quats: Array, scales: Array) -> tuple[Array, Array]:  # [N, 4]
     both = Rotation.from_quat(np.roll(quats, -1, axis=1)) * Rotation.from_quat(np.roll(turns[best], -1, axis=1))
     turned = np.roll(both.as_quat(), 1, axis=1)
     return turned * np.where(turned[:, :1] < 0, -1, 1), np.take_along_axis(scales, axes[best], axis=1)
-
-
-def _bytes(data: bytes) -> Tensor:  # [n] uint8
-    return torch.from_numpy(np.frombuffer(data, np.uint8).copy())

@@ -320,9 +320,10 @@ class SemanticField:
                 f"classes: expected a LabelSet or embeddings [C, D], got the name {classes!r}; query({classes!r}) finds the "
                 "Gaussians of one class"
             )
-        if classes is None and self.classes is None:
+        classes = self.classes if classes is None else classes
+        if classes is None:
             raise ValueError("classes: expected a label set, got none, and the field holds none; pass the classes")
-        return class_rows(self.classes if classes is None else classes, self.dim, self.info)
+        return class_rows(classes, self.dim, self.info)
 
     def _rank(self, camera: Camera, classes: Classes | None, top: int, *, early: bool) -> Ranked:
         rows = self._rows(classes)

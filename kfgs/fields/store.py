@@ -143,7 +143,7 @@ def _digest(tensors: Mapping[str, Tensor], about: Mapping[str, Any]) -> str:
     for name in sorted(tensors):
         value = tensors[name].contiguous()
         digest.update(f"{name} {tuple(value.shape)} {value.dtype}".encode())
-        digest.update(value.reshape(-1).view(torch.uint8).numpy() if value.numel() else b"")
+        digest.update(value.reshape(-1).view(torch.uint8).numpy().data if value.numel() else b"")
     return digest.hexdigest()
 
 
@@ -188,7 +188,7 @@ def _from_tensors(
 ) -> tuple[dict[str, Any], Any, dict[str, Any] | None]:
     """The parts of a field, which `SemanticField` checks."""
     origin, classes = as_origin(about.get("origin", ORIGIN)), None
-    cloud = {name: tensors[f"gaussians.{name}"] for name in CLOUD if f"gaussians.{name}" in tensors}
+    cloud: dict[str, Any] = {name: tensors[f"gaussians.{name}"] for name in CLOUD if f"gaussians.{name}" in tensors}
     for name, value in cloud.items():
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
             raise ValueError(f"gaussians.{name} has NaN or infinity")
