@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .._card import html_card, short_repr
 from .._check import as_tensor, check_shapes, check_whole
-from .._rows import unit_embeddings
+from .._rows import unit_embeddings, unit_rows
 from ..cameras import Camera
 from ..gaussians import Gaussians, as_rows
 from ..labels import LOGIT_SCALE, Classification, LabelSet, Score, Selection, select_by_similarity
@@ -224,11 +224,16 @@ class SemanticField:
         """
         if score == "cosine" and isinstance(negatives, str) and negatives == "auto":
             negatives = "none"
-        question = make_question(target, self.classes if classes is None else classes, negatives, self.dim, self.info)
-        cosines = self.cosines(question.rows)
-        against = None if question.negatives is None else cosines[:, 1:]
+        source, classes = self if self.fused is None else self.fused, self.classes if classes is None else classes
+        question = make_question(target, classes, negatives, source.decoder.dim, self.info)
+        latents, rows = source.features, question.rows
+        named = isinstance(target, str) and isinstance(negatives, str)  # the rows of a label set are checked
+        unit = unit_rows(rows) if named else unit_embeddings(rows, "embedding, negatives")
+        with torch.no_grad():
+            cosines = source.decoder.cosines(latents, unit.to(latents))
         options: dict[str, Any] = {"score": score, "logit_scale": logit_scale}
-        return select_by_similarity(cosines[:, 0], against, threshold, self.known, **options)
+        against = None if question.negatives is None else cosines[:, 1:]
+        return select_by_similarity(cosines[:, 0], against, threshold, latents.any(dim=1), **options)
 
     def segment(self, camera: Camera, classes: Classes | None = None) -> Tensor:  # [H, W] int64
         """The class of each pixel from a viewpoint, -1 for empty pixels; the rule is that of the decoder.

@@ -8,8 +8,8 @@ from .edits import Duplicate, Edit, EditList, Extract, Insert, Move, Opacity, Re
 from .label_set import LabelSet, load_label_set
 from .nearest import Transfer, default_distance, nearest_labels
 from .parts import Part, connected_parts
-from .scores import CANONICAL, LOGIT_SCALE, Score, relevancy, select_by_similarity
-from .selection import Selection
+from .scores import CANONICAL, LOGIT_SCALE, Score
+from .selection import Selection, relevancy, select_by_similarity
 from .transfer import transfer_labels
 from .where import InBox, InSphere, OfClass, OfIndex, Where
 

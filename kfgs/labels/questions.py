@@ -50,6 +50,8 @@ def class_rows(classes: Classes, dim: int, info: dict[str, Any]) -> Tensor:  # [
         ValueError: if there is another number of channels.
     """
     if isinstance(classes, LabelSet):
+        if classes.embeddings.shape[1] == dim and info.get("teacher") == classes.info.get("teacher"):
+            return classes.embeddings
         difference = teacher_mismatch(info, classes.info)
         what, again = "text of another teacher", AGAIN
         if "examples" in classes.info:
@@ -95,7 +97,7 @@ def make_question(
             raise ValueError(
                 f"classes: expected a LabelSet to look {target!r} up in, got {type(classes).__name__}; pass one, or an embedding"
             )
-        index = table.index(target)
+        index = table.names.index(target) if target in table.names else table.index(target)
         row, words = table.embeddings[index], table.names[index]
     else:
         row, words = as_tensor("embedding", target, floating=True), "embedding"
@@ -106,12 +108,16 @@ def make_question(
         against = as_tensor("negatives", negatives, floating=True)
         check_rows("negatives", against, ("M",), dim)
         return Question(row, against, words)
+    if (
+        negatives == "auto"
+        and len(others)
+        and (isinstance(target, str) or (rows is not None and len(others) < len(rows)))
+    ):
+        return Question(row, others, words)
     check_choice("negatives", negatives, ("auto", "classes", "canonical", "none"))
     canonical = None if table is None else _canonical(table, words, row)
     if negatives == "auto":
-        one_of_them = isinstance(target, str) or (rows is not None and len(others) < len(rows))
-        chosen = others if one_of_them and len(others) else canonical
-        return Question(row, chosen, words)
+        return Question(row, canonical, words)
     if negatives == "classes" and len(others) == 0:
         raise ValueError(f"negatives: expected other classes than {words!r}, got none; use 'canonical' or 'none'")
     if negatives == "canonical" and canonical is None:

@@ -1,4 +1,4 @@
-"""Turn cosines with words into scores, and scores into a selection (Sec. 3.4).
+"""The threshold of scores that selects a thing (Sec. 3.4), and the constants of scores.
 
 Gamma, the similarity threshold of Sec. 3.4, is the score that a selected Gaussian must exceed.
 """
@@ -8,13 +8,8 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
-
-from .._check import check_choice, check_range, check_shapes
-from .._rows import check_finite
-from .selection import Selection
 
 TEMPERATURE = 10.0  # factor of the cosines in LERF (Kerr 2023)
 CANONICAL = ("object", "things", "stuff", "texture")  # LERF's negatives for a scene without known classes
@@ -33,93 +28,6 @@ SHARES = ((0.5, CLEAR), (0.75, 0.7))
 """A gap with more than half of the scene above it usually separates two parts of the background. If there is no other, up
 to three quarters may lie above it (the walls of a room), if it is 5 times sparser than the modes beside it."""
 TOP, WAY = 0.999, 0.7  # if no gap is clear: 70 % of the way from the median to the 99.9 % quantile
-
-
-def relevancy(
-    similarity: Tensor,  # [N]
-    negatives: Tensor,  # [N, M]
-) -> Tensor:  # [N] in (0, 1)
-    """LERF's relevancy (Kerr 2023, Sec. 3.4): how much more similar to the query than to the most similar negative.
-
-    min over j of the first entry of softmax(10 [s, n_j]), which is sigmoid(10 (s - max_j n_j)). Above 0.5 the query is
-    more similar than every negative. LERF's negatives are the texts in `CANONICAL`; other classes of the scene are better
-    if they are known.
-
-    Args:
-        similarity: cosine with the query.
-        negatives: cosine with each of M >= 1 negatives.
-
-    Raises:
-        ValueError: if shapes disagree, there is no negative, or a number is not finite.
-
-    Example:
-        >>> relevancy(torch.tensor([0.9, 0.3]), torch.tensor([[0.2, 0.9], [0.1, 0.2]])).tolist()
-        [0.5, 0.7310585975646973]
-    """
-    check_shapes(("similarity", similarity, "N"), ("negatives", negatives, "N M"))
-    if negatives.shape[1] == 0:
-        raise ValueError("negatives: expected at least one column, got none; pass what the query should not find")
-    check_finite("similarity", similarity)
-    check_finite("negatives", negatives)
-    return torch.sigmoid(TEMPERATURE * (similarity - negatives.amax(dim=1)))
-
-
-def select_by_similarity(
-    similarity: Tensor,  # [N]
-    negatives: Tensor | None = None,  # [N, M]
-    threshold: float | None = None,
-    valid: Tensor | None = None,  # [N] bool
-    *,
-    score: Score | None = None,
-    logit_scale: float = LOGIT_SCALE,
-) -> Selection:
-    """Select the Gaussians with a score above gamma; the score is the cosine, or with negatives the relevancy.
-
-    If gamma is not given, `similarity_threshold` finds it in the scores. For a relevancy it is 0.5: more similar to the
-    query than to any negative. On room_0 (scores averaged over 30 views, all other classes as negatives; mean IoU over 18
-    classes with the data set's labels): cosine 0.88, relevancy 0.90, softmax 0.92.
-
-    Args:
-        similarity: cosine with the query.
-        negatives: cosine with each negative (words to exclude), or None.
-        threshold: gamma; a cosine in [-1, 1], or another score in [0, 1].
-        valid: Gaussians whose feature is not all-zero; the others are not selected, score 0, and do not influence gamma.
-        score: "cosine", in [-1, 1]; "relevancy", in (0, 1); or "softmax": the query's entry of
-            softmax(l [s, n_1, ..., n_M]), its share among all words. None: the relevancy with negatives, else the cosine.
-        logit_scale: l of the softmax; a larger one is sharper.
-
-    Raises:
-        ValueError: if shapes disagree, negatives are missing, a number is not finite, or an option is out of range.
-    """
-    check_shapes(("similarity", similarity, "N"), ("negatives", negatives, "N M"), ("valid", valid, "N"))
-    check_finite("similarity", similarity)
-    score = score or ("cosine" if negatives is None else "relevancy")
-    check_choice("score", score, ("cosine", "softmax", "relevancy"))
-    if threshold is not None:
-        check_range("threshold", threshold, -1 if score == "cosine" else 0, 1)
-    if score == "cosine":
-        scores = similarity
-    elif negatives is None:
-        raise ValueError(f"negatives: expected some for score {score!r}, got none; pass words that are not meant")
-    elif score == "relevancy":
-        scores = relevancy(similarity, negatives)
-    else:
-        check_finite("negatives", negatives)
-        check_range("logit_scale", logit_scale, 0, closed=(False, True))
-        scores = (logit_scale * torch.cat([similarity[:, None], negatives], dim=1)).softmax(dim=1)[:, 0]
-    known = torch.ones_like(similarity, dtype=torch.bool) if valid is None else valid
-    scores = scores.masked_fill(~known, 0)
-    if threshold is not None:
-        gamma, how = float(threshold), "given"
-    elif score == "relevancy":
-        assert negatives is not None
-        gamma, how = EVEN, f"more like the query than like any of {negatives.shape[1]} negatives"
-    else:
-        gamma, how = similarity_threshold(scores[known])
-    if score == "softmax":
-        assert negatives is not None
-        how += f"; softmax over {1 + negatives.shape[1]} words, logit scale {logit_scale:.4g}"
-    return Selection((scores > gamma) & known, scores, gamma, how)
 
 
 def similarity_threshold(scores: Tensor) -> tuple[float, str]:  # scores: [N]

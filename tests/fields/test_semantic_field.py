@@ -245,7 +245,7 @@ def test_query_by_any_score(mode):
     against = {"negatives": embeddings()[:2]}
     cosine = made.query(embeddings()[2], threshold=0.5, score="cosine", **against)
     torch.testing.assert_close(cosine.scores, torch.tensor([0, 0, root, root]))
-    raw = made.query(embeddings()[2], threshold=0.3, score="softmax", logit_scale="raw", **against)
+    raw = made.query(embeddings()[2], threshold=0.3, score="softmax", logit_scale=1.0, **against)
     low, high = 1 / (2 + math.e), math.exp(root) / (math.exp(root) + 2)
     torch.testing.assert_close(raw.scores, torch.tensor([low, low, high, high]))
     assert raw.mask.tolist() == [False, False, True, True]
