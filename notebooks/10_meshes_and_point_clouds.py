@@ -2,8 +2,8 @@
 # # 10. Meshes and point clouds
 #
 # **How do I use the classes of a field outside of kfgs: in trimesh, Open3D or pyvista, and on a mesh of the same room?** You will
-# see the chairs as a point cloud of trimesh, the classes carried to a mesh, the area and the volume of each class beside
-# the true ones, and files for Blender.
+# see the chairs as a point cloud of trimesh, the classes carried to a mesh, the area of each class next to
+# the true one, and files for Blender.
 #
 # About a minute on two CPU cores if no notebook was run before this one, 15 seconds if
 # `5_query_transfer_edit` was. Needs the extra `notebook`, no data. Open3D (400 MB) is used if it is there.
@@ -37,7 +37,7 @@ from PIL import Image
 import kfgs
 from kfgs import viz
 from kfgs.cameras import Orbit, estimate_up, orbit_cameras
-from kfgs.labels import label_mesh
+from kfgs.labels import nearest_labels
 from kfgs.toy import build_room
 
 scene = kfgs.load_scene(folder).undistorted()
@@ -85,7 +85,7 @@ else:
 # %% [markdown]
 # ## Classes on a mesh
 #
-# The other direction: every vertex, and the centre of every face, takes the label of the nearest Gaussian that is closer than
+# The other direction: the centre of every face takes the label of the nearest Gaussian that is closer than
 # lambda (Sec. 3.4 of the paper). Large faces are divided first: a wall of two triangles has two centres. This mesh has sides
 # that no picture shows, for example the undersides and the backs of the cabinets. A small lambda leaves them without a class;
 # without a lambda of yours, 99.5 % of the mesh get one.
@@ -103,21 +103,21 @@ if mesh_file is None:
 else:
     mesh = trimesh.load_mesh(mesh_file)
 fine = mesh.subdivide_to_size(finest, max_iter=20)
-labelled = label_mesh(fine, splat, reach)
-print(labelled)
-print(labelled.transfer)
+near = nearest_labels(splat.means, splat.labels, fine.triangles_center, reach)
+faces = near.labels.numpy()
+print(near)
 
 # %% [markdown]
-# The result holds arrays; they can be attached to a mesh of any library. Here pyvista draws it, without walls and ceiling.
+# The labels are one array; it can be attached to a mesh of any library. Here pyvista draws it, without walls and ceiling.
 
 # %% tags=["thumbnail"]
 surface = pv.wrap(fine)
-surface.cell_data["rgb"] = viz.palette(labelled.face_labels, classes.names)
+surface.cell_data["rgb"] = viz.palette(faces, classes.names)
 hidden = [-1, *(classes.index(name) for name in shell if classes.knows(name))]
-inside = surface.extract_cells(~np.isin(labelled.face_labels, hidden))
+inside = surface.extract_cells(~np.isin(faces, hidden))
 up = estimate_up(scene.cameras)
 orbit = Orbit(frames=1, size=(450, 640), elevation_degrees=50, start_degrees=120, zoom=1.8)
-furniture = splat.gaussians[~np.isin(splat.gaussians.labels, hidden)]
+furniture = splat[~np.isin(splat.labels, hidden)]
 outside = orbit_cameras(furniture.means, orbit, up=up)[0]
 plotter = viz.make_plotter(*outside.size, off_screen=True)
 plotter.add_mesh(inside, scalars="rgb", rgb=True, ambient=0.4, diffuse=0.7)
@@ -128,21 +128,19 @@ shown = viz.show_cloud(furniture, color_by="rgb")(outside)
 Image.fromarray(viz.picture_grid([[shown, picture]], ("the splat", "the mesh with its classes"), width=512))
 
 # %% [markdown]
-# ## Areas and volumes
+# ## Areas
 #
-# The area of a class is the sum of its faces. A part of the mesh without holes has a volume as well; its class is the one with
-# the largest area on it. The toy room knows the truth: the solids that each class is made of. Found areas are smaller where
-# sides are hidden (sofa, cabinet), and larger where the class spills over to what is near (the chairs to floor and rug below
-# them, of which the splat has few Gaussians). Volumes are exact: they only ask for the class of a part. A scan of a real
-# room is one open surface, with areas and without volumes.
+# The area of a class is the sum of its faces. The toy room knows the truth: the solids that each class is made of. Found areas
+# are smaller where sides are hidden (sofa, cabinet), and larger where the class spills over to what is near (the chairs to floor
+# and rug below them, of which the splat has few Gaussians).
 
 # %%
-areas, volumes = labelled.areas(), labelled.volumes()
+areas = np.bincount(faces + 1, fine.area_faces, len(classes) + 1)[1:]  # the first is of no class
 for name in measured:
-    line = f"{name:<10} area {areas.get(name, 0.0):6.2f}   volume {volumes.get(name, 0.0):6.3f}"
+    line = f"{name:<10} area {areas[classes.index(name)]:6.2f}"
     if mesh_file is None:
         true = [part for part, solid in zip(parts, solids, strict=True) if solid.label == name]
-        line += f"   true: {sum(one.area for one in true):6.2f} {sum(one.volume for one in true):6.3f}"
+        line += f"   true: {sum(part.area for part in true):6.2f}"
     print(line)
 
 # %% [markdown]
@@ -153,11 +151,11 @@ for name in measured:
 
 # %%
 out.mkdir(exist_ok=True)
-fine.visual.face_colors = viz.palette(labelled.face_labels, classes.names)
+fine.visual.face_colors = viz.palette(faces, classes.names)
 fine.export(out / "classes.glb")
 for label, part in splat.by_class().items():
     name = "unlabelled" if label < 0 else classes.names[label].replace(" ", "_")
-    part.save(out / f"{name}.ply", plain=True)
+    kfgs.write_splats(part.replace(labels=None, scores=None), out / f"{name}.ply", plain=True)
 print(*sorted(path.name for path in out.glob("*.[gp]l[by]")), sep=", ")
 
 # %% [markdown]

@@ -175,12 +175,13 @@ rows = [[viz.show_cloud(cloud, **picture)(view) for cloud in (labelled, edited)]
 Image.fromarray(viz.picture_grid(rows, ("before", f"no {thing}, {painted} in red"), width=320))
 
 # %% [markdown]
-# Places combine with `&`, `|` and `~`: here it is only the chair in one box. `undo` gives the list without its last edit.
+# Selections combine with `&`, `|` and `~`: here it is only the chair in one box. `undo` gives the list without its last edit.
 # Any splat viewer opens the file that is written; the classes travel along.
 
 # %%
 low, high = (corner.tolist() for corner in things[0].extent)
-one = kfgs.EditList().then(kfgs.Recolor(OfClass(thing) & InBox(low, high), "teal"))
+first = OfClass(thing).select(labelled) & InBox(low, high).select(labelled)
+one = kfgs.EditList().then(kfgs.Recolor(first, "teal"))
 states = {"before": one.undo(), f"one {thing} painted": one}
 view = cameras[things[0].best_view.index]
 row = [viz.show_cloud(edit.apply(labelled), **picture)(view) for edit in states.values()]

@@ -1,5 +1,4 @@
 import builtins
-import dataclasses
 import importlib
 import inspect
 import pkgutil
@@ -96,7 +95,7 @@ def test_long_content_makes_no_long_line():
         *engine,
         LabelSet((long, long + "2"), torch.eye(2)),
         Camera(torch.eye(4), torch.eye(3), 4, 3, name=long + "\n"),
-        dataclasses.replace(splats, info={"format": long}),
+        splats.replace(names=(long,), extra={long: np.zeros(50)}),
         EditList([Remove("chair")] * 300),
         Selection.of(torch.tensor([True, False]), f"two\nlines {long}"),
     ):

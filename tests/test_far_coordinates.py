@@ -11,7 +11,7 @@ from kfgs._origin import choose_origin, to_world
 from kfgs.cameras import Orbit, orbit_cameras, path_cameras
 from kfgs.cameras.similarity import Similarity
 from kfgs.formats.ply import read_ply, write_ply
-from kfgs.labels import InBox, InSphere, Move, OfClass, Selection, connected_parts, join, label_mesh
+from kfgs.labels import InBox, InSphere, Move, OfClass, Selection, connected_parts, join
 from kfgs.scenes import align_by_cameras
 from kfgs.splat.transform import transform_gaussians
 
@@ -63,7 +63,7 @@ def test_ply_in_double_is_read_and_written_to_the_millimetre(tmp_path):
     splats = read_splats(tmp_path / "far.ply")
     assert splats.means.dtype == torch.float32
     assert np.abs(world_of(splats) - world).max() < 1e-5
-    splats.save(tmp_path / "again.ply")
+    write_splats(splats, tmp_path / "again.ply")
     assert {read_ply(tmp_path / "again.ply")[name].dtype.str for name in "xyz"} == {"<f8"}
     again = read_splats(tmp_path / "again.ply")
     assert again.origin == splats.origin
@@ -81,7 +81,7 @@ def test_a_near_cloud_is_written_as_before(tmp_path):
 @pytest.mark.parametrize("ending", ["glb", "splat", "spz", "sog", "compressed.ply"])
 def test_other_formats_keep_the_place(tmp_path, ending):
     world = far_file(tmp_path / "far.ply")
-    written = read_splats(tmp_path / "far.ply").save(tmp_path / f"far.{ending}")
+    written = write_splats(read_splats(tmp_path / "far.ply"), tmp_path / f"far.{ending}")
     back = read_splats(tmp_path / f"far.{ending}")
     order = np.arange(len(world)) if written.order is None else written.order.numpy()
     assert np.abs(world_of(back) - world[order]).max() < 2e-3
@@ -95,7 +95,7 @@ def test_other_formats_keep_the_place(tmp_path, ending):
 
 def test_plain_ply_keeps_its_62_floats_and_the_place(tmp_path):
     world = far_file(tmp_path / "far.ply")
-    written = read_splats(tmp_path / "far.ply").save(tmp_path / "plain.ply", plain=True)
+    written = write_splats(read_splats(tmp_path / "far.ply"), tmp_path / "plain.ply", plain=True)
     table = read_ply(tmp_path / "plain.ply")
     assert len(table) == 62
     assert {column.dtype for column in table.values()} == {np.dtype(np.float32)}
@@ -117,7 +117,7 @@ def test_origin_of_another_version_is_refused_and_its_advice_works(tmp_path):
 
 def test_a_written_near_cloud_removes_an_old_origin(tmp_path):
     far_file(tmp_path / "far.ply")
-    read_splats(tmp_path / "far.ply").save(tmp_path / "a.splat")
+    write_splats(read_splats(tmp_path / "far.ply"), tmp_path / "a.splat")
     write_splats(cloud()[0], tmp_path / "a.splat")
     assert not (tmp_path / "a.splat.origin.json").exists()
     assert read_splats(tmp_path / "a.splat").origin == (0, 0, 0)
@@ -139,10 +139,10 @@ def test_places_of_a_rule_are_those_of_the_world(tmp_path):
     splats = read_splats(tmp_path / "far.ply")
     low, high = UTM - 0.4, UTM + 0.7
     inside = ((world >= low) & (world <= high)).all(1)
-    assert InBox(tuple(low), tuple(high)).mask(splats).tolist() == inside.tolist()
+    assert InBox(tuple(low), tuple(high)).select(splats).mask.tolist() == inside.tolist()
     ball = np.linalg.norm(world - UTM, axis=1) <= 0.8
     assert 0 < ball.sum() < len(ball)
-    assert InSphere(tuple(UTM), 0.8).mask(splats).tolist() == ball.tolist()
+    assert InSphere(tuple(UTM), 0.8).select(splats).mask.tolist() == ball.tolist()
 
 
 def test_parts_and_selections_answer_in_the_world(tmp_path):
@@ -153,18 +153,18 @@ def test_parts_and_selections_answer_in_the_world(tmp_path):
     np.testing.assert_allclose(part.centroid.numpy(), world.mean(0), atol=1e-4, rtol=0)
     np.testing.assert_allclose(part.extent[0].numpy(), world.min(0), atol=1e-4, rtol=0)
     np.testing.assert_allclose(chosen.points(gaussians), world, atol=1e-4, rtol=0)
-    assert bool(chosen.box(gaussians).contains(torch.from_numpy(chosen.points(gaussians))).all())
+    np.testing.assert_allclose(chosen.box(gaussians).center.numpy(), world.mean(0), atol=1, rtol=0)
     assert f"{world.mean(0)[1]:.2f}" in repr(part)
 
 
 def test_labels_pass_between_clouds_of_different_origins():
     source, _ = cloud(seed=1)
     target, _ = cloud(seed=2)
-    near = transfer_labels(source, source.labels, target)
+    near = transfer_labels(source, target)
     a, b = tuple(UTM), tuple(UTM + np.array([12, -8, 3]))
-    far = transfer_labels(source.replace(origin=a), source.labels, target.replace(origin=a).with_origin(b))
+    far = transfer_labels(source.replace(origin=a), target.replace(origin=a).with_origin(b))
     assert torch.equal(near.labels, far.labels)
-    assert far.distance == pytest.approx(near.distance, rel=1e-4)
+    torch.testing.assert_close(near.scores, far.scores, rtol=1e-3, atol=1e-3)
 
 
 def test_edits_and_joins_stay_in_the_world(tmp_path):
@@ -173,9 +173,9 @@ def test_edits_and_joins_stay_in_the_world(tmp_path):
     moved = Move(OfClass("b"), translation=(0.5, 0, 0), rotation=("z", 90), pivot=tuple(UTM)).apply(splats)
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     want = np.where((np.arange(60) % 3 == 1)[:, None], (world - UTM) @ quarter.T + UTM + [0.5, 0, 0], world)
-    assert np.abs(world_of(moved.gaussians) - want).max() < 1e-4
+    assert np.abs(world_of(moved) - want).max() < 1e-4
     other = splats.with_origin(tuple(UTM + 40))
-    both = join(splats, other).gaussians
+    both = join(splats, other)
     assert np.abs(world_of(both) - np.concatenate([world, world])).max() < 1e-4
 
 
@@ -198,8 +198,8 @@ def test_a_splat_file_says_its_origin_and_keeps_it(tmp_path):
     far_file(tmp_path / "far.ply")
     splats = read_splats(tmp_path / "far.ply")
     part = splats.select(torch.arange(5))
-    assert part.gaussians.origin == splats.origin != (0, 0, 0)
-    assert part.gaussians.gaussians.detach().to(torch.float64).origin == splats.origin
+    assert part.origin == splats.origin != (0, 0, 0)
+    assert part.detach().to(torch.float64).origin == splats.origin
 
 
 def test_pictures_of_two_clouds_share_an_origin(tmp_path):
@@ -232,14 +232,6 @@ def test_cameras_around_a_far_cloud_see_it():
     walk = path_cameras([orbit, other.with_origin(tuple(UTM + 9))], 4)
     for camera in (orbit, *walk):
         assert float(rasterize(far, camera).alpha.max()) > 0.05
-
-
-def test_truth_and_meshes_meet_the_field_in_the_world():
-    near, places = cloud(count=200)
-    far = near.replace(origin=tuple(UTM))
-    world = places.numpy() + UTM
-    mesh = label_mesh((world, np.array([[0, 1, 2]])), far, classes=("a", "b", "c"))
-    assert torch.equal(torch.from_numpy(mesh.vertex_labels), near.labels)
 
 
 def test_a_checkpoint_in_double_keeps_its_place(tmp_path):

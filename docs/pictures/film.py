@@ -42,7 +42,7 @@ def main() -> None:
     edited = EditList().then(Remove(given.remove)).then(Recolor(thing, paint)).apply(labelled)
     train = scene.views("train")
     keys = [scene.cameras[train[i]] for i in given.views or range(0, len(train), max(len(train) // 6, 1))]
-    cloud, names = labelled.gaussians, labelled.names
+    cloud, names = labelled, labelled.names
     colors = show_cloud(cloud, background="black", color_by="rgb")
     parts = [
         ("an ordinary colour scene", colors),
@@ -50,7 +50,7 @@ def main() -> None:
         (f'asked for "{given.ask}"', show_selection(cloud, OfClass(given.ask).mask(labelled), colors)),
         (
             f"edited: no {given.remove}, another {thing}",
-            show_cloud(edited.gaussians, background="black", color_by="rgb"),
+            show_cloud(edited, background="black", color_by="rgb"),
         ),
     ]
     font, frames, each = ImageFont.load_default(15), [], FRAMES // len(parts)

@@ -55,7 +55,7 @@ class Demo:
         self.index = next(i for i in self.scene.views("test") if self.scene.stem(i) == stem)
         self.stem, self.camera = stem, self.scene.cameras[self.index]
         self.large = self.camera.resized(480, 640)
-        self.colors = show_cloud(self.splat.gaussians, color_by="rgb")
+        self.colors = show_cloud(self.splat, color_by="rgb")
 
     def photo(self) -> np.ndarray:
         """The photograph of the view."""
@@ -176,7 +176,7 @@ def draw_lambda(demo: Demo) -> None:
     """Labels of a field that has never seen the plant, carried to the splat within three distances."""
     labelled = demo.field.label(demo.words)
     source = labelled[labelled.labels != demo.words.index("plant")]
-    target, shown, titles = demo.splat.gaussians, [], []
+    target, shown, titles = demo.splat, [], []
     for distance in (0.02, 0.1, 0.8):
         carried = transfer_labels(source, source.labels, target, distance).labels
         shown.append(show_cloud(target.replace(labels=carried), color_by="label", names=demo.words.names)(demo.large))
@@ -195,7 +195,7 @@ def draw_errors(demo: Demo) -> None:
 
 def draw_landing(demo: Demo) -> None:
     """Photo, classes, a query, and an edited scene."""
-    edited = EditList().then(Remove("chair")).then(Recolor("plant", "#c04040")).apply(demo.splat).gaussians
+    edited = EditList().then(Remove("chair")).then(Recolor("plant", "#c04040")).apply(demo.splat)
     asked = demo.field.query("chair", demo.words).mask
     pictures = [
         demo.photo(),

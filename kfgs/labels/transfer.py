@@ -39,4 +39,4 @@ def transfer_labels(source: Gaussians, target: Gaussians, distance: float | None
         raise ValueError("source: expected Gaussians with labels, got none; `SemanticField.label` gives them some")
     means = recounted(target.means, target.origin, source.origin)
     carried = nearest_labels(source.means, source.labels, means, distance)
-    return target.replace(labels=carried.labels, scores=carried.scores, names=source.names)
+    return target.replace(labels=carried.labels, scores=carried.scores.to(target.means.dtype), names=source.names)
