@@ -21,7 +21,7 @@ MADE = {
     "Scene": "load_scene(path) reads one",
     "SemanticField": "SemanticField.load(path) reads one",
     "LabelSet": "load_label_set(path) reads one",
-    "Gaussians": "read_splats(path).gaussians are some",
+    "Gaussians": "read_splats(path) gives some",
     "Camera": "a Scene has .cameras",
 }
 """How to make what `typed` misses."""

@@ -170,7 +170,7 @@ ERRORS = {
         ),
         (
             ["{plain}", "--out", "{o}.ply", "--remove", "chair", "--scene", "{room}"],
-            ("--scene:", "colours", "got SplatFile("),
+            ("--scene:", "colours", "got Gaussians("),
         ),
     ],
     "color": [

@@ -63,8 +63,8 @@ def test_examples_run_one_after_the_other(examples, desk, monkeypatch):
     made = replace(made, info=made.info | {"scene": "scene"}, classes=scene_classes(Path("scene")))
     fuse_views(made, [scene.cameras[i] for i in scene.views("train")]).save("run/field.kfgs")
     exec(editing, known)
-    before, after = known["found"].splats, read_splats("edited.ply")
-    chairs = before.gaussians.labels == before.names.index("chair")
+    before, after = known["found"].gaussians, read_splats("edited.ply")
+    chairs = before.labels == before.names.index("chair")
     assert 0 < int(chairs.sum()) == len(before) - len(after)
     assert len(kfgs.EditList.load("edits.json")) == 1
     pytest.importorskip("anywidget")
@@ -111,5 +111,5 @@ def test_the_ten_lines_of_the_readme_run(examples, desk, tmp_path, monkeypatch):
     assert known["labels"].shape == room.cameras[0].size
     assert 0 < len(known["parts"]) <= len(known["chair"])
     before, after = known["splat"], read_splats("edited.ply")
-    chairs = before.gaussians.labels == before.names.index("chair")
+    chairs = before.labels == before.names.index("chair")
     assert 0 < int(chairs.sum()) == len(before) - len(after)

@@ -14,7 +14,6 @@ from kfgs.fields.checkpoint import Checkpoint, write_checkpoint
 from kfgs.formats import write_splats
 from kfgs.gaussians import Gaussians
 from kfgs.labels import (
-    Component,
     Duplicate,
     EditList,
     InBox,
@@ -25,7 +24,6 @@ from kfgs.labels import (
     Opacity,
     Recolor,
     Remove,
-    Turn,
 )
 from kfgs.quant import Autoencoder, Codebook, IndexMaps, LinearLatents
 
@@ -118,8 +116,8 @@ def _edits(place: Path, add: Add) -> None:
     write_splats(cloud(5), place / "lamp.ply")
     plant = OfClass("plant") - InBox((0, 0, 0), (0.1, 0.1, 0.1))
     edits = EditList([
-        Recolor(plant, "#c04040", "hue"), Opacity("wall", 0.3), Move("chair", (0.5, 0, 0), Turn("z", 30), 1.5),
-        Duplicate(Component(OfClass("chair"), 10.0), (1, 0, 0)), Remove("wall", grow=0.01), Insert(place / "lamp.ply"),
+        Recolor(plant, "#c04040", "hue"), Opacity("wall", 0.3), Move("chair", (0.5, 0, 0), ("z", 30), 1.5),
+        Duplicate(OfClass("chair", 0, 10.0), (1, 0, 0)), Remove("wall", grow=0.01), Insert(place / "lamp.ply"),
     ])  # fmt: skip
     edits.undo().save(place / "a.edits.json")
     edits.save(place / "b.edits.json")

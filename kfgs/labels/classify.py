@@ -41,10 +41,6 @@ def classify(
 
     Runs in chunks, without a table [N, C]. A tie goes to the lowest class; an all-zero feature has label -1.
 
-    Args:
-        features: decoded features of Gaussians or pixels, or codewords; any scale.
-        embeddings: one row per class, in class order; any scale.
-
     Raises:
         ValueError: if shapes disagree, there is no class, an embedding is all-zero, or a number is not finite.
 

@@ -66,14 +66,8 @@ def recolor(
       luminance stay, as if the albedo changed under the same light. If the middle is below 1/255, the colour is flat.
     - `"hue"` keeps luminance from every direction and changes hue and saturation only: a dark plant stays dark.
 
-    Args:
-        gaussians: a colour field (with `sh`).
-        mask: which Gaussians to paint.
-        rgb: the colour, in the same (display) space as the photographs; text as `parse_color` reads it.
-        mode: see above.
-
     Raises:
-        ValueError: if there is no `sh`, the mask has another length, or `rgb` is not a colour.
+        ValueError: if there is no `sh`, the mask has another length, or `rgb` is not a colour (see `parse_color`).
         TypeError: if the mask is not boolean.
     """
     mask = as_tensor("mask", mask)

@@ -41,10 +41,7 @@ class LabelSet:
     """The origin of the rows, as JSON: `teacher` (`teachers.identify`), `templates`, `synonyms`, `examples`."""
 
     def __post_init__(self) -> None:
-        if isinstance(self.names, str):
-            raise TypeError(
-                f"names: expected a list of class names, got the text {self.names!r:.80}; put it into a list"
-            )
+        _check_list(self.names)
         object.__setattr__(self, "names", tuple(self.names))
         words = (*self.names, *self.negative_names)
         if any(not isinstance(name, str) or not name or not name.isprintable() for name in words):
@@ -98,8 +95,7 @@ class LabelSet:
         Raises:
             ValueError: if one is unknown (the message offers near ones), or named twice.
         """
-        if isinstance(names, str):
-            raise TypeError(f"names: expected a list of class names, got the text {names!r}; put it into a list")
+        _check_list(names)
         rows = [self.index(name) for name in names]
         return replace(self, names=tuple(self.names[row] for row in rows), embeddings=self.embeddings[rows])
 
@@ -130,8 +126,7 @@ def load_label_set(classes: str | Path, embeddings: str | Path | None = None) ->
 
     Args:
         classes: a table (.safetensors, from `LabelSet.save`), or class names (a JSON list of strings).
-        embeddings: needed with class names: an .npy file [C, D] of floats with a row per name, or a table to take these
-            classes from.
+        embeddings: with class names: an .npy file [C, D] of floats with a row per name, or a table to take the classes from.
 
     Raises:
         FileNotFoundError: if a file is missing.
@@ -166,13 +161,8 @@ def load_label_set(classes: str | Path, embeddings: str | Path | None = None) ->
 def teacher_mismatch(one: dict[str, Any], other: dict[str, Any]) -> str | None:
     """How the teacher of another field or label set differs, in words; None if no difference is known.
 
-    Two encoders can have the same number of channels and unrelated spaces: of the 61 words that CLIP ViT-B/16 (COCO-Stuff)
-    and ViT-B/32 (LVIS) both embedded, no pair of embeddings of one word was nearest to each other. Only the name and the
-    weights are compared; other options (window, scales) do not affect text.
-
-    Args:
-        one: `info` of a SemanticField or a LabelSet, which may not name its teacher.
-        other: the same.
+    Encoders with the same number of channels have unrelated spaces: no word of 61 that CLIP ViT-B/16 and ViT-B/32 both
+    embedded was nearest to itself. Names and weights are compared: the `info` of two SemanticFields or LabelSets.
     """
     ours, theirs = one.get("teacher"), other.get("teacher")
     if isinstance(ours, dict) and isinstance(theirs, dict):
@@ -181,6 +171,11 @@ def teacher_mismatch(one: dict[str, Any], other: dict[str, Any]) -> str | None:
             if mine is not None and its is not None and mine != its:
                 return f"{key} {its!r:.40} instead of {mine!r:.40}"
     return None
+
+
+def _check_list(names: Sequence[str]) -> None:
+    if isinstance(names, str):
+        raise TypeError(f"names: expected a list of class names, got the text {names!r:.80}; put it into a list")
 
 
 def _read_table(path: Path) -> LabelSet:

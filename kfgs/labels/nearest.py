@@ -71,17 +71,9 @@ def nearest_labels(
 ) -> Transfer:
     """Give each destination the label of the nearest labelled source **strictly** closer than `distance`.
 
-    The rule of Sec. 3.4; `distance` is its lambda. The paper does not say which label wins if several are in range: here
-    the nearest does. Of equally near sources (as float64 distances), the one with the lowest index gives its label.
-
-    Args:
-        src_means: positions with labels. Both clouds are counted from the same origin.
-        src_labels: their labels; sources with -1 take no part.
-        dst_means: positions that receive labels.
-        distance: lambda in world units; None: `default_distance`.
-
-    Returns:
-        Labels, distances and sources on the destinations' device. Without any labelled source no destination has a label.
+    The rule of Sec. 3.4; `distance` is its lambda, in world units (None: `default_distance`). The paper does not say which
+    label wins if several are in range: here the nearest does. Of equally near sources (as float64 distances), the one with
+    the lowest index gives its label. Both clouds are counted from the same origin.
 
     Raises:
         ValueError: if shapes disagree, a position is not finite, a label is below -1, or the distance is not positive.
@@ -115,14 +107,13 @@ def nearest_labels(
             labels[rows] = np.where(some, label[:, 0], -1)
             winners[rows] = np.where(some, kept[sources.first[winner]], -1)
             disagree[rows] = (hit & ((label != label[:, :1]) | sources.mixed[index])).any(axis=1)
-    device = dst_means.device
     return Transfer(
-        torch.from_numpy(labels).to(device),
-        torch.from_numpy(distances).to(dst_means),
-        torch.from_numpy(winners).to(device),
-        torch.from_numpy(disagree).to(device),
-        chosen,
-        how,
+        labels=torch.from_numpy(labels).to(dst_means.device),
+        distances=torch.from_numpy(distances).to(dst_means),
+        sources=torch.from_numpy(winners).to(dst_means.device),
+        disagree=torch.from_numpy(disagree).to(dst_means.device),
+        distance=chosen,
+        how=how,
     )
 
 
@@ -195,11 +186,9 @@ def default_distance(
     """Lambda for two clouds, in world units. The paper gives no value for it.
 
     The distance within which 99.5 % of the destinations have a source, but at least 2 median spacings of the sources (a
-    spacing is the distance to the nearest other source) and at most 10 times the 90 % quantile of the spacings. With the
-    lower bound a destination between two sources reaches both. The upper bound keeps floaters and background, which only
-    the colour field has, from taking labels across the room; it uses a quantile because a few large Gaussians fill a wall.
-    With a single source position there are no spacings, and only the 99.5 % count. Measured on an evenly strided sample
-    of at most 20,000 Gaussians of each cloud.
+    spacing is the distance to the nearest other source), so that a destination between two sources reaches both. And at
+    most 10 times the 90 % quantile of the spacings, so that floaters and background, which only the colour field has, take
+    no labels across the room. Measured on an evenly strided sample of at most 20,000 Gaussians of each cloud.
 
     Raises:
         ValueError: if a cloud is empty or a position is not finite.

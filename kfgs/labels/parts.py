@@ -98,10 +98,10 @@ def connected_parts(
     most: int = 100,
     engine: str = "auto",
 ) -> list[Part]:
-    """Split a selection into its connected parts ("the four chairs"), largest first.
+    """Split a selection of these Gaussians into its connected parts ("the four chairs"), largest first.
 
     Args:
-        gaussians: the selection's cloud.
+        gaussians: the cloud.
         selection: an empty one has no parts.
         cameras: views without distortion, to find the best one of each part.
         distance: Gaussians at most this far apart are connected, in world units; see `component_numbers`.

@@ -38,16 +38,9 @@ class Question(NamedTuple):
 
 
 def class_rows(classes: Classes, dim: int, info: dict[str, Any]) -> Tensor:  # [C, D]
-    """The embeddings of some classes, checked against a field's features. Warns if another teacher embedded them.
+    """The embeddings of a label set, or rows as they are, checked against a field's D and `info`.
 
-    Args:
-        classes: a label set, or embeddings as a tensor, an array or a list of rows.
-        dim: D of the field.
-        info: of the field; it may name its teacher.
-
-    Raises:
-        TypeError: if it is neither.
-        ValueError: if there is another number of channels.
+    Warns if another teacher embedded them; raises a TypeError if it is neither, a ValueError for other channels.
     """
     if isinstance(classes, LabelSet):
         if classes.embeddings.shape[1] == dim and info.get("teacher") == classes.info.get("teacher"):

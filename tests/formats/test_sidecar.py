@@ -31,7 +31,7 @@ def _splats(n: int = 6) -> Gaussians:
 def path(tmp_path):
     """A .splat file, which has no place for labels, with its labels beside it."""
     assert write_splats(_splats(), tmp_path / "a.splat").paths == [
-        tmp_path / "a.splat", tmp_path / "a.splat.labels.npz", tmp_path / "a.splat.names.json"
+        tmp_path / "a.splat", tmp_path / "a.splat.labels.npz", tmp_path / "a.splat.classes.json"
     ]  # fmt: skip
     return tmp_path / "a.splat"
 
@@ -136,7 +136,7 @@ def test_labels_that_state_gigabytes_in_a_small_array_are_named(path):
 
 def test_names_that_nest_too_deep_are_named(path):
     names_path(path).write_text('{"class_id": ' + "[" * 100_000 + "]" * 100_000 + "}")
-    with pytest.raises(ValueError, match=tells("a.splat.names.json:", "nest more than 200 deep")):
+    with pytest.raises(ValueError, match=tells("a.splat.classes.json:", "nest more than 200 deep")):
         read_splats(path)
 
 
@@ -166,7 +166,7 @@ def test_names_survive(tmp_path):
 )
 def test_damaged_names_are_named(path, content, message):
     names_path(path).write_text(content)
-    with pytest.raises(ValueError, match=tells("a.splat.names.json:", *message)):
+    with pytest.raises(ValueError, match=tells("a.splat.classes.json:", *message)):
         read_splats(path)
 
 

@@ -15,6 +15,7 @@ from kfgs import FeatureFolder, SemanticField, Uplift, UpliftConfig, attach, loa
 from kfgs import fit as fit_field
 from kfgs.cli import main
 from kfgs.fields import GaussianParams, join_fields
+from kfgs.formats import write_splats
 from kfgs.formats.ply import read_ply, write_ply
 from kfgs.pipeline.color import ColorConfig, fit_color
 
@@ -67,7 +68,7 @@ def test_answers_and_files_are_in_the_world(rooms, capsys):
     answers = {}
     for name, (folder, field, _) in rooms.items():
         attached = attach(field, folder / "my.ply")
-        attached.splats.save(folder / "labelled.ply")
+        write_splats(attached.gaussians, folder / "labelled.ply")
         assert main(["select", "chair", str(folder / "labelled.ply"), "--out", str(folder / "chosen")]) == 0
         facts = json.loads((folder / "chosen" / "selection.json").read_text())
         low, high = ([str(round(x, 3)) for x in corner] for corner in facts["parts"][0]["extent"])
