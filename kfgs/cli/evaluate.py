@@ -39,7 +39,7 @@ def evaluate(
         kfgs evaluate color.ply --scene scene/ --protocol kfgs-color
 
     Args:
-        field: A run or field folder, or a folder of a teacher's maps; for kfgs-color a colour splat, or a run that has one.
+        field: A run or field, or a folder of a teacher's maps; for kfgs-color a colour splat, or a run that has one.
         protocol: Its name, with or without version; a wrong name lists all.
         truth: Folder or file of the ground truth, if it is not in the scene; the teacher's maps for feature3dgs-teacher.
         split: Which views: train, test, another split, or all. By default test views with labels.

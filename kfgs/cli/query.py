@@ -43,7 +43,7 @@ def select(
 
     Args:
         query: A class name, "chair"; with --teacher any phrase.
-        source: A field folder (RUN/field.kfgs), or a splat with classes.
+        source: A field (RUN/field.kfgs), or a splat with classes.
         out: Folder for selection.json (with the indices), selection.ply (the Gaussians) and parts.png (each part in its best
             view, if the cameras are known).
         threshold: Scores must be above it. For a field it is the paper's gamma; by default 0.5 for a relevancy, else derived
@@ -192,7 +192,7 @@ def info(path: Positional[Path]) -> None:
         kfgs info scene/
 
     Args:
-        path: A field folder, run folder, --out folder of a batch, scene folder, folder of feature maps, splat file, or .ply of
+        path: A field, run folder, --out folder of a batch, scene folder, folder of feature maps, splat file, or .ply of
             points.
     """
     from ..pipeline import describe

@@ -50,7 +50,7 @@ def text(
         no_negatives: Leave out LERF's canonical words (object, things, stuff, texture), which `kfgs select --negatives
             canonical` needs.
         examples: A .json file of examples, or COCO's annotations, instead of words.
-        field: The field folder of the examples.
+        field: The field of the examples.
     """
     from ..labels import CANONICAL
     from ..labels.label_set import SUFFIX
