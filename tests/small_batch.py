@@ -8,10 +8,10 @@ from cases_training import changed
 from small_room import ROOM
 from tiny_teacher import Tiny
 
+from kfgs.batch import BatchOptions
 from kfgs.fields import SemanticField
 from kfgs.labels import load_label_set
-from kfgs.pipeline import ColorConfig, Uplift, evaluate, fit, segment_scene, true_labels
-from kfgs.scale import BatchOptions
+from kfgs.pipeline import ColorConfig, Uplift, fit, score_scene, segment_scene, true_labels
 from kfgs.scenes import FeatureFolder, extract_features, load_scene
 from kfgs.toy.room_folder import make_toy_room
 
@@ -21,7 +21,7 @@ COLOR = dataclasses.replace(
     training=changed(ColorConfig.quick().training.with_steps(24), maximum=800, checkpoint_every=8),
 )
 METHOD = Uplift(color=COLOR)
-OPTIONS = BatchOptions(teacher="tiny_teacher:Tiny", method=METHOD, device="cpu", share=2, pictures=0)
+OPTIONS = BatchOptions(teacher="tiny_teacher:Tiny", method=METHOD, pictures=0)
 TIMES = ("seconds", "mtime_ns", "command", "machine", "history.json")  # the last: its size, in a list of files
 NOT_RESULTS = ("log.txt", "state.json", "digests.json", "done/")
 
@@ -35,11 +35,13 @@ def one_process(room: Path, out: Path) -> Path:
     """The stages one after the other, as a person calls them."""
     scene = load_scene(room)
     extract_features(Tiny(), scene, out / "features")
-    fit(scene.undistorted(), FeatureFolder(out / "features").of(scene), METHOD, folder=out, device="cpu")
+    fit(scene.undistorted(), FeatureFolder(out / "features").of(scene), METHOD, folder=out)
     classes = load_label_set(room / "classes.json", room / "text.npy")
     truth = true_labels(scene, room / "labels", "test")
-    segment_scene(SemanticField.load(out / "field.kfgs"), scene, classes, out / "segmented", pictures=0, truth=truth)
-    report = evaluate(out / "field.kfgs", room, encode=classes, truth=room / "labels")
+    field = SemanticField.load(out / "field.kfgs")
+    report = score_scene(
+        segment_scene(field, scene, classes, out / "segmented", pictures=0, truth=truth), truth, classes
+    )
     (out / "scores.json").write_text(json.dumps({"scene": room.name, **report.to_json()}, indent=2) + "\n")
     return out
 
@@ -51,7 +53,11 @@ def results(run: Path) -> dict[str, bytes]:
         name = file.relative_to(run).as_posix()
         if not file.is_file() or name.startswith(NOT_RESULTS) or any(part.startswith(".") for part in name.split("/")):
             continue
-        found[name] = timeless(file.read_bytes()) if file.suffix == ".json" else file.read_bytes()
+        if name == "field.kfgs":  # whose notes say how long it took
+            cloud = SemanticField.load(file).gaussians
+            found[name] = b"".join(values.numpy().tobytes() for values in (cloud.means, cloud.scales, cloud.features))
+        else:
+            found[name] = timeless(file.read_bytes()) if file.suffix == ".json" else file.read_bytes()
     return found
 
 

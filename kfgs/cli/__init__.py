@@ -1,7 +1,7 @@
 """The command line: `kfgs COMMAND ...`; `kfgs --help` lists the commands.
 
 Every command names the files it wrote, shows progress on long work, and ends with 0 (done), 1 (bad input, with one
-message that says what to do), 2 (wrong usage), 130 (interrupted; demo, features, fit, color, blocks and batch
+message that says what to do), 2 (wrong usage), 130 (interrupted; demo, features, fit, color and batch
 continue where they stopped) or 141 (its output was closed).
 """
 
@@ -24,7 +24,6 @@ import tyro
 from .._card import error_line, short_of_memory
 from .._interrupts import interruptible
 from .batch import batch
-from .blocks import blocks, join
 from .evaluate import evaluate
 from .features import features
 from .fit import color, demo, fit, sfm
@@ -41,14 +40,14 @@ from .view import view
 GROUPS: dict[str, tuple[Any, ...]] = {
     "Start here": (demo, info),
     "Make a semantic field": (sfm, features, text, fit),
-    "More than one machine": (batch, blocks, join),
+    "More than one machine": (batch,),
     "Ask it": (select, segment, label, view, render),
     "Store it": (pack,),
     "Score it": (evaluate,),
     "Colour splats": (color, attach, edit, convert),
 }
 COMMANDS = {command.__name__: command for group in GROUPS.values() for command in group}
-RESUMED = {"demo", "features", "fit", "color", "batch", "blocks"}  # commands that reuse their earlier work
+RESUMED = {"demo", "features", "fit", "color", "batch"}  # commands that reuse their earlier work
 STRICT = "--strict"  # of every command that reads files
 NARROW = 40  # columns: in a few, tyro never ends
 STYLE = (

@@ -56,7 +56,6 @@ def open_field(name: str, field: Path) -> Any:
 
     found = find_field(field)
     if found is None:
-        check_joined(name, field)
         what = "a file" if field.is_file() else "a folder without one" if field.is_dir() else "no such file"
         raise ValueError(
             f"{name}: expected a field (RUN/field.kfgs, or the run folder), got {field}, {what}; make one with `kfgs fit`"
@@ -74,7 +73,6 @@ def open_splats(name: str, path: Path, *, labelled: bool = False, named: bool = 
     from ..formats import read_splats
     from ..formats.sidecar import names_path
 
-    check_joined(name, path)
     if is_field(path):
         raise ValueError(
             f"{name}: expected a splat file, got {path}, a semantic field; pass a colour splat, for example what "
@@ -91,17 +89,3 @@ def open_splats(name: str, path: Path, *, labelled: bool = False, named: bool = 
             "where the splat was, or run `kfgs attach` again"
         )
     return splats
-
-
-def check_joined(name: str, path: Path) -> None:
-    """Raise a ValueError, with the command that helps, if a path is a scene in blocks: other commands read one field."""
-    if (path / "blocks.json").is_file():
-        from ..scale import FieldInBlocks
-        from ..scale.in_blocks import in_numbers
-
-        city = FieldInBlocks.open(path)
-        raise ValueError(
-            f"{name}: expected one field, got {path}, a scene in blocks ({len(city):,} Gaussians); join all of it with "
-            f"`kfgs join {path} --out FIELD`, or a part, for example {city.blocks[0].name}, with "
-            f"`kfgs join {path} --out FIELD --box={in_numbers(city.boxes[0])}`, and pass FIELD"
-        )

@@ -195,8 +195,8 @@ def info(path: Positional[Path]) -> None:
         path: A field, run folder, --out folder of a batch, scene folder, folder of feature maps, splat file, or .ply of
             points.
     """
+    from ..batch import describe_batch
     from ..pipeline import describe
-    from ..scale.board import describe_batch
 
     say(describe_batch(path) or describe(path))
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .._files import check_output, real_path
-from .files import check_alone, check_joined, is_field, open_splats
+from .files import check_alone, is_field, open_splats
 from .options import Classes, Given, Positional, Teacher
 from .output import say, wrote
 from .places import check_apart
@@ -69,7 +69,6 @@ def view(
         out: Folder for saved pictures and selections.
     """
     place = "browser" if where == "auto" else where
-    check_joined("source", source)
     if where in ("html", "picture") or out.exists():  # the others write only when asked
         check_output("out", out, "a folder")
     read = functools.partial(_read, source, color, ask, distance, out, classes, teacher)

@@ -9,6 +9,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
+from kfgs.scale import FieldInBlocks, fit_block, fit_blocks, split_scene
+from kfgs.scale.blocks import _put
+from kfgs.scale.in_blocks import _in_view
 from killed import kill_everywhere
 from messages import tells
 from PIL import Image
@@ -31,9 +34,6 @@ from kfgs.gaussians import Gaussians
 from kfgs.labels import transfer_labels
 from kfgs.pipeline import Uplift
 from kfgs.quant import LinearLatents
-from kfgs.scale import FieldInBlocks, fit_block, fit_blocks, split_scene
-from kfgs.scale.blocks import _put
-from kfgs.scale.in_blocks import _in_view
 from kfgs.scenes import SceneError, load_scene
 from kfgs.toy.room_folder import ToyConfig
 

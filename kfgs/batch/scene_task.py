@@ -1,0 +1,186 @@
+"""One scene of a batch from its photos to its scores: the steps of the task that a worker runs.
+
+Each step calls the function that does it for a single scene, and these find what an earlier call has finished.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from .._check import check_whole
+from .._files import as_path, read_json, write_json
+from .._notes import is_strict
+from ..fields import scene_classes
+from ..labels import LabelSet, load_label_set
+from ..pipeline import Paper, Uplift, fit, score_scene, segment_scene, true_labels
+from ..pipeline.train import training_device
+from ..scenes import (
+    FeatureFolder,
+    Scene,
+    SceneError,
+    SfmConfig,
+    extract_features,
+    is_scene,
+    link_images,
+    list_images,
+    load_scene,
+    run_sfm,
+)
+from ..teachers.load import load_teacher
+from ..teachers.protocol import Teacher
+
+
+@dataclass(frozen=True)
+class BatchOptions:
+    """Options of `run_batch`, the same for all scenes. Workers receive them, so they hold paths and plain values."""
+
+    teacher: str | None = None
+    """Name of the network that makes feature maps, see `load_teacher`; None: each scene has its maps in `features/`."""
+    weights: str | None = None
+    """The teacher's weights: a file or folder that every worker can read, or a hub id."""
+    teacher_options: Mapping[str, Any] = field(default_factory=dict)
+    """The teacher's options."""
+    sfm: SfmConfig = field(default_factory=SfmConfig)
+    """For folders of photos without poses; `num_threads` follows `threads`."""
+    method: Uplift | Paper = field(default_factory=Uplift)
+    """How fields are made."""
+    text: str | None = None
+    """Text table of `kfgs text` for all scenes; None: each scene's `classes.json` and `text.npy` or `text.safetensors`."""
+    pictures: int = 4
+    """How many views of a scene get a sheet, an overlay and a picture of features."""
+    threads: int = 1
+    """Threads of each task. Equal numbers of threads give equal bits, however many workers there are."""
+    discard_features: bool = False
+    """Delete a scene's feature maps when its field is made."""
+    strict: bool = field(default_factory=is_strict)
+    """Refuse scenes of which something broken would be left out (`--strict`)."""
+
+    def __post_init__(self) -> None:
+        check_whole("threads", self.threads, 1)
+        check_whole("pictures", self.pictures, 0)
+        for name in ("weights", "text"):  # workers run in other folders
+            value = getattr(self, name)
+            if value is not None and as_path(value).exists():
+                object.__setattr__(self, name, str(as_path(value).absolute()))
+
+
+def make_scene(
+    source: Path,
+    run: Path,
+    options: BatchOptions,
+    step: Callable[[str], AbstractContextManager[None]],
+    say: Callable[[str], None],
+) -> dict[str, Any]:
+    """Make the field of a scene, segment its test views and score them.
+
+    Args:
+        source: a scene, or a folder of photos.
+        run: receives what is made.
+        options: what to do.
+        step: a context for each step of the work.
+        say: receives notes.
+
+    Returns:
+        `gaussians`, `latents`, and `miou` (None without true labels).
+    """
+    maps = source / "features"
+    with step("cameras"):
+        scene = _load(source, run / "scene", replace(options.sfm, num_threads=options.threads), say)
+    for note in scene.notes:
+        say(f"note: {note}")
+    if options.teacher is not None:
+        maps = run / "features"
+        with step("features"):
+            extract_features(_teacher(options), scene, maps)
+    elif not maps.is_dir():
+        raise SceneError(f"{source}: expected feature maps in features/, got none; name a teacher (--teacher)")
+    with step("fit"):
+        made = fit(scene.undistorted(), FeatureFolder(maps).of(scene), options.method, folder=run, report=say)
+    if options.discard_features and options.teacher is not None:
+        shutil.rmtree(maps)
+    value: dict[str, Any] = {"gaussians": len(made), "latents": made.features.shape[1], "miou": None}
+    classes = scene_classes(source) if options.text is None else load_label_set(options.text)
+    if classes is None:
+        return value
+    with step("segment"):
+        scene, shown = scene.undistorted(), "test" if scene.splits.get("test") else "train"
+        truth = _truth(source, scene, shown, classes, say)
+        labels = segment_scene(
+            made, scene, classes, run / "segmented", split=shown, pictures=options.pictures, truth=truth
+        )
+        if truth:
+            report = score_scene(labels, truth, classes)
+            write_json(run / "scores.json", {"scene": run.name, **report.to_json()})
+            say(str(report))
+            value["miou"] = float(report.miou.value)
+    return value
+
+
+def _load(source: Path, posed: Path, config: SfmConfig, say: Callable[[str], None]) -> Scene:
+    """The scene; if it has no poses, they are estimated from its photos and written to `posed`."""
+    if not source.is_dir():
+        raise FileNotFoundError(f"{source}: no such folder; expected a scene or photos there")
+    if is_scene(source):
+        return load_scene(source)
+    photos = next((place for place in (source / "images", source) if place.is_dir() and list_images(place)), None)
+    if photos is None:
+        raise SceneError(f"{source}: expected a COLMAP model, a transforms.json or photos, got none of them")
+    say(
+        f"note: no poses in {source}: no COLMAP model and no transforms.json; its cameras are found from the photos (sfm)"
+    )
+    facts, noted = {"photos": stamps(photos), "config": asdict(config)}, posed / "sfm.json"
+    if not noted.is_file() or read_json(noted) != facts:
+        try:
+            run_sfm(photos, posed, config=config, replace=True)
+        except SceneError as error:
+            advice = f"try other options or photos: `kfgs sfm {photos} --out SCENE`, and put SCENE into the list"
+            raise SceneError(f"no cameras found; {advice}. sfm says: {error}") from error
+        link_images(photos, posed)
+        write_json(noted, facts)
+    return load_scene(posed, images=photos)
+
+
+def _truth(source: Path, scene: Scene, split: str, classes: LabelSet, say: Callable[[str], None]) -> dict[str, Tensor]:
+    """The true labels of a split, if the scene has any and they count the same classes."""
+    folder = next((source / name for name in ("labels_scored", "labels") if (source / name).is_dir()), None)
+    listed = source / "classes.json"
+    if folder is not None and listed.is_file() and tuple(read_json(listed)) != classes.names:
+        say(f"note: not scored: the labels mean the classes of {listed}, and the text table has others")
+        return {}
+    return {} if folder is None else true_labels(scene, folder, split)
+
+
+def stamps(folder: Path, skip: str | None = None) -> list[list[Any]]:
+    """[name, size, time] of each file below a folder. Links are followed, but no folder is listed twice."""
+    rows, seen = list[list[Any]](), set[str]()
+    for here, folders, names in os.walk(folder, followlinks=True):
+        seen.add(os.path.realpath(here))
+        known = seen | {os.path.join(os.path.realpath(folder), skip or ".")}
+        folders[:] = [name for name in sorted(folders) if os.path.realpath(os.path.join(here, name)) not in known]
+        for file in (Path(here, name) for name in sorted(names)):
+            if file.is_file():
+                info = file.stat()
+                rows.append([file.relative_to(folder).as_posix(), info.st_size, info.st_mtime_ns])
+    return rows
+
+
+_loaded: dict[str, Teacher] = {}
+
+
+def _teacher(options: BatchOptions) -> Teacher:
+    """The teacher of this worker process, loaded once."""
+    assert options.teacher is not None
+    key = repr((options.teacher, options.weights, options.teacher_options))
+    if key not in _loaded:
+        _loaded.clear()
+        teacher = load_teacher(options.teacher, options.weights, **options.teacher_options)
+        _loaded[key] = teacher.to(training_device("auto")) if hasattr(teacher, "to") else teacher
+    return _loaded[key]
