@@ -30,9 +30,8 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
 from small_batch import results
 
 from kfgs._files import digest_file, write_json
+from kfgs.batch import BatchOptions, SceneEntry, describe_batch, open_client, run_batch
 from kfgs.pipeline import ColorConfig, Uplift
-from kfgs.scale import BatchOptions, SceneEntry, open_client, run_batch
-from kfgs.scale.board import event_line, table
 from kfgs.teachers import Teacher
 from kfgs.toy.room_folder import ToyConfig, make_toy_room
 
@@ -85,36 +84,25 @@ def kill_some(client, kills: int, seed: int, stop: threading.Event, log: list[st
         print(f"  killed process {pid}", flush=True)
 
 
-def measure(
-    scenes: list[SceneEntry], out: Path, options: BatchOptions, workers: int, kills: int = 0
-) -> tuple[float, int]:
-    """Seconds of a batch without the start of its workers, and how many tasks were submitted again."""
-    lost: list[str] = []
-
-    def report(event, rows) -> None:
-        lost.extend([event.name] * (event.kind == "lost"))
-        shown[:] = rows
-        if (line := event_line(event, rows)) is not None:
-            print(f"  {time.perf_counter() - start:7.1f} s  {line}", flush=True)
-
-    shown: list = []
-    with open_client(workers=workers) as client:
+def measure(scenes: list[SceneEntry], out: Path, options: BatchOptions, workers: int, kills: int = 0) -> float:
+    """Seconds of a batch without the start of its workers."""
+    with open_client(workers) as client:
         client.run(_warm)
         stop, killed = threading.Event(), list[str]()
         killer = threading.Thread(target=kill_some, args=(client, kills, 0, stop, killed))
         start = time.perf_counter()
         killer.start()
-        run_batch(scenes, out, options, client=client, report=report)
+        run_batch(scenes, out, options, client=client, report=lambda line: print(f"  {line}", flush=True))
         seconds = time.perf_counter() - start
         stop.set()
         killer.join()
-    print(table(shown))
-    return seconds, len(lost)
+    print(describe_batch(out))
+    return seconds
 
 
 def _warm() -> None:
     """Import what a worker imports for its first task."""
-    import kfgs.scale.stages  # noqa: F401
+    import kfgs.batch  # noqa: F401
 
 
 def main() -> None:
@@ -141,12 +129,12 @@ def main() -> None:
     )
     network = None if given.weights is None else str(given.weights.absolute())
     teacher = {"teacher": "batch:LookedUp", "teacher_options": {"rooms": str(base), "real": network}}
-    options = BatchOptions(method=Uplift(color=color), device="cpu", pictures=1, **teacher)
+    options = BatchOptions(method=Uplift(color=color), pictures=1, **teacher)
     found = {}
     for name, workers, kills in (("one worker", 1, 0), ("two workers", 2, 0), ("two workers, killed", 2, given.kills)):
         print(f"{name}:", flush=True)
-        seconds, lost = measure(scenes, base / name.replace(",", "").replace(" ", "_"), options, workers, kills)
-        found[name] = {"seconds": round(seconds, 1), "submitted again": lost}
+        seconds = measure(scenes, base / name.replace(",", "").replace(" ", "_"), options, workers, kills)
+        found[name] = {"seconds": round(seconds, 1)}
     runs = {name: base / name.replace(",", "").replace(" ", "_") for name in found}
     first = {scene.name: results(runs["one worker"] / scene.name) for scene in scenes}
     for name, run in runs.items():
@@ -154,9 +142,9 @@ def main() -> None:
         found[name]["byte-equal"] = sum(results(run / scene.name) == first[scene.name] for scene in scenes)
     write_json(base / "batch.json", {"scenes": len(scenes), **found})
     print(json.dumps(found, indent=2))
-    print(f"| {len(scenes)} scenes | seconds | speed-up | submitted again | scenes byte-equal |\n|---|---|---|---|---|")
+    print(f"| {len(scenes)} scenes | seconds | speed-up | scenes byte-equal |\n|---|---|---|---|")
     for name, row in found.items():
-        print(f"| {name} | {row['seconds']} | {row['speed-up']} | {row['submitted again']} | {row['byte-equal']} |")
+        print(f"| {name} | {row['seconds']} | {row['speed-up']} | {row['byte-equal']} |")
     field = runs["one worker"] / scenes[0].name / "field.kfgs"
     print(f"{field.name} of {scenes[0].name}: {digest_file(field)[:12]}")
 

@@ -25,11 +25,12 @@ def main() -> None:
     """Run, and print a table."""
     from toy_town import make_toy_town
 
+    from kfgs._files import read_json
+    from kfgs.batch import join_blocks
     from kfgs.fields import SemanticField, UpliftConfig
-    from kfgs.formats import read_splats
     from kfgs.pipeline import ColorConfig, Uplift, fit_color
-    from kfgs.scale import FieldInBlocks, split_scene
     from kfgs.scenes import load_scene
+    from kfgs.scenes.blocks import Block
     from kfgs.toy.room_folder import ToyConfig
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -64,17 +65,12 @@ def main() -> None:
     whole["seconds"] = time.perf_counter() - began
     _print("whole", SemanticField.load(args.out / f"run{args.seed}" / "field.kfgs"), scene, town, None, whole)
     folder = args.out / f"blocks{args.seed}"
-    blocks = split_scene(town, folder, args.blocks, splat=splat)
-    began, facts = time.perf_counter(), []
-    everything = len(read_splats(splat))
-    for block in blocks:
-        share = len(read_splats(folder / block.name / "splat.ply")) / everything
-        facts.append(
-            _apart(_fit_block, folder / block.name, Uplift(None, UpliftConfig(max_gaussians=int(total * share))))
-        )
-        print(f"  {block.name}: {len(block.views)} views, {share:.0%} of the Gaussians, {facts[-1]}")
-    took = {"seconds": time.perf_counter() - began, "peak_mib": max(fact["peak_mib"] for fact in facts)}
-    _print(f"{args.blocks} blocks", FieldInBlocks.open(folder).joined(), scene, town, blocks, took)
+    config = Uplift(splat=splat, uplift=UpliftConfig(max_gaussians=2 * total // args.blocks))
+    began = time.perf_counter()
+    took = _apart(_fit_in_blocks, town, folder, args.blocks, config)
+    took["seconds"] = time.perf_counter() - began
+    blocks = [Block.from_json(block) for block in read_json(folder / "blocks.json")["blocks"]]
+    _print(f"{args.blocks} blocks", join_blocks(folder), scene, town, blocks, took)
     _print("whole", SemanticField.load(args.out / f"run{args.seed}" / "field.kfgs"), scene, town, blocks, whole)
 
 
@@ -86,10 +82,10 @@ def _fit_whole(town: Path, run: Path, method: Any) -> None:
     fit(scene, FeatureFolder(town / "features").of(scene, "train"), method, folder=run)
 
 
-def _fit_block(folder: Path, config: Any) -> None:
-    from kfgs.scale import fit_block
+def _fit_in_blocks(town: Path, folder: Path, count: int, method: Any) -> None:
+    from kfgs.batch import fit_blocks
 
-    fit_block(folder, config)
+    fit_blocks(town, folder, count, replace(method, splat=None), splat=method.splat)
 
 
 def _apart(do: Any, *args: Any) -> dict[str, Any]:

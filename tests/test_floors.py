@@ -29,7 +29,7 @@ FLOORS = (
     {"features", "viewer"},
     {"evaluation"},
     {"pipeline"},
-    {"scale"},
+    {"batch"},
     {""},  # kfgs/__init__.py, the public names
     {"cli"},
     {"__main__"},
@@ -51,12 +51,9 @@ THIRD_PARTY = {
     "IPython": "kfgs/viewer/",
     "anywidget": "kfgs/viewer/",
     "traitlets": "kfgs/viewer/",
-    "dask": "kfgs/scale/",
-    "distributed": "kfgs/scale/",
-    "dask_jobqueue": "kfgs/scale/",
-    "submitit": "kfgs/scale/",
-    "fsspec": "kfgs/scale/",
-    "cloudpickle": "kfgs/scale/",
+    "dask": "kfgs/batch/",
+    "distributed": "kfgs/batch/",
+    "dask_jobqueue": "kfgs/batch/",
 }
 
 
@@ -180,8 +177,8 @@ def test_no_file_imports_a_later_file_of_its_package():
         ("kfgs/labels/edit.py", "import pyvista as pv", "imports pyvista, whose place is kfgs/viz/"),
         ("kfgs/viz/clouds.py", "def f():\n    from pycolmap import Camera", "imports pycolmap, whose place is kfgs/sc"),
         ("kfgs/splat/tiles.py", "import numba", "imports numba, whose place is kfgs/splat/engines/"),
-        ("kfgs/pipeline/fit.py", "from ..scale import run_batch", "imports kfgs.scale"),
-        ("kfgs/pipeline/fit.py", "import distributed", "imports distributed, whose place is kfgs/scale/"),
+        ("kfgs/pipeline/fit.py", "from ..batch import run_batch", "imports kfgs.batch"),
+        ("kfgs/pipeline/fit.py", "import distributed", "imports distributed, whose place is kfgs/batch/"),
         ("kfgs/scenes/sfm.py", "import transformers.models", "imports transformers, whose place is kfgs/teachers/"),
     ],
 )

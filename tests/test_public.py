@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = [
     "kfgs.cameras", "kfgs.evaluation",
     "kfgs.fields", "kfgs.formats", "kfgs.labels", "kfgs.metrics", "kfgs.pipeline",
-    "kfgs.quant", "kfgs.scale", "kfgs.scenes", "kfgs.splat", "kfgs.teachers", "kfgs.toy", "kfgs.viewer", "kfgs.viz",
+    "kfgs.quant", "kfgs.batch", "kfgs.scenes", "kfgs.splat", "kfgs.teachers", "kfgs.toy", "kfgs.viewer", "kfgs.viz",
 ]  # fmt: skip
 
 

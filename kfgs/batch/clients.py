@@ -78,7 +78,9 @@ def open_client(workers: int | str = 1, *, threads: int = 1) -> Iterator[Any]:
             silence_logs=logging.CRITICAL,
             preload=[__name__],  # each worker calls dask_setup
         )
-    patience = {"distributed.deploy.lost-worker-timeout": "10 minutes"}  # a new worker imports for longer than Dask's 15 s
+    patience = {
+        "distributed.deploy.lost-worker-timeout": "10 minutes"
+    }  # a new worker imports for longer than Dask's 15 s
     try:
         with dask.config.set(patience), cluster, Client(cluster, set_as_default=False) as client:
             yield client

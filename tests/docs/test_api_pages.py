@@ -4,10 +4,9 @@ import ast
 import doctest
 import importlib
 import inspect
-import json
 import re
 import shutil
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from functools import cache
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -18,12 +17,12 @@ from small_room import make_desk
 from test_public import PACKAGES
 
 import kfgs
-from kfgs import scale
+from kfgs import batch
 from kfgs.pipeline import true_labels
 from kfgs.scenes import load_cameras
 from kfgs.viz import available
 
-RUN_BATCH = scale.run_batch
+RUN_BATCH = batch.run_batch
 
 PAGES = Path(kfgs.__file__).parents[1] / "docs" / "api"
 if not PAGES.is_dir():
@@ -214,7 +213,7 @@ AS_THEY_STAND = [
     "quickstart",
 ]
 ELSEWHERE = {"recipes": "test_first_scripts.py", "guide": "test_readme.py"}
-WITH_DATA = {"protocols", "engines", "scale/README"}  # the three tests below
+WITH_DATA = {"protocols", "engines", "howto/batch"}  # the three tests below
 
 
 @pytest.mark.parametrize("page", AS_THEY_STAND)
@@ -266,27 +265,18 @@ def test_the_python_of_engines_runs(tmp_path, monkeypatch):
 
 
 def test_the_python_of_many_scenes_runs(inside, monkeypatch):
-    """With a thread instead of four processes; tests/scale/test_batch.py makes the fields, here only the call is checked."""
+    """Without processes; tests/batch makes the fields, here only the calls are checked."""
     called = []
-    monkeypatch.setattr(scale, "run_batch", lambda *args, **kwargs: called.append((args, kwargs)))
-    for name in ("kitchen", "hall"):
-        Path(name).symlink_to("scene")
-    Path("scenes.txt").write_text("kitchen\nhall\n")
-    several, table = blocks_of("scale/README")
-    assert several.count("open_client(workers=4)") == 1
-    known = {"__name__": "__main__", "ThreadPoolExecutor": ThreadPoolExecutor}
-    exec(several.replace("open_client(workers=4)", "ThreadPoolExecutor(1)"), known)
+    result = batch.SceneResult("kitchen", value={"miou": 0.5})
+    monkeypatch.setattr(batch, "open_client", lambda workers: nullcontext())
+    monkeypatch.setattr(batch, "run_batch", lambda *args, **kwargs: called.append((args, kwargs)) or [result])
+    Path("kitchen").symlink_to("scene")
+    Path("scenes.txt").write_text("kitchen\n")
+    join, several = blocks_of("howto/batch")
+    exec(several, {"__name__": "__main__"})
     [(arguments, named)] = called
     inspect.signature(inspect.unwrap(RUN_BATCH)).bind(*arguments, **named)
-    assert [entry.name for entry in arguments[0]] == ["kitchen", "hall"]
-    assert [one.value for one in known["found"]] == [len(list(Path("scene").rglob("*.png")))] * 2
-    for name, failure in (("attic", {"message": "no pictures"}), ("kitchen", None)):
-        (Path("runs") / name).mkdir(parents=True)
-        (Path("runs") / name / "state.json").write_text(json.dumps({"failure": failure}))
-    Path("runs/kitchen/scores.json").write_text(json.dumps({"scores": {"mIoU": 0.5, "accuracy": 0.75}}))
-    exec(table, {})
-    rows = Path("scores.csv").read_text().splitlines()
-    assert rows == ["scene,mIoU,accuracy,failure", "attic,,,no pictures", "kitchen,0.5,0.75,"]
+    assert "join_blocks(" in join
 
 
 def test_the_file_of_cameras_on_the_page_of_export_can_be_read(tmp_path):
