@@ -19,8 +19,8 @@ ROOT = Path(kfgs.__file__).parent
 FLOORS = (
     {"_card", "_names", "_stems"},
     {"_check", "_compiling", "_files", "_interrupts", "_notes", "_progress", "_rows", "_tensors"},
-    {"_typed", "_origin"},
-    {"_arrays", "_torch_files", "gaussians", "cameras"},
+    {"_arrays", "_typed", "_origin"},
+    {"_torch_files", "gaussians", "cameras"},
     {"splat", "quant", "metrics"},
     {"formats"},
     {"scenes", "labels"},

@@ -18,7 +18,7 @@ from small_batch import OPTIONS, make_rooms, one_process, results
 from kfgs._files import read_json
 from kfgs.batch import BatchOptions, SceneEntry, describe_batch, open_client, run_batch
 from kfgs.cli import main
-from kfgs.scenes import SceneError
+from kfgs.scenes import SceneError, load_scene
 from kfgs.scenes.sfm import SfmReport
 
 
@@ -87,13 +87,15 @@ def test_killed_workers_change_no_byte_and_a_second_batch_does_nothing(rooms, al
 def test_a_failed_scene_is_tried_again_and_others_are_not_touched(rooms, tmp_path):
     room, runs = tmp_path / "room", tmp_path / "runs"
     shutil.copytree(rooms[0], room)
-    camera = next((room / "images").iterdir())
-    hidden = camera.rename(tmp_path / camera.name)
+    scene = load_scene(room)
+    photo = scene.image_paths[scene.views("train")[0]]
+    good = photo.read_bytes()
+    photo.write_bytes(b"damaged")
     first = run_batch([room], runs, dataclasses.replace(OPTIONS, strict=True))[0]
     assert first.value is None
-    assert camera.name in first.failure
+    assert photo.name in first.failure
     assert "1 failed" in describe_batch(runs)
-    hidden.rename(camera)
+    photo.write_bytes(good)
     second = run_batch([room], runs, OPTIONS)[0]
     assert second.failure is None
     assert "1 finished, mean mIoU" in describe_batch(runs)
