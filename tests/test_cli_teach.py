@@ -31,14 +31,6 @@ TEACHER = ["--teacher", "cases_teach:TinyLSeg", "--weights"]
 QUICK = ["--steps", "3", "--method", "paper", "--mode", "adc"]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def no_pictures():
-    """Curves of the training take a second of each fit; test_cli.py has them."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("kfgs.pipeline.write_training_pictures", lambda result: [])
-        yield
-
-
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
     return make_room(tmp_path_factory.mktemp("room") / "scene")
