@@ -26,7 +26,7 @@ FLOORS = (
     {"scenes", "labels"},
     {"toy"},
     {"teachers", "fields", "viz"},
-    {"features", "viewer"},
+    {"viewer"},
     {"evaluation"},
     {"pipeline"},
     {"batch"},

@@ -194,7 +194,7 @@ def _import_all() -> None:
 
     names = ("torch", "kornia", "numba", "PIL.Image", "safetensors.torch", "skimage.io", "scipy.spatial", "tyro", "zstandard",
              "matplotlib.pyplot", "pycolmap", "kfgs.cli", "kfgs.pipeline", "kfgs.fields", "kfgs.formats.table", "kfgs.scenes",
-             "kfgs.toy.room_folder", "kfgs.viz", "kfgs.features", "kfgs.teachers", "kfgs.evaluation",
+             "kfgs.toy.room_folder", "kfgs.viz", "kfgs.teachers", "kfgs.evaluation",
              "kfgs.splat.engines.table", "kfgs.cli.splats", "kfgs.labels", "campaign.jobs")  # fmt: skip
     for name in names:
         try:
