@@ -6,7 +6,7 @@ import pytest
 
 from kfgs import cli
 from kfgs.pipeline import demo
-from kfgs.viewer import serving
+from kfgs.viz import plotter
 
 fit = sys.modules["kfgs.cli.fit"]  # kfgs.cli.fit is the command
 
@@ -21,7 +21,7 @@ def opened(monkeypatch):
 
 
 def test_in_a_terminal_with_a_display_it_ends_by_opening_the_viewer(opened, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(serving, "has_display", lambda: True)
+    monkeypatch.setattr(plotter, "has_display", lambda: True)
     monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
     assert cli.main(["demo", "--out", str(tmp_path / "out")]) == 0
@@ -32,7 +32,7 @@ def test_in_a_terminal_with_a_display_it_ends_by_opening_the_viewer(opened, tmp_
 
 @pytest.mark.parametrize("missing", ["display", "terminal"])
 def test_elsewhere_it_says_how_to_look(opened, tmp_path, monkeypatch, capsys, missing):
-    monkeypatch.setattr(serving, "has_display", lambda: missing != "display")
+    monkeypatch.setattr(plotter, "has_display", lambda: missing != "display")
     monkeypatch.setattr(sys.stdin, "isatty", lambda: missing != "terminal", raising=False)
     assert cli.main(["demo", "--out", str(tmp_path / "out")]) == 0
     assert not opened
