@@ -121,10 +121,7 @@ class SemanticField:
         return html_card("SemanticField", facts)
 
     def to(self, *args: Any, **kwargs: Any) -> SemanticField:
-        """The field on another device or in another dtype; the arguments are those of `torch.Tensor.to`.
-
-        Cameras that you pass to `segment` and `render` afterwards must be on the same device.
-        """
+        """The field on another device or in another dtype, as `torch.Tensor.to`; pass cameras there afterwards, too."""
         parts = {name: getattr(self, name) for name in ("gaussians", "decoder", "seen", "fused")}
         moved = {name: part.to(*args, **kwargs) for name, part in parts.items() if part is not None}
         return replace(self, **moved, cameras=tuple(camera.to(*args, **kwargs) for camera in self.cameras))
@@ -236,12 +233,7 @@ class SemanticField:
         return select_by_similarity(cosines[:, 0], against, threshold, latents.any(dim=1), **options)
 
     def segment(self, camera: Camera, classes: Classes | None = None) -> Tensor:  # [H, W] int64
-        """The class of each pixel from a viewpoint, -1 for empty pixels; the rule is that of the decoder.
-
-        Args:
-            camera: any viewpoint.
-            classes: a label set, or embeddings [C, D]; None: the field's own.
-        """
+        """The class of each pixel from a viewpoint, -1 for empty pixels; the rule is that of the decoder."""
         return self._rank(camera, classes, 1, early=True).labels[..., 0]
 
     def rank(self, camera: Camera, classes: Classes | None = None, *, top: int = 1) -> Ranked:
