@@ -116,9 +116,9 @@ Image.fromarray(viz.draw_view(orbit_cameras(inside.means, orbit, up=up)[0], draw
 carried = nearest_labels(semantic.means, semantic.labels, colors.means)
 print(carried)
 plotter = viz.linked_clouds(semantic, colors, camera=camera, height=360, off_screen=True)
-both = plotter.screenshot()
+picture = plotter.screenshot()
 plotter.close()
-Image.fromarray(both)
+Image.fromarray(picture)
 
 # %% [markdown]
 # Who gave a label to whom? From above and without walls, with the colour cloud moved aside: each line joins a colour Gaussian
@@ -126,22 +126,23 @@ Image.fromarray(both)
 
 # %%
 kept = torch.isin(carried.labels, hidden, invert=True)
-sides = torch.linalg.cross(up, torch.tensor([0.6, 0.8, 0.0]).to(up)), 1.3 * scene.extent
-aside = (sides[0] / sides[0].norm() * sides[1]).tolist()
-apart = colors.replace(means=colors.means + torch.tensor(aside).to(colors.means))
+above = Orbit(frames=1, size=(420, 960), elevation_degrees=40, start_degrees=30, zoom=1.6)
+right = orbit_cameras(inside.means, above, up=up)[0].viewmat[0, :3].to(inside.means)  # in this picture
+across = inside.means @ right
+aside = (1.1 * (across.max() - across.min()) * right).tolist()
+apart = colors.replace(means=colors.means + torch.tensor(aside).to(colors.means)).select(kept)
 only = replace(carried, labels=torch.where(kept, carried.labels, -1))
-whole = torch.cat([inside.means, apart.means[kept]])
 
 
 def draw_transfer(plotter):
     viz.add_cloud(plotter, inside, style="gaussians")
-    viz.add_cloud(plotter, apart.select(kept), color_by="rgb", style="gaussians")
+    viz.add_cloud(plotter, apart, color_by="rgb", style="gaussians")
     viz.add_transfer(plotter, semantic, colors, only, shift=aside, sample=300)
     viz.add_legend(plotter, inside.labels, classes.names)
 
 
-above = Orbit(frames=1, size=(480, 960), elevation_degrees=40, start_degrees=30, zoom=1.5)
-Image.fromarray(viz.draw_view(orbit_cameras(whole, above, up=up)[0], draw_transfer))
+both = torch.cat([inside.means, apart.means])
+Image.fromarray(viz.draw_view(orbit_cameras(both, above, up=up)[0], draw_transfer))
 
 # %% [markdown]
 # If $\lambda$ is too small, Gaussians stay without a label (grey). The last picture shows another way, `attach(by="views")`:

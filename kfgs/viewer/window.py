@@ -34,7 +34,6 @@ SHOW_NAMES: dict[Show, str] = {"labels": "classes", "rgb": "colours", "score": "
 MANY = 150_000  # Gaussians: a frame of them takes half a second in software; more are drawn as points
 REST = 0.04  # factor on the opacity of Gaussians that are not selected; points fade to almost white instead
 HIGHLIGHT = np.array((255, 120, 0))  # tints a selection shown in its own colours: a white sofa is hard to see on white
-STILL = 3  # pixels that the mouse may move during a click; further is a drag
 KEYS = """n, N  next, previous class    Esc  no class    {shows}
 r  first view    p  save the picture    s  save the selection    q  close"""
 
@@ -305,7 +304,7 @@ class _Controls:
     def _on_release(self, *_: Any) -> None:
         pressed, self.pressed = self.pressed, None
         x, y = self.plotter.iren.get_event_position()
-        if pressed is not None and max(abs(x - pressed[0]), abs(y - pressed[1])) <= STILL:
+        if pressed is not None and max(abs(x - pressed[0]), abs(y - pressed[1])) <= 3:  # pixels; further is a drag
             below = self.plotter.render_window.GetSize()[1] - 1 - y  # VTK counts rows from below
             self.call(lambda: self.explorer.pick(x, below))
 
