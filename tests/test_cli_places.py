@@ -155,8 +155,7 @@ def test_pictures_elsewhere_are_known_from_what_the_field_remembers(desk, tmp_pa
                 refused(words, {"tmp": tmp_path}, capsys, "--out", "pictures and feature maps", photos)
 
 
-def test_the_page_puts_no_picture_among_those_of_the_scene(desk, capsys, monkeypatch):
-    monkeypatch.setattr("kfgs.viewer.serving.wait", lambda: pytest.fail("it was served"))
+def test_the_page_puts_no_picture_among_those_of_the_scene(desk, capsys):
     refused("view {run} --out {scene}/images/mine", desk, capsys, "--out", "pictures", desk["scene"] / "images")
 
 

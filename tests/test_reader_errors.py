@@ -6,7 +6,6 @@ import struct
 import numpy as np
 import pytest
 import torch
-from kfgs.scenes.replica import _cam_params
 from messages import tells
 from PIL import Image
 
@@ -89,12 +88,6 @@ def test_an_image_longer_than_any_is_refused_before_masks_are_filled(tmp_path):
     (tmp_path / "annotations.json").write_text(json.dumps(whole))
     with pytest.raises(ValueError, match=tells("annotations.json", "size of image 'a'", "16777216")):
         load_coco_labels(tmp_path / "annotations.json")
-
-
-def test_a_camera_of_whole_numbers_beyond_int64(tmp_path):
-    camera = {"w": 4, "h": 3, "fx": 10**40, "fy": 5, "cx": 2, "cy": 1.5, "scale": 1000}
-    (tmp_path / "cam_params.json").write_text(json.dumps({"camera": camera}))
-    assert _cam_params(tmp_path)[0].dtype == np.float64
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,10 @@
 import torch
 from baselines import plain_uplift
-from kfgs.labels.views import average_views
 from small_task import task
 
 from kfgs._rows import unit_rows
 from kfgs.cameras import resize_map
+from kfgs.splat import average_views
 
 
 def test_it_is_the_mean_by_rendering_weight():
