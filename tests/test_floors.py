@@ -19,7 +19,7 @@ ROOT = Path(kfgs.__file__).parent
 FLOORS = (
     {"_card", "_names", "_stems"},
     {"_check", "_compiling", "_files", "_interrupts", "_notes", "_progress", "_rows", "_tensors"},
-    {"_arrays", "_typed", "_origin"},
+    {"_arrays", "_origin"},
     {"_torch_files", "gaussians", "cameras"},
     {"splat", "quant", "metrics"},
     {"formats"},

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from .._card import short_repr
 from .._check import check_range
-from .._typed import typed
 from ..cameras.camera import Camera
 from ..cameras.projection import camera_to_pixel, projection_jacobian, world_to_camera
 from ..gaussians import Gaussians
@@ -37,7 +36,6 @@ class Projected(NamedTuple):
         return short_repr(self)
 
 
-@typed
 def project(
     gaussians: Gaussians,
     camera: Camera,

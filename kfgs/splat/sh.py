@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from .._check import check_shapes
-from .._typed import typed
 from ..cameras.similarity import exact_rotation
 
 SH_C0 = 0.5 * sqrt(1 / pi)
@@ -19,7 +18,6 @@ C2 = sqrt(15 / (4 * pi)), sqrt(5 / (16 * pi)), sqrt(15 / (16 * pi))
 C3 = sqrt(35 / (32 * pi)), sqrt(105 / (4 * pi)), sqrt(21 / (32 * pi)), sqrt(7 / (16 * pi)), sqrt(105 / (16 * pi))
 
 
-@typed
 def evaluate_sh(
     sh: Tensor,  # [N, K, 3], K = 1, 4, 9 or 16
     directions: Tensor,  # [N, 3]
@@ -50,7 +48,6 @@ def evaluate_sh(
     return (torch.einsum("nk,nkc->nc", _basis(directions, K), sh) + 0.5).clamp(min=0)
 
 
-@typed
 def rotate_sh(
     sh: Tensor,  # [N, K, 3], K = 1, 4, 9 or 16
     rotation: Tensor,  # [3, 3]

@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from .._check import check_shapes
-from .._typed import typed
 from .engines import check_sizes, ops
 from .engines.contract import ALPHA_MIN, Tiles
 from .engines.table import choose_compiled
@@ -16,7 +15,6 @@ __all__ = ["Tiles", "bin_tiles"]
 
 
 @torch.no_grad()
-@typed
 def bin_tiles(projected: Projected, width: int, height: int, tile_size: int = 16, *, engine: str = "auto") -> Tiles:
     """List the Gaussians of every tile.
 
