@@ -75,7 +75,7 @@ def test_each_output_of_edit_has_its_own_edits(splat, tmp_path):
     for suffix, kept in ((".ply", 1), (".spz", 0)):
         edits = EditList.load(tmp_path / f"e{suffix}.edits.json")
         assert len(edits) == 1
-        assert set(edits.apply(read_splats(splat)).gaussians.labels.tolist()) == {kept}
+        assert set(edits.apply(read_splats(splat)).labels.tolist()) == {kept}
 
 
 def test_a_comparison_puts_no_picture_over_one_of_the_scene(room, run, other, capsys):

@@ -61,8 +61,8 @@ def test_four_things_side_by_side(run, tmp_path, capsys):
 def test_a_labelled_splat(run, tmp_path):
     scene = load_scene(run.parent / "scene")
     colors = read_splats(run / "color.ply")
-    labels = (colors.gaussians.means[:, 2] > 1).long()
-    labelled = colors.gaussians.replace(labels=labels).replace(names=("low", "high"))
+    labels = (colors.means[:, 2] > 1).long()
+    labelled = colors.replace(labels=labels).replace(names=("low", "high"))
     write_splats(labelled, tmp_path / "l.ply")
     assert film(tmp_path / "l.ply", "--out", tmp_path / "a.gif", "--show", "photo,labels,query=high") == 0
     assert film(tmp_path / "l.ply", "--out", tmp_path / "b.gif", "--path", "cameras", "--scene", scene.folder) == 0
