@@ -54,10 +54,10 @@ def test_examples_run_one_after_the_other(examples, desk, monkeypatch):
     monkeypatch.chdir(desk)
     _, fitting, editing, looking = examples
     assert fitting.count('Uplift("my.spz")') == 1
-    known = {"SHORT": SHORT, "other_points": read_splats("my.spz").means}
+    known = {"SHORT": SHORT}
     exec(fitting.replace('Uplift("my.spz")', 'Uplift("my.spz", SHORT)'), known)
     assert known["chair"].mask.shape == (len(known["field"]),)
-    assert len(known["carried"].labels) == len(known["other_points"])
+    assert len(known["labelled"].labels) == len(read_splats("my.spz"))
     make_field(Path("scene"), Path("run/field.kfgs"))  # a few small maps know no plant: this one knows the truth
     made, scene = SemanticField.load("run/field.kfgs"), load_scene("scene")
     made = replace(made, info=made.info | {"scene": "scene"}, classes=scene_classes(Path("scene")))
