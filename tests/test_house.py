@@ -1,13 +1,76 @@
-"""The house does not grow: a budget holds it small, where taste did not."""
+"""The house does not grow: a budget per folder holds it small, where taste did not."""
 
+import importlib
+import inspect
+from dataclasses import is_dataclass
 from pathlib import Path
 
+import pytest
+
 import kfgs
+from kfgs.cli import COMMANDS
 
-LINES = 66_200  # of Python, docstrings included; a change may lower the number, and never raises it
+ROOT = Path(kfgs.__file__).parent
+AIM = {  # lines of Python with docstrings (DESIGN, section 2); "base": the files of kfgs/ itself
+    "cli": 1_800, "batch": 700, "pipeline": 1_900, "evaluation": 2_000, "viewer": 2_000, "viz": 2_100, "teachers": 1_900,
+    "fields": 2_300, "toy": 1_000, "labels": 1_900, "scenes": 3_200, "formats": 2_600, "splat": 1_000,
+    "splat/engines": 5_300, "quant": 1_100, "cameras": 950, "base": 1_200,
+}  # fmt: skip
+NOT_YET = {  # what is above its aim: a change may lower these numbers, and never raises them
+    "cli": 3_290, "batch": 794, "pipeline": 2_478, "teachers": 2_354, "fields": 3_363, "toy": 1_229, "labels": 2_504,
+    "scenes": 4_668, "formats": 4_411, "splat/engines": 6_336, "quant": 1_565, "cameras": 1_233, "base": 1_866,
+}  # fmt: skip
+SCRIPTS = 4_000  # lines of the viewer's JavaScript
+PUBLIC, TOP, COMMAND, OPTIONS = 261, 56, 18, 192  # names, of kfgs itself, commands, options; aims: 170, 40, 14, 110
+PACKAGES = [folder for folder in AIM if "/" not in folder and folder not in ("cli", "base")]
 
 
-def test_who_adds_lines_names_the_lines_that_go():
-    """A change that adds lines to kfgs/ names the lines that it removes, in its commit, so that the sum does not rise."""
-    files = Path(kfgs.__file__).parent.rglob("*.py")
-    assert sum(len(file.read_text(encoding="utf-8").splitlines()) for file in files) <= LINES
+def room(file: Path) -> str:
+    inside = file.relative_to(ROOT).as_posix()
+    if inside == "metrics.py":
+        return "evaluation"
+    return next((name for name in sorted(AIM, key=len, reverse=True) if inside.startswith(f"{name}/")), "base")
+
+
+def lines(pattern: str) -> dict[Path, int]:
+    return {file: len(file.read_text(encoding="utf-8").splitlines()) for file in ROOT.rglob(pattern)}
+
+
+@pytest.mark.parametrize("folder", AIM)
+def test_who_adds_lines_names_the_lines_that_go(folder):
+    """A change that adds lines to a full folder names the lines that it removes there, in its commit."""
+    count = sum(number for file, number in lines("*.py").items() if room(file) == folder)
+    assert count <= max(AIM[folder], NOT_YET.get(folder, 0))
+    assert NOT_YET.get(folder, AIM[folder] + 1) > AIM[folder], "within its aim: remove its line from NOT_YET"
+
+
+def test_the_viewers_scripts_are_within_their_budget():
+    assert sum(lines("*.js").values()) <= SCRIPTS
+
+
+def test_public_names_are_few():
+    packages = [importlib.import_module(f"kfgs.{name}") for name in PACKAGES] + [
+        importlib.import_module("kfgs.metrics")
+    ]
+    assert len(kfgs.__all__) <= TOP
+    assert len({name for package in packages for name in package.__all__} | set(kfgs.__all__)) <= PUBLIC
+
+
+def options(kind: object) -> int:
+    """The options that a parameter of a command makes: those of its fields, if it is a dataclass."""
+    if is_dataclass(kind):
+        return sum(
+            options(parameter.annotation) for parameter in inspect.signature(kind, eval_str=True).parameters.values()
+        )
+    return 1
+
+
+def test_commands_and_their_options_are_few():
+    counts = {
+        name: sum(
+            options(parameter.annotation) for parameter in inspect.signature(command, eval_str=True).parameters.values()
+        )
+        for name, command in COMMANDS.items()
+    }
+    assert len(counts) <= COMMAND
+    assert sum(counts.values()) <= OPTIONS, counts
