@@ -97,6 +97,11 @@ class Gaussians:
             "gaussians: expected an array, got Gaussians, which hold several; to_numpy() gives them by name"
         )
 
+    @property
+    def gaussians(self) -> Gaussians:
+        """The cloud itself: scripts written for `read_splats(...).gaussians` continue to work."""
+        return self
+
     def _tensors(self) -> dict[str, Tensor]:
         values = {name: getattr(self, name) for name in TENSORS}
         return {name: value for name, value in values.items() if value is not None}
