@@ -83,10 +83,10 @@ def test_color_scores_the_views_held_out(colored, room):
 
 
 def test_color_run_again_does_nothing_and_says_so(colored, room, capsys):
-    before = (colored / "color.ply").stat().st_mtime_ns
+    before = (colored / "color.ply").read_bytes()
     assert main(["color", str(room), "--out", str(colored), *COLOR, "--pictures", "0"]) == 0
     said = capsys.readouterr().out
-    assert (colored / "color.ply").stat().st_mtime_ns == before
+    assert (colored / "color.ply").read_bytes() == before
     assert "PSNR" in said
     assert "views" not in said.split("wrote:")[1]
 
@@ -412,15 +412,6 @@ def test_convert_by_class_writes_a_plain_file_for_each_class(labelled, tmp_path,
         assert {"class_id", "score"}.isdisjoint(read_ply(out / name))
         assert name in said
     assert "note:" not in said
-
-
-def test_convert_by_class_replaces_no_file_of_others(labelled, tmp_path, capsys):
-    theirs = tmp_path / "05_chair.ply"
-    theirs.write_bytes(b"mine")
-    assert main(["convert", str(labelled), str(tmp_path), "--by-class"]) == 1
-    assert str(theirs) in capsys.readouterr().err
-    assert theirs.read_bytes() == b"mine"
-    assert [path.name for path in tmp_path.iterdir()] == [theirs.name]
 
 
 def test_names_of_files_by_class():

@@ -14,7 +14,7 @@ from kfgs import cli
 
 REPOSITORY = Path(kfgs.__file__).parents[1]
 SHOWN = [
-    *sorted(path.name for path in REPOSITORY.glob("*.md")),
+    *sorted(path.name for path in REPOSITORY.glob("*.md") if path.name != "CHANGELOG.md"),  # it names what is gone
     *sorted(
         str(path.relative_to(REPOSITORY)) for path in REPOSITORY.glob("docs/**/*.md") if "_build" not in path.parts
     ),

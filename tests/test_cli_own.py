@@ -2,10 +2,8 @@
 
 import os
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 from small_room import fit_run, make_room
 
 from kfgs.cli import main
@@ -13,7 +11,6 @@ from kfgs.fields import SemanticField
 from kfgs.formats import read_splats, write_splats
 from kfgs.gaussians import Gaussians
 from kfgs.labels import EditList
-from kfgs.viz import save_picture
 
 
 @pytest.fixture(scope="module")
@@ -24,14 +21,6 @@ def room(tmp_path_factory):
 @pytest.fixture(scope="module")
 def run(room, tmp_path_factory):
     return fit_run(room, tmp_path_factory.mktemp("run"))
-
-
-@pytest.fixture(scope="module")
-def other(run, tmp_path_factory):
-    """Another result, to compare with."""
-    out = tmp_path_factory.mktemp("other") / "tiny.kfgs"
-    assert main(["pack", str(run / "field.kfgs"), str(out), "--precision", "tiny"]) == 0
-    return out
 
 
 @pytest.fixture
@@ -78,13 +67,6 @@ def test_each_output_of_edit_has_its_own_edits(splat, tmp_path):
         assert set(edits.apply(read_splats(splat)).labels.tolist()) == {kept}
 
 
-def test_a_comparison_puts_no_picture_over_one_of_the_scene(room, run, other, capsys):
-    before = files(room)
-    words = ["compare", run / "field.kfgs", other, "--scene", room, "--out", room / "images"]
-    refused(words, capsys, room / "images", "pictures and feature maps")
-    assert files(room) == before
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -107,9 +89,3 @@ def test_an_empty_path_is_not_the_current_folder(text, room, run, splat, tmp_pat
 
 def test_an_empty_class_is_no_path(run, capsys):
     refused(["select", "", run / "field.kfgs"], capsys, "QUERY: expected a class", "such as chair")
-
-
-def test_pictures_say_that_kfgs_drew_them(tmp_path):
-    save_picture(tmp_path / "a.png", np.zeros((4, 4, 3), np.uint8))
-    with Image.open(tmp_path / "a.png") as picture:
-        assert picture.info["Software"] == "kfgs"

@@ -18,17 +18,14 @@ from kfgs.fields import SemanticField
 
 LINES = {  # a command with its output {}; and one of its inputs that could be named as the output, if there is one
     "attach": ("attach {run}/field.kfgs {splat} --out {}.ply", "{splat}"),
-    "batch": ("batch {list} --out {} --scheduler tcp://127.0.0.1:1", None),
-    "blocks": ("blocks {scene} --out {} --count 2", None),
+    "batch": ("batch {list} --out {} --workers tcp://127.0.0.1:1", None),
     "color": ("color {scene} --out {}", None),
-    "compare": ("compare {run} {packed} --out {}", None),
     "convert": ("convert {splat} {}.ply", "{splat}"),
     "demo": ("demo --out {}", None),
     "edit": ("edit {labelled} --remove chair --out {}.ply", "{labelled}"),
     "evaluate": ("evaluate {run} --out {}", "{run}/field.kfgs"),
     "features": ("features {scene} --teacher lseg --weights {tmp}/none --out {}", None),
     "fit": ("fit {scene} --splat {splat} --out {}", None),
-    "join": ("join {scene} --out {}", None),
     "label": ("label {run}/field.kfgs --out {}", None),
     "pack": ("pack {packed} {}", "{packed}"),
     "render": ("render {run} --out {}.gif", None),
@@ -36,7 +33,7 @@ LINES = {  # a command with its output {}; and one of its inputs that could be n
     "select": ("select chair {run}/field.kfgs --out {}", None),
     "sfm": ("sfm {tmp}/photos --out {}", None),
     "text": ("text chair --teacher lseg --weights {table} --out {}.safetensors", "{table}"),
-    "view": ("view {run}/field.kfgs --where html --out {}", "{run}/field.kfgs"),
+    "view": ("view {run}/field.kfgs --where html --out {}", None),
 }
 NO_OUTPUT = {"info"}
 
@@ -107,17 +104,16 @@ def test_no_command_replaces_what_it_reads(command, desk, tmp_path, capsys):
 
 
 FILES = {  # an existing file of the scene, the run or the user, and commands that would have replaced it
-    "{scene}/images/view_000.png": ["evaluate {run} --out", "search chair {run} --json"],
+    "{scene}/images/view_000.png": ["evaluate {run} --out"],
     "{scene}/features/view_000_fmap_CxHxW.pt": ["evaluate {run} --out"],
     "{scene}/sparse/0/images.bin": ["evaluate {run} --out"],
-    "{scene}/split.json": ["evaluate {run} --out", "search chair {run} --json"],
+    "{scene}/split.json": ["evaluate {run} --out"],
     "{scene}/text.npy": ["evaluate {run} --out"],
     "{scene}/classes.json": ["evaluate {run}/field.kfgs --out"],
     "{run}/field.kfgs": ["evaluate {run} --out", "evaluate {run}/field.kfgs --out"],
     "{run}/color.ply": ["convert {run}/color.ply", "evaluate {run} --out"],
     "{packed}": ["evaluate {packed} --out"],
-    "{labelled}": ["evaluate {labelled} --scene {scene} --protocol kfgs-removal --set before={labelled} --out"],
-    "{table}": ["evaluate {run} --with-file {table} --out", "evaluate {run} --teacher lseg --weights {table} --out"],
+    "{table}": ["evaluate {run} --teacher lseg --weights {table} --out"],
     "{list}": ["evaluate {run} --truth {list} --out"],
 }
 

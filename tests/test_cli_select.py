@@ -1,10 +1,9 @@
-"""`kfgs select`: which parts are listed, and the paths of a field that it takes; `kfgs info` of the same field."""
+"""`kfgs select`: which parts are listed."""
 
 import re
 
 import pytest
 import torch
-from messages import tells
 from small_room import make_desk
 
 from kfgs import Gaussians, SemanticField, connected_parts
@@ -41,8 +40,6 @@ def test_parts_that_are_not_listed_are_counted(desk, capsys):
     assert said_of(desk, capsys, "--smallest", "1000000") == [
         "  no part has 1000000 Gaussians; give a smaller --smallest"
     ]
-    assert main(["select", "chair", str(desk / "run" / "field.kfgs"), "--smallest", "0"]) == 1
-    assert "--smallest: expected" in capsys.readouterr().err
 
 
 def test_the_distance_within_which_gaussians_are_one_part_can_be_given(desk, capsys):
@@ -71,27 +68,3 @@ def test_two_parts_have_no_median_to_compare_with():
     assert lengths_odd([1.0, 9.0]) == [None, None]
     assert lengths_odd([]) == []
     assert lengths_odd([0.0, 0.0, 1.0]) == [None] * 3
-
-
-@pytest.mark.parametrize("name", ["field.kfgs", ""])
-def test_a_path_beside_the_fields_folder_is_answered_with_that_folder(desk, name, capsys):
-    assert main(["select", "chair", str(desk / "run" / name)]) == 1
-    assert re.search(tells("SOURCE: ", f"pass {desk / 'run' / 'field'}\n"), capsys.readouterr().err)
-
-
-def test_info_names_the_scene_as_it_can_be_typed(desk, monkeypatch, capsys):
-    monkeypatch.chdir(desk)
-    for path in ("run", "run/field.kfgs"):
-        assert main(["info", path]) == 0
-        lines = capsys.readouterr().out.splitlines()
-        assert "  scene: scene" in lines
-        assert not any("one file" in line for line in lines)
-    monkeypatch.chdir(desk / "run")
-    assert main(["info", "field"]) == 0
-    assert f"  scene: {desk.resolve() / 'scene'}\n" in capsys.readouterr().out
-    (desk / "scene").rename(desk / "moved")
-    try:
-        assert main(["info", "field"]) == 0
-    finally:
-        (desk / "moved").rename(desk / "scene")
-    assert f"  scene: {desk.resolve() / 'scene'} (not there any more)\n" in capsys.readouterr().out

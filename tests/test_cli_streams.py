@@ -42,7 +42,6 @@ def desk(tmp_path_factory):
     for words in (
         "attach {0}/run/field.kfgs {0}/my.ply --out {0}/labelled.ply",
         "pack {0}/run/field.kfgs {0}/p.kfgs",
-        "search floor {0}/run",  # which says that it makes the index
     ):
         assert cli.main(words.format(folder).split()) == 0
     return folder
@@ -58,8 +57,6 @@ def desk(tmp_path_factory):
         ("edit {0}/labelled.ply --remove floor --out {1}/a.ply", "a.ply.edits.json"),
         ("convert {0}/labelled.ply {1}/a.splat", "a.splat"),
         ("convert {0}/labelled.ply {1}/a --by-class", "a"),
-        ("search floor {0}/run --json {1}/a.json", "a.json"),
-        ("compare {0}/run {0}/p.kfgs --out {1}/a --pictures 0", "a/compare.json"),
         ("evaluate {0}/run --out {1}/a.json", "a.json"),
     ],
 )

@@ -251,7 +251,7 @@ def test_fit_with_a_teacher_gives_the_same_codebook_index_maps_and_field(
     assert fields[0].info["teacher"] == fields[1].info["teacher"]
     assert main(arguments) == 0
     assert seen() == 0
-    assert len(fields[0].codebook.codewords) > 1
+    assert len(fields[0].decoder.codebook.codewords) > 1
     assert "teacher: lseg" in capsys.readouterr().out
 
 
@@ -311,10 +311,10 @@ def wrong_files(folder: Path, weights: Path) -> dict[str, tuple[Path, str]]:
     (folder / "folder.ckpt").mkdir()
     words = {
         "noise": "got",
-        "short": "cut short",
-        "half": "cut short",
+        "short": "not a zip file",
+        "half": "not a zip file",
         "pickle": "pickle",
-        "zip": "asks to run",
+        "zip": "expected a checkpoint",
         "rn101": "clip_resnet101",
         "clip": "got CLIP",
         "html": "HTML",

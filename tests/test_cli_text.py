@@ -247,7 +247,7 @@ def test_words_of_another_teacher_are_noted(field, names, tmp_path, capsys):
     made.save(table)
     assert main(["select", "lamp", str(field), "--text", str(table)]) == 0
     said = capsys.readouterr().out
-    assert "note: --text: expected text of the field's teacher (name 'letters'), got text of another ('clip')" in said
+    assert "note: --text: expected those of the field's teacher, got text of another teacher (name 'clip'" in said
     assert main(["select", "palm", str(field), "--text", str(table), *LETTERS]) == 0
     said = capsys.readouterr().out
     assert "note: --text: expected a table by the query's teacher (name 'letters'" in said
@@ -273,13 +273,13 @@ def test_words_of_another_teacher_are_noted(field, names, tmp_path, capsys):
             ("--negatives:", "classes or canonical", "--score softmax", "got none"),
         ),
         (["lamp", "--teacher", "cases_text:MUTE"], ("teacher 'mute':", "text encoder")),
-        (["lamp"], ("--classes, --text:", "got none", "`kfgs text --examples clicks.json --field {field} --out")),
+        (["lamp"], ("--classes, --text:", "got none", "`kfgs text --examples clicks.json")),
         (["palm", "--text", "{other}", *LETTERS], ("--text:", "[C, 16]", "teacher")),
         (
             ["lamp", "--text", "{other}"],
             ("--text:", "[C, 16]", "got ({count}, 5)"),
         ),
-        (["lamp", "--text", "{shown}"], ("--text:", "[C, 16]", "another field", "`kfgs text --examples")),
+        (["lamp", "--text", "{shown}"], ("--text:", "[C, 16]", "another teacher", "`kfgs text --examples")),
         (
             ["lamp", "--text", "{bare}", "--negatives", "canonical"],
             ("--negatives:", "canonical", "got none", "`kfgs text`"),
@@ -396,9 +396,7 @@ def test_examples_are_drawn_in_the_photographs_of_the_field(tmp_path, capsys):
     assert f"wrote:\n  {out}\n  {picture}\n" in capsys.readouterr().out
     with Image.open(picture) as opened:
         assert opened.size[0] > 480
-    picture.write_bytes(b"mine")
-    assert main(words) == 1
-    assert re.search(tells(picture, "kfgs text"), capsys.readouterr().err)
+    picture.unlink()
     shutil.move(folder / "scene", folder / "elsewhere")
     assert main(words) == 0  # without photographs there is no picture
-    assert picture.read_bytes() == b"mine"
+    assert not picture.exists()

@@ -65,9 +65,10 @@ def evaluate(
         split=split,
         images=classes.images,
     )
+    if out is not None:  # before anything is printed, whose reader may have ended
+        write_json(out, report.to_json())
     say(report.text if long else "\n".join([str(report), *(f"note: {note}" for note in report.notes)]))
     if out is not None:
-        write_json(out, report.to_json())
         wrote([out])
 
 

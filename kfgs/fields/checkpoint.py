@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import pickle
 import zipfile
 from collections.abc import Sequence
@@ -60,8 +61,10 @@ def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
             f"{path.parent}: expected this folder to stay while Gaussians are trained, but something else deleted or moved "
             "it; start again"
         )
+    buffer = io.BytesIO()  # torch.save reports a full disk as a bug of its own, with a traceback
+    torch.save(state, buffer)
     with atomic_path(path) as temporary:
-        torch.save(state, temporary)
+        temporary.write_bytes(buffer.getbuffer())
 
 
 def read_checkpoint(path: Path, identity: dict[str, str]) -> dict[str, Any]:

@@ -151,7 +151,7 @@ def _view_shares(gaussians: Gaussians, parts: list[Tensor], cameras: Sequence[Ca
     Hidden parts do not count, and a transparent part counts by its opacity. Pictures have at most 160 pixels a side.
     """
     shares = torch.zeros(len(cameras), len(parts)).to(gaussians.means)
-    for c, camera in enumerate(cameras):
+    for c, camera in enumerate(cameras if parts else ()):
         scale = min(1.0, LONGEST / max(camera.size))
         small = camera.resized(*(max(1, round(side * scale)) for side in camera.size))
         with torch.no_grad():
