@@ -19,7 +19,7 @@ def _cloud(path: Path) -> None:
 
 
 def _mesh(path: Path) -> None:
-    from kfgs.formats.ply_mesh import read_mesh
+    from kfgs.formats.ply import read_mesh
 
     read_mesh(path)
 

@@ -22,7 +22,7 @@ from .._files import Names, as_path, check_output, digest_file, digest_value, lo
 from .._origin import to_world
 from ..fields import SemanticField, join_fields, sample_latents, scene_classes
 from ..formats import read_splats, write_splats
-from ..formats.folders import splat_file_of
+from ..formats.table import splat_file_of
 from ..gaussians import Gaussians
 from ..pipeline import Uplift, fit
 from ..pipeline.maps import maps_of_views

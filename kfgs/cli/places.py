@@ -140,7 +140,7 @@ def _of_field(command: str, path: Path, images: Path | None) -> Iterator[Kept]:
     """The files of a field or run, and the parts of the scene that it remembers; the splat of another program's folder."""
     from ..fields import recall_scene
     from ..fields.store import find_field, read_description
-    from ..formats.folders import newest_splat
+    from ..formats.table import newest_splat
 
     field, splat = find_field(path), newest_splat(path)
     if splat is not None:

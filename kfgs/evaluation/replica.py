@@ -12,8 +12,7 @@ from torch import Tensor
 from .._arrays import reading
 from .._files import as_path, read_json, real_path
 from .._origin import in_world
-from ..formats.ply import points_from_columns
-from ..formats.ply_mesh import read_mesh
+from ..formats.ply import points_from_columns, read_mesh
 from ..scenes.files import natural_key, some
 from .label_pictures import Ids, read_ids, relabel
 from .truth import LabelTruth, PointTruth, ReadWhenAsked

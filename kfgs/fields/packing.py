@@ -19,7 +19,7 @@ from torch import Tensor
 
 from .._arrays import most_unpacked
 from .._check import check_choice, check_range
-from ..formats.order import morton_cells, morton_codes
+from ..formats.encodings import morton_cells, morton_codes
 from ..formats.values import unit_quats
 
 Array = NDArray[Any]

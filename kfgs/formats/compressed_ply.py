@@ -13,7 +13,6 @@ and 1 as logits of -10 and 10. The tests use it as an independent reader and wri
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,11 +23,10 @@ from torch import Tensor
 
 from .._notes import tell
 from ..gaussians import Gaussians
-from .order import morton_order
+from .encodings import pack_smallest_three, unpack_smallest_three
 from .ply import Columns, read_comments, read_ply_elements, write_ply_elements
 from .render_mode import comments_of_mode, mode_from_comments, with_mode
-from .smallest_three import pack_smallest_three, rotation_error, unpack_smallest_three
-from .values import NO_DEGREE_4, SH_C0, Precision, colours_to_write, describe_coarse, describe_loss, positive_scales
+from .values import NO_DEGREE_4, SH_C0, colours_to_write, describe_coarse, describe_loss, positive_scales
 
 NAME = "compressed_ply"
 SUFFIXES = (".compressed.ply",)
@@ -134,33 +132,8 @@ def write(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
     write_ply_elements(path, elements, comments=("written by kfgs", *comments_of_mode(gaussians)))
     return (
         describe_loss(gaussians, ".compressed.ply", 3)
-        + describe_coarse(g, _half_steps(values[0], _STEPS), ".compressed.ply")
-        + _words_of_clipping(g, _half_steps(values[2], _COLOR_STEPS))
-    )
-
-
-def precision(gaussians: Gaussians) -> Precision:
-    """Half a step between the bounds of this cloud's chunks in Morton order, plus what the fixed ranges cut off.
-
-    `means` is [N, 3] in the order of `gaussians`; scales, colours and harmonics are those of the worst chunk.
-    """
-    order = morton_order(gaussians.means).cpu()
-    g = colours_to_write(gaussians, ".compressed.ply").select(order)
-    assert g.sh is not None
-    errors = [_half_steps(value, count) for value, count in zip(_quantities(g), _ALL_STEPS, strict=True)]
-    means = torch.empty(len(g), 3, dtype=torch.float64)
-    means[order] = torch.from_numpy(errors[0])
-    log_scales = g.scales.log().numpy()
-    clipped = np.abs(np.clip(log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT) - log_scales)
-    strongest = float(g.sh[:, 1:].abs().max()) if g.sh.shape[1] > 1 and len(g) else 0.0
-    ends = SH_LIMIT - 1 / 32  # the outermost steps are read as the ends of the range, the others as their middles
-    return Precision(
-        means=means,
-        scales=math.expm1(min(float((errors[1] + clipped).max(initial=0.0)), 700.0)) * (1 + 1e-5) + 1e-6,
-        rotation=rotation_error(1023),
-        opacities=0.5 / 255 + 1e-6,
-        sh0=float(errors[2].max(initial=0.0)) / SH_C0 + 1e-6,
-        sh_rest=max(1 / 64 if strongest < ends else 1 / 32, strongest - SH_LIMIT) + 1e-6,
+        + describe_coarse(g, half_steps(values[0], _STEPS), ".compressed.ply")
+        + _words_of_clipping(g, half_steps(values[2], _COLOR_STEPS))
     )
 
 
@@ -193,7 +166,8 @@ def _between(bounds: _Bounds, fraction: NDArray[np.float32]) -> NDArray[np.float
         return bounds.low[chunk] + fraction * (bounds.high - bounds.low)[chunk]
 
 
-def _half_steps(values: NDArray[np.float64], steps: NDArray[np.float32]) -> NDArray[np.float64]:  # [N, 3]
+def half_steps(values: NDArray[np.float64], steps: NDArray[np.float32]) -> NDArray[np.float64]:  # [N, 3]
+    """The largest error of each value in even `steps` between the bounds of its chunk."""
     bounds = _chunk_bounds(values)
     chunk = np.arange(len(values)) // CHUNK
     largest = np.maximum(np.abs(bounds.low), np.abs(bounds.high)).astype(np.float64)

@@ -29,12 +29,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from .._arrays import FileError, reading
 from .._notes import tell
+from ..cameras.similarity import Similarity
 from ..gaussians import Gaussians
-from .gltf_accessors import AccessorWriter, read_accessor
-from .gltf_container import MAGIC as GLB
-from .gltf_container import Document, open_document, write_document
-from .gltf_nodes import place, placed_meshes
+from ..splat.transform import transform_gaussians
+from .gltf_document import MAGIC as GLB
+from .gltf_document import BufferWriter, Document
 from .ply import Columns
 from .render_mode import describe_lost_mode
 from .values import (
@@ -43,7 +44,6 @@ from .values import (
     SCORE,
     SH_C0,
     UP_AND_BACK,
-    Precision,
     colours_to_write,
     describe_loss,
     flip_axes,
@@ -57,7 +57,12 @@ SUFFIXES = (".glb", ".gltf")
 HOLDS_LABELS = True
 HOLDS_ORIGIN = True
 EXTENSION = "KHR_gaussian_splatting"
-KERNEL, COLOR_SPACE, PROJECTION, SORTING = "ellipse", "srgb_rec709_display", "perspective", "cameraDistance"
+_WRITTEN = {
+    "kernel": "ellipse",
+    "colorSpace": "srgb_rec709_display",
+    "projection": "perspective",
+    "sortingMethod": "cameraDistance",
+}
 _UNDERSTOOD = (EXTENSION, "KHR_mesh_quantization")
 _POINTS = 0
 _LEAST_BYTES = 8  # bytes per Gaussian: with fewer, the file shows one buffer many times
@@ -80,37 +85,30 @@ def read(path: Path) -> Gaussians:
         ValueError: if it is damaged, holds no splats, needs an extension that kfgs does not know (compressed splats), or
             a node mirrors or shears its splats.
     """
-    document = open_document(path)
-    required = document.list_of(document.root, "extensionsRequired", "extensionsRequired")
-    unknown = [name for name in required if name not in _UNDERSTOOD]
-    if unknown:
-        raise ValueError(
-            f"{path}: expected a file that needs {EXTENSION} alone, got one that needs {', '.join(map(str, unknown))}; "
-            "write it again without compression"
-        )
-    parts: list[Gaussians] = []
-    ignored, total = 0, 0
-    for where, mesh, matrix in placed_meshes(document):
-        for primitive in document.list_of(document.item("meshes", mesh), "primitives", f"meshes[{mesh}].primitives"):
-            extension = _extension(document, primitive, mesh)
-            if extension is None:
-                ignored += 1
-                continue
-            part = _read_primitive(document, primitive, f"meshes[{mesh}]")
-            total += len(part)
-            if total * _LEAST_BYTES > path.stat().st_size + document.fetched:
-                raise ValueError(
-                    f"{path}: expected {total} Gaussians in more bytes; one buffer is shown too many times"
-                )
-            parts.append(place(document, where, part, matrix))
-            for key, drawn in (("colorSpace", COLOR_SPACE), ("projection", PROJECTION)):
-                if extension.get(key, drawn) != drawn:
-                    tell(f"{path.name}: the file says {key} {extension[key]!r:.80}: drawn as if it were {drawn!r}")
-    if not parts:
-        raise ValueError(
-            f"{path}: expected a primitive with {EXTENSION}, got {ignored} primitives without; it holds no splats"
-        )
-    return flip_axes(_join(parts), UP_AND_BACK)
+    with reading(path, "glTF 2.0 with Gaussians", "export it again"):
+        document = Document(path)
+        unknown = [name for name in document.root.get("extensionsRequired", []) if name not in _UNDERSTOOD]
+        if unknown:
+            raise FileError(
+                f"{path}: expected a file that needs {EXTENSION} alone, got one that needs {', '.join(map(str, unknown))}; "
+                "write it again without compression"
+            )
+        parts: list[Gaussians] = []
+        total = 0
+        for where, mesh, matrix in document.placed_meshes():
+            for primitive in document.item("meshes", mesh).get("primitives", []):
+                if EXTENSION not in primitive.get("extensions", {}):
+                    continue
+                part = _read_primitive(document, primitive, f"meshes[{mesh}]")
+                total += len(part)
+                if total * _LEAST_BYTES > path.stat().st_size + document.fetched:
+                    raise FileError(
+                        f"{path}: expected {total} Gaussians in more bytes; one buffer is shown too many times"
+                    )
+                parts.append(_place(document, where, part, matrix))
+        if not parts:
+            raise FileError(f"{path}: expected a primitive with {EXTENSION}, got none; it holds no splats")
+        return flip_axes(_join(parts), UP_AND_BACK)
 
 
 def write(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
@@ -123,23 +121,22 @@ def write(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
     if len(g) == 0:
         raise ValueError("gaussians: expected at least one Gaussian, got none; glTF has no empty accessors, write .ply")
     assert g.sh is not None
-    writer = AccessorWriter()
-    quats = unit_quats(g.quats)[:, [1, 2, 3, 0]]
+    writer = BufferWriter()
     attributes = {
         "POSITION": writer.add(g.means.numpy(), bounds=True),
-        f"{EXTENSION}:ROTATION": writer.add(quats.numpy()),
+        f"{EXTENSION}:ROTATION": writer.add(unit_quats(g.quats)[:, [1, 2, 3, 0]].numpy()),
         f"{EXTENSION}:SCALE": writer.add(g.scales.numpy()),
         f"{EXTENSION}:OPACITY": writer.add(g.opacities.clamp(0, 1).numpy()),
     }
     for k in range(g.sh.shape[1]):
         attributes[_coefficient(k)] = writer.add(g.sh[:, k].numpy())
-    attributes["COLOR_0"] = writer.add(_fallback(g))
-    extras, kept = _write_columns(g, writer, attributes)
-    extension = {"kernel": KERNEL, "colorSpace": COLOR_SPACE, "projection": PROJECTION, "sortingMethod": SORTING}
+    color = torch.cat([g.sh[:, 0] * SH_C0 + 0.5, g.opacities[:, None]], 1)
+    attributes["COLOR_0"] = writer.add((color.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
+    extras = _write_columns(g, writer, attributes)
     primitive = {
         "mode": _POINTS,
         "attributes": attributes,
-        "extensions": {EXTENSION: extension},
+        "extensions": {EXTENSION: _WRITTEN},
         "extras": {"kfgs": extras},
     }
     root = {
@@ -149,68 +146,56 @@ def write(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, **({"translation": list(g.origin)} if any(g.origin) else {})}],
         "meshes": [{"primitives": [primitive]}],
-        "accessors": writer.accessors,
-        "bufferViews": writer.views,
     }
-    write_document(path, root, writer.binary())
-    left = {name: values for name, values in g.extra.items() if name not in kept}
+    writer.write(path, root)
+    left = {name: values for name, values in g.extra.items() if name not in extras["columns"].values()}
     lost = describe_loss(gaussians.replace(scores=None, extra=left), path.suffix, 3)
     return lost + describe_lost_mode(gaussians, path.suffix)
 
 
-def precision(gaussians: Gaussians) -> Precision:
-    """float32 of the values themselves; rotations are brought to length 1."""
-    return Precision(means=0.0, scales=1e-6, rotation=1e-3, opacities=1e-7, sh0=0.0, sh_rest=0.0)
-
-
-def _extension(document: Document, primitive: object, mesh: int) -> dict[str, Any] | None:
-    if not isinstance(primitive, dict):
-        raise document.wrong(f"meshes[{mesh}].primitives", "objects", primitive)
-    extensions = document.table(primitive, "extensions", f"meshes[{mesh}].extensions")
-    if EXTENSION not in extensions:
-        return None
-    extension = document.table(extensions, EXTENSION, EXTENSION)
-    nested = document.table(extension, "extensions", f"{EXTENSION}.extensions")
-    if extension.get("kernel", KERNEL) != KERNEL or nested:
-        got = ", ".join(nested) or repr(extension["kernel"])
-        raise ValueError(
-            f"{document.path}: meshes[{mesh}]: expected Gaussians of the kernel {KERNEL!r} without a further extension, "
-            f"got {got}; write it again as plain {EXTENSION}"
+def _read_primitive(document: Document, primitive: dict[str, Any], where: str) -> Gaussians:
+    extension, attributes = primitive["extensions"][EXTENSION], primitive["attributes"]
+    kernel = extension.get("kernel", _WRITTEN["kernel"])
+    if kernel != _WRITTEN["kernel"] or extension.get("extensions"):
+        got = ", ".join(extension.get("extensions", ())) or repr(kernel)
+        raise FileError(
+            f"{document.path}: {where}: expected Gaussians of the kernel {_WRITTEN['kernel']!r} without a further extension, "
+            f"got {got:.80}; write it again as plain {EXTENSION}"
         )
     if primitive.get("mode", 4) != _POINTS:
-        raise document.wrong(f"meshes[{mesh}].mode", "0 (points)", primitive.get("mode", 4))
-    return extension
-
-
-def _read_primitive(document: Document, primitive: dict[str, Any], where: str) -> Gaussians:
-    attributes = document.table(primitive, "attributes", f"{where}.attributes")
+        raise document.wrong(f"{where}.mode", "0 (points)", primitive.get("mode", 4))
+    for key in ("colorSpace", "projection"):
+        if extension.get(key, _WRITTEN[key]) != _WRITTEN[key]:
+            said = f"the file says {key} {extension[key]!r:.80}"
+            tell(f"{document.path.name}: {said}: drawn as if it were {_WRITTEN[key]!r}")
 
     def values(width: int, *names: str) -> NDArray[np.float32] | None:
         index = next((attributes[name] for name in names if name in attributes), None)
-        return None if index is None else read_accessor(document, index, width, count)
+        return None if index is None else document.values(index, width, count)
 
     count: int | None = None
     means = values(3, "POSITION")
     count = None if means is None else len(means)
     quats = values(4, f"{EXTENSION}:ROTATION", "_ROTATION")
     scales = values(3, f"{EXTENSION}:SCALE", "_SCALE")
-    color = values(0, "COLOR_0")
-    opacities = values(1, f"{EXTENSION}:OPACITY")
-    base = values(3, _coefficient(0))
-    if opacities is None and color is not None and color.shape[1] == 4:
-        opacities = color[:, 3:]
-    if base is None and color is not None and color.shape[1] >= 3:
-        base = (color[:, :3] - 0.5) / np.float32(SH_C0)
+    opacities, base, color = values(1, f"{EXTENSION}:OPACITY"), values(3, _coefficient(0)), values(0, "COLOR_0")
+    if color is not None:
+        opacities = color[:, 3:] if opacities is None and color.shape[1] == 4 else opacities
+        base = (color[:, :3] - 0.5) / np.float32(SH_C0) if base is None and color.shape[1] >= 3 else base
     if means is None or quats is None or scales is None or opacities is None or base is None:
         raise document.wrong(f"{where}.attributes", "POSITION, ROTATION, SCALE, OPACITY and SH_DEGREE_0", [*attributes])
-    coefficients = [base, *_higher(document, attributes, where, len(means))]
+    have = [k for k in range(1, 25) if _coefficient(k) in attributes]
+    if len(have) not in (0, 3, 8, 15, 24) or have != list(range(1, len(have) + 1)):
+        raise document.wrong(f"{where}.attributes", "whole degrees of harmonics", [_coefficient(k) for k in have][-3:])
+    if len(have) > 15:
+        tell(f"{document.path.name}: {NO_DEGREE_4}")
     outside = opacities[np.isfinite(opacities) & ((opacities < 0) | (opacities > 1))]
     if outside.size:
         raise document.wrong(f"{where}.OPACITY", "values in [0, 1]", outside[:4].tolist())
     if (scales < 0).any():  # "MUST NOT be negative": a draft's logarithms
         with np.errstate(invalid="ignore"):  # left out
             scales = np.exp(np.minimum(scales, np.float32(80)))
-    sh = np.stack(coefficients, 1)
+    sh = np.stack([base, *(document.values(attributes[_coefficient(k)], 3, count) for k in have[:15])], 1)
     gaussians = Gaussians(
         means=torch.from_numpy(means),
         quats=torch.from_numpy(quats)[:, [3, 0, 1, 2]],
@@ -218,7 +203,7 @@ def _read_primitive(document: Document, primitive: dict[str, Any], where: str) -
         opacities=torch.from_numpy(opacities[:, 0].copy()),
         sh=torch.from_numpy(sh),
     )
-    return _read_columns(document, primitive, attributes, gaussians, where)
+    return _read_columns(document, primitive, gaussians, where)
 
 
 def _coefficient(k: int) -> str:
@@ -227,45 +212,41 @@ def _coefficient(k: int) -> str:
     return f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - degree * degree}"
 
 
-def _higher(
-    document: Document, attributes: dict[str, Any], where: str, count: int
-) -> list[NDArray[np.float32]]:  # of [N, 3]
-    """The coefficients of degrees 1 to 4, as far as present; each degree must be complete, and none skipped."""
-    have = [k for k in range(1, 25) if _coefficient(k) in attributes]
-    if len(have) not in (0, 3, 8, 15, 24) or have != list(range(1, len(have) + 1)):
-        raise document.wrong(f"{where}.attributes", "whole degrees of harmonics", [_coefficient(k) for k in have][-3:])
-    return [read_accessor(document, attributes[_coefficient(k)], 3, count) for k in have if k < 16]
-
-
-def _read_columns(
-    document: Document, primitive: dict[str, Any], attributes: dict[str, Any], gaussians: Gaussians, where: str
-) -> Gaussians:
+def _read_columns(document: Document, primitive: dict[str, Any], gaussians: Gaussians, where: str) -> Gaussians:
     """Labels, score and other columns: attributes of one number whose name begins with an underscore."""
     extras = primitive.get("extras")
     ours = extras.get("kfgs") if isinstance(extras, dict) else None
     ours = ours if isinstance(ours, dict) else {}
-    names, classes = ours.get("columns"), ours.get("classes")
-    names = names if isinstance(names, dict) else {}
+    names, classes = ours.get("columns", {}), ours.get("classes", [])
     extra: Columns = {}
-    for attribute, index in attributes.items():
+    for attribute, index in primitive["attributes"].items():
         known = attribute in ("_ROTATION", "_SCALE")
         if known or not attribute.startswith("_") or document.item("accessors", index).get("type") != "SCALAR":
             continue
-        name = names.get(attribute)
-        name = name if isinstance(name, str) else attribute[1:].lower()
-        extra[name] = read_accessor(document, index, 1, len(gaussians))[:, 0].copy()
-    if _coefficient(16) in attributes:
-        tell(f"{document.path.name}: {NO_DEGREE_4}")
-    labels = extra.pop("class_id", None)
+        extra[str(names.get(attribute, attribute[1:].lower()))] = document.values(index, 1, len(gaussians))[:, 0].copy()
+    labels, score = extra.pop("class_id", None), extra.pop(SCORE, None)
     if labels is not None:
         if (labels != np.trunc(labels))[np.isfinite(labels)].any() or (labels < -1).any() or (labels > EXACT).any():
             raise document.wrong(f"{where}._CLASS_ID", "whole numbers of -1 or more", labels[:4].tolist())
         gaussians = gaussians.replace(labels=whole_labels(labels))
-    if labels is None or not isinstance(classes, list) or not all(isinstance(name, str) for name in classes):
+    if labels is None or not all(isinstance(name, str) for name in classes):
         classes = []
-    score = extra.pop(SCORE, None)
     scores = None if score is None else torch.from_numpy(score)
     return gaussians.replace(scores=scores, names=tuple(classes), extra=extra)
+
+
+def _place(document: Document, where: str, gaussians: Gaussians, matrix: Tensor) -> Gaussians:  # matrix: [4, 4]
+    """Apply a node's matrix to the Gaussians of its mesh, and turn their colours with it."""
+    if torch.equal(matrix, torch.eye(4, dtype=torch.float64)):
+        return gaussians
+    try:
+        similarity = Similarity.from_matrix(matrix)
+    except ValueError as error:
+        raise FileError(
+            f"{document.path}: {where}: expected a rotation, one scale for all axes and a translation ({error}); apply "
+            "the node's transform in the program that wrote it"
+        ) from error
+    return transform_gaussians(gaussians, similarity)
 
 
 def _join(parts: list[Gaussians]) -> Gaussians:
@@ -290,15 +271,8 @@ def _join(parts: list[Gaussians]) -> Gaussians:
     return Gaussians.cat(padded)
 
 
-def _fallback(g: Gaussians) -> NDArray[np.uint8]:  # [N, 4]
-    """Base colour and opacity, for viewers that cannot draw splats."""
-    assert g.sh is not None
-    color = torch.cat([g.sh[:, 0] * SH_C0 + 0.5, g.opacities[:, None]], 1)
-    return (color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-
-
-def _write_columns(g: Gaussians, writer: AccessorWriter, attributes: dict[str, int]) -> tuple[dict[str, Any], set[str]]:
-    """Add labels and other columns; returns their entry in `extras`, and the names of the columns that fit."""
+def _write_columns(g: Gaussians, writer: BufferWriter, attributes: dict[str, int]) -> dict[str, Any]:
+    """Add labels and the columns that float32 holds; returns the entry in `extras`, with the names of these columns."""
     columns: Columns = {}
     if g.labels is not None:
         columns["class_id"] = g.labels.numpy()
@@ -308,7 +282,7 @@ def _write_columns(g: Gaussians, writer: AccessorWriter, attributes: dict[str, i
         columns[SCORE] = g.scores.numpy().astype(np.float32)
     for name, values in g.extra.items():
         as_written = values.astype(np.float32)
-        if np.array_equal(as_written.astype(values.dtype), values):  # float32 holds them
+        if np.array_equal(as_written.astype(values.dtype), values):
             columns[name] = as_written
     extras: dict[str, Any] = {"columns": {}}
     for name, values in columns.items():
@@ -320,4 +294,4 @@ def _write_columns(g: Gaussians, writer: AccessorWriter, attributes: dict[str, i
             extras["columns"][attribute] = name
     if g.labels is not None and g.names:
         extras["classes"] = list(g.names)
-    return extras, set(extras["columns"].values())
+    return extras

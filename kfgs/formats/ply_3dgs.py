@@ -26,7 +26,6 @@ from .values import (
     NO_DEGREE_4,
     SCORE,
     SH_C0,
-    Precision,
     colours_to_write,
     describe_loss,
     positive_scales,
@@ -100,11 +99,6 @@ def write_plain(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
     return describe_loss(gaussians, what, 3)
 
 
-def precision(gaussians: Gaussians) -> Precision:
-    """float32 of logarithms and logits."""
-    return Precision(means=0.0, scales=1e-5, rotation=1e-3, opacities=1e-5, sh0=0.0, sh_rest=0.0)
-
-
 def _is_ours(name: str) -> bool:
     known = {"x", "y", "z", "opacity", "class_id", SCORE, FILTER, *NORMALS}
     return name in known or name.startswith(("f_dc_", "f_rest_", "scale_", "rot_", "semantic_"))
@@ -129,7 +123,7 @@ def gaussians_from_columns(columns: Columns) -> Gaussians:
     Raises:
         ValueError: if a column of the 3DGS layout is missing, or numbered columns have gaps or an odd count.
     """
-    if {"scale_0", "scale_1"} <= columns.keys():  # 2DGS has no third; `render_mode.flattened` makes it thin
+    if {"scale_0", "scale_1"} <= columns.keys():  # 2DGS has no third; `with_mode` makes it thin
         columns = {"scale_2": np.minimum(columns["scale_0"], columns["scale_1"]), **columns}
     needed = ["x", "y", "z", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     missing = [name for name in needed if name not in columns]

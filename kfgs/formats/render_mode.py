@@ -40,19 +40,12 @@ class Mode(NamedTuple):
     unknown: tuple[str, ...] = ()  # what kfgs does not know, as the file writes it
 
 
+_PLAIN, _MIP, _SURFELS = Mode(), Mode(antialiased=True), Mode(surfels=True)
 _MODES = {
-    "default": Mode(),
-    "0": Mode(),
-    "1": Mode(antialiased=True),
-    "mip": Mode(antialiased=True),
-    "antialiased": Mode(antialiased=True),
-    "2dgs": Mode(surfels=True),
-}
-_VALUES = {
-    "splatrendermode:": ("default", "mip", "2dgs"),
-    "antialiased": ("0", "1"),
-    "postshot.anti_aliasing": ("0", "1"),
-    "model": ("default", "antialiased", "2dgs"),
+    "splatrendermode:": {"default": _PLAIN, "mip": _MIP, "2dgs": _SURFELS},
+    "antialiased": {"0": _PLAIN, "1": _MIP},
+    "postshot.anti_aliasing": {"0": _PLAIN, "1": _MIP},
+    "model": {"default": _PLAIN, "antialiased": _MIP, "2dgs": _SURFELS},
 }
 """What a file may say, by the word that announces it."""
 
@@ -62,50 +55,40 @@ def mode_from_comments(comments: Iterable[str]) -> Mode:
     mode, unknown = Mode(), []
     for comment in comments:
         key, *values = comment.lower().replace("=", " ").split() or [""]
-        if key not in _VALUES or len(values) != 1:
-            continue
-        if values[0] in _VALUES[key]:
-            mode = _MODES[values[0]]
-        else:
-            unknown.append(comment.strip())
+        if key in _MODES and len(values) == 1:
+            mode = _MODES[key].get(values[0], mode)
+            unknown += [comment.strip()] * (values[0] not in _MODES[key])
     return mode._replace(unknown=tuple(unknown))
 
 
 def mode_from_meta(meta: Mapping[str, Any]) -> Mode:
     """Read the mode from the `meta.json` of a SOG scene; `model` has priority over `antialias`."""
     model, antialias = meta.get("model"), meta.get("antialias")
-    if model in _VALUES["model"]:
-        return _MODES[model]
+    if isinstance(model, str) and model in _MODES["model"]:
+        return _MODES["model"][model]
     said = {"model": model, "antialias": None if isinstance(antialias, bool) else antialias}
     unknown = tuple(f"{key}: {value!r:.40}" for key, value in said.items() if value is not None)
     return Mode(antialias is True, unknown=unknown)
 
 
 def with_mode(path: Path, gaussians: Gaussians, mode: Mode) -> Gaussians:
-    """A cloud that is drawn as its file says, with notes where that is not quite possible."""
+    """A cloud that is drawn as its file says, with notes where that is not quite possible.
+
+    Surfels have no extent along their third axis, whatever the file has there.
+    """
     for words in mode.unknown:
         tell(f"{path.name}: the file says {words!r}, which kfgs does not know: drawn as 3-D Gaussians")
     if mode.surfels:
         tell(f"{path.name}: {AS_FLAT}")
-        gaussians = flattened(gaussians)
+        sides, depth = gaussians.scales[:, :2], gaussians.scales[:, 2]
+        depth = torch.minimum(depth, FLAT * sides.amin(dim=1))
+        gaussians = gaussians.replace(scales=torch.cat([sides, depth[:, None]], dim=1))
     return gaussians.replace(antialiased=mode.antialiased)
-
-
-def flattened(gaussians: Gaussians) -> Gaussians:
-    """Surfels as 3-D Gaussians: they have no extent along their third axis, whatever the file has there."""
-    sides, depth = gaussians.scales[:, :2], gaussians.scales[:, 2]
-    depth = torch.minimum(depth, FLAT * sides.amin(dim=1))
-    return gaussians.replace(scales=torch.cat([sides, depth[:, None]], dim=1))
 
 
 def comments_of_mode(gaussians: Gaussians) -> tuple[str, ...]:
     """Comments for a PLY header, in the words of Brush and of Postshot; none for an ordinary cloud."""
     return ("SplatRenderMode: mip", "antialiased 1") if gaussians.antialiased else ()
-
-
-def meta_of_mode(gaussians: Gaussians) -> dict[str, Any]:
-    """Keys for the `meta.json` of a SOG scene; none for an ordinary cloud."""
-    return {"antialias": True, "model": "antialiased"} if gaussians.antialiased else {}
 
 
 def describe_lost_mode(gaussians: Gaussians, name: str) -> tuple[str, ...]:

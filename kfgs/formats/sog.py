@@ -13,27 +13,27 @@ use it as an independent reader.
 
 from __future__ import annotations
 
+import io
 import json
 import math
+import zipfile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor
 
-from .._files import atomic_folder, atomic_path
+from .._files import atomic_path
 from .._notes import tell
 from ..gaussians import Gaussians
-from .order import morton_order
-from .palette import Palette, fit_codebook, fit_palette, nearest_codes
-from .render_mode import meta_of_mode, with_mode
+from .encodings import fit_codebook, fit_palette, nearest_codes, pack_smallest_three, unpack_smallest_three
+from .render_mode import with_mode
 from .sidecar import read_sidecar
-from .smallest_three import pack_smallest_three, rotation_error, unpack_smallest_three
-from .sog_images import META, SogFiles, encode_image, write_zip
-from .sog_meta import SogMeta, parse_meta
-from .values import NO_DEGREE_4, Precision, colours_to_write, describe_coarse, describe_loss, positive_scales
+from .sog_files import META, SogFiles, SogMeta, parse_meta
+from .values import NO_DEGREE_4, colours_to_write, describe_coarse, describe_loss, positive_scales
 
 NAME = "sog"
 SUFFIXES = (".sog",)
@@ -43,15 +43,7 @@ SORTS = True
 _LARGEST_FIRST = 252  # alpha of a rotation whose largest component is w
 _PER_LINE = 64  # rows of the palette in a line of its image
 _LEVELS = 65535
-REST_FILES = ("shN_centroids.webp", "shN_labels.webp")
-
-
-class _Rest(NamedTuple):
-    """The higher harmonics as they are stored."""
-
-    palette: Palette  # rows [P, (K - 1) * 3]
-    codebook: NDArray[np.float32]  # [256]
-    codes: NDArray[np.uint8]  # [P, (K - 1) * 3]
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # a fixed date, so that equal scenes give equal files
 
 
 def matches(head: bytes) -> bool:
@@ -67,7 +59,7 @@ def read(path: Path) -> Gaussians:
     """
     with SogFiles(path) as files:
         meta = parse_meta(path, files.read_meta(), files.size())
-        n = meta.gaussians
+        n = meta.size
         low, high = (_pixels(files, name, n)[:, :3].astype(np.float64) for name in meta.files["means"])
         scales = _pixels(files, meta.files["scales"][0], n)
         rgba = _pixels(files, meta.files["sh0"][0], n)
@@ -78,11 +70,15 @@ def read(path: Path) -> Gaussians:
     with np.errstate(over="ignore", invalid="ignore"):  # left out
         means = np.sign(logs) * np.expm1(np.abs(logs))
         linear = np.exp(_look_up(meta.tables["scales"], scales[:, :3]))
+    opacities = torch.from_numpy(rgba[:, 3].astype(np.float32) / 255)
+    if meta.logits is not None:
+        least, largest = meta.logits
+        opacities = torch.from_numpy((least + (largest - least) * (rgba[:, 3] / 255.0)).astype(np.float32)).sigmoid()
     gaussians = Gaussians(
         means=torch.from_numpy(means),
         quats=quats,
         scales=positive_scales(path, linear),
-        opacities=_opacities(meta, rgba[:, 3]),
+        opacities=opacities,
         sh=torch.from_numpy(sh[:, :16]),
     )
     if sh.shape[1] > 16:
@@ -92,45 +88,26 @@ def read(path: Path) -> Gaussians:
 
 
 def write(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
-    """Write version 2 in the given order: a zip file if the name ends in .sog, else a folder.
+    """Write version 2 in the given order, as a zip file without compression (its images have it) and without dates.
 
     Raises:
-        ValueError: if the cloud has no colours, or there is a folder of that name with files that do not belong to a SOG scene.
+        ValueError: if the cloud has no colours.
     """
     g = colours_to_write(gaussians, ".sog")
-    files = _encode(g, meta_of_mode(gaussians))
-    if path.name.lower().endswith(SUFFIXES):
-        with atomic_path(path) as temporary:
-            write_zip(temporary, files)
-    else:
-        _check_folder(path)
-        with atomic_folder(path) as folder:
-            for name, data in files.items():
-                (folder / name).write_bytes(data)
-        for name in set(REST_FILES) - set(files):  # of an older scene with more harmonics
-            (path / name).unlink(missing_ok=True)
-    return describe_loss(gaussians, ".sog", 3) + describe_coarse(g, _errors(g.means.numpy()), ".sog")
+    mode = {"antialias": True, "model": "antialiased"} if gaussians.antialiased else {}
+    files = _encode(g, mode)
+    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
+        for name, data in files.items():
+            archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)
+    return describe_loss(gaussians, ".sog", 3) + describe_coarse(g, position_errors(g.means.numpy()), ".sog")
 
 
-def precision(gaussians: Gaussians) -> Precision:
-    """The errors with this cloud's codebooks and palette; `means` is [N, 3] in the order of `gaussians`.
-
-    Takes as long as writing, because codebooks and palette are fitted.
-    """
-    g = colours_to_write(gaussians, ".sog").select(morton_order(gaussians.means).cpu())
-    assert g.sh is not None
-    rest = _fit_rest(g.sh)
-    return Precision(
-        means=_errors(gaussians.means.detach().cpu().double().numpy()),
-        scales=math.expm1(_code_error(g.scales.log().numpy())) + 1e-5,
-        rotation=rotation_error(255),
-        opacities=0.5 / 255 + 1e-6,
-        sh0=_code_error(g.sh[:, 0].numpy()) + 1e-6,
-        sh_rest=_rest_error(g.sh, rest) + 1e-6,
-    )
-
-
-# Reading
+def position_errors(means: NDArray[np.float64]) -> Tensor:  # [N, 3] -> [N, 3]
+    """The largest errors of positions, in world units: half a step of the logarithm."""
+    logs = _log_positions(means)
+    half_step = (logs.max(0) - logs.min(0)) / _LEVELS / 2 if len(means) else np.zeros(3)
+    size = np.exp(np.abs(logs))
+    return torch.from_numpy(size * np.expm1(half_step) * (1 + 1e-6) + size * 2.0**-23)
 
 
 def _pixels(files: SogFiles, name: str, count: int) -> NDArray[np.uint8]:  # [count, 4]
@@ -141,15 +118,8 @@ def _look_up(table: NDArray[np.float32], codes: NDArray[np.uint8]) -> NDArray[np
     return np.stack([table[channel][codes[..., channel]] for channel in range(3)], -1)
 
 
-def _opacities(meta: SogMeta, alpha: NDArray[np.uint8]) -> Tensor:  # [N]
-    if meta.logits is None:
-        return torch.from_numpy(alpha.astype(np.float32) / 255)
-    low, high = meta.logits
-    return torch.from_numpy((low + (high - low) * (alpha / 255.0)).astype(np.float32)).sigmoid()
-
-
 def _read_rotations(files: SogFiles, meta: SogMeta) -> Tensor:  # [N, 4] wxyz
-    pixels = _pixels(files, meta.files["quats"][0], meta.gaussians)
+    pixels = _pixels(files, meta.files["quats"][0], meta.size)
     if (pixels[:, 3] < _LARGEST_FIRST).any():
         row = int((pixels[:, 3] < _LARGEST_FIRST).argmax())
         raise ValueError(
@@ -161,41 +131,26 @@ def _read_rotations(files: SogFiles, meta: SogMeta) -> Tensor:  # [N, 4] wxyz
 
 
 def _read_rest(files: SogFiles, meta: SogMeta) -> NDArray[np.float32]:  # [N, K - 1, 3]
+    """The higher harmonics. Version 1 does not say their degree and the palette's size: the images do."""
     if "shN" not in meta.files:
-        return np.zeros((meta.gaussians, 0, 3), np.float32)
-    names = meta.files["shN"]
-    labels = _pixels(files, names[1], meta.gaussians)[:, :2].astype(np.int64) @ np.array([1, 256])
+        return np.zeros((meta.size, 0, 3), np.float32)
+    centroids, indices = meta.files["shN"]
+    labels = _pixels(files, indices, meta.size)[:, :2].astype(np.int64) @ np.array([1, 256])
     size = int(labels.max(initial=-1)) + 1 if meta.palette is None else meta.palette
     lines = -(-size // _PER_LINE)
-    widths = {1: 3 * _PER_LINE, 2: 8 * _PER_LINE, 3: 15 * _PER_LINE, 4: 24 * _PER_LINE}
-    image = files.read_image(names[0], lines * widths[meta.degree or 1], max(lines, 1024) * widths[4])[:, :, :3]
+    widths = {degree: ((degree + 1) ** 2 - 1) * _PER_LINE for degree in (1, 2, 3, 4)}
+    image = files.read_image(centroids, lines * widths[meta.degree or 1], max(lines, 1024) * widths[4])[:, :, :3]
     expected = [widths[meta.degree]] if meta.degree else list(widths.values())
-    if image.shape[1] not in expected or len(image) < lines:
+    if image.shape[1] not in expected or len(image) < lines or labels.max(initial=-1) >= size:
         raise ValueError(
-            f"{files.path}: expected {names[0]!r} of {' or '.join(map(str, expected))} x {lines} pixels, got "
-            f"{image.shape[1]} x {image.shape[0]}; export it again"
+            f"{files.path}: expected {centroids!r} of {' or '.join(map(str, expected))} x {lines} pixels, and indices below "
+            f"{size} in {indices!r}, got {image.shape[1]} x {image.shape[0]} and {labels.max(initial=-1)}; export it again"
         )
-    if len(labels) and labels.max() >= size:
-        raise ValueError(
-            f"{files.path}: expected labels below {size} in {names[1]!r}, got {labels.max()}; export it again"
-        )
-    codes = image.reshape(-1, image.shape[1] // _PER_LINE, 3)[labels]
-    return _look_up(meta.tables["shN"], codes)
-
-
-# Writing
+    return _look_up(meta.tables["shN"], image.reshape(-1, image.shape[1] // _PER_LINE, 3)[labels])
 
 
 def _log_positions(means: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sign(means) * np.log1p(np.abs(means))
-
-
-def _errors(means: NDArray[np.float64]) -> Tensor:  # [N, 3] -> [N, 3]
-    """The largest errors of positions: half a step of the logarithm."""
-    logs = _log_positions(means)
-    half_step = (logs.max(0) - logs.min(0)) / _LEVELS / 2 if len(means) else np.zeros(3)
-    size = np.exp(np.abs(logs))
-    return torch.from_numpy(size * np.expm1(half_step) * (1 + 1e-6) + size * 2.0**-23)
 
 
 def _encode(g: Gaussians, mode: dict[str, Any]) -> dict[str, bytes]:
@@ -225,58 +180,38 @@ def _encode(g: Gaussians, mode: dict[str, Any]) -> dict[str, bytes]:
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": books["sh0"].tolist(), "files": ["sh0.webp"]},
     }
-    rest = _fit_rest(g.sh)
-    if rest is not None:
-        names = list(REST_FILES)
-        images |= dict(zip(names, _rest_images(rest), strict=True))
-        degree = {9: 1, 24: 2, 45: 3}[rest.codes.shape[1]]
-        book = rest.codebook.tolist()
-        meta["shN"] = {"count": len(rest.codes), "bands": degree, "codebook": book, "files": names}
-    encoded = {name: encode_image(pixels.astype(np.uint8)) for name, pixels in images.items()}
+    if g.sh.shape[1] > 1 and len(g):
+        codebook, codes, labels = encode_rest(g.sh)
+        padded = np.zeros((-(-len(codes) // _PER_LINE) * _PER_LINE, codes.shape[1]), np.uint8)
+        padded[: len(codes)] = codes
+        images["shN_centroids.webp"] = padded.reshape(len(padded) // _PER_LINE, -1, 3)
+        images["shN_labels.webp"] = np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], 1)
+        names, degree = ["shN_centroids.webp", "shN_labels.webp"], math.isqrt(g.sh.shape[1]) - 1
+        meta["shN"] = {"count": len(codes), "bands": degree, "codebook": codebook.tolist(), "files": names}
+    encoded = {name: _encode_image(pixels.astype(np.uint8)) for name, pixels in images.items()}
     return {META: json.dumps(meta, allow_nan=False).encode(), **encoded}
 
 
-def _fit_rest(sh: Tensor) -> _Rest | None:  # [N, K, 3]
-    """A palette of the higher harmonics: 1,024 rows, doubled up to 65,536 for more Gaussians."""
-    if sh.shape[1] == 1 or not len(sh):
-        return None
+def encode_rest(sh: Tensor) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int64]]:  # [N, K, 3]
+    """Codebook [256], a palette of higher harmonics as its indices [P, (K - 1) * 3], and each Gaussian's row of it [N].
+
+    The palette has 1,024 rows, doubled up to 65,536 for more Gaussians.
+    """
     size = 1024 * min(64, 2 ** int(math.log2(max(len(sh), 1024) / 1024)))
-    palette = fit_palette(sh[:, 1:].flatten(1).float(), size)
-    rows = palette.rows.double().numpy()
+    palette, labels = fit_palette(sh[:, 1:].flatten(1).float(), size)
+    rows = palette.double().numpy()
     codebook = fit_codebook(rows)
-    return _Rest(palette, codebook, nearest_codes(codebook, rows))
+    return codebook, nearest_codes(codebook, rows), labels.numpy()
 
 
-def _rest_images(rest: _Rest) -> tuple[NDArray[Any], NDArray[Any]]:
-    """The palette, 64 rows to a line, and each Gaussian's row in two bytes."""
-    lines = -(-len(rest.codes) // _PER_LINE)
-    padded = np.zeros((lines * _PER_LINE, rest.codes.shape[1]), np.uint8)
-    padded[: len(rest.codes)] = rest.codes
-    labels = rest.palette.labels.numpy()
-    return padded.reshape(lines, -1, 3), np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], 1)
-
-
-def _code_error(values: NDArray[np.float64]) -> float:
-    book = fit_codebook(values)
-    return float(np.abs(book[nearest_codes(book, values)] - values).max(initial=0.0))
-
-
-def _rest_error(sh: Tensor, rest: _Rest | None) -> float:
-    if rest is None:
-        return 0.0
-    stored = torch.from_numpy(rest.codebook[rest.codes])[rest.palette.labels]
-    return float((stored - sh[:, 1:].flatten(1)).abs().max())
-
-
-def _check_folder(path: Path) -> None:
-    """Raise unless a folder holds only a scene, whose files are replaced."""
-    if not path.exists():
-        return
-    others = [] if path.is_dir() else [path.name]
-    if path.is_dir():
-        others = [file.name for file in path.iterdir() if file.name != META and file.suffix != ".webp"]
-    if others or path.name == META:
-        raise ValueError(
-            f"path: expected a new folder, or one with a SOG scene alone, got {path} with {', '.join(others[:3])}; choose "
-            "another name, or one that ends in .sog"
-        )
+def _encode_image(pixels: NDArray[np.uint8]) -> bytes:  # [n, 3 or 4] or [H, W, 3 or 4]
+    """A lossless WebP image; rows of values become an image about as high as wide, its sides multiples of 4."""
+    if pixels.ndim == 2:
+        width = 4 * max(1, math.ceil(math.sqrt(len(pixels)) / 4))
+        height = 4 * max(1, math.ceil(len(pixels) / width / 4))
+        image = np.zeros((height * width, pixels.shape[1]), np.uint8)
+        image[: len(pixels)] = pixels
+        pixels = image.reshape(height, width, -1)
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, "WEBP", lossless=True, exact=True, quality=50, method=4)
+    return stream.getvalue()

@@ -18,8 +18,6 @@ from ..gaussians import Gaussians
 from .render_mode import describe_lost_mode
 from .values import (
     SH_C0,
-    Precision,
-    byte_error,
     colours_to_write,
     describe_cut,
     describe_loss,
@@ -84,17 +82,3 @@ def write(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
         rows.tofile(temporary)
     cut = describe_cut(rgba[:, :3], 0.0, 1.0, "colours", ".splat")
     return describe_loss(gaussians, ".splat", 0) + cut + describe_lost_mode(gaussians, ".splat")
-
-
-def precision(gaussians: Gaussians) -> Precision:
-    """Positions and scales exactly; colour and opacity in 255 steps, colours beyond 0 to 1 cut off."""
-    sh = torch.zeros(0) if gaussians.sh is None else gaussians.sh[:, 0].double()
-    return Precision(
-        means=0.0,
-        scales=1e-6,
-        rotation=_ROTATION,
-        opacities=0.5 / 255 + 1e-6,
-        sh0=byte_error(sh, -0.5 / SH_C0, 0.5 / SH_C0),
-        sh_rest=0.0,
-        degree=0,
-    )

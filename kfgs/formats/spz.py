@@ -1,4 +1,10 @@
-"""SPZ, Niantic's compressed splat file: versions 1 to 4 are read, 2 to 4 written. Labels are in an extension record.
+"""SPZ, Niantic's compressed splat file: versions 1 to 4 are read, 4 is written. Labels are in an extension record.
+
+The streams: positions, 24-bit fixed point (float16 in version 1); alphas, 255 steps of opacity; colors, 255 steps of f_dc from
+-0.5/0.15 to 0.5/0.15; scales, ln(s) = byte / 16 - 10; rotations, the three smaller of x, y, z, w, 9 bits and a sign each (x, y,
+z as bytes before version 3); sh, (byte - 128) / 128, coefficient by coefficient, red, green and blue together.
+
+**Convention**: SPZ's own axes are x right, y up, z back (RUB) against x right, y down, z forward (RDF) of the 3DGS PLY.
 
 **Why not a library**: Niantic's Python binding is not in the package index (in 2026 `spz` 0.0.1 there has another author,
 and a wheel for Python 3.13 only). gsply 0.4.6 does not convert the axes, drops flags and extension records, and unpacks a
@@ -20,48 +26,43 @@ from __future__ import annotations
 import json
 import struct
 import zlib
-from math import exp
+from math import exp, floor, log2, sqrt
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
 import zstandard
 from numpy.typing import NDArray
+from torch import Tensor
 
-from .._check import check_choice, check_whole
-from .._files import as_path, parse_json
+from .._files import parse_json
 from .._notes import tell
-from ..gaussians import Gaussians, check_gaussians
-from .spz_codec import (
-    DC,
-    LOG_SCALES,
-    choose_fractional_bits,
-    most_fractional_bits,
-    pack,
-    precision_of,
-    unpack,
-)
-from .spz_streams import ANTIALIASED, GZIP, MAGIC, MAX_FRACTIONAL_BITS, Container, read_container, write_container
+from ..gaussians import Gaussians
+from .encodings import join_largest, split_largest
+from .spz_container import ANTIALIASED, GZIP, MAGIC, Container, read_container, unpack_frame, write_container
 from .values import (
     NO_DEGREE_4,
     UP_AND_BACK,
-    Precision,
-    check_splats,
     colours_to_write,
     describe_coarse,
     describe_cut,
     describe_loss,
+    flip_axes,
+    unit_quats,
 )
 
 NAME = "spz"
 SUFFIXES = (".spz",)
 HOLDS_LABELS = True
-_COORDINATES = 0xADBE0003  # Adobe's record: u32, the axes of the file
 LABELS = 0x4B460001  # vendor 0x4B46 (KF), extension 1
+_COORDINATES = 0xADBE0003  # Adobe's record: u32, the axes of the file
 _LABELS_VERSION, _HAS_SCORE = 1, 0x1
 _LABELS_HEAD = struct.Struct("<HHII")
 _MAX_NAMES = 1 << 20
+_DC = 0.5 / 0.15  # the degree-0 coefficient of byte 255
+_LOG_SCALES = (-10.0, 255 / 16 - 10)
+_MAX_FIXED = (1 << 23) - 1
+_COMMON_BITS, _STEPS = 12, 14  # bits that every writer uses; a small cloud gets 2^14 steps across
 
 
 def matches(head: bytes) -> bool:
@@ -75,156 +76,118 @@ def matches(head: bytes) -> bool:
 
 
 def read(path: Path) -> Gaussians:
-    """Read an SPZ file of version 1, 2, 3 or 4, gzipped or plain, into the axes of the 3DGS PLY.
-
-    Harmonics of degree 4 are dropped.
+    """Read an SPZ file of version 1 to 4, gzipped or plain, into the axes of the 3DGS PLY; harmonics of degree 4 are dropped.
 
     Raises:
         ValueError: if it is damaged, of another version, or in axes that no flip turns into those of the PLY.
     """
     c = read_container(path)
-    records: dict[int, bytes] = dict(c.extensions)
-    axes = _axes(path, records.pop(_COORDINATES, None))
-    label_record = records.pop(LABELS, None)
+    records = dict(c.extensions)
+    axes = _axes(path, records.get(_COORDINATES))
     if c.degree > 3:
         tell(f"{path.name}: {NO_DEGREE_4}")
-    gaussians = unpack(c, axes).replace(antialiased=bool(c.flags & ANTIALIASED))
-    if label_record is None:
-        return gaussians
-    record = _unpack_labels(path, label_record, c.count)
-    labels = torch.from_numpy(record.class_id.astype(np.int64))
-    scores = None if record.score is None else torch.from_numpy(record.score)
-    return gaussians.replace(labels=labels, scores=scores, names=record.classes)
+    rotations = c.streams["rotations"]
+    coefficients = c.streams["sh"].reshape(c.size, (c.degree + 1) ** 2 - 1, 3)[:, :15]
+    base = (_floats(c.streams["colors"]) / 255 - 0.5) / 0.15
+    gaussians = Gaussians(
+        means=torch.from_numpy(_unpack_positions(c)),
+        quats=torch.from_numpy(_unpack_xyz(rotations) if c.version < 3 else _unpack_smallest_three(rotations)),
+        scales=torch.from_numpy(_floats(c.streams["scales"]) / 16 - 10).view(-1, 3).exp(),
+        opacities=torch.from_numpy(_floats(c.streams["alphas"]) / 255),
+        sh=torch.cat([torch.from_numpy(base).view(-1, 1, 3), (torch.from_numpy(_floats(coefficients)) - 128) / 128], 1),
+        antialiased=bool(c.flags & ANTIALIASED),
+    )
+    return _with_labels(path, flip_axes(gaussians, axes), records.get(LABELS))
 
 
 def write(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
-    """Write version 4 with the finest positions that the cloud's extent allows; see `write_spz`."""
-    return write_spz(gaussians, path)
+    """Write version 4 with the finest positions that the cloud's extent allows.
 
-
-def write_spz(
-    gaussians: Gaussians,
-    path: str | Path,
-    *,
-    version: int = 4,
-    fractional_bits: int | None = None,
-    sh_bits: tuple[int, int] = (8, 8),
-) -> tuple[str, ...]:
-    """Write an SPZ file, labels, scores and class names included.
-
-    Args:
-        gaussians: a cloud with colours.
-        path: the file, whole or absent.
-        version: 4 (Zstandard streams), or 3 or 2 (gzip) for older readers; 2 keeps rotations as three bytes.
-        fractional_bits: bits after the point of positions, 0 to 24: a step is 2^-bits world units. By default 12, fewer
-            for a cloud that reaches beyond 2048 units, more for a small one.
-        sh_bits: bits kept of harmonics of degree 1, and of degrees 2 and 3, 1 to 8. (5, 4) is what Niantic's own
-            writer keeps: on a scene of degree 3 the file was 0.6 times as large, the picture at 33 instead of 49 dB.
-
-    Returns:
-        Descriptions of what the file could not store.
+    A step of a position is 2^-12 world units: larger for a cloud that reaches beyond 2048 units, smaller for a small one.
 
     Raises:
-        ValueError: if the cloud has no colours, values that `write_splats` refuses, or reaches further than 24 bits hold, or
-            an option is out of its range.
+        ValueError: if the cloud has no colours, reaches further than 24 bits hold, or its names take more than 1 MiB.
     """
-    check_choice("version", version, (2, 3, 4))
-    for bits in sh_bits:
-        check_whole("sh_bits", bits, 1, 8)
-    check_gaussians(gaussians)
-    check_splats(gaussians)
     g = colours_to_write(gaussians, ".spz")
-    if fractional_bits is None:
-        fractional_bits = max(choose_fractional_bits(g.means), 0)
-    else:
-        check_whole("fractional_bits", fractional_bits, 0, MAX_FRACTIONAL_BITS)
-    if fractional_bits > (most := most_fractional_bits(g.means)):
+    bits = choose_fractional_bits(g.means)
+    if bits < 0:
         raise ValueError(
-            f"means: expected coordinates within {2.0 ** (23 - fractional_bits):g} units for {fractional_bits} fractional "
-            f"bits, got {g.means.abs().max().item():g}; "
-            + (f"choose {most} bits or fewer" if most >= 0 else "write .ply or .sog, which have no such limit")
+            f"means: expected coordinates within {2.0**23:g} units, got {g.means.abs().max().item():g}; write .ply or .sog, "
+            "which have no such limit"
         )
-    assert g.sh is not None
-    degree = int(g.sh.shape[1] ** 0.5) - 1
-    flags = ANTIALIASED if g.antialiased else 0
-    records = [] if g.labels is None else [(LABELS, _pack_labels(_record(g)))]
-    streams = pack(g, version, fractional_bits, sh_bits)
-    write_container(as_path(path), Container(version, len(g), degree, fractional_bits, flags, streams, records))
-    return _lost(gaussians, g, fractional_bits)
+    records = [] if g.labels is None else [(LABELS, _pack_labels(g))]
+    turned = flip_axes(g, UP_AND_BACK)
+    assert turned.sh is not None
+    fixed = (turned.means * 2**bits).round().to(torch.int32).numpy()
+    streams = {
+        "positions": np.ascontiguousarray(fixed.astype("<i4")[..., None].view(np.uint8)[..., :3]).reshape(-1),
+        "alphas": _bytes(turned.opacities * 255),
+        "colors": _bytes(turned.sh[:, 0] * (0.15 * 255) + 127.5),
+        "scales": _bytes((turned.scales.log().clamp(*_LOG_SCALES) + 10) * 16),
+        "rotations": _pack_smallest_three(unit_quats(turned.quats).numpy()),
+        "sh": _bytes((turned.sh[:, 1:] * 128 + 128 + 0.5).floor()),
+    }
+    degree = int(turned.sh.shape[1] ** 0.5) - 1
+    write_container(path, Container(4, len(g), degree, bits, ANTIALIASED * g.antialiased, streams, records))
+    return _describe_lost(gaussians, g, bits)
 
 
-def precision(gaussians: Gaussians) -> Precision:
-    """The precision of `write`; the bits of positions depend on the cloud."""
-    return precision_of(gaussians, choose_fractional_bits(gaussians.means))
+def choose_fractional_bits(means: Tensor) -> int:  # means: [N, 3]
+    """The bits after the point for a cloud's extent: usually 12, fewer beyond 2048 units from the origin, more within 2.
+
+    Negative if not even whole units fit into 24 bits.
+    """
+    reach = means.abs().max().item() if len(means) else 0.0
+    if reach == 0.0:
+        return _COMMON_BITS
+    return min(max(_COMMON_BITS, _STEPS - floor(log2(reach))), 20, floor(log2(_MAX_FIXED / reach)))
 
 
-class _LabelRecord(NamedTuple):
-    """The content of kfgs's extension record."""
-
-    class_id: NDArray[np.int32]  # [N], -1 = none
-    score: NDArray[np.float32] | None  # [N]
-    classes: tuple[str, ...]
-
-
-def _pack_labels(record: _LabelRecord) -> bytes:
-    """The payload of a record; a ValueError if the names take more than 1 MiB."""
-    names = json.dumps(list(record.classes), ensure_ascii=False).encode() if record.classes else b""
+def _pack_labels(g: Gaussians) -> bytes:
+    """The payload of kfgs's record."""
+    assert g.labels is not None
+    names = json.dumps(list(g.names), ensure_ascii=False).encode() if g.names else b""
     if len(names) > _MAX_NAMES:
         raise ValueError(f"classes: expected names of at most {_MAX_NAMES} bytes, got {len(names)}; shorten them")
-    parts = [record.class_id.astype("<i4").tobytes(), names]
-    if record.score is not None:
-        parts.insert(1, record.score.astype("<f4").tobytes())
-    head = _LABELS_HEAD.pack(
-        _LABELS_VERSION, 0 if record.score is None else _HAS_SCORE, len(record.class_id), len(names)
-    )
-    return head + zstandard.compress(b"".join(parts), 12)
+    scores = b"" if g.scores is None else g.scores.numpy().astype("<f4").tobytes()
+    flags = 0 if g.scores is None else _HAS_SCORE
+    head = _LABELS_HEAD.pack(_LABELS_VERSION, flags, len(g), len(names))
+    return head + zstandard.compress(g.labels.numpy().astype("<i4").tobytes() + scores + names, 12)
 
 
-def _unpack_labels(path: Path, payload: bytes, count: int) -> _LabelRecord:
-    """Read the record of a file with `count` Gaussians; a ValueError if it is damaged or does not fit."""
-    version, flags, n, names_size = (
-        _LABELS_HEAD.unpack_from(payload) if len(payload) >= _LABELS_HEAD.size else (0, 0, 0, 0)
-    )
+def _with_labels(path: Path, g: Gaussians, payload: bytes | None) -> Gaussians:
+    """Add the labels, scores and names of kfgs's record."""
+    if payload is None:
+        return g
+    n, head, frame = len(g), payload[: _LABELS_HEAD.size], payload[_LABELS_HEAD.size :]
+    version, flags, count, names_size = _LABELS_HEAD.unpack(head) if len(head) == _LABELS_HEAD.size else (0, 0, 0, 0)
     if version != _LABELS_VERSION:
         raise ValueError(
             f"{path}: expected labels of layout {_LABELS_VERSION}, got {version}; update kfgs, or write them again"
         )
-    if n != count or names_size > _MAX_NAMES:
+    if count != n or names_size > _MAX_NAMES:
         raise ValueError(
-            f"{path}: expected labels of {count} Gaussians and at most {_MAX_NAMES} bytes of names, got {n} and {names_size}; "
+            f"{path}: expected labels of {n} Gaussians and at most {_MAX_NAMES} bytes of names, got {count} and {names_size}; "
             "the record is damaged"
         )
-    scores = flags & _HAS_SCORE
-    size = n * (8 if scores else 4) + names_size
+    size = n * (8 if flags & _HAS_SCORE else 4) + names_size
+    plain = unpack_frame(path, "labels", frame, size)
     try:
-        if zstandard.get_frame_parameters(payload[_LABELS_HEAD.size :]).content_size != size:
-            raise zstandard.ZstdError("of another size")
-        plain = (
-            zstandard.ZstdDecompressor().decompress(payload[_LABELS_HEAD.size :], allow_extra_data=False)
-            if size
-            else b""
-        )
-        classes = parse_json(plain[size - names_size :]) if names_size else []
-    except (zstandard.ZstdError, ValueError) as error:
-        raise ValueError(f"{path}: expected {size} bytes of labels, but they cannot be read ({error})") from error
-    class_id = np.frombuffer(plain, "<i4", n).astype(np.int32)
-    score = np.frombuffer(plain, "<f4", n, 4 * n).astype(np.float32) if scores else None
-    if (class_id < -1).any() or not isinstance(classes, list) or not all(isinstance(name, str) for name in classes):
+        names = parse_json(plain[size - names_size :]) if names_size else []
+    except ValueError as error:
+        raise ValueError(f"{path}: expected names of classes, but they cannot be read ({error})") from error
+    labels = np.frombuffer(plain, "<i4", n).astype(np.int64)
+    scores = np.frombuffer(plain, "<f4", n, 4 * n).astype(np.float32) if flags & _HAS_SCORE else None
+    if (labels < -1).any() or not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"{path}: expected class_id of -1 or more and a list of names; the labels are damaged")
-    return _LabelRecord(class_id, score, tuple(classes))
-
-
-def _record(g: Gaussians) -> _LabelRecord:
-    assert g.labels is not None
-    score = None if g.scores is None else g.scores.numpy().astype(np.float32)
-    return _LabelRecord(g.labels.numpy().astype(np.int32), score, g.names)
+    return g.replace(
+        labels=torch.from_numpy(labels), scores=None if scores is None else torch.from_numpy(scores), names=tuple(names)
+    )
 
 
 def _axes(path: Path, record: bytes | None) -> tuple[int, int, int]:
     """Signs of a file's axes against those of the PLY: RUB, unless Adobe's record says otherwise."""
-    if record is None:
-        return UP_AND_BACK
-    value = struct.unpack("<I", record)[0] if len(record) == 4 else -1
+    value = 0 if record is None else struct.unpack("<I", record)[0] if len(record) == 4 else -1
     if value == 0:  # unspecified
         return UP_AND_BACK
     if not 1 <= value <= 8:
@@ -236,14 +199,53 @@ def _axes(path: Path, record: bytes | None) -> tuple[int, int, int]:
     return (1 if right else -1, -1 if up else 1, 1 if front else -1)
 
 
-def _lost(gaussians: Gaussians, g: Gaussians, fractional_bits: int) -> tuple[str, ...]:
-    lost = list(describe_loss(gaussians, ".spz", 3))
-    lost += describe_coarse(g, 0.5 * 2.0**-fractional_bits, ".spz")
+def _describe_lost(gaussians: Gaussians, g: Gaussians, bits: int) -> tuple[str, ...]:
     assert g.sh is not None
-    lost += describe_cut(g.sh[:, :1], -DC, DC, "colours", ".spz")
+    lost = describe_loss(gaussians, ".spz", 3) + describe_coarse(g, 0.5 * 2.0**-bits, ".spz")
+    lost += describe_cut(g.sh[:, :1], -_DC, _DC, "colours", ".spz")
     lost += describe_cut(g.sh[:, 1:], -1.0, 127 / 128, "higher harmonics", ".spz")
-    low, high = (exp(end) for end in LOG_SCALES)
-    cut = int(((g.scales < low / 1.032) | (g.scales > high * 1.032)).any(1).sum())
+    low, high = (exp(end) for end in _LOG_SCALES)
+    cut = int(((g.scales < low / 1.032) | (g.scales > high * 1.032)).any(1).sum())  # 1.032: half a step
     if cut:
-        lost.append(f"the extent of {cut} Gaussians: .spz holds {low:.1e} to {high:.0f} units along an axis")
-    return tuple(lost)
+        lost += (f"the extent of {cut} Gaussians: .spz holds {low:.1e} to {high:.0f} units along an axis",)
+    return lost
+
+
+def _floats(values: NDArray[np.uint8]) -> NDArray[np.float32]:
+    return values.astype(np.float32)
+
+
+def _bytes(values: Tensor) -> NDArray[np.uint8]:
+    return values.round().clamp(0, 255).to(torch.uint8).numpy().reshape(-1)
+
+
+def _unpack_positions(c: Container) -> NDArray[np.float32]:  # [N, 3]
+    stream = c.streams["positions"]
+    if c.version == 1:
+        return stream.view("<f2").astype(np.float32).reshape(-1, 3)
+    wide = np.zeros((c.size, 3, 4), np.uint8)
+    wide[..., 1:] = stream.reshape(c.size, 3, 3)  # the upper three bytes of an int32: the shift back keeps the sign
+    return (wide.view("<i4")[..., 0] >> 8).astype(np.float32) * np.float32(2.0**-c.fractional_bits)
+
+
+def _unpack_xyz(stream: NDArray[np.uint8]) -> NDArray[np.float32]:  # [N, 4] wxyz
+    xyz = _floats(stream).reshape(-1, 3) / np.float32(127.5) - 1
+    w = np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1, keepdims=True)))
+    return np.concatenate([w, xyz], 1)
+
+
+def _unpack_smallest_three(stream: NDArray[np.uint8]) -> NDArray[np.float32]:  # [N, 4] wxyz
+    """Bits 30-31 name the largest of x, y, z, w; the other three follow in order, the last one in the lowest 10 bits."""
+    word = stream.view("<u4").astype(np.uint32)
+    values = np.stack([(word >> shift) & 0x3FF for shift in (20, 10, 0)], 1)  # [N, 3]
+    small = (values & 0x1FF).astype(np.float32) * np.float32(sqrt(0.5) / 511)
+    small = np.where(values & 0x200, -small, small)
+    return join_largest((word >> 30).astype(np.int64), small)[:, [3, 0, 1, 2]]
+
+
+def _pack_smallest_three(quats: NDArray[np.float64]) -> NDArray[np.uint8]:  # quats: [N, 4] wxyz, unit
+    largest, small = split_largest(quats[:, [1, 2, 3, 0]])
+    sizes = np.minimum(np.round(np.abs(small) * (511 / sqrt(0.5))), 511).astype(np.uint32)
+    values = sizes | np.where(small < 0, 0x200, 0).astype(np.uint32)
+    word = (largest.astype(np.uint32) << 30) | (values[:, 0] << 20) | (values[:, 1] << 10) | values[:, 2]
+    return word.astype("<u4").view(np.uint8)

@@ -22,7 +22,7 @@ and a line in `MODULES`.
 
 from __future__ import annotations
 
-import os
+import re
 from codecs import BOM_UTF8
 from collections.abc import Mapping
 from importlib import import_module
@@ -37,8 +37,7 @@ from .._files import as_path
 from .._notes import is_strict
 from .._origin import describe_origin
 from ..gaussians import Gaussians, check_gaussians
-from .folders import PATTERNS, splat_file_of
-from .order import morton_order
+from .encodings import morton_order
 from .sidecar import find_names, names_path, read_sidecar, write_sidecar
 from .values import check_splats, leave_out_broken, near_zero
 
@@ -53,6 +52,11 @@ MODULES = (  # tried in this order: compressed PLY before PLY, because both end 
     "splat",
 )
 _HEAD_BYTES = 1 << 16
+PATTERNS = (  # of the output folders of training programs: Inria's 3DGS, gsplat, nerfstudio; * is the step
+    "point_cloud/iteration_*/point_cloud.ply",
+    "ckpts/ckpt_*_rank0.pt",
+    "nerfstudio_models/step-*.ckpt",
+)
 
 
 class Written(NamedTuple):
@@ -199,7 +203,7 @@ def _format_to_write(path: Path, name: str | None) -> ModuleType:
                 f"format: expected one of {', '.join(known)}, got {name!r}; leave it out to go by the name"
             )
         return known[name]
-    lower = os.fspath(path.name).lower()
+    lower = path.name.lower()
     for module in known.values():
         if lower.endswith(module.SUFFIXES):
             return module
@@ -207,3 +211,29 @@ def _format_to_write(path: Path, name: str | None) -> ModuleType:
     raise ValueError(
         f"path: expected a name that ends in one of {endings}, got {path.name!r}; rename it or pass format"
     )
+
+
+def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
+    """The files of a pattern with one `*`, by the whole number in its place."""
+    before, after = pattern.split("*")
+    found = {}
+    for file in folder.glob(pattern) if folder.is_dir() else ():
+        match = re.fullmatch(re.escape(before) + r"(\d{1,18})" + re.escape(after), file.relative_to(folder).as_posix())
+        if match and file.is_file():
+            found[int(match[1])] = file
+    return found
+
+
+def newest_splat(folder: Path) -> Path | None:
+    """The splat of the highest step in the output folder of a training program; None if this is no such folder."""
+    for pattern in PATTERNS:
+        files = numbered_files(folder, pattern)
+        if files:
+            return files[max(files)]
+    return None
+
+
+def splat_file_of(path: str | Path) -> Path:
+    """The path itself; of the output folder of a training program, its newest splat."""
+    path = as_path(path)
+    return newest_splat(path) or path if path.is_dir() else path

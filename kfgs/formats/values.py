@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .._arrays import most_unpacked
-from .._card import short_repr
 from .._check import ORIGIN, as_origin
 from .._notes import tell
 from .._origin import choose_origin, to_local
@@ -43,21 +42,6 @@ _RAW = {
     "opacities": "if they are logits, as 3DGS trains them, take opacities.sigmoid()",
 }
 """What to do if most values are out of range."""
-
-
-class Precision(NamedTuple):
-    """The largest error of a value that was written and read again. Each format states it, and the tests check it."""
-
-    means: float | Tensor  # world units, per axis: one number, or [N, 3]
-    scales: float  # relative, of each standard deviation
-    rotation: float  # radians between the rotations
-    opacities: float  # absolute
-    sh0: float  # absolute, of the degree-0 coefficients
-    sh_rest: float  # absolute, of the higher coefficients
-    degree: int = 3  # highest degree of spherical harmonics
-
-    def __repr__(self) -> str:
-        return short_repr(self)
 
 
 def check_count(path: Path, count: int, degree: int, packed: int) -> None:
@@ -292,10 +276,3 @@ def describe_cut(values: Tensor, low: float, high: float, what: str, name: str) 
     beyond = ((values < low - step) | (values > high + step)).flatten(1).any(1)
     count = int(beyond.sum())
     return (f"{what} of {count} of {len(values)} Gaussians beyond what {name} holds: cut off",) if count else ()
-
-
-def byte_error(values: Tensor, low: float, high: float) -> float:
-    """Largest error of values in 256 even steps from `low` to `high`: half a step, or the largest cut-off."""
-    step = (high - low) / 255
-    beyond = (values - values.clamp(low, high)).abs().max().item() if values.numel() else 0.0
-    return max(step / 2, beyond) * (1 + 1e-4)  # float32 rounding on the way back

@@ -14,8 +14,8 @@ from .._origin import to_world
 from ..fields import SemanticField
 from ..fields.store import find_field
 from ..formats import find_format, read_splats
-from ..formats.folders import splat_file_of
 from ..formats.ply import read_ply
+from ..formats.table import splat_file_of
 from ..gaussians import Gaussians
 from ..scenes import FeatureFolder, Scene, SceneError, is_scene, list_images, load_scene
 from ..scenes.files import some

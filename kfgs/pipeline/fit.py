@@ -38,7 +38,7 @@ from ..fields import (
 )
 from ..fields.store import NAME, check_place
 from ..formats import read_splats, write_splats
-from ..formats.folders import splat_file_of
+from ..formats.table import splat_file_of
 from ..gaussians import Gaussians
 from ..quant import (
     Autoencoder,

@@ -13,7 +13,7 @@ from .._check import check_choice
 from .._files import as_path, real_path
 from .._notes import tell_repairs
 from ..cameras.camera import Camera
-from ..formats.folders import newest_splat
+from ..formats.table import newest_splat
 from .colmap import colmap_cameras, load_colmap
 from .files import SceneError, natural_key, picture_size, some
 from .layouts import LAYOUTS, find_layout

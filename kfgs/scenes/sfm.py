@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from .._check import check_choice, check_range
 from .._files import as_path, atomic_folder, check_output, real_path
-from ..formats.folders import newest_splat
+from ..formats.table import newest_splat
 from .colmap import LENSES
 from .colmap_model import has_model
 from .files import SceneError, list_images, picture_size, some

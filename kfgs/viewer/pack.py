@@ -18,7 +18,7 @@ from PIL import Image
 
 from .._check import as_array
 from .._rows import check_finite
-from ..formats.smallest_three import pack_smallest_three
+from ..formats.encodings import pack_smallest_three
 from ..gaussians import Gaussians
 from ..scenes import Scene
 from ..splat import SH_C0

@@ -4,13 +4,13 @@ import pytest
 import torch
 from messages import tells
 from oracles_packed import compressed_gaussian
-from oracles_precision import assert_within, rotation_angles
+from oracles_precision import assert_within, precision, rotation_angles
 
 from kfgs import Gaussians, rasterize
 from kfgs.cameras.camera import Camera
 from kfgs.formats import find_format, read_splats, write_splats
-from kfgs.formats.compressed_ply import precision, read, write
-from kfgs.formats.order import morton_order
+from kfgs.formats.compressed_ply import read, write
+from kfgs.formats.encodings import morton_order
 from kfgs.formats.ply import read_ply_elements, write_ply_elements
 
 
@@ -62,7 +62,7 @@ def test_real_files_survive(tmp_path, shared_data, name):
     far = ("170 of 9,080",) if name.startswith("inria") else ()  # a few of a wide scene: chunks are wide, too
     assert [words in note for words, note in zip(far, lost, strict=True)] == [True] * len(far)
     assert find_format(tmp_path / "a.compressed.ply").NAME == "compressed_ply"
-    order, stated = morton_order(cloud.means), precision(cloud)
+    order, stated = morton_order(cloud.means), precision("compressed_ply", cloud)
     back = read(tmp_path / "a.compressed.ply")
     assert_within(back, cloud.select(order), stated._replace(means=stated.means[order]))
     assert stated.means.median() < 0.1  # the tolerance says something
@@ -87,7 +87,7 @@ def test_made_clouds_survive_and_others_read_them(tmp_path, degree):
     cloud = _cloud(degree=degree)
     path = tmp_path / "a.compressed.ply"
     written = write_splats(cloud, path)
-    order, stated, back = written.order, precision(cloud), read(path)
+    order, stated, back = written.order, precision("compressed_ply", cloud), read(path)
     assert written.lost == ()
     assert_within(back, cloud.select(order), stated._replace(means=stated.means[order]))
     _assert_read_as_the_oracle_does(path, [0, 300, 699])
@@ -112,7 +112,7 @@ def test_files_of_gsply_are_read(tmp_path):
         shN=cloud.sh[:, 1:].contiguous().numpy(),
     )
     gsply.plywrite(str(tmp_path / "a.compressed.ply"), data, compressed=True)
-    stated = precision(cloud)  # gsply 0.4.6 cuts off where we round: whole steps instead of halves
+    stated = precision("compressed_ply", cloud)  # gsply 0.4.6 cuts off where we round: whole steps instead of halves
     assert_within(
         read(tmp_path / "a.compressed.ply"),
         cloud,
@@ -174,7 +174,7 @@ def test_what_lies_beyond_the_ranges_is_told(tmp_path):
         "scales of 1 Gaussians: .compressed.ply holds e^-20 to e^20",
         "strong higher harmonics of 1 Gaussians: .compressed.ply holds -4 to 4",
     )
-    order, stated = written.order, precision(odd)
+    order, stated = written.order, precision("compressed_ply", odd)
     assert stated.sh_rest >= 5
     back = read(tmp_path / "a.compressed.ply")
     assert_within(back, odd.select(order), stated._replace(means=stated.means[order]))
@@ -191,7 +191,7 @@ def test_labels_stay_with_their_gaussians(tmp_path):
     assert torch.equal(back.labels, cloud.labels[order])
     assert back.names == tuple("abcdef")
     np.testing.assert_array_equal(back.scores, score[order.numpy()])
-    stated = precision(cloud)
+    stated = precision("compressed_ply", cloud)
     assert_within(back, cloud.select(order), stated._replace(means=stated.means[order]))
 
 
@@ -201,7 +201,7 @@ def test_an_empty_cloud_survives(tmp_path, degree):
     write(tmp_path / "a.compressed.ply", empty)
     back = read(tmp_path / "a.compressed.ply")
     assert back.sh.shape == (0, (degree + 1) ** 2, 3)
-    assert precision(empty).means.shape == (0, 3)
+    assert precision("compressed_ply", empty).means.shape == (0, 3)
 
 
 def test_the_picture_stays_the_same(tmp_path, shared_data):

@@ -11,7 +11,6 @@ from cases_gltf import KHR, bent_gltf, json_of_glb, random_cloud
 from messages import tells
 from scipy.spatial.transform import Rotation
 
-from kfgs.formats import gltf as format_gltf
 from kfgs.formats import read_splats, write_splats
 from kfgs.splat import evaluate_sh
 
@@ -200,8 +199,3 @@ def test_what_cannot_be_written_is_named(tmp_path):
     with pytest.raises(ValueError, match=tells("labels:", "expected -1 to 16777216", "glTF", "got 99999999")):
         write_splats(random_cloud(2).replace(labels=torch.tensor([0, 99_999_999])), tmp_path / "a.glb")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_its_precision_is_that_of_float32():
-    stated = format_gltf.precision(random_cloud())
-    assert (stated.means, stated.sh0, stated.sh_rest, stated.degree) == (0.0, 0.0, 0.0, 3)

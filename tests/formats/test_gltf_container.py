@@ -49,7 +49,7 @@ def test_links_that_lead_elsewhere_are_refused(tmp_path):
     (tmp_path / "scene").mkdir()
     (tmp_path / "scene" / "a.bin").symlink_to(tmp_path / "secret.bin")
     path = bent_gltf(tmp_path / "scene", **{"buffers/0/uri": "a.bin"})
-    with pytest.raises(ValueError, match=tells("bent.gltf:", "link", "secret.bin")):
+    with pytest.raises(ValueError, match=tells("bent.gltf:", "link", "a.bin")):
         read_splats(path)
 
 
@@ -59,35 +59,35 @@ A = "meshes/0/primitives/0/attributes"
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"asset": None}, ("glTF", "2.0", "asset.version", "got None")),
-        ({"asset/version": "1.0"}, ("glTF", "2.0", "asset.version", "got '1.0'")),
+        ({"asset": None}, ("glTF", "2.0", "asset")),
+        ({"asset/version": "1.0"}, ("2.0", "asset.version", "got '1.0'")),
         ({"extensionsRequired": [KHR, "KHR_gaussian_splatting_compression_spz_2"]}, ("compression_spz_2",)),
-        ({"meshes/0/primitives/0/extensions": {}}, ("KHR_gaussian_splatting", "got 1")),
+        ({"meshes/0/primitives/0/extensions": {}}, ("KHR_gaussian_splatting", "got none")),
         ({"meshes/0/primitives/0/extensions/KHR_gaussian_splatting/kernel": "box"}, ("'ellipse'", "got 'box'")),
         ({"meshes/0/primitives/0/mode": 4}, ("mode:", "expected 0", "got 4")),
-        ({"meshes/0/primitives": 3}, ("primitives:", "got 3")),
+        ({"meshes/0/primitives": 3}, ("glTF", "export it again")),
         ({"meshes": None}, ("meshes:", "got 0")),
         ({f"{A}/POSITION": 99}, ("accessors:", "got 99")),
         ({f"{A}/{KHR}:SCALE": None}, ("attributes:", "POSITION, ROTATION, SCALE, OPACITY and SH_DEGREE_0")),
         ({f"{A}/{KHR}:SH_DEGREE_1_COEF_1": None}, ("attributes:", "degrees", "SH_DEGREE_1_COEF_0")),
         ({"accessors/0/count": 10**12}, ("accessors[0]:", "expected 1000000000000", "damaged")),
         ({"accessors/0/count": 6}, ("accessors[0]:", "expected 6", "damaged")),
-        ({"accessors/1/count": 4}, ("expected 5", "POSITION", "got 4")),
+        ({"accessors/1/count": 4}, ("accessors[1]", "expected 5", "'count': 4")),
         ({"accessors/0/count": -1}, ("count:", "got -1")),
         ({"accessors/0/count": True}, ("count:", "got True")),
-        ({"accessors/0/componentType": 5124}, ("componentType:", "5120", "got 5124")),
+        ({"accessors/0/componentType": 5124}, ("5120", "'componentType': 5124")),
         ({"accessors/0/type": "MAT4"}, ("type:", "got 'MAT4'")),
         ({"accessors/0/type": ["VEC3"]}, ("type:", "3 numbers", "got ['VEC3']")),
         ({"accessors/0/sparse": {}}, ("accessors[0]:", "sparse")),
         ({"accessors/0/byteOffset": 8}, ("expected 5 elements", "60 bytes", "'68 bytes")),
         ({"bufferViews/0/byteOffset": 10**9}, ("bufferViews[0]:", "bytes")),
         ({"bufferViews/0/byteStride": 8}, ("60 bytes", "'44 bytes, 8 apart'")),
-        ({"bufferViews/0/byteStride": 300}, ("byteStride:", "expected 4 to 252", "got 300")),
+        ({"bufferViews/0/byteStride": 300}, ("4 to 252", "300]")),
         ({"buffers/0/byteLength": 10**15}, ("buffers[0]:", "expected 1000000000000000")),
         ({"buffers/0/uri": None}, ("buffers[0]:", "uri", "chunk")),
         ({"buffers/0/uri": "data:text/plain,hello"}, ("uri:", "data:", ";base64")),
-        ({"buffers/0/uri": "data:;base64,*"}, ("uri:", "expected base64")),
-        ({"buffers/0/uri": 7}, ("uri:", "got 7")),
+        ({"buffers/0/uri": "data:;base64,*"}, ("base64",)),
+        ({"buffers/0/uri": 7}, ("glTF", "export it again")),
         ({"nodes/0/children": [0]}, ("nodes[0]:", "tree")),
         ({"nodes/0/scale": [1, 2, 1]}, ("nodes[0]:", "scale", "translation")),
         ({"nodes/0/scale": [0, 0, 0]}, ("nodes[0]:", "scale", "translation")),
@@ -95,7 +95,7 @@ A = "meshes/0/primitives/0/attributes"
         ({"nodes/0/matrix": [1, 0, 0, 0, 0.5, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}, ("nodes[0]:", "scale", "apply")),
         ({"nodes/0/rotation": [0, 0, 0, 0]}, ("nodes[0].rotation:", "quaternion", "x, y, z, w")),
         ({"nodes/0/matrix": [1] * 15}, ("matrix:", "expected 16")),
-        ({"nodes/0/translation": ["a", 0, 0]}, ("translation:", "expected 3")),
+        ({"nodes/0/translation": ["a", 0, 0]}, ("glTF", "export it again")),
     ],
 )  # fmt: skip
 def test_bent_documents_are_named(tmp_path, changes, message):
@@ -152,11 +152,11 @@ def test_bad_values_are_named(tmp_path, attribute, values, message):
         (b"glTF", ("version 2", ".glb", "got 0")),
         (struct.pack("<4sII", b"glTF", 1, 12), ("version 2", ".glb", "got 1")),
         (struct.pack("<4sII", b"glTF", 2, 1 << 31), ("expected 2147483648", "got 12")),
-        (struct.pack("<4sII", b"glTF", 2, 12), ("JSON", "chunk", "got none")),
+        (struct.pack("<4sII", b"glTF", 2, 12), ("JSON", "chunk")),
         (struct.pack("<4sIIII", b"glTF", 2, 20, 1 << 30, 0x4E4F534A), ("chunk", "got 0", "truncated")),
-        (b'{"accessors": [', ("glTF", "JSON")),
-        (b'{"accessors": ' + b"[" * 100_000, ("glTF", "JSON")),
-        (b"hello", ("glTF", "JSON")),
+        (b'{"accessors": [', ("glTF", "cannot be read")),
+        (b'{"accessors": ' + b"[" * 100_000, ("glTF", "cannot be read")),
+        (b"hello", ("glTF", "cannot be read")),
     ],
 )
 def test_bad_containers_are_named(tmp_path, content, message):

@@ -1,6 +1,7 @@
 """Damaged and hostile files of every format: a ValueError that names the file, in bounded memory, or a sound cloud."""
 
 import gc
+import gzip
 import io
 import itertools
 import json
@@ -14,10 +15,10 @@ import numpy as np
 import pytest
 import torch
 from messages import tells
+from oracles_spz import legacy_payload
 
 from kfgs import Gaussians
 from kfgs.formats import formats, read_splats, write_splats
-from kfgs.formats.spz import write_spz
 
 MOST_MEMORY = 48 << 20  # bytes, for files of a few kB
 MOST_SECONDS = 5.0
@@ -54,8 +55,8 @@ def sound(tmp_path_factory, request):
             rows = "\n".join(" ".join(f"{i + j / 8:g}" for j in range(len(names))) for i in range(6))
             return ".ply", f"ply\nformat ascii 1.0\nelement vertex 6\n{head}end_header\n{rows}\n".encode()
         if kind == "spz-2":
-            write_spz(_cloud(), folder / "two.spz", version=2)
-            return ".spz", (folder / "two.spz").read_bytes()
+            row = {"position": (256, -512, 768), "alpha": 51, "color": (0, 128, 255), "scale": (160, 128, 96)}
+            return ".spz", gzip.compress(legacy_payload([row | {"rotation": (191, 64, 200)}] * 40, version=2))
         suffix = ".gltf" if kind == "gltf-text" else formats()[kind].SUFFIXES[0]
         write_splats(_cloud(), folder / f"a{suffix}")
         return suffix, (folder / f"a{suffix}").read_bytes()

@@ -95,13 +95,13 @@ def test_file_of_another_program_opens(shared_data):
         (b"ply\nformat ascii 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n1\n", ("truncated",)),
         (
             b"ply\nformat binary_little_endian 1.0\nelement face 5\nproperty float x\nend_header\n",
-            ("'vertex'", "got 'face'"),
+            ("'vertex'", "got ['face']"),
         ),
         (
             b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n",
-            ("scalar", "'property list uchar int x'"),
+            ("scalar", "'property list x'"),
         ),
-        (b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n", ("'vertex'", "properties", "got 0")),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n", ("'vertex'", "properties", "got []")),
         (b"ply\nformat exotic 1.0\nelement vertex 0\nproperty float x\nend_header\n", ("'exotic'",)),
     ],
 )
@@ -120,7 +120,7 @@ def test_missing_file_and_columns(tmp_path):
         gaussians_from_columns({"x": np.zeros(1), "y": np.zeros(1), "z": np.zeros(1), "opacity": np.zeros(1)})
     with pytest.raises(ValueError, match=tells("columns:", "length", "{'x': 1, 'y': 2}")):
         write_ply(tmp_path / "a.ply", {"x": np.zeros(1), "y": np.zeros(2)})
-    with pytest.raises(ValueError, match=tells("columns:", "got {'x': 'i8'}", "astype")):
+    with pytest.raises(ValueError, match=tells("columns:", "got {'x': 'i8'}", "convert")):
         write_ply(tmp_path / "a.ply", {"x": np.zeros(1, np.int64)})
     assert list(tmp_path.iterdir()) == []
 
@@ -206,7 +206,7 @@ def test_several_elements_survive_the_file(tmp_path):
     write_ply_elements(tmp_path / "a.ply", TABLES, comments=("first", "and second"))
     _assert_same(read_ply_elements(tmp_path / "a.ply"), TABLES)
     assert read_comments(tmp_path / "a.ply") == ["first", "and second"]
-    with pytest.raises(ValueError, match=tells("a.ply:", "'vertex'", "got 'chunk'")):
+    with pytest.raises(ValueError, match=tells("a.ply:", "'vertex'", "got ['chunk'")):
         read_ply(tmp_path / "a.ply")
 
 
@@ -234,13 +234,13 @@ def test_elements_that_cannot_be_read_are_named(tmp_path):
         read_ply_elements(tmp_path / "short.ply")
     head = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\n"
     (tmp_path / "face.ply").write_bytes(head + b"element face 1\nproperty list uchar int i\nend_header\n" + b"\0" * 9)
-    with pytest.raises(ValueError, match=tells("face.ply:", "scalar", "got 'property list")):
+    with pytest.raises(ValueError, match=tells("face.ply:", "scalar", "got ['property list")):
         read_ply_elements(tmp_path / "face.ply")
     (tmp_path / "twice.ply").write_bytes(head + b"element vertex 1\nproperty float y\nend_header\n" + b"\0" * 8)
     with pytest.raises(ValueError, match=tells("twice.ply:", "got ['vertex', 'vertex']")):
         read_ply_elements(tmp_path / "twice.ply")
     (tmp_path / "empty.ply").write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
-    with pytest.raises(ValueError, match=tells("empty.ply:", "'vertex'", "got none")):
+    with pytest.raises(ValueError, match=tells("empty.ply:", "'vertex'", "got []")):
         read_ply(tmp_path / "empty.ply")
     with pytest.raises(FileNotFoundError, match=tells("none.ply:", "no such file")):
         read_comments(tmp_path / "none.ply")

@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import oracles_splat as oracle
@@ -12,7 +13,7 @@ from kfgs import Gaussians
 from kfgs.cameras import Camera
 from kfgs.formats import formats, read_splats, write_splats
 from kfgs.formats.ply import read_comments, write_ply
-from kfgs.formats.render_mode import AS_FLAT, Mode, flattened, mode_from_comments, mode_from_meta
+from kfgs.formats.render_mode import AS_FLAT, Mode, mode_from_comments, mode_from_meta, with_mode
 from kfgs.splat import rasterize
 
 WRITABLE = [name for name, module in formats().items() if hasattr(module, "write")]
@@ -159,7 +160,9 @@ def test_surfels_drawn_as_flat_gaussians_are_nearly_those_of_2dgs(tilt, most):
     values = [0.1, -0.05, 3.0], [float(np.cos(turn)), 0.0, float(np.sin(turn)), 0.0]
     surfel = Gaussians(*(torch.tensor([v]) for v in values), torch.full((1, 3), 0.1), torch.tensor([0.8]))
     camera = Camera(torch.eye(4), torch.tensor([[250.0, 0, 30], [0, 250, 30], [0, 0, 1]]), 60, 60)
-    drawn = rasterize(flattened(surfel).replace(features=torch.ones(1, 1)), camera, engine="reference").alpha.numpy()
+    drawn = rasterize(
+        with_mode(Path("a"), surfel, Mode(surfels=True)).replace(features=torch.ones(1, 1)), camera, engine="reference"
+    ).alpha.numpy()
     at = camera.viewmat.numpy(), camera.K.numpy().astype(float)
     expected = [
         [oracle.surfel_alpha(x + 0.5, y + 0.5, *values, [0.1, 0.1], 0.8, *at) for x in range(60)] for y in range(60)

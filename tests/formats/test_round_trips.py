@@ -4,12 +4,12 @@ import gsply
 import numpy as np
 import pytest
 import torch
-from oracles_precision import assert_within
+from oracles_precision import assert_within, precision
 
 from kfgs import Gaussians
 from kfgs.cameras import Camera
 from kfgs.formats import find_format, formats, read_splats, write_splats
-from kfgs.formats.order import morton_order
+from kfgs.formats.encodings import morton_order
 from kfgs.metrics import psnr
 from kfgs.splat import rasterize
 
@@ -89,7 +89,7 @@ def test_real_files_survive_every_format(tmp_path, shared_data, name, to):
     written = write_splats(cloud, tmp_path / f"a{module.SUFFIXES[0]}")
     back = read_splats(written.paths[0])
     assert len(written.paths) == 1
-    order, stated = _order(to, cloud), module.precision(cloud)
+    order, stated = _order(to, cloud), precision(to, cloud)
     if isinstance(stated.means, torch.Tensor):
         stated = stated._replace(means=stated.means[order])
     assert_within(back, cloud.select(order), stated)
@@ -208,7 +208,7 @@ def test_every_format_through_every_other_and_back(tmp_path, to):
     write_splats(once, tmp_path / "2.ply")
     write_splats(read_splats(tmp_path / "2.ply"), tmp_path / f"3{suffix}")
     twice = read_splats(tmp_path / f"3{suffix}")
-    stated = formats()[to].precision(once)
+    stated = precision(to, once)
     order = _order(to, once)
     if isinstance(stated.means, torch.Tensor):
         stated = stated._replace(means=stated.means[order])

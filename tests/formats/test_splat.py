@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 import torch
 from messages import tells
-from oracles_precision import assert_within, rotation_angles
+from oracles_precision import assert_within, precision, rotation_angles
 
 from kfgs import Gaussians
 from kfgs.formats import read_splats, write_splats
-from kfgs.formats.splat import precision, read, write
+from kfgs.formats.splat import read, write
 
 
 def _cloud(n: int = 500, degree: int = 0) -> Gaussians:
@@ -37,7 +37,7 @@ def test_a_cloud_comes_back_as_exactly_as_stated(tmp_path):
     cloud = _cloud()
     assert write(tmp_path / "a.splat", cloud) == ()
     assert (tmp_path / "a.splat").stat().st_size == 500 * 32
-    back, stated = read(tmp_path / "a.splat"), precision(cloud)
+    back, stated = read(tmp_path / "a.splat"), precision("splat", cloud)
     assert_within(back, cloud, stated)
     assert (back.sh - cloud.sh).abs().max() > 0.9 * stated.sh0
     assert (back.opacities - cloud.opacities).abs().max() > 0.9 * stated.opacities
@@ -57,7 +57,7 @@ def test_real_files_survive(tmp_path, shared_data, name):
     cloud = read_splats(shared_data / "splats" / name)
     written = write_splats(cloud, tmp_path / "a.splat")
     back = read_splats(tmp_path / "a.splat")
-    assert_within(back, cloud, precision(cloud))
+    assert_within(back, cloud, precision("splat", cloud))
     lost = {"inria_9080.ply": ["spherical harmonics of degree 3: .splat holds the base colour only"]}.get(name, [])
     beyond = ((0.28209479177387814 * cloud.sh[:, 0].double()).abs() > 0.5 + 1 / 255).any(1).sum()
     if beyond:
@@ -79,8 +79,8 @@ def test_what_is_cut_off_is_in_the_precision(tmp_path):
     cloud = _cloud(3)
     cloud.sh[1, 0, 2] = 4.0
     write(tmp_path / "a.splat", cloud)
-    assert precision(cloud).sh0 == pytest.approx(4 - 0.5 / 0.28209479177387814, rel=1e-3)
-    assert_within(read(tmp_path / "a.splat"), cloud, precision(cloud))
+    assert precision("splat", cloud).sh0 == pytest.approx(4 - 0.5 / 0.28209479177387814, rel=1e-3)
+    assert_within(read(tmp_path / "a.splat"), cloud, precision("splat", cloud))
 
 
 def test_an_empty_file_is_an_empty_cloud(tmp_path):

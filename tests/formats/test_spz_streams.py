@@ -12,9 +12,8 @@ from messages import tells
 from oracles_spz import legacy_payload
 
 from kfgs import Gaussians
-from kfgs.formats import read_splats, write_spz
-from kfgs.formats import spz as module
-from kfgs.formats.spz import LABELS, read
+from kfgs.formats import read_splats
+from kfgs.formats.spz import LABELS, read, write
 
 ROW = {"position": (256, -512, 768), "alpha": 51, "color": (0, 128, 255), "scale": (160, 128, 96)}
 
@@ -73,7 +72,7 @@ BAD = {
     "damaged gzip": (gzip.compress(_GOOD)[:-8] + bytes(8), ("gzip", "unpacked")),
     "bytes after gzip": (gzip.compress(_GOOD) + b"abc", ("gzip", "damaged")),
     "bytes in gzip": (gzip.compress(_GOOD + b"x"), ("header", "got more")),
-    "bytes after raw": (_GOOD + b"x", ("expected 76", "got 77")),
+    "bytes after raw": (_GOOD + b"x", ("expected 60", "got 61")),
     "cut raw": (_GOOD[:-1], ("3 Gaussians", "60", "59")),
     "gzip bomb": (gzip.compress(_BOMB), ("header", "got more")),
     "4 billion in gzip": (gzip.compress(_GOOD[:8] + b"\xff\xff\xff\xff" + _GOOD[12:]), ("4294967295 Gaussians",)),
@@ -122,11 +121,11 @@ BAD = {
     ),
     "labels of 9": (_with_labels(_labels(9)), ("labels", "1 Gaussians", "got 9")),
     "labels layout 2": (_with_labels(_labels(version=2)), ("layout 1", "got 2")),
-    "labels cut": (_with_labels(_labels()[:-3]), ("labels", "read")),
+    "labels cut": (_with_labels(_labels()[:-3]), ("Zstandard", "labels")),
     "short labels": (_with_labels(b"\x01"), ("layout 1", "got 0")),
-    "labels bomb": (_with_labels(_labels(rest=zstandard.compress(bytes(1 << 26)))), ("labels", "size")),
+    "labels bomb": (_with_labels(_labels(rest=zstandard.compress(bytes(1 << 26)))), ("labels", "67108864")),
     "labels below": (_with_labels(_labels(rest=zstandard.compress(struct.pack("<i", -2)))), ("class_id", "-1")),
-    "names no json": (_with_labels(_labels(names=b"[nope")), ("labels", "read")),
+    "names no json": (_with_labels(_labels(names=b"[nope")), ("names", "read")),
     "names no list": (_with_labels(_labels(names=b'{"a": 1}')), ("list", "names")),
     "long names": (_with_labels(struct.pack("<HHII", 1, 0, 1, 1 << 30)), ("1048576", "names")),
 }
@@ -173,8 +172,8 @@ def test_the_undamaged_files_of_these_tests_are_read(tmp_path):
 
 
 def test_every_cut_of_a_file_is_refused(tmp_path):
-    write_spz(_labelled(12), tmp_path / "a.spz")
-    write_spz(_labelled(12), tmp_path / "b.spz", version=3)
+    write(tmp_path / "a.spz", _labelled(12))
+    (tmp_path / "b.spz").write_bytes(gzip.compress(_GOOD))
     for name in ("a.spz", "b.spz"):
         data = (tmp_path / name).read_bytes()
         for end in range(0, len(data), 7):
@@ -185,9 +184,9 @@ def test_every_cut_of_a_file_is_refused(tmp_path):
 
 @pytest.mark.parametrize("version", [3, 4])
 def test_random_damage_is_a_value_error_or_nothing(tmp_path, version):
-    write_spz(_labelled(6), tmp_path / "a.spz", version=version)
+    write(tmp_path / "a.spz", _labelled(6))
     whole, rng = (tmp_path / "a.spz").read_bytes(), np.random.default_rng(version)
-    data, refused = np.frombuffer(whole if version == 4 else gzip.decompress(whole), np.uint8), 0
+    data, refused = np.frombuffer(whole if version == 4 else _with_labels(_labels()), np.uint8), 0
     for _ in range(300):
         bad = data.copy()
         bad[rng.integers(0, len(bad) if rng.random() < 0.5 else 40, 3)] = rng.integers(0, 256, 3)
@@ -203,10 +202,3 @@ def test_several_gzip_members_are_one_stream(tmp_path):
     data = legacy_payload([ROW | {"rotation": 0xC0000000}] * 5, version=3)
     (tmp_path / "a.spz").write_bytes(gzip.compress(data[:30]) + gzip.compress(data[30:]) + b"\0" * 7)
     assert len(read(tmp_path / "a.spz")) == 5
-
-
-def test_files_are_known_by_their_content(tmp_path):
-    write_spz(_labelled(40), tmp_path / "a.spz", version=3)
-    (tmp_path / "a.spz").rename(tmp_path / "a.bin")
-    assert not module.matches(b"\x1f\x8b\x08\xff\xff\xff\xff\xff\xff\xff\xff\xff")
-    assert not module.matches(b"ply\n")

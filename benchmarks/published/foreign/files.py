@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kfgs._torch_files import plain_tensor, read_torch
-from kfgs.formats.folders import numbered_files
+from kfgs.formats.table import numbered_files
 from kfgs.gaussians import Gaussians
 
 

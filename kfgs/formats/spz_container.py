@@ -11,23 +11,21 @@ import gzip
 import io
 import struct
 import zlib
-from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
 from .._arrays import most_unpacked
-from .._card import short_repr
 from .._files import atomic_path
 from .values import check_count
 
 MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"
 ANTIALIASED, HAS_EXTENSIONS = 0x1, 0x2
-MAX_DEGREE = 4
-MAX_FRACTIONAL_BITS = 24
+_MAX_DEGREE, _MAX_FRACTIONAL_BITS = 4, 24
 _LEGACY = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, fractional bits, flags, reserved
 _HEADER = struct.Struct("<4sIIBBBBI12x")  # the same, but the number of streams, and where the table begins
 _ENTRY = struct.Struct("<QQ")  # compressed and plain bytes of a stream
@@ -35,37 +33,23 @@ _RECORD = struct.Struct("<II")
 _PART = 1 << 20  # bytes that are unpacked at once
 
 
-@dataclass(frozen=True, eq=False)
-class Container:
+class Container(NamedTuple):
     """An SPZ file, its streams plain but still quantised."""
 
     version: int
-    count: int
-    degree: int
-    """Of the spherical harmonics, 0 to 4."""
+    size: int  # Gaussians
+    degree: int  # of the spherical harmonics, 0 to 4
     fractional_bits: int
     flags: int
-    streams: dict[str, NDArray[np.uint8]]
-    """The bytes of each attribute, as many as `stream_sizes` says."""
-    extensions: list[tuple[int, bytes]] = field(default_factory=list)
-    """Records as (type, payload)."""
-
-    __repr__ = short_repr
-
-
-def stream_sizes(version: int, count: int, degree: int) -> dict[str, int]:
-    """Plain bytes of each stream, in the order of the file."""
-    position, rotation = (6 if version == 1 else 9), (3 if version < 3 else 4)
-    each = {"positions": position, "alphas": 1, "colors": 3, "scales": 3, "rotations": rotation}
-    each["sh"] = 3 * ((degree + 1) ** 2 - 1)
-    return {name: size * count for name, size in each.items()}
+    streams: dict[str, NDArray[np.uint8]]  # the bytes of each attribute, in the order of the file
+    extensions: list[tuple[int, bytes]]  # records: type, payload
 
 
 def read_container(path: Path) -> Container:
     """Read an SPZ file of version 1 to 4. Sizes that the file cannot hold are refused before unpacking.
 
     Raises:
-        ValueError: if it is no SPZ file, or damaged: truncated, or with counts or sizes that do not fit.
+        ValueError: if it is not an SPZ file, or damaged: truncated, or with counts or sizes that do not fit.
     """
     data = path.read_bytes()
     if data[:2] == GZIP:
@@ -74,47 +58,57 @@ def read_container(path: Path) -> Container:
         raise ValueError(
             f"{path}: expected an SPZ file (NGSP, or gzip around it), got {data[:4]!r}; is it another format?"
         )
-    if struct.unpack_from("<I", data, 4)[0] < 4:
-        return _parse_legacy(path, data)
-    return _parse_streams(path, data)
+    return (_parse_legacy if struct.unpack_from("<I", data, 4)[0] < 4 else _parse_streams)(path, data)
 
 
-def write_container(path: Path, container: Container) -> None:
-    """Write a container in the layout of its version (2, 3 or 4), atomically."""
-    c = container
+def write_container(path: Path, c: Container) -> None:
+    """Write a container of version 4, atomically."""
     records = b"".join(_RECORD.pack(kind, len(payload)) + payload for kind, payload in c.extensions)
     flags = c.flags | (HAS_EXTENSIONS if records else 0)
     streams = [values.tobytes() for values in c.streams.values() if values.size]
-    if c.version < 4:
-        head = _LEGACY.pack(MAGIC, c.version, c.count, c.degree, c.fractional_bits, flags, 0)
-        deflate = zlib.compressobj(9, wbits=31)  # 31: gzip
-        parts = [deflate.compress(part) for part in (head, *streams, records)] + [deflate.flush()]
-    else:
-        packed = [zstandard.compress(stream, 12) for stream in streams]
-        table = [_ENTRY.pack(len(small), len(plain)) for small, plain in zip(packed, streams, strict=True)]
-        start = _HEADER.size + len(records)
-        head = _HEADER.pack(MAGIC, 4, c.count, c.degree, c.fractional_bits, flags, len(packed), start)
-        parts = [head, records, *table, *packed]
+    packed = [zstandard.compress(stream, 12) for stream in streams]
+    table = [_ENTRY.pack(len(small), len(plain)) for small, plain in zip(packed, streams, strict=True)]
+    start = _HEADER.size + len(records)
+    head = _HEADER.pack(MAGIC, 4, c.size, c.degree, c.fractional_bits, flags, len(packed), start)
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        file.writelines(parts)
+        file.writelines([head, records, *table, *packed])
+
+
+def unpack_frame(path: Path, name: str, data: bytes, size: int) -> bytes:
+    """One Zstandard frame of exactly `size` plain bytes."""
+    if not data and not size:
+        return b""
+    try:
+        promised = zstandard.get_frame_parameters(data).content_size
+        if promised not in (size, zstandard.CONTENTSIZE_UNKNOWN):  # the decompressor allocates the promised size
+            raise ValueError(
+                f"{path}: expected {size} bytes of {name}, got a frame of {promised} bytes; the file is damaged"
+            )
+        unpacker = zstandard.ZstdDecompressor()
+        plain = unpacker.decompress(data, max_output_size=size, allow_extra_data=False) if size else b""
+    except zstandard.ZstdError as error:
+        raise ValueError(
+            f"{path}: expected a Zstandard stream of {name}, but it cannot be unpacked ({error})"
+        ) from error
+    if len(plain) != size:
+        raise ValueError(f"{path}: expected {size} bytes of {name}, got {len(plain)}; the file is damaged")
+    return plain
 
 
 def _check_header(path: Path, data: bytes | bytearray) -> tuple[int, int, int, int, int, dict[str, int]]:
-    """Check the fields that all versions share; returns them, and the sizes of the streams."""
+    """Check the fields that all versions share; returns them, and the plain bytes of each stream in the file's order."""
     _, version, count, degree, bits, flags, _ = _LEGACY.unpack_from(data)
-    if not 1 <= version <= 4:
-        raise ValueError(
-            f"{path}: expected SPZ version 1 to 4, got {version}; ask for an update of kfgs, or convert it"
-        )
-    if degree > MAX_DEGREE:
-        raise ValueError(
-            f"{path}: expected spherical harmonics of degree 0 to {MAX_DEGREE}, got {degree}; the header is damaged"
-        )
-    if bits > MAX_FRACTIONAL_BITS:
-        raise ValueError(
-            f"{path}: expected 0 to {MAX_FRACTIONAL_BITS} fractional bits, got {bits}; the header is damaged"
-        )
-    return version, count, degree, bits, flags, stream_sizes(version, count, degree)
+    for what, value, low, high in (
+        ("SPZ version", version, 1, 4),
+        ("spherical harmonics of degree", degree, 0, _MAX_DEGREE),
+        ("fractional bits from", bits, 0, _MAX_FRACTIONAL_BITS),
+    ):
+        if not low <= value <= high:
+            raise ValueError(f"{path}: expected {what} {low} to {high}, got {value}; update kfgs, or convert the file")
+    position, rotation = (6 if version == 1 else 9), (3 if version < 3 else 4)
+    each = {"positions": position, "alphas": 1, "colors": 3, "scales": 3, "rotations": rotation}
+    each["sh"] = 3 * ((degree + 1) ** 2 - 1)
+    return version, count, degree, bits, flags, {name: size * count for name, size in each.items()}
 
 
 def _inflate(path: Path, data: bytes) -> bytearray:
@@ -129,10 +123,8 @@ def _inflate(path: Path, data: bytes) -> bytearray:
                 )
             _, count, degree, _, flags, sizes = _check_header(path, head)
             check_count(path, count, degree, len(data))
-            size = sum(sizes.values())
-            limit = (
-                most_unpacked(len(data)) if flags & ~ANTIALIASED else size
-            )  # other flags announce more after the streams
+            # Flags other than antialiased announce more after the streams.
+            limit = most_unpacked(len(data)) if flags & ~ANTIALIASED else sum(sizes.values())
             plain = bytearray(head)
             while len(plain) <= _LEGACY.size + limit and (part := file.read(_PART)):
                 plain += part
@@ -151,20 +143,16 @@ def _parse_legacy(path: Path, data: bytes | bytearray) -> Container:
     version, count, degree, bits, flags, sizes = _check_header(path, data)
     if version == 4:
         raise ValueError(f"{path}: expected version 1 to 3 in a gzip stream, got 4; the file is damaged")
-    if (needed := sum(sizes.values())) > len(data) - _LEGACY.size:
+    needed, have = sum(sizes.values()), len(data) - _LEGACY.size
+    if needed > have or (needed < have and not flags & ~ANTIALIASED):
         raise ValueError(
-            f"{path}: expected {needed} bytes for {count} Gaussians, got {len(data) - _LEGACY.size}; the file is truncated"
+            f"{path}: expected {needed} bytes for {count} Gaussians, got {have}; the file is truncated, or damaged"
         )
     streams, at = {}, _LEGACY.size
     for name, size in sizes.items():
         streams[name] = np.frombuffer(data, np.uint8, size, at)
         at += size
-    rest = data[at:]
-    if rest and not flags & ~ANTIALIASED:  # other flags announce something after the streams
-        raise ValueError(
-            f"{path}: expected {at} bytes for {count} Gaussians, got {len(data)}; the file is damaged, or longer than it says"
-        )
-    records = _parse_records(path, rest) if flags & HAS_EXTENSIONS else []
+    records = _parse_records(path, data[at:]) if flags & HAS_EXTENSIONS else []
     return Container(version, count, degree, bits, flags, streams, records)
 
 
@@ -203,30 +191,9 @@ def _parse_streams(path: Path, data: bytes) -> Container:
                 f"{path}: expected a stream of {sizes[name]} bytes of {name} within {len(data)} bytes, got {plain} bytes "
                 f"packed up to byte {at + small}; the file is truncated, or damaged"
             )
-        streams[name] = np.frombuffer(_unpack_frame(path, name, data[at : at + small], plain), np.uint8)
+        streams[name] = np.frombuffer(unpack_frame(path, name, data[at : at + small], plain), np.uint8)
         at += small
     if at != len(data):
         raise ValueError(f"{path}: expected the end at byte {at}, got {len(data) - at} bytes more; the file is damaged")
     records = _parse_records(path, data[_HEADER.size : start]) if flags & HAS_EXTENSIONS else []
     return Container(version, count, degree, bits, flags, streams, records)
-
-
-def _unpack_frame(path: Path, name: str, data: bytes, size: int) -> bytes:
-    """One Zstandard frame of exactly `size` plain bytes."""
-    if not data and not size:
-        return b""
-    try:
-        promised = zstandard.get_frame_parameters(data).content_size
-        if promised not in (size, zstandard.CONTENTSIZE_UNKNOWN):  # the decompressor allocates the promised size
-            raise ValueError(
-                f"{path}: expected {size} bytes of {name}, got a frame of {promised} bytes; the file is damaged"
-            )
-        unpacker = zstandard.ZstdDecompressor()
-        plain = unpacker.decompress(data, max_output_size=size, allow_extra_data=False) if size else b""
-    except zstandard.ZstdError as error:
-        raise ValueError(
-            f"{path}: expected a Zstandard stream of {name}, but it cannot be unpacked ({error})"
-        ) from error
-    if len(plain) != size:
-        raise ValueError(f"{path}: expected {size} bytes of {name}, got {len(plain)}; the file is damaged")
-    return plain

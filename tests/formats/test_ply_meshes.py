@@ -4,8 +4,7 @@ import pytest
 from meshes import QUADS, XYZ, write_mesh
 from messages import tells
 
-from kfgs.formats.ply import write_ply
-from kfgs.formats.ply_mesh import read_mesh
+from kfgs.formats.ply import read_mesh, write_ply
 
 
 @pytest.mark.parametrize("id_first", [False, True])
