@@ -10,7 +10,7 @@
 # `notebook`, no data.
 
 # %%
-# Your own data: a scene, its feature maps as `kfgs features` writes them, and the teacher's words (`kfgs text`).
+# Your own data: a scene, its feature maps as `kfgs features` writes them, and the teacher's words (`kfgs features --words`).
 import os
 from pathlib import Path
 

@@ -64,5 +64,5 @@ def stages(lines: list[str]) -> dict[str, str]:
 def fit_run(room: Path, out: Path) -> Path:
     """A fitted run, made through the command line, without an autoencoder for speed."""
     arguments = ["fit", str(room), "--features", str(room / "features"), "--out", str(out)]
-    assert main([*arguments, "--method", "paper", "--mode", "adc", "--steps", "60", "--max-gaussians", "2000"]) == 0
+    assert main([*arguments, "--method", "adc", "--steps", "60", "--max-gaussians", "2000"]) == 0
     return out

@@ -12,7 +12,6 @@ from small_room import fit_run, make_room
 
 from kfgs import scenes
 from kfgs.cli import main
-from kfgs.fields import SemanticField
 from kfgs.formats.ply import read_comments, read_ply, write_ply
 
 
@@ -39,23 +38,23 @@ def test_fit_names_what_it_wrote(run):
 
 def test_info_knows_fields_runs_scenes_and_plys(run, room, tmp_path, capsys):
     for path in (run, run / "field.kfgs"):
-        assert main(["info", str(path)]) == 0
+        assert main(["convert", str(path)]) == 0
         assert "Gaussians" in capsys.readouterr().out
-    assert main(["info", str(room)]) == 0
+    assert main(["convert", str(room)]) == 0
     assert "9 posed images" in capsys.readouterr().out
     shutil.copytree(run / "stages", tmp_path / "half" / "stages")
-    assert main(["info", str(tmp_path / "half")]) == 0
+    assert main(["convert", str(tmp_path / "half")]) == 0
     said = capsys.readouterr().out
     assert "unfinished run" in said
     assert "codebook: done in" in said
     write_ply(tmp_path / "a.ply", {"x": np.zeros(3, np.float32)})
-    assert main(["info", str(tmp_path / "a.ply")]) == 0
+    assert main(["convert", str(tmp_path / "a.ply")]) == 0
     assert "3 vertices; columns x" in capsys.readouterr().out
 
 
 def test_segment_scores_where_truth_is_known(run, room, tmp_path, capsys):
     out = tmp_path / "seg"
-    assert main(["segment", str(run / "field.kfgs"), "--scene", str(room), "--out", str(out), "--pictures", "1"]) == 0
+    assert main(["segment", str(run / "field.kfgs"), "--scene", str(room), "--out", str(out)]) == 0
     said = capsys.readouterr().out
     assert "kfgs-pooled/1" in said
     scores = json.loads((out / "scores.json").read_text())
@@ -65,95 +64,56 @@ def test_segment_scores_where_truth_is_known(run, room, tmp_path, capsys):
         assert str(out / name) in said
 
 
-def test_label_carries_classes_to_another_cloud_and_keeps_its_columns(run, room, tmp_path, capsys):
+def test_attach_carries_classes_to_points_and_keeps_their_columns(run, room, tmp_path, capsys):
     surface = np.load(room / "surface.npz")["points"].astype(np.float32)
     cloud = {name: np.ascontiguousarray(surface[:, i]) for i, name in enumerate("xyz")}
-    write_ply(tmp_path / "cloud.ply", cloud | {"mass": np.arange(len(surface), dtype=np.float32)})
-    out = tmp_path / "labelled"
-    arguments = [
-        "label",
-        str(run / "field.kfgs"),
-        "--scene",
-        str(room),
-        "--out",
-        str(out),
-        "--cloud",
-        str(tmp_path / "cloud.ply"),
-    ]
-    assert main(arguments) == 0
-    columns = read_ply(out / "cloud.ply")
+    red = np.full(len(surface), 200, np.uint8)
+    columns = cloud | {"mass": np.arange(len(surface), dtype=np.float32), "red": red, "green": red, "blue": red}
+    write_ply(tmp_path / "cloud.ply", columns, comments=("SplatRenderMode: mip",))
+    out = tmp_path / "labelled.ply"
+    arguments = ["attach", str(run / "field.kfgs"), str(tmp_path / "cloud.ply"), "--scene", str(room)]
+    assert main([*arguments, "--out", str(out)]) == 0
+    columns = read_ply(out)
     np.testing.assert_array_equal(columns["mass"], np.arange(len(surface)))
     assert (columns["class_id"] >= 0).mean() > 0.8
-    names = json.loads((out / "cloud.ply.classes.json").read_text())
+    assert set(columns["red"].tolist()) == {200}
+    assert "SplatRenderMode: mip" in read_comments(out)
+    names = json.loads((tmp_path / "labelled.ply.classes.json").read_text())
     assert names["class_id"]["1"] == "floor"
     assert names["distance"] > 0
-    assert {"class_id", "score", "f_dc_0"} <= set(read_ply(out / "gaussians.ply"))
 
 
-def test_nothing_of_the_users_is_overwritten(run, room, tmp_path, capsys, monkeypatch):
+def test_a_field_becomes_a_splat_in_the_colours_of_its_classes(run, tmp_path):
+    assert main(["convert", str(run), str(tmp_path / "labelled.ply")]) == 0
+    assert {"class_id", "score", "f_dc_0"} <= set(read_ply(tmp_path / "labelled.ply"))
+
+
+def test_nothing_of_the_users_is_overwritten(run, room, tmp_path):
     before = (room / "labels" / "view_001.png").read_bytes()
-    assert main(["segment", str(run / "field.kfgs"), "--scene", str(room), "--out", str(room), "--pictures", "0"]) == 0
+    assert main(["segment", str(run / "field.kfgs"), "--scene", str(room), "--out", str(room)]) == 0
     assert (room / "labels" / "view_001.png").read_bytes() == before
-    cloud = tmp_path / "gaussians.ply"
-    write_ply(cloud, {name: np.zeros(3, np.float32) for name in "xyz"})
-    before = cloud.read_bytes()
-    monkeypatch.setattr(SemanticField, "load", None)  # the work
-    arguments = ["label", str(run / "field.kfgs"), "--scene", str(room), "--out", str(tmp_path), "--cloud", str(cloud)]
-    assert main(arguments) == 1
-    assert "would be overwritten" in capsys.readouterr().err
-    assert cloud.read_bytes() == before
-
-
-def test_a_clouds_own_colours_and_comments_are_kept(run, room, tmp_path):
-    red = np.full(4, 200, np.uint8)
-    columns = {n: np.zeros(4, np.float32) for n in "xyz"} | {"red": red, "green": red, "blue": red}
-    write_ply(tmp_path / "c.ply", columns, comments=("SplatRenderMode: mip",))
-    arguments = [
-        "label",
-        str(run / "field.kfgs"),
-        "--scene",
-        str(room),
-        "--out",
-        str(tmp_path / "o"),
-        "--rule",
-        "paper",
-    ]
-    assert main([*arguments, "--cloud", str(tmp_path / "c.ply")]) == 0
-    assert read_ply(tmp_path / "o" / "cloud.ply")["red"].tolist() == [200] * 4
-    assert "SplatRenderMode: mip" in read_comments(tmp_path / "o" / "cloud.ply")
 
 
 def test_a_mesh_is_refused_since_its_faces_would_be_lost(run, room, tmp_path, capsys):
     header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
     faces = "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
     (tmp_path / "mesh.ply").write_text(header + faces)
-    arguments = ["label", str(run / "field.kfgs"), "--scene", str(room), "--out", str(tmp_path / "o")]
-    assert main([*arguments, "--cloud", str(tmp_path / "mesh.ply")]) == 1
+    arguments = ["attach", str(run / "field.kfgs"), str(tmp_path / "mesh.ply"), "--out", str(tmp_path / "o.ply")]
+    assert main(arguments) == 1
     assert "mesh.ply: expected nothing but points, got face" in capsys.readouterr().err
-    assert not (tmp_path / "o").exists()
+    assert not (tmp_path / "o.ply").exists()
 
 
 def test_views_without_label_pictures_are_segmented_without_a_score(run, room, tmp_path, capsys):
-    arguments = ["segment", str(run / "field.kfgs"), "--scene", str(room), "--out", str(tmp_path), "--pictures", "0"]
+    arguments = ["segment", str(run / "field.kfgs"), "--scene", str(room), "--out", str(tmp_path)]
     assert main([*arguments, "--split", "train"]) == 0
     assert "trained on 6 of these views" in capsys.readouterr().out
-
-
-def test_a_single_query_reports_its_threshold(run, room, tmp_path, capsys):
-    assert (
-        main(["label", str(run / "field.kfgs"), "--scene", str(room), "--out", str(tmp_path), "--query", "chair"]) == 0
-    )
-    assert "above gamma = " in capsys.readouterr().out
-    labels = read_ply(tmp_path / "gaussians.ply")["class_id"]
-    names = json.loads((tmp_path / "gaussians.ply.classes.json").read_text())["class_id"]
-    assert {names[str(int(label))] for label in labels if label >= 0} == {"chair"}
-    assert (labels == -1).any()
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["info", "{tmp}/nothing"], ("{tmp}/nothing:", "no such file or folder")),
+        (["convert", "{tmp}/nothing"], ("{tmp}/nothing:", "no such file or folder")),
         (
             ["segment", "{tmp}", "--scene", "{room}", "--out", "{tmp}/o"],
             ("FIELD:", "field.kfgs", "got {tmp}", "`kfgs fit`"),
@@ -169,36 +129,12 @@ def test_a_single_query_reports_its_threshold(run, room, tmp_path, capsys):
             ("--split:", "train, test", "got 'val'"),
         ),
         (
-            ["label", "{run}/field.kfgs", "--out", "{tmp}/o", "--classes", "{room}/classes.json"],
-            ("--classes, --text:", "got none", "--scene", "`kfgs text`"),
-        ),
-        (
-            ["fit", "{room}", "--features", "{room}/features", "--out", "{tmp}/o", "--mode", "adc"],
-            ("--mode:", "got 'adc'", "--method paper"),
-        ),
-        (
             ["fit", "{room}", "--out", "{tmp}/o", "--method", "paper", "--splat", "a.ply"],
             ("--splat:", "--method paper", "got a.ply"),
         ),
         (
-            ["label", "{run}/field.kfgs", "--scene", "{room}", "--out", "{tmp}/o", "--query", "dragon"],
-            ("class:", "got 'dragon'"),
-        ),
-        (
-            ["label", "{run}/field.kfgs", "--scene", "{room}", "--out", "{tmp}/o", "--distance", "1"],
-            ("--distance:", "--cloud", "got none"),
-        ),
-        (
-            ["label", "{run}/field.kfgs", "--scene", "{room}", "--out", "{tmp}/o", "--threshold", "1"],
-            ("--threshold:", "--query", "got none"),
-        ),
-        (
-            ["label", "{run}/field.kfgs", "--scene", "{room}", "--out", "{tmp}/o", "--cloud", "{room}/no.ply"],
+            ["attach", "{run}/field.kfgs", "{room}/no.ply", "--scene", "{room}", "--out", "{tmp}/o/a.ply"],
             ("{room}/no.ply:", "no such file"),
-        ),
-        (
-            ["segment", "{run}/field.kfgs", "--scene", "{room}", "--out", "{tmp}/o", "--labels", "{tmp}"],
-            ("--labels:", "{tmp}", "'test'", "none"),
         ),
         (["sfm", "{tmp}", "--out", "{tmp}/o"], ("{tmp}:", "3 images", "got 0")),
     ],
@@ -214,7 +150,7 @@ def test_bad_input_ends_with_1_one_message_and_no_files(arguments, message, run,
 
 
 def test_wrong_usage_ends_with_2():
-    for arguments in (["fly"], ["fit"], ["fit", "x", "--out", "y", "--features", "z", "--preset", "gpu"]):
+    for arguments in (["fly"], ["fit"], ["fit", "x", "--out", "y", "--features", "z", "--method", "gpu"]):
         with pytest.raises(SystemExit) as stop:
             main(arguments)
         assert stop.value.code == 2
@@ -223,7 +159,7 @@ def test_wrong_usage_ends_with_2():
 def test_help_is_quick_to_ask_for_and_names_every_command():
     code = "import sys; from kfgs.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\nprint('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    for command in ("demo", "sfm", "fit", "segment", "label", "info"):
+    for command in ("demo", "sfm", "fit", "segment", "attach", "convert"):
         assert command in done.stdout
     assert done.stdout.strip().endswith("False")  # no heavy import for a help text
 

@@ -62,7 +62,7 @@ def labelled(room, field, splat, tmp_path_factory):
 def colored(room, tmp_path_factory):
     """A run of `kfgs color`."""
     out = tmp_path_factory.mktemp("color")
-    assert main(["color", str(room), "--out", str(out), *COLOR, "--pictures", "2"]) == 0
+    assert main(["color", str(room), "--out", str(out), *COLOR]) == 0
     return out
 
 
@@ -79,16 +79,15 @@ def test_color_scores_the_views_held_out(colored, room):
         psnr[scene.stem(i)] = -10 * np.log10(((rendered.numpy() - taken) ** 2).mean())
     assert {stem: row["psnr"] for stem, row in scores["views"].items()} == pytest.approx(psnr, abs=1e-3)
     assert scores["psnr"] == pytest.approx(np.mean(list(psnr.values())), abs=1e-3)
-    assert sorted(path.name for path in (colored / "views").iterdir()) == ["view_001.png", "view_007.png"]
+    assert len(list((colored / "views").iterdir())) == len(scene.views("test"))
 
 
 def test_color_run_again_does_nothing_and_says_so(colored, room, capsys):
     before = (colored / "color.ply").read_bytes()
-    assert main(["color", str(room), "--out", str(colored), *COLOR, "--pictures", "0"]) == 0
+    assert main(["color", str(room), "--out", str(colored), *COLOR]) == 0
     said = capsys.readouterr().out
     assert (colored / "color.ply").read_bytes() == before
     assert "PSNR" in said
-    assert "views" not in said.split("wrote:")[1]
 
 
 def test_color_interrupted_goes_on_to_the_same_field(colored, room, tmp_path, monkeypatch, capsys):
@@ -105,9 +104,9 @@ def test_color_interrupted_goes_on_to_the_same_field(colored, room, tmp_path, mo
 
     monkeypatch.setattr(color_module, "fit_field", often)
     monkeypatch.setattr(TrainingPictures, "__getitem__", stopping)
-    arguments = ["color", str(room), "--out", str(tmp_path), *COLOR, "--pictures", "0"]
+    arguments = ["color", str(room), "--out", str(tmp_path), *COLOR]
     assert main(arguments) == 130
-    assert "goes on where it stopped" in capsys.readouterr().err
+    assert "continues where it stopped" in capsys.readouterr().err
     assert not (tmp_path / "color.ply").exists()
     assert main(arguments) == 0
     assert len(looks) == 25 + 1 + 10  # once for the size, then steps 21 to 30
@@ -154,7 +153,7 @@ def test_attach_by_views_is_what_a_scene_does(field, splat, truth, room, tmp_pat
 
 
 def test_attach_by_files_and_a_distance(field, splat, truth, room, tmp_path):
-    files = ["--classes", str(room / "classes.json"), "--text", str(room / "text.npy")]
+    files = ["--text", str(room / "text.npy")]
     out = tmp_path / "a.ply"
     assert main(["attach", str(field), str(splat), *files, "--out", str(out), "--distance", "0.3", "--same-frame"]) == 0
     assert (read_splats(out).labels == truth).float().mean() > 0.999
@@ -185,7 +184,7 @@ def test_select_counts_places_and_saves(labelled, room, tmp_path, capsys):
 
 def test_select_asks_a_field_by_text(field, truth, room, capsys):
     names = json.loads((room / "classes.json").read_text())
-    arguments = ["select", "lamp", str(field), "--classes", str(room / "classes.json")]
+    arguments = ["select", "lamp", str(field)]
     assert main([*arguments, "--text", str(room / "text.npy")]) == 0
     said = capsys.readouterr().out
     # Each Gaussian carries its class's own embedding.
@@ -214,36 +213,18 @@ def by_name(path):
 
 def test_edit_does_each_of_its_options(labelled, tmp_path, capsys):
     out = tmp_path / "new" / "e.ply"
-    options = ["--remove", "chair", "--remove", "rug", "--move", "sofa:0.5,0,-0.25", "--opacity", "lamp:0.5"]
-    options += [
-        "--recolor",
-        "plant:#0000ff",
-        "--rotate",
-        "table:z,90",
-        "--scale",
-        "door:2",
-        "--duplicate",
-        "lamp:0,1,0",
-    ]
+    options = ["--remove", "chair", "--remove", "rug", "--move", "sofa:0.5,0,-0.25"]
+    options += ["--recolor", "plant:#0000ff"]
     assert main(["edit", str(labelled), "--out", str(out), *options]) == 0
     (before, old), (after, new) = by_name(labelled), by_name(out)
     a, b = before, after
-    lamps = int(old["lamp"].sum())
-    assert f"4000 Gaussians before, {len(b)} after 8 edit(s)" in capsys.readouterr().out
-    assert len(b) == 4000 - int(old["chair"].sum()) - int(old["rug"].sum()) + lamps
+    assert f"4000 Gaussians before, {len(b)} after 4 edit(s)" in capsys.readouterr().out
+    assert len(b) == 4000 - int(old["chair"].sum()) - int(old["rug"].sum())
     assert not new["chair"].any()
     assert not new["rug"].any()
     torch.testing.assert_close(b.means[new["sofa"]], a.means[old["sofa"]] + torch.tensor([0.5, 0.0, -0.25]))
-    torch.testing.assert_close(b.opacities[new["lamp"]], torch.full((2 * lamps,), 0.475))
-    shift = b.means[new["lamp"]][lamps:] - a.means[old["lamp"]]
-    torch.testing.assert_close(shift, torch.tensor([0.0, 1.0, 0.0]).expand(lamps, 3))
     rgb = b.sh[new["plant"]][:, 0] * SH0 + 0.5
     assert (rgb[:, 2] > rgb[:, 0] + 0.1).all()
-    centred = [x.means[m["table"]] - x.means[m["table"]].mean(0) for x, m in ((a, old), (b, new))]
-    torch.testing.assert_close(centred[1][:, :2], centred[0][:, :2].flip(1) * torch.tensor([-1.0, 1.0]))
-    centred = [x.means[m["door"]] - x.means[m["door"]].mean(0) for x, m in ((a, old), (b, new))]
-    torch.testing.assert_close(centred[1], 2 * centred[0])
-    torch.testing.assert_close(b.scales[new["door"]], 2 * a.scales[old["door"]])
     torch.testing.assert_close(b.means[new["wall"]], a.means[old["wall"]], rtol=0, atol=0)
 
 
@@ -254,7 +235,6 @@ def test_edit_takes_the_parts_that_select_lists(labelled, tmp_path, capsys):
     assert len(parts) > 1
     for number, part in enumerate(parts, start=1):
         assert f"  chair/{number}: Part({part['count']} Gaussians" in said
-    assert "with `kfgs edit`" not in said  # which joins as far without an option
     assert main(["edit", str(labelled), "--out", str(tmp_path / "e.ply"), "--extract", "chair/2"]) == 0
     found, cloud = read_splats(tmp_path / "e.ply"), read_splats(labelled)
     assert torch.equal(found.means, cloud.means[parts[1]["indices"]])
@@ -274,17 +254,6 @@ def test_edit_takes_the_parts_that_select_lists(labelled, tmp_path, capsys):
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "e.ply").read_bytes()
 
 
-def test_parts_within_a_distance_keep_their_names(labelled, tmp_path, capsys):
-    assert main(["select", "chair", str(labelled), "--out", str(tmp_path), "--distance", "100"]) == 0
-    said = capsys.readouterr().out
-    (part,) = json.loads((tmp_path / "selection.json").read_text())["parts"]
-    assert f"  chair/1: Part({part['count']} Gaussians" in said
-    assert "with `kfgs edit`, add --distance 100.0\n" in said
-    arguments = ["edit", str(labelled), "--out", str(tmp_path / "e.ply"), "--extract", "chair/1", "--distance", "100"]
-    assert main(arguments) == 0
-    assert len(read_splats(tmp_path / "e.ply")) == part["count"]
-
-
 @pytest.mark.parametrize("option", ["--remove", "--extract"])
 def test_a_part_beyond_the_last_is_refused_even_beside_one_that_is_there(labelled, tmp_path, capsys, option):
     assert main(["select", "chair", str(labelled), "--out", str(tmp_path)]) == 0
@@ -292,21 +261,8 @@ def test_a_part_beyond_the_last_is_refused_even_beside_one_that_is_there(labelle
     out = tmp_path / "e.ply"
     wrong = f"Chair/{count + 1}"
     assert main(["edit", str(labelled), "--out", str(out), option, "chair/1", option, wrong]) == 1
-    assert f"{wrong}: expected a part from Chair/1 to Chair/{count}" in capsys.readouterr().err
+    assert f"{wrong}: expected one of the {count} parts of Chair" in capsys.readouterr().err
     assert not out.exists()
-
-
-def test_hue_keeps_luminance_and_tint_does_not(labelled, tmp_path):
-    luminance = torch.tensor([0.2126, 0.7152, 0.0722])
-    changes = {}
-    for mode in ("hue", "tint"):
-        out = tmp_path / f"{mode}.ply"
-        assert main(["edit", str(labelled), "--out", str(out), "--recolor", "sofa:#101030", "--mode", mode]) == 0
-        (before, mask), (after, _) = by_name(labelled), by_name(out)
-        rgb = [(c.sh[mask["sofa"]][:, 0] * SH0 + 0.5) @ luminance for c in (before, after)]
-        changes[mode] = float((rgb[1] - rgb[0]).abs().max())
-    assert changes["hue"] < 1e-5
-    assert changes["tint"] > 0.1
 
 
 def test_edits_are_replayed_to_the_same_bytes_from_anywhere(labelled, tmp_path, capsys):
@@ -334,27 +290,20 @@ def test_edits_are_replayed_to_the_same_bytes_from_anywhere(labelled, tmp_path, 
 def test_edit_shows_before_and_after(labelled, room, tmp_path, capsys):
     out = tmp_path / "e.spz"
     arguments = ["edit", str(labelled), "--out", str(out), "--remove", "table", "--scene", str(room)]
-    assert main([*arguments, "--pictures", "1"]) == 0
+    assert main(arguments) == 0
     said = capsys.readouterr().out
     assert "before and after from view_" in said
     picture = np.asarray(Image.open(tmp_path / "e.spz.png")).astype(int)
     left, right = picture[-66:-6, 6:86], picture[-66:-6, 92:172]
     assert (np.abs(left - right).max(-1) > 8).mean() > 0.02
-    assert main([*arguments, "--views", "view_003", "--views", "view_001.png"]) == 0
-    assert "from view_003.png, view_001.png" in capsys.readouterr().out
-    with Image.open(tmp_path / "e.spz.png") as both:
-        assert both.height == picture.shape[0] + 66
     (tmp_path / "e.spz.png").unlink()
-    assert main([*arguments, "--recolor", "lamp:#00ff00", "--pictures", "2"]) == 0
+    assert main([*arguments, "--recolor", "lamp:#00ff00"]) == 0
     chosen = capsys.readouterr().out.split("before and after from ")[1].splitlines()[0].split(", ")
     before, edits = read_splats(labelled), EditList.load(tmp_path / "e.spz.edits.json")
     cameras = load_scene(room).cameras
     states = [before, *(EditList(edits.edits[: i + 1]).apply(before) for i in range(2))]
     expected = views_of_change(states[0], states[-1], cameras, 2, between=states[1:-1])
     assert chosen == [cameras[i].name for i in expected]
-    (tmp_path / "e.spz.png").unlink()
-    assert main([*arguments, "--pictures", "0"]) == 0
-    assert not (tmp_path / "e.spz.png").exists()
 
 
 def test_an_edit_that_no_view_shows_gets_no_picture(labelled, room, tmp_path, capsys):
@@ -369,7 +318,7 @@ def test_everything_may_be_removed(labelled, room, tmp_path, capsys):
     few = cloud.select(cloud.labels == 5)
     write_splats(few, tmp_path / "chairs.ply")
     arguments = ["edit", str(tmp_path / "chairs.ply"), "--out", str(tmp_path / "e.ply"), "--remove", "chair"]
-    assert main([*arguments, "--scene", str(room), "--pictures", "1"]) == 0
+    assert main([*arguments, "--scene", str(room)]) == 0
     assert "nothing is left" in capsys.readouterr().out
     assert len(read_splats(tmp_path / "e.ply")) == 0
 
@@ -426,10 +375,7 @@ def test_all_photographs_can_be_used_and_none_is_left_to_score(room, splat, tmp_
     field = SemanticField.load(tmp_path / "run" / "field.kfgs")
     assert [Path(name).stem for name in field.info["views"]] == every
     out = tmp_path / "segmented"
-    assert (
-        main(["segment", str(tmp_path / "run" / "field.kfgs"), "--out", str(out), "--split", "all", "--pictures", "0"])
-        == 0
-    )
+    assert main(["segment", str(tmp_path / "run" / "field.kfgs"), "--out", str(out), "--split", "all"]) == 0
     assert sorted(path.stem for path in (out / "predicted").iterdir()) == every
     capsys.readouterr()
     assert main(["color", str(room), "--out", str(tmp_path / "color"), *COLOR, "--split", "all"]) == 0

@@ -99,7 +99,7 @@ def test_command_lines_in_the_docs_are_understood(name, monkeypatch):
 
 # of SplatTransform, Dask, gsplat
 OF_OTHERS = {"--spz-version", "--nthreads", "--no-normalize-world-space"}
-OF_BENCHMARKS = {"--kinds", "--quick", "--room-0", "--whole", "--atoms", "--copies", "--compare"}
+OF_BENCHMARKS = {"--kinds", "--quick", "--room-0", "--whole", "--atoms", "--copies", "--compare", "--check"}
 
 
 @pytest.mark.parametrize("name", SHOWN)
@@ -119,9 +119,12 @@ def test_an_option_that_the_docs_name_exists(name):
 def test_a_home_folder_is_understood_everywhere(monkeypatch, tmp_path, capsys):
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "words.txt").write_text("wall\nfloor\n")
-    assert cli.main(["text", "~/words.txt", "--teacher", "cases_text:TEACHER", "--out=~/t.safetensors"]) == 0
+    assert (
+        cli.main(["features", "--words", "~/words.txt", "--teacher", "cases_text:TEACHER", "--out=~/t.safetensors"])
+        == 0
+    )
     assert (tmp_path / "t.safetensors").is_file()
-    assert cli.main(["info", "~/nothing"]) == 1
+    assert cli.main(["convert", "~/nothing"]) == 1
     assert f"{tmp_path}/nothing" in capsys.readouterr().err
 
 
@@ -143,7 +146,7 @@ def test_version_and_overview(capsys):
     ("line", "choices"),
     [
         ("attach run/field.kfgs a.ply --out b.ply --by color", ["views", "distance"]),
-        ("fit scene --out run --method paper --mode fast", ["decouple", "adc", "adc+sc"]),
+        ("fit scene --out run --method fast", ["uplift", "paper", "paper-full", "adc", "decouple"]),
     ],
 )
 def test_a_wrong_choice_is_told_the_words_that_can_be_given(line, choices, capsys, monkeypatch):
@@ -160,14 +163,6 @@ def test_messages_name_options_as_they_are_written():
     names = cli._shown_names(cli.COMMANDS["attach"])
     assert cli._in_options("splat_scene: expected", names) == "--splat-scene: expected"
     assert cli._in_options("field, text: expected: one", names) == "FIELD, --text: expected: one"
-    message = (
-        "scene: expected 9 images (min_registered = 0.9), got 3; pass single_camera=False, or lower min_registered"
-    )
-    names = cli._shown_names(cli.COMMANDS["sfm"])
-    expected = message.replace("min_registered", "--min-registered").replace(
-        "single_camera=False", "--no-single-camera"
-    )
-    assert cli._in_options(message, names) == expected
     for message in ("a.ply: no such file", "no colon", "splats, more: expected"):
         assert cli._in_options(message, names) == message
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from kfgs import cli
-from kfgs.cli import _in_options, main
+from kfgs.cli import main
 from kfgs.cli.output import END, LINE, say
 from kfgs.formats import write_splats
 from kfgs.gaussians import Gaussians
@@ -53,7 +53,7 @@ def test_the_middle_of_a_long_line_is_left_out():
 
 def test_class_names_of_a_stranger_reach_the_terminal_without_control_characters(tmp_path, capsys):
     file = splat(tmp_path / "a.ply", ("wall\x1b]0;owned\x07", "chair\x9b2J"))
-    assert main(["info", str(file)]) == 0
+    assert main(["convert", str(file)]) == 0
     assert main(["select", "sofa", str(file), "--out", str(tmp_path / "b.ply")]) == 1
     said = capsys.readouterr()
     assert "wall\\x1b" in said.out
@@ -88,11 +88,6 @@ def test_a_stream_that_takes_nothing_is_named(stream, name, monkeypatch):
             monkeypatch.setattr(sys, stream, full)
         with pytest.raises(OSError, match=f"^{name} cannot be written"):
             say("hello", full)
-
-
-def test_advice_for_python_is_left_out_on_the_command_line():
-    message = "splat: no frame (in Python: frame=Similarity.identity() says so); give cameras (see f(x))"
-    assert _in_options(message, {}) == "splat: no frame; give cameras (see f(x))"
 
 
 @pytest.mark.parametrize("error", [AttributeError, ImportError, SystemError])

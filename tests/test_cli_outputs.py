@@ -5,7 +5,6 @@ import shutil
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 import torch
 from messages import tells
@@ -14,7 +13,6 @@ from small_room import fit_run, make_room
 from kfgs.cli import main
 from kfgs.fields import SemanticField
 from kfgs.formats import write_splats
-from kfgs.formats.ply import write_ply
 from kfgs.gaussians import Gaussians
 
 
@@ -63,15 +61,14 @@ def refused(arguments, capsys, *parts):
         "fit {room} --out {file}",
         "color {room} --out {file}",
         "segment {run}/field.kfgs --out {file}",
-        "label {run}/field.kfgs --out {file}",
         "select chair {run}/field.kfgs --out {file}",
         "view {run}/field.kfgs --out {file}",
-        "text chair --teacher lseg --out {file}/deep/a.safetensors",
+        "features --words chair --teacher lseg --out {file}/deep/a.safetensors",
         "attach {run}/field.kfgs {splat} --out {file}/deep/a.ply",
         "edit {splat} --remove chair --out {file}/deep/a.ply",
         "convert {splat} {file}/deep/a.ply",
         "render {run} --out {file}/deep/a.gif",
-        "pack {run}/field.kfgs {file}/deep/a.kfgs",
+        "convert {run}/field.kfgs {file}/deep/a.kfgs",
         "evaluate {run}/field.kfgs --out {file}/deep/a.json",
     ],
 )
@@ -93,34 +90,8 @@ def test_an_output_that_cannot_be_is_refused_before_the_work(words, room, run, s
 def test_nothing_is_written_among_pictures_and_maps(place, words, room, run, capsys):
     before = set(room.rglob("*"))
     arguments = [word.format(room=room, run=run, out=room / place) for word in words.split()]
-    refused(arguments, capsys, "--out:", "pictures and feature maps", room / place)
+    refused(arguments, capsys, "--out:", "apart", room)
     assert set(room.rglob("*")) == before
-
-
-@pytest.mark.parametrize("name", ["images_4", "photos"])
-@pytest.mark.parametrize(
-    "words",
-    [
-        "fit {room} --out {out}",
-        "features {room} --teacher lseg --out {out}",
-        "segment {run}/field.kfgs --scene {room} --out {out}",
-        "label {run}/field.kfgs --scene {room} --out {out}",
-        "select chair {run}/field.kfgs --scene {room} --out {out}",
-        "view {run}/field.kfgs --scene {room} --where html --out {out}",
-        "render {run} --scene {room} --out {out}/a.gif",
-        "edit {splat} --remove chair --scene {room} --out {out}/a.ply",
-    ],
-)
-def test_pictures_are_known_wherever_they_are_read_from(words, name, room, run, splat, tmp_path, capsys):
-    """Other names than `images`: found by kfgs itself, or named by the user."""
-    scene = tmp_path / "other"
-    shutil.copytree(room, scene)
-    (scene / "images").rename(scene / name)
-    before = set(scene.rglob("*"))
-    given = ["--images", name] if name == "photos" else []
-    arguments = [word.format(room=scene, run=run, splat=splat, out=scene / name) for word in words.split()]
-    refused([*arguments, *given], capsys, "--out:", "pictures and feature maps", scene / name)
-    assert set(scene.rglob("*")) == before
 
 
 @pytest.mark.parametrize("given", [[], ["--scene", "{room}"]])
@@ -191,9 +162,7 @@ def test_the_second_fit_and_the_second_color_are_told_who_works_there(room, run,
         first.stdin.close()
 
 
-@pytest.mark.parametrize(
-    "words", ["label {run}/field.kfgs --cloud {splat}", "attach {run}/field.kfgs {splat} --by distance"]
-)
+@pytest.mark.parametrize("words", ["attach {run}/field.kfgs {splat} --by distance"])
 @pytest.mark.parametrize("distance", ["0", "-1", "nan"])
 def test_a_distance_of_nothing_is_refused_before_the_work(words, distance, run, splat, capsys, monkeypatch):
     monkeypatch.setattr(SemanticField, "load", None)
@@ -219,17 +188,14 @@ def test_two_runs_of_kfgs_give_the_same_bytes(room, run, tmp_path):
 @pytest.mark.parametrize(
     ("words", "limit"),
     [
-        ("label {run}/field.kfgs --cloud {cloud} --distance 1", 600_000),  # gaussians.ply is smaller, cloud.ply larger
-        ("label {run}/field.kfgs", 3_000),
         ("select chair {run}/field.kfgs --scene {room}", 20_000),  # selection.ply and selection.json are smaller
         ("select chair {run}/field.kfgs --scene {room}", 200),
     ],
 )
 def test_a_disk_that_takes_no_more_leaves_no_half_of_a_folder(words, limit, room, run, tmp_path):
     """A limit between the sizes of the files: some of them can be written."""
-    write_ply(tmp_path / "cloud.ply", {name: np.random.default_rng(0).random(100_000, np.float32) for name in "xyz"})
     out = tmp_path / "out"
-    arguments = [*words.format(room=room, run=run, cloud=tmp_path / "cloud.ply").split(), "--out", str(out)]
+    arguments = [*words.format(room=room, run=run).split(), "--out", str(out)]
     done = subprocess.run([sys.executable, "-c", LIMITED, str(limit), *arguments], capture_output=True, text=True)
     assert done.returncode == 1, done.stderr
     (error,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]

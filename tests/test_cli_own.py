@@ -72,9 +72,9 @@ def test_each_output_of_edit_has_its_own_edits(splat, tmp_path):
     [
         "fit {room} --out |",
         "color {room} --out=|",
-        "label {run}/field.kfgs --out |",
+        "attach {run}/field.kfgs {splat} --out |",
         "convert {splat} |",
-        "info |",
+        "convert |",
         "fit | --out {out}",
     ],
 )
@@ -88,4 +88,4 @@ def test_an_empty_path_is_not_the_current_folder(text, room, run, splat, tmp_pat
 
 
 def test_an_empty_class_is_no_path(run, capsys):
-    refused(["select", "", run / "field.kfgs"], capsys, "QUERY: expected a class", "such as chair")
+    refused(["select", "", run / "field.kfgs"], capsys, "expected a name", "empty text")

@@ -30,7 +30,7 @@ def cloud(tmp_path):
     return tmp_path
 
 
-@pytest.mark.parametrize("words", ["--help", "--version", "info --help"])
+@pytest.mark.parametrize("words", ["--help", "--version", "convert --help"])
 def test_a_reader_that_ends_is_no_error(words, tmp_path):
     line = f"{{ sleep 0.1; {KFGS} {words}; echo $? >&2; }} | true"
     assert shell(line, tmp_path) == (0, "", "141\n")
@@ -39,10 +39,7 @@ def test_a_reader_that_ends_is_no_error(words, tmp_path):
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory):
     folder = make_desk(tmp_path_factory.mktemp("desk"))
-    for words in (
-        "attach {0}/run/field.kfgs {0}/my.ply --out {0}/labelled.ply",
-        "pack {0}/run/field.kfgs {0}/p.kfgs",
-    ):
+    for words in ("attach {0}/run/field.kfgs {0}/my.ply --out {0}/labelled.ply",):
         assert cli.main(words.format(folder).split()) == 0
     return folder
 
@@ -51,8 +48,8 @@ def desk(tmp_path_factory):
     ("words", "written"),
     [
         ("attach {0}/run/field.kfgs {0}/my.ply --out {1}/a.ply", "a.ply"),
-        ("label {0}/run/field.kfgs --out {1}/a", "a/gaussians.ply"),
-        ("label {0}/run/field.kfgs --out {1}/a --cloud {0}/my.ply", "a/cloud.ply"),
+        ("convert {0}/run/field.kfgs {1}/a.ply", "a.ply"),
+        ("convert {0}/run/field.kfgs {1}/a.kfgs", "a.kfgs"),
         ("select floor {0}/run/field.kfgs --out {1}/a", "a/selection.json"),
         ("edit {0}/labelled.ply --remove floor --out {1}/a.ply", "a.ply.edits.json"),
         ("convert {0}/labelled.ply {1}/a.splat", "a.splat"),
@@ -69,7 +66,7 @@ def test_what_is_asked_for_is_written_though_nobody_reads_what_is_said(words, wr
     assert (tmp_path / written).exists()
 
 
-@pytest.mark.parametrize("words", ["--help", "--version", "info a.ply"])
+@pytest.mark.parametrize("words", ["--help", "--version", "convert a.ply"])
 def test_output_that_cannot_be_written_is_named(words, cloud):
     code, _, said = shell(f"{KFGS} {words} > /dev/full", cloud)
     assert (code, said.count("\n")) == (1, 1)
@@ -77,10 +74,10 @@ def test_output_that_cannot_be_written_is_named(words, cloud):
 
 
 def test_closed_streams_change_nothing_and_no_file_gets_their_numbers(cloud):
-    code, said, _ = shell(f"{KFGS} info a.ply 2>&-", cloud)
+    code, said, _ = shell(f"{KFGS} convert a.ply 2>&-", cloud)
     assert (code, "3 vertices" in said) == (0, True)
-    assert shell(f"{KFGS} info a.ply >&- <&-", cloud) == (0, "", "")
-    assert shell(f"{KFGS} info missing.ply 2>&-", cloud)[0] == 1
+    assert shell(f"{KFGS} convert a.ply >&- <&-", cloud) == (0, "", "")
+    assert shell(f"{KFGS} convert missing.ply 2>&-", cloud)[0] == 1
     code = "import os; from kfgs.cli import main; main(['--version']); print(os.open('a.ply', os.O_RDONLY) > 2)"
     assert shell(f'{sys.executable} -c "{code}" 2>&- <&-', cloud)[1].endswith("True\n")
 

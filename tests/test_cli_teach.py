@@ -18,17 +18,17 @@ from cases_teach import TinyLSeg, save_checkpoint, shrink_door
 from lseg_layout import layout
 from messages import tells
 from PIL import Image
-from safetensors.torch import load_file
 from small_room import make_room
 
 from kfgs.cli import main
 from kfgs.fields import SemanticField
+from kfgs.labels import load_label_set
 from kfgs.scenes import load_scene
 from kfgs.teachers.lseg import LSegConfig
 
 HERE = Path(__file__).parent
 TEACHER = ["--teacher", "cases_teach:TinyLSeg", "--weights"]
-QUICK = ["--steps", "3", "--method", "paper", "--mode", "adc"]
+QUICK = ["--steps", "3", "--method", "adc"]
 
 
 @pytest.fixture(scope="module")
@@ -100,11 +100,6 @@ def fails(arguments, capsys) -> str:
     return error
 
 
-def stage(run: Path, name: str) -> Path:
-    (found,) = (run / "stages").glob(f"{name}-*")
-    return found
-
-
 def told(folder: Path):
     """What features.json tells."""
     return json.loads((folder / "features.json").read_text())
@@ -126,7 +121,7 @@ def command(arguments, **environment):
     ("sent", "code", "last_words"),
     [
         (signal.SIGKILL, -signal.SIGKILL, ""),
-        (signal.SIGINT, 130, "interrupted; the same command goes on where it stopped\n"),
+        (signal.SIGINT, 130, "interrupted; the same command continues where it stopped\n"),
     ],
     ids=["killed", "interrupted"],
 )
@@ -196,19 +191,15 @@ def test_run_again_nothing_is_made_and_a_changed_picture_is_made_alone(
 def test_other_weights_are_refused_unless_the_maps_are_given_up(scene, pictures, maps, seen, tmp_path, capsys):
     out, other = tmp_path / "maps", save_checkpoint(tmp_path / "other.ckpt", seed=1)
     shutil.copytree(maps, out)
-    name = f"{next(iter(pictures))}.npy"
     arguments = ["features", scene, *TEACHER, other, "--out", out]
     error = fails(arguments, capsys)
-    assert re.search(tells("same teacher", out, "weights", "--overwrite", f"{len(pictures)} maps"), error)
+    assert re.search(tells("same teacher", out, "weights", f"{len(pictures)} maps"), error)
     assert seen() == 0
     assert told(out) == told(maps)
-    assert main([*map(str, arguments), "--overwrite"]) == 0
-    assert seen() == len(pictures)
-    assert (out / name).read_bytes() != (maps / name).read_bytes()
 
 
 def test_check_reports_maps_that_do_not_fit(scene, pictures, maps, tmp_path, capsys):
-    assert main(["features", str(scene), "--check", str(maps)]) == 0
+    assert main(["features", str(scene), "--out", str(maps)]) == 0
     assert f"next: kfgs fit {scene} --out run --features {maps}" in capsys.readouterr().out
     out = tmp_path / "maps"
     shutil.copytree(maps, out)
@@ -217,9 +208,9 @@ def test_check_reports_maps_that_do_not_fit(scene, pictures, maps, tmp_path, cap
     np.save(out / f"{broken}.npy", np.full_like(np.load(out / f"{broken}.npy"), np.nan))
     np.save(out / f"{turned}.npy", np.load(out / f"{turned}.npy").transpose(1, 0, 2))
     capsys.readouterr()
-    assert main(["features", str(scene), "--check", str(out)]) == 1
+    assert main(["features", str(scene), "--out", str(out)]) == 1
     said, error = capsys.readouterr()
-    assert error.startswith(f"error: --check: expected a map that fits for each of the {len(pictures)} views of split")
+    assert error.startswith(f"error: --out: expected a map that fits for each of the {len(pictures)} views of split")
     assert error.count("\n") == 1
     for name in (gone, broken, turned):
         assert name in said
@@ -228,7 +219,7 @@ def test_check_reports_maps_that_do_not_fit(scene, pictures, maps, tmp_path, cap
 
 
 def test_info_tells_a_folder_of_maps(pictures, maps, capsys):
-    assert main(["info", str(maps)]) == 0
+    assert main(["convert", str(maps)]) == 0
     said = capsys.readouterr().out
     assert f"{len(pictures)} feature maps by lseg" in said
     h, w, D = np.load(maps / f"{next(iter(pictures))}.npy").shape
@@ -236,28 +227,21 @@ def test_info_tells_a_folder_of_maps(pictures, maps, capsys):
     assert told(maps)["teacher"]["weights"] in said
 
 
-def test_fit_with_a_teacher_gives_the_same_codebook_index_maps_and_field(
-    scene, pictures, weights, run, seen, tmp_path, capsys
-):
-    arguments = ["fit", str(scene), *TEACHER, str(weights), "--out", str(tmp_path / "run"), *QUICK]
-    assert main(arguments) == 0
-    assert seen() == len(pictures)
-    for name, file in (("codebook", "codebook"), ("index_maps", "index_maps"), ("field", "params")):
-        found, expected = (load_file(stage(one, name) / f"{file}.safetensors") for one in (tmp_path / "run", run))
-        assert found.keys() == expected.keys()
-        assert all(torch.equal(found[key], expected[key]) for key in expected), name
-    assert len(list((tmp_path / "run" / "features").glob("*.npy"))) == len(pictures)
-    fields = [SemanticField.load(one / "field.kfgs") for one in (tmp_path / "run", run)]
-    assert fields[0].info["teacher"] == fields[1].info["teacher"]
-    assert main(arguments) == 0
-    assert seen() == 0
-    assert len(fields[0].decoder.codebook.codewords) > 1
-    assert "teacher: lseg" in capsys.readouterr().out
+def test_maps_and_words_of_a_scene_are_made_in_one_go(scene, pictures, weights, maps, tmp_path, capsys):
+    copy = tmp_path / "scene"
+    shutil.copytree(scene, copy, ignore=shutil.ignore_patterns("features", "text.npy", "classes.json"))
+    assert main(["features", str(copy), "--words", "door,wall", *TEACHER, str(weights)]) == 0
+    assert f"wrote:\n  {copy / 'text.safetensors'}\n  {copy / 'features'}" in capsys.readouterr().out
+    assert load_label_set(copy / "text.safetensors").names == ("door", "wall")
+    name = f"{next(iter(pictures))}.npy"
+    assert (copy / "features" / name).read_bytes() == (maps / name).read_bytes()
 
 
 def test_words_of_the_same_weights_query_the_field(run, weights, tmp_path, capsys):
     table = tmp_path / "text.safetensors"
-    assert main(["text", "wooden door,stone wall,ground", *TEACHER, str(weights), "--out", str(table)]) == 0
+    assert (
+        main(["features", "--words", "wooden door,stone wall,ground", *TEACHER, str(weights), "--out", str(table)]) == 0
+    )
     assert "3 classes, 16 channels each, by lseg, as '{}'" in capsys.readouterr().out
     field = SemanticField.load(run / "field.kfgs")
     assert main(["select", "wooden door", str(run / "field.kfgs"), "--text", str(table)]) == 0
@@ -342,7 +326,9 @@ def test_wrong_weights_are_named_in_one_line_and_not_run(room, weights, tmp_path
     assert not (tmp_path / "marker").exists()
     assert not out.exists()
     table = tmp_path / "t.safetensors"
-    assert str(path) in fails(["text", "wall", "--teacher", "lseg", "--weights", path, "--out", table], capsys)
+    assert str(path) in fails(
+        ["features", "--words", "wall", "--teacher", "lseg", "--weights", path, "--out", table], capsys
+    )
     assert not table.exists()
     assert not (tmp_path / "marker").exists()
 
@@ -357,13 +343,13 @@ def test_the_marker_would_have_been_made(tmp_path, kind):
 
 def test_a_process_says_no_more_than_the_one_line(room, weights, tmp_path):
     path = wrong_files(tmp_path, weights)["pickle"][0]
-    process = command(["fit", room, "--teacher", "lseg", "--weights", path, "--out", tmp_path / "run"])
+    process = command(["features", room, "--teacher", "lseg", "--weights", path, "--out", tmp_path / "maps"])
     _, error = process.communicate()
     assert process.returncode == 1
     assert error.startswith(f"error: {path}: ")
     assert error.count("\n") == 1
     assert not (tmp_path / "marker").exists()
-    assert not (tmp_path / "run" / "stages").exists()
+    assert not (tmp_path / "maps").exists()
 
 
 def test_a_missing_tensor_is_counted_and_named(room, tmp_path, capsys):
@@ -381,26 +367,8 @@ def test_what_a_manifest_says_is_told_in_one_line_each(maps, tmp_path, capsys):
     facts = json.loads((folder / "features.json").read_text())
     facts["teacher"] = {"name": "x\x1b[31mPWN\nwrote:\n  fake"}
     (folder / "features.json").write_text(json.dumps(facts))
-    assert main(["info", str(folder)]) == 0
+    assert main(["convert", str(folder)]) == 0
     said = capsys.readouterr().out
     assert "\x1b" not in said
     assert "\nwrote:" not in said
     assert r"x\x1b[31mPWN\nwrote:" in said
-
-
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        (["--teacher", "cases_teach:TinyLSeg", "--weights", "w", "--features", "x"], "stored in OUT/features"),
-        (
-            ["--teacher", "cases_teach:TinyLSeg", "--weights", "w", "--undistorted-features"],
-            "sees the original pictures",
-        ),
-        (["--fast"], "fast: expected none without --teacher"),
-        (["--size", "4", "5"], "size: expected none without --teacher"),
-        (["--weights", "w"], "weights: expected none without --teacher"),
-    ],
-)
-def test_options_without_effect_are_refused(scene, maps, given, words, tmp_path, capsys):
-    folder = [] if "--teacher" in given else ["--features", str(maps)]
-    assert words in fails(["fit", str(scene), "--out", str(tmp_path / "run"), *folder, *given], capsys)

@@ -13,10 +13,9 @@ from messages import tells
 from PIL import Image
 from small_room import make_desk, make_room
 
-from kfgs.cli import main
+from kfgs.cli import features, main
+from kfgs.cli.features import read_words
 from kfgs.cli.options import Classes, Teacher
-from kfgs.cli.text import read_words
-from kfgs.cli.text import text as text_command
 from kfgs.fields import Identity, SemanticField, read_examples
 from kfgs.labels import load_label_set
 from kfgs.scenes import load_scene
@@ -26,7 +25,7 @@ LETTERS = ["--teacher", "cases_text:TEACHER"]
 
 
 def text(names, teacher, out, **options):
-    text_command(names, teacher=Teacher(teacher), out=out, **options)
+    features(words=names, teacher=Teacher(teacher), out=out, **options)
 
 
 @pytest.fixture(scope="module")
@@ -79,19 +78,16 @@ def test_words_are_words_whatever_lies_in_the_folder(tmp_path, monkeypatch):
 
 def test_text_writes_a_table_with_its_origin(tmp_path, capsys):
     out = tmp_path / "new" / "t.safetensors"
-    text("wall,chair;seat", "cases_text:TEACHER", out, templates="a {}")
+    text("wall,chair;seat", "cases_text:TEACHER", out)
     said = capsys.readouterr().out
-    assert f"2 classes, {DIM} channels each, by letters, as 'a {{}}'" in said
+    assert f"2 classes, {DIM} channels each, by letters, as" in said
     assert "chair: also seat" in said
     assert f"wrote:\n  {out}" in said
     found = load_label_set(out)
     assert found.names == ("wall", "chair")
-    assert found.info["templates"] == ["a {}"]
-    expected = make_label_set(TEACHER, ["wall", "chair;seat"], templates="a {}")
+    expected = make_label_set(TEACHER, ["wall", "chair;seat"])
     assert found.embeddings.equal(expected.embeddings)
     assert found.negatives.equal(expected.negatives)
-    text("wall", "cases_text:TEACHER", out, no_negatives=True)
-    assert load_label_set(out).negatives is None
 
 
 @pytest.mark.parametrize(
@@ -101,13 +97,12 @@ def test_text_writes_a_table_with_its_origin(tmp_path, capsys):
         ("wall", {"out": "."}, ("out:", ".safetensors")),
         ("wall", {"teacher": "cases_text:MUTE"}, ("teacher 'mute':", "text encoder")),
         ("wall", {"teacher": "no_such_teacher"}, ("teacher:", "got 'no_such_teacher'")),
-        ("wall", {"templates": "clip8"}, ("templates:", "got 'clip8'", "'clip7'")),
-        (" , ", {}, ("names:", "got none")),
-        ("", {}, ("names:", "got none", "''")),
-        ("{tmp}/a.yaml", {}, ("names:", ".json", ".txt")),
+        (" , ", {}, ("words:", "got none")),
+        ("", {}, ("words:", "got none", "''")),
+        ("{tmp}/a.yaml", {}, ("words:", ".json", ".txt")),
         ("{tmp}/no.json", {}, ("no such file", "JSON")),
         ("{tmp}/no.txt", {}, ("no such file", "text", "class")),
-        ("{tmp}/a.json", {}, ("names:", "got {'wall': 1}")),
+        ("{tmp}/a.json", {}, ("words:", "got {'wall': 1}")),
         ("{tmp}/a.txt", {}, ("UTF-8", "text")),
     ],
 )
@@ -129,10 +124,6 @@ def test_a_table_alone_serves_select_label_and_segment(field, room, truth, names
     said = capsys.readouterr().out
     assert f"lamp: {count(truth, names, 'lamp')} of 4000 Gaussians" in said
     assert f"{len(names) - 1} negatives" in said
-    assert main(["label", str(field), "--text", str(table), "--out", str(tmp_path / "o")]) == 0
-    said = capsys.readouterr().out
-    for name in names:
-        assert f"  {name:<16s} {count(truth, names, name):8d} Gaussians" in said
     assert main(["segment", str(field), "--scene", str(room), "--text", str(table), "--out", str(tmp_path / "s")]) == 0
     assert "mIoU" in capsys.readouterr().out
 
@@ -152,23 +143,6 @@ def test_a_table_in_the_scene_is_found(field, room, truth, names, tmp_path, caps
     assert "note: label numbers follow the class list of" in capsys.readouterr().out
     np.save(scene / "text.npy", np.ones((len(names), 3), np.float32))
     assert Classes(scene).load_classes().embeddings.shape == (len(names), 3)  # the pair of old goes first
-
-
-def test_where_classes_are_looked_for(tmp_path):
-    scene, table, names, rows = (tmp_path / name for name in ("s", "t.safetensors", "c.json", "t.npy"))
-    assert Classes(text=table).files() == (table,)
-    assert Classes(classes=table).files() == (table,)
-    assert Classes(classes=names, text=table).files() == (names, table)
-    assert Classes(scene=scene).files() == (scene / "classes.json", scene / "text.npy")
-    assert Classes(scene=scene, classes=names).files() == (names, scene / "text.npy")
-    assert Classes(scene=scene, text=table).files() == (table,)
-    assert Classes(text=rows).files() is None
-    with pytest.raises(ValueError, match=tells("text:", "none", "t.npy")):
-        Classes(classes=table, text=rows).files()
-    with pytest.raises(
-        ValueError, match=tells("classes, text:", "--classes", "--text", "--scene", "`kfgs text`", "got none")
-    ):
-        Classes(classes=names).load_classes()
 
 
 def test_any_phrase_with_a_teacher_and_no_table(field, truth, names, capsys):
@@ -191,53 +165,14 @@ def test_a_phrase_joins_the_classes_of_a_table(field, room, truth, names, tmp_pa
     text(str(room / "classes.json"), "cases_text:TEACHER", table)
     arguments = [str(field), "--text", str(table), *LETTERS]
     lamps = count(truth, names, "lamp")
-    assert main(["select", "palm", *arguments, "--negatives", "none", "--threshold", "0.999"]) == 0  # the same letters
-    assert f"palm: {lamps} of 4000 Gaussians, score > 0.999" in capsys.readouterr().out
-    assert main(["select", "palm", *arguments, "--negatives", "classes"]) == 0
+    assert main(["select", "palm", *arguments]) == 0  # the same letters as a lamp
     said = capsys.readouterr().out
-    assert f"palm: {lamps} of 4000 Gaussians" in said  # the same letters as a lamp: not told from itself
+    assert f"palm: {lamps} of 4000 Gaussians" in said
     assert f"{len(names) - 1} negatives" in said
-    assert main(["select", "palm", *arguments]) == 0
-    assert f"{len(names) - 1} negatives" in capsys.readouterr().out
     assert main(["select", "spoon", *arguments]) == 0  # like no class of the table
     assert "4 negatives" in capsys.readouterr().out
     assert main(["select", "Lamp", *arguments]) == 0  # a class of the table
-    said = capsys.readouterr().out
-    assert f"lamp: {lamps} of 4000 Gaussians" in said
-    assert f"{len(names) - 1} negatives" in said
-    assert main(["select", "lamp", *arguments, "--negatives", "canonical"]) == 0
-    assert "4 negatives" in capsys.readouterr().out
-    text("lamp", "cases_text:TEACHER", table)
-    assert main(["select", "lamp", str(field), "--text", str(table)]) == 0
-    assert "4 negatives" in capsys.readouterr().out  # there are no other classes
-
-
-def test_a_phrase_takes_the_templates_of_the_table(field, truth, names, tmp_path, capsys):
-    table = tmp_path / "t.safetensors"
-    text("lamp", "cases_text:TEACHER", table, templates="{} ll")
-    framed, lamp = torch.nn.functional.normalize(letters(["palm ll", "lamp"]).double(), dim=1)
-    cosine = float(framed @ lamp)
-    assert 0.5 < cosine < 0.98  # asked bare it would be 1
-    arguments = [str(field), "--text", str(table), *LETTERS, "--negatives", "none", "--threshold"]
-    found = []
-    for threshold in (cosine - 1e-3, cosine + 1e-3):
-        assert main(["select", "palm", *arguments, str(threshold)]) == 0
-        found.append(int(capsys.readouterr().out.split("palm: ")[1].split()[0]))
-    assert found[0] - found[1] == count(truth, names, "lamp")
-
-
-def test_scores_by_name(field, room, truth, names, tmp_path, capsys):
-    table = tmp_path / "t.safetensors"
-    text(str(room / "classes.json"), "cases_text:TEACHER", table)
-    arguments = ["select", "lamp", str(field), "--text", str(table), "--score"]
-    lamps = count(truth, names, "lamp")
-    assert main([*arguments, "cosine", "--threshold", "0.999"]) == 0
-    assert f"lamp: {lamps} of 4000 Gaussians, score > 0.999 (given)" in capsys.readouterr().out
-    assert main([*arguments, "softmax", "--threshold", "0.5", "--out", str(tmp_path / "o")]) == 0
-    said = capsys.readouterr().out
-    assert f"softmax over {len(names)} words, logit scale 100" in said
-    facts = json.loads((tmp_path / "o" / "selection.json").read_text())
-    assert "softmax" in facts["how"]
+    assert f"lamp: {lamps} of 4000 Gaussians" in capsys.readouterr().out
 
 
 def test_words_of_another_teacher_are_noted(field, names, tmp_path, capsys):
@@ -250,7 +185,10 @@ def test_words_of_another_teacher_are_noted(field, names, tmp_path, capsys):
     assert "note: --text: expected those of the field's teacher, got text of another teacher (name 'clip'" in said
     assert main(["select", "palm", str(field), "--text", str(table), *LETTERS]) == 0
     said = capsys.readouterr().out
-    assert "note: --text: expected a table by the query's teacher (from --teacher and --weights), got one by another" in said
+    assert (
+        "note: --text: expected a table by the query's teacher (from --teacher and --weights), got one by another"
+        in said
+    )
     assert "they cannot be compared: use the table's teacher for the query" in said
     assert "field's teacher" not in said  # the query is of the field's own
 
@@ -263,28 +201,15 @@ def test_words_of_another_teacher_are_noted(field, names, tmp_path, capsys):
             ("class:", "got 'lampp'", "'lamp'?", "--teacher", "--weights"),
         ),
         (["lamp", "--text", "{table}", "--weights", "a.pt"], ("--weights:", "--teacher", "got a.pt")),
-        (["lamp", *LETTERS, "--negatives", "classes"], ("--negatives:", "'lamp'", "got none")),
-        (
-            ["lamp", "--text", "{table}", "--score", "cosine", "--negatives", "classes"],
-            ("--negatives:", "--score cosine", "got classes"),
-        ),
-        (
-            ["lamp", "--text", "{table}", "--score", "softmax", "--negatives", "none"],
-            ("--negatives:", "classes or canonical", "--score softmax", "got none"),
-        ),
         (["lamp", "--teacher", "cases_text:MUTE"], ("teacher 'mute':", "text encoder")),
-        (["lamp"], ("--classes, --text:", "got none", "`kfgs text --examples clicks.json")),
+        (["lamp"], ("--text:", "got none", "`kfgs features FIELD --examples clicks.json")),
         (["palm", "--text", "{other}", *LETTERS], ("--text:", "[C, 16]", "teacher")),
         (
             ["lamp", "--text", "{other}"],
             ("--text:", "[C, 16]", "got ({count}, 5)"),
         ),
-        (["lamp", "--text", "{shown}"], ("--text:", "[C, 16]", "another teacher", "`kfgs text --examples")),
-        (
-            ["lamp", "--text", "{bare}", "--negatives", "canonical"],
-            ("--negatives:", "canonical", "got none", "`kfgs text`"),
-        ),
-        (["lamp", "--text", "{tmp}/no.safetensors"], ("no.safetensors:", "no such file", "`kfgs text`")),
+        (["lamp", "--text", "{shown}"], ("--text:", "[C, 16]", "another teacher", "`kfgs features FIELD --examples")),
+        (["lamp", "--text", "{tmp}/no.safetensors"], ("no.safetensors:", "no such file")),
     ],
 )
 def test_wrong_queries_are_named(field, names, tmp_path, capsys, arguments, message):
@@ -370,11 +295,10 @@ def test_annotations_of_coco_are_classes_by_example(room, truth, names, tmp_path
     (tmp_path / "annotations.json").write_text(json.dumps(content))
     table = tmp_path / "table.safetensors"
     arguments = [
-        "text",
+        "features",
+        str(tmp_path / "field.kfgs"),
         "--examples",
         str(tmp_path / "annotations.json"),
-        "--field",
-        str(tmp_path / "field.kfgs"),
         "--out",
         str(table),
     ]
@@ -390,7 +314,7 @@ def test_examples_are_drawn_in_the_photographs_of_the_field(tmp_path, capsys):
     clicks, out = tmp_path / "clicks.json", tmp_path / "shown.safetensors"
     view = SemanticField.load(folder / "run/field.kfgs").cameras[0].name
     clicks.write_text(json.dumps({"chair": [{"view": view, "points": [[20, 30]]}], "wall": [{"gaussians": [3]}]}))
-    words = ["text", "--examples", str(clicks), "--field", str(folder / "run/field.kfgs"), "--out", str(out)]
+    words = ["features", str(folder / "run/field.kfgs"), "--examples", str(clicks), "--out", str(out)]
     assert main(words) == 0
     picture = tmp_path / "shown.safetensors.png"
     assert f"wrote:\n  {out}\n  {picture}\n" in capsys.readouterr().out

@@ -69,7 +69,7 @@ def test_a_question_lights_up_on_both_sides(room, files, tmp_path, capsys):
     truth = surface(room)[1]
     names = json.loads((room / "classes.json").read_text())
     name = names[int(truth.mode().values)]
-    words = ["--text", files / "text.safetensors", "--color", files / "color.ply", "--distance", 1e-3]
+    words = ["--text", files / "text.safetensors", "--color", files / "color.ply"]
     said = drawn([files / "field.kfgs", *words, "--ask", name, "--where", "picture", "--out", tmp_path / "out"], capsys)
     n, total = count(room, truth, name), len(truth)
     assert f"semantic: {n} of {total} Gaussians" in said.replace(",", "")
@@ -109,7 +109,7 @@ def test_clouds_in_different_frames_are_noted(files, tmp_path, capsys):
     splats = read_splats(files / "color.ply")
     moved = splats.replace(means=splats.means + 1000)
     write_splats(moved, tmp_path / "far.ply")
-    arguments = ["--color", tmp_path / "far.ply", "--distance", 0.1, "--where", "picture", "--out", tmp_path]
+    arguments = ["--color", tmp_path / "far.ply", "--where", "picture", "--out", tmp_path]
     said = drawn([files / "labelled.ply", *arguments], capsys)
     assert "note: only 0 of" in said
     assert "another frame? `kfgs attach` checks and aligns" in said
@@ -165,14 +165,9 @@ def test_no_driver_is_told_before_anything_is_read(files, monkeypatch, capsys):
     ("arguments", "message"),
     [
         (["FIELD", "--where", "window"], "--where: expected a display for a window, got none"),
-        (["FIELD", "--where", "picture", "--host", "0.0.0.0"], "--host: expected none without --where browser"),
-        (["FIELD", "--where", "picture", "--port", "80"], "--port: expected none without --where browser"),
-        (["FIELD", "--where", "picture"], "--classes, --text: expected class names"),
-        (["FIELD", "--where", "picture", "--distance", "0"], "--distance: expected"),
-        (["FIELD", "--where", "picture", "--images", "x"], "--images: expected none without --scene"),
-        (["FIELD", "--text", "TABLE", "--where", "picture", "--weights", "x"], "--weights: expected none without --teacher"),
+        (["FIELD", "--where", "picture"], "--text: expected a table of words"),
+        (["FIELD", "--text", "TABLE", "--where", "picture", "--weights", "x"], "--weights: expected --teacher with it"),
         (["FIELD", "--text", "TABLE", "--where", "picture", "--ask", "wal"], "wal"),
-        (["SPLAT", "--text", "TABLE", "--where", "picture"], "--text: expected none with a splat"),
         (["COLOR", "--where", "picture"], "SOURCE: expected a splat with classes"),
         (["nowhere", "--where", "picture"], "SOURCE: expected a field (RUN/field.kfgs"),
         (["FIELD", "--text", "TABLE", "--color", "FIELD", "--where", "picture"], "--color: expected a splat file"),

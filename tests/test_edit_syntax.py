@@ -4,10 +4,10 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.cli.edit_syntax import Edits, check_parts, inserted_files, parse_edits
+from kfgs.cli.edit_syntax import Edits, check_parts, parse_edits
 from kfgs.gaussians import Gaussians
 from kfgs.labels import connected_parts
-from kfgs.labels.edits import Duplicate, Extract, Insert, Move, Opacity, Recolor, Remove
+from kfgs.labels.edits import Extract, Insert, Move, Recolor, Remove
 from kfgs.labels.where import OfClass
 
 
@@ -17,12 +17,7 @@ def read(**words):
 
 def test_each_option_is_the_edit_it_says():
     assert read(recolor=["plant:#ff0080"]) == [Recolor(OfClass("plant"), (1.0, 0.0, 128 / 255), "tint")]
-    assert read(recolor=["plant:teal"], mode="hue") == [Recolor(OfClass("plant"), (0.0, 128 / 255, 128 / 255), "hue")]
-    assert read(opacity=["lamp:0.3"]) == [Opacity(OfClass("lamp"), 0.3)]
-    assert read(scale=["lamp:1.5"]) == [Move(OfClass("lamp"), scale=1.5)]
-    assert read(rotate=["table:y,-90"]) == [Move(OfClass("table"), rotation=("y", -90))]
     assert read(move=["table:0.5,0,-2e-1"]) == [Move(OfClass("table"), (0.5, 0.0, -0.2))]
-    assert read(duplicate=["chair:1,0,0"]) == [Duplicate(OfClass("chair"), (1.0, 0.0, 0.0))]
     assert read(remove=["window blind", "chair"]) == [Remove(OfClass("window blind")), Remove(OfClass("chair"))]
     assert read(extract=["rug", "sofa"]) == [Extract([OfClass("rug"), OfClass("sofa")])]
 
@@ -37,17 +32,13 @@ def test_the_order_does_not_depend_on_the_line(tmp_path):
         "insert": [str(tmp_path / "a.ply")],
         "extract": ["a"],
         "remove": ["b"],
-        "duplicate": ["c:0,0,1"],
         "move": ["d:1,2,3"],
-        "rotate": ["e:z,5"],
-        "scale": ["f:2"],
-        "opacity": ["g:0.5"],
         "recolor": ["h:red", "i:blue"],
     }
-    expected = ["recolor", "recolor", "opacity", "move", "move", "move", "duplicate", "remove", "extract", "insert"]
+    expected = ["recolor", "recolor", "move", "remove", "extract", "insert"]
     edits = read(**words)
     assert [edit.op for edit in edits] == expected
-    assert [edit.where[0].name for edit in edits[:8]] == ["h", "i", "g", "f", "e", "d", "c", "b"]
+    assert [edit.where[0].name for edit in edits[:4]] == ["h", "i", "d", "b"]
 
 
 def test_a_class_asked_twice_is_removed_once():
@@ -65,11 +56,7 @@ def test_a_class_asked_in_other_case_is_removed_with_it():
 def test_a_number_behind_a_class_is_a_part_of_it():
     second = OfClass("chair", 1)
     assert read(recolor=["chair/2:red"]) == [Recolor(second, (1.0, 0.0, 0.0), "tint")]
-    assert read(opacity=["chair/2:0.3"]) == [Opacity(second, 0.3)]
-    assert read(scale=["chair/2:1.5"]) == [Move(second, scale=1.5)]
-    assert read(rotate=["chair/2:y,-90"]) == [Move(second, rotation=("y", -90))]
     assert read(move=["chair/2:0.5,0,0"]) == [Move(second, (0.5, 0.0, 0.0))]
-    assert read(duplicate=["chair/2:1,0,0"]) == [Duplicate(second, (1.0, 0.0, 0.0))]
     assert read(extract=["chair/2", "rug"]) == [Extract([second, OfClass("rug")])]
     assert read(remove=["chair/2"]) == [Remove(second)]
     for name in ("tv/monitor", "chair/", "/2", "chair/-1", "chair/1.5"):
@@ -94,6 +81,11 @@ def test_parts_are_numbered_as_select_lists_them():
         assert torch.equal(edit.selected(cloud).nonzero()[:, 0], thing.indices)
 
 
+def test_a_part_that_select_does_not_list_is_refused():
+    with pytest.raises(ValueError, match=tells("chair/3:", "2 parts of chair", "`kfgs select chair SPLAT`")):
+        check_parts(rows(20, 60), read(remove=["chair/3"]))
+
+
 def test_parts_that_are_removed_are_counted_together():
     cloud = rows(20, 60, 40, 50)
     (edit,) = read(remove=["chair/1", "chair/2"])
@@ -103,37 +95,8 @@ def test_parts_that_are_removed_are_counted_together():
     assert edit.apply(cloud).labels.unique().tolist() == [0]
 
 
-def test_parts_are_those_within_a_distance():
-    cloud = rows(20, 60, 40)
-    shifted = cloud.means.clone()
-    shifted[50:80, 0] += 0.15  # a gap in the row of 60: 30 and 30
-    cloud = cloud.replace(means=shifted)
-    things = connected_parts(cloud, OfClass("chair").select(cloud), distance=0.12)
-    assert [thing.count for thing in things] == [40, 30, 30, 20]
-    (edit,) = read(remove=["chair/3"], distance=0.12)
-    assert edit == Remove(OfClass("chair", 2, 0.12))
-    assert torch.equal(edit.selected(cloud).nonzero()[:, 0], things[2].indices)
-    check_parts(cloud, [edit])
-    with pytest.raises(
-        ValueError, match=tells("chair/5:", "chair/1 to chair/4", "`kfgs select chair SPLAT --distance 0.12`")
-    ):
-        check_parts(cloud, read(remove=["chair/5"], distance=0.12))
-
-
-def test_a_distance_without_a_part_is_refused():
-    with pytest.raises(ValueError, match=tells("distance:", "chair/2", "got 0.12")):
-        read(remove=["chair"], move=["rug:1,0,0"], distance=0.12)
-
-
 def test_a_class_name_may_hold_a_colon():
-    assert read(opacity=["a:b:0.5"]) == [Opacity(OfClass("a:b"), 0.5)]
-
-
-def test_a_turn_about_z_takes_x_to_y():
-    (edit,) = read(rotate=["chair:z,90"])
-    one = Gaussians(torch.eye(3)[:1], torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 3), torch.ones(1))
-    pivot = Move(edit.where, rotation=edit.rotation, pivot=(0, 0, 0))
-    torch.testing.assert_close(pivot.similarity(one).apply(one.means), torch.tensor([[0.0, 1.0, 0.0]]))
+    assert read(move=["a:b:1,0,0"]) == [Move(OfClass("a:b"), (1.0, 0.0, 0.0))]
 
 
 def test_a_file_is_inserted_where_it_is_or_moved(tmp_path):
@@ -144,7 +107,6 @@ def test_a_file_is_inserted_where_it_is_or_moved(tmp_path):
     (moved,) = read(insert=[f"{path}:1,0,-2"])
     point = torch.tensor([[0.5, 0.5, 0.5]], dtype=torch.float64)
     assert moved.similarity.apply(point).tolist() == [[1.5, 0.5, -1.5]]
-    assert inserted_files([there, Remove("a"), moved]) == [path, path]
 
 
 def test_a_file_whose_name_holds_a_colon_is_itself(tmp_path):
@@ -161,17 +123,8 @@ def test_a_file_whose_name_holds_a_colon_is_itself(tmp_path):
         ("recolor", "plant:", ("recolor:", "got 'plant:'")),
         ("recolor", "plant:rde", ("recolor:", "got 'rde'")),
         ("recolor", "plant:#ff000080", ("recolor:", "got '#ff000080'")),
-        ("opacity", "lamp:3", ("opacity:", "got 'lamp:3'")),
-        ("opacity", "lamp:x", ("opacity:", "got 'lamp:x'")),
-        ("opacity", "lamp:nan", ("opacity:", "got 'lamp:nan'")),
-        ("scale", "lamp:0", ("scale:", "above 0", "got 'lamp:0'")),
-        ("scale", "lamp:1,2", ("scale:", "got 'lamp:1,2'")),
-        ("rotate", "table:90", ("rotate:", "got 'table:90'", "'table:z,90'")),
-        ("rotate", "table:z", ("rotate:", "got 'table:z'")),
-        ("rotate", "table:z,inf", ("rotate:", "got 'table:z,inf'")),
         ("move", "table:1,2", ("move:", "expected 3", "got 'table:1,2'")),
         ("move", "table:1,2,inf", ("move:", "expected 3", "got 'table:1,2,inf'")),
-        ("duplicate", "chair:1 0 0", ("duplicate:", "expected 3", "got 'chair:1 0 0'")),
         ("remove", "chair/0", ("remove:", "got 'chair/0'", "'chair/1'")),
         ("move", "chair/00:1,0,0", ("move:", "got 'chair/00'", "'chair/1'")),
         ("insert", "no.ply:1,0,0", ("insert:", "got 'no.ply:1,0,0'", "'no.ply'")),
@@ -191,10 +144,10 @@ def test_an_insertion_with_part_of_a_translation_is_refused(tmp_path):
 
 
 def test_a_class_of_that_exact_name_wins_over_a_part():
-    words = Edits(opacity=["chair/1/2:0.5"], remove=["Chair/1", "chair/2"])
+    words = Edits(move=["chair/1/2:1,0,0"], remove=["Chair/1", "chair/2"])
     edits = [edit for _, edit in parse_edits(words, ["chair", "chair/1"])]
     assert edits == [
-        Opacity(OfClass("chair/1", 1), 0.5),
+        Move(OfClass("chair/1", 1), (1.0, 0.0, 0.0)),
         Remove(OfClass("Chair/1")),
         Remove(OfClass("chair", 1)),
     ]

@@ -57,7 +57,7 @@ def make_fixture(folder: Path) -> None:
         toy,
         command("uplift", "room", "labelled.ply", "--out", "run/field.kfgs"),
         command("uplift", "room", "other.ply", "--out", "older"),
-        command("pack", "run/field.kfgs", "packed.kfgs"),
+        command("convert", "run/field.kfgs", "packed.kfgs"),
         command("label", "run/field.kfgs", "--out", "labelled", "--query", "chair", "--scene", "room"),
         command("fit", "room", "--splat", "other.ply", "--out", "two"),
         command("fit", "room", "--splat", "labelled.ply", "--out", "two"),

@@ -89,7 +89,7 @@ def _names_and_rows(path: Path) -> None:
 
 
 def _words(path: Path) -> None:
-    from kfgs.cli.text import read_words
+    from kfgs.cli.features import read_words
 
     read_words(str(path))
 

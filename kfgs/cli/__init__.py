@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import inspect
 import os
 import re
@@ -26,25 +27,22 @@ from .._interrupts import interruptible
 from .batch import batch
 from .evaluate import evaluate
 from .features import features
+from .files import check_outputs
 from .fit import color, demo, fit, sfm
-from .output import called, open_streams, said_on_stderr, said_whole, say, warnings_as_notes
-from .pack import pack
-from .places import checked
-from .query import info, label, select
+from .output import open_streams, said_on_stderr, said_whole, say, warnings_as_notes
 from .render import render
 from .segment import segment
+from .select import select
 from .splats import attach, convert, edit
-from .text import text
 from .view import view
 
 GROUPS: dict[str, tuple[Any, ...]] = {
-    "Start here": (demo, info),
-    "Make a semantic field": (sfm, features, text, fit),
+    "Start here": (demo,),
+    "Make a semantic field": (sfm, features, fit),
     "More than one machine": (batch,),
-    "Ask it": (select, segment, label, view, render),
-    "Store it": (pack,),
+    "Ask it": (select, segment, view, render),
     "Score it": (evaluate,),
-    "Colour splats": (color, attach, edit, convert),
+    "Splats": (color, attach, edit, convert),
 }
 COMMANDS = {command.__name__: command for group in GROUPS.values() for command in group}
 RESUMED = {"demo", "features", "fit", "color", "batch"}  # commands that reuse their earlier work
@@ -80,7 +78,7 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         goes_on = bool(RESUMED & {*words[:1]})
         with suppress(OSError):  # the same Ctrl-C may have ended who read it
-            say("interrupted" + ("; the same command goes on where it stopped" if goes_on else ""), sys.stderr)
+            say("interrupted" + ("; the same command continues where it stopped" if goes_on else ""), sys.stderr)
         return 130
     except BrokenPipeError:
         return 141
@@ -103,37 +101,45 @@ def _run(words: list[str], names: dict[str, str]) -> int:
         if told:
             return 0
         raise SystemExit(2)
-    _check_working_directory()
-    command = COMMANDS[name]
-    called[:] = ["kfgs", name, *given, *[STRICT][:strict]]
+    try:
+        os.getcwd()
+    except FileNotFoundError as error:  # torch's libraries would end the process
+        raise OSError("expected a working directory, got one that was deleted; change to another (cd)") from error
+    if any(word == "" or (word.startswith("--") and word.endswith("=")) for word in given):
+        raise ValueError("arguments: expected a name, got an empty text; leave it out, or write . for this folder")
+    command = documented(COMMANDS[name])
 
     def spoken(message: str) -> str:
         return _in_options(message, names)
 
-    _check_words(given, command)
     with interruptible(), warnings_as_notes(spoken, strict=strict), said_on_stderr(), said_whole():
         names |= _shown_names(command)
-        options = {word.partition("=")[0] for word in given}
-        if "text" in names and "--text" in options and "--classes" not in options:
-            names["classes"] = "--text"  # the table of classes came from there
-        command.__doc__ = re.sub(r"\n {8,}(?!kfgs)", " ", inspect.getdoc(command) or "")  # an option's text on one line
-        about = _description(command)
-        tyro.cli(checked(command), prog=f"kfgs {name}", description=about, args=given, config=STYLE)
+        names.setdefault("classes", names.get("text", "classes"))  # the classes come from there
+        tyro.cli(command, prog=f"kfgs {name}", description=_description(command), args=given, config=STYLE)
     return 0
+
+
+def documented(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with each option's text on one line, as tyro reads it, and with `check_outputs` before its work."""
+
+    @functools.wraps(command)
+    def run(*arguments: Any, **options: Any) -> None:
+        given = inspect.signature(command).bind(*arguments, **options).arguments
+        grouped = [vars(group) for group in given.values() if dataclasses.is_dataclass(group)]
+        named = dict(given) | {name: value for group in grouped for name, value in group.items()}
+        check_outputs(named, "features" if command.__name__ == "features" else None)
+        command(*arguments, **options)
+
+    del run.__wrapped__  # tyro would read the text of the command itself
+    run.__annotations__, run.__signature__ = get_type_hints(command, include_extras=True), inspect.signature(command)
+    run.__doc__ = re.sub(r"\n {8,}(?!kfgs)", " ", inspect.getdoc(command) or "")
+    return run
 
 
 def _version() -> str:
     from .. import __version__
 
     return f"kfgs {__version__}"
-
-
-def _check_working_directory() -> None:
-    """Raise an OSError if it was deleted: torch's libraries then end the process."""
-    try:
-        os.getcwd()
-    except FileNotFoundError as error:
-        raise OSError("expected a working directory, got one that was deleted; change to another (cd)") from error
 
 
 def _expand_home(word: str) -> str:
@@ -144,18 +150,6 @@ def _expand_home(word: str) -> str:
     if option.startswith("--") and value.startswith("~"):
         return f"{option}={as_path(value)}"
     return str(as_path(word)) if word.startswith("~") else word
-
-
-def _check_words(words: list[str], command: Callable[..., None]) -> None:
-    """Raise a ValueError for an empty word, which as a path would be the current folder."""
-    first = next(iter(inspect.signature(command).parameters), "")
-    if words[:1] == [""] and first in ("query", "names"):
-        raise ValueError(f"{first.upper()}: expected a class or a phrase, got an empty text; write one, such as chair")
-    for before, word in zip(["", *words], words, strict=False):
-        option = word[:-1] if word.startswith("--") and word.endswith("=") else before if not word else None
-        if option is not None:
-            about = option if option.startswith("-") else "arguments"
-            raise ValueError(f"{about}: expected a name, got an empty text; leave it out, or write . for this folder")
 
 
 def _overview() -> str:
@@ -213,15 +207,9 @@ def _shown_names(kind: Any) -> dict[str, str]:
 
 
 def _in_options(message: str, names: dict[str, str]) -> str:
-    """A message about arguments as one about options: "splat_scene: expected" becomes "--splat-scene: expected".
-
-    What is said in brackets for Python alone, "(in Python: ...)", is left out.
-    """
-    message = re.sub(r" \(in Python: (?:[^()]|\([^()]*\))*\)", "", message)
+    """A message about arguments as one about options: "splat_scene: expected" becomes "--splat-scene: expected"."""
     about, colon, rest = message.partition(": ")
-    arguments = about.replace("-", "_").split(", ")
+    arguments = about.split(", ")
     if colon and all(argument in names for argument in arguments):
         about = ", ".join(dict.fromkeys(names[argument] for argument in arguments))
-    for name in (name for name in names if "_" in name):  # in the text, replace only names that are no English words
-        rest = re.sub(rf"\b{name}(=\w+)?\b", names[name], rest)
     return about + colon + rest

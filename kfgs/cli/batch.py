@@ -47,7 +47,7 @@ def batch(
             OUT/field.kfgs is the joined field.
         teacher: Network that makes the feature maps; without it each scene has its maps in features/.
         weights: Its weights, a file or folder that all workers can read.
-        text: Text table of `kfgs text` for all scenes; each scene's classes.json and text.* when not given.
+        text: Text table of `kfgs features --words` for all scenes; each scene's classes.json and text.* when not given.
         workers: Processes on this machine, or a Dask scheduler (tcp://HOST:8786), or slurm:PARTITION:NUMBER. One scene after
             the other in this process when not given.
         discard_features: Delete a scene's feature maps when its field is made.
@@ -93,7 +93,7 @@ def batch(
     with nullcontext() if workers is None else open_client(workers) as client:
         results = run_batch(entries, out, options, client=client, report=say)
     failed = [result.name for result in results if result.failure is not None]
-    say(f"{len(results) - len(failed)} of {len(results)} scenes are finished; kfgs info {out} has a line for each")
+    say(f"{len(results) - len(failed)} of {len(results)} scenes are finished; kfgs convert {out} has a line for each")
     if failed:
         some = ", ".join(failed[:3]) + (", ..." if len(failed) > 3 else "")
         raise ValueError(

@@ -1,123 +1,113 @@
-"""The command features: make feature maps, or check them."""
+"""The command features: feature maps of pictures, and tables of classes in the same space."""
 
 from __future__ import annotations
 
 import json
+import os
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from .._files import check_output
-from .files import check_alone
-from .options import Device, Flag, Given, MapTeacher, SceneFolder, Views
+from .files import open_field
+from .options import Classes, Flag, Given, Name, Positional, Split, Teacher, load_views
 from .output import say, wrote
 
-# Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
+# Heavy imports happen inside the functions, so that `kfgs --help` answers at once.
+
+TABLE = "text.safetensors"
 
 
 def features(
-    scene: SceneFolder,
+    source: Positional[Given[Path]] = None,
     *,
     out: Given[Path] = None,
-    overwrite: Flag = False,
-    check: Given[Path] = None,
-    device: Device = "auto",
-    teacher: MapTeacher,
-    views: Views,
+    words: Name = None,
+    examples: Given[Path] = None,
+    fast: Flag = False,
+    images: Given[Path] = None,
+    split: Split = "train",
+    teacher: Teacher,
 ) -> None:
-    """Run a teacher over a scene's pictures and store its feature maps; or check existing maps.
+    """Run a teacher over a scene's pictures and store its feature maps, and embed the words that you will ask for.
 
-    Pictures are processed one at a time. After a kill, the same command continues with the next picture.
+    Pictures are processed one at a time; after a kill, the same command continues with the next picture. Without a teacher,
+    existing maps are checked. Other commands take the table of words as --text, and find SCENE/text.safetensors themselves.
 
     Examples:
-        kfgs features scene/ --teacher lseg --weights demo_e200.ckpt
+        kfgs features scene/ --words wall,floor,chair,plant --teacher lseg --weights demo_e200.ckpt
         kfgs features scene/ --teacher dinov2 --weights facebook/dinov2-small --out maps/
-        kfgs features scene/ --check maps/    # by Feature 3DGS, or in .npy or .safetensors
+        kfgs features scene/ --out maps/    # checks maps by Feature 3DGS, or in .npy or .safetensors
+        kfgs features --words "chair;armchair,plant" --teacher lseg --weights demo_e200.ckpt --out words.safetensors
+        kfgs features run/field.kfgs --examples clicks.json --out shown.safetensors    # for a teacher without text
+
+    In clicks.json each class has its examples: {"chair": [{"view": "a.png", "points": [[x, y]]}, {"view": "b.png",
+    "box": [x0, y0, x1, y1]}, {"gaussians": [3, 14]}], ...}. A mask of Segment Anything is {"view": "a.png", "segmentation":
+    {"size": ..., "counts": ...}}, or {"view": "a.png", "masks": "a.json", "index": 3} for one of a file. An annotations.json
+    in the format of COCO will do, too: each category is a class.
 
     Args:
-        out: Folder for the maps; by default SCENE/features.
-        overwrite: Replace maps that kfgs made with another teacher, other weights or other options; without it they are an
-            error. Maps of other programs always are.
-        check: Check this folder of maps instead, and report every file that does not fit.
-        device: Where the teacher runs: auto (a GPU if there is one), cpu or cuda.
+        source: A scene: folder with images and a COLMAP model or transforms.json. With --examples, the field. Without it, only
+            --words are embedded.
+        out: Folder for the maps, by default SCENE/features. Without a scene: the table to write (.safetensors). With
+            --examples, a picture of them is written next to it (OUT.png): see there whether the clicks hit what you mean.
+        words: Words between commas, a .txt file (a class a line), or a .json file (a list). Synonyms follow a semicolon:
+            "chair;armchair;seat" is called chair. With a scene they go to SCENE/text.safetensors.
+        examples: A .json file of examples, or COCO's annotations, instead of words.
+        fast: One pass over each picture instead of the exact evaluation at several scales (lseg).
+        images: Folder of the pictures, if it is not SCENE/images.
+        split: Which views: train, test, all, or another split that SCENE/split.json names.
     """
+    if examples is not None:
+        if source is None:
+            raise ValueError("source: expected the field of the examples, got none; pass RUN/field.kfgs")
+        _learn_examples(_table(out), open_field("source", source), _read_examples(examples))
+        return
+    if source is None and words is None:
+        raise ValueError("source, words: expected a scene, or words to embed, got neither; see `kfgs features --help`")
+    folder = None if source is None else source if source.is_dir() else source.parent
+    table = None if words is None else _table(out if folder is None else folder / TABLE)
+    if table is not None and teacher.teacher is None:
+        raise ValueError("words: expected --teacher with it, whose text encoder embeds them, got none; pass --teacher")
+    listed = None if words is None else read_words(words)
+    target = None if folder is None else folder / "features" if out is None else out
+    if target is not None:
+        check_output("out", target, "a folder")
+    scene = None if source is None else load_views(source, images, split)
+    network = teacher.load(**({"fast": True} if fast else {}))
+    written = []
+    if table is not None:
+        _embed_words(network, listed or [], table)
+        written.append(table)
+    if scene is not None and target is not None:
+        _make_maps(network, scene, target, split)
+        given = "" if out is None else f" --features {out}"
+        say(f"next: kfgs fit {source} --out run{given}" + ("" if split == "train" else f" --split {split}"))
+        written += [target] if network is not None else []
+    if written:
+        wrote(written)
+
+
+def _make_maps(network: Any, scene: Any, target: Path, split: str) -> None:
+    """Make the maps of a teacher; without one, check those that are there."""
     from ..scenes import FeatureFolder, extract_features
 
-    if check is not None:
-        for name, given in (("teacher", teacher.teacher), ("weights", teacher.weights), ("out", out)):
-            check_alone(name, given, "with --check, which encodes nothing")
-    target = out if out is not None else scene_folder(scene) / "features"
-    if check is None:
-        check_output("out", target, "a folder")
-    loaded = views.load(scene)
-    chosen = "" if views.split == "train" else f" --split {views.split}"
-    if check is not None:
-        problems, count = FeatureFolder(check).check(loaded, views.split), len(loaded.views(views.split))
-        say(f"{check}: {count - len(problems)} of {count} views have a map that fits")
-        for name, text in problems.items():
-            say(f"{name}: {text}")
-        if problems:
-            raise ValueError(
-                f"check: expected a map that fits for each of the {count} views of split {views.split!r}, got "
-                f"{len(problems)} that are missing or do not fit (named above); make these maps again, or name the "
-                "photos to use in SCENE/split.json"
-            )
-        say(f"next: kfgs fit {scene} --out run --features {check}{chosen}")
+    if network is not None:
+        extract_features(network, scene, target, split, progress=True)
+        maps = FeatureFolder(target).of(scene, split)
+        say(f"{len(maps)} maps of {' x '.join(map(str, maps.shape))} by {teacher_words(maps.identity or {})}")
         return
-    network = choose_teacher(teacher.teacher, teacher.weights, teacher.fast, teacher.size, device)
-    extract_features(network, loaded, target, views.split, overwrite=overwrite, progress=True)
-    maps = FeatureFolder(target).of(loaded, views.split)
-    say(f"{len(maps)} maps of {' x '.join(map(str, maps.shape))} by {teacher_words(maps.identity or {})}")
-    say(f"next: kfgs fit {scene} --out run" + ("" if out is None else f" --features {out}") + chosen)
-    wrote([target])
-
-
-def choose_teacher(name: str | None, weights: str | None, fast: bool, size: tuple[int, ...], device: str) -> Any:
-    """Load the teacher of a command on its device; a ValueError if none is named, or an option does not fit."""
-    from ..pipeline.train import training_device
-    from ..teachers.load import load_teacher, teacher_names
-
-    if name is None:
+    if not target.is_dir():
+        raise ValueError(f"teacher: expected a teacher, or maps in {target} to check, got neither; pass --teacher")
+    problems, count = FeatureFolder(target).check(scene, split), len(scene.views(split))
+    say(f"{target}: {count - len(problems)} of {count} views have a map that fits")
+    for name, text in problems.items():
+        say(f"{name}: {text}")
+    if problems:
         raise ValueError(
-            f"teacher: expected one of {', '.join(teacher_names())}, or package.module:name, got none; pass --teacher "
-            "(and --weights), or --check FOLDER to check existing maps"
+            f"out: expected a map that fits for each of the {count} views of split {split!r}, got {len(problems)} that are "
+            "missing or do not fit (named above); make these maps again, or name the photos to use in SCENE/split.json"
         )
-    target = training_device(device)
-    teacher = load_teacher(name, weights, **teacher_options(name, fast, size))
-    return teacher.to(target) if hasattr(teacher, "to") else teacher
-
-
-def teacher_options(name: str, fast: bool, size: tuple[int, ...]) -> dict[str, Any]:
-    """The teacher's options for --fast and --size.
-
-    Raises:
-        ValueError: if the teacher has no such option, or takes another number of numbers.
-    """
-    options: dict[str, Any] = {}
-    if fast:
-        if name != "lseg":
-            raise ValueError(f"fast: expected none with teacher {name!r}, which has one pass only; leave it out")
-        options["fast"] = True
-    if size:
-        wanted = 2 if name == "lseg" else 1
-        if len(size) != wanted or ":" in name:
-            what = "HEIGHT WIDTH" if name == "lseg" else "the long side in pixels" if ":" not in name else "none"
-            raise ValueError(
-                f"size: expected {what} for teacher {name!r}, got {' '.join(map(str, size))}; correct --size"
-            )
-        options["size"] = size if name == "lseg" else size[0]
-    return options
-
-
-def stored_maps(scene: Any, views: list[int], folder: Path) -> Any:
-    """The maps of some views of a scene."""
-    from ..scenes import FeatureFolder
-
-    return FeatureFolder(folder).of(scene, views)
-
-
-def scene_folder(scene: Path) -> Path:
-    """The folder of a scene that is given as a folder or as a transforms.json."""
-    return scene if scene.is_dir() else scene.parent
 
 
 def teacher_words(identity: dict[str, Any]) -> str:
@@ -131,3 +121,95 @@ def teacher_words(identity: dict[str, Any]) -> str:
         [f"{name} {json.dumps(value)}" for name, value in sorted(options.items())] if isinstance(options, dict) else []
     )
     return ", ".join(words)
+
+
+def _table(out: Path | None) -> Path:
+    """The file of a table, checked."""
+    table = Path(TABLE) if out is None else out
+    if table.suffix != ".safetensors" or table.is_dir():
+        raise ValueError(f"out: expected a file whose name ends in .safetensors, got {table}; give another name")
+    check_output("out", table, "a file")
+    return table
+
+
+def _embed_words(network: Any, words: Sequence[str], table: Path) -> None:
+    from ..labels import CANONICAL
+
+    made = text_encoder(network)(words, negatives=CANONICAL)
+    made.save(table)
+    templates = ", ".join(map(repr, made.info["templates"]))
+    say(f"{len(made)} classes, {made.dim} channels each, by {made.info['teacher']['name']}, as {templates}")
+    for name, more in made.info["synonyms"].items():
+        say(f"  {name}: also {', '.join(more)}")
+
+
+def _learn_examples(out: Path, field: Any, examples: dict[str, Any]) -> None:
+    """Write a table of examples and, if the photographs of their views are at hand, a picture of what was shown."""
+    from ..fields import label_set_from_examples
+    from ..viz import draw_examples, save_picture
+    from ..viz.films import show_photos
+
+    scene = Classes().photos_of(field)
+    made = label_set_from_examples(field, examples)
+    made.save(out)
+    written = [out]
+    if scene is not None and any(hasattr(example, "view") for shown in examples.values() for example in shown):
+        written.append(out.with_name(f"{out.name}.png"))
+        save_picture(written[-1], draw_examples(field.cameras, examples, show_photos(scene)))
+    say(f"{len(made)} classes, {made.dim} channels each, by examples: {', '.join(made.names)}")
+    wrote(written)
+
+
+def _read_examples(path: Path) -> dict[str, Any]:
+    """The examples of a file, which may be COCO's."""
+    from .._files import read_json
+    from ..evaluation.coco import load_coco_examples
+    from ..fields import read_examples
+
+    content = read_json(path)
+    coco = isinstance(content, dict) and {"images", "annotations", "categories"} <= set(content)
+    return load_coco_examples(path) if coco else read_examples(path)
+
+
+def read_words(words: str) -> list[str]:
+    """Class names from a .json list, a .txt file with a class a line, or words between commas.
+
+    Text with neither ending is words, even if a folder has the same name; a file with another ending is an error.
+
+    Raises:
+        FileNotFoundError: if the file does not exist.
+        ValueError: if it is no list of words, or empty.
+    """
+    from .._files import read_json, read_text
+
+    kind = Path(words).suffix.lower()
+    listed: Any = words.split(",")
+    if kind == ".json":
+        listed = read_json(words, "a JSON file with a list of classes")
+    elif kind == ".txt":
+        listed = read_text(words, "a text file with a class a line").splitlines()
+    elif os.path.isfile(words):  # False, not an error, for words that no file name could hold
+        raise ValueError(
+            f"words: expected a .json or .txt file, or words between commas, got {words}; write one of these"
+        )
+    if not isinstance(listed, list) or not all(isinstance(word, str) for word in listed):
+        raise ValueError(
+            f'words: expected a list of words like ["wall", "floor"] in {words}, got {listed!r:.80}; write one'
+        )
+    listed = [word.strip() for word in listed if word.strip()]
+    if not listed:
+        raise ValueError(f"words: expected at least one word, got none in {words!r}; write wall,floor or name a file")
+    return listed
+
+
+def text_encoder(network: Any) -> Callable[..., Any]:
+    """A function that makes label sets of words with a teacher; it raises a ValueError if there is no text encoder."""
+    from ..teachers.prompts import make_label_set
+
+    def encode(names: Sequence[str], **options: Any) -> Any:
+        try:
+            return make_label_set(network, names, **options)
+        except NotImplementedError as error:
+            raise ValueError(str(error)) from error
+
+    return encode

@@ -2,38 +2,26 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import shlex
 import subprocess
 import sys
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from .._files import check_output, real_path, write_json
-from .features import choose_teacher, stored_maps
-from .files import check_alone
-from .options import (
-    CameraSearch,
-    FieldMethod,
-    Flag,
-    Given,
-    Maps,
-    MapTeacher,
-    Positional,
-    SceneFolder,
-    Training,
-    Views,
-    fit_method,
-    trained,
-)
-from .output import called, say, wrote
+from .options import Flag, Given, GivenMatching, Positional, SceneFolder, Split, load_views
+from .output import say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
+PICTURES = 4  # held-out views that `kfgs color` draws
+Method = Literal["uplift", "paper", "paper-full", "adc", "decouple"]
 
-def demo(out: Path = Path("kfgs_demo"), seed: int = 0) -> None:
+
+def demo(out: Path = Path("kfgs_demo")) -> None:
     """See all of kfgs at work on a small room that it makes itself (about two minutes).
 
     It trains colours, makes a semantic field, segments unseen views, labels points, edits colours, and scores each against the
@@ -45,15 +33,14 @@ def demo(out: Path = Path("kfgs_demo"), seed: int = 0) -> None:
 
     Args:
         out: Folder for the scene, the run and its results; running again continues where it stopped.
-        seed: Every random choice follows from it.
     """
     from ..pipeline import demo as run_demo
     from ..toy.room_folder import ToyConfig
     from ..viz.plotter import has_display
 
     check_output("out", out, "a folder")
-    room = ToyConfig(train_views=36, test_views=9, seed=seed)
-    wrote(run_demo.run(out, seed=seed, room=room, report=say, progress=True))
+    room = ToyConfig(train_views=36, test_views=9)
+    wrote(run_demo.run(out, room=room, report=say, progress=True))
     look = ["view", str(out / "run" / "field.kfgs"), "--scene", str(out / "scene"), "--color", str(out / "color.ply")]
     say(f'6. Look. Type "chair" there, select, edit: kfgs {shlex.join(look)}')
     if has_display() and sys.stdin.isatty() and sys.stdout.isatty():
@@ -64,17 +51,19 @@ def demo(out: Path = Path("kfgs_demo"), seed: int = 0) -> None:
 def sfm(
     images: Positional[Path],
     out: Path,
-    fps: Given[float] = None,
-    seed: int = 0,
-    replace: Flag = False,
     *,
-    search: CameraSearch,
+    fps: Given[float] = None,
+    matching: GivenMatching = None,
+    camera_model: str = "SIMPLE_RADIAL",
+    no_single_camera: Flag = False,
+    ignore_poses: Flag = False,
+    replace: Flag = False,
 ) -> None:
     """Find the cameras of photographs or of a video (structure from motion, pycolmap).
 
     Of a video, the sharpest frames are written to OUT/images first. HEIC photographs are written there as JPEG. A folder that
     has poses already (transforms.json, ScanNet, Polycam, ...) keeps them: only its points are found. Nothing is found where a
-    photograph is black in its mask, masks/NAME.png in the folder or beside it, or transparent.
+    photograph is black in its mask, masks/NAME.png in the folder or next to it, or transparent.
 
     Examples:
         kfgs sfm photos/ --out scene/
@@ -86,37 +75,23 @@ def sfm(
         images: Folder of photographs, a video, or a folder with poses.
         out: Scene folder to make; OUT/sparse/0 receives the COLMAP model.
         fps: Frames of each second of a video that are used, 2 when not given: the sharpest of each half second.
-        seed: Every random choice follows from it.
+        matching: sequential for the frames of a video, exhaustive for everything else; by default so.
+        camera_model: COLMAP's name of the lens model.
+        no_single_camera: The photographs were taken with several cameras, or with changes of zoom.
+        ignore_poses: Estimate poses also if the folder has some.
         replace: Replace a model that is in OUT/sparse/0 already; without it that is an error.
     """
-    from ..scenes import (
-        SfmConfig,
-        is_scene,
-        link_images,
-        list_images,
-        load_scene,
-        run_sfm,
-        write_known_poses,
-    )
+    from ..scenes import SfmConfig, is_scene, link_images, list_images, load_scene, run_sfm, write_known_poses
     from ..scenes.masks import folder_masks
     from ..scenes.pictures import is_video
 
     check_output("out", out, "a folder")
-    video = is_video(images)
-    if not video:
-        check_alone("fps", fps, "with photographs, which are all used")
     config = SfmConfig(
-        matching=search.matching or ("sequential" if video else "exhaustive"),
-        camera_model=search.camera_model,
-        single_camera=not search.no_single_camera,
-        min_registered=search.min_registered,
-        seed=seed,
+        matching=matching or ("sequential" if is_video(images) else "exhaustive"),
+        camera_model=camera_model,
+        single_camera=not no_single_camera,
     )
-    if not video and not search.ignore_poses and (is_scene(images) or images.suffix == ".json"):
-        for name, given in (("matching", search.matching), ("no_single_camera", search.no_single_camera)):
-            check_alone(
-                name, given, "with a folder that has poses, whose neighbours are compared (or give --ignore-poses)"
-            )
+    if not is_video(images) and not ignore_poses and (is_scene(images) or images.suffix == ".json"):
         scene = load_scene(images, split="all")
         say(
             f"{images}: has the poses of {len(scene)} pictures: they are kept, and points are found (not so: --ignore-poses)"
@@ -147,11 +122,11 @@ def _plain_pictures(images: Path, out: Path, fps: float | None) -> Path:
         frames = extract_frames(images, out / "images", fps=2.0 if fps is None else fps, progress=True)
         say(f"{images}: the {len(frames)} sharpest frames are in {out / 'images'}")
     elif has_heic(images):
-        found = convert_heic(images, out / "images", progress=True)
+        pictures = convert_heic(images, out / "images", progress=True)
         masks = next((place / "masks" for place in (images, images.parent) if (place / "masks").is_dir()), None)
         if masks is not None and not os.path.lexists(out / "masks"):
             (out / "masks").symlink_to(real_path(masks), target_is_directory=True)
-        say(f"{images}: HEIC photographs are JPEG files in {out / 'images'}, {len(found)} pictures in all")
+        say(f"{images}: HEIC photographs are JPEG files in {out / 'images'}, {len(pictures)} pictures in all")
     elif images.is_file():
         raise ValueError(
             f"images: expected a folder, or a video ({', '.join(VIDEO_SUFFIXES)}), got {images}; convert it to .mp4"
@@ -165,14 +140,15 @@ def fit(
     scene: SceneFolder,
     out: Path,
     *,
+    features: Given[Path] = None,
     splat: Given[Path] = None,
-    method: FieldMethod,
-    views: Views,
-    maps: Maps,
-    teacher: MapTeacher,
-    training: Training,
+    method: Method = "uplift",
+    steps: Given[int] = None,
+    max_gaussians: Given[int] = None,
+    images: Given[Path] = None,
+    split: Split = "train",
 ) -> None:
-    """Make a semantic field of a scene and its teacher features.
+    """Make a semantic field of a scene and its teacher's feature maps.
 
     The features are averaged onto Gaussians in 3-D and then compressed. The Gaussians are those of --splat, or of the
     newest splat in the scene's folder (an output folder of 3DGS has one). Without both they are trained on the pictures
@@ -182,57 +158,71 @@ def fit(
     Examples:
         kfgs fit scene/ --out run/ --splat my.ply
         kfgs fit scene/ --out run/ --features maps/
-        kfgs fit scene/ --out run/ --teacher lseg --weights demo_e200.ckpt    # maps in run/features
-        kfgs fit scene/ --out run/ --splat my.ply --max-gaussians 0            # keeps every Gaussian of the splat
-        kfgs fit scene/ --out run/ --method paper --preset paper
+        kfgs fit scene/ --out run/ --splat my.ply --max-gaussians 0    # keeps every Gaussian of the splat
+        kfgs fit scene/ --out run/ --method paper
 
     Args:
         out: Run folder; OUT/field.kfgs receives the field, OUT/report.html what was made. Running again continues.
+        features: Folder of maps by `kfgs features` or another program; SCENE/features when not given.
         splat: Any splat file of the scene, in its frame: the Gaussians to average onto.
+        method: uplift: average the features in 3-D, then compress. paper: compress each map, then train Gaussians on it
+            (DF-3DGS) in minutes on two cores; paper-full: with the published 30,000 steps; adc: without the autoencoder;
+            decouple: on the raw features.
+        steps: Training steps; those of the method when not given.
+        max_gaussians: At most this many Gaussians in the result, 0: all of the splat; the method's when not given.
+        images: Folder of the pictures, if it is not SCENE/images.
+        split: Which views: train, test, all, or another split that SCENE/split.json names.
     """
     from ..pipeline import fit as fit_field
     from ..pipeline import write_run_report
     from ..pipeline.train import check_scene
+    from ..scenes import FeatureFolder
 
-    made_by = fit_method(method, splat, training=training)
+    made_by = _method(method, splat, steps, max_gaussians)
     check_output("out", out, "a folder")
-    if splat is not None:
-        check_alone("steps", training.steps, "with --splat, which needs no training")
-    as_taken = views.load(scene)
-    if splat is None and as_taken.splat is not None and method.method != "paper":
-        check_alone(
-            "steps", training.steps, f"with a scene that has its splat ({as_taken.splat}), which needs no training"
-        )
+    as_taken = load_views(scene, images, split)
     loaded = as_taken.undistorted()
-    chosen = loaded.views(views.split)
-    check_scene(loaded, chosen)  # before hours of features
-    if teacher.teacher is not None:
-        check_alone("features", maps.features, "with --teacher, whose maps are stored in OUT/features")
-        check_alone(
-            "undistorted_features", maps.undistorted_features, "with --teacher, which sees the original pictures"
+    chosen = loaded.views(split)
+    check_scene(loaded, chosen)
+    folder = features or (scene if scene.is_dir() else scene.parent) / "features"
+    if not folder.is_dir():
+        raise ValueError(
+            f"features: expected a folder of feature maps, got {folder}, which is none; name another, or make them with "
+            "`kfgs features`"
         )
-        source = choose_teacher(teacher.teacher, teacher.weights, teacher.fast, teacher.size, training.device)
-    else:
-        teacher.check_weights()
-        check_alone("size", teacher.size or None, "without --teacher, whose option it is")
-        check_alone("fast", teacher.fast, "without --teacher, whose option it is")
-        source = stored_maps(as_taken, chosen, maps.folder(scene))
     field = fit_field(
-        loaded,
-        source,
-        made_by,
-        folder=out,
-        split=views.split,
-        seed=training.seed,
-        device=training.device,
-        undistorted_features=maps.undistorted_features,
-        report=say,
-        progress=True,
+        loaded, FeatureFolder(folder).of(as_taken, chosen), made_by, folder=out, split=split, report=say, progress=True
     )
-    command = f"cd {shlex.quote(os.getcwd())}\n{shlex.join(called)}"
-    report = write_run_report(out, field, loaded, made_by, split=views.split, command=command)
+    command = f"cd {shlex.quote(os.getcwd())}\n{shlex.join(['kfgs', *sys.argv[1:]])}"
+    report = write_run_report(out, field, loaded, made_by, split=split, command=command)
     say(field.summary())
     wrote([out / "field.kfgs", *report])
+
+
+def _method(method: Method, splat: Path | None, steps: int | None, most: int | None) -> Any:
+    """The options of `pipeline.fit` for a method's name and the given numbers."""
+    from ..fields import UpliftConfig
+    from ..pipeline import Paper, Uplift
+
+    if method == "uplift":
+        uplift = Uplift(splat)
+        options = uplift.uplift if most is None else UpliftConfig(max_gaussians=most or None)
+        return replace(
+            uplift, uplift=options, color=replace(uplift.color, training=_trained(uplift.color.training, steps))
+        )
+    if splat is not None:
+        raise ValueError(f"splat: expected none with --method {method}, which trains its own Gaussians, got {splat}")
+    paper = Paper.paper() if method == "paper-full" else Paper()
+    paper = replace(paper, training=_trained(paper.training, steps, most))
+    if method == "decouple":
+        return replace(paper, codebook=None, autoencoder=None)
+    return replace(paper, autoencoder=None) if method == "adc" else paper
+
+
+def _trained(options: Any, steps: int | None, most: int | None = None) -> Any:
+    """The options of a training with another number of steps and Gaussians."""
+    options = options if steps is None else options.with_steps(steps)
+    return options.with_maximum(most or None)
 
 
 def color(
@@ -240,41 +230,41 @@ def color(
     out: Path,
     *,
     preset: Literal["quick", "cpu", "paper"] = "cpu",
-    pictures: int = 4,
-    views: Views,
-    training: Training,
+    steps: Given[int] = None,
+    max_gaussians: Given[int] = None,
+    images: Given[Path] = None,
+    split: Split = "train",
 ) -> None:
     """Train a colour splat (3-D Gaussian Splatting) on a scene, and score it on the views held out.
 
     Examples:
         kfgs color scene/ --out run/
-        kfgs color scene/ --out run/ --preset paper --device cuda
+        kfgs color scene/ --out run/ --preset paper
 
     Args:
         out: Run folder; OUT/color.ply receives the splat. Running again continues where it stopped.
         preset: quick (a minute, for small scenes), cpu (minutes on two cores) or paper (30,000 steps, full size, degree 3:
             for a GPU).
-        pictures: Number of held-out views to draw next to their photographs.
+        steps: Training steps; the preset's when not given.
+        max_gaussians: At most this many Gaussians; the preset's when not given.
+        images: Folder of the pictures, if it is not SCENE/images.
+        split: Which views: train, test, all, or another split that SCENE/split.json names.
     """
-    from .._check import check_whole
     from ..evaluation.color import score_views
     from ..pipeline.color import ColorConfig, fit_color
     from ..pipeline.compare import PhotoPictures
 
-    check_whole("pictures", pictures, 0)
     check_output("out", out, "a folder")
     config = {"quick": ColorConfig.quick, "cpu": ColorConfig.cpu, "paper": ColorConfig.paper}[preset]()
-    config = dataclasses.replace(config, training=trained(config.training, training))
-    loaded = views.load(scene).undistorted()
+    config = replace(config, training=_trained(config.training, steps, max_gaussians))
+    loaded = load_views(scene, images, split).undistorted()
     held_out = loaded.splits.get("test", [])
-    tested = [] if set(held_out) & set(loaded.views(views.split)) else [loaded.stem(i) for i in held_out]
-    if tested:
-        beside = PhotoPictures(out / "views", tested, pictures)
-    where = {"split": views.split, "seed": training.seed, "device": training.device}
-    gaussians = fit_color(loaded, out, config, **where, report=say, progress=True)
+    tested = [] if set(held_out) & set(loaded.views(split)) else [loaded.stem(i) for i in held_out]
+    gaussians = fit_color(loaded, out, config, split=split, report=say, progress=True)
     say(repr(gaussians))
     written = [out / "color.ply"]
     if tested:
+        beside = PhotoPictures(out / "views", tested, PICTURES)
         scores = score_views(gaussians, loaded, "test", show=beside)
         write_json(out / "scores.json", {"color": scores.to_json()})
         say(str(scores))

@@ -8,29 +8,12 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from statistics import median
 from typing import Any, TextIO
 
 from .._notes import hear
 
 LINE, END = 2000, 600
 """Most characters of a printed line, and how many of them are from its end, where an error says what to do."""
-called: list[str] = []
-"""The words of the command that runs, for its report."""
-
-
-LONG = 1.6  # times the median length: two chairs side by side are about twice as long as one
-
-
-def lengths_odd(lengths: Sequence[float]) -> list[float | None]:
-    """How many times as long as the median each part is, if that is more than `LONG`, else None; always None below 3 parts.
-
-    Example:
-        >>> lengths_odd([1.0, 2.0, 1.1]), lengths_odd([1.0, 9.0])
-        ([None, 1.8181818181818181, None], [None, None])
-    """
-    middle = median(lengths) if len(lengths) >= 3 else 0.0
-    return [one / middle if middle > 0 and one > LONG * middle else None for one in lengths]
 
 
 def say(text: str, file: TextIO | None = None) -> None:
@@ -90,7 +73,9 @@ def _shown(line: str) -> str:
     left = len(line) - LINE
     if left > 0:
         line = f"{line[: LINE - END]} ... ({left} characters left out) ... {line[-END:]}"
-    return "".join(one if one.isprintable() or one == "\t" else ascii(one)[1:-1] for one in line)
+    return "".join(
+        character if character.isprintable() or character == "\t" else ascii(character)[1:-1] for character in line
+    )
 
 
 def wrote(paths: list[Path]) -> None:

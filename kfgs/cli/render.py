@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 WORDS = "photo, labels, features or query=TEXT"
 KEYS = 40  # cameras of a long walk that become keys: enough to follow it, few enough to smooth out a shaking hand
+FPS = 15.0
 FRAMES, WIDTH = 72, 480  # of a path without cameras of your own
 MOST_FRAMES = 100_000  # more than an hour of film at 25 a second
 LARGEST = 1 << 14  # pixels on a side: a square picture in floats takes 3 GB
@@ -32,9 +33,6 @@ def render(
     show: Given[str] = None,
     color: Given[Path] = None,
     frames: Given[int] = None,
-    fps: float = 15.0,
-    width: Given[int] = None,
-    teacher: Teacher,
     classes: Classes,
 ) -> None:
     """Make a film of a field or a labelled splat: an orbit, or a flight along its cameras or your own.
@@ -56,8 +54,6 @@ def render(
             photo,labels, or labels if there are no colours.
         color: Colour splat in the same frame; by default that of the run, or that which the field was made on.
         frames: Number of pictures; by default 72, or one for each camera of your own.
-        fps: Pictures a second.
-        width: Width of each picture in pixels; by default 480, or that of your own cameras.
     """
     from tqdm import tqdm
 
@@ -68,28 +64,27 @@ def render(
     check_output("out", out, "a file")
     if out.suffix.lower() not in SUFFIXES:
         raise ValueError(f"out: expected a name that ends in .gif or .mp4, got {out.name!r}; rename it")
-    check_target(out, fps)
-    walked = check_walk(path, frames, width, film=True)
-    classes.check_images()
-    found = find_field(source)
-    meaning, cameras = open_meaning(source if found is None else found, classes, teacher)
-    if classes.scene is not None:
-        cameras = classes.load_scene().undistorted().cameras
-    colors = open_colors(found, color, meaning)
+    check_target(out, FPS)
+    walked = read_walk(path, frames, film=True)
+    field = find_field(source)
+    meaning, cameras = open_meaning(field or source, classes, Teacher())
+    if (scene := classes.load_scene()) is not None:
+        cameras = scene.cameras
+    colors = open_colors(field, color, meaning)
     semantic = meaning.gaussians
     colors = None if colors is None else colors.with_origin(semantic.origin)
     if path == "orbit":
         semantic, colors = _opened(meaning.names, semantic, colors)
     words = [word.strip() for word in (show or ("labels" if colors is None else "photo,labels")).split(",")]
     shows = {_title(word): _show(word, meaning, semantic, colors) for word in words}
-    walk = walk_of(walked, semantic if colors is None else colors, cameras, frames, width)
+    walk = walk_of(walked, semantic if colors is None else colors, cameras, frames)
     listed = semantic.labels.unique() if "labels" in words else None
     with tqdm(total=len(walk), desc="render", unit="frame") as bar:
         save_animation(
             out,
             shows,
             walk,
-            fps=fps,
+            fps=FPS,
             names=None if listed is None else meaning.names,
             listed=listed,
             progress=lambda *_: bar.update(),
@@ -117,50 +112,33 @@ def _opened(names: Any, semantic: Any, colors: Any) -> tuple[Any, Any]:
     return shown, None if colors is None else shown if colors is semantic else kept(colors)
 
 
-def check_walk(path: Walk, frames: int | None, width: int | None, *, film: bool = False) -> Walk | list[Camera]:
+def read_walk(path: Walk, frames: int | None, *, film: bool = False) -> Walk | list[Camera]:
     """Check what `walk_of` is asked for, before anything else is read; cameras of your own are read here.
 
     Args:
         path: the name of a path, or a file or folder with cameras of your own.
         frames: how many cameras; None: as many as there are.
-        width: of the pictures.
         film: the cameras must be of one size.
 
     Returns:
         The name of the path, or the cameras.
     """
     from .._check import check_whole
-
-    for name, value, least, most in (("frames", frames, 2, MOST_FRAMES), ("width", width, 16, LARGEST)):
-        if value is not None:
-            check_whole(name, value, least, most)
-    if not isinstance(path, Path):
-        return path
-    _check_place(path)
-    return _own_walk(path, frames, width, film)
-
-
-def _check_place(path: Path) -> None:
-    """Raise a ValueError unless a path can have cameras of your own."""
-    from ..fields.store import find_field
     from ..scenes import is_scene
 
-    if (path.suffix == ".json" and path.exists()) or (path.is_dir() and is_scene(path)):
-        return
-    got, advice = "a folder without cameras", "correct it"
-    if not path.exists():
-        got = "which does not exist"
-    elif find_field(path) is not None:
-        got, advice = "a field", "`--path cameras` flies along the cameras of its scene"
-    elif not path.is_dir():
-        got, advice = "another file", "name the file or folder with the cameras"
-    raise ValueError(
-        "path: expected orbit, cameras, a transforms.json (a name that ends in .json), or a folder with a COLMAP model, "
-        f"got {path}, {got}; {advice}"
-    )
+    if frames is not None:
+        check_whole("frames", frames, 2, MOST_FRAMES)
+    if not isinstance(path, Path):
+        return path
+    if not ((path.suffix == ".json" and path.exists()) or (path.is_dir() and is_scene(path))):
+        raise ValueError(
+            "path: expected orbit, cameras, a transforms.json (a name that ends in .json), or a folder with a COLMAP model, "
+            f"got {path}; `--path cameras` flies along the cameras of the field"
+        )
+    return _own_walk(path, frames, film)
 
 
-def _own_walk(path: Path, frames: int | None, width: int | None, film: bool) -> list[Camera]:
+def _own_walk(path: Path, frames: int | None, film: bool) -> list[Camera]:
     """The cameras of a file or folder; with `frames`, those of a smooth path through them."""
     from ..cameras import path_cameras
     from ..cameras.paths import TooFewViewsError
@@ -170,15 +148,12 @@ def _own_walk(path: Path, frames: int | None, width: int | None, film: bool) -> 
     for note in notes:
         say(f"note: {note}")
     sizes = [(camera.width, camera.height) for camera in own]
-    if width is not None:
-        sizes = [(width, max(1, round(width * h / w))) for w, h in sizes]
     if frames is not None:
         sizes = sizes[:1]
     for w, h in sizes:
         if max(w, h) > LARGEST:
             raise ValueError(
-                f"{'path' if width is None else 'width'}: expected cameras of at most {LARGEST} x {LARGEST} pixels, got "
-                f"{w} x {h} in {path}; give a smaller --width"
+                f"path: expected cameras of at most {LARGEST} x {LARGEST} pixels, got {w} x {h} in {path}; make them smaller"
             )
     if film and len(set(sizes)) > 1:
         listed = " and ".join(f"{w}x{h}" for w, h in sorted(set(sizes))[:3])
@@ -197,10 +172,8 @@ def _own_walk(path: Path, frames: int | None, width: int | None, film: bool) -> 
         ) from error
 
 
-def walk_of(
-    path: Walk | list[Camera], cloud: Any, cameras: list[Camera], frames: int | None, width: int | None
-) -> list[Camera]:
-    """The cameras of a path that `check_walk` gave. Those of the scene are needed for a flight along them."""
+def walk_of(path: Walk | list[Camera], cloud: Any, cameras: list[Camera], frames: int | None) -> list[Camera]:
+    """The cameras of a path that `read_walk` gave. Those of the scene are needed for a flight along them."""
     from ..cameras import Orbit, orbit_cameras, path_cameras
     from ..viz.linked import upwards
 
@@ -208,9 +181,9 @@ def walk_of(
         # the size of the scene, not that of the path, says what is too near to be drawn
         near = min((camera.near for camera in cameras), default=path[0].near)
         return [replace(camera, near=near) for camera in path]
-    frames, width = frames or FRAMES, width or WIDTH
+    frames = frames or FRAMES
     if path == "orbit":
-        size = (round(width * 3 / 4), width)
+        size = (round(WIDTH * 3 / 4), WIDTH)
         orbit = Orbit(frames=frames, size=size, elevation_degrees=45, zoom=1.5, cut=0.6)
         return orbit_cameras(cloud.means, orbit, up=upwards(cameras), origin=cloud.origin)
     if not cameras:
@@ -218,7 +191,7 @@ def walk_of(
             f"scene: expected --scene for --path {path}, whose cameras it needs, got none; or take an orbit"
         )
     cameras = [camera.with_origin(cloud.origin) for camera in cameras]
-    size = (max(1, round(width * cameras[0].height / cameras[0].width)), width)
+    size = (max(1, round(WIDTH * cameras[0].height / cameras[0].width)), WIDTH)
     return path_cameras(cameras, frames, every=max(1, round(len(cameras) / KEYS)), size=size)
 
 

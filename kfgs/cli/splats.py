@@ -1,4 +1,4 @@
-"""Commands for colour splats: attach, edit, convert."""
+"""Commands for splats: attach, edit, convert."""
 
 from __future__ import annotations
 
@@ -8,20 +8,32 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-from .._files import Names, check_output, real_path
-from .edit_syntax import Edits, check_parts, classes_of, inserted_files, parse_edits
-from .files import check_alone, check_target, open_splats
-from .options import Classes, Flag, Given, GivenBy, Positional, SceneOption, Several
+from .._files import check_output, real_path
+from .edit_syntax import Edits, check_parts, classes_of, parse_edits
+from .files import check_target, is_field, open_field, open_splats
+from .options import Classes, Flag, Given, GivenBy, Positional, Precision
 from .output import say, say_counts, say_lost, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
 TITLES = ("before", "after")
+PICTURES = 2  # views that `kfgs edit` shows
+UNITS = {
+    "gaussians.means": "world units a coordinate",
+    "gaussians.quats": "degrees",
+    "gaussians.scales": "of a scale, and as much of twice the error of a coordinate",
+    "seen.pixels": "of a count, and as much of a pixel",
+    "gaussians.opacities": "",
+    "gaussians.features": "",
+    "fused.latents": "",
+    "seen.agreement": "",
+}
+"""What the error of a tensor is measured in; that of all others is a share."""
 
 
 def attach(
     field: Positional[Path],
-    splats: Positional[Path],
+    cloud: Positional[Path],
     out: Path,
     *,
     by: GivenBy = None,
@@ -30,7 +42,7 @@ def attach(
     same_frame: Flag = False,
     classes: Classes,
 ) -> None:
-    """Give every Gaussian of a splat file the class that a semantic field has at its position.
+    """Give every Gaussian of a splat, or every point of a cloud, the class that a semantic field has at its position.
 
     The frames of field and splat are compared first, and aligned if they differ.
 
@@ -38,53 +50,62 @@ def attach(
         kfgs attach run/field.kfgs run/color.ply --out labelled.ply
         kfgs attach run/field.kfgs my.spz --out labelled.spz --splat-scene my_scene/
         kfgs attach run/field.kfgs my.ply --out labelled.ply --by distance --distance 0.05    # the paper's rule
+        kfgs attach run/field.kfgs points.ply --out labelled.ply
 
     Args:
-        field: The folder that `kfgs fit` wrote (RUN/field.kfgs).
-        splats: A splat of the same scene in any format, by any program.
-        out: The labelled splat to write; its ending chooses the format.
+        field: The field that `kfgs fit` wrote (RUN/field.kfgs).
+        cloud: A splat of the same scene in any format, by any program; or a PLY of points in the field's frame, which are
+            labelled by distance and keep their other columns.
+        out: The labelled splat to write, whose ending chooses the format; of points a .ply.
         by: views (the default): the field segments its training views, and each Gaussian takes the class of the pixels that
             it fills. distance: the nearest labelled Gaussian of the field within lambda decides, as in the paper (Sec. 3.4).
         distance: The paper's lambda: the distance within which a label is carried over, in the splat's world units; by
             default from the clouds' spacing.
         splat_scene: Scene folder of the splat's own cameras, if its frame differs: cameras of the same names align the two.
-            Without it the shapes of the clouds do.
         same_frame: Do not compare the frames; they are the same.
     """
     from .._check import check_range
     from ..cameras.similarity import Similarity
     from ..formats import write_splats
+    from ..pipeline import label_cloud
     from ..pipeline.attach import attach as attach_field
     from ..scenes import SceneError, load_scene
 
     check_target("out", out)
-    classes.check_images()
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
-    if same_frame and splat_scene is not None:
-        raise ValueError("same_frame: expected it alone, got --splat-scene too, whose cameras find the frame; drop one")
-    loaded, cloud = classes.open_field("field", field), open_splats("splats", splats)
-    for name, asked in (("by", by == "views"), ("splat_scene", splat_scene is not None)):
-        if asked and not loaded.cameras:
-            raise ValueError(
-                f"{name}: expected --scene with it for a field that remembers no cameras, got none; pass --scene"
-            )
-    label_set = classes.of_field(loaded)
+    loaded = classes.open_field("field", field)
+    label_set = classes.load_classes(loaded)
+    if _of_points(cloud):
+        moved, paths = label_cloud(loaded.label(label_set), cloud, out, distance=distance)
+        say(str(moved))
+        say_counts(moved.labels, label_set.names)
+        wrote(paths)
+        return
+    splats = open_splats("cloud", cloud)
     same = Similarity.identity() if same_frame else None
     frame = same if splat_scene is None else load_scene(splat_scene).undistorted().cameras
     try:
-        found = attach_field(loaded, cloud, label_set, frame=frame, distance=distance, by=by)
+        labelled = attach_field(loaded, splats, label_set, frame=frame, distance=distance, by=by)
     except SceneError as error:
         raise SceneError(
-            f"splats: no frame found in which field and splat agree: {error} (--splat-scene gives the splat's cameras, "
+            f"cloud: no frame found in which field and splat agree: {error} (--splat-scene gives the splat's cameras, "
             "--same-frame says that there is nothing to find)"
         ) from error
-    written = write_splats(found.gaussians, out, facts=found.facts)
-    for note in found.notes:
+    written = write_splats(labelled.gaussians, out, facts=labelled.facts)
+    for note in labelled.notes:
         say(note)
-    say_counts(found.labels, label_set.names)
+    say_counts(labelled.labels, label_set.names)
     say_lost(written)
     wrote(written.paths)
+
+
+def _of_points(path: Path) -> bool:
+    """Whether a file is a PLY without Gaussians."""
+    from ..formats import find_format
+    from ..formats.ply import read_ply
+
+    return path.is_file() and not is_field(path) and find_format(path).NAME == "ply" and "scale_0" not in read_ply(path)
 
 
 def edit(
@@ -92,18 +113,17 @@ def edit(
     out: Path,
     *,
     replay: Given[Path] = None,
-    views: Several = (),
-    pictures: int = 2,
+    scene: Given[Path] = None,
     edits: Edits,
-    scene: SceneOption,
 ) -> None:
     """Edit a labelled splat by class. The edits are saved next to the result and can be replayed.
 
-    The input does not change. For another order of edits run the command several times, or use --replay.
+    The input does not change. For another order of edits run the command several times, or use --replay. In Python there are
+    more: `kfgs.labels.edits`.
 
     Examples:
         kfgs edit labelled.ply --out edited.ply --remove chair --recolor "plant:#c04040" --scene scene/
-        kfgs edit labelled.ply --out edited.spz --move table:0.5,0,0 --opacity lamp:0.3
+        kfgs edit labelled.ply --out edited.spz --move table:0.5,0,0
         kfgs edit other.ply --out again.ply --replay edited.ply.edits.json
 
     Args:
@@ -111,39 +131,43 @@ def edit(
         out: The edited splat; its ending chooses the format. The edits go to a file next to it (edited.ply.edits.json for
             edited.ply), and with --scene the views before and after to a picture (edited.ply.png).
         replay: Saved edits; they come first.
-        views: Name of a view to show (with --scene). By default one for each edit, then those in which most changes.
-        pictures: How many views to show if none is named.
+        scene: Scene folder in the same frame, for pictures of the views in which most changes.
     """
-    from .._check import check_whole
     from ..formats import write_splats
     from ..labels.edits import EditList
+    from ..labels.edits.edit_list import edits_path
     from ..pipeline.compare import views_of_change, write_comparison
+    from ..scenes import load_scene
 
     check_target("out", out)
-    saved = _edits_beside(out, replay)
-    check_whole("pictures", pictures, 0)
-    if scene.scene is None:
-        check_alone("views", ", ".join(views) or None, "without --scene, whose views they are")
-        scene.check_images()
+    saved = check_output("out", edits_path(out), "a file")
+    if replay is not None and real_path(replay) == real_path(saved):
+        raise ValueError(
+            f"replay: expected another file than {saved}, where the edits are saved, got the same; give --out another name"
+        )
+    for name in (part for words in edits.insert for part in (words, words.rpartition(":")[0]) if part):
+        if real_path(name) == real_path(out):
+            raise ValueError(f"out: expected another place than {name}, which is read; give another name")
     replayed = EditList() if replay is None else EditList.load(replay, anywhere=True)  # the user's own file
     asked = parse_edits(edits)
     if not asked and not len(replayed):
         raise ValueError("edits: expected at least one, got none; give --remove, --recolor, --move or another")
-    check_target("out", out, *inserted_files([*replayed, *(edit for _, edit in asked)]))
-    by_class = [*classes_of(replayed), *classes_of(edit for _, edit in asked)]
-    named = any(isinstance(one, str) for one in by_class)
+    by_class = [*classes_of(list(replayed)), *classes_of([change for _, change in asked])]
+    named = any(isinstance(name, str) for name in by_class)
     before = open_splats("splats", splats, labelled=bool(by_class), named=named)
     start, listed = replayed.apply(before), replayed
     asked = parse_edits(edits, start.names)
-    check_parts(start, [edit for _, edit in asked])
-    for _, edit in asked:
-        listed = listed.then(edit)
-    cameras = [] if scene.scene is None else _cameras_to_show(before, scene, views)
+    check_parts(start, [change for _, change in asked])
+    for _, change in asked:
+        listed = listed.then(change)
+    if scene is not None and before.sh is None:
+        raise ValueError(f"scene: expected a splat with colours to show in it, got {before!r}; leave --scene out")
+    cameras = [] if scene is None else load_scene(scene).undistorted().cameras
     after = _apply(listed, before, [words for words, _ in asked])
-    shown = cameras
-    if cameras and not views:
-        states = list(accumulate(listed, lambda cloud, edit: edit.apply(cloud), initial=before))[1:-1]
-        shown = [cameras[i] for i in views_of_change(before, after, cameras, pictures, between=states)]
+    shown = []
+    if cameras:
+        states = list(accumulate(listed, lambda cloud, change: change.apply(cloud), initial=before))[1:-1]
+        shown = [cameras[i] for i in views_of_change(before, after, cameras, PICTURES, between=states)]
     written = write_splats(after, out)
     paths = [*written.paths, listed.save(saved)]
     if shown:
@@ -153,62 +177,121 @@ def edit(
     if len(after) == 0:
         say("note: nothing is left")
     say_lost(written)
-    if cameras and pictures and not shown:
+    if cameras and not shown:
         say("note: no view of the scene shows a change")
     if shown:
         say("before and after from " + ", ".join(camera.name for camera in shown))
     wrote(paths)
 
 
+def _apply(edits: Any, splats: Any, asked: list[str]) -> Any:
+    """Apply edits, of which the last ones come from options: the error of one quotes the option's words."""
+    from ..labels.edits.edit_list import EditError
+
+    try:
+        return edits.apply(splats)
+    except EditError as error:
+        option = error.index - (len(edits) - len(asked))
+        if option < 0:
+            raise
+        raise ValueError(f"{asked[option]}: {error.why}") from error
+
+
 def convert(
     source: Positional[Path],
-    target: Positional[Path],
+    target: Positional[Given[Path]] = None,
     *,
+    precision: Precision = "small",
+    text: Given[Path] = None,
     plain: Flag = False,
     by_class: Flag = False,
 ) -> None:
-    """Convert a splat file to another format. Classes are kept; losses of the new format are reported.
+    """Convert a splat file to another format, or pack a field; without TARGET, describe what a path holds.
+
+    Classes are kept; losses of the new format are reported.
 
     Examples:
+        kfgs convert run/    # describes a run, field, batch, scene, folder of maps, splat or cloud
         kfgs convert edited.ply edited.spz
-        kfgs convert scene.ksplat scene.ply
         kfgs convert output/ scene.ply    # the newest splat of 3DGS, gsplat or nerfstudio
-        kfgs convert labelled.ply for_unity.ply --plain
         kfgs convert labelled.ply objects/ --by-class
+        kfgs convert run/ room.kfgs --precision fine    # a small file of a field
+        kfgs convert run/ labelled.ply    # the field's own Gaussians in the colours of their classes
 
     Args:
         source: A .ply (3DGS, or SuperSplat's compressed), .splat, .ksplat, .spz, .sog, .glb or .gltf file; a checkpoint of
-            gsplat (.pt) or nerfstudio (.ckpt); or the output folder of 3DGS, gsplat or nerfstudio, whose newest splat is read.
-        target: The file to write; its ending chooses the format: .ply, .compressed.ply, .splat, .spz, .sog, .glb, .gltf.
+            gsplat (.pt) or nerfstudio (.ckpt); the output folder of 3DGS, gsplat or nerfstudio, whose newest splat is read; or
+            a field.
+        target: The file to write; its ending chooses the format: .ply, .compressed.ply, .splat, .spz, .sog, .glb, .gltf; of a
+            field .kfgs or .ply.
+        precision: Of a .kfgs file: lossless; fine (labels hardly change); small (0.6 MB for 50,000 Gaussians); tiny. The
+            errors of each are printed, and kept in the file. All but lossless sort the Gaussians.
+        text: Words that the .kfgs file shall know instead of the field's: a table of `kfgs features --words`.
         plain: Write a .ply with exactly the properties of Inria's 3DGS, for importers that fail on others. The classes go to
-            a file beside it, which kfgs finds again.
+            a file next to it, which kfgs finds again.
         by_class: TARGET is a folder that receives one plain .ply for each class, 05_chair.ply for class 5.
     """
+    from ..batch import describe_batch
     from ..formats import write_splats
+    from ..pipeline import describe, save_labelled
 
-    if by_class:
-        check_alone("plain", plain, "with --by-class, whose files are plain")
-        return _convert_by_class(source, target)
-    check_target("target", target)
-    splats = open_splats("source", source)
-    shown = repr(splats)
-    written = write_splats(splats, target, plain=plain)
-    say(shown)
-    say_lost(written)
-    say(f"{_bytes_of(source) / 2**10:,.1f} KiB -> {_bytes_of(target) / 2**10:,.1f} KiB")
-    wrote(written.paths)
+    if target is None:
+        say(describe_batch(source) or describe(source))
+    elif is_field(source) and target.suffix == ".ply":
+        check_output("target", target, "a file")
+        labelled = open_field("source", source).label()
+        wrote(save_labelled(target, labelled, rule="what the views show of each Gaussian; score = cosine"))
+    elif is_field(source) or target.suffix == ".kfgs":
+        _pack(source, target, precision, text)
+    elif by_class:
+        _convert_by_class(source, target)
+    else:
+        check_target("target", target)
+        splats = open_splats("source", source)
+        shown = repr(splats)
+        written = write_splats(splats, target, plain=plain)
+        say(shown)
+        say_lost(written)
+        say(f"{_bytes_of(source) / 2**10:,.1f} KiB -> {_bytes_of(target) / 2**10:,.1f} KiB")
+        wrote(written.paths)
+
+
+def _pack(source: Path, target: Path, precision: Precision, text: Path | None) -> None:
+    """Write a field again, with other words if some are given; say the error of each part, read back from the file."""
+    from dataclasses import replace
+
+    from ..fields.store import check_place, read_description, stream_sizes
+    from ..labels.questions import class_rows
+
+    check_output("target", target, "a file")
+    check_place(target)
+    field = open_field("source", source)
+    if text is not None:
+        words = Classes(text=text).load_classes()
+        class_rows(words, field.dim, field.info)  # of the field's teacher
+        field = replace(field, classes=words)
+    field.save(target, None if precision == "lossless" else precision)
+    if precision != "lossless":
+        about = read_description(target)
+        errors = about["info"]["rounded"][-1]["errors"]
+        for name, size in stream_sizes(target).items():
+            error, words_of_error = errors.get(name), ""
+            if error is not None:
+                share = f"{100 * error:.2g} % of a row's typical number"
+                words_of_error = "within " + (f"{error:.3g} {UNITS[name]}" if name in UNITS else share)
+            say(f"  {name:<32s} {size:>10,d} bytes  {words_of_error}".rstrip())
+        say(f"{about['gaussians']:,} Gaussians in {target.stat().st_size / 2**20:.2f} MiB")
+        say(
+            "note: neighbours now lie side by side (Morton order), so indices into the old field do not fit the new one"
+        )
+    wrote([target])
 
 
 def _convert_by_class(source: Path, folder: Path) -> None:
-    """One plain PLY for each class of a splat. The class is in the name of its file, so there is nothing beside it."""
+    """One plain PLY for each class of a splat. The class is in the name of its file, so there is nothing next to it."""
     from .._files import atomic_folder
-    from ..formats import formats, write_splats
+    from ..formats import write_splats
 
-    endings = *(ending for one in formats().values() for ending in one.SUFFIXES), ".zip"
-    if folder.name.lower().endswith(endings) and not folder.is_dir():
-        raise ValueError(
-            f"target: expected a folder for the files of the classes, got {folder}, the name of a file; leave its ending out"
-        )
     check_output("target", folder, "a folder")
     splats = open_splats("source", source, labelled=True)
     if len(splats) == 0:
@@ -234,56 +317,6 @@ def _file_name(label: int, classes: Sequence[str]) -> str:
         return "unlabelled.ply"
     word = re.sub(r"[^\w-]+", "_", classes[label]).strip("_")[:80] if label < len(classes) else ""
     return f"{label:02d}_{word}.ply" if word else f"{label:02d}.ply"
-
-
-def _apply(edits: Any, splats: Any, asked: list[str]) -> Any:
-    """Apply edits, of which the last ones come from options: the error of one quotes the option's words."""
-    from ..labels.edits.edit_list import EditError
-
-    try:
-        return edits.apply(splats)
-    except EditError as error:
-        option = error.index - (len(edits) - len(asked))
-        if option < 0:
-            raise
-        raise ValueError(f"{asked[option]}: {error.why}") from error
-
-
-def _edits_beside(out: Path, replay: Path | None) -> Path:
-    """The file for the edits of a splat file; an error if it is the file to replay, another file, or cannot be written."""
-    from ..labels.edits.edit_list import edits_path
-
-    saved = edits_path(out)
-    check_output("out", saved, "a file")
-    if replay is not None and real_path(replay) == real_path(saved):
-        raise ValueError(
-            f"replay: expected another file than {saved}, where the edits behind {out} are saved, got the same; give --out "
-            "another name"
-        )
-    return saved
-
-
-def _cameras_to_show(splats: Any, scene: SceneOption, views: Sequence[str]) -> list[Any]:
-    """The undistorted cameras of a scene, or of some of its views."""
-    if splats.sh is None:
-        raise ValueError(f"scene: expected a splat with colours to show in it, got {splats!r}; leave --scene out")
-    loaded = scene.load_scene()
-    return list((_choose_views(loaded, views) if views else loaded).undistorted().cameras)
-
-
-def _choose_views(scene: Any, names: Sequence[str]) -> Any:
-    """The scene with the named views only; a ValueError if a name is unknown, or one view is named twice."""
-    known, seen = Names((camera.name for camera in scene.cameras), bare=True), set[str]()
-    for name in names:
-        view = known.find(name)
-        if view is None:
-            raise ValueError(
-                f"views: expected names of the scene's {len(scene)} views, got {name!r}; {known.advice(name)}"
-            )
-        if view in seen:
-            raise ValueError(f"views: expected each view once, got {view!r} twice; name it once")
-        seen.add(view)
-    return scene.select(names)
 
 
 def _bytes_of(path: Path) -> int:

@@ -2,36 +2,23 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 from .._files import check_output, real_path
-from .files import check_alone, is_field, open_splats
+from .features import text_encoder
+from .files import is_field, open_splats
 from .options import Classes, Given, Positional, Teacher
 from .output import say, wrote
-from .places import check_apart
-from .text import note_other_teacher, text_encoder
+from .select import note_other_teacher
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
-Where = Literal["auto", "browser", "html", "window", "picture"]
+Where = Literal["browser", "html", "window", "picture"]
 FEW = 0.05  # of a colour cloud within lambda, under which the frames probably differ
-
-
-@dataclass(frozen=True)
-class Display:
-    """Options of the display and of the page."""
-
-    show: Given[Literal["labels", "rgb", "score", "latents"]] = None
-    """The meaning of the colours at the start. When not given: the page shows colours if there are any, all else labels."""
-    host: str = "127.0.0.1"
-    """Address on which the page listens. Anything but 127.0.0.1 lets others look and save."""
-    port: int = 0
-    """Port of the page; 0: a free one."""
 
 
 def view(
@@ -39,12 +26,10 @@ def view(
     *,
     color: Given[Path] = None,
     ask: Given[str] = None,
-    distance: Given[float] = None,
-    where: Where = "auto",
+    where: Where = "browser",
     out: Path = Path("kfgs_view"),
     teacher: Teacher,
     classes: Classes,
-    display: Display,
 ) -> None:
     """Explore a field: type "chair", change gamma and lambda, click a Gaussian, save the selection.
 
@@ -62,81 +47,51 @@ def view(
         source: A run folder of `kfgs fit` or its field, asked by text; or a splat with classes (`kfgs attach`), asked by class.
         color: Colour splat in the same frame, any splat file. Of a field, by default: RUN/color.ply, or the splat it was made on.
         ask: A first question.
-        distance: Lambda at the start, in world units; by default from the clouds' spacing.
         where: browser; html (writes OUT/view.html, one file that any browser opens without kfgs, and ends); window (pyvista:
-            two clouds side by side); or picture (writes OUT/view.png and ends). auto: browser. The first two show small
-            photos of the scene, too.
+            two clouds side by side); or picture (writes OUT/view.png and ends). The first two show small photos of the
+            scene, too.
         out: Folder for saved pictures and selections.
     """
-    place = "browser" if where == "auto" else where
-    if where in ("html", "picture") or out.exists():  # the others write only when asked
-        check_output("out", out, "a folder")
-    read = functools.partial(_read, source, color, ask, distance, out, classes, teacher)
-    if place == "browser":
-        _viewer(read(), source, out, classes, display).serve(display.host, display.port, report=say)
-        return
-    for name, given, usual in (("host", display.host, "127.0.0.1"), ("port", display.port, 0)):
-        check_alone(name, None if given == usual else given, "without --where browser, whose page listens there")
-    _check_drawing(place)
-    state = read()
-    if place == "html":
-        out.mkdir(parents=True, exist_ok=True)
-        wrote([_viewer(state, source, out, classes, display).save_html(out / "view.html")])
-    else:
-        _draw(state, place, out, display)
-
-
-def _check_drawing(place: Where) -> None:
-    """Raise a ValueError if a window or a picture is impossible here."""
+    from ..fields.store import find_field
+    from ..viewer import Exploration, Explorer, Viewer
     from ..viz.plotter import has_display, require
 
-    if place == "window" and not has_display():
+    if where in ("html", "picture") or out.exists():  # the others write only when asked
+        check_output("out", out, "a folder")
+    if where == "window" and not has_display():
         raise ValueError("where: expected a display for a window, got none; use browser or picture")
-    try:
-        if place in ("window", "picture"):
+    if where in ("window", "picture"):
+        try:
             require()
-    except RuntimeError as error:  # nothing draws here
-        raise ValueError(str(error)) from error
-
-
-def _read(
-    source: Path,
-    color: Path | None,
-    ask: str | None,
-    distance: float | None,
-    out: Path,
-    classes: Classes,
-    teacher: Teacher,
-) -> Any:
-    """The exploration, whose pictures and selections go to `out`."""
-    from .._check import check_range
-    from ..fields.store import find_field
-    from ..viewer import Exploration
-
-    if distance is not None:
-        check_range("distance", distance, 0, closed=(False, False))
-    check_apart("view", {"source": source, "color": color, "out": out, "classes": classes})
-    classes.check_images()
+        except RuntimeError as error:  # nothing draws here
+            raise ValueError(str(error)) from error
     say("reading")
-    found = find_field(source)
-    meaning, cameras = open_meaning(found or source, classes, teacher)
-    colors = open_colors(found, color, meaning)
-    cloud = None if colors is meaning.gaussians else colors
-    state = Exploration(meaning, cloud, cameras=cameras, distance=distance)
+    field = find_field(source)
+    meaning, cameras = open_meaning(field or source, classes, teacher)
+    colors = open_colors(field, color, meaning)
+    state = Exploration(meaning, None if colors is meaning.gaussians else colors, cameras=cameras)
     _note(state)
     if ask is not None:
         state.ask(ask)
     for line in state.lines():
         say(line)
-    return state
-
-
-def _viewer(state: Any, source: Path, out: Path, classes: Classes, display: Display) -> Any:
-    from ..viewer import Viewer
-
-    state.set_show(display.show or state.first_show)
-    scene = classes.scene_of(getattr(state.meaning, "field", None))
-    return Viewer(state, title=_title(source), scene=scene, out=out)
+    if where in ("window", "picture"):
+        with Explorer(state, out=out, off_screen=where == "picture") as explorer:
+            explorer.set_show("labels")
+            if where == "window":
+                explorer.show()
+            else:
+                explorer.screenshot(out / "view.png")
+                wrote([out / "view.png"])
+        return
+    state.set_show(state.first_show)
+    scene = classes.photos_of(getattr(meaning, "field", None))
+    viewer = Viewer(state, title=_title(source), scene=scene, out=out)
+    if where == "html":
+        out.mkdir(parents=True, exist_ok=True)
+        wrote([viewer.save_html(out / "view.html")])
+    else:
+        viewer.serve(report=say)
 
 
 def _title(source: Path) -> str:
@@ -145,19 +100,6 @@ def _title(source: Path) -> str:
 
     path = real_path(source)
     return path.parent.name if path.name == NAME else path.stem
-
-
-def _draw(state: Any, place: Where, out: Path, display: Display) -> None:
-    """Open a window until the user closes it, or write its picture."""
-    from ..viewer import Explorer
-
-    with Explorer(state, out=out, off_screen=place != "window") as explorer:
-        explorer.set_show(display.show or "labels")
-        if place == "window":
-            explorer.show()
-        else:
-            explorer.screenshot(out / "view.png")
-            wrote([out / "view.png"])
 
 
 def open_colors(field: Path | None, color: Path | None, meaning: Any) -> Any:
@@ -184,13 +126,10 @@ def open_meaning(source: Path, classes: Classes, teacher: Teacher) -> tuple[Any,
 
     if is_field(source) or not source.exists():
         field = classes.open_field("source", source)
-        label_set, embed = _words_of(classes.of_field(field), teacher)
+        label_set, embed = _words_of(classes.load_classes(field), teacher)
         return FieldMeaning(field, label_set, embed=embed), list(field.cameras)
-    given = {"classes": classes.classes, "text": classes.text} | dataclasses.asdict(teacher)
-    for name, value in given.items():
-        check_alone(name, value, "with a splat, which has its own classes")
-    cameras = [] if classes.scene is None else classes.load_scene().undistorted().cameras
-    return SplatMeaning(open_splats("source", source, labelled=True)), cameras
+    scene = classes.load_scene()
+    return SplatMeaning(open_splats("source", source, labelled=True)), [] if scene is None else scene.cameras
 
 
 def _words_of(label_set: Any, teacher: Teacher) -> tuple[Any, Callable[[str], Any] | None]:
@@ -199,16 +138,16 @@ def _words_of(label_set: Any, teacher: Teacher) -> tuple[Any, Callable[[str], An
     The teacher is loaded here, so that a wrong file is reported at once. If the table has no canonical words to compare a
     phrase with, the teacher embeds them.
     """
-    if teacher.teacher is None:
-        teacher.check_weights()
-        return label_set, None
     from ..labels import CANONICAL
 
-    encode, templates = text_encoder(teacher), label_set.info.get("templates")
+    network = teacher.load()
+    if network is None:
+        return label_set, None
+    encode, templates = text_encoder(network), label_set.info.get("templates")
     probe = encode(["thing"], templates=templates, negatives=CANONICAL)
     note_other_teacher(probe, label_set)
     if label_set.negatives is None and probe.dim == label_set.dim:
-        label_set = dataclasses.replace(label_set, negatives=probe.negatives, negative_names=probe.negative_names)
+        label_set = replace(label_set, negatives=probe.negatives, negative_names=probe.negative_names)
 
     @functools.cache
     def embed(phrase: str) -> Any:
@@ -223,5 +162,5 @@ def _note(state: Any) -> None:
     if color and color["total"] - color["none"] < FEW * color["total"]:
         say(
             f"note: only {color['total'] - color['none']:,} of {color['total']:,} colour Gaussians lie within lambda of "
-            "the field; another frame? `kfgs attach` checks and aligns, --distance sets lambda"
+            "the field; another frame? `kfgs attach` checks and aligns"
         )

@@ -53,14 +53,9 @@ def identify_fit(
 
 
 def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write the file; it is whole or absent. Its folder was made at the start: one that is made again would hide until the end
-    that something else deleted it.
-    """
+    """Write the file; it is whole or absent. Its folder was made at the start and is not made again."""
     if not path.parent.is_dir():
-        raise FileNotFoundError(
-            f"{path.parent}: expected this folder to stay while Gaussians are trained, but something else deleted or moved "
-            "it; start again"
-        )
+        raise FileNotFoundError(f"{path.parent}: expected this folder to stay while Gaussians are trained; start again")
     buffer = io.BytesIO()  # torch.save reports a full disk as a bug of its own, with a traceback
     torch.save(state, buffer)
     with atomic_path(path) as temporary:

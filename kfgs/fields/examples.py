@@ -131,7 +131,7 @@ def read_examples(path: str | Path) -> dict[str, list[Example]]:
         except (TypeError, LookupError, ValueError, OverflowError) as error:
             why = f"{type(error).__name__}: {error}" if isinstance(error, LookupError) else str(error)
             raise ValueError(
-                f"{path}: {name!r}[{i}]: expected an example, got {entry!r:.60} ({why}); see kfgs text --help"
+                f"{path}: {name!r}[{i}]: expected an example, got {entry!r:.60} ({why}); see kfgs features --help"
             ) from error
     return examples
 

@@ -92,8 +92,8 @@ def leave_out_broken(path: Path, g: Gaussians, *, strict: bool) -> tuple[Gaussia
         )
     if left_out and strict:
         raise ValueError(
-            f"{path}: expected finite values in every Gaussian, got others: {'; '.join(left_out)}; without --strict (in Python: "
-            "strict=False) they are left out"
+            f"{path}: expected finite values in every Gaussian, got others: {'; '.join(left_out)}; without --strict "
+            "they are left out"
         )
     notes = [f"{words}: left out" for words in left_out]
     notes += [f"{words}: read as not turned" for words in _count(unturned & kept, "have a rotation of length 0")]
@@ -227,7 +227,7 @@ def _check_rows(name: str, expected: str, values: Tensor, good: Tensor) -> None:
     bad = ~good.reshape(len(good), -1).all(1)
     row = int(bad.nonzero()[0])
     raw = values.isfinite().all() and 2 * int(bad.sum()) > len(bad) and name in _RAW
-    advice = _RAW[name] if raw else "correct them, or leave these Gaussians out (in Python: with select)"
+    advice = _RAW[name] if raw else "correct them, or leave these Gaussians out"
     raise ValueError(
         f"{name}: expected {expected} in every Gaussian, got {values[row].flatten()[:4].tolist()} at {row} and others at "
         f"{int(bad.sum()) - 1} more of {len(bad)}; {advice}"

@@ -144,7 +144,7 @@ def load_label_set(classes: str | Path, embeddings: str | Path | None = None) ->
     if embeddings is None:
         raise ValueError(
             f"embeddings: expected an .npy file of one row per name in {classes}, got none; pass it, or pass a table that "
-            "`kfgs text` made, instead of both"
+            "`kfgs features --words` made, instead of both"
         )
     path = as_path(embeddings)
     if path.suffix == SUFFIX:
@@ -180,7 +180,7 @@ def _check_list(names: Sequence[str]) -> None:
 
 def _read_table(path: Path) -> LabelSet:
     """Read what `LabelSet.save` wrote."""
-    expected, advice = f"a kfgs {KIND} (a table of words)", "make it again with `kfgs text`"
+    expected, advice = f"a kfgs {KIND} (a table of words)", "make it again with `kfgs features --words`"
     parts, metadata = read_safetensors(path, expected, advice, kfgs=(KIND, VERSION))
     parts = {name: rows.float() for name, rows in parts.items()}
     for name, rows in parts.items():

@@ -48,7 +48,7 @@ def class_rows(classes: Classes, dim: int, info: dict[str, Any]) -> Tensor:  # [
         difference = teacher_mismatch(info, classes.info)
         what, again = "text of another teacher", AGAIN
         if "examples" in classes.info:
-            what, again = "examples of another teacher", "make them again: `kfgs text --examples FILE --field FIELD`"
+            what, again = "examples of another teacher", "make them again: `kfgs features FIELD --examples FILE`"
         more = "" if difference is None else f" ({difference})"
         if classes.dim != dim:
             got = f"got {tuple(classes.embeddings.shape)}: {what}?{more}"
@@ -115,7 +115,7 @@ def make_question(
         raise ValueError(f"negatives: expected other classes than {words!r}, got none; use 'canonical' or 'none'")
     if negatives == "canonical" and canonical is None:
         raise ValueError(
-            "negatives: expected canonical words in the classes' table, got none; make the table with `kfgs text`, or use "
+            "negatives: expected canonical words in the classes' table, got none; make the table with `kfgs features --words`, or use "
             "'classes' or 'none'"
         )
     return Question(row, {"classes": others, "canonical": canonical, "none": None}[negatives], words)

@@ -193,7 +193,7 @@ def _check_folder(folder: Path, identity: dict[str, Any], pictures: list[Picture
         there, now = ({key: teacher.get(key) for key in keys} for teacher in (manifest.teacher, identity))
         raise ValueError(
             f"{folder}: expected maps of the same teacher as now ({one_line(json.dumps(now), 200)}), got others "
-            f"({one_line(json.dumps(there), 200)}); use another folder, or pass overwrite=True (--overwrite) to give up its "
+            f"({one_line(json.dumps(there), 200)}); use another folder, or pass overwrite=True to give up its "
             f"{len(manifest.pictures)} maps"
         )
 

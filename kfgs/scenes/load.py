@@ -214,7 +214,7 @@ def _advice(path: Path) -> str:
         return f"it holds scenes ({some(inside)}): give one of them, as in {path / inside[0]}"
     if is_scene(real_path(path).parent):
         return f"the folder above is a scene: give {real_path(path).parent}"
-    return f"estimate the cameras first: `kfgs sfm {shlex.quote(str(path))} --out scene/` (in Python: run_sfm)"
+    return f"estimate the cameras first: `kfgs sfm {shlex.quote(str(path))} --out scene/`, or run_sfm"
 
 
 def find_images(root: Path, model: Path) -> Path:

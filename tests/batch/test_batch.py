@@ -176,7 +176,7 @@ def test_the_command_takes_a_list_to_the_end_and_fails_if_a_scene_does(tmp_path,
     said = capsys.readouterr()
     assert "0 of 2 scenes are finished" in said.out
     assert "2 failed (kitchen, hall)" in said.err
-    assert main(["info", str(tmp_path / "runs")]) == 0
+    assert main(["convert", str(tmp_path / "runs")]) == 0
     assert "hall: failed in cameras" in capsys.readouterr().out
     for extra, word in (
         (["--workers", "0"], "--workers"),

@@ -169,4 +169,4 @@ def test_the_command(town, splat, tmp_path, capsys):
     assert main(["batch", str(town), "--out", str(out), "--blocks", "2", "--splat", str(splat)]) == 0
     assert "block01: " in capsys.readouterr().out
     assert len(SemanticField.load(out / "field.kfgs")) == len(join_blocks(out))
-    assert main(["info", str(out / "field.kfgs")]) == 0
+    assert main(["convert", str(out / "field.kfgs")]) == 0

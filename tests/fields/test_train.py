@@ -267,7 +267,7 @@ def test_a_folder_that_is_deleted_meanwhile_is_noticed_at_the_next_checkpoint(tm
             assert path.is_file()
             shutil.rmtree(tmp_path / "run")
 
-    with pytest.raises(FileNotFoundError, match=tells(path.parent, "something else deleted", "start again")):
+    with pytest.raises(FileNotFoundError, match=tells(path.parent, "this folder to stay", "start again")):
         fit_field(start(), cameras, targets, SHORT, checkpoint=path, progress=watch)
     assert steps[-1] == 40
     assert not (tmp_path / "run").exists()

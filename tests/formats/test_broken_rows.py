@@ -222,7 +222,7 @@ def test_a_label_that_is_no_number_is_no_label(tmp_path, notes):
 def test_every_command_tells_it_once_and_strict_refuses(tmp_path, capsys):
     path = _ply(tmp_path / "a.ply", "x", np.nan)
     note = "note: a.ply: 3 of 600 Gaussians have NaN or infinity in means (rows 7, 8, 400): left out\n"
-    for words in (["info"], ["convert", tmp_path / "b.spz"], ["convert", tmp_path / "c", "--by-class"]):
+    for words in (["convert"], ["convert", tmp_path / "b.spz"], ["convert", tmp_path / "c", "--by-class"]):
         command = [words[0], str(path), *map(str, words[1:])]
         assert main(command) == 0
         assert capsys.readouterr().out.count(note) == 1

@@ -114,7 +114,7 @@ def test_all_ranks_are_joined(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     write_gsplat(tmp_path / "ckpts/ckpt_999_rank0.pt", raw_values(2))
     found = read_splats(tmp_path)  # the newest step of the folder
     assert torch.equal(found.means, torch.cat([raw["means"] for raw in parts]))
-    assert main(["info", str(tmp_path)]) == 0
+    assert main(["convert", str(tmp_path)]) == 0
     assert "format: checkpoint" in capsys.readouterr().out
     (tmp_path / "ckpts/ckpt_6999_rank0.pt").unlink()
     with pytest.raises(ValueError, match=tells("ranks 0 to 1", "[1]", "copy them all")):

@@ -110,7 +110,7 @@ def test_a_table_that_is_none_is_named(tmp_path):
         with pytest.raises(ValueError, match=tells(*words)):
             load_label_set(path)
     save_file({"embeddings": torch.full((1, 3), torch.nan)}, path, metadata=head)
-    with pytest.raises(ValueError, match=tells("t.safetensors:", "finite", "embeddings", "`kfgs text`")):
+    with pytest.raises(ValueError, match=tells("t.safetensors:", "finite", "embeddings", "`kfgs features --words`")):
         load_label_set(path)
     save_file({"others": torch.ones(1, 3)}, path, metadata=head)
     with pytest.raises(ValueError, match=tells("t.safetensors:", "read", "'embeddings'")):

@@ -116,7 +116,7 @@ def test_missing_negatives_are_named():
     bare = LabelSet(("wall",), FIVE[:1])
     with pytest.raises(ValueError, match=tells("negatives:", "'wall'", "got none", "'canonical'")):
         field().query("wall", bare, negatives="classes")
-    with pytest.raises(ValueError, match=tells("negatives:", "got none", "`kfgs text`")):
+    with pytest.raises(ValueError, match=tells("negatives:", "got none", "`kfgs features --words`")):
         field().query("wall", bare, negatives="canonical")
     with pytest.raises(ValueError, match=tells("negatives:", "'auto', 'classes', 'canonical', 'none'", "got 'all'")):
         field().query("wall", bare, negatives="all")
@@ -164,7 +164,7 @@ def test_words_of_other_channels_are_refused_before_any_view_is_drawn(monkeypatc
         ):
             ask()
     shown = dataclasses.replace(other, info={"examples": {"wall": 1, "chair": 1}})
-    with pytest.raises(ValueError, match=tells("classes:", "[C, 5]", "got (2, 7)", "examples", "kfgs text --examples")):
+    with pytest.raises(ValueError, match=tells("classes:", "[C, 5]", "got (2, 7)", "examples", "kfgs features FIELD --examples")):
         field().label(shown)
 
 

@@ -1,4 +1,4 @@
-"""What `kfgs info` says of folders that are no scene."""
+"""What `kfgs convert` says of folders that are no scene."""
 
 import shutil
 

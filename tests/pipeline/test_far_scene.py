@@ -75,7 +75,7 @@ def test_answers_and_files_are_in_the_world(rooms, capsys):
         edit = ["edit", str(folder / "labelled.ply"), "--remove", "chair", "--move", "sofa:0.5,0,0"]
         assert main([*edit, "--out", str(folder / "edited.ply")]) == 0
         capsys.readouterr()
-        assert main(["info", str(folder / "edited.ply")]) == 0
+        assert main(["convert", str(folder / "edited.ply")]) == 0
         answers[name] = attached.labels, facts["parts"], (low, high), capsys.readouterr().out
     assert torch.equal(answers["near"][0], answers["far"][0])
     for near, far in zip(answers["near"][1], answers["far"][1], strict=True):

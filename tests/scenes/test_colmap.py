@@ -15,7 +15,7 @@ from colmap_models import (
 from messages import tells
 
 from kfgs.cameras.projection import camera_to_pixel
-from kfgs.cli.render import check_walk
+from kfgs.cli.render import read_walk
 from kfgs.scenes import SceneError
 from kfgs.scenes.colmap import LENSES, convert_intrinsics, load_colmap
 from kfgs.scenes.load import cameras_and_notes
@@ -91,7 +91,7 @@ def test_an_image_without_pose_is_left_out_and_noted(tmp_path: Path, capsys: pyt
     cameras, notes = cameras_and_notes(model)
     assert [camera.name for camera in cameras] == ["a.png"]
     assert note in notes
-    check_walk(model, None, None)
+    read_walk(model, None)
     assert f"note: {note}" in capsys.readouterr().out
 
 

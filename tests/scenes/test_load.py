@@ -201,7 +201,7 @@ def test_what_cannot_be_loaded_is_named(tmp_path: Path) -> None:
         load_scene(tmp_path / "nothing")
     photos = tmp_path / "my photos"
     photos.mkdir()
-    advice = f"`kfgs sfm '{photos}' --out scene/` (in Python: run_sfm)"
+    advice = f"`kfgs sfm '{photos}' --out scene/`, or run_sfm"
     with pytest.raises(SceneError, match=tells("COLMAP", "transforms.json", "docs/datasets.md", "none", advice)):
         load_scene(photos)
     with pytest.raises(ValueError, match=tells("split:", "'auto'", "got 'random'")):

@@ -127,8 +127,6 @@ def test_sfm_of_a_video(shared_data: Path, tmp_path: Path, capsys: pytest.Captur
         (tmp_path / "a.gif").write_bytes(b"GIF89a")
         assert main(["sfm", str(tmp_path / file), "--out", str(tmp_path / "other")]) == 1
         assert message in capsys.readouterr().err
-    assert main(["sfm", str(photos), "--out", str(tmp_path / "other"), "--fps", "2"]) == 1
-    assert "fps: expected none with photographs" in capsys.readouterr().err.replace("--fps", "fps")
 
 
 def test_heic_without_its_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

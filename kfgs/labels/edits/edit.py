@@ -69,7 +69,7 @@ class OnSelection(Edit):
         if not self.allow_empty and not bool(mask.any()):
             raise ValueError(
                 f"where: expected a selection of some of {len(gaussians)} Gaussians, got none from "
-                f"{', '.join(map(repr, rules)):.120}; {_present(gaussians)} (in Python: or pass allow_empty=True)"
+                f"{', '.join(map(repr, rules)):.120}; {_present(gaussians)} (allow_empty=True allows it)"
             )
         return mask
 
