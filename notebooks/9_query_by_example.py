@@ -106,6 +106,6 @@ row = [scene.image(scene.views("test")[1]), scores]
 Image.fromarray(viz.picture_grid([row], ["unseen picture", f"like what was shown as {wanted}"], width=400))
 
 # %% [markdown]
-# In a shell, `kfgs features run/field.kfgs --examples examples.json` makes the same classes of a file. In the explorer you click in the scene.
+# In a shell, `kfgs features FIELD --examples FILE` makes the same classes. In the explorer you click in the scene.
 #
 # Next: [10_meshes_and_point_clouds](10_meshes_and_point_clouds.ipynb) takes labels to other programs.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import re
 import textwrap
 import warnings
 from collections.abc import Iterator
@@ -29,7 +28,7 @@ def described(command: Any) -> str:
 
 def options_of(command: Any) -> Iterator[tuple[str, str, list[tuple[str, str]]]]:
     """Title, text and options of each group of a command's options; an option is how it is written, and its help."""
-    command.__doc__ = re.sub(r"\n {8,}(?!kfgs)", " ", inspect.getdoc(command) or "")  # as `kfgs` itself does
+    command = cli.documented(command)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         parser = tyro.extras.get_parser(command, prog=f"kfgs {command.__name__}", config=cli.STYLE)

@@ -53,7 +53,7 @@ class BatchOptions:
     method: Uplift | Paper = field(default_factory=Uplift)
     """How fields are made."""
     text: str | None = None
-    """Text table of `kfgs features --words` for all scenes; None: each scene's `classes.json` and `text.npy` or `text.safetensors`."""
+    """Table of `kfgs features --words` for all scenes; None: each scene's `classes.json` and `text.npy` or `text.safetensors`."""
     pictures: int = 4
     """How many views of a scene get a sheet, an overlay and a picture of features."""
     threads: int = 1

@@ -131,7 +131,8 @@ def documented(command: Callable[..., None]) -> Callable[..., None]:
         command(*arguments, **options)
 
     del run.__wrapped__  # tyro would read the text of the command itself
-    run.__annotations__, run.__signature__ = get_type_hints(command, include_extras=True), inspect.signature(command)
+    run.__annotations__ = get_type_hints(command, include_extras=True)
+    vars(run)["__signature__"] = inspect.signature(command)
     run.__doc__ = re.sub(r"\n {8,}(?!kfgs)", " ", inspect.getdoc(command) or "")
     return run
 

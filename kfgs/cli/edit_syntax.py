@@ -43,7 +43,8 @@ def parse_edits(asked: Edits, names: Sequence[str] = ()) -> list[tuple[str, Any]
     from ..labels.color import parse_color
     from ..labels.edits import Extract, Move, Recolor, Remove
 
-    known, edits = {name.casefold() for name in names}, []
+    known = {name.casefold() for name in names}
+    edits: list[tuple[str, Any]] = []
     for words in asked.recolor:
         name, value = _split("recolor", words, "plant:#c04040")
         edits.append((f"--recolor {words}", Recolor(_where("recolor", name, known), parse_color(value, "recolor"))))

@@ -115,7 +115,7 @@ def make_question(
         raise ValueError(f"negatives: expected other classes than {words!r}, got none; use 'canonical' or 'none'")
     if negatives == "canonical" and canonical is None:
         raise ValueError(
-            "negatives: expected canonical words in the classes' table, got none; make the table with `kfgs features --words`, or use "
+            "negatives: expected canonical words in the classes' table, got none; make it with `kfgs features --words`, or use "
             "'classes' or 'none'"
         )
     return Question(row, {"classes": others, "canonical": canonical, "none": None}[negatives], words)

@@ -164,7 +164,9 @@ def test_words_of_other_channels_are_refused_before_any_view_is_drawn(monkeypatc
         ):
             ask()
     shown = dataclasses.replace(other, info={"examples": {"wall": 1, "chair": 1}})
-    with pytest.raises(ValueError, match=tells("classes:", "[C, 5]", "got (2, 7)", "examples", "kfgs features FIELD --examples")):
+    with pytest.raises(
+        ValueError, match=tells("classes:", "[C, 5]", "got (2, 7)", "examples", "kfgs features FIELD --examples")
+    ):
         field().label(shown)
 
 
