@@ -55,12 +55,10 @@ def make_fixture(folder: Path) -> None:
 
     steps = [
         toy,
-        command("uplift", "room", "labelled.ply", "--out", "run/field.kfgs"),
-        command("uplift", "room", "other.ply", "--out", "older"),
+        command("fit", "room", "--splat", "labelled.ply", "--max-gaussians", "0", "--out", "run"),
+        command("fit", "room", "--splat", "other.ply", "--max-gaussians", "0", "--out", "two"),
+        command("convert", "two/field.kfgs", "older.kfgs", "--precision", "lossless"),
         command("convert", "run/field.kfgs", "packed.kfgs"),
-        command("label", "run/field.kfgs", "--out", "labelled", "--query", "chair", "--scene", "room"),
-        command("fit", "room", "--splat", "other.ply", "--out", "two"),
-        command("fit", "room", "--splat", "labelled.ply", "--out", "two"),
     ]
     for step in steps:
         ended = Process(step, folder).wait()
@@ -151,20 +149,15 @@ def all_jobs() -> list[Job]:
         Job("save edits", _save_edits, _with()),
         Job("toy room", _toy_room, _with(), idle=True),
         Job(
-            "label",
-            command("label", field, "--out", "work/labelled", "--cloud", "in/labelled.ply", "--distance", "1", *room),
-            _with(files={"labelled": "labelled"}, notes=("labelled/notes.txt",)),
-        ),
-        Job(
             "pack",
-            command("pack", field, "work/a.kfgs"),
+            command("convert", field, "work/a.kfgs"),
             _with(files={"a.kfgs": "packed.kfgs"}),
         ),
         Job(
             "unpack",
-            command("pack", "in/packed.kfgs", "work/field.kfgs"),
+            command("convert", "in/packed.kfgs", "work/field.kfgs"),
             _with(),
-            fields=("field",),
+            fields=("field.kfgs",),
         ),
         Job(
             "select",
@@ -178,13 +171,13 @@ def all_jobs() -> list[Job]:
         ),
         Job(
             "segment",
-            command("segment", field, "--out", "work/seen", "--pictures", "1", *room),
+            command("segment", field, "--out", "work/seen", *room),
             _with(notes=("seen/notes.txt",)),
             loose=images,
         ),
         Job(
             "text of examples",
-            command("text", "--examples", "in/clicks.json", "--field", field, "--out", "work/t.safetensors"),
+            command("features", field, "--examples", "in/clicks.json", "--out", "work/t.safetensors"),
             _with(),
         ),
         Job(
@@ -193,12 +186,6 @@ def all_jobs() -> list[Job]:
             _with(files={"a.ply": "other.ply"}),
         ),
         Job("save html", _save_html, _with()),
-        Job(
-            "uplift",
-            command("uplift", "in/room", "in/labelled.ply", "--out", "work/field.kfgs"),
-            _with(files={"field": "older"}, notes=("notes.txt", "field/notes.txt")),
-            fields=("field",),
-        ),
         Job(
             "features",
             command("features", "in/room", "--teacher", "campaign.jobs:grey_teacher", "--out", "work/maps"),
@@ -209,7 +196,7 @@ def all_jobs() -> list[Job]:
         Job(
             "fit",
             command("fit", "in/room", "--splat", "in/labelled.ply", "--out", "work/run"),
-            _with(files={"run/field.kfgs": "older"}, notes=("run/field/mine.ply", "run/notes.txt")),
+            _with(files={"run/field.kfgs": "older.kfgs"}, notes=("run/field/mine.ply", "run/notes.txt")),
             fields=("run/field.kfgs",),
             loose=times,
             resumed=True,
@@ -229,8 +216,6 @@ def all_jobs() -> list[Job]:
                 "fit",
                 "in/room",
                 "--method",
-                "paper",
-                "--mode",
                 "adc",
                 "--steps",
                 "12",
