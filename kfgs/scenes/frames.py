@@ -40,8 +40,8 @@ NEAR_SHARE, LEAST_SHARE = 0.8, 0.3
 """Shares of the points of the better and of the worse cloud that must be near. (Field and colour splat of Replica's room_0: 0.88;
 the toy room turned by half a turn: 0.63.) The second is low because one cloud may be a part of the other."""
 DRIFT_SHARE, DRIFT_SIZE = 0.9, 0.009
-"""The best fit nearby may move 90 % of the surface, along its normals, by at most this share of the size. (Field and colours of the toy
-room in one frame, from short trainings: 0.0056 and 0.0077; 5 % larger: 0.0126 and 0.0135; moved by 1 % of the size: 0.010, 0.012.)"""
+"""The best fit nearby may move 90 % of the surface, along its normals, by at most this share of the size. (Field and colours of
+the toy room in one frame, short trainings: 0.0056 and 0.0077; 5 % larger: 0.0126 and 0.0135; moved by 1 %: 0.010, 0.012.)"""
 NEARBY, FITTED, FEWEST = 0.05, 3_000, 12  # of the size: counterparts; points of the fit; fewer points give no surface
 
 
