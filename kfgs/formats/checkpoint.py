@@ -20,6 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .._arrays import reading
 from .._files import read_json
 from .._notes import tell
 from .._torch_files import plain_tensor, read_torch
@@ -55,16 +56,16 @@ def read(path: Path) -> Gaussians:
             `dataparser_transforms.json` is damaged.
     """
     top = read_torch(path, _EXPECTED)
-    found = top if isinstance(top, dict) else {}
-    if isinstance(found.get("splats"), dict):
+    content = top if isinstance(top, dict) else {}
+    if isinstance(content.get("splats"), dict):
         files = _ranks(path)
-        parts = [_gsplat(file, found if file == path else read_torch(file, _EXPECTED)) for file in files]
-        _tell_dropped(path, found["splats"])
+        parts = [_gsplat(file, content if file == path else read_torch(file, _EXPECTED)) for file in files]
+        _tell_dropped(path, content["splats"])
         return with_mode(path, Gaussians.cat(parts), _mode(path))
-    if isinstance(found.get("pipeline"), dict):
-        _tell_dropped(path, found["pipeline"])
-        return with_mode(path, _undo_frame(path, _splatfacto(path, found["pipeline"])), _mode(path))
-    got = f"one with {', '.join(map(str, list(found)[:5]))}" if found else type(top).__name__
+    if isinstance(content.get("pipeline"), dict):
+        _tell_dropped(path, content["pipeline"])
+        return with_mode(path, _undo_frame(path, _splatfacto(path, content["pipeline"])), _mode(path))
+    got = f"one with {', '.join(map(str, list(content)[:5]))}" if content else type(top).__name__
     raise ValueError(f"{path}: expected {_EXPECTED}, got {got:.200}; name another file")
 
 
@@ -84,8 +85,8 @@ def _ranks(path: Path) -> list[Path]:
     match = re.fullmatch(r"(.*_rank)(\d+)(\.pt)", path.name)
     if match is None:
         return [path]
-    found = (re.fullmatch(re.escape(match[1]) + r"(\d+)\.pt", file.name) for file in path.parent.glob("*.pt"))
-    numbers = sorted(int(one[1]) for one in found if one)
+    ranks = (re.fullmatch(re.escape(match[1]) + r"(\d+)\.pt", file.name) for file in path.parent.glob("*.pt"))
+    numbers = sorted(int(rank[1]) for rank in ranks if rank)
     if numbers != list(range(len(numbers))):
         raise ValueError(
             f"{path}: expected the files of ranks 0 to {numbers[-1]} beside it, got {numbers}; copy them all"
@@ -135,25 +136,17 @@ def _raw(path: Path, name: str, value: object) -> Tensor:
 def _cloud(path: Path, raw: dict[str, Tensor], dc: Tensor, rest: Tensor) -> Gaussians:
     """The Gaussians of raw values; a ValueError if shapes disagree."""
     N = len(raw["means"])
-    shapes = {"means": [N, 3], "scales": [N, 3], "quats": [N, 4]}
-    odd = [f"{name} {list(raw[name].shape)}" for name, shape in shapes.items() if list(raw[name].shape) != shape]
-    odd += [f"opacities {list(raw['opacities'].shape)}"] if raw["opacities"].numel() != N else []
-    odd += [f"colours {list(dc.shape)}"] if list(dc.shape) != [N, 1, 3] else []
-    if rest.ndim != 3 or rest.shape[1] not in (0, 3, 8, 15, 24) or list(rest.shape[::2]) != [N, 3]:
-        odd.append(f"higher colours {list(rest.shape)}")
-    if odd:
-        raise ValueError(
-            f"{path}: expected values of {N} Gaussians (from means), got {', '.join(odd)}; is the file damaged?"
+    with reading(path, f"values of {N} Gaussians (from means)"):
+        if list(dc.shape) != [N, 1, 3] or rest.shape[1] not in (0, 3, 8, 15, 24) or raw["opacities"].numel() != N:
+            shapes = ", ".join(f"{name} {list(value.shape)}" for name, value in (raw | {"rest": rest}).items())
+            raise ValueError(shapes)
+        return Gaussians(
+            raw["means"],
+            raw["quats"],
+            positive_scales(path, raw["scales"].exp().numpy()),
+            raw["opacities"].reshape(N).sigmoid(),
+            sh=torch.cat([dc, rest], 1)[:, :16],
         )
-    scales = raw["scales"].exp()
-    opacities = raw["opacities"].reshape(N).sigmoid()
-    return Gaussians(
-        raw["means"],
-        raw["quats"],
-        positive_scales(path, scales.numpy()),
-        opacities,
-        sh=torch.cat([dc, rest], 1)[:, :16],
-    )
 
 
 def _tell_dropped(path: Path, values: dict[Any, Any]) -> None:
@@ -172,14 +165,10 @@ def _undo_frame(path: Path, cloud: Gaussians) -> Gaussians:
             stacklevel=4,
         )
         return cloud
-    content = read_json(file)
-    try:
+    with reading(file, "a rigid 'transform' [3][4] and a 'scale' above 0"):
+        content = read_json(file)
         rows, scale = torch.tensor(content["transform"], dtype=torch.float64), float(content["scale"])
         if rows.shape not in ((3, 4), (4, 4)) or not scale > 0:
             raise ValueError(f"{list(rows.shape)} and {scale}")
         data_from_run = Similarity(scale, rows[:3, :3], scale * rows[:3, 3]).inverse()
-    except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise ValueError(
-            f"{file}: expected a rigid 'transform' [3][4] and a 'scale' above 0, got something else ({error}); copy it again"
-        ) from error
     return transform_gaussians(cloud, data_from_run)

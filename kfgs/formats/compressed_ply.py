@@ -14,7 +14,6 @@ and 1 as logits of -10 and 10. The tests use it as an independent reader and wri
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -50,9 +49,7 @@ _ROUGH = 0.02  # error of a base colour that is seen, and reported: 5 of 255
 _ROUNDING = 6 * 2.0**-24  # float32: of the bounds, their difference, the product and the sum
 
 
-class _Bounds(NamedTuple):
-    low: NDArray[np.float32]  # [C, 3]
-    high: NDArray[np.float32]  # [C, 3]
+_Bounds = tuple[NDArray[np.float32], NDArray[np.float32]]  # lowest and highest values of each chunk, [C, 3]
 
 
 def matches(head: bytes) -> bool:
@@ -69,16 +66,20 @@ def read(path: Path) -> Gaussians:
     """
     elements = read_ply_elements(path)
     chunk, vertex = (elements.get(name, {}) for name in ("chunk", "vertex"))
-    n = _check_elements(path, chunk, vertex)
-    extents, sizes, colours = (_read_bounds(path, chunk, axes) for axes in _AXES)
-    assert extents is not None
-    assert sizes is not None
+    _check_columns(path, "vertex", vertex, _PACKED, "uint32")
+    n, chunks = len(vertex[_PACKED[0]]), len(next(iter(chunk.values()), ()))
+    if chunks != -(-n // CHUNK):
+        raise ValueError(
+            f"{path}: expected {-(-n // CHUNK)} chunks for {n} Gaussians, {CHUNK} each, got {chunks}; the file is damaged"
+        )
+    extents, sizes = _read_bounds(path, chunk, _AXES[0]), _read_bounds(path, chunk, _AXES[1])
+    has_colours = any(name in chunk for side in _AXES[2] for name in side)  # older files have no bounds of colours
     positions = _between(extents, _unpack_vectors(vertex["packed_position"]))
     log_scales = _between(sizes, _unpack_vectors(vertex["packed_scale"]))
     rgba = (vertex["packed_color"][:, None] >> np.array([24, 16, 8, 0], np.uint32) & 255).astype(
         np.float32
     ) / np.float32(255)
-    rgb = rgba[:, :3] if colours is None else _between(colours, rgba[:, :3])
+    rgb = _between(_read_bounds(path, chunk, _AXES[2]), rgba[:, :3]) if has_colours else rgba[:, :3]
     sh0 = (rgb - 0.5) / np.float32(SH_C0)
     sh = np.concatenate([sh0[:, None], _read_rest(path, elements.get("sh"), n)], 1)
     with np.errstate(over="ignore"):  # left out
@@ -148,14 +149,14 @@ def _chunk_bounds(values: NDArray[np.float64]) -> _Bounds:  # [N, 3]
     """Minimum and maximum of each 256 values as float32 (rounded, so a value may lie half a bit outside)."""
     starts = np.arange(0, len(values), CHUNK)
     if not len(starts):
-        return _Bounds(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
     least, largest = (extreme.reduceat(values, starts, axis=0) for extreme in (np.minimum, np.maximum))
-    return _Bounds(least.astype(np.float32), largest.astype(np.float32))
+    return least.astype(np.float32), largest.astype(np.float32)
 
 
 def _position_between(bounds: _Bounds, values: NDArray[np.float64]) -> NDArray[np.float64]:  # [N, 3] in [0, 1]
     chunk = np.arange(len(values)) // CHUNK
-    low, high = bounds.low.astype(np.float64), bounds.high.astype(np.float64)
+    low, high = (bound.astype(np.float64) for bound in bounds)
     size = np.where(high > low, high - low, 1.0)
     return np.clip((values - low[chunk]) / size[chunk], 0, 1)
 
@@ -163,15 +164,15 @@ def _position_between(bounds: _Bounds, values: NDArray[np.float64]) -> NDArray[n
 def _between(bounds: _Bounds, fraction: NDArray[np.float32]) -> NDArray[np.float32]:  # [N, 3]
     chunk = np.arange(len(fraction)) // CHUNK
     with np.errstate(over="ignore", invalid="ignore"):  # left out
-        return bounds.low[chunk] + fraction * (bounds.high - bounds.low)[chunk]
+        return bounds[0][chunk] + fraction * (bounds[1] - bounds[0])[chunk]
 
 
 def half_steps(values: NDArray[np.float64], steps: NDArray[np.float32]) -> NDArray[np.float64]:  # [N, 3]
     """The largest error of each value in even `steps` between the bounds of its chunk."""
-    bounds = _chunk_bounds(values)
+    low, high = _chunk_bounds(values)
     chunk = np.arange(len(values)) // CHUNK
-    largest = np.maximum(np.abs(bounds.low), np.abs(bounds.high)).astype(np.float64)
-    half = (bounds.high.astype(np.float64) - bounds.low) / steps / 2
+    largest = np.maximum(np.abs(low), np.abs(high)).astype(np.float64)
+    half = (high.astype(np.float64) - low) / steps / 2
     return (half + largest * _ROUNDING)[chunk]
 
 
@@ -199,49 +200,29 @@ def _read_rest(path: Path, columns: Columns | None, n: int) -> NDArray[np.float3
     if columns is None:
         return np.zeros((n, 0, 3), np.float32)
     names = [f"f_rest_{i}" for i in range(len(columns))]
-    types = {column.dtype.name for column in columns.values()}
-    if len(names) not in (9, 24, 45, 72) or set(names) != set(columns) or types != {"uint8"}:
+    kinds = {(column.dtype.name, len(column)) for column in columns.values()}
+    if len(names) not in (9, 24, 45, 72) or set(names) != set(columns) or kinds != {("uint8", n)}:
         raise ValueError(
-            f"{path}: expected an 'sh' element of 9, 24, 45 or 72 bytes f_rest_0, f_rest_1, ..., got {len(columns)} columns; "
-            "write the file again"
-        )
-    if len(columns["f_rest_0"]) != n:
-        raise ValueError(
-            f"{path}: expected 'sh' of {n} rows (from vertex), got {len(columns['f_rest_0'])}; write the file again"
+            f"{path}: expected 'sh' of 9, 24, 45 or 72 columns f_rest_0, f_rest_1, ... of {n} bytes each, got {len(names)} "
+            f"columns of {kinds!r:.80}; write the file again"
         )
     table = (((np.arange(256) + 0.5) / 256 - 0.5) * 2 * SH_LIMIT).astype(np.float32)
     table[0], table[255] = -SH_LIMIT, SH_LIMIT
     return np.stack([table[columns[name]] for name in names], 1).reshape(n, 3, len(names) // 3).transpose(0, 2, 1)
 
 
-def _read_bounds(path: Path, chunk: Columns, axes: tuple[tuple[str, ...], tuple[str, ...]]) -> _Bounds | None:
-    """The bounds of one kind, or None if the file has none (colours in older files)."""
-    names = [name for side in axes for name in side]
-    if not any(name in chunk for name in names) and names[0] == "min_r":
-        return None
-    wrong = [name for name in names if name not in chunk or chunk[name].dtype != np.float32]
-    if wrong:
-        raise ValueError(
-            f"{path}: expected 'chunk' with float {', '.join(names)}, {', '.join(wrong)} missing; write the file again"
-        )
+def _read_bounds(path: Path, chunk: Columns, axes: tuple[tuple[str, ...], tuple[str, ...]]) -> _Bounds:
+    _check_columns(path, "chunk", chunk, (*axes[0], *axes[1]), "float32")
     low, high = (np.stack([chunk[name] for name in side], 1) for side in axes)
-    return _Bounds(low, high)
+    return low, high
 
 
-def _check_elements(path: Path, chunk: Columns, vertex: Columns) -> int:
-    """Check that the elements fit together, and return the number of Gaussians."""
-    wrong = [name for name in _PACKED if name not in vertex or vertex[name].dtype != np.uint32]
+def _check_columns(path: Path, element: str, columns: Columns, names: tuple[str, ...], kind: str) -> None:
+    wrong = [name for name in names if name not in columns or columns[name].dtype.name != kind]
     if wrong:
         raise ValueError(
-            f"{path}: expected 'vertex' with uint {', '.join(_PACKED)}, {', '.join(wrong)} missing; write the file again"
+            f"{path}: expected {element!r} with {kind} {', '.join(names)}, {', '.join(wrong)} missing; write the file again"
         )
-    n = len(vertex[_PACKED[0]])
-    chunks = len(next(iter(chunk.values()), ()))
-    if chunks != -(-n // CHUNK):
-        raise ValueError(
-            f"{path}: expected {-(-n // CHUNK)} chunks for {n} Gaussians, {CHUNK} each, got {chunks}; the file is damaged"
-        )
-    return n
 
 
 def _words_of_clipping(

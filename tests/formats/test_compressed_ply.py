@@ -6,9 +6,8 @@ from messages import tells
 from oracles_packed import compressed_gaussian
 from oracles_precision import assert_within, precision, rotation_angles
 
-from kfgs import Gaussians, rasterize
-from kfgs.cameras.camera import Camera
-from kfgs.formats import find_format, read_splats, write_splats
+from kfgs import Gaussians
+from kfgs.formats import read_splats, write_splats
 from kfgs.formats.compressed_ply import read, write
 from kfgs.formats.encodings import morton_order
 from kfgs.formats.ply import read_ply_elements, write_ply_elements
@@ -53,19 +52,6 @@ def test_the_same_scene_as_spz_agrees(shared_data):
     angles = rotation_angles(ours.quats.double().numpy(), other.quats.double().numpy())
     assert np.quantile(angles, 0.999) < 0.01
     assert (ours.sh[:, 0] - other.sh[:, 0]).abs().max() < 0.03
-
-
-@pytest.mark.parametrize("name", ["guitar.compressed.ply", "inria_9080.ply"])
-def test_real_files_survive(tmp_path, shared_data, name):
-    cloud = read_splats(shared_data / "splats" / name)
-    lost = write_splats(cloud, tmp_path / "a.compressed.ply").lost
-    far = ("170 of 9,080",) if name.startswith("inria") else ()  # a few of a wide scene: chunks are wide, too
-    assert [words in note for words, note in zip(far, lost, strict=True)] == [True] * len(far)
-    assert find_format(tmp_path / "a.compressed.ply").NAME == "compressed_ply"
-    order, stated = morton_order(cloud.means), precision("compressed_ply", cloud)
-    back = read(tmp_path / "a.compressed.ply")
-    assert_within(back, cloud.select(order), stated._replace(means=stated.means[order]))
-    assert stated.means.median() < 0.1  # the tolerance says something
 
 
 @pytest.mark.parametrize("name", ["biker", "guitar"])
@@ -195,24 +181,6 @@ def test_labels_stay_with_their_gaussians(tmp_path):
     assert_within(back, cloud.select(order), stated._replace(means=stated.means[order]))
 
 
-@pytest.mark.parametrize("degree", [0, 3])
-def test_an_empty_cloud_survives(tmp_path, degree):
-    empty = _cloud(0, degree)
-    write(tmp_path / "a.compressed.ply", empty)
-    back = read(tmp_path / "a.compressed.ply")
-    assert back.sh.shape == (0, (degree + 1) ** 2, 3)
-    assert precision("compressed_ply", empty).means.shape == (0, 3)
-
-
-def test_the_picture_stays_the_same(tmp_path, shared_data):
-    cloud = read_splats(shared_data / "splats" / "inria_9080.ply")
-    write(tmp_path / "a.compressed.ply", cloud)
-    camera = Camera(torch.eye(4), torch.tensor([[90.0, 0, 64], [0, 90, 48], [0, 0, 1]]), 128, 96)
-    pictures = [rasterize(g, camera).map.clamp(0, 1) for g in (cloud, read(tmp_path / "a.compressed.ply"))]
-    assert pictures[0].std() > 0.1
-    assert -10 * (pictures[0] - pictures[1]).square().mean().log10() > 40
-
-
 def _damage(elements, what):
     chunk, vertex = elements["chunk"], elements["vertex"]
     if what == "chunks":
@@ -245,7 +213,7 @@ def _damage(elements, what):
         ("type", ("'chunk'", "min_x")),
         ("colour", ("'chunk'", "min_r", "max_b")),
         ("packed", ("'vertex'", "packed_scale")),
-        ("sh rows", ("'sh'", "600", "got 599")),
+        ("sh rows", ("'sh'", "600", "599")),
         ("sh columns", ("'sh'", "24", "45", "f_rest_0", "f_rest_1", "got 8")),
         ("sh type", ("'sh'", "24", "45", "got 9")),
     ],
@@ -257,25 +225,3 @@ def test_damaged_files_are_named(tmp_path, what, message):
     write_ply_elements(tmp_path / "bad.ply", elements)
     with pytest.raises(ValueError, match=tells("bad.ply:", *message)):
         read_splats(tmp_path / "bad.ply")
-
-
-def test_a_truncated_file_is_named(tmp_path):
-    write(tmp_path / "a.compressed.ply", _cloud(600, 1))
-    content = (tmp_path / "a.compressed.ply").read_bytes()
-    for end in (len(content) - 1, len(content) // 2, 1500):
-        (tmp_path / "bad.ply").write_bytes(content[:end])
-        with pytest.raises(ValueError, match=tells("bad.ply:", "truncated")):
-            read_splats(tmp_path / "bad.ply")
-    (tmp_path / "bad.ply").write_bytes(content.replace(b"element vertex 600", b"element vertex 99999999999"))
-    with pytest.raises(ValueError, match=tells("bad.ply:", "99999999999")):
-        read_splats(tmp_path / "bad.ply")
-
-
-def test_clouds_that_cannot_be_written_are_named(tmp_path):
-    with pytest.raises(ValueError, match=tells("gaussians:", "colours", ".compressed.ply")):
-        write(tmp_path / "a.compressed.ply", _cloud().replace(sh=None))
-    means = _cloud().means.clone()
-    means[5, 1] = torch.nan
-    with pytest.raises(ValueError, match=tells("means:", "finite", "nan")):
-        write_splats(_cloud().replace(means=means), tmp_path / "a.compressed.ply")
-    assert list(tmp_path.iterdir()) == []

@@ -125,16 +125,6 @@ def test_missing_file_and_columns(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("degree", [0, 1, 3])
-def test_empty_clouds_survive_the_file(tmp_path, degree):
-    cloud = _cloud(0, degree)
-    write_ply(tmp_path / "a.ply", columns_from_gaussians(cloud))
-    back = gaussians_from_columns(read_ply(tmp_path / "a.ply"))
-    assert len(back) == 0
-    assert back.sh.shape == (0, (degree + 1) ** 2, 3)
-    assert back.features.shape == (0, 9)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -177,13 +167,6 @@ def test_a_mesh_is_read_and_its_faces_are_told(tmp_path, layout):
     (tmp_path / "a.ply").write_bytes(head.encode() + (text.encode() if layout == "ascii" else points.tobytes() + face))
     np.testing.assert_array_equal(points_from_columns(read_ply(tmp_path / "a.ply")).numpy(), points)
     assert other_elements(tmp_path / "a.ply") == ["face"]
-
-
-def test_a_cloud_has_no_other_elements(tmp_path):
-    write_ply(tmp_path / "a.ply", columns_from_gaussians(_cloud()))
-    assert other_elements(tmp_path / "a.ply") == []
-    with pytest.raises(FileNotFoundError, match=tells("none.ply:", "no such file", "PLY")):
-        other_elements(tmp_path / "none.ply")
 
 
 TABLES = {

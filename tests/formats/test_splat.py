@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 from messages import tells
-from oracles_precision import assert_within, precision, rotation_angles
+from oracles_precision import rotation_angles
 
 from kfgs import Gaussians
 from kfgs.formats import read_splats, write_splats
@@ -33,36 +33,12 @@ def test_a_record_by_hand(tmp_path):
     assert rotation_angles(g.quats.numpy(), quat[:, [3, 0, 1, 2]]).max() > 0.5  # read as x, y, z, w it is another
 
 
-def test_a_cloud_comes_back_as_exactly_as_stated(tmp_path):
-    cloud = _cloud()
-    assert write(tmp_path / "a.splat", cloud) == ()
-    assert (tmp_path / "a.splat").stat().st_size == 500 * 32
-    back, stated = read(tmp_path / "a.splat"), precision("splat", cloud)
-    assert_within(back, cloud, stated)
-    assert (back.sh - cloud.sh).abs().max() > 0.9 * stated.sh0
-    assert (back.opacities - cloud.opacities).abs().max() > 0.9 * stated.opacities
-    assert rotation_angles(back.quats.numpy(), cloud.quats.numpy()).max() > 0.5 * stated.rotation
-
-
 def test_rotations_about_an_axis_are_exact(tmp_path):
     cloud = _cloud(8).replace(quats=torch.cat([torch.eye(4), -torch.eye(4)]) * 3)
     write(tmp_path / "a.splat", cloud)
     assert rotation_angles(read(tmp_path / "a.splat").quats.numpy(), cloud.quats.numpy()).max() == 0
     stored = np.fromfile(tmp_path / "a.splat", np.uint8).reshape(8, 32)[:, 28:]
     assert set(stored.ravel()) == {0, 128}  # -1 has a byte, +1 has none: a viewer that does not normalise is right too
-
-
-@pytest.mark.parametrize("name", ["inria_9080.ply", "minimal.splat", "biker.spz"])
-def test_real_files_survive(tmp_path, shared_data, name):
-    cloud = read_splats(shared_data / "splats" / name)
-    written = write_splats(cloud, tmp_path / "a.splat")
-    back = read_splats(tmp_path / "a.splat")
-    assert_within(back, cloud, precision("splat", cloud))
-    lost = {"inria_9080.ply": ["spherical harmonics of degree 3: .splat holds the base colour only"]}.get(name, [])
-    beyond = ((0.28209479177387814 * cloud.sh[:, 0].double()).abs() > 0.5 + 1 / 255).any(1).sum()
-    if beyond:
-        lost.append(f"colours of {beyond} of {len(cloud)} Gaussians beyond what .splat holds: cut off")
-    assert list(written.lost) == lost
 
 
 def test_labels_go_beside(tmp_path):
@@ -73,14 +49,6 @@ def test_labels_go_beside(tmp_path):
     back = read_splats(tmp_path / "a.splat")
     assert back.labels.tolist() == splats.labels.tolist()
     assert back.names == ("rug", "sofa")
-
-
-def test_what_is_cut_off_is_in_the_precision(tmp_path):
-    cloud = _cloud(3)
-    cloud.sh[1, 0, 2] = 4.0
-    write(tmp_path / "a.splat", cloud)
-    assert precision("splat", cloud).sh0 == pytest.approx(4 - 0.5 / 0.28209479177387814, rel=1e-3)
-    assert_within(read(tmp_path / "a.splat"), cloud, precision("splat", cloud))
 
 
 def test_an_empty_file_is_an_empty_cloud(tmp_path):
@@ -114,10 +82,3 @@ def test_damage_is_named(tmp_path, content, message):
     (tmp_path / "bad.splat").write_bytes(content)
     with pytest.raises(ValueError, match=tells("bad.splat:", *message)):
         read_splats(tmp_path / "bad.splat")
-
-
-def test_a_field_without_colours_is_refused(tmp_path):
-    cloud = _cloud().replace(sh=None, features=torch.zeros(500, 9))
-    with pytest.raises(ValueError, match=tells("gaussians:", "colours", ".splat", ".ply")):
-        write(tmp_path / "a.splat", cloud)
-    assert list(tmp_path.iterdir()) == []

@@ -1,5 +1,3 @@
-import sys
-
 import numpy as np
 import pytest
 import torch
@@ -7,7 +5,6 @@ from messages import tells
 
 from kfgs import Gaussians
 from kfgs.formats import find_format, formats, read_splats, write_splats
-from kfgs.formats import table as module_table
 from kfgs.formats.encodings import morton_order
 from kfgs.formats.sidecar import labels_path, names_path
 
@@ -34,12 +31,6 @@ def test_every_format_keeps_the_contract():
         assert hasattr(module, "write") == (name not in ("ksplat", "checkpoint"))
         assert module.__doc__
     assert {"ply", "compressed_ply", "spz", "sog", "gltf", "ksplat", "splat", "checkpoint"} == set(formats())
-
-
-def test_every_module_of_a_format_is_listed():
-    found = {name.rpartition(".")[2] for name, module in sys.modules.items()
-             if name.startswith("kfgs.formats.") and hasattr(module, "SUFFIXES")}  # fmt: skip
-    assert found == set(module_table.MODULES)
 
 
 @pytest.mark.parametrize("name", ["ply", "compressed_ply", "spz", "sog", "gltf"])
@@ -168,15 +159,6 @@ def _with(name, row, value):
 def test_what_readers_refuse_is_not_written(tmp_path, file, name, value, message):
     with pytest.raises(ValueError, match=tells(*message)):
         write_splats(_with(name, 3, value), tmp_path / file)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_double_that_float32_cannot_hold_is_refused(tmp_path):
-    wide = _cloud().to(torch.float64)
-    with pytest.raises(ValueError, match=tells("means:", "got [-inf, -inf, -inf]")):
-        write_splats(wide.replace(means=wide.means * 1e300), tmp_path / "a.ply")
-    with pytest.raises(ValueError, match=tells("scales:", "above 0")):
-        write_splats(wide.replace(scales=wide.scales * 1e-60), tmp_path / "a.ply")
     assert list(tmp_path.iterdir()) == []
 
 
