@@ -48,12 +48,12 @@ maps = kfgs.FeatureFolder(features).of(scene, "train")
 
 # %%
 quick = kfgs.ColorConfig.quick()
-quick = replace(quick, training=replace(quick.training.with_steps(800), max_gaussians=60_000))
+quick = replace(quick, training=quick.training.with_steps(800).with_maximum(60_000))
 trained = {"codebook": kfgs.GrownCodebook(), "autoencoder": kfgs.AutoencoderConfig(steps=500)}
 methods = {
     "fused": kfgs.Uplift(color=quick),
-    "paper": kfgs.Paper(**trained, training=kfgs.FieldConfig.cpu().with_steps(400)),
-    "raw": kfgs.Paper(None, None, kfgs.FieldConfig.cpu(render_scale=1.0).with_steps(60)),
+    "paper": kfgs.Paper(**trained, training=kfgs.Training.cpu().with_steps(400)),
+    "raw": kfgs.Paper(None, None, replace(kfgs.Training.cpu(), render_scale=1.0).with_steps(60)),
 }
 runs = {"fused": data / "run", "paper": data / "run_paper", "raw": data / "run_raw"}
 fields = {}
