@@ -77,7 +77,13 @@ def read(path: Path) -> Gaussians:
             f"{path}: the header promises {most} sections, but only {len(data)} bytes follow; it is truncated"
         )
     sh_range = (low, high) if low < high and np.isfinite([low, high]).all() else (-_SH_RANGE, _SH_RANGE)
-    sections = [_section(path, data, i) for i in range(most)]
+    sections = [_Section(*_SECTION.unpack_from(data, _HEADER_BYTES + i * _SECTION_BYTES)) for i in range(most)]
+    for i, section in enumerate(sections):
+        if section.size > section.capacity or section.degree > _MAX_DEGREE:
+            raise ValueError(
+                f"{path}: expected at most {section.capacity} Gaussians of degree 0 to {_MAX_DEGREE} in section {i}, got "
+                f"{section.size} of degree {section.degree}; the file is damaged"
+            )
     degree = max((s.degree for s in sections if s.size), default=0)
     parts, start = [], _HEADER_BYTES + most * _SECTION_BYTES
     for section in sections:
@@ -90,16 +96,6 @@ def read(path: Path) -> Gaussians:
             f"{start}; the file is damaged"
         )
     return gaussians
-
-
-def _section(path: Path, data: bytes, index: int) -> _Section:
-    section = _Section(*_SECTION.unpack_from(data, _HEADER_BYTES + index * _SECTION_BYTES))
-    if section.size > section.capacity or section.degree > _MAX_DEGREE:
-        raise ValueError(
-            f"{path}: expected at most {section.capacity} Gaussians of degree 0 to {_MAX_DEGREE} in section {index}, got "
-            f"{section.size} of degree {section.degree}; the file is damaged"
-        )
-    return section
 
 
 def _record(level: int, degree: int) -> np.dtype[np.void]:
@@ -139,15 +135,15 @@ def _read_section(
     if level == 2:
         sh = np.float32(sh_range[0]) + sh * np.float32((sh_range[1] - sh_range[0]) / 255)
     rgba = torch.from_numpy(rows["rgba"].astype(np.float32)) / 255
-    rest = torch.zeros(s.size, (degree + 1) ** 2 - 1, 3)
-    if s.size:  # the degree of an empty section has no meaning
-        rest[:, : (s.degree + 1) ** 2 - 1] = torch.from_numpy(_by_coefficient(sh))
+    rest = np.zeros((s.size, (degree + 1) ** 2 - 1, 3), np.float32)
+    for first, last in ((0, 3), (3, 8))[: s.degree if s.size else 0]:  # the degree of an empty section has no meaning
+        rest[:, first:last] = sh[:, 3 * first : 3 * last].reshape(s.size, 3, last - first).transpose(0, 2, 1)
     gaussians = Gaussians(
         means=torch.from_numpy(means),
         quats=torch.from_numpy(quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), np.float32(1e-12))),
         scales=positive_scales(path, scales),
         opacities=rgba[:, 3].contiguous(),
-        sh=torch.cat([((rgba[:, :3] - 0.5) / SH_C0)[:, None], rest], 1),
+        sh=torch.cat([((rgba[:, :3] - 0.5) / SH_C0)[:, None], torch.from_numpy(rest)], 1),
     )
     return gaussians, end
 
@@ -164,10 +160,3 @@ def _buckets(path: Path, s: _Section, lengths: NDArray[np.uint32]) -> NDArray[np
     ends = full + np.cumsum(lengths, dtype=np.int64)
     partial = s.full_buckets + np.searchsorted(ends, row, side="right")
     return np.where(row < full, row // max(s.bucket_size, 1), partial)
-
-
-def _by_coefficient(sh: NDArray[np.float32]) -> NDArray[np.float32]:  # [N, 3 C] -> [N, C, 3]
-    """Bands of red, green, blue side by side become coefficients of (red, green, blue)."""
-    bands = [sh[:, first:last] for first, last in ((0, 9), (9, 24)) if last <= sh.shape[1]]
-    turned = [band.reshape(len(sh), 3, band.shape[1] // 3).transpose(0, 2, 1) for band in bands]
-    return np.concatenate([np.zeros((len(sh), 0, 3), np.float32), *turned], 1)

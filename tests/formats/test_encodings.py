@@ -1,120 +1,86 @@
-"""The same splat in the encodings that programs really write: each opens as the same Gaussians."""
-
-from itertools import product
-
 import numpy as np
-import pygltflib
 import pytest
+import torch
 
-from kfgs.formats import read_splats
-
-N = 5
-LAYOUTS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-WORDS = {"f4": ("float", "float32"), "f8": ("double", "float64")}
+from kfgs.formats.encodings import fit_codebook, fit_palette, morton_cells, morton_codes, morton_order, nearest_codes
 
 
-def _columns() -> dict[str, np.ndarray]:
-    """Values of a 3DGS PLY, degree 1, all exact in float32."""
-    rng = np.random.default_rng(5)
-    names = [*"xyz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(9)), "opacity"]
-    names += [*(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
-    return {name: (rng.normal(size=N) - (3 if name.startswith("scale") else 0)).astype("f4") for name in names}
+def test_a_grid_is_ordered_by_interleaved_bits():
+    cells = torch.cartesian_prod(*[torch.arange(4)] * 3)  # x slowest
+
+    def code(cell):  # 2 bits an axis, x lowest
+        x, y, z = (int(v) for v in cell)
+        return sum((v >> bit & 1) << (3 * bit + axis) for axis, v in enumerate((x, y, z)) for bit in range(2))
+
+    expected = sorted(range(64), key=lambda i: code(cells[i]))
+    grid = cells.double() * 0.25 + torch.tensor([3.0, -7.0, 0.5])  # bit patterns do not depend on place and size
+    # 3 of 3 fills all bits; 1 and 2 of 3 lie at one and two thirds, whose leading bits are 01 and 10
+    assert morton_order(grid).tolist() == expected
 
 
-def _write(path, columns, layout, kind, spelling, newline, normals, backwards):
-    """A PLY written by hand, row by row."""
-    if normals:
-        columns = columns | {name: np.zeros(N, "f4") for name in ("nx", "ny", "nz")}
-    if backwards:
-        columns = dict(reversed(columns.items()))
-    head = ["ply", f"format {layout} 1.0", "comment by hand", f"element vertex {N}"]
-    head += [f"property {WORDS[kind][spelling]} {name}" for name in columns] + ["end_header"]
-    body = b""
-    for i in range(N):
-        row = [values[i] for values in columns.values()]
-        if layout == "ascii":
-            body += (" ".join(repr(float(value)) for value in row) + newline).encode()
-        else:
-            body += b"".join(np.array(value, LAYOUTS[layout] + kind).tobytes() for value in row)
-    path.write_bytes((newline.join(head) + newline).encode() + body)
+@pytest.mark.parametrize("means", [torch.zeros(0, 3), torch.zeros(1, 3), torch.ones(5, 3, dtype=torch.float64)])
+def test_clouds_without_extent(means):
+    assert morton_order(means).tolist() == list(range(len(means)))
 
 
-@pytest.mark.parametrize(
-    ("layout", "kind", "spelling", "newline", "normals"),
-    list(product(LAYOUTS, WORDS, (0, 1), ("\n", "\r\n"), (False, True))),
-)
-def test_48_encodings_of_ply_are_one_splat(tmp_path, layout, kind, spelling, newline, normals):
-    columns = _columns()
-    _write(tmp_path / "a.ply", columns, layout, kind, spelling, newline, normals, backwards=normals and spelling == 1)
-    cloud = read_splats(tmp_path / "a.ply")
-    wide = {name: values.astype(float) for name, values in columns.items()}
-
-    def stacked(*names: str) -> np.ndarray:
-        return np.stack([wide[name] for name in names], -1)
-
-    rest = stacked(*(f"f_rest_{i}" for i in range(9))).reshape(N, 3, 3)  # channel-major
-    expected = {
-        "means": stacked(*"xyz"),
-        "scales": np.exp(stacked("scale_0", "scale_1", "scale_2")),
-        "quats": stacked("rot_0", "rot_1", "rot_2", "rot_3"),
-        "opacities": 1 / (1 + np.exp(-wide["opacity"])),
-        "sh": np.concatenate([stacked("f_dc_0", "f_dc_1", "f_dc_2")[:, None], rest.transpose(0, 2, 1)], 1),
-    }
-    for name, values in expected.items():
-        np.testing.assert_allclose(getattr(cloud, name).numpy(), values, rtol=1e-6, atol=1e-7, err_msg=name)
+def test_large_coordinates_do_not_overflow():
+    means = torch.tensor([[3e38, -3e38, 0.0], [-3e38, 3e38, 1.0], [-3e38, -3e38, 0.0]])
+    assert morton_order(means).tolist() == [2, 0, 1]
 
 
-@pytest.mark.parametrize("bits", [8, 16])
-def test_quantised_gltf_is_read_to_half_a_step(tmp_path, bits):
-    """KHR_gaussian_splatting with normalised whole numbers for rotation and opacity (KHR_mesh_quantization's rule)."""
-    rng = np.random.default_rng(2)
-    turns = rng.normal(size=(N, 4))
-    turns /= np.linalg.norm(turns, axis=1, keepdims=True)  # x y z w
-    opacity = rng.uniform(0.1, 0.9, N)
-    most, all_ones = 2 ** (bits - 1) - 1, 2**bits - 1
-    code = {8: (5120, 5121), 16: (5122, 5123)}[bits]
-    extension = "KHR_gaussian_splatting"
-    data = {
-        "POSITION": (5126, "VEC3", False, rng.normal(size=(N, 3)).astype("<f4")),
-        f"{extension}:ROTATION": (code[0], "VEC4", True, (turns * most).round().astype(f"<i{bits // 8}")),
-        f"{extension}:SCALE": (5126, "VEC3", False, np.full((N, 3), 0.1, "<f4")),
-        f"{extension}:OPACITY": (code[1], "SCALAR", True, (opacity * all_ones).round().astype(f"<u{bits // 8}")),
-        f"{extension}:SH_DEGREE_0_COEF_0": (5126, "VEC3", False, rng.normal(size=(N, 3)).astype("<f4")),
-    }
-    blob, views, accessors = b"", [], []
-    for i, (component, kind, normalized, values) in enumerate(data.values()):
-        stride = -(-values[0].nbytes // 4) * 4  # attributes lie at multiples of four bytes
-        padded = b"".join(row.tobytes().ljust(stride, b"\0") for row in values)
-        views.append(pygltflib.BufferView(buffer=0, byteOffset=len(blob), byteLength=len(padded), byteStride=stride))
-        accessors.append(
-            pygltflib.Accessor(bufferView=i, componentType=component, normalized=normalized, count=N, type=kind)
-        )
-        blob += padded
-    accessors[0].min, accessors[0].max = (
-        data["POSITION"][3].min(0).tolist(),
-        data["POSITION"][3].max(0).tolist(),
-    )
-    primitive = pygltflib.Primitive(
-        mode=0, extensions={extension: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}}
-    )
-    for i, name in enumerate(data):
-        setattr(primitive.attributes, name, i)
-    document = pygltflib.GLTF2(
-        asset=pygltflib.Asset(version="2.0"),
-        extensionsUsed=[extension],
-        scenes=[pygltflib.Scene(nodes=[0])],
-        scene=0,
-        nodes=[pygltflib.Node(mesh=0)],
-        meshes=[pygltflib.Mesh(primitives=[primitive])],
-        accessors=accessors,
-        bufferViews=views,
-        buffers=[pygltflib.Buffer(byteLength=len(blob))],
-    )
-    document.set_binary_blob(blob)
-    document.save_binary(str(tmp_path / "a.glb"))
-    cloud = read_splats(tmp_path / "a.glb")
-    np.testing.assert_allclose(cloud.opacities.numpy(), opacity, atol=0.51 / all_ones)
-    quats = cloud.quats.numpy() / np.linalg.norm(cloud.quats.numpy(), axis=1, keepdims=True)
-    wanted = turns[:, [3, 0, 1, 2]] * [1, 1, -1, -1]  # w x y z, with y and z flipped as the axes are
-    sign = np.sign((quats * wanted).sum(1, keepdims=True))
-    np.testing.assert_allclose(quats * sign, wanted, atol=1.5 / most)
+def test_codes_interleave_bits_and_cells_take_them_apart():
+    assert morton_codes(np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 3]], np.uint64)).tolist() == [1, 2, 4, 44]
+    cells = np.random.default_rng(0).integers(0, 1 << 21, (200, 3)).astype(np.uint64)
+    assert (morton_cells(morton_codes(cells)) == cells).all()
+
+
+def test_up_to_256_values_are_kept_as_they_are():
+    values = np.repeat(np.float32([3.5, -1, 0.25]), 10).astype(np.float64)
+    book = fit_codebook(values)
+    assert book.shape == (256,)
+    assert set(book.tolist()) == {3.5, -1, 0.25}
+    np.testing.assert_array_equal(book[nearest_codes(book, values)], values)
+    assert fit_codebook(np.zeros(0)).tolist() == [0] * 256
+
+
+def test_a_codebook_is_where_the_values_are():
+    values = np.random.default_rng(0).laplace(size=(5000, 3))
+    values[0, 0] = 40  # an outlier gets its own number
+    book = fit_codebook(values)
+    assert (np.diff(book) >= 0).all()
+    error = np.abs(book[nearest_codes(book, values)] - values)
+    even = (values.max() - values.min()) / 255 / np.sqrt(12)
+    assert (error**2).mean() ** 0.5 < even / 4  # 256 numbers reach even / 4.7 (Panter and Dite)
+    assert error.max() < 0.3
+    np.testing.assert_array_equal(nearest_codes(book, values[:9]), np.abs(values[:9, :, None] - book).argmin(2))
+    np.testing.assert_array_equal(book, fit_codebook(values))
+
+
+def test_a_small_set_is_its_own_palette():
+    rows = torch.randn(20, 9, generator=torch.Generator().manual_seed(0))
+    palette, labels = fit_palette(rows, 32)
+    assert torch.equal(palette[labels], rows)
+
+
+def test_clusters_become_rows_of_the_palette():
+    g = torch.Generator().manual_seed(1)
+    centers = torch.randn(50, 9, generator=g) * 10
+    which = torch.arange(50).repeat_interleave(40)
+    rows = centers[which] + torch.randn(2000, 9, generator=g) * 0.01
+    palette, labels = fit_palette(rows, 128)
+    assert len(palette) <= 128
+    assert (palette[labels] - rows).abs().max() < 0.2
+    assert all(map(torch.equal, (palette, labels), fit_palette(rows, 128)))  # no chance
+
+
+def test_a_larger_palette_is_nearer_and_beats_picked_rows():
+    rows = torch.randn(3000, 24, generator=torch.Generator().manual_seed(2)).cumsum(1)
+    rows = rows[rows[:, -1].argsort()]
+    errors = []
+    for size in (64, 512):
+        palette, labels = fit_palette(rows, size)
+        assert size / 2 < len(palette) <= size
+        errors.append(float((palette[labels] - rows).square().mean()))
+        picked = rows[:: len(rows) // size]
+        assert errors[-1] < 0.8 * float(torch.cdist(rows, picked).min(1).values.square().mean()) / 24
+    assert errors[1] < 0.7 * errors[0]

@@ -54,15 +54,6 @@ def test_a_plain_cloud_stays_plain(tmp_path, notes, to):
     assert (lost, back.antialiased, notes) == ((), False, [])
 
 
-def test_antialiased_goes_all_the_way_round(tmp_path):
-    splats = _splats(antialiased=True)
-    for i, suffix in enumerate((".spz", ".sog", ".compressed.ply", ".ply", ".spz")):
-        write_splats(splats, tmp_path / f"{i}{suffix}")
-        splats = read_splats(tmp_path / f"{i}{suffix}")
-    assert splats.antialiased
-    assert (tmp_path / "4.spz").read_bytes()[14] == 1  # the header's flags
-
-
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply"])
 def test_comments_are_those_that_others_look_for(tmp_path, suffix):
     for mode, comments in (

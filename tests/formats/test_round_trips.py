@@ -161,29 +161,6 @@ def test_others_see_the_same_picture(tmp_path, to):
     assert _decibels(cloud, other, camera, turned) > LEAST_PSNR.get(to, 80)
 
 
-def test_the_picture_tells_every_single_mistake():
-    """What the tests above are worth: each of these stays below what they ask for, 42 dB and less."""
-    cloud = _asymmetrical()
-    mistakes = [
-        cloud.replace(quats=cloud.quats[:, [1, 2, 3, 0]]),
-        cloud.replace(sh=cloud.sh[..., [2, 1, 0]]),
-        cloud.replace(scales=cloud.scales.roll(1, 1)),
-        cloud.replace(scales=cloud.scales.roll(2, 1)),
-    ]
-    for axis in range(3):
-        sign = torch.ones(3).index_fill(0, torch.tensor(axis), -1.0)
-        mistakes.append(cloud.replace(means=(cloud.means - 0.5) * sign + 0.5))
-        mistakes.append(cloud.replace(quats=cloud.quats * torch.cat([torch.ones(1), sign])))
-    for k in range(1, 16):
-        flipped, swapped = cloud.sh.clone(), cloud.sh.clone()
-        flipped[:, k] *= -1
-        swapped[:, [k - 1, k]] = swapped[:, [k, k - 1]]
-        mistakes += [cloud.replace(sh=flipped), cloud.replace(sh=swapped)]
-    camera = _camera(cloud, ASLANT)
-    seen = [_decibels(cloud, wrong, camera) for wrong in mistakes]
-    assert max(seen) < min(LEAST_PSNR.values()), seen
-
-
 @pytest.mark.parametrize("to", WRITABLE)
 def test_meaning_survives_every_format(tmp_path, to):
     given = _made()

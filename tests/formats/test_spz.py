@@ -220,16 +220,8 @@ def test_what_is_lost_is_said(tmp_path):
 def test_bad_requests_are_named(tmp_path):
     cloud = _cloud()
     path = tmp_path / "a.spz"
-    cases = [
-        ({"means": cloud.means * 1e9}, ("means:", "8.38861e+06")),
-        ({"means": cloud.means * float("nan")}, ("means:", "39", "40", "got [nan, nan, nan]")),
-        ({"scales": cloud.scales - 0.2}, ("scales:", "above 0")),
-        ({"sh": None}, ("gaussians:", "colours", "got Gaussians(40", ".ply")),
-        ({"labels": torch.full((40,), -3)}, ("labels:", "-1", "2147483647", "got [-3]")),
-    ]
-    for changes, message in cases:
-        with pytest.raises(ValueError, match=tells(*message)):
-            write_splats(cloud.replace(**changes), path)
+    with pytest.raises(ValueError, match=tells("means:", "8.38861e+06")):
+        write_splats(cloud.replace(means=cloud.means * 1e9), path)
     names = cloud.replace(labels=torch.zeros(40, dtype=torch.int64)).replace(names=("a" * (1 << 20),))
     with pytest.raises(ValueError, match=tells("classes:", "1048576", "got 1048580")):
         write(path, names)
