@@ -89,7 +89,7 @@ def _ranks(path: Path) -> list[Path]:
     numbers = sorted(int(rank[1]) for rank in ranks if rank)
     if numbers != list(range(len(numbers))):
         raise ValueError(
-            f"{path}: expected the files of ranks 0 to {numbers[-1]} beside it, got {numbers}; copy them all"
+            f"{path}: expected the files of ranks 0 to {numbers[-1]} next to it, got {numbers}; copy them all"
         )
     return [path.with_name(f"{match[1]}{number}{match[3]}") for number in numbers]
 

@@ -106,11 +106,11 @@ def _is_ours(name: str) -> bool:
 
 def _numbered(columns: Columns, group: str) -> list[str]:
     """Names of the columns of a group, which are numbered from 0 without a gap."""
-    found = [name for name in columns if name.startswith(group)]
-    names = [f"{group}{i}" for i in range(len(found))]
+    have = [name for name in columns if name.startswith(group)]
+    names = [f"{group}{i}" for i in range(len(have))]
     missing = [name for name in names if name not in columns]
     if missing:
-        odd = sorted(set(found) - set(names))
+        odd = sorted(set(have) - set(names))
         raise ValueError(
             f"columns: expected {missing[0]} as well as {odd[0]}, got none; number {group}* from 0 to the last"
         )

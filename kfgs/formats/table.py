@@ -189,10 +189,10 @@ def write_splats(
     lost = module.write_plain(path, gaussians) if plain else module.write(path, gaussians)
     holds_origin = getattr(module, "HOLDS_ORIGIN", False) and not plain
     holds_labels = module.HOLDS_LABELS and not plain
-    beside = write_sidecar(path, gaussians, facts or {}, holds_labels=holds_labels, holds_origin=holds_origin)
+    others = write_sidecar(path, gaussians, facts or {}, holds_labels=holds_labels, holds_origin=holds_origin)
     if not holds_origin:
         lost = (*lost, *describe_origin(gaussians.origin, f"{path.name}"))
-    return Written([path, *beside], tuple(lost), order)
+    return Written([path, *others], tuple(lost), order)
 
 
 def _format_to_write(path: Path, name: str | None) -> ModuleType:
@@ -216,12 +216,12 @@ def _format_to_write(path: Path, name: str | None) -> ModuleType:
 def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
     """The files of a pattern with one `*`, by the whole number in its place."""
     before, after = pattern.split("*")
-    found = {}
+    files = {}
     for file in folder.glob(pattern) if folder.is_dir() else ():
         match = re.fullmatch(re.escape(before) + r"(\d{1,18})" + re.escape(after), file.relative_to(folder).as_posix())
         if match and file.is_file():
-            found[int(match[1])] = file
-    return found
+            files[int(match[1])] = file
+    return files
 
 
 def newest_splat(folder: Path) -> Path | None:

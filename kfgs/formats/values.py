@@ -216,7 +216,7 @@ def check_splats(gaussians: Gaussians) -> None:
     expected = f"-1 (none) to {most}" + (" (the named classes)" if g.names else "")
     if "class_id" in g.extra:
         raise ValueError(
-            "extra['class_id']: expected no such column beside labels, which are stored under that name, got both; leave it out"
+            "extra['class_id']: expected no such column next to labels, which are stored under that name, got both; leave it out"
         )
     _check_rows("labels", expected, g.labels, (g.labels >= -1) & (g.labels <= most))
 
