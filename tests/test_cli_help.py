@@ -64,7 +64,7 @@ def test_help_is_short_and_has_no_python_in_it(command, capsys, monkeypatch):
     assert re.sub(r" --\S+( (?!--)\S+)?", "", usage).endswith(" ".join(positionals))
     main_options = text.split("─ options ─")[1].split("╰")[0] if "─ options ─" in text else ""
     assert len(re.findall(r"^│ --", main_options, re.MULTILINE)) <= 8
-    assert max(map(len, text.split("Examples:")[0].splitlines())) <= 80
+    assert max(map(len, text.split("Examples:")[0].splitlines()[1:])) <= 80  # without tyro's usage
     assert f"kfgs {command} " in text.split("Examples:")[1] or command == "demo"
 
 

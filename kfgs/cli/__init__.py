@@ -95,6 +95,7 @@ def _run(words: list[str], names: dict[str, str]) -> int:
     """Run the command that the words ask for; `names` receives the command-line names of its parameters."""
     name, *given = [_expand_home(word) for word in words] or [""]
     given, strict = [word for word in given if word != STRICT], STRICT in given
+    name = "convert" if name == "info" else name  # `kfgs info PATH`: convert without a target
     if name not in COMMANDS:
         told = {"-h": _overview, "--help": _overview, "--version": _version}.get(name)
         say(told() if told else _unknown(name), None if told else sys.stderr)

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from .options import Flag, Given, Name, Positional
+from .options import Given, Name, Positional
 from .output import say, wrote
 
 # Heavy imports happen inside the command, so that `kfgs --help` answers at once.
@@ -25,7 +25,6 @@ def batch(
     weights: Name = None,
     text: Given[Path] = None,
     workers: Workers = None,
-    discard_features: Flag = False,
     blocks: Given[int] = None,
     splat: Given[Path] = None,
 ) -> None:
@@ -50,7 +49,6 @@ def batch(
         text: Text table of `kfgs features --words` for all scenes; each scene's classes.json and text.* when not given.
         workers: Processes on this machine, or a Dask scheduler (tcp://HOST:8786), or slurm:PARTITION:NUMBER. One scene after
             the other in this process when not given.
-        discard_features: Delete a scene's feature maps when its field is made.
         blocks: Cut the scene SCENES into this many blocks. With fewer than about 300 views in each, a block fits into the
             memory of most machines.
         splat: With --blocks: Gaussians of the whole scene, a splat file; without it each block trains its own.
@@ -65,7 +63,6 @@ def batch(
             ("teacher", teacher),
             ("weights", weights),
             ("text", text),
-            ("discard_features", discard_features or None),
         ):
             if value is not None:
                 raise ValueError(
@@ -88,7 +85,6 @@ def batch(
         weights=weights,
         text=None if text is None else str(text),
         threads=threads,
-        discard_features=discard_features,
     )
     with nullcontext() if workers is None else open_client(workers) as client:
         results = run_batch(entries, out, options, client=client, report=say)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .._files import check_output, real_path, write_json
-from .options import Flag, Given, GivenMatching, Positional, SceneFolder, Split, load_views
+from .options import Flag, Given, GivenMatching, Positional, SceneFolder, Split, Teacher, load_views
 from .output import say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -54,8 +54,8 @@ def sfm(
     *,
     fps: Given[float] = None,
     matching: GivenMatching = None,
-    camera_model: str = "SIMPLE_RADIAL",
     no_single_camera: Flag = False,
+    min_registered: float = 0.9,
     ignore_poses: Flag = False,
     replace: Flag = False,
 ) -> None:
@@ -76,8 +76,8 @@ def sfm(
         out: Scene folder to make; OUT/sparse/0 receives the COLMAP model.
         fps: Frames of each second of a video that are used, 2 when not given: the sharpest of each half second.
         matching: sequential for the frames of a video, exhaustive for everything else; by default so.
-        camera_model: COLMAP's name of the lens model.
         no_single_camera: The photographs were taken with several cameras, or with changes of zoom.
+        min_registered: Share of the images that must be placed; fewer is an error.
         ignore_poses: Estimate poses also if the folder has some.
         replace: Replace a model that is in OUT/sparse/0 already; without it that is an error.
     """
@@ -88,8 +88,8 @@ def sfm(
     check_output("out", out, "a folder")
     config = SfmConfig(
         matching=matching or ("sequential" if is_video(images) else "exhaustive"),
-        camera_model=camera_model,
         single_camera=not no_single_camera,
+        min_registered=min_registered,
     )
     if not is_video(images) and not ignore_poses and (is_scene(images) or images.suffix == ".json"):
         scene = load_scene(images, split="all")
@@ -147,6 +147,7 @@ def fit(
     max_gaussians: Given[int] = None,
     images: Given[Path] = None,
     split: Split = "train",
+    teacher: Teacher,
 ) -> None:
     """Make a semantic field of a scene and its teacher's feature maps.
 
@@ -158,6 +159,7 @@ def fit(
     Examples:
         kfgs fit scene/ --out run/ --splat my.ply
         kfgs fit scene/ --out run/ --features maps/
+        kfgs fit scene/ --out run/ --teacher mine:colors    # makes the maps, in OUT/features
         kfgs fit scene/ --out run/ --splat my.ply --max-gaussians 0    # keeps every Gaussian of the splat
         kfgs fit scene/ --out run/ --method paper
 
@@ -184,15 +186,15 @@ def fit(
     loaded = as_taken.undistorted()
     chosen = loaded.views(split)
     check_scene(loaded, chosen)
+    network = teacher.load()
     folder = features or (scene if scene.is_dir() else scene.parent) / "features"
-    if not folder.is_dir():
+    if network is None and not folder.is_dir():
         raise ValueError(
             f"features: expected a folder of feature maps, got {folder}, which is none; name another, or make them with "
             "`kfgs features`"
         )
-    field = fit_field(
-        loaded, FeatureFolder(folder).of(as_taken, chosen), made_by, folder=out, split=split, report=say, progress=True
-    )
+    maps = network or FeatureFolder(folder).of(as_taken, chosen)
+    field = fit_field(loaded, maps, made_by, folder=out, split=split, report=say, progress=True)
     command = f"cd {shlex.quote(os.getcwd())}\n{shlex.join(['kfgs', *sys.argv[1:]])}"
     report = write_run_report(out, field, loaded, made_by, split=split, command=command)
     say(field.summary())

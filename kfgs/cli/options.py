@@ -42,7 +42,6 @@ By = Literal["views", "distance"]
 LabelRule = Literal["own", "nearest"]  # of `kfgs evaluate`: who says the class of a pixel
 Matching = Literal["exhaustive", "sequential"]  # of `kfgs sfm`: which pairs of pictures are compared
 Precision = Literal["lossless", "fine", "small", "tiny"]  # `fields.precision`, without its imports
-Rule = Literal["fused", "paper"]
 Walk = Literal["orbit", "cameras"] | Path  # paths of cameras
 GivenBy = Annotated[By | None, _choice(By), _quiet]
 GivenRule = Annotated[LabelRule | None, _choice(LabelRule), _quiet]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from .._files import check_output, file_stem, read_json, write_json
 from .files import open_field
-from .options import Classes, Flag, Given, GivenWalk, Positional, Rule, Split
+from .options import Classes, Flag, Given, GivenWalk, Positional, Split
 from .output import say, wrote
 from .render import read_walk, walk_of
 from .view import open_colors
@@ -27,7 +27,6 @@ def segment(
     path: GivenWalk = None,
     frames: Given[int] = None,
     coco: Flag = False,
-    rule: Rule = "fused",
     classes: Classes,
 ) -> None:
     """Segment the views of a scene with a field; score them if there are label pictures. Or segment a camera path.
@@ -49,7 +48,6 @@ def segment(
         frames: Number of cameras of the path; by default 72, or your own cameras.
         coco: Write coco/annotations.json (COCO's run lengths, areas and boxes; one annotation for each class of each picture)
             and its pictures to coco/images: undistorted photographs, or with --path rendered colours.
-        rule: fused: the classes of the field's Gaussians; paper: decode every pixel (Sec. 3.4), seconds a view.
     """
     from ..fields import recall_scene
     from ..pipeline import score_scene, segment_scene, true_labels, write_coco
@@ -72,15 +70,14 @@ def segment(
     seen = set(loaded_field.info.get("views", ())) & {scene.cameras[i].name for i in scene.views(split)}
     if seen:
         say(f"note: the field was trained on {len(seen)} of these views")
-    answers = loaded_field.paper if rule == "paper" else loaded_field
-    maps = segment_scene(answers, scene, label_set, out, split=split, truth=truth, progress=True)
+    maps = segment_scene(loaded_field, scene, label_set, out, split=split, truth=truth, progress=True)
     written = [out / name for name in ("predicted", "colored", "sheets")]
     if coco:
         views = {scene.stem(i): i for i in scene.views(split)}
         written.append(write_coco(out, maps, label_set.names, lambda stem: scene.image(views[stem])))
     if truth:
         scores = score_scene(maps, truth, label_set)
-        facts = {"truth": str(labels), "field": str(field), "rule": rule}
+        facts = {"truth": str(labels), "field": str(field)}
         write_json(out / "scores.json", {"segmentation": scores.to_json(), **facts})
         plot_iou(scores.iou, list(label_set.names), out / "iou.png")
         written += [out / name for name in ("scores.json", "iou.png")]

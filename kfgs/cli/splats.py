@@ -202,7 +202,6 @@ def convert(
     target: Positional[Given[Path]] = None,
     *,
     precision: Precision = "small",
-    text: Given[Path] = None,
     plain: Flag = False,
     by_class: Flag = False,
 ) -> None:
@@ -226,7 +225,6 @@ def convert(
             field .kfgs or .ply.
         precision: Of a .kfgs file: lossless; fine (labels hardly change); small (0.6 MB for 50,000 Gaussians); tiny. The
             errors of each are printed, and kept in the file. All but lossless sort the Gaussians.
-        text: Words that the .kfgs file shall know instead of the field's: a table of `kfgs features --words`.
         plain: Write a .ply with exactly the properties of Inria's 3DGS, for importers that fail on others. The classes go to
             a file next to it, which kfgs finds again.
         by_class: TARGET is a folder that receives one plain .ply for each class, 05_chair.ply for class 5.
@@ -242,7 +240,7 @@ def convert(
         labelled = open_field("source", source).label()
         wrote(save_labelled(target, labelled, rule="what the views show of each Gaussian; score = cosine"))
     elif is_field(source) or target.suffix == ".kfgs":
-        _pack(source, target, precision, text)
+        _pack(source, target, precision)
     elif by_class:
         _convert_by_class(source, target)
     else:
@@ -256,20 +254,13 @@ def convert(
         wrote(written.paths)
 
 
-def _pack(source: Path, target: Path, precision: Precision, text: Path | None) -> None:
-    """Write a field again, with other words if some are given; say the error of each part, read back from the file."""
-    from dataclasses import replace
-
+def _pack(source: Path, target: Path, precision: Precision) -> None:
+    """Write a field again; say the error of each part, read back from the file."""
     from ..fields.store import check_place, read_description, stream_sizes
-    from ..labels.questions import class_rows
 
     check_output("target", target, "a file")
     check_place(target)
     field = open_field("source", source)
-    if text is not None:
-        words = Classes(text=text).load_classes()
-        class_rows(words, field.dim, field.info)  # of the field's teacher
-        field = replace(field, classes=words)
     field.save(target, None if precision == "lossless" else precision)
     if precision != "lossless":
         about = read_description(target)
