@@ -18,7 +18,7 @@ from torch import Tensor
 import kfgs
 from kfgs import Camera, Codebook, Gaussians, SemanticField, rasterize
 from kfgs._card import LONGEST, html_card, short_repr, short_value
-from kfgs.fields import Autoencoded
+from kfgs.fields import Autoencoded, Identity
 from kfgs.labels import LabelSet, Selection
 from kfgs.labels.edits import EditList, Remove
 from kfgs.quant import LinearLatents
@@ -156,7 +156,7 @@ def test_lines_stay_short_and_cards_are_tables():
         assert "\n" not in repr(thing)
     assert repr(autoencoder) == "Autoencoder(512 channels to 9 latents and back, widths [512, 64, 9, 64, 512])"
     for card, facts in (
-        (field._repr_html_(), ("&lt;lseg&gt;", "decouple+ADC+SC", ">300<", ">512<")),
+        (field._repr_html_(), ("&lt;lseg&gt;", "decouple+ADC+SC", " for 512 of the teacher")),
         (book._repr_html_(), (">300<", "[300, 512] float32")),
         (rendering._repr_html_(), ("30 x 20", "9")),
     ):
@@ -186,7 +186,9 @@ class Names(dict):
 
 
 BOX = kfgs.labels.OrientedBox(torch.zeros(3), torch.eye(3), torch.ones(3))
+FLAT = torch.ones(40, 3)
 KNOWN = {
+    SemanticField: SemanticField(Gaussians(FLAT, torch.ones(40, 4), FLAT, FLAT[:, 0] / 2, FLAT), Identity(3)),
     Camera: Camera(torch.eye(4), torch.eye(3), 4, 3, name="view.png"),
     kfgs.Similarity: kfgs.Similarity.identity(),
     kfgs.labels.Part: kfgs.labels.Part(torch.arange(40), 1.0, torch.ones(3), BOX, (torch.ones(3),) * 2, None, "name"),
@@ -223,7 +225,9 @@ def made_up(kind):
 
 def filled(kind):
     hints = typing.get_type_hints(kind, {}, Names(vars(importlib.import_module(kind.__module__))))
-    values = {name: made_up(hints[name]) for name in field_names(kind)}
+    values = {
+        name: None if kind in typing.get_args(hints[name]) else made_up(hints[name]) for name in field_names(kind)
+    }
     if hasattr(kind, "_make"):
         return kind._make(values.values())
     thing = object.__new__(kind)

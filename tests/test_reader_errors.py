@@ -149,15 +149,6 @@ def test_a_scan_without_positions_is_named(tmp_path):
         load_scannet_points(file)
 
 
-def test_objects_beyond_every_integer(tmp_path):
-    file = _scan(tmp_path, {axis: np.zeros(2, np.float32) for axis in "xyz"})
-    (tmp_path / "scene0000_00_vh_clean_2.0.010000.segs.json").write_text('{"segIndices": [7, 9]}')
-    groups = [{"objectId": 2**70, "segments": [7]}]
-    (tmp_path / "scene0000_00.aggregation.json").write_text(json.dumps({"segGroups": groups}))
-    with pytest.raises(ValueError, match=tells("scene0000_00.aggregation.json", "objectId")):
-        load_scannet_points(file)
-
-
 def _mesh(folder, face):
     head = (
         "ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"

@@ -12,7 +12,7 @@ import torch
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
-from .._files import atomic_folder, real_path
+from .._files import as_path, atomic_folder, real_path
 from ..cameras.camera import Camera
 from .files import MASKS, SceneError
 from .pycolmap_import import quiet_pycolmap, scene_errors
@@ -81,7 +81,7 @@ def write_known_poses(
     """
     if not isinstance(scene, Scene):
         raise TypeError(f"scene: expected a Scene, got {type(scene).__name__}; pass load_scene(folder)")
-    model = check_model_place(Path(out), replace)
+    model = check_model_place(as_path(out), replace)
     out = model.parents[1]
     links = {out / "images" / c.name: real_path(path) for c, path in zip(scene.cameras, scene.image_paths, strict=True)}
     for camera, mask in zip(scene.cameras, scene.masks or [None] * len(scene), strict=True):

@@ -109,10 +109,7 @@ def to_pyvista(
     Points are in the world: in float64 if the cloud has an origin. The arrays are `index`, `rgb` (uint8), `opacity`,
     `scale` (standard deviations), `quat` (w, x, y, z), and, if present, `label` and the values of `color_by` (`score`).
     `to_pyvista(cloud).plot(scalars="rgb", rgb=True)` shows it. Arguments as in `add_cloud`.
-
-    Example:
-        >>> points = to_pyvista(cloud)  # doctest: +SKIP
-        >>> trimesh.PointCloud(points.points, colors=points["rgb"])  # doctest: +SKIP
+    For trimesh: `trimesh.PointCloud(points.points, colors=points["rgb"])`.
     """
     colors = cloud_colors(gaussians, color_by, feature_colors)
     mesh = _points(gaussians)

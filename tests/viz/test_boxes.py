@@ -8,6 +8,12 @@ from kfgs.labels import OrientedBox
 from kfgs.viz import add_boxes, palette
 
 
+def between(low, high):
+    """A box along the world's axes."""
+    low, high = torch.tensor(low).double(), torch.tensor(high).double()
+    return OrientedBox((low + high) / 2, torch.eye(3).double(), (high - low) / 2)
+
+
 @pytest.fixture
 def plotter():
     with some_plotter() as plotter:
@@ -19,7 +25,7 @@ def test_edges_are_those_of_the_box(plotter):
     axes = torch.tensor([[angle.cos(), angle.sin(), 0], [-angle.sin(), angle.cos(), 0], [0, 0, 1]])
     boxes = [
         OrientedBox(torch.tensor([1.0, 2, 3]), axes, torch.tensor([3.0, 2, 1])),
-        OrientedBox.between([0] * 3, [1] * 3),
+        between([0] * 3, [1] * 3),
     ]
     mesh = data(add_boxes(plotter, boxes, labels=[5, 2]))
     assert mesh["box"].tolist() == [0] * 12 + [1] * 12
@@ -36,7 +42,7 @@ def test_edges_are_those_of_the_box(plotter):
 
 
 def test_names_stand_over_their_boxes(monkeypatch, plotter):
-    boxes, drawn = [OrientedBox.between([0, 0, 0], [1, 2, 3]), OrientedBox.between([5, 0, 0], [6, 1, 1])], []
+    boxes, drawn = [between([0, 0, 0], [1, 2, 3]), between([5, 0, 0], [6, 1, 1])], []
     draw = plotter.add_point_labels
     monkeypatch.setattr(plotter, "add_point_labels", lambda *a, **k: (drawn.append(a), draw(*a, **k))[1])
     add_boxes(plotter, boxes, names=["low", "high"], up=(0, 0, 2))
@@ -51,7 +57,7 @@ def test_names_stand_over_their_boxes(monkeypatch, plotter):
 def test_no_name_is_left_out_where_boxes_are_close():
     def drawn(names):
         with some_plotter() as plotter:
-            boxes = [OrientedBox.between([0.12 * i, 0, 0], [0.12 * i + 0.1, 0.1, 0.1 + 0.02 * i]) for i in range(3)]
+            boxes = [between([0.12 * i, 0, 0], [0.12 * i + 0.1, 0.1, 0.1 + 0.02 * i]) for i in range(3)]
             add_boxes(plotter, boxes, names=names)
             plotter.view_xz()
             plotter.camera.zoom(0.6)
@@ -64,7 +70,7 @@ def test_no_name_is_left_out_where_boxes_are_close():
 
 
 def test_what_cannot_be_boxed_is_named(plotter):
-    box = OrientedBox.between([0] * 3, [1] * 3)
+    box = between([0] * 3, [1] * 3)
     with pytest.raises(ValueError, match=tells("boxes:", "got none")):
         add_boxes(plotter, [])
     with pytest.raises(ValueError, match=tells("labels, names:", "expected 1", "got 2 and 0")):
