@@ -78,10 +78,8 @@ def main() -> None:
         field = SemanticField.load(args.field)
         cameras = load_scene(args.scene).cameras if args.scene else field.cameras
         fields, camera = [field], cameras[0].resized(height, width)
-        try:
-            rows = field.classes.embeddings  # the field's own classes, whatever --classes says
-        except (ValueError, FileNotFoundError):  # it has none, or their files are elsewhere
-            rows = torch.randn(args.classes, field.dim, generator=g)
+        own = field.classes  # whatever --classes says
+        rows = torch.randn(args.classes, field.dim, generator=g) if own is None else own.embeddings
         if len(rows) < 5:
             parser.error(
                 f"--field: expected a field of at least 5 classes, of which a row takes the best, got {len(rows)}"
@@ -178,7 +176,7 @@ def compare(field: SemanticField, camera: Camera, rows: Tensor, repeats: int) ->
     return [
         measure(
             "exact decode",
-            lambda: decoded(field, rendering.map, table.labels, covered),
+            lambda: decoded(field, rendering.map, table, covered),
             lambda: label_pixels(rendering.map, book, table, coder, covered=covered),
             max(2, repeats // 5),
         )
