@@ -1,4 +1,4 @@
-"""How long does it take to carry labels to another cloud, and which method takes what?
+"""How long does it take to carry labels to another cloud, with lambda given and with lambda chosen?
 
     python benchmarks/transfer.py [--sources 100000] [--destinations 600000] [--repeats 3]
 
@@ -20,7 +20,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from kfgs.gaussians import Gaussians
-from kfgs.labels import default_distance, transfer_labels
+from kfgs.labels import default_distance, nearest_labels
 
 SIZE = np.array([6.0, 4.0, 3.0])
 
@@ -66,9 +66,8 @@ def main() -> None:
         seconds = least(args.repeats, lambda k=k: cKDTree(points).query(targets, k=k, workers=-1))  # type: ignore[misc]
         print(f"{f'scipy alone, {k} neighbours':34} {seconds[0]:8.2f} {seconds[1]:9.2f}")
     rows = [("nearest, lambda chosen", {"distance": None}), ("nearest", {})]
-    rows += [(f"{m}, {k} neighbours", {"method": m, "neighbours": k}) for m in ("vote", "mahalanobis") for k in (8, 16)]
     for name, options in rows:
-        call = partial(transfer_labels, src, labels, dst, **{"distance": distance, **options})
+        call = partial(nearest_labels, src.means, labels, dst.means, **{"distance": distance, **options})
         result = call()
         shares = result.labelled / len(dst), result.ambiguous / len(dst)
         seconds = least(args.repeats, call)
