@@ -122,8 +122,9 @@ def extract(args: argparse.Namespace) -> str:
     turns = [pictures[i % len(pictures)] for i in range(args.images)]
     named = [Picture(f"{i:04d}", picture.path) for i, picture in enumerate(turns)]
     teacher = RandomTeacher(tuple(args.size), args.channels, args.device)
-    made = extract_features(teacher, named, args.folder / "maps", progress=True)
-    return f"{sum(record.bytes for record in made.maps.values()) / 1e9:.2f} GB written"
+    folder = args.folder / "maps"
+    made = extract_features(teacher, named, folder, progress=True)
+    return f"{sum((folder / f'{stem}.npy').stat().st_size for stem in made.pictures) / 1e9:.2f} GB written"
 
 
 def codebook(args: argparse.Namespace) -> str:
