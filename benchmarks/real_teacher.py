@@ -322,7 +322,7 @@ def main() -> None:
         print(f"{args.head}: {len(tokens):,} tokens, {right:.1%} right; {time.perf_counter() - start:.0f} s")
         return
     teacher = RealTeacher(args.weights, args.head).to(args.device)
-    extract_features(teacher, scene, args.out, "all", report=print, progress=sys.stderr.isatty())
+    extract_features(teacher, scene, args.out, "all", progress=sys.stderr.isatty())
     print(f"{args.out}: {len(scene)} maps; {time.perf_counter() - start:.0f} s")
     report = score_maps(scene, args.out, args.scene / args.truth, classes)
     print(f"{args.scene / args.truth}: no label of a test view, nothing to score" if report is None else report)

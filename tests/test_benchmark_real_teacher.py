@@ -133,7 +133,7 @@ def test_commands_make_the_maps_that_the_teacher_makes(module, backbone, room, t
     monkeypatch.chdir(ROOT)
     teacher = load_teacher("benchmarks.real_teacher:RealTeacher", weights)
     manifest = json.loads((out / "features.json").read_text())
-    assert (len(manifest["maps"]), manifest["teacher"]) == (9, teacher.identity)
+    assert (len(manifest["pictures"]), manifest["teacher"]) == (9, teacher.identity)
     stored = np.load(out / f"{scene.stem(0)}.npy")
     assert (stored.dtype, stored.shape) == (np.float16, (8, 10, 32))
     picture, (weight, bias, size) = scene.image(0).permute(2, 0, 1), module.load_head(head)
