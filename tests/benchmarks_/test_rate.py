@@ -42,7 +42,7 @@ def test_every_format_carries_the_labels_of_the_field(made, tmp_path):
 
 def test_the_curve_falls_in_size_as_its_errors_grow(made, tmp_path):
     points = rate.packed(Room(made), made, tmp_path)
-    assert [one.name for one in points[:5]] == ["folder", "lossless", "fine", "small", "tiny"]
+    assert [one.name for one in points[:4]] == ["lossless", "fine", "small", "tiny"]
     curve = [one.bytes for one in points if one.kind == "curve"]
     assert curve == sorted(curve, reverse=True)
     assert len(curve) == len(rate.FACTORS)
@@ -50,7 +50,7 @@ def test_the_curve_falls_in_size_as_its_errors_grow(made, tmp_path):
     assert rate.scaled(100).degrees == 30
     text = rate.table(points, len(made)).splitlines()
     assert len(text) == len(points) + 2
-    assert text[-1].startswith("| folder |")
+    assert text[-1].startswith("| lossless |")
     rate.plot(tmp_path / "rate.png", points)
     assert (tmp_path / "rate.png").read_bytes()[:4] == b"\x89PNG"
 
