@@ -4,6 +4,8 @@ import figure6
 import table2
 from small_task import MIB
 
+from kfgs.quant import PaperCodebook
+
 
 def row(dim):
     scores = {"miou": 0.7, "accuracy": 0.9, "gaussians": 20_000, "storage": 5 * MIB, "fps_maps": 70.0, "steps": 800}
@@ -20,11 +22,11 @@ def test_table_puts_the_paper_beside(tmp_path):
 
 
 def test_512_is_the_row_without_an_autoencoder():
-    args = argparse.Namespace(preset="cpu", quick=True, steps=None, seed=3, device="cpu")
+    args = argparse.Namespace(preset="cpu", quick=True, steps=None, device="cpu")
     config = table2.config_of(512, args)
-    assert (config.mode, config.method, config.field.steps, config.seed) == ("adc", "paper", 350, 3)
+    assert (config.codebook, config.autoencoder, config.training.steps) == (PaperCodebook(), None, 350)
     config = table2.config_of(6, args)
-    assert (config.mode, config.autoencoder.latent, config.field.steps) == ("adc+sc", 6, 800)
+    assert (config.codebook, config.autoencoder.latent, config.training.steps) == (PaperCodebook(), 6, 800)
 
 
 def test_codewords_are_drawn_for_every_scene(tmp_path):
