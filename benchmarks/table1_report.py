@@ -16,7 +16,7 @@ from kfgs.metrics import MIB
 from kfgs.scenes import load_scene
 from kfgs.viz import overlay_labels, plot_quality_storage, save_picture
 from kfgs.viz.pictures import legend_strip, picture_grid
-from kfgs.viz.plots import finish, new_figure
+from kfgs.viz.plots import finish
 
 COLUMNS = 5  # of the picture of labels
 HEAD = (
@@ -117,16 +117,12 @@ def draw_plots(out: Path, scene: Path, truth: str, results: list[dict[str, Any]]
             sizes[title] = mean(one["storage"] for one in found) / MIB, miou
             times[title] = max(median(fitting_seconds(one["stages"]) for one in found) / 60, 1e-3), miou
     paper = {f"{row.title.split(' (')[0]} (paper)": row.paper for row in ROWS.values() if row.paper is not None}
-    figure = new_figure(12, 8)  # large enough for the names of both kinds of points
-    plot_quality_storage(
-        sizes,
-        ax=figure.add_subplot(),
-        reference={name: (p["mib"], p["miou"] / 100) for name, p in paper.items()},
-    )
+    reference = {name: (p["mib"], p["miou"] / 100) for name, p in paper.items()}
+    figure = plot_quality_storage(sizes, reference=reference)
+    figure.set_size_inches(12, 8)  # large enough for the names of both kinds of points
     finish(figure, out / "quality_storage.png")
-    figure = new_figure(7.6, 5.2)
-    axes = figure.add_subplot()
-    plot_quality_storage(times, ax=axes)
+    figure = plot_quality_storage(times)
+    (axes,) = figure.axes
     axes.set(xlabel="minutes beyond the shared coloured Gaussians, on this machine", title="Quality against time")
     finish(figure, out / "quality_time.png")
     draw_labels(out, scene, truth, results)

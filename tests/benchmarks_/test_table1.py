@@ -78,10 +78,10 @@ def test_presets_are_said(key):
 def test_the_paper_s_rows_have_the_paper_s_codebook_and_autoencoder():
     for preset in ("quick", "cpu", "paper"):
         for key in ("adc", "adc+sc"):
-            config = table1_rows.kfgs_config(table1_rows.ROWS[key], key, preset, None, 0)
+            config = table1_rows.kfgs_config(table1_rows.ROWS[key], key, preset, None)
             assert config.codebook == PaperCodebook()
-            assert config.autoencoder == AutoencoderConfig.paper()
-    own = table1_rows.kfgs_config(table1_rows.ROWS["own-adc+sc"], "own-adc+sc", "quick", None, 0)
+            assert config.autoencoder == (None if key == "adc" else AutoencoderConfig.paper())
+    own = table1_rows.kfgs_config(table1_rows.ROWS["own-adc+sc"], "own-adc+sc", "quick", None)
     assert (own.codebook, own.autoencoder) == (GrownCodebook(), AutoencoderConfig())
 
 
