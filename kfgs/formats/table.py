@@ -77,7 +77,7 @@ def formats() -> dict[str, ModuleType]:
 
 
 def find_format(path: str | Path) -> ModuleType:
-    """The format of a file: by its content, or by its name if the content has no mark (`.splat`).
+    """The format of a file: by its content, or by its name if the content has no mark (``.splat``).
 
     Of the output folder of a training program it is the format of its newest splat.
 
