@@ -10,7 +10,7 @@ import torch
 
 from kfgs.cameras import Camera
 from kfgs.fields import Autoencoded, Codewords, Linear, Seen, SemanticField
-from kfgs.fields.checkpoint import Checkpoint, write_checkpoint
+from kfgs.fields.checkpoint import write_checkpoint
 from kfgs.formats import write_splats
 from kfgs.gaussians import Gaussians
 from kfgs.labels import (
@@ -102,9 +102,9 @@ def _parts(place: Path, add: Add) -> None:
     add("codebook", place, "codebook.safetensors")
     add("autoencoder", place, "autoencoder.safetensors")
     add("index maps", place, "maps.npz")
-    checkpoint = Checkpoint({"a": torch.ones(3, 2)}, {"step": 4, "history": [1.0, 2.0]})
-    write_checkpoint(place / "checkpoint.safetensors", checkpoint, {"config": "x"})
-    add("training", place, "checkpoint.safetensors")
+    state = {"identity": {"config": "x"}, "a": torch.ones(3, 2), "step": 4, "history": [1.0, 2.0]}
+    write_checkpoint(place / "checkpoint.pt", state)
+    add("training", place, "checkpoint.pt")
     run = place / "run/stages/uplift-0123"
     run.mkdir(parents=True)
     (run / "stage.json").write_text(json.dumps({"name": "uplift", "seconds": 1.5, "inputs": {}}))
@@ -114,9 +114,9 @@ def _parts(place: Path, add: Add) -> None:
 def _edits(place: Path, add: Add) -> None:
     place.mkdir()
     write_splats(cloud(5), place / "lamp.ply")
-    plant = OfClass("plant") - InBox((0, 0, 0), (0.1, 0.1, 0.1))
+    corner = InBox((0, 0, 0), (0.1, 0.1, 0.1))
     edits = EditList([
-        Recolor(plant, "#c04040", "hue"), Opacity("wall", 0.3), Move("chair", (0.5, 0, 0), ("z", 30), 1.5),
+        Recolor(["plant", corner], "#c04040", "hue"), Opacity("wall", 0.3), Move("chair", (0.5, 0, 0), ("z", 30), 1.5),
         Duplicate(OfClass("chair", 0, 10.0), (1, 0, 0)), Remove("wall", grow=0.01), Insert(place / "lamp.ply"),
     ])  # fmt: skip
     edits.undo().save(place / "a.edits.json")

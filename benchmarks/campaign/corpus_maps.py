@@ -30,11 +30,6 @@ def make(folder: Path, add: Add) -> None:
     place.mkdir()
     save_file({"map": torch.from_numpy(MAP)}, place / "a.safetensors")
     add("maps", place, "a.safetensors", opens=".")
-    place = folder / "langsplat"
-    place.mkdir()
-    np.save(place / "a_s.npy", np.arange(4 * 6 * 8, dtype=np.float32).reshape(4, 6, 8) % 4 - 1)
-    np.save(place / "a_f.npy", MAP.reshape(12, 5)[:4].astype(np.float32))
-    add("maps", place, "a_s.npy", "a_f.npy", opens=".")
     _written(folder / "written", add)
     _checkpoints(folder / "checkpoints", add)
 

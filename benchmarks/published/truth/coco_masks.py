@@ -31,7 +31,10 @@ def load_coco_masks(path: str | Path) -> MaskTruth:
         parts: dict[int, list[MaskAndBoxes]] = {}
         for category, mask, annotation in masks_of(path, names, picture):
             if category not in void:
-                x, y, width, height = annotation["bbox"]
+                given = annotation.get("bbox")
+                if not isinstance(given, list) or [type(one) in (int, float) for one in given] != [True] * 4:
+                    raise ValueError(f"{path}: expected a bbox [x, y, width, height] of each annotation, got {given!r}")
+                x, y, width, height = given
                 box = torch.tensor([[x, y, x + width, y + height]], dtype=torch.float32)
                 parts.setdefault(category, []).append(MaskAndBoxes(mask, box))
         return {names[category]: _union(each) for category, each in parts.items()}
