@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import kfgs
-from kfgs import cli
+from kfgs import cli, labels
 
 EXTENSIONS = Path(kfgs.__file__).parents[1] / "docs" / "_ext"
 if not EXTENSIONS.is_dir():
@@ -82,7 +82,7 @@ def test_shapes_beside_arguments_are_read_and_other_comments_are_not():
         return means
 
     assert shapes(scored) == ["``means`` [N, 3]", "``mask`` [N] bool", "returns [N]"]
-    assert shapes(kfgs.labels.nearest_labels)[1].startswith("``src_labels`` [S] int64")
+    assert shapes(labels.nearest_labels)[1].startswith("``src_labels`` [S] int64")
     assert shapes(inspect.signature) == []
 
 
@@ -90,7 +90,7 @@ def test_a_comment_beside_a_whole_signature_is_not_given_to_each_argument():
     shapes = load("kfgs_shapes").shapes_of
     assert shapes(kfgs.SemanticField.cosines) == ["[M, D] -> [N, M]"]
     assert shapes(kfgs.SemanticField.feature_map) == ["returns [H, W, D]"]
-    assert shapes(kfgs.labels.OrientedBox.around) == ["``points`` [N, 3]"]
+    assert shapes(labels.OrientedBox.around) == ["``points`` [N, 3]"]
 
 
 def test_comments_beside_the_fields_of_a_class_are_read():
