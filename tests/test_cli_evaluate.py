@@ -58,9 +58,12 @@ def scored(capsys, *words):
     return capsys.readouterr().out.strip()
 
 
-def test_a_run_remembers_its_scene_and_its_score_is_the_protocols(run, words, asked, tmp_path, capsys):
+def test_a_run_remembers_its_scene_and_its_score_is_the_protocols(run, words, asked, tmp_path, capsys, monkeypatch):
+    typed = ["kfgs", "evaluate", str(run), "--out", str(tmp_path / "s.json")]
+    monkeypatch.setattr("sys.argv", typed)
     capsys.readouterr()
-    said = scored(capsys, run, "--out", tmp_path / "s.json").splitlines()[0]
+    assert main() == 0
+    said = capsys.readouterr().out.splitlines()[0]
     expected = KfgsPooled().score(
         FieldMethod(SemanticField.load(run / "field.kfgs")), *asked, lambda _: words.embeddings
     )
@@ -69,7 +72,7 @@ def test_a_run_remembers_its_scene_and_its_score_is_the_protocols(run, words, as
     assert kept["scores"] == dict(expected.scores)
     assert (kept["protocol"], kept["options"]) == ("kfgs-pooled/1", {"level": 0, "labels": "own"})
     assert kept["machine"]
-    assert kept["command"].startswith("kfgs ")
+    assert kept["command"] == " ".join(typed)
 
 
 @pytest.mark.parametrize(

@@ -104,13 +104,13 @@ def _cut(source: Path, out: Path, count: int, splat: str | Path | None, latents:
         raise SceneError(f"scene: expected a folder with a COLMAP model, got {source}; make one with `kfgs sfm`")
     maps = maps_of_views(whole, whole.views("train"), FeatureFolder(source / "features").of(whole, "train"))
     if isinstance(latents, LinearLatents) and latents.dim != maps[0].shape[2]:
-        channels = maps[0].shape[2]
-        raise ValueError(f"latents: expected those of features with {channels} channels, got {latents.dim}")
+        raise ValueError(f"latents: expected those of features with {maps[0].shape[2]} channels, got {latents.dim}")
     blocks, training = partition(read_whole_model(model), count), set(whole.views("train"))
     unseen = next((block.name for block in blocks if not training & _views_of(whole, block)), None)
     if unseen is not None:
         raise SceneError(f"{unseen}: expected training views that see it, got none; ask for fewer blocks than {count}")
-    cloud = None if splat is None else read_splats(splat)
+    todo = [block for block in blocks if not (out / block.name / BLOCK).is_file()]
+    cloud = read_splats(splat) if todo and splat is not None else None
     facts = {
         "format": "kfgs.blocks/2",
         "scene": os.path.relpath(real_path(source), real_path(out)),
@@ -124,8 +124,8 @@ def _cut(source: Path, out: Path, count: int, splat: str | Path | None, latents:
         raise ValueError(f"out: expected a new folder, or one with these blocks, got {out} with others; choose another")
     if not (out / LATENTS).is_file():
         (sample_latents(maps, count=latents) if isinstance(latents, int) else latents).save(out / LATENTS)
-    todo = [block for block in blocks if not (out / block.name / BLOCK).is_file()]
-    write_parts(model, {out / block.name / "sparse/0": block.views for block in todo})
+    if todo:
+        write_parts(model, {out / block.name / "sparse/0": block.views for block in todo})
     for block in todo:
         _write_block(out / block.name, block, whole, cloud)
     return [block.name for block in blocks]

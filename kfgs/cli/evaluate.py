@@ -47,6 +47,7 @@ def evaluate(
     from .._files import write_json
     from ..fields import recall_scene
     from ..pipeline import evaluate as evaluate_result
+    from ..pipeline import open_question
 
     if out is not None:
         check_output("out", out, "a file")
@@ -62,15 +63,10 @@ def evaluate(
     rows = (scene / "text.npy").is_file() or (scene / "text.safetensors").is_file()
     if classes.text is not None or rows or (loaded is not None and loaded.classes is not None):
         words = replace(classes, scene=scene).load_classes(loaded)
-    report = evaluate_result(
-        field,
-        scene,
-        protocol,
-        encode=words,
-        labels=labels,
-        command=shlex.join(["kfgs", *sys.argv[1:]]),
-        truth=truth,
-    )
+    question = open_question(scene, protocol, truth=truth)
+    colors = getattr(question.protocol, "of_colors", False)
+    result, command = field if colors or loaded is None else loaded, shlex.join(["kfgs", *sys.argv[1:]])
+    report = evaluate_result(result, question, encode=words, labels=labels, command=command)
     if out is not None:  # before anything is printed, whose reader may have ended
         write_json(out, report.to_json())
     say(report.text if long else "\n".join([str(report), *(f"note: {note}" for note in report.notes)]))

@@ -59,7 +59,7 @@ def _parts(folders: set[Path]) -> Iterator[Path]:
         if is_scene(scene):
             root = scene if scene.is_dir() else scene.parent
             yield from (root / name for name in ("features", "sparse", "labels", "labels_scored"))
-            yield from (folder for folder in picture_folders(scene, None) if folder != root)
+            yield from (folder for folder in picture_folders(scene) if folder != root)
 
 
 def check_target(name: str, target: Path) -> None:

@@ -217,7 +217,7 @@ def _show(word: str, meaning: Any, semantic: Any, colors: Any) -> Any:
     if word == "features":
         if semantic.features is None:
             raise ValueError("show: expected a field for features, got a splat without; leave it out")
-        return show_cloud(semantic, color_by="feature", feature_colors=meaning.feature_colors())
+        return show_cloud(semantic, color_by="feature")
     if word.startswith("query="):
         asked = meaning.ask(word.removeprefix("query="))
         say(f"{asked.words}: {len(asked.selection)} of {len(meaning.gaussians)} Gaussians, {asked.selection.summary}")

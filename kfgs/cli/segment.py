@@ -89,6 +89,7 @@ def segment(
 
 def _segment_path(field: Path, out: Path, path: Any, frames: int | None, coco: bool, classes: Classes) -> list[Path]:
     """Segment the cameras of a path, and with --coco render the colours that they see; name what was written."""
+    from ..fields.store import find_field
     from ..pipeline import segment_cameras, write_coco
     from ..pipeline.segment import picture_names
     from ..viz import show_cloud
@@ -105,7 +106,7 @@ def _segment_path(field: Path, out: Path, path: Any, frames: int | None, coco: b
     maps = segment_cameras(loaded, list(walk.values()), label_set, out, progress=True)
     written = [out / "predicted", out / "colored"]
     if coco:
-        colors = open_colors(field, None, loaded)
+        colors = open_colors(find_field(field), None, loaded)
         show = None if colors is None else show_cloud(colors, color_by="rgb")
         if show is None:
             say(

@@ -163,10 +163,10 @@ def edit(
     if scene is not None and before.sh is None:
         raise ValueError(f"scene: expected a splat with colours to show in it, got {before!r}; leave --scene out")
     cameras = [] if scene is None else load_scene(scene).undistorted().cameras
-    after = _apply(listed, before, [words for words, _ in asked])
+    after = _apply(EditList(tuple(change for _, change in asked)), start, [words for words, _ in asked])
     shown = []
     if cameras:
-        states = list(accumulate(listed, lambda cloud, change: change.apply(cloud), initial=before))[1:-1]
+        states = list(accumulate(list(listed)[:-1], lambda cloud, change: change.apply(cloud), initial=before))[1:]
         shown = [cameras[i] for i in views_of_change(before, after, cameras, PICTURES, between=states)]
     written = write_splats(after, out)
     paths = [*written.paths, listed.save(saved)]
@@ -185,16 +185,13 @@ def edit(
 
 
 def _apply(edits: Any, splats: Any, asked: list[str]) -> Any:
-    """Apply edits, of which the last ones come from options: the error of one quotes the option's words."""
+    """Apply the edits of options: the error of one quotes the option's words."""
     from ..labels.edits.edit_list import EditError
 
     try:
         return edits.apply(splats)
     except EditError as error:
-        option = error.index - (len(edits) - len(asked))
-        if option < 0:
-            raise
-        raise ValueError(f"{asked[option]}: {error.why}") from error
+        raise ValueError(f"{asked[error.index]}: {error.why}") from error
 
 
 def convert(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from .._files import Names
 from ..cameras import undistort_labels
 from ..scenes import Scene
 from ..scenes.files import some
+from ..scenes.scene import as_taken
 from .find import find_labels
 from .label_pictures import load_label_map
 from .method import View
@@ -94,7 +94,7 @@ def sized_view(scene: Scene, i: int, size: tuple[int, int]) -> View:
 
 def labels_of_view(scene: Scene, i: int, labels: Tensor) -> Tensor:  # [h, w] int64
     """True labels of a view's picture as the view is: without lens, and void (-1) where a pixel does not count."""
-    taken = scene if scene.lenses is None else replace(scene, cameras=scene.lenses, lenses=None)
+    taken = as_taken(scene)
     size = int(labels.shape[0]), int(labels.shape[1])
     counted = taken.counted(i, size)
     labels = labels if counted is None else labels.where(counted, -1)

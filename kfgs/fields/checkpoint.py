@@ -22,6 +22,15 @@ from .params import GaussianParams
 from .training import Training
 
 
+def digest_tensors(*tensors: Tensor) -> str:
+    """SHA-256 over shapes, dtypes and values, in hexadecimal."""
+    digest = hashlib.sha256()
+    for tensor in tensors:
+        digest.update(f"{tuple(tensor.shape)}{tensor.dtype}".encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
 def identify_fit(
     params: GaussianParams,
     cameras: Sequence[Camera],
@@ -31,23 +40,15 @@ def identify_fit(
     generator: torch.Generator,
 ) -> dict[str, str]:
     """A digest of each input of a fit. Of the targets, only their number and the first map count."""
-
-    def digest(*tensors: Tensor) -> str:
-        whole = hashlib.sha256()
-        for tensor in tensors:
-            whole.update(f"{tuple(tensor.shape)} {tensor.dtype}".encode())
-            whole.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-        return whole.hexdigest()
-
     views = [tensor for camera in cameras for tensor in (camera.viewmat, camera.K)]
     facts = [(camera.size, camera.near) for camera in cameras]
     options = {name: value for name, value in asdict(training).items() if name != "checkpoint_every"}
     return {
-        "params": digest(*params.to_tensors().values()) + digest_value([params.origin, params.antialiased]),
-        "cameras": digest(*views) + digest_value(facts),
-        "targets": digest(as_tensor("targets[0]", targets[0], floating=True)) + str(len(targets)),
+        "params": digest_tensors(*params.to_tensors().values()) + digest_value([params.origin, params.antialiased]),
+        "cameras": digest_tensors(*views) + digest_value(facts),
+        "targets": digest_tensors(as_tensor("targets[0]", targets[0], floating=True)) + str(len(targets)),
         "training": digest_value(options),
-        "generator": digest(generator.get_state()),
+        "generator": digest_tensors(generator.get_state()),
         "loss": getattr(loss, "__qualname__", None) or repr(loss),
     }
 

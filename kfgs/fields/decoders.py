@@ -120,11 +120,11 @@ class Linear(Decoder):
 
     @property
     def dim(self) -> int:
-        return int(self.latents.basis.shape[0])
+        return self.latents.dim
 
     @property
     def latent(self) -> int:
-        return int(self.latents.basis.shape[1])
+        return self.latents.latent
 
     @property
     def parameters(self) -> int:
@@ -134,11 +134,11 @@ class Linear(Decoder):
         return self.latents.decode(latents)
 
     def cosines(self, latents: Tensor, rows: Tensor) -> Tensor:
-        return unit_rows(latents) @ (rows @ self.latents.basis.to(rows)).T
+        return self.latents.cosines(latents, rows)
 
     def votes(self, latents: Tensor, rows: Tensor) -> Votes | None:
         if self.paper:
-            return similarity_votes(latents, rows @ self.latents.basis.to(rows))
+            return similarity_votes(latents, self.latents.encode(rows))
         return divide_votes(self.cosines(latents, rows), latents.any(dim=1))
 
     def to_tensors(self) -> dict[str, Tensor]:
@@ -261,9 +261,9 @@ def _quantised_cosines(decoder: Codewords | Autoencoded, latents: Tensor, rows: 
 def _best(pixels: Tensor, cosines: Tensor, top: int, covered: Tensor | None) -> tuple[Tensor, Tensor]:
     """The `top` largest of the cosines [n, C] of pixels [..., d]; ties go to the lowest class."""
     scores, labels = cosines.sort(dim=1, descending=True, stable=True)
-    empty = (
-        (row_norms(pixels) <= EPS)[..., None] if covered is None else (~covered | (row_norms(pixels) <= EPS))[..., None]
-    )
+    empty = (row_norms(pixels) <= EPS)[..., None]
+    if covered is not None:
+        empty = empty | ~covered[..., None]
     shape = *pixels.shape[:-1], top
     return labels[:, :top].reshape(shape).masked_fill(empty, -1), scores[:, :top].reshape(shape).masked_fill(empty, 0)
 

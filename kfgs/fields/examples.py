@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -106,6 +107,8 @@ def read_examples(path: str | Path) -> dict[str, list[Example]]:
     """
     content, folder = read_json(path), as_path(path).parent
 
+    masks_of = functools.cache(lambda name: read_json(folder / name))  # one file may have the masks of many examples
+
     def read(entry: dict[str, Any]) -> Example:
         if "gaussians" in entry:
             return Picked([int(index) for index in entry["gaussians"]])
@@ -116,7 +119,7 @@ def read_examples(path: str | Path) -> dict[str, list[Example]]:
             x0, y0, x1, y1 = map(float, entry["box"])
             return Box(view, (x0, y0, x1, y1))
         if "masks" in entry:
-            masks = read_json(folder / entry["masks"])
+            masks = masks_of(entry["masks"])
             entry = (masks["annotations"] if isinstance(masks, dict) else masks)[entry["index"]]
         return Mask(view, decode_rle(entry["segmentation"]))
 

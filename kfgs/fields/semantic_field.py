@@ -92,7 +92,12 @@ class SemanticField:
     @property
     def known(self) -> Tensor:  # [N] bool
         """Which Gaussians a training view has shown; nothing is known about the others, so they have no class."""
-        return (self if self.fused is None else self.fused).features.any(dim=1)
+        return self._source.features.any(dim=1)
+
+    @property
+    def _source(self) -> SemanticField:
+        """The field that answers for the Gaussians: the fused one, if there is one."""
+        return self if self.fused is None else self.fused
 
     @property
     def paper(self) -> SemanticField:
@@ -164,15 +169,14 @@ class SemanticField:
         """
         rows = as_tensor("rows", rows, floating=True)
         check_rows("rows", rows, ("M",), self.dim)
-        source = self if self.fused is None else self.fused
+        source = self._source
         with torch.no_grad():
             return source.decoder.cosines(source.features, unit_embeddings(rows, "rows").to(source.features))
 
     def own_features(self, rows: Tensor) -> Tensor:  # [n] int64 -> [n, D]
         """The features of some Gaussians, all-zero if unknown. Rows and errors: see `Gaussians.select`."""
-        source = self if self.fused is None else self.fused
-        rows = as_rows("rows", rows, len(self)).to(self.features.device)
-        return source.decode(source.features[rows]) * source.known[rows, None]
+        latents = self._source.features[as_rows("rows", rows, len(self)).to(self.features.device)]
+        return self._source.decode(latents) * latents.any(dim=1)[:, None]
 
     def classify(self, classes: Classes | None = None) -> Classification:
         """The class of each Gaussian by max-similarity (Sec. 3.4), and its cosine with that class.
@@ -221,7 +225,7 @@ class SemanticField:
         """
         if score == "cosine" and isinstance(negatives, str) and negatives == "auto":
             negatives = "none"
-        source, classes = self if self.fused is None else self.fused, self.classes if classes is None else classes
+        source, classes = self._source, self.classes if classes is None else classes
         question = make_question(target, classes, negatives, source.decoder.dim, self.info)
         latents, rows = source.features, question.rows
         named = isinstance(target, str) and isinstance(negatives, str)  # the rows of a label set are checked

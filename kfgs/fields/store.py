@@ -38,8 +38,7 @@ WHAT, AGAIN = "a field of kfgs", "copy it again, or fit the field again"
 
 def find_field(path: str | Path) -> Path | None:
     """The file of the field at a path: itself, or `field.kfgs` in a folder; None if there is none."""
-    path = as_path(path)
-    path = path / NAME if path.is_dir() else path
+    path = _field_file(path)
     try:
         with safe_open(path, framework="pt") as file:
             return path if (file.metadata() or {}).get("kfgs") == KIND else None
@@ -77,14 +76,6 @@ def save_field(path: str | Path, parts: Mapping[str, Any], precision: Precision 
     tensors[ABOUT] = torch.frombuffer(bytearray(packed), dtype=torch.uint8)
     with atomic_path(path) as temporary:
         save_tensors(temporary, tensors, {"kfgs": KIND, "version": VERSION})
-
-
-def holds_field(path: Path, parts: Mapping[str, Any]) -> bool:
-    """Whether a file holds already what `save_field` would write to it, without packing."""
-    try:
-        return bool(read_description(path)["sha256"] == _digest(*_to_tensors(path, parts)))
-    except (OSError, ValueError):
-        return False
 
 
 def load_field(path: str | Path) -> tuple[dict[str, Any], Any, dict[str, Any] | None]:

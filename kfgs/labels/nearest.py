@@ -123,8 +123,7 @@ class Sources:
     def __init__(self, points: Array, labels: Array) -> None:
         self.first, group = distinct(points)
         """Which of `points` each source is, ascending."""
-        self.points = points[self.first]
-        self.tree = cKDTree(self.points)
+        self.tree = cKDTree(points[self.first])
         self.labels = labels[self.first]
         self.mixed = np.zeros(len(self.first), dtype=bool)  # positions with sources of different labels
         self.mixed[group[labels != self.labels[group]]] = True

@@ -152,8 +152,7 @@ def _view_shares(gaussians: Gaussians, parts: list[Tensor], cameras: Sequence[Ca
     """
     shares = torch.zeros(len(cameras), len(parts)).to(gaussians.means)
     for c, camera in enumerate(cameras if parts else ()):
-        scale = min(1.0, LONGEST / max(camera.size))
-        small = camera.resized(*(max(1, round(side * scale)) for side in camera.size))
+        small = camera.fitted(LONGEST)
         with torch.no_grad():
             index, _, weights = sum_pixels(gaussians, small, torch.ones(*small.size, 1).to(shares), engine=engine)
         whole = torch.zeros(len(gaussians)).to(shares).index_add_(0, index, weights.to(shares))

@@ -16,10 +16,11 @@ from .._files import check_output
 from .._progress import Progress, as_progress
 from ..cameras import Camera, resize_map
 from ..fields import ColorLoss, Densify, FieldFit, GaussianParams, Rates, Training, fit_field
+from ..fields.checkpoint import digest_tensors
 from ..formats import write_splats
 from ..gaussians import Gaussians
 from ..scenes import Scene
-from .stages import Run, Stage, digest_pictures, digest_scene, digest_tensors, stage_generator
+from .stages import Run, Stage, digest_pictures, digest_scene, stage_generator
 from .train import field_stage, stage_params, training_device, training_views, with_extent, with_points
 
 

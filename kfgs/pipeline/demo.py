@@ -96,8 +96,7 @@ def run(
     say(f"unseen views: {scores}")
     say(f"the 2-D network alone, on the same views: {teacher.miou}")
 
-    labels, cosines = field.classify(classes)
-    gaussians = field.gaussians.replace(labels=labels, scores=cosines, names=classes.names)
+    gaussians = field.label(classes)
     written = save_labelled(out / "gaussians.ply", gaussians, rule="fused features; score = cosine")
     surface = _label_surface(gaussians, folder, out / "surface.ply")
     say(f"surface points: {surface}")

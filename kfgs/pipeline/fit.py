@@ -36,24 +36,29 @@ from ..fields import (
     scene_classes,
     uplift_maps,
 )
+from ..fields.checkpoint import digest_tensors
 from ..fields.store import NAME, check_place
 from ..formats import read_splats, write_splats
 from ..formats.table import splat_file_of
 from ..gaussians import Gaussians
 from ..quant import (
     Autoencoder,
+    AutoencoderConfig,
     Codebook,
+    GrownCodebook,
     IndexMaps,
     LatentMaps,
+    PaperCodebook,
     fit_autoencoder,
     fit_codebook,
     quantize_maps,
 )
 from ..scenes import FeatureFolder, Scene, extract_features
+from ..scenes.scene import as_taken
 from .color import color_stage, find_color
-from .maps import KnownFeatures, Maps, as_maps, as_taken, describe_maps, map_shape, maps_of_views
+from .maps import KnownFeatures, Maps, as_maps, describe_maps, map_shape, maps_of_views
 from .methods import Paper, Uplift
-from .stages import Run, Stage, digest_cameras, digest_scene, digest_shape, digest_tensors, stage_generator
+from .stages import Run, Stage, digest_cameras, digest_scene, digest_shape, stage_generator
 from .train import field_stage, training_device, training_views, with_extent, with_points
 
 REPORT = ("report.html", "preview.png", "codebook.png", "field.png")  # what `write_run_report` writes
@@ -244,11 +249,11 @@ def _paper(job: _Job, method: Paper) -> tuple[SemanticField, dict[str, Any]]:
     decoder: Decoder = Identity(map_shape(job.maps)[-1])
     inputs: dict[str, Any] = {"features": job.features}
     if method.codebook is not None:
-        codebook, book = _codebook(job, method)
+        codebook, book = _codebook(job, method.codebook)
         index_maps, indexed = _index_maps(job, codebook, book)
         inputs, latents, decoder = {"index_maps": indexed.key}, codebook.codewords, Codewords(codebook)
         if method.autoencoder is not None:
-            autoencoder, coder = _autoencoder(job, method, codebook, book)
+            autoencoder, coder = _autoencoder(job, method.autoencoder, codebook, book)
             inputs["autoencoder"], decoder = coder.key, Autoencoded(codebook, autoencoder)
             with torch.no_grad():
                 latents = autoencoder.encode(codebook.codewords)
@@ -263,10 +268,8 @@ def _paper(job: _Job, method: Paper) -> tuple[SemanticField, dict[str, Any]]:
     return SemanticField.load(answers.folder), {"method": "paper", "steps": {"field": method.training.steps}}
 
 
-def _codebook(job: _Job, method: Paper) -> tuple[Codebook, Stage]:
+def _codebook(job: _Job, options: PaperCodebook | GrownCodebook) -> tuple[Codebook, Stage]:
     """Adaptive Data Compression, Sec. 3.3.1: the codebook S."""
-    options = method.codebook
-    assert options is not None
 
     def make(folder: Path) -> None:
         made = fit_codebook(job.maps, options, generator=job.generator("codebook"), progress=job.progress)
@@ -290,10 +293,8 @@ def _index_maps(job: _Job, codebook: Codebook, book: Stage) -> tuple[IndexMaps, 
     return IndexMaps.load(stage.folder / "index_maps.safetensors"), stage
 
 
-def _autoencoder(job: _Job, method: Paper, codebook: Codebook, book: Stage) -> tuple[Autoencoder, Stage]:
+def _autoencoder(job: _Job, options: AutoencoderConfig, codebook: Codebook, book: Stage) -> tuple[Autoencoder, Stage]:
     """Semantic Compression, Sec. 3.3.2: encoder E and decoder Psi."""
-    options = method.autoencoder
-    assert options is not None
 
     def make(folder: Path) -> None:
         made = fit_autoencoder(codebook, options, generator=job.generator("autoencoder"), progress=job.progress)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -12,12 +11,14 @@ import torch
 from torch import Tensor
 
 from .._check import as_tensor
-from .._files import digest_file, digest_value
+from .._files import digest_value
 from .._rows import EPS, row_norms
 from ..cameras import undistort
+from ..fields.checkpoint import digest_tensors
 from ..scenes import Scene
 from ..scenes.files import has_alpha
-from .stages import Run, describe_lens, digest_tensors
+from ..scenes.scene import as_taken
+from .stages import Run, describe_lens
 
 
 class Maps(Protocol):
@@ -85,11 +86,14 @@ class ViewMaps:
         """The digests of the original maps; None if unknown."""
         return _known_digests(self.maps)
 
-    def describe(self, i: int) -> list[Any] | None:
-        """What decides the change of a map: the lens, and the files of mask and transparent picture; None: nothing."""
-        lens = describe_lens(self._taken.cameras[i]) if self._straighten else None
-        files = changing_files(self._taken, i)
-        return [lens, *map(digest_file, files)] if files else lens
+    def changes(self, run: Run) -> list[list[Any] | None]:
+        """What decides the change of each map: the lens, and the files of mask and transparent picture; None: nothing."""
+        lenses = [describe_lens(camera) if self._straighten else None for camera in self._taken.cameras]
+        files = [changing_files(self._taken, i) for i in range(len(self))]
+        known = iter(run.digests([file for each in files for file in each]))
+        return [
+            [lens, *(next(known)[1] for _ in each)] if each else lens for lens, each in zip(lenses, files, strict=True)
+        ]
 
     def __getitem__(self, i: int, /) -> Tensor:  # [h, w, D]
         features = self.maps[i]
@@ -144,11 +148,6 @@ def maps_of_views(scene: Scene, views: Sequence[int], maps: Maps, *, undistorted
     return ViewMaps(maps, as_taken(chosen) if lens else chosen, lens) if changed else maps
 
 
-def as_taken(scene: Scene) -> Scene:
-    """The scene with its lenses."""
-    return scene if scene.lenses is None else replace(scene, cameras=scene.lenses, lenses=None)
-
-
 def changing_files(scene: Scene, i: int) -> list[Path]:
     """The mask of a view, and its picture if that may have transparent pixels."""
     mask, picture = None if scene.masks is None else scene.masks[i], scene.image_paths[i]
@@ -158,7 +157,7 @@ def changing_files(scene: Scene, i: int) -> list[Path]:
 def describe_maps(run: Run, maps: Maps) -> dict[str, Any]:
     """What decides the maps, as JSON: their digests (of files only if the maps do not know them), and how they are changed."""
     known = _known_digests(maps)
-    changes = [maps.describe(i) for i in range(len(maps))] if isinstance(maps, ViewMaps) else []
+    changes = maps.changes(run) if isinstance(maps, ViewMaps) else []
     changed = any(change is not None for change in changes)
     files = run.digests(maps.files) if known is None else known
     return {"files": files, "changes": digest_value(changes) if changed else None}

@@ -24,6 +24,7 @@ from .._compiling import say_compiling
 from .._files import atomic_folder, digest_file, digest_value, locked, read_json, real_path, write_json
 from .._origin import Origin
 from ..cameras import Camera
+from ..fields.checkpoint import digest_tensors
 from ..gaussians import Gaussians
 from ..scenes import Scene
 
@@ -146,15 +147,6 @@ def stage_generator(seed: int, purpose: str) -> torch.Generator:
     """A separate generator for each stage, so that reusing a stage does not change later ones."""
     digest = hashlib.sha256(f"{purpose}:{seed}".encode()).digest()
     return torch.Generator().manual_seed(int.from_bytes(digest[:7], "little"))
-
-
-def digest_tensors(*tensors: Tensor) -> str:
-    """SHA-256 over shapes, dtypes and values, in hexadecimal."""
-    digest = hashlib.sha256()
-    for tensor in tensors:
-        digest.update(f"{tuple(tensor.shape)}{tensor.dtype}".encode())
-        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
 
 
 def digest_shape(gaussians: Gaussians) -> str:

@@ -19,6 +19,7 @@ from ..cameras.projection import project_points
 from ..fields import FieldFit, GaussianParams, Training
 from ..fields.training import check_extent
 from ..scenes import Scene, SceneError, SfmConfig, find_points
+from ..scenes.scene import check_is_scene
 from ..splat import available_engines
 from .stages import Run, Stage, digest_pictures, digest_scene, origin_tensors
 
@@ -51,8 +52,7 @@ def training_device(device: str | torch.device = "auto") -> torch.device:
 
 def training_views(scene: Scene, split: str) -> list[int]:
     """The views of a split, checked: see `check_scene`."""
-    if not isinstance(scene, Scene):
-        raise TypeError(f"scene: expected a Scene, got {type(scene).__name__}; load it with load_scene")
+    check_is_scene(scene)
     views = scene.views(split)
     check_scene(scene, views)
     return views

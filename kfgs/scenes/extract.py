@@ -37,8 +37,6 @@ class Picture:
 
 def pictures_of(scene: Scene, split: Split = "all") -> list[Picture]:
     """The pictures of some views of a scene (a split, `all`, or a list of view names or indices), as they are on disk."""
-    if not isinstance(scene, Scene):
-        raise TypeError(f"scene: expected a Scene, got {type(scene).__name__}; pass load_scene(folder)")
     chosen = scene.select(scene.views(split) if isinstance(split, str) else split)
     return [Picture(chosen.stem(i), chosen.image_paths[i], chosen.cameras[i].size) for i in range(len(chosen))]
 
@@ -166,9 +164,7 @@ def _check_pictures(pictures: Sequence[Picture]) -> list[Picture]:
         raise ValueError(f"pictures: expected at least one picture, each stem once, got {got}; rename them")
     for picture in pictures:
         if not _is_inside(picture.stem):
-            raise ValueError(
-                f"stem: expected a name within the folder of maps, got {picture.stem!r}; rename the picture"
-            )
+            raise ValueError(f"stem: expected a name within the folder, got {picture.stem!r}; rename the picture")
         if not picture.path.is_file():
             raise FileNotFoundError(f"{picture.path}: no such file; expected the picture of view {picture.stem!r}")
     return list(pictures)

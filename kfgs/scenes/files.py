@@ -81,10 +81,12 @@ def find_pictures(folder: Path, names: Iterable[str]) -> dict[str, Path]:
     lost = [name for name in wanted if name not in files]
     if lost:
         others = Names(name for name in list_images(folder) if name not in files)
+        taken = set(files.values())
         pairs = [(name, file) for name in lost if (file := others.find(name)) is not None]
         for name, file in sorted(pairs, key=lambda pair: folded_name(pair[0]) != folded_name(pair[1])):
-            if folder / file not in files.values():  # two names that are one file: the nearer one has it
+            if folder / file not in taken:  # two names that are one file: the nearer one has it
                 files[name] = folder / file
+                taken.add(folder / file)
     return files
 
 

@@ -31,11 +31,7 @@ SIGMAS = 4.0  # in the last fits, cameras farther off than this many median dist
 PAIRS = 5_000  # pairs of cameras tried for scale and place
 
 SAMPLE = 20_000  # points of each cloud that are measured
-REACH_SPACINGS, REACH_SIZE, REACH_MOST = (
-    2.0,
-    0.01,
-    0.025,
-)  # near: spacings of the other cloud; least and most shares of the size
+REACH_SPACINGS, REACH_SIZE, REACH_MOST = 2.0, 0.01, 0.025  # near: spacings, but between these shares of the size
 NEAR_SHARE, LEAST_SHARE = 0.8, 0.3
 """Shares of the points of the better and of the worse cloud that must be near. (Field and colour splat of Replica's room_0: 0.88;
 the toy room turned by half a turn: 0.63.) The second is low because one cloud may be a part of the other."""
@@ -269,8 +265,8 @@ def frames_agree(
     distances = _nearest(trees[1], a)[0], _nearest(trees[0], b)[0]
     near = float((distances[0] < to_dst).mean()), float((distances[1] < to_src).mean())
     drift = _drift(*(cloud[d < NEARBY * size] for cloud, d in zip((a, b), distances, strict=True)))
-    agree = max(near) >= NEAR_SHARE and min(near) >= LEAST_SHARE
-    agree = agree and drift <= (DRIFT_MOST if min(near) >= BOTH_NEAR else DRIFT_SIZE) * size
+    most = DRIFT_MOST if min(near) >= BOTH_NEAR else DRIFT_SIZE
+    agree = max(near) >= NEAR_SHARE and min(near) >= LEAST_SHARE and drift <= most * size
     summary = (
         f"the frames {'agree' if agree else 'disagree'}: {near[0]:.0%} and {near[1]:.0%} of the points lie within "
         f"{to_dst:.3g} and {to_src:.3g} of the other cloud (spacings {spacings[0]:.3g} and {spacings[1]:.3g}, size "

@@ -16,7 +16,7 @@ from .._files import as_path, atomic_folder, real_path
 from ..cameras.camera import Camera
 from .files import MASKS, SceneError
 from .pycolmap_import import quiet_pycolmap, scene_errors
-from .scene import Scene
+from .scene import Scene, check_is_scene
 from .sfm import SfmConfig, SfmReport, SfmRun, check_model_place
 
 MOST_VIEWS = 200  # that `find_points` looks at, evenly chosen: about 100,000 points of a room in some minutes
@@ -49,8 +49,7 @@ def find_points(
         SceneError: if there are fewer than 2 views, or pictures and poses do not fit together.
         ImportError: if pycolmap is not installed.
     """
-    if not isinstance(scene, Scene):
-        raise TypeError(f"scene: expected a Scene, got {type(scene).__name__}; pass load_scene(folder)")
+    check_is_scene(scene)
     count = len(scene) if most_views is None else min(most_views, len(scene))
     chosen = np.unique(np.linspace(0, len(scene) - 1, count).round().astype(int)).tolist() if count else []
     with tempfile.TemporaryDirectory(prefix="kfgs-points-") as scratch:
@@ -79,8 +78,7 @@ def write_known_poses(
         FileExistsError: if `out/sparse/0` holds a model, and `replace` is False; or if `out/images` holds other files.
         SceneError, ImportError: as for `find_points`.
     """
-    if not isinstance(scene, Scene):
-        raise TypeError(f"scene: expected a Scene, got {type(scene).__name__}; pass load_scene(folder)")
+    check_is_scene(scene)
     model = check_model_place(as_path(out), replace)
     out = model.parents[1]
     links = {out / "images" / c.name: real_path(path) for c, path in zip(scene.cameras, scene.image_paths, strict=True)}

@@ -24,11 +24,11 @@ from .depth import points_from_depth
 from .files import MAX_NUMBER, MAX_SIDE, SceneError, list_images, picture_size, read_scene_json, some
 from .posed import Matrix, PosedPicture, read_numbers, read_points, scene_of_poses
 from .scene import Scene
+from .transforms_frame import FLIP
 
 AGAIN = "copy it again from the data set"
 NOWHERE = np.full((4, 4), np.nan)  # the pose of a view that is left out
 MESH = "_vh_clean_2.ply"  # of ScanNet
-_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def intrinsics(values: Sequence[Any], where: str) -> tuple[Matrix, tuple[int, int]]:
@@ -193,7 +193,7 @@ def load_polycam(folder: Path, _: Path | None = None) -> Scene:
         pose = np.eye(4)
         pose[:3] = np.array(numbers[6:], np.float64).reshape(3, 4)
         lens = intrinsics(numbers[:6], str(file))
-        views.append(PosedPicture(name, images / name, pose @ _OPENGL, str(file), lens))
+        views.append(PosedPicture(name, images / name, pose @ FLIP, str(file), lens))
     if not views:
         raise SceneError(
             f"{cameras}: expected a file NAME.json for each of {some(names, 3) or 'no pictures'}, got none"
@@ -225,17 +225,17 @@ def load_inria(folder: Path, images: Path | None = None) -> Scene:
     place = Path(source[1].replace("\\", "/")) if source else folder
     inner = name[1] if name and name[1] else "images"
     tried = [place / inner, folder / place / inner, folder.parent / place.name / inner, folder / inner]
-    tried = (
-        [images] if images is not None else [*tried, *([place] if (place / "transforms_train.json").is_file() else [])]
-    )
-    pictures = next((place for place in tried if place.is_dir() and list_images(place)), None)
-    if pictures is None:
+    if (place / "transforms_train.json").is_file():
+        tried.append(place)
+    tried = tried if images is None else [images]
+    pictures, files = next(((place, files) for place in tried if (files := list_images(place))), (folder, []))
+    if not files:
         listed = ", ".join(map(str, dict.fromkeys(tried)))
         raise FileNotFoundError(
             f"{folder}: expected the pictures of {path.name} in one of {listed}, found none; "
             "name their folder (images=, or --images)"
         )
-    known = Names(list_images(pictures), bare=True)
+    known = Names(files, bare=True)
     views, missing = list[PosedPicture](), list[str]()
     for i, entry in enumerate(entries):
         found, where = known.find(str(entry.get("img_name", ""))), f"{path}, camera {i}"

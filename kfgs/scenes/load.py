@@ -154,16 +154,14 @@ def _with_masks(scene: Scene, root: Path) -> Scene:
     return scene
 
 
-def picture_folders(path: str | Path, images: str | Path | None = None) -> list[Path]:
+def picture_folders(path: str | Path) -> list[Path]:
     """The folders, but for the scene folder itself, from which `load_scene` reads pictures; empty if there is no scene."""
     path = as_path(path)
     root = path if path.is_dir() else path.parent
     try:
-        given, model = _given_folder(root, images), find_model(path)
-        if model is not None:
-            found = {given if given is not None else find_images(path, model)}
-        else:
-            found = {file.parent for file in _load_views(path, given).image_paths}
+        model = find_model(path)
+        files = [] if model is not None else _load_views(path, None).image_paths
+        found = {find_images(path, model)} if model is not None else {file.parent for file in files}
     except (OSError, ValueError):
         return []
     return sorted(folder for folder in found if real_path(folder) not in (real_path(root), *real_path(root).parents))

@@ -71,23 +71,22 @@ def folder_masks(
     """
     places = [pictures] if pictures == root else [pictures, pictures.parent, real_path(pictures).parent]
     places = [place / MASKS for place in (*([] if root is None else [root]), *places)]
-    folder = next((place for place in places if place.is_dir() and list_images(place)), None)
-    if folder is None:
+    folder, files = next(((place, files) for place in places if (files := list_images(place))), (pictures, []))
+    if not files:
         return None, []
-    files = list_images(folder)
     known = Names(files)
     heic = [f"{file_stem(name)}.heic" for name in names]  # photos are converted from HEIC
     chosen = [a or b for a, b in zip(known.find_each(names), known.find_each(heic), strict=True)]
     masks = [None if file is None else folder / file for file in chosen]
-    extra = [file for file in files if folder / file not in masks]
+    taken = set(chosen) - {None}
+    extra = [file for file in files if file not in taken]
     if len(extra) == len(files):
         example = f"{file_stem(names[0])}.png" if names else "NAME.png"
         none = (
             f"none of {len(files)} masks ({some(files, 3)}) has the name of one photo, such as {example}; none is used"
         )
         return None, [f"{folder}: {none}"]
-    used = len({mask for mask in masks if mask is not None})
-    note = f"masks: {used} of {len(names)} photos have one in {folder}; black is ignored"
+    note = f"masks: {len(taken)} of {len(names)} photos have one in {folder}; black is ignored"
     more = f"; {len(extra)} more have the name of no photo, or of several: {some(extra, 3)}"
     return masks, [note + (more if extra else "")]
 

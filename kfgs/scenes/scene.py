@@ -234,3 +234,14 @@ class Scene:
         if len(set(indices)) != len(indices):
             raise ValueError("which: expected each view once, got one twice; remove the repetition")
         return indices
+
+
+def check_is_scene(scene: object) -> None:
+    """Raise a TypeError for anything else than a scene, such as its folder."""
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene: expected a Scene, got {type(scene).__name__}; pass load_scene(folder)")
+
+
+def as_taken(scene: Scene) -> Scene:
+    """The scene with its lenses."""
+    return scene if scene.lenses is None else replace(scene, cameras=scene.lenses, lenses=None)

@@ -27,7 +27,7 @@ _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 _COEFFICIENTS = {"PINHOLE": (), "SIMPLE_PINHOLE": (), **dict.fromkeys(_FISHEYE, ("k1", "k2", "k3", "k4"))}
 _LENS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "k1", "k2", "k3", "k4", "p1", "p2")
 _CORRECT = "correct it, or take the frame out of the file"
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL axes to COLMAP's
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL axes to COLMAP's
 
 
 @dataclass(frozen=True)
@@ -137,4 +137,4 @@ class Frame:
             raise self.fail(
                 name, "0 0 0 1 as the last row", pose[3].tolist(), "transpose the matrix, if its last column is 0 0 0 1"
             )
-        return pose @ _FLIP
+        return pose @ FLIP

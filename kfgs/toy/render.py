@@ -27,7 +27,6 @@ class View(NamedTuple):
     image: NDArray[np.uint8]  # [H, W, 3]
     depth: Array  # [H, W] z-depth at the pixel's centre, metres
     labels: NDArray[np.uint8]  # [H, W] class index
-    solids: NDArray[np.int64]  # [H, W] index of the solid
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -133,4 +132,4 @@ def render(solids: Sequence[Solid], noise: Noise, camera: Camera) -> View:
     )
     color = color.reshape(camera.height, _SPLIT, camera.width, _SPLIT, 3).mean((1, 3))
     classes = np.array([CLASSES.index(solid.label) for solid in solids], np.uint8)
-    return View(np.round(color * 255).astype(np.uint8), depth, classes[index], index)
+    return View(np.round(color * 255).astype(np.uint8), depth, classes[index])

@@ -15,7 +15,6 @@ from ..fields import Linear, SemanticField, fuse_views
 from ..gaussians import Gaussians
 from ..labels import LabelSet, OfClass, Selection
 from ..labels.questions import class_rows, make_question
-from ..viz.colors import FeatureColors
 
 UNIT = (0.0, 1.0)
 KEPT = 0.9  # of a selection, by the suggested gamma of what is like it
@@ -100,10 +99,6 @@ class FieldMeaning:
         selection = Selection(field.known & (scores > gamma), scores, gamma, how)
         return _asked("like the selection", selection, field.known, False, False)
 
-    def feature_colors(self) -> FeatureColors:
-        """The projection of the field's latents, the same as in its rendered views."""
-        return FeatureColors.fit(self.field.features)
-
     def _phrase(self, words: str) -> Tensor:  # [D]
         if self._embed is None or not words:
             try:
@@ -166,11 +161,6 @@ class SplatMeaning:
     def similar(self, mask: Tensor) -> Asked:  # [N] bool
         """Raises a ValueError: a splat has classes only."""
         raise ValueError("selection: expected a field, whose features can be compared, got a splat; search for a class")
-
-    def feature_colors(self) -> FeatureColors:
-        """A projection fitted to the features of the Gaussians that have some."""
-        assert self.gaussians.features is not None
-        return FeatureColors.fit(self.gaussians.features)
 
 
 Meaning = FieldMeaning | SplatMeaning

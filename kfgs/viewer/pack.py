@@ -264,11 +264,12 @@ def _add_cameras(buffers: _Buffers, state: Exploration, scene: Scene | None) -> 
     """Add the photos of the cameras that have one, and describe all cameras."""
     paths = [] if scene is None else zip(scene.cameras, scene.image_paths, strict=True)
     there, packed = {camera.name for camera, path in paths if path.is_file()}, []
+    show = None if scene is None else show_photos(scene)
     for index, camera in enumerate(state.cameras):
         name = None
-        if scene is not None and camera.name in there:
+        if show is not None and camera.name in there:
             name = f"thumbnails/{index}"
-            buffers.add(name, np.frombuffer(as_jpeg(show_photos(scene)(camera.fitted(PHOTO))), dtype=np.uint8))
+            buffers.add(name, np.frombuffer(as_jpeg(show(camera.fitted(PHOTO))), dtype=np.uint8))
         packed.append(
             {
                 "name": camera.name,

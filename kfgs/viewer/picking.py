@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_shapes, check_whole
-from ..cameras import Camera
+from ..cameras import Camera, world_to_camera
 from ..gaussians import Gaussians
 from ..splat import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, project
 from ..splat.project import FIELD_OF_VIEW_MARGIN
@@ -100,7 +100,7 @@ def _near_ray(gaussians: Gaussians, camera: Camera, place: tuple[float, float]) 
     camera = camera.to(gaussians.means).with_origin(gaussians.origin)
     reach = 2 * torch.log(gaussians.opacities / ALPHA_MIN)  # d^T C d where alpha falls to 1/255
     largest = gaussians.scales.amax(dim=1).square()
-    points = gaussians.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    points = world_to_camera(camera, gaussians.means)
     z = points[:, 2]
     near = (z > camera.near) & (reach >= 0)
     for axis, size in enumerate((camera.width, camera.height)):

@@ -14,7 +14,7 @@ from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels.nearest import Sources, explained_distance, neighbours_together, positions
 from ..splat import sh0_to_rgb
-from ..viz.colors import Array, cloud_colors
+from ..viz.colors import Array, FeatureColors, cloud_colors
 from ..viz.palette import UNLABELLED, palette
 from ..viz.pictures import as_bytes
 from .meaning import Asked, Meaning
@@ -67,6 +67,7 @@ class Exploration:
         self._own_labels = as_array(semantic.labels).astype(np.int64)
         self.source, self.far, suggested, self.distance_how = self._find_sources()
         self._base: dict[Side, Array] = {}
+        self._latents: Array | None = None
         colored = any(cloud.sh is not None for cloud in self._clouds.values())
         shows: dict[Show, bool] = {
             "labels": True,
@@ -181,9 +182,12 @@ class Exploration:
 
     def latents(self) -> Array:  # [S, 3] uint8
         """The latents of the semantic side as colours; grey if a latent was never learnt."""
-        features = self._clouds["semantic"].features
-        assert features is not None
-        return np.where(as_array(features.any(dim=1))[:, None], self.meaning.feature_colors()(features), GREY)
+        if self._latents is None:
+            features = self._clouds["semantic"].features
+            assert features is not None
+            known = as_array(features.any(dim=1))[:, None]
+            self._latents = np.where(known, FeatureColors.fit(features)(features), GREY)
+        return self._latents.copy()
 
     def details(self) -> dict[str, Any]:
         """The state as JSON: question, gamma, lambda, and the count of each class on each side.

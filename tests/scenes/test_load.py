@@ -230,25 +230,16 @@ def test_the_real_scenes(shared_data: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("folder", "given", "found"),
-    [
-        ("images", None, "images"),
-        ("images_4", None, "images_4"),
-        ("photos", "photos", "photos"),
-        ("images/left", None, "images"),
-        (".", None, None),
-    ],
+    ("folder", "found"), [("images", "images"), ("images_4", "images_4"), ("images/left", "images"), (".", None)]
 )
-def test_picture_folders_are_those_that_are_read(
-    tmp_path: Path, folder: str, given: str | None, found: str | None
-) -> None:
+def test_picture_folders_are_those_that_are_read(tmp_path: Path, folder: str, found: str | None) -> None:
     root = tmp_path / "scene"
     name = "left/a.png" if folder == "images/left" else "a.png"
     write_model(root / "sparse/0", [name])
     _pictures(root / folder, ["a.png"])
-    assert [file.is_relative_to(root / (found or ".")) for file in load_scene(root, images=given).image_paths] == [True]
+    assert [file.is_relative_to(root / (found or ".")) for file in load_scene(root).image_paths] == [True]
     (root / "sparse/0/images.bin").write_bytes(b"")  # the model is not read for it
-    assert picture_folders(root, given) == ([] if found is None else [root / found])
+    assert picture_folders(root) == ([] if found is None else [root / found])
     assert picture_folders(tmp_path) == []  # no scene
 
 
