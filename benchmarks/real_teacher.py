@@ -36,11 +36,12 @@ from torch import Tensor
 from torch.nn.functional import cross_entropy, linear, normalize
 
 from kfgs._files import atomic_folder, atomic_path, digest_file
-from kfgs.cameras import resize_labels
+from kfgs.cameras.resample import resize_labels
 from kfgs.evaluation import SegmentationReport, load_label_map
 from kfgs.labels import LabelSet, classify, load_label_set
 from kfgs.pipeline import score_teacher, true_labels
-from kfgs.scenes import FeatureFolder, Scene, extract_features, load_scene, pictures_of, read_image
+from kfgs.scenes import FeatureFolder, Scene, extract_features, load_scene, read_image
+from kfgs.scenes.extract import pictures_of
 from kfgs.teachers import Teacher, load_teacher
 from kfgs.teachers.transformers_source import quiet, require_transformers
 

@@ -32,7 +32,8 @@ from kfgs.cameras import resize_map
 from kfgs.fields import UpliftConfig, uplift_maps
 from kfgs.formats import read_splats
 from kfgs.quant import Codebook, GrownCodebook, PaperCodebook, fit_codebook, quantize_maps
-from kfgs.scenes import FeatureFolder, Picture, extract_features, load_scene, pictures_of
+from kfgs.scenes import FeatureFolder, extract_features, load_scene
+from kfgs.scenes.extract import Picture, pictures_of
 
 STAGES = ("start", "extract", "codebook", "index maps", "uplift")
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import cosine_similarity, mse_loss
 
 from kfgs._rows import unit_rows
-from kfgs.cameras import resize_labels
+from kfgs.cameras.resample import resize_labels
 from kfgs.quant.fit_autoencoder import quick_on_a_cpu
 
 from .common import FLOAT, Clock, Fitted, KeptMaps, Task, is_shown, sample_rows, seeded

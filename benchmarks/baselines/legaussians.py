@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import cross_entropy
 
 from kfgs._rows import EPS, row_norms, unit_rows
-from kfgs.cameras import resize_labels
+from kfgs.cameras.resample import resize_labels
 from kfgs.gaussians import Gaussians
 
 from .common import FLOAT, Clock, Fitted, KeptMaps, Task, is_shown, seeded

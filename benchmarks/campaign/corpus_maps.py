@@ -9,7 +9,8 @@ import torch
 from PIL import Image
 from safetensors.torch import save_file
 
-from kfgs.scenes import Picture, extract_features
+from kfgs.scenes import extract_features
+from kfgs.scenes.extract import Picture
 
 from .corpus import SEED, Add
 

@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from kfgs.cameras import resize_labels
+from kfgs.cameras.resample import resize_labels
 from kfgs.evaluation.method import Method, View, annotated, check_level
 from kfgs.evaluation.report import Report, Row, make_report, mean
 from kfgs.evaluation.texts import Encode

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kfgs._check import check_choice, check_range, check_whole
-from kfgs.cameras import resize_labels
+from kfgs.cameras.resample import resize_labels
 from kfgs.evaluation.method import Method, View, annotated, check_level, label_view
 from kfgs.evaluation.report import Report, Row, make_report, mean
 from kfgs.evaluation.texts import Encode, encode_unit

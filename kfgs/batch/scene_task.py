@@ -22,18 +22,9 @@ from ..fields import scene_classes
 from ..labels import LabelSet, load_label_set
 from ..pipeline import Paper, Uplift, fit, score_scene, segment_scene, true_labels
 from ..pipeline.train import training_device
-from ..scenes import (
-    FeatureFolder,
-    Scene,
-    SceneError,
-    SfmConfig,
-    extract_features,
-    is_scene,
-    link_images,
-    list_images,
-    load_scene,
-    run_sfm,
-)
+from ..scenes import FeatureFolder, Scene, SceneError, SfmConfig, extract_features, list_images, load_scene, run_sfm
+from ..scenes.load import is_scene
+from ..scenes.sfm import link_images
 from ..teachers.load import load_teacher
 from ..teachers.protocol import Teacher
 

@@ -61,18 +61,16 @@ def sfm(
 ) -> None:
     """Find the cameras of photographs or of a video (structure from motion, pycolmap).
 
-    Of a video, the sharpest frames are written to OUT/images first. HEIC photographs are written there as JPEG. A folder that
-    has poses already (transforms.json, ScanNet, Polycam, ...) keeps them: only its points are found. Nothing is found where a
-    photograph is black in its mask, masks/NAME.png in the folder or next to it, or transparent.
+    Of a video, the sharpest frames are written to OUT/images first. HEIC photographs are written there as JPEG. Nothing is found
+    where a photograph is black in its mask, masks/NAME.png in the folder or next to it, or transparent.
 
     Examples:
         kfgs sfm photos/ --out scene/
         kfgs sfm video.mp4 --out scene/ --fps 2
         kfgs sfm frames/ --out scene/ --matching sequential    # frames of a video
-        kfgs sfm capture/ --out scene/                         # capture/ has poses: they are kept
 
     Args:
-        images: Folder of photographs, a video, or a folder with poses.
+        images: Folder of photographs, or a video.
         out: Scene folder to make; OUT/sparse/0 receives the COLMAP model.
         fps: Frames of each second of a video that are used, 2 when not given: the sharpest of each half second.
         matching: sequential for the frames of a video, exhaustive for everything else; by default so.
@@ -81,9 +79,11 @@ def sfm(
         ignore_poses: Estimate poses also if the folder has some.
         replace: Replace a model that is in OUT/sparse/0 already; without it that is an error.
     """
-    from ..scenes import SfmConfig, is_scene, link_images, list_images, load_scene, run_sfm, write_known_poses
+    from ..scenes import SfmConfig, list_images, run_sfm
+    from ..scenes.load import is_scene
     from ..scenes.masks import folder_masks
     from ..scenes.pictures import is_video
+    from ..scenes.sfm import link_images
 
     check_output("out", out, "a folder")
     config = SfmConfig(
@@ -92,13 +92,10 @@ def sfm(
         min_registered=min_registered,
     )
     if not is_video(images) and not ignore_poses and (is_scene(images) or images.suffix == ".json"):
-        scene = load_scene(images, split="all")
-        say(
-            f"{images}: has the poses of {len(scene)} pictures: they are kept, and points are found (not so: --ignore-poses)"
+        raise ValueError(
+            f"images: expected photographs without poses, got {images} with some; `kfgs fit` and `kfgs color` take it as it is "
+            "(and find its points, if it has none), or give --ignore-poses to estimate new ones"
         )
-        say(str(write_known_poses(scene, out, config=config, replace=replace, progress=True)))
-        wrote([out / "sparse" / "0", out / "images"])
-        return
     images = _plain_pictures(images, out, fps)
     for note in folder_masks(list_images(images), images)[1]:
         say(f"note: {note}")
@@ -115,8 +112,7 @@ def sfm(
 
 def _plain_pictures(images: Path, out: Path, fps: float | None) -> Path:
     """A folder of pictures that pycolmap reads: of a video its frames, of HEIC photographs JPEG files, both in OUT/images."""
-    from ..scenes import convert_heic, extract_frames
-    from ..scenes.pictures import VIDEO_SUFFIXES, has_heic, is_video
+    from ..scenes.pictures import VIDEO_SUFFIXES, convert_heic, extract_frames, has_heic, is_video
 
     if is_video(images):
         frames = extract_frames(images, out / "images", fps=2.0 if fps is None else fps, progress=True)

@@ -126,7 +126,7 @@ def read_walk(path: Walk, frames: int | None, *, film: bool = False) -> Walk | l
         The name of the path, or the cameras.
     """
     from .._check import check_whole
-    from ..scenes import is_scene
+    from ..scenes.load import is_scene
 
     if frames is not None:
         check_whole("frames", frames, 2, MOST_FRAMES)

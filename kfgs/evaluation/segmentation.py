@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .._card import short_repr
 from .._check import as_tensor
-from ..cameras import resize_labels
+from ..cameras.resample import resize_labels
 from ..metrics import ConfusionMatrix, Score
 from .label_pictures import load_label_map
 

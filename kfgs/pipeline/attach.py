@@ -19,7 +19,8 @@ from ..fields import SemanticField, fuse_views
 from ..formats import read_splats
 from ..gaussians import Gaussians
 from ..labels import LabelSet, Transfer, nearest_labels
-from ..scenes import Alignment, SceneError, align_by_cameras, frames_agree
+from ..scenes import SceneError, align_by_cameras, frames_agree
+from ..scenes.frames import Alignment
 from ..splat import transform_gaussians, vote_labels
 
 By = Literal["distance", "views"]

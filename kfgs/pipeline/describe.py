@@ -17,8 +17,9 @@ from ..formats import find_format, read_splats
 from ..formats.ply import read_ply
 from ..formats.table import splat_file_of
 from ..gaussians import Gaussians
-from ..scenes import FeatureFolder, Scene, SceneError, is_scene, list_images, load_scene
+from ..scenes import FeatureFolder, Scene, SceneError, list_images, load_scene
 from ..scenes.files import some
+from ..scenes.load import is_scene
 from .stages import Run
 
 

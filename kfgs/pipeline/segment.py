@@ -13,7 +13,8 @@ from tqdm import tqdm
 
 from .._check import check_range
 from .._files import Names, as_path, atomic_path, check_output, file_stem
-from ..cameras import Camera, resize_labels
+from ..cameras import Camera
+from ..cameras.resample import resize_labels
 from ..evaluation import SegmentationReport, evaluate_segmentation, load_label_map
 from ..evaluation.coco import save_coco
 from ..evaluation.label_pictures import VOID

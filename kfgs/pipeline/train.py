@@ -97,7 +97,7 @@ def with_points(run: Run, scene: Scene, views: Sequence[int], seed: int, progres
         count = f"only {len(scene.points)} points" if len(scene.points) else "none"
         run.say(
             f"points: the scene has {count}, and training starts from points; they are triangulated from {len(seen)} pictures "
-            "and their poses (write_known_poses does the same once for all runs)"
+            "and their poses"
         )
         made = scene
         try:

@@ -38,7 +38,7 @@ PANORAMA = "cut perspective views out of the panoramas, and give these with thei
 def convert_intrinsics(model: str, params: Sequence[float]) -> tuple[torch.Tensor, Distortion | None]:
     """K [3, 3] float64 and the lens of a COLMAP camera; a perspective lens with all coefficients zero is a pinhole."""
     if model not in LENSES:
-        advice = "undistort the images first: `kfgs.scenes.undistort_scene(images, model, out)` or `colmap image_undistorter`"
+        advice = "undistort the images first (`colmap image_undistorter`)"
         raise SceneError(
             f"camera: expected one of the COLMAP models {', '.join(LENSES)}, got {model}; "
             f"{PANORAMA if model == 'EQUIRECTANGULAR' else advice}"

@@ -12,12 +12,12 @@ import torch
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
-from .._files import as_path, atomic_folder, real_path
+from .._files import real_path
 from ..cameras.camera import Camera
-from .files import MASKS, SceneError
+from .files import SceneError
 from .pycolmap_import import quiet_pycolmap, scene_errors
 from .scene import Scene, check_is_scene
-from .sfm import SfmConfig, SfmReport, SfmRun, check_model_place
+from .sfm import SfmConfig, SfmRun
 
 MOST_VIEWS = 200  # that `find_points` looks at, evenly chosen: about 100,000 points of a room in some minutes
 NEIGHBOURS = 20  # views that each view is compared with: twice what COLMAP takes of a video
@@ -51,89 +51,35 @@ def find_points(
     """
     check_is_scene(scene)
     count = len(scene) if most_views is None else min(most_views, len(scene))
-    chosen = np.unique(np.linspace(0, len(scene) - 1, count).round().astype(int)).tolist() if count else []
-    with tempfile.TemporaryDirectory(prefix="kfgs-points-") as scratch:
-        model, _ = _triangulate(scene.select(chosen), Path(scratch), config or SfmConfig(), progress)
-        points = [model.points3D[i] for i in sorted(model.points3D)]
-    places = torch.from_numpy(np.array([point.xyz for point in points])).float()
-    colors = torch.from_numpy(np.array([point.color for point in points], np.uint8))
-    return replace(scene, points=places, colors=colors)
-
-
-def write_known_poses(
-    scene: Scene, out: str | Path, *, config: SfmConfig | None = None, replace: bool = False, progress: bool = False
-) -> SfmReport:
-    """Write a scene with known poses as a COLMAP model with triangulated points in `out/sparse/0`.
-
-    `out/images` and `out/masks` have links to the pictures and their masks.
-
-    Args:
-        scene: posed views, with or without lens. All are used.
-        out: the scene folder.
-        config: `max_features`, `seed` and `num_threads` are used.
-        replace: replace a model that is in `out/sparse/0` already.
-        progress: show a bar.
-
-    Raises:
-        FileExistsError: if `out/sparse/0` holds a model, and `replace` is False; or if `out/images` holds other files.
-        SceneError, ImportError: as for `find_points`.
-    """
-    check_is_scene(scene)
-    model = check_model_place(as_path(out), replace)
-    out = model.parents[1]
-    links = {out / "images" / c.name: real_path(path) for c, path in zip(scene.cameras, scene.image_paths, strict=True)}
-    for camera, mask in zip(scene.cameras, scene.masks or [None] * len(scene), strict=True):
-        if mask is not None:
-            links[out / MASKS / f"{camera.name}{mask.suffix}"] = real_path(mask)
-    taken = next((place for place, file in links.items() if place.exists() and real_path(place) != file), None)
-    if taken is not None:
-        raise FileExistsError(
-            f"{taken}: expected a link to {links[taken]}, got another file; name another folder (--out)"
-        )
-    with tempfile.TemporaryDirectory(prefix="kfgs-points-") as scratch:
-        known, seconds = _triangulate(scene, Path(scratch), config or SfmConfig(), progress)
-        for number, camera in enumerate(scene.cameras, 1):
-            known.images[number].name = camera.name
-        with quiet_pycolmap() as pycolmap:
-            known.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array(scene.origin)))
-        with atomic_folder(model) as folder:
-            known.write(str(folder))
-    for place, file in links.items():
-        if not place.exists():
-            place.parent.mkdir(parents=True, exist_ok=True)
-            place.symlink_to(file)
-    error = float(known.compute_mean_reprojection_error())
-    return SfmReport(len(scene), len(scene), len(known.points3D), error, seconds)
-
-
-def _triangulate(scene: Scene, scratch: Path, config: SfmConfig, progress: bool) -> tuple[Any, dict[str, float]]:
-    """The reconstruction, with image i + 1 for view i, and the seconds of each part."""
-    if len(scene) < 2:
-        raise SceneError(f"scene: expected at least 2 views to triangulate points, got {len(scene)}; add pictures")
-    folder, photos = scratch / "images", {}
-    folder.mkdir()
-    for i, path in enumerate(scene.image_paths):
+    if count < 2:
+        raise SceneError(f"scene: expected at least 2 views to triangulate points, got {count}; add pictures")
+    seen = scene.select(np.linspace(0, len(scene) - 1, count).round().astype(int).tolist())
+    for path in seen.image_paths:
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such file; expected a picture of the scene there")
-        name = f"{i:06d}{path.suffix.lower()}"  # pycolmap cuts names at blanks in a list of pairs
-        (folder / name).symlink_to(real_path(path))
-        photos[name] = (path, None if scene.masks is None else scene.masks[i])
     advice = "check the pictures, or estimate the poses again (`kfgs sfm --ignore-poses`)"
     with (
+        tempfile.TemporaryDirectory(prefix="kfgs-points-") as scratch,
         quiet_pycolmap() as pycolmap,
         scene_errors("scene: expected pictures that fit their poses", advice),
         tqdm(disable=not progress, unit="image") as bar,
     ):
-        names, known = list(photos), _reconstruction(pycolmap, scene, list(photos))
-        run = SfmRun(pycolmap, folder, scratch, config, bar, photos)
+        folder, photos = Path(scratch) / "images", {}
+        folder.mkdir()
+        for i, path in enumerate(seen.image_paths):
+            name = f"{i:06d}{path.suffix.lower()}"  # pycolmap cuts names at blanks in a list of pairs
+            (folder / name).symlink_to(real_path(path))
+            photos[name] = (path, None if seen.masks is None else seen.masks[i])
+        names, known = list(photos), _reconstruction(pycolmap, seen, list(photos))
+        run = SfmRun(pycolmap, folder, Path(scratch), config or SfmConfig(), bar, photos)
         with pycolmap.Database.open(run.database) as database:
             for kind in ("camera", "rig", "frame", "image"):
                 for value in getattr(known, f"{kind}s").values():
                     getattr(database, f"write_{kind}")(value, **{f"use_{kind}_id": True})
         run.stage("features", lambda: run.extract(known=True))
-        run.stage("matching", lambda: run.match_pairs([(names[a], names[b]) for a, b in neighbours(scene.cameras)]))
-        (scratch / "points").mkdir()
-        arguments = (known, run.database, str(folder), str(scratch / "points"), True, run.options())
+        run.stage("matching", lambda: run.match_pairs([(names[a], names[b]) for a, b in neighbours(seen.cameras)]))
+        (run.scratch / "points").mkdir()
+        arguments = (known, run.database, str(folder), str(run.scratch / "points"), True, run.options())
         run.stage("points", lambda: pycolmap.triangulate_points(*arguments))
         with pycolmap.Database.open(run.database) as database:
             matches = sum(len(pair.inlier_matches) for pair in database.read_two_view_geometries()[1])
@@ -146,7 +92,10 @@ def _triangulate(scene: Scene, scratch: Path, config: SfmConfig, progress: bool)
                 "right? Else estimate them again (`kfgs sfm --ignore-poses`)"
             )
         known.extract_colors_for_all_images(str(folder))
-        return known, run.seconds
+        points = [known.points3D[i] for i in sorted(known.points3D)]
+    places = torch.from_numpy(np.array([point.xyz for point in points])).float()
+    colors = torch.from_numpy(np.array([point.color for point in points], np.uint8))
+    return replace(scene, points=places, colors=colors)
 
 
 def neighbours(cameras: list[Camera]) -> list[tuple[int, int]]:

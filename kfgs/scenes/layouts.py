@@ -1,33 +1,25 @@
-"""Folders with a pose for each picture: Replica (two renderings), ScanNet, Polycam, and the output of Inria's 3DGS.
+"""Folders with a pose for each picture: Replica (two renderings) and ScanNet.
 
 **Convention**: poses in files are camera to world, x right, y down, z forward, unless a reader says otherwise.
 """
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from .._files import Names, file_stem, real_path
-from .._origin import to_world
-from ..formats.table import read_splats
-from ..formats.values import SH_C0
+from .._files import file_stem, real_path
 from .depth import points_from_depth
 from .files import MAX_NUMBER, MAX_SIDE, SceneError, list_images, picture_size, read_scene_json, some
 from .posed import Matrix, PosedPicture, read_numbers, read_points, scene_of_poses
 from .scene import Scene
-from .transforms_frame import FLIP
 
 AGAIN = "copy it again from the data set"
-NOWHERE = np.full((4, 4), np.nan)  # the pose of a view that is left out
 MESH = "_vh_clean_2.ply"  # of ScanNet
 
 
@@ -160,129 +152,10 @@ def _square(path: Path) -> Matrix:  # [4, 4]
     return matrix
 
 
-def load_polycam(folder: Path, _: Path | None = None) -> Scene:
-    """Polycam's raw captures, which are ARKit's: poses that it corrected (`corrected_cameras/`), else ARKit's (`cameras/`).
-
-    **Convention**: `t_00` to `t_23` of a camera file are the first three rows of a camera-to-world matrix with OpenGL axes
-    (y up, z backward), in metres. Depth pictures (LiDAR) are in millimetres. So programs say that read such captures;
-    none was at hand.
-    """
-    place = folder / "keyframes"
-    kind = (
-        "corrected_" if (place / "corrected_cameras").is_dir() else ""
-    )  # after Polycam's bundle adjustment, or before
-    cameras, images = place / f"{kind}cameras", place / f"{kind}images"
-    names, views, lost = list_images(images), [], []
-    for name in names:
-        file = cameras / f"{file_stem(name)}.json"
-        if not file.is_file():
-            lost.append(name)
-            continue
-        values = read_scene_json(file, "export the capture again (raw data, developer mode)")
-        values = values if isinstance(values, dict) else {}
-        keys = ("width", "height", "fx", "fy", "cx", "cy", *(f"t_{i}{j}" for i in range(3) for j in range(4)))
-        numbers: list[Any] = [values.get(key) for key in keys]
-        if any(type(n) is float and not math.isfinite(n) for n in numbers):
-            views.append(PosedPicture(name, images / name, NOWHERE, str(file), (np.eye(3), (1, 1))))
-            continue
-        odd = [key for key, n in zip(keys, numbers, strict=True) if type(n) not in (int, float) or abs(n) >= MAX_NUMBER]
-        if odd:
-            raise SceneError(
-                f"{file}: expected {', '.join(keys[:6])} and t_00 to t_23 as numbers, got {odd[0]} otherwise; {AGAIN}"
-            )
-        pose = np.eye(4)
-        pose[:3] = np.array(numbers[6:], np.float64).reshape(3, 4)
-        lens = intrinsics(numbers[:6], str(file))
-        views.append(PosedPicture(name, images / name, pose @ FLIP, str(file), lens))
-    if not views:
-        raise SceneError(
-            f"{cameras}: expected a file NAME.json for each of {some(names, 3) or 'no pictures'}, got none"
-        )
-    notes = [f"{len(lost)} pictures have no file in {cameras.name}/ and were left out: {some(lost)}"] if lost else []
-    if cameras.name == "cameras":
-        notes.append("poses are ARKit's own: this capture has no corrected_cameras/")
-    depth = next((p for p in (cameras.parent / "corrected_depth", cameras.parent / "depth") if p.is_dir()), None)
-    depths = [(depth or cameras) / f"{file_stem(view.name)}.png" for view in views]
-    return scene_of_poses(folder, views, None, points_from_depth(views, depths), notes)
-
-
-def load_inria(folder: Path, images: Path | None = None) -> Scene:
-    """3DGS and its descendants: `cameras.json` and `point_cloud/`, with the pictures that it was trained on.
-
-    Points are those of `input.ply`, else the centres of the newest splat's Gaussians. The pictures are in `images`, in
-    `source_path` of `cfg_args` (also if that folder was moved next to this one), or in `images/` here. If `cfg_args` says
-    `eval=True`, the views that 3DGS lists before the training views are the `test` split.
-
-    **Convention**: an entry has the centre of the camera (`position`) and a camera-to-world rotation (`rotation`, rows); the
-    principal point is the middle of the picture.
-    """
-    path, settings = folder / "cameras.json", folder / "cfg_args"
-    text = settings.read_text(encoding="utf-8", errors="replace")[:65536] if settings.is_file() else ""
-    entries = read_scene_json(path, AGAIN)
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise SceneError(f"{path}: expected a list of cameras, got {entries!r:.80}; {AGAIN}")
-    source, name = (re.search(rf"\b{key}='([^']*)'", text) for key in ("source_path", "images"))
-    place = Path(source[1].replace("\\", "/")) if source else folder
-    inner = name[1] if name and name[1] else "images"
-    tried = [place / inner, folder / place / inner, folder.parent / place.name / inner, folder / inner]
-    if (place / "transforms_train.json").is_file():
-        tried.append(place)
-    tried = tried if images is None else [images]
-    pictures, files = next(((place, files) for place in tried if (files := list_images(place))), (folder, []))
-    if not files:
-        listed = ", ".join(map(str, dict.fromkeys(tried)))
-        raise FileNotFoundError(
-            f"{folder}: expected the pictures of {path.name} in one of {listed}, found none; "
-            "name their folder (images=, or --images)"
-        )
-    known = Names(files, bare=True)
-    views, missing = list[PosedPicture](), list[str]()
-    for i, entry in enumerate(entries):
-        found, where = known.find(str(entry.get("img_name", ""))), f"{path}, camera {i}"
-        if found is None:
-            missing.append(str(entry.get("img_name")))
-            continue
-        numbers, pose = [entry.get(key) for key in ("width", "height", "fx", "fy")], np.eye(4)
-        if any(type(n) is float and not math.isfinite(n) for n in numbers):
-            views.append(PosedPicture(found, pictures / found, NOWHERE, where, (np.eye(3), (1, 1))))
-            continue
-        middle = [n / 2 if isinstance(n, int | float) else n for n in numbers[:2]]
-        try:
-            pose[:3, :3], pose[:3, 3] = np.array(entry["rotation"], np.float64), np.array(entry["position"], np.float64)
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise SceneError(
-                f"{where}: expected a rotation [3][3] and a position [3], got {error!r:.100}; {AGAIN}"
-            ) from error
-        views.append(PosedPicture(found, pictures / found, pose, where, intrinsics([*numbers, *middle], where)))
-    if not views:
-        raise SceneError(
-            f"{pictures}: expected the pictures of {path} ({some(missing, 3)}), found none of them; "
-            "name the folder that has them (images=, or --images)"
-        )
-    notes = (
-        [f"{len(missing)} of {len(entries)} cameras have no picture in {pictures}: {some(missing)}"] if missing else []
-    )
-    if (folder / "input.ply").is_file():
-        points, colors, told = read_points(folder / "input.ply")
-    else:
-        cloud = read_splats(folder)
-        shades = torch.full((len(cloud), 3), 0.5) if cloud.sh is None else 0.5 + SH_C0 * cloud.sh[:, 0]
-        points, colors, told = to_world(cloud.means, cloud.origin), (shades.clamp(0, 1) * 255).round().byte(), []
-    scene = scene_of_poses(folder, views, None, (points, colors), [*notes, *told])
-    order = [view.name for view in views]
-    falls = [i for i in range(1, len(order)) if order[i] < order[i - 1]]  # where the order of names begins again
-    held_out = set(order[: falls[0]]) if "eval=True" in text and len(falls) == 1 else set()
-    test = [i for i, camera in enumerate(scene.cameras) if camera.name in held_out]
-    return replace(scene, splits={"train": [i for i in range(len(scene)) if i not in test], "test": test})
-
-
 LAYOUTS = (
     ("Replica (NICE-SLAM)", ("results", "traj.txt"), load_nice_slam),
     ("Replica (Semantic-NeRF)", ("rgb", "traj_w_c.txt"), load_semantic_nerf),
     ("ScanNet", ("color", "pose"), load_scannet),
-    ("Polycam", ("keyframes/cameras", "keyframes/images"), load_polycam),
-    ("Polycam", ("keyframes/corrected_cameras", "keyframes/corrected_images"), load_polycam),
-    ("3DGS's output", ("cameras.json", "point_cloud"), load_inria),
 )
 """Name, what a folder is recognised by, and reader; asked in this order."""
 

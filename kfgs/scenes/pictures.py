@@ -45,7 +45,7 @@ def refuse_heic(folder: Path) -> None:
     if names:
         raise SceneError(
             f"{folder}: expected pictures that pycolmap reads, got HEIC photographs ({some(names, 3)}); make JPEG files of them: "
-            "`kfgs sfm` does, and kfgs.scenes.convert_heic(images, out)"
+            "`kfgs sfm` does, and kfgs.scenes.pictures.convert_heic(images, out)"
         )
 
 

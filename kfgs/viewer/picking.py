@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from .._check import check_shapes, check_whole
-from ..cameras import Camera, world_to_camera
+from ..cameras import Camera
+from ..cameras.projection import world_to_camera
 from ..gaussians import Gaussians
 from ..splat import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, project
 from ..splat.project import FIELD_OF_VIEW_MARGIN

@@ -11,7 +11,8 @@ from kornia.geometry.camera import PinholeCamera
 from messages import tells
 from oracles_cameras import project_pinhole
 
-from kfgs.cameras import Camera, Distortion, from_kornia, project_points, to_kornia, unproject_depth
+from kfgs.cameras import Camera, Distortion, from_kornia, project_points, to_kornia
+from kfgs.cameras.projection import unproject_depth
 
 K = torch.tensor([[70.0, 0.0, 50.0], [0.0, 66.0, 30.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
 

@@ -6,15 +6,8 @@ import torch
 from messages import tells
 from oracles_cameras import HEIGHT, LENSES, WIDTH, colmap_pixels, project_pinhole
 
-from kfgs.cameras import (
-    Camera,
-    Distortion,
-    camera_to_pixel,
-    project_points,
-    projection_jacobian,
-    unproject_depth,
-    world_to_camera,
-)
+from kfgs.cameras import Camera, Distortion, project_points
+from kfgs.cameras.projection import camera_to_pixel, projection_jacobian, unproject_depth, world_to_camera
 
 K = torch.tensor([[70.0, 0.0, 50.0], [0.0, 66.0, 30.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
 QUAT_XYZW = np.array([0.1, -0.2, 0.3, 0.9]) / np.linalg.norm([0.1, -0.2, 0.3, 0.9])

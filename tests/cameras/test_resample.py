@@ -2,8 +2,8 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.cameras import resize_labels, resize_map
-from kfgs.cameras.resample import fits_aspect
+from kfgs.cameras import resize_map
+from kfgs.cameras.resample import fits_aspect, resize_labels
 
 
 def ramp(height, width, dtype=torch.float64):

@@ -4,7 +4,8 @@ import torch
 from messages import tells
 from scipy.spatial.transform import Rotation
 
-from kfgs.cameras import Camera, Similarity, fit_similarity, world_to_camera
+from kfgs.cameras import Camera, Similarity, fit_similarity
+from kfgs.cameras.projection import world_to_camera
 
 QUARTER = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # x to y
 MIRROR = torch.diag(torch.tensor([1.0, 1.0, -1.0]))

@@ -53,7 +53,7 @@ def test_pixels_are_those_of_pycolmap(tmp_path: Path, model: str) -> None:
 
 
 def test_models_without_exact_form_are_refused_by_name(tmp_path: Path) -> None:
-    with pytest.raises(SceneError, match=tells("got FOV", "kfgs.scenes.undistort_scene")):
+    with pytest.raises(SceneError, match=tells("got FOV", "colmap image_undistorter")):
         load_colmap(*_scene_folder(tmp_path, ["a.png"], model="FOV", params=[50, 55, 31, 25, 0.1]))
 
 

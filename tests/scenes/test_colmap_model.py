@@ -168,7 +168,7 @@ def test_corrupt_models_are_refused_or_load_with_equal_shapes(tmp_path: Path, te
         file.write_bytes(_mutate(files[file], rng))
         try:
             lost = any(image.pose is None for image in read_whole_model(folder).images.values())
-            with whole_model(folder) as safe:  # undistort_scene hands it to pycolmap, which must not hang
+            with whole_model(folder) as safe:  # `write_parts` hands it to pycolmap, which must not hang
                 read_with_pycolmap(safe)
             found = _shape(read_model(folder) if lost else _read_alike(folder))
         except SceneError:

@@ -16,7 +16,8 @@ from PIL import Image
 
 import kfgs
 from kfgs.cameras import Camera
-from kfgs.scenes import FeatureFolder, Picture, Scene, extract_features, pictures_of
+from kfgs.scenes import FeatureFolder, Scene, extract_features
+from kfgs.scenes.extract import Picture, pictures_of
 
 STEMS = ["a", "b", "sub/c"]
 
@@ -117,7 +118,8 @@ def test_maps_of_other_programs_are_left_alone(pictures, tmp_path):
 CHILD = """
 import sys, time
 from pathlib import Path
-from kfgs.scenes import Picture, extract_features
+from kfgs.scenes import extract_features
+from kfgs.scenes.extract import Picture
 
 def slow(image):
     with open(sys.argv[2], "a") as log:

@@ -15,8 +15,7 @@ from safetensors.torch import load_file
 from kfgs.cameras import Camera, Distortion
 from kfgs.cli import main
 from kfgs.formats.ply import write_ply
-from kfgs.scenes import Scene, SceneError, SfmConfig, find_points, load_scene, write_known_poses
-from kfgs.scenes.colmap_model import read_whole_model
+from kfgs.scenes import Scene, SceneError, SfmConfig, find_points, load_scene
 from kfgs.scenes.known_poses import neighbours
 from kfgs.scenes.pycolmap_import import import_pycolmap
 
@@ -29,7 +28,7 @@ def posed(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Scene:
     folder = tmp_path_factory.mktemp("posed")
     truth = load_scene(shared_data / "lund_door", split="all").select(range(6))
     files = sorted(downsized(shared_data / "lund_door/images", folder / "images", 6).iterdir())
-    files[0] = files[0].rename(files[0].with_name(f"the  door {files[0].name}"))  # COLMAP cuts it in a text file
+    files[0] = files[0].rename(files[0].with_name(f"the  door {files[0].name}"))  # COLMAP cuts it in a list of pairs
     with Image.open(files[0]) as picture:
         width, height = picture.size
     frames = []
@@ -71,26 +70,6 @@ def test_points_are_triangulated_from_the_given_poses(posed: Scene, shared_data:
     assert torch.equal(straight.points, found.points)
 
 
-def test_sfm_keeps_poses_it_is_given(posed: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["sfm", str(posed.folder), "--out", str(tmp_path / "out")]) == 0
-    said = capsys.readouterr().out
-    assert "has the poses of 6 pictures: they are kept" in said
-    scene = load_scene(tmp_path / "out", split="all")
-    assert len(scene.points) > 300
-    assert [camera.name for camera in scene.cameras] == [camera.name for camera in posed.cameras]
-    for mine, given in zip(scene.cameras, posed.cameras, strict=True):
-        torch.testing.assert_close(mine.viewmat, given.viewmat, atol=1e-5, rtol=0)
-        torch.testing.assert_close(mine.K, given.K)
-        torch.testing.assert_close(
-            torch.tensor(mine.distortion.coefficients), torch.tensor(given.distortion.coefficients)
-        )
-    assert torch.equal(scene.image(2), posed.image(2))
-    assert len(read_whole_model(tmp_path / "out/sparse/0").images) == 6  # as its message advises for names with blanks
-    again = ["sfm", str(posed.folder / "transforms.json"), "--out", str(tmp_path / "out")]
-    assert main(again) == 1
-    assert "--replace" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("count", [0, 2])
 def test_a_field_of_a_scene_with_few_or_no_points_trains(posed: Scene, tmp_path: Path, capsys, count: int) -> None:
     folder, top = posed.folder, json.loads((posed.folder / "transforms.json").read_text())
@@ -113,6 +92,13 @@ def test_a_field_of_a_scene_with_few_or_no_points_trains(posed: Scene, tmp_path:
     assert len(load_file(tensors)["points"]) > 300
 
 
+def test_sfm_leaves_poses_as_they_are(posed: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for given in (posed.folder, posed.folder / "transforms.json"):
+        assert main(["sfm", str(given), "--out", str(tmp_path / "out")]) == 1
+        assert "--ignore-poses" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_poses_that_do_not_fit_are_refused(posed: Scene) -> None:
     turned = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))  # OpenGL axes taken for COLMAP's
     g = torch.Generator().manual_seed(0)
@@ -128,14 +114,6 @@ def test_poses_that_do_not_fit_are_refused(posed: Scene) -> None:
     gone = dataclasses.replace(posed, image_paths=[*posed.image_paths[:-1], Path("gone.png")])
     with pytest.raises(FileNotFoundError, match=tells("gone.png")):
         find_points(gone, config=FEW)
-
-
-def test_images_of_other_files_are_not_replaced(posed: Scene, tmp_path: Path) -> None:
-    (tmp_path / "images").mkdir()
-    (tmp_path / "images" / posed.cameras[0].name).write_bytes(b"mine")
-    with pytest.raises(FileExistsError, match=tells(posed.cameras[0].name, "--out")):
-        write_known_poses(posed, tmp_path, config=FEW)
-    assert not (tmp_path / "sparse").exists()
 
 
 def test_each_lens_reaches_pycolmap(posed: Scene) -> None:
@@ -207,46 +185,3 @@ def test_points_from_the_depth_of_a_transforms_json(tmp_path: Path, key: str) ->
     for other in ("../depth/a.png", 7, "depth/gone.png", "a\0.png"):
         (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": [frame | {key: other}]}))
         assert len(load_scene(tmp_path).points) == 0
-
-
-def _polycam(folder: Path, kind: str = "corrected_") -> Path:
-    keyframes = folder / "keyframes"
-    for name in ("1001", "1002"):
-        _wall(keyframes, name)
-        values = {f"t_{i}{j}": OPENGL[i][j] for i in range(3) for j in range(4)}
-        values |= {"fx": 50, "fy": 50.0, "cx": 32, "cy": 24, "width": 64, "height": 48, "blur_score": 90.5}
-        (keyframes / f"{kind}cameras").mkdir(exist_ok=True)
-        (keyframes / f"{kind}cameras/{name}.json").write_text(json.dumps(values))
-    if kind:
-        (keyframes / "images").rename(keyframes / f"{kind}images")
-    return folder
-
-
-@pytest.mark.parametrize("kind", ["corrected_", ""])
-def test_a_raw_capture_of_polycam(tmp_path: Path, kind: str) -> None:
-    scene = load_scene(_polycam(tmp_path, kind), split="all")
-    assert [camera.name for camera in scene.cameras] == ["1001.png", "1002.png"]
-    assert scene.cameras[0].center.tolist() == [1, 2, 0]
-    assert scene.cameras[0].viewmat[2, :3].tolist() == [0, 0, 1]  # looks along +z
-    assert scene.cameras[0].viewmat[1, :3].tolist() == [0, 1, 0]  # down is +y
-    assert scene.image(0).shape == (48, 64, 3)
-    assert len(scene.points) == 2 * 768
-    _at_the_wall(dataclasses.replace(scene, points=scene.points[:768], colors=scene.colors[:768]))
-    assert any("ARKit's own" in note for note in scene.notes) == (kind == "")
-
-
-def test_a_capture_that_is_damaged(tmp_path: Path) -> None:
-    folder = _polycam(tmp_path) / "keyframes"
-    file = folder / "corrected_cameras/1001.json"
-    values = json.loads(file.read_text())
-    for change, part in (
-        ({"t_12": None}, "t_12"),
-        ({"fx": -1}, "fx"),
-        ({"width": 0.5}, "width"),
-        ({"t_00": 3}, "1001.json"),
-    ):
-        file.write_text(json.dumps(values | change))
-        with pytest.raises(SceneError, match=tells("1001.json", part)):
-            load_scene(tmp_path)
-    file.unlink()
-    assert any("1 pictures have no file in corrected_cameras" in note for note in load_scene(tmp_path).notes)

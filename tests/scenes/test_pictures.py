@@ -14,8 +14,8 @@ from messages import tells
 from PIL import Image, ImageFilter
 
 from kfgs.cli import main
-from kfgs.scenes import SceneError, SfmConfig, convert_heic, extract_frames, load_scene, read_image, run_sfm
-from kfgs.scenes.pictures import SOURCE, has_heic, is_video, sharpness
+from kfgs.scenes import SceneError, SfmConfig, load_scene, read_image, run_sfm
+from kfgs.scenes.pictures import SOURCE, convert_heic, extract_frames, has_heic, is_video, sharpness
 
 # imageio-ffmpeg leaves the pipes of a finished ffmpeg to the garbage collector, which warns.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")

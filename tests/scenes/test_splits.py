@@ -4,9 +4,9 @@ from pathlib import Path
 import pytest
 from messages import tells
 
-from kfgs.scenes import SceneError, make_split
+from kfgs.scenes import SceneError
 from kfgs.scenes.files import natural_key
-from kfgs.scenes.splits import choose_split, read_lists, read_split
+from kfgs.scenes.splits import choose_split, make_split, read_lists, read_split
 
 
 def test_the_papers_split_takes_every_10th_from_the_1st_and_6th() -> None:
