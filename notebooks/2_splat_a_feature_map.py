@@ -134,7 +134,7 @@ Image.fromarray(viz.picture_grid(rows, width=min(scene.cameras[0].width, 320)))
 # apart, to see how well the others predict it.
 
 # %%
-from kfgs import GaussianParams
+from kfgs.fields import GaussianParams
 from kfgs.splat import accumulate_pixels
 
 h, w, D = maps.shape
@@ -172,7 +172,7 @@ Image.fromarray(viz.picture_grid([pictures], ["photograph", "the teacher", "rend
 # %%
 import time
 
-from kfgs import available_engines
+from kfgs.splat import available_engines
 
 latents = semantic.replace(features=semantic.features[:, :9].contiguous())
 seconds = {}

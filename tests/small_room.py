@@ -6,9 +6,9 @@ from pathlib import Path
 from cases_color import make_splat
 from cases_training import changed
 
-from kfgs import FeatureFolder, Paper, Uplift, UpliftConfig, fit, load_scene
+from kfgs import FeatureFolder, Paper, Uplift, fit, load_scene
 from kfgs.cli import main
-from kfgs.fields import Training
+from kfgs.fields import Training, UpliftConfig
 from kfgs.quant import AutoencoderConfig, PaperCodebook
 from kfgs.toy.room_folder import ToyConfig, make_toy_room
 

@@ -16,12 +16,12 @@ from cases_quant import made_autoencoder
 from torch import Tensor
 
 import kfgs
-from kfgs import Camera, Codebook, Gaussians, SemanticField, rasterize
+from kfgs import Camera, Gaussians, SemanticField, rasterize
 from kfgs._card import LONGEST, html_card, short_repr, short_value
 from kfgs.fields import Autoencoded, Identity
 from kfgs.labels import LabelSet, Selection
 from kfgs.labels.edits import EditList, Remove
-from kfgs.quant import LinearLatents
+from kfgs.quant import Codebook, LinearLatents
 from kfgs.quant.codebook import CodebookReport, Nearest
 from kfgs.splat.engines.contract import Cloud, Composited, Pinhole, Splats
 
@@ -190,7 +190,7 @@ FLAT = torch.ones(40, 3)
 KNOWN = {
     SemanticField: SemanticField(Gaussians(FLAT, torch.ones(40, 4), FLAT, FLAT[:, 0] / 2, FLAT), Identity(3)),
     Camera: Camera(torch.eye(4), torch.eye(3), 4, 3, name="view.png"),
-    kfgs.Similarity: kfgs.Similarity.identity(),
+    kfgs.cameras.Similarity: kfgs.cameras.Similarity.identity(),
     kfgs.labels.Part: kfgs.labels.Part(torch.arange(40), 1.0, torch.ones(3), BOX, (torch.ones(3),) * 2, None, "name"),
     str: "name",
     Path: Path("/a/folder/name"),

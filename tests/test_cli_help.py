@@ -1,10 +1,7 @@
 """The help of every command, and the command lines that docs and help show: true, and in the words of the command line."""
 
-import os
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -165,19 +162,3 @@ def test_messages_name_options_as_they_are_written():
     assert cli._in_options("field, text: expected: one", names) == "FIELD, --text: expected: one"
     for message in ("a.ply: no such file", "no colon", "splats, more: expected"):
         assert cli._in_options(message, names) == message
-
-
-@pytest.mark.parametrize("words", [["--help"], ["select", "--help"]])
-def test_help_is_there_without_docstrings(words):
-    shown = [
-        subprocess.run(
-            [sys.executable, *flags, "-m", "kfgs", *words],
-            env={**os.environ, "PYTHONOPTIMIZE": level, "COLUMNS": "100"},
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
-        for flags, level in (((), ""), ((), "2"), (("-OO",), ""))
-    ]
-    assert "Find the Gaussians" in shown[0]
-    assert shown[0] == shown[1] == shown[2]

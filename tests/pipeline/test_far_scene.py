@@ -11,10 +11,10 @@ from cases_color import make_splat
 from cases_training import changed
 from small_room import FIELD, make_room
 
-from kfgs import FeatureFolder, SemanticField, Uplift, UpliftConfig, attach, load_scene, read_splats
+from kfgs import FeatureFolder, SemanticField, Uplift, attach, load_scene, read_splats
 from kfgs import fit as fit_field
 from kfgs.cli import main
-from kfgs.fields import GaussianParams, join_fields
+from kfgs.fields import GaussianParams, UpliftConfig, join_fields
 from kfgs.formats import write_splats
 from kfgs.formats.ply import read_ply, write_ply
 from kfgs.pipeline.color import ColorConfig, fit_color

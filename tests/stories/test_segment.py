@@ -11,7 +11,7 @@ from kfgs.splat import rasterize_labels
 def miou(field, room) -> float:
     truth = true_labels(room.scene, room.folder / "labels", "test")
     labels = {room.scene.stem(i): field.segment(room.scene.cameras[i], room.classes) for i in room.scene.views("test")}
-    return float(kfgs.evaluate_segmentation(labels.__getitem__, truth, room.classes.names).miou.value)
+    return float(kfgs.evaluation.evaluate_segmentation(labels.__getitem__, truth, room.classes.names).miou.value)
 
 
 def test_kfgs_method(fused, room, recorded):
