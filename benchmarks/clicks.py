@@ -2,7 +2,7 @@
 
     python benchmarks/clicks.py FIELD [FIELD ...] [--clicks FILE.json]    # writes clicks for `kfgs features --examples`
 
-For each field (docs/howto/own.md makes them; photos of 540x960, `--images` of 270x480): the classes by CLICKS, and the fox in
+For each field (docs/howto/labels.md makes them; photos of 540x960, `--images` of 270x480): the classes by CLICKS, and the fox in
 the unseen photo 0027 against OUTLINE, which was drawn by hand. All numbers are pixels of 270x480.
 """
 

@@ -43,7 +43,10 @@ python_use_unqualified_type_names = True
 python_display_short_literal_types = True
 python_maximum_signature_line_length = 80
 autodoc_member_order = "bysource"
-autodoc_default_options = {"undoc-members": True}  # fields that have a comment beside them; see kfgs_shapes
+autodoc_default_options = {
+    "members": True,
+    "undoc-members": True,
+}  # fields that have a comment beside them; see kfgs_shapes
 autodoc_typehints = "signature"
 autodoc_class_signature = "mixed"
 napoleon_use_rtype = False

@@ -36,7 +36,7 @@ def anchors_of(path):
     text = path.read_text(encoding="utf-8")
     titles = re.findall(r"^#+ (.+)$", re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE), re.MULTILINE)
     made = {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
-    return made | set(re.findall(r"^\((\w+)\)=$", text, re.MULTILINE))
+    return made | set(re.findall(r"^\(([\w-]+)\)=$", text, re.MULTILINE))
 
 
 @pytest.mark.parametrize("page", LINKED, ids=name_of)
