@@ -11,7 +11,7 @@ BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 if not (BENCHMARKS / "devices.py").is_file():  # a source distribution comes without them
     pytest.skip(f"no folder {BENCHMARKS}", allow_module_level=True)
 WITH_DEVICE = (
-    "codebook", "color_count", "color_field", "engines", "figure6", "fuse", "growth", "labels", "real_teacher",
+    "codebook", "color_field", "engines", "figure6", "fuse", "growth", "labels", "real_teacher",
     "streaming", "table1", "table2",
 )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""The standing campaign in short: its mutants and kills find nothing in kfgs, and find each kind of fault that is put in."""
+"""The campaign in short: its mutants find nothing in kfgs, and find each kind of fault that is put in."""
 
 import json
 import os
@@ -20,7 +20,7 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 sys.path.insert(0, {benchmarks!r})
-from campaign import crowds, files, jobs, kills, processes, readers
+from campaign import files, readers
 from campaign.record import Record
 record = Record(Path({out!r}), Path({scratch!r}))
 """
@@ -133,56 +133,6 @@ def test_containers_come_back_and_keep_lengths_and_checksums(tmp_path, monkeypat
         picture.load()  # the checksum fits
 
 
-JOBS = """
-def write_plainly():
-    with open("work/a.txt.new", "wb") as file: file.write(b"new")
-    with open("work/a.out", "r+b") as file:
-        file.write(b"n")
-        file.flush()
-        open("work/other", "w").close()  # an event in the middle of the file
-        file.write(b"ew")
-def prepare(fixture, work):
-    (work / "a.out").write_bytes(b"old")
-    (work / "notes.txt").write_text(jobs.NOTES)
-jobs.make_fixture = kills.make_fixture = lambda folder: folder.mkdir(parents=True)
-"""
-
-
-def test_a_command_that_writes_halves_is_found(tmp_path):
-    code = (
-        JOBS
-        + """
-kills.all_jobs = lambda: [jobs.Job("plain", write_plainly, prepare)]
-kills.TIMED = 0
-kills.run_kills(record, seed=1, seconds=60, most=3)
-"""
-    )
-    found = findings(run(code, tmp_path))
-    assert {line["why"] for line in found} == {"neither old nor new: a.out"}
-
-
-def test_kills_find_nothing_in_a_command_that_converts(tmp_path):
-    code = """
-kills.make_fixture = lambda folder: _fixture(folder)
-def _fixture(folder):
-    from campaign.corpus_splats import cloud
-    from kfgs.formats import write_splats
-    folder.mkdir(parents=True)
-    for name, n in (("labelled.ply", 40), ("other.ply", 30)):
-        write_splats(cloud(n), folder / name)
-for run in (kills.run_kills, crowds.run_pairs, crowds.run_signals, crowds.run_full):
-    run(record, seed=1, seconds=30, most=12 if run is kills.run_kills else 3, only="convert with")
-"""
-    pytest.skip(
-        "a killed `kfgs convert labelled.ply a.splat` leaves .kfgs-new-* behind, which CHANGELOG.md allows: let the "
-        "campaign (`hidden_in`, or the jobs) allow it, or clean it up at the next start; then remove this"
-    )
-    lines = run(code, tmp_path)
-    assert findings(lines) == []
-    assert {line["kind"] for line in lines} == {"kills", "pairs", "signals", "full"}
-    assert sum(line["kind"] == "kills" and line["killed"] for line in lines) >= 3
-
-
 def test_a_second_start_goes_on(tmp_path):
     code = """
 import functools
@@ -194,23 +144,3 @@ for most in (20, 10):
     words, names = "fields/classes/words.txt", "fields/classes/classes.json (words)"
     assert [(line["case"], line["first"]) for line in lines] == [(words, 0), (names, 0), (words, 10)]
     assert findings(lines) == []
-
-
-def test_leaks_are_found_and_flat_runs_are_not():
-    code = f"""
-import json, sys
-sys.path.insert(0, {str(BENCHMARKS)!r})
-from campaign.long import faults_of, measure
-kept = []
-for do in (lambda i: kept.append(b"x" * 2_000_000), lambda i: b"x" * 2_000_000):
-    facts = measure(do, 40, 300)
-    more = facts | {{"threads_last": facts["threads_first"] + 1}}
-    print(json.dumps([facts, faults_of(facts), faults_of(more)]))
-"""
-    # A process of its own: what other tests gave back to the allocator would take the leak in.
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    (leak, found, _), (flat, none, threads) = map(json.loads, done.stdout.splitlines())
-    assert (leak["rounds"], flat["rounds"]) == (40, 40)
-    assert [fault.partition(":")[0] for fault in found] == ["memory grows"]
-    assert none == []
-    assert [fault.partition(":")[0] for fault in threads] == ["threads grow"]

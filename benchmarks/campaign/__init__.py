@@ -1,4 +1,4 @@
-"""A standing campaign against kfgs: mutated files, kills, pairs of processes, signals, full disks, long runs.
+"""Mutated files against the readers of kfgs: `python benchmarks/campaign OUT` runs it, docs/results.md says what it found.
 
-`python benchmarks/campaign OUT` runs it; docs/promises.md says what it checks, docs/results.md what it found.
+Kills and crowds of processes are in tests/test_files.py.
 """

@@ -1,4 +1,4 @@
-"""`python benchmarks/campaign OUT [--kinds files,kills,...] [--minutes N] [--seed S]`; a second start goes on."""
+"""`python benchmarks/campaign OUT [--minutes N] [--seed S]`; a second start continues."""
 
 from __future__ import annotations
 
@@ -8,28 +8,25 @@ import shutil
 import signal
 import sys
 from pathlib import Path
-from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: processes are forked
 os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 if __package__ in (None, ""):
     sys.path[0] = str(Path(__file__).resolve().parents[1])  # instead of this folder, whose names are common words
 
+from campaign.files import run_files
 from campaign.record import Record
-
-KINDS = ("files", "kills", "pairs", "signals", "full", "long")
 
 
 def main(words: list[str] | None = None) -> int:
     """Run the campaign; the exit code is 1 if it has found anything, now or earlier in the same folder."""
     parser = argparse.ArgumentParser(prog="python benchmarks/campaign", description=__doc__)
-    parser.add_argument("out", type=Path, help="folder of results.jsonl and of what broke; a second start goes on")
-    parser.add_argument("--kinds", default=",".join(KINDS), help="with commas between; default: %(default)s")
-    parser.add_argument("--minutes", type=float, default=10.0, help="for each kind (default: %(default)s)")
+    parser.add_argument("out", type=Path, help="folder of results.jsonl and of what broke; a second start continues")
+    parser.add_argument("--minutes", type=float, default=10.0, help="default: %(default)s")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=1, help="processes at once, for files (default: 1)")
-    parser.add_argument("--only", default="", help="cases or jobs whose name holds this word")
-    parser.add_argument("--most", type=int, help="most mutants or kills of this start")
+    parser.add_argument("--workers", type=int, default=1, help="processes at once (default: 1)")
+    parser.add_argument("--only", default="", help="files whose name holds this word")
+    parser.add_argument("--most", type=int, help="most mutants of this start")
     parser.add_argument(
         "--scratch", type=Path, help="place for working files; default: /dev/shm if there is one, else OUT"
     )
@@ -37,37 +34,20 @@ def main(words: list[str] | None = None) -> int:
     quick = Path("/dev/shm")
     scratch = given.scratch or (quick if quick.is_dir() else given.out) / f"kfgs-campaign-{os.getpid()}"
     record = Record(given.out, scratch)
-    options = {"seed": given.seed, "seconds": 60 * given.minutes, "only": given.only, "most": given.most}
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the scratch folder is deleted
     try:
-        for kind in given.kinds.split(","):
-            if kind not in KINDS:
-                parser.error(f"--kinds: expected some of {', '.join(KINDS)}, got {kind}")
-            _run(kind, record, given.workers, options)
+        run_files(
+            record,
+            workers=given.workers,
+            seed=given.seed,
+            seconds=60 * given.minutes,
+            only=given.only,
+            most=given.most,
+        )
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
     print(record.table())
     return 1 if record.findings() else 0
-
-
-def _run(kind: str, record: Record, workers: int, options: dict[str, Any]) -> None:
-    """Import as late as possible: processes are forked from one that has used nothing."""
-    if kind == "files":
-        from campaign.files import run_files
-
-        run_files(record, workers=workers, **options)
-    elif kind == "kills":
-        from campaign.kills import run_kills
-
-        run_kills(record, **options)
-    elif kind == "long":
-        from campaign.long import run_long
-
-        run_long(record, **options)
-    else:
-        from campaign import crowds
-
-        {"pairs": crowds.run_pairs, "signals": crowds.run_signals, "full": crowds.run_full}[kind](record, **options)
 
 
 if __name__ == "__main__":

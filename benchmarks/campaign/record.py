@@ -55,11 +55,6 @@ class Record:
             bad = [line for line in found if line["kind"] == "files finding"]
             rows.append(f"| mutated files ({len({b['case'] for b in batches})} files, {len({b['reader'] for b in batches})} "
                         f"readers) | {total:,} | {total - len(bad):,} | {len(bad):,} |")  # fmt: skip
-        for kind in ("kills", "pairs", "signals", "full", "long"):
-            tried = [line for line in lines if line["kind"] == kind]
-            bad = [line for line in found if line["kind"] == f"{kind} finding"]
-            if tried:
-                rows.append(f"| {kind} | {len(tried):,} | {len(tried) - len(bad):,} | {len(bad):,} |")
         seeds = sorted({line["seed"] for line in lines if "seed" in line})
         rows += ["", f"seeds: {', '.join(map(str, seeds)) or 'none'}"]
         groups = Counter((line["kind"], line.get("case", ""), line["what"], line["why"][:160]) for line in found)
