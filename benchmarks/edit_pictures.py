@@ -6,8 +6,6 @@ python benchmarks/edit_pictures.py LABELLED_SPLAT ROOM_0 OUT
 from __future__ import annotations
 
 import sys
-from functools import reduce
-from operator import or_
 from pathlib import Path
 
 import torch
@@ -15,7 +13,7 @@ from PIL import Image
 
 from kfgs import read_splats
 from kfgs.gaussians import Gaussians
-from kfgs.labels import EditList, InBox, OfClass, Recolor, Remove, Where, connected_parts
+from kfgs.labels import EditList, InBox, OfClass, Recolor, Remove, connected_parts
 from kfgs.pipeline.compare import render_color
 from kfgs.scenes import Scene, load_scene
 from kfgs.viz.pictures import picture_grid
@@ -43,7 +41,7 @@ def removals(before: Gaussians) -> dict[str, Gaussians]:
     chairs = connected_parts(before.gaussians, OfClass("chair").select(before))
     rug = before.gaussians.means[before.gaussians.labels == before.names.index("rug")]  # the chairs stand on it
     lowest = float(rug[:, 2].median()) + ABOVE_RUG  # z points up; feet reach below their chair's Gaussians
-    boxes: list[Where] = []
+    boxes: list[InBox] = []
     for chair in chairs:
         print(chair)
         low, high = (corner.tolist() for corner in chair.extent)
@@ -54,7 +52,7 @@ def removals(before: Gaussians) -> dict[str, Gaussians]:
             )
         )
     by_name = EditList().then(Remove(OfClass("chair")))
-    by_place = by_name.then(Remove(reduce(or_, boxes)))
+    by_place = by_name.then(Remove(boxes))
     return {
         "before": before.gaussians,
         "chair removed": by_name.apply(before).gaussians,
@@ -69,11 +67,12 @@ def recolors(before: Gaussians) -> dict[str, Gaussians]:
     low, high = plant.extent
     aside = torch.tensor([AROUND_PLANT, AROUND_PLANT, 0.0], dtype=low.dtype)  # below it stands its vase
     box = InBox(tuple((low - aside).tolist()), tuple((high + AROUND_PLANT).tolist()))
-    petals = box - (OfClass("table") | OfClass("book") | OfClass("vase"))
+    others = [OfClass(name).select(before) for name in ("table", "book", "vase")]
+    petals = box.select(before) - others[0] - others[1] - others[2]
     return {
         "before": before.gaussians,
         "plant recoloured": EditList().then(Recolor(OfClass("plant"), RED)).apply(before).gaussians,
-        "and all its petals": EditList().then(Recolor(OfClass("plant") | petals, RED)).apply(before).gaussians,
+        "and all its petals": EditList().then(Recolor(["plant", petals], RED)).apply(before).gaussians,
     }
 
 

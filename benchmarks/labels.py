@@ -25,7 +25,9 @@ from torch import Tensor
 
 from kfgs import Camera
 from kfgs.fields import Autoencoded, Linear, SemanticField
-from kfgs.labels import LOGIT_SCALE, classify, label_pixels, relevancy
+from kfgs.labels import classify, relevancy
+from kfgs.labels.classify import pixel_codewords
+from kfgs.labels.scores import LOGIT_SCALE
 from kfgs.quant import Autoencoder, Codebook, LinearLatents
 from kfgs.scenes import load_scene
 from kfgs.splat import bin_tiles, project, rasterize, rasterize_labels
@@ -177,7 +179,7 @@ def compare(field: SemanticField, camera: Camera, rows: Tensor, repeats: int) ->
         measure(
             "exact decode",
             lambda: decoded(field, rendering.map, table, covered),
-            lambda: label_pixels(rendering.map, book, table, coder, covered=covered),
+            lambda: table[pixel_codewords(rendering.map, book, coder, covered=covered)].masked_fill(~covered, -1),
             max(2, repeats // 5),
         )
     ]

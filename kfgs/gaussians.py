@@ -159,7 +159,7 @@ class Gaussians:
 
     @staticmethod
     def cat(parts: Sequence[Gaussians]) -> Gaussians:
-        """Concatenate clouds that carry the same tensors and columns; `labels.join` joins others.
+        """Concatenate clouds that carry the same tensors and columns; the edit `Insert` joins others.
 
         Raises:
             ValueError: if there is nothing to join, or one cloud carries what another lacks.

@@ -20,8 +20,7 @@ from kfgs.fields import SemanticField, fuse_views
 from kfgs.formats import read_splats, write_splats
 from kfgs.formats.ply import read_ply
 from kfgs.formats.sidecar import names_path
-from kfgs.labels import load_label_set
-from kfgs.labels.edits import EditList
+from kfgs.labels import EditList, load_label_set
 from kfgs.pipeline.color import TrainingPictures
 from kfgs.pipeline.compare import views_of_change
 from kfgs.scenes import load_scene

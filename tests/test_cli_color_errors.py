@@ -11,7 +11,7 @@ from small_room import make_room
 
 from kfgs.cli import main
 from kfgs.formats import read_splats, write_splats
-from kfgs.labels.edits import EditList, Remove
+from kfgs.labels import EditList, Remove
 
 ERRORS = {
     "attach": [

@@ -6,9 +6,7 @@ from messages import tells
 
 from kfgs.cli.edit_syntax import Edits, check_parts, parse_edits
 from kfgs.gaussians import Gaussians
-from kfgs.labels import connected_parts
-from kfgs.labels.edits import Extract, Insert, Move, Recolor, Remove
-from kfgs.labels.where import OfClass
+from kfgs.labels import Extract, Insert, Move, OfClass, Recolor, Remove, connected_parts
 
 
 def read(**words):

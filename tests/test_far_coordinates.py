@@ -11,7 +11,8 @@ from kfgs._origin import choose_origin, to_world
 from kfgs.cameras import Orbit, orbit_cameras, path_cameras
 from kfgs.cameras.similarity import Similarity
 from kfgs.formats.ply import read_ply, write_ply
-from kfgs.labels import InBox, InSphere, Move, OfClass, Selection, connected_parts, join
+from kfgs.labels import InBox, InSphere, Move, OfClass, OrientedBox, Selection, connected_parts
+from kfgs.labels.edit_list import join
 from kfgs.scenes import align_by_cameras
 from kfgs.splat.transform import transform_gaussians
 
@@ -152,8 +153,7 @@ def test_parts_and_selections_answer_in_the_world(tmp_path):
     (part,) = connected_parts(gaussians, chosen, distance=5.0)
     np.testing.assert_allclose(part.centroid.numpy(), world.mean(0), atol=1e-4, rtol=0)
     np.testing.assert_allclose(part.extent[0].numpy(), world.min(0), atol=1e-4, rtol=0)
-    np.testing.assert_allclose(chosen.points(gaussians), world, atol=1e-4, rtol=0)
-    np.testing.assert_allclose(chosen.box(gaussians).center.numpy(), world.mean(0), atol=1, rtol=0)
+    np.testing.assert_allclose(part.box.center.numpy(), world.mean(0), atol=1, rtol=0)
     assert f"{world.mean(0)[1]:.2f}" in repr(part)
 
 
@@ -213,7 +213,7 @@ def test_pictures_of_two_clouds_share_an_origin(tmp_path):
     plotter = pv.Plotter(off_screen=True, window_size=(32, 24))
     near = Camera.look_at((0, -4, 1), (0, 0, 0), width=32, height=24)
     camera = Camera(near.viewmat, near.K, 32, 24, origin=tuple(UTM))
-    box = Selection.of(torch.ones(60, dtype=torch.bool)).box(gaussians)
+    box = OrientedBox.around(torch.from_numpy(world))
     actors = [add_cloud(plotter, gaussians), add_cloud(plotter, gaussians.with_origin(tuple(UTM + 50)))]
     frames = add_boxes(plotter, [box]).mapper.dataset, add_cameras(plotter, [camera]).mapper.dataset
     one, two = (actor.mapper.dataset.points for actor in actors)

@@ -117,7 +117,7 @@ def _edits(place: Path, add: Add) -> None:
     corner = InBox((0, 0, 0), (0.1, 0.1, 0.1))
     edits = EditList([
         Recolor(["plant", corner], "#c04040", "hue"), Opacity("wall", 0.3), Move("chair", (0.5, 0, 0), ("z", 30), 1.5),
-        Duplicate(OfClass("chair", 0, 10.0), (1, 0, 0)), Remove("wall", grow=0.01), Insert(place / "lamp.ply"),
+        Duplicate(OfClass("chair", 0, 10.0), (1, 0, 0)), Remove("wall"), Insert(place / "lamp.ply"),
     ])  # fmt: skip
     edits.undo().save(place / "a.edits.json")
     edits.save(place / "b.edits.json")

@@ -77,7 +77,8 @@ def check_parts(splats: Any, edits: Sequence[Any]) -> None:
     """Raise a ValueError if an edit names a part of a class (`chair/6`) that `kfgs select` does not list."""
     import torch
 
-    from ..labels import OfClass, component_numbers
+    from ..labels import OfClass
+    from ..labels.components import component_numbers
     from ..labels.parts import SPECK
 
     rules = [rule for edit in edits for rule in getattr(edit, "where", ())]
@@ -108,7 +109,7 @@ def _insertion(words: str) -> Any:
     import torch
 
     from ..cameras.similarity import Similarity
-    from ..labels.edits import Insert
+    from ..labels import Insert
 
     path, colon, value = words.rpartition(":")
     if Path(words).exists() or not colon:

@@ -133,7 +133,7 @@ def _table(out: Path | None) -> Path:
 
 
 def _embed_words(network: Any, words: Sequence[str], table: Path) -> None:
-    from ..labels import CANONICAL
+    from ..labels.scores import CANONICAL
 
     made = text_encoder(network)(words, negatives=CANONICAL)
     made.save(table)

@@ -119,7 +119,7 @@ def edit(
     """Edit a labelled splat by class. The edits are saved next to the result and can be replayed.
 
     The input does not change. For another order of edits run the command several times, or use --replay. In Python there are
-    more: `kfgs.labels.edits`.
+    more: `kfgs.labels`.
 
     Examples:
         kfgs edit labelled.ply --out edited.ply --remove chair --recolor "plant:#c04040" --scene scene/
@@ -134,8 +134,8 @@ def edit(
         scene: Scene folder in the same frame, for pictures of the views in which most changes.
     """
     from ..formats import write_splats
-    from ..labels.edits import EditList
-    from ..labels.edits.edit_list import edits_path
+    from ..labels import EditList
+    from ..labels.edit_list import edits_path
     from ..pipeline.compare import views_of_change, write_comparison
     from ..scenes import load_scene
 
@@ -163,7 +163,7 @@ def edit(
     if scene is not None and before.sh is None:
         raise ValueError(f"scene: expected a splat with colours to show in it, got {before!r}; leave --scene out")
     cameras = [] if scene is None else load_scene(scene).undistorted().cameras
-    after = _apply(EditList(tuple(change for _, change in asked)), start, [words for words, _ in asked])
+    after = _apply(asked, start)
     shown = []
     if cameras:
         states = list(accumulate(list(listed)[:-1], lambda cloud, change: change.apply(cloud), initial=before))[1:]
@@ -184,14 +184,14 @@ def edit(
     wrote(paths)
 
 
-def _apply(edits: Any, splats: Any, asked: list[str]) -> Any:
-    """Apply the edits of options: the error of one quotes the option's words."""
-    from ..labels.edits.edit_list import EditError
-
-    try:
-        return edits.apply(splats)
-    except EditError as error:
-        raise ValueError(f"{asked[error.index]}: {error.why}") from error
+def _apply(asked: list[tuple[str, Any]], splats: Any) -> Any:
+    """Apply the edits of options: an error quotes the option's words."""
+    for words, change in asked:
+        try:
+            splats = change.apply(splats)
+        except ValueError as error:
+            raise ValueError(f"{words}: {error}") from error
+    return splats
 
 
 def convert(

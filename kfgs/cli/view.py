@@ -138,7 +138,7 @@ def _words_of(label_set: Any, teacher: Teacher) -> tuple[Any, Callable[[str], An
     The teacher is loaded here, so that a wrong file is reported at once. If the table has no canonical words to compare a
     phrase with, the teacher embeds them.
     """
-    from ..labels import CANONICAL
+    from ..labels.scores import CANONICAL
 
     network = teacher.load()
     if network is None:

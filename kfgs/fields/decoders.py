@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from .._rows import EPS, check_directions, row_norms, unit_rows
-from ..labels import label_pixels
+from ..labels.classify import pixel_codewords
 from ..quant import Autoencoder, Codebook, LinearLatents
 from .votes import Votes, divide_votes, similarity_votes
 
@@ -182,7 +182,7 @@ class Codewords(Decoder):
     ) -> tuple[Tensor, Tensor]:
         if not self.paper:
             return _best(pixels, unit_rows(pixels).flatten(0, -2) @ rows.T, top, covered)
-        index = label_pixels(pixels, self.codebook, torch.arange(self.codebook.size), covered=covered)
+        index = pixel_codewords(pixels, self.codebook, covered=covered)
         return _look_up(index, self.codebook, rows, top)
 
     def to_tensors(self) -> dict[str, Tensor]:
@@ -230,9 +230,7 @@ class Autoencoded(Decoder):
     def label_pixels(
         self, pixels: Tensor, rows: Tensor, top: int = 1, covered: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        numbers = torch.arange(self.codebook.size)
-        how: Any = "exact" if self.paper else "latent"
-        index = label_pixels(pixels, self.codebook, numbers, self.autoencoder, decode=how, covered=covered)
+        index = pixel_codewords(pixels, self.codebook, self.autoencoder, exact=self.paper, covered=covered)
         return _look_up(index, self.codebook, rows, top)
 
     def to_tensors(self) -> dict[str, Tensor]:

@@ -16,7 +16,7 @@ from torch import Tensor
 from .._rows import EPS, row_norms, unit_rows
 from ..cameras import Camera
 from ..gaussians import Gaussians
-from ..labels import nearest_codeword
+from ..labels.classify import nearest_codeword
 from ..quant import fit_linear_latents
 from ..splat import average_views, rasterize
 from .decoders import Autoencoded, Codewords, Linear

@@ -15,8 +15,10 @@ from .._check import as_tensor, check_shapes, check_whole
 from .._rows import unit_embeddings, unit_rows
 from ..cameras import Camera
 from ..gaussians import Gaussians, as_rows
-from ..labels import LOGIT_SCALE, Classification, LabelSet, Score, Selection, select_by_similarity
+from ..labels import LabelSet, Selection
+from ..labels.classify import Classification
 from ..labels.questions import Classes, Negatives, check_rows, class_rows, make_question
+from ..labels.scores import LOGIT_SCALE, Score, select_by_similarity
 from ..metrics import MIB, semantic_storage_bytes
 from ..splat import Ranked, Rendering, rasterize, rasterize_labels
 from .decoders import Decoder

@@ -15,7 +15,7 @@ from .._card import short_repr
 from .._rows import row_norms
 from ..cameras import Camera
 from ..gaussians import Gaussians
-from ..labels import LOGIT_SCALE
+from ..labels.scores import LOGIT_SCALE
 from ..splat import Ranked, rasterize_labels
 
 LEAST_SHARE = 1e-30

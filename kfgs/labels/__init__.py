@@ -1,24 +1,16 @@
 """Labels: classes of pixels and Gaussians, their transfer to the colour field, selections and edits (Sec. 3.4)."""
 
-from .boxes import OrientedBox
-from .classify import Classification, classify, label_pixels, nearest_codeword
-from .color import parse_color, recolor
-from .components import component_numbers
-from .edits import Duplicate, Edit, EditList, Extract, Insert, Move, Opacity, Recolor, Remove, join
+from .classify import classify
+from .edit_list import EditList, Insert
+from .edits import Duplicate, Extract, Move, Opacity, Recolor, Remove
 from .label_set import LabelSet, load_label_set
-from .nearest import Transfer, default_distance, nearest_labels
-from .parts import Part, connected_parts
-from .scores import CANONICAL, LOGIT_SCALE, Score
-from .selection import Selection, relevancy, select_by_similarity
-from .transfer import transfer_labels
-from .where import InBox, InSphere, OfClass, OfIndex, Where
+from .parts import OrientedBox, Part, connected_parts
+from .scores import relevancy
+from .selection import InBox, InSphere, OfClass, OfIndex, Selection
+from .transfer import Transfer, nearest_labels, transfer_labels
 
 __all__ = [
-    "CANONICAL",
-    "LOGIT_SCALE",
-    "Classification",
     "Duplicate",
-    "Edit",
     "EditList",
     "Extract",
     "InBox",
@@ -33,22 +25,12 @@ __all__ = [
     "Part",
     "Recolor",
     "Remove",
-    "Score",
     "Selection",
     "Transfer",
-    "Where",
     "classify",
-    "component_numbers",
     "connected_parts",
-    "default_distance",
-    "join",
-    "label_pixels",
     "load_label_set",
-    "nearest_codeword",
     "nearest_labels",
-    "parse_color",
-    "recolor",
     "relevancy",
-    "select_by_similarity",
     "transfer_labels",
 ]

@@ -1,14 +1,14 @@
-"""Classify features, and label rendered pixels by codewords (Sec. 3.4)."""
+"""Classify features, and quantise rendered latents to codewords (Sec. 3.4)."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from .._card import short_repr
-from .._check import as_tensor, check_choice, check_shapes
+from .._check import as_tensor, check_shapes
 from .._rows import EPS, check_directions, row_norms, unit_embeddings, unit_rows
 from ..quant.codebook import Codebook
 from ..splat.engines.table import choose, load, offers
@@ -60,61 +60,41 @@ def classify(
     return Classification(labels.masked_fill(nothing, -1), scores.masked_fill(nothing, 0))
 
 
-def label_pixels(
-    latent_map: Tensor,  # [..., d], usually [H, W, d]
+def pixel_codewords(
+    latents: Tensor,  # [..., d], usually a rendered map [H, W, d]
     codebook: Codebook,
-    labels: Tensor,  # [K] int64
     autoencoder: Autoencoder | None = None,
     *,
-    decode: Literal["exact", "latent"] = "exact",
+    exact: bool = True,
     covered: Tensor | None = None,  # [...] bool
 ) -> Tensor:  # [...] int64
-    """Label each rendered latent: decode it (Psi), quantise it by cosine to the codebook (Eq. 5), look up its class.
+    """The codeword of each rendered latent: decode it (Psi), and quantise it by cosine to the codebook (Eq. 5).
 
-    `decode="exact"` is the paper's method and the reference. `decode="latent"` takes the codeword with the nearest
-    **latent** (Euclidean): it saves the decoder's 0.83 M multiply-adds per pixel, and gives the same class for 98.9 % of
-    pixels that mixed two latents (72 codewords). Without an autoencoder the map holds features, which are quantised.
-
-    Args:
-        latent_map: a rendered map [H, W, d], or the latents of N Gaussians [N, d].
-        codebook: S.
-        labels: the class of each codeword, from `classify(codebook.codewords, ...)`.
-        autoencoder: the scene's autoencoder, or None.
-        decode: see above.
-        covered: pixels that show something, for instance `alpha > 0.5`; the others get label -1.
-
-    Returns:
-        Labels on the map's device, -1 = none. All-zero features have none; an all-zero latent is a normal value.
-
-    Raises:
-        ValueError: if shapes disagree, or `decode` is unknown.
+    That is the paper's method. Not `exact`, it is the codeword with the nearest **latent** (Euclidean): this saves the
+    decoder's 0.83 M multiply-adds per pixel, and gives the same class for 98.9 % of the pixels that mix two latents (72
+    codewords). Without an autoencoder the map holds features, which are quantised. -1 where the feature is all-zero, or
+    the pixel is not `covered`.
     """
-    check_choice("decode", decode, ("exact", "latent"))
-    check_shapes(("codebook.codewords", codebook.codewords, "K D"), ("labels", labels, "K"))
-    shape = latent_map.shape[:-1]
-    if covered is not None and covered.shape != shape:
-        raise ValueError(f"covered: expected a mask {tuple(shape)} (from latent_map), got {tuple(covered.shape)}")
-    rows = latent_map.detach().reshape(-1, latent_map.shape[-1])
-    table = labels.to(rows.device, torch.int64)
+    rows = latents.detach().reshape(-1, latents.shape[-1])
     out = torch.full((len(rows),), -1, dtype=torch.int64, device=rows.device)
     which = torch.arange(len(rows), device=rows.device) if covered is None else covered.reshape(-1).nonzero()[:, 0]
     with torch.no_grad():
         centres = None
-        if autoencoder is not None and decode == "latent":
+        if autoencoder is not None and not exact:
             centres = autoencoder.encode(codebook.codewords).to(rows)
         layers = None if autoencoder is None else _score_layers(rows, codebook, autoencoder, centres)
         if layers is not None:
-            winners, leads = load(_engine(rows)).decide(layers, table, rows[which])
-            out[which] = table[winners]
+            own = torch.arange(codebook.size, device=rows.device)
+            winners, leads = load(_engine(rows)).decide(layers, own, rows[which])
+            out[which] = winners
             which = which[~(leads > LEAD)]
         for part in which.split(PIXELS):
             if centres is not None:
-                out[part] = table[nearest_codeword(rows[part], centres)]
+                out[part] = nearest_codeword(rows[part], centres)
             else:
                 features = rows[part] if autoencoder is None else autoencoder.decode(rows[part])
-                nothing = row_norms(features) <= EPS
-                out[part] = table[codebook.quantize(features)].masked_fill(nothing, -1)
-    return out.reshape(shape)
+                out[part] = codebook.quantize(features).masked_fill(row_norms(features) <= EPS, -1)
+    return out.reshape(latents.shape[:-1])
 
 
 def nearest_codeword(
@@ -122,7 +102,6 @@ def nearest_codeword(
     centres: Tensor,  # [K, d]
 ) -> Tensor:  # [N] int64
     """The codeword whose latent is nearest, argmin_k |x - c_k|^2 = argmin_k |c_k|^2 - 2 x.c_k; ties go to the lowest."""
-    check_shapes(("latents", latents, "N d"), ("centres", centres, "K d"))
     return torch.addmm((centres * centres).sum(dim=-1), latents, centres.T, alpha=-2).argmin(dim=-1)
 
 

@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, get_args
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
 
 import torch
 from PIL import ImageColor
 from torch import Tensor
 
-from .._card import short_repr
-from .._check import as_tensor, check_choice, check_shapes
 from ..gaussians import Gaussians
 from ..splat.sh import rgb_to_sh0, sh0_to_rgb
 
 Mode = Literal["tint", "hue"]
-MODES: tuple[Mode, ...] = get_args(Mode)
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709 weights of R, G, B, on display values, in which blending is linear
 DARK = 1 / 255  # an object darker than one 8-bit step has no shading
 
 
 def parse_color(color: str | Sequence[float] | Tensor, name: str = "rgb") -> tuple[float, float, float]:
-    """A colour as (red, green, blue) in [0, 1].
+    """A colour as (red, green, blue) in [0, 1], from `"#c04040"`, a CSS name, `"rgb(192, 64, 64)"`, or three numbers in [0, 1].
 
-    Args:
-        color: `"#c04040"`, a CSS name like `"teal"`, `"rgb(192, 64, 64)"`; or three numbers in [0, 1].
-        name: the argument's name in errors (ValueError).
+    `name` is the argument's name in errors (ValueError).
 
     Example:
         >>> parse_color("#ff0080") == parse_color("rgb(255, 0, 128)") == (1.0, 0.0, 128 / 255)
@@ -52,13 +47,13 @@ def parse_color(color: str | Sequence[float] | Tensor, name: str = "rgb") -> tup
 def recolor(
     gaussians: Gaussians,
     mask: Tensor,  # [N] bool
-    rgb: str | Sequence[float] | Tensor,  # [3] in [0, 1]
+    rgb: Sequence[float],  # [3] in [0, 1]
     mode: Mode = "tint",
 ) -> Gaussians:
-    """Give the Gaussians under the mask one hue and keep their shading.
+    """Give the Gaussians under the mask one hue and keep their shading: what the edit `Recolor` does.
 
     Each Gaussian's luminance L (Rec. 709, of its view-independent colour) is replaced by a colour T(L) on a curve from
-    black over the shades of `rgb` to white (`Shades`), and its view-dependent luminance follows the curve's slope there:
+    black over the shades of `rgb` to white (`shades`), and its view-dependent luminance follows the curve's slope there:
     `color(v) = T(L) + T'(L) (L(v) - L)`. That is linear in the spherical harmonics, so it holds from every direction,
     and blending keeps it. The paper says only "color modification".
 
@@ -66,23 +61,13 @@ def recolor(
       luminance stay, as if the albedo changed under the same light. If the middle is below 1/255, the colour is flat.
     - `"hue"` keeps luminance from every direction and changes hue and saturation only: a dark plant stays dark.
 
-    Raises:
-        ValueError: if there is no `sh`, the mask has another length, or `rgb` is not a colour (see `parse_color`).
-        TypeError: if the mask is not boolean.
+    A ValueError if there is no `sh`.
     """
-    mask = as_tensor("mask", mask)
-    check_shapes(("gaussians.means", gaussians.means, "N 3"), ("mask", mask, "N"))
-    if mask.dtype != torch.bool:
-        raise TypeError(f"mask: expected a boolean mask, got {mask.dtype}; compare first, as in labels == 3")
-    check_choice("mode", mode, MODES)
     if gaussians.sh is None:
         raise ValueError(
             "gaussians.sh: expected spherical harmonics [N, K, 3], got None; pass the colour field, not the semantic one"
         )
-    target = gaussians.sh.new_tensor(parse_color(rgb))
-    if not bool(mask.any()):
-        return gaussians
-    sh = gaussians.sh[mask]
+    sh, target = gaussians.sh[mask], gaussians.sh.new_tensor(rgb)
     weights = sh.new_tensor(LUMINANCE)
     luminance = sh0_to_rgb(sh[:, 0]) @ weights  # [n], may be slightly negative: 3DGS clamps after summing
     middle = _middle(luminance.detach(), gaussians.opacities[mask].detach(), gaussians.scales[mask].detach())
@@ -90,8 +75,7 @@ def recolor(
     if mode == "tint" and float(middle) < DARK:
         painted[:, 0] = rgb_to_sh0(target)
     else:
-        shades = same_luminance(target) if mode == "hue" else tint(target, middle)
-        colors, slopes = shades(luminance)
+        colors, slopes = shades(target, middle if mode == "tint" else None)(luminance)
         painted[:, 0] = rgb_to_sh0(colors)
         painted[:, 1:] = (sh[:, 1:] @ weights)[..., None] * slopes[:, None]
     recoloured = gaussians.sh.clone()
@@ -108,52 +92,32 @@ def _middle(luminance: Tensor, opacities: Tensor, scales: Tensor) -> Tensor:  # 
     return luminance[order][int(torch.searchsorted(reached, reached[-1] / 2).clamp(max=len(order) - 1))]
 
 
-class Shades(NamedTuple):
-    """The colour that replaces each luminance: a curve from black to white through the shades and tints of one hue.
+def shades(
+    rgb: Tensor,  # [3]
+    middle: Tensor | None,
+) -> Callable[[Tensor], tuple[Tensor, Tensor]]:  # [n] -> [n, 3], [n, 3]
+    """What replaces each luminance: a colour on the curve from black to white through the shades and tints of one hue.
 
-    The old luminance L first becomes a tone t(L): `gain L` up to the bend, then linear to white at L = 1. A tone is its
-    luminance in the given hue, as saturated as the display allows: `peak t / knee` up to the knee, then linear to white.
+    The function gives the colours, and by how much they change per unit of luminance. The old luminance L first becomes a
+    tone t(L). Without a `middle` it is L. Otherwise the middle becomes `rgb`, and ratios stay as at a change of albedo:
+    t = gain L. A brighter colour could leave the display's range: then ratios hold up to a bend, where the hue is at its
+    brightest or halfway to white, and t goes linearly to 1 at L = 1. A tone is its luminance in the hue, as saturated as
+    the display allows: `peak t / knee` up to the knee, then linear to white. Black has no hue, so it gives greys.
     """
+    weights = rgb.new_tensor(LUMINANCE)
+    peak = rgb / rgb.max() if float(rgb.max()) > 0 else torch.ones_like(rgb)  # the brightest colour of this hue
+    knee = peak @ weights
+    gain = torch.ones_like(knee) if middle is None else rgb @ weights / middle
+    bend = torch.minimum(knee, (1 + rgb @ weights) / 2) / gain if float(gain) > 1 else torch.full_like(knee, torch.inf)
+    straight = (1 - gain * bend) / (1 - bend) if float(gain) > 1 else gain
+    to_white = (1 - peak) / (1 - knee) if float(1 - knee) > 1e-6 else torch.ones_like(peak)  # greys stay grey
 
-    peak: Tensor  # [3] the brightest colour of the hue and saturation: its largest channel is 1
-    knee: Tensor  # [] its luminance
-    gain: Tensor  # [] ratio of new to old luminance
-    bend: Tensor  # [] old luminance up to which the ratio holds; infinite if it holds throughout
-
-    def __repr__(self) -> str:
-        return short_repr(self)
-
-    def __call__(self, luminance: Tensor) -> tuple[Tensor, Tensor]:  # [n] -> [n, 3], [n, 3]
-        """The colour of each luminance, and by how much it changes per unit of luminance."""
-        bent = luminance > self.bend
-        straight = (1 - self.gain * self.bend) / (1 - self.bend) if bool(bent.any()) else self.gain
-        tone = self.gain * luminance.clamp(max=self.bend) + straight * (luminance - self.bend).clamp(min=0)
-        rate = torch.where(bent, straight, self.gain)
-        above = (tone > self.knee)[:, None]
-        rest = 1 - self.knee
-        to_white = (1 - self.peak) / rest if float(rest) > 1e-6 else torch.ones_like(self.peak)  # greys stay grey
-        slopes = torch.where(above, to_white, self.peak / self.knee)
-        colors = torch.where(above, self.peak + to_white * (tone - self.knee)[:, None], slopes * tone[:, None])
+    def replace(luminance: Tensor) -> tuple[Tensor, Tensor]:
+        tone = gain * luminance.clamp(max=bend) + straight * (luminance - bend).clamp(min=0)
+        rate = torch.where(luminance > bend, straight, gain)
+        above = (tone > knee)[:, None]
+        slopes = torch.where(above, to_white, peak / knee)
+        colors = torch.where(above, peak + to_white * (tone - knee)[:, None], slopes * tone[:, None])
         return colors, slopes * rate[:, None]
 
-
-def same_luminance(rgb: Tensor) -> Shades:  # rgb: [3]
-    """Shades that keep every luminance and take the hue of `rgb` (black has none: greys)."""
-    brightest = rgb.max()
-    peak = rgb / brightest if float(brightest) > 0 else torch.ones_like(rgb)
-    knee = peak @ rgb.new_tensor(LUMINANCE)
-    return Shades(peak, knee, torch.ones_like(knee), torch.full_like(knee, torch.inf))
-
-
-def tint(rgb: Tensor, middle: Tensor) -> Shades:  # [3], []
-    """Shades that turn the luminance `middle` (> 0) into `rgb` and keep ratios, as a change of albedo does.
-
-    A darker colour than before keeps all ratios. A brighter one could leave the display's range: then ratios hold until
-    the hue is at its brightest, or halfway to white, and brighter values go linearly to white.
-    """
-    shades = same_luminance(rgb)
-    target = rgb @ rgb.new_tensor(LUMINANCE)
-    gain = target / middle
-    if float(gain) <= 1:
-        return shades._replace(gain=gain)
-    return shades._replace(gain=gain, bend=torch.minimum(shades.knee, (1 + target) / 2) / gain)
+    return replace

@@ -41,8 +41,7 @@ class LabelSet:
     """The origin of the rows, as JSON: `teacher` (`teachers.identify`), `templates`, `synonyms`, `examples`."""
 
     def __post_init__(self) -> None:
-        _check_list(self.names)
-        object.__setattr__(self, "names", tuple(self.names))
+        object.__setattr__(self, "names", _as_list(self.names))
         words = (*self.names, *self.negative_names)
         if any(not isinstance(name, str) or not name or not name.isprintable() for name in words):
             raise ValueError(f"names: expected words, got {list(words)!r:.200}; give each class a name")
@@ -58,20 +57,13 @@ class LabelSet:
         return len(self.names)
 
     def __repr__(self) -> str:
-        return f"LabelSet({len(self)} classes: {cut(self._shown(5), 140)}; {self.dim} channels)"
+        return f"LabelSet({len(self)} classes: {cut(', '.join(self.names[:12]), 140)}; {self.dim} channels)"
 
     def _repr_html_(self) -> str:
         teacher = self.info.get("teacher")
-        facts = {
-            "classes": f"{len(self)}: {self._shown(12)}",
-            "embeddings": self.embeddings,
-            "negatives": self.negatives,
-            "teacher": teacher.get("name") if isinstance(teacher, dict) else None,
-        }
-        return html_card("LabelSet", facts)
-
-    def _shown(self, count: int) -> str:
-        return ", ".join(self.names[:count]) + (", ..." if len(self) > count else "")
+        name = teacher.get("name") if isinstance(teacher, dict) else None
+        classes = f"{len(self)}: {cut(', '.join(self.names), 140)}"
+        return html_card("LabelSet", {"classes": classes, "embeddings": self.embeddings, "teacher": name})
 
     @property
     def dim(self) -> int:
@@ -90,43 +82,37 @@ class LabelSet:
             return False
 
     def select(self, names: Sequence[str]) -> LabelSet:
-        """Keep only the named classes; their order gives the new labels, from 0.
-
-        Raises:
-            ValueError: if one is unknown (the message offers near ones), or named twice.
-        """
-        _check_list(names)
-        rows = [self.index(name) for name in names]
+        """Keep only the named classes; their order gives the new labels, from 0. A ValueError for an unknown name."""
+        rows = [self.index(name) for name in _as_list(names)]
         return replace(self, names=tuple(self.names[row] for row in rows), embeddings=self.embeddings[rows])
 
     def save(self, path: str | Path) -> None:
         """Write one .safetensors file with everything, names included; `load_label_set` reads it.
 
-        Raises:
-            ValueError: if the name does not end in .safetensors, or `info` is not JSON.
+        A ValueError if the name does not end in .safetensors, or `info` is not JSON.
         """
         path = as_path(path)
         if path.suffix != SUFFIX:
-            raise ValueError(f"path: expected a file name that ends in {SUFFIX}, got {path}; give another name")
+            raise ValueError(f"path: expected a name that ends in {SUFFIX}, got {path.name!r}; rename it")
+        texts = {"kfgs": KIND, "version": VERSION}
         try:
-            info = json.dumps(self.info, allow_nan=False)
+            for name in ("names", "negative_names", "info"):
+                texts[name] = json.dumps(getattr(self, name), allow_nan=False)
         except (TypeError, ValueError) as error:
             raise ValueError(
                 f"info: expected what JSON can hold, got {error}; use strings and finite numbers"
             ) from error
         parts = {"embeddings": self.embeddings} | ({} if self.negatives is None else {"negatives": self.negatives})
         tensors = {name: rows.detach().to("cpu", torch.float32).contiguous().clone() for name, rows in parts.items()}
-        names = {name: json.dumps(getattr(self, name)) for name in ("names", "negative_names")}
         with atomic_path(path) as temporary:
-            save_tensors(temporary, tensors, {"kfgs": KIND, "version": VERSION, "info": info} | names)
+            save_tensors(temporary, tensors, texts)
 
 
 def load_label_set(classes: str | Path, embeddings: str | Path | None = None) -> LabelSet:
     """Read classes and their embeddings from one table, or from two files: names and rows.
 
-    Args:
-        classes: a table (.safetensors, from `LabelSet.save`), or class names (a JSON list of strings).
-        embeddings: with class names: an .npy file [C, D] of floats with a row per name, or a table to take the classes from.
+    `classes` is a table (.safetensors, from `LabelSet.save`), or class names (a JSON list of strings). With class names,
+    `embeddings` is an .npy file [C, D] of floats with a row per name, or a table to take the classes from.
 
     Raises:
         FileNotFoundError: if a file is missing.
@@ -143,8 +129,8 @@ def load_label_set(classes: str | Path, embeddings: str | Path | None = None) ->
         )
     if embeddings is None:
         raise ValueError(
-            f"embeddings: expected an .npy file of one row per name in {classes}, got none; pass it, or pass a table that "
-            "`kfgs features --words` made, instead of both"
+            f"embeddings: expected an .npy file of one row per name in {classes}, got none; pass it, or pass a table of "
+            "`kfgs features --words` alone"
         )
     path = as_path(embeddings)
     if path.suffix == SUFFIX:
@@ -173,21 +159,21 @@ def teacher_mismatch(one: dict[str, Any], other: dict[str, Any]) -> str | None:
     return None
 
 
-def _check_list(names: Sequence[str]) -> None:
+def _as_list(names: Sequence[str]) -> tuple[str, ...]:
     if isinstance(names, str):
         raise TypeError(f"names: expected a list of class names, got the text {names!r:.80}; put it into a list")
+    return tuple(names)
 
 
 def _read_table(path: Path) -> LabelSet:
     """Read what `LabelSet.save` wrote."""
     expected, advice = f"a kfgs {KIND} (a table of words)", "make it again with `kfgs features --words`"
     parts, metadata = read_safetensors(path, expected, advice, kfgs=(KIND, VERSION))
-    parts = {name: rows.float() for name, rows in parts.items()}
-    for name, rows in parts.items():
-        if rows.ndim != 2 or not torch.isfinite(rows).all():
-            raise ValueError(f"{path}: expected finite rows of {name}, got others; {advice}")
-    try:
+    with reading(path, expected, advice):
+        for name, rows in parts.items():
+            if rows.ndim != 2 or not torch.isfinite(rows).all():
+                raise ValueError(f"it has other {name} than finite rows")
+        rows, negatives = parts["embeddings"].float(), parts.get("negatives")
         names, negative_names, info = (parse_json(metadata[key]) for key in ("names", "negative_names", "info"))
-        return LabelSet(tuple(names), parts["embeddings"], parts.get("negatives"), tuple(negative_names), {**info})
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected {expected}, but it cannot be read ({error}); {advice}") from error
+        negatives = None if negatives is None else negatives.float()
+        return LabelSet(tuple(names), rows, negatives, tuple(negative_names), {**info})

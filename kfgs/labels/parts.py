@@ -9,18 +9,71 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._card import say_coordinate
-from .._check import check_shapes, check_whole
+from .._card import say_coordinate, short_repr
+from .._check import as_tensor, check_range, check_shapes, check_whole
 from .._origin import to_world
+from .._rows import check_finite
 from ..cameras import Camera
 from ..gaussians import Gaussians, check_gaussians
 from ..splat import sum_pixels
-from .boxes import OrientedBox
 from .components import component_numbers
 from .selection import Selection
 
 LONGEST = 160  # longer side in pixels of the views compared; on room_0 shares change by at most 0.3 % of the picture
 SPECK = 0.05  # parts smaller than this share of the largest are left out
+
+
+@dataclass(frozen=True, eq=False)
+class OrientedBox:
+    """A box with any orientation, in world units: the points `center + sum_i t_i axes[i]` with |t_i| <= half[i].
+
+    **Convention**: the axes are the *rows* of a rotation (right-handed); `half` are half the edges. In Open3D the box is
+    `OrientedBoundingBox(box.center.numpy(), box.axes.numpy().T, 2 * box.half.numpy())`.
+    """
+
+    center: Tensor  # [3]
+    axes: Tensor  # [3, 3] orthonormal rows
+    half: Tensor  # [3] >= 0
+
+    __repr__ = short_repr
+
+    @classmethod
+    def around(cls, points: Tensor) -> OrientedBox:  # points: [N, 3]
+        """The smaller of two boxes around points: along their principal axes, and along the world's; longest edge first.
+
+        A ValueError if there is no point, or one is not finite.
+        """
+        points = as_tensor("points", points).detach().cpu().double()
+        check_shapes(("points", points, "N 3"))
+        if len(points) == 0:
+            raise ValueError("points: expected at least one, got none; select something first")
+        check_finite("points", points)
+        middle = points.mean(dim=0)
+        principal = torch.linalg.svd((points - middle).T @ (points - middle))[2]
+        boxes = []
+        for axes in (principal, torch.eye(3, dtype=torch.float64)):
+            low, high = ((points - middle) @ axes.T).aminmax(dim=0)
+            longest = (high - low).argsort(descending=True, stable=True)
+            first, second = axes[longest[0]], axes[longest[1]]
+            axes = torch.stack([first, second, torch.linalg.cross(first, second)])  # right-handed
+            low, high = ((points - middle) @ axes.T).aminmax(dim=0)
+            boxes.append(OrientedBox(middle + (low + high) / 2 @ axes, axes, (high - low) / 2))
+        return min(boxes, key=lambda box: box.volume)
+
+    @property
+    def volume(self) -> float:
+        """The volume in cubed world units; 0 for a flat box."""
+        return float((2 * self.half).prod())
+
+    @property
+    def corners(self) -> Tensor:  # [8, 3]
+        """The eight corners, sorted by their coordinates along the first, second and third axis."""
+        signs = torch.cartesian_prod(*([torch.tensor([-1.0, 1.0])] * 3)).to(self.half)
+        return self.center + (signs * self.half) @ self.axes
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain lists: center, axes (rows) and half edges."""
+        return {name: getattr(self, name).tolist() for name in ("center", "axes", "half")}
 
 
 @dataclass(frozen=True)
@@ -50,22 +103,6 @@ class Part:
         """How many Gaussians."""
         return len(self.indices)
 
-    @property
-    def volume(self) -> float:
-        """Of the oriented box, in cubed world units."""
-        return self.box.volume
-
-    def selection(self, count: int) -> Selection:
-        """This part as a selection in the selection's cloud, which has `count` Gaussians; scores are 1 inside, 0 outside.
-
-        Raises:
-            ValueError: if the cloud has fewer Gaussians than the highest index needs.
-        """
-        check_whole("count", count, int(self.indices[-1]) + 1)
-        mask = torch.zeros(count, dtype=torch.bool, device=self.indices.device)
-        mask[self.indices] = True
-        return Selection.of(mask, self.how)
-
     def __repr__(self) -> str:
         place = ", ".join(say_coordinate(x, 3) for x in self.centroid.tolist())
         size = " x ".join(f"{2 * x:.3g}" for x in self.box.half.tolist())
@@ -81,7 +118,7 @@ class Part:
             "centroid": self.centroid.tolist(),
             "box": self.box.to_json(),
             "extent": [corner.tolist() for corner in self.extent],
-            "volume": self.volume,
+            "volume": self.box.volume,
             "best_view": None if self.best_view is None else vars(self.best_view).copy(),
             "how": self.how,
             "indices": self.indices.tolist(),
@@ -96,7 +133,6 @@ def connected_parts(
     distance: float | None = None,
     smallest: int | None = None,
     most: int = 100,
-    engine: str = "auto",
 ) -> list[Part]:
     """Split a selection of these Gaussians into its connected parts ("the four chairs"), largest first.
 
@@ -104,10 +140,9 @@ def connected_parts(
         gaussians: the cloud.
         selection: an empty one has no parts.
         cameras: views without distortion, to find the best one of each part.
-        distance: Gaussians at most this far apart are connected, in world units; see `component_numbers`.
+        distance: Gaussians at most this far apart are connected, in world units; None takes it from their spacing.
         smallest: parts with fewer Gaussians are left out; None: those below 5 % of the largest.
         most: the most parts to return.
-        engine: compositing engine.
 
     Raises:
         ValueError: if shapes disagree, a position is not finite, or a number is out of range.
@@ -115,6 +150,8 @@ def connected_parts(
     check_gaussians(gaussians)
     check_shapes(("gaussians.means", gaussians.means, "N 3"), ("selection.mask", selection.mask, "N"))
     check_whole("most", most, 1)
+    if distance is not None:
+        check_range("distance", distance, 0, closed=(False, False))
     numbers = component_numbers(gaussians.means, selection.mask, distance)
     sizes = torch.bincount(numbers[selection.mask])
     if len(sizes) == 0:
@@ -123,7 +160,7 @@ def connected_parts(
     kept = int((sizes[:most] >= least).sum())
     order = torch.argsort(numbers, stable=True)[int((numbers < 0).sum()) :]  # part by part, ascending in each
     members = list(order.split(sizes.tolist())[:kept])
-    shares = _view_shares(gaussians, members, cameras or [], engine)
+    shares = _view_shares(gaussians, members, cameras or [])
     parts = []
     for i, indices in enumerate(members):
         points = to_world(gaussians.means[indices].detach().double(), gaussians.origin)
@@ -131,30 +168,22 @@ def connected_parts(
         if cameras and bool((shares[:, i] > 0).any()):
             best = int(shares[:, i].argmax())
             view = BestView(cameras[best].name, best, float(shares[best, i]))
-        part = Part(
-            indices=indices,
-            score=float(selection.scores[indices].double().mean()),
-            centroid=points.mean(dim=0),
-            box=OrientedBox.around(points),
-            extent=(points.amin(dim=0), points.amax(dim=0)),
-            best_view=view,
-            how=f"{selection.how}; part {i + 1} of {len(sizes)}",
-            total=len(sizes),
-        )
-        parts.append(part)
+        score, extent = float(selection.scores[indices].double().mean()), (points.amin(dim=0), points.amax(dim=0))
+        how, box = f"{selection.how}; part {i + 1} of {len(sizes)}", OrientedBox.around(points)
+        parts.append(Part(indices, score, points.mean(dim=0), box, extent, view, how, len(sizes)))
     return parts
 
 
-def _view_shares(gaussians: Gaussians, parts: list[Tensor], cameras: Sequence[Camera], engine: str) -> Tensor:  # [C, P]
+def _view_shares(gaussians: Gaussians, parts: list[Tensor], cameras: Sequence[Camera]) -> Tensor:  # [C, P]
     """The share of each camera's picture that each part fills: the mean over pixels of its rendering weights w = T alpha.
 
     Hidden parts do not count, and a transparent part counts by its opacity. Pictures have at most 160 pixels a side.
     """
     shares = torch.zeros(len(cameras), len(parts)).to(gaussians.means)
-    for c, camera in enumerate(cameras if parts else ()):
+    for c, camera in enumerate(cameras):
         small = camera.fitted(LONGEST)
         with torch.no_grad():
-            index, _, weights = sum_pixels(gaussians, small, torch.ones(*small.size, 1).to(shares), engine=engine)
+            index, _, weights = sum_pixels(gaussians, small, torch.ones(*small.size, 1).to(shares))
         whole = torch.zeros(len(gaussians)).to(shares).index_add_(0, index, weights.to(shares))
         shares[c] = torch.stack([whole[part].sum() for part in parts]) / (small.width * small.height)
     return shares

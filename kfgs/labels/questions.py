@@ -9,7 +9,6 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from .._card import short_repr
 from .._check import as_tensor, check_choice, check_shapes
 from .._rows import unit_rows
 from .label_set import LabelSet, teacher_mismatch
@@ -26,10 +25,6 @@ class Question(NamedTuple):
 
     row: Tensor  # [D]
     negatives: Tensor | None  # [M, D]
-    words: str
-
-    def __repr__(self) -> str:
-        return short_repr(self)
 
     @property
     def rows(self) -> Tensor:  # [1 + M, D]
@@ -42,32 +37,31 @@ def class_rows(classes: Classes, dim: int, info: dict[str, Any]) -> Tensor:  # [
 
     Warns if another teacher embedded them; raises a TypeError if it is neither, a ValueError for other channels.
     """
-    if isinstance(classes, LabelSet):
-        if classes.embeddings.shape[1] == dim and info.get("teacher") == classes.info.get("teacher"):
-            return classes.embeddings
-        difference = teacher_mismatch(info, classes.info)
-        what, again = "text of another teacher", AGAIN
-        if "examples" in classes.info:
-            what, again = "examples of another teacher", "make them again: `kfgs features FIELD --examples FILE`"
-        more = "" if difference is None else f" ({difference})"
-        if classes.dim != dim:
-            got = f"got {tuple(classes.embeddings.shape)}: {what}?{more}"
-            raise ValueError(f"classes: expected embeddings [C, {dim}] (from the field), {got} If so, {again}")
-        if difference is not None:
-            warnings.warn(
-                f"classes: expected those of the field's teacher, got {what}{more}; their spaces do not mix: {again}",
-                stacklevel=4,
-            )
-        return classes.embeddings
-    try:
-        rows = as_tensor("embeddings", classes, floating=True)
-    except TypeError as error:
-        raise TypeError(
-            f"classes: expected a LabelSet or embeddings [C, {dim}], got {type(classes).__name__}; load_label_set reads one, "
-            "make_label_set makes one"
-        ) from error
-    check_rows("embeddings", rows, ("C",), dim)
-    return rows
+    if not isinstance(classes, LabelSet):
+        try:
+            rows = as_tensor("embeddings", classes, floating=True)
+        except TypeError as error:
+            got = type(classes).__name__
+            raise TypeError(
+                f"classes: expected a LabelSet or embeddings [C, {dim}], got {got}; load_label_set reads one, make_label_set "
+                "makes one"
+            ) from error
+        check_rows("embeddings", rows, ("C",), dim)
+        return rows
+    difference, what, again = teacher_mismatch(info, classes.info), "text", AGAIN
+    if "examples" in classes.info:
+        what, again = "examples", "make them again: `kfgs features FIELD --examples FILE`"
+    got = f"{what} of another teacher" + ("" if difference is None else f" ({difference})")
+    if classes.dim != dim:
+        shape = tuple(classes.embeddings.shape)
+        raise ValueError(
+            f"classes: expected embeddings [C, {dim}] (from the field), got {shape}: {got}? If so, {again}"
+        )
+    if difference is not None:
+        warnings.warn(
+            f"classes: expected those of the field's teacher, got {got}; their spaces do not mix: {again}", stacklevel=4
+        )
+    return classes.embeddings
 
 
 def make_question(
@@ -96,38 +90,30 @@ def make_question(
         row, words = as_tensor("embedding", target, floating=True), "embedding"
         check_rows("embedding", row, (), dim)
         row = row if rows is None else row.to(rows)
-    others = row.new_zeros(0, dim) if rows is None else rows[_unlike(rows, row)]
     if not isinstance(negatives, str):
         against = as_tensor("negatives", negatives, floating=True)
         check_rows("negatives", against, ("M",), dim)
-        return Question(row, against, words)
-    if (
-        negatives == "auto"
-        and len(others)
-        and (isinstance(target, str) or (rows is not None and len(others) < len(rows)))
-    ):
-        return Question(row, others, words)
+        return Question(row, against)
     check_choice("negatives", negatives, ("auto", "classes", "canonical", "none"))
+    others = row.new_zeros(0, dim) if rows is None else rows[_unlike(rows, row)]
     canonical = None if table is None else _canonical(table, words, row)
     if negatives == "auto":
-        return Question(row, canonical, words)
+        is_class = isinstance(target, str) or (rows is not None and len(others) < len(rows))
+        negatives = "classes" if is_class and len(others) else "none" if canonical is None else "canonical"
     if negatives == "classes" and len(others) == 0:
         raise ValueError(f"negatives: expected other classes than {words!r}, got none; use 'canonical' or 'none'")
     if negatives == "canonical" and canonical is None:
         raise ValueError(
-            "negatives: expected canonical words in the classes' table, got none; make it with `kfgs features --words`, or use "
-            "'classes' or 'none'"
+            "negatives: expected canonical words in the classes' table, got none; `kfgs features --words` writes them"
         )
-    return Question(row, {"classes": others, "canonical": canonical, "none": None}[negatives], words)
+    return Question(row, {"classes": others, "canonical": canonical, "none": None}[negatives])
 
 
 def check_rows(name: str, rows: Tensor, axes: Sequence[str], dim: int) -> None:
     """Raise a ValueError unless rows have this shape. If only D differs, it asks whether the text is of another teacher."""
     if rows.ndim == len(axes) + 1 and rows.shape[-1] != dim:
-        expected = ", ".join((*axes, str(dim)))
-        raise ValueError(
-            f"{name}: expected [{expected}], got {tuple(rows.shape)}: text of another teacher? If so, {AGAIN}"
-        )
+        expected, got = ", ".join((*axes, str(dim))), tuple(rows.shape)
+        raise ValueError(f"{name}: expected [{expected}], got {got}: text of another teacher? If so, {AGAIN}")
     check_shapes((name, rows, (*axes, dim)))
 
 

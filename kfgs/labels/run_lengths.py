@@ -9,13 +9,9 @@ from torch import Tensor
 
 
 def decode_rle(segmentation: dict[str, Any]) -> Tensor:  # [H, W] bool
-    """A mask from COCO's run lengths: `{"size": [H, W], "counts": ...}`, zeros first, column by column.
+    """A mask from `{"size": [H, W], "counts": ...}`: lengths of runs, zeros first, column by column; or COCO's packed text.
 
-    Args:
-        segmentation: `counts` is a list of lengths, or the text that COCO's tools compress it to.
-
-    Raises:
-        ValueError: if the lengths do not add up to the size.
+    A ValueError if the lengths do not add up to the size.
 
     Example:
         >>> decode_rle({"size": [2, 2], "counts": [1, 2, 1]}).int().tolist()
@@ -24,16 +20,16 @@ def decode_rle(segmentation: dict[str, Any]) -> Tensor:  # [H, W] bool
     from pycocotools import mask as coco
 
     size, counts = segmentation.get("size"), segmentation.get("counts")
-    if not (isinstance(size, list) and len(size) == 2 and all(type(side) is int and 0 < side < 2**16 for side in size)):
-        raise ValueError(f"size: expected [height, width], got {size!r:.80}")
     try:
-        runs = segmentation
+        height, width = (int(side) for side in size)  # type: ignore[union-attr]
+        if not (0 < height < 2**16 and 0 < width < 2**16):
+            raise ValueError("sides of 1 to 65,535 pixels")
         if not isinstance(counts, str):
-            if sum(counts) != size[0] * size[1]:  # type: ignore[arg-type]
-                raise ValueError("they do not")
-            runs = coco.frPyObjects(segmentation, *size)
-        return torch.from_numpy(coco.decode(runs)).bool()
+            if sum(counts) != height * width:  # type: ignore[arg-type]
+                raise ValueError("another sum")
+            segmentation = coco.frPyObjects(segmentation, height, width)
+        return torch.from_numpy(coco.decode(segmentation)).bool()
     except Exception as error:  # pycocotools raises bare exceptions
         raise ValueError(
-            f"counts: expected lengths of runs that add up to {size[0]} x {size[1]}, got {counts!r:.80} ({error})"
+            f"counts: expected runs that add up to the size [H, W], got {counts!r:.80} for {size!r:.80} ({error})"
         ) from error

@@ -1,35 +1,43 @@
-"""Selections of Gaussians with scores, the operators that combine them, and the selection of what is like a query."""
+"""Selections of Gaussians with scores, and rules that select by class, index, box or sphere.
+
+A rule works on any cloud: `OfClass("chair").select(gaussians)` is a `Selection`. Edits hold rules, and JSON can.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import get_args
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor
 
-from .._card import cut, html_card
-from .._check import as_tensor, check_choice, check_range, check_shapes
+from .._card import cut, html_card, say_coordinate
+from .._check import as_tensor, check_range, check_shapes, check_whole
+from .._names import class_indices
 from .._origin import to_world
 from .._rows import check_finite
 from ..gaussians import Gaussians
-from .boxes import OrientedBox
-from .nearest import Array, positions
-from .scores import EVEN, LOGIT_SCALE, TEMPERATURE, Score, similarity_threshold
+from .components import component_numbers
+from .transfer import Array, positions
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Some of N Gaussians, with a score for every one of them.
+    """Some of N Gaussians, with a score for every one of them; `gaussians[selection]` are the Gaussians.
 
     `a & b`, `a | b`, `a - b` and `~a` combine selections of the same Gaussians. Scores follow Zadeh's rules: `&` takes the
     smaller, `|` the larger, `~a` has 1 - score; `a - b` is `a & ~b`. `len` is the number selected, so an empty selection is
     false in an `if`. `OfClass("chair").select(gaussians)`, `SemanticField.query` and `Selection.of(mask)` make selections.
 
     Example:
-        >>> near = Selection.of(torch.tensor([True, True, False]), "near")
-        >>> near.points(torch.tensor([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]])).max(axis=0).tolist()
-        [1.0, 0.0, 0.0]
+        >>> a, b = Selection.of(torch.tensor([True, True, False])), Selection.of(torch.tensor([True, False, False]))
+        >>> (a - b).indices.tolist()
+        [1]
     """
 
     mask: Tensor  # [N] bool
@@ -46,15 +54,12 @@ class Selection:
         return cls(mask, mask.to(torch.get_default_dtype()), None, how)
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.mask, Tensor) and isinstance(self.scores, Tensor)):
-            object.__setattr__(self, "mask", as_tensor("mask", self.mask))
-            object.__setattr__(self, "scores", as_tensor("scores", self.scores))
-        if self.mask.ndim != 1 or self.mask.shape != self.scores.shape:
-            check_shapes(("mask", self.mask, "N"), ("scores", self.scores, "N"))
+        for name in ("mask", "scores"):
+            object.__setattr__(self, name, as_tensor(name, getattr(self, name)))
+        check_shapes(("mask", self.mask, "N"), ("scores", self.scores, "N"))
         if self.mask.dtype != torch.bool:
             raise TypeError(f"mask: expected a boolean mask, got {self.mask.dtype}; compare first, as in labels == 3")
-        if not bool(torch.isfinite(self.scores).all()):
-            check_finite("scores", self.scores)
+        check_finite("scores", self.scores)
 
     def __len__(self) -> int:
         return int(self.mask.sum())
@@ -77,21 +82,6 @@ class Selection:
     def summary(self) -> str:
         """How it was made and its threshold, in words."""
         return self.how if self.threshold is None else f"score > {self.threshold:.4g} ({self.how})"
-
-    def points(self, cloud: Gaussians | Tensor) -> Array:  # [n, 3] float64
-        """The centres of the selected Gaussians in world units; `cloud` is their cloud, or positions [N, 3]."""
-        means = to_world(cloud.means, cloud.origin) if isinstance(cloud, Gaussians) else as_tensor("cloud", cloud)
-        check_shapes(("selection.mask", self.mask, "N"), ("cloud", means, "N 3"))
-        return positions("cloud", means[self.mask])
-
-    def box(self, cloud: Gaussians | Tensor) -> OrientedBox:
-        """A small box around `points`; a ValueError if nothing is selected."""
-        return OrientedBox.around(torch.from_numpy(self.points(cloud)))
-
-    def within(self, mask: Tensor, how: str) -> Selection:  # mask: [N] bool
-        """The part of this selection under a mask, with the same scores and threshold; `how` is added to the summary."""
-        check_shapes(("selection.mask", self.mask, "N"), ("mask", mask, "N"))
-        return Selection(self.mask & mask, self.scores, self.threshold, f"{self.how}; {how}" if self.how else how)
 
     def __and__(self, other: Selection) -> Selection:
         scores = torch.minimum(*self._both_scores(other))
@@ -123,100 +113,176 @@ class Selection:
         return self.scores.to(dtype), other.scores.to(self.scores.device, dtype)
 
 
-def relevancy(
-    similarity: Tensor,  # [N]
-    negatives: Tensor,  # [N, M]
-) -> Tensor:  # [N] in (0, 1)
-    """LERF's relevancy (Kerr 2023, Sec. 3.4): how much more similar to the query than to the most similar negative.
+class Where(ABC):
+    """A rule that selects some Gaussians of a cloud. Rules are plain data: equal ones compare equal."""
 
-    min over j of the first entry of softmax(10 [s, n_j]), which is sigmoid(10 (s - max_j n_j)). Above 0.5 the query is
-    more similar than every negative. LERF's negatives are the texts in `CANONICAL`; other classes of the scene are better
-    if they are known.
+    kind: ClassVar[str]
 
-    Args:
-        similarity: cosine with the query.
-        negatives: cosine with each of M >= 1 negatives.
+    def select(self, gaussians: Gaussians) -> Selection:
+        """Apply the rule; a ValueError if the cloud lacks the labels, class or index that it needs."""
+        return Selection.of(*self._find(gaussians))
 
-    Raises:
-        ValueError: if shapes disagree, there is no negative, or a number is not finite.
+    @abstractmethod
+    def _find(self, gaussians: Gaussians) -> tuple[Tensor, str]:
+        """The mask [N] of what is selected, and the rule in words."""
 
-    Example:
-        >>> relevancy(torch.tensor([0.9, 0.3]), torch.tensor([[0.2, 0.9], [0.1, 0.2]])).tolist()
-        [0.5, 0.7310585975646973]
+    def to_json(self) -> dict[str, Any]:
+        """Plain values that JSON can hold: `kind`, and the fields."""
+        return {"kind": self.kind} | plain_fields(self)
+
+
+@dataclass(frozen=True)
+class OfClass(Where):
+    """The Gaussians labelled with one class, or one connected part of them."""
+
+    kind: ClassVar[str] = "class"
+    name: str | int
+    """A name (exact, or else without regard to case), or an index, -1 for Gaussians without a label.
+
+    A name selects all classes with that name. An unknown name is an error; an index that no Gaussian has selects nothing.
     """
-    _check_cosines(similarity, negatives)
-    return torch.sigmoid(TEMPERATURE * (similarity - negatives.amax(dim=1)))
+    part: int | None = None
+    """Which connected part: 0 is the largest, 1 the next; one past the last selects nothing. None: all of the class."""
+    distance: float | None = None
+    """Gaussians at most this far apart are in one part, world units; None takes it from their spacing."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            check_whole("name", self.name, -1, 2**31 - 1)
+        if self.part is not None:
+            check_whole("part", self.part, 0)
+        if self.distance is not None:
+            check_range("distance", self.distance, 0, closed=(False, False))
+
+    def _find(self, gaussians: Gaussians) -> tuple[Tensor, str]:
+        labels = gaussians.labels
+        if labels is None:
+            raise ValueError(
+                f"gaussians.labels: expected labels to find class {self.name!r} by, got None; attach a semantic field "
+                "first, or select by a box or a sphere"
+            )
+        indices = class_indices(self.name, gaussians.names) if isinstance(self.name, str) else (self.name,)
+        mask, how = torch.isin(labels, torch.tensor(indices, device=labels.device)), f"label {self.name}"
+        if self.part is not None and bool(mask.any()):
+            parts = component_numbers(gaussians.means, mask, self.distance)
+            mask, how = parts == self.part, f"{how}; part {self.part + 1} of {int(parts.max()) + 1}"
+        return mask, how
 
 
-def select_by_similarity(
-    similarity: Tensor,  # [N]
-    negatives: Tensor | None = None,  # [N, M]
-    threshold: float | None = None,
-    valid: Tensor | None = None,  # [N] bool
-    *,
-    score: Score | None = None,
-    logit_scale: float = LOGIT_SCALE,
-) -> Selection:
-    """Select the Gaussians with a score above gamma; the score is the cosine, or with negatives the relevancy.
+@dataclass(frozen=True)
+class InBox(Where):
+    """The Gaussians whose centres lie in a box along the world's axes, faces included."""
 
-    If gamma is not given, `similarity_threshold` finds it in the scores. For a relevancy it is 0.5: more similar to the
-    query than to any negative. On room_0 (scores averaged over 30 views, all other classes as negatives; mean IoU over 18
-    classes with the data set's labels): cosine 0.88, relevancy 0.90, softmax 0.92.
+    kind: ClassVar[str] = "box"
+    min: tuple[float, ...]
+    """The least x, y, z, world units."""
+    max: tuple[float, ...]
+    """The greatest x, y, z."""
 
-    Args:
-        similarity: cosine with the query.
-        negatives: cosine with each negative (words to exclude), or None.
-        threshold: gamma; a cosine in [-1, 1], or another score in [0, 1].
-        valid: Gaussians whose feature is not all-zero; the others are not selected, score 0, and do not influence gamma.
-        score: "cosine", in [-1, 1]; "relevancy", in (0, 1); or "softmax": the query's entry of
-            softmax(l [s, n_1, ..., n_M]), its share among all words. None: the relevancy with negatives, else the cosine.
-        logit_scale: l of the softmax; a larger one is sharper.
+    def __post_init__(self) -> None:
+        set_fields(self, min=three_numbers("min", self.min), max=three_numbers("max", self.max))
+        if any(low > high for low, high in zip(self.min, self.max, strict=True)):
+            raise ValueError(f"max: expected no less than min {self.min} on every axis, got {self.max}; swap them")
 
-    Raises:
-        ValueError: if shapes disagree, negatives are missing, a number is not finite, or an option is out of range.
-    """
-    _check_cosines(similarity, negatives, valid)
-    score = score or ("cosine" if negatives is None else "relevancy")
-    if score not in get_args(Score):
-        check_choice("score", score, get_args(Score))
-    if threshold is not None:
-        check_range("threshold", threshold, -1 if score == "cosine" else 0, 1)
-    if score == "cosine":
-        scores = similarity
-    elif negatives is None:
-        raise ValueError(f"negatives: expected some for score {score!r}, got none; pass words that are not meant")
-    elif score == "relevancy":
-        scores = torch.sigmoid(TEMPERATURE * (similarity - negatives.amax(dim=1)))
-    else:
-        check_range("logit_scale", logit_scale, 0, closed=(False, True))
-        scores = (logit_scale * torch.cat([similarity[:, None], negatives], dim=1)).softmax(dim=1)[:, 0]
-    known = torch.ones_like(similarity, dtype=torch.bool) if valid is None else valid
-    scores = scores.masked_fill(~known, 0)
-    if threshold is not None:
-        gamma, how = float(threshold), "given"
-    elif score == "relevancy":
-        assert negatives is not None
-        gamma, how = EVEN, f"more like the query than like any of {negatives.shape[1]} negatives"
-    else:
-        gamma, how = similarity_threshold(scores[known])
-    if score == "softmax":
-        assert negatives is not None
-        how += f"; softmax over {1 + negatives.shape[1]} words, logit scale {logit_scale:.4g}"
-    return Selection((scores > gamma) & known, scores, gamma, how)
+    def _find(self, gaussians: Gaussians) -> tuple[Tensor, str]:
+        points = _points(gaussians)
+        inside = (points >= points.new_tensor(self.min)) & (points <= points.new_tensor(self.max))
+        size = " x ".join(f"{b - a:.4g}" for a, b in zip(self.min, self.max, strict=True))
+        return inside.all(dim=1), f"in a box of {size}"
 
 
-def _check_cosines(similarity: Tensor, negatives: Tensor | None, valid: Tensor | None = None) -> None:
-    """Raise a ValueError if shapes disagree, there is no negative, or a number is not finite."""
-    shapes = (
-        similarity.shape,
-        None if negatives is None else negatives.shape[:1],
-        None if valid is None else valid.shape,
-    )
-    if similarity.ndim != 1 or any(shape not in (None, similarity.shape) for shape in shapes):
-        check_shapes(("similarity", similarity, "N"), ("negatives", negatives, "N M"), ("valid", valid, "N"))
-    if negatives is not None and (negatives.ndim != 2 or negatives.shape[1] == 0):
-        check_shapes(("negatives", negatives, "N M"))
-        raise ValueError("negatives: expected at least one column, got none; pass what the query should not find")
-    for name, values in (("similarity", similarity), ("negatives", negatives)):
-        if values is not None and not bool(torch.isfinite(values).all()):
-            check_finite(name, values)
+@dataclass(frozen=True)
+class InSphere(Where):
+    """The Gaussians whose centres are at most `radius` from `center`, world units."""
+
+    kind: ClassVar[str] = "sphere"
+    center: tuple[float, ...]
+    radius: float
+
+    def __post_init__(self) -> None:
+        set_fields(self, center=three_numbers("center", self.center))
+        check_range("radius", self.radius, 0, closed=(False, False))
+
+    def _find(self, gaussians: Gaussians) -> tuple[Tensor, str]:
+        points = _points(gaussians)
+        inside = (points - points.new_tensor(self.center)).norm(dim=1) <= self.radius
+        center = ", ".join(say_coordinate(x, 4) for x in self.center)
+        return inside, f"within {self.radius:.4g} of ({center})"
+
+
+@dataclass(frozen=True)
+class OfIndex(Where):
+    """The Gaussians with these indices **in the cloud it is applied to**; an earlier edit may have renumbered them."""
+
+    kind: ClassVar[str] = "index"
+    indices: tuple[int, ...]
+    """Ascending, without repetition; made from whole numbers in any order."""
+
+    def __post_init__(self) -> None:
+        given: Any = self.indices.tolist() if isinstance(self.indices, Tensor) else self.indices
+        if isinstance(given, str) or not isinstance(given, Sequence):
+            raise TypeError(f"indices: expected a list of whole numbers, got {given!r:.80}; write it as [4, 7]")
+        for index in given:
+            check_whole("indices", index, 0, 2**62)
+        set_fields(self, indices=tuple(sorted(set(given))))
+
+    def _find(self, gaussians: Gaussians) -> tuple[Tensor, str]:
+        if self.indices and self.indices[-1] >= len(gaussians):
+            raise ValueError(
+                f"indices: expected indices below {len(gaussians)} (the number of Gaussians), got {self.indices[-1]}; "
+                "were they taken from another cloud, or before an edit that removed some?"
+            )
+        mask = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+        mask[list(self.indices)] = True
+        return mask, "by index"
+
+
+def class_name(names: Sequence[str], index: int) -> str:
+    """The name of a class; one without a name is called `class 7`."""
+    return names[index] if index < len(names) else f"class {index}"
+
+
+KINDS: dict[str, type[Where]] = {kind.kind: kind for kind in (OfClass, InBox, InSphere, OfIndex)}
+
+
+def _points(gaussians: Gaussians) -> Tensor:  # [N, 3] float64, in the world
+    return to_world(torch.from_numpy(positions("gaussians.means", gaussians.means)), gaussians.origin)
+
+
+def three_numbers(name: str, values: Any) -> tuple[float, ...]:
+    """Three finite numbers from a list, tuple, array or tensor, as a tuple; else a ValueError."""
+    plain = values.tolist() if hasattr(values, "tolist") else values
+    if not isinstance(plain, list | tuple) or len(plain) != 3:
+        raise ValueError(f"{name}: expected 3 numbers, got {values!r:.80}; write them as [x, y, z]")
+    for value in plain:
+        check_range(name, value, -math.inf, closed=(False, False))
+    return tuple(float(value) for value in plain)
+
+
+def set_fields(frozen: Any, **values: Any) -> None:
+    """Replace fields of a frozen dataclass by their checked form; called in its `__post_init__`."""
+    for name, value in values.items():
+        object.__setattr__(frozen, name, value)
+
+
+def plain_fields(value: Any) -> dict[str, Any]:
+    """The fields of a rule or an edit by name, as values for JSON; `read_object` reads them."""
+    values = {member.name: getattr(value, member.name) for member in fields(value)}
+    return {name: _plain(member) for name, member in values.items() if member is not None}
+
+
+def _plain(value: Any) -> Any:
+    if hasattr(value, "to_json"):
+        return value.to_json()
+    return [_plain(part) for part in value] if isinstance(value, tuple) else value
+
+
+def read_object(name: str, value: Any, kinds: Mapping[str, type[T]], tag: str) -> T:
+    """Make the rule or the edit that a JSON object names by `tag`; a ValueError begins with `name`, its place in the file."""
+    kind = value.get(tag) if isinstance(value, dict) else None
+    if not isinstance(kind, str) or kind not in kinds:
+        raise ValueError(f"{name}: expected an object whose {tag!r} is one of {', '.join(kinds)}, got {value!r:.80}")
+    try:
+        return kinds[kind](**{key: part for key, part in value.items() if key != tag})
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: {error}") from error

@@ -2,22 +2,72 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from .._check import as_tensor, check_range, check_shapes
 from .._origin import recounted
+from .._rows import check_finite
 from ..gaussians import Gaussians, check_gaussians
-from .nearest import nearest_labels
+
+CHUNK = 16_384  # destinations at a time
+SAMPLE = 20_000  # Gaussians measured for lambda or a spacing
+COVERAGE = 0.995  # lambda reaches this share of the destinations ...
+NEAREST = 2.0  # ... but is at least this many median spacings of the sources ...
+FARTHEST = 10.0  # ... and at most this many wide spacings,
+WIDE = 0.9  # which are this quantile of the spacings
+
+Array = np.ndarray[Any, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Transfer:
+    """Labels carried from S source positions to N destinations."""
+
+    labels: Tensor  # [N] int64, -1 = none
+    distances: Tensor  # [N] world units, to the source that gave the label; infinite if there is none
+    sources: Tensor  # [N] int64, index of that source; -1 if there is none
+    distance: float  # lambda, the distance within which a label is carried over, world units
+    how: str  # how lambda was found
+
+    @property
+    def labelled(self) -> int:
+        """The number of destinations with a label."""
+        return int((self.labels >= 0).sum())
+
+    @property
+    def orphaned(self) -> int:
+        """The number of destinations without a label: no labelled source in range."""
+        return len(self.labels) - self.labelled
+
+    @property
+    def scores(self) -> Tensor:  # [N] in [0, 1]
+        """How sure each label is: 1 - distance / lambda; 0 without a label."""
+        reach = max(self.distance, torch.finfo(self.distances.dtype).tiny)
+        return (1 - self.distances / reach).clamp_min(0.0)
+
+    def __repr__(self) -> str:
+        return (
+            f"Transfer({self.labelled:,} of {len(self.labels):,} labelled (nearest within {self.distance:.4g}), "
+            f"{self.orphaned:,} orphaned; lambda: {self.how})"
+        )
 
 
 def transfer_labels(source: Gaussians, target: Gaussians, distance: float | None = None) -> Gaussians:
     """Label a splat by distance: `transfer_labels(field.label(classes), read_splats("mine.ply"))`.
 
-    Each target takes the label of the nearest labelled source **strictly** closer than lambda (see `nearest_labels`, which
-    also says which source that is). Both clouds must share one frame; `kfgs.attach` finds the common frame, and can label
-    by views instead of by distance.
+    The rule is that of `nearest_labels`, which also says who gave each label. Both clouds must share one frame;
+    `kfgs.attach` finds the common frame, and can label by views instead of by distance.
 
     Args:
         source: Gaussians with labels, for instance from `SemanticField.label`, or a labelled splat.
         target: the splat to label; old labels, scores and names are replaced.
-        distance: lambda, the distance within which a label is carried over, in world units; None: `default_distance`.
+        distance: lambda, the distance within which a label is carried over, in world units; None: from both clouds.
 
     Returns:
         The target with `labels`, with `scores` (1 - distance / lambda), and with the class names of the source.
@@ -27,7 +77,6 @@ def transfer_labels(source: Gaussians, target: Gaussians, distance: float | None
         ValueError: if the source has no labels, a position is not finite, or the distance is not positive.
 
     Example:
-        >>> import torch
         >>> a, b = (torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), torch.tensor([[0.1, 0.0, 0.0], [0.5, 0.0, 0.0]]))
         >>> cloud = Gaussians(a, torch.ones(2, 4), torch.ones(2, 3), torch.ones(2), labels=torch.tensor([0, 1]))
         >>> transfer_labels(cloud, cloud.replace(means=b, labels=None), 0.4).labels.tolist()
@@ -40,3 +89,136 @@ def transfer_labels(source: Gaussians, target: Gaussians, distance: float | None
     means = recounted(target.means, target.origin, source.origin)
     carried = nearest_labels(source.means, source.labels, means, distance)
     return target.replace(labels=carried.labels, scores=carried.scores.to(target.means.dtype), names=source.names)
+
+
+def nearest_labels(
+    src_means: Tensor | Array,  # [S, 3]
+    src_labels: Tensor | Array,  # [S] int64, -1 = none
+    dst_means: Tensor | Array,  # [N, 3]
+    distance: float | None = None,
+) -> Transfer:
+    """Give each destination the label of the nearest labelled source **strictly** closer than `distance`.
+
+    The rule of Sec. 3.4; `distance` is its lambda, in world units. The paper does not say which label wins if several are
+    in range: here the nearest does. Of equally near sources (as float64 distances), the one with the lowest index gives its
+    label. Both clouds are counted from the same origin.
+
+    The paper gives no value for lambda either. Without one, it is the distance within which 99.5 % of the destinations have
+    a source, but at least 2 median spacings of the sources (a spacing is the distance to the nearest other source), so that
+    a destination between two sources reaches both. And at most 10 times the 90 % quantile of the spacings, so that floaters
+    and background, which only the colour field has, take no labels across the room.
+
+    Raises:
+        ValueError: if shapes disagree, a position is not finite, a label is below -1, or the distance is not positive.
+        TypeError: if the labels are not integers.
+    """
+    src_means, dst_means = as_tensor("src_means", src_means), as_tensor("dst_means", dst_means)
+    src_labels = as_tensor("src_labels", src_labels)
+    check_shapes(("src_means", src_means, "S 3"), ("src_labels", src_labels, "S"), ("dst_means", dst_means, "N 3"))
+    if src_labels.is_floating_point() or src_labels.dtype == torch.bool:
+        raise TypeError(f"src_labels: expected integer labels, got {src_labels.dtype}; convert them with .long()")
+    if distance is not None:
+        check_range("distance", distance, 0, closed=(False, False))
+    given: Array = src_labels.detach().cpu().numpy().astype(np.int64)
+    if given.size and given.min() < -1:
+        raise ValueError(f"src_labels: expected class indices or -1, got {given.min()}; map other codes to -1 first")
+    points, targets = positions("src_means", src_means), positions("dst_means", dst_means)
+    sources = Sources(points, given >= 0)
+    chosen, how = sources.default_distance(targets) if distance is None else (float(distance), "given")
+    distances, index = sources.nearest(targets, chosen)
+    labels = np.where(index >= 0, given[index], -1) if len(sources) else np.full(len(targets), -1)
+    device = dst_means.device
+    return Transfer(
+        torch.from_numpy(labels).to(device),
+        torch.from_numpy(distances).to(dst_means),
+        torch.from_numpy(index).to(device),
+        chosen,
+        how,
+    )
+
+
+class Sources:
+    """The positions of labelled Gaussians, as a tree. Of those at one position only the one with the lowest index answers."""
+
+    def __init__(self, points: Array, labelled: Array) -> None:  # [S, 3], [S] bool
+        kept = np.flatnonzero(labelled)
+        order = kept[np.lexsort(points[kept].T)]  # stable: equal points keep their order; half the time of np.unique
+        new = np.ones(len(order), dtype=bool)
+        new[1:] = (points[order[1:]] != points[order[:-1]]).any(axis=1)
+        self.index = np.sort(order[new])
+        """The Gaussian of each position of the tree, ascending."""
+        self.tree = cKDTree(points[self.index])
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def nearest(self, points: Array, distance: float = np.inf) -> tuple[Array, Array]:  # [N] float64, [N] int64
+        """Distance and index of the nearest source **strictly** closer than `distance`; infinite and -1 if there is none.
+
+        Of equally near ones it is the lowest index. scipy returns them in any order: if all that were found are equally
+        near, more are searched.
+        """
+        far, index = np.full(len(points), np.inf), np.full(len(points), -1)
+        order = _neighbours_together(points)
+        for left in (order[i : i + CHUNK] for i in range(0, len(points), CHUNK) if len(self)):
+            k = 1
+            while left.size:
+                k = min(2 * k, len(self))
+                near, which = self.tree.query(points[left], k=k, distance_upper_bound=distance, workers=-1)
+                near, which = np.reshape(near, (len(left), k)), np.reshape(which, (len(left), k))
+                near[near >= distance] = np.inf  # scipy compares squares, which rounds otherwise
+                tied, found = near == near[:, :1], np.isfinite(near[:, 0])
+                lowest = np.where(tied, which, len(self)).min(axis=1)
+                far[left] = near[:, 0]
+                index[left] = np.where(found, self.index[np.where(found, lowest, 0)], -1)
+                left = left[tied.all(axis=1) & found & (k < len(self))]
+        return far, index
+
+    def default_distance(self, targets: Array) -> tuple[float, str]:
+        """Lambda for these destinations (see `nearest_labels`), in world units, and one line that explains it.
+
+        Measured on an evenly strided sample of at most 20,000 Gaussians of each cloud.
+        """
+        if len(self) == 0:
+            return 0.0, "no labelled source"
+        tiny = 1e-6 * max(1.0, float(np.abs(self.tree.maxes).max()), float(np.abs(self.tree.mins).max()))
+        if len(targets) == 0:
+            return tiny, "no destinations"
+        needed = f"{100 * COVERAGE:g} % of the destinations"
+        reach = float(np.quantile(self.tree.query(sampled(targets), workers=-1)[0], COVERAGE))
+        if len(self) == 1:
+            return max(1.01 * reach, tiny), f"{needed} lie within {reach:.3g} of the one source position"
+        spacings = np.asarray(self.tree.query(sampled(np.asarray(self.tree.data)), k=2, workers=-1)[0])[:, 1]
+        usual, wide = (float(spacing) for spacing in np.quantile(spacings, [0.5, WIDE]))
+        if reach > FARTHEST * wide:
+            return max(FARTHEST * wide, tiny), (
+                f"{FARTHEST:g} wide source spacings of {wide:.3g} ({needed} would need {reach:.3g})"
+            )
+        if reach < NEAREST * usual:
+            return max(NEAREST * usual, tiny), (
+                f"{NEAREST:g} median source spacings of {usual:.3g} ({needed} need only {reach:.3g})"
+            )
+        return max(
+            reach, tiny
+        ), f"{needed} have a source within it (source spacings: {usual:.3g} median, {wide:.3g} wide)"
+
+
+def _neighbours_together(points: Array) -> Array:  # [N, 3] -> [N] int64
+    """An order in which neighbours follow each other: queries of a tree in this order are twice as fast."""
+    if len(points) == 0:
+        return np.empty(0, dtype=np.int64)
+    cell = max(float(np.ptp(points, axis=0).max()) / 64, np.finfo(np.float64).tiny)
+    order: Array = np.lexsort(np.floor((points - points.min(axis=0)) / cell).T)
+    return order
+
+
+def sampled(points: Array) -> Array:
+    """At most 20,000 of the points, evenly strided."""
+    return points[:: max(1, -(-len(points) // SAMPLE))]
+
+
+def positions(name: str, means: Tensor) -> Array:  # [N, 3] float64
+    """The means in numpy; a ValueError names the first that is not finite."""
+    check_finite(name, means)
+    points: Array = means.detach().cpu().double().numpy()
+    return points

@@ -87,7 +87,7 @@ def attach(
         cameras: undistorted views in the field's frame; None: its training views.
         frame: the similarity from the field's frame to the splat's (`Similarity.identity()` if they are the same), or views
             in the splat's frame, some with the same names as `cameras`. None compares the clouds.
-        distance: lambda in the splat's world units; None: `default_distance`.
+        distance: lambda in the splat's world units; None: see `labels.nearest_labels`.
         by: None: "views", which follows the borders of objects much better, or "distance" for a field without cameras.
 
     Raises:
@@ -128,7 +128,7 @@ def attach(
     if by == "distance":
         transfer = _carry(transform_gaussians(semantic, similarity), splats, distance)
         labels, scores = transfer.labels, transfer.scores
-        how = {"labelled by": "distance to the field's Gaussians", "score": NEARNESS, "ambiguous": transfer.ambiguous}
+        how = {"labelled by": "distance to the field's Gaussians", "score": NEARNESS}
     else:
         assert cameras is not None
         labels, scores, transfer = _by_views(field, splats, semantic, classes, cameras, similarity, distance)

@@ -23,9 +23,8 @@ from ..labels import (
     Remove,
     connected_parts,
     load_label_set,
-    parse_color,
 )
-from ..labels.edits.edit_list import edits_path
+from ..labels.edit_list import edits_path
 from ..scenes import FeatureFolder, Scene, load_scene
 from ..toy.room_folder import ToyConfig, make_toy_room
 from .attach import attach
@@ -133,7 +132,7 @@ def _edit_colors(
         say(f"  {REMOVED}: {part!r}")
     edits = {
         "removed": EditList((Remove(OfClass(REMOVED)),)),
-        "recolored": EditList((Recolor(OfClass(PAINTED), parse_color(PAINT)),)),
+        "recolored": EditList((Recolor(OfClass(PAINTED), PAINT),)),
     }
     after = {name: edit.apply(before) for name, edit in edits.items()}
     for name, edit in edits.items():

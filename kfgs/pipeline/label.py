@@ -98,7 +98,7 @@ def write_parts(
             continue
         camera = cameras[part.best_view.index]
         camera = camera.resized(max(1, round(WIDTH * camera.height / camera.width)), WIDTH)
-        mask = part.selection(len(gaussians)).mask
+        mask = torch.zeros(len(gaussians), dtype=torch.bool).index_fill_(0, part.indices.cpu(), True)
         pictures.append(show_selection(gaussians, mask, under)(camera))
         titles.append(f"{name}/{number} in {camera.name}" if camera.name else f"{name}/{number}")
     if not pictures:

@@ -94,7 +94,7 @@ export class PythonLink {
     return { ...answer, number: undefined, example: true, scores: new Float32Array(scores) };
   }
 
-  /** Connected parts of a mask: {parts: [{count, volume, corners}], numbers: Int16Array}, the largest first; -1: of no part. */
+  /** Connected parts of a mask: {parts: [{count, corners}], numbers: Int16Array}, the largest first; -1: of no part. */
   async parts(side, mask, edits) {
     const [answer, numbers] = await this.call("parts", { side, edits: { [side]: edits } }, bitsOf(mask));
     return { ...answer, numbers: new Int16Array(numbers) };

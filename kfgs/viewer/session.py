@@ -22,7 +22,7 @@ from .._files import as_path, write_json
 from ..formats import write_splats
 from ..gaussians import Gaussians
 from ..labels import EditList, Selection, connected_parts
-from ..labels.edits.edit_list import read_edits
+from ..labels.edit_list import read_edits
 from ..viz.linked import evenly
 from .meaning import Asked
 from .picking import views_seeing
@@ -102,7 +102,7 @@ class Session:
         numbers = np.full(len(mask), -1, "<i2")
         for number, part in enumerate(parts):
             numbers[part.indices.cpu().numpy()] = number
-        shown = [{"count": part.count, "volume": part.volume, "corners": part.box.corners.tolist()} for part in parts]
+        shown = [{"count": part.count, "corners": part.box.corners.tolist()} for part in parts]
         return {"parts": shown}, numbers.tobytes()
 
     def _save_selection(self, args: dict[str, Any], attached: bytes) -> Answer:

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from .._check import as_array, check_choice, check_range
 from ..cameras import Camera
 from ..gaussians import Gaussians
-from ..labels.nearest import Sources, explained_distance, neighbours_together, positions
+from ..labels.transfer import Sources, positions
 from ..splat import sh0_to_rgb
 from ..viz.colors import Array, FeatureColors, cloud_colors
 from ..viz.palette import UNLABELLED, palette
@@ -37,7 +37,7 @@ class Exploration:
         meaning: the semantic cloud and its answers.
         color: the colour cloud, in the same frame; None: the semantic side alone.
         cameras: views without distortion, to find those that see a Gaussian.
-        distance: lambda, world units; None: from the clouds' spacing (`labels.default_distance`).
+        distance: lambda, world units; None: from the clouds' spacing (see `labels.nearest_labels`).
     """
 
     def __init__(
@@ -230,20 +230,15 @@ class Exploration:
     def _find_sources(self) -> tuple[Array, Array, float, str]:
         """For each colour Gaussian the nearest labelled semantic one (-1: none is labelled), its distance; and lambda.
 
-        The same as `nearest_labels`, for all lambdas at once. Ties go to the lowest index.
+        The same as `nearest_labels`, for all lambdas at once.
         """
         if "color" not in self._clouds:
             return np.zeros(0, np.int64), np.zeros(0), 1.0, "no colour side"
         points, targets = (positions(side, cloud.means) for side, cloud in self._clouds.items())
-        source, far = np.full(len(targets), -1, dtype=np.int64), np.full(len(targets), np.inf)
-        kept = np.flatnonzero(self._own_labels >= 0)
-        if kept.size == 0:
-            return source, far, 1.0, "no labelled source"
-        sources = Sources(points[kept], self._own_labels[kept])
-        order = neighbours_together(targets)
-        distances, near = sources.near(targets[order], 1, np.inf)
-        source[order], far[order] = kept[sources.first][near[:, 0]], distances[:, 0]
-        return source, far, *explained_distance(sources.tree, targets)
+        sources = Sources(points, self._own_labels >= 0)
+        far, source = sources.nearest(targets)
+        distance, how = sources.default_distance(targets)
+        return source, far, distance or 1.0, how
 
     def _on(self, side: Side, own: Array, nothing: Any) -> Array:
         """Values of the semantic Gaussians, or carried from them to the colour side; `nothing` beyond lambda."""

@@ -7,7 +7,7 @@ from .examples import draw_examples
 from .films import save_animation, show_cloud
 from .frusta import add_cameras
 from .legends import add_legend, add_scalar_bar
-from .linked import add_matches, add_transfer, linked_clouds
+from .linked import add_transfer, linked_clouds
 from .palette import palette
 from .pictures import legend_strip, overlay_labels, picture_grid, save_picture
 from .plots import plot_history, plot_iou, plot_quality_storage, plot_scores
@@ -19,7 +19,6 @@ __all__ = [
     "add_cameras",
     "add_cloud",
     "add_legend",
-    "add_matches",
     "add_scalar_bar",
     "add_transfer",
     "available",

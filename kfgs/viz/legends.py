@@ -25,16 +25,14 @@ def add_legend(
     plotter: pv.Plotter,
     labels: Tensor | Array,  # any shape, int
     names: Sequence[str],
-    *,
-    colors: Array | None = None,  # [C, 3] uint8
 ) -> Any:
     """List the classes present, by name and colour, in the lower left corner of the active subplot.
 
     It is a small picture: pyvista's own legend writes each name in its colour, for instance yellow on white. If the subplot
     is too low for all classes, the letters shrink to at least 9 pixels, then the list gets several columns.
 
-    Colours are those of `palette(labels, names)`, as of a cloud with these names, or the `colors` of each class.
-    `plotter.remove_actor` removes what is returned.
+    Colours are those of `palette(labels, names)`, as of a cloud with these names. `plotter.remove_actor` removes what is
+    returned.
 
     Raises:
         ValueError: if there is no label, or one has no name.
@@ -48,9 +46,7 @@ def add_legend(
     _, bottom, _, top = plotter.renderer.GetViewport()
     room = round((top - bottom) * plotter.window_size[1])
     for size in range(max(LETTERS, round(room / 55)), SMALLEST - 1, -1):
-        picture = draw_legend(
-            present, names, size, colors=colors, height=room - 2 * MARGIN if size == SMALLEST else None
-        )
+        picture = draw_legend(present, names, size, height=room - 2 * MARGIN if size == SMALLEST else None)
         if len(picture) <= room - 2 * MARGIN:
             break
     height, width, _ = picture.shape

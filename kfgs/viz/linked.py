@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .._check import as_array, check_choice, check_shapes
+from .._check import as_array, check_shapes
 from ..cameras import Camera, estimate_up
 from ..gaussians import Gaussians
 from ..labels import Transfer
@@ -23,9 +23,6 @@ if TYPE_CHECKING:
 FAR = 99.0  # percentile of distances from the middle that the first view shows: floaters stay outside
 TITLES = {"label": "classes", "rgb": "colours", "view": "colours", "opacity": "opacity"}
 LINES = 500  # more lines than this hide the clouds
-STATES = ("matched", "ambiguous", "orphaned")  # ambiguous: labelled, but its sources disagree; orphaned: no label
-STATE_COLORS = np.array([[86, 180, 233], [213, 94, 0], [0, 0, 255]], np.uint8)  # every eye can tell them apart
-Shift = tuple[float, float, float]
 
 
 def linked_clouds(
@@ -86,23 +83,21 @@ def add_transfer(
     dst: Gaussians,
     transfer: Transfer,
     *,
-    color_by: Literal["label", "state"] = "label",
     names: Sequence[str] | None = None,
-    shift: Shift = (0.0, 0.0, 0.0),
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
     sample: int = LINES,
     line_width: float = 1.0,
 ) -> pv.Actor:
     """Draw a line from each labelled destination to the source of its label.
 
     Lines are as short as lambda. To see them, draw the destinations aside: pass a `shift` here, and draw the cloud
-    `dst.replace(means=dst.means + shift)`. Cells carry `label`, `state`, `source`, `destination`, `distance` and `rgb`.
+    `dst.replace(means=dst.means + shift)`. Cells carry `label`, `source`, `destination`, `distance` and `rgb`.
 
     Args:
         plotter: where to draw.
         src: the Gaussians that labels came from.
         dst: the Gaussians that received them.
-        transfer: the result of `transfer_labels` for these two.
-        color_by: `label`, or `state`: 0 matched, 1 ambiguous (its sources disagree).
+        transfer: the result of `nearest_labels` for these two.
         names: class names, for the colours of labels as in `palette`; None: those of `src`.
         shift: added to the destinations' positions, world units.
         sample: the most lines, evenly chosen among the labelled destinations.
@@ -113,7 +108,6 @@ def add_transfer(
     """
     import pyvista as pv
 
-    check_choice("color_by", color_by, ("label", "state"))
     check_shapes(("dst.means", dst.means, "N 3"), ("transfer.labels", transfer.labels, "N"))
     src, dst = placed(plotter, src), placed(plotter, dst)
     labelled = np.flatnonzero(as_array(transfer.labels) >= 0)
@@ -128,58 +122,12 @@ def add_transfer(
             f"transfer: expected sources below {len(src)} (from src), got {sources.max()}; pass its own clouds"
         )
     ends = np.stack([as_array(dst.means)[chosen] + shift, as_array(src.means)[sources]], axis=1).reshape(-1, 3)
-    labels, states = as_array(transfer.labels)[chosen], match_states(transfer)[chosen]
+    labels = as_array(transfer.labels)[chosen]
     lines = pv.line_segments_from_points(ends.astype(np.float32))
-    lines.cell_data["label"], lines.cell_data["state"] = labels, states
+    lines.cell_data["label"], lines.cell_data["rgb"] = labels, palette(labels, names or names_of(src))
     lines.cell_data["source"], lines.cell_data["destination"] = sources, chosen
     lines.cell_data["distance"] = as_array(transfer.distances)[chosen]
-    lines.cell_data["rgb"] = palette(labels, names or names_of(src)) if color_by == "label" else STATE_COLORS[states]
     return draw_mesh(plotter, lines, scalars="rgb", rgb=True, line_width=line_width, lighting=False)
-
-
-def add_matches(
-    plotter: pv.Plotter,
-    src: Gaussians,
-    dst: Gaussians,
-    transfer: Transfer,
-    *,
-    shift: Shift = (0.0, 0.0, 0.0),
-    sample: int = LINES,
-    point_size: float = 3.0,
-) -> pv.Actor:
-    """Draw the destinations as matched, ambiguous or orphaned points, lines to their sources, and how many of each.
-
-    Draw the sources with `add_cloud`. Arguments as in `add_transfer`.
-
-    Returns:
-        The points, with `state` (0 matched, 1 ambiguous: labelled, but its sources disagree, 2 orphaned), `label`,
-        `distance` and `rgb`.
-
-    Raises:
-        ValueError: if the transfer belongs to other clouds.
-    """
-    import pyvista as pv
-
-    check_shapes(("dst.means", dst.means, "N 3"), ("transfer.labels", transfer.labels, "N"))
-    moved = placed(plotter, dst)
-    states = match_states(transfer)
-    points = pv.PolyData((as_array(moved.means) + shift).astype(np.float32))
-    points["state"], points["label"] = states, as_array(transfer.labels)
-    points["distance"], points["rgb"] = as_array(transfer.distances), STATE_COLORS[states]
-    dots = draw_mesh(plotter, points, style="points", scalars="rgb", rgb=True, point_size=point_size, lighting=False)
-    if transfer.labelled:
-        add_transfer(plotter, src, dst, transfer, color_by="state", shift=shift, sample=sample)
-    counts = np.bincount(states, minlength=len(STATES))
-    names = [f"{name} {count:,}" for name, count in zip(STATES, counts, strict=True)]
-    if transfer.labelled > sample:
-        names[:2] = [f"{name} (1 line in {transfer.labelled / sample:.3g})" for name in names[:2]]
-    add_legend(plotter, np.unique(states), names, colors=STATE_COLORS)
-    return dots
-
-
-def match_states(transfer: Transfer) -> Array:  # [N] int64
-    """The state of each destination, an index into `STATES`."""
-    return np.where(as_array(transfer.labels) < 0, 2, np.where(as_array(transfer.disagree), 1, 0))
 
 
 def look_over(plotter: pv.Plotter, gaussians: Gaussians, up: Sequence[float] = (0.0, 0.0, 1.0)) -> None:

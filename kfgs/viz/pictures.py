@@ -77,15 +77,14 @@ def draw_legend(
     *,
     width: int | None = None,
     height: int | None = None,
-    colors: Array | None = None,  # [C, 3] uint8
 ) -> Array:  # [h, w, 3] uint8
-    """A legend of the classes present, with letters of `size` pixels, in `colors` or else those of `palette`.
+    """A legend of the classes present, with letters of `size` pixels.
 
     With a width, entries go from left to right and wrap. Without, there is one per line, in columns of at most `height`.
     """
     present = [int(label) for label in np.unique(as_array(labels, "labels"))]
     check_names(present, names)
-    swatches = palette(np.array(present), names) if colors is None else colors[present]
+    swatches = palette(np.array(present), names)
     font = ImageFont.load_default(size=size)
     gap, line = size // 2, round(size * 1.6)
     x, y, right, bottom, left = gap, gap, gap, gap, gap

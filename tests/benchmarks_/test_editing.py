@@ -14,7 +14,7 @@ from oracles_editing import paint_room
 from PIL import Image
 
 from kfgs.evaluation import find_points
-from kfgs.labels import recolor
+from kfgs.labels.color import recolor
 from kfgs.metrics import psnr
 from kfgs.scenes import load_scene
 from kfgs.splat import rasterize

@@ -8,7 +8,8 @@ from cases_quant import made_autoencoder
 from messages import tells
 from oracles_labels import cosine, most_similar
 
-from kfgs.labels import classify, label_pixels, nearest_codeword
+from kfgs.labels import classify
+from kfgs.labels.classify import nearest_codeword, pixel_codewords
 from kfgs.quant import Autoencoder, Codebook
 
 
@@ -107,38 +108,38 @@ def setting():
     codebook = Codebook(autoencoder.decode(centres))
     index = torch.randint(0, K, (5, 7), generator=generator)
     rendered = centres[index] + 0.001 * torch.randn(5, 7, d, generator=generator)
-    return autoencoder, codebook, torch.randn(3, D, generator=generator), index, rendered
+    return autoencoder, codebook, index, rendered
 
 
-def test_exact_path_is_decode_quantise_look_up(setting):
-    autoencoder, codebook, embeddings, index, rendered = setting
-    labels = label_pixels(rendered, codebook, classify(codebook.codewords, embeddings).labels, autoencoder)
+def test_exact_path_is_decode_and_quantise(setting):
+    autoencoder, codebook, index, rendered = setting
+    found = pixel_codewords(rendered, codebook, autoencoder)
+    assert found.dtype == torch.int64
     words = most_similar(autoencoder.decode(rendered).reshape(-1, D), codebook.codewords).reshape(5, 7)
-    assert labels.dtype == torch.int64
-    np.testing.assert_array_equal(labels, most_similar(codebook.codewords, embeddings)[words])
+    np.testing.assert_array_equal(found, words)
     np.testing.assert_array_equal(words, index)
 
 
 def test_without_autoencoder_the_map_is_quantised_itself(setting):
-    _, codebook, _, index, _ = setting
+    _, codebook, index, _ = setting
     features = codebook.codewords[index] * 3
     features[2, 3] = 0
     expected = index.clone()
     expected[2, 3] = -1
-    assert label_pixels(features, codebook, torch.arange(K)).equal(expected)
+    assert pixel_codewords(features, codebook).equal(expected)
 
 
 def test_uncovered_pixels_have_no_label(setting):
-    autoencoder, codebook, _, index, rendered = setting
+    autoencoder, codebook, index, rendered = setting
     covered = index % 2 == 0
-    labels = label_pixels(rendered, codebook, torch.arange(K), autoencoder, covered=covered)
+    labels = pixel_codewords(rendered, codebook, autoencoder, covered=covered)
     assert labels.equal(torch.where(covered, index, -1))
 
 
 def test_gaussians_are_labelled_like_pixels(setting):
-    autoencoder, codebook, _, index, rendered = setting
-    assert label_pixels(rendered.reshape(-1, d), codebook, torch.arange(K), autoencoder).equal(index.reshape(-1))
-    assert label_pixels(torch.empty(0, d), codebook, torch.arange(K), autoencoder).shape == (0,)
+    autoencoder, codebook, index, rendered = setting
+    assert pixel_codewords(rendered.reshape(-1, d), codebook, autoencoder).equal(index.reshape(-1))
+    assert pixel_codewords(torch.empty(0, d), codebook, autoencoder).shape == (0,)
 
 
 def test_nearest_codeword_is_euclidean_and_ties_go_low():
@@ -148,51 +149,39 @@ def test_nearest_codeword_is_euclidean_and_ties_go_low():
     assert nearest_codeword(torch.tensor([[0.5, 0.0]]), torch.tensor([[1.0, 0.0], [0.0, 0.0]])).tolist() == [0]
 
 
-def test_missing_pieces_are_named(setting):
-    autoencoder, codebook, _, _, rendered = setting
-    with pytest.raises(ValueError, match=tells("labels:", "[K]", "K = 6", "got (5,)")):
-        label_pixels(rendered, codebook, torch.arange(5), autoencoder)
-    with pytest.raises(ValueError, match=tells("decode:", "'exact', 'latent'", "got 'fast'")):
-        label_pixels(rendered, codebook, torch.arange(K), autoencoder, decode="fast")
-    with pytest.raises(ValueError, match=tells("covered:", "(5, 7)", "got (7, 5)")):
-        label_pixels(rendered, codebook, torch.arange(K), autoencoder, covered=torch.ones(7, 5, dtype=torch.bool))
-
-
-def plainly(latents, codebook, table, autoencoder):
+def plainly(latents, codebook, autoencoder):
     """Every latent decoded, and the codeword most similar to it: the slow path."""
     features = autoencoder.decode(latents)
-    return table[codebook.quantize(features)].masked_fill(torch.linalg.vector_norm(features, dim=-1) <= 1e-8, -1)
+    return codebook.quantize(features).masked_fill(torch.linalg.vector_norm(features, dim=-1) <= 1e-8, -1)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("classes", [1, 3, 30])
-def test_decoders_of_layers_give_the_labels_of_the_slow_path(classes, dtype):
-    g = torch.Generator().manual_seed(classes)
+def test_decoders_of_layers_give_the_codewords_of_the_slow_path(dtype):
+    g = torch.Generator().manual_seed(3)
     autoencoder = decoder().to(dtype)
     codebook = Codebook(autoencoder.decode(torch.rand(30, d, generator=g).to(dtype)))
-    table = torch.randint(-1, classes, (30,), generator=g)
     latents = torch.rand(60, 50, d, generator=g).to(dtype)
     covered = torch.rand(60, 50, generator=g) > 0.2
-    labels = label_pixels(latents, codebook, table, autoencoder, covered=covered)
-    assert labels.equal(plainly(latents, codebook, table, autoencoder).masked_fill(~covered, -1))
-    assert len(labels.unique()) > min(classes, 15)
+    found = pixel_codewords(latents, codebook, autoencoder, covered=covered)
+    assert found.equal(plainly(latents, codebook, autoencoder).masked_fill(~covered, -1))
+    assert len(found.unique()) > 15
 
 
-def test_pixels_between_two_classes_are_decoded_in_full(monkeypatch):
-    """Two codewords that differ by rounding, of two classes: no lead is sure, and the slow path decides."""
+def test_pixels_between_two_codewords_are_decoded_in_full(monkeypatch):
+    """Two codewords that differ by rounding: no lead is sure, and the slow path decides."""
     g = torch.Generator().manual_seed(1)
     autoencoder, decoded = decoder(), []
     codewords = autoencoder.decode(torch.rand(6, d, generator=g))
     codebook = Codebook(torch.cat([codewords, codewords * (1 + 1e-7) + 3e-8]))
     latents = torch.rand(4000, d, generator=g)
-    expected = plainly(latents, codebook, torch.arange(12), autoencoder)
+    expected = plainly(latents, codebook, autoencoder)
     decode = Autoencoder.decode
     monkeypatch.setattr(Autoencoder, "decode", lambda *a, **k: decoded.append(len(a[1])) or decode(*a, **k))
-    assert label_pixels(latents, codebook, torch.arange(12), autoencoder).equal(expected)
+    assert pixel_codewords(latents, codebook, autoencoder).equal(expected)
     assert sum(decoded) == 4000
     decoded.clear()
-    assert label_pixels(latents, codebook, torch.arange(12) % 6, autoencoder).equal(expected % 6)
-    assert sum(decoded) < 100  # twins of one class need no decision
+    assert pixel_codewords(latents, Codebook(codewords), autoencoder).equal(expected % 6)
+    assert sum(decoded) < 100
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -203,11 +192,10 @@ def test_nearest_latents_are_those_of_the_plain_comparison(spread, dtype):
     autoencoder = decoder().to(dtype)
     codebook = Codebook(autoencoder.decode(torch.rand(40, d, generator=g).to(dtype)))
     centres = autoencoder.encode(codebook.codewords)
-    table = torch.arange(40) % 7
     latents = centres[torch.randint(40, (5000,), generator=g)] + spread * torch.randn(5000, d, generator=g).to(dtype)
     latents[0], latents[1] = torch.nan, (centres[3] + centres[4]) / 2
-    expected = table[nearest_codeword(latents, centres)]
-    assert label_pixels(latents, codebook, table, autoencoder, decode="latent").equal(expected)
+    expected = nearest_codeword(latents, centres)
+    assert pixel_codewords(latents, codebook, autoencoder, exact=False).equal(expected)
     assert len(expected.unique()) > 4
 
 
@@ -215,6 +203,6 @@ def test_latents_that_decode_to_nothing_have_no_label():
     autoencoder = decoder(bias=0.0)
     codebook = Codebook(torch.eye(K, D))
     latents = torch.cat([torch.zeros(3, d), torch.rand(5, d, generator=torch.Generator().manual_seed(2))])
-    labels = label_pixels(latents, codebook, torch.arange(K), autoencoder)
+    labels = pixel_codewords(latents, codebook, autoencoder)
     assert labels[:3].tolist() == [-1] * 3
-    assert labels.equal(plainly(latents, codebook, torch.arange(K), autoencoder))
+    assert labels.equal(plainly(latents, codebook, autoencoder))

@@ -4,10 +4,15 @@ import torch
 from messages import tells
 
 from kfgs.gaussians import Gaussians
-from kfgs.labels import parse_color, recolor
+from kfgs.labels import Recolor, Selection
+from kfgs.labels.color import parse_color
 
 WEIGHTS = torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
 C0 = 0.28209479177387814  # 1 / (2 sqrt(pi))
+
+
+def recolor(gaussians, mask, rgb, mode="tint"):
+    return Recolor(Selection.of(mask), rgb, mode).apply(gaussians)
 
 
 def field(n=12, coefficients=4, seed=0):
@@ -149,29 +154,6 @@ def test_black_object_becomes_flat():
     painted = recolor(black, black.labels == 0, [0.3, 0.6, 0.9])
     torch.testing.assert_close(painted.sh[0, 0] * C0 + 0.5, torch.tensor([0.3, 0.6, 0.9], dtype=torch.float64))
     assert not painted.sh[0, 1:].any()
-
-
-def test_empty_mask_changes_nothing():
-    gaussians = field()
-    nothing = torch.zeros(12, dtype=torch.bool)
-    assert recolor(gaussians, nothing, (1.0, 0.0, 0.0)).sh.equal(gaussians.sh)
-
-
-def test_wrong_input_is_named():
-    gaussians = field()
-    mask = gaussians.labels == 0
-    with pytest.raises(TypeError, match=tells("mask:", "got torch.int64")):
-        recolor(gaussians, gaussians.labels, "red")
-    with pytest.raises(ValueError, match=tells("mask:", "[N]", "N = 12", "got (5,)")):
-        recolor(gaussians, mask[:5], "red")
-    with pytest.raises(ValueError, match=tells("gaussians.sh:", "got None")):
-        recolor(gaussians.replace(sh=None), mask, (1.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match=tells("rgb:", "[0, 1]", "got (255, 0, 0)")):
-        recolor(gaussians, mask, (255, 0, 0))
-    with pytest.raises(ValueError, match=tells("rgb:", "got (0.5, 0.5)")):
-        recolor(gaussians, mask, (0.5, 0.5))
-    with pytest.raises(ValueError, match=tells("mode:", "'tint', 'hue'", "got 'paint'")):
-        recolor(gaussians, mask, "red", "paint")
 
 
 RED = (192 / 255, 64 / 255, 64 / 255)

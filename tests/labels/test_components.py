@@ -4,11 +4,9 @@ import tracemalloc
 import numpy as np
 import pytest
 import torch
-from messages import tells
 from oracles_selection import components as oracle
 
-from kfgs.labels import component_numbers
-from kfgs.labels.components import component_distance, radius_components
+from kfgs.labels.components import component_distance, component_numbers, radius_components
 
 
 def clumps(n, heaps, spread, seed):
@@ -103,15 +101,3 @@ def test_default_distance_parts_things_that_stand_close(gap, parts):
     means = torch.cat([grid([0.0, 0, 0], n=20, step=0.1), grid([1.9 + gap, 0, 0], n=20, step=0.1)])
     numbers = component_numbers(means, torch.ones(800, dtype=torch.bool))
     assert numbers.bincount().tolist() == parts
-
-
-def test_wrong_input_is_named():
-    means, mask = torch.rand(4, 3), torch.ones(4, dtype=torch.bool)
-    broken = means.clone()
-    broken[2, 1] = math.nan
-    with pytest.raises(ValueError, match=tells("means:", "got NaN", "row 2")):
-        component_numbers(broken, mask)
-    with pytest.raises(TypeError, match=tells("mask:", "got torch.int64")):
-        component_numbers(means, mask.long())
-    with pytest.raises(ValueError, match=tells("distance:", "(0, inf)", "got 0")):
-        component_numbers(means, mask, 0)

@@ -59,7 +59,6 @@ def test_a_selection_in_numbers():
     assert [corner.tolist() for corner in part.extent] == [pytest.approx([-1, 0, 4]), pytest.approx([-1, 0.8, 4])]
     assert (2 * part.box.half).tolist() == pytest.approx([0.8, 0, 0], abs=1e-6)
     assert part.box.axes[0].abs().tolist() == pytest.approx([0, 1, 0], abs=1e-6)
-    assert part.volume == pytest.approx(0, abs=1e-6)
     assert part.best_view is None
 
 
@@ -130,20 +129,6 @@ def test_large_pictures_are_compared_small():
     assert a == b
 
 
-def test_parts_are_selections_of_the_whole_cloud():
-    gaussians = scene()
-    asked = chosen(gaussians)
-    left, right = (part.selection(len(gaussians)) for part in connected_parts(gaussians, asked, distance=0.3))
-    assert left.indices.tolist() == [0, 1, 2, 3, 4]
-    assert left.scores.tolist() == [1.0] * 5 + [0.0] * 5
-    assert (left.threshold, left.how) == (None, "given; part 1 of 2")
-    assert not left & right
-    assert (left | right).mask.equal(asked.mask)
-    assert (asked & left).scores[:5].equal(asked.scores[:5])
-    with pytest.raises(ValueError, match=tells("count:", "[5, ", "got 4")):
-        whole(gaussians, chosen(gaussians, 5)).selection(4)
-
-
 def test_a_part_in_words_and_as_json():
     gaussians = scene()
     part = whole(gaussians, chosen(gaussians, 5), [camera(name="front")])
@@ -164,3 +149,5 @@ def test_wrong_input_is_named():
         connected_parts(broken, chosen(gaussians))
     with pytest.raises(ValueError, match=tells("most:", "got 0")):
         connected_parts(gaussians, chosen(gaussians), most=0)
+    with pytest.raises(ValueError, match=tells("distance:", "(0, inf)", "got 0")):
+        connected_parts(gaussians, chosen(gaussians), distance=0)

@@ -7,8 +7,8 @@ import torch
 from messages import tells
 from oracles_words import softmax_share
 
-from kfgs.labels import relevancy, select_by_similarity
-from kfgs.labels.scores import similarity_threshold
+from kfgs.labels import relevancy
+from kfgs.labels.scores import select_by_similarity, similarity_threshold
 
 
 def oracle(similarity, negatives):

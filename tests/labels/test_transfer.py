@@ -7,7 +7,7 @@ from messages import tells
 from oracles_labels import transfer as oracle
 
 from kfgs.gaussians import Gaussians
-from kfgs.labels import default_distance, nearest_labels, transfer_labels
+from kfgs.labels import nearest_labels, transfer_labels
 
 
 def points(n, seed, scale=1.0):
@@ -26,6 +26,7 @@ def test_agrees_with_the_oracle(distance):
     assert result.labelled == (expected_labels >= 0).sum()
     assert result.labelled + result.orphaned == 200
     assert (result.distance, result.how) == (distance, "given")
+    assert f"{result.orphaned} orphaned" in repr(result)
 
 
 def test_distance_is_strict():
@@ -62,16 +63,6 @@ def test_many_sources_at_one_position_are_quick_and_the_first_labelled_one_count
     result = nearest_labels(torch.zeros(20000, 3), labels, torch.full((500, 3), 0.1), 1.0)
     assert (result.labels == 2).all()
     assert (result.sources == 1).all()
-    assert result.ambiguous == 500
-
-
-def test_ambiguous_counts_other_labels_in_range_only():
-    src = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
-    dst = torch.tensor([[0.4, 0.0, 0.0], [-0.5, 0.0, 0.0], [5.2, 0.0, 0.0], [50.0, 0.0, 0.0]])
-    result = nearest_labels(src, torch.tensor([0, 1, 0]), dst, 1.0)
-    assert (result.labelled, result.orphaned, result.ambiguous) == (3, 1, 1)
-    assert result.disagree.tolist() == [True, False, False, False]
-    assert "1 orphaned, 1 ambiguous" in repr(result)
 
 
 @pytest.mark.parametrize("distance", [None, 0.3])
@@ -81,7 +72,7 @@ def test_without_sources_or_destinations(distance):
         result = nearest_labels(src, labels, dst, distance)
         assert result.labels.tolist() == [-1] * 6
         assert result.distances.tolist() == [math.inf] * 6
-        assert (result.labelled, result.orphaned, result.ambiguous) == (0, 6, 0)
+        assert (result.labelled, result.orphaned) == (0, 6)
     assert nearest_labels(points(5, 6), torch.arange(5), torch.empty(0, 3)).labels.shape == (0,)
 
 
@@ -125,6 +116,10 @@ def test_a_splat_is_labelled_in_one_call():
         transfer_labels(field, "mine.ply")
 
 
+def default_distance(src, dst):
+    return nearest_labels(src, torch.zeros(len(src), dtype=torch.int64), dst).distance
+
+
 def above(height, n=100):
     axis = torch.arange(10.0)
     return torch.cartesian_prod(axis, axis, torch.zeros(1))[:n] + torch.tensor([0.0, 0.0, height])
@@ -140,7 +135,7 @@ def above(height, n=100):
 )
 def test_default_distance_covers_nearly_all_between_its_bounds(height, distance, words):
     result = nearest_labels(above(0.0), torch.zeros(100, dtype=torch.int64), above(height))
-    assert result.distance == default_distance(above(0.0), above(height)) == pytest.approx(distance)
+    assert result.distance == pytest.approx(distance)
     assert words in result.how
 
 
@@ -163,5 +158,3 @@ def test_a_sparse_wall_does_not_cut_the_reach_short():
     corner = torch.cartesian_prod(axis, axis, axis[:4]) * 0.01  # 400 sources, spacing 0.01
     between = above(0.0) + 0.5
     assert default_distance(torch.cat([above(0.0), corner + 20]), between) == pytest.approx(0.75**0.5)
-    with pytest.raises(ValueError, match=tells("src_means:", "got none")):
-        default_distance(torch.empty(0, 3), torch.ones(1, 3))

@@ -5,7 +5,8 @@ from cases_text import DIM, MUTE, TEACHER, letters
 from messages import tells
 from oracles_words import ensemble
 
-from kfgs.labels import CANONICAL, LabelSet, load_label_set
+from kfgs.labels import LabelSet, load_label_set
+from kfgs.labels.scores import CANONICAL
 from kfgs.teachers import CallableTeacher
 from kfgs.teachers.prompts import TEMPLATES, embed_labels, make_label_set
 from kfgs.teachers.protocol import PROMPTS_AT_ONCE

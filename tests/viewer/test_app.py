@@ -15,7 +15,7 @@ from cases_web import SECONDS, needs_chromium, software_chromium
 from PIL import Image
 
 from kfgs.labels import EditList
-from kfgs.labels.edits.edit_list import read_edits
+from kfgs.labels.edit_list import read_edits
 from kfgs.viewer import Exploration, FieldMeaning
 from kfgs.viewer.page import save_html
 

@@ -8,8 +8,7 @@ from cases_web import PAPER, needs_chromium, numbers, psnr
 from small_room import make_room
 
 from kfgs.cameras import Camera
-from kfgs.labels import OfIndex, Opacity, Recolor, Remove
-from kfgs.labels.edits import Duplicate, Move
+from kfgs.labels import Duplicate, Move, OfIndex, Opacity, Recolor, Remove
 from kfgs.splat import rasterize
 from kfgs.viewer import Exploration
 from kfgs.viewer.pack import pack_scene

@@ -3,11 +3,10 @@ import pytest
 import torch
 from cases_viz import data, some_camera, some_gaussians, some_plotter
 from messages import tells
-from oracles_palette import worst_distance
 
 from kfgs.labels import nearest_labels
-from kfgs.viz import add_matches, add_transfer, linked_clouds, make_plotter, palette
-from kfgs.viz.linked import STATE_COLORS, look_over, match_states
+from kfgs.viz import add_transfer, linked_clouds, make_plotter, palette
+from kfgs.viz.linked import look_over
 from kfgs.viz.pictures import draw_legend
 
 
@@ -119,63 +118,10 @@ def test_wrong_transfers_are_named(plotter):
         add_transfer(plotter, src, dst, nearest_labels(src.means, src.labels, dst.means, 1e-9))
 
 
-def line_of_five():
-    """Sources of two classes on a line; destinations between them and far away."""
-    place = lambda xs: torch.tensor([[x, 0.0, 0.0] for x in xs])  # noqa: E731
-    src = some_gaussians(4).replace(means=place([0.0, 1.0, 2.0, 3.0]), labels=torch.tensor([0, 0, 1, -1]))
-    dst = some_gaussians(5).replace(means=place([0.1, 1.4, 2.2, 3.5, 9.0]), labels=None)
-    return src, dst, nearest_labels(src.means, src.labels, dst.means, 0.8)
-
-
-def test_states_follow_the_rule():
-    _, _, transfer = line_of_five()
-    # 1.4 has class 0 at 0.4 and class 1 at 0.6; 3.5 has only an unlabelled source within 0.8
-    assert match_states(transfer).tolist() == [0, 1, 0, 2, 2]
+def test_lines_end_where_the_destinations_are_drawn(plotter):
     src, dst = some_gaussians(80, 1), some_gaussians(50, 2)
     transfer = nearest_labels(src.means, src.labels, dst.means, 0.3)
-    counts = np.bincount(match_states(transfer), minlength=3)
-    assert counts.tolist() == [transfer.labelled - transfer.ambiguous, transfer.ambiguous, transfer.orphaned]
-    assert counts.min() > 0
-
-
-def test_matches_are_told_apart_and_moved_aside(plotter):
-    src, dst, transfer = line_of_five()
-    points = data(add_matches(plotter, src, dst, transfer, shift=(0, 0, 2)))
-    lines = data(add_transfer(plotter, src, dst, transfer, color_by="state", shift=(0, 0, 2)))
-    np.testing.assert_allclose(points.points, dst.means + torch.tensor([0, 0, 2.0]))
-    assert points["state"].tolist() == [0, 1, 0, 2, 2]
-    assert points["rgb"].tolist() == STATE_COLORS[[0, 1, 0, 2, 2]].tolist()
-    assert lines["destination"].tolist() == [0, 1, 2]
-    assert lines["state"].tolist() == [0, 1, 0]
-    np.testing.assert_array_equal(lines["rgb"], points["rgb"][:3])
-    np.testing.assert_allclose(lines.points[::2, 2], 2)
-    np.testing.assert_allclose(lines.points[1::2], src.means[transfer.sources[:3]])
-    plotter.reset_camera()
-    assert len(np.unique(plotter.screenshot(return_img=True).reshape(-1, 3), axis=0)) > 4
-
-
-def test_states_look_unlike_to_colour_blind_eyes_too():
-    colors = STATE_COLORS
-    apart = worst_distance(colors, np.concatenate([colors, [[255, 255, 255]]]))
-    assert apart[:, :3][~np.eye(3, dtype=bool)].min() > 70
-    assert apart[:, 3].min() > 40  # from paper
-
-
-def test_without_any_match_there_are_only_points(plotter):
-    src, dst, _ = line_of_five()
-    points = add_matches(plotter, src, dst, nearest_labels(src.means, src.labels, dst.means, 1e-9))
-    assert data(points)["state"].tolist() == [2] * 5
-
-
-def test_legend_counts_states_and_says_how_many_lines_are_drawn(monkeypatch, plotter):
-    seen = []
-    monkeypatch.setattr(
-        "kfgs.viz.linked.add_legend", lambda plotter, labels, names, colors: seen.append((labels, names))
-    )
-    src, dst, transfer = line_of_five()
-    add_matches(plotter, src, dst, transfer)
-    add_matches(plotter, src, dst, transfer, sample=2)
-    assert [[names[i] for i in labels] for labels, names in seen] == [
-        ["matched 2", "ambiguous 1", "orphaned 2"],
-        ["matched 2 (1 line in 1.5)", "ambiguous 1 (1 line in 1.5)", "orphaned 2"],
-    ]
+    lines = data(add_transfer(plotter, src, dst, transfer, shift=(0, 0, 2)))
+    there = dst.means[lines["destination"]] + torch.tensor([0, 0, 2.0])
+    np.testing.assert_allclose(lines.points[::2], there)
+    np.testing.assert_allclose(lines.points[1::2], src.means[transfer.sources[lines["destination"]]])
