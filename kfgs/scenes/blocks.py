@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from .._check import check_whole
 from .._files import as_path, atomic_folder
 from ..cameras.bounds import robust_bounds
-from .colmap_model import ColmapModel, read_whole_model
+from .colmap_model import ColmapModel
 from .files import SceneError
-from .pycolmap_import import quiet_pycolmap, scene_errors, whole_model
+from .pycolmap_import import quiet_pycolmap, scene_errors, without_rigs
 
 Array = NDArray[np.float64]
 Box = tuple[tuple[float, ...], tuple[float, ...]]  # low and high corner, world units
@@ -67,12 +67,11 @@ class Block:
         return Block(value["name"], core, reach, tuple(value["views"]))
 
 
-def partition(model: ColmapModel | str | Path, count: int) -> list[Block]:
+def partition(model: ColmapModel, count: int) -> list[Block]:
     """Cut a scene into blocks with about equally many points, at medians along the longest side of each part.
 
     The tracks of the model say which image sees which point.
     """
-    model = model if isinstance(model, ColmapModel) else read_whole_model(model)
     check_whole("count", count, 1)
     ids, images = model.point_ids, [image for image in model.images.values() if image.pose is not None]
     seen = [np.searchsorted(ids, image.observed[np.isin(image.observed, ids)]) for image in images]
@@ -108,12 +107,12 @@ def write_parts(model: str | Path, parts: Mapping[Path, Iterable[str]]) -> None:
     The model is read once, as that of a city has gigabytes; then memory holds it, and a copy from which one part is made.
 
     Args:
-        model: the folder of the model.
+        model: the folder of the model, which `read_whole_model` accepts.
         parts: the folder of each new model, with the names of its images.
     """
     model = as_path(model)
     with (
-        whole_model(model) as safe,
+        without_rigs(model) as safe,
         quiet_pycolmap() as pycolmap,
         scene_errors(f"{model}: expected a model that pycolmap can read", "write it again with COLMAP"),
     ):

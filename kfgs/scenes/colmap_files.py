@@ -12,7 +12,7 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,46 +45,19 @@ ADVICE = "copy the model again from its source, or write it again with COLMAP"
 _BROKEN = re.compile(r"[+-]?(nan\(\w*\)|1\.#\w+)", re.IGNORECASE)  # numbers that are none, as Windows writes them
 
 
-class CameraRow(NamedTuple):
-    """`where` is the place in the file, for messages."""
-
-    where: str
-    id: int
-    model: str
-    width: int
-    height: int
-    params: tuple[float, ...]
-
-
-class ImageRow(NamedTuple):
-    """`observed` [n] has the id of the 3-D point that each 2-D point sees, -1 = none."""
-
-    where: str
-    id: int
-    numbers: tuple[float, ...]  # qw qx qy qz tx ty tz, world to camera
-    camera_id: int
-    name: str
-    observed: NDArray[np.int64]
-
-
-class PointRow(NamedTuple):
-    """`track` [n, 2] has the images that see the point, and the numbers of their 2-D points."""
-
-    id: int
-    xyz: tuple[float, ...]
-    rgb: tuple[int, ...]
-    track: NDArray[np.int64]
+Ints = NDArray[np.int64]
+# The rows of the three tables; `where` is the place in the file, for messages.
+CameraRow = tuple[str, int, str, int, int, tuple[float, ...]]  # where, id, model, width, height, parameters
+ImageRow = tuple[str, int, tuple[float, ...], int, str, Ints]
+"""where, id, qw qx qy qz tx ty tz (world to camera), camera, name, the 3-D point that each 2-D point sees (-1: none)."""
+PointRow = tuple[int, tuple[float, ...], tuple[int, ...], Ints]
+"""id, place, colour, track [n, 2]: the images that see the point, and the numbers of their 2-D points."""
 
 
 def require(condition: bool, where: str, expected: str, got: object, advice: str = ADVICE) -> None:
     """Raise a SceneError in four parts unless `condition` holds."""
     if not condition:
         raise SceneError(f"{where}: expected {expected}, got {got}; {advice}")
-
-
-def open_table(path: Path) -> BinaryTable | TextTable:
-    """One file of a model; its suffix says whether it is binary or text."""
-    return BinaryTable(path) if path.suffix == ".bin" else TextTable(path)
 
 
 class BinaryTable:
@@ -99,47 +72,44 @@ class BinaryTable:
     def cameras(self) -> Iterator[CameraRow]:
         """The rows of the cameras file."""
         models = list(CAMERA_MODELS.items())
-        for _ in self._records("camera", 24 + 2 * 8):
+        for where in self._records("camera", 24 + 2 * 8):
             camera_id, model, width, height = self._take("IiQQ")
-            require(0 <= model < len(models), self.where, f"a camera model in 0..{len(models) - 1}", model)
+            require(0 <= model < len(models), where, f"a camera model in 0..{len(models) - 1}", model)
             name, params = models[model]
-            yield CameraRow(self.where, camera_id, name, width, height, self._take(f"{len(params.split())}d"))
+            yield where, camera_id, name, width, height, self._take(f"{len(params.split())}d")
 
     def images(self) -> Iterator[ImageRow]:
         """The rows of the images file."""
-        for _ in self._records("image", 4 + 7 * 8 + 4 + 1 + 8):
+        for where in self._records("image", 4 + 7 * 8 + 4 + 1 + 8):
             image_id, *numbers, camera_id = self._take("I7dI")
             end = self.data.find(b"\0", self.position, self.position + 4096)  # the longest path of Linux
-            require(end >= 0, self.where, "a NAME that ends", "none within 4096 bytes")
+            require(end >= 0, where, "a NAME that ends", "none within 4096 bytes")
             raw, self.position = self.data[self.position : end], end + 1
             try:
                 name = raw.decode("utf-8")
             except UnicodeDecodeError as error:
-                raise SceneError(f"{self.where}: expected a UTF-8 NAME, got {raw[:40]!r}; {ADVICE}") from error
+                raise SceneError(f"{where}: expected a UTF-8 NAME, got {raw[:40]!r}; {ADVICE}") from error
             points = self._array(np.dtype([("X", "<f8"), ("Y", "<f8"), ("ID", "<i8")]), "2-D points")
-            yield ImageRow(self.where, image_id, tuple(numbers), camera_id, name, points["ID"].astype(np.int64))
+            yield where, image_id, tuple(numbers), camera_id, name, points["ID"].astype(np.int64)
 
     def points(self) -> Iterator[PointRow]:
         """The rows of the points file."""
         for _ in self._records("point", 8 + 3 * 8 + 3 + 8 + 8):
             point_id, x, y, z, *rgb, _ = self._take("q3d3Bd")
-            track = self._array(np.dtype(("<u4", 2)), "the track")
-            yield PointRow(point_id, (x, y, z), tuple(rgb), track.astype(np.int64))
+            yield point_id, (x, y, z), tuple(rgb), self._array(np.dtype(("<u4", 2)), "the track").astype(np.int64)
 
-    def _records(self, what: str, smallest: int) -> Iterator[int]:
-        count = self._count(f"number of {what}s", smallest)
-        for i in range(count):
+    def _records(self, what: str, smallest: int) -> Iterator[str]:
+        """The place of each record; the file must end after the last."""
+        for i in range(self._count(f"number of {what}s", smallest)):
             self.where = f"{self.path}, {what} {i}"
-            yield i
+            yield self.where
         left = len(self.data) - self.position
         require(left == 0, str(self.path), f"the end of the file at byte {self.position}", f"{left} more bytes")
 
     def _take(self, layout: str) -> tuple[Any, ...]:
-        size = struct.calcsize("<" + layout)
-        left = len(self.data) - self.position
-        require(
-            size <= left, self.where, f"{size} bytes at byte {self.position}", f"{left}: it is truncated or corrupt"
-        )
+        size, left = struct.calcsize("<" + layout), len(self.data) - self.position
+        got = f"{left}: it is truncated or corrupt"
+        require(size <= left, self.where, f"{size} bytes at byte {self.position}", got)
         self.position += size
         return struct.unpack_from("<" + layout, self.data, self.position - size)
 
@@ -166,35 +136,35 @@ class TextTable:
         for line in self._records():
             with self._parsing("CAMERA_ID MODEL WIDTH HEIGHT PARAMS"):
                 camera_id, model, width, height, *params = line.split()
-                row = CameraRow(self.where, int(camera_id), model, int(width), int(height), tuple(map(_number, params)))
+                row = self.where, int(camera_id), model, int(width), int(height), tuple(map(_number, params))
             yield row
 
     def images(self) -> Iterator[ImageRow]:
         """The rows of the images file: two lines each, of which the second may be empty."""
         for line in self._records():
             with self._parsing("IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"):
-                *words, name = line.strip().split(maxsplit=9)  # the rest of the line: a name may hold blanks
-                image_id, *numbers, camera_id = words
-                first = self.where, int(image_id), tuple(map(_number, numbers)), int(camera_id), name
+                image_id, *words, camera_id, name = line.strip().split(maxsplit=9)  # a name may hold blanks
+                first = self.where, int(image_id), tuple(map(_number, words)), int(camera_id), name
+                if len(words) != 7:
+                    raise ValueError(f"{len(words) + 3} words")
             below = next(self.lines, None)
             require(below is not None, first[0], "a line of 2-D points below each image", "the end of the file")
             with self._parsing("2-D points as X Y POINT3D_ID"):
                 points = (below or "").split()
                 if len(points) % 3:
                     raise ValueError(f"{len(points)} words")
-                observed = np.array(points[2::3], np.int64)
-            yield ImageRow(*first, observed)
+                row = *first, np.array(points[2::3], np.int64)
+            yield row
 
     def points(self) -> Iterator[PointRow]:
         """The rows of the points file."""
         for line in self._records():
             with self._parsing("POINT3D_ID X Y Z R G B ERROR TRACK as (IMAGE_ID POINT2D_IDX)"):
                 point_id, x, y, z, r, g, b, _, *track = line.split()
-                rgb = int(r), int(g), int(b)
-                pairs = np.array(track, np.int64).reshape(-1, 2)
+                rgb, pairs = (int(r), int(g), int(b)), np.array(track, np.int64).reshape(-1, 2)
                 if not all(0 <= value <= 255 for value in rgb) or (pairs < 0).any():
                     raise ValueError(f"colour {rgb}, track {track[:6]}")
-                row = PointRow(int(point_id), (_number(x), _number(y), _number(z)), rgb, pairs)
+                row = int(point_id), (_number(x), _number(y), _number(z)), rgb, pairs
             yield row
 
     def _lines(self) -> Iterator[str]:

@@ -8,6 +8,7 @@ needed: the images file has every pose.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from .._files import as_path
 from .._notes import Repair
-from .colmap_files import CAMERA_MODELS, open_table, require
+from .colmap_files import CAMERA_MODELS, BinaryTable, CameraRow, ImageRow, Ints, TextTable, require
 from .files import MAX_NUMBER, MAX_SIDE, SceneError, some
 from .posed import Matrix, is_rotation, mending_notes
 
@@ -49,7 +50,7 @@ class ColmapImage:
     camera_id: int
     pose: Matrix | None
     """[4, 4] world to camera; None if the file has no plausible one."""
-    observed: NDArray[np.int64] = field(repr=False)
+    observed: Ints = field(repr=False)
     """[n] the id of the 3-D point that each 2-D point sees, -1 = none."""
 
 
@@ -59,7 +60,7 @@ class ColmapModel:
 
     cameras: dict[int, ColmapCamera]
     images: dict[int, ColmapImage]
-    point_ids: NDArray[np.int64]  # [P] ascending
+    point_ids: Ints  # [P] ascending
     points: Matrix  # [P, 3]
     colors: NDArray[np.uint8]  # [P, 3]
     notes: tuple[str, ...] = ()  # what was left out
@@ -94,21 +95,31 @@ def read_model(path: str | Path) -> ColmapModel:
             f"{', '.join(present) or 'none of these files'}; copy the missing files or run COLMAP (`kfgs sfm`)"
         )
     files = [folder / f"{name}.{suffix}" for name in FILES]
-    cameras, scales = _read_cameras(files[0]), dict[str, float]()
-    images = _read_images(files[1], cameras, scales)
-    point_ids, points, colors, notes = _read_points(files[2], images)
-    notes += mending_notes([], scales)
+    table, scales = BinaryTable if suffix == "bin" else TextTable, dict[str, float]()
+    cameras = _cameras(table(files[0]).cameras())
+    images = _images(table(files[1]).images(), cameras, scales)
+    rows = sorted(table(files[2]).points(), key=lambda row: row[0])
+    ids = np.array([row[0] for row in rows], np.int64)
+    points = np.array([row[1] for row in rows], np.float64).reshape(-1, 3)
+    colors = np.array([row[2] for row in rows], np.uint8).reshape(-1, 3)
+    twice = ids[1:][ids[1:] == ids[:-1]]
+    require(len(twice) == 0, str(files[2]), "each point id once", f"{twice[:1]} again")
+    notes = _check_tracks(str(files[2]), ids, [row[3] for row in rows], images) + mending_notes([], scales)
+    good = (np.abs(points) < MAX_NUMBER).all(1)  # NaN fails
+    if not good.all():
+        lost = some(list(map(str, ids[~good])))
+        notes.append(f"{(~good).sum()} of {len(ids)} points have no finite place and were left out (ids {lost})")
     lensless = [image.name for image in images.values() if not cameras[image.camera_id].usable]
     if lensless:
         lens = "a camera without a focal length above 0 and finite parameters"
         notes.append(f"{len(lensless)} images have {lens}: {some(lensless)}")
-    return ColmapModel(cameras, images, point_ids, points, colors, tuple(map(Repair, notes)))
+    return ColmapModel(cameras, images, ids[good], points[good], colors[good], tuple(map(Repair, notes)))
 
 
 def read_whole_model(path: str | Path) -> ColmapModel:
-    """Read a model for pycolmap, which needs all of it: nothing may be left out."""
+    """Read a model of which pycolmap needs all: nothing may be left out."""
     model = read_model(path)
-    advice = "write a binary model of what is whole, with the same poses: `kfgs sfm SCENE --out OUT`"
+    advice = "write a whole binary model with COLMAP, or estimate one: `kfgs sfm PHOTOS --out OUT`"
     require(not model.notes, str(path), "a model with nothing broken, for pycolmap", "; ".join(model.notes), advice)
     blank = next((image.name for image in model.images.values() if len(image.name.split()) > 1), "")
     expected = "names without blanks, at which COLMAP cuts those of text files"
@@ -116,12 +127,13 @@ def read_whole_model(path: str | Path) -> ColmapModel:
     return model
 
 
-def _read_cameras(file: Path) -> dict[int, ColmapCamera]:
+def _cameras(rows: Iterator[CameraRow]) -> dict[int, ColmapCamera]:
     cameras: dict[int, ColmapCamera] = {}
-    for where, camera_id, model, width, height, params in open_table(file).cameras():
+    for where, camera_id, model, width, height, params in rows:
         require(model in CAMERA_MODELS, where, f"a MODEL of {', '.join(CAMERA_MODELS)}", repr(model))
-        names = CAMERA_MODELS[model].split()
-        require(len(params) == len(names), where, f"the parameters {' '.join(names)} of {model}", f"{len(params)}")
+        count = len(CAMERA_MODELS[model].split())
+        expected = f"the parameters {CAMERA_MODELS[model]} of {model}"
+        require(len(params) == count, where, expected, f"{len(params)}")
         good = 0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE
         require(good, where, f"an image of 1 to {MAX_SIDE} pixels a side", f"{width} x {height}")
         require(camera_id not in cameras, where, "an id that no other has", f"{camera_id} again")
@@ -129,10 +141,12 @@ def _read_cameras(file: Path) -> dict[int, ColmapCamera]:
     return cameras
 
 
-def _read_images(file: Path, cameras: dict[int, ColmapCamera], scales: dict[str, float]) -> dict[int, ColmapImage]:
+def _images(
+    rows: Iterator[ImageRow], cameras: dict[int, ColmapCamera], scales: dict[str, float]
+) -> dict[int, ColmapImage]:
     images: dict[int, ColmapImage] = {}
     names: dict[str, int] = {}
-    for where, image_id, numbers, camera_id, name, observed in open_table(file).images():
+    for where, image_id, numbers, camera_id, name, observed in rows:
         inside = not PurePosixPath(name).is_absolute() and ".." not in PurePosixPath(name).parts
         rename = "rename the image in the model (no absolute path, no '..', no control characters)"
         expected = "an image's file name inside the image folder"
@@ -171,39 +185,18 @@ def _pose(numbers: tuple[float, ...], key: str, scales: dict[str, float]) -> Mat
     return _pose((*(number / norm for number in numbers[:4]), *translation), key, {})
 
 
-def _read_points(
-    file: Path, images: dict[int, ColmapImage]
-) -> tuple[NDArray[np.int64], Matrix, NDArray[np.uint8], list[str]]:
-    """The points by ascending ids, and notes."""
-    rows = list(open_table(file).points())
-    ids = np.array([row.id for row in rows], np.int64)
-    order = np.argsort(ids)
-    twice = ids[order][1:] == ids[order][:-1]
-    require(not twice.any(), str(file), "each point id once", f"{ids[order][1:][twice][:1]} again")
-    notes = _check_tracks(str(file), ids, [row.track for row in rows], images)
-    points = np.array([row.xyz for row in rows], np.float64).reshape(-1, 3)[order]
-    colors = np.array([row.rgb for row in rows], np.uint8).reshape(-1, 3)[order]
-    good = (np.abs(points) < MAX_NUMBER).all(1)  # NaN fails
-    if not good.all():
-        shown = some(list(map(str, ids[order][~good])))
-        notes.append(f"{(~good).sum()} of {len(points)} points have no finite place and were left out (ids {shown})")
-    return ids[order][good], points[good], colors[good], notes
-
-
-def _check_tracks(
-    where: str, ids: NDArray[np.int64], tracks: list[NDArray[np.int64]], images: dict[int, ColmapImage]
-) -> list[str]:
+def _check_tracks(where: str, ids: Ints, tracks: list[Ints], images: dict[int, ColmapImage]) -> list[str]:
     """A note if 2-D points that tracks name are not there, or do not name the point of the track.
 
     kfgs does not use the tracks. But images and points of which most do not fit together come from two different models.
     """
     owner = np.repeat(ids, list(map(len, tracks)))
     image_ids, numbers = np.concatenate([np.zeros((0, 2), np.int64), *tracks]).T
-    known = np.array(sorted(images), np.int64)
-    sizes = np.array([len(images[i].observed) for i in known.tolist()], np.int64)
-    place = np.searchsorted(known, image_ids).clip(max=max(len(known) - 1, 0))
-    there = np.zeros(len(owner), bool) if len(known) == 0 else (known[place] == image_ids) & (numbers < sizes[place])
-    seen = np.concatenate([np.zeros(0, np.int64), *(images[i].observed for i in known.tolist())])
+    known = sorted(images)
+    sizes = np.array([len(images[i].observed) for i in known], np.int64)
+    seen = np.concatenate([np.zeros(0, np.int64), *(images[i].observed for i in known)])
+    place, there = np.searchsorted(known, image_ids), np.isin(image_ids, known)
+    there[there] = numbers[there] < sizes[place[there]]
     good = there.copy()
     good[there] = seen[(np.cumsum(sizes) - sizes)[place[there]] + numbers[there]] == owner[there]
     if good.all():
@@ -211,10 +204,9 @@ def _check_tracks(
     strange, lost = there & ~good, sorted(set(image_ids.tolist()) - set(images))
     wrong = int(np.flatnonzero(strange if strange.any() else ~good)[0])
     example = f"point {owner[wrong]} names 2-D point {numbers[wrong]} of image {image_ids[wrong]}"
-    require(
-        strange.sum() <= STRANGE * there.sum(), where, "tracks over 2-D points that see them",
-        f"{strange.sum()} that see other points ({example})", "copy the images and points files of one model",
-    )  # fmt: skip
+    got = f"{strange.sum()} that see other points ({example})"
+    fits = strange.sum() <= STRANGE * there.sum()
+    require(fits, where, "tracks over 2-D points that see them", got, "copy the images and points files of one model")
     gone = f"; images {some(list(map(str, lost)))} are not in the model" if lost else ""
     count = f"{(~good).sum()} of {len(good)} entries of tracks"
     return [f"{count} lead to no 2-D point that sees the point and were left out ({example}{gone})"]

@@ -1,4 +1,4 @@
-"""Import pycolmap late, after Pillow and without its log; give it whole models only; turn its exceptions into a SceneError.
+"""Import pycolmap late, after Pillow and without its log; turn its exceptions into a SceneError.
 
 Pillow's C module must be loaded **before** pycolmap. In the other order (pycolmap 4.2.1, Pillow 13.0.0, Linux wheels)
 the first PNG that Pillow writes corrupts the heap and aborts the process. So this file loads Pillow.
@@ -17,7 +17,7 @@ from typing import Any
 import PIL.Image  # noqa: F401  # see above: the order matters
 
 from .._files import real_path
-from .colmap_model import FILES, model_suffix, read_whole_model
+from .colmap_model import FILES, model_suffix
 from .files import SceneError
 
 # Exceptions of pycolmap for unusable input (a failed CHECK is a ValueError, a missing id an IndexError).
@@ -73,11 +73,13 @@ def scene_errors(what: str, advice: str) -> Iterator[None]:
 
 
 @contextmanager
-def whole_model(folder: Path) -> Iterator[Path]:
-    """A folder with links to the checked files of a model, for pycolmap; rigs and frames are left out."""
-    read_whole_model(folder)
-    suffix = model_suffix(folder)
+def without_rigs(model: Path) -> Iterator[Path]:
+    """A folder with links to the cameras, images and points of a model, which `read_whole_model` has checked.
+
+    Rigs and frames are left out: the images file has every pose, and pycolmap never returns from random bytes in frames.bin.
+    """
     with tempfile.TemporaryDirectory(prefix="kfgs-model-") as scratch:
-        for name in FILES:  # random bytes in frames.bin would never return
-            (Path(scratch) / f"{name}.{suffix}").symlink_to(real_path(folder / f"{name}.{suffix}"))
+        for name in FILES:
+            file = real_path(model / f"{name}.{model_suffix(model)}")
+            (Path(scratch) / file.name).symlink_to(file)
         yield Path(scratch)

@@ -19,7 +19,7 @@ def room(tmp_path_factory):
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7])
 def test_every_point_of_space_lies_in_one_core(room, count):
-    blocks = partition(room / "sparse/0", count)
+    blocks = partition(read_model(room / "sparse/0"), count)
     points = np.concatenate([np.random.default_rng(0).normal(0, 50, (500, 3)), read_model(room / "sparse/0").points])
     assert len(blocks) == count
     assert (sum(block.holds(points).astype(int) for block in blocks) == 1).all()
@@ -27,7 +27,7 @@ def test_every_point_of_space_lies_in_one_core(room, count):
 
 def test_points_are_shared_evenly_and_outliers_do_not_count(room):
     points = read_model(room / "sparse/0").points
-    blocks = partition(room / "sparse/0", 4)
+    blocks = partition(read_model(room / "sparse/0"), 4)
     counts = [int(block.holds(points).sum()) for block in blocks]
     assert max(counts) < 1.2 * min(counts)
     assert np.ptp([block.reach for block in blocks]) < 20  # the room is 6 m long, its outliers lie 100 m away
@@ -46,7 +46,7 @@ def test_what_stands_between_a_camera_and_the_core_is_needed(room):
     scene = load_scene(room)
     centers = {camera.name: camera.center.numpy() for camera in scene.cameras}
     points = read_model(room / "sparse/0").points
-    for block in partition(room / "sparse/0", 4):
+    for block in partition(read_model(room / "sparse/0"), 4):
         core = points[block.holds(points)]
         core = core[np.abs(core).max(1) < 8]  # without outliers
         for name in block.views:
@@ -58,12 +58,12 @@ def test_what_stands_between_a_camera_and_the_core_is_needed(room):
 
 
 def test_a_block_survives_json(room):
-    for block in partition(room / "sparse/0", 3):
+    for block in partition(read_model(room / "sparse/0"), 3):
         assert Block.from_json(json.loads(json.dumps(block.to_json(), allow_nan=False))) == block
 
 
 def test_a_part_of_a_model_is_a_model(room, tmp_path):
-    block = partition(room / "sparse/0", 4)[1]
+    block = partition(read_model(room / "sparse/0"), 4)[1]
     views = block.views[:4]
     write_parts(room / "sparse/0", {tmp_path / "part": views})
     whole, part = load_scene(room), read_model(tmp_path / "part")
@@ -79,9 +79,9 @@ def test_a_part_of_a_model_is_a_model(room, tmp_path):
 
 def test_what_cannot_be_cut(room, tmp_path):
     with pytest.raises(SceneError, match=tells("count", "fewer")):
-        partition(room / "sparse/0", 10_000)
+        partition(read_model(room / "sparse/0"), 10_000)
     with pytest.raises(ValueError, match=tells("count", "0")):
-        partition(room / "sparse/0", 0)
+        partition(read_model(room / "sparse/0"), 0)
     model = read_model(room / "sparse/0")
     for image in model.images.values():
         image.observed[:] = -1

@@ -20,7 +20,7 @@ from messages import tells
 from kfgs.scenes import SceneError
 from kfgs.scenes.colmap_files import CAMERA_MODELS
 from kfgs.scenes.colmap_model import ColmapModel, read_model, read_whole_model
-from kfgs.scenes.pycolmap_import import whole_model
+from kfgs.scenes.pycolmap_import import without_rigs
 
 LAYOUTS = [(text, rigs) for text in (False, True) for rigs in (False, True)]
 
@@ -28,7 +28,7 @@ LAYOUTS = [(text, rigs) for text in (False, True) for rigs in (False, True)]
 def _read_alike(folder: Path) -> ColmapModel:
     """Read a model with kfgs and with pycolmap; cameras, poses and points must be the same to the last bit."""
     ours = read_whole_model(folder)
-    with whole_model(folder) as safe:
+    with without_rigs(folder) as safe:
         theirs = read_with_pycolmap(safe)
     assert set(ours.cameras) == set(theirs.cameras)
     for i, camera in theirs.cameras.items():
@@ -168,7 +168,7 @@ def test_corrupt_models_are_refused_or_load_with_equal_shapes(tmp_path: Path, te
         file.write_bytes(_mutate(files[file], rng))
         try:
             lost = any(image.pose is None for image in read_whole_model(folder).images.values())
-            with whole_model(folder) as safe:  # `write_parts` hands it to pycolmap, which must not hang
+            with without_rigs(folder) as safe:  # `write_parts` hands it to pycolmap, which must not hang
                 read_with_pycolmap(safe)
             found = _shape(read_model(folder) if lost else _read_alike(folder))
         except SceneError:
@@ -271,7 +271,7 @@ def test_broken_numbers_are_noted_and_kept_from_pycolmap(
     (note,) = read_model(folder).notes
     assert note.startswith(count)
     assert place in note
-    with pytest.raises(SceneError, match=tells("nothing broken", count, "kfgs sfm SCENE --out OUT")):
+    with pytest.raises(SceneError, match=tells("nothing broken", count, "kfgs sfm PHOTOS --out OUT")):
         read_whole_model(folder)
 
 
@@ -286,7 +286,7 @@ def test_an_image_whose_pose_is_broken_has_none(tmp_path: Path, numbers: str) ->
 def test_names_may_hold_blanks_which_colmap_cuts_in_text_files(tmp_path: Path) -> None:
     folder = write_text_model(tmp_path / "m", images=IMAGES.replace("b.png", " my  shot (1).png"))
     assert [image.name for image in read_model(folder).images.values()] == ["a.png", "my  shot (1).png"]
-    with pytest.raises(SceneError, match=tells("without blanks", "'my  shot (1).png'", "kfgs sfm SCENE --out OUT")):
+    with pytest.raises(SceneError, match=tells("without blanks", "'my  shot (1).png'", "kfgs sfm PHOTOS --out OUT")):
         read_whole_model(folder)
 
 
