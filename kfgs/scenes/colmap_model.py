@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from .._files import as_path
 from .._notes import Repair
 from .colmap_files import CAMERA_MODELS, BinaryTable, CameraRow, ImageRow, Ints, TextTable, require
-from .files import MAX_NUMBER, MAX_SIDE, SceneError, some
+from .files import MAX_NUMBER, MAX_SIDE, SceneError, is_inside, some
 from .posed import Matrix, is_rotation, mending_notes
 
 FILES = ("cameras", "images", "points3D")
@@ -147,10 +147,9 @@ def _images(
     images: dict[int, ColmapImage] = {}
     names: dict[str, int] = {}
     for where, image_id, numbers, camera_id, name, observed in rows:
-        inside = not PurePosixPath(name).is_absolute() and ".." not in PurePosixPath(name).parts
         rename = "rename the image in the model (no absolute path, no '..', no control characters)"
         expected = "an image's file name inside the image folder"
-        require(bool(name) and name.isprintable() and inside, where, expected, repr(name), rename)
+        require(name.isprintable() and is_inside(name), where, expected, repr(name), rename)
         known = f"a camera of the model ({', '.join(map(str, sorted(cameras)[:8])) or 'it has none'})"
         require(camera_id in cameras, where, f"image {image_id}: {known}", f"camera {camera_id}")
         expected = f"image {image_id}: a name that no other image has"

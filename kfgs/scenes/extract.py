@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import inspect
 import json
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -16,7 +17,7 @@ from tqdm import tqdm
 from .._check import one_line
 from .._files import as_path, digest_file, locked, read_json, write_json
 from .feature_files import ENDINGS, OWN, Size, save_feature_map
-from .files import read_image, some
+from .files import is_inside, read_image, some
 from .scene import Scene
 
 MANIFEST, FORMAT, LOCK = "features.json", "kfgs-features/2", ".features.lock"
@@ -106,14 +107,14 @@ def extract_features(
         FileNotFoundError: if a picture is missing.
     """
     folder, (encode, identity) = as_path(folder), _as_encoder(teacher)
-    chosen = _check_pictures(pictures_of(pictures, split) if isinstance(pictures, Scene) else pictures)
+    chosen = pictures_of(pictures, split) if isinstance(pictures, Scene) else pictures
+    _check_pictures(chosen)
     _check_folder(folder, identity, chosen, overwrite)  # a folder that is refused stays as it is, without a lock file
     with locked(folder, LOCK):
         manifest = read_manifest(folder)
         if manifest is not None and manifest.teacher != identity:
-            for stem in manifest.pictures:
-                if _is_inside(stem):
-                    (folder / f"{stem}{OWN}").unlink(missing_ok=True)
+            for stem in filter(is_inside, manifest.pictures):
+                (folder / f"{stem}{OWN}").unlink(missing_ok=True)
             manifest = None
         manifest = manifest or Manifest(identity)
         manifest.save(folder)
@@ -122,14 +123,16 @@ def extract_features(
             digest, file = digest_file(picture.path), folder / f"{picture.stem}{OWN}"
             if file.is_file() and manifest.pictures.get(picture.stem) == digest:
                 continue
-            features = _encode(encode, identity["name"], picture)
-            if features.shape[2] != (channels or features.shape[2]):
+            with torch.inference_mode():
+                features = encode(read_image(picture.path).permute(2, 0, 1).contiguous())
+                half = _half(features, f"teacher {identity['name']!r}", picture.path)
+            if half.shape[2] != (channels or half.shape[2]):
                 raise ValueError(
                     f"teacher {identity['name']!r}: expected {channels} channels for {picture.path} as before, got "
-                    f"{features.shape[2]}; use one teacher with the same options for all pictures"
+                    f"{half.shape[2]}; use one teacher with the same options for all pictures"
                 )
-            channels = int(features.shape[2])
-            save_feature_map(folder, picture.stem, features)
+            channels = int(half.shape[2])
+            save_feature_map(folder, picture.stem, half)
             manifest = replace(manifest, pictures={**manifest.pictures, picture.stem: digest})
             manifest.save(folder)
     return manifest
@@ -140,8 +143,8 @@ def _as_encoder(teacher: Any) -> tuple[Callable[[Tensor], Tensor], dict[str, Any
     encode = getattr(teacher, "encode_image", teacher)
     if inspect.isclass(teacher) or not callable(encode):
         raise TypeError(
-            "teacher: expected an object with encode_image, or a function from [3, H, W] to [D, h, w], got "
-            f"{teacher.__name__ if inspect.isclass(teacher) else type(teacher).__name__}; load_teacher(name) loads one"
+            f"teacher: expected an object with encode_image, or a function from [3, H, W] to [D, h, w], got {teacher!r:.80}; "
+            "load_teacher(name) loads one"
         )
     name = getattr(teacher, "name", None) or getattr(teacher, "__name__", type(teacher).__name__)
     version = getattr(teacher, "version", "")
@@ -154,27 +157,21 @@ def _as_encoder(teacher: Any) -> tuple[Callable[[Tensor], Tensor], dict[str, Any
         ) from error
 
 
-def _check_pictures(pictures: Sequence[Picture]) -> list[Picture]:
+def _check_pictures(pictures: Sequence[Picture]) -> None:
     if not isinstance(pictures, Sequence) or not all(isinstance(picture, Picture) for picture in pictures):
         raise TypeError(f"pictures: expected a Scene or a list of Picture, got {type(pictures).__name__}; load one")
-    stems = [picture.stem for picture in pictures]
-    twice = sorted({stem for stem in stems if stems.count(stem) > 1})
-    if not stems or twice:
-        got = f"{some(twice)} more than once" if twice else "none"
+    twice = [stem for stem, count in Counter(picture.stem for picture in pictures).items() if count > 1]
+    if not pictures or twice:
+        got = f"{some(sorted(twice))} more than once" if twice else "none"
         raise ValueError(f"pictures: expected at least one picture, each stem once, got {got}; rename them")
     for picture in pictures:
-        if not _is_inside(picture.stem):
+        if not is_inside(picture.stem):
             raise ValueError(f"stem: expected a name within the folder, got {picture.stem!r}; rename the picture")
         if not picture.path.is_file():
             raise FileNotFoundError(f"{picture.path}: no such file; expected the picture of view {picture.stem!r}")
-    return list(pictures)
 
 
-def _is_inside(stem: str) -> bool:
-    return bool(stem) and not PurePosixPath(stem).is_absolute() and ".." not in PurePosixPath(stem).parts
-
-
-def _check_folder(folder: Path, identity: dict[str, Any], pictures: list[Picture], overwrite: bool) -> None:
+def _check_folder(folder: Path, identity: dict[str, Any], pictures: Sequence[Picture], overwrite: bool) -> None:
     """Raise a ValueError if a folder holds maps of another program, or of another teacher."""
     manifest = read_manifest(folder)
     files = (folder / f"{picture.stem}{ending}" for picture in pictures for ending in ENDINGS)
@@ -194,27 +191,25 @@ def _check_folder(folder: Path, identity: dict[str, Any], pictures: list[Picture
         )
 
 
-def _encode(encode: Callable[[Tensor], Tensor], name: str, picture: Picture) -> Tensor:  # [h, w, D] float16
-    """A teacher's map of one picture as it is stored: channels last, rounded to half precision, on the CPU."""
-    with torch.inference_mode():
-        features = encode(read_image(picture.path).permute(2, 0, 1).contiguous())
-        if not isinstance(features, Tensor) or features.layout != torch.strided:
-            raise TypeError(f"teacher {name!r}: expected a dense tensor [D, h, w], got a {type(features).__name__}")
-        if features.ndim != 3 or 0 in features.shape or not features.is_floating_point():
-            raise ValueError(
-                f"teacher {name!r}: expected floats [D, h, w] for one picture, got {features.dtype} "
-                f"{tuple(features.shape)}; leave out the batch axis"
-            )
-        half = features.permute(1, 2, 0).to(torch.float16).cpu().contiguous()
-        if not bool(torch.isfinite(half).all()):
-            raise ValueError(
-                f"teacher {name!r}: expected finite features below 65504 (they are stored as float16) for {picture.path}, got "
-                f"values from {float(features.min()):g} to {float(features.max()):g}; check its weights, or scale the rows"
-            )
-        empty = ~half.any(-1)
-        if bool(empty.any()) and bool(features[:, empty.to(features.device)].any()):
-            raise ValueError(
-                f"teacher {name!r}: expected features above 6e-8 (they are stored as float16) for {picture.path}, got some "
-                "that become all-zero, which means unknown; scale them, or bring the rows to unit length"
-            )
+def _half(features: Any, teacher: str, picture: Path) -> Tensor:  # [D, h, w] -> [h, w, D] float16
+    """A teacher's answer as it is stored: channels last, rounded to half precision, on the CPU."""
+    if not isinstance(features, Tensor) or features.layout != torch.strided:
+        raise TypeError(f"{teacher}: expected a dense tensor [D, h, w], got a {type(features).__name__}")
+    if features.ndim != 3 or 0 in features.shape or not features.is_floating_point():
+        raise ValueError(
+            f"{teacher}: expected floats [D, h, w] for one picture, got {features.dtype} {tuple(features.shape)}; leave out "
+            "the batch axis"
+        )
+    half = features.permute(1, 2, 0).to(torch.float16).cpu().contiguous()
+    if not bool(torch.isfinite(half).all()):
+        raise ValueError(
+            f"{teacher}: expected finite features below 65504 (they are stored as float16) for {picture}, got values from "
+            f"{float(features.min()):g} to {float(features.max()):g}; check its weights, or scale the rows"
+        )
+    empty = ~half.any(-1)
+    if bool(empty.any()) and bool(features[:, empty.to(features.device)].any()):
+        raise ValueError(
+            f"{teacher}: expected features above 6e-8 (they are stored as float16) for {picture}, got some that become "
+            "all-zero, which means unknown; scale them, or bring the rows to unit length"
+        )
     return half

@@ -6,7 +6,7 @@ import math
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,8 +26,6 @@ Size = tuple[int, int]
 OWN, FEATURE_3DGS, SAFETENSORS = ".npy", "_fmap_CxHxW.pt", ".safetensors"
 ENDINGS = (OWN, FEATURE_3DGS, SAFETENSORS)
 """Endings of a map's file after the picture's stem. If a view has several maps, the first of this order is read."""
-WIDTHS = frozenset((128, 256, 384, 512, 768, 1024, 1152, 1280, 1536))
-"""Numbers of channels of known encoders. A first axis of one of these sizes, and a last axis of none, hints at [D, h, w]."""
 AGAIN = "encode it again, or leave the photo out (split.json)"
 ROW_BLOCK = 32  # rows of a map converted at a time: 30 MB in single precision at 480 x 512 channels
 
@@ -37,15 +35,18 @@ def open_map(
 ) -> StoredMap:  # [h, w, D]
     """Map a file into memory without reading its values.
 
+    Feature 3DGS writes [D, h, w], kfgs [h, w, D]. In other files a known number of channels decides, then the aspect of the
+    picture; if both orders fit, or nothing is known, it is [h, w, D].
+
     Args:
         file: the map.
-        channels: D, if it is known; it decides the order of the axes, and then the aspect of the picture does.
+        channels: D, if it is known.
         size: of the view's picture, if it is known.
-        own: kfgs wrote the map, so it is [h, w, D].
+        own: kfgs wrote the map.
     """
     try:
         values = _load(file)
-    except (FileError, TypeError):
+    except FileError:
         raise
     except Exception as error:  # a damaged pickle raises almost anything: struct.error, KeyError, EOFError, ...
         reason = str(error).split(". ")[0].strip()[:120]
@@ -57,55 +58,32 @@ def open_map(
         raise ValueError(f"{file}: expected floating-point features, got {values.dtype}; {AGAIN}")
     if values.ndim != 3 or 0 in values.shape:
         raise ValueError(f"{file}: expected a map [h, w, D], got {tuple(values.shape)}; save one view per file")
-    known = "D h w" if file.name.endswith(FEATURE_3DGS) else "h w D" if own and file.name.endswith(OWN) else None
-    if (known or find_axes(str(file), tuple(map(int, values.shape)), channels, size)) == "D h w":
-        return values.permute(1, 2, 0) if isinstance(values, Tensor) else values.transpose(1, 2, 0)
-    return values
+    first, middle, last = map(int, values.shape)
+    if file.name.endswith(FEATURE_3DGS):
+        turned = True
+    elif own and file.name.endswith(OWN):
+        turned = False
+    elif channels in (first, last) and first != last:
+        turned = first == channels
+    else:
+        turned = size is not None and not fits_aspect((first, middle), size) and fits_aspect((middle, last), size)
+    if not turned:
+        return values
+    return values.permute(1, 2, 0) if isinstance(values, Tensor) else values.transpose(1, 2, 0)
 
 
 def _load(file: Path) -> Any:
-    if file.name.endswith(FEATURE_3DGS):
-        values = torch.load(file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file))
-        plain = isinstance(values, Tensor) and values.layout == torch.strided and not values.is_meta
-        if plain and values.untyped_storage().nbytes() < values.numel() * values.element_size():
-            raise ValueError("its values repeat")  # a few bytes on disk that would fill the memory
-        return (
-            values.detach() if isinstance(values, Tensor) else values
-        )  # saved by a training run, it may ask for gradients
     if file.name.endswith(OWN):
         return read_array(file, "a feature map", AGAIN, mapped=True)
-    tensors = list(read_safetensors(file, "a feature map", AGAIN)[0].values())
-    if len(tensors) != 1:
-        raise ValueError(f"expected one tensor, got {len(tensors)}")
-    return tensors[0]
-
-
-def find_axes(
-    name: str, shape: tuple[int, ...], channels: int | None = None, size: Size | None = None
-) -> Literal["h w D", "D h w"]:
-    """The order of the axes of a map: [h, w, D], as kfgs writes it, or [D, h, w], as encoders return it.
-
-    A known number of channels decides, then the picture's aspect. If both orders fit, or nothing is known, it is [h, w, D].
-
-    Example:
-        >>> find_axes("a.npy", (512, 90, 120), channels=512), find_axes("a.npy", (90, 120, 512))
-        ('D h w', 'h w D')
-    """
-    first, middle, last = shape
-    if channels is not None and channels in (first, last) and first != last:
-        return "h w D" if last == channels else "D h w"
-    if size is not None:
-        if fits_aspect((first, middle), size):
-            return "h w D"
-        if fits_aspect((middle, last), size):
-            return "D h w"
-    stretched, plain = max(first / middle, middle / first) > 3, max(middle / last, last / middle) <= 3
-    if channels is None and first in WIDTHS and last not in WIDTHS and (last > 64 or (stretched and plain)):
-        raise ValueError(
-            f"{name}: expected a map [h, w, D], got {shape}, which may also be [D, h, w]; give the number of channels "
-            "or the size of the picture, or save it as [h, w, D]"
-        )
-    return "h w D"
+    if file.name.endswith(SAFETENSORS):
+        (tensor,) = read_safetensors(file, "a feature map", AGAIN)[0].values()
+        return tensor
+    values = torch.load(file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file))
+    if not isinstance(values, Tensor) or values.layout != torch.strided:
+        return values
+    if values.untyped_storage().nbytes() < values.numel() * values.element_size():
+        raise ValueError("its values repeat")  # a few bytes on disk that would fill the memory
+    return values.detach()  # saved by a training run, it may ask for gradients
 
 
 def read_rows(

@@ -12,7 +12,7 @@ from typing import Any, overload
 import torch
 from torch import Tensor
 
-from .._files import Names, as_path, folded_name
+from .._files import Names, as_path
 from .._rows import EPS, row_norms
 from ..cameras.resample import fits_aspect
 from ..quant.sampling import grid_slices
@@ -83,10 +83,8 @@ class FeatureFolder(Sequence[Tensor]):
                 f"stems (in {self.path}): expected at least one view, each once, got {got}; name the views"
             )
         self.channels, self.sizes = channels, None if sizes is None else list(sizes)
-        if self.sizes is not None and len(self.sizes) != len(self.stems):
-            raise ValueError(
-                f"sizes: expected {len(self.stems)} (one per view), got {len(self.sizes)}; give one for each"
-            )
+        if self.sizes is not None and len(self.sizes) != len(self):
+            raise ValueError(f"sizes: expected {len(self)} (one per view), got {len(self.sizes)}; give one for each")
         if stems is not None:
             _ = self.files  # views without a map are an error here, not hours later
 
@@ -105,45 +103,39 @@ class FeatureFolder(Sequence[Tensor]):
     @cached_property
     def _listed(self) -> dict[str, Path]:
         """All maps of the folder by stem; of several files with one stem, the first in the order of `ENDINGS`."""
-        listed: dict[str, Path] = {}
-        for ending in ENDINGS:
-            for here, folders, names in os.walk(self.path):
-                folders[:] = sorted(name for name in folders if not name.startswith("."))
-                for name in sorted(name for name in names if name.endswith(ending) and not name.startswith(".")):
-                    stem = (Path(here) / name).relative_to(self.path).as_posix().removesuffix(ending)
+        files: list[tuple[int, str, Path]] = []
+        for here, folders, names in os.walk(self.path):
+            folders[:] = sorted(name for name in folders if not name.startswith("."))
+            for name in sorted(name for name in names if not name.startswith(".")):
+                rank = next((i for i, ending in enumerate(ENDINGS) if name.endswith(ending)), None)
+                if rank is not None:
+                    file = Path(here) / name
+                    stem = file.relative_to(self.path).as_posix().removesuffix(ENDINGS[rank])
                     after = PurePosixPath(stem).suffix  # rgb_1.png.npy is the map of rgb_1, too
                     stem = stem.removesuffix(after) if after.lower() in IMAGE_SUFFIXES else stem
-                    listed.setdefault(stem, Path(here) / name)
-        return listed
+                    files.append((rank, stem, file))
+        return {stem: file for _, stem, file in sorted(files, key=lambda entry: -entry[0])}
 
     def _find(self, stems: Sequence[str]) -> dict[str, Path]:
         """The map of each view that has one."""
-        folded = {folded_name(stem): stem for stem in self._listed}
-        names = {stem: stem if stem in self._listed else folded.get(folded_name(stem)) for stem in stems}
-        if not any(names.values()):
-            names = dict(zip(stems, Names(self._listed, bare=True).find_each(stems), strict=True))
-        return {stem: self._listed[name] for stem, name in names.items() if name is not None}
+        names = Names(self._listed, bare=True).find_each(stems)
+        return {stem: self._listed[name] for stem, name in zip(stems, names, strict=True) if name is not None}
 
     @cached_property
     def files(self) -> list[Path]:
         """The file of each view's map."""
         files = self._find(self.stems)
         missing = [stem for stem in self.stems if stem not in files]
-        if missing:
-            raise FileNotFoundError(f"{self.path}: {self._explain(self.stems, missing)}")
-        return [files[stem] for stem in self.stems]
-
-    def _explain(self, stems: list[str], missing: list[str]) -> str:
-        """The message for views without a map: which views, and the names of the maps that exist."""
-        text = f"expected a feature map for each of {len(stems)} views, {len(missing)} missing: {some(missing)}"
-        others = sorted(set(self._listed) - set(stems))
-        if len(missing) == len(stems) and others and self.identity is None:
-            return (
-                f"{text}; the maps there ({len(others)}) are called {some(others, 3)}, but the pictures "
-                f"{some(stems, 3)}: rename the maps to the names of the pictures"
-            )
-        split = "" if self.identity is None else f" --split all --out {self.path}"
-        return f"{text}; make them with `kfgs features SCENE{split}`, or leave these views out"
+        if not missing:
+            return [files[stem] for stem in self.stems]
+        text = f"expected a feature map for each of {len(self)} views, {len(missing)} missing: {some(missing)}"
+        others = sorted(set(self._listed) - set(self.stems))
+        if not files and others and self.identity is None:
+            advice = f"rename the maps there ({len(others)}: {some(others, 3)}) to the names of the pictures"
+        else:
+            split = "" if self.identity is None else f" --split all --out {self.path}"
+            advice = f"make them with `kfgs features SCENE{split}`, or leave these views out"
+        raise FileNotFoundError(f"{self.path}: {text}; {advice}")
 
     @cached_property
     def shape(self) -> tuple[int, int, int]:
@@ -170,34 +162,29 @@ class FeatureFolder(Sequence[Tensor]):
 
     def grid(self, i: int, step: tuple[int, int] | None, samples: int) -> Tensor:  # [n, D] float32
         """`quant.sample_grid(maps[i], step, samples=samples)`, reading no more of the file than these pixels."""
-        stored = self._checked(i)
+        stored = self._open(i)
         rows, columns = grid_slices(int(stored.shape[0]), int(stored.shape[1]), step, samples=samples)
-        return torch.cat(list(self._finite(i, read_rows(stored, rows, columns)))).flatten(0, 1)
+        return torch.cat(list(self.blocks(i, rows, columns))).flatten(0, 1)
 
-    def blocks(self, i: int) -> Iterator[Tensor]:  # each [at most 32, w, D] float32
-        """A map, a few rows at a time, which takes less memory than `maps[i]`."""
-        return self._finite(i, read_rows(self._checked(i)))
-
-    def _open(self, i: int) -> StoredMap:  # [h, w, D]
-        size = self.sizes[i] if self.sizes else None
-        return open_map(self.files[i], self.channels, size, own=self.identity is not None)
-
-    def _checked(self, i: int) -> StoredMap:  # [h, w, D]
-        """View i's map on disk, if it has the channels of the first."""
+    def blocks(
+        self, i: int, rows: slice = slice(None), columns: slice = slice(None)
+    ) -> Iterator[Tensor]:  # each [at most 32, w, D] float32
+        """A map, or some of its rows and columns, a few rows at a time, which takes less memory than `maps[i]`."""
         stored = self._open(i)
         if stored.shape[2] != self.shape[2]:
             raise ValueError(
                 f"{self.files[i]}: expected {self.shape[2]} channels as in {self.files[0].name}, got {stored.shape[2]}; {AGAIN}"
             )
-        return stored
-
-    def _finite(self, i: int, blocks: Iterator[Tensor]) -> Iterator[Tensor]:
-        for block in blocks:
+        for block in read_rows(stored, rows, columns):
             if bad := count_bad(block):
                 raise ValueError(
                     f"{self.files[i]}: expected finite features, got {bad} NaN or infinite values; {AGAIN}"
                 )
             yield block
+
+    def _open(self, i: int) -> StoredMap:  # [h, w, D]
+        size = self.sizes[i] if self.sizes else None
+        return open_map(self.files[i], self.channels, size, own=self.identity is not None)
 
     def check(self, scene: Scene | None = None, split: Split = "train", *, values: bool = True) -> dict[str, str]:
         """Check the map of every view; says why a map cannot be used, by its file (if there is none, by the view).
@@ -210,34 +197,32 @@ class FeatureFolder(Sequence[Tensor]):
             split: of the scene, as in `of`.
             values: False checks only shape and type, in milliseconds.
         """
-        views = list(zip(self.stems, self.sizes or [None] * len(self), strict=True))
+        sizes = dict(zip(self.stems, self.sizes or [None] * len(self), strict=True))
         if scene is not None:
-            views = [(picture.stem, picture.size) for picture in pictures_of(scene, split)]
-        files = self._find([stem for stem, _ in views])
-        problems = {stem: "expected its map, got none" for stem, _ in views if stem not in files}
-        shapes: dict[str, tuple[int, int, int]] = {}
+            sizes = {picture.stem: picture.size for picture in pictures_of(scene, split)}
+        files = self._find(list(sizes))
+        problems = {stem: "expected its map, got none" for stem in sizes if stem not in files}
+        shapes: dict[str, tuple[int, ...]] = {}
         turned: dict[str, str] = {}
-        for file, size in ((files[stem], size) for stem, size in views if stem in files):
-            name = file.relative_to(self.path).as_posix()
+        for stem, file in files.items():
+            name, size = file.relative_to(self.path).as_posix(), sizes[stem]
             try:
                 stored = open_map(file, self.channels, size, own=self.identity is not None)
             except (ValueError, TypeError) as error:
                 problems[name] = str(error).removeprefix(f"{file}: ")
                 continue
-            h, w, D = map(int, stored.shape)
-            shapes[name] = h, w, D
+            h, w, _ = shapes[name] = tuple(map(int, stored.shape))
             if size is not None and not fits_aspect((h, w), size) and fits_aspect((w, h), size):
                 turned[name] = f"expected the aspect of a picture of {size}, got {h} x {w} cells (transposed?)"
-            counts = [
-                (count_bad(rows), int((row_norms(rows) > EPS).sum())) for rows in (read_rows(stored) if values else ())
-            ]
-            bad, known = sum(n for n, _ in counts), sum(n for _, n in counts)
-            if values and (bad or not known):
-                problems[name] = f"{bad} NaN or infinite values" if bad else "every feature is all-zero"
-        channels = self.channels or Counter(D for _, _, D in shapes.values()).most_common(1)[0][0] if shapes else 0
-        problems |= {
-            name: f"expected {channels} channels, got {D}" for name, (_, _, D) in shapes.items() if channels != D
-        }
+            if values:
+                counts = [(count_bad(rows), int((row_norms(rows) > EPS).sum())) for rows in read_rows(stored)]
+                bad, known = map(sum, zip(*counts, strict=True))
+                if bad or not known:
+                    problems[name] = f"{bad} NaN or infinite values" if bad else "every feature is all-zero"
+        most = Counter(shape[2] for shape in shapes.values()).most_common(1)
+        channels = self.channels or (most[0][0] if most else 0)
+        wrong = {name: shape[2] for name, shape in shapes.items() if shape[2] != channels}
+        problems |= {name: f"expected {channels} channels, got {D}" for name, D in wrong.items()}
         if len({shape[:2] for shape in shapes.values()}) > 1 or (self.identity is None and len(turned) == len(shapes)):
             problems |= turned  # else the encoder has one grid for all pictures
         return problems
@@ -246,5 +231,5 @@ class FeatureFolder(Sequence[Tensor]):
         """Raise a ValueError if a map does not fit, from shapes and types alone: for use before a long run."""
         problems = self.check(values=False)
         for name, text in problems.items():
-            more = f" ({len(problems) - 1} more do not fit; `kfgs features SCENE --check {self.path}` names them)"
+            more = f" ({len(problems) - 1} more do not fit; `kfgs features SCENE --out {self.path}` names them)"
             raise ValueError(f"{self.path / name}: {text}; {AGAIN}{more if len(problems) > 1 else ''}")

@@ -211,8 +211,6 @@ def test_last_parts_of_names_are_looked_for_when_nothing_else_fits(tmp_path):
     maps = FeatureFolder(tmp_path, ["train/a"])
     assert [file.relative_to(tmp_path).as_posix() for file in maps.files] == ["a.npy"]
     assert FeatureFolder(tmp_path, ["b"]).files == [tmp_path / "feat" / "b.npy"]
-    with pytest.raises(FileNotFoundError, match=tells("2 views", "1 missing: b")):
-        FeatureFolder(tmp_path, ["a", "b"])  # a fits as it is: then so must b
     with pytest.raises(FileNotFoundError, match=tells("2 views", "2 missing", "left/a")):
         FeatureFolder(tmp_path, ["left/a", "right/a"])  # which of them?
 
@@ -220,7 +218,9 @@ def test_last_parts_of_names_are_looked_for_when_nothing_else_fits(tmp_path):
 def test_names_of_other_maps_are_shown_when_none_fits(tmp_path):
     for i in range(4):
         np.save(tmp_path / f"frame_{i}.npy", features(i).numpy())
-    with pytest.raises(FileNotFoundError, match=tells("(4)", "frame_0, frame_1, frame_2", "rgb_0, rgb_1", "rename")):
+    with pytest.raises(
+        FileNotFoundError, match=tells("2 missing: rgb_0, rgb_1", "rename", "(4: frame_0, frame_1, frame_2")
+    ):
         FeatureFolder(tmp_path, ["rgb_0", "rgb_1"])
 
 
@@ -232,9 +232,6 @@ def test_sizes_of_pictures_or_channels_tell_the_order_of_the_axes(tmp_path):
     assert torch.equal(maps[0], want)
     assert torch.equal(maps[1:][0], want)
     assert torch.equal(FeatureFolder(tmp_path, ["a"], channels=20)[0], want)
-    np.save(tmp_path / "c.npy", np.zeros((512, 9, 100), np.float32))
-    with pytest.raises(ValueError, match=tells("c.npy:", "got (512, 9, 100)", "[D, h, w]")):
-        _ = FeatureFolder(tmp_path, ["c"]).shape
 
 
 @pytest.mark.parametrize("kind", FILES)
