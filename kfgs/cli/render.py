@@ -144,11 +144,9 @@ def _own_walk(path: Path, frames: int | None, film: bool) -> list[Camera]:
     """The cameras of a file or folder; with `frames`, those of a smooth path through them."""
     from ..cameras import path_cameras
     from ..cameras.paths import TooFewViewsError
-    from ..scenes.load import cameras_and_notes
+    from ..scenes import load_cameras
 
-    own, notes = cameras_and_notes(path)
-    for note in notes:
-        say(f"note: {note}")
+    own = load_cameras(path)
     sizes = [(camera.width, camera.height) for camera in own]
     if frames is not None:
         sizes = sizes[:1]

@@ -91,11 +91,15 @@ def load_colmap(path: Path, images: Path) -> Scene:
     return assemble_scene(cameras, paths, points, colors, notes)
 
 
-def colmap_cameras(path: Path) -> tuple[list[Camera], list[str]]:
-    """The cameras (in float64) of a model's images with a pose, by names, and notes; the image files need not be there."""
+def colmap_cameras(path: Path) -> Scene:
+    """The views of a model's images with a pose, whose image files need not be there, without points."""
     model = read_model(path)
     views, notes = _posed(model)
-    return _cameras(path, model, [replace(view, name=view.name.replace("\\", "/")) for view in views]), notes
+    cameras = _cameras(path, model, [replace(view, name=view.name.replace("\\", "/")) for view in views])
+    if not cameras:
+        raise SceneError(f"{path}: expected cameras with poses, got none; run COLMAP again (`kfgs sfm`)")
+    nothing = torch.zeros(0, 3)
+    return assemble_scene(cameras, [Path(camera.name) for camera in cameras], nothing, nothing.byte(), notes)
 
 
 def _posed(model: ColmapModel) -> tuple[list[ColmapImage], list[str]]:

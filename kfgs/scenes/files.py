@@ -52,10 +52,10 @@ def some(names: list[str], count: int = 5) -> str:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a file under this path; False for a name that is too long for the disk, where Path.is_file raises."""
+    """Whether there is a file under this path; False for a name that no file can have, where Path.is_file raises."""
     try:
         return path.is_file()
-    except OSError:
+    except (OSError, ValueError):
         return False
 
 

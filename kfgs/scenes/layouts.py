@@ -6,9 +6,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from torch import Tensor
@@ -34,7 +34,7 @@ def intrinsics(values: Sequence[Any], where: str) -> tuple[Matrix, tuple[int, in
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64), (int(width), int(height))
 
 
-def load_nice_slam(folder: Path, _: Path | None = None) -> Scene:
+def load_nice_slam(folder: Path) -> Scene:
     """Replica by NICE-SLAM: `results/frame000000.jpg`, `results/depth000000.png`, `traj.txt`, `cam_params.json`.
 
     The last may be one level up. Its intrinsics count pixel centres from 0, so cx and cy grow by 0.5 here.
@@ -59,7 +59,7 @@ def load_nice_slam(folder: Path, _: Path | None = None) -> Scene:
     return scene_of_poses(folder, views, (K, size), points_from_depth(views, depths, 1 / scale, K), notes)
 
 
-def load_semantic_nerf(folder: Path, _: Path | None = None) -> Scene:
+def load_semantic_nerf(folder: Path) -> Scene:
     """Replica by Semantic-NeRF: `rgb/rgb_0.png`, `depth/depth_0.png` (millimetres), `traj_w_c.txt`.
 
     No file has the intrinsics: the field of view is 90 degrees across, the principal point is the middle of the picture.
@@ -104,7 +104,7 @@ def _numbered(folder: Path, pattern: str, poses: Path) -> tuple[list[PosedPictur
     return views, [f"{missing} of {len(rows)} poses in {poses} have no picture"] if missing else []
 
 
-def load_scannet(folder: Path, _: Path | None = None) -> Scene:
+def load_scannet(folder: Path) -> Scene:
     """ScanNet: `color/0.jpg`, `pose/0.txt`, `intrinsic/intrinsic_color.txt`, whose intrinsics are used as they are.
 
     Views whose pose is not finite (tracking was lost) are left out and noted. Points are all vertices of
@@ -152,15 +152,22 @@ def _square(path: Path) -> Matrix:  # [4, 4]
     return matrix
 
 
+class Layout(NamedTuple):
+    """How a data set's folder is recognised and read."""
+
+    name: str
+    files: tuple[str, str]
+    read: Callable[[Path], Scene]
+    video: bool  # neighbouring views show the same
+
+
 LAYOUTS = (
-    ("Replica (NICE-SLAM)", ("results", "traj.txt"), load_nice_slam),
-    ("Replica (Semantic-NeRF)", ("rgb", "traj_w_c.txt"), load_semantic_nerf),
-    ("ScanNet", ("color", "pose"), load_scannet),
+    Layout("Replica (NICE-SLAM)", ("results", "traj.txt"), load_nice_slam, True),
+    Layout("Replica (Semantic-NeRF)", ("rgb", "traj_w_c.txt"), load_semantic_nerf, True),
+    Layout("ScanNet", ("color", "pose"), load_scannet, False),
 )
-"""Name, what a folder is recognised by, and reader; asked in this order."""
 
 
-def find_layout(folder: Path) -> int | None:
-    """The row of `LAYOUTS` that a folder has; None if it has none."""
-    fits = (i for i, (_, files, _) in enumerate(LAYOUTS) if all((folder / file).exists() for file in files))
-    return next(fits, None)
+def find_layout(folder: Path) -> Layout | None:
+    """The layout of a folder; None if it has none."""
+    return next((layout for layout in LAYOUTS if all((folder / file).exists() for file in layout.files)), None)

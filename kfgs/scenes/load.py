@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
-
-import torch
 
 from .._check import check_choice
 from .._files import as_path, real_path
@@ -18,14 +18,14 @@ from .colmap import colmap_cameras, load_colmap
 from .files import SceneError, natural_key, picture_size, some
 from .layouts import LAYOUTS, find_layout
 from .masks import check_mask, folder_masks, picture_folder
-from .posed import near_zero
 from .scene import Scene
 from .splits import RULES, choose_split, make_split, read_lists, read_split
 from .sub_models import above, choice_note, find_model
-from .transforms import load_transforms, transforms_cameras
+from .transforms import load_transforms
 
 _TRANSFORMS = ("transforms.json", "transforms_train.json")
 
+PICTURES = ("images", "results", "rgb", "color")  # of transforms.json, Replica and ScanNet
 SplitChoice = Literal["auto", "file", "df3dgs", "feature3dgs", "holdout8", "all"]
 
 
@@ -37,14 +37,13 @@ def load_scene(
     The first of these is read: a COLMAP model in `sparse`, `colmap/sparse`, `dense/sparse`, `distorted/sparse`,
     `colmap_ground_truth` or the folder itself (of several there, as `sparse/0` and `sparse/1`, that with most images; binary
     before text); `transforms.json`; Blender's `transforms_train.json`; Replica as NICE-SLAM (`results/`, `traj.txt`) or
-    Semantic-NeRF (`rgb/`, `traj_w_c.txt`) rendered it; ScanNet (`color/`, `pose/`); raw captures of Polycam (`keyframes/`);
-    the output of Inria's 3DGS (`cameras.json`, `point_cloud/`).
+    Semantic-NeRF (`rgb/`, `traj_w_c.txt`) rendered it; ScanNet (`color/`, `pose/`).
 
     Args:
         path: the scene folder, a model folder, or a .json file.
         images: the image folder, also by its name in the scene folder, as in `"images_4"` of Mip-NeRF 360, whose cameras are
             then resized; None: `images/` next to the model or up to two folders above it, else the first of `images_2`,
-            `images_4`, ..., else the scene folder. Replica, ScanNet and Polycam know one place only.
+            `images_4`, ..., else the scene folder. Replica and ScanNet know one place only.
         split: `"auto"`: split.json if there is one, else lists of names next to the model or in the scene folder (`test.txt`,
             `train_list.txt`, `train_test_lists.json`, ...), else the split of the transforms.json if it has one, else
             `"df3dgs"` for the videos of Replica, `"holdout8"` from 8 images, below 8 `"all"`; `"file"`: split.json; or a rule
@@ -65,14 +64,12 @@ def load_scene(
     check_choice("split", split, ("auto", "file", *RULES))
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such folder; expected a scene there")
-    root = path if path.is_dir() else path.parent
-    try:
-        scene = replace(_load_views(path, _given_folder(root, images)), folder=root)
+    root = _root(path)
+    if images is not None and not as_path(images).is_dir() and (root / images).is_dir():
+        images = root / images
+    with _naming(root):
+        scene = replace(_load_views(path, None if images is None else as_path(images)), folder=root)
         scene = _with_masks(_with_splat(scene, root), root)
-    except SceneError as error:  # of cameras that do not fit together
-        if str(root) in str(error):
-            raise
-        raise SceneError(f"{path}: {error}") from error
     tell_repairs(str(path), scene.notes, strict, SceneError)
     return _with_split(scene, path, split)
 
@@ -104,29 +101,29 @@ def load_cameras(path: str | Path) -> list[Camera]:
         >>> camera.name, camera.size, camera.center
         ('0000.png', (480, 640), tensor([ 0.5000, -2.0000,  1.2000]))
     """
-    return cameras_and_notes(path)[0]
-
-
-def cameras_and_notes(path: str | Path) -> tuple[list[Camera], list[str]]:
-    """The cameras of `load_cameras`, and a note if the file has more than these."""
     path = as_path(path)
-    notes: list[str] = []
     model = find_model(path)
-    if model is not None:
-        cameras, notes = colmap_cameras(model)
-    elif path.exists() and _is_transforms(path):
-        cameras, notes = transforms_cameras(path)
-    else:
-        return load_scene(path).undistorted().cameras, notes
-    if not cameras:
-        raise SceneError(f"{path}: expected cameras with poses, got none; run COLMAP again (`kfgs sfm`)")
-    cameras, nothing, _ = near_zero(cameras, torch.zeros(0, 3))
+    if model is None and not (path.exists() and _is_transforms(path)):
+        return load_scene(path).undistorted().cameras
+    with _naming(path):
+        scene = load_transforms(path, pictures=False) if model is None else colmap_cameras(model)
+    tell_repairs(str(path), scene.notes, False, SceneError)
+    return scene.undistorted().cameras
+
+
+def _root(path: Path) -> Path:
+    return path if path.is_dir() else path.parent
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Errors of cameras that do not fit together name the scene."""
     try:
-        scene = Scene(cameras, [Path(camera.name) for camera in cameras], nothing, nothing.byte())
-    except SceneError as error:  # of two names that are the same
+        yield
+    except SceneError as error:
+        if str(path) in str(error):
+            raise
         raise SceneError(f"{path}: {error}") from error
-    tell_repairs(str(path), notes, False, SceneError)
-    return scene.with_near().undistorted().cameras, notes
 
 
 def _with_splat(scene: Scene, root: Path) -> Scene:
@@ -157,36 +154,25 @@ def _with_masks(scene: Scene, root: Path) -> Scene:
 def picture_folders(path: str | Path) -> list[Path]:
     """The folders, but for the scene folder itself, from which `load_scene` reads pictures; empty if there is no scene."""
     path = as_path(path)
-    root = path if path.is_dir() else path.parent
-    try:
-        model = find_model(path)
-        files = [] if model is not None else _load_views(path, None).image_paths
-        found = {find_images(path, model)} if model is not None else {file.parent for file in files}
-    except (OSError, ValueError):
-        return []
-    return sorted(folder for folder in found if real_path(folder) not in (real_path(root), *real_path(root).parents))
-
-
-def _given_folder(root: Path, images: str | Path | None) -> Path | None:
-    """The image folder that the user named, perhaps by its name in the scene folder."""
-    if images is None:
-        return None
-    return root / images if not as_path(images).is_dir() and (root / images).is_dir() else as_path(images)
+    root, model = _root(path), find_model(path)
+    folders = [root / name for name in PICTURES] if model is None else [find_images(path, model)]
+    own = (real_path(root), *real_path(root).parents)
+    return [folder for folder in folders if folder.is_dir() and real_path(folder) not in own]
 
 
 def _load_views(path: Path, images: Path | None) -> Scene:
     model = find_model(path)
     if model is not None:
-        scene = load_colmap(model, images if images is not None else find_images(path, model))
+        scene = load_colmap(model, images or find_images(path, model))
         return replace(scene, notes=(*scene.notes, *choice_note(path, model)))
     if _is_transforms(path):
         return load_transforms(path, images)
-    row = find_layout(path)
-    if row is not None:
-        return LAYOUTS[row][2](path, images)
-    parts = [(file, name, files) for name, files, _ in LAYOUTS for file in files if (path / file).exists()]
+    layout = find_layout(path)
+    if layout is not None:
+        return layout.read(path)
+    parts = [(file, layout) for layout in LAYOUTS for file in layout.files if (path / file).exists()]
     half = "".join(
-        f" (there is {file}, but not all of {name}: {' and '.join(files)})" for file, name, files in parts[:1]
+        f" (there is {file}, but not all of {row.name}: {' and '.join(row.files)})" for file, row in parts[:1]
     )
     raise SceneError(
         f"{path}: expected a COLMAP model, a transforms.json or the layout of a data set (docs/datasets.md), found "
@@ -201,8 +187,8 @@ def _is_transforms(path: Path) -> bool:
 def is_scene(path: str | Path) -> bool:
     """Whether a folder has poses: a COLMAP model, a transforms.json, or the layout of a data set."""
     path = as_path(path)
-    transforms = any((path / name).is_file() for name in _TRANSFORMS)
-    return find_model(path) is not None or transforms or find_layout(path) is not None
+    has_poses = path.is_dir() and (_is_transforms(path) or find_layout(path) is not None)
+    return has_poses or find_model(path) is not None
 
 
 def _advice(path: Path) -> str:
@@ -231,8 +217,7 @@ def find_images(root: Path, model: Path) -> Path:
 
 
 def _with_split(scene: Scene, path: Path, split: SplitChoice) -> Scene:
-    model, names = find_model(path), [camera.name for camera in scene.cameras]
-    root = path if path.is_dir() else path.parent
+    model, names, root = find_model(path), [camera.name for camera in scene.cameras], _root(path)
     homes = [root] if model is None else list(dict.fromkeys((model, root, *above(model)[: 4 if model == path else 0])))
     file = next((home / "split.json" for home in homes if (home / "split.json").is_file()), root / "split.json")
     chosen = None
@@ -244,10 +229,11 @@ def _with_split(scene: Scene, path: Path, split: SplitChoice) -> Scene:
         return replace(scene, splits=chosen[0], notes=(*scene.notes, *chosen[1]))
     if split == "auto" and (scene.splits.get("test") or len(scene.splits["train"]) < len(scene)):  # of its own lists
         return scene
-    replica = model is None and find_layout(root) in (0, 1)
-    rule = choose_split(len(scene), replica) if split == "auto" else split
-    assert rule != "file"
-    splits = make_split(len(scene), rule)
+    rule = split
+    if split == "auto":
+        layout = None if model is not None else find_layout(root)
+        rule = choose_split(len(scene), layout is not None and layout.video)
+    splits = make_split(len(scene), rule)  # type: ignore[arg-type]  # "file" was read above
     note = f"split {rule}: {len(splits['train'])} of {len(scene)} views train, {len(splits['test'])} test"
     if not splits["train"]:
         raise SceneError(

@@ -47,12 +47,13 @@ def choice_note(path: Path, model: Path) -> list[str]:
 
 
 def above(model: Path) -> list[Path]:
-    """The folders above a model that may be its scene, nearest first: two, or all up to that which holds one of `PLACES`."""
+    """The folders above a model that may be its scene, nearest first: two, or all up to the one that holds `PLACES`."""
     parents = list(real_path(model).parents)[:6]
     names = [folder.name for folder in parents]
-    count = names.index("sparse") + 2 if "sparse" in names else 0
-    inner = {place.partition("/")[0] for place in PLACES if "/" in place}
-    return parents[: max(2, count + (names[count - 1 : count] != [] and names[count - 1] in inner))]
+    if "sparse" not in names:
+        return parents[:2]
+    count = names.index("sparse") + 2
+    return parents[: count + (names[count - 1 : count] in (["colmap"], ["dense"], ["distorted"]))]
 
 
 def count_images(model: Path) -> int:

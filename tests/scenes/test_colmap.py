@@ -14,11 +14,10 @@ from colmap_models import (
 )
 from messages import tells
 
+from kfgs._notes import hear
 from kfgs.cameras.projection import camera_to_pixel
-from kfgs.cli.render import read_walk
-from kfgs.scenes import SceneError
+from kfgs.scenes import SceneError, load_cameras
 from kfgs.scenes.colmap import LENSES, convert_intrinsics, load_colmap
-from kfgs.scenes.load import cameras_and_notes
 
 INTRINSICS = {
     "SIMPLE_PINHOLE": [50.0, 31, 25],
@@ -88,11 +87,9 @@ def test_an_image_without_pose_is_left_out_and_noted(tmp_path: Path, capsys: pyt
     scene = load_colmap(model, tmp_path / "images")
     assert [camera.name for camera in scene.cameras] == ["a.png"]
     assert note in scene.notes
-    cameras, notes = cameras_and_notes(model)
-    assert [camera.name for camera in cameras] == ["a.png"]
-    assert note in notes
-    read_walk(model, None)
-    assert f"note: {note}" in capsys.readouterr().out
+    with hear(print):
+        assert [camera.name for camera in load_cameras(model)] == ["a.png"]
+    assert note in capsys.readouterr().out
 
 
 def test_missing_files_and_unposed_files_are_noted(tmp_path: Path) -> None:

@@ -312,7 +312,7 @@ def test_without_a_size_cameras_are_as_large_as_their_pictures(tmp_path: Path) -
         (["a.png", "a.jpg"], ("path.json:", "names that differ", "'a' twice")),
         (["a\0.png"], ("path.json, frame 0, file_path:", "a file's name")),
         (["a.png", "b\n.png"], ("path.json, frame 1, file_path:", "control characters", r"got 'b\n.png'")),
-        (["\x1b[2J.png"], ("path.json, frame 0, file_path:", "control characters", "leave it out")),
+        (["\x1b[2J.png"], ("path.json, frame 0, file_path:", "control characters", "take the frame out")),
         (["/"], ("path.json, frame 0, file_path:", "a file's name")),
         ([3], ("path.json, frame 0, file_path:", "a file's name", "got 3")),
         ([], ("path.json, top level:", "'frames'", "is this a transforms.json")),
