@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from operator import index
@@ -16,7 +17,7 @@ from .._files import Names, file_stem
 from ..cameras.bounds import camera_extent
 from ..cameras.camera import NEAR, Camera
 from ..cameras.undistort import undistort
-from .files import SceneError, read_alpha, read_image
+from .files import SceneError, read_alpha, read_image, some
 from .masks import read_mask, shrink_mask
 
 NEAR_SHARE = (
@@ -62,24 +63,21 @@ class Scene:
         for name, values in (("image_paths", self.image_paths), ("lenses", self.lenses), ("masks", self.masks)):
             if values is not None and len(values) != views:
                 raise ValueError(f"{name}: expected {views} (one per camera), got {len(values)}; give one for each")
-        stems = [file_stem(camera.name) for camera in self.cameras]
-        if len(set(stems)) != views:
-            twice = next(stem for stem in stems if stems.count(stem) > 1)
+        twice = [stem for stem, n in Counter(file_stem(camera.name) for camera in self.cameras).items() if n > 1]
+        if twice:
             raise SceneError(
                 f"cameras: expected names that differ before the suffix (features and labels are found by them), "
-                f"got {twice!r} twice; move one of the two images away, or rename it here and in the file of the poses"
+                f"got {twice[0]!r} twice; move one of the two images away, or rename it here and in the file of the poses"
             )
         for name, indices in self.splits.items():
-            wrong = [i for i in indices if not hasattr(i, "__index__") or not 0 <= index(i) < views]
+            wrong = [i for i in indices if not 0 <= i < views]
             if wrong:
                 raise ValueError(
-                    f"splits[{name!r}]: expected whole numbers in [0, {views}), got {wrong[0]!r:.80}; correct the split"
+                    f"splits[{name!r}]: expected numbers in [0, {views}), got {wrong[0]}; correct the split"
                 )
         origins = {camera.origin for camera in [*self.cameras, *(self.lenses or [])]}
         if len(origins) > 1:
-            raise ValueError(
-                f"cameras: expected one origin, got {sorted(origins)[:2]}; bring them to one with camera.with_origin()"
-            )
+            raise ValueError(f"cameras: expected one origin, got {sorted(origins)[:2]}; use camera.with_origin()")
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -94,12 +92,11 @@ class Scene:
         return f"Scene({len(self)} views, {len(self.points)} points, splits: {splits or 'none'})"
 
     def _repr_html_(self) -> str:
-        sizes = sorted({f"{camera.width}x{camera.height}" for camera in self.cameras})
         facts = {
             "folder": None if self.folder is None else str(self.folder),
             "views": len(self),
             **{f"split {name}": len(views) for name, views in self.splits.items()},
-            "pixels": ", ".join(sizes[:3]) + (f" and {len(sizes) - 3} more sizes" if len(sizes) > 3 else ""),
+            "pixels": some(sorted({f"{camera.width}x{camera.height}" for camera in self.cameras}), 3),
             "lens": "distorted: use scene.undistorted()" if self.distorted else "pinhole",
             "masks": None if self.masks is None else sum(mask is not None for mask in self.masks),
             "points": len(self.points),
@@ -135,13 +132,12 @@ class Scene:
 
     def mask(self, i: int) -> Tensor:  # [H, W] bool
         """Which pixels of view `i` count: not those that are black in its mask, nor those beyond an undistorted picture."""
+        lens = self.cameras[i] if self.lenses is None else self.lenses[i]
         path = None if self.masks is None else self.masks[i]
+        mask = torch.ones(lens.size, dtype=torch.bool) if path is None else read_mask(path, lens.size)
         if self.lenses is None:
-            size = self.cameras[i].size
-            return torch.ones(size, dtype=torch.bool) if path is None else read_mask(path, size)
-        lens = self.lenses[i]
-        ignored = torch.zeros(lens.size) if path is None else (~read_mask(path, lens.size)).float()
-        share, _, recorded = undistort(ignored[..., None], lens)
+            return mask
+        share, _, recorded = undistort((~mask).float()[..., None], lens)
         return recorded & (share[..., 0] < ROUNDING)
 
     def alpha(self, i: int) -> Tensor | None:  # [H, W] in [0, 1]
@@ -201,28 +197,15 @@ class Scene:
         Args:
             which: the name of a split, for instance "train"; or names of views (with or without suffix), or their indices.
         """
-        indices = self._resolve(which)
-        place = {view: position for position, view in enumerate(indices)}
-        return replace(
-            self,
-            cameras=[self.cameras[i] for i in indices],
-            image_paths=[self.image_paths[i] for i in indices],
-            lenses=None if self.lenses is None else [self.lenses[i] for i in indices],
-            masks=None if self.masks is None else [self.masks[i] for i in indices],
-            splits={name: sorted(place[i] for i in views if i in place) for name, views in self.splits.items()},
-        )
-
-    def _resolve(self, which: str | Iterable[str] | Iterable[int]) -> list[int]:
         if isinstance(which, str):
             if which not in self.splits:
                 raise ValueError(
                     f"which: expected one of the splits {sorted(self.splits)}, got {which!r}; pass a list to select views "
                     "by name"
                 )
-            return list(self.splits[which])
+            which = self.splits[which]
         place = {camera.name: i for i, camera in enumerate(self.cameras)}
-        names = Names(place, bare=True)
-        indices: list[int] = []
+        names, indices = Names(place, bare=True), list[int]()
         for view in which:
             i = place.get(names.find(view) or "", -1) if isinstance(view, str) else index(view)  # also torch's integers
             if not 0 <= i < len(self):
@@ -231,9 +214,17 @@ class Scene:
                     f"which: expected names or indices of the scene's {len(self)} views, got {view!r}; {advice}"
                 )
             indices.append(i)
-        if len(set(indices)) != len(indices):
+        position = {view: n for n, view in enumerate(indices)}
+        if len(position) != len(indices):
             raise ValueError("which: expected each view once, got one twice; remove the repetition")
-        return indices
+        return replace(
+            self,
+            cameras=[self.cameras[i] for i in indices],
+            image_paths=[self.image_paths[i] for i in indices],
+            lenses=None if self.lenses is None else [self.lenses[i] for i in indices],
+            masks=None if self.masks is None else [self.masks[i] for i in indices],
+            splits={name: sorted(position[i] for i in views if i in position) for name, views in self.splits.items()},
+        )
 
 
 def check_is_scene(scene: object) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from .._check import check_choice
 from .._files import Names, file_stem, read_text
@@ -54,13 +54,7 @@ def read_split(path: Path, names: Sequence[str]) -> Split:
         path: the file.
         names: the views of the scene in order; those in the file may lack the suffix.
     """
-    value = read_scene_json(path, "repair the file or remove it")
-    if not _is_split(value):
-        raise SceneError(
-            f'{path}: expected {{"train": [names], "test": [names]}}, got {str(value)[:80]}; '
-            "list file stems under at least 'train'"
-        )
-    return split_by_lists(str(path), value, names)
+    return split_by_lists(str(path), _read_lists(path, "repair the file or remove it"), names)
 
 
 def read_lists(folder: Path, names: Sequence[str]) -> Split | None:
@@ -72,23 +66,29 @@ def read_lists(folder: Path, names: Sequence[str]) -> Split | None:
     lists: dict[str, list[str]] = {}
     files = []
     for split in ("train", "val", "test"):
-        for file in (folder / f"{split}.txt", folder / f"{split}_list.txt"):
-            if split not in lists and file.is_file():
-                try:
-                    lines = read_text(file, "a list of names of views").split("\n")
-                except ValueError as error:
-                    raise SceneError(str(error)) from error
-                lists[split] = [line.strip() for line in lines if line.strip()]
-                files.append(file.name)
-    where = ", ".join(files)
+        both = (folder / f"{split}.txt", folder / f"{split}_list.txt")
+        for file in [file for file in both if file.is_file()][:1]:
+            try:
+                lines = read_text(file, "a list of names of views").split("\n")
+            except ValueError as error:
+                raise SceneError(str(error)) from error
+            lists[split] = [line.strip() for line in lines if line.strip()]
+            files.append(file.name)
     if not lists and (folder / SCANNETPP).is_file():
-        value, where = read_scene_json(folder / SCANNETPP, "correct it or remove it"), SCANNETPP
-        lists = {name: value[name] for name in ("train", "val", "test") if isinstance(value, dict) and name in value}
-        if not _is_split(lists):
-            raise SceneError(
-                f"{folder / where}: expected lists train and test, got {value!r:.80}; correct it or remove it"
-            )
-    return split_by_lists(str(folder / where), lists, names) if any(lists.values()) else None
+        lists, files = _read_lists(folder / SCANNETPP, "correct it or remove it"), [SCANNETPP]
+    return split_by_lists(str(folder / ", ".join(files)), lists, names) if any(lists.values()) else None
+
+
+def _read_lists(path: Path, advice: str) -> dict[str, list[str]]:
+    """The lists of names in a JSON file; what is not a list is passed over."""
+    value = read_scene_json(path, advice)
+    lists = {name: words for name, words in value.items() if isinstance(words, list)} if isinstance(value, dict) else {}
+    if "train" not in lists or not all(isinstance(word, str) and word for words in lists.values() for word in words):
+        expected = '{"train": [names], "test": [names]}'
+        raise SceneError(
+            f"{path}: expected {expected}, got {str(value)[:80]}; stems are enough, and there must be a 'train'"
+        )
+    return lists
 
 
 def split_by_lists(where: str, lists: Mapping[str, Sequence[str]], names: Sequence[str]) -> Split:
@@ -124,9 +124,3 @@ def split_by_lists(where: str, lists: Mapping[str, Sequence[str]], names: Sequen
     return splits, [
         f"{len(unknown)} names in {where} are not in the scene: {some(unknown)} ({known.advice(unknown[0])})"
     ]
-
-
-def _is_split(value: Any) -> bool:
-    if not isinstance(value, dict) or "train" not in value:
-        return False
-    return all(isinstance(v, list) and all(isinstance(s, str) and s for s in v) for v in value.values())
