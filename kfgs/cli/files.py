@@ -53,13 +53,12 @@ def _files_of(paths: list[Path]) -> Iterator[Path]:
 
 def _parts(folders: set[Path]) -> Iterator[Path]:
     """The folders with pictures, maps, cameras and labels of those folders that are scenes."""
-    from ..scenes.load import is_scene, picture_folders
+    from ..scenes.load import is_scene
 
     for scene in folders:
         if is_scene(scene):
             root = scene if scene.is_dir() else scene.parent
-            yield from (root / name for name in ("features", "sparse", "labels", "labels_scored"))
-            yield from (folder for folder in picture_folders(scene) if folder != root)
+            yield from (root / name for name in ("images", "features", "sparse", "labels", "labels_scored"))
 
 
 def check_target(name: str, target: Path) -> None:

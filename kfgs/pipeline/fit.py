@@ -114,7 +114,7 @@ def fit(
         run = Run(Path(place), report)
         maps = _open_maps(maps, scene, split, run.folder / "features", progress is True)
         with run.locked():
-            if isinstance(method, Paper) or (method.splat is None and scene.splat is None):  # else nothing is trained
+            if isinstance(method, Paper) or method.splat is None:  # else nothing is trained
                 scene = with_points(run, scene, views, seed, progress)
             seen = maps_of_views(scene, views, maps, undistorted=undistorted_features)
             job = _Job(run, scene, views, seen, describe_maps(run, seen), seed, target, progress)
@@ -224,7 +224,7 @@ def _uplift(job: _Job, method: Uplift) -> tuple[SemanticField, dict[str, Any]]:
 
 def _geometry(job: _Job, method: Uplift) -> tuple[Gaussians, dict[str, Any]]:
     """The Gaussians to fuse onto, and where they are from."""
-    splat = job.scene.splat if method.splat is None else method.splat
+    splat = method.splat
     if isinstance(splat, Gaussians):
         return splat, {"geometry": "given"}
     if splat is not None:

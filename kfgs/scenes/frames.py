@@ -15,6 +15,7 @@ from torch import Tensor
 
 from .._check import as_tensor, check_shapes
 from .._files import file_stem, folded_name
+from .._rows import check_finite
 from ..cameras.bounds import robust_bounds
 from ..cameras.camera import Camera
 from ..cameras.similarity import Similarity, fit_similarity
@@ -82,18 +83,13 @@ def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
 
     Wrong poses are left out as long as half of the common cameras agree. The rotation is the one that most orientations agree
     on; scale and translation come from the pair of centres that fits most cameras; least squares on the cameras that fit, in
-    place and in orientation, refine all (`fit_similarity`, Umeyama 1991). Intrinsics are not used.
+    place and in orientation, refine all (`fit_similarity`, Umeyama 1991). Intrinsics are not used. Names are compared without
+    folder and suffix ("images/a.JPG" is "a.png"), unless names repeat without folders.
 
     Raises:
         SceneError: if fewer than two names are common, all common cameras stand at one place (no scale follows), or
             fewer than half agree on one similarity.
-
-    Note:
-        Names are compared without folder and suffix ("images/a.JPG" is "a.png"), unless names repeat without folders.
     """
-    for name, side in (("src", src), ("dst", dst)):
-        if not isinstance(side, Sequence) or not all(isinstance(camera, Camera) for camera in side):
-            raise TypeError(f"{name}: expected a list of cameras, got {type(side).__name__}; pass load_cameras(folder)")
     pairs = _common_cameras(src, dst)
     names = [file_stem(a.name) for a, _ in pairs]
     origins = pairs[0][0].origin, pairs[0][1].origin
@@ -101,7 +97,7 @@ def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
     A, B = (torch.stack([camera.center for camera in side]).cpu().numpy() for side in sides)  # [V, 3]
     R, S = (torch.stack([camera.viewmat[:3, :3] for camera in side]).detach().cpu().numpy() for side in sides)
     turns = S.transpose(0, 2, 1) @ R  # [V, 3, 3] source world to destination world
-    sizes = _extents(B)
+    sizes, least = _extents(B), max(2, MIN_INLIERS * len(A))
     if min(sizes[0] / max(1.0, np.abs(B).max()), _extents(A)[0] / max(1.0, np.abs(A).max())) < 1e-9:
         raise SceneError(
             f"cameras: expected common cameras at different places, got {len(pairs)} at one ({some(names)}), from which "
@@ -110,23 +106,21 @@ def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
     similarity, good, size = None, np.zeros(len(A), dtype=bool), sizes[0]
     for trial in sizes:
         start = _start(A, B, turns, MAX_ERROR * trial)
-        if start is not None:
+        if start is not None and good.sum() < least:
             fit, fits = _refine(start, A, B, turns, trial)
             spread = np.ptp(B[fits], axis=0).max(initial=0.0) if fits.any() else 0.0
             if spread > TRIPOD * trial and fits.sum() > good.sum():  # at one place any scale fits
                 similarity, good, size = fit, fits, trial
-        if good.sum() >= max(2, MIN_INLIERS * len(A)):
-            break
-    if similarity is None or good.sum() < max(2, MIN_INLIERS * len(A)):
+    if similarity is None or good.sum() < least:
         raise SceneError(
             f"cameras: expected at least half of the {len(pairs)} common cameras to fit one similarity, got "
             f"{int(good.sum())}; check that the names mean the same pictures in both, or pass the similarity"
         )
-    errors = _distances(similarity, A, B)
+    errors, angles = _errors(similarity, A, B, turns)
     details = {
         "worst cameras": {names[i]: float(errors[i]) for i in np.argsort(-errors)[:5]},
         "left out": [name for name, ok in zip(names, good, strict=True) if not ok],
-        "median angle": float(np.median(_angles(similarity, turns)[good])),
+        "median angle": float(np.median(angles[good])),
     }
     rms = float(np.sqrt((errors[good] ** 2).mean()))
     return Alignment(similarity.between_worlds(*origins), rms, size, int(good.sum()), len(pairs), details)
@@ -152,7 +146,7 @@ def _start(A: Array, B: Array, turns: Array, reach: float) -> Similarity | None:
     """The rotation that most cameras' orientations agree on, then scale and translation from the best pair of centres."""
     near = (np.einsum("iab,jab->ij", turns, turns) - 1) / 2 > np.cos(np.radians(MAX_ANGLE))
     row = near[int(near.sum(1).argmax())]
-    R = _nearest_rotation(turns[row].sum(0))
+    R = Rotation.from_matrix(turns[row]).mean().as_matrix()
     turned, there = A[row] @ R.T, B[row]  # [n, 3]
     i, j = np.triu_indices(len(turned), 1)
     chosen = np.random.default_rng(0).permutation(len(i))[:PAIRS]
@@ -165,45 +159,37 @@ def _start(A: Array, B: Array, turns: Array, reach: float) -> Similarity | None:
             shift = there[first] - scale * turned[first]
             fits = int((np.linalg.norm(scale * turned + shift - there, axis=1) < reach).sum())
             if fits > most:
-                best, most = _similarity(scale, R, shift), fits
+                best, most = Similarity(float(scale), torch.from_numpy(R), torch.from_numpy(shift)), fits
     return best
 
 
-def _refine(start: Similarity, A: Array, B: Array, turns: Array, size: float) -> tuple[Similarity, Array]:
+def _refine(similarity: Similarity, A: Array, B: Array, turns: Array, size: float) -> tuple[Similarity, Array]:
     """Least squares over the cameras that fit, repeated until they stay the same; gives the fit and these cameras."""
-
-    def fitting(limit: float) -> Array:
-        good: Array = (_distances(similarity, A, B) <= limit) & (_angles(similarity, turns) <= MAX_ANGLE)
-        return good
-
-    similarity = start
-    good = fitting(MAX_ERROR * size)
+    limit, before = MAX_ERROR * size, None
     for _ in range(10):
-        if good.sum() < 2:
+        errors, angles = _errors(similarity, A, B, turns)
+        good = (errors <= limit) & (angles <= MAX_ANGLE)
+        if good.sum() < 2 or (before is not None and bool((good == before).all())):
             break
         a, b = A[good] - A[good].mean(0), B[good] - B[good].mean(0)
         widths = np.linalg.svd(a, compute_uv=False)
         if len(a) < 3 or widths[1] < 1e-3 * widths[0]:  # on a line: the rotation is that of the orientations
-            R = _nearest_rotation(turns[good].sum(0))
+            R = Rotation.from_matrix(turns[good]).mean().as_matrix()
             scale = float(((a @ R.T) * b).sum() / (a**2).sum())
-            similarity = _similarity(scale, R, B[good].mean(0) - scale * R @ A[good].mean(0))
+            shift = B[good].mean(0) - scale * R @ A[good].mean(0)
+            similarity = Similarity(scale, torch.from_numpy(R), torch.from_numpy(shift))
         else:
             similarity = fit_similarity(torch.from_numpy(A[good]), torch.from_numpy(B[good]))
-        typical = float(np.median(_distances(similarity, A, B)[good]))
-        before, good = good, fitting(min(MAX_ERROR * size, SIGMAS * typical + ROUNDING * size))
-        if bool((good == before).all()):
-            break
+        typical = float(np.median(_errors(similarity, A, B, turns)[0][good]))
+        limit, before = min(MAX_ERROR * size, SIGMAS * typical + ROUNDING * size), good
     return similarity, good
 
 
-def _distances(similarity: Similarity, A: Array, B: Array) -> Array:
-    return np.linalg.norm(similarity.apply(torch.from_numpy(A)).numpy() - B, axis=1)
-
-
-def _angles(similarity: Similarity, turns: Array) -> Array:
-    """Degrees between the rotation of each camera from frame to frame and that of the similarity."""
+def _errors(similarity: Similarity, A: Array, B: Array, turns: Array) -> tuple[Array, Array]:
+    """How far a similarity leaves each camera from its counterpart: the distance, and the angle in degrees."""
+    distances = np.linalg.norm(similarity.apply(torch.from_numpy(A)).numpy() - B, axis=1)
     cosines = (np.einsum("vij,ij->v", turns, similarity.rotation.numpy()) - 1) / 2
-    return np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    return distances, np.degrees(np.arccos(np.clip(cosines, -1, 1)))
 
 
 def _extents(centers: Array) -> list[float]:
@@ -217,17 +203,6 @@ def _extents(centers: Array) -> list[float]:
     if upper <= TRIPOD * largest and median <= TRIPOD * largest:
         return [largest]
     return [upper, median] if median <= TRIPOD * upper else [median, upper]
-
-
-def _nearest_rotation(matrix: Array) -> Array:  # [3, 3]
-    """The rotation nearest to a matrix; of a sum of rotations, their mean."""
-    U, _, Vt = np.linalg.svd(matrix)
-    rotation: Array = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-    return rotation
-
-
-def _similarity(scale: float, rotation: Array, translation: Array) -> Similarity:
-    return Similarity(float(scale), torch.from_numpy(np.array(rotation)), torch.from_numpy(np.array(translation)))
 
 
 class FrameCheck(NamedTuple):
@@ -283,12 +258,7 @@ def _nearest(tree: cKDTree, places: Array, k: int = 1) -> tuple[Array, Array]:
 def _bulk(name: str, points: Tensor) -> Array:
     """The points within robust bounds as float64, thinned to about `SAMPLE`, without duplicates (the spacing would be 0)."""
     values = points.detach().double().cpu()
-    finite = values.isfinite().all(1)
-    if not bool(finite.all()):
-        row = int((~finite).nonzero()[0])
-        raise ValueError(
-            f"{name}: expected finite positions, got NaN or infinity in row {row}; remove such points first"
-        )
+    check_finite(name, values)
     if len(values) < 2:
         raise ValueError(f"{name}: expected at least two points, got {len(values)}; there is nothing to compare")
     kept: Array = values[robust_bounds(values, margin=0.0).inside].numpy() if len(values) > 100 else values.numpy()
@@ -323,7 +293,7 @@ def _drift(a: Array, b: Array) -> float:
         x = np.linalg.solve(system + damping, (rows * w).T @ ((Q - P) * normals).sum(1))
         turn, factor = Rotation.from_rotvec(x[:3]).as_matrix(), float(np.exp(np.clip(x[6], -0.1, 0.1)))
         t = factor * turn @ (t - center) + center + x[3:6]
-        R, s = _nearest_rotation(turn @ R), s * factor
+        R, s = Rotation.from_matrix(turn @ R).as_matrix(), s * factor
     shift = s * a @ R.T + t - a
     return float(np.quantile(np.abs((shift * m).sum(1)), DRIFT_SHARE))
 

@@ -13,7 +13,6 @@ from .._check import check_choice
 from .._files import as_path, real_path
 from .._notes import tell_repairs
 from ..cameras.camera import Camera
-from ..formats.table import newest_splat
 from .colmap import colmap_cameras, load_colmap
 from .files import SceneError, natural_key, picture_size, some
 from .layouts import LAYOUTS, find_layout
@@ -24,32 +23,26 @@ from .sub_models import above, choice_note, find_model
 from .transforms import load_transforms
 
 _TRANSFORMS = ("transforms.json", "transforms_train.json")
-
-PICTURES = ("images", "results", "rgb", "color")  # of transforms.json, Replica and ScanNet
 SplitChoice = Literal["auto", "file", "df3dgs", "feature3dgs", "holdout8", "all"]
 
 
 def load_scene(
     path: str | Path, *, images: str | Path | None = None, split: SplitChoice = "auto", strict: bool = False
 ) -> Scene:
-    """Open a folder with pictures and their poses, in the layout of COLMAP, nerfstudio, or a data set.
+    """Open a folder with pictures and their poses, in the layout of COLMAP, nerfstudio, Replica or ScanNet.
 
     The first of these is read: a COLMAP model in `sparse`, `colmap/sparse`, `dense/sparse`, `distorted/sparse`,
-    `colmap_ground_truth` or the folder itself (of several there, as `sparse/0` and `sparse/1`, that with most images; binary
-    before text); `transforms.json`; Blender's `transforms_train.json`; Replica as NICE-SLAM (`results/`, `traj.txt`) or
-    Semantic-NeRF (`rgb/`, `traj_w_c.txt`) rendered it; ScanNet (`color/`, `pose/`).
+    `colmap_ground_truth` or the folder itself (of several the one with most images); `transforms.json`;
+    Blender's `transforms_train.json`; Replica as NICE-SLAM or Semantic-NeRF rendered it; ScanNet.
 
     Args:
         path: the scene folder, a model folder, or a .json file.
-        images: the image folder, also by its name in the scene folder, as in `"images_4"` of Mip-NeRF 360, whose cameras are
-            then resized; None: `images/` next to the model or up to two folders above it, else the first of `images_2`,
-            `images_4`, ..., else the scene folder. Replica and ScanNet know one place only.
-        split: `"auto"`: split.json if there is one, else lists of names next to the model or in the scene folder (`test.txt`,
-            `train_list.txt`, `train_test_lists.json`, ...), else the split of the transforms.json if it has one, else
-            `"df3dgs"` for the videos of Replica, `"holdout8"` from 8 images, below 8 `"all"`; `"file"`: split.json; or a rule
-            of `make_split`.
-        strict: refuse a scene of which something broken was left out or mended (poses of NaN or with a scale, tracks of
-            images that are gone); else the notes say it.
+        images: the image folder, also by its name in the scene folder; cameras are resized to its pictures. None: `images/`
+            next to the model or above it, else the first of `images_2`, `images_4`, ..., else the scene folder.
+        split: `"auto"`: split.json, else lists of names (`test.txt`, `train_list.txt`, ...), else the split of the
+            transforms.json, else `"df3dgs"` for the videos of Replica, `"holdout8"` from 8 images, below 8 `"all"`; `"file"`:
+            split.json; or a rule of `make_split`.
+        strict: refuse a scene of which something broken was left out or mended; else the notes say it.
 
     Returns:
         The scene, with views in natural order of names, and cameras with a `near` for the size of the scene
@@ -69,22 +62,16 @@ def load_scene(
         images = root / images
     with _naming(root):
         scene = replace(_load_views(path, None if images is None else as_path(images)), folder=root)
-        scene = _with_masks(_with_splat(scene, root), root)
+        scene = _with_masks(scene, root)
     tell_repairs(str(path), scene.notes, strict, SceneError)
     return _with_split(scene, path, split)
 
 
 def load_cameras(path: str | Path) -> list[Camera]:
-    """The cameras of a scene, or of a camera path of your own. Use it where no pictures are needed. Lens distortion is removed.
+    """The cameras of a scene, or of a camera path of your own, in natural order of their names, without lens distortion.
 
-    `near` is chosen as by `load_scene`, from these cameras alone. Images of a COLMAP model without a pose are left out.
-
-    Args:
-        path: what `load_scene` reads. The pictures of a COLMAP model or a transforms.json are not needed: the cameras have the
-            sizes that it says. A frame of a transforms.json needs no `file_path` either; its number is then its name.
-
-    Returns:
-        The cameras in natural order of their names.
+    The pictures of a COLMAP model or a transforms.json are not needed. A frame of a transforms.json needs no `file_path`
+    either; its number is then its name.
 
     Raises:
         FileNotFoundError: if there is no such file or folder.
@@ -126,19 +113,6 @@ def _naming(path: Path) -> Iterator[None]:
         raise SceneError(f"{path}: {error}") from error
 
 
-def _with_splat(scene: Scene, root: Path) -> Scene:
-    """The scene with the splat that 3DGS left in its folder. Other programs train in a frame of their own: only a note."""
-    splat = newest_splat(root)
-    if splat is None:
-        return scene
-    name = splat.relative_to(root).as_posix()
-    if name.startswith("point_cloud/"):
-        note = f"{name} is a splat of this scene: a field is made on its Gaussians (--splat names others)"
-        return replace(scene, splat=splat, notes=(*scene.notes, note))
-    note = f"{name} is not used by itself, as its program may train in another frame; if they agree, name it: --splat {splat}"
-    return replace(scene, notes=(*scene.notes, note))
-
-
 def _with_masks(scene: Scene, root: Path) -> Scene:
     """The scene with the masks of a folder `masks`, if its file names none; a mask must have the shape of its photo."""
     if scene.masks is None:
@@ -149,15 +123,6 @@ def _with_masks(scene: Scene, root: Path) -> Scene:
         if mask is not None:
             check_mask(mask, picture_size(mask), camera.size)
     return scene
-
-
-def picture_folders(path: str | Path) -> list[Path]:
-    """The folders, but for the scene folder itself, from which `load_scene` reads pictures; empty if there is no scene."""
-    path = as_path(path)
-    root, model = _root(path), find_model(path)
-    folders = [root / name for name in PICTURES] if model is None else [find_images(path, model)]
-    own = (real_path(root), *real_path(root).parents)
-    return [folder for folder in folders if folder.is_dir() and real_path(folder) not in own]
 
 
 def _load_views(path: Path, images: Path | None) -> Scene:

@@ -36,30 +36,20 @@ def is_video(path: str | Path) -> bool:
 
 def has_heic(folder: str | Path) -> bool:
     """Whether a folder has HEIC photographs without a JPEG or PNG of the same name."""
-    return as_path(folder).is_dir() and bool(_heic_names(as_path(folder)))
+    return bool(heic_names(as_path(folder)))
 
 
-def refuse_heic(folder: Path) -> None:
-    """Raise a SceneError if a folder has photographs that pycolmap would leave out without a word."""
-    names = _heic_names(folder)
-    if names:
-        raise SceneError(
-            f"{folder}: expected pictures that pycolmap reads, got HEIC photographs ({some(names, 3)}); make JPEG files of them: "
-            "`kfgs sfm` does, and kfgs.scenes.pictures.convert_heic(images, out)"
-        )
+def heic_names(folder: Path) -> list[str]:
+    """The HEIC files of a folder that no other picture has the name of, in natural order."""
+    others = {file_stem(name) for name in list_images(folder)}
+    return [name for name in list_images(folder, HEIC_SUFFIXES) if file_stem(name) not in others]
 
 
 def extract_frames(video: str | Path, out: str | Path, *, fps: float = 2.0, progress: bool = False) -> list[Path]:
-    """Write the sharpest frame of each part of a video that is 1 / `fps` seconds long, as JPEG files, in order of time.
+    """Write the sharpest frame of each part of a video that is 1 / `fps` seconds long, as `out/frame_00001.jpg`, ....
 
     The sharpest frame is that with the largest variance of the Laplacian of its grey values. Frames stay as they are: no
-    resizing; the rotation that a phone notes in the file is applied.
-
-    Args:
-        video: the file.
-        out: the folder of the frames `frame_00001.jpg`, .... Frames of the same video and `fps` that are there are kept.
-        fps: frames per second of the video that are written, at most those of the video.
-        progress: show a bar.
+    resizing; the rotation that a phone notes in the file is applied. Frames of the same video and `fps` that are there are kept.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -130,22 +120,10 @@ def _decode(video: Path) -> Iterator[tuple[Frame, float]]:
         ) from error
 
 
-def _heic_names(folder: Path) -> list[str]:
-    """The HEIC files of a folder that no other picture has the name of, in natural order."""
-    others = {file_stem(name) for name in list_images(folder)}
-    return [name for name in list_images(folder, HEIC_SUFFIXES) if file_stem(name) not in others]
-
-
 def convert_heic(images: str | Path, out: str | Path, *, progress: bool = False) -> list[Path]:
     """Write the HEIC photographs of a folder as JPEG files, or PNG if some of it is transparent, and links to its other pictures.
 
-    Args:
-        images: the folder, with subfolders.
-        out: the folder to write. What an earlier call made of the same photographs is kept.
-        progress: show a bar.
-
-    Returns:
-        All pictures in `out`.
+    What an earlier call made of the same photographs is kept. Returns all pictures in `out`.
 
     Raises:
         FileExistsError: if `out` holds something else.
@@ -153,7 +131,7 @@ def convert_heic(images: str | Path, out: str | Path, *, progress: bool = False)
         ImportError: if pillow-heif is not installed.
     """
     images, out = as_path(images), as_path(out)
-    names, others = _heic_names(images), list_images(images)
+    names, others = heic_names(images), list_images(images)
     stems = [file_stem(name) for name in names]
     twice = [name for name, stem in zip(names, stems, strict=True) if stems.count(stem) > 1]
     if twice:  # both would be the same JPEG file
@@ -163,18 +141,18 @@ def convert_heic(images: str | Path, out: str | Path, *, progress: bool = False)
     source = {"images": [[name, digest_file(images / name)] for name in names], "others": others}
     if not _made_before(out, source):
         with atomic_folder(out) as folder:
+            for name in [*names, *others]:
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
             for name in tqdm(names, disable=not progress, unit="image", desc="HEIC"):
-                target = folder / f"{file_stem(name)}.jpg"
-                target.parent.mkdir(parents=True, exist_ok=True)
                 with open_picture(images / name, "a HEIC photograph") as picture:
                     exif = picture.getexif()  # with the focal length, from which COLMAP starts
                     exif.pop(ORIENTATION, None)  # pillow-heif has turned the picture
                     if picture.mode == "RGBA" and np.asarray(picture.getchannel("A")).min() < 255:
-                        picture.save(target.with_suffix(".png"), exif=exif)
+                        picture.save(folder / f"{file_stem(name)}.png", exif=exif)
                     else:
-                        picture.convert("RGB").save(target, quality=QUALITY, subsampling=0, exif=exif)
+                        jpeg = folder / f"{file_stem(name)}.jpg"
+                        picture.convert("RGB").save(jpeg, quality=QUALITY, subsampling=0, exif=exif)
             for name in others:
-                (folder / name).parent.mkdir(parents=True, exist_ok=True)
                 (folder / name).symlink_to(real_path(images / name))
             write_json(folder / SOURCE, source)
     return [out / name for name in list_images(out)]

@@ -52,8 +52,6 @@ class Scene:
     """Only in an undistorted scene: the cameras with the distortion that the files on disk still have."""
     folder: Path | None = None
     """The path that the scene was loaded from."""
-    splat: Path | None = None
-    """A trained splat in the frame of the cameras, found in the scene's folder. `fit` averages features onto it."""
     masks: list[Path | None] | None = None
     """V masks of the pictures on disk, None for a view without one: what is black in it is ignored by everything."""
 

@@ -16,17 +16,14 @@ from tqdm import tqdm
 
 from .._check import check_choice, check_range
 from .._files import as_path, atomic_folder, check_output, real_path
-from ..formats.table import newest_splat
 from .colmap import LENSES
 from .colmap_model import has_model
 from .files import SceneError, list_images, picture_size, some
 from .masks import folder_masks, write_colmap_masks
-from .pictures import refuse_heic
+from .pictures import heic_names
 from .pycolmap_import import quiet_pycolmap, scene_errors
 
-OVERLAP = (
-    10  # next images with which one of a video is compared, and as many at distances 1, 2, 4, ... (COLMAP's default)
-)
+OVERLAP = 10  # next images that one of a video is compared with, and as many at distances 1, 2, 4, ... (as COLMAP)
 SMALL = 400
 """Pixels of the longer side; smaller photos have too few features: of 22 with 192x144 pixels 8 got a pose, enlarged all."""
 
@@ -93,9 +90,10 @@ def run_sfm(
     replace: bool = False,
     progress: bool = False,
 ) -> SfmReport:
-    """Estimate cameras and a sparse cloud, and write them to `out/sparse/0`.
+    """Estimate cameras and a sparse cloud with pycolmap, and write them to `out/sparse/0`.
 
-    Nothing is found where a photo is transparent, or black in its mask (`masks/NAME.png`, in the folder or next to it).
+    Nothing is found where a photo is transparent, or black in its mask (`masks/NAME.png`, in the folder or next to it). Every
+    random choice is seeded; several threads may still differ in the last digits.
 
     Args:
         images: folder of images (with subfolders); other files are ignored.
@@ -106,30 +104,27 @@ def run_sfm(
 
     Raises:
         FileNotFoundError: if there is no such folder.
-        FileExistsError: if `out/sparse/0` holds a model, and `replace` is False; or if `out/point_cloud` holds a splat, which was
-            trained with other poses.
+        FileExistsError: if `out/sparse/0` holds a model, and `replace` is False.
         ValueError: if `out` is a file.
         SceneError: if there are fewer than 3 images, pycolmap fails, or the largest model places fewer than
             `min_registered` of the images (the rest is lost, or COLMAP split the scene into unconnected models).
         ImportError: if pycolmap is not installed.
-
-    Note:
-        Every random choice is seeded; several threads may still differ in the last digits.
     """
     images, out, config = as_path(images), as_path(out), config or SfmConfig()
     if not images.is_dir():
         raise FileNotFoundError(f"{images}: no such folder; expected the images there")
-    model = check_model_place(out, replace)
-    splat = newest_splat(out)
-    if splat is not None and splat.is_relative_to(
-        out / "point_cloud"
-    ):  # `load_scene` would take it for one of these poses
+    model = check_output("out", out, "a folder") / "sparse" / "0"
+    if has_model(model) and not replace:
         raise FileExistsError(
-            f"out: expected a scene folder without a splat of other poses, got {splat}, which will not fit the new ones; move "
-            f"{out / 'point_cloud'} away, or name another folder"
+            f"out: expected a scene folder without a model, got one in {model}; name another folder, or pass replace=True "
+            "(--replace) to give up that model"
         )
-    refuse_heic(images)
-    names = list_images(images)
+    heic, names = heic_names(images), list_images(images)
+    if heic:
+        raise SceneError(
+            f"{images}: expected pictures that pycolmap reads, got HEIC photographs ({some(heic, 3)}); make JPEG files of them: "
+            "`kfgs sfm` does, and kfgs.scenes.pictures.convert_heic(images, out)"
+        )
     if len(names) < 3:
         raise SceneError(f"{images}: expected at least 3 images (PNG, JPEG, TIFF, WebP), got {len(names)}; add views")
     advice = "check the images and the free disk space"
@@ -154,17 +149,6 @@ def run_sfm(
         placed = {image.name for image in models[0].images.values() if image.has_pose}
         error, missing = float(models[0].compute_mean_reprojection_error()), [n for n in names if n not in placed]
         return SfmReport(len(placed), len(names), len(models[0].points3D), error, run.seconds, tuple(missing))
-
-
-def check_model_place(out: Path, replace: bool) -> Path:
-    """`out/sparse/0`, where a model will be written; a FileExistsError if there is one that may not be replaced."""
-    model = check_output("out", out, "a folder") / "sparse" / "0"
-    if has_model(model) and not replace:
-        raise FileExistsError(
-            f"out: expected a scene folder without a model, got one in {model}; name another folder, or pass replace=True "
-            "(--replace) to give up that model"
-        )
-    return model
 
 
 def link_images(images: str | Path, out: str | Path) -> bool:
@@ -243,15 +227,13 @@ class SfmRun:
         names = list(self.photos)
         if self.config.matching == "exhaustive":
             self._match(self.pycolmap.match_exhaustive, {}, len(names) * (len(names) - 1) // 2)
-        elif not any(character.isspace() for name in names for character in name):
-            self.match_pairs(sequential_pairs(names))
-        elif sorted(names) == names:  # without a list COLMAP orders names letter by letter, 10.png before 9.png
-            self._match(self.pycolmap.match_sequential, {}, len(names))
-        else:  # in a list it cuts names at blanks
+            return
+        if any(character.isspace() for name in names for character in name):  # pycolmap cuts them in a list of pairs
             raise SceneError(
-                f"{self.images}: expected names without blanks, or padded with zeros, for sequential matching, got "
-                f"{some(names, 3)}; rename the images or use matching='exhaustive' (--matching exhaustive)"
+                f"{self.images}: expected names without blanks for sequential matching, got {some(names, 3)}; rename the images "
+                "or use matching='exhaustive' (--matching exhaustive)"
             )
+        self.match_pairs(sequential_pairs(names))
 
     def match_pairs(self, pairs: list[tuple[str, str]]) -> None:
         """Compare given pairs of images; no name may have a blank."""
@@ -299,13 +281,15 @@ def _too_few(images: Path, sizes: list[int], names: list[str], config: SfmConfig
     got = f"{sizes[0] if sizes else 0}"
     if len(sizes) > 1:
         got = f"a scene split into {len(sizes)} unconnected models of {', '.join(map(str, sizes))} images"
-    width, height = max((_size(images / name) for name in names), key=max, default=(0, 0))
-    small = "use the original photos, or enlarge them to twice their size: these are small"
-    advice = [f"{small} ({width}x{height} pixels)"] if 0 < max(width, height) < SMALL else []
-    advice += ["use matching='exhaustive' (--matching exhaustive)"] if config.matching == "sequential" else []
-    advice += ["take overlapping photos between the parts"]
-    several = "give single_camera=False (--no-single-camera) if several cameras took them, or zoom differs"
-    advice += [several] if config.single_camera else []
+    width, height = max((_size(images / name) for name in names), key=max)
+    advice = ["take overlapping photos between the parts"]
+    if 0 < max(width, height) < SMALL:
+        small = f"these are small ({width}x{height} pixels)"
+        advice.insert(0, f"use the original photos, or enlarge them to twice their size: {small}")
+    if config.matching == "sequential":
+        advice.append("use matching='exhaustive' (--matching exhaustive)")
+    if config.single_camera:
+        advice.append("give single_camera=False (--no-single-camera) if several cameras took them, or zoom differs")
     return (
         f"expected at least {config.min_registered * len(names):.0f} of {len(names)} images registered in one model "
         f"(min_registered = {config.min_registered:g}), got {got}; {', or '.join(advice)}, or lower min_registered "

@@ -9,7 +9,6 @@ from colmap_models import write_model, write_picture
 from messages import tells
 
 from kfgs.scenes import SceneError, load_cameras, load_scene
-from kfgs.scenes.load import picture_folders
 
 
 def _pictures(folder: Path, names: list[str]) -> None:
@@ -227,20 +226,6 @@ def test_the_real_scenes(shared_data: Path) -> None:
     fox = load_scene(shared_data / "fox", split="holdout8")
     assert (len(fox), len(fox.points), len(fox.splits["train"])) == (50, 0, 43)
     assert [c.name for c in load_scene(shared_data / "fox/transforms.json").cameras] == [c.name for c in fox.cameras]
-
-
-@pytest.mark.parametrize(
-    ("folder", "found"), [("images", "images"), ("images_4", "images_4"), ("images/left", "images"), (".", None)]
-)
-def test_picture_folders_are_those_that_are_read(tmp_path: Path, folder: str, found: str | None) -> None:
-    root = tmp_path / "scene"
-    name = "left/a.png" if folder == "images/left" else "a.png"
-    write_model(root / "sparse/0", [name])
-    _pictures(root / folder, ["a.png"])
-    assert [file.is_relative_to(root / (found or ".")) for file in load_scene(root).image_paths] == [True]
-    (root / "sparse/0/images.bin").write_bytes(b"")  # the model is not read for it
-    assert picture_folders(root) == ([] if found is None else [root / found])
-    assert picture_folders(tmp_path) == []  # no scene
 
 
 def _same(some: list[Any], others: list[Any]) -> bool:

@@ -220,13 +220,6 @@ def test_a_model_is_replaced_only_when_asked_and_other_files_stay(tmp_path: Path
     run_sfm(tmp_path / "photos", tmp_path / "scene", replace=True)
     assert (model / "cameras.bin").read_bytes() == b"new"
     assert (model / "notes.txt").read_text() == "mine"
-    splat = tmp_path / "scene" / "point_cloud" / "iteration_7000" / "point_cloud.ply"
-    splat.parent.mkdir(parents=True)
-    splat.touch()
-    (model / "cameras.bin").write_bytes(b"old")
-    with pytest.raises(FileExistsError, match=tells("out:", splat, f"move {tmp_path / 'scene' / 'point_cloud'} away")):
-        run_sfm(tmp_path / "photos", tmp_path / "scene", replace=True)
-    assert (model / "cameras.bin").read_bytes() == b"old"
 
 
 def test_files_that_are_no_pictures_are_named(tmp_path: Path) -> None:
