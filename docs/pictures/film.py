@@ -54,7 +54,7 @@ def main() -> None:
         ),
     ]
     font, frames, each = ImageFont.load_default(15), [], FRAMES // len(parts)
-    for number, camera in enumerate(path_cameras(keys, FRAMES, size=SIZE, closed=True)):
+    for number, camera in enumerate(path_cameras([*keys, keys[0]], FRAMES + 1, size=SIZE)[:-1]):
         part, at = divmod(number, each)
         picture = parts[part][1](camera).astype(float)
         if (left := each - at) <= BLEND:  # fade to the next part

@@ -19,14 +19,11 @@ from .._origin import to_world
 DistortionModel = Literal["brown_conrady", "kannala_brandt"]
 COEFFICIENTS = {"brown_conrady": (4, 5, 8), "kannala_brandt": (4,)}
 
+ROTATION_TOLERANCE = 1e-3  # of R R^T: matrices from text files have few digits
 NEAR = 0.2
 """World units: the smallest depth that 3DGS draws, meant for scenes of metres."""
-
-PIXELS = 2**31 - 1
-"""Most pixels of a picture: the rasteriser numbers them in 32 bits."""
-
-UP = (0.0, 0.0, 1.0)
-"""The direction that is up in the world, by default."""
+PIXELS = 2**31 - 1  # of a picture, at most: the rasteriser numbers them in 32 bits
+UP = (0.0, 0.0, 1.0)  # in the world, by default
 
 
 @dataclass(frozen=True)
@@ -82,10 +79,8 @@ class Camera:
         if self.width * self.height > PIXELS:
             got = f"{self.width:,} x {self.height:,}"
             raise ValueError(f"width, height: expected at most {PIXELS:,} pixels, got {got}; give a smaller size")
-        if not torch.compiler.is_compiling():  # a traced matrix has no values yet
-            self._check_values()
-
-    def _check_values(self) -> None:
+        if torch.compiler.is_compiling():  # a traced matrix has no values yet
+            return
         check_range("near", self.near, 0, closed=(False, False))
         object.__setattr__(self, "near", float(self.near))
         K, E = self.K.detach().double().cpu(), self.viewmat.detach().double().cpu()  # cameras are tiny
@@ -97,16 +92,9 @@ class Camera:
             raise ValueError(f"K: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] without skew, got {K.tolist()}")
         check_range("K[0, 0] (fx)", float(K[0, 0]), 0, closed=(False, False))
         check_range("K[1, 1] (fy)", float(K[1, 1]), 0, closed=(False, False))
-        R = E[:3, :3]
-        if E[3].tolist() != [0.0, 0.0, 0.0, 1.0] or (R @ R.T - torch.eye(3, dtype=R.dtype)).abs().max() > 1e-3:
-            raise ValueError(
-                f"viewmat: expected a rigid motion (orthonormal rotation, last row 0 0 0 1), got {E.tolist()}; "
-                "remove any scale from the pose first"
-            )
-        if torch.linalg.det(R) < 0:
-            raise ValueError(
-                "viewmat: expected a rotation, got a reflection (determinant -1); check the axes' handedness"
-            )
+        if E[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
+            raise ValueError(f"viewmat: expected the last row 0 0 0 1, got {E[3].tolist()}; pass points as columns")
+        exact_rotation("viewmat", E[:3, :3])
 
     @staticmethod
     def look_at(
@@ -124,10 +112,8 @@ class Camera:
 
         A floating-point tensor `eye` decides dtype and device of the matrices. `up` is the world's up, which is up in the
         picture too; COLMAP's worlds often have no axis that points up: pass `estimate_up(scene.cameras)`. `fov_degrees` is
-        the vertical field of view; pixels are square.
-
-        Raises:
-            ValueError: if eye and target are at one place, or `up` is the direction of view, which leaves the roll open.
+        the vertical field of view; pixels are square. A ValueError if eye and target are at one place, or `up` is the
+        direction of view, which leaves the roll open.
 
         Example:
             >>> camera = Camera.look_at((0, -4, 0), (0, 0, 0), fov_degrees=90, width=64, height=48)
@@ -136,7 +122,7 @@ class Camera:
         """
         check_range("fov_degrees", fov_degrees, 0, 180, closed=(False, False))
         like = eye if isinstance(eye, Tensor) and eye.is_floating_point() else torch.zeros(())
-        place, aim = (as_tensor(name, one).detach().double().cpu() for name, one in (("eye", eye), ("target", target)))
+        place, aim = (as_tensor(n, point).detach().double().cpu() for n, point in (("eye", eye), ("target", target)))
         check_shapes(("eye", place, "3"), ("target", aim, "3"))
         forward, zenith = unit_vector("target - eye", aim - place), unit_vector("up", up)
         right = torch.linalg.cross(forward, zenith)
@@ -192,6 +178,13 @@ class Camera:
         scale = min(1.0, longest / max(self.size))
         return self.resized(max(1, round(scale * self.height)), max(1, round(scale * self.width)))
 
+    def letterboxed(self, height: int, width: int) -> Camera:
+        """The same view, complete and in the middle of a picture of another shape, with its pixels as high as wide."""
+        scale = min(height / self.height, width / self.width)
+        K = self.K * self.K.new_tensor([scale, scale, 1.0])[:, None]
+        K[:2, 2] += self.K.new_tensor([width - scale * self.width, height - scale * self.height]) / 2
+        return replace(self, K=K, width=width, height=height)
+
     def with_origin(self, origin: Sequence[float]) -> Camera:  # [3]
         """The same view of the world, with `viewmat` mapping from coordinates counted from another origin."""
         shift = [b - a for a, b in zip(self.origin, as_origin(origin), strict=True)]
@@ -209,6 +202,25 @@ class Camera:
 def at_one_origin(cameras: Sequence[Camera]) -> list[Camera]:
     """The cameras, with all viewmats counted from the origin of the first."""
     return [camera.with_origin(cameras[0].origin) for camera in cameras]
+
+
+def exact_rotation(name: str, matrix: Tensor) -> Tensor:  # [3, 3] -> [3, 3] float64
+    """The exact rotation nearest to a rounded one; errors name the argument `name`.
+
+    Raises:
+        ValueError: if the matrix is not finite, not orthonormal to 1e-3, or a reflection.
+    """
+    check_shapes((name, matrix, "3 3"))
+    M = matrix.detach().double().cpu()
+    error = (M @ M.T - torch.eye(3, dtype=torch.float64)).abs().max()
+    if not error <= ROTATION_TOLERANCE:  # NaN fails every comparison
+        raise ValueError(
+            f"{name}: expected a rotation (rigid: without scale or shear), got {M.tolist()}; divide by the scale first"
+        )
+    if torch.linalg.det(M) < 0:
+        raise ValueError(f"{name}: expected a rotation, got a reflection (determinant -1); check the axes' handedness")
+    U, _, Vh = torch.linalg.svd(M)
+    return M.clone() if error < 1e-14 else U @ Vh
 
 
 def unit_vector(name: str, vector: Tensor | Sequence[float]) -> Tensor:  # [3] float64

@@ -22,7 +22,6 @@ Array = np.ndarray[Any, Any]
 SAME = 1e-9  # successive views closer than this, in position and direction, are one
 STANDING = 1e-6  # of the coordinates: cameras on one tripod differ by the rounding of float32
 LEVEL = 0.05  # if the pictures' x axes spread less than this in their second direction, they do not determine "up"
-AROUND = 3  # a closed path is continued by this many keys at both ends: keys farther away hardly change a spline
 
 
 class TooFewViewsError(ValueError):
@@ -30,12 +29,7 @@ class TooFewViewsError(ValueError):
 
 
 def path_cameras(
-    cameras: Sequence[Camera],
-    frames: int = 150,
-    *,
-    every: int = 1,
-    size: tuple[int, int] | None = None,
-    closed: bool = False,
+    cameras: Sequence[Camera], frames: int = 150, *, every: int = 1, size: tuple[int, int] | None = None
 ) -> list[Camera]:
     """Cameras along a smooth path through given cameras (the keys), in the order given.
 
@@ -48,7 +42,6 @@ def path_cameras(
         frames: the number of cameras to return. The first and last stand at the first and last key.
         every: take only every N-th camera as a key, and the last one. A hand-held video of 200 pictures trembles less with 10.
         size: (height, width) in pixels; None: that of the first camera. A key of another shape stays complete, in the middle.
-        closed: come back to the first camera, for a film that repeats; the path ends one step before its start.
 
     Returns:
         Pinhole cameras, `path_0000` and so on, with the smallest `near` of all. Focal lengths and principal points change
@@ -63,57 +56,34 @@ def path_cameras(
     check_whole("every", every, 1)
     if size is not None:
         check_size(size)
-    keys = _keys(at_one_origin(cameras), every, closed)
-    height, width = size or cameras[0].size
-    keys = [_in_frame(key, *cameras[0].size).resized(height, width) for key in keys]
-    places, turns = _poses(keys)
-    times = np.concatenate([[0.0], np.cumsum(_steps(places, turns))])
-    start, end = (times[AROUND], times[-AROUND - 1]) if closed else (times[0], times[-1])
-    moments = np.linspace(start, end, frames, endpoint=not closed)
-    R = RotationSpline(times, turns)(moments).as_matrix()  # [frames, 3, 3] world to camera
-    t = -np.einsum("nij,nj->ni", R, CubicSpline(times, places)(moments))  # t = -R c
-    lenses = np.stack([_numpy(key.K) for key in keys])[:, [0, 1, 0, 1], [0, 1, 2, 2]]  # [k, 4] fx, fy, cx, cy
-    lenses = np.stack([np.interp(moments, times, column) for column in lenses.T], axis=1)
-    near = min(camera.near for camera in cameras)
-    path = []
-    for number in range(frames):
-        viewmat, K = np.eye(4), np.eye(3)
-        viewmat[:3, :3], viewmat[:3, 3] = R[number], t[number]
-        K[0, 0], K[1, 1], K[0, 2], K[1, 2] = lenses[number]
-        name = f"path_{number:04d}"
-        lens = torch.from_numpy(K), width, height
-        path.append(Camera(torch.from_numpy(viewmat), *lens, name=name, near=near, origin=cameras[0].origin))
-    return path
-
-
-def _keys(cameras: Sequence[Camera], every: int, closed: bool) -> list[Camera]:
-    """The keys, each different from the one before; those of a closed path are continued past both ends."""
-    keys = [*cameras[::every]]
-    if not closed and (len(cameras) - 1) % every:
-        keys.append(cameras[-1])
+    cameras = at_one_origin(cameras)
+    keys = [*cameras[::every], *([cameras[-1]] if (len(cameras) - 1) % every else [])]
     if len(keys) > 1:
         moved = _steps(*_poses(keys)) > SAME
         keys = [keys[0], *(key for key, new in zip(keys[1:], moved, strict=True) if new)]
-    if closed and len(keys) > 1 and _steps(*_poses([keys[-1], keys[0]]))[0] <= SAME:
-        keys.pop()
     if len(keys) < 2:
         raise TooFewViewsError(
             f"cameras: expected at least two different views, got {len(keys)} (of {len(cameras)}, every {every}); pass the "
             "cameras of the scene in the order of the path"
         )
-    if closed:
-        keys = [keys[i % len(keys)] for i in range(-AROUND, len(keys) + AROUND + 1)]
-    return keys
-
-
-def _in_frame(key: Camera, height: int, width: int) -> Camera:
-    """The view of a portrait in the middle of a landscape, with its pixels as high as wide; others stay as they are."""
-    if fits_aspect(key.size, (height, width)):
-        return key
-    scale = min(height / key.height, width / key.width)
-    K = key.K * key.K.new_tensor([scale, scale, 1.0])[:, None]
-    K[:2, 2] += key.K.new_tensor([width - scale * key.width, height - scale * key.height]) / 2
-    return replace(key, K=K, width=width, height=height)
+    first, (height, width) = cameras[0].size, size or cameras[0].size
+    keys = [key if fits_aspect(key.size, first) else key.letterboxed(*first) for key in keys]
+    keys = [key.resized(height, width) for key in keys]
+    places, turns = _poses(keys)
+    times = np.concatenate([[0.0], np.cumsum(_steps(places, turns))])
+    moments = np.linspace(0, times[-1], frames)
+    R = RotationSpline(times, turns)(moments).as_matrix()  # [frames, 3, 3] world to camera
+    t = -np.einsum("nij,nj->ni", R, CubicSpline(times, places)(moments))  # t = -R c
+    Ks = np.stack([_numpy(key.K) for key in keys]).reshape(-1, 9)
+    Ks = np.stack([np.interp(moments, times, column) for column in Ks.T], axis=1).reshape(-1, 3, 3)
+    near, origin = min(camera.near for camera in cameras), cameras[0].origin
+    path = []
+    for number in range(frames):
+        viewmat = np.eye(4)
+        viewmat[:3, :3], viewmat[:3, 3] = R[number], t[number]
+        lens = torch.from_numpy(Ks[number]), width, height
+        path.append(Camera(torch.from_numpy(viewmat), *lens, f"path_{number:04d}", near=near, origin=origin))
+    return path
 
 
 def _poses(keys: Sequence[Camera]) -> tuple[Array, Rotation]:  # [k, 3], k rotations from world to camera
@@ -207,9 +177,6 @@ def orbit_cameras(
         orbit: number of cameras, size, elevation, ...; None: the defaults of `Orbit`.
         up: the world's up, see `Camera.look_at`.
         origin: that the points are counted from, `gaussians.origin`.
-
-    Raises:
-        ValueError: if there are no points, one is not finite, or `up` has no direction.
     """
     orbit = orbit or Orbit()
     cloud = points.detach().double().cpu()

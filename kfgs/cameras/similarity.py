@@ -10,9 +10,8 @@ from torch import Tensor
 
 from .._check import ORIGIN, check_range, check_shapes
 from .._origin import FAR_UNITS, Origin
-from .camera import Camera
+from .camera import Camera, exact_rotation
 
-ROTATION_TOLERANCE = 1e-3  # as for Camera.viewmat: matrices from text files have few digits
 LAST_ROW_TOLERANCE = 1e-5  # a float32 matrix inverse leaves 1e-7 there
 STRAIGHT = 1e-6  # points whose second spread is below this share of the first lie on a line
 
@@ -22,10 +21,7 @@ class Similarity:
     """x' = scale * R x + t: a rotation, one factor for all axes, and a shift.
 
     **Convention**: points are columns; rotation and translation are copied to float64 on the CPU. The rotation is the exact
-    rotation nearest to the given matrix.
-
-    Raises:
-        ValueError: if the scale is not positive, a number is not finite, or the matrix is not a rotation.
+    rotation nearest to the given matrix; a matrix that is not nearly a rotation is refused.
 
     Example:
         >>> quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # x to y
@@ -59,12 +55,7 @@ class Similarity:
 
     @staticmethod
     def from_matrix(matrix: Tensor) -> Similarity:  # [4, 4]
-        """Read scale, rotation and translation from [[s R, t], [0, 1]].
-
-        Raises:
-            ValueError: if the last row is not 0 0 0 1 up to the rounding of float32 (1e-5), or the rest shears, mirrors or
-                scales the axes differently.
-        """
+        """Read scale, rotation and translation from [[s R, t], [0, 1]]; a ValueError if it shears, mirrors or is projective."""
         check_shapes(("matrix", matrix, "4 4"))
         matrix = matrix.detach().double().cpu()
         if not (matrix[3] - matrix.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().max() <= LAST_ROW_TOLERANCE:  # NaN fails
@@ -128,45 +119,20 @@ class Similarity:
 def fit_similarity(src: Tensor, dst: Tensor) -> Similarity:  # [N, 3], [N, 3]
     """The similarity with the least sum of |s R src + t - dst|^2, in closed form (Umeyama 1991, by scikit-image).
 
-    Flat clouds are accepted (the result is the rotation, not the mirror image). Points on a line are refused, because the
-    rotation about the line is unknown.
-
-    Raises:
-        ValueError: if shapes disagree, a number is not finite, or fewer than three pairs span a plane in both frames.
+    Flat clouds are accepted (the result is the rotation, not the mirror image). A ValueError if fewer than three pairs span a
+    plane in both frames: the rotation about a line is unknown.
     """
     from skimage.transform import SimilarityTransform  # slow to import, and seldom needed
 
     check_shapes(("src", src, "N 3"), ("dst", dst, "N 3"))
-    points = [values.detach().double().cpu().numpy() for values in (src, dst)]
-    for name, values in zip(("src", "dst"), map(torch.from_numpy, points), strict=True):
+    points = [values.detach().double().cpu() for values in (src, dst)]
+    for name, values in zip(("src", "dst"), points, strict=True):
         if len(values) < 3 or not torch.isfinite(values).all():
             raise ValueError(f"{name}: expected at least 3 finite points, got {len(values)}; add pairs, leave NaN out")
         spread = torch.linalg.svdvals(values - values.mean(0))
         if spread[1] <= STRAIGHT * spread[0]:
-            raise ValueError(
-                f"{name}: expected points that span a plane, got points on a line (spreads {spread.tolist()}); "
-                "add pairs next to it"
-            )
-    fit = SimilarityTransform.from_estimate(*points)
+            raise ValueError(f"{name}: expected points that span a plane, got points on a line; add pairs next to it")
+    fit = SimilarityTransform.from_estimate(*(values.numpy() for values in points))
     if not fit or not fit.scale > 0:
         raise ValueError("dst: expected points that a rotation and a scale can reach, got others; check the pairs")
     return Similarity.from_matrix(torch.from_numpy(fit.params))
-
-
-def exact_rotation(name: str, matrix: Tensor) -> Tensor:  # [3, 3] -> [3, 3] float64
-    """The exact rotation nearest to a rounded one; errors name the argument `name`.
-
-    Raises:
-        ValueError: if the matrix is not finite, not orthonormal to 1e-3, or a reflection.
-    """
-    check_shapes((name, matrix, "3 3"))
-    M = matrix.detach().double().cpu()
-    error = (M @ M.T - torch.eye(3, dtype=torch.float64)).abs().max()
-    if not error <= ROTATION_TOLERANCE:  # NaN fails every comparison
-        raise ValueError(
-            f"{name}: expected a rotation (orthonormal, without scale or shear), got {M.tolist()}; divide by the scale first"
-        )
-    if torch.linalg.det(M) < 0:
-        raise ValueError(f"{name}: expected a rotation, got a reflection (determinant -1); check the axes' handedness")
-    U, _, Vh = torch.linalg.svd(M)
-    return M.clone() if error < 1e-14 else U @ Vh

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_shapes
-from ..cameras.similarity import exact_rotation
+from ..cameras.camera import exact_rotation
 
 SH_C0 = 0.5 * sqrt(1 / pi)
 """The constant harmonic, 0.28209...: rgb = SH_C0 * coefficient + 0.5 at degree 0."""

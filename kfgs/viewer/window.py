@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import log10
 from pathlib import Path
 from typing import Any
@@ -129,7 +129,7 @@ class Explorer:
             return
         width, height = self.plotter.window_size
         width //= len(self.state.sides)
-        look_through(self.plotter, letterboxed(camera, height, width))
+        look_through(self.plotter, camera.to("cpu", torch.float64).letterboxed(height, width))
         if np.isclose(float(camera.K[0, 0]), float(camera.K[1, 1]), rtol=1e-6):
             self.plotter.camera.SetUseExplicitAspectRatio(False)  # the window may be resized
         for renderer in self.plotter.renderers:
@@ -307,13 +307,3 @@ class _Controls:
         if pressed is not None and max(abs(x - pressed[0]), abs(y - pressed[1])) <= 3:  # pixels; further is a drag
             below = self.plotter.render_window.GetSize()[1] - 1 - y  # VTK counts rows from below
             self.call(lambda: self.explorer.pick(x, below))
-
-
-def letterboxed(camera: Camera, height: int, width: int) -> Camera:
-    """Resize a camera. The old view stays complete and centred, at its aspect ratio."""
-    scale = min(height / camera.height, width / camera.width)
-    K = camera.K.detach().double().cpu().clone()
-    K[:2] *= scale
-    K[0, 2] += (width - scale * camera.width) / 2
-    K[1, 2] += (height - scale * camera.height) / 2
-    return replace(camera, viewmat=camera.viewmat.detach().double().cpu(), K=K, width=width, height=height)
