@@ -36,15 +36,6 @@ def test_pairs_need_like_features_and_nearness():
     assert cf3.find_pairs(far, 0.9, everyone).tolist() == []
 
 
-def test_structure_loss_against_numbers():
-    latents, features = torch.eye(3)[:2], torch.tensor([[1.0, 0.0], [1.0, 0.0]])
-    assert float(cf3.structure_loss(latents, features)) == pytest.approx(2 / 4)
-
-
-def test_brightest_drops_a_share():
-    assert cf3.brightest(torch.tensor([1.0, 90.0, 2.0, 7.0]), 0.03).tolist() == [False, True, False, True]
-
-
 def test_fit_has_gaussians_of_its_own():
     found = cf3.fit(task(), cf3.CF3Config(epochs=20, batch=8, rounds=2, steps=10))
     assert found.own_geometry

@@ -1,15 +1,12 @@
 """The protocols judged by edits whose outcome is known: by true labels, by wrong labels, by halves, by nothing."""
 
-import dataclasses
 import json
 import math
-import shutil
 
 import numpy as np
 import pytest
 import torch
-from editing import ClassTruth, score_recolor, score_removal
-from messages import tells
+from editing import score_recolor, score_removal
 from oracles_editing import paint_room
 from PIL import Image
 
@@ -61,14 +58,6 @@ def test_removing_nothing_leaves_everything(room, cloud):
     assert not report.passed
 
 
-def test_removing_everything_leaves_nothing(room, cloud):
-    nothing = cloud.select(torch.zeros(len(cloud), dtype=torch.bool))
-    report = score_removal(cloud, nothing, room, "chair")
-    assert (report.gone_pixels, report.gone_points, report.kept_points) == (1, 1, 0)
-    assert report.untouched_pixels < 0.2
-    assert not report.passed
-
-
 def test_removing_a_wrong_class_fails(room, cloud, mask):
     report = score_removal(cloud, cloud.select(~mask["table"]), room, "chair")
     assert report.gone_pixels < 0.05
@@ -88,46 +77,6 @@ def test_removing_half_scores_half(room, cloud, mask):
     assert abs(report.gone_points - share) < 0.03
     assert 0.1 < report.gone_pixels < 0.9
     assert not report.passed
-
-
-def test_a_class_that_looks_as_before_is_not_removed(room, cloud, mask):
-    report = score_removal(cloud, cloud.select(~mask["rug"]), room, "rug")
-    perfect = {"gone_pixels": 1.0, "gone_points": 1.0, "untouched_pixels": 1.0, "kept_points": 1.0}
-    assert dataclasses.replace(report, **perfect).passed
-    assert not dataclasses.replace(report, **perfect, changed_pixels=0.5).passed
-    assert not dataclasses.replace(report, **perfect, changed_pixels=math.nan).passed
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_fields_on_a_gpu_score_the_same(room, cloud, mask):
-    after = cloud.select(~mask["chair"])
-    here, there = (score_removal(cloud.to(d), after.to(d), room, "chair").to_json() for d in ("cpu", "cuda"))
-    assert there == pytest.approx(here, abs=0.01)
-    after = recolor(cloud, mask["chair"], BLUE)
-    here, there = (score_recolor(cloud.to(d), after.to(d), room, "chair", BLUE) for d in ("cpu", "cuda"))
-    assert there.hue_inside == pytest.approx(here.hue_inside, abs=0.01)
-    assert there.psnr_outside == pytest.approx(here.psnr_outside, abs=0.5)
-
-
-def test_an_object_that_was_not_there_is_no_success(room, cloud, mask):
-    without = cloud.select(~mask["chair"])
-    report = score_removal(without, without, room, "chair")
-    assert report.measured_pixels < 0.05
-    assert not report.passed
-
-
-def test_a_report_is_plain_json(room, cloud, mask):
-    report = score_removal(cloud, cloud.select(~mask["rug"]), room, "rug")
-    plain = json.loads(json.dumps(report.to_json(), allow_nan=False))
-    assert plain["protocol"].startswith("kfgs-removal/1: ")
-    assert plain["name"] == "rug"
-    assert plain["gone_pixels"] == report.gone_pixels
-    assert plain["passed"] is report.passed
-    assert f"{report.gone_pixels:.4f} of its pixels gone" in str(report)
-    assert "kfgs-removal/1, 2 views" in str(report)
-    void = dataclasses.replace(report, gone_points=math.nan)
-    assert void.to_json()["gone_points"] is None
-    assert not void.passed
 
 
 @pytest.mark.parametrize("name", ["chair", "rug"])
@@ -167,50 +116,3 @@ def test_the_psnr_is_over_all_pixels_outside(room, cloud, mask):
     report = score_recolor(cloud, after, room, "rug", BLUE)
     assert report.psnr_outside == pytest.approx(expected, abs=1e-3)
     assert report.psnr_off_border > report.psnr_outside  # soft edges are where the error is
-
-
-def test_the_border_is_two_pixels_wide(room):
-    for _, inside, far in ClassTruth(room, "chair", "test").views():
-        for row in range(40, 100, 7):
-            for column in range(10, 150, 7):
-                around = inside[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
-                assert far[row, column] == (not around.any())
-
-
-def test_what_cannot_be_scored_is_named(room, cloud, tmp_path):
-    with pytest.raises(ValueError, match=tells("name:", "wall, floor", "got 'dragon'")):
-        score_removal(cloud, cloud, room, "dragon")
-    with pytest.raises(ValueError, match=tells("split:", "got 'holdout'")):
-        score_removal(cloud, cloud, room, "chair", split="holdout")
-    with pytest.raises(ValueError, match=tells("before, after:", "sh ", "got None")):
-        score_removal(cloud, cloud.replace(sh=None), room, "chair")
-    with pytest.raises(ValueError, match=tells("rgb:", "[0, 1]", "got (255, 0, 0)")):
-        score_recolor(cloud, cloud, room, "chair", (255, 0, 0))
-    with pytest.raises(ValueError, match=tells("rgb:", "hue", "(0.5, 0.5, 0.5)")):
-        score_recolor(cloud, cloud, room, "chair", (0.5, 0.5, 0.5))
-    with pytest.raises(FileNotFoundError, match=tells("classes.json:", "no such file")):
-        score_removal(cloud, cloud, tmp_path, "chair")
-
-
-def test_a_scene_without_truth_is_named(room, cloud, tmp_path):
-    copy = tmp_path / "copy"
-    shutil.copytree(room, copy, ignore=shutil.ignore_patterns("features", "depth"))
-    surface = copy / "surface.npz"
-    np.savez(surface, points=np.zeros((1, 3), np.float32))
-    with pytest.raises(ValueError, match=tells("surface.npz:", "'points' and 'labels'")):
-        score_removal(cloud, cloud, copy, "chair")
-    surface.write_bytes(b"PK nonsense")
-    with pytest.raises(ValueError, match=tells("surface.npz:", "arrays", "room")):
-        score_removal(cloud, cloud, copy, "chair")
-    surface.unlink()
-    with pytest.raises(FileNotFoundError, match=tells("truth:", "labelled points", "surface.npz", "found none")):
-        score_removal(cloud, cloud, copy, "chair")
-    names = copy / "classes.json"
-    names.write_text(json.dumps([*json.loads(names.read_text()), "ghost"]))
-    with pytest.raises(ValueError, match=tells("name:", "got 'ghost'")):
-        score_removal(cloud, cloud, copy, "ghost")
-    scene = load_scene(copy)
-    picture = copy / "labels" / f"{scene.stem(scene.views('test')[0])}.png"
-    Image.fromarray(np.full((5, 6), 5, np.uint8)).save(picture)
-    with pytest.raises(ValueError, match=tells("view_001.png:", "(120, 160)", "got (5, 6)")):
-        score_recolor(cloud, cloud, copy, "chair", BLUE)

@@ -12,12 +12,6 @@ def test_loss_is_the_mean_over_pixels_and_channels():
     assert float(model.loss(rendered, target, 1)) == pytest.approx(6 / 8)
 
 
-def test_loss_resizes_with_aligned_corners():
-    model = feature_3dgs.Features(3, 1, feature_3dgs.Feature3DGSConfig())
-    rendered = torch.tensor([[[0.0], [1.0], [2.0], [3.0]]])
-    assert float(model.loss(rendered, torch.tensor([[[0.0], [3.0]]]), 1)) == 0  # corner on corner
-
-
 def test_convolution_has_the_published_number_of_weights():
     model = feature_3dgs.Features(3, 512, feature_3dgs.Feature3DGSConfig.published(128))
     assert sum(value.numel() for value in model.convolution.parameters()) == 66_048
@@ -28,11 +22,6 @@ def test_convolution_has_the_published_number_of_weights():
 def test_storage_is_the_published_one():
     assert feature_3dgs.storage_bytes(602_200, 512, 512) / MIB == pytest.approx(1_175.2, rel=1e-3)
     assert feature_3dgs.storage_bytes(607_200, 128, 512) / MIB == pytest.approx(296.5, rel=1e-3)
-
-
-def test_published_schedule():
-    config = feature_3dgs.Feature3DGSConfig.published()
-    assert (config.steps, config.feature_rate, config.convolution_rate) == (30_000, 1e-3, 1e-4)
 
 
 def test_feature_loss_moves_no_geometry():

@@ -9,12 +9,10 @@ import torch
 from cases_foreign import (
     K,
     N,
-    columns_of,
     cosines_of,
     decoder_of,
     random_rows,
     save_capture,
-    save_legaussians,
     save_ply,
 )
 from messages import tells
@@ -23,60 +21,12 @@ from published.foreign import (
     load_feature3dgs,
     load_foreign,
     load_langsplat,
-    load_legaussians_field,
     load_occam,
     load_splat_features,
 )
 
 from kfgs.formats import read_splats
 from kfgs.formats.ply import read_ply, write_ply
-
-
-def test_files_that_are_missing_or_of_another_program(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=tells("iteration_<step>", "Feature 3DGS", "none")):
-        load_feature3dgs(tmp_path)
-    save_ply(tmp_path / "point_cloud/iteration_30000/point_cloud.ply", {})
-    with pytest.raises(FileNotFoundError, match=tells("iteration_7", "steps [30000]")):
-        load_feature3dgs(tmp_path, 7)
-    with pytest.raises(ValueError, match=tells("point_cloud.ply", "semantic_0", "trained with features")):
-        load_feature3dgs(tmp_path)
-    with pytest.raises(ValueError, match=tells("point_cloud.ply", "semantic_0")):
-        load_foreign(tmp_path)
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match=tells("empty", "known program", "Feature 3DGS", "LangSplat")):
-        load_foreign(tmp_path / "empty")
-    with pytest.raises(FileNotFoundError, match=tells("nothing", "no such file")):
-        load_foreign(tmp_path / "nothing")
-    network = decoder_of((3, 9))
-    torch.save(network.state_dict(), tmp_path / "ae.pth")
-    with pytest.raises(FileNotFoundError, match=tells("room_1", "chkpnt<step>.pth", "LangSplat")):
-        load_langsplat(tmp_path / "room", tmp_path / "ae.pth")
-    path = save_capture(tmp_path / "run/chkpnt30000.pth", [])
-    with pytest.raises(
-        ValueError, match=tells("chkpnt30000.pth", "language features", "colours alone", "trained the features")
-    ):
-        load_langsplat(path, tmp_path / "ae.pth")
-    save_capture(path, [random_rows(N, 4)])
-    with pytest.raises(ValueError, match=tells("ae.pth", "decoder.0.weight", "4 inputs", "[9, 3]", "another run")):
-        load_langsplat(path, tmp_path / "ae.pth")
-    save_capture(path, [random_rows(N - 1, 3)])
-    with pytest.raises(ValueError, match=tells("chkpnt30000.pth", f"[{N}, d]", f"[{N - 1}, 3]")):
-        load_langsplat(path, tmp_path / "ae.pth")
-    save_capture(path, [torch.full((N, 3), torch.nan)])
-    with pytest.raises(ValueError, match=tells("chkpnt30000.pth", "finite", "language features")):
-        load_langsplat(path, tmp_path / "ae.pth")
-    torch.save({"a": 1}, tmp_path / "ae.pth")
-    torch.save({"a": 1}, path)
-    with pytest.raises(ValueError, match=tells("chkpnt30000.pth", "1 values")):
-        load_occam(path)
-    network, _ = save_legaussians(tmp_path / "leg")
-    with pytest.raises(FileNotFoundError, match=tells("chkpnt30000.pth", "point_cloud.ply")):
-        load_legaussians_field(tmp_path / "leg", tmp_path / "leg/codebook.pt")
-    save_ply(
-        tmp_path / "leg/point_cloud/iteration_30000/point_cloud.ply", columns_of(random_rows(N, 8), "clip_f_indices_")
-    )
-    with pytest.raises(ValueError, match=tells("codebook.pt", "[5, 512 or more]", "[5, 14]")):
-        load_legaussians_field(tmp_path / "leg", tmp_path / "leg/codebook.pt")
 
 
 def test_a_real_splat_without_and_with_features(tmp_path: Path, shared_data: Path) -> None:

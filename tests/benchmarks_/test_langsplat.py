@@ -44,20 +44,6 @@ def test_loss_is_a_mean_over_masked_pixels_too():
     assert int(rendered.grad.count_nonzero()) == 3
 
 
-def test_pixels_take_the_value_of_their_cell():
-    target = torch.arange(4.0).view(2, 2, 1)
-    found = langsplat.nearest(target, torch.zeros(4, 6, 3))[..., 0]
-    assert found.tolist() == [[0, 0, 0, 1, 1, 1]] * 2 + [[2, 2, 2, 3, 3, 3]] * 2
-
-
-def test_scores_are_products_with_the_decoded_feature():
-    network = langsplat.Autoencoder(16).eval()
-    latents, text = torch.randn(5, 3), torch.randn(4, 16)
-    raw = network.decoder(latents)
-    assert torch.allclose(network.scores(latents, text), raw @ text.T, atol=1e-5)
-    assert torch.allclose(network.features(latents).norm(dim=1), torch.ones(5), atol=1e-5)
-
-
 def test_fit_lowers_the_loss():
     config = LangSplatConfig(4, 32, 1e-2, 1_000, False, 120, 2e-2)
     found = langsplat.fit(task(), config)

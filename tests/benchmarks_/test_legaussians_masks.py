@@ -3,7 +3,6 @@ import numpy as np
 import oracles_protocols as dull
 import pytest
 import torch
-from published.class_lists import load_classes
 from published.legaussians_masks import LEGaussiansMasks, average_precision, mask_scores
 from published.mask_truth import MaskAndBoxes, MaskTruth
 
@@ -49,17 +48,3 @@ def test_the_whole_protocol_against_loops(level):
     report = LEGaussiansMasks(threshold=0.45, level=level).score(method, MaskTruth(frames), views, method.encode)
     iou, accuracy, precision, area = np.mean(want, 0)
     assert list(report.scores.values()) == pytest.approx([iou, accuracy, precision, area / 100, area / 101], abs=1e-9)
-
-
-def test_texts_are_those_of_the_scenes():
-    lists = load_classes("legaussians")
-    assert {scene: len(texts) for scene, texts in lists.items() if scene != "source"} == {
-        "bicycle": 6,
-        "bonsai": 6,
-        "counter": 11,
-        "garden": 9,
-        "kitchen": 5,
-        "room": 11,
-    }
-    with pytest.raises(ValueError, match="threshold: expected a number in"):
-        LEGaussiansMasks(threshold=2)

@@ -58,19 +58,6 @@ def test_the_whole_protocol_against_loops(filter, seed):
     assert 0.05 < reports["chosen"]["mIoU"] <= reports["oracle"]["mIoU"] < 1
 
 
-def test_the_threshold_and_the_scale_are_options():
-    method, truth, views = _scene()
-    report = LerfOvs2D(threshold=0.2, scale=30).score(method, truth, views, method.encode)
-    ious = []
-    for stem, texts in truth.frames.items():
-        for text, (mask, boxes) in texts.items():
-            found = dull.relevancy_maps(method.maps[stem], text, CANONICAL, 30.0)
-            each, level, _ = dull.lerf_2d(found, mask.numpy(), boxes.tolist(), 0.2)
-            ious.append(each[level])
-    assert report["mIoU"] == pytest.approx(np.mean(ious), abs=1e-9)
-    assert str(report).endswith("(lerf-ovs-2d/1, threshold=0.2, scale=30)")
-
-
 def test_a_perfect_spot_is_found_by_hand():
     """A plateau of 1 in a map of 0: blended with its mean it is 0.745 at (26, 36), which
     is stretched to 0.49. Far outside it is 0."""
@@ -91,31 +78,3 @@ def test_edges_of_a_box_count():
     smoothed = box_mean(impulse)
     assert localise(smoothed, torch.tensor([[65.0, 55.0, 90.0, 90.0]]))
     assert not localise(smoothed, torch.tensor([[65.5, 0.0, 90.0, 99.0]]))
-
-
-def test_texts_without_boxes_are_not_localised():
-    method, truth, views = _scene()
-    frames = {stem: {text: MaskAndBoxes(m.mask) for text, m in texts.items()} for stem, texts in truth.frames.items()}
-    report = LerfOvs2D().score(method, MaskTruth(frames), views, method.encode)
-    assert np.isnan(report["localisation"])
-    assert report.to_json()["scores"]["localisation"] is None
-
-
-def test_bad_input_is_named():
-    method, truth, views = _scene()
-    with pytest.raises(ValueError, match="got none for frame_00041; pass views"):
-        LerfOvs2D().score(method, truth, views[:1], method.encode)
-    with pytest.raises(ValueError, match="level: expected one of 'chosen', 'oracle'"):
-        LerfOvs2D(level="best")
-    frames = {"frame_00002": {"mug": MaskAndBoxes(torch.zeros(3, 3).bool())}}
-    with pytest.raises(ValueError, match="use cameras of the size of the annotated pictures"):
-        LerfOvs2D().score(method, MaskTruth(frames), views, method.encode)
-
-
-def test_a_method_that_knows_nothing_of_a_view_hits_no_box():
-    texts = ["mug", *CANONICAL]
-    method = cases.Numbers(texts, {"a": {text: torch.full((2, 12, 16), torch.nan) for text in texts}})
-    mask = torch.ones(12, 16, dtype=torch.bool)
-    truth = MaskTruth({"a": {"mug": MaskAndBoxes(mask, torch.tensor([[3.0, 3, 9, 9]]))}})
-    report = LerfOvs2D().score(method, truth, [cases.view("a", 12, 16)], method.encode)
-    assert dict(report.scores) == {"mIoU": 0, "localisation": 0}

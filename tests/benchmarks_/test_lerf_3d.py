@@ -5,10 +5,9 @@ import oracles_uplift
 import pytest
 import torch
 from published.class_lists import load_classes
-from published.lerf_3d import LerfOvs3D, nearest_gaussians, share_above, silhouette
+from published.lerf_3d import LerfOvs3D
 from published.mask_truth import MaskAndBoxes, MaskTruth
 
-from kfgs.evaluation import TeacherMethod
 from kfgs.labels.scores import CANONICAL
 
 SIZE = (18, 24)
@@ -144,51 +143,6 @@ def test_argmax_asks_the_published_list_of_the_scene():
         LerfOvs3D().select(method, ["plate"], method.encode, ["Sheep"])
 
 
-def test_both_thresholds_are_printed():
-    method, truth, views = _scene()
-    said = str(LerfOvs3D.vala().score(method, truth, views, method.encode))
-    assert said.endswith("(lerf-ovs-3d/1, selection=smoothed, threshold=0.6, silhouette=0.0392)")
-    said = str(LerfOvs3D().score(method, truth, views, method.encode))
-    assert said.endswith("(lerf-ovs-3d/1, selection=argmax, threshold=0.6, silhouette=0.7)")
-
-
-def test_accuracy_is_strict_by_hand():
-    assert share_above([0.25, 0.26], 0.25) == 0.5
-    assert np.isnan(share_above([], 0.5))
-
-
-def test_the_silhouette_is_that_of_the_selection_alone():
-    method, _, views = _scene()
-    nothing = torch.zeros(40, dtype=torch.bool)
-    assert not silhouette(method.gaussians, nothing, views[0].camera).any()
-    wide = silhouette(method.gaussians, ~nothing, views[0].camera, 10 / 255)
-    assert wide.sum() > silhouette(method.gaussians, ~nothing, views[0].camera, 0.7).sum() > 0
-
-
-def test_a_method_that_knows_nothing_scores_zero():
-    method, truth, views = _scene()
-    for values in method.own.values():
-        values[:] = np.nan
-    for protocol in PROTOCOLS.values():
-        assert protocol.score(method, truth, views, method.encode)["mIoU"] == 0
-
-
-def test_the_nearest_include_the_gaussian_itself():
-    means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
-    assert nearest_gaussians(means, 2).tolist() == [[0, 1], [1, 0], [2, 1]]
-    assert nearest_gaussians(means, 9).shape == (3, 3)
-
-
-def test_the_scenes_texts_are_the_published_ones():
-    texts = load_classes("lerf_ovs")["texts"]
-    assert {scene: len(names) for scene, names in texts.items()} == {
-        "waldo_kitchen": 18,
-        "ramen": 14,
-        "figurines": 21,
-        "teatime": 14,
-    }
-
-
 def test_other_texts_of_the_scene_compete():
     method, truth, views = _scene(levels=1)
     few = LerfOvs3D().select(method, ["mug"], method.encode)["mug"]
@@ -197,19 +151,3 @@ def test_other_texts_of_the_scene_compete():
     assert 0 < some.sum() < 39
     with pytest.raises(ValueError, match="expected all annotated texts, got none of plate; add them"):
         LerfOvs3D(texts=TEXTS[:2]).score(method, truth, views, method.encode)
-
-
-def test_bad_input_is_named():
-    method, truth, views = _scene()
-    with pytest.raises(TypeError, match="expected one with Gaussians, got 'teacher' without"):
-        LerfOvs3D().score(TeacherMethod({}), truth, views, method.encode)
-    with pytest.raises(ValueError, match="selection: expected one of 'argmax'"):
-        LerfOvs3D(selection="leaf")
-
-
-@pytest.mark.parametrize("protocol", [LerfOvs3D(), LerfOvs3D.vala(), LerfOvs3D.dr_splat()])
-def test_a_method_without_gaussians_selects_none(protocol):
-    method, truth, views = _scene()
-    method.gaussians = method.gaussians.select(torch.zeros(40, dtype=torch.bool))
-    method.own = {text: values[:, :0] for text, values in method.own.items()}
-    assert protocol.score(method, truth, views, method.encode).value == 0

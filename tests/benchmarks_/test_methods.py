@@ -3,7 +3,7 @@ import torch
 from baselines.methods import LabelMaps, LinearDecoder, RenderedMethod
 from small_task import cameras, cloud
 
-from kfgs.evaluation import Labeller, Method, View
+from kfgs.evaluation import View
 from kfgs.splat import rasterize
 
 
@@ -36,35 +36,12 @@ def test_fast_labels_are_the_largest_cosines(matrix, bias):
         assert 0 < int(drawn.sum()) < drawn.numel()
 
 
-def test_it_is_a_method():
-    assert isinstance(method(), Method)
-    assert isinstance(method(), Labeller)
-
-
 def test_cosines_are_those_of_the_rendered_feature():
     one, rows, camera = method(), text(3), cameras()[0]
     map = rasterize(one.gaussians, camera).map[10, 12]
     found = one.cosines(View("view", camera), rows)
     assert found.shape == (1, 20, 24, 4)
     assert torch.allclose(found[0, 10, 12], rows @ map / map.norm(), atol=1e-5)
-
-
-def test_gaussians_without_a_feature_are_nan():
-    found = method().gaussian_cosines(text(3))
-    assert found.shape == (1, 12, 4)
-    assert found[0].isnan().any(1).nonzero().tolist() == [[4]]
-
-
-def test_label_maps_are_made_once_and_for_these_classes_only():
-    one, rows, view = method(), text(3), View("view", cameras()[0])
-    maps = LabelMaps(one, rows)
-    found = maps.labels(view, rows)
-    assert torch.equal(found, one.labels(view, rows))
-    assert maps.labels(view, rows) is found
-    smaller = View("view", cameras()[0].resized(10, 12))
-    assert maps.labels(smaller, rows).shape == (10, 12)
-    with pytest.raises(ValueError, match="expected the classes that these maps are of"):
-        maps.labels(view, rows.flip(0))
 
 
 def test_votes_are_blended_softmaxes_of_what_each_gaussian_says():

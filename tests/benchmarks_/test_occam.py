@@ -29,18 +29,6 @@ def test_weight_is_alpha_at_the_pixel_below_the_centre():
     assert float(weight) == pytest.approx(0.6 * 2.718281828 ** (-0.5 * (0.2**2 + 0.7**2) / 0.3), rel=1e-3)
 
 
-def test_weight_is_dimmed_by_what_is_in_front():
-    near, far = (8.5, 5.5, 2.0, 0.6), (8.5, 5.5, 4.0, 0.5)
-    index, weight, _ = occam.centre_weights(balls(far, near), CAMERA)
-    assert dict(zip(index.tolist(), weight.tolist(), strict=True)) == pytest.approx({0: 0.4 * 0.5, 1: 0.6}, rel=1e-4)
-
-
-def test_centres_outside_and_hidden_ones_are_left_out():
-    wall = [(8.5, 5.5, 2.0 + 0.1 * i, 0.99) for i in range(3)]
-    index, _, _ = occam.centre_weights(balls(*wall, (8.5, 5.5, 4.0, 0.9), (0.2, 9.0, 2.0, 0.9)), CAMERA)
-    assert index.tolist() == [0]  # the second would bring T to 1e-4; column floor(0.2 - 0.5) = -1
-
-
 def test_weights_are_those_of_the_renderer():
     geometry = cloud(60)
     one_hot = geometry.replace(features=torch.eye(60))

@@ -75,15 +75,6 @@ def test_accuracy_by_hand():
     assert one_hot_accuracy(torch.tensor([[0, 0, -1, 1]]), masks) == 0.75
 
 
-def test_closed_uses_the_methods_own_labels():
-    method, truth, views = _scene(0)
-    labeller = cases.Labels(method.texts, method.maps)
-    own = OVS3DClosed(texts=TEXTS).score(labeller, truth, views, method.encode)
-    assert own.scores == OVS3DClosed(texts=TEXTS, level=1).score(method, truth, views, method.encode).scores
-    with pytest.raises(ValueError, match="expected all annotated texts, got none of lamp; add them"):
-        OVS3DClosed(texts=TEXTS[:3]).score(method, truth, views, method.encode)
-
-
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("filter", ["langsplat", "langsplatv2"])
 def test_threshold_against_loops(filter, seed):
@@ -113,12 +104,6 @@ def test_a_stable_threshold_by_hand():
     assert found.mask.sum() == 100
 
 
-def test_one_step_is_hidden_by_the_median():
-    level = torch.zeros(1, 20, 20)
-    level[:, :5], level[:, 5:10] = 1.0, 0.3
-    assert stable_mask(level).threshold == 0.50  # the middle of all thresholds
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_stability_against_loops(seed):
     method, truth, views = _scene(seed, levels=3, contrast=0.1 if seed else 0.6)
@@ -133,18 +118,3 @@ def test_stability_against_loops(seed):
             assert (row["level"], row["threshold"]) == (level, pytest.approx(threshold))
             ious.append(dull.iou(dull.majority(seen), _small(mask)))
     assert report["mIoU"] == pytest.approx(np.mean(ious), abs=1e-9)
-
-
-def test_without_a_stable_threshold_it_is_one_half():
-    ramp = torch.linspace(0, 1, 400).view(1, 20, 20)
-    flat = stable_mask(torch.cat([0.5 * ramp, ramp]), steepest=0.1)
-    assert (flat.level, flat.threshold) == (1, 0.5)
-    assert flat.mask.sum() == 200
-    assert not stable_mask(torch.ones(1, 4, 4)).mask.any()
-
-
-def test_bad_options_are_named():
-    with pytest.raises(ValueError, match="steepest: expected a number in"):
-        OVS3DStability(steepest=0)
-    with pytest.raises(ValueError, match="level: expected one of 'chosen'"):
-        OVS3DThreshold(level="oracle")

@@ -75,10 +75,3 @@ def test_masks_of_a_scene_are_found(room, splats, tmp_path, said):
     long = said(*words, "--truth", tmp_path, "--long")
     assert "3dovs-closed/1" in long
     assert "each pixel takes the most similar text" in long
-
-
-def test_what_the_command_cannot_do_is_named(room, splats, said):
-    with pytest.raises(SystemExit, match="NAME=VALUE"):
-        said(room / "features", "--scene", room, "--set", "level")
-    with pytest.raises(ValueError, match="expected one of kfgs-pooled/1, .*lerf-ovs-2d/1"):
-        said(room / "features", "--scene", room, "--protocol", "nothing")

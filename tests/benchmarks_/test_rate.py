@@ -53,11 +53,3 @@ def test_the_curve_falls_in_size_as_its_errors_grow(made, tmp_path):
     assert text[-1].startswith("| lossless |")
     rate.plot(tmp_path / "rate.png", points)
     assert (tmp_path / "rate.png").read_bytes()[:4] == b"\x89PNG"
-
-
-def test_bytes_of_folders_and_files_are_added(tmp_path):
-    (tmp_path / "a").mkdir()
-    (tmp_path / "a" / "x").write_bytes(bytes(3))
-    (tmp_path / "b").write_bytes(bytes(4))
-    assert rate.size_of(tmp_path / "a", tmp_path / "b") == 7
-    assert rate.quickest(lambda: 5)[0] == 5

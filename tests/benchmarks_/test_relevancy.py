@@ -4,14 +4,11 @@ import pytest
 import torch
 from published.relevancy import (
     box_mean,
-    clean_mask,
     fill_unknown,
     lerf_relevancy,
     majority,
-    mask_iou,
     pool_majority,
     pool_mean,
-    smooth_relevancy,
     stretch,
 )
 
@@ -64,38 +61,10 @@ def test_majority_never_looks_at_the_last_row_and_column():
     assert majority(edge, 3, skip_last=False).any()  # the corner's window: 3 of 4
 
 
-def test_a_tie_of_the_majority_is_false():
-    half = torch.zeros(20, 20, dtype=torch.bool)
-    half[:, ::2] = True
-    found = majority(half, 7, skip_last=False)
-    assert not found[10, 0]  # its columns 0 to 3: two of four
-    assert not majority(half[:, 1:], 7, skip_last=False)[10, 0]
-    with pytest.raises(ValueError, match="expected an odd number"):
-        majority(half, 6)
-
-
-def test_filters_by_name():
-    image, mask = torch.rand(20, 20), torch.rand(20, 20) > 0.5
-    assert torch.equal(smooth_relevancy(image, "langsplat"), box_mean(image))
-    assert torch.equal(smooth_relevancy(image, "langsplatv2"), pool_mean(image))
-    assert torch.equal(clean_mask(mask, "langsplat"), majority(mask))
-    assert torch.equal(clean_mask(mask, "langsplatv2"), pool_majority(mask))
-    with pytest.raises(ValueError, match="filter: expected one of 'langsplat'"):
-        clean_mask(mask, "gags")
-
-
 def test_unknown_pixels_are_the_least_relevant():
     nan = float("nan")
     maps = torch.tensor([[[0.4, nan], [0.9, 0.6]], [[nan, nan], [nan, nan]]])
     assert fill_unknown(maps).tolist() == torch.tensor([[[0.4, 0.4], [0.9, 0.6]], [[0, 0], [0, 0]]]).tolist()
-
-
-def test_an_unknown_pixel_is_selected_only_with_all_known_ones():
-    nan = float("nan")
-    for known, threshold, expected in (([0.6, 0.9], 0.5, True), ([0.6, 0.9], 0.7, False)):
-        assert bool((fill_unknown(torch.tensor([[*known, nan]])) >= threshold)[0, 2]) is expected
-    stretched = stretch(fill_unknown(torch.tensor([[0.6, 0.9, nan]])))
-    assert stretched.tolist() == [[0, 1, 0]]  # no threshold above 0 selects it
 
 
 def test_stretch_against_loops():
@@ -104,12 +73,3 @@ def test_stretch_against_loops():
     for i in range(3):
         np.testing.assert_allclose(found[i], dull.stretch(values[i]), atol=1e-12)
     assert stretch(torch.ones(4, 4)).eq(0).all()
-
-
-def test_overlap():
-    nothing, some = torch.zeros(2, 2, dtype=torch.bool), torch.tensor([[True, False], [True, True]])
-    assert mask_iou(nothing, nothing) == 0
-    assert mask_iou(nothing, nothing, empty=1.0) == 1
-    assert mask_iou(some, torch.ones(2, 2).bool()) == 0.75
-    with pytest.raises(ValueError, match=r"expected the size of the truth, \(2, 2\), got \(2, 3\)"):
-        mask_iou(torch.zeros(2, 3).bool(), nothing)

@@ -1,9 +1,5 @@
-import sys
-
 import numpy as np
-import pytest
 import torch
-from messages import tells
 from oracles_editing import density
 from surface_density import surface_density
 
@@ -28,31 +24,6 @@ def test_it_is_the_sum_of_the_definition():
     expected = [density(cloud, point) for point in points.double().numpy()]
     assert sum(value > 0.01 for value in expected) >= 60  # most points see something
     np.testing.assert_allclose(surface_density(cloud, points).numpy(), expected, rtol=1e-6, atol=1e-9)
-
-
-def test_small_batches_give_the_same(monkeypatch):
-    module = sys.modules[surface_density.__module__]
-    cloud, points = _cloud(), torch.randn(300, 3, generator=torch.Generator().manual_seed(7))
-    whole = surface_density(cloud, points)
-    monkeypatch.setattr(module, "_PAIRS", 50)
-    monkeypatch.setattr(module, "_QUERY", 7)
-    torch.testing.assert_close(surface_density(cloud, points), whole)
-
-
-def test_nothing_gives_nothing():
-    cloud, points = _cloud(), torch.zeros(3, 3)
-    assert surface_density(cloud.select(torch.zeros(40, dtype=torch.bool)), points).tolist() == [0, 0, 0]
-    assert surface_density(cloud, points[:0]).shape == (0,)
-    assert surface_density(cloud.replace(opacities=torch.full((40,), 1e-3)), points).tolist() == [
-        0,
-        0,
-        0,
-    ]  # below 1/255
-
-
-def test_shapes_are_checked():
-    with pytest.raises(ValueError, match=tells("points:", "[P, 3]", "got (3, 2)")):
-        surface_density(_cloud(), torch.zeros(3, 2))
 
 
 def test_places_far_from_zero_are_counted_from_the_clouds_origin():

@@ -8,7 +8,6 @@ import table1_rows
 from small_room import ROOM
 from small_task import MIB, cloud
 
-from kfgs.fields import Training
 from kfgs.formats import write_splats
 from kfgs.quant import AutoencoderConfig, GrownCodebook, PaperCodebook
 from kfgs.toy.room_folder import make_toy_room
@@ -64,17 +63,6 @@ def test_published_figures_are_those_of_the_paper():
     assert len(table1_rows.ROWS) == 13
 
 
-@pytest.mark.parametrize("key", table1_rows.ROWS)
-def test_presets_are_said(key):
-    steps = {}
-    for preset in ("quick", "cpu", "paper"):
-        config = table1_rows.config_of(key, preset, None, 0)
-        assert json.loads(json.dumps(config))
-        steps[preset] = config.get("steps", config.get("field", {}).get("steps"))
-    if steps["paper"] is not None and key != "kfgs":
-        assert steps["quick"] < steps["cpu"] < steps["paper"]
-
-
 def test_the_paper_s_rows_have_the_paper_s_codebook_and_autoencoder():
     for preset in ("quick", "cpu", "paper"):
         for key in ("adc", "adc+sc"):
@@ -83,20 +71,6 @@ def test_the_paper_s_rows_have_the_paper_s_codebook_and_autoencoder():
             assert config.autoencoder == (None if key == "adc" else AutoencoderConfig.paper())
     own = table1_rows.kfgs_config(table1_rows.ROWS["own-adc+sc"], "own-adc+sc", "quick", None)
     assert (own.codebook, own.autoencoder) == (GrownCodebook(), AutoencoderConfig())
-
-
-def test_answers_are_not_counted_as_fitting():
-    assert table1_rows.fitting_seconds({"codebook": 3.0, "field": 4.0, "answers": 20.0}) == 7
-
-
-@pytest.mark.parametrize(("words", "said"), [(["--splat", "none.ply"], "none.ply"), ([], "labels_scored")])
-def test_wrong_files_are_refused_before_anything_runs(words, said, tmp_path, monkeypatch, capsys):
-    (tmp_path / "labels").mkdir()
-    monkeypatch.setattr(sys, "argv", ["table1.py", str(tmp_path), str(tmp_path), str(tmp_path / "out"), *words])
-    with pytest.raises(SystemExit):
-        table1.main()
-    assert said in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_run_writes_table_and_pictures_and_resumes(tmp_path, monkeypatch, capsys):
@@ -130,7 +104,3 @@ def test_a_run_writes_table_and_pictures_and_resumes(tmp_path, monkeypatch, caps
     (room / "features" / "more.txt").write_text("other data")
     with pytest.raises(pytest.fail.Exception, match="made again"):
         table1.main()
-
-
-def test_quick_steps_are_fewer_than_the_preset():
-    assert max(table1_rows.QUICK_STEPS.values()) < Training.cpu().steps

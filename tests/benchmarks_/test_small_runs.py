@@ -1,0 +1,93 @@
+"""Benchmarks that print tables: one small run of each."""
+
+import importlib
+import json
+import re
+import runpy
+from argparse import Namespace
+from pathlib import Path
+
+import pytest
+from small_room import make_room
+
+from kfgs.fields import GaussianParams
+from kfgs.formats import write_splats
+from kfgs.quant import IndexMaps
+from kfgs.scenes import load_scene
+
+ROOT = Path(__file__).resolve().parents[2]
+BENCHMARKS = ROOT / "benchmarks"
+
+
+def start(monkeypatch, name, *words):
+    monkeypatch.setattr("sys.argv", [f"{name}.py", *map(str, words)])
+    return importlib.import_module(name)
+
+
+def rows_of(said):
+    return [line.split(" | ") for line in said.splitlines() if line.startswith("| ")][1:]
+
+
+def test_color_field_fits_scores_and_draws(tmp_path, monkeypatch, capsys):
+    words = [make_room(tmp_path / "room"), tmp_path / "out", "--preset", "quick", "--steps", 20, "--pictures", 2]
+    start(monkeypatch, "color_field", *words).main()
+    facts = json.loads((tmp_path / "out" / "scores.json").read_text())
+    assert (facts["steps"], facts["preset"], len(facts["scores"]["views"])) == (20, "quick", 3)
+    assert facts["scores"]["psnr"] > 8
+    assert len(list((tmp_path / "out" / "views").glob("*.png"))) == 2
+    assert "kfgs-color/1" in capsys.readouterr().out
+
+
+def test_growth(monkeypatch, capsys, tmp_path):
+    growth = start(monkeypatch, "growth", tmp_path / "out", "--quick")
+    growth.main()
+    facts = json.loads((tmp_path / "out" / "growth.json").read_text())
+    assert list(facts) == ["Gaussians", "pixels", "channels", "classes", "views"]
+    assert (tmp_path / "out" / "growth.png").stat().st_size > 10_000
+    assert capsys.readouterr().out.count("| ") > 30
+    rows = [{"size": 10, "a": 0.5}, {"size": 1000, "a": 5.0}]
+    assert growth.table("views", ("a",), rows).splitlines()[-1] == "| 1,000 | 5,000.0 (0.5) |"
+
+
+def test_old_and_new_label_maps_are_equal(monkeypatch, capsys):
+    start(monkeypatch, "labels", "--quick").main()
+    rows = rows_of(capsys.readouterr().out)
+    assert len(rows) == 6
+    assert [row[-1] for row in rows if "query" not in row[0]] == ["yes |"] * 5
+
+
+def test_transfer_prints_every_row(monkeypatch, capsys):
+    options = ["--sources", "4000", "--destinations", "5000", "--repeats", "1"]
+    monkeypatch.setattr("sys.argv", ["transfer.py", *options])
+    runpy.run_path(str(BENCHMARKS / "transfer.py"), run_name="__main__")
+    rows = dict(re.findall(r"^(.*?) {2,}\d.* ([\d.]+)% +[\d.]+%$", capsys.readouterr().out, re.MULTILINE))
+    assert set(rows) == {"nearest, lambda chosen", "nearest"}
+    assert all(95 < float(share) <= 100 for share in rows.values())  # lambda covers 99.5 % of the destinations
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the highest memory is read from /proc")
+def test_streaming_measures_each_stage(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    scene, table = make_room(tmp_path / "scene"), tmp_path / "table.json"
+    read = load_scene(scene)
+    write_splats(
+        GaussianParams.from_points(read.points, colors=read.colors, sh_degree=0).activated(), tmp_path / "splat.ply"
+    )
+    words = ["--images", 11, "--size", 12, 16, "--channels", 7, "--epochs", 2, "--json", table]
+    words += ["--splat", tmp_path / "splat.ply", "--folder", tmp_path / "kept"]
+    streaming = start(monkeypatch, "streaming", scene, *words)
+    apart = streaming.run_apart  # a process costs seconds of imports
+
+    def run(args, stage):
+        return (
+            apart(args, stage) if stage == "start" else streaming.run_stage(Namespace(**vars(args) | {"stage": stage}))
+        )
+
+    monkeypatch.setattr(streaming, "run_apart", run)
+    streaming.main()
+    facts = json.loads(table.read_text())
+    assert [row["stage"] for row in facts["stages"]] == ["start", "extract", "codebook", "index maps", "uplift"]
+    assert 5e7 < facts["stages"][0]["peak"] < 2e9
+    maps = IndexMaps.load(tmp_path / "kept" / "index_maps.safetensors")
+    assert (len(maps), maps[0].shape) == (11, (12, 16))
+    assert "| extract |" in capsys.readouterr().out
