@@ -39,25 +39,22 @@ HEAD = (
     "minutes",
     "MiB",
     "labels, FPS",
-    "seeds",
-    "machine",
-    "command",
+    "row",
 )
 UNITS = (
     "MiB: every number of the result in float32, with decoder and codebook. Labels, FPS: views a second that get a class for "
-    "each pixel (rendering included), on the machine of the row."
+    "each pixel (rendering included)."
 )
 INTRO = f"""# Leaderboard
 
-Every row was run with kfgs's own implementation of the method (`benchmarks/baselines/`), on the same scene and teacher, by the
-command beside it. mIoU and accuracy are `{PROTOCOL}`; IoU7 is `feature3dgs-teacher/1` with the scene's classes
-([protocols](protocols.md)). Where a row has several seeds, scores are means, and the lowest and highest mIoU stand in brackets;
-minutes and frames are medians.
+Every row was run with kfgs's own implementation of the method (`benchmarks/baselines/`), on the same scene and teacher. mIoU and
+accuracy are `{PROTOCOL}`; IoU7 is `feature3dgs-teacher/1` with the scene's classes ([protocols](protocols.md)).
 "Nearest text / votes" is the mIoU if pixels take the text nearest to their rendered feature, and if Gaussians vote with the
 softmax of 100 cosines, as kfgs's default does; the mIoU before it is by the method's own rule. Minutes are those of training,
-without the teacher and the Gaussians that methods share. [Results](results.md) say more about rows and shortened schedules.
+without the teacher and the Gaussians that methods share. [Results](results.md#other-methods) says what is not as published.
 
-To run a row again, make what all rows share, once; then type the command beside the row. OUT is any folder of yours:
+To run a row again, make what all rows share, once; then type the command below the table, with the name of the row as ROW. OUT is
+any folder of yours:
 
 ```bash
 pip install -c constraints.txt torch==2.13.0 -e ".[test]" onnx                    # in a clone of this repository
@@ -189,7 +186,10 @@ def section(name: str, runs: dict[str, Any]) -> str:
         of_row.setdefault(row["row"], []).append(row)
     ranked = sorted(of_row.items(), key=lambda one: -mean(row["miou"] for row in one[1]))
     lines += [f"| {' | '.join(cells(place, key, rows))} |" for place, (key, rows) in enumerate(ranked, 1)]
-    return "\n".join([*lines, "", UNITS, "", f"Source: [runs/{name}.json](runs/{name}.json).", ""])
+    machines = "; ".join(dict.fromkeys(row["machine"] for row in runs["rows"]))
+    longest = max((row["command"].partition(" --rows ")[0] for row in runs["rows"]), key=len)
+    lines += ["", f"`{longest} --rows ROW`; {machines}. {UNITS} Source: [runs/{name}.json](runs/{name}.json).", ""]
+    return "\n".join(lines)
 
 
 def cells(place: int, key: str, rows: list[dict[str, Any]]) -> list[str]:
@@ -203,12 +203,9 @@ def cells(place: int, key: str, rows: list[dict[str, Any]]) -> list[str]:
     spread = f" ({min(mious):.1f} to {max(mious):.1f})" if len(rows) > 1 else ""
     minutes = median(fitting_seconds(row["stages"]) for row in rows) / 60
     frames = f"{median(row['fps_labels'] for row in rows):.1f}"
-    seeds = ", ".join(str(row["seed"]) for row in rows)
-    again = rows[0]["command"].rpartition(" --seeds ")[0] + " --seeds " + seeds.replace(",", "")
-    machines = "; ".join(dict.fromkeys(row["machine"] for row in rows))
     return [
         str(place), ROWS[key].title, average("miou") + spread, rules, average("accuracy"), average("teacher_iou7"),
-        f"{minutes:.2f}", average("storage", 1 / MIB, 2), frames, seeds, machines, f"`{again}`",
+        f"{minutes:.2f}", average("storage", 1 / MIB, 2), frames, f"`{key}`",
     ]  # fmt: skip
 
 
