@@ -53,7 +53,7 @@ def test_examples_run_one_after_the_other(examples, desk, monkeypatch):
     made = replace(made, info=made.info | {"scene": "scene"}, classes=scene_classes(Path("scene")))
     fuse_views(made, [scene.cameras[i] for i in scene.views("train")]).save("run/field.kfgs")
     exec(editing, known)
-    before, after = known["found"].gaussians, read_splats("edited.ply")
+    before, after = known["attached"].gaussians, read_splats("edited.ply")
     chairs = before.labels == before.names.index("chair")
     assert 0 < int(chairs.sum()) == len(before) - len(after)
     assert len(kfgs.EditList.load("edits.json")) == 1
