@@ -100,7 +100,7 @@ def compare_networks() -> None:
     with torch.inference_mode():
         features, seconds = timed(lambda: network(window))
         print(f"kfgs, a window:  {seconds:.2f} s, peak {peak_gib():.2f} GiB, {tuple(features.shape)}")
-        rows, seconds = timed(lambda: tower(ids))
+        rows, seconds = timed(lambda: tower(input_ids=ids).text_embeds)
         print(f"kfgs, prompts:   {seconds:.2f} s, {tuple(rows.shape)}")
 
     import oracles_lseg

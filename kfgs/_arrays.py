@@ -20,10 +20,7 @@ from ._check import one_line
 from ._files import as_path
 
 Array = NDArray[Any]
-SPARE, RATIO = 64 << 20, 100
-_KINDS = "biufcU"  # of NumPy's dtype.kind: numbers and texts
 AGAIN = "copy it again, or write it again"
-_AXIS = 1 << 48  # longest axis; NumPy multiplies axes in 64 bits
 
 
 class FileError(ValueError):
@@ -32,34 +29,20 @@ class FileError(ValueError):
 
 def most_unpacked(packed: int) -> int:
     """The most bytes that a compressed file of `packed` bytes may take in memory, whatever its format (promises.md)."""
-    return SPARE + RATIO * packed
+    return (64 << 20) + 100 * packed
 
 
-def read_array(
-    path: str | Path, expected: str = "an .npy file of numbers", advice: str = AGAIN, *, mapped: bool = False
-) -> Array:
-    """Read a `.npy` file.
-
-    Args:
-        path: the file.
-        expected: what should be there, for the message.
-        advice: the end of the message.
-        mapped: map the file into memory; values are read when they are used.
+def read_array(path: str | Path, expected: str = "an .npy file of numbers", advice: str = AGAIN) -> Array:
+    """Map a `.npy` file into memory: values are read when they are used, and cannot be written.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        FileError: if it is no `.npy` file of numbers, is damaged or cut short, or states more values than it has.
+        FileNotFoundError: if there is no such file. `expected` and `advice` are parts of the messages.
+        FileError: if it is not a `.npy` file of numbers, is damaged or cut short, or states more values than it has.
     """
     with reading(path, expected, advice), as_path(path).open("rb") as file:
-        size = as_path(path).stat().st_size
-        stated = _stated_bytes(file)
-        if stated > size - file.tell():
-            raise ValueError(f"its header states {stated} bytes of values, {size - file.tell()} follow")
-        if mapped:
-            array: Array = np.load(path, mmap_mode="r", allow_pickle=False)
-            return array
-        file.seek(0)
-        return np.lib.format.read_array(file, allow_pickle=False)
+        _check_header(file, as_path(path).stat().st_size)
+        array: Array = np.load(as_path(path), mmap_mode="r", allow_pickle=False)
+        return array
 
 
 def read_arrays(
@@ -75,22 +58,32 @@ def read_arrays(
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileError: if it is no `.npz` file of numbers and texts, is damaged, or unpacks to more than `most` bytes.
+        FileError: if it is not an `.npz` file of numbers and texts, is damaged, or unpacks to more than `most` bytes.
     """
-    found = {}
     with reading(path, expected, advice), zipfile.ZipFile(path) as archive:
-        total = sum(entry.file_size for entry in archive.infolist())
+        entries = archive.infolist()
+        total = sum(entry.file_size for entry in entries)
         most = most_unpacked(as_path(path).stat().st_size) if most is None else most
         if total > most:
             raise ValueError(f"it would unpack to {total} bytes, expected at most {most}")
-        for entry in archive.infolist():
+        for entry in entries:
             with archive.open(entry) as file:
-                stated = _stated_bytes(file)
-                if stated != entry.file_size - file.tell():
-                    raise ValueError(f"{one_line(entry.filename)} states {stated} bytes of values, and has others")
-            with archive.open(entry) as file:
-                found[entry.filename.removesuffix(".npy")] = np.lib.format.read_array(file, allow_pickle=False)
-    return found
+                _check_header(file, entry.file_size)
+        with np.load(as_path(path), allow_pickle=False) as arrays:
+            return dict(arrays)
+
+
+def _check_header(file: IO[bytes], size: int) -> None:
+    """Raise a ValueError unless a `.npy` file of `size` bytes holds the numbers or texts that its header states."""
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(file)
+    if dtype.hasobject:
+        raise ValueError("it holds pickled objects, which are never loaded")
+    stated, rest = math.prod(shape) * dtype.itemsize, size - file.tell()
+    lies = stated > rest or min(shape, default=1) < 0 or (dtype.itemsize == 0 and math.prod(shape) > 1)
+    if lies or version > (2, 0) or dtype.kind not in "biufcU":
+        raise ValueError(f"its header states numbers or texts {one_line(shape)} of {dtype}, {rest} bytes follow")
 
 
 def read_safetensors(
@@ -126,32 +119,12 @@ def read_safetensors(
     raise FileError(f"{path}: expected a kfgs {kfgs[0]}, version {kfgs[1]}, got {what}; {advice}")
 
 
-def _stated_bytes(file: IO[bytes]) -> int:
-    """The bytes of values that the header of a `.npy` file states; leaves the file behind the header."""
-    version = np.lib.format.read_magic(file)
-    if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"version {version} of the .npy format is not for plain numbers")
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(file)
-    if dtype.kind not in _KINDS or (dtype.itemsize == 0 and math.prod(shape) > 1):
-        what = "pickled objects, which are never loaded" if dtype.hasobject else f"values of type {dtype}"
-        raise ValueError(f"it holds {one_line(what)}")
-    if any(not 0 <= axis <= _AXIS for axis in shape):
-        raise ValueError(f"it states the shape {one_line(shape)}")
-    return math.prod(shape) * dtype.itemsize
-
-
 @contextmanager
 def reading(path: str | Path, expected: str, advice: str = AGAIN) -> Iterator[None]:
     """Turn whatever fails while a file is read, and its content checked, into a `FileError`.
 
-    Args:
-        path: the file.
-        expected: what should be there, for the message.
-        advice: the end of the message.
-
     Raises:
-        FileNotFoundError: if there is no such file.
+        FileNotFoundError: if there is no such file. `expected` and `advice` are parts of the messages.
         FileError: if the block fails. One of the block itself is raised as it is, and so is a PermissionError.
     """
     if not as_path(path).is_file():

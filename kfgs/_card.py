@@ -10,29 +10,17 @@ from typing import Any
 
 LONGEST = 100  # characters of one value in a line
 LINE = 199  # characters of a whole line: two lines of a terminal
-SHORT = ("can't allocate memory", "out of memory", "bad_alloc", "can't start new thread")
-"""How torch and the C++ library say in a RuntimeError that memory is short."""
-STYLE = "text-align:left;padding:1px 10px 1px 0"  # notebooks centre cells by default
+LEFT = "text-align:left;padding:1px 10px 1px 0"  # notebooks centre cells by default
 
 
 def html_card(title: str, facts: Mapping[str, object]) -> str:
-    """An HTML table for `_repr_html_`: a title and one row for each fact. Everything is escaped.
-
-    Args:
-        title: what the object is, such as "Codebook".
-        facts: the name and the value of each row, in order. A value of None leaves its row out; `short_value` shortens
-            the others.
-
-    Example:
-        >>> html_card("Codebook", {"codewords": 64, "fitted to": None}).count("<tr>")
-        1
-    """
-    rows = "".join(
-        f'<tr><th style="{STYLE}">{escape(name)}</th><td style="{STYLE}">{escape(_plain(value))}</td></tr>'
-        for name, value in facts.items()
-        if value is not None
-    )
-    return f'<table><caption style="{STYLE};font-weight:bold">{escape(title)}</caption><tbody>{rows}</tbody></table>'
+    """An HTML table for `_repr_html_`: a title and one row for each fact that is not None. Everything is escaped."""
+    rows = ""
+    for name, value in facts.items():
+        shown = cut(value) if isinstance(value, str) else f"{value:,}" if type(value) is int else short_value(value)
+        if value is not None:
+            rows += f'<tr><th style="{LEFT}">{escape(name)}</th><td style="{LEFT}">{escape(shown)}</td></tr>'
+    return f'<table><caption style="{LEFT};font-weight:bold">{escape(title)}</caption><tbody>{rows}</tbody></table>'
 
 
 def short_repr(thing: Any) -> str:
@@ -56,9 +44,7 @@ def short_repr(thing: Any) -> str:
 
 
 def short_value(value: object) -> str:
-    """One value in at most `LONGEST` characters: a tensor by its shape and type, a long list by its length.
-
-    Paths are shown by their names, and the rows of a table by their number and the keys of the first.
+    """One value in at most `LONGEST` characters: a tensor by its shape and type, a path by its name, a long list by its length.
 
     Example:
         >>> short_value(range(1000)), short_value([1.5, 2.0]), short_value(list("a long list"))
@@ -69,24 +55,15 @@ def short_value(value: object) -> str:
         device = str(getattr(value, "device", "cpu"))
         return f"{list(shape)} {value.dtype}".replace("torch.", "") + ("" if device == "cpu" else f" on {device}")
     if isinstance(value, Mapping):
-        return (
-            f"{len(value)} entries"
-            if len(value) > 3
-            else cut(", ".join(f"{k}: {short_value(v)}" for k, v in value.items()))
-        )
+        few = cut(", ".join(f"{key}: {short_value(part)}" for key, part in value.items()))
+        return few if len(value) <= 3 else f"{len(value)} entries"
     if isinstance(value, list | tuple) and not hasattr(value, "_fields"):
         if value and all(isinstance(item, Path) for item in value):
             return cut(f"[{', '.join(item.name for item in value)}]")
-        if value and all(isinstance(item, Mapping) for item in value):
-            return cut(f"{len(value)} rows of {', '.join(map(str, value[0]))}")
         simple = len(value) <= 4 and all(isinstance(item, str | int | float) for item in value)
         kinds = sorted({type(item).__name__ for item in value})
         return cut(repr(value) if simple else f"{len(value)} of {' or '.join(kinds)}")
     return cut(repr(value))
-
-
-def _plain(value: object) -> str:
-    return cut(value) if isinstance(value, str) else f"{value:,}" if type(value) is int else short_value(value)
 
 
 def cut(text: str, longest: int = LONGEST) -> str:
@@ -110,21 +87,12 @@ def error_line(error: BaseException) -> str:
 
 
 def short_of_memory(error: BaseException) -> bool:
-    """Whether an error says that memory is short: of Python, NumPy, torch on the CPU or on a GPU.
-
-    Example:
-        >>> short_of_memory(MemoryError()), short_of_memory(RuntimeError("shapes differ"))
-        (True, False)
-    """
-    said = str(error).lower() if isinstance(error, RuntimeError) else ""
-    return isinstance(error, MemoryError) or any(words in said for words in SHORT)
+    """Whether an error says that memory is short. torch and the C++ library say it in a RuntimeError."""
+    words = ("can't allocate memory", "out of memory", "bad_alloc", "can't start new thread")
+    is_runtime = isinstance(error, RuntimeError)
+    return isinstance(error, MemoryError) or (is_runtime and any(word in str(error).lower() for word in words))
 
 
 def say_coordinate(value: float, digits: int) -> str:
-    """A coordinate for people: some digits, or two after the point if it is far from zero.
-
-    Example:
-        >>> say_coordinate(1.23456, 3), say_coordinate(5411932.123, 3)
-        ('1.23', '5411932.12')
-    """
+    """A coordinate for people: some digits, or two after the point if it is far from zero."""
     return f"{value:.{digits}g}" if abs(value) < 10_000 else f"{value:.2f}"

@@ -17,25 +17,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ._card import error_line, short_of_memory
-
 PARTS = ("embeddings", "codewords", "map", "means", "gaussians")  # where our objects keep what is mostly meant
-
-
-ORIGIN = (0.0, 0.0, 0.0)
-"""The origin of a scene whose coordinates are counted from the world's own zero."""
+ORIGIN = (0.0, 0.0, 0.0)  # of a scene whose coordinates are counted from the world's own zero
 
 
 def as_origin(value: Any) -> tuple[float, float, float]:
-    """Three finite numbers as Python floats (float64): a place in the world.
-
-    Raises:
-        ValueError: if there are not three, or one is not finite.
-    """
-    numbers_of = tuple(float(one) for one in value)
-    if len(numbers_of) != 3 or not all(math.isfinite(one) for one in numbers_of):
-        raise ValueError(f"origin: expected three finite numbers, got {numbers_of}; for instance (0, 0, 0)")
-    return numbers_of
+    """Three finite numbers as Python floats (float64): a place in the world; a ValueError if they are not."""
+    place = tuple(float(number) for number in value)
+    if len(place) != 3 or not all(math.isfinite(number) for number in place):
+        raise ValueError(f"origin: expected three finite numbers, got {place}; for instance (0, 0, 0)")
+    return place
 
 
 def check_shapes(*arguments: tuple[str, Any, str | tuple[str | int, ...]]) -> dict[str, int]:
@@ -46,11 +37,8 @@ def check_shapes(*arguments: tuple[str, Any, str | tuple[str | int, ...]]) -> di
             letter or word binds a size at its first appearance, a number must match exactly. A tensor that is None is
             skipped.
 
-    Returns:
-        The size of each named axis.
-
     Raises:
-        TypeError: if an argument has no shape, or is sparse, nested, quantised or on the meta device.
+        TypeError: if an argument has no shape.
         ValueError: if an axis disagrees; the message names the argument that bound the size.
 
     Example:
@@ -63,14 +51,12 @@ def check_shapes(*arguments: tuple[str, Any, str | tuple[str | int, ...]]) -> di
     for name, value, spec in arguments:
         if value is None:
             continue
-        _check_plain(name, value)
         words = spec.split() if isinstance(spec, str) else spec
         axes = [int(axis) if isinstance(axis, str) and axis.isdigit() else axis for axis in words]
+        expected_shape = f"[{', '.join(map(str, axes))}]"
         if not hasattr(value, "shape"):
-            raise TypeError(
-                f"{name}: expected a tensor of shape [{', '.join(map(str, axes))}], got {type(value).__name__}; "
-                f"{_instead(value)}"
-            )
+            got = f"{type(value).__name__}; {_instead(value)}"
+            raise TypeError(f"{name}: expected a tensor of shape {expected_shape}, got {got}")
         shape = tuple(value.shape)  # no int(): a size may be a symbol while torch.compile or torch.export traces
         wrong = len(shape) != len(axes)
         own: dict[str, int] = {}  # an axis may also appear twice within one argument
@@ -80,8 +66,7 @@ def check_shapes(*arguments: tuple[str, Any, str | tuple[str | int, ...]]) -> di
         if wrong:
             known = [f"{a} = {sizes[a]} (from {bound_by[a]})" for a in axes if isinstance(a, str) and a in sizes]
             where = f" with {', '.join(known)}" if known else ""
-            expected_shape = ", ".join(map(str, axes))
-            raise ValueError(f"{name}: expected [{expected_shape}]{where}, got {shape}; pass a tensor of that shape")
+            raise ValueError(f"{name}: expected {expected_shape}{where}, got {shape}; pass a tensor of that shape")
         for axis, size in zip(axes, shape, strict=True):
             if isinstance(axis, str) and axis not in sizes:
                 sizes[axis], bound_by[axis] = size, name
@@ -91,100 +76,35 @@ def check_shapes(*arguments: tuple[str, Any, str | tuple[str | int, ...]]) -> di
 def as_tensor(name: str, value: Any, *, floating: bool = False) -> Tensor:
     """A tensor as it is; a NumPy array or a list of numbers as a tensor.
 
-    The tensor shares the memory of a NumPy array that may be written to. The floats of a list get torch's default type.
-
-    Args:
-        name: the argument, for the message.
-        value: what was passed.
-        floating: also require floating-point numbers. The whole numbers of a list become such.
+    The tensor shares the memory of a NumPy array where torch can. The floats of a list get torch's default type, and so do
+    its whole numbers if `floating` numbers are required.
 
     Raises:
-        TypeError: if it is something else, has a mask, is not of floating point, or is sparse, nested, quantised or on the
-            meta device; the message says what to pass instead.
+        TypeError: if it is something else, or not of floating point; the message says what to pass instead.
     """
-    advice = ".float()"
     if not isinstance(value, Tensor):
-        value, advice = _from_numbers(name, value, floating), '.astype("float32")'
-    _check_plain(name, value)
+        value = _from_numbers(name, value, floating)
     if floating and not value.is_floating_point():
-        raise TypeError(f"{name}: expected floating-point numbers, got {value.dtype}; convert them with {advice}")
+        raise TypeError(f"{name}: expected floating-point numbers, got {value.dtype}; convert them, as with .float()")
     return value
 
 
-def _check_plain(name: str, value: Any) -> None:
-    """Raise a TypeError if a tensor has no value in memory for each of its elements; anything else passes."""
-    if not isinstance(value, Tensor):
-        return
-    for odd, got, advice in (
-        (value.device.type == "meta", "one on the meta device, which has no values", "make it on another device"),
-        (value.is_nested, "a nested one", "pad it with .to_padded_tensor(0.0)"),
-        (value.layout != torch.strided, f"a sparse one ({value.layout})", "convert it with .to_dense()"),
-        (value.is_quantized, f"a quantised one ({value.dtype})", "convert it with .dequantize()"),
-    ):
-        if odd:
-            raise TypeError(f"{name}: expected a dense tensor, got {got}; {advice}")
-
-
-def moved_to(value: Tensor, *args: Any, **kwargs: Any) -> Tensor:
-    """`value.to(...)`; a ValueError if there is no such device here."""
-    try:
-        return value.to(*args, **kwargs)
-    except (AssertionError, RuntimeError) as error:  # torch without CUDA; no driver, no such GPU, no such name
-        if short_of_memory(error):
-            raise
-        asked = ", ".join(map(str, (*args, *kwargs.values())))
-        raise ValueError(
-            f"device: expected one that this torch can use, got {asked} ({error_line(error)}); use 'cpu', or install a torch "
-            "for that device"
-        ) from error
-
-
 def _from_numbers(name: str, value: Any, floating: bool) -> Tensor:
-    """Lists and whatever NumPy calls an array. Our own sequences, which may read a file for each item, are not looked into."""
-    is_list = type(value) in (list, tuple, range) or isinstance(
-        value, numbers.Real
-    )  # a named tuple is an object of ours
-    array, kind = np.empty(0, dtype=object), type(value).__name__
-    if isinstance(value, np.ma.MaskedArray):
-        raise TypeError(
-            f"{name}: expected numbers without a mask, got {kind}; fill the masked ones with .filled(number)"
-        )
-    if is_list and _holds_tensors(value):
-        raise TypeError(f"{name}: expected a tensor, got a {kind} of tensors; join them with torch.stack")
+    """Lists, and whatever NumPy calls an array. Our own sequences, which may read a file for each item, are refused."""
+    is_list = isinstance(value, list | tuple | range | numbers.Real)
+    array = np.empty(0, dtype=object)
     if is_list or hasattr(value, "__array__"):
-        with contextlib.suppress(
-            ValueError, TypeError, RuntimeError
-        ):  # rows of different lengths, another library's array
+        with contextlib.suppress(ValueError, TypeError, RuntimeError):  # rows of different lengths, other objects
             array = np.asarray(value)
     if array.dtype.kind not in "fiub":
-        rows = type(value) in (list, tuple) and len(value)
-        advice = "pass numbers, in rows of equal length" if rows else _instead(value)
-        raise TypeError(f"{name}: expected a tensor, got {kind}; {advice}")
-    if not array.dtype.isnative:
-        array = array.astype(array.dtype.newbyteorder("="))
-    odd = any(
-        stride < 0 or stride % array.itemsize for stride in array.strides
-    )  # torch refuses it, and warns of read-only
-    if odd or not array.flags.writeable:
-        array = array.copy()
-    try:
-        tensor = torch.as_tensor(array)
-    except TypeError as error:
-        raise TypeError(
-            f'{name}: expected numbers of a type that torch has, got {array.dtype}; convert them with .astype("float64")'
-        ) from error
+        advice = "pass numbers, in rows of equal length" if is_list else _instead(value)
+        raise TypeError(f"{name}: expected a tensor, got {type(value).__name__}; {advice}")
+    shared = array.flags.writeable and array.flags.aligned and array.dtype.isnative
+    if not shared or any(stride < 0 for stride in array.strides):  # torch would refuse it, or warn
+        array = np.array(array, dtype=array.dtype.newbyteorder("="))
+    tensor = torch.from_numpy(array)
     converted = is_list and (tensor.is_floating_point() or (floating and tensor.dtype != torch.bool))
     return tensor.to(torch.get_default_dtype()) if converted else tensor
-
-
-def _holds_tensors(value: Any) -> bool:
-    """Whether the first number of nested lists is a tensor that NumPy cannot read: with gradient, bfloat16, or elsewhere."""
-    while isinstance(value, list | tuple) and len(value):
-        unread = (one for one in value if isinstance(one, Tensor))
-        if any(one.requires_grad or one.dtype == torch.bfloat16 or one.device.type != "cpu" for one in unread):
-            return True
-        value = value[0]
-    return False
 
 
 def as_array(values: Any, name: str = "values") -> np.ndarray[Any, Any]:
@@ -193,10 +113,10 @@ def as_array(values: Any, name: str = "values") -> np.ndarray[Any, Any]:
     NumPy has no bfloat16: such values become float32.
 
     Raises:
-        TypeError: if it is a text, one of our objects that holds tensors, or no dense tensor.
+        TypeError: if it is a text, or one of our objects that holds tensors.
     """
     if isinstance(values, Tensor):
-        dense = as_tensor(name, values).detach().cpu()
+        dense = values.detach().cpu()
         array: np.ndarray[Any, Any] = (dense.float() if dense.dtype == torch.bfloat16 else dense).numpy()
         return array
     if isinstance(values, str) or any(hasattr(values, part) for part in PARTS):
@@ -205,12 +125,10 @@ def as_array(values: Any, name: str = "values") -> np.ndarray[Any, Any]:
 
 
 def _instead(value: object) -> str:
-    """What to pass in place of a value that is no tensor."""
+    """What to pass in place of a value that is not a tensor."""
     if isinstance(value, str):
-        lookups = "field.query(name, classes) and OfClass(name).select(splats) look a class up"
-        return (
-            f"pass the numbers, not the name {one_line(value)!r}: the embedding, a row of classes.embeddings; {lookups}"
-        )
+        lookups = "field.query(name) and OfClass(name).select(splats) look a class up"
+        return f"pass the embedding, not the name {one_line(value)!r}; {lookups}"
     part = next((part for part in PARTS if hasattr(value, part)), None)
     return f"pass its .{part}" if part else "convert it with torch.as_tensor"
 
@@ -218,7 +136,7 @@ def _instead(value: object) -> str:
 def check_choice(name: str, value: object, choices: Iterable[object]) -> None:
     """Raise a ValueError unless `value` is one of `choices`."""
     options = list(choices)
-    if isinstance(value, Tensor | np.ndarray) or value not in options:
+    if value not in options:
         near = difflib.get_close_matches(str(value).lower(), map(str, options), n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
         raise ValueError(f"{name}: expected one of {', '.join(map(repr, options))}, got {value!r}{hint}")
@@ -228,22 +146,19 @@ def check_range(
     name: str, value: Any, low: float, high: float = float("inf"), *, closed: tuple[bool, bool] = (True, True)
 ) -> None:
     """Raise a ValueError unless `value` is a finite number between `low` and `high` (`closed`: are the ends included)."""
-    array = isinstance(
-        value, Tensor | np.ndarray | np.generic
-    )  # no getattr: a number may be a symbol while torch traces
-    if array and math.prod(value.shape) != 1:
-        got = f"{type(value).__name__} of shape {tuple(value.shape)}"
-        raise TypeError(f"{name}: expected one number, got {got}; pass a float")
-    odd = value.dtype in (torch.bool, np.bool_) if array else not isinstance(value, int | float | numbers.Real)
-    if odd or isinstance(value, bool):
+    is_array = isinstance(value, Tensor | np.ndarray | np.generic)  # no getattr: it may be a symbol while torch traces
+    if is_array:
+        odd = math.prod(value.shape) != 1 or value.dtype in (torch.bool, np.bool_)
+    else:
+        odd = isinstance(value, bool) or not isinstance(value, int | float | numbers.Real)
+    if odd:
         raise TypeError(f"{name}: expected a number, got {value!r:.80} ({type(value).__name__}); pass a float")
     over = value >= low if closed[0] else value > low
     under = value <= high if closed[1] else value < high
     if not (over and under and -math.inf < value < math.inf):  # NaN fails every comparison
         left = "[" if closed[0] and math.isfinite(low) else "("
-        hint = "" if -math.inf < value < math.inf else "; pass a finite number"
         right = "]" if closed[1] and math.isfinite(high) else ")"
-        raise ValueError(f"{name}: expected a number in {left}{low:g}, {high:g}{right}, got {value!r}{hint}")
+        raise ValueError(f"{name}: expected a number in {left}{low:g}, {high:g}{right}, got {value!r}")
 
 
 def check_whole(name: str, value: float, low: float, high: float = float("inf")) -> None:

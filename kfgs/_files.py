@@ -23,10 +23,7 @@ from ._stems import file_stem as file_stem
 from ._stems import folded_name as folded_name
 
 ASIDE = ".kfgs-new-"  # begins the name of the folder in which a file is written; one that a killed process left may be deleted
-LARGEST = 1 << 29  # most bytes of a JSON file: COCO's own annotations have 470 MB
-DIGITS = 300  # most digits of a whole number in JSON, so that it fits into a float
 UNNAMED = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)  # errors that Python raises without a file
-BLOCK = 4096  # a disk with fewer free bytes is full
 
 
 class InUseError(ValueError):
@@ -46,16 +43,11 @@ def real_path(path: str | Path) -> Path:
 
 
 def check_output(name: str, path: str | Path, kind: Literal["a file", "a folder"]) -> Path:
-    """Check before long work that its result can be written; return the path, with `~` expanded.
-
-    Args:
-        name: the argument, for messages.
-        path: the file or folder to write; it need not exist.
-        kind: which of the two.
+    """Check before long work that its result can be written to `path`, which need not exist; return it with `~` expanded.
 
     Raises:
         ValueError: if the path is empty, something of another kind is there, or a file is in place of a folder above it.
-        OSError: if it cannot be written to, or the disk is full.
+        OSError: if it cannot be written to. The messages name the argument, `name`.
     """
     target = as_path(path)
     got = "a folder" if target.is_dir() else "a file" if target.is_file() else "a pipe or a device"
@@ -67,9 +59,8 @@ def check_output(name: str, path: str | Path, kind: Literal["a file", "a folder"
     try:
         if target.exists() and not os.access(target, os.W_OK):
             raise PermissionError(errno.EACCES, "Permission denied")
-        with tempfile.TemporaryFile(dir=target if target.is_dir() else above, buffering=0) as trial:
-            if trial.write(bytes(BLOCK)) < BLOCK:
-                raise OSError(errno.ENOSPC, "No space left on device")
+        with tempfile.TemporaryFile(dir=target if target.is_dir() else above) as trial:
+            trial.write(bytes(4096))  # what a full disk does not take
     except OSError as error:
         message = f"{name}: expected {kind} that can be written, got {path} ({error.strerror}); choose another place"
         raise type(error)(message) from error
@@ -132,12 +123,9 @@ def _aside(target: Path) -> Iterator[Path]:
     try:
         yield place
     except OSError as error:
-        named = error.filename is not None and str(place) in str(error.filename)
-        unnamed = error.filename is None and (
-            error.errno in UNNAMED or "requested and" in str(error)
-        )  # the last: numpy's
-        if not (named or unnamed):
-            raise
+        short = error.errno in UNNAMED or "requested and" in str(error)  # the last: NumPy's
+        if str(place) not in str(error.filename) and not (error.filename is None and short):
+            raise  # another file's
         raise OSError(error.errno or errno.ENOSPC, error.strerror or str(error), str(target)) from error
     except SafetensorError as error:
         code = re.search(r"\(os error (\d+)\)", str(error))
@@ -148,12 +136,9 @@ def _aside(target: Path) -> Iterator[Path]:
 
 @contextmanager
 def locked(folder: Path, name: str) -> Iterator[None]:
-    """Keep other processes from working in a folder, which is made if it does not exist; `name` is that of the lock file.
+    """Keep other processes out of a folder, which is made if it does not exist (InUseError if one is in it).
 
-    The system ends the lock with its process. The file stays.
-
-    Raises:
-        InUseError: if another process holds the lock.
+    `name` is that of the lock file, which stays. The system ends the lock with its process.
     """
     check_output("folder", folder, "a folder").mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / name)
@@ -178,12 +163,7 @@ def write_json(path: str | Path, value: Any) -> None:
 
 
 def read_json(path: str | Path, expected: str = "a JSON file") -> Any:
-    """Read a JSON file; the error names the file, what was `expected`, and what is wrong with it.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is not JSON, or larger than `LARGEST`.
-    """
+    """Read a JSON file; a ValueError names the file, and what is wrong with it (FileNotFoundError: what was `expected`)."""
     text = read_text(path, expected)
     try:
         return parse_json(text)
@@ -191,18 +171,24 @@ def read_json(path: str | Path, expected: str = "a JSON file") -> Any:
         raise ValueError(f"{path}: expected a JSON file, but it cannot be parsed ({error})") from error
 
 
+def parse_json(text: str | bytes) -> Any:
+    """The value of a JSON text; a ValueError if it is not JSON, or its brackets nest too deep."""
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("brackets nest too deep") from None
+
+
 def read_text(path: str | Path, expected: str = "a text file") -> str:
     """Read a text in UTF-8 or UTF-16, with or without a byte-order mark.
 
     Raises:
         FileNotFoundError: if there is no such file; the message says what was `expected`.
-        ValueError: if it is in another encoding, or larger than `LARGEST`.
+        ValueError: if it is in another encoding.
     """
     path = as_path(path)
     if not os.path.isfile(path):  # Path.is_file raises for a name that is too long for the disk
         raise FileNotFoundError(f"{path}: no such file; expected {expected} there")
-    if (size := path.stat().st_size) > LARGEST:
-        raise ValueError(f"{path}: expected {expected} of at most {LARGEST:,} bytes, got {size:,}; split it")
     try:
         return path.read_text(encoding=text_encoding(path))
     except UnicodeError as error:
@@ -217,23 +203,6 @@ def text_encoding(path: Path) -> str:
         return "utf-16" if file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig"
 
 
-def parse_json(text: str | bytes, **options: Any) -> Any:
-    """The value of a JSON text; a ValueError if it is not one, or has numbers or brackets that are only an attack.
-
-    `options` are those of `json.loads`.
-    """
-
-    def whole_number(word: str) -> int:
-        if len(word) > DIGITS:
-            raise ValueError(f"a number has {len(word)} digits")
-        return int(word)
-
-    try:
-        return json.loads(text, **{"parse_int": whole_number} | options)
-    except RecursionError:
-        raise ValueError("brackets nest too deep") from None
-
-
 def digest_file(path: str | Path) -> str:
     """SHA-256 of a file's bytes, in hexadecimal."""
     with as_path(path).open("rb") as file:
@@ -243,15 +212,3 @@ def digest_file(path: str | Path) -> str:
 def digest_value(value: Any) -> str:
     """SHA-256 of a JSON-able value (keys sorted), in hexadecimal."""
     return hashlib.sha256(json.dumps(value, sort_keys=True, allow_nan=False).encode()).hexdigest()
-
-
-def bytes_in_words(count: float) -> str:
-    """Bytes for people: `15.9 GB`, `0.3 MB`."""
-    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.1f} MB"
-
-
-def seconds_in_words(seconds: float) -> str:
-    """A duration for people: `40 s`, `12 min`, `3.3 h`."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -6,55 +6,43 @@ import difflib
 from collections.abc import Sequence
 
 SHOWN = 20  # names listed in a message
-TAKE = "take one of these classes"
 
 
-def class_index(name: str, names: Sequence[str], otherwise: str = TAKE) -> int:
-    """The label of a class: its place in `names`, found as `class_indices` does; `otherwise` is its advice.
-
-    Raises:
-        ValueError: if the name is unknown (the message offers the nearest names), or several labels have it.
-
-    Example:
-        >>> class_index("chair", ["wall", "chair"])
-        1
-    """
-    found = class_indices(name, names, otherwise)
-    if len(found) > 1:
+def class_index(name: str, names: Sequence[str], otherwise: str = "take one of these classes") -> int:
+    """The label of a class: its place in `names`, as `class_indices` finds it; a ValueError if there are several."""
+    labels = class_indices(name, names, otherwise)
+    if len(labels) > 1:
         raise ValueError(
-            f"class: expected one class called {name!r}, got {len(found)} (labels {', '.join(map(str, found))}); "
+            f"class: expected one class called {name!r}, got {len(labels)} (labels {', '.join(map(str, labels))}); "
             "rename all but one, or ask for one by its index"
         )
-    return found[0]
+    return labels[0]
 
 
-def class_indices(name: str, names: Sequence[str], otherwise: str = TAKE) -> tuple[int, ...]:
+def class_indices(name: str, names: Sequence[str], otherwise: str = "take one of these classes") -> tuple[int, ...]:
     """The labels of a class, ascending. There are several if several classes have the same name.
 
-    A name is looked up exactly, then without regard to case, if only one spelling fits. `otherwise` is the advice about a name
-    that is like none.
+    A name is looked up exactly, then without regard to case, if only one spelling fits.
 
     Raises:
-        ValueError: if the name is unknown; the message offers the nearest names.
+        ValueError: if the name is unknown. The message offers similar names; if there are none, the advice is `otherwise`.
 
     Example:
         >>> class_indices("chair", ["chair", "wall", "chair"]), class_indices("Wall", ["chair", "wall"])
         ((0, 2), (1,))
     """
-    if not isinstance(name, str):
-        raise TypeError(f"class: expected a name, got {type(name).__name__}; pass one of the class names")
-    folded = {one for one in names if one.casefold() == name.casefold()}
+    folded = {known for known in names if known.casefold() == name.casefold()}
     spelled = name if name in names else folded.pop() if len(folded) == 1 else None
     if spelled is not None:
-        return tuple(index for index, one in enumerate(names) if one == spelled)
+        return tuple(index for index, known in enumerate(names) if known == spelled)
     if not names:
         raise ValueError(
             f"class: expected class names to look {name!r} up in, got none; pass the names or use an index"
         )
-    lower = {one.lower(): one for one in names}
-    near = sorted(folded)
-    near += [lower[m] for m in difflib.get_close_matches(name.lower(), lower, 3) if lower[m] not in near]
-    near += [one for one in dict.fromkeys(names) if name and name.lower() in one.lower() and one not in near][:3]
+    lower = {known.lower(): known for known in names}
+    alike = [lower[match] for match in difflib.get_close_matches(name.lower(), lower, 3)]
+    alike += [known for known in dict.fromkeys(names) if name and name.lower() in known.lower()][:3]
+    near = list(dict.fromkeys([*sorted(folded), *alike]))
     listed = ", ".join(names[:SHOWN]) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
     hint = f"did you mean {' or '.join(map(repr, near))}?" if near else otherwise
     raise ValueError(f"class: expected one of {listed}, got {name!r}; {hint}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -13,14 +12,10 @@ Progress = bool | Callable[[dict[str, Any]], None]
 
 
 def as_progress(progress: Any) -> Progress:
-    """A function as it is; a number or NumPy's truth value as a bool, so that `is True` may be asked; None as False.
-
-    Raises:
-        TypeError: if it is something else.
-    """
+    """A function as it is, a truth value as a bool; a TypeError for anything else."""
     if callable(progress):
         return progress
-    if not isinstance(progress, Real | np.bool_ | None):
+    if not isinstance(progress, int | np.bool_ | None):
         raise TypeError(
             f"progress: expected True, False or a function, got {progress!r:.60}; True shows a bar, a function gets each row"
         )
@@ -28,14 +23,7 @@ def as_progress(progress: Any) -> Progress:
 
 
 def as_bar(progress: Any) -> bool:
-    """`as_progress` where there is no history, so no function can be called.
-
-    Raises:
-        TypeError: if it is a function, or something else.
-    """
-    found = as_progress(progress)
-    if callable(found):
-        raise TypeError(
-            "progress: expected True or False, got a function; there are no rows to call it with, so pass True for a bar"
-        )
-    return found
+    """`as_progress` where there is no history to call a function with (TypeError)."""
+    if callable(progress):
+        raise TypeError("progress: expected True or False, got a function; there are no rows to call it with")
+    return bool(as_progress(progress))

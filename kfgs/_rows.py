@@ -11,14 +11,10 @@ REMOVE = "remove or repair such rows"
 ENCODE = "encode that image again"
 
 
-def unit_rows(
-    x: Tensor,  # [..., D]
-    eps: float = EPS,
-) -> Tensor:  # [..., D]
-    """Divide each row by its length, or by `eps` where it is shorter: x / max(|x|, eps).
+def unit_rows(x: Tensor, eps: float = EPS) -> Tensor:  # [..., D]
+    """Divide each row by its length, or by `eps` where it is shorter, so that an all-zero row stays zero.
 
-    An all-zero row stays zero, so its cosine with anything is 0 and never NaN. In half precision, where `eps` would
-    underflow, the smallest normal number of the type takes its place.
+    In half precision, where `eps` would underflow, the smallest normal number of the type takes its place.
     """
     return x / row_norms(x)[..., None].clamp_min(max(eps, torch.finfo(x.dtype).tiny))
 
@@ -37,22 +33,18 @@ def unit_embeddings(embeddings: Tensor, name: str = "embeddings") -> Tensor:  # 
     empty = lengths <= EPS
     if bool(empty.any()):
         row = int(empty.nonzero()[0])
-        got = (
-            f"a length of {float(embeddings[row].double().norm()):.3g}" if bool(embeddings[row].any()) else "all zeros"
-        )
+        length = float(embeddings[row].double().norm())
         raise ValueError(
-            f"{name}: expected rows with a direction (longer than {EPS:g}), got {got} in row {row}; drop or replace that class"
+            f"{name}: expected rows longer than {EPS:g}, got a length of {length:.3g} in row {row}; drop or replace that class"
         )
     return unit_rows(embeddings.detach())
 
 
-def check_directions(
-    name: str,
-    rows: Tensor,  # [..., D]
-    lengths: Tensor | None = None,  # of the rows, if they are known
-    advice: str = REMOVE,
-) -> None:
-    """Raise a ValueError if the length of a row is not finite: for NaN, infinity, or numbers whose squares overflow."""
+def check_directions(name: str, rows: Tensor, lengths: Tensor | None = None, advice: str = REMOVE) -> None:
+    """Raise a ValueError if the length of a row is not finite: for NaN, infinity, or numbers whose squares overflow.
+
+    `lengths` are those of the rows [..., D], if they are known.
+    """
     lengths = row_norms(rows) if lengths is None else lengths
     if bool(torch.isfinite(lengths).all()):
         return

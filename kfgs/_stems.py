@@ -58,14 +58,14 @@ class Names:
         """The one of the names that is meant; None if there is none, or it is not clear which."""
         if name in self.names:
             return name
-        stems, folded, folded_stems, last = self._tables
-        short, plain = _ENDING.sub("", name), folded_name(name)
-        ways = [(stems, name), (folded, plain), (stems, short), (folded_stems, plain)]
-        parts = plain.split("/")
+        stems, folded, folded_stems, bare = self._tables
+        parts = folded_name(name).split("/")
+        ways = [(stems, name)]
         for i in range(len(parts)):
             tail = "/".join(parts[i:])
             ways += [(folded, tail), (folded_stems, tail), (folded_stems, _ENDING.sub("", tail))]
-        ways += [(last, plain), (last, _ENDING.sub("", plain))] if self.bare and len(parts) == 1 else []
+        if self.bare and len(parts) == 1:
+            ways += [(bare, parts[0]), (bare, _ENDING.sub("", parts[0]))]
         fits = next((table[word] for table, word in ways if word in table), [])
         return fits[0] if len(fits) == 1 else None
 
@@ -88,10 +88,10 @@ class Names:
         """The names by their stems, folded, by folded stems, and by folded names and stems without folders."""
         tables: tuple[dict[str, list[str]], ...] = ({}, {}, {}, {})
         for name in self.names:
-            stem = file_stem(name)
-            bare = {folded_name(PurePosixPath(word.replace("\\", "/")).name) for word in (name, stem)}
-            keys = ({stem}, {folded_name(name)}, {folded_name(stem)}, bare)
-            for table, words in zip(tables, keys, strict=True):
+            stem, plain = file_stem(name), folded_name(name)
+            folded_stem = folded_name(stem)
+            bare = {plain.rpartition("/")[2], folded_stem.rpartition("/")[2]}
+            for table, words in zip(tables, ({stem}, {plain}, {folded_stem}, bare), strict=True):
                 for word in words:
                     table.setdefault(word, []).append(name)
         return tables

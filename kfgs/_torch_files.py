@@ -23,13 +23,11 @@ from ._arrays import FileError, most_unpacked, reading
 
 SAVE = "download it again, or save the state_dict() with torch.save or as .safetensors where you trust it"
 _LOCK = threading.Lock()  # the names that torch allows are global
-_BEFORE_1_6 = b"\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19."  # the magic number of older files, as a pickle
 _KINDS = (
     (b"version https://git-lfs", "a Git LFS pointer, not the file itself: run `git lfs pull` where it came from"),
     (b"<", "an HTML or XML page: the download failed, most likely behind a login"),
     (b"{", "a JSON file, not the weights"),
     (b"\x1f\x8b", "a gzip file: unpack it first"),
-    (b"PK\x05\x06", "an empty zip archive"),
 )
 
 
@@ -50,21 +48,15 @@ class _Items:
 def read_torch(path: Path, expected: str, advice: str = SAVE) -> Any:
     """The object in a file of `torch.save`, on the CPU. Tensors of a zip archive are views of the file.
 
-    Args:
-        path: the file.
-        expected: what should be there, for the message.
-        advice: the end of the message.
-
     Raises:
-        FileNotFoundError: if there is no such file.
+        FileNotFoundError: if there is no such file. `expected` and `advice` are parts of the messages.
         FileError: if it is something else, damaged, or unpacks to much more than its size.
     """
     with reading(path, expected, advice):
         with path.open("rb") as file:
             head = file.read(64).lstrip()
-        if not head.startswith(b"PK\x03\x04") and _BEFORE_1_6 not in head:
-            other = "something else than torch.save writes" if head else "an empty file"
-            kind = next((words for start, words in _KINDS if head.startswith(start)), other)
+        kind = next((words for start, words in _KINDS if head.startswith(start)), None)
+        if kind is not None:
             raise FileError(f"{path}: expected {expected}, got {kind}; {advice}")
         zipped = head.startswith(b"PK")
         with _LOCK, warnings.catch_warnings(), safe_globals(_stand_ins(path) if zipped else []):
@@ -95,7 +87,7 @@ def plain_tensor(
         FileError: if it is something else, repeats its values by strides, or has numbers that are not `finite`.
     """
     if not isinstance(value, Tensor) or value.layout != torch.strided or value.is_quantized or value.is_meta:
-        kind = "a sparse, nested, quantised or empty one" if isinstance(value, Tensor) else type(value).__name__
+        kind = "another kind" if isinstance(value, Tensor) else type(value).__name__
         raise FileError(f"{path}: expected a dense tensor for {name}, got {kind}; is this another program's file?")
     held = value.untyped_storage().nbytes() // value.element_size()
     if value.numel() > held:  # a few bytes could fill the memory

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ._card import LINE, cut, short_value
-from ._check import ORIGIN, as_array, as_origin, as_tensor, check_shapes, moved_to
+from ._check import ORIGIN, as_array, as_origin, as_tensor, check_shapes
 
 Array = np.ndarray[Any, Any]
 TENSORS = ("means", "quats", "scales", "opacities", "features", "sh", "labels", "scores")
@@ -93,13 +93,11 @@ class Gaussians:
 
     def __array__(self, *args: Any, **kwargs: Any) -> Array:
         """None: without it, NumPy would look into g[0][0][0]... for numbers."""
-        raise TypeError(
-            "gaussians: expected an array, got Gaussians, which hold several; to_numpy() gives them by name"
-        )
+        raise TypeError("gaussians: expected an array, got Gaussians, which hold several; use to_numpy()")
 
     @property
     def gaussians(self) -> Gaussians:
-        """The cloud itself: scripts written for `read_splats(...).gaussians` continue to work."""
+        """The cloud itself, so that `read_splats(...).gaussians` works."""
         return self
 
     def _tensors(self) -> dict[str, Tensor]:
@@ -119,8 +117,8 @@ class Gaussians:
         """Some of the Gaussians as a new cloud; `gaussians[which]` is the same.
 
         Args:
-            which: a mask [N], indices [n] in any order, a slice, one index, or an object with a `mask`, as a `Selection`.
-                Masks and indices may be tensors, NumPy arrays or lists.
+            which: a mask [N], indices [n] in any order, a slice, one index, or a `Selection`. Tensors, NumPy arrays and
+                lists are taken.
 
         Raises:
             ValueError: if a mask is not [N].
@@ -144,7 +142,7 @@ class Gaussians:
 
     def to(self, *args: Any, **kwargs: Any) -> Gaussians:
         """Move or convert the floating tensors as `Tensor.to` does; labels keep their integer type."""
-        moved = {name: moved_to(value, *args, **kwargs) for name, value in self._tensors().items() if name != "labels"}
+        moved = {name: value.to(*args, **kwargs) for name, value in self._tensors().items() if name != "labels"}
         if self.labels is not None:
             moved["labels"] = self.labels.to(moved["means"].device)
         return self.replace(**moved)
@@ -176,9 +174,9 @@ class Gaussians:
                 ("antialiased", first.antialiased, part.antialiased),
             ):
                 if got != expected:
+                    way = "with_origin()" if what == "origin" else "replace()"
                     raise ValueError(
-                        f"parts[{i}]: expected the {what} {expected} as in parts[0], got {got}; bring them to one with "
-                        f"{'with_origin()' if what == 'origin' else 'replace()'}"
+                        f"parts[{i}]: expected the {what} {expected} as in parts[0], got {got}; bring them to one with {way}"
                     )
         tensors = {name: torch.cat([part._tensors()[name] for part in parts]) for name in names}
         extra = {name: np.concatenate([part.extra[name] for part in parts]) for name in first.extra}
@@ -186,29 +184,20 @@ class Gaussians:
 
 
 def as_rows(name: str, which: Any, count: int) -> Tensor:  # [count] bool, or [n] whole numbers
-    """Which of `count` Gaussians, in any form that `Gaussians.select` takes, as a tensor to index with.
-
-    It is looked at before anything walks through it: a cloud can be indexed for ever, g[0][0][0]...
-
-    Raises:
-        ValueError: if a mask is not [count].
-        TypeError: if it is neither a mask nor whole numbers.
-        IndexError: if there is no such Gaussian.
-    """
+    """Which of `count` Gaussians, in any form that `Gaussians.select` takes and with its errors, as a tensor to index with."""
     which = getattr(which, "mask", which)
     if isinstance(which, slice):
         return torch.from_numpy(np.arange(*which.indices(count)))
-    rows = which
     if not isinstance(which, Tensor):
         numbers = isinstance(which, int | np.integer | list | tuple | range) or hasattr(which, "__array__")
         if isinstance(which, Gaussians) or not numbers:
             got = type(which).__name__
             raise TypeError(f"{name}: expected a mask or whole numbers, got {got}; pass a Selection, a mask or indices")
-        rows = as_tensor(name, which)
-        rows = rows.long() if rows.numel() == 0 and rows.dtype != torch.bool else rows
+        which = as_tensor(name, which)
+    rows = which.long() if which.numel() == 0 and which.dtype != torch.bool else which
     if rows.dtype == torch.bool and rows.shape != (count,):
         raise ValueError(f"{name}: expected a mask [N] with N = {count}, got {tuple(rows.shape)}")
-    if rows.is_floating_point() or rows.is_complex():
+    if rows.is_floating_point():
         raise TypeError(f"{name}: expected a mask or whole numbers, got {rows.dtype}; compare first, as in x > 0.5")
     if rows.ndim == 0:
         rows = rows.reshape(-1)

@@ -1,29 +1,13 @@
 """CLIP's tokenizer as Hugging Face's `tokenizers` computes it, over a vocabulary that is put together here."""
 
 import bz2
-import itertools
 from pathlib import Path
 from typing import Any
 
 
 def read_merges(path: Path) -> list[str]:
-    """The lines "a b" behind a packed list of joined symbols: each is taken apart by the merges before it."""
-    ranks: dict[tuple[str, str], int] = {}
-    for symbol in bz2.decompress(path.read_bytes()).replace(b"\r", b"</w>\n").decode("utf-8").split("\n"):
-        ended = symbol.endswith("</w>")
-        parts = list(symbol[:-4] if ended else symbol)
-        if ended:
-            parts[-1] += "</w>"
-        while len(parts) > 2:
-            known = [(ranks[pair], i) for i, pair in enumerate(itertools.pairwise(parts)) if pair in ranks]
-            pair = tuple(parts[min(known)[1] : min(known)[1] + 2])
-            i = 0
-            while i < len(parts) - 1:
-                if (parts[i], parts[i + 1]) == pair:
-                    parts[i : i + 2] = [parts[i] + parts[i + 1]]
-                i += 1
-        ranks[parts[0], parts[1]] = len(ranks)
-    return [" ".join(pair) for pair in ranks]
+    """The lines "a b"."""
+    return bz2.decompress(path.read_bytes()).decode("utf-8").splitlines()
 
 
 def vocabulary(merges: list[str]) -> dict[str, int]:

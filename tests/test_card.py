@@ -77,7 +77,7 @@ def test_no_value_is_long():
 
 def test_paths_and_rows_say_what_they_are():
     assert short_value([Path("/a/room.ply"), Path("/a/b.json")]) == "[room.ply, b.json]"
-    assert short_value([{"step": 1, "loss": 2.0}] * 3) == "3 rows of step, loss"
+    assert short_value([{"step": 1, "loss": 2.0}] * 3) == "3 of dict"
     assert short_value(["word " * 40] * 2).endswith(" word...")
 
 

@@ -7,10 +7,9 @@ import sys
 import numpy as np
 import pytest
 import torch
-from messages import tells
 from small_room import make_desk
 
-from kfgs import _check, cli
+from kfgs import cli
 from kfgs.formats.ply import write_ply
 
 KFGS = f"{sys.executable} -m kfgs"
@@ -109,14 +108,6 @@ def test_another_runtime_error_stays_a_bug(monkeypatch):
     monkeypatch.setitem(cli.COMMANDS, "probe", probe)
     with pytest.raises(RuntimeError, match="a bug of ours"):
         cli.main(["probe"])
-
-
-def test_too_little_memory_is_no_missing_device():
-    value = torch.zeros(1).expand(1 << 55)
-    with pytest.raises(RuntimeError, match="allocate memory"):
-        _check.moved_to(value, torch.float64)
-    with pytest.raises(ValueError, match=tells("device", "nowhere")):
-        _check.moved_to(torch.zeros(1), "nowhere")
 
 
 @pytest.mark.parametrize("words", [["--help"], ["fit", "--help"]])

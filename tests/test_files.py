@@ -21,14 +21,12 @@ from kfgs._files import (
     as_path,
     atomic_folder,
     atomic_path,
-    bytes_in_words,
     check_output,
     digest_file,
     digest_value,
     locked,
     read_json,
     read_text,
-    seconds_in_words,
     write_json,
 )
 
@@ -284,8 +282,3 @@ def test_digests_are_sha256(tmp_path):
     # FIPS 180-2, appendix B.1
     assert digest_file(tmp_path / "abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
     assert digest_value({"b": 1, "a": [2]}) == hashlib.sha256(json.dumps({"a": [2], "b": 1}).encode()).hexdigest()
-
-
-def test_bytes_and_seconds_in_words():
-    assert [bytes_in_words(count) for count in (15_925_248_000, 999e6, 340_000)] == ["15.9 GB", "999.0 MB", "0.3 MB"]
-    assert [seconds_in_words(seconds) for seconds in (40, 720, 11_880)] == ["40 s", "12 min", "3.3 h"]

@@ -45,26 +45,6 @@ def test_after_the_command_has_ended(tmp_path):
     assert run(tmp_path, "--version", code=BEFORE + "atexit.register(ctrl_c)\n" + RUN) == (130, "interrupted\n")
 
 
-DELETED = """
-from kfgs import cli
-def probe() -> None:
-    "Delete an object."
-    class Interrupted:
-        def __del__(self):
-            ctrl_c()
-    Interrupted()
-    print("went on")
-cli.COMMANDS["probe"] = probe
-"""
-
-
-def test_where_python_forgets_exceptions(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-c", BEFORE + DELETED + RUN, "probe"], cwd=tmp_path, capture_output=True, text=True
-    )
-    assert (done.returncode, done.stderr, done.stdout) == (130, "interrupted\n", "")
-
-
 def test_a_shell_that_ignores_ctrl_c_for_its_jobs_is_obeyed():
     code = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n" + RUN
     end = "\nassert signal.getsignal(signal.SIGINT) is signal.SIG_IGN"

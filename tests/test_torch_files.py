@@ -80,12 +80,12 @@ def test_the_settings_in_a_file_of_lightning_do_not_matter(tmp_path):
 
 
 KINDS = {
-    "empty": (b"", "an empty file"),
+    "empty": (b"", "cannot be read"),
     "page": (b"\n<!DOCTYPE html>\n<html></html>", "HTML"),
     "pointer": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 3\n", "git lfs pull"),
     "gzip": (b"\x1f\x8b\x08" + b"x" * 50, "unpack it"),
     "index": (b'{"weight_map": {}}', "JSON"),
-    "picture": (b"\x89PNG\r\n\x1a\n123", "something else"),
+    "picture": (b"\x89PNG\r\n\x1a\n123", "cannot be read"),
     "zip": (zip_of({"photo.txt": b"hello"}), "cannot be read"),
     "bomb": (zip_of({"a/data.pkl": b"N.", "a/data/0": bytes(80 << 20)}, zipfile.ZIP_DEFLATED), "unpack to"),
     "cut": (archive(pickle.dumps({"a": 1}, 2))[:-40], "cannot be read"),

@@ -152,7 +152,7 @@ def _manifest(path: Path) -> None:
 
 
 def _checkpoint(path: Path) -> None:
-    from kfgs.teachers import read_checkpoint
+    from kfgs.teachers.checkpoint import read_checkpoint
 
     for value in read_checkpoint(path).values():
         value.sum()

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .._card import cut
-from .._check import ORIGIN, as_origin, as_tensor, check_choice, check_range, check_shapes, moved_to
+from .._check import ORIGIN, as_origin, as_tensor, check_choice, check_range, check_shapes
 from .._files import Names
 from .._origin import to_world
 
@@ -196,7 +196,7 @@ class Camera:
 
     def to(self, *args: Any, **kwargs: Any) -> Camera:
         """Move or convert the matrices as `Tensor.to` does."""
-        return replace(self, viewmat=moved_to(self.viewmat, *args, **kwargs), K=moved_to(self.K, *args, **kwargs))
+        return replace(self, viewmat=self.viewmat.to(*args, **kwargs), K=self.K.to(*args, **kwargs))
 
 
 def at_one_origin(cameras: Sequence[Camera]) -> list[Camera]:

@@ -9,7 +9,7 @@ import torch
 
 from .._card import say_coordinate
 from .._check import one_line
-from .._files import as_path, bytes_in_words
+from .._files import as_path
 from .._origin import to_world
 from ..fields import SemanticField
 from ..fields.store import find_field
@@ -98,7 +98,7 @@ def _describe_maps(path: Path) -> str:
     lines = [
         f"{path}: {len(maps)} feature maps by {one_line(about.get('name', 'an unknown teacher'))}",
         f"  {h} x {w} cells, {D} channels",
-        f"  {bytes_in_words(sum(file.stat().st_size for file in maps.files))}",
+        f"  {sum(file.stat().st_size for file in maps.files) / 1e6:,.1f} MB",
         *(f"  {one_line(name)}: {one_line(value, 200)}" for name, value in about.items() if name != "name"),
     ]
     return "\n".join(lines)

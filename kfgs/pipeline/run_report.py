@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from .._files import as_path, atomic_path, bytes_in_words, seconds_in_words
+from .._files import as_path, atomic_path
 from ..fields import SemanticField
 from ..fields.store import NAME
 from ..scenes import Scene
@@ -86,8 +86,8 @@ def write_run_report(
         "geometry": info.get("geometry", "trained with the field"),
         "Gaussians": f"{len(field):,}",
         "numbers for each Gaussian's meaning": f"{field.features.shape[1]}, for {field.dim} channels of the teacher",
-        "size on disk": bytes_in_words((folder / NAME).stat().st_size),
-        "size as the paper's Table 1 counts it": bytes_in_words(field.storage()),
+        "size on disk": f"{(folder / NAME).stat().st_size / 1e6:,.1f} MB",
+        "size as the paper's Table 1 counts it": f"{field.storage() / 1e6:,.1f} MB",
         "seed": info["seed"],
         "kfgs, torch": f"{info['kfgs']}, {torch.__version__}",
     }
@@ -99,7 +99,7 @@ def write_run_report(
         "<h2>What was fitted</h2>",
         _table(facts.items()),
         "<h2>Time of each stage</h2>",
-        _table((name, seconds_in_words(value)) for name, value in seconds.items()),
+        _table((name, f"{value:,.0f} s") for name, value in seconds.items()),
         "<h2>How to repeat it</h2>",
         f"<pre>{html.escape(command or f'kfgs.fit(scene, maps, method, folder={str(folder)!r})')}</pre>",
         f"<details><summary>All options</summary><pre>{html.escape(json.dumps(method.options(), indent=1))}</pre></details>",

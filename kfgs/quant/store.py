@@ -10,7 +10,6 @@ from typing import Any, Self
 from torch import Tensor
 
 from .._arrays import read_safetensors, reading
-from .._check import moved_to
 from .._files import atomic_path
 from .._tensors import save_tensors
 
@@ -37,7 +36,7 @@ class Stored:
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
         """A copy with the tensors moved or converted as `Tensor.to` does."""
-        moved = {name: moved_to(value, *args, **kwargs) for name, value in self.state_dict().items()}
+        moved = {name: value.to(*args, **kwargs) for name, value in self.state_dict().items()}
         return replace(self, **moved)  # type: ignore[type-var]
 
     def save(self, path: str | Path) -> None:

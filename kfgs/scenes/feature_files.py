@@ -74,7 +74,7 @@ def open_map(
 
 def _load(file: Path) -> Any:
     if file.name.endswith(OWN):
-        return read_array(file, "a feature map", AGAIN, mapped=True)
+        return read_array(file, "a feature map", AGAIN)
     if file.name.endswith(SAFETENSORS):
         (tensor,) = read_safetensors(file, "a feature map", AGAIN)[0].values()
         return tensor

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from .._arrays import read_safetensors
 from .._check import one_line
-from .._files import as_path, digest_file
+from .._files import as_path
 from .._torch_files import SAVE, plain_tensor, read_torch
 
 _EXPECTED = "a checkpoint (.ckpt, .pt, .pth or .safetensors)"
@@ -25,10 +25,13 @@ def read_checkpoint(path: str | Path) -> dict[str, Tensor]:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is not a checkpoint, is damaged, or names something dangerous.
+        ValueError: if it is not a checkpoint, or is damaged.
     """
     path = as_path(path)
-    _check_file(path)
+    if path.is_dir():
+        raise ValueError(f"{path}: expected {_EXPECTED}, got a folder; name the file of weights in it")
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected {_EXPECTED}, got no such file; check its name")
     with path.open("rb") as file:
         head = file.read(9)
     if head[8:9] == b"{" and int.from_bytes(head[:8], "little") < 2**27:  # the length of a JSON header, below 100 MB
@@ -45,25 +48,6 @@ def read_checkpoint(path: str | Path) -> dict[str, Tensor]:
         for name, value in state.items()
         if isinstance(name, str) and isinstance(value, Tensor)
     }
-
-
-def weights_digest(path: str | Path) -> str:
-    """SHA-256 of a checkpoint's file, in hexadecimal, to identify the weights.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is a folder.
-    """
-    path = as_path(path)
-    _check_file(path)
-    return digest_file(path)
-
-
-def _check_file(path: Path) -> None:
-    if path.is_dir():
-        raise ValueError(f"{path}: expected {_EXPECTED}, got a folder; name the file of weights in it")
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected {_EXPECTED}, got no such file; check its name")
 
 
 def _find_state(top: Any, depth: int = 0) -> dict[Any, Any] | None:

@@ -72,37 +72,28 @@ def check_teacher_name(name: str) -> None:
 
 def _imported(name: str, weights: str | Path | None, options: dict[str, Any]) -> Teacher:
     """The teacher `package.module:name`, with an `identity` of its name, version, weights and options if it has none."""
-    added = "" not in sys.path
-    sys.path[:0] = [""] if added else []  # the folder where the command runs
-    try:
-        found = _find(name)
-        given = [] if weights is None else [weights]
-        if inspect.isclass(found):
-            try:
-                found = found(*given, **options)
-            except TypeError as error:
-                got = ", ".join([*(["weights"] if given else []), *options]) or "nothing"
-                raise ValueError(
-                    f"weights, options: expected what {name!r} takes, got {got} ({error}); pass just those"
-                ) from error
-        elif given or options:
+    value = _find(name)
+    given = [] if weights is None else [weights]
+    if inspect.isclass(value):
+        try:
+            value = value(*given, **options)
+        except TypeError as error:
+            got = ", ".join([*(["weights"] if given else []), *options]) or "nothing"
             raise ValueError(
-                f"weights: expected none for {name!r}, which is made already, got {weights or ', '.join(options)}; name a "
-                "class that takes them instead"
-            )
-    finally:
-        if added and "" in sys.path:  # entries that the module added stay
-            sys.path.remove("")
-    if not isinstance(found, Teacher) and not callable(found):
+                f"weights, options: expected what {name!r} takes, got {got} ({error}); pass just those"
+            ) from error
+    elif given or options:
         raise ValueError(
-            f"teacher: expected a teacher, a class of teachers or a function from [3, H, W] to [D, h, w], got "
-            f"{type(found).__name__} behind {name!r}, which lacks name, encode_image or encode_text; see "
-            "kfgs.teachers.Teacher"
+            f"weights: expected none for {name!r}, which is made already, got {weights or ', '.join(options)}; name a "
+            "class that takes them instead"
         )
-    teacher: Any = as_teacher(found)
+    try:
+        teacher: Any = as_teacher(value)
+    except TypeError as error:
+        raise ValueError(f"{name}: {error}") from error
     if not isinstance(getattr(teacher, "identity", None), dict):
         plain = {
-            key: value if isinstance(value, bool | int | float | str) else str(value) for key, value in options.items()
+            key: part if isinstance(part, bool | int | float | str) else str(part) for key, part in options.items()
         }
         identity = {"name": str(teacher.name), "version": str(getattr(teacher, "version", "")), "source": name}
         teacher.identity = {**identity, "weights": None if weights is None else str(weights), "options": plain}
@@ -110,8 +101,10 @@ def _imported(name: str, weights: str | Path | None, options: dict[str, Any]) ->
 
 
 def _find(name: str) -> Any:
-    """Import the object `package.module:name`."""
+    """Import the object `package.module:name`; the folder where the command runs is searched too."""
     module_name, _, attribute = name.partition(":")
+    added = "" not in sys.path
+    sys.path[:0] = [""] if added else []
     try:
         importlib.invalidate_caches()
         return getattr(importlib.import_module(module_name), attribute)
@@ -120,3 +113,6 @@ def _find(name: str) -> Any:
             f"teacher: expected package.module:name that can be imported, got {name!r} ({error_line(error)}); check both "
             "names, and that `import` of the module works"
         ) from error
+    finally:
+        if added and "" in sys.path:  # entries that the module added stay
+            sys.path.remove("")

@@ -40,12 +40,10 @@ def embed_labels(
 ) -> Tensor:  # [C, D] float32, unit rows, on the teacher's device
     """One embedding per class: encode each word in each template as unit rows, average, and normalise.
 
-    A name may contain synonyms as in ADE20K, "chair;armchair;seat": the first is the class's name. Underscores become
-    spaces in prompts. Repeated words count once.
-
     Args:
         teacher: a teacher with a text encoder.
-        names: C class names.
+        names: C class names. One may contain synonyms as in ADE20K, "chair;armchair;seat": the first is the class's name.
+            Underscores become spaces in prompts. Repeated words count once.
         templates: a name of `TEMPLATES`, one template, or several; `{}` is replaced by the word. None: the teacher's
             `templates` if it has any, else bare words, as for LSeg.
         synonyms: further words of a class, by its name.
@@ -57,7 +55,7 @@ def embed_labels(
     """
     teacher = as_teacher(teacher)
     words, patterns = _words(names, synonyms), _templates_of(teacher, templates)
-    prompts = [[pattern.replace("{}", word) for word in one for pattern in patterns] for one in words.values()]
+    prompts = [[pattern.replace("{}", word) for word in group for pattern in patterns] for group in words.values()]
     distinct = list(dict.fromkeys(prompt for group in prompts for prompt in group))
     rows = _encode(teacher, distinct)
     place = {prompt: i for i, prompt in enumerate(distinct)}
@@ -99,47 +97,40 @@ def make_label_set(
     return LabelSet(tuple(words), rows.cpu(), other, against, info)
 
 
-def template_set(templates: str | Sequence[str]) -> tuple[str, ...]:
-    """The templates of a named set, or the given ones; a ValueError if there is none, or one has no `{}`."""
-    found = TEMPLATES.get(templates, (templates,)) if isinstance(templates, str) else tuple(templates)
-    if not found or any("{}" not in one for one in found):
-        wrong = next((one for one in found if "{}" not in one), "none")
+def _templates_of(teacher: Teacher, templates: str | Sequence[str] | None) -> tuple[str, ...]:
+    """The templates of a named set, the given ones, or the teacher's; a ValueError if one has no `{}`."""
+    named = getattr(teacher, "templates", "bare") if templates is None else templates
+    patterns = TEMPLATES.get(named, (named,)) if isinstance(named, str) else tuple(named)
+    wrong = next((pattern for pattern in patterns if "{}" not in pattern), None if patterns else "none")
+    if wrong is not None:
         near = difflib.get_close_matches(wrong, TEMPLATES, n=1)
         raise ValueError(
             f"templates: expected one of {', '.join(TEMPLATES)}, or text with {{}} for the word, got {wrong!r}; "
             + (f"did you mean {near[0]!r}?" if near else 'write it as in "a photo of a {}."')
         )
-    return found
-
-
-def _templates_of(teacher: Teacher, templates: str | Sequence[str] | None) -> tuple[str, ...]:
-    """The given templates, or the teacher's."""
-    return template_set(getattr(teacher, "templates", "bare") if templates is None else templates)
+    return patterns
 
 
 def _words(names: Sequence[str], synonyms: Mapping[str, Sequence[str]] | None) -> dict[str, list[str]]:
     """The words of each class, as written in prompts, by the class's name, which is its first word."""
     if isinstance(names, str):
         raise TypeError(f"names: expected a list of class names, got the text {names!r}; put it into a list")
-    words = [[part.strip() for part in name.split(";")] for name in names]
-    keys, more = [group[0] for group in words], dict(synonyms or {})
-    if not keys or any(not part.replace("_", "").strip() for group in words for part in group):
+    groups = [[part.strip() for part in name.split(";")] for name in names]
+    keys, more = [group[0] for group in groups], dict(synonyms or {})
+    if not keys or any(not part.replace("_", "").strip() for group in groups for part in group):
         raise ValueError(f"names: expected at least one name and no empty word, got {list(names)!r:.200}; leave it out")
     twice = next((key for key in keys if keys.count(key) > 1), None)
     if twice is not None:
         raise ValueError(f"names: expected different names, got {twice!r} more than once; leave out repeats")
     for name, others in more.items():
-        if name not in keys:
+        if name not in keys or isinstance(others, str):
             raise ValueError(
-                f"synonyms: expected words of {', '.join(keys[:10])}, got some of {name!r}; name the first word"
-            )
-        if isinstance(others, str) or not all(isinstance(word, str) and word.strip(" _") for word in others):
-            raise ValueError(
-                f"synonyms: expected a list of words for {name!r}, got {others!r:.80}; write them as [...]"
+                f"synonyms: expected a list of words for names of {', '.join(keys[:10])}, got {name!r}: {others!r:.80}; "
+                "name the first word of a class"
             )
     return {
         key: list(dict.fromkeys(" ".join(word.replace("_", " ").split()) for word in [*group, *more.get(key, ())]))
-        for key, group in zip(keys, words, strict=True)
+        for key, group in zip(keys, groups, strict=True)
     }
 
 

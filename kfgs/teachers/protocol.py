@@ -140,12 +140,7 @@ def identify(teacher: Teacher) -> dict[str, Any]:
 
 
 def check_picture(image: Any) -> None:
-    """Raise unless `image` is a picture: [3, H, W], at least one pixel, finite floats in [0, 1]; reads the values.
-
-    Raises:
-        TypeError: if it is not a dense tensor of floats.
-        ValueError: if it has another shape, or a value is not finite or not in [0, 1] (1e-4 of rounding is allowed).
-    """
+    """Raise unless `image` is a picture: [3, H, W], at least one pixel, finite floats in [0, 1]; reads the values."""
     image = as_tensor("image", image)
     check_shapes(("image", image, "3 H W"))
     if not image.is_floating_point():
@@ -162,12 +157,9 @@ def check_picture(image: Any) -> None:
 
 def check_prompts(prompts: Any) -> None:
     """Raise a TypeError unless `prompts` is a list of texts, and a ValueError if it is empty."""
-    if isinstance(prompts, str):
-        raise TypeError(f"prompts: expected a list of texts, got the text {prompts!r}; put it into a list")
-    if not isinstance(prompts, Sequence) or not all(isinstance(prompt, str) for prompt in prompts):
-        other = (
-            next((x for x in prompts if not isinstance(x, str)), prompts) if hasattr(prompts, "__iter__") else prompts
+    if isinstance(prompts, str) or not isinstance(prompts, Sequence) or not all(isinstance(p, str) for p in prompts):
+        raise TypeError(
+            f"prompts: expected a list of texts, got {type(prompts).__name__} {prompts!r:.80}; pass a list of str"
         )
-        raise TypeError(f"prompts: expected a list of texts, got {type(other).__name__} {other!r:.80}; use str")
     if len(prompts) == 0:
         raise ValueError("prompts: expected at least one text, got none; name what to look for")

@@ -13,8 +13,8 @@ from kornia.models.sam import Sam, SamConfig
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from .._files import as_path
-from .checkpoint import read_checkpoint, weights_digest
+from .._files import as_path, digest_file
+from .checkpoint import read_checkpoint
 from .protocol import check_picture
 from .transformers_teacher import resize_picture
 
@@ -54,21 +54,15 @@ def load_sam(source: str | Path) -> SamTeacher:
     else:
         with torch.device("meta"):  # initialising 637 M weights takes long
             encoder = Sam.from_config(config).image_encoder
-    expected, got = (
-        {name: tuple(tensor.shape) for name, tensor in tensors.items()} for tensors in (encoder.state_dict(), state)
-    )
-    wrong = [
-        f"{name!r} {got.get(name, 'missing')} instead of {expected.get(name, 'none')}"
-        for name in [*expected, *(name for name in got if name not in expected)]
-        if got.get(name) != expected.get(name)
-    ]
-    if wrong:
+    try:
+        encoder.load_state_dict(state, assign=True)
+    except RuntimeError as error:  # lists all missing, unexpected and misshapen tensors
+        wrong = " ".join(str(error).split())
         raise ValueError(
-            f"{path}: expected the weights of SAM's image encoder, {len(wrong)} missing, left over or of another shape, the "
-            f"first {wrong[0]}; use a checkpoint of SAM 1 as it was published"
-        )
-    encoder.load_state_dict(state, assign=True)
-    identity = {"name": "sam", "options": {}, "weights": weights_digest(path)}
+            f"{path}: expected the weights of SAM's image encoder, got others ({wrong:.300}); use a checkpoint of SAM 1 as it "
+            "was published"
+        ) from error
+    identity = {"name": "sam", "options": {}, "weights": digest_file(path)}
     return SamTeacher(encoder.eval().requires_grad_(False), identity)
 
 

@@ -1,4 +1,4 @@
-"""Read CLIP in OpenCLIP's layout (for instance LAION's ViT-B-16 of LERF and LangSplat) as a CLIPModel of transformers."""
+"""Read CLIP in OpenCLIP's layout, which is OpenAI's and that of LSeg's text tower, as a model of transformers."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._card import error_line
 from .._files import read_json
 from .checkpoint import read_checkpoint
-from .transformers_source import explained, find_class, quiet, refuse_gaps, require_transformers
+from .transformers_package import explained, load_complete, require_transformers
 
 _CONFIG = "open_clip_config.json"
 _WEIGHTS = ("open_clip_model.safetensors", "open_clip_pytorch_model.safetensors", "open_clip_pytorch_model.bin")
@@ -68,7 +67,7 @@ def _fetch(kind: str, source: str, *, local_only: bool) -> Path | None:
         return next((file for name in _WEIGHTS if (file := fetch(name)) is not None), None)
 
 
-def load_openclip(file: Path, *, activation: str) -> Any:
+def load_openclip(kind: str, file: Path, *, activation: str) -> Any:
     """A CLIPModel with the weights of an OpenCLIP file.
 
     Sizes come from the weights' shapes, heads and activation from `open_clip_config.json` in the same folder. Without that
@@ -78,15 +77,13 @@ def load_openclip(file: Path, *, activation: str) -> Any:
         ValueError: if the file is not a CLIP of plain vision and text transformers, is OpenAI's TorchScript archive, or is
             damaged.
     """
-    transformers = require_transformers()
-    config_class, model_class = (find_class(transformers, name, "clip") for name in ("CLIPConfig", "CLIPModel"))
     if _is_torchscript(file):
         raise ValueError(
             f"{file}: expected the tensors of a CLIP, got a TorchScript archive as OpenAI publishes it, which is a "
             "program and is not run; use the hub id openai/clip-vit-base-patch16 (the weights of ViT-B-16.pt) or its like, "
             "a folder of that, or a file of OpenCLIP"
         )
-    state = _unwrapped(read_checkpoint(file))
+    state = {name.removeprefix("module."): value for name, value in read_checkpoint(file).items()}
     known = read_json(file.with_name(_CONFIG)) if file.with_name(_CONFIG).is_file() else {}
     settings = known.get("model_cfg", {}) if isinstance(known, dict) else {}
     missing = [name for name in _NEEDED if name not in state]
@@ -96,20 +93,31 @@ def load_openclip(file: Path, *, activation: str) -> Any:
             f"{next(iter(state), 'none')!r} (no {missing[0]!r}); use a ViT model like ViT-B-16, or a folder of "
             "save_pretrained"
         )
-    try:
-        config = _config_of(config_class, state, settings, activation)
-        mapped = _mapped(state)
-        with quiet(transformers):
-            model, info = model_class.from_pretrained(
-                None, config=config, state_dict=mapped, dtype=torch.float32, output_loading_info=True
-            )
-    except Exception as error:  # shapes that do not fit, sizes of no model: transformers has its own errors for those
-        raise ValueError(
-            f"{file}: expected a CLIP in OpenCLIP's layout, but its weights do not fit together ({error_line(error)}); use "
-            "the file and the config of one model"
-        ) from error
-    refuse_gaps(file, "CLIPModel", info)
-    return model.eval()
+    with explained(kind, file):  # shapes that do not fit, sizes of no model
+        act = ("quick_gelu" if settings.get("quick_gelu") else "gelu") if settings else activation
+        width, _, patch, _ = state["visual.conv1.weight"].shape
+        cells = round((state["visual.positional_embedding"].shape[0] - 1) ** 0.5)
+        head_width = int(settings.get("vision_cfg", {}).get("head_width", _HEAD_WIDTHS.get(width, 64)))
+        text_width = state["ln_final.weight"].shape[0]
+        config = require_transformers().CLIPConfig(
+            projection_dim=state["text_projection"].shape[1],
+            vision_config={
+                **_sizes(state, "visual.", max(1, width // head_width), act),
+                "image_size": cells * patch,
+                "patch_size": patch,
+                "projection_dim": state["visual.proj"].shape[1],
+            },
+            text_config=_text_config(state, settings.get("text_cfg", {}).get("heads", max(1, text_width // 64)), act),
+        )
+        return load_complete("CLIPModel", file, None, config=config, state_dict=_mapped(state))
+
+
+def load_text_tower(source: str, state: dict[str, Tensor], heads: int) -> Any:
+    """The text tower of a CLIP of OpenAI in OpenCLIP's names, as a CLIPTextModelWithProjection."""
+    with explained("lseg", Path(source), "a text tower"):
+        config = require_transformers().CLIPTextConfig(**_text_config(state, heads, "quick_gelu"))
+        mapped = {name: value for name, value in _mapped(state).items() if name.startswith("text_")}
+        return load_complete("CLIPTextModelWithProjection", Path(source), None, config=config, state_dict=mapped)
 
 
 def _is_torchscript(file: Path) -> bool:
@@ -121,72 +129,52 @@ def _is_torchscript(file: Path) -> bool:
         return False  # not a zip archive; a damaged one is explained by `read_checkpoint`
 
 
-def _unwrapped(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Remove the prefix of training on several devices, and convert to single precision."""
-    floats = {name: tensor.float() for name, tensor in state.items() if tensor.is_floating_point()}  # no masks
-    return {name.removeprefix("module."): tensor for name, tensor in floats.items()}
+def _sizes(state: dict[str, Tensor], tower: str, heads: int, activation: str) -> dict[str, Any]:
+    """The sizes of a tower by the shapes of its weights."""
+    layers = [re.match(re.escape(tower) + r"transformer\.resblocks\.(\d+)\.", name) for name in state]
+    hidden, width = state[f"{tower}transformer.resblocks.0.mlp.c_fc.weight"].shape
+    return {
+        "hidden_size": width,
+        "intermediate_size": hidden,
+        "num_hidden_layers": 1 + max(int(match[1]) for match in layers if match),
+        "num_attention_heads": heads,
+        "hidden_act": activation,
+    }
 
 
-def _config_of(config_class: Any, state: dict[str, Tensor], settings: dict[str, Any], activation: str) -> Any:
-    vision, text = settings.get("vision_cfg", {}), settings.get("text_cfg", {})
-    width, _, patch, _ = state["visual.conv1.weight"].shape
-    cells = round((state["visual.positional_embedding"].shape[0] - 1) ** 0.5)
-    length, text_width = state["positional_embedding"].shape
+def _text_config(state: dict[str, Tensor], heads: int, activation: str) -> dict[str, Any]:
     vocabulary = state["token_embedding.weight"].shape[0]
-    act = ("quick_gelu" if settings.get("quick_gelu") else "gelu") if settings else activation
-    image_heads = width // int(vision.get("head_width", _HEAD_WIDTHS.get(width, 64)))
-    return config_class(
-        projection_dim=state["text_projection"].shape[1],
-        vision_config={
-            "hidden_size": width,
-            "intermediate_size": state["visual.transformer.resblocks.0.mlp.c_fc.weight"].shape[0],
-            "num_hidden_layers": _layers(state, "visual.transformer."),
-            "num_attention_heads": max(1, image_heads),
-            "image_size": cells * patch,
-            "patch_size": patch,
-            "hidden_act": act,
-            "projection_dim": state["visual.proj"].shape[1],
-        },
-        text_config={
-            "hidden_size": text_width,
-            "intermediate_size": state["transformer.resblocks.0.mlp.c_fc.weight"].shape[0],
-            "num_hidden_layers": _layers(state, "transformer."),
-            "num_attention_heads": int(text.get("heads", max(1, text_width // 64))),
-            "max_position_embeddings": length,
-            "vocab_size": vocabulary,
-            "hidden_act": act,
-            "projection_dim": state["text_projection"].shape[1],
-            "bos_token_id": vocabulary - 2,
-            "eos_token_id": vocabulary - 1,  # the text is pooled here
-            "pad_token_id": 0,
-        },
-    )
-
-
-def _layers(state: dict[str, Tensor], prefix: str) -> int:
-    pattern = re.compile(re.escape(prefix) + r"resblocks\.(\d+)\.")
-    return 1 + max(int(found[1]) for name in state if (found := pattern.match(name)))
+    return {
+        **_sizes(state, "", int(heads), activation),
+        "max_position_embeddings": state["positional_embedding"].shape[0],
+        "vocab_size": vocabulary,
+        "projection_dim": state["text_projection"].shape[1],
+        "bos_token_id": vocabulary - 2,
+        "eos_token_id": vocabulary - 1,  # the text is pooled here
+        "pad_token_id": 0,
+    }
 
 
 def _mapped(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    """OpenCLIP's names and layouts as those of transformers."""
-    mapped = {
-        "visual_projection.weight": state["visual.proj"].T.contiguous(),
-        "text_projection.weight": state["text_projection"].T.contiguous(),
-        "logit_scale": state.get("logit_scale", torch.tensor(0.0)).reshape(()),
-    }
-    for name, tensor in state.items():
-        if name in ("visual.proj", "text_projection", "logit_scale", "logit_bias", "attn_mask"):
+    """OpenCLIP's names and layouts as those of transformers, in float32; masks of attention are left out."""
+    mapped: dict[str, Tensor] = {"logit_scale": torch.tensor(0.0)}
+    for name, value in state.items():
+        if not value.is_floating_point() or name in ("logit_bias", "attn_mask"):
             continue
-        tower = "vision_model." if name.startswith("visual.") else "text_model."
-        inner = name.removeprefix("visual.")
-        for pattern, replacement in _TOWER:
-            inner = re.sub(pattern, replacement, inner)
-        if ".attn.in_proj_" in inner:
-            kind = inner.rpartition("_")[2]  # weight or bias
-            stem = inner.partition(".attn.in_proj_")[0]
-            for letter, part in zip("qkv", tensor.chunk(3), strict=True):
-                mapped[f"{tower}{stem}.self_attn.{letter}_proj.{kind}"] = part.contiguous()
+        tensor = value.float()
+        if name == "logit_scale":
+            mapped[name] = tensor.reshape(())
+        elif name in ("visual.proj", "text_projection"):
+            mapped[name.replace(".proj", "_projection") + ".weight"] = tensor.T.contiguous()
         else:
-            mapped[tower + inner] = tensor
+            inner = name.removeprefix("visual.")
+            for pattern, replacement in _TOWER:
+                inner = re.sub(pattern, replacement, inner)
+            inner = ("vision_model." if name.startswith("visual.") else "text_model.") + inner
+            block, fused, kind = inner.partition(".attn.in_proj_")  # kind: weight or bias
+            if not fused:
+                mapped[inner] = tensor
+                continue
+            for letter, part in zip("qkv", tensor.chunk(3), strict=True):
+                mapped[f"{block}.self_attn.{letter}_proj.{kind}"] = part.contiguous()
     return mapped

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from torch.nn.functional import interpolate, normalize
 
 from .._check import check_choice, check_whole
 from .protocol import PROMPTS_AT_ONCE, check_picture, check_prompts
-from .tokenizer import tokenize as clip_tokens
+from .tokenizer import clip_tokenizer
 from .transformers_openclip import find_openclip, load_openclip
 from .transformers_patches import Patches, patch_size
 from .transformers_source import find_source, load_model, load_tokenizer_of, read_config, weights_of
@@ -41,8 +41,8 @@ def load_transformers_teacher(
         source: a folder from `save_pretrained`, or a hub id `owner/name`, which is downloaded. clip and openclip also take
             a file or a folder in OpenCLIP's layout, but not OpenAI's .pt files (ViT-B-16.pt), which are TorchScript
             programs: use `openai/clip-vit-base-patch16` on the hub, which has the same weights.
-        size: resize the longer side of pictures to so many pixels; None: do not resize. A map has one cell per patch, so
-            larger pictures give finer maps.
+        size: resize the longer side of pictures to this number of pixels; None: do not resize. A map has one cell per
+            patch, so larger pictures give finer maps.
         residual: clip, openclip: keep the residual connection and the MLP of the last block in addition to its values (as in
             MaskCLIP's code). tipsv2: the values of the last block instead of its attention, residual and MLP kept.
         local_only: use only the local cache for a hub id.
@@ -56,55 +56,46 @@ def load_transformers_teacher(
     if size is not None:
         check_whole("size", size, 1)
     if residual and not row.residual:
-        able = [name for name, other in TRANSFORMERS.items() if other.residual]
-        raise ValueError(
-            f"residual: expected False for teacher {kind!r}, got True; only {', '.join(able)} have that path"
-        )
-    found = find_source(kind, source)
-    openclip = find_openclip(kind, found, local_only=local_only) if row.activation is not None else None
+        able = ", ".join(name for name, other in TRANSFORMERS.items() if other.residual)
+        raise ValueError(f"residual: expected False for teacher {kind!r}, got True; only {able} have that path")
+    place = find_source(kind, source)
+    openclip = find_openclip(kind, place, local_only=local_only) if row.activation is not None else None
     if openclip is not None:
-        model, model_type = load_openclip(openclip, activation=str(row.activation)), "clip"
-        commit = openclip.parent.name if isinstance(found, str) else None
+        model, model_type = load_openclip(kind, openclip, activation=str(row.activation)), "clip"
+        commit = openclip.parent.name if isinstance(place, str) else None
     else:
-        model_type, commit = read_config(kind, found, local_only=local_only)
-        model = load_model(kind, found, model_type, commit, local_only=local_only)
-    weights = weights_of(openclip or found if isinstance(found, Path) else found, commit)
+        model_type, commit = read_config(kind, place, local_only=local_only)
+        model = load_model(kind, place, model_type, commit, local_only=local_only)
+    weights = weights_of(openclip or place if isinstance(place, Path) else place, commit)
     identity = {"name": kind, "options": {"size": size, "residual": bool(residual)}, "weights": weights}
-    if isinstance(found, str):
-        identity["source"] = found
-    tokenize = _tokenize_of(kind, found, commit, model, local_only=local_only) if row.text is not None else None
+    if isinstance(place, str):
+        identity["source"] = place
+    tokenize = _tokenize_of(kind, place, commit, model, local_only=local_only) if row.text is not None else None
     return TransformersTeacher(model, row, row.models[model_type][1], identity, tokenize)
 
 
 def _tokenize_of(kind: str, source: Path | str, commit: str | None, model: Any, *, local_only: bool) -> _Tokenize:
-    """The tokenizer next to the weights; if there is none and the kind uses CLIP's vocabulary, kfgs's copy.
+    """The tokenizer next to the weights; if there is none and the kind uses CLIP's vocabulary, that of kfgs.
 
     It is read at the first prompt; without prompts it is not needed.
     """
-    row = TRANSFORMERS[kind]
+    row, words = TRANSFORMERS[kind], model.config.text_config
     folder = source.parent if isinstance(source, Path) and source.is_file() else source
-    words, rule = model.config.text_config, row.text
-    longest = int(words.max_position_embeddings)
+    rule, longest = row.text, int(words.max_position_embeddings)
     assert rule is not None
 
-    def bare() -> bool:
-        return isinstance(folder, Path) and not any((folder / name).is_file() for name in _TOKENIZER_FILES)
-
-    if bare() and row.activation is not None and words.vocab_size == _CLIP_VOCABULARY:
-
-        def plain(prompts: list[str]) -> tuple[Tensor, Tensor]:
-            ids = clip_tokens(prompts)
-            return ids, torch.ones_like(ids)  # never used: CLIP is causal and pools at the end of the text
-
-        return plain
-    load = cache(partial(load_tokenizer_of, kind, folder, commit, local_only=local_only))
+    @cache
+    def load() -> Any:
+        if isinstance(folder, str) or any((folder / name).is_file() for name in _TOKENIZER_FILES):
+            return load_tokenizer_of(kind, folder, commit, local_only=local_only)
+        if row.activation is not None and words.vocab_size == _CLIP_VOCABULARY:
+            return clip_tokenizer()
+        raise ValueError(
+            f"{folder}: expected a tokenizer next to the weights of teacher {kind!r} ({', '.join(_TOKENIZER_FILES[:2])}, "
+            "...), got none; download those files too, or use a text table made elsewhere"
+        )
 
     def tokenize(prompts: list[str]) -> tuple[Tensor, Tensor]:
-        if bare():
-            raise ValueError(
-                f"{folder}: expected a tokenizer next to the weights of teacher {kind!r} ({', '.join(_TOKENIZER_FILES[:2])}, "
-                "...), got none; download those files too, or use a text table made elsewhere"
-            )
         tokens = load()(
             [prompt.lower() for prompt in prompts] if rule.lower else prompts,
             **({"padding": "max_length", "max_length": longest} if rule.pad else {"padding": True}),

@@ -10,7 +10,7 @@ import torch
 from messages import tells
 from safetensors.torch import save_file
 
-from kfgs.teachers.checkpoint import read_checkpoint, weights_digest
+from kfgs.teachers.checkpoint import read_checkpoint
 
 DTYPES = [
     torch.float32,
@@ -127,7 +127,7 @@ def test_every_truncation_and_many_flips_give_one_line(tmp_path: Path) -> None:
         ([torch.ones(3)], ("a.pt:", "list")),
         (argparse.Namespace(a=1), ("a.pt:", "state_dict()")),
         (torch.nn.Linear(2, 2), ("a.pt:", "state_dict()")),
-        ({"a": torch.eye(2).to_sparse(), "b": torch.ones(1)}, ("a.pt:", "dense tensor for a", "sparse")),
+        ({"a": torch.eye(2).to_sparse(), "b": torch.ones(1)}, ("a.pt:", "dense tensor for a")),
         ({"a": torch.ones(1).expand(1000)}, ("a.pt: a has [1000]", "only 1", "contiguous")),
     ],
 )
@@ -140,8 +140,5 @@ def test_what_torch_saves_beside_state_dicts_is_named(tmp_path: Path, value: obj
 def test_no_file_and_folder(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=tells("a.ckpt:", "checkpoint", "no such file")):
         read_checkpoint(tmp_path / "a.ckpt")
-    with pytest.raises(FileNotFoundError, match=tells("a.ckpt:", "checkpoint", "no such file")):
-        weights_digest(tmp_path / "a.ckpt")
-    for read in (read_checkpoint, weights_digest):
-        with pytest.raises(ValueError, match=tells("checkpoint", "got a folder", "weights")):
-            read(tmp_path)
+    with pytest.raises(ValueError, match=tells("checkpoint", "got a folder", "weights")):
+        read_checkpoint(tmp_path)

@@ -4,8 +4,8 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.teachers import Teacher, identify
 from kfgs.teachers.load import load_teacher, teacher_names
+from kfgs.teachers.protocol import Teacher, identify
 
 CLASS = (
     "import torch\n"
@@ -105,7 +105,7 @@ def test_modules_are_found_beside_the_command_but_the_path_stays(write):
         ("import absent_package\n", ("teacher:", "got 'mine:f'", "'absent_package'")),
         (
             "f = 3\n",
-            ("got int", "'mine:f'", "encode_image", "encode_text", "kfgs.teachers.Teacher"),
+            ("mine:f:", "got int", "encode_image", "encode_text", "kfgs.teachers.Teacher"),
         ),
     ],
 )

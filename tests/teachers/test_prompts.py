@@ -90,7 +90,7 @@ def test_a_label_set_knows_what_made_it(tmp_path):
         (["wall;_"], {}, ("names:", "got ['wall;_']")),
         (["wall", "wall;side"], {}, ("names:", "got 'wall'")),
         (["wall"], {"synonyms": {"wal": ["side"]}}, ("synonyms:", "'wal'")),
-        (["wall"], {"synonyms": {"wall": "side"}}, ("synonyms:", "'wall'", "got 'side'")),
+        (["wall"], {"synonyms": {"wall": "side"}}, ("synonyms:", "'wall'", "'side'")),
         (["wall"], {"templates": "clip8"}, ("templates:", "got 'clip8'", "'clip7'")),
         (["wall"], {"templates": ("{}", "a photo")}, ("templates:", "{}", "got 'a photo'")),
         (["wall"], {"templates": ()}, ("templates:", "bare, clip7, tcl9, siglip", "got 'none'")),

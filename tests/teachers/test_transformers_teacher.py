@@ -11,8 +11,7 @@ from messages import tells  # noqa: E402
 from oracles_transformers import clip_features, siglip_features  # noqa: E402
 from tiny_transformers import CHANNELS, KINDS, write_teacher  # noqa: E402
 
-from kfgs.teachers import identify  # noqa: E402
-from kfgs.teachers.protocol import Teacher  # noqa: E402
+from kfgs.teachers.protocol import Teacher, identify  # noqa: E402
 from kfgs.teachers.transformers_table import TRANSFORMERS  # noqa: E402
 from kfgs.teachers.transformers_teacher import load_transformers_teacher  # noqa: E402
 

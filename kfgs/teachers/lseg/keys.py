@@ -1,17 +1,18 @@
-"""Map the tensor names of LSeg's checkpoint to `LSegNetwork` and `ClipText`; errors say which network a wrong file has."""
+"""Build LSeg's networks on the tensors of its checkpoint, whose names are translated here."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
 from ..._check import one_line
+from ..transformers_openclip import load_text_tower
 from .network import LSegConfig, LSegNetwork
-from .text import ClipText
 
 _EXPECTED = "the LSeg checkpoint of backbone clip_vitl16_384 (demo_e200.ckpt)"
 _POSITIONS = "vit.patch_embedding.positions"
@@ -19,7 +20,7 @@ _COUNTER = "num_batches_tracked"
 _TEXT = "clip_pretrained."
 
 # Our names as patterns, and LSeg's. Levels count from 1 there, from 0 here (`{1+}` adds one).
-_IMAGE_NAMES = (
+_NAMES = (
     (r"vit\.patch_embedding\.cls_token", "pretrained.model.cls_token"),
     (r"vit\.patch_embedding\.positions", "pretrained.model.pos_embed"),
     (r"vit\.patch_embedding\.backbone\.", "pretrained.model.patch_embed.proj."),
@@ -37,33 +38,11 @@ _IMAGE_NAMES = (
     (r"fusion\.(\d)\.out\.", r"scratch.refinenet{\1+}.out_conv."),
     (r"head\.", "scratch.head1."),
 )
-_TEXT_NAMES = (
-    (r"token_embedding\.", "clip_pretrained.token_embedding."),
-    (r"positions", "clip_pretrained.positional_embedding"),
-    (r"projection$", "clip_pretrained.text_projection"),
-    (r"norm\.", "clip_pretrained.ln_final."),
-    (r"blocks\.(\d+)\.qkv\.", r"clip_pretrained.transformer.resblocks.\1.attn.in_proj_"),
-    (r"blocks\.(\d+)\.projection\.", r"clip_pretrained.transformer.resblocks.\1.attn.out_proj."),
-    (r"blocks\.(\d+)\.norm(\d)\.", r"clip_pretrained.transformer.resblocks.\1.ln_\2."),
-    (r"blocks\.(\d+)\.fc1\.", r"clip_pretrained.transformer.resblocks.\1.mlp.c_fc."),
-    (r"blocks\.(\d+)\.fc2\.", r"clip_pretrained.transformer.resblocks.\1.mlp.c_proj."),
-)
-# In the checkpoint, without any effect on the features: CLIP's image tower, the ViT's last norm and classes, the part of
-# the coarsest fusion that has nothing to fuse, counters, and blocks that act on the logits (arch_option 1 and 2).
+# In the checkpoint, without any effect on the features: CLIP, the ViT's last norm and classes, the part of the coarsest
+# fusion that has nothing to fuse, counters, and blocks that act on the logits (arch_option 1 and 2).
 _UNUSED = re.compile(
-    r"clip_pretrained\.(visual\.|logit_scale$)|pretrained\.model\.(norm|head)\.|scratch\.refinenet4\.resConfUnit1\."
+    r"clip_pretrained\.|pretrained\.model\.(norm|head)\.|scratch\.refinenet4\.resConfUnit1\."
     r"|scratch\.head_block\.|logit_scale$|.*\.num_batches_tracked$"
-)
-
-# Other networks by prefixes of their tensor names. The first rule that fits counts; LSeg's own are checked before.
-_OTHERS = (
-    (("pretrained.layer1",), "LSeg of backbone clip_resnet101, or another without a ViT"),
-    (("pretrained.", "scratch."), None),
-    (("student.", "teacher."), "a self-supervised training checkpoint (DINO, iBOT)"),
-    (("image_encoder.", "mask_decoder.", "vision_encoder."), "a SAM checkpoint"),
-    (("visual.", "transformer.resblocks.", "vision_model.", "text_model."), "CLIP alone, without LSeg's decoder"),
-    (("conv1.", "layer1."), "a ResNet"),
-    (("blocks.", "patch_embed.", "encoder.layer.", "embeddings."), "a ViT alone (DINO, timm), without LSeg's decoder"),
 )
 
 
@@ -79,62 +58,49 @@ def network_from_state(state: Mapping[str, Tensor], config: LSegConfig, *, sourc
         source: the file's name, for messages.
 
     Raises:
-        ValueError: if tensors are missing, unknown, of another shape or no floats; the message guesses the network.
+        ValueError: if tensors are missing, unknown, of another shape or no floats.
     """
     state = _stripped(state)
     with torch.device("meta"):
         network = LSegNetwork(config)
-    names = _names(network, _IMAGE_NAMES)
-    shapes = _shapes(network, names)
+    own = network.state_dict()
+    names = {name: _lseg_name(name) for name in own if not name.endswith(_COUNTER)}
+    shapes = {theirs: tuple(own[name].shape) for name, theirs in names.items()}
     shapes[names[_POSITIONS]] = (1, 1 + config.position_grid**2, config.width)
-    _check({name: value for name, value in state.items() if not name.startswith(_TEXT)}, shapes, source)
-    tensors = _as_float(state, names)
+    _check(state, shapes, source)
+    tensors = {name: state[theirs].detach().to(torch.float32) for name, theirs in names.items()}
     tensors[_POSITIONS] = _resize_positions(tensors[_POSITIONS], config.position_grid, config.grid)
-    _fill(network, tensors)
-    return network
+    counters = {name: torch.tensor(0) for name in own if name.endswith(_COUNTER)}
+    network.requires_grad_(False).load_state_dict({**tensors, **counters}, assign=True)
+    return network.eval()
 
 
-def text_from_state(state: Mapping[str, Tensor], config: LSegConfig, *, source: str) -> ClipText:
-    """Build the text tower on the tensors of a checkpoint, like `network_from_state`.
+def text_from_state(state: Mapping[str, Tensor], config: LSegConfig, *, source: str) -> Any:
+    """The text tower of a checkpoint, which is CLIP ViT-B/32's, as transformers' CLIPTextModelWithProjection.
 
     Raises:
-        ValueError: if the file holds no text tower, or one of other sizes.
+        ImportError: if transformers is missing.
+        ValueError: if the file holds no text tower, or a damaged one.
     """
     every = _stripped(state)
-    state = {name: value for name, value in every.items() if name.startswith(_TEXT)}
-    if not state:
+    tower = {name.removeprefix(_TEXT): value for name, value in every.items() if name.startswith(_TEXT)}
+    if not tower:
         raise ValueError(
             f"{source}: expected CLIP's text tower in it ({_TEXT}*), got {len(every)} tensors without it; use the "
             "whole demo_e200.ckpt to embed prompts, or give the rows to LabelSet"
         )
-    with torch.device("meta"):
-        tower = ClipText(config)
-    names = _names(tower, _TEXT_NAMES)
-    shapes = _shapes(tower, names)
-    _check(state, shapes, source)
-    _fill(tower, _as_float(state, names))
-    return tower
+    return load_text_tower(source, tower, config.text_heads).requires_grad_(False)
 
 
 def _stripped(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name.removeprefix("net."): value for name, value in state.items()}
 
 
-def _names(module: nn.Module, table: tuple[tuple[str, str], ...]) -> dict[str, str]:
-    """LSeg's name of each of a module's own tensors, counters left out."""
-    names = {}
-    for own in module.state_dict():
-        if own.endswith(_COUNTER):
-            continue
-        found = [re.sub(f"^{pattern}", theirs, own) for pattern, theirs in table if re.match(pattern, own)]
-        assert len(found) == 1, own
-        names[own] = re.sub(r"\{(\d)\+\}", lambda match: str(int(match[1]) + 1), found[0])
-    return names
-
-
-def _shapes(module: nn.Module, names: Mapping[str, str]) -> dict[str, tuple[int, ...]]:
-    own = module.state_dict()
-    return {theirs: tuple(own[name].shape) for name, theirs in names.items()}
+def _lseg_name(own: str) -> str:
+    """LSeg's name of one of our tensors."""
+    fits = [re.sub(f"^{pattern}", theirs, own) for pattern, theirs in _NAMES if re.match(pattern, own)]
+    assert len(fits) == 1, own
+    return re.sub(r"\{(\d)\+\}", lambda match: str(int(match[1]) + 1), fits[0])
 
 
 def _check(state: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]], source: str) -> None:
@@ -146,21 +112,11 @@ def _check(state: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]], s
         for name, shape in shapes.items()
         if name in state and not (tuple(state[name].shape) == shape and state[name].is_floating_point())
     ]
-    if not (missing or unknown or other):
-        return
-    what = next((what for start, what in _OTHERS if any(name.startswith(start) for name in state)), None)
-    if state.get("scratch.head1.weight", torch.zeros(0)).shape[:1] == (768,) or "scratch.output_conv.0.weight" in state:
-        what = "LSeg or DPT of another backbone or head"
-    if what is None:
-        lists = ((missing, "missing"), (unknown, "unknown"), (other, "of another shape or type"))
-        what = f"{len(state)} tensors"
-        what += "".join(f", {len(names)} {kind} ({'; '.join(names[:2])})" for names, kind in lists if names)
-    raise ValueError(f"{source}: expected {_EXPECTED}, got {what}; use the file as its authors published it")
-
-
-def _as_float(state: Mapping[str, Tensor], names: Mapping[str, str]) -> dict[str, Tensor]:
-    """Tensors by our names as float32, without a copy if they are float32 already."""
-    return {own: state[theirs].detach().to(torch.float32) for own, theirs in names.items()}
+    lists = ((missing, "missing"), (unknown, "unknown"), (other, "of another shape or type"))
+    wrong = "".join(f", {len(names)} {kind} ({'; '.join(names[:2])})" for names, kind in lists if names)
+    if wrong:
+        got = f"another network of {len(state)} tensors{wrong}"
+        raise ValueError(f"{source}: expected {_EXPECTED}, got {got}; use the file as its authors published it")
 
 
 def _resize_positions(positions: Tensor, side: int, grid: int) -> Tensor:
@@ -171,10 +127,3 @@ def _resize_positions(positions: Tensor, side: int, grid: int) -> Tensor:
     square = patches.T.unflatten(1, (side, side))[None]  # [1, width, side, side]
     resized = functional.interpolate(square, size=(grid, grid), mode="bilinear", align_corners=False)
     return torch.cat([readout, resized[0].flatten(1).T])
-
-
-def _fill(module: nn.Module, tensors: dict[str, Tensor]) -> None:
-    """Give a module that was built without storage its tensors, in evaluation mode and without gradients."""
-    counters = {name: torch.tensor(0) for name in module.state_dict() if name.endswith(_COUNTER)}
-    module.requires_grad_(False).load_state_dict({**tensors, **counters}, assign=True)
-    module.eval()

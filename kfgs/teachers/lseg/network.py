@@ -1,6 +1,6 @@
 """The image network of LSeg (Li et al., ICLR 2022): a ViT-L/16 whose tokens a DPT decoder (Ranftl et al., ICCV 2021) fuses.
 
-The ViT is kornia's. The checkpoint's own names are translated in `keys`; the text tower is in `text`.
+The ViT is kornia's. The checkpoint's own names are translated in `keys`; the text tower is that of transformers.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class LSegConfig:
         assert self.window % (2 * _PATCH) == 0, "windows are cut into patches, whose grid is halved once"
         assert len(self.hooks) == len(self.neck) == 4
         assert list(self.hooks) == sorted(self.hooks) and self.hooks[-1] < self.depth  # noqa: PT018
-        assert self.width % self.heads == self.text_width % self.text_heads == 0
+        assert self.width % self.heads == 0
 
     @property
     def grid(self) -> int:

@@ -14,12 +14,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ..._check import check_choice, check_range, check_size
-from ..checkpoint import read_checkpoint, weights_digest
+from ..._files import digest_file
+from ..checkpoint import read_checkpoint
 from ..protocol import PROMPTS_AT_ONCE, check_picture, check_prompts
 from ..tokenizer import tokenize
 from .keys import network_from_state, text_from_state
 from .network import LSegConfig, LSegNetwork
-from .text import ClipText
 from .windows import BASE_OVER_CROP, multi_scale_features
 
 PAPER_SCALES = (0.75, 1.0, 1.25, 1.75)
@@ -93,13 +93,13 @@ class LSeg(nn.Module):
         network: LSegNetwork,
         options: LSegOptions | None = None,
         *,
-        load_text: Callable[[], ClipText] | None = None,
+        load_text: Callable[[], Any] | None = None,
         weights: Callable[[], str | None] = lambda: None,
     ) -> None:
         super().__init__()
         self.network = network
         self.options = LSegOptions() if options is None else options
-        self.text: ClipText | None = None
+        self.text: Any = None
         self._load_text, self._digest = load_text, weights
         self._weights: str | None = None
         self.eval()
@@ -156,7 +156,7 @@ class LSeg(nn.Module):
                 )
             self.text = self._load_text().to(self.device).eval()
         ids = tokenize(prompts, self.network.config.context).to(self.device)
-        rows = torch.cat([self.text(part) for part in ids.split(PROMPTS_AT_ONCE)])
+        rows = torch.cat([self.text(input_ids=part).text_embeds for part in ids.split(PROMPTS_AT_ONCE)])
         return functional.normalize(rows.float(), dim=1)
 
     def _head(self, x: Tensor) -> Tensor:  # [1, 3, S, S] -> [1, D, S/2, S/2] float32
@@ -196,11 +196,11 @@ def load_lseg(
     scales, flip = base.scales if scales is None else tuple(scales), base.flip if flip is None else flip
     options, source = LSegOptions(scales, flip, size, precision), str(weights)
 
-    def load_text() -> ClipText:
+    def load_text() -> Any:
         return text_from_state(read_checkpoint(weights), config, source=source)
 
     network = network_from_state(read_checkpoint(weights), config, source=source)
-    return LSeg(network, options, load_text=load_text, weights=partial(weights_digest, weights))
+    return LSeg(network, options, load_text=load_text, weights=partial(digest_file, weights))
 
 
 def _plain(values: LSegOptions | LSegConfig) -> dict[str, Any]:

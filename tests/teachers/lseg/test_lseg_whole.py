@@ -19,7 +19,7 @@ TINY = LSegConfig(
     width=32, depth=5, heads=4, window=64, position_grid=3, hooks=(0, 1, 3, 4), neck=(8, 12, 16, 20), fusion=12, dim=10,
     text_width=32, text_layers=3, text_heads=4,
 )  # fmt: skip
-MERGES = Path(kfgs.__file__).parent / "teachers" / "data" / "clip_bpe_symbols.txt.bz2"
+MERGES = Path(kfgs.__file__).parent / "teachers" / "data" / "clip_bpe_merges.txt.bz2"
 CLOSE = 1e-5  # of the largest value: the acceptance is 1e-4
 
 # Labels of ADE20K as LSeg is asked for them, and what people type beside them.

@@ -123,4 +123,6 @@ def test_with_all_channels_it_is_still_transformers_dpt_and_clip():
     ids[0, :3], ids[1, :5] = torch.tensor([49406, 320, 49407]), torch.tensor([49406, 17, 40000, 9, 49407])
     network, tower = (build(state, config, source="full") for build in (network_from_state, text_from_state))
     assert relative(network(x), oracles_lseg.features(state, config, x, "eager")) < 1e-5
-    assert relative(tower(ids), oracles_lseg.text(state, config, ids, torch.float32, "eager")) < 1e-5
+    assert (
+        relative(tower(input_ids=ids).text_embeds, oracles_lseg.text(state, config, ids, torch.float32, "eager")) < 1e-5
+    )

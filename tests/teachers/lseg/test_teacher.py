@@ -84,7 +84,7 @@ def test_text_is_unit_rows_of_the_tower_in_the_order_of_the_prompts() -> None:
     teacher = with_text()
     prompts = ["wall", "a", "door"] + ["b" * (k % 5) for k in range(80)]  # more than are embedded at a time
     rows = teacher.encode_text(prompts)
-    expected = text_from_state(STATE, TINY, source="tiny")(tokenize(prompts))
+    expected = text_from_state(STATE, TINY, source="tiny")(input_ids=tokenize(prompts)).text_embeds
     assert rows.shape == (83, 10)
     torch.testing.assert_close(rows.norm(dim=1), torch.ones(83), rtol=1e-6, atol=0)
     torch.testing.assert_close(rows, functional.normalize(expected, dim=1), rtol=1e-4, atol=1e-5)
