@@ -104,7 +104,7 @@ def test_long_content_makes_no_long_line():
         assert "\n" not in line
         assert "tensor(" not in line
     assert repr(EditList([Remove("chair")] * 300)).startswith("EditList(300 edits: Remove(")
-    assert repr(EditList([Remove("chair")]).undo()) == "EditList(0 edits)"
+    assert repr(EditList([Remove("chair")]).undo()) == "EditList(0 edits: )"
 
 
 PACKAGES = ["kfgs.quant", "kfgs.fields", "kfgs.splat", "kfgs.viz", "kfgs.gaussians", "kfgs.metrics"]

@@ -75,8 +75,8 @@ def test_parts_are_numbered_as_select_lists_them():
     things = connected_parts(cloud, OfClass("chair").select(cloud))
     assert [thing.count for thing in things] == [60, 60, 40, 20]
     for number, thing in enumerate(things, start=1):
-        (edit,) = read(remove=[f"Chair/{number}"])
-        assert torch.equal(edit.selected(cloud).nonzero()[:, 0], thing.indices)
+        (edit,) = read(extract=[f"Chair/{number}"])
+        assert torch.equal(edit.apply(cloud).means, cloud.means[thing.indices])
 
 
 def test_a_part_that_select_does_not_list_is_refused():

@@ -135,12 +135,11 @@ def edit(
     """
     from ..formats import write_splats
     from ..labels import EditList
-    from ..labels.edit_list import edits_path
     from ..pipeline.compare import views_of_change, write_comparison
     from ..scenes import load_scene
 
     check_target("out", out)
-    saved = check_output("out", edits_path(out), "a file")
+    saved = check_output("out", out.with_name(f"{out.name}.edits.json"), "a file")
     if replay is not None and real_path(replay) == real_path(saved):
         raise ValueError(
             f"replay: expected another file than {saved}, where the edits are saved, got the same; give --out another name"

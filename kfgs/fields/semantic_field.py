@@ -18,7 +18,7 @@ from ..gaussians import Gaussians, as_rows
 from ..labels import LabelSet, Selection
 from ..labels.classify import Classification
 from ..labels.questions import Classes, Negatives, check_rows, class_rows, make_question
-from ..labels.scores import LOGIT_SCALE, Score, select_by_similarity
+from ..labels.scores import Score, select_by_similarity
 from ..metrics import MIB, semantic_storage_bytes
 from ..splat import Ranked, Rendering, rasterize, rasterize_labels
 from .decoders import Decoder
@@ -207,7 +207,6 @@ class SemanticField:
         *,
         negatives: Negatives | Tensor = "auto",
         score: Score | None = None,
-        logit_scale: float = LOGIT_SCALE,
     ) -> Selection:
         """The Gaussians of one thing: those with a score above a threshold (gamma of Sec. 3.4).
 
@@ -219,8 +218,7 @@ class SemanticField:
             classes: to look up the name and for the negatives; None: the field's own.
             threshold: gamma. None: 0.5 for a relevancy, else derived from the scores; `how` of the result explains it.
             negatives: "classes", "canonical" (words of the classes' table), "none", rows [M, D], or "auto" as above.
-            score: "relevancy", "softmax" over target and negatives, or "cosine". None: relevancy if there are negatives.
-            logit_scale: for the softmax: the number that multiplies the cosines.
+            score: "relevancy" or "cosine". None: relevancy if there are negatives.
 
         Raises:
             ValueError: if there is no such class, shapes disagree, a row is all-zero, or an option is unknown.
@@ -234,9 +232,8 @@ class SemanticField:
         unit = unit_rows(rows) if named else unit_embeddings(rows, "embedding, negatives")
         with torch.no_grad():
             cosines = source.decoder.cosines(latents, unit.to(latents))
-        options: dict[str, Any] = {"score": score, "logit_scale": logit_scale}
         against = None if question.negatives is None else cosines[:, 1:]
-        return select_by_similarity(cosines[:, 0], against, threshold, latents.any(dim=1), **options)
+        return select_by_similarity(cosines[:, 0], against, threshold, latents.any(dim=1), score)
 
     def segment(self, camera: Camera, classes: Classes | None = None) -> Tensor:  # [H, W] int64
         """The class of each pixel from a viewpoint, -1 for empty pixels; the rule is that of the decoder."""

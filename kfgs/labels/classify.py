@@ -18,9 +18,7 @@ if TYPE_CHECKING:
 
 CHUNK = 65_536  # rows per step: with 200 classes, 50 MB of similarities at a time
 PIXELS = 8192  # latents decoded at once: the decoder's widest layer then holds 32 MB
-LEAD = 1e-4
-"""Of the best codeword's score. Sums of a decoder's 1,000 products in another order differ by about 1e-6 of it (float32); where
-other codewords are nearer to the best one, the plain computation decides."""
+LEAD = 1e-4  # of the best score; a smaller one could be rounding (1e-6 of 1,000 products), so the plain computation decides
 
 
 class Classification(NamedTuple):
@@ -39,10 +37,8 @@ def classify(
 ) -> Classification:
     """Give each feature the class of the most similar embedding, by cosine (Sec. 3.4, max-similarity).
 
-    Runs in chunks, without a table [N, C]. A tie goes to the lowest class; an all-zero feature has label -1.
-
-    Raises:
-        ValueError: if shapes disagree, there is no class, an embedding is all-zero, or a number is not finite.
+    A tie goes to the lowest class; an all-zero feature has label -1. A ValueError if shapes disagree, there is no class, an
+    embedding is all-zero, or a number is not finite.
 
     Example:
         >>> classify(torch.tensor([[2.0, 0.0], [0.1, 0.3], [0.0, 0.0]]), torch.eye(2)).labels.tolist()
@@ -70,10 +66,9 @@ def pixel_codewords(
 ) -> Tensor:  # [...] int64
     """The codeword of each rendered latent: decode it (Psi), and quantise it by cosine to the codebook (Eq. 5).
 
-    That is the paper's method. Not `exact`, it is the codeword with the nearest **latent** (Euclidean): this saves the
-    decoder's 0.83 M multiply-adds per pixel, and gives the same class for 98.9 % of the pixels that mix two latents (72
-    codewords). Without an autoencoder the map holds features, which are quantised. -1 where the feature is all-zero, or
-    the pixel is not `covered`.
+    Not `exact`, it is the codeword with the nearest **latent** (Euclidean): this saves the decoder's 0.83 M multiply-adds per
+    pixel, and gives the same class for 98.9 % of the pixels that mix two latents (72 codewords). Without an autoencoder the
+    map holds features, which are quantised. -1 where the feature is all-zero, or the pixel is not `covered`.
     """
     rows = latents.detach().reshape(-1, latents.shape[-1])
     out = torch.full((len(rows),), -1, dtype=torch.int64, device=rows.device)
@@ -85,7 +80,7 @@ def pixel_codewords(
         layers = None if autoencoder is None else _score_layers(rows, codebook, autoencoder, centres)
         if layers is not None:
             own = torch.arange(codebook.size, device=rows.device)
-            winners, leads = load(_engine(rows)).decide(layers, own, rows[which])
+            winners, leads = load(choose("auto", rows.device.type, rows.dtype)).decide(layers, own, rows[which])
             out[which] = winners
             which = which[~(leads > LEAD)]
         for part in which.split(PIXELS):
@@ -116,7 +111,8 @@ def _score_layers(
     With a decoder W h + b and unit codewords C, argmax over C (W h) + C b: one layer in place of the last one and of the
     comparison. The nearest latent is argmax over 2 c·x - |c|^2; the constant makes the largest output positive.
     """
-    if rows.dtype not in (torch.float32, torch.float64) or not offers(_engine(rows), "decide"):
+    plain = rows.dtype in (torch.float32, torch.float64)
+    if not plain or not offers(choose("auto", rows.device.type, rows.dtype), "decide"):
         return None
     if centres is not None:
         squares = centres.square().sum(dim=-1)
@@ -128,7 +124,3 @@ def _score_layers(
         return None
     unit = codebook.unit.to(rows)
     return *decoder[:-1], (unit @ weight, unit @ bias)
-
-
-def _engine(rows: Tensor) -> str:
-    return choose("auto", rows.device.type, rows.dtype)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from PIL import ImageColor
@@ -11,13 +11,14 @@ from torch import Tensor
 
 from ..gaussians import Gaussians
 from ..splat.sh import rgb_to_sh0, sh0_to_rgb
+from .selection import three_numbers
 
 Mode = Literal["tint", "hue"]
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709 weights of R, G, B, on display values, in which blending is linear
 DARK = 1 / 255  # an object darker than one 8-bit step has no shading
 
 
-def parse_color(color: str | Sequence[float] | Tensor, name: str = "rgb") -> tuple[float, float, float]:
+def parse_color(color: str | Sequence[float] | Tensor, name: str = "rgb") -> tuple[float, ...]:
     """A colour as (red, green, blue) in [0, 1], from `"#c04040"`, a CSS name, `"rgb(192, 64, 64)"`, or three numbers in [0, 1].
 
     `name` is the argument's name in errors (ValueError).
@@ -30,18 +31,14 @@ def parse_color(color: str | Sequence[float] | Tensor, name: str = "rgb") -> tup
         try:
             channels = ImageColor.getrgb(color.strip())
         except ValueError as error:
-            raise ValueError(
-                f"{name}: expected a colour like '#c04040', 'teal' or 'rgb(192, 64, 64)', got {color!r:.80}; "
-                "write one of these"
-            ) from error
+            raise ValueError(f"{name}: expected a colour like '#c04040' or 'teal', got {color!r:.80}") from error
         if len(channels) != 3:
             raise ValueError(f"{name}: expected a colour without alpha, got {color!r}; use the Opacity edit for that")
         return channels[0] / 255, channels[1] / 255, channels[2] / 255
-    plain: Any = color.tolist() if hasattr(color, "tolist") else color
-    numbers = isinstance(plain, Sequence) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in plain)
-    if not numbers or len(plain) != 3 or not all(0 <= value <= 1 for value in plain):
+    rgb = three_numbers(name, color)
+    if not all(0 <= value <= 1 for value in rgb):
         raise ValueError(f"{name}: expected three numbers in [0, 1], got {color!r:.80}; divide 8-bit colours by 255")
-    return float(plain[0]), float(plain[1]), float(plain[2])
+    return rgb
 
 
 def recolor(
@@ -54,19 +51,12 @@ def recolor(
 
     Each Gaussian's luminance L (Rec. 709, of its view-independent colour) is replaced by a colour T(L) on a curve from
     black over the shades of `rgb` to white (`shades`), and its view-dependent luminance follows the curve's slope there:
-    `color(v) = T(L) + T'(L) (L(v) - L)`. That is linear in the spherical harmonics, so it holds from every direction,
-    and blending keeps it. The paper says only "color modification".
-
-    - `"tint"` paints it: the object's middle luminance (the median by visible area) becomes `rgb`, and ratios of
-      luminance stay, as if the albedo changed under the same light. If the middle is below 1/255, the colour is flat.
-    - `"hue"` keeps luminance from every direction and changes hue and saturation only: a dark plant stays dark.
-
-    A ValueError if there is no `sh`.
+    `color(v) = T(L) + T'(L) (L(v) - L)`. That is linear in the spherical harmonics, so it holds from every direction, and
+    blending keeps it. `"tint"` makes the object's middle luminance (the median by visible area) `rgb`; if that was below
+    1/255, the colour is flat. `"hue"` keeps luminance: a dark plant stays dark. The paper says only "color modification".
     """
     if gaussians.sh is None:
-        raise ValueError(
-            "gaussians.sh: expected spherical harmonics [N, K, 3], got None; pass the colour field, not the semantic one"
-        )
+        raise ValueError("gaussians.sh: expected spherical harmonics [N, K, 3], got None; pass the colour field")
     sh, target = gaussians.sh[mask], gaussians.sh.new_tensor(rgb)
     weights = sh.new_tensor(LUMINANCE)
     luminance = sh0_to_rgb(sh[:, 0]) @ weights  # [n], may be slightly negative: 3DGS clamps after summing
@@ -98,11 +88,10 @@ def shades(
 ) -> Callable[[Tensor], tuple[Tensor, Tensor]]:  # [n] -> [n, 3], [n, 3]
     """What replaces each luminance: a colour on the curve from black to white through the shades and tints of one hue.
 
-    The function gives the colours, and by how much they change per unit of luminance. The old luminance L first becomes a
-    tone t(L). Without a `middle` it is L. Otherwise the middle becomes `rgb`, and ratios stay as at a change of albedo:
-    t = gain L. A brighter colour could leave the display's range: then ratios hold up to a bend, where the hue is at its
-    brightest or halfway to white, and t goes linearly to 1 at L = 1. A tone is its luminance in the hue, as saturated as
-    the display allows: `peak t / knee` up to the knee, then linear to white. Black has no hue, so it gives greys.
+    The function gives the colours, and their change per unit of luminance. The old luminance L first becomes a tone t(L): L
+    without a `middle`; otherwise gain L, so that the middle becomes `rgb` and ratios stay, as at a change of albedo. If the
+    new colour is brighter, ratios hold up to a bend (the hue at its brightest, or halfway to white), and t goes linearly to 1
+    at L = 1. A tone is shown as saturated as possible: `peak t / knee` up to the knee, then linear to white. Black gives greys.
     """
     weights = rgb.new_tensor(LUMINANCE)
     peak = rgb / rgb.max() if float(rgb.max()) > 0 else torch.ones_like(rgb)  # the brightest colour of this hue

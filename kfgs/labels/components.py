@@ -21,15 +21,13 @@ def component_distance(
     means: Tensor,  # [N, 3]
     mask: Tensor,  # [N] bool
 ) -> float:
-    """The default distance of `component_numbers`, in world units: it keeps a thing in one piece, and things apart.
+    """The default distance of `component_numbers`, in world units: 1.5 spacings of the masked Gaussians, at most 4 of all.
 
-    1.5 times the distance within which 90 % of the masked Gaussians have their fourth neighbour among themselves, but at
-    most four times that of all Gaussians. No constant works: on room_0 0.08 m joins two chairs and still breaks a sofa.
+    It keeps a thing in one piece, and things apart. No constant does: on room_0 0.08 m joins two chairs and breaks a sofa.
     """
     points = positions("means", means)
     own, whole = _spacing(points[mask.cpu().numpy()]), _spacing(points)
-    chosen = min(SPACINGS * own, MOST_SPACINGS * whole)
-    return chosen if chosen > 0 else 1.0  # all at one position: any distance joins them
+    return min(SPACINGS * own, MOST_SPACINGS * whole) or 1.0  # all at one position: any distance joins them
 
 
 def component_numbers(
@@ -40,13 +38,12 @@ def component_numbers(
     """Number the connected parts of the Gaussians under a mask: 0 is the largest, -1 lies outside the mask.
 
     Two Gaussians are connected if their means are at most `distance` apart, directly or through others under the mask. Of
-    equally large parts the one with the lowest index comes first. Without a distance it is `component_distance`. 600,000
-    Gaussians take about 5 seconds on one core. A ValueError if a position is not finite.
+    equally large parts the one with the lowest index comes first. 600,000 Gaussians take about 5 seconds on one core.
     """
-    distance = component_distance(means, mask) if distance is None else distance
     points = positions("means", means)[mask.cpu().numpy()]
-    numbers = torch.full(mask.shape, -1, dtype=torch.int64, device=mask.device)
-    numbers[mask] = torch.from_numpy(radius_components(points, distance)).to(mask.device)
+    parts = radius_components(points, distance or component_distance(means, mask))
+    numbers = torch.full(mask.shape, -1, device=mask.device)
+    numbers[mask] = torch.from_numpy(parts).to(mask.device)
     return numbers
 
 
@@ -90,10 +87,7 @@ def radius_components(
 
 
 def _spacing(points: Array) -> float:
-    """The distance within which 90 % of the positions have their fourth neighbour (the last, if fewer); 0 for one position.
-
-    Copies at one position count once.
-    """
+    """The distance within which 90 % of the positions have their fourth neighbour (the last, if fewer); 0 for one position."""
     places = np.unique(points, axis=0)
     if len(places) < 2:
         return 0.0

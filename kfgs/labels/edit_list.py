@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,8 +28,8 @@ FORMAT, VERSION = "kfgs.edits", 1
 class Insert(Edit):
     """Add the Gaussians of another splat file after those of the scene. Classes of the same name become the same class.
 
-    The file is read when the edit is applied. The scene decides how all is drawn (harmonics of a lower degree are padded
-    with zeros). What one of the two lacks is filled: labels with -1, scores and other columns with 0.
+    The file is read when the edit is applied. All is drawn as the scene is, with or without antialiasing; harmonics of a
+    lower degree are padded with zeros. What one of the two lacks is filled: labels with -1, scores and other columns with 0.
     """
 
     op: ClassVar[str] = "insert"
@@ -53,25 +52,17 @@ class Insert(Edit):
             part = transformed(part, self.similarity, gaussians.origin)
         return join(gaussians, part)
 
-    def to_json(self) -> dict[str, Any]:
-        """See `Edit.to_json`."""
-        matrix = {} if self.similarity is None else {"similarity": self.similarity.matrix().tolist()}
-        return {"op": self.op, "source": os.fspath(self.source), **matrix}
-
     def seen_from(self, folder: Path) -> Insert:
         """The same edit with its path relative to the folder if it lies in it, else in full."""
         path, folder = real_path(self.source), real_path(folder)
-        inside = path.is_relative_to(folder)
-        return replace(self, source=path.relative_to(folder).as_posix() if inside else str(path))
+        return replace(self, source=path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path))
 
     def placed_in(self, folder: Path, name: str, *, anywhere: bool) -> Insert:
         """The same edit of a list saved in a folder: its file lies there or below (links are followed), unless `anywhere`."""
         path = folder / self.source
         if not anywhere and not Path(os.path.realpath(path)).is_relative_to(real_path(folder)):
-            raise ValueError(
-                f"{name}.source: expected a file in {folder} or below, got {str(self.source)!r:.200}; copy it there, or load "
-                "with anywhere=True if you trust these edits"
-            )
+            got = f"{str(self.source)!r:.200}; copy it there, or load with anywhere=True if you trust these edits"
+            raise ValueError(f"{name}.source: expected a file in {folder} or below, got {got}")
         if not os.path.exists(path):
             raise FileNotFoundError(f"{name}.source: expected a splat file at {path!s:.400}, got none; put it there")
         return replace(self, source=path)
@@ -80,17 +71,9 @@ class Insert(Edit):
 OPS: dict[str, type[Edit]] = {op.op: op for op in (Remove, Extract, Recolor, Opacity, Move, Duplicate, Insert)}
 
 
-def edits_path(path: str | Path) -> Path:
-    """`scene.ply` -> `scene.ply.edits.json`: the edits that made this one splat file."""
-    path = as_path(path)
-    return path.with_name(path.name + ".edits.json")
-
-
 @dataclass(frozen=True)
 class EditList:
-    """Edits that are applied one after the other, each to the result of the one before.
-
-    Nothing is changed in place: `then` and `undo` give new lists, `apply` a new cloud.
+    """Edits that are applied one after the other; `then` and `undo` give new lists, `apply` a new cloud.
 
     Example:
         >>> edits = EditList().then(Recolor("plant", "#c04040")).then(Remove("chair"))
@@ -108,8 +91,7 @@ class EditList:
         object.__setattr__(self, "edits", tuple(edits))
 
     def __repr__(self) -> str:
-        edits = ", ".join(map(repr, self.edits[:9])) + (", ..." if len(self) > 9 else "")
-        return f"EditList({len(self)} edits{': ' + cut(edits, 140) if edits else ''})"
+        return f"EditList({len(self)} edits: {cut(', '.join(map(repr, self.edits[:9])), 140)})"
 
     def __len__(self) -> int:
         return len(self.edits)
@@ -126,12 +108,7 @@ class EditList:
         return EditList(self.edits[:-1])
 
     def apply(self, gaussians: Gaussians) -> Gaussians:
-        """The cloud after all edits.
-
-        Raises:
-            ValueError: if an edit cannot be done; the message says which.
-            FileNotFoundError: if a file to insert is missing.
-        """
+        """The cloud after all edits; a ValueError says which one cannot be done."""
         for i, edit in enumerate(self.edits):
             try:
                 gaussians = edit.apply(gaussians)
@@ -140,11 +117,7 @@ class EditList:
         return gaussians
 
     def save(self, path: str | Path) -> Path:
-        """Write the list as JSON.
-
-        Files to insert that lie in the folder of the JSON file or below are named relative to it. Others are named in full,
-        and `load` reads them only with `anywhere=True`.
-        """
+        """Write the list as JSON. Files to insert that lie in its folder or below are named relative to it, others in full."""
         path = as_path(path)
         edits = [edit.seen_from(path.parent) if isinstance(edit, Insert) else edit for edit in self.edits]
         write_json(path, {"format": FORMAT, "version": VERSION, "edits": [edit.to_json() for edit in edits]})
@@ -152,22 +125,14 @@ class EditList:
 
     @staticmethod
     def load(path: str | Path, *, anywhere: bool = False) -> EditList:
-        """Read what `save` wrote.
+        """Read what `save` wrote. Files to insert must lie in the folder of the JSON file or below, unless `anywhere`.
 
-        Args:
-            path: the JSON file. Paths of files to insert are relative to its folder.
-            anywhere: also allow files to insert from outside this folder.
-
-        Raises:
-            FileNotFoundError: if there is no such file, or a file to insert is missing.
-            ValueError: if it is another kind of file, or an edit in it is unknown or wrong; the message names its place.
+        A ValueError names the place of an edit that is unknown or wrong.
         """
         path = as_path(path)
         content = read_json(path)
         if not isinstance(content, dict) or content.get("format") != FORMAT or content.get("version") != VERSION:
-            raise ValueError(
-                f"{path}: expected edits that kfgs saved ('format': {FORMAT!r}, 'version': {VERSION}), got something else"
-            )
+            raise ValueError(f"{path}: expected edits ('format': {FORMAT!r}, 'version': {VERSION}), got something else")
         name = f"{path}: edits"
         edits = [
             edit.placed_in(path.parent, f"{name}[{i}]", anywhere=anywhere) if isinstance(edit, Insert) else edit
@@ -184,40 +149,31 @@ def read_edits(values: Any, name: str = "edits") -> tuple[Edit, ...]:
 
 
 def join(first: Gaussians, second: Gaussians) -> Gaussians:
-    """The Gaussians of two clouds, the first before the second, as `Insert` does it.
-
-    New classes come after those of the first. A class without a name is called `class 7` if the other cloud has names; if
-    neither has names, indices are kept. A ValueError if one has colours and the other has none.
-    """
+    """The Gaussians of two clouds, the first before the second, as `Insert` does it; a ValueError if only one has colours."""
     second = second.to(first.means.device, first.means.dtype).with_origin(first.origin)
     if (first.sh is None) != (second.sh is None):
         which = "the scene" if first.sh is None else "what is inserted"
         raise ValueError(f"sh: expected colours in both clouds, got none in {which}; choose one with colours")
-    if first.antialiased != second.antialiased:
-        how = ("fainter", "with") if first.antialiased else ("more opaque", "without")
-        warnings.warn(
-            f"insert: what is smaller than a pixel looks {how[0]} than in its own file: all is drawn {how[1]} antialiasing, as "
-            "the scene is",
-            stacklevel=2,
-        )
     labels, names = _in_classes_of(first, second)
     second = second.replace(labels=labels, names=names, antialiased=first.antialiased)
     degrees = max(0 if cloud.sh is None else cloud.sh.shape[1] for cloud in (first, second))
     columns = {**first.extra, **second.extra}
 
     def filled(cloud: Gaussians, other: Gaussians) -> Gaussians:
-        n, like = len(cloud), cloud.means
-        empty = {"labels": torch.full((n,), -1, device=like.device), "scores": like.new_zeros(n)}
+        empty = {"labels": torch.full_like(cloud.opacities, -1).long(), "scores": torch.zeros_like(cloud.opacities)}
         missing = [name for name in empty if getattr(cloud, name) is None and getattr(other, name) is not None]
         sh = None if cloud.sh is None else torch.nn.functional.pad(cloud.sh, (0, 0, 0, degrees - cloud.sh.shape[1]))
-        extra = {name: cloud.extra.get(name, np.zeros(n, values.dtype)) for name, values in columns.items()}
+        extra = {name: cloud.extra.get(name, np.zeros(len(cloud), values.dtype)) for name, values in columns.items()}
         return cloud.replace(**{name: empty[name] for name in missing}, sh=sh, names=names, extra=extra)
 
     return Gaussians.cat([filled(first, second), filled(second, first)])
 
 
 def _in_classes_of(first: Gaussians, second: Gaussians) -> tuple[Tensor | None, tuple[str, ...]]:
-    """The labels of the second cloud as classes of the first, which gets the classes that it lacks; and their names."""
+    """The labels of the second cloud as classes of the first, after which come the classes that it lacks; and all names.
+
+    A class without a name is called `class 7` if the other cloud has names; if neither has names, indices are kept.
+    """
     if second.labels is None or not (first.names or second.names):
         return second.labels, first.names
     highest = -1 if first.labels is None or not len(first) else int(first.labels.max())

@@ -7,14 +7,13 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
-from operator import or_
 from typing import Any, ClassVar, get_args
 
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from .._card import cut
 from .._check import check_choice, check_range
 from .._origin import Origin, to_world
 from ..cameras.similarity import Similarity
@@ -36,8 +35,6 @@ from .selection import (
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 HIDDEN = 1e-6  # an opacity that every renderer skips (alpha < 1/255) and every file can hold
-Rules = str | Selection | Where | Sequence[str | Selection | Where]
-"""Which Gaussians an edit changes: a class name, a selection or a rule; or several, for all that any of them selects."""
 
 
 class Edit(ABC):
@@ -58,8 +55,8 @@ class Edit(ABC):
 class OnSelection(Edit):
     """An edit of the Gaussians that rules select."""
 
-    where: Rules
-    """Which Gaussians; becomes a tuple of rules (`OfClass`, `InBox`, `InSphere`, `OfIndex`)."""
+    where: str | Selection | Where | Sequence[str | Selection | Where]
+    """A class name, a selection or a rule (`OfClass`, `InBox`, `InSphere`, `OfIndex`); or several: what any of them selects."""
 
     def __post_init__(self) -> None:
         where: Any = self.where
@@ -71,12 +68,10 @@ class OnSelection(Edit):
     def apply(self, gaussians: Gaussians) -> Gaussians:
         """See `Edit.apply`."""
         rules: tuple[Where, ...] = self.where  # type: ignore[assignment]  # since __post_init__
-        mask = reduce(or_, (rule.select(gaussians).mask for rule in rules))
+        mask = torch.stack([rule.select(gaussians).mask for rule in rules]).any(dim=0)
         if not bool(mask.any()):
-            raise ValueError(
-                f"where: expected a selection of some of {len(gaussians)} Gaussians, got none from "
-                f"{', '.join(map(repr, rules)):.120}; {_present(gaussians)}"
-            )
+            got = f"none from {', '.join(map(repr, rules)):.120}; {_present(gaussians)}"
+            raise ValueError(f"where: expected a selection of some of {len(gaussians)} Gaussians, got {got}")
         return self._change(gaussians, mask)
 
     @abstractmethod
@@ -92,19 +87,14 @@ def _rule(where: Any) -> Where:
     if isinstance(where, dict):
         return read_object("where", where, KINDS, "kind")
     if not isinstance(where, Where):
-        raise TypeError(
-            f"where: expected a class name, a Selection or a rule like OfClass('chair'), got {where!r:.80}; build one"
-        )
+        raise TypeError(f"where: expected a class name, a Selection or a rule like OfClass, got {where!r:.80}")
     return where
 
 
 def _present(gaussians: Gaussians) -> str:
-    labels = gaussians.labels
-    if labels is None:
-        return "the cloud carries no labels: widen the box or sphere"
-    sizes = Counter(class_name(gaussians.names, label) for label in labels[labels >= 0].tolist())
-    named = ", ".join(f"{name} ({count})" for name, count in sizes.most_common(12))
-    return f"classes present are {named or 'none'}{', ...' * (len(sizes) > 12)}: select one of them"
+    labels = [] if gaussians.labels is None else gaussians.labels.tolist()
+    sizes = Counter(class_name(gaussians.names, label) for label in labels if label >= 0)
+    return f"classes present are {cut(', '.join(f'{name} ({n})' for name, n in sizes.most_common()) or 'none', 200)}"
 
 
 @dataclass(frozen=True)
@@ -132,7 +122,7 @@ class Recolor(OnSelection):
     """Give Gaussians one hue and keep their shading, from every direction."""
 
     op: ClassVar[str] = "recolor"
-    rgb: tuple[float, float, float]
+    rgb: str | tuple[float, ...]
     """Red, green, blue in [0, 1], or text like `"#c04040"` or `"teal"`."""
     mode: Mode = "tint"
     """`"tint"`: the object's middle luminance becomes `rgb`. `"hue"`: luminance stays."""
@@ -143,7 +133,7 @@ class Recolor(OnSelection):
         check_choice("mode", self.mode, get_args(Mode))
 
     def _change(self, gaussians: Gaussians, mask: Tensor) -> Gaussians:
-        return recolor(gaussians, mask, self.rgb, self.mode)
+        return recolor(gaussians, mask, parse_color(self.rgb), self.mode)
 
 
 @dataclass(frozen=True)
@@ -173,17 +163,25 @@ class _Motion(OnSelection):
 
     translation: tuple[float, ...] = (0.0, 0.0, 0.0)
     """World units."""
-    rotation: tuple[str | tuple[float, ...], float] | None = None
+    rotation: tuple[Any, float] | None = None
     """An axis ("x", "y", "z" or a direction) and degrees by the right hand, like `("z", 90)`."""
     scale: float = 1.0
     """> 0"""
     pivot: str | tuple[float, ...] = "centroid"
-    """The fixed point of rotation and scale: (x, y, z), or `"centroid"` (the mean of the selected positions, weighted by
-    opacity; the plain mean if every opacity is 0)."""
+    """The fixed point of rotation and scale: (x, y, z), or the mean of the selected positions, weighted by opacity."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        set_fields(self, translation=three_numbers("translation", self.translation), rotation=_rotation(self.rotation))
+        set_fields(self, translation=three_numbers("translation", self.translation))
+        if self.rotation is not None:
+            if not isinstance(self.rotation, list | tuple) or len(self.rotation) != 2:
+                raise ValueError(f"rotation: expected an axis and degrees like ('z', 90), got {self.rotation!r:.80}")
+            axis, degrees = self.rotation
+            axis = three_numbers("rotation axis", AXES.get(axis, axis) if isinstance(axis, str) else axis)
+            check_range("rotation degrees", degrees, -math.inf, closed=(False, False))
+            if not any(axis):
+                raise ValueError("rotation: expected an axis, got (0, 0, 0); name 'x', 'y', 'z' or a direction")
+            set_fields(self, rotation=(axis, float(degrees)))
         check_range("scale", self.scale, 0, closed=(False, False))
         if self.pivot != "centroid":
             set_fields(self, pivot=three_numbers("pivot", self.pivot))
@@ -192,15 +190,14 @@ class _Motion(OnSelection):
         """The selected Gaussians in their new place."""
         R = torch.eye(3, dtype=torch.float64)
         if self.rotation is not None:
-            axis, degrees = self.rotation
-            direction = torch.tensor(AXES[axis] if isinstance(axis, str) else axis, dtype=torch.float64)
-            direction = direction / direction.abs().max()  # no overflow
-            vector = math.fmod(degrees, 360) * direction / direction.norm()
+            axis = torch.tensor(self.rotation[0], dtype=torch.float64)
+            axis = axis / axis.abs().max()  # no overflow
+            vector = math.fmod(self.rotation[1], 360) * axis / axis.norm()
             R = torch.from_numpy(Rotation.from_rotvec(vector.numpy(), degrees=True).as_matrix())
-        pivot = torch.tensor(self.pivot if isinstance(self.pivot, tuple) else (0.0, 0.0, 0.0), dtype=torch.float64)
-        if self.pivot == "centroid":
-            weights = part.opacities.detach().double().cpu()
-            weights = weights if bool(weights.any()) else torch.ones_like(weights)
+        if isinstance(self.pivot, tuple):
+            pivot = torch.tensor(self.pivot, dtype=torch.float64)
+        else:
+            weights = part.opacities.detach().double().cpu().clamp_min(1e-30)  # all may be 0
             pivot = to_world(weights @ part.means.detach().double().cpu() / weights.sum(), part.origin)
         shift = torch.tensor(self.translation, dtype=torch.float64)
         return transformed(part, Similarity(self.scale, R, pivot + shift - self.scale * (R @ pivot)), part.origin)
@@ -232,37 +229,20 @@ class Duplicate(_Motion):
 
 
 def transformed(gaussians: Gaussians, similarity: Similarity, origin: Origin) -> Gaussians:
-    """`transform_gaussians`, counted from an origin; a ValueError if a number leaves the range in which its type is of use.
+    """`transform_gaussians`, counted from an origin; a ValueError if numbers leave the range in which their type is of use.
 
-    Fourth powers (determinants of 2-D covariances) stay finite, scales stay above 0, and positions are not rounded by more than
-    a tenth of the size of what moves, unless they were before.
+    Fourth powers (determinants of 2-D covariances) stay finite, scales above 0; positions are rounded by less than a tenth of
+    the size of what moves, unless they were before.
     """
     moved = transform_gaussians(gaussians, similarity).with_origin(origin)
     if len(moved) == 0:
         return moved
-    limits = torch.finfo(moved.means.dtype)
-    largest = torch.maximum(moved.means.abs().max(), moved.scales.max())
+    limits, reach, scales = torch.finfo(moved.means.dtype), moved.means.abs().max(), moved.scales
     size = torch.maximum(gaussians.means.amax(0) - gaussians.means.amin(0), gaussians.scales.amax(0)).max()
-    rounding = limits.eps * moved.means.abs().max()
     allowed = torch.maximum(0.1 * similarity.scale * size, 2 * limits.eps * gaussians.means.abs().max())
-    if not (largest <= limits.max**0.25 and bool((moved.scales > 0).all()) and rounding <= allowed):
-        raise ValueError(
-            f"expected positions and scales that {moved.means.dtype} can tell apart, got some beyond after scale "
-            f"{similarity.scale:g} and translation {[float(f'{part:.3g}') for part in similarity.translation.tolist()]}; move "
-            "less far, or scale less"
-        )
+    fits = torch.maximum(reach, scales.max()) <= limits.max**0.25 and bool((scales > 0).all())
+    if not (fits and limits.eps * reach <= allowed):
+        shift = [float(f"{part:.3g}") for part in similarity.translation.tolist()]
+        got = f"some beyond after scale {similarity.scale:g} and translation {shift}; move less far, or scale less"
+        raise ValueError(f"expected positions and scales that {moved.means.dtype} can tell apart, got {got}")
     return moved
-
-
-def _rotation(value: Any) -> tuple[Any, float] | None:
-    if value is None:
-        return None
-    if not isinstance(value, list | tuple) or len(value) != 2:
-        raise ValueError(f"rotation: expected an axis and degrees, got {value!r:.80}; write it as ('z', 90)")
-    axis, degrees = value
-    if not (isinstance(axis, str) and axis in AXES):
-        axis = three_numbers("rotation axis", axis)
-        if not any(axis):
-            raise ValueError("rotation: expected an axis, got (0, 0, 0); name 'x', 'y', 'z' or a direction")
-    check_range("rotation degrees", degrees, -math.inf, closed=(False, False))
-    return axis, float(degrees)

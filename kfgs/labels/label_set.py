@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from .._arrays import read_array, read_safetensors, reading
-from .._card import cut, html_card
+from .._card import cut
 from .._check import as_tensor, check_shapes
 from .._files import as_path, atomic_path, parse_json, read_json
-from .._names import class_index, class_indices
+from .._names import class_index
 from .._tensors import save_tensors
 
 KIND, VERSION = "label set", "1"  # of the metadata's "kfgs" and "version"
@@ -59,12 +59,6 @@ class LabelSet:
     def __repr__(self) -> str:
         return f"LabelSet({len(self)} classes: {cut(', '.join(self.names[:12]), 140)}; {self.dim} channels)"
 
-    def _repr_html_(self) -> str:
-        teacher = self.info.get("teacher")
-        name = teacher.get("name") if isinstance(teacher, dict) else None
-        classes = f"{len(self)}: {cut(', '.join(self.names), 140)}"
-        return html_card("LabelSet", {"classes": classes, "embeddings": self.embeddings, "teacher": name})
-
     @property
     def dim(self) -> int:
         """D, the channels of the teacher's space."""
@@ -76,10 +70,7 @@ class LabelSet:
 
     def knows(self, name: str) -> bool:
         """Whether `index` finds a class of that name."""
-        try:
-            return bool(class_indices(name, self.names))
-        except ValueError:
-            return False
+        return name.casefold() in map(str.casefold, self.names)
 
     def select(self, names: Sequence[str]) -> LabelSet:
         """Keep only the named classes; their order gives the new labels, from 0. A ValueError for an unknown name."""
@@ -99,9 +90,7 @@ class LabelSet:
             for name in ("names", "negative_names", "info"):
                 texts[name] = json.dumps(getattr(self, name), allow_nan=False)
         except (TypeError, ValueError) as error:
-            raise ValueError(
-                f"info: expected what JSON can hold, got {error}; use strings and finite numbers"
-            ) from error
+            raise ValueError(f"info: expected what JSON can hold, got {error}; use texts and numbers") from error
         parts = {"embeddings": self.embeddings} | ({} if self.negatives is None else {"negatives": self.negatives})
         tensors = {name: rows.detach().to("cpu", torch.float32).contiguous().clone() for name, rows in parts.items()}
         with atomic_path(path) as temporary:
@@ -112,11 +101,8 @@ def load_label_set(classes: str | Path, embeddings: str | Path | None = None) ->
     """Read classes and their embeddings from one table, or from two files: names and rows.
 
     `classes` is a table (.safetensors, from `LabelSet.save`), or class names (a JSON list of strings). With class names,
-    `embeddings` is an .npy file [C, D] of floats with a row per name, or a table to take the classes from.
-
-    Raises:
-        FileNotFoundError: if a file is missing.
-        ValueError: if a file has another content, the counts differ, or embeddings are missing or given twice.
+    `embeddings` is an .npy file [C, D] of floats with a row per name, or a table to take the classes from. A ValueError names
+    the file that has another content.
     """
     if as_path(classes).suffix == SUFFIX:
         if embeddings is not None:
@@ -124,16 +110,12 @@ def load_label_set(classes: str | Path, embeddings: str | Path | None = None) ->
         return _read_table(as_path(classes))
     names = read_json(classes)
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or not names:
-        raise ValueError(
-            f'{classes}: expected a JSON list of class names like ["wall", "floor"], got {type(names).__name__}'
-        )
+        raise ValueError(f'{classes}: expected a list of class names, ["wall", "floor"], got {type(names).__name__}')
     if embeddings is None:
         raise ValueError(
-            f"embeddings: expected an .npy file of one row per name in {classes}, got none; pass it, or pass a table of "
-            "`kfgs features --words` alone"
+            f"embeddings: expected an .npy file of one row per name in {classes}, got none; pass it as well"
         )
-    path = as_path(embeddings)
-    if path.suffix == SUFFIX:
+    if (path := as_path(embeddings)).suffix == SUFFIX:
         return _read_table(path).select(names)
     rows = read_array(path, "an .npy file of numbers, one embedding row per class")
     if rows.ndim != 2 or rows.dtype.kind != "f" or len(rows) != len(names) or not np.isfinite(rows).all():
@@ -145,10 +127,9 @@ def load_label_set(classes: str | Path, embeddings: str | Path | None = None) ->
 
 
 def teacher_mismatch(one: dict[str, Any], other: dict[str, Any]) -> str | None:
-    """How the teacher of another field or label set differs, in words; None if no difference is known.
+    """How the teacher of another field's or label set's `info` differs, in words; None if no difference is known.
 
-    Encoders with the same number of channels have unrelated spaces: no word of 61 that CLIP ViT-B/16 and ViT-B/32 both
-    embedded was nearest to itself. Names and weights are compared: the `info` of two SemanticFields or LabelSets.
+    Encoders have unrelated spaces: no word of 61 that CLIP ViT-B/16 and ViT-B/32 both embedded was nearest to itself.
     """
     ours, theirs = one.get("teacher"), other.get("teacher")
     if isinstance(ours, dict) and isinstance(theirs, dict):
@@ -173,7 +154,6 @@ def _read_table(path: Path) -> LabelSet:
         for name, rows in parts.items():
             if rows.ndim != 2 or not torch.isfinite(rows).all():
                 raise ValueError(f"it has other {name} than finite rows")
-        rows, negatives = parts["embeddings"].float(), parts.get("negatives")
+        tables = {name: rows.float() for name, rows in parts.items()}
         names, negative_names, info = (parse_json(metadata[key]) for key in ("names", "negative_names", "info"))
-        negatives = None if negatives is None else negatives.float()
-        return LabelSet(tuple(names), rows, negatives, tuple(negative_names), {**info})
+        return LabelSet(tuple(names), tables["embeddings"], tables.get("negatives"), tuple(negative_names), {**info})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -39,10 +39,7 @@ class OrientedBox:
 
     @classmethod
     def around(cls, points: Tensor) -> OrientedBox:  # points: [N, 3]
-        """The smaller of two boxes around points: along their principal axes, and along the world's; longest edge first.
-
-        A ValueError if there is no point, or one is not finite.
-        """
+        """The smaller of two boxes around the points: along their principal axes, or the world's; longest edge first."""
         points = as_tensor("points", points).detach().cpu().double()
         check_shapes(("points", points, "N 3"))
         if len(points) == 0:
@@ -71,13 +68,8 @@ class OrientedBox:
         signs = torch.cartesian_prod(*([torch.tensor([-1.0, 1.0])] * 3)).to(self.half)
         return self.center + (signs * self.half) @ self.axes
 
-    def to_json(self) -> dict[str, Any]:
-        """Plain lists: center, axes (rows) and half edges."""
-        return {name: getattr(self, name).tolist() for name in ("center", "axes", "half")}
 
-
-@dataclass(frozen=True)
-class BestView:
+class BestView(NamedTuple):
     """The camera that shows a part largest."""
 
     camera: str  # its name
@@ -107,8 +99,9 @@ class Part:
         place = ", ".join(say_coordinate(x, 3) for x in self.centroid.tolist())
         size = " x ".join(f"{2 * x:.3g}" for x in self.box.half.tolist())
         view = "" if self.best_view is None else f", {self.best_view.share:.1%} of {self.best_view.camera!r}"
-        what = "Gaussian" if self.count == 1 else "Gaussians"
-        return f"Part({self.count} {what} at ({place}), {size}, score {self.score:.3f}{view})"
+        return (
+            f"Part({self.count} Gaussian{'s' * (self.count != 1)} at ({place}), {size}, score {self.score:.3f}{view})"
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Plain numbers, lists and strings."""
@@ -116,10 +109,10 @@ class Part:
             "count": self.count,
             "score": self.score,
             "centroid": self.centroid.tolist(),
-            "box": self.box.to_json(),
+            "box": {name: value.tolist() for name, value in vars(self.box).items()},
             "extent": [corner.tolist() for corner in self.extent],
             "volume": self.box.volume,
-            "best_view": None if self.best_view is None else vars(self.best_view).copy(),
+            "best_view": None if self.best_view is None else self.best_view._asdict(),
             "how": self.how,
             "indices": self.indices.tolist(),
         }
@@ -143,9 +136,6 @@ def connected_parts(
         distance: Gaussians at most this far apart are connected, in world units; None takes it from their spacing.
         smallest: parts with fewer Gaussians are left out; None: those below 5 % of the largest.
         most: the most parts to return.
-
-    Raises:
-        ValueError: if shapes disagree, a position is not finite, or a number is out of range.
     """
     check_gaussians(gaussians)
     check_shapes(("gaussians.means", gaussians.means, "N 3"), ("selection.mask", selection.mask, "N"))
@@ -159,9 +149,8 @@ def connected_parts(
     least = SPECK * int(sizes[0]) if smallest is None else smallest
     kept = int((sizes[:most] >= least).sum())
     order = torch.argsort(numbers, stable=True)[int((numbers < 0).sum()) :]  # part by part, ascending in each
-    members = list(order.split(sizes.tolist())[:kept])
+    members, parts = list(order.split(sizes.tolist())[:kept]), []
     shares = _view_shares(gaussians, members, cameras or [])
-    parts = []
     for i, indices in enumerate(members):
         points = to_world(gaussians.means[indices].detach().double(), gaussians.origin)
         view = None
@@ -175,10 +164,7 @@ def connected_parts(
 
 
 def _view_shares(gaussians: Gaussians, parts: list[Tensor], cameras: Sequence[Camera]) -> Tensor:  # [C, P]
-    """The share of each camera's picture that each part fills: the mean over pixels of its rendering weights w = T alpha.
-
-    Hidden parts do not count, and a transparent part counts by its opacity. Pictures have at most 160 pixels a side.
-    """
+    """The share of each camera's picture that each part fills: the mean over pixels of its rendering weights w = T alpha."""
     shares = torch.zeros(len(cameras), len(parts)).to(gaussians.means)
     for c, camera in enumerate(cameras):
         small = camera.fitted(LONGEST)

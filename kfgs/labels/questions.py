@@ -16,8 +16,7 @@ from .label_set import LabelSet, teacher_mismatch
 SAME = 1 - 1e-4  # cosine of one text embedded twice: half precision stays well above, other words below
 AGAIN = "embed the words with the teacher whose features this field was fitted to"
 Negatives = Literal["auto", "classes", "canonical", "none"]
-Classes = LabelSet | Tensor
-"""Classes with names, or embeddings [C, D] alone."""
+Classes = LabelSet | Tensor  # classes with names, or embeddings [C, D] alone
 
 
 class Question(NamedTuple):
@@ -41,11 +40,8 @@ def class_rows(classes: Classes, dim: int, info: dict[str, Any]) -> Tensor:  # [
         try:
             rows = as_tensor("embeddings", classes, floating=True)
         except TypeError as error:
-            got = type(classes).__name__
-            raise TypeError(
-                f"classes: expected a LabelSet or embeddings [C, {dim}], got {got}; load_label_set reads one, make_label_set "
-                "makes one"
-            ) from error
+            got = f"{type(classes).__name__}; load_label_set reads one, make_label_set makes one"
+            raise TypeError(f"classes: expected a LabelSet or embeddings [C, {dim}], got {got}") from error
         check_rows("embeddings", rows, ("C",), dim)
         return rows
     difference, what, again = teacher_mismatch(info, classes.info), "text", AGAIN
@@ -53,14 +49,10 @@ def class_rows(classes: Classes, dim: int, info: dict[str, Any]) -> Tensor:  # [
         what, again = "examples", "make them again: `kfgs features FIELD --examples FILE`"
     got = f"{what} of another teacher" + ("" if difference is None else f" ({difference})")
     if classes.dim != dim:
-        shape = tuple(classes.embeddings.shape)
-        raise ValueError(
-            f"classes: expected embeddings [C, {dim}] (from the field), got {shape}: {got}? If so, {again}"
-        )
+        got = f"{tuple(classes.embeddings.shape)}: {got}"
+        raise ValueError(f"classes: expected embeddings [C, {dim}] (from the field), got {got}? If so, {again}")
     if difference is not None:
-        warnings.warn(
-            f"classes: expected those of the field's teacher, got {got}; their spaces do not mix: {again}", stacklevel=4
-        )
+        warnings.warn(f"classes: expected those of the field's teacher, got {got}; {again}", stacklevel=4)
     return classes.embeddings
 
 
@@ -71,7 +63,7 @@ def make_question(
     dim: int,
     info: dict[str, Any],
 ) -> Question:
-    """The rows of a target and its negatives; see `SemanticField.query`.
+    """The rows of a target and its negatives.
 
     With negatives "auto", a class (given by name or by its embedding) is compared with the other classes, or with the
     canonical words if it is the only class. Any other target is compared with the canonical words, or with nothing if there
@@ -81,9 +73,8 @@ def make_question(
     table = classes if isinstance(classes, LabelSet) else None
     if isinstance(target, str):
         if table is None:
-            raise ValueError(
-                f"classes: expected a LabelSet to look {target!r} up in, got {type(classes).__name__}; pass one, or an embedding"
-            )
+            got = f"{type(classes).__name__}; pass one, or an embedding"
+            raise ValueError(f"classes: expected a LabelSet to look {target!r} up in, got {got}")
         index = table.names.index(target) if target in table.names else table.index(target)
         row, words = table.embeddings[index], table.names[index]
     else:
@@ -104,7 +95,7 @@ def make_question(
         raise ValueError(f"negatives: expected other classes than {words!r}, got none; use 'canonical' or 'none'")
     if negatives == "canonical" and canonical is None:
         raise ValueError(
-            "negatives: expected canonical words in the classes' table, got none; `kfgs features --words` writes them"
+            "negatives: expected canonical words in the table, got none; `kfgs features --words` makes some"
         )
     return Question(row, {"classes": others, "canonical": canonical, "none": None}[negatives])
 

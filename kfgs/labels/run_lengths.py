@@ -11,8 +11,6 @@ from torch import Tensor
 def decode_rle(segmentation: dict[str, Any]) -> Tensor:  # [H, W] bool
     """A mask from `{"size": [H, W], "counts": ...}`: lengths of runs, zeros first, column by column; or COCO's packed text.
 
-    A ValueError if the lengths do not add up to the size.
-
     Example:
         >>> decode_rle({"size": [2, 2], "counts": [1, 2, 1]}).int().tolist()
         [[0, 1], [1, 0]]
@@ -21,15 +19,12 @@ def decode_rle(segmentation: dict[str, Any]) -> Tensor:  # [H, W] bool
 
     size, counts = segmentation.get("size"), segmentation.get("counts")
     try:
-        height, width = (int(side) for side in size)  # type: ignore[union-attr]
-        if not (0 < height < 2**16 and 0 < width < 2**16):
-            raise ValueError("sides of 1 to 65,535 pixels")
-        if not isinstance(counts, str):
-            if sum(counts) != height * width:  # type: ignore[arg-type]
-                raise ValueError("another sum")
-            segmentation = coco.frPyObjects(segmentation, height, width)
-        return torch.from_numpy(coco.decode(segmentation)).bool()
+        height, width = size  # type: ignore[misc]
+        if max(height, width) >= 2**16 or (not isinstance(counts, str) and sum(counts) != height * width):  # type: ignore[arg-type]
+            raise ValueError("another size")
+        runs = segmentation if isinstance(counts, str) else coco.frPyObjects(segmentation, height, width)
+        return torch.from_numpy(coco.decode(runs)).bool()
     except Exception as error:  # pycocotools raises bare exceptions
         raise ValueError(
-            f"counts: expected runs that add up to the size [H, W], got {counts!r:.80} for {size!r:.80} ({error})"
+            f"counts: expected runs that fill {size!r:.80} pixels, got {counts!r:.80} ({error})"
         ) from error

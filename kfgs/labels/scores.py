@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -12,14 +12,13 @@ from torch import Tensor
 from .._check import check_choice, check_range, check_shapes
 from .._rows import check_finite
 from .selection import Selection
+from .transfer import Array
 
 TEMPERATURE = 10.0  # factor of the cosines in LERF (Kerr 2023)
 CANONICAL = ("object", "things", "stuff", "texture")  # LERF's negatives for a scene without known classes
 EVEN = 0.5  # relevancy of a feature that is equally similar to the query and to its nearest negative
-LOGIT_SCALE = 100.0
-"""Of the softmax: CLIP's at the end of its training (LSeg trains with 14.3, Feature 3DGS edits with 1)."""
-Array = np.ndarray[Any, Any]
-Score = Literal["cosine", "softmax", "relevancy"]
+LOGIT_SCALE = 100.0  # of a vote's softmax: CLIP's at the end of its training (LSeg trains with 14.3)
+Score = Literal["cosine", "relevancy"]
 
 BINS = 128
 SMOOTHING = 2.0  # standard deviation, in bins
@@ -27,7 +26,7 @@ PER = 30_000  # counts are scaled to this many features, so that two copies of a
 CLEAR = 0.3  # a gap is clear if its floor is at least 2 x (10^0.3) sparser than the mode on either side
 SHARES = ((0.5, CLEAR), (0.75, 0.7))
 """A gap with more than half of the scene above it usually separates two parts of the background. If there is no other, up
-to three quarters may lie above it (the walls of a room), if it is 5 times sparser than the modes beside it."""
+to three quarters may lie above it (the walls of a room), if it is 5 times sparser than the modes next to it."""
 TOP, WAY = 0.999, 0.7  # if no gap is clear: 70 % of the way from the median to the 99.9 % quantile
 
 
@@ -37,13 +36,9 @@ def relevancy(
 ) -> Tensor:  # [N] in (0, 1)
     """LERF's relevancy (Kerr 2023, Sec. 3.4): how much more similar to the query than to the most similar negative.
 
-    min over j of the first entry of softmax(10 [s, n_j]), which is sigmoid(10 (s - max_j n_j)). Above 0.5 the query is
-    more similar than every negative.
-
-    Both arguments are cosines. Negatives are the other classes of the scene, or `LabelSet.negatives`.
-
-    Raises:
-        ValueError: if shapes disagree, there is no negative, or a number is not finite.
+    min over j of the first entry of softmax(10 [s, n_j]), which is sigmoid(10 (s - max_j n_j)), from cosines with the query
+    and with negatives (the other classes of the scene, or `LabelSet.negatives`). Above 0.5 the query is more similar than
+    every negative. A ValueError if shapes disagree, there is no negative, or a number is not finite.
 
     Example:
         >>> relevancy(torch.tensor([0.9, 0.3]), torch.tensor([[0.2, 0.9], [0.1, 0.2]])).tolist()
@@ -62,41 +57,30 @@ def select_by_similarity(
     negatives: Tensor | None = None,  # [N, M]
     threshold: float | None = None,
     valid: Tensor | None = None,  # [N] bool
-    *,
     score: Score | None = None,
-    logit_scale: float = LOGIT_SCALE,
 ) -> Selection:
-    """Select the Gaussians with a score above gamma: what `SemanticField.query` does with its cosines, and its options.
+    """Select the Gaussians with a score above gamma, from cosines with a query and its negatives (`SemanticField.query`).
 
-    Without a `threshold`, gamma is 0.5 for a relevancy: more similar to the query than to any negative. Otherwise
-    `similarity_threshold` finds it in the scores. A "softmax" is the query's entry of softmax(l [s, n_1, ..., n_M]), its
-    share among all words. Gaussians that are not `valid` have score 0 and no influence on gamma. On room_0 (scores averaged
-    over 30 views, all other classes as negatives; mean IoU over 18 classes with the data set's labels): cosine 0.88,
-    relevancy 0.90, softmax 0.92.
+    Without a `threshold`, gamma is 0.5 for a relevancy: more similar to the query than to any negative. For a cosine,
+    `similarity_threshold` finds it in the scores. Gaussians that are not `valid` have score 0 and no influence on gamma. On
+    room_0 (mean IoU over 18 classes with the data set's labels): cosine 0.88, relevancy 0.90.
     """
     score = score or ("cosine" if negatives is None else "relevancy")
     check_choice("score", score, get_args(Score))
     if threshold is not None:
         check_range("threshold", threshold, -1 if score == "cosine" else 0, 1)
     check_finite("similarity", similarity)
-    gamma, how = threshold, "given"
-    if score == "cosine":
-        scores = similarity
-    elif negatives is None:
-        raise ValueError(f"negatives: expected some for score {score!r}, got none; pass words that are not meant")
-    elif score == "relevancy":
+    gamma, how, scores = threshold, "given", similarity
+    if score == "relevancy":
+        if negatives is None:
+            raise ValueError("negatives: expected some for a relevancy, got none; pass words that are not meant")
         scores = relevancy(similarity, negatives)
         if gamma is None:
             gamma, how = EVEN, f"more like the query than like any of {negatives.shape[1]} negatives"
-    else:
-        check_range("logit_scale", logit_scale, 0, closed=(False, True))
-        scores = (logit_scale * torch.cat([similarity[:, None], negatives], dim=1)).softmax(dim=1)[:, 0]
     known = torch.ones_like(similarity, dtype=torch.bool) if valid is None else valid
     scores = scores.masked_fill(~known, 0)
     if gamma is None:
         gamma, how = similarity_threshold(scores[known])
-    if score == "softmax" and negatives is not None:
-        how += f"; softmax over {1 + negatives.shape[1]} words, logit scale {logit_scale:.4g}"
     return Selection((scores > gamma) & known, scores, float(gamma), how)
 
 
@@ -109,10 +93,8 @@ def similarity_threshold(scores: Tensor) -> tuple[float, str]:  # scores: [N]
     highest of these gaps. If no gap is clear (one mode, or modes that overlap), the cut is 70 % of the way from the median
     to the 99.9 % quantile.
 
-    Measured with scores averaged over views, as the mean IoU over classes of the selected Gaussians with those of the
-    true label: room_0 (18 classes) 0.88, and 0.90 with the best threshold in hindsight. On the toy room (13 classes) 0.98.
-
-    No scores give 1.0, all-equal scores their value. Selection is strict, so nothing is selected then.
+    Mean IoU over classes on room_0: 0.88, and 0.90 with the best threshold in hindsight. On the toy room: 0.98. No scores
+    give 1.0, all-equal scores their value. Selection is strict, so nothing is selected then.
     """
     values = scores.detach().double().cpu().numpy()
     if values.size == 0:
@@ -131,10 +113,8 @@ def similarity_threshold(scores: Tensor) -> tuple[float, str]:  # scores: [N]
     candidates = [depth * part for part, clear in parts if (depth * part).max() >= clear]
     if not candidates:
         median, top = np.quantile(values, (0.5, TOP))
-        return float(median + WAY * (top - median)), (
-            f"{WAY:.0%} of the way from the median {median:.3f} to the top {top:.3f}: no clear gap between modes of "
-            f"{values.size} scores; check the scores"
-        )
+        how = f"no clear gap between modes: {WAY:.0%} of the way from the median {median:.3f} to the top {top:.3f}"
+        return float(median + WAY * (top - median)), how
     depth = candidates[0]
     deep = np.flatnonzero(depth >= depth.max() / 2)
     breaks = np.flatnonzero(np.diff(deep) > 1)

@@ -9,16 +9,18 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor
 
-from .._card import cut, html_card, say_coordinate
+from .._card import cut, say_coordinate
 from .._check import as_tensor, check_range, check_shapes, check_whole
 from .._names import class_indices
 from .._origin import to_world
 from .._rows import check_finite
+from ..cameras.similarity import Similarity
 from ..gaussians import Gaussians
 from .components import component_numbers
 from .transfer import Array, positions
@@ -28,11 +30,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Some of N Gaussians, with a score for every one of them; `gaussians[selection]` are the Gaussians.
+    """Some of N Gaussians, with a score for every one of them; `gaussians[selection]` are the Gaussians, `len` their number.
 
     `a & b`, `a | b`, `a - b` and `~a` combine selections of the same Gaussians. Scores follow Zadeh's rules: `&` takes the
-    smaller, `|` the larger, `~a` has 1 - score; `a - b` is `a & ~b`. `len` is the number selected, so an empty selection is
-    false in an `if`. `OfClass("chair").select(gaussians)`, `SemanticField.query` and `Selection.of(mask)` make selections.
+    smaller, `|` the larger, `~a` has 1 - score; `a - b` is `a & ~b`.
 
     Example:
         >>> a, b = Selection.of(torch.tensor([True, True, False])), Selection.of(torch.tensor([True, False, False]))
@@ -67,12 +68,6 @@ class Selection:
     def __repr__(self) -> str:
         return f"Selection({len(self)} of {len(self.mask)} Gaussians: {cut(self.summary, 140)})"
 
-    def _repr_html_(self) -> str:
-        chosen = self.scores[self.mask]
-        scores = f"{float(chosen.min()):.3g} to {float(chosen.max()):.3g}" if len(chosen) else None
-        count = f"{len(self):,} of {len(self.mask):,} Gaussians"
-        return html_card("Selection", {"selected": count, "scores": scores, "how": self.summary})
-
     @property
     def indices(self) -> Tensor:  # [n] int64
         """The selected Gaussians, ascending."""
@@ -95,20 +90,15 @@ class Selection:
         return Selection(~self.mask, 1 - self.scores, None, f"not ({self.summary})")
 
     def __sub__(self, other: Selection) -> Selection:
-        self._both_scores(other)
         return self & ~other
 
     def _both_scores(self, other: Selection) -> tuple[Tensor, Tensor]:
         """Both scores in one dtype, after a check that both select among the same Gaussians."""
         if not isinstance(other, Selection):
-            raise TypeError(
-                f"other: expected a Selection, got {type(other).__name__}; make one with Selection.of(mask)"
-            )
+            raise TypeError(f"other: expected a Selection, got {type(other).__name__}; make one by Selection.of(mask)")
         if len(self.mask) != len(other.mask):
-            raise ValueError(
-                f"other: expected a selection among the same {len(self.mask)} Gaussians, got one among "
-                f"{len(other.mask)}; select in the same cloud, or carry the labels over with transfer_labels"
-            )
+            own, its = len(self.mask), len(other.mask)
+            raise ValueError(f"other: expected a selection among the same {own} Gaussians, got one among {its}")
         dtype = torch.promote_types(self.scores.dtype, other.scores.dtype)
         return self.scores.to(dtype), other.scores.to(self.scores.device, dtype)
 
@@ -137,12 +127,9 @@ class OfClass(Where):
 
     kind: ClassVar[str] = "class"
     name: str | int
-    """A name (exact, or else without regard to case), or an index, -1 for Gaussians without a label.
-
-    A name selects all classes with that name. An unknown name is an error; an index that no Gaussian has selects nothing.
-    """
+    """A name (exact, or else without regard to case; an unknown one is an error), or an index, -1 for those without a label."""
     part: int | None = None
-    """Which connected part: 0 is the largest, 1 the next; one past the last selects nothing. None: all of the class."""
+    """Which connected part: 0 is the largest, one past the last selects nothing. None: all of the class."""
     distance: float | None = None
     """Gaussians at most this far apart are in one part, world units; None takes it from their spacing."""
 
@@ -157,10 +144,8 @@ class OfClass(Where):
     def _find(self, gaussians: Gaussians) -> tuple[Tensor, str]:
         labels = gaussians.labels
         if labels is None:
-            raise ValueError(
-                f"gaussians.labels: expected labels to find class {self.name!r} by, got None; attach a semantic field "
-                "first, or select by a box or a sphere"
-            )
+            need = f"labels to find class {self.name!r} by"
+            raise ValueError(f"gaussians.labels: expected {need}, got None; attach a semantic field first")
         indices = class_indices(self.name, gaussians.names) if isinstance(self.name, str) else (self.name,)
         mask, how = torch.isin(labels, torch.tensor(indices, device=labels.device)), f"label {self.name}"
         if self.part is not None and bool(mask.any()):
@@ -220,7 +205,7 @@ class OfIndex(Where):
 
     def __post_init__(self) -> None:
         given: Any = self.indices.tolist() if isinstance(self.indices, Tensor) else self.indices
-        if isinstance(given, str) or not isinstance(given, Sequence):
+        if not isinstance(given, list | tuple | range):
             raise TypeError(f"indices: expected a list of whole numbers, got {given!r:.80}; write it as [4, 7]")
         for index in given:
             check_whole("indices", index, 0, 2**62)
@@ -228,10 +213,8 @@ class OfIndex(Where):
 
     def _find(self, gaussians: Gaussians) -> tuple[Tensor, str]:
         if self.indices and self.indices[-1] >= len(gaussians):
-            raise ValueError(
-                f"indices: expected indices below {len(gaussians)} (the number of Gaussians), got {self.indices[-1]}; "
-                "were they taken from another cloud, or before an edit that removed some?"
-            )
+            got = f"{self.indices[-1]}; were they taken from another cloud, or before an edit that removed some?"
+            raise ValueError(f"indices: expected indices below {len(gaussians)} (the number of Gaussians), got {got}")
         mask = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
         mask[list(self.indices)] = True
         return mask, "by index"
@@ -272,9 +255,13 @@ def plain_fields(value: Any) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    if hasattr(value, "to_json"):
+    if isinstance(value, tuple):
+        return [_plain(part) for part in value]
+    if isinstance(value, Where):
         return value.to_json()
-    return [_plain(part) for part in value] if isinstance(value, tuple) else value
+    if isinstance(value, Similarity):
+        return value.matrix().tolist()
+    return str(value) if isinstance(value, Path) else value
 
 
 def read_object(name: str, value: Any, kinds: Mapping[str, type[T]], tag: str) -> T:

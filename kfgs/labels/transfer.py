@@ -19,8 +19,7 @@ CHUNK = 16_384  # destinations at a time
 SAMPLE = 20_000  # Gaussians measured for lambda or a spacing
 COVERAGE = 0.995  # lambda reaches this share of the destinations ...
 NEAREST = 2.0  # ... but is at least this many median spacings of the sources ...
-FARTHEST = 10.0  # ... and at most this many wide spacings,
-WIDE = 0.9  # which are this quantile of the spacings
+FARTHEST, WIDE = 10.0, 0.9  # ... and at most 10 times this quantile of the spacings
 
 Array = np.ndarray[Any, Any]
 
@@ -42,14 +41,13 @@ class Transfer:
 
     @property
     def orphaned(self) -> int:
-        """The number of destinations without a label: no labelled source in range."""
+        """The number of destinations without a label."""
         return len(self.labels) - self.labelled
 
     @property
     def scores(self) -> Tensor:  # [N] in [0, 1]
         """How sure each label is: 1 - distance / lambda; 0 without a label."""
-        reach = max(self.distance, torch.finfo(self.distances.dtype).tiny)
-        return (1 - self.distances / reach).clamp_min(0.0)
+        return (1 - self.distances / (self.distance or 1.0)).clamp_min(0.0)
 
     def __repr__(self) -> str:
         return (
@@ -61,20 +59,11 @@ class Transfer:
 def transfer_labels(source: Gaussians, target: Gaussians, distance: float | None = None) -> Gaussians:
     """Label a splat by distance: `transfer_labels(field.label(classes), read_splats("mine.ply"))`.
 
-    The rule is that of `nearest_labels`, which also says who gave each label. Both clouds must share one frame;
-    `kfgs.attach` finds the common frame, and can label by views instead of by distance.
+    The rule is that of `nearest_labels`, which also says who gave each label. The target gets new `labels`, `scores`
+    (1 - distance / lambda), and the class names of the source. Both clouds must share one frame; `kfgs.attach` finds the
+    common frame, and can label by views instead of by distance.
 
-    Args:
-        source: Gaussians with labels, for instance from `SemanticField.label`, or a labelled splat.
-        target: the splat to label; old labels, scores and names are replaced.
-        distance: lambda, the distance within which a label is carried over, in world units; None: from both clouds.
-
-    Returns:
-        The target with `labels`, with `scores` (1 - distance / lambda), and with the class names of the source.
-
-    Raises:
-        TypeError: if one of them is not Gaussians, for instance a path.
-        ValueError: if the source has no labels, a position is not finite, or the distance is not positive.
+    A ValueError if the source has no labels, a position is not finite, or the distance is not positive.
 
     Example:
         >>> a, b = (torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), torch.tensor([[0.1, 0.0, 0.0], [0.5, 0.0, 0.0]]))
@@ -86,8 +75,8 @@ def transfer_labels(source: Gaussians, target: Gaussians, distance: float | None
     check_gaussians(target, "target")
     if source.labels is None:
         raise ValueError("source: expected Gaussians with labels, got none; `SemanticField.label` gives them some")
-    means = recounted(target.means, target.origin, source.origin)
-    carried = nearest_labels(source.means, source.labels, means, distance)
+    places = recounted(target.means, target.origin, source.origin)
+    carried = nearest_labels(source.means, source.labels, places, distance)
     return target.replace(labels=carried.labels, scores=carried.scores.to(target.means.dtype), names=source.names)
 
 
@@ -108,9 +97,7 @@ def nearest_labels(
     a destination between two sources reaches both. And at most 10 times the 90 % quantile of the spacings, so that floaters
     and background, which only the colour field has, take no labels across the room.
 
-    Raises:
-        ValueError: if shapes disagree, a position is not finite, a label is below -1, or the distance is not positive.
-        TypeError: if the labels are not integers.
+    A ValueError if shapes disagree, a position is not finite, a label is below -1, or the distance is not positive.
     """
     src_means, dst_means = as_tensor("src_means", src_means), as_tensor("dst_means", dst_means)
     src_labels = as_tensor("src_labels", src_labels)
@@ -126,15 +113,9 @@ def nearest_labels(
     sources = Sources(points, given >= 0)
     chosen, how = sources.default_distance(targets) if distance is None else (float(distance), "given")
     distances, index = sources.nearest(targets, chosen)
-    labels = np.where(index >= 0, given[index], -1) if len(sources) else np.full(len(targets), -1)
-    device = dst_means.device
-    return Transfer(
-        torch.from_numpy(labels).to(device),
-        torch.from_numpy(distances).to(dst_means),
-        torch.from_numpy(index).to(device),
-        chosen,
-        how,
-    )
+    labels = np.append(given, -1)[index]  # the last one for index -1
+    carried, winners = (torch.from_numpy(values).to(dst_means.device) for values in (labels, index))
+    return Transfer(carried, torch.from_numpy(distances).to(dst_means), winners, chosen, how)
 
 
 class Sources:
@@ -155,61 +136,44 @@ class Sources:
     def nearest(self, points: Array, distance: float = np.inf) -> tuple[Array, Array]:  # [N] float64, [N] int64
         """Distance and index of the nearest source **strictly** closer than `distance`; infinite and -1 if there is none.
 
-        Of equally near ones it is the lowest index. scipy returns them in any order: if all that were found are equally
-        near, more are searched.
+        Of equally near ones it is the lowest index. scipy returns them in any order: while all are equally near, ask for more.
         """
         far, index = np.full(len(points), np.inf), np.full(len(points), -1)
-        order = _neighbours_together(points)
-        for left in (order[i : i + CHUNK] for i in range(0, len(points), CHUNK) if len(self)):
+        if not (len(points) and len(self)):
+            return far, index
+        # neighbours follow each other: a tree answers twice as fast
+        cell = max(float(np.ptp(points, axis=0).max()) / 64, np.finfo(np.float64).tiny)
+        order: Array = np.lexsort(np.floor((points - points.min(axis=0)) / cell).T)
+        n, ours = len(self), np.append(self.index, -1)  # scipy's index of none is n
+        for left in (order[i : i + CHUNK] for i in range(0, len(points), CHUNK)):
             k = 1
             while left.size:
-                k = min(2 * k, len(self))
+                k = min(2 * k, n)
                 near, which = self.tree.query(points[left], k=k, distance_upper_bound=distance, workers=-1)
                 near, which = np.reshape(near, (len(left), k)), np.reshape(which, (len(left), k))
                 near[near >= distance] = np.inf  # scipy compares squares, which rounds otherwise
-                tied, found = near == near[:, :1], np.isfinite(near[:, 0])
-                lowest = np.where(tied, which, len(self)).min(axis=1)
-                far[left] = near[:, 0]
-                index[left] = np.where(found, self.index[np.where(found, lowest, 0)], -1)
-                left = left[tied.all(axis=1) & found & (k < len(self))]
+                tied = (near == near[:, :1]) & np.isfinite(near)
+                far[left], index[left] = near[:, 0], ours[np.where(tied, which, n).min(axis=1)]
+                left = left[tied.all(axis=1) & (k < n)]
         return far, index
 
     def default_distance(self, targets: Array) -> tuple[float, str]:
-        """Lambda for these destinations (see `nearest_labels`), in world units, and one line that explains it.
-
-        Measured on an evenly strided sample of at most 20,000 Gaussians of each cloud.
-        """
+        """Lambda for these destinations (see `nearest_labels`), in world units, and one line that explains it."""
         if len(self) == 0:
             return 0.0, "no labelled source"
         tiny = 1e-6 * max(1.0, float(np.abs(self.tree.maxes).max()), float(np.abs(self.tree.mins).max()))
         if len(targets) == 0:
             return tiny, "no destinations"
-        needed = f"{100 * COVERAGE:g} % of the destinations"
         reach = float(np.quantile(self.tree.query(sampled(targets), workers=-1)[0], COVERAGE))
-        if len(self) == 1:
-            return max(1.01 * reach, tiny), f"{needed} lie within {reach:.3g} of the one source position"
-        spacings = np.asarray(self.tree.query(sampled(np.asarray(self.tree.data)), k=2, workers=-1)[0])[:, 1]
-        usual, wide = (float(spacing) for spacing in np.quantile(spacings, [0.5, WIDE]))
-        if reach > FARTHEST * wide:
-            return max(FARTHEST * wide, tiny), (
-                f"{FARTHEST:g} wide source spacings of {wide:.3g} ({needed} would need {reach:.3g})"
-            )
-        if reach < NEAREST * usual:
-            return max(NEAREST * usual, tiny), (
-                f"{NEAREST:g} median source spacings of {usual:.3g} ({needed} need only {reach:.3g})"
-            )
-        return max(
-            reach, tiny
-        ), f"{needed} have a source within it (source spacings: {usual:.3g} median, {wide:.3g} wide)"
-
-
-def _neighbours_together(points: Array) -> Array:  # [N, 3] -> [N] int64
-    """An order in which neighbours follow each other: queries of a tree in this order are twice as fast."""
-    if len(points) == 0:
-        return np.empty(0, dtype=np.int64)
-    cell = max(float(np.ptp(points, axis=0).max()) / 64, np.finfo(np.float64).tiny)
-    order: Array = np.lexsort(np.floor((points - points.min(axis=0)) / cell).T)
-    return order
+        usual = wide = 1.01 * reach / NEAREST  # of a single source, which is to reach that far
+        if len(self) > 1:
+            spacings = np.asarray(self.tree.query(sampled(np.asarray(self.tree.data)), k=2, workers=-1)[0])[:, 1]
+            usual, wide = (float(spacing) for spacing in np.quantile(spacings, [0.5, WIDE]))
+        chosen = min(max(reach, NEAREST * usual), FARTHEST * wide)
+        return max(chosen, tiny), (
+            f"{100 * COVERAGE:g} % of the destinations have a source within {reach:.3g}; the sources' spacings are "
+            f"{usual:.3g} (median) and {wide:.3g} ({100 * WIDE:g} % are smaller)"
+        )
 
 
 def sampled(points: Array) -> Array:

@@ -128,7 +128,7 @@ def attach(
     if by == "distance":
         transfer = _carry(transform_gaussians(semantic, similarity), splats, distance)
         labels, scores = transfer.labels, transfer.scores
-        how = {"labelled by": "distance to the field's Gaussians", "score": NEARNESS}
+        how: dict[str, Any] = {"labelled by": "distance to the field's Gaussians", "score": NEARNESS}
     else:
         assert cameras is not None
         labels, scores, transfer = _by_views(field, splats, semantic, classes, cameras, similarity, distance)

@@ -24,7 +24,6 @@ from ..labels import (
     connected_parts,
     load_label_set,
 )
-from ..labels.edit_list import edits_path
 from ..scenes import FeatureFolder, Scene, load_scene
 from ..toy.room_folder import ToyConfig, make_toy_room
 from .attach import attach
@@ -136,7 +135,7 @@ def _edit_colors(
     }
     after = {name: edit.apply(before) for name, edit in edits.items()}
     for name, edit in edits.items():
-        written += [*write_splats(after[name], out / f"{name}.ply").paths, edit.save(edits_path(out / f"{name}.ply"))]
+        written += [*write_splats(after[name], out / f"{name}.ply").paths, edit.save(out / f"{name}.ply.edits.json")]
         before_after = before, after[name]
         views = views_of_change(*before_after, scene.cameras)
         picture = out / f"{name}.png"

@@ -79,12 +79,10 @@ def test_negatives_are_the_classes_the_canonical_words_or_none():
     assert canonical.scores[0] == 0.5
     alone = field().query("chair", CLASSES, 0.9, negatives="none")
     assert alone.scores.tolist() == [0, 1, 0, 0, 0, 0]
-    share = field().query("chair", CLASSES, 0.5, negatives="classes", score="softmax", logit_scale=100)
-    assert share.indices.tolist() == [1]
     rows = field().query("chair", CLASSES, negatives=FIVE[4:])
     assert "any of 1 negatives" in rows.how
     assert rows.scores[4] < 0.01
-    for found in (chair, canonical, alone, share, rows):
+    for found in (chair, canonical, alone, rows):
         assert found.scores[5] == 0  # never learnt
 
 

@@ -22,10 +22,10 @@ def test_run_lengths() -> None:
 @pytest.mark.parametrize(
     ("segmentation", "message"),
     [
-        ({"size": [3, 4], "counts": [3, 2]}, "another sum"),
+        ({"size": [3, 4], "counts": [3, 2]}, "another size"),
         ({"size": [3, 4], "counts": [13, -1]}, "counts: expected"),
-        ({"size": [3], "counts": [3]}, "add up to the size"),
-        ({"size": [10**9, 10**9], "counts": [10**18]}, "65,535"),
+        ({"size": [3], "counts": [3]}, "counts: expected"),
+        ({"size": [10**9, 10**9], "counts": [10**18]}, "another size"),
         ({"size": [3, 4], "counts": "T"}, "Invalid RLE"),
         ({"size": [3, 4], "counts": "3 1"}, "Invalid RLE"),
     ],

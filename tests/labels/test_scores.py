@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import torch
 from messages import tells
-from oracles_words import softmax_share
 
 from kfgs.labels import relevancy
 from kfgs.labels.scores import select_by_similarity, similarity_threshold
@@ -46,29 +45,11 @@ def cosines(n=40, m=5, seed=0):
     return values[:, 0], values[:, 1:]
 
 
-@pytest.mark.parametrize("scale", [1.0, 1 / 0.07, 100.0])
-def test_softmax_is_the_share_of_the_query(scale):
-    similarity, negatives = cosines()
-    scores = select_by_similarity(similarity, negatives, score="softmax", logit_scale=scale).scores
-    np.testing.assert_allclose(scores, softmax_share(similarity, negatives, scale), rtol=1e-9)
-
-
 def test_defaults_are_the_relevancy_with_negatives_and_the_cosine_without():
     similarity, negatives = cosines()
     assert select_by_similarity(similarity).scores.equal(similarity)
     assert select_by_similarity(similarity, negatives).scores.equal(relevancy(similarity, negatives))
     assert select_by_similarity(similarity, negatives, score="cosine").scores.equal(similarity)
-
-
-def test_a_softmax_finds_its_threshold_in_the_scores_and_says_its_scale():
-    similarity = torch.cat([torch.full((90,), 0.1), torch.full((10,), 0.4)])
-    negatives = torch.full((100, 3), 0.2)
-    found = select_by_similarity(similarity, negatives, score="softmax")
-    assert found.indices.tolist() == list(range(90, 100))
-    assert "softmax over 4 words, logit scale 100" in found.how
-    raw = select_by_similarity(similarity, negatives, score="softmax", logit_scale=1.0)
-    assert raw.mask.equal(found.mask)  # nearly uniform, but its modes are apart all the same
-    assert select_by_similarity(similarity, negatives, score="cosine").mask.equal(found.mask)
 
 
 # Facts about real embeddings: CLIP ViT-B/32 of LVIS's 1203 names ("a {name}"), CLIP ViT-B/16 of COCO-Stuff's 171.
@@ -102,17 +83,14 @@ def test_wrong_input_is_named():
         relevancy(torch.ones(3), torch.ones(4, 1))
     with pytest.raises(ValueError, match=tells("similarity:", "got NaN", "row 1")):
         select_by_similarity(torch.tensor([0.0, math.nan]))
-    for score in (None, "softmax"):
-        with pytest.raises(ValueError, match=tells("threshold:", "[0, 1]", "got -0.5")):
-            select_by_similarity(similarity, negatives, -0.5, score=score)
+    with pytest.raises(ValueError, match=tells("threshold:", "[0, 1]", "got -0.5")):
+        select_by_similarity(similarity, negatives, -0.5)
     with pytest.raises(ValueError, match=tells("threshold:", "[-1, 1]", "got 1.5")):
         select_by_similarity(similarity, threshold=1.5)
-    with pytest.raises(ValueError, match=tells("score:", "'cosine', 'softmax', 'relevancy'", "got 'dot'")):
+    with pytest.raises(ValueError, match=tells("score:", "'cosine', 'relevancy'", "got 'dot'")):
         select_by_similarity(similarity, score="dot")
-    with pytest.raises(ValueError, match=tells("negatives", "'softmax'", "got none")):
-        select_by_similarity(similarity, score="softmax")
-    with pytest.raises(ValueError, match=tells("logit_scale:", "(0, inf)", "got 0")):
-        select_by_similarity(similarity, negatives, score="softmax", logit_scale=0)
+    with pytest.raises(ValueError, match=tells("negatives", "got none")):
+        select_by_similarity(similarity, score="relevancy")
 
 
 def mixture(parts, seed=0):

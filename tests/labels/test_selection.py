@@ -135,7 +135,6 @@ def test_what_a_selection_knows():
     chosen = Selection(torch.tensor([False, True, True]), torch.tensor([0.1, 0.7, 0.9]), 0.5, "given")
     assert (len(chosen), chosen.indices.tolist()) == (2, [1, 2])
     assert repr(chosen) == "Selection(2 of 3 Gaussians: score > 0.5 (given))"
-    assert "2 of 3 Gaussians" in chosen._repr_html_()
     assert not Selection.of(torch.zeros(3, dtype=torch.bool))  # empty is false
 
 
@@ -216,6 +215,5 @@ def test_flat_thin_and_single_points():
     assert (2 * OrientedBox.around(flat).half).tolist() == pytest.approx([2, 1, 0], abs=1e-9)
     point = OrientedBox.around(torch.tensor([[1.0, 2, 3]]).expand(5, 3))
     assert (point.center.tolist(), point.half.tolist(), point.volume) == ([1, 2, 3], [0, 0, 0], 0)
-    assert set(point.to_json()) == {"center", "axes", "half"}
     with pytest.raises(ValueError, match=tells("points:", "got NaN", "row 1")):
         OrientedBox.around(torch.tensor([[0.0, 0, 0], [0, math.inf, 0]]))
