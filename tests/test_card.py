@@ -1,13 +1,5 @@
-import builtins
 import importlib
-import inspect
-import pkgutil
-import types
-import typing
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
-from pathlib import Path
-from typing import NamedTuple
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
@@ -15,10 +7,9 @@ import torch
 from cases_quant import made_autoencoder
 from torch import Tensor
 
-import kfgs
 from kfgs import Camera, Gaussians, SemanticField, rasterize
 from kfgs._card import LONGEST, html_card, short_repr, short_value
-from kfgs.fields import Autoencoded, Identity
+from kfgs.fields import Autoencoded
 from kfgs.labels import EditList, LabelSet, Remove, Selection
 from kfgs.quant import Codebook, LinearLatents
 from kfgs.quant.codebook import CodebookReport, Nearest
@@ -52,20 +43,6 @@ def test_a_line_shows_tensors_by_shape_and_type():
 
     assert repr(Thing(torch.zeros(4, 2), ("a", "b"))) == "Thing(rows=[4, 2] float32, names=('a', 'b'))"
     assert repr(Thing(torch.zeros(0, 2, dtype=torch.float64), ("a",) * 9)).endswith("[0, 2] float64, names=9 of str)")
-
-
-def test_a_line_of_a_named_tuple():
-    class Pair(NamedTuple):
-        left: np.ndarray
-        right: object
-
-        def __repr__(self) -> str:
-            return short_repr(self)
-
-    inner = Pair(np.zeros(2), 1)
-    assert repr(Pair(np.zeros((3, 1), dtype=np.int64), inner)) == (
-        "Pair(left=[3, 1] int64, right=Pair(left=[2] float64, right=1))"
-    )
 
 
 def test_no_value_is_long():
@@ -162,107 +139,3 @@ def test_lines_stay_short_and_cards_are_tables():
         assert card.startswith("<table>")
         assert all(fact in card for fact in facts)
         assert len(card) < 2_000
-
-
-class Anything(type):
-    """What stands for names that are imported for type checkers alone: it has every attribute."""
-
-    def __getattr__(cls, name):
-        if name.startswith("__"):
-            raise AttributeError(name)
-        return cls
-
-
-class Nothing(metaclass=Anything):
-    pass
-
-
-class Names(dict):
-    """The names that the annotations of a module are read with."""
-
-    def __missing__(self, name):
-        return getattr(builtins, name, Nothing)
-
-
-BOX = kfgs.labels.OrientedBox(torch.zeros(3), torch.eye(3), torch.ones(3))
-FLAT = torch.ones(40, 3)
-KNOWN = {
-    SemanticField: SemanticField(Gaussians(FLAT, torch.ones(40, 4), FLAT, FLAT[:, 0] / 2, FLAT), Identity(3)),
-    Camera: Camera(torch.eye(4), torch.eye(3), 4, 3, name="view.png"),
-    kfgs.cameras.Similarity: kfgs.cameras.Similarity.identity(),
-    kfgs.labels.Part: kfgs.labels.Part(torch.arange(40), 1.0, torch.ones(3), BOX, (torch.ones(3),) * 2, None, "name"),
-    str: "name",
-    Path: Path("/a/folder/name"),
-}
-
-
-def field_names(kind):
-    return [one.name for one in fields(kind)] if is_dataclass(kind) else list(getattr(kind, "_fields", ()))
-
-
-def made_up(kind):
-    """A value of an annotated type. Tensors and arrays have 120 numbers; objects are not checked, but filled in."""
-    origin, inside = typing.get_origin(kind), typing.get_args(kind)
-    if kind in KNOWN:
-        return KNOWN[kind]
-    if Tensor in (kind, origin) or np.ndarray in (kind, origin):
-        return torch.rand(40, 3) if kind is Tensor else np.random.default_rng(0).random((40, 3))
-    if origin in (typing.Annotated, typing.Union, types.UnionType):
-        return made_up(Tensor if Tensor in inside else inside[0])
-    if origin is typing.Literal:
-        return inside[0]
-    if origin is tuple:
-        return tuple(made_up(one) for one in (inside[:1] * 3 if inside[-1] is Ellipsis else inside))
-    if inspect.isclass(origin) and issubclass(origin, Mapping):
-        return {f"name {i}": made_up(inside[1]) for i in range(3)}
-    if inspect.isclass(origin) and issubclass(origin, Sequence):
-        return [made_up(inside[0])] * 3
-    if kind in (int, float, bool):
-        return kind(1)
-    return filled(kind) if inspect.isclass(kind) and kind.__module__.startswith("kfgs") and field_names(kind) else None
-
-
-def filled(kind):
-    hints = typing.get_type_hints(kind, {}, Names(vars(importlib.import_module(kind.__module__))))
-    values = {
-        name: None if kind in typing.get_args(hints[name]) else made_up(hints[name]) for name in field_names(kind)
-    }
-    if hasattr(kind, "_make"):
-        return kind._make(values.values())
-    thing = object.__new__(kind)
-    for name, value in values.items():
-        object.__setattr__(thing, name, value)
-    return thing
-
-
-def holds_numbers(value):
-    """Whether a tensor or an array lies in it, at any depth."""
-    if isinstance(value, Mapping):
-        return any(map(holds_numbers, value.values()))
-    if isinstance(value, list | tuple):
-        return any(map(holds_numbers, value))
-    inside = is_dataclass(value) and any(holds_numbers(getattr(value, name)) for name in field_names(value))
-    return inside or isinstance(value, Tensor | np.ndarray)
-
-
-def kinds():
-    """The public dataclasses and named tuples, without options, which show all that was chosen."""
-    for package in pkgutil.iter_modules(kfgs.__path__, "kfgs."):
-        names = getattr(importlib.import_module(package.name), "__all__", ()) if package.ispkg else ()
-        for kind in (getattr(importlib.import_module(package.name), name) for name in names):
-            own = inspect.isclass(kind) and kind.__module__.startswith("kfgs") and not inspect.isabstract(kind)
-            if own and field_names(kind) and kind.__name__ not in ("Uplift", "BatchOptions"):
-                yield kind
-
-
-def test_every_object_with_tensors_shows_itself_in_a_short_line():
-    seen, long = 0, []
-    for kind in kinds():
-        thing = KNOWN.get(kind) or filled(kind)
-        if holds_numbers(thing):
-            seen += 1
-            line = repr(thing)
-            if len(line) >= 200 or "\n" in line:
-                long.append(f"{kind.__module__}.{kind.__name__}: {line[:80]}")
-    assert seen > 25
-    assert long == [], "\n".join(long)

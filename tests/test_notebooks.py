@@ -6,11 +6,9 @@ import importlib.util
 import json
 import re
 import sys
-import tomllib
 from pathlib import Path
 
 import pytest
-from messages import tells
 
 jupytext = pytest.importorskip("jupytext", reason='the notebooks need: pip install "kfgs[notebook]"')
 pytest.importorskip("nbclient", reason='the notebooks need: pip install "kfgs[notebook]"')
@@ -65,14 +63,6 @@ def test_a_notebook_has_at_most_100_lines_of_code(source):
         line for cell in code_cells(source) for line in cell.splitlines() if line.strip() and line.strip()[0] != "#"
     ]
     assert len(lines) <= 100
-
-
-def test_there_is_no_notebook_without_its_source():
-    assert {path.stem for path in NOTEBOOKS.glob("*.ipynb")} == {path.stem for path in SOURCES}
-
-
-def test_they_are_numbered_from_1():
-    assert [int(path.name.split("_")[0]) for path in SOURCES] == list(range(1, len(SOURCES) + 1))
 
 
 def test_one_cell_is_for_your_own_data_and_it_is_among_the_first(source):
@@ -132,13 +122,6 @@ def test_the_readme_lists_them_all():
         assert f"]({path.stem}.ipynb)" in text
 
 
-def test_links_between_notebooks_lead_somewhere(source):
-    for cell in jupytext.read(source, fmt="py:percent").cells:
-        if cell.cell_type == "markdown":
-            for target in [part.split(")")[0].strip() for part in cell.source.split("](")[1:]]:
-                assert target.startswith("http") or (NOTEBOOKS / target).exists(), f"no {target}"
-
-
 PICTURE = "from PIL import Image\n\nImage.new('RGB', (8, 8), (255, 0, 0))"
 
 
@@ -195,23 +178,3 @@ def test_a_cell_that_ends_python_or_never_ends_is_reported(runner, tmp_path):
     outcome = runner.run_notebook(sleeper, tmp_path / "built", seconds=1)
     assert outcome.problems[0].startswith("cell 1 (import time) does not end")
     assert not list(tmp_path.glob("built/*"))
-
-
-def test_unknown_numbers_are_refused(runner, tmp_path, capsys):
-    write_source(tmp_path, "1")
-    assert [path.name for path in runner.find_sources(tmp_path)] == ["1_tiny.py"]
-    with pytest.raises(ValueError, match=tells("N:", "[1]", "got 4")):
-        runner.find_sources(tmp_path, [1, 4])
-    with pytest.raises(SystemExit):
-        runner.main(["4", "--sources", str(tmp_path)])
-    assert "expected one of [1]" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    "path", [*SOURCES, NOTEBOOKS / "README.md", NOTEBOOKS.parent / "README.md"], ids=lambda p: p.name
-)
-def test_every_extra_that_is_named_exists(path):
-    text = path.read_text(encoding="utf-8")
-    declared = tomllib.loads((NOTEBOOKS.parent / "pyproject.toml").read_text(encoding="utf-8"))
-    extras = {extra for found in re.findall(r'"\.\[([^]]*)\]"', text) for extra in found.split(",")}
-    assert extras <= declared["project"]["optional-dependencies"].keys()

@@ -162,13 +162,6 @@ def test_what_users_are_shown_to_import_is_on_a_page_with_an_example(path):
         assert has_example(entry), f"{name}: no example"
 
 
-def test_names_are_read_from_imports_and_attributes():
-    code = (
-        "import kfgs\nfrom kfgs import viz, attach\nfrom kfgs.labels import InBox as Box\nviz.palette()\nkfgs.uplift.x"
-    )
-    assert names_of_kfgs(ast.parse(code)) == {"kfgs.attach", "kfgs.labels.InBox", "kfgs.viz.palette", "kfgs.uplift"}
-
-
 @pytest.mark.parametrize("topic", TOPICS)
 def test_the_examples_of_a_page_run(topic, request):
     if topic == "view":

@@ -42,10 +42,6 @@ def site(tmp_path_factory):
     return built
 
 
-def test_there_are_formulas():
-    assert PAGES
-
-
 def test_every_formula_is_drawn_without_a_network(site):
     with software_chromium(OFFLINE) as browser:
         tab = browser.new_page()

@@ -86,13 +86,6 @@ def test_shapes_beside_arguments_are_read_and_other_comments_are_not():
     assert shapes(inspect.signature) == []
 
 
-def test_a_comment_beside_a_whole_signature_is_not_given_to_each_argument():
-    shapes = load("kfgs_shapes").shapes_of
-    assert shapes(kfgs.SemanticField.cosines) == ["[M, D] -> [N, M]"]
-    assert shapes(kfgs.SemanticField.feature_map) == ["returns [H, W, D]"]
-    assert shapes(labels.OrientedBox.around) == ["``points`` [N, 3]"]
-
-
 def test_comments_beside_the_fields_of_a_class_are_read():
     source = (
         "class Seen(NamedTuple):\n"
@@ -108,12 +101,6 @@ def test_comments_beside_the_fields_of_a_class_are_read():
     analyzer = importlib.import_module("sphinx.pycode").ModuleAnalyzer.for_string(source, "seen")
     load("kfgs_shapes").analyze(analyzer)
     assert analyzer.attr_docs["Seen", "pixels"] == ["[N] of all views", ""]
-
-
-def test_a_tilde_in_code_is_kept():
-    lines = ["`~a` and `a | b`"]
-    load("kfgs_shapes").add_shapes(None, "class", "kfgs.A", None, None, lines)
-    assert lines == ["``~a`` and `a | b`"]
 
 
 def notebook_of(title, *pictures, tagged=None):
