@@ -1,5 +1,6 @@
 import importlib
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
