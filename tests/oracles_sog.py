@@ -68,24 +68,3 @@ def sog_gaussian(files: dict[str, bytes], i: int) -> dict[str, np.ndarray]:
         "opacities": np.array(color[3] / 255),
         "sh": np.array(sh),
     }
-
-
-def version_1(files: dict[str, bytes], degree: int) -> dict[str, bytes]:
-    """The same images under a `meta.json` of version 1, which has bounds for codebooks and says no degree."""
-    meta = json.loads(files["meta.json"])
-    count = meta["count"]
-    old = {
-        "means": {"shape": [count, 3], "dtype": "float32", **meta["means"]},
-        "scales": {"shape": [count, 3], "mins": [-9.0, -8.0, -7.0], "maxs": [1.0, 2.0, 0.5], "files": ["scales.webp"]},
-        "quats": {"shape": [count, 4], "encoding": "quaternion_packed", "files": ["quats.webp"]},
-        "sh0": {"shape": [count, 1, 4], "mins": [-2.0, -1.5, -1, -6], "maxs": [2, 3, 4, 7.5], "files": ["sh0.webp"]},
-    }
-    if degree:
-        old["shN"] = {
-            "shape": [count, 3],
-            "mins": -0.75,
-            "maxs": 1.25,
-            "quantization": 8,
-            "files": meta["shN"]["files"],
-        }
-    return files | {"meta.json": json.dumps(old).encode()}

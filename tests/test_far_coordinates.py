@@ -110,7 +110,7 @@ def test_origin_of_another_version_is_refused_and_its_advice_works(tmp_path):
     write_splats(splats.replace(labels=None), tmp_path / "far.splat")
     with (tmp_path / "far.splat").open("r+b") as file:
         file.truncate(32)
-    with pytest.raises(ValueError, match=r"far.splat.origin.json: expected the origin of this version .*; delete it"):
+    with pytest.raises(ValueError, match=r"far.splat.origin.json: .* another version; delete it"):
         read_splats(tmp_path / "far.splat")
     (tmp_path / "far.splat.origin.json").unlink()
     assert len(read_splats(tmp_path / "far.splat")) == 1

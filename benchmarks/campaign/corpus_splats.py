@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from kfgs.formats import formats, write_splats
+from kfgs.formats import write_splats
 from kfgs.formats.ply import write_ply
+from kfgs.formats.table import formats
 from kfgs.gaussians import Gaussians
 
 from .corpus import SEED, Add
@@ -57,8 +58,6 @@ def _others(place: Path, add: Add) -> None:
     add("splats", place, "a.gltf", "two.spz", "a.ksplat", "ascii.ply")
     write_ply(place / "points.ply", {name: np.arange(9, dtype=np.float32) for name in "xyz"})
     add("cloud", place, "points.ply")
-    (place / "mesh.ply").write_bytes(_mesh())
-    add("mesh", place, "mesh.ply")
 
 
 def _ascii_ply() -> bytes:
@@ -67,15 +66,6 @@ def _ascii_ply() -> bytes:
     head = "".join(f"property float {name}\n" for name in names)
     rows = "\n".join(" ".join(f"{i + j / 8:g}" for j in range(len(names))) for i in range(6))
     return f"ply\nformat ascii 1.0\ncomment made by hand\nelement vertex 6\n{head}end_header\n{rows}\n".encode()
-
-
-def _mesh() -> bytes:
-    head = (
-        "ply\nformat binary_little_endian 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
-    )
-    head += "element face 2\nproperty list uchar int vertex_indices\nproperty int object_id\nend_header\n"
-    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4").tobytes()
-    return head.encode() + corners + b"".join(struct.pack("<B3ii", 3, *three) for three in ((0, 1, 2, 7), (0, 2, 3, 9)))
 
 
 def _ksplat(n: int = 3) -> bytes:

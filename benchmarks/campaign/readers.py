@@ -15,13 +15,7 @@ def _splats(path: Path) -> None:
 def _cloud(path: Path) -> None:
     from kfgs.formats.ply import points_from_columns, read_ply
 
-    points_from_columns(read_ply(path))
-
-
-def _mesh(path: Path) -> None:
-    from kfgs.formats.ply import read_mesh
-
-    read_mesh(path)
+    points_from_columns(path, read_ply(path))
 
 
 def _scene(path: Path) -> None:
@@ -167,7 +161,6 @@ def _foreign(path: Path) -> None:
 READERS: dict[str, Callable[[Path], None]] = {
     "splats": _splats,
     "cloud": _cloud,
-    "mesh": _mesh,
     "scene": _scene,
     "points": _points,
     "labels": _labels,

@@ -63,7 +63,7 @@ def _parts(folders: set[Path]) -> Iterator[Path]:
 
 def check_target(name: str, target: Path) -> None:
     """Raise a ValueError unless `target` can become a splat file; see `check_output`."""
-    from ..formats import formats
+    from ..formats.table import formats
 
     endings = tuple(ending for kind in formats().values() if hasattr(kind, "write") for ending in kind.SUFFIXES)
     if not target.name.lower().endswith(endings):

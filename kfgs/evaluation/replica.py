@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from plyfile import PlyData, PlyElementParseError
 from torch import Tensor
 
 from .._arrays import reading
 from .._files import as_path, read_json, real_path
 from .._origin import in_world
-from ..formats.ply import points_from_columns, read_mesh
 from ..scenes.files import natural_key, some
 from .label_pictures import Ids, read_ids, relabel
 from .truth import LabelTruth, PointTruth, ReadWhenAsked
@@ -42,20 +43,27 @@ def load_replica_points(path: str | Path) -> PointTruth:
     file = next((place for place in places if place.is_file()), None)
     if file is None:
         raise FileNotFoundError(f"{places[0]}: no such file; expected Replica's mesh with an object per face there")
-    mesh = read_mesh(file)
-    if "object_id" not in mesh.faces:
-        raise ValueError(
-            f"{file}: expected faces with an 'object_id', got {', '.join(mesh.faces) or 'corners only'}; give "
-            "habitat/mesh_semantic.ply, not mesh.ply"
-        )
     names, of_object = read_replica_info(file.with_name(INFO))
-    with reading(file, "a mesh with vertices"):
-        points = in_world(points_from_columns(mesh.vertices))
-    objects = np.repeat(mesh.faces["object_id"].astype(np.int64), mesh.counts)
-    instances = _most_frequent(mesh.corners, objects, len(points))
+    points, corners, counts, objects = _read_mesh(file)
+    instances = _most_frequent(corners, np.repeat(objects, counts), len(points))
     unique, inverse = np.unique(instances, return_inverse=True)
     labels = np.array([of_object.get(int(o), -1) for o in unique], dtype=np.int64)[inverse]
-    return PointTruth(points, torch.from_numpy(labels), names, torch.from_numpy(instances))
+    return PointTruth(in_world(torch.from_numpy(points)), torch.from_numpy(labels), names, torch.from_numpy(instances))
+
+
+def _read_mesh(file: Path) -> tuple[NDArray[np.float64], Ids, Ids, Ids]:
+    """Vertices [N, 3]; the corners [C] of all faces, one face after another; how many each has [F], and its object [F]."""
+    with reading(file, "a mesh with vertices and faces with an 'object_id' (habitat/mesh_semantic.ply, not mesh.ply)"):
+        try:  # mapped if all faces are quads, as in most rooms; others are read one by one
+            ply = PlyData.read(file, known_list_len={"face": {"vertex_indices": 4}})
+        except PlyElementParseError:
+            ply = PlyData.read(file)
+        faces, objects = np.asarray(ply["face"]["vertex_indices"]), np.array(ply["face"]["object_id"], np.int64)
+        points = np.stack([ply["vertex"][axis] for axis in "xyz"], 1).astype(np.float64)
+        corners = np.concatenate([np.zeros(0, np.int64), *faces]).astype(np.int64)
+        if len(corners) and not 0 <= corners.min() <= corners.max() < len(points):
+            raise ValueError(f"it has {len(points)} vertices, and a face of vertex {corners.max()}")
+        return points, corners, np.array([len(face) for face in faces], np.int64), objects
 
 
 def load_semantic_nerf_labels(path: str | Path, info: str | Path | None = None) -> LabelTruth:

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from .._arrays import reading
 from .._files import as_path
 from .._origin import in_world
 from ..formats.ply import points_from_columns, read_ply
@@ -43,8 +42,7 @@ def load_scannet_points(path: str | Path) -> PointTruth:
     if not bool(((labels >= 1) & (labels <= 40)).any()):
         got = labels.unique()[:5].tolist()
         raise ValueError(f"{file}: expected NYU40 ids of 1 to 40, got only {got}; are these labels of another table?")
-    with reading(file, "a mesh with labelled vertices"):
-        points = in_world(points_from_columns(columns))
+    points = in_world(points_from_columns(file, columns))
     return PointTruth(points, labels, nyu40_names())
 
 

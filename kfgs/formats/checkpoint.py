@@ -20,23 +20,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._arrays import reading
+from .._arrays import FileError, reading
 from .._files import read_json
-from .._notes import tell
 from .._torch_files import plain_tensor, read_torch
 from ..cameras.similarity import Similarity
 from ..gaussians import Gaussians
 from ..splat.transform import transform_gaussians
 from .render_mode import Mode, with_mode
-from .values import NO_DEGREE_4, SH_C0, positive_scales
+from .values import SH_C0, positive_scales, up_to_degree_3
 
 NAME = "checkpoint"
 SUFFIXES = (".pt", ".ckpt")
-HOLDS_LABELS = False
 FRAME = "dataparser_transforms.json"
 SETTINGS = ("config.yml", "cfg.yml")
 _EXPECTED = "a checkpoint of gsplat (with 'splats') or of nerfstudio's splatfacto (with 'pipeline')"
-_NAMES = ("means", "scales", "quats", "opacities")
 
 
 def matches(head: bytes) -> bool:
@@ -50,23 +47,16 @@ def read(path: Path) -> Gaussians:
     """Read the Gaussians of a checkpoint; optimisers and networks in it are skipped.
 
     Of gsplat, the files of all ranks of the step are joined.
-
-    Raises:
-        ValueError: if it is something else, damaged, or its colours come from a network (gsplat's `app_opt`); or if
-            `dataparser_transforms.json` is damaged.
     """
     top = read_torch(path, _EXPECTED)
     content = top if isinstance(top, dict) else {}
-    if isinstance(content.get("splats"), dict):
-        files = _ranks(path)
-        parts = [_gsplat(file, content if file == path else read_torch(file, _EXPECTED)) for file in files]
-        _tell_dropped(path, content["splats"])
+    if "splats" in content:
+        parts = [_gsplat(file, content if file == path else read_torch(file, _EXPECTED)) for file in _ranks(path)]
         return with_mode(path, Gaussians.cat(parts), _mode(path))
-    if isinstance(content.get("pipeline"), dict):
-        _tell_dropped(path, content["pipeline"])
+    if "pipeline" in content:
         return with_mode(path, _undo_frame(path, _splatfacto(path, content["pipeline"])), _mode(path))
     got = f"one with {', '.join(map(str, list(content)[:5]))}" if content else type(top).__name__
-    raise ValueError(f"{path}: expected {_EXPECTED}, got {got:.200}; name another file")
+    raise FileError(f"{path}: expected {_EXPECTED}, got {got:.200}; name another file")
 
 
 def _mode(path: Path) -> Mode:
@@ -88,71 +78,53 @@ def _ranks(path: Path) -> list[Path]:
     ranks = (re.fullmatch(re.escape(match[1]) + r"(\d+)\.pt", file.name) for file in path.parent.glob("*.pt"))
     numbers = sorted(int(rank[1]) for rank in ranks if rank)
     if numbers != list(range(len(numbers))):
-        raise ValueError(
-            f"{path}: expected the files of ranks 0 to {numbers[-1]} next to it, got {numbers}; copy them all"
-        )
+        raise ValueError(f"expected the files of ranks 0 to {numbers[-1]} next to it, got {numbers}; copy them all")
     return [path.with_name(f"{match[1]}{number}{match[3]}") for number in numbers]
 
 
-def _gsplat(path: Path, top: Any) -> Gaussians:
-    splats = top.get("splats") if isinstance(top, dict) else None
-    if not isinstance(splats, dict):
-        raise ValueError(f"{path}: expected {_EXPECTED}, got another file; copy the checkpoints again")
+def _gsplat(path: Path, top: dict[str, Any]) -> Gaussians:
+    splats = top["splats"]
     if "sh0" not in splats and "features" in splats:
         raise ValueError(
-            f"{path}: expected colours as spherical harmonics (sh0, shN), got features for a network (app_opt); export a PLY "
-            "with gsplat (--save_ply), or train without app_opt"
+            "its colours are features for a network (app_opt), not harmonics (sh0, shN); export a PLY with gsplat "
+            "(--save_ply), or train without app_opt"
         )
-    raw = {name: _raw(path, name, splats.get(name)) for name in (*_NAMES, "sh0")}
-    rest = _raw(path, "shN", splats["shN"]) if "shN" in splats else raw["sh0"][:, :0]
-    return _cloud(path, raw, raw["sh0"], rest)
+    return _cloud(path, splats, splats["sh0"], splats.get("shN"))
 
 
-def _splatfacto(path: Path, state: dict[Any, Any]) -> Gaussians:
-    prefixes = {
-        str(name).removesuffix("means") for name in state if re.search(r"(gauss_params|_model)\.means$", str(name))
-    }
+def _splatfacto(path: Path, state: dict[str, Any]) -> Gaussians:
+    prefixes = {name.removesuffix("means") for name in state if re.search(r"(gauss_params|_model)\.means$", name)}
     if len(prefixes) != 1:
         raise ValueError(
-            f"{path}: expected the Gaussians of splatfacto (_model.gauss_params.means, ...), got {len(prefixes)} sets; "
-            "is this a checkpoint of another method?"
+            f"it has {len(prefixes)} sets of Gaussians of splatfacto (_model.gauss_params.means, ...), not one: is it of "
+            "another method?"
         )
     (prefix,) = prefixes
-    raw = {name: _raw(path, prefix + name, state.get(prefix + name)) for name in (*_NAMES, "features_dc")}
-    dc = raw["features_dc"] if raw["features_dc"].ndim == 3 else raw["features_dc"][:, None]
-    rest = (
-        _raw(path, "features_rest", state[f"{prefix}features_rest"]) if f"{prefix}features_rest" in state else dc[:, :0]
-    )
-    if rest.ndim == 3 and rest.shape[1] == 0:  # trained without harmonics
-        dc = (dc.sigmoid() - 0.5) / SH_C0
-    return _cloud(path, raw, dc, rest)
+    values = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+    dc, rest = values["features_dc"], values.get("features_rest")
+    dc = dc if dc.ndim == 3 else dc[:, None]
+    if rest is None or rest.shape[1] == 0:  # trained without harmonics
+        dc, rest = (dc.sigmoid() - 0.5) / SH_C0, None
+    return _cloud(path, values, dc, rest)
 
 
-def _raw(path: Path, name: str, value: object) -> Tensor:
-    """A tensor of a file; broken Gaussians stay until `read_splats`, and places may be far from zero."""
-    return plain_tensor(path, name, value, torch.float64 if name.endswith("means") else torch.float32, finite=False)
-
-
-def _cloud(path: Path, raw: dict[str, Tensor], dc: Tensor, rest: Tensor) -> Gaussians:
-    """The Gaussians of raw values; a ValueError if shapes disagree."""
+def _cloud(path: Path, values: dict[str, Any], dc: Tensor, rest: Tensor | None) -> Gaussians:
+    """The Gaussians of raw values; broken ones stay until `read_splats`, and places may be far from zero."""
+    raw = {name: values[name] for name in ("means", "quats", "scales", "opacities")} | {"sh0": dc}
+    raw |= {} if rest is None else {"shN": rest}
+    wide = {"means": torch.float64}
+    raw = {name: plain_tensor(path, name, v, wide.get(name, torch.float32), finite=False) for name, v in raw.items()}
     N = len(raw["means"])
-    with reading(path, f"values of {N} Gaussians (from means)"):
-        if list(dc.shape) != [N, 1, 3] or rest.shape[1] not in (0, 3, 8, 15, 24) or raw["opacities"].numel() != N:
-            shapes = ", ".join(f"{name} {list(value.shape)}" for name, value in (raw | {"rest": rest}).items())
-            raise ValueError(shapes)
-        return Gaussians(
-            raw["means"],
-            raw["quats"],
-            positive_scales(path, raw["scales"].exp().numpy()),
-            raw["opacities"].reshape(N).sigmoid(),
-            sh=torch.cat([dc, rest], 1)[:, :16],
-        )
-
-
-def _tell_dropped(path: Path, values: dict[Any, Any]) -> None:
-    rest = [value for name, value in values.items() if str(name).endswith(("shN", "features_rest"))]
-    if any(getattr(value, "shape", ())[1:] == (24, 3) for value in rest):
-        tell(f"{path.name}: {NO_DEGREE_4}")
+    if raw["opacities"].numel() != N:
+        shapes = ", ".join(f"{name} {list(value.shape)}" for name, value in raw.items())
+        raise ValueError(f"its {N} Gaussians (from means) have values of other shapes: {shapes}")
+    return Gaussians(
+        raw["means"],
+        raw["quats"],
+        positive_scales(raw["scales"].exp().numpy()),
+        raw["opacities"].reshape(N).sigmoid(),
+        sh=up_to_degree_3(path, torch.cat([raw[name] for name in ("sh0", "shN") if name in raw], 1)),
+    )
 
 
 def _undo_frame(path: Path, cloud: Gaussians) -> Gaussians:

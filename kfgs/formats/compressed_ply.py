@@ -13,24 +13,24 @@ and 1 as logits of -10 and 10. The tests use it as an independent reader and wri
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from .._notes import tell
 from ..gaussians import Gaussians
 from .encodings import pack_smallest_three, unpack_smallest_three
 from .ply import Columns, read_comments, read_ply_elements, write_ply_elements
 from .render_mode import comments_of_mode, mode_from_comments, with_mode
-from .values import NO_DEGREE_4, SH_C0, colours_to_write, describe_coarse, describe_loss, positive_scales
+from .values import SH_C0, describe_coarse, positive_scales, up_to_degree_3
 
 NAME = "compressed_ply"
 SUFFIXES = (".compressed.ply",)
 MAGIC = b"ply"
-HOLDS_LABELS = False
+HOLDS = frozenset({"harmonics", "antialiased"})
 SORTS = True
 CHUNK = 256  # Gaussians between shared bounds
 LOG_SCALE_LIMIT = 20.0  # scales from e^-20 to e^20 world units, as other writers keep them
@@ -44,10 +44,8 @@ _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _FIELDS = (11, 10, 11)  # bits of x, y and z
 _STEPS = np.array([2047, 1023, 2047], np.float32)  # between the bounds of positions and log scales
 _COLOR_STEPS = np.array([255, 255, 255], np.float32)
-_ALL_STEPS = (_STEPS, _STEPS, _COLOR_STEPS)
 _ROUGH = 0.02  # error of a base colour that is seen, and reported: 5 of 255
 _ROUNDING = 6 * 2.0**-24  # float32: of the bounds, their difference, the product and the sum
-
 
 _Bounds = tuple[NDArray[np.float32], NDArray[np.float32]]  # lowest and highest values of each chunk, [C, 3]
 
@@ -59,90 +57,65 @@ def matches(head: bytes) -> bool:
 
 
 def read(path: Path) -> Gaussians:
-    """Read a compressed PLY file with harmonics of degree 0 to 4 (4 is dropped); opacities of 0 and 1 stay 0 and 1.
-
-    Raises:
-        ValueError: if it is truncated, or elements or columns are missing or disagree.
-    """
+    """Read a compressed PLY file; opacities of 0 and 1 stay 0 and 1."""
     elements = read_ply_elements(path)
     chunk, vertex = (elements.get(name, {}) for name in ("chunk", "vertex"))
-    _check_columns(path, "vertex", vertex, _PACKED, "uint32")
-    n, chunks = len(vertex[_PACKED[0]]), len(next(iter(chunk.values()), ()))
+    position, rotation, scale, color = _columns("vertex", vertex, _PACKED, "uint32")
+    n, chunks = len(position), len(next(iter(chunk.values()), ()))
     if chunks != -(-n // CHUNK):
-        raise ValueError(
-            f"{path}: expected {-(-n // CHUNK)} chunks for {n} Gaussians, {CHUNK} each, got {chunks}; the file is damaged"
-        )
-    extents, sizes = _read_bounds(path, chunk, _AXES[0]), _read_bounds(path, chunk, _AXES[1])
+        raise ValueError(f"expected {-(-n // CHUNK)} chunks for {n} Gaussians, {CHUNK} each, got {chunks}")
+    rgba = _unpack(color, (8, 8, 8, 8)) / np.float32(255)
     has_colours = any(name in chunk for side in _AXES[2] for name in side)  # older files have no bounds of colours
-    positions = _between(extents, _unpack_vectors(vertex["packed_position"]))
-    log_scales = _between(sizes, _unpack_vectors(vertex["packed_scale"]))
-    rgba = (vertex["packed_color"][:, None] >> np.array([24, 16, 8, 0], np.uint32) & 255).astype(
-        np.float32
-    ) / np.float32(255)
-    rgb = _between(_read_bounds(path, chunk, _AXES[2]), rgba[:, :3]) if has_colours else rgba[:, :3]
-    sh0 = (rgb - 0.5) / np.float32(SH_C0)
-    sh = np.concatenate([sh0[:, None], _read_rest(path, elements.get("sh"), n)], 1)
+    rgb = _between(_read_bounds(chunk, 2), rgba[:, :3]) if has_colours else rgba[:, :3]
+    sh = np.concatenate([((rgb - 0.5) / np.float32(SH_C0))[:, None], _read_rest(elements.get("sh", {}), n)], 1)
+    largest, *small = _unpack(rotation, (2, 10, 10, 10)).T
     with np.errstate(over="ignore"):  # left out
-        scales = np.exp(log_scales)
+        scales = np.exp(_between(_read_bounds(chunk, 1), _unpack(scale, _FIELDS) / _STEPS))
     gaussians = Gaussians(
-        means=torch.from_numpy(positions),
-        quats=_unpack_rotations(vertex["packed_rotation"]),
-        scales=positive_scales(path, scales),
+        means=torch.from_numpy(_between(_read_bounds(chunk, 0), _unpack(position, _FIELDS) / _STEPS)),
+        quats=unpack_smallest_three(largest.astype(np.int64), np.stack(small, 1), 1023),
+        scales=positive_scales(scales),
         opacities=torch.from_numpy(rgba[:, 3].copy()),
-        sh=torch.from_numpy(sh[:, :16]),
+        sh=up_to_degree_3(path, torch.from_numpy(sh)),
     )
-    if sh.shape[1] > 16:
-        tell(f"{path.name}: {NO_DEGREE_4}")
     return with_mode(path, gaussians, mode_from_comments(read_comments(path)))
 
 
-def write(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
-    """Write a compressed PLY file in the given order; precision is best if each 256 Gaussians lie close together.
-
-    Raises:
-        ValueError: if the cloud has no colours.
-    """
-    g = colours_to_write(gaussians, ".compressed.ply")
+def write(path: Path, g: Gaussians) -> list[str]:
+    """Write a compressed PLY file in the given order; precision is best if each 256 Gaussians lie close together."""
     assert g.sh is not None
-    values = _quantities(g)
-    bounds = [_chunk_bounds(value) for value in values]
-    chunk = {
-        name: column
-        for axes, bound in zip(_AXES, bounds, strict=True)
-        for names, table in zip(axes, bound, strict=True)
-        for name, column in zip(names, np.ascontiguousarray(table.T), strict=True)
-    }
-    steps = [
-        np.round(_position_between(bound, value) * count).astype(np.uint32)
-        for bound, value, count in zip(bounds, values, _ALL_STEPS, strict=True)
-    ]
-    opacity = np.round(np.clip(g.opacities.numpy(), 0, 1) * 255)
-    rgba = np.concatenate([steps[2], opacity[:, None].astype(np.uint32)], 1)
+    log_scales = g.scales.log().clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT).numpy()
+    means, rgb = g.means.numpy(), (g.sh[:, 0] * SH_C0 + 0.5).numpy()
+    chunk: Columns = {}
+    steps = []
+    for axes, values, count in zip(_AXES, (means, log_scales, rgb), (_STEPS, _STEPS, _COLOR_STEPS), strict=True):
+        bounds = _chunk_bounds(values)
+        steps.append(np.round(_place_between(bounds, values) * count).astype(np.uint32))
+        for names, bound in zip(axes, bounds, strict=True):
+            chunk |= {name: np.ascontiguousarray(bound[:, i]) for i, name in enumerate(names)}
+    opacity = np.round(np.clip(g.opacities.numpy(), 0, 1) * 255).astype(np.uint32)
     rotations = np.concatenate(pack_smallest_three(g.quats, 1023), 1).astype(np.uint32)
     vertex = {
         "packed_position": _pack(steps[0], _FIELDS),
         "packed_rotation": _pack(rotations, (2, 10, 10, 10)),
         "packed_scale": _pack(steps[1], _FIELDS),
-        "packed_color": _pack(rgba, (8, 8, 8, 8)),
+        "packed_color": _pack(np.concatenate([steps[2], opacity[:, None]], 1), (8, 8, 8, 8)),
     }
     elements = {"chunk": chunk, "vertex": vertex}
     if g.sh.shape[1] > 1:
         rest = g.sh[:, 1:].transpose(1, 2).flatten(1).numpy()  # channel by channel
         steps_of_rest = np.clip(np.floor((rest / (2 * SH_LIMIT) + 0.5) * 256), 0, 255).astype(np.uint8)
         elements["sh"] = {f"f_rest_{i}": np.ascontiguousarray(column) for i, column in enumerate(steps_of_rest.T)}
-    write_ply_elements(path, elements, comments=("written by kfgs", *comments_of_mode(gaussians)))
-    return (
-        describe_loss(gaussians, ".compressed.ply", 3)
-        + describe_coarse(g, half_steps(values[0], _STEPS), ".compressed.ply")
-        + _words_of_clipping(g, half_steps(values[2], _COLOR_STEPS))
-    )
+    write_ply_elements(path, elements, comments=("written by kfgs", *comments_of_mode(g)))
+    return describe_coarse(g, half_steps(means, _STEPS), ".compressed.ply") + _describe_cut(g, rgb)
 
 
-def _quantities(g: Gaussians) -> tuple[NDArray[np.float64], ...]:  # 3 x [N, 3]
-    """The values stored between bounds: positions, logarithms of scales, base colours."""
-    assert g.sh is not None
-    log_scales = g.scales.log().clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
-    return g.means.numpy(), log_scales.numpy(), (g.sh[:, 0] * SH_C0 + 0.5).numpy()
+def half_steps(values: NDArray[np.float64], steps: NDArray[np.float32]) -> NDArray[np.float64]:  # [N, 3]
+    """The largest error of each value in even `steps` between the bounds of its chunk."""
+    low, high = _chunk_bounds(values)
+    largest = np.maximum(np.abs(low), np.abs(high)).astype(np.float64)
+    half = (high.astype(np.float64) - low) / steps / 2
+    return (half + largest * _ROUNDING)[np.arange(len(values)) // CHUNK]
 
 
 def _chunk_bounds(values: NDArray[np.float64]) -> _Bounds:  # [N, 3]
@@ -154,7 +127,7 @@ def _chunk_bounds(values: NDArray[np.float64]) -> _Bounds:  # [N, 3]
     return least.astype(np.float32), largest.astype(np.float32)
 
 
-def _position_between(bounds: _Bounds, values: NDArray[np.float64]) -> NDArray[np.float64]:  # [N, 3] in [0, 1]
+def _place_between(bounds: _Bounds, values: NDArray[np.float64]) -> NDArray[np.float64]:  # [N, 3] in [0, 1]
     chunk = np.arange(len(values)) // CHUNK
     low, high = (bound.astype(np.float64) for bound in bounds)
     size = np.where(high > low, high - low, 1.0)
@@ -162,85 +135,63 @@ def _position_between(bounds: _Bounds, values: NDArray[np.float64]) -> NDArray[n
 
 
 def _between(bounds: _Bounds, fraction: NDArray[np.float32]) -> NDArray[np.float32]:  # [N, 3]
+    """The inverse of `_place_between`."""
     chunk = np.arange(len(fraction)) // CHUNK
     with np.errstate(over="ignore", invalid="ignore"):  # left out
         return bounds[0][chunk] + fraction * (bounds[1] - bounds[0])[chunk]
 
 
-def half_steps(values: NDArray[np.float64], steps: NDArray[np.float32]) -> NDArray[np.float64]:  # [N, 3]
-    """The largest error of each value in even `steps` between the bounds of its chunk."""
-    low, high = _chunk_bounds(values)
-    chunk = np.arange(len(values)) // CHUNK
-    largest = np.maximum(np.abs(low), np.abs(high)).astype(np.float64)
-    half = (high.astype(np.float64) - low) / steps / 2
-    return (half + largest * _ROUNDING)[chunk]
-
-
 def _pack(fields: NDArray[np.uint32], bits: tuple[int, ...]) -> NDArray[np.uint32]:  # [N, F] -> [N]
-    """Put whole numbers side by side, the first at the high end."""
+    """Put whole numbers next to each other, the first at the high end."""
     packed = np.zeros(len(fields), np.uint32)
     for i, width in enumerate(bits):
         packed = packed << np.uint32(width) | fields[:, i]
     return packed
 
 
-def _unpack_vectors(packed: NDArray[np.uint32]) -> NDArray[np.float32]:  # [N] -> [N, 3]
-    """Fractions of the way from the least value to the largest."""
-    whole = packed[:, None] >> np.array([21, 11, 0], np.uint32) & _STEPS.astype(np.uint32)
-    return whole.astype(np.float32) / _STEPS
+def _unpack(packed: NDArray[np.uint32], bits: tuple[int, ...]) -> NDArray[np.float32]:  # [N] -> [N, F]
+    """The inverse of `_pack`."""
+    shifts = [sum(bits[i + 1 :]) for i in range(len(bits))]
+    fields = [packed >> np.uint32(shift) & np.uint32(2**width - 1) for shift, width in zip(shifts, bits, strict=True)]
+    return np.stack(fields, 1).astype(np.float32)
 
 
-def _unpack_rotations(packed: NDArray[np.uint32]) -> Tensor:  # [N] -> [N, 4] wxyz
-    small = (packed[:, None] >> np.array([20, 10, 0], np.uint32) & 1023).astype(np.float32)
-    return unpack_smallest_three((packed >> np.uint32(30)).astype(np.int64), small, 1023)
-
-
-def _read_rest(path: Path, columns: Columns | None, n: int) -> NDArray[np.float32]:  # [N, K - 1, 3]
+def _read_rest(columns: Columns, n: int) -> NDArray[np.float32]:  # [n, K - 1, 3]
     """The higher harmonics; the outermost bytes mean the ends of the range, the others the middles of their steps."""
-    if columns is None:
+    if not columns:
         return np.zeros((n, 0, 3), np.float32)
-    names = [f"f_rest_{i}" for i in range(len(columns))]
-    kinds = {(column.dtype.name, len(column)) for column in columns.values()}
-    if len(names) not in (9, 24, 45, 72) or set(names) != set(columns) or kinds != {("uint8", n)}:
-        raise ValueError(
-            f"{path}: expected 'sh' of 9, 24, 45 or 72 columns f_rest_0, f_rest_1, ... of {n} bytes each, got {len(names)} "
-            f"columns of {kinds!r:.80}; write the file again"
-        )
+    values = np.stack(_columns("sh", columns, [f"f_rest_{i}" for i in range(len(columns))], "uint8"), 1)
+    if values.shape not in [(n, width) for width in (9, 24, 45, 72)]:
+        raise ValueError(f"expected 9, 24, 45 or 72 columns of {n} rows in 'sh', got {values.shape[::-1]}")
     table = (((np.arange(256) + 0.5) / 256 - 0.5) * 2 * SH_LIMIT).astype(np.float32)
     table[0], table[255] = -SH_LIMIT, SH_LIMIT
-    return np.stack([table[columns[name]] for name in names], 1).reshape(n, 3, len(names) // 3).transpose(0, 2, 1)
+    return table[values].reshape(n, 3, len(columns) // 3).transpose(0, 2, 1)
 
 
-def _read_bounds(path: Path, chunk: Columns, axes: tuple[tuple[str, ...], tuple[str, ...]]) -> _Bounds:
-    _check_columns(path, "chunk", chunk, (*axes[0], *axes[1]), "float32")
-    low, high = (np.stack([chunk[name] for name in side], 1) for side in axes)
+def _read_bounds(chunk: Columns, group: int) -> _Bounds:
+    low, high = (np.stack(_columns("chunk", chunk, names, "float32"), 1) for names in _AXES[group])
     return low, high
 
 
-def _check_columns(path: Path, element: str, columns: Columns, names: tuple[str, ...], kind: str) -> None:
+def _columns(element: str, columns: Columns, names: Sequence[str], kind: str) -> list[NDArray[Any]]:
     wrong = [name for name in names if name not in columns or columns[name].dtype.name != kind]
     if wrong:
-        raise ValueError(
-            f"{path}: expected {element!r} with {kind} {', '.join(names)}, {', '.join(wrong)} missing; write the file again"
-        )
+        raise ValueError(f"expected {kind} {', '.join(wrong)} in {element!r}, got {', '.join(columns)!r:.80}")
+    return [columns[name] for name in names]
 
 
-def _words_of_clipping(
-    g: Gaussians, shades: NDArray[np.float64]
-) -> tuple[str, ...]:  # shades: [N, 3], errors of colours
+def _describe_cut(g: Gaussians, rgb: NDArray[np.float64]) -> list[str]:  # rgb: [N, 3]
     """Describe the values that the fixed ranges cut off, and colours rounded because others of their chunk are far off."""
     assert g.sh is not None
     lost = []
-    small = int((g.scales.log().abs() > LOG_SCALE_LIMIT).any(1).sum())
-    if small:
+    if small := int((g.scales.log().abs() > LOG_SCALE_LIMIT).any(1).sum()):
         lost.append(f"scales of {small} Gaussians: .compressed.ply holds e^-20 to e^20")
-    large = int((g.sh[:, 1:].abs() > SH_LIMIT).any(2).any(1).sum())
-    if large:
+    if large := int((g.sh[:, 1:].abs() > SH_LIMIT).any(2).any(1).sum()):
         lost.append(f"strong higher harmonics of {large} Gaussians: .compressed.ply holds -4 to 4")
-    rough = (shades > _ROUGH).any(1)
-    if rough.any():
+    errors = half_steps(rgb, _COLOR_STEPS)
+    if rough := int((errors > _ROUGH).any(1).sum()):
         lost.append(
-            f"base colours of {int(rough.sum()):,} Gaussians, by up to {shades.max():.3g} (1 is white): others near them have "
-            "colours far outside 0 to 1"
+            f"base colours of {rough:,} Gaussians, by up to {errors.max():.3g} (1 is white): others near them have colours "
+            "far outside 0 to 1"
         )
-    return tuple(lost)
+    return lost

@@ -32,10 +32,9 @@ def pack_smallest_three(
     quats: Tensor,  # [N, 4] wxyz, of any length
     steps: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:  # [N, 1] in 0..3, [N, 3] in 0..steps
-    """The index of the largest component in (w, x, y, z), and the other three in whole steps.
+    """The index of the largest component in (w, x, y, z), and the others in whole steps from -1/sqrt(2) to 1/sqrt(2).
 
-    Each of the three lies between -1/sqrt(2) and 1/sqrt(2), which are steps 0 and `steps`. A quaternion of length 0 is
-    read as the identity. Of equally large components the first is the largest.
+    A quaternion of length 0 is the identity. Of equally large components the first is the largest.
     """
     largest, small = split_largest(unit_quats(quats.detach().cpu().double()).numpy())
     whole = np.clip(np.round((small * math.sqrt(0.5) + 0.5) * steps), 0, steps).astype(np.int64)
@@ -48,9 +47,8 @@ def unpack_smallest_three(
     steps: int,
 ) -> Tensor:  # [N, 4] wxyz float32, of length 1
     """The inverse of `pack_smallest_three`."""
-    return torch.from_numpy(
-        join_largest(largest, (small / np.float32(steps) - np.float32(0.5)) * np.float32(math.sqrt(2)))
-    )
+    parts = (small / np.float32(steps) - np.float32(0.5)) * np.float32(math.sqrt(2))
+    return torch.from_numpy(join_largest(largest, parts))
 
 
 def split_largest(

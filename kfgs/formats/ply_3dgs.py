@@ -16,30 +16,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .._check import ORIGIN
-from .._notes import tell
 from .._origin import to_world
 from ..gaussians import Gaussians
 from .ply import Columns, points_from_columns, read_comments, read_ply, stack_columns, write_ply
 from .render_mode import comments_of_mode, mode_from_comments, with_mode
-from .values import (
-    EXACT,
-    NO_DEGREE_4,
-    SCORE,
-    SH_C0,
-    colours_to_write,
-    describe_loss,
-    positive_scales,
-    whole_labels,
-)
+from .values import EXACT, SCORE, SH_C0, positive_scales, up_to_degree_3, whole_labels
 
 NAME = "ply"
 SUFFIXES = (".ply",)
 MAGIC = b"ply"
-HOLDS_LABELS = True
-HOLDS_ORIGIN = True
+HOLDS = frozenset({"labels", "origin", "harmonics", "antialiased", "features", "columns"})
 FILTER = "filter_3D"  # Mip-Splatting's own files: the 3-D filter's deviation, not yet part of scales and opacities
 NORMALS = ("nx", "ny", "nz")  # always zero in 3DGS files; written, not kept
 RGB = ("red", "green", "blue")  # colours, if there is no f_dc_*
+OURS = ("f_dc_", "f_rest_", "scale_", "rot_", "semantic_")  # beginnings of columns that are not kept in `extra`
 COEFFICIENTS = 16  # of harmonics of degree 3, which Inria's script always writes
 
 
@@ -49,76 +39,52 @@ def matches(head: bytes) -> bool:
 
 
 def read(path: Path) -> Gaussians:
-    """Read a 3DGS PLY with spherical harmonics of degree 0 to 4 (4 is dropped); unknown columns go to `extra`.
-
-    The comments, or columns, say whether it is antialiased or has surfels (`render_mode`).
-
-    Raises:
-        ValueError: if it is damaged, or no 3DGS file; opacities of 0 and 1, whose logits are infinite, stay 0 and 1.
-    """
+    """Read a 3DGS PLY; unknown columns go to `extra`. The comments, or columns, say how it is drawn (`render_mode`)."""
     columns = read_ply(path)
-    try:
-        gaussians = gaussians_from_columns(columns)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-    used = () if gaussians.sh is None or "f_dc_0" in columns else RGB
-    extra = {name: values for name, values in columns.items() if not _is_ours(name) and name not in used}
-    gaussians = gaussians.replace(scales=positive_scales(path, gaussians.scales.numpy()), extra=extra)
-    if "f_rest_45" in columns:
-        tell(f"{path.name}: {NO_DEGREE_4}")
+    gaussians = gaussians_from_columns(path, columns)
+    known = {"x", "y", "z", "opacity", "class_id", SCORE, FILTER, *NORMALS}
+    known |= set(RGB) if gaussians.sh is not None and "f_dc_0" not in columns else set()
+    extra = {name: values for name, values in columns.items() if name not in known and not name.startswith(OURS)}
     mode = mode_from_comments(read_comments(path))
-    mode = mode._replace(
-        surfels=mode.surfels or "scale_2" not in columns, antialiased=mode.antialiased or FILTER in columns
-    )
-    return with_mode(path, gaussians, mode)
+    surfels, antialiased = mode.surfels or "scale_2" not in columns, mode.antialiased or FILTER in columns
+    return with_mode(path, gaussians.replace(extra=extra), mode._replace(surfels=surfels, antialiased=antialiased))
 
 
-def write(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
+def write(path: Path, g: Gaussians) -> list[str]:
     """Write the 3DGS layout, labels and extra columns included; x, y, z are double if it has an origin.
 
     Nothing is lost but columns whose name PLY cannot have.
     """
-    comments = ("written by kfgs", *comments_of_mode(gaussians))
-    columns, extra = columns_from_gaussians(gaussians), gaussians.extra
-    own = {name: values for name, values in extra.items() if name.split() == [name] and name not in columns}
-    write_ply(path, columns | own, comments=comments)
-    left = {name: values for name, values in extra.items() if name not in own}
-    return describe_loss(gaussians.replace(features=None, scores=None, extra=left), ".ply", 3)
+    columns = columns_from_gaussians(g)
+    own = {name: values for name, values in g.extra.items() if name.split() == [name] and name not in columns}
+    write_ply(path, columns | own, comments=("written by kfgs", *comments_of_mode(g)))
+    left = [name for name in g.extra if name not in own]
+    return [f"the columns {', '.join(left)}: .ply has no place for them"] if left else []
 
 
-def write_plain(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
-    """Write the 62 properties of the files of Inria's script, no more and no fewer: harmonics up to degree 3, zero if unknown.
-
-    Some importers count properties, or cannot skip those that they do not know.
+def plain_cloud(g: Gaussians) -> Gaussians:
+    """What a file of Inria's script has room for, whose 62 properties some importers count: harmonics of degree 3 at most,
+    zero if unknown, and nothing else.
     """
-    what = "a plain PLY"
-    g = colours_to_write(gaussians, what)
     assert g.sh is not None
     whole = torch.nn.functional.pad(g.sh, (0, 0, 0, COEFFICIENTS - g.sh.shape[1]))
-    write(path, g.replace(sh=whole, features=None, labels=None, scores=None, extra={}, origin=ORIGIN))
-    return describe_loss(gaussians, what, 3)
+    return g.replace(sh=whole, features=None, labels=None, scores=None, extra={}, origin=ORIGIN)
 
 
-def _is_ours(name: str) -> bool:
-    known = {"x", "y", "z", "opacity", "class_id", SCORE, FILTER, *NORMALS}
-    return name in known or name.startswith(("f_dc_", "f_rest_", "scale_", "rot_", "semantic_"))
-
-
-def _numbered(columns: Columns, group: str) -> list[str]:
+def _numbered(columns: Columns, group: str, counts: tuple[int, ...]) -> list[str]:
     """Names of the columns of a group, which are numbered from 0 without a gap."""
-    have = [name for name in columns if name.startswith(group)]
+    have = {name for name in columns if name.startswith(group)}
     names = [f"{group}{i}" for i in range(len(have))]
-    missing = [name for name in names if name not in columns]
-    if missing:
-        odd = sorted(set(have) - set(names))
-        raise ValueError(
-            f"columns: expected {missing[0]} as well as {odd[0]}, got none; number {group}* from 0 to the last"
-        )
+    missing = [name for name in names if name not in have]
+    if missing or (counts and len(names) not in counts):
+        allowed = f"{' or '.join(map(str, counts))} columns " if counts else ""
+        gap = f", {missing[0]} missing" if missing else ""
+        raise ValueError(f"expected {allowed}{group}0, {group}1, ..., got {len(names)}{gap}")
     return names
 
 
-def gaussians_from_columns(columns: Columns) -> Gaussians:
-    """Read a 3DGS vertex table (values activated on the way).
+def gaussians_from_columns(path: Path, columns: Columns) -> Gaussians:
+    """Read a 3DGS vertex table (values activated on the way); `path` is for messages.
 
     Raises:
         ValueError: if a column of the 3DGS layout is missing, or numbered columns have gaps or an odd count.
@@ -128,24 +94,17 @@ def gaussians_from_columns(columns: Columns) -> Gaussians:
     needed = ["x", "y", "z", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     missing = [name for name in needed if name not in columns]
     if missing:
-        raise ValueError(
-            f"columns: expected the 3DGS layout, {', '.join(missing)} missing; is this a plain point cloud?"
-        )
-    dc_names, rest, features = (_numbered(columns, group) for group in ("f_dc_", "f_rest_", "semantic_"))
-    colours = bool(dc_names) or all(name in columns for name in RGB)
-    for group, names, counts in (("f_dc_", dc_names, (0, 3)), ("f_rest_", rest, (0, 9, 24, 45, 72))):
-        if len(names) not in counts or (rest and not colours):
-            raise ValueError(
-                f"columns: expected {group}0, {group}1, ... of {' or '.join(map(str, counts))} columns (f_rest_* only "
-                f"with f_dc_0 to f_dc_2), got {len(names)} {group}*; export the splat with whole degrees of harmonics"
-            )
+        raise ValueError(f"the 3DGS layout has {', '.join(missing)}, it has not; is this a plain point cloud?")
+    colours = all(name in columns for name in RGB)
+    dc_names, features = _numbered(columns, "f_dc_", (0, 3)), _numbered(columns, "semantic_", ())
+    rest = _numbered(columns, "f_rest_", (0, 9, 24, 45, 72))
+    if rest and not (dc_names or colours):
+        raise ValueError("expected f_dc_0 to f_dc_2 next to f_rest_*, got none")
     sh = None
-    if colours:
+    if dc_names or colours:
         dc = (stack_columns(columns, dc_names) if dc_names else _dc_from_rgb(columns))[:, None]
-        higher = dc[:, :0]
-        if rest:  # stored channel-major
-            higher = stack_columns(columns, rest).view(len(dc), 3, len(rest) // 3).transpose(1, 2)
-        sh = torch.cat([dc, higher], 1)[:, :COEFFICIENTS]
+        higher = stack_columns(columns, rest) if rest else dc.new_zeros(len(dc), 0)  # stored channel-major
+        sh = torch.cat([dc, higher.view(len(dc), 3, len(rest) // 3).transpose(1, 2)], 1)
     scales = stack_columns(columns, [f"scale_{i}" for i in range(3)]).exp()
     opacities = stack_columns(columns, ["opacity"])[:, 0].sigmoid()
     if FILTER in columns:  # Yu et al. 2024, eq. 7: a Gaussian that is widened becomes fainter
@@ -153,12 +112,12 @@ def gaussians_from_columns(columns: Columns) -> Gaussians:
         wide = (narrow**2 + stack_columns(columns, [FILTER]).double() ** 2).sqrt()
         scales, opacities = wide.float(), (opacities * (narrow / wide.clamp_min(1e-300)).prod(dim=1)).float()
     return Gaussians(
-        means=points_from_columns(columns),
+        means=points_from_columns(path, columns),
         quats=stack_columns(columns, [f"rot_{i}" for i in range(4)]),
-        scales=scales,
+        scales=positive_scales(scales.numpy()),
         opacities=opacities,
         features=stack_columns(columns, features) if features else None,
-        sh=sh,
+        sh=None if sh is None else up_to_degree_3(path, sh),
         labels=whole_labels(columns["class_id"]) if "class_id" in columns else None,
         scores=stack_columns(columns, [SCORE])[:, 0] if SCORE in columns else None,
     )
@@ -184,7 +143,7 @@ def columns_from_gaussians(gaussians: Gaussians) -> Columns:
         groups.append(("semantic", g.features))
     places = to_world(g.means, g.origin)
     columns: Columns = {name: places[:, i].numpy() for i, name in enumerate("xyz")}
-    columns |= {name: np.zeros(len(g), np.float32) for name in ("nx", "ny", "nz")}
+    columns |= {name: np.zeros(len(g), np.float32) for name in NORMALS}
     for group, values in groups:
         for i in range(values.shape[1]):
             columns[group if group == "opacity" else f"{group}_{i}"] = values[:, i].contiguous().numpy()

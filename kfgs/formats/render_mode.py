@@ -89,8 +89,3 @@ def with_mode(path: Path, gaussians: Gaussians, mode: Mode) -> Gaussians:
 def comments_of_mode(gaussians: Gaussians) -> tuple[str, ...]:
     """Comments for a PLY header, in the words of Brush and of Postshot; none for an ordinary cloud."""
     return ("SplatRenderMode: mip", "antialiased 1") if gaussians.antialiased else ()
-
-
-def describe_lost_mode(gaussians: Gaussians, name: str) -> tuple[str, ...]:
-    """Describe the mode of a cloud if a format cannot store it."""
-    return (f"antialiased rendering: {name} has no place for it",) if gaussians.antialiased else ()

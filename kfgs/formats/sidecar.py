@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -40,22 +40,20 @@ def write_names(path: str | Path, classes: tuple[str, ...], **facts: Any) -> Pat
     return target
 
 
-def write_sidecar(
-    path: Path, gaussians: Gaussians, facts: Mapping[str, Any], *, holds_labels: bool, holds_origin: bool
-) -> list[Path]:
-    """Write the labels, names and origin that the format cannot store, and delete those of an older `path`.
+def write_sidecar(path: Path, gaussians: Gaussians, facts: Mapping[str, Any], holds: frozenset[str]) -> list[Path]:
+    """Write the labels and the origin if a format does not hold them, and the names; delete those of an older `path`.
 
     Names are written for every labelled file, even if the format stores them, so that people can read them.
     """
     labels, written = gaussians.labels, []
-    if labels is not None and not holds_labels:
+    if labels is not None and "labels" not in holds:
         arrays = {"class_id": labels.to(torch.int32).cpu().numpy(), "of": np.array(digest_file(path))}
         if gaussians.scores is not None:
             arrays[SCORE] = gaussians.scores.detach().to("cpu", torch.float32).numpy()
         with atomic_path(labels_path(path)) as temporary, temporary.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
         written.append(labels_path(path))
-    if gaussians.origin != ORIGIN and not holds_origin:
+    if gaussians.origin != ORIGIN and "origin" not in holds:
         write_json(origin_path(path), {"origin": gaussians.origin, "of": digest_file(path)})
         written.append(origin_path(path))
     if labels is not None and gaussians.names:
@@ -71,10 +69,10 @@ def read_sidecar(path: Path, gaussians: Gaussians) -> Gaussians:
     If `path` is a link, files next to the link come first, then those next to the file that it leads to.
 
     Raises:
-        ValueError: if such a file is damaged, or its labels belong to another version of the splat file.
+        FileError: if such a file is damaged, or its labels belong to another version of the splat file.
     """
+    labels, origin, names = (_next_to(path, name) for name in (labels_path, origin_path, names_path))
     digest = None
-    labels, origin, names = (_find(path, name) for name in (labels_path, origin_path, names_path))
     if labels is not None or origin is not None:
         digest = digest_file(path / "meta.json" if path.is_dir() else path)
     if gaussians.labels is None and labels is not None:
@@ -82,28 +80,26 @@ def read_sidecar(path: Path, gaussians: Gaussians) -> Gaussians:
     if origin is not None:
         with reading(origin, "an origin of three numbers", "delete it"):
             content = read_json(origin)
-            if content["of"] != digest:
-                raise FileError(
-                    f"{origin}: expected the origin of this version of {path.name}, got that of another version; delete it if "
-                    "the file has coordinates of the world, or write both again"
-                )
+            _check_version(origin, path, content["of"], digest)
             gaussians = gaussians.replace(origin=as_origin(content["origin"]))
     if gaussians.labels is not None and not gaussians.names and names is not None:
         gaussians = gaussians.replace(names=read_names(names))
     return gaussians
 
 
-def find_names(path: str | Path) -> Path | None:
-    """The file with the class names of a splat file (`names_path`): next to the path or, if that is a link, to its target."""
-    return _find(path, names_path)
+def _next_to(path: Path, name: Callable[[Path], Path]) -> Path | None:
+    return next((file for place in (path, real_path(path)) if (file := name(place)).is_file()), None)
 
 
-def _find(path: str | Path, name: Any) -> Path | None:
-    return next((file for place in (as_path(path), real_path(path)) if (file := name(place)).is_file()), None)
+def _check_version(file: Path, path: Path, of: object, digest: str | None) -> None:
+    if of != digest:
+        raise FileError(
+            f"{file}: expected a file of this version of {path.name}, got one of another version; delete it, or write both again"
+        )
 
 
 def read_names(path: Path) -> tuple[str, ...]:
-    """The names of classes 0, 1, ... from a file that `write_names` wrote; a ValueError if it holds something else."""
+    """The names of classes 0, 1, ... from a file that `write_names` wrote; a FileError if it holds something else."""
     with reading(path, "'class_id' with the names of classes 0, 1, ...", "write each class as a string"):
         table = read_json(path)["class_id"]
         names = tuple(table[str(i)] for i in range(len(table)))
@@ -118,15 +114,8 @@ def _with_labels(file: Path, path: Path, gaussians: Gaussians, digest: str | Non
     what = f"labels of the {n} Gaussians of {path.name}"
     with reading(file, what, "delete it"):
         arrays = read_arrays(file, what, "delete it", most=16 * n + _NPZ_HEADERS)
-        labels, score = arrays["class_id"], arrays.get(SCORE)
-        if str(arrays["of"]) != digest or labels.shape != (n,):
-            raise FileError(
-                f"{file}: expected the labels of this version of {path.name}, got those of another version; delete it, or write "
-                "both again"
-            )
+        labels, scores = arrays["class_id"], arrays.get(SCORE)
+        _check_version(file, path, str(arrays["of"]), digest)
         if labels.dtype.kind not in "iu" or (labels < -1).any():
             raise ValueError(f"class_id: {labels.dtype}, not whole numbers of -1 or more")
-        if score is not None and (score.dtype.kind != "f" or score.shape != labels.shape):
-            raise ValueError("score: not a number for each Gaussian")
-        scores = None if score is None else torch.from_numpy(score)
-        return gaussians.replace(labels=torch.from_numpy(labels.astype(np.int64)), scores=scores)
+        return gaussians.replace(labels=labels.astype(np.int64), scores=scores)

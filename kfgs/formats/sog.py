@@ -4,8 +4,7 @@ Each Gaussian is one pixel, row by row. `means_l`, `means_u`: low and high byte 
 sign(x) ln(1 + |x|). `quats`: three smaller components in 8 bits each, 252 + the index of the largest (w, x, y, z) as
 alpha. `scales`: indices into a codebook of natural logarithms. `sh0`: indices into a codebook of base colours, opacity
 as alpha. `shN_labels`: which row of `shN_centroids`, 64 to a line, holds the higher harmonics, as indices into a third
-codebook. Version 1 has even steps between bounds instead of codebooks, and opacity as a logit; it is read, not written.
-Axes are those of the 3DGS PLY. The format cannot store labels, so they go to a separate file.
+codebook. Axes are those of the 3DGS PLY. The format cannot store labels, so they go to a separate file.
 
 **Why not a library**: gsply 0.4.6 reads SOG but does not write it, and unpacks a zip entry to any size it claims. The tests
 use it as an independent reader.
@@ -27,18 +26,16 @@ from PIL import Image
 from torch import Tensor
 
 from .._files import atomic_path
-from .._notes import tell
 from ..gaussians import Gaussians
 from .encodings import fit_codebook, fit_palette, nearest_codes, pack_smallest_three, unpack_smallest_three
 from .render_mode import with_mode
-from .sidecar import read_sidecar
-from .sog_files import META, SogFiles, SogMeta, parse_meta
-from .values import NO_DEGREE_4, colours_to_write, describe_coarse, describe_loss, positive_scales
+from .sog_files import META, SogFiles, SogMeta, open_scene
+from .values import describe_coarse, positive_scales, up_to_degree_3
 
 NAME = "sog"
 SUFFIXES = (".sog",)
 MAGIC = b"PK\x03\x04"
-HOLDS_LABELS = False
+HOLDS = frozenset({"harmonics", "antialiased"})
 SORTS = True
 _LARGEST_FIRST = 252  # alpha of a rotation whose largest component is w
 _PER_LINE = 64  # rows of the palette in a line of its image
@@ -47,59 +44,48 @@ _EPOCH = (1980, 1, 1, 0, 0, 0)  # a fixed date, so that equal scenes give equal 
 
 
 def matches(head: bytes) -> bool:
-    """A zip file (no other format here is one), or a `meta.json` that names means and rotations."""
-    return head.startswith(MAGIC) or (head.lstrip()[:1] == b"{" and b'"means"' in head and b'"quats"' in head)
+    """A zip file (no other format here is one)."""
+    return head.startswith(MAGIC)
 
 
 def read(path: Path) -> Gaussians:
-    """Read a .sog file, a folder with `meta.json`, or that `meta.json`; opacities of 0 and 1 stay 0 and 1.
-
-    Raises:
-        ValueError: if it is neither, a file is missing or damaged, or sizes and indices disagree.
-    """
-    with SogFiles(path) as files:
-        meta = parse_meta(path, files.read_meta(), files.size())
+    """Read a .sog file, or a folder with `meta.json`; opacities of 0 and 1 stay 0 and 1."""
+    with open_scene(path) as files:
+        meta = files.read_meta()
         n = meta.size
         low, high = (_pixels(files, name, n)[:, :3].astype(np.float64) for name in meta.files["means"])
         scales = _pixels(files, meta.files["scales"][0], n)
         rgba = _pixels(files, meta.files["sh0"][0], n)
-        quats = _read_rotations(files, meta)
-        sh = np.concatenate([_look_up(meta.tables["sh0"], rgba[:, :3])[:, None], _read_rest(files, meta)], 1)
-    bounds = np.array(meta.bounds)  # [2, 3]
-    logs = bounds[0] + (bounds[1] - bounds[0]) * ((low + 256 * high) / _LEVELS)
+        turns = _pixels(files, meta.files["quats"][0], n)
+        sh = np.concatenate([meta.tables["sh0"][rgba[:, :3]][:, None], _read_rest(files, meta)], 1)
+    if (turns[:, 3] < _LARGEST_FIRST).any():
+        row = int((turns[:, 3] < _LARGEST_FIRST).argmax())
+        raise ValueError(
+            f"the rotation of Gaussian {row} has alpha {turns[row, 3]}, not 252 to 255: an image with loss?"
+        )
+    logs = meta.bounds[0] + (meta.bounds[1] - meta.bounds[0]) * ((low + 256 * high) / _LEVELS)
     with np.errstate(over="ignore", invalid="ignore"):  # left out
         means = np.sign(logs) * np.expm1(np.abs(logs))
-        linear = np.exp(_look_up(meta.tables["scales"], scales[:, :3]))
-    opacities = torch.from_numpy(rgba[:, 3].astype(np.float32) / 255)
-    if meta.logits is not None:
-        least, largest = meta.logits
-        opacities = torch.from_numpy((least + (largest - least) * (rgba[:, 3] / 255.0)).astype(np.float32)).sigmoid()
+        linear = np.exp(meta.tables["scales"][scales[:, :3]])
     gaussians = Gaussians(
         means=torch.from_numpy(means),
-        quats=quats,
-        scales=positive_scales(path, linear),
-        opacities=opacities,
-        sh=torch.from_numpy(sh[:, :16]),
+        quats=unpack_smallest_three(
+            turns[:, 3].astype(np.int64) - _LARGEST_FIRST, turns[:, :3].astype(np.float32), 255
+        ),
+        scales=positive_scales(linear),
+        opacities=torch.from_numpy(rgba[:, 3].astype(np.float32) / 255),
+        sh=up_to_degree_3(path, torch.from_numpy(sh)),
     )
-    if sh.shape[1] > 16:
-        tell(f"{path.name}: {NO_DEGREE_4}")
-    gaussians = with_mode(path, gaussians, meta.mode)
-    return read_sidecar(path.parent, gaussians) if path.name == META else gaussians  # labels are next to the folder
+    return with_mode(path, gaussians, meta.mode)
 
 
-def write(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
-    """Write version 2 in the given order, as a zip file without compression (its images have it) and without dates.
-
-    Raises:
-        ValueError: if the cloud has no colours.
-    """
-    g = colours_to_write(gaussians, ".sog")
-    mode = {"antialias": True, "model": "antialiased"} if gaussians.antialiased else {}
-    files = _encode(g, mode)
+def write(path: Path, g: Gaussians) -> list[str]:
+    """Write version 2 in the given order, as a zip file without compression (its images have it) and without dates."""
+    files = _encode(g)
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
         for name, data in files.items():
             archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)
-    return describe_loss(gaussians, ".sog", 3) + describe_coarse(g, position_errors(g.means.numpy()), ".sog")
+    return describe_coarse(g, position_errors(g.means.numpy()), ".sog")
 
 
 def position_errors(means: NDArray[np.float64]) -> Tensor:  # [N, 3] -> [N, 3]
@@ -114,47 +100,28 @@ def _pixels(files: SogFiles, name: str, count: int) -> NDArray[np.uint8]:  # [co
     return files.read_image(name, count).reshape(-1, 4)[:count]
 
 
-def _look_up(table: NDArray[np.float32], codes: NDArray[np.uint8]) -> NDArray[np.float32]:  # [3, 256], [..., 3]
-    return np.stack([table[channel][codes[..., channel]] for channel in range(3)], -1)
-
-
-def _read_rotations(files: SogFiles, meta: SogMeta) -> Tensor:  # [N, 4] wxyz
-    pixels = _pixels(files, meta.files["quats"][0], meta.size)
-    if (pixels[:, 3] < _LARGEST_FIRST).any():
-        row = int((pixels[:, 3] < _LARGEST_FIRST).argmax())
-        raise ValueError(
-            f"{files.path}: expected rotations whose alpha is 252 to 255, got {pixels[row, 3]} at Gaussian {row}; was the "
-            "image saved with loss? export it again"
-        )
-    largest = pixels[:, 3].astype(np.int64) - _LARGEST_FIRST
-    return unpack_smallest_three(largest, pixels[:, :3].astype(np.float32), 255)
-
-
 def _read_rest(files: SogFiles, meta: SogMeta) -> NDArray[np.float32]:  # [N, K - 1, 3]
-    """The higher harmonics. Version 1 does not say their degree and the palette's size: the images do."""
-    if "shN" not in meta.files:
+    """The higher harmonics."""
+    if meta.degree == 0:
         return np.zeros((meta.size, 0, 3), np.float32)
     centroids, indices = meta.files["shN"]
     labels = _pixels(files, indices, meta.size)[:, :2].astype(np.int64) @ np.array([1, 256])
-    size = int(labels.max(initial=-1)) + 1 if meta.palette is None else meta.palette
-    lines = -(-size // _PER_LINE)
-    widths = {degree: ((degree + 1) ** 2 - 1) * _PER_LINE for degree in (1, 2, 3, 4)}
-    image = files.read_image(centroids, lines * widths[meta.degree or 1], max(lines, 1024) * widths[4])[:, :, :3]
-    expected = [widths[meta.degree]] if meta.degree else list(widths.values())
-    if image.shape[1] not in expected or len(image) < lines or labels.max(initial=-1) >= size:
+    lines, K = -(-meta.palette // _PER_LINE), (meta.degree + 1) ** 2
+    image = files.read_image(centroids, lines * (K - 1) * _PER_LINE, max(lines, 1024) * (K - 1) * _PER_LINE)
+    if image.shape[1] != (K - 1) * _PER_LINE or len(image) < lines or labels.max(initial=-1) >= meta.palette:
         raise ValueError(
-            f"{files.path}: expected {centroids!r} of {' or '.join(map(str, expected))} x {lines} pixels, and indices below "
-            f"{size} in {indices!r}, got {image.shape[1]} x {image.shape[0]} and {labels.max(initial=-1)}; export it again"
+            f"the palette of harmonics has {image.shape[1]} x {len(image)} pixels, and an index of {labels.max(initial=-1)}; "
+            f"expected {(K - 1) * _PER_LINE} x {lines}, and {meta.palette} rows"
         )
-    return _look_up(meta.tables["shN"], image.reshape(-1, image.shape[1] // _PER_LINE, 3)[labels])
+    return meta.tables["shN"][image.reshape(-1, K - 1, 4)[labels, :, :3]]
 
 
 def _log_positions(means: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sign(means) * np.log1p(np.abs(means))
 
 
-def _encode(g: Gaussians, mode: dict[str, Any]) -> dict[str, bytes]:
-    """The files of a scene; `mode` goes into `meta.json`."""
+def _encode(g: Gaussians) -> dict[str, bytes]:
+    """The files of a scene."""
     assert g.sh is not None
     logs = _log_positions(g.means.numpy())
     low, high = (logs.min(0), logs.max(0)) if len(g) else (np.zeros(3), np.zeros(3))
@@ -174,7 +141,7 @@ def _encode(g: Gaussians, mode: dict[str, Any]) -> dict[str, bytes]:
         "version": 2,
         "asset": {"generator": "kfgs"},
         "count": len(g),
-        **mode,
+        **({"antialias": True, "model": "antialiased"} if g.antialiased else {}),
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": books["scales"].tolist(), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},

@@ -15,21 +15,12 @@ import torch
 
 from .._files import atomic_path
 from ..gaussians import Gaussians
-from .render_mode import describe_lost_mode
-from .values import (
-    SH_C0,
-    colours_to_write,
-    describe_cut,
-    describe_loss,
-    positive_scales,
-    unit_quats,
-)
+from .values import SH_C0, describe_cut, positive_scales, unit_quats
 
 NAME = "splat"
 SUFFIXES = (".splat",)
-HOLDS_LABELS = False
+HOLDS: frozenset[str] = frozenset()
 RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
-_ROTATION = 0.016  # radians: twice the error of 4 components, each half of 1/128 off, after normalising
 
 
 def matches(head: bytes) -> bool:
@@ -38,17 +29,10 @@ def matches(head: bytes) -> bool:
 
 
 def read(path: Path) -> Gaussians:
-    """Read a .splat file: colours of degree 0, opacities as stored (0 and 1 included).
-
-    Raises:
-        ValueError: if its size is no multiple of 32 bytes, or most scales are negative.
-    """
+    """Read a .splat file: colours of degree 0, opacities as stored (0 and 1 included)."""
     size = path.stat().st_size
     if size % RECORD.itemsize:
-        raise ValueError(
-            f"{path}: expected records of {RECORD.itemsize} bytes, got {size} bytes, {size % RECORD.itemsize} too many; the "
-            "file is truncated, or of another format"
-        )
+        raise ValueError(f"its {size} bytes are no whole records of {RECORD.itemsize}: truncated, or another format")
     rows = np.fromfile(path, dtype=RECORD)
     rgba = torch.from_numpy(rows["rgba"].astype(np.float32)) / 255
     quats = (torch.from_numpy(rows["quats"].astype(np.float32)) - 128) / 128
@@ -56,19 +40,14 @@ def read(path: Path) -> Gaussians:
     return Gaussians(
         means=torch.from_numpy(rows["means"].copy()),
         quats=quats / quats.norm(dim=1, keepdim=True).clamp(min=1e-12),  # 0 stays 0
-        scales=positive_scales(path, rows["scales"]),
+        scales=positive_scales(rows["scales"]),
         opacities=rgba[:, 3].contiguous(),
         sh=((rgba[:, :3] - 0.5) / SH_C0)[:, None],
     )
 
 
-def write(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
-    """Write the base colours; a quaternion is stored with its largest component negative, since -1 fits and +1 does not.
-
-    Raises:
-        ValueError: if the cloud has no colours.
-    """
-    g = colours_to_write(gaussians, ".splat")
+def write(path: Path, g: Gaussians) -> list[str]:
+    """Write the base colours; a quaternion is stored with its largest component negative, since -1 fits and +1 does not."""
     assert g.sh is not None
     quats = unit_quats(g.quats)
     largest = quats.gather(1, quats.abs().argmax(1, keepdim=True))
@@ -80,5 +59,4 @@ def write(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
     rows["quats"] = (quats * 128 + 128).round().clamp(0, 255).numpy()
     with atomic_path(path) as temporary:
         rows.tofile(temporary)
-    cut = describe_cut(rgba[:, :3], 0.0, 1.0, "colours", ".splat")
-    return describe_loss(gaussians, ".splat", 0) + cut + describe_lost_mode(gaussians, ".splat")
+    return describe_cut(rgba[:, :3], 0.0, 1.0, "colours", ".splat")

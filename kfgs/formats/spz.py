@@ -1,33 +1,28 @@
-"""SPZ, Niantic's compressed splat file: versions 1 to 4 are read, 4 is written. Labels are in an extension record.
+"""SPZ, Niantic's compressed splat file: versions 1 to 4 are read, 4 is written.
 
-The streams: positions, 24-bit fixed point (float16 in version 1); alphas, 255 steps of opacity; colors, 255 steps of f_dc from
--0.5/0.15 to 0.5/0.15; scales, ln(s) = byte / 16 - 10; rotations, the three smaller of x, y, z, w, 9 bits and a sign each (x, y,
-z as bytes before version 3); sh, (byte - 128) / 128, coefficient by coefficient, red, green and blue together.
+Versions 1 to 3 are one gzip stream: 16 bytes of header, the streams of bytes one after another, extension records. Version 4
+has 32 bytes of header, the records, a table, and a Zstandard frame per stream. A record is `[u32 type][u32 length][payload]`;
+readers skip types that they do not know. All numbers are little-endian. The streams: positions, 24-bit fixed point (float16
+in version 1); alphas, 255 steps of opacity; colors, 255 steps of f_dc from -0.5/0.15 to 0.5/0.15; scales, ln(s) = byte / 16 -
+10; rotations, the three smaller of x, y, z, w, 9 bits and a sign each (x, y, z as bytes before version 3); sh, (byte - 128) /
+128, coefficient by coefficient, red, green and blue together. There is no place for labels, so they go to a separate file.
 
 **Convention**: SPZ's own axes are x right, y up, z back (RUB) against x right, y down, z forward (RDF) of the 3DGS PLY.
 
 **Why not a library**: Niantic's Python binding is not in the package index (in 2026 `spz` 0.0.1 there has another author,
 and a wheel for Python 3.13 only). gsply 0.4.6 does not convert the axes, drops flags and extension records, and unpacks a
 gzip stream to any size. The tests use it as an independent reader and writer.
-
-**Labels** are in kfgs's extension record, type 0x4B460001; other readers skip it. Its payload, little-endian:
-
-| bytes | what |
-|---|---|
-| u16 | layout version, 1; a reader refuses others |
-| u16 | flags: 1 = scores follow |
-| u32 | N, the number of Gaussians, as in the file's header |
-| u32 | J, bytes of JSON: at most 1 MiB |
-| rest | one Zstandard frame of N int32 class_id (-1 = none), N float32 score if flagged, J bytes of a JSON list of names |
 """
 
 from __future__ import annotations
 
-import json
+import gzip
+import io
 import struct
 import zlib
 from math import exp, floor, log2, sqrt
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -35,39 +30,59 @@ import zstandard
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .._files import parse_json
-from .._notes import tell
+from .._arrays import most_unpacked
+from .._files import atomic_path
 from ..gaussians import Gaussians
 from .encodings import join_largest, split_largest
-from .spz_container import ANTIALIASED, GZIP, MAGIC, Container, read_container, unpack_frame, write_container
 from .values import (
-    NO_DEGREE_4,
     UP_AND_BACK,
-    colours_to_write,
+    check_count,
     describe_coarse,
     describe_cut,
-    describe_loss,
     flip_axes,
     unit_quats,
+    up_to_degree_3,
 )
 
 NAME = "spz"
 SUFFIXES = (".spz",)
-HOLDS_LABELS = True
-LABELS = 0x4B460001  # vendor 0x4B46 (KF), extension 1
+HOLDS = frozenset({"harmonics", "antialiased"})
+MAGIC = b"NGSP"
+_GZIP = b"\x1f\x8b"
+_ANTIALIASED, _HAS_EXTENSIONS = 0x1, 0x2
 _COORDINATES = 0xADBE0003  # Adobe's record: u32, the axes of the file
-_LABELS_VERSION, _HAS_SCORE = 1, 0x1
-_LABELS_HEAD = struct.Struct("<HHII")
-_MAX_NAMES = 1 << 20
+_LEGACY = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, fractional bits, flags, reserved
+_HEADER = struct.Struct("<4sIIBBBBI12x")  # the same, but the number of streams, and where the table begins
+_ENTRY = struct.Struct("<QQ")  # compressed and plain bytes of a stream
+_RECORD = struct.Struct("<II")
+_PART = 1 << 20  # bytes that are unpacked at once
 _DC = 0.5 / 0.15  # the degree-0 coefficient of byte 255
 _LOG_SCALES = (-10.0, 255 / 16 - 10)
+_HALF_STEP = exp(1 / 32)  # of a scale
 _MAX_FIXED = (1 << 23) - 1
 _COMMON_BITS, _STEPS = 12, 14  # bits that every writer uses; a small cloud gets 2^14 steps across
 
 
+class _Header(NamedTuple):
+    """What both containers begin with."""
+
+    version: int
+    size: int  # Gaussians
+    degree: int  # of the spherical harmonics, 0 to 4
+    fractional_bits: int
+    flags: int
+
+    def streams(self) -> dict[str, int]:
+        """The plain bytes of each stream, in the order of the file."""
+        position, rotation = (6 if self.version == 1 else 9), (3 if self.version < 3 else 4)
+        each = {"positions": position, "alphas": 1, "colors": 3, "scales": 3, "rotations": rotation}
+        each["sh"] = 3 * ((self.degree + 1) ** 2 - 1)
+        return {name: size * self.size for name, size in each.items()}
+
+
 def matches(head: bytes) -> bool:
     """NGSP at the beginning, or at the beginning of a gzip stream."""
-    if head[:2] != GZIP:
+    if head[:2] != _GZIP:
         return head.startswith(MAGIC)
     try:
         return zlib.decompressobj(wbits=31).decompress(head, len(MAGIC)) == MAGIC
@@ -76,47 +91,42 @@ def matches(head: bytes) -> bool:
 
 
 def read(path: Path) -> Gaussians:
-    """Read an SPZ file of version 1 to 4, gzipped or plain, into the axes of the 3DGS PLY; harmonics of degree 4 are dropped.
+    """Read an SPZ file of version 1 to 4, gzipped or plain, into the axes of the 3DGS PLY."""
+    header, streams, records = _read_streams(path.read_bytes())
 
-    Raises:
-        ValueError: if it is damaged, of another version, or in axes that no flip turns into those of the PLY.
-    """
-    c = read_container(path)
-    records = dict(c.extensions)
-    axes = _axes(path, records.get(_COORDINATES))
-    if c.degree > 3:
-        tell(f"{path.name}: {NO_DEGREE_4}")
-    rotations = c.streams["rotations"]
-    coefficients = c.streams["sh"].reshape(c.size, (c.degree + 1) ** 2 - 1, 3)[:, :15]
-    base = (_floats(c.streams["colors"]) / 255 - 0.5) / 0.15
+    def floats(name: str) -> Tensor:
+        return torch.from_numpy(streams[name].astype(np.float32))
+
+    rotations = streams["rotations"]
+    base = ((floats("colors") / 255 - 0.5) / 0.15).view(-1, 1, 3)
+    rest = ((floats("sh") - 128) / 128).view(header.size, (header.degree + 1) ** 2 - 1, 3)
     gaussians = Gaussians(
-        means=torch.from_numpy(_unpack_positions(c)),
-        quats=torch.from_numpy(_unpack_xyz(rotations) if c.version < 3 else _unpack_smallest_three(rotations)),
-        scales=torch.from_numpy(_floats(c.streams["scales"]) / 16 - 10).view(-1, 3).exp(),
-        opacities=torch.from_numpy(_floats(c.streams["alphas"]) / 255),
-        sh=torch.cat([torch.from_numpy(base).view(-1, 1, 3), (torch.from_numpy(_floats(coefficients)) - 128) / 128], 1),
-        antialiased=bool(c.flags & ANTIALIASED),
+        means=torch.from_numpy(_unpack_positions(header, streams["positions"])),
+        quats=torch.from_numpy(_unpack_xyz(rotations) if header.version < 3 else _unpack_smallest_three(rotations)),
+        scales=(floats("scales") / 16 - 10).view(-1, 3).exp(),
+        opacities=floats("alphas") / 255,
+        sh=up_to_degree_3(path, torch.cat([base, rest], 1)),
+        antialiased=bool(header.flags & _ANTIALIASED),
     )
-    return _with_labels(path, flip_axes(gaussians, axes), records.get(LABELS))
+    return flip_axes(gaussians, _axes(records.get(_COORDINATES)))
 
 
-def write(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
+def write(path: Path, g: Gaussians) -> list[str]:
     """Write version 4 with the finest positions that the cloud's extent allows.
 
     A step of a position is 2^-12 world units: larger for a cloud that reaches beyond 2048 units, smaller for a small one.
 
     Raises:
-        ValueError: if the cloud has no colours, reaches further than 24 bits hold, or its names take more than 1 MiB.
+        ValueError: if the cloud reaches further than 24 bits hold.
     """
-    g = colours_to_write(gaussians, ".spz")
     bits = choose_fractional_bits(g.means)
     if bits < 0:
         raise ValueError(
             f"means: expected coordinates within {2.0**23:g} units, got {g.means.abs().max().item():g}; write .ply or .sog, "
             "which have no such limit"
         )
-    records = [] if g.labels is None else [(LABELS, _pack_labels(g))]
     turned = flip_axes(g, UP_AND_BACK)
+    assert g.sh is not None
     assert turned.sh is not None
     fixed = (turned.means * 2**bits).round().to(torch.int32).numpy()
     streams = {
@@ -127,9 +137,20 @@ def write(path: Path, gaussians: Gaussians) -> tuple[str, ...]:
         "rotations": _pack_smallest_three(unit_quats(turned.quats).numpy()),
         "sh": _bytes((turned.sh[:, 1:] * 128 + 128 + 0.5).floor()),
     }
+    plain = [values.tobytes() for values in streams.values() if values.size]
+    packed = [zstandard.compress(stream, 12) for stream in plain]
+    table = [_ENTRY.pack(len(small), len(stream)) for small, stream in zip(packed, plain, strict=True)]
     degree = int(turned.sh.shape[1] ** 0.5) - 1
-    write_container(path, Container(4, len(g), degree, bits, ANTIALIASED * g.antialiased, streams, records))
-    return _describe_lost(gaussians, g, bits)
+    head = (MAGIC, 4, len(g), degree, bits, _ANTIALIASED * g.antialiased, len(packed), _HEADER.size)
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.writelines([_HEADER.pack(*head), *table, *packed])
+    lost = describe_coarse(g, 0.5 * 2.0**-bits, ".spz")
+    lost += describe_cut(g.sh[:, :1], -_DC, _DC, "colours", ".spz")
+    lost += describe_cut(g.sh[:, 1:], -1.0, 127 / 128, "higher harmonics", ".spz")
+    low, high = (exp(end) for end in _LOG_SCALES)
+    if cut := int(((g.scales < low / _HALF_STEP) | (g.scales > high * _HALF_STEP)).any(1).sum()):
+        lost.append(f"the extent of {cut} Gaussians: .spz holds {low:.1e} to {high:.0f} units along an axis")
+    return lost
 
 
 def choose_fractional_bits(means: Tensor) -> int:  # means: [N, 3]
@@ -143,93 +164,130 @@ def choose_fractional_bits(means: Tensor) -> int:  # means: [N, 3]
     return min(max(_COMMON_BITS, _STEPS - floor(log2(reach))), 20, floor(log2(_MAX_FIXED / reach)))
 
 
-def _pack_labels(g: Gaussians) -> bytes:
-    """The payload of kfgs's record."""
-    assert g.labels is not None
-    names = json.dumps(list(g.names), ensure_ascii=False).encode() if g.names else b""
-    if len(names) > _MAX_NAMES:
-        raise ValueError(f"classes: expected names of at most {_MAX_NAMES} bytes, got {len(names)}; shorten them")
-    scores = b"" if g.scores is None else g.scores.numpy().astype("<f4").tobytes()
-    flags = 0 if g.scores is None else _HAS_SCORE
-    head = _LABELS_HEAD.pack(_LABELS_VERSION, flags, len(g), len(names))
-    return head + zstandard.compress(g.labels.numpy().astype("<i4").tobytes() + scores + names, 12)
+_Streams = tuple[_Header, dict[str, NDArray[np.uint8]], dict[int, bytes]]  # header, plain streams, extension records
 
 
-def _with_labels(path: Path, g: Gaussians, payload: bytes | None) -> Gaussians:
-    """Add the labels, scores and names of kfgs's record."""
-    if payload is None:
-        return g
-    n, head, frame = len(g), payload[: _LABELS_HEAD.size], payload[_LABELS_HEAD.size :]
-    version, flags, count, names_size = _LABELS_HEAD.unpack(head) if len(head) == _LABELS_HEAD.size else (0, 0, 0, 0)
-    if version != _LABELS_VERSION:
-        raise ValueError(
-            f"{path}: expected labels of layout {_LABELS_VERSION}, got {version}; update kfgs, or write them again"
-        )
-    if count != n or names_size > _MAX_NAMES:
-        raise ValueError(
-            f"{path}: expected labels of {n} Gaussians and at most {_MAX_NAMES} bytes of names, got {count} and {names_size}; "
-            "the record is damaged"
-        )
-    size = n * (8 if flags & _HAS_SCORE else 4) + names_size
-    plain = unpack_frame(path, "labels", frame, size)
-    try:
-        names = parse_json(plain[size - names_size :]) if names_size else []
-    except ValueError as error:
-        raise ValueError(f"{path}: expected names of classes, but they cannot be read ({error})") from error
-    labels = np.frombuffer(plain, "<i4", n).astype(np.int64)
-    scores = np.frombuffer(plain, "<f4", n, 4 * n).astype(np.float32) if flags & _HAS_SCORE else None
-    if (labels < -1).any() or not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise ValueError(f"{path}: expected class_id of -1 or more and a list of names; the labels are damaged")
-    return g.replace(
-        labels=torch.from_numpy(labels), scores=None if scores is None else torch.from_numpy(scores), names=tuple(names)
-    )
+def _read_streams(data: bytes) -> _Streams:
+    """The content of a file. Sizes that it cannot hold are refused before unpacking."""
+    if data[:2] == _GZIP:
+        return _read_plain(_inflate(data))
+    return (_read_plain if _read_header(data).version < 4 else _read_packed)(data)
 
 
-def _axes(path: Path, record: bytes | None) -> tuple[int, int, int]:
+def _read_header(data: bytes | bytearray) -> _Header:
+    if data[:4] != MAGIC or len(data) < _LEGACY.size:
+        raise ValueError(f"it begins with {bytes(data[:4])!r}, not with NGSP and {_LEGACY.size - 4} bytes more")
+    _, version, count, degree, bits, flags, _ = _LEGACY.unpack_from(data)
+    for what, value, low, high in (
+        ("its version", version, 1, 4),
+        ("the degree of its harmonics", degree, 0, 4),
+        ("the number of its fractional bits", bits, 0, 24),
+    ):
+        if not low <= value <= high:
+            raise ValueError(f"{what} is {value}, not {low} to {high}")
+    return _Header(version, count, degree, bits, flags)
+
+
+def _inflate(data: bytes) -> bytearray:
+    """The plain bytes of a gzip stream (one member or several), at most as many as its SPZ header implies."""
+    with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+        plain = bytearray(file.read(_LEGACY.size))
+        header = _read_header(plain)
+        check_count(header.size, header.degree, len(data))
+        # Flags other than antialiased announce more after the streams.
+        limit = most_unpacked(len(data)) if header.flags & ~_ANTIALIASED else sum(header.streams().values())
+        while len(plain) <= _LEGACY.size + limit and (part := file.read(_PART)):
+            plain += part
+    if len(plain) > _LEGACY.size + limit:
+        raise ValueError(f"its header promises {limit} plain bytes, it has more")
+    return plain
+
+
+def _read_plain(data: bytes | bytearray) -> _Streams:
+    """Versions 1 to 3: 16 bytes of header, the streams, extension records."""
+    header = _read_header(data)
+    if header.version == 4:
+        raise ValueError("a gzip stream holds version 1 to 3, not 4")
+    sizes = header.streams()
+    needed, have = sum(sizes.values()), len(data) - _LEGACY.size
+    if needed > have or (needed < have and not header.flags & ~_ANTIALIASED):
+        raise ValueError(f"{header.size} Gaussians take {needed} bytes, it has {have}: is it truncated?")
+    streams, at = {}, _LEGACY.size
+    for name, size in sizes.items():
+        streams[name] = np.frombuffer(data, np.uint8, size, at)
+        at += size
+    return (header, streams, _read_records(data[at:]) if header.flags & _HAS_EXTENSIONS else {})
+
+
+def _read_packed(data: bytes) -> _Streams:
+    """Version 4: 32 bytes of header, extension records, the table of contents, one Zstandard frame per stream."""
+    header = _read_header(data)
+    check_count(header.size, header.degree, len(data))
+    *_, number, start = _HEADER.unpack_from(data)
+    sizes = header.streams()
+    names = [name for name, size in sizes.items() if size] if number < len(sizes) else list(sizes)
+    end = start + number * _ENTRY.size
+    if number != len(names) or start < _HEADER.size or end > len(data):
+        raise ValueError(f"{len(names)} streams expected in {len(data)} bytes, got {number} listed at byte {start}")
+    streams, at = {name: np.zeros(0, np.uint8) for name in sizes}, end
+    for name, (small, plain) in zip(names, _ENTRY.iter_unpack(data[start:end]), strict=True):
+        if plain != sizes[name] or at + small > len(data):
+            raise ValueError(f"{sizes[name]} bytes of {name} expected, got {plain} up to byte {at + small}: truncated?")
+        streams[name] = np.frombuffer(_unpack_frame(name, data[at : at + small], plain), np.uint8)
+        at += small
+    if at != len(data):
+        raise ValueError(f"it should end at byte {at}, it has {len(data) - at} bytes more")
+    return (header, streams, _read_records(data[_HEADER.size : start]) if header.flags & _HAS_EXTENSIONS else {})
+
+
+def _read_records(data: bytes | bytearray) -> dict[int, bytes]:
+    records, at = dict[int, bytes](), 0
+    while at < len(data):
+        kind, length = _RECORD.unpack_from(data, at)
+        at += _RECORD.size
+        if at + length > len(data):
+            raise ValueError("an extension record reaches beyond all of them")
+        records[kind] = bytes(data[at : at + length])
+        at += length
+    return records
+
+
+def _unpack_frame(name: str, data: bytes, size: int) -> bytes:
+    """One Zstandard frame of exactly `size` plain bytes."""
+    promised = zstandard.get_frame_parameters(data).content_size if data else 0
+    if promised not in (size, zstandard.CONTENTSIZE_UNKNOWN):  # the decompressor allocates the promised size
+        raise ValueError(f"{size} bytes of {name} expected, {promised} promised")
+    plain = zstandard.ZstdDecompressor().decompress(data, max_output_size=size, allow_extra_data=False) if size else b""
+    if len(plain) != size:
+        raise ValueError(f"{size} bytes of {name} expected, got {len(plain)}")
+    return plain
+
+
+def _axes(record: bytes | None) -> tuple[int, int, int]:
     """Signs of a file's axes against those of the PLY: RUB, unless Adobe's record says otherwise."""
-    value = 0 if record is None else struct.unpack("<I", record)[0] if len(record) == 4 else -1
+    (value,) = (0,) if record is None else struct.unpack("<I", record)
     if value == 0:  # unspecified
         return UP_AND_BACK
     if not 1 <= value <= 8:
-        raise ValueError(
-            f"{path}: expected a coordinate system of 1 to 8 (x, y, z with signs), got {value}; turn it to RUB with the program "
-            "that wrote it"
-        )
+        raise ValueError(f"its coordinate system is {value}, not 1 to 8 (x, y, z with signs)")
     right, up, front = ((value - 1) >> bit & 1 for bit in range(3))  # LDB, RDB, LUB, RUB, LDF, RDF, LUF, RUF
     return (1 if right else -1, -1 if up else 1, 1 if front else -1)
-
-
-def _describe_lost(gaussians: Gaussians, g: Gaussians, bits: int) -> tuple[str, ...]:
-    assert g.sh is not None
-    lost = describe_loss(gaussians, ".spz", 3) + describe_coarse(g, 0.5 * 2.0**-bits, ".spz")
-    lost += describe_cut(g.sh[:, :1], -_DC, _DC, "colours", ".spz")
-    lost += describe_cut(g.sh[:, 1:], -1.0, 127 / 128, "higher harmonics", ".spz")
-    low, high = (exp(end) for end in _LOG_SCALES)
-    cut = int(((g.scales < low / 1.032) | (g.scales > high * 1.032)).any(1).sum())  # 1.032: half a step
-    if cut:
-        lost += (f"the extent of {cut} Gaussians: .spz holds {low:.1e} to {high:.0f} units along an axis",)
-    return lost
-
-
-def _floats(values: NDArray[np.uint8]) -> NDArray[np.float32]:
-    return values.astype(np.float32)
 
 
 def _bytes(values: Tensor) -> NDArray[np.uint8]:
     return values.round().clamp(0, 255).to(torch.uint8).numpy().reshape(-1)
 
 
-def _unpack_positions(c: Container) -> NDArray[np.float32]:  # [N, 3]
-    stream = c.streams["positions"]
-    if c.version == 1:
+def _unpack_positions(header: _Header, stream: NDArray[np.uint8]) -> NDArray[np.float32]:  # [N, 3]
+    if header.version == 1:
         return stream.view("<f2").astype(np.float32).reshape(-1, 3)
-    wide = np.zeros((c.size, 3, 4), np.uint8)
-    wide[..., 1:] = stream.reshape(c.size, 3, 3)  # the upper three bytes of an int32: the shift back keeps the sign
-    return (wide.view("<i4")[..., 0] >> 8).astype(np.float32) * np.float32(2.0**-c.fractional_bits)
+    wide = np.zeros((header.size, 3, 4), np.uint8)
+    wide[..., 1:] = stream.reshape(header.size, 3, 3)  # the upper bytes of an int32: the shift back keeps the sign
+    return (wide.view("<i4")[..., 0] >> 8).astype(np.float32) * np.float32(2.0**-header.fractional_bits)
 
 
 def _unpack_xyz(stream: NDArray[np.uint8]) -> NDArray[np.float32]:  # [N, 4] wxyz
-    xyz = _floats(stream).reshape(-1, 3) / np.float32(127.5) - 1
+    xyz = stream.astype(np.float32).reshape(-1, 3) / np.float32(127.5) - 1
     w = np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1, keepdims=True)))
     return np.concatenate([w, xyz], 1)
 

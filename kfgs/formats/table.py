@@ -1,23 +1,16 @@
 """Find the format of a splat file: by content when reading, by name when writing.
 
-A format is one module of this package with
+A format is one module of this package, and a line in `MODULES`. It has
 
 - `NAME`, `SUFFIXES`: its name, and the endings of its files;
 - `MAGIC`, if all files begin with the same bytes: then the ending of a name alone never chooses this format;
 - `matches(head)`: whether a file that begins with these bytes (up to 64 KiB) has this format;
-- `read(path) -> Gaussians`;
-- `write(path, gaussians) -> tuple[str, ...]`: write the file, whole or not at all, and describe what it could not store
-  (formats that are only read have no `write`);
-- `precision(gaussians) -> Precision`: the largest errors of a written cloud;
-- `HOLDS_ORIGIN = True`, if the file holds coordinates in double; `write` then puts the cloud's origin back. Other files hold
-  coordinates counted from it, and a file next to them has the origin;
-- `HOLDS_LABELS`: whether the file stores `class_id` and `score`. If not, they go to a separate file (see `sidecar`, which
-  also writes the class names of every labelled file);
-- `write_plain`, if files can be written without labels and other columns (PLY);
-- `SORTS = True`, if the format packs neighbours together: `write` keeps the given order, and `write_splats` passes Morton
-  order;
-
-and a line in `MODULES`.
+- `read(path) -> Gaussians`: whatever it raises becomes an error that names the file; other programs' broken Gaussians stay;
+- `write(path, gaussians) -> list[str]`: write the file, whole or not at all, and describe what it rounds or cuts off. The cloud
+  has been checked, is in float64 on the CPU, and has colours (but for PLY). Formats that are only read have no `write`;
+- `HOLDS`: what a written file can have of "labels" (with scores; others go to a file next to it, see `sidecar`), "origin"
+  (coordinates in double; others are counted from it), "harmonics", "antialiased", "features" and "columns";
+- `SORTS = True`, if the format packs neighbours together: `write` keeps the given order, `write_splats` passes Morton order.
 """
 
 from __future__ import annotations
@@ -30,16 +23,20 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
+from .._arrays import reading
 from .._card import short_repr
 from .._files import as_path
 from .._notes import is_strict
 from .._origin import describe_origin
 from ..gaussians import Gaussians, check_gaussians
 from .encodings import morton_order
-from .sidecar import find_names, names_path, read_sidecar, write_sidecar
-from .values import check_splats, leave_out_broken, near_zero
+from .ply_3dgs import plain_cloud
+from .sidecar import names_path, read_sidecar, write_sidecar
+from .sog_files import META
+from .values import check_splats, describe_loss, leave_out_broken, near_zero
 
 MODULES = (  # tried in this order: compressed PLY before PLY, because both end in .ply
     "compressed_ply",
@@ -52,6 +49,7 @@ MODULES = (  # tried in this order: compressed PLY before PLY, because both end 
     "splat",
 )
 _HEAD_BYTES = 1 << 16
+_PLAIN = frozenset({"harmonics", "antialiased"})  # what a plain PLY holds
 PATTERNS = (  # of the output folders of training programs: Inria's 3DGS, gsplat, nerfstudio; * is the step
     "point_cloud/iteration_*/point_cloud.ply",
     "ckpts/ckpt_*_rank0.pt",
@@ -85,27 +83,27 @@ def find_format(path: str | Path) -> ModuleType:
         FileNotFoundError: if there is no such file.
         ValueError: if it is none of the known formats.
     """
-    path = splat_file_of(path)
+    path, known = splat_file_of(path), formats()
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file; expected a splat file there")
-    head = b""
     if path.is_file():
         try:
             with path.open("rb") as file:
                 head = file.read(_HEAD_BYTES).removeprefix(BOM_UTF8)
         except OSError as error:  # Python names no file if reading fails
-            raise type(error)(
-                f"{path}: expected a splat file that can be read ({error.strerror}); copy it again"
-            ) from error
-    for module in formats().values():
-        if module.matches(head) or (path.is_dir() and module.NAME == "sog" and (path / "meta.json").is_file()):
-            return module
-    for module in formats().values():
-        if path.is_file() and path.name.lower().endswith(module.SUFFIXES) and not hasattr(module, "MAGIC"):
-            return module
-    known = ", ".join(f"{name} ({', '.join(module.SUFFIXES)})" for name, module in formats().items())
-    known += f", and folders with {' or '.join(PATTERNS)}"
-    raise ValueError(f"{path}: expected a splat file of a known format, got something else; known are {known}")
+            raise type(error)(f"{path}: expected a splat file that can be read ({error.strerror})") from error
+        lower = path.name.lower()
+        by_name = [
+            module for module in known.values() if lower.endswith(module.SUFFIXES) and not hasattr(module, "MAGIC")
+        ]
+        candidates = [module for module in known.values() if module.matches(head)] or by_name
+        if candidates:
+            return candidates[0]
+    elif (path / META).is_file():
+        return known["sog"]
+    names = ", ".join(f"{name} ({', '.join(module.SUFFIXES)})" for name, module in known.items())
+    names += f", and folders with {' or '.join(PATTERNS)}"
+    raise ValueError(f"{path}: expected a splat file of a known format, got something else; known are {names}")
 
 
 def read_splats(path: str | Path, *, strict: bool = False) -> Gaussians:
@@ -113,7 +111,7 @@ def read_splats(path: str | Path, *, strict: bool = False) -> Gaussians:
 
     Gaussians with NaN or infinity, and rows of zeros, are left out, with their labels and columns. A quaternion of length 0
     is read as no rotation, (1, 0, 0, 0): rasterisers do the same. A logged note says how many, and where; also what is not
-    drawn as the file says.
+    drawn as the file says. Harmonics of degree 4 are read up to degree 3.
 
     **Convention**: axes are those of the 3DGS PLY (COLMAP's frame: x right, y down, z forward), whatever the file has.
 
@@ -133,28 +131,24 @@ def read_rows(path: str | Path, *, strict: bool = False) -> tuple[Gaussians, Ten
     """`read_splats`, and which rows of the file its Gaussians are: for values of each row in another file."""
     path = splat_file_of(path)
     module = find_format(path)
-    gaussians, kept = leave_out_broken(path, read_sidecar(path, module.read(path)), strict=strict or is_strict())
-    gaussians = near_zero(gaussians)
+    with reading(path / META if path.is_dir() else path, f"a {module.NAME} file of Gaussians", "export it again"):
+        gaussians = module.read(path)
+    gaussians, kept = leave_out_broken(path, read_sidecar(path, gaussians), strict=strict or is_strict())
     labels, names = gaussians.labels, gaussians.names
     if labels is not None and len(labels):
         low, high = int(labels.min()), int(labels.max())
         if low < -1 or (names and high >= len(names)):
             raise ValueError(
-                f"{path}: expected labels from -1 to {len(names) - 1} (the named classes), got {low} to {high}; "
-                f"correct the labels, or the names in {(find_names(path) or names_path(path)).name}"
+                f"{path}: expected labels from -1 to {len(names) - 1} (the named classes), got {low} to {high}; correct the "
+                f"labels, or the names in {names_path(path).name}"
             )
-    return gaussians, kept
+    return near_zero(gaussians), kept
 
 
 def write_splats(
-    gaussians: Gaussians,
-    path: str | Path,
-    *,
-    format: str | None = None,
-    plain: bool = False,
-    facts: Mapping[str, Any] | None = None,
+    gaussians: Gaussians, path: str | Path, *, plain: bool = False, facts: Mapping[str, Any] | None = None
 ) -> Written:
-    """Write a cloud in the format of the file's ending.
+    """Write a cloud in the format of the file's ending. The file is whole or absent.
 
     **Convention**: formats that pack neighbours together (compressed PLY, SOG) store the Gaussians in Morton order, with
     their labels and scores. `Written.order` is that order: apply it to indices that you keep (an edit of `OfIndex`), or
@@ -162,55 +156,43 @@ def write_splats(
 
     Args:
         gaussians: a cloud with colours; its labels, scores, class names and other columns are written too.
-        path: the file; it is whole or absent. Its ending chooses the format.
-        format: a format's name, if the ending does not say it.
+        path: the file.
         plain: write a PLY with exactly the 62 properties of Inria's 3DGS, for importers that fail on others. Classes and
             scores go to a file next to it, which `read_splats` finds; other columns and features are lost.
         facts: how the labels were made, for the file with the class names.
 
-    Returns:
-        The files written, what the format could not store, and the order.
-
     Raises:
-        ValueError: if no format has this ending, or the format cannot be written or cannot store this cloud, or a value is
-            NaN or infinite, a quaternion 0, a scale not positive, an opacity outside [0, 1] (both ends are allowed), or a
-            label has no name in `names`; or if `plain` is asked of another format, or of a cloud without colours. Nothing
-            is written then.
+        ValueError: if no format has this ending, or cannot store this cloud; or a value is NaN or infinite, a quaternion 0,
+            a scale not positive, an opacity outside [0, 1] (both ends are allowed), or a label has no name in `names`.
+            Nothing is written then.
     """
     check_gaussians(gaussians)
     path = as_path(path)
-    module = _format_to_write(path, format)
-    if plain and not hasattr(module, "write_plain"):
+    endings = {
+        ending: module for module in formats().values() if hasattr(module, "write") for ending in module.SUFFIXES
+    }
+    module = next((module for ending, module in endings.items() if path.name.lower().endswith(ending)), None)
+    if module is None:
+        raise ValueError(
+            f"path: expected a name that ends in one of {', '.join(endings)}, got {path.name!r}; rename it"
+        )
+    if plain and module.NAME != "ply":
         raise ValueError(f"plain: expected it for a file that ends in .ply, got {path}; leave it out")
+    what, holds = ("a plain PLY", _PLAIN) if plain else (module.SUFFIXES[0], module.HOLDS)
+    if gaussians.sh is None and (plain or module.NAME != "ply"):
+        raise ValueError(
+            f"gaussians: expected a cloud with colours (sh [N, K, 3]) for {what}, got {gaussians!r}; write a field without "
+            "colours as .ply"
+        )
     check_splats(gaussians)
     order = morton_order(gaussians.means) if getattr(module, "SORTS", False) else None
-    if order is not None:
-        gaussians = gaussians.select(order)
-    lost = module.write_plain(path, gaussians) if plain else module.write(path, gaussians)
-    holds_origin = getattr(module, "HOLDS_ORIGIN", False) and not plain
-    holds_labels = module.HOLDS_LABELS and not plain
-    others = write_sidecar(path, gaussians, facts or {}, holds_labels=holds_labels, holds_origin=holds_origin)
-    if not holds_origin:
-        lost = (*lost, *describe_origin(gaussians.origin, f"{path.name}"))
+    gaussians = gaussians if order is None else gaussians.select(order)
+    cloud = gaussians.detach().to("cpu", torch.float64)
+    lost = describe_loss(cloud, what, holds) + module.write(path, plain_cloud(cloud) if plain else cloud)
+    others = write_sidecar(path, gaussians, facts or {}, holds)
+    if "origin" not in holds:
+        lost += describe_origin(gaussians.origin, path.name)
     return Written([path, *others], tuple(lost), order)
-
-
-def _format_to_write(path: Path, name: str | None) -> ModuleType:
-    known = {key: module for key, module in formats().items() if hasattr(module, "write")}
-    if name is not None:
-        if name not in known:
-            raise ValueError(
-                f"format: expected one of {', '.join(known)}, got {name!r}; leave it out to go by the name"
-            )
-        return known[name]
-    lower = path.name.lower()
-    for module in known.values():
-        if lower.endswith(module.SUFFIXES):
-            return module
-    endings = ", ".join(suffix for module in known.values() for suffix in module.SUFFIXES)
-    raise ValueError(
-        f"path: expected a name that ends in one of {endings}, got {path.name!r}; rename it or pass format"
-    )
 
 
 def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
@@ -226,14 +208,13 @@ def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
 
 def newest_splat(folder: Path) -> Path | None:
     """The splat of the highest step in the output folder of a training program; None if this is no such folder."""
-    for pattern in PATTERNS:
-        files = numbered_files(folder, pattern)
-        if files:
-            return files[max(files)]
-    return None
+    steps = (numbered_files(folder, pattern) for pattern in PATTERNS)
+    return next((files[max(files)] for files in steps if files), None)
 
 
 def splat_file_of(path: str | Path) -> Path:
-    """The path itself; of the output folder of a training program, its newest splat."""
+    """The path itself; of the output folder of a training program, its newest splat; of SOG's `meta.json`, its folder."""
     path = as_path(path)
+    if path.name == META and path.is_file():
+        return path.parent
     return newest_splat(path) or path if path.is_dir() else path

@@ -1,7 +1,8 @@
-"""Helpers of all formats: checks of values, flipped axes, and descriptions of what a format cannot store."""
+"""Helpers of all formats: values that are mended or refused, flipped axes, and descriptions of what a format cannot store."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,18 +26,18 @@ _TINY_SCALE = 1e-10  # world units, instead of a scale of 0
 _SHORTEST = 1e-12  # of a quaternion; kornia divides by no less
 _SHOWN = 5  # rows that a note names
 _UNKNOWN = torch.iinfo(torch.int64).min  # a label that is no number
-NO_DEGREE_4 = "spherical harmonics of degree 4: read up to degree 3"
 EXACT = 1 << 24  # float32 holds all whole numbers up to this one
 _LABELS = 2**31 - 1  # the largest int32
-_EXPECTED = {
-    "means": "finite numbers",
-    "quats": "finite numbers, not all 0",
-    "scales": "finite numbers above 0",
-    "opacities": "numbers from 0 to 1",
-    "sh": "finite numbers",
-    "features": "finite numbers",
+_RULES: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
+    "means": ("finite numbers", Tensor.isfinite),
+    "quats": ("finite numbers, not all 0", lambda q: q.isfinite() & (q.norm(dim=1, keepdim=True) > _SHORTEST)),
+    "scales": ("finite numbers above 0", lambda s: s.isfinite() & (s > 0)),
+    "opacities": ("numbers from 0 to 1", lambda o: (o >= 0) & (o <= 1)),
+    "sh": ("finite numbers", Tensor.isfinite),
+    "features": ("finite numbers", Tensor.isfinite),
+    "scores": ("finite numbers", Tensor.isfinite),
 }
-
+"""What values have to be when they are written, in words and as a mask. All but scores make Gaussians that cannot be drawn."""
 _RAW = {
     "scales": "if they are logarithms, as 3DGS trains them, take scales.exp()",
     "opacities": "if they are logits, as 3DGS trains them, take opacities.sigmoid()",
@@ -44,17 +45,14 @@ _RAW = {
 """What to do if most values are out of range."""
 
 
-def check_count(path: Path, count: int, degree: int, packed: int) -> None:
+def check_count(count: int, degree: int, packed: int) -> None:
     """Raise a ValueError if a compressed file of `packed` bytes promises more Gaussians than `most_unpacked` allows.
 
     They are counted as they will be in memory: float32.
     """
     size, most = 4 * (11 + 3 * (degree + 1) ** 2) * count, most_unpacked(packed)
     if size > most:
-        raise ValueError(
-            f"{path}: expected at most {most} bytes from a compressed file of {packed}, got {count} Gaussians of {size} bytes by "
-            "its header; it is truncated or damaged, or export it as .ply"
-        )
+        raise ValueError(f"it promises {count} Gaussians, {size} bytes; {packed} compressed bytes may become {most}")
 
 
 def leave_out_broken(path: Path, g: Gaussians, *, strict: bool) -> tuple[Gaussians, Tensor]:  # and [N] bool
@@ -69,46 +67,35 @@ def leave_out_broken(path: Path, g: Gaussians, *, strict: bool) -> tuple[Gaussia
     Raises:
         ValueError: if nothing is left, or `strict` and something is broken.
     """
-    N = len(g)
-    bad = {
-        name: ~value.float().isfinite().reshape(N, -1).all(1)
-        for name in _EXPECTED
-        if N and (value := getattr(g, name)) is not None
-    }
-    bad = {name: rows for name, rows in bad.items() if bool(rows.any())}
-    broken = torch.stack([*bad.values(), torch.zeros(N, dtype=torch.bool)]).any(0)
+    if not len(g):
+        return g, torch.ones(0, dtype=torch.bool)
+    tensors = {name: getattr(g, name) for name in _RULES if name != "scores" and getattr(g, name) is not None}
+    finite = {name: value.float().isfinite().reshape(len(g), -1).all(1) for name, value in tensors.items()}
+    broken = ~torch.stack(list(finite.values())).all(0)
     unturned = (g.quats.norm(dim=1) <= _SHORTEST) & ~broken
     empty = unturned.clone()
-    if unturned.any():
-        rows = torch.cat([g.means, g.scales, g.opacities[:, None]], 1)[unturned]
-        _, same, counts = rows.unique(dim=0, return_inverse=True, return_counts=True)
-        empty[unturned] = counts[same] > 1
-    left_out = _count(broken, f"have NaN or infinity in {', '.join(bad)}") + _count(empty, "are rows of zeros")
+    rows = torch.cat([g.means, g.scales, g.opacities[:, None]], 1)[unturned]
+    _, same, counts = rows.unique(dim=0, return_inverse=True, return_counts=True)
+    empty[unturned] = counts[same] > 1
     kept = ~(broken | empty)
-    if N and not kept.any():
-        raise ValueError(
-            f"{path}: expected Gaussians with finite values, got none: {'; '.join(left_out)}; read another file, for example an "
-            "earlier step of the training"
-        )
-    if left_out and strict:
-        raise ValueError(
-            f"{path}: expected finite values in every Gaussian, got others: {'; '.join(left_out)}; without --strict "
-            "they are left out"
-        )
+    bad = ", ".join(name for name, good in finite.items() if not good.all())
+    left_out = _count(broken, f"have NaN or infinity in {bad}") + _count(empty, "are rows of zeros")
+    if left_out and (strict or not kept.any()):
+        advice = "read another file, for example an earlier step of the training"
+        advice = "without --strict they are left out" if kept.any() else advice
+        raise ValueError(f"{path}: expected Gaussians with finite values, got others: {'; '.join(left_out)}; {advice}")
     notes = [f"{words}: left out" for words in left_out]
     notes += [f"{words}: read as not turned" for words in _count(unturned & kept, "have a rotation of length 0")]
     if g.labels is not None:
         unknown = g.labels == _UNKNOWN
         notes += [f"{words}: read as no class" for words in _count(unknown & kept, "have no number as class_id")]
         g = g.replace(labels=g.labels.masked_fill(unknown, -1))
-    if g.scores is not None and (words := _count(~g.scores.isfinite() & kept, "have no number as score")):
-        notes.append(f"{words[0]}: read as 0")
+    if g.scores is not None:
+        notes += [f"{words}: read as 0" for words in _count(~g.scores.isfinite() & kept, "have no number as score")]
         g = g.replace(scores=g.scores.nan_to_num(0.0, 0.0, 0.0))
-    if notes:
-        g = g.replace(quats=known_quats(g.quats))
     for note in notes:
         tell(f"{path.name}: {note}")
-    return (g.select(kept) if left_out else g), kept
+    return g.replace(quats=known_quats(g.quats)).select(kept) if notes else g, kept
 
 
 def _count(rows: Tensor, what: str) -> list[str]:  # rows: [N] bool
@@ -119,17 +106,22 @@ def _count(rows: Tensor, what: str) -> list[str]:  # rows: [N] bool
     return [f"{len(places):,} of {len(rows):,} Gaussians {what} ({word} {where})"] if places else []
 
 
-def positive_scales(path: Path, scales: NDArray[np.float32]) -> Tensor:  # [N, 3] float32
+def positive_scales(scales: NDArray[np.float32]) -> Tensor:  # [N, 3] float32
     """Linear scales as read, zeros raised to 1e-10. Negative ones become NaN; if most are, it is another format (ValueError)."""
     negative = (scales < 0).any(1)
     if 2 * negative.sum() > len(scales):
-        row = int(negative.argmax())
         raise ValueError(
-            f"{path}: expected scales of 0 or more, got {scales[row].tolist()} at Gaussian {row} and others at "
-            f"{int(negative.sum()) - 1} more; it is of another format, or damaged: export it again, as .ply if you can"
+            f"scales of 0 or more, got {scales[int(negative.argmax())].tolist()} and others: is it another format?"
         )
     usable = np.where(scales < 0, np.float32("nan"), scales)
     return torch.from_numpy(np.where(scales == 0, np.float32(_TINY_SCALE), usable))
+
+
+def up_to_degree_3(path: Path, sh: Tensor) -> Tensor:  # [N, K, 3] -> [N, at most 16, 3]
+    """Harmonics as `Gaussians` holds them; a note says if there are more."""
+    if sh.shape[1] > 16:
+        tell(f"{path.name}: spherical harmonics of degree 4: read up to degree 3")
+    return sh[:, :16]
 
 
 def whole_labels(values: NDArray[Any]) -> Tensor:  # [N] -> [N] int64
@@ -140,7 +132,7 @@ def whole_labels(values: NDArray[Any]) -> Tensor:  # [N] -> [N] int64
     if not whole.all():
         row = int((~whole).argmax())
         raise ValueError(
-            f"class_id: expected whole numbers, got {values[row]} at Gaussian {row}; are these scores? name the column score"
+            f"class_id: {values[row]} at Gaussian {row} is not a whole number; name a column of scores 'score'"
         )
     return torch.from_numpy(np.where(unknown, _UNKNOWN, values.astype(np.int64)))
 
@@ -169,8 +161,7 @@ def flip_axes(g: Gaussians, axes: tuple[int, int, int]) -> Gaussians:
 def known_quats(quats: Tensor) -> Tensor:  # [N, 4] wxyz twice
     """The quaternions; those of length 0, which are no rotation at all, become the identity, as in the rasteriser."""
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype)
-    known = quats.norm(dim=1, keepdim=True) > _SHORTEST
-    return quats if bool(known.all()) else torch.where(known, quats, identity)
+    return torch.where(quats.norm(dim=1, keepdim=True) > _SHORTEST, quats, identity)
 
 
 def unit_quats(quats: Tensor) -> Tensor:  # [N, 4] wxyz -> [N, 4] of length 1
@@ -187,38 +178,23 @@ def check_splats(gaussians: Gaussians) -> None:
 
     Raises:
         ValueError: if a value is NaN or infinite, a quaternion is 0, a scale is not positive, an opacity lies outside [0, 1],
-            a label is below -1 or none of the named classes, or a score is not finite.
+            a label is below -1 or none of the named classes, or a score is not finite; or a column is not of numbers, or has
+            the name under which labels are stored.
     """
     g = gaussians.detach()
-    for name, expected in _EXPECTED.items():
-        values = getattr(g, name)
-        if values is None:
-            continue
-        values = values.float()
-        good = values.isfinite()
-        if name == "quats":
-            good &= values.norm(dim=1, keepdim=True) > _SHORTEST
-        elif name == "scales":
-            good &= values > 0
-        elif name == "opacities":
-            good &= (values >= 0) & (values <= 1)
-        _check_rows(name, expected, values, good)
+    for name, (expected, rule) in _RULES.items():
+        if (values := getattr(g, name)) is not None:
+            _check_rows(name, expected, values.float(), rule(values.float()))
     for name, column in g.extra.items():
-        if np.asarray(column).dtype.kind not in "biuf":
+        if np.asarray(column).dtype.kind not in "biuf" or (name == "class_id" and g.labels is not None):
             raise ValueError(
-                f"extra[{name!r:.80}]: expected numbers, got {np.asarray(column).dtype}; number them, or leave the column out"
+                f"extra[{name!r:.80}]: expected numbers, under another name than the labels' class_id, got "
+                f"{np.asarray(column).dtype}; number them, or leave the column out"
             )
-    if g.scores is not None:
-        _check_rows("scores", "finite numbers", g.scores, g.scores.isfinite())
-    if g.labels is None:
-        return
-    most = len(g.names) - 1 if g.names else _LABELS
-    expected = f"-1 (none) to {most}" + (" (the named classes)" if g.names else "")
-    if "class_id" in g.extra:
-        raise ValueError(
-            "extra['class_id']: expected no such column next to labels, which are stored under that name, got both; leave it out"
-        )
-    _check_rows("labels", expected, g.labels, (g.labels >= -1) & (g.labels <= most))
+    if g.labels is not None:
+        most = len(g.names) - 1 if g.names else _LABELS
+        expected = f"-1 (none) to {most}" + (" (the named classes)" if g.names else "")
+        _check_rows("labels", expected, g.labels, (g.labels >= -1) & (g.labels <= most))
 
 
 def _check_rows(name: str, expected: str, values: Tensor, good: Tensor) -> None:  # [N, ...] twice
@@ -234,45 +210,36 @@ def _check_rows(name: str, expected: str, values: Tensor, good: Tensor) -> None:
     )
 
 
-def colours_to_write(gaussians: Gaussians, name: str) -> Gaussians:
-    """The cloud in float64 on the CPU, detached; a ValueError if it has no spherical harmonics."""
-    if gaussians.sh is None:
-        raise ValueError(
-            f"gaussians: expected a cloud with colours (sh [N, K, 3]) for {name}, got {gaussians!r}; write a field without "
-            "colours as .ply"
-        )
-    return gaussians.detach().to("cpu", torch.float64)
-
-
-def describe_loss(g: Gaussians, name: str, degree: int) -> tuple[str, ...]:
-    """Describe the losses of a format without features, other columns, and harmonics above a degree."""
+def describe_loss(g: Gaussians, name: str, holds: frozenset[str]) -> list[str]:
+    """Describe what a format has no place for, of all that a cloud can have; `holds` is the format's `HOLDS`."""
     lost = []
-    if g.sh is not None and (have := int(g.sh.shape[1] ** 0.5) - 1) > degree:
-        kept = "the base colour only" if degree == 0 else f"degree {degree}"
-        lost.append(f"spherical harmonics of degree {have}: {name} holds {kept}")
-    if g.features is not None:
+    if "harmonics" not in holds and g.sh is not None and g.sh.shape[1] > 1:
+        lost.append(f"spherical harmonics of degree {int(g.sh.shape[1] ** 0.5) - 1}: {name} holds the base colour only")
+    if "features" not in holds and g.features is not None:
         lost.append(f"{g.features.shape[1]} features per Gaussian: {name} has no place for them")
-    columns = [*([SCORE] if g.labels is None and g.scores is not None else []), *g.extra]
+    scores = [SCORE] if "columns" not in holds and g.labels is None and g.scores is not None else []
+    columns = [*scores, *(() if "columns" in holds else g.extra)]
     if columns:
         lost.append(f"the columns {', '.join(columns)}: {name} has no place for them")
-    return tuple(lost)
+    if "antialiased" not in holds and g.antialiased:
+        lost.append(f"antialiased rendering: {name} has no place for it")
+    return lost
 
 
-def describe_coarse(g: Gaussians, errors: Any, name: str) -> tuple[str, ...]:  # errors: number or [N, 3], world units
+def describe_coarse(g: Gaussians, errors: Any, name: str) -> list[str]:  # errors: number or [N, 3], world units
     """Describe positions that a format rounds so much that Gaussians move by more than twice their own size."""
-    off = torch.as_tensor(errors, dtype=torch.float64).expand(len(g), 3).norm(dim=1).cpu()
-    moved = off > 2 * g.scales.amax(1).cpu() if len(g) else off > 0
+    off = torch.as_tensor(errors, dtype=torch.float64).expand(len(g), 3).norm(dim=1)
+    moved = off > 2 * g.scales.amax(1) if len(g) else off > 0
     if not moved.any():
-        return ()
-    return (
+        return []
+    return [
         f"positions of {int(moved.sum()):,} of {len(g):,} Gaussians, which move by up to {off[moved].max().item():.3g} units, "
-        f"more than their own size: {name} has too few digits for a cloud this wide; .ply and .glb keep them",
-    )
+        f"more than their own size: {name} has too few digits for a cloud this wide; .ply and .glb keep them"
+    ]
 
 
-def describe_cut(values: Tensor, low: float, high: float, what: str, name: str) -> tuple[str, ...]:  # values: [N, ...]
+def describe_cut(values: Tensor, low: float, high: float, what: str, name: str) -> list[str]:  # values: [N, ...]
     """Describe the loss of a format that holds values in 256 steps from `low` to `high`: those beyond become the ends."""
     step = (high - low) / 255
-    beyond = ((values < low - step) | (values > high + step)).flatten(1).any(1)
-    count = int(beyond.sum())
-    return (f"{what} of {count} of {len(values)} Gaussians beyond what {name} holds: cut off",) if count else ()
+    count = int(((values < low - step) | (values > high + step)).flatten(1).any(1).sum())
+    return [f"{what} of {count} of {len(values)} Gaussians beyond what {name} holds: cut off"] if count else []

@@ -64,11 +64,7 @@ def label_cloud(
             f"{cloud}: expected nothing but points, got {', '.join(others)} too, which labelling would lose; save the "
             "vertices as a point cloud"
         )
-    try:
-        points = points_from_columns(columns)
-    except ValueError as error:
-        raise ValueError(f"{cloud}: {error}; give a point cloud or a 3DGS file") from error
-    local = recounted(points, ORIGIN, gaussians.origin)
+    local = recounted(points_from_columns(cloud, columns), ORIGIN, gaussians.origin)
     moved = nearest_labels(gaussians.means, gaussians.labels, local, distance)
     added = {"class_id": label_column(moved.labels)}
     if not {"red", "green", "blue"} & set(columns):

@@ -186,7 +186,7 @@ def read_points(path: Path) -> tuple[Tensor, Tensor, list[str]]:  # [P, 3] float
     """The vertices of a PLY and their colours, grey if it has none; and a note if some are left out as they are not finite."""
     try:
         columns = read_ply(path)
-        points = points_from_columns(columns)
+        points = points_from_columns(path, columns)
     except ValueError as error:
         raise SceneError(str(error)) from error
     colors = torch.full((len(points), 3), 128, dtype=torch.uint8)

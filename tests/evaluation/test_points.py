@@ -73,8 +73,17 @@ def test_replica_points_that_are_not_whole(tmp_path: Path) -> None:
         load_replica_points(tmp_path)
     _replica(tmp_path)
     write_mesh(tmp_path / "habitat/mesh_semantic.ply", QUADS, extra=False)
-    with pytest.raises(ValueError, match=tells("mesh_semantic.ply", "'object_id'", "corners only")):
+    with pytest.raises(ValueError, match=tells("mesh_semantic.ply", "'object_id'")):
         load_replica_points(tmp_path)
+    write_mesh(tmp_path / "habitat/mesh_semantic.ply", [([0, 1, 77], 4)])
+    with pytest.raises(ValueError, match=tells("mesh_semantic.ply", "6 vertices", "77")):
+        load_replica_points(tmp_path)
+    write_mesh(tmp_path / "habitat/mesh_semantic.ply", QUADS)
+    whole = (tmp_path / "habitat/mesh_semantic.ply").read_bytes()
+    for cut in (1, 10, 30):
+        (tmp_path / "habitat/mesh_semantic.ply").write_bytes(whole[:-cut])
+        with pytest.raises(ValueError, match="mesh_semantic.ply"):
+            load_replica_points(tmp_path)
     write_mesh(tmp_path / "habitat/mesh_semantic.ply", QUADS)
     broken = INFO | {"objects": [{"id": 4, "class_id": 81}]}
     (tmp_path / "habitat/info_semantic.json").write_text(json.dumps(broken))

@@ -111,9 +111,8 @@ def test_names_and_comments_that_are_not_ascii(tmp_path, coding):
     assert read_comments(tmp_path / "b.ply") == ["Büro"]
     splats = read_splats(tmp_path / "b.ply")
     assert list(splats.extra) == ["größe"]
-    for name in ("c.ply", "c.glb"):
-        assert write_splats(splats, tmp_path / name).lost == ()
-        assert read_splats(tmp_path / name).extra["größe"].tolist() == list(range(50))
+    assert write_splats(splats, tmp_path / "c.ply").lost == ()
+    assert read_splats(tmp_path / "c.ply").extra["größe"].tolist() == list(range(50))
     assert "größe" in " ".join(write_splats(splats, tmp_path / "c.splat").lost)
 
 

@@ -18,7 +18,8 @@ from messages import tells
 from oracles_spz import legacy_payload
 
 from kfgs import Gaussians
-from kfgs.formats import formats, read_splats, write_splats
+from kfgs.formats import read_splats, write_splats
+from kfgs.formats.table import formats
 
 MOST_MEMORY = 48 << 20  # bytes, for files of a few kB
 MOST_SECONDS = 5.0

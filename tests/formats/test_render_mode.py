@@ -11,9 +11,10 @@ import torch
 
 from kfgs import Gaussians
 from kfgs.cameras import Camera
-from kfgs.formats import formats, read_splats, write_splats
+from kfgs.formats import read_splats, write_splats
 from kfgs.formats.ply import read_comments, write_ply
 from kfgs.formats.render_mode import AS_FLAT, Mode, mode_from_comments, mode_from_meta, with_mode
+from kfgs.formats.table import formats
 from kfgs.splat import rasterize
 
 WRITABLE = [name for name, module in formats().items() if hasattr(module, "write")]

@@ -8,8 +8,9 @@ from oracles_precision import assert_within, precision
 
 from kfgs import Gaussians
 from kfgs.cameras import Camera
-from kfgs.formats import find_format, formats, read_splats, write_splats
+from kfgs.formats import find_format, read_splats, write_splats
 from kfgs.formats.encodings import morton_order
+from kfgs.formats.table import formats
 from kfgs.metrics import psnr
 from kfgs.splat import rasterize
 

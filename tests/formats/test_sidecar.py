@@ -83,14 +83,14 @@ def test_labels_of_another_version_are_refused(path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"class_id": np.zeros(5, np.int32)}, ("a.splat", "another version")),
+        ({"class_id": np.zeros(5, np.int32)}, ("labels", "5")),
         ({"class_id": np.zeros(6, np.float32)}, ("class_id", "float32")),
         ({"class_id": np.full(6, "a")}, ("class_id", "<U1")),
         ({"class_id": np.full(6, -2)}, ("class_id", "-1")),
         ({"class_id": None}, ("class_id", "delete")),
         ({"of": None}, ("of", "delete")),
         ({"of": np.array("other")}, ("a.splat", "another version")),
-        ({"score": np.zeros(7)}, ("score", "each Gaussian")),
+        ({"score": np.zeros(7)}, ("scores", "7")),
         ({"score": np.zeros(100_000)}, ("800664 bytes", "6 Gaussians")),
         ({"class_id": np.array([None] * 6)}, ("read", "a.splat")),  # pickled objects are never loaded
     ],
