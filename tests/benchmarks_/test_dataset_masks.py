@@ -53,24 +53,6 @@ def test_lerf_ovs_objects_of_one_text_are_one_mask_with_several_boxes(tmp_path: 
     assert truth.texts == ("egg", "bowl")
 
 
-def test_lerf_ovs_from_the_scene_or_the_folder_of_all(tmp_path: Path) -> None:
-    _lerf(tmp_path)
-    (tmp_path / "ramen/images").mkdir(parents=True)
-    (tmp_path / "ramen/transforms.json").write_text("{}")  # no label
-    for path, scene in ((tmp_path / "ramen", None), (tmp_path, "ramen"), (tmp_path, None)):
-        assert len(load_lerf_ovs(path, scene).frames) == 7
-        assert load_lerf_ovs(path, scene).scene == "ramen"
-    (tmp_path / "label/ramen").rename(tmp_path / "ramen/label")  # a scene with labels of its own
-    for truth in (load_lerf_ovs(tmp_path / "ramen"), find_masks(tmp_path / "ramen")):
-        assert (len(truth.frames), truth.scene) == (7, "ramen")
-    _lerf(tmp_path, "ramen")
-    _lerf(tmp_path, "teatime")
-    with pytest.raises(ValueError, match=tells("scene", "ramen, teatime", "None")):
-        load_lerf_ovs(tmp_path)
-    with pytest.raises(FileNotFoundError, match=tells("garden", "*.json", "looked in", "give the right folder")):
-        load_lerf_ovs(tmp_path, "garden")
-
-
 def _mask(path: Path, box: tuple[int, int, int, int], size: tuple[int, int] = (10, 12), value: int = 255) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     grey = np.zeros(size, np.uint8)

@@ -3,18 +3,12 @@
 import json
 import math
 
-import numpy as np
 import pytest
-import torch
 from editing import score_recolor, score_removal
 from oracles_editing import paint_room
-from PIL import Image
 
-from kfgs.evaluation import find_points
 from kfgs.labels.color import recolor
-from kfgs.metrics import psnr
 from kfgs.scenes import load_scene
-from kfgs.splat import rasterize
 from kfgs.toy.room_folder import ToyConfig, make_toy_room
 
 ROOM = ToyConfig(
@@ -58,27 +52,6 @@ def test_removing_nothing_leaves_everything(room, cloud):
     assert not report.passed
 
 
-def test_removing_a_wrong_class_fails(room, cloud, mask):
-    report = score_removal(cloud, cloud.select(~mask["table"]), room, "chair")
-    assert report.gone_pixels < 0.05
-    assert report.gone_points < 0.05
-    assert report.untouched_pixels < 0.95
-    assert report.kept_points < 0.99
-    assert not report.passed
-
-
-def test_removing_half_scores_half(room, cloud, mask):
-    """By place: the rug's half with x > 0.05, its centre. A pixel or a point is either gone or it is not."""
-    half = mask["rug"] & (cloud.means[:, 0] > 0.05)
-    report = score_removal(cloud, cloud.select(~half), room, "rug")
-    surface = find_points(room)
-    rug = next(i for i, name in surface.names.items() if name == "rug")
-    share = float((surface.points[surface.labels == rug][:, 0] > 0.05).double().mean())
-    assert abs(report.gone_points - share) < 0.03
-    assert 0.1 < report.gone_pixels < 0.9
-    assert not report.passed
-
-
 @pytest.mark.parametrize("name", ["chair", "rug"])
 def test_recolouring_by_true_labels_stays_inside(room, cloud, mask, name):
     report = score_recolor(cloud, recolor(cloud, mask[name], BLUE), room, name, BLUE)
@@ -102,17 +75,3 @@ def test_recolouring_a_wrong_class_fails(room, cloud, mask):
     report = score_recolor(cloud, recolor(cloud, mask["wall"], BLUE), room, "chair", BLUE)
     assert report.psnr_outside < 20
     assert not report.passed
-
-
-def test_the_psnr_is_over_all_pixels_outside(room, cloud, mask):
-    after = recolor(cloud, mask["rug"], BLUE)
-    scene = load_scene(room)
-    old, new = [], []
-    for i in scene.views("test"):
-        outside = np.array(Image.open(room / "labels" / f"{scene.stem(i)}.png")) != 3  # rug
-        old.append(rasterize(cloud, scene.cameras[i]).map.clamp(0, 1)[torch.from_numpy(outside)])
-        new.append(rasterize(after, scene.cameras[i]).map.clamp(0, 1)[torch.from_numpy(outside)])
-    expected = float(psnr(torch.cat(new)[None], torch.cat(old)[None]))
-    report = score_recolor(cloud, after, room, "rug", BLUE)
-    assert report.psnr_outside == pytest.approx(expected, abs=1e-3)
-    assert report.psnr_off_border > report.psnr_outside  # soft edges are where the error is

@@ -70,11 +70,3 @@ def test_a_perfect_spot_is_found_by_hand():
     smoothed = box_mean(relevancy)
     assert localise(smoothed, torch.tensor([[45.0, 35.0, 54.0, 44.0]]))
     assert not localise(smoothed, torch.tensor([[0.0, 0.0, 20.0, 79.0]]))
-
-
-def test_edges_of_a_box_count():
-    impulse = torch.zeros(1, 100, 100)
-    impulse[0, 40, 50] = 900  # the mean is 1 on rows 26 to 55 and columns 36 to 65
-    smoothed = box_mean(impulse)
-    assert localise(smoothed, torch.tensor([[65.0, 55.0, 90.0, 90.0]]))
-    assert not localise(smoothed, torch.tensor([[65.5, 0.0, 90.0, 99.0]]))

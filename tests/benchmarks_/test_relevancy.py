@@ -4,7 +4,6 @@ import pytest
 import torch
 from published.relevancy import (
     box_mean,
-    fill_unknown,
     lerf_relevancy,
     majority,
     pool_majority,
@@ -13,11 +12,6 @@ from published.relevancy import (
 )
 
 SIZES = [(40, 33), (9, 12), (31, 1), (1, 1)]
-
-
-def test_relevancy_by_hand():
-    found = lerf_relevancy(torch.tensor([0.30]), torch.tensor([0.25, 0.20, 0.10, 0.28]))
-    assert float(found) == pytest.approx(0.549834, abs=1e-6)
 
 
 def test_relevancy_against_the_pairwise_softmax():
@@ -59,12 +53,6 @@ def test_majority_never_looks_at_the_last_row_and_column():
     edge[-1], edge[:, -1] = True, True
     assert not majority(edge).any()
     assert majority(edge, 3, skip_last=False).any()  # the corner's window: 3 of 4
-
-
-def test_unknown_pixels_are_the_least_relevant():
-    nan = float("nan")
-    maps = torch.tensor([[[0.4, nan], [0.9, 0.6]], [[nan, nan], [nan, nan]]])
-    assert fill_unknown(maps).tolist() == torch.tensor([[[0.4, 0.4], [0.9, 0.6]], [[0, 0], [0, 0]]]).tolist()
 
 
 def test_stretch_against_loops():

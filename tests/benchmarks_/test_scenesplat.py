@@ -88,18 +88,6 @@ def test_votes_by_hand():
     assert vote_instances(labels, instances).tolist() == [1, 1, 1, 2, 3]
 
 
-def test_true_instances_are_an_option():
-    texts = [f"this is a {name}" for name in LISTS["scannet20"]["classes"]]
-    method, truth = _scene(0, texts)
-    usual, inflated = SceneSplatBench(ignored=OTHERS), SceneSplatBench(within_instances=True, ignored=OTHERS)
-    assert (
-        usual.score(method, truth, (), method.encode).scores != inflated.score(method, truth, (), method.encode).scores
-    )
-    bare = PointTruth(truth.points, truth.labels, truth.names)
-    with pytest.raises(ValueError, match="expected instances for within_instances"):
-        inflated.score(method, bare, (), method.encode)
-
-
 def _named(labels, names):
     return PointTruth(torch.zeros(len(labels), 3), torch.tensor(labels), names)
 
@@ -114,43 +102,3 @@ def test_all_names_of_scannet_find_their_class(benchmark, ceiling):
     found = match_names(_named([1, 28, 39, 22, 13, 13, 0, 77], NYU40), classes)
     assert found.labels.tolist() == [0, 15, 19, ceiling, -1, -1, -1, -1]
     assert found.left_out == ({"blinds": 2} if ceiling == 20 else {"blinds": 2, "ceiling": 1})
-
-
-def test_names_in_another_spelling_are_matched_and_strange_ones_are_an_error():
-    classes = ("wall", "shower curtain", "tv stand")
-    found = match_names(
-        _named([0, 1, 2, 3, -1], {0: "Wall", 1: "shower_curtain", 2: "TV-Stand", 3: "Unlabelled"}), classes
-    )
-    assert found.labels.tolist() == [0, 1, 2, -1, -1]
-    assert found.left_out == {"Unlabelled": 1}
-    names = {0: "wall", 1: "showercurtains", 2: "sofa", 3: "nowhere"}  # two classes have no name: one may be theirs
-    strange = _named([0, 1, 2, 2], names)
-    with pytest.raises(
-        ValueError, match=r"shower curtain, tv stand among them, got points named showercurtains, sofa;"
-    ):
-        match_names(strange, classes)
-    with pytest.raises(ValueError, match="give the others as ignored=sofa$"):
-        match_names(strange, classes, ["Shower Curtains"])
-    found = match_names(strange, classes, ["Shower Curtains", "sofa"])
-    assert found.labels.tolist() == [0, -1, -1, -1]
-    assert found.left_out == {"showercurtains": 1, "sofa": 2}
-    with pytest.raises(ValueError, match="ignored: expected names that are no classes of the protocol, got TV stand"):
-        match_names(strange, classes, ["TV stand"])
-
-
-@pytest.mark.parametrize(("benchmark", "published"), [("scannetpp100", 1.0), ("scannet20", 0.0)])
-def test_gaussians_without_a_feature_vote_as_published(benchmark, published):
-    texts = [f"this is a {name}" for name in LISTS[benchmark]["classes"]]
-    own = {text: np.full((1, 5), 0.1) for text in texts}
-    own["this is a chair"][:] = 0.2
-    for values in own.values():
-        values[:, :3] = np.nan  # three of five know nothing: if they vote, "none" wins
-    method = cases.Numbers(texts, own=own, gaussians=cases.spread_gaussians(np.random.default_rng(0), 5))
-    truth = _named([7], {7: "chair"})
-    scores = {}
-    for drop in (None, True, False):
-        report = SceneSplatBench(benchmark=benchmark, drop_unknown=drop).score(method, truth, (), method.encode)
-        scores[drop] = report["mAcc"]
-        assert report.notes[0].endswith("left out of the vote" if scores[drop] else "vote for none")
-        assert ("drop_unknown" in str(report)) == (drop is not None)
-    assert scores == {None: published, True: 1.0, False: 0.0}

@@ -33,19 +33,3 @@ def test_scenesplat_points(tmp_path: Path) -> None:
     assert open_points(None, scene / "segment20.npy")[0].labels.tolist() == twenty
     with pytest.raises(ValueError, match=tells(scene, "one file of labels", "segment20.npy, segment200.npy")):
         open_points(None, scene)
-
-
-def test_scenesplat_points_of_several_labels(tmp_path: Path) -> None:
-    several = np.array([[5, 9], [99, -1], [-1, -1], [0, 1], [1, 0], [2, 2]], np.int16)
-    scene = _scenesplat(tmp_path / "a", segment=several)
-    truth = load_scenesplat_points(scene, "scannetpp100")
-    assert (truth.labels.tolist(), truth.instances) == ([5, 99, -1, 0, 1, 2], None)
-    assert truth.names[99] == "marker"
-    with pytest.raises(ValueError, match=tells("segment.npy", "[6]", "[6, 2]", "one scene")):
-        load_scenesplat_points(scene, "matterport21")
-    with pytest.raises(
-        ValueError, match=tells("benchmark", "scannetpp100, matterport21, holicity4", "segment.npy", "None")
-    ):
-        load_scenesplat_points(scene)
-    column = _scenesplat(tmp_path / "b", segment=several[:, 1:] * 0 + 3)
-    assert load_scenesplat_points(column, "holicity4").labels.tolist() == [3] * 6

@@ -9,7 +9,6 @@ from small_room import ROOM
 from small_task import MIB, cloud
 
 from kfgs.formats import write_splats
-from kfgs.quant import AutoencoderConfig, GrownCodebook, PaperCodebook
 from kfgs.toy.room_folder import make_toy_room
 
 
@@ -52,25 +51,10 @@ def test_table_puts_the_paper_beside():
     assert "Teacher: mIoU 73.1, accuracy 90.3 over 30 views" in text
 
 
-def test_table_of_seeds_has_mean_and_range():
-    found = [result("occam", seed, miou=miou) for seed, miou in enumerate((0.3, 0.5, 0.4))]
-    assert "| 40.0 (30.0 to 50.0) |" in table1_report.table_text(ABOUT, found)
-
-
 def test_published_figures_are_those_of_the_paper():
     paper = {key: row.paper["miou"] for key, row in table1_rows.ROWS.items() if row.paper}
     assert list(paper.values()) == [32.0, 58.5, 73.4, 73.9, 73.5, 77.9, 76.6]
     assert len(table1_rows.ROWS) == 13
-
-
-def test_the_paper_s_rows_have_the_paper_s_codebook_and_autoencoder():
-    for preset in ("quick", "cpu", "paper"):
-        for key in ("adc", "adc+sc"):
-            config = table1_rows.kfgs_config(table1_rows.ROWS[key], key, preset, None)
-            assert config.codebook == PaperCodebook()
-            assert config.autoencoder == (None if key == "adc" else AutoencoderConfig.paper())
-    own = table1_rows.kfgs_config(table1_rows.ROWS["own-adc+sc"], "own-adc+sc", "quick", None)
-    assert (own.codebook, own.autoencoder) == (GrownCodebook(), AutoencoderConfig())
 
 
 def test_a_run_writes_table_and_pictures_and_resumes(tmp_path, monkeypatch, capsys):
