@@ -22,11 +22,9 @@ def plane_to_pixel(
 ) -> Tensor:  # [..., 2]
     """Map points of the z = 1 plane to pixels: u = fx D(x, y)_x + cx, v = fy D(x, y)_y + cy, with D the lens.
 
-    **Convention**: K decides where pixel centres are; COLMAP's K puts them on halves.
-
-    Note:
-        D is kornia's `distort_points` or `distort_points_kannala_brandt`, which agree with COLMAP's camera models.
-        With a lens, slopes are clamped at 1e4, so that a point at the camera's side gives a large number instead of NaN.
+    D is kornia's `distort_points` or `distort_points_kannala_brandt`, which agree with COLMAP's camera models. K decides where
+    pixel centres are. With a lens, slopes are clamped at 1e4, so that a point at the camera's side gives a large number
+    instead of NaN.
     """
     intrinsics = torch.stack([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
     if distortion is None:
@@ -46,10 +44,6 @@ def fold_radius(distortion: Distortion | None) -> float:
     It is the first positive root of the derivative of the distorted radius,
     r (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6), or for the fisheye of
     theta (1 + k1 theta^2 + ... + k4 theta^8) with r = tan(theta); tangential terms are ignored.
-
-    Example:
-        >>> round(fold_radius(Distortion("brown_conrady", (-1 / 3, 0, 0, 0))), 6)  # r - r^3 / 3 turns at r = 1
-        1.0
     """
     if distortion is None:
         return math.inf

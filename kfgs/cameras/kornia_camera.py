@@ -10,6 +10,7 @@ from kornia.geometry.camera import PinholeCamera
 
 from .._check import check_shapes
 from .camera import NEAR, Camera, at_one_origin
+from .projection import refuse_distortion
 
 
 def to_kornia(cameras: Sequence[Camera], *, integer_centers: bool = False) -> PinholeCamera:
@@ -22,13 +23,10 @@ def to_kornia(cameras: Sequence[Camera], *, integer_centers: bool = False) -> Pi
 
     Returns:
         `intrinsics` and `extrinsics` [B, 4, 4] in the widest dtype, `height` and `width` [B] int64, counted from the origin
-        of the first camera. Names, `near` and that origin are lost.
+        of the first camera. Names, `near` and that origin are lost. `project` does not test for front and border.
 
     Raises:
         ValueError: if there is no camera, one has distortion, or they are on several devices.
-
-    Note:
-        `project` does not test for front and border: a point behind a camera gets a plausible pixel (`project_points` masks it).
 
     Example:
         >>> camera = Camera(torch.eye(4), torch.tensor([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]), 64, 48)
@@ -38,12 +36,8 @@ def to_kornia(cameras: Sequence[Camera], *, integer_centers: bool = False) -> Pi
     if not len(cameras):
         raise ValueError("cameras: expected at least one Camera, got none; select a view that the scene has")
     cameras = at_one_origin(cameras)
-    for i, camera in enumerate(cameras):
-        if camera.distortion is not None:
-            raise ValueError(
-                f"cameras[{i}]: expected a pinhole camera, got {camera.distortion.model} distortion (camera "
-                f"{camera.name!r}), which PinholeCamera cannot hold; undistort it first (kfgs.cameras.undistort)"
-            )
+    for camera in cameras:
+        refuse_distortion(camera)
     matrices = [matrix for camera in cameras for matrix in (camera.K, camera.viewmat)]
     devices = {str(matrix.device) for matrix in matrices}
     if len(devices) > 1:
@@ -70,21 +64,7 @@ def from_kornia(
         near: of every camera, world units; kornia's cameras have none.
         integer_centers: whether its K puts pixel centres on integers, as kornia's documentation says of its cameras; 0.5 is
             then added to cx and cy. A K from COLMAP has them on halves, inside kornia's cameras too.
-
-    Raises:
-        ValueError: if it is not [B, 4, 4], the number of names is wrong, or kfgs cannot hold a camera (skew, a pose with
-            scale, a size that is not a whole number of pixels).
-
-    Example:
-        >>> camera = Camera(torch.eye(4), torch.tensor([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]), 64, 48)
-        >>> [again] = from_kornia(to_kornia([camera]), ["a.png"])
-        >>> again.name, again.size, torch.equal(again.K, camera.K)
-        ('a.png', (48, 64), True)
     """
-    if not isinstance(pinhole, PinholeCamera):
-        raise TypeError(
-            f"pinhole: expected a kornia.geometry.camera.PinholeCamera, got {type(pinhole).__name__}; build one"
-        )
     count = pinhole.batch_size
     for name in ("intrinsics", "extrinsics"):
         check_shapes((f"pinhole.{name}", getattr(pinhole, name), (count, 4, 4)))

@@ -139,10 +139,8 @@ def estimate_up(cameras: Sequence[Camera]) -> Tensor:  # [3] float64, unit
 
     People hold cameras level: the x axes of the pictures are horizontal in whatever direction they look. So up is the
     direction that is most nearly perpendicular to all of them (least eigenvector of sum x x^T), on the side of the upper
-    edges. If all cameras look in one direction, the x axes do not determine it, and up is the mean of the pictures' y axes.
-
-    Raises:
-        ValueError: if there are no cameras, or their upper edges point in all directions and cancel.
+    edges. If all cameras look in one direction, up is the mean of the pictures' y axes. A ValueError if there are no cameras,
+    or their upper edges cancel.
     """
     if not cameras:
         raise ValueError("cameras: expected at least one camera, got none; give up as a vector instead")

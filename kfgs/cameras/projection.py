@@ -22,13 +22,8 @@ def world_to_camera(camera: Camera, points: Tensor) -> Tensor:  # points: [N, 3]
 
     Written out because kornia's `transform_points` divides by a homogeneous coordinate that is always 1 here, and takes
     twice as long.
-
-    Example:
-        >>> camera = Camera(torch.eye(4), torch.tensor([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]), 64, 48)
-        >>> world_to_camera(camera, torch.tensor([[1.0, 2.0, 3.0]]))
-        tensor([[1., 2., 3.]])
     """
-    _check_points("points", points)
+    check_shapes(("points", as_tensor("points", points, floating=True), "N 3"))
     viewmat = camera.viewmat.to(points)
     return points @ viewmat[:3, :3].T + viewmat[:3, 3]
 
@@ -38,14 +33,8 @@ def camera_to_pixel(camera: Camera, points_cam: Tensor) -> Tensor:  # points_cam
 
     A point behind the camera gives an ordinary-looking pixel, so mask by depth *before* calling (`project_points` does). At
     z = 0 the division is skipped: the result is finite, and means nothing.
-
-    Example:
-        >>> camera = Camera(torch.eye(4), torch.tensor([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]), 64, 48)
-        >>> camera_to_pixel(camera, torch.tensor([[0.0, 0.0, 2.0], [0.2, 0.1, 2.0]]))
-        tensor([[32., 24.],
-                [42., 29.]])
     """
-    _check_points("points_cam", points_cam)
+    check_shapes(("points_cam", as_tensor("points_cam", points_cam, floating=True), "N 3"))
     plane = convert_points_from_homogeneous(points_cam)  # finite at z = 0, where project_points_z1 is not
     return plane_to_pixel(plane, camera.K.to(points_cam), camera.distortion)
 
@@ -54,11 +43,8 @@ def projection_jacobian(camera: Camera, points_cam: Tensor) -> Tensor:  # points
     """Derivative of the pinhole projection, d(u, v) / d(x, y, z), in pixels per world unit (EWA, Zwicker 2001).
 
     The caller masks `z > near` first.
-
-    Raises:
-        ValueError: if the camera has distortion, or `points_cam` are not [N, 3].
     """
-    _check_points("points_cam", points_cam)
+    check_shapes(("points_cam", points_cam, "N 3"))
     refuse_distortion(camera)
     return dx_project_points_z1(points_cam) * camera.K.diagonal()[:2].to(points_cam)[:, None]
 
@@ -107,11 +93,6 @@ def unproject_depth(camera: Camera, depth: Tensor) -> Tensor:  # depth: [H, W] -
     """Lift a depth map (along the optical axis, in world units) to one world point per pixel centre.
 
     A pixel of depth 0 (often "unknown") gives the centre of the camera: mask it.
-
-    Example:
-        >>> camera = Camera(torch.eye(4), torch.tensor([[2.0, 0, 1], [0, 2, 1], [0, 0, 1]]), 2, 2)
-        >>> unproject_depth(camera, torch.full((2, 2), 4.0))[0, 0]  # the ray of the pixel centre (0.5, 0.5)
-        tensor([-1., -1.,  4.])
     """
     check_shapes(("depth", as_tensor("depth", depth, floating=True), (camera.height, camera.width)))
     refuse_distortion(camera)
@@ -127,7 +108,3 @@ def refuse_distortion(camera: Camera) -> None:
             f"camera: expected a pinhole camera, got {camera.distortion.model} distortion (camera {camera.name!r}); "
             "undistort its images first (kfgs.cameras.undistort) and use the camera that returns"
         )
-
-
-def _check_points(name: str, points: Tensor) -> None:
-    check_shapes((name, as_tensor(name, points, floating=True), "N 3"))

@@ -42,12 +42,8 @@ def resize_map(
         map: any number of channels, floating point (resize labels with `resize_labels`).
         size: (height, width) of the result.
         align_corners: True puts the centres of the corner pixels on each other instead.
-        antialias: blur before shrinking (kornia's Gaussian). It changes nothing at the paper's 4/3, and matters from a
-            factor of about 2, where plain bilinear sampling skips pixels and leaves them without gradient.
-
-    Example:
-        >>> resize_map(torch.tensor([[[0.0], [1.0], [2.0], [3.0]]]), (1, 2))[..., 0]
-        tensor([[0.5000, 2.5000]])
+        antialias: blur before shrinking (kornia's Gaussian). It matters from a factor of about 2, where plain bilinear sampling
+            skips pixels and leaves them without gradient.
     """
     map = as_tensor("map", map)
     check_shapes(("map", map, "H W D"))
@@ -68,10 +64,6 @@ def resize_labels(
 
     Row i of the result reads row floor((i + 0.5) H / h), in whole numbers. kornia's `resize(interpolation="nearest")` takes
     floor(i H / h), the label at the pixel's corner, and neither it nor "nearest-exact" accepts int64.
-
-    Example:
-        >>> resize_labels(torch.tensor([[0, 1, 2, -1]]), (1, 2))  # centres 1.0 and 3.0 lie in pixels 1 and 3
-        tensor([[ 1, -1]])
     """
     labels = as_tensor("labels", labels)
     check_shapes(("labels", labels, "H W"))
@@ -86,11 +78,6 @@ def resize_labels(
 
 
 def fits_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether two (height, width) have the same aspect, up to one pixel (or cell) of rounding in the smaller one.
-
-    Example:
-        >>> fits_aspect((90, 120), (360, 480)), fits_aspect((48, 64), (479, 640)), fits_aspect((120, 90), (360, 480))
-        (True, True, False)
-    """
+    """Whether two (height, width) have the same aspect, up to one pixel (or cell) of rounding in the smaller one."""
     (h, w), (H, W) = sorted((size, other), key=math.prod)
     return abs(h - H * w / W) <= 1 or abs(w - W * h / H) <= 1

@@ -21,7 +21,8 @@ def undistort(
 ) -> tuple[Tensor, Camera, Tensor]:  # [H, W, C], camera, [H, W] bool
     """Undistort a picture or a feature map; K, pose and size stay.
 
-    Each pixel of the result looks up, bilinearly, where its ray fell in the distorted picture.
+    Each pixel of the result looks up, bilinearly, where its ray fell in the distorted picture. kornia's `undistort_image` does
+    the same two steps (distort the grid, remap), but has no fisheye model and no mask.
 
     Args:
         image: any number of channels, floating point, as large as the camera says (a smaller feature map:
@@ -29,12 +30,9 @@ def undistort(
         camera: the camera that took it. Without distortion the picture is returned unchanged.
 
     Returns:
-        The picture, 0 at unrecorded pixels; the camera without distortion; and the mask of recorded pixels.
-
-    Note:
-        kornia's `undistort_image` does the same two steps (distort the grid, remap), but has no fisheye model and no mask.
-        Pixels beyond the border of the picture, or beyond the `fold_radius` of the lens model, do not count as recorded.
-        Within half a pixel of the border the outermost pixel is repeated.
+        The picture, 0 at unrecorded pixels; the camera without distortion; and the mask of recorded pixels. Pixels beyond the
+        border of the picture, or beyond the `fold_radius` of the lens model, are not recorded. Within half a pixel of the
+        border the outermost pixel is repeated.
     """
     check_shapes(("image", image, f"{camera.height} {camera.width} C"))
     if not image.is_floating_point():

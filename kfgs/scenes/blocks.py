@@ -104,11 +104,8 @@ def partition(model: ColmapModel, count: int) -> list[Block]:
 def write_parts(model: str | Path, parts: Mapping[Path, Iterable[str]]) -> None:
     """Write COLMAP models with some of the images of another, and the points that at least two of them see.
 
-    The model is read once, as that of a city has gigabytes; then memory holds it, and a copy from which one part is made.
-
-    Args:
-        model: the folder of the model, which `read_whole_model` accepts.
-        parts: the folder of each new model, with the names of its images.
+    `parts` has the folder of each new model, with the names of its images. The model, which `read_whole_model` accepts, is read
+    once, as that of a city has gigabytes; then memory holds it, and a copy from which one part is made.
     """
     model = as_path(model)
     with (

@@ -10,27 +10,21 @@ import torch
 
 from .._files import Names
 from .._notes import Repair
-from ..cameras.camera import Camera, Distortion
+from ..cameras.camera import Camera, Distortion, DistortionModel
 from .colmap_files import CAMERA_MODELS
 from .colmap_model import ColmapImage, ColmapModel, read_model
-from .files import SceneError, find_pictures, list_images, natural_key, some, spelling_note
-from .posed import NO_POINTS, as_large_as_pictures, assemble_scene
+from .files import SceneError, find_pictures, list_images, natural_key, some
+from .posed import NO_POINTS, NOTHING, as_large_as_pictures, assemble_scene
 from .scene import Scene
 
 # COLMAP's model: (our lens, its number of coefficients). COLMAP's own order after the intrinsics is ours in each case:
 # brown_conrady k1 k2 p1 p2 [k3 k4 k5 k6], kannala_brandt k1 k2 k3 k4; what COLMAP leaves out at the end is zero.
-LENSES: dict[str, tuple[str | None, int]] = {
-    "SIMPLE_PINHOLE": (None, 0),
-    "PINHOLE": (None, 0),
-    "SIMPLE_RADIAL": ("brown_conrady", 4),
-    "RADIAL": ("brown_conrady", 4),
-    "OPENCV": ("brown_conrady", 4),
+LENSES: dict[str, tuple[DistortionModel | None, int]] = {
+    **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE"), (None, 0)),
+    **dict.fromkeys(("SIMPLE_RADIAL", "RADIAL", "OPENCV"), ("brown_conrady", 4)),
     "FULL_OPENCV": ("brown_conrady", 8),
-    "OPENCV_FISHEYE": ("kannala_brandt", 4),
-    "SIMPLE_RADIAL_FISHEYE": ("kannala_brandt", 4),
-    "RADIAL_FISHEYE": ("kannala_brandt", 4),
-    "SIMPLE_FISHEYE": ("kannala_brandt", 4),
-    "FISHEYE": ("kannala_brandt", 4),
+    **dict.fromkeys(("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), ("kannala_brandt", 4)),
+    **dict.fromkeys(("SIMPLE_FISHEYE", "FISHEYE"), ("kannala_brandt", 4)),
 }
 PANORAMA = "cut perspective views out of the panoramas, and give these with their poses"  # no undistorter flattens them
 
@@ -48,27 +42,19 @@ def convert_intrinsics(model: str, params: Sequence[float]) -> tuple[torch.Tenso
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     if kind is None or (kind == "brown_conrady" and not any(lens)):
         return K, None
-    coefficients = tuple(float(k) for k in lens) + (0.0,) * (length - len(lens))
-    return K, Distortion(kind, coefficients)  # type: ignore[arg-type]  # the table holds only these two names
+    return K, Distortion(kind, tuple(float(k) for k in lens) + (0.0,) * (length - len(lens)))
 
 
 def load_colmap(path: Path, images: Path) -> Scene:
-    """Read a COLMAP model and pair it with its image files.
-
-    Args:
-        path: the model's folder (cameras, images, points3D; binary or text).
-        images: the folder that the model's image names are relative to. Its pictures may have another size than the model
-            says, as in `images_2`, `images_4` of Mip-NeRF 360: the cameras are resized to them.
-    """
+    """Read a COLMAP model and pair it with its image files in a folder, to whose sizes the cameras are resized."""
     if not images.is_dir():
         raise FileNotFoundError(f"{images}: no such folder; expected the images of {path} there")
     model = read_model(path)
     views, notes = _posed(model)
     files, there = find_pictures(images, [view.name for view in views]), list_images(images)
-    found = [
-        replace(view, name=files[view.name].relative_to(images).as_posix()) for view in views if view.name in files
-    ]
-    missing = [view.name for view in views if view.name not in files]
+    names = {name: file.relative_to(images).as_posix() for name, file in files.items()}
+    found = [replace(view, name=names[view.name]) for view in views if view.name in names]
+    missing = [view.name for view in views if view.name not in names]
     if not found:
         raise SceneError(
             f"{images}: expected the images of {path}, none of its {len(views)} posed images ({some(missing, 3)}) "
@@ -77,7 +63,10 @@ def load_colmap(path: Path, images: Path) -> Scene:
     found.sort(key=lambda view: natural_key(view.name))
     paths = [images / view.name for view in found]
     cameras, resized = as_large_as_pictures(_cameras(path, model, found), paths, images)
-    notes += [*resized, *spelling_note(images, files)]
+    notes += resized
+    other = [f"{name} is {file}" for name, file in names.items() if name != file]
+    if other:
+        notes.append(f"{len(other)} images of {images} were found by a name that is spelled otherwise: {some(other)}")
     known = {view.name for view in (*found, *model.images.values())}
     extra = [name for name in there if name not in known]
     if missing:
@@ -87,8 +76,7 @@ def load_colmap(path: Path, images: Path) -> Scene:
         notes.append(f"{len(extra)} image files in {images} have no pose in the model: {some(extra)}")
     if len(model.points) == 0:
         notes.append(NO_POINTS)
-    points, colors = torch.from_numpy(model.points), torch.from_numpy(model.colors)
-    return assemble_scene(cameras, paths, points, colors, notes)
+    return assemble_scene(cameras, paths, torch.from_numpy(model.points), torch.from_numpy(model.colors), notes)
 
 
 def colmap_cameras(path: Path) -> Scene:
@@ -98,27 +86,26 @@ def colmap_cameras(path: Path) -> Scene:
     cameras = _cameras(path, model, [replace(view, name=view.name.replace("\\", "/")) for view in views])
     if not cameras:
         raise SceneError(f"{path}: expected cameras with poses, got none; run COLMAP again (`kfgs sfm`)")
-    nothing = torch.zeros(0, 3)
-    return assemble_scene(cameras, [Path(camera.name) for camera in cameras], nothing, nothing.byte(), notes)
+    return assemble_scene(cameras, [Path(camera.name) for camera in cameras], *NOTHING, notes)
 
 
 def _posed(model: ColmapModel) -> tuple[list[ColmapImage], list[str]]:
     """The images with a pose and a lens, in natural order of names, and notes about the others and all that is broken."""
     views = sorted(model.images.values(), key=lambda image: natural_key(image.name))
     lost = [image.name for image in views if image.pose is None]
-    notes = [f"{len(lost)} images of the model have no pose and were left out: {some(lost)}"] if lost else []
+    notes = [Repair(f"{len(lost)} images of the model have no pose and were left out: {some(lost)}")] if lost else []
     whole = [image for image in views if image.pose is not None and model.cameras[image.camera_id].usable]
-    return whole, [*map(Repair, notes), *model.notes]
+    return whole, [*notes, *model.notes]
 
 
 def _cameras(path: Path, model: ColmapModel, images: list[ColmapImage]) -> list[Camera]:
     cameras = []
     for image in images:
-        camera = model.cameras[image.camera_id]
+        lens = model.cameras[image.camera_id]
         try:
-            K, lens = convert_intrinsics(camera.model, camera.params)
+            K, distortion = convert_intrinsics(lens.model, lens.params)
             pose = torch.from_numpy(image.pose)
-            cameras.append(Camera(pose, K.float(), camera.width, camera.height, image.name, lens))
+            cameras.append(Camera(pose, K.float(), lens.width, lens.height, image.name, distortion))
         except ValueError as error:
             raise SceneError(f"{path}, image {image.name}, camera {image.camera_id}: {error}") from error
     return cameras

@@ -11,6 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..cameras.camera import Camera
+from ..cameras.projection import unproject_depth
 from .files import SceneError, is_file, open_picture, read_alpha, read_image
 from .masks import folder_masks, picture_folder, read_mask
 from .posed import Matrix, PosedPicture
@@ -40,11 +42,12 @@ def points_from_depth(
 ) -> tuple[Tensor, Tensor] | None:  # [P, 3] float64, [P, 3] uint8
     """About `DEPTH_POINTS` points of surfaces with their colours, from `DEPTH_VIEWS` evenly chosen depth pictures.
 
-    Pixels that are masked or transparent in the colour picture give none.
+    Pixels that are masked or transparent in the colour picture give none. Views without a pose and missing depth pictures are
+    left out.
 
     Args:
-        views: the pictures; those without a pose are left out.
-        depths: their depth pictures; a missing file is left out.
+        views: the pictures.
+        depths: their depth pictures.
         unit: world units per step of the depth pictures.
         K: intrinsics of the depth pictures. None takes those of each view (`lens`), resized: pictures and depth then show
             the same. A colour is that of the same place in the colour picture.
@@ -69,14 +72,14 @@ def points_from_depth(
             own = np.diag([width / view.lens[1][0], height / view.lens[1][1], 1.0]) @ view.lens[0]
         y, x = (axis.reshape(-1) for axis in np.mgrid[step // 2 : height : step, step // 2 : width : step])
         rows, columns = y * image.shape[0] // height, x * image.shape[1] // width  # in the colour picture
-        z, mask, alpha = depth[y, x], view.mask or folder_mask, read_alpha(view.path)
+        mask, alpha, known = view.mask or folder_mask, read_alpha(view.path), depth[y, x] > 0
         if mask is not None:
-            z = z * read_mask(mask, image.shape[:2]).numpy()[rows, columns]
+            known &= read_mask(mask, image.shape[:2]).numpy()[rows, columns]
         if alpha is not None:
-            z = z * (alpha > 0.5).numpy()[rows, columns]
-        rows, columns, x, y, z = (values[z > 0] for values in (rows, columns, x, y, z))
-        local = np.stack([(x + 0.5 - own[0, 2]) / own[0, 0] * z, (y + 0.5 - own[1, 2]) / own[1, 1] * z, z], 1)
+            known &= (alpha > 0.5).numpy()[rows, columns]
+        camera = Camera(torch.eye(4), torch.from_numpy(own), width, height)
+        local = unproject_depth(camera, torch.from_numpy(depth)).numpy()[y[known], x[known]]
         points.append(local @ view.pose[:3, :3].T + view.pose[:3, 3])
-        colors.append(image[rows, columns])
+        colors.append(image[rows[known], columns[known]])
     shades = torch.from_numpy((np.concatenate(colors) * 255).round().astype(np.uint8))
     return torch.from_numpy(np.concatenate(points)), shades

@@ -90,7 +90,7 @@ def extract_features(
         teacher: an object with `encode_image`, from [3, H, W] RGB in [0, 1] to [D, h, w], a `name` and perhaps `identity`
             (JSON of everything that the features depend on: weights, options), as in `kfgs.teachers`; or a function, which is
             known by its name alone.
-        pictures: a scene, whose pictures are taken as they are on disk, or a list, see `pictures_of`.
+        pictures: a scene, whose pictures are taken as they are on disk, or a list of `Picture`.
         folder: for the maps; made if it does not exist.
         split: of a scene: the name of a split, `all`, or a list of view names or indices.
         overwrite: replace maps that kfgs made by another teacher (or with other weights or options).
@@ -100,10 +100,8 @@ def extract_features(
         The manifest, with all maps that kfgs made in the folder.
 
     Raises:
-        TypeError: if `teacher` is not a teacher, or JSON cannot hold its identity.
-        ValueError: if there are no pictures or two have the same stem; if a map is not [D, h, w], not finite in float16, or
-            has other channels than the one before; if the folder holds maps of another teacher (without `overwrite`) or
-            of another program, or another process is writing to it.
+        ValueError: if there are no pictures; if a map is not [D, h, w], not finite in float16, or has other channels than the
+            one before; if the folder holds maps of another teacher or program, or another process is writing to it.
         FileNotFoundError: if a picture is missing.
     """
     folder, (encode, identity) = as_path(folder), _as_encoder(teacher)

@@ -6,7 +6,7 @@ import importlib
 import os
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -36,12 +36,7 @@ class SceneError(ValueError):
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
-    """A sort key under which rgb_5 comes before rgb_10.
-
-    Example:
-        >>> sorted(["rgb_10", "rgb_5"], key=natural_key)
-        ['rgb_5', 'rgb_10']
-    """
+    """A sort key under which rgb_5 comes before rgb_10."""
     parts = re.split(r"([0-9]+)", name)
     return [(0, int(part[:LONGEST]), part) if i % 2 else (1, 0, part) for i, part in enumerate(parts)]
 
@@ -95,24 +90,12 @@ def find_pictures(folder: Path, names: Iterable[str]) -> dict[str, Path]:
     return files
 
 
-def spelling_note(folder: Path, files: Mapping[str, Path]) -> list[str]:
-    """A note if pictures have other names than those by which they were found."""
-    pairs = [(name, file.relative_to(folder).as_posix()) for name, file in files.items()]
-    other = [f"{name} is {file}" for name, file in pairs if name != file]
-    note = f"{len(other)} images of {folder} were found by a name that is spelled otherwise: {some(other)}"
-    return [note] if other else []
-
-
 def read_image(path: str | Path, background: str = "white") -> Tensor:  # [H, W, 3] float32 in [0, 1]
     """Read a PNG, JPEG, TIFF or WebP file. EXIF orientation is ignored, as by COLMAP.
 
     Transparent pixels are laid on white, as most cut-out objects are shown that networks were trained with; `Scene.image` lays
     them on black, before which colours are trained. Grey, palette, CMYK and 16-bit pictures are converted. kornia's reader
-    gives the same values but refuses some of these, and its decoders panic when memory is short.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        SceneError: if it cannot be decoded, or has more pixels than `open_picture` allows.
+    refuses some of these. A SceneError if the file cannot be decoded, or has too many pixels for its size.
     """
     with open_picture(path, small=COLORS) as picture:
         picture.getexif().pop(ORIENTATION, None)  # Pillow would turn a TIFF
@@ -121,10 +104,11 @@ def read_image(path: str | Path, background: str = "white") -> Tensor:  # [H, W,
             if values.dtype.kind == "f" or values.min(initial=0) < 0 or values.max(initial=0) > 65535:
                 raise ValueError(f"its pixels are {values.dtype}, not whole numbers of at most 16 bits")
             return torch.from_numpy(values.astype(np.float32) / 65535)[..., None].expand(-1, -1, 3).contiguous()
+        shown: Image.Image = picture
         if _may_be_clear(picture):
             whole = picture.convert("RGBA")
-            return _as_floats(Image.alpha_composite(Image.new("RGBA", whole.size, background), whole))
-        return _as_floats(picture)
+            shown = Image.alpha_composite(Image.new("RGBA", whole.size, background), whole)
+        return torch.from_numpy(np.array(shown.convert("RGB"))).float().div_(255)
 
 
 def read_alpha(path: Path) -> Tensor | None:  # [H, W] float32 in [0, 1]
@@ -152,10 +136,6 @@ def _may_be_clear(picture: Image.Image) -> bool:
     return not picture.mode.startswith(("I", "F")) and ("A" in picture.mode or "transparency" in picture.info)
 
 
-def _as_floats(picture: Image.Image) -> Tensor:  # [H, W, 3] in [0, 1]
-    return torch.from_numpy(np.array(picture.convert("RGB"))).float().div_(255)
-
-
 @contextmanager
 def open_picture(
     path: str | Path,
@@ -172,15 +152,18 @@ def open_picture(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our limits come next
             if path.suffix.lower() in HEIC_SUFFIXES:
-                _allow_heic(path)
+                importlib.import_module("pillow_heif").register_heif_opener()
             picture = Image.open(path)
         with picture:
             width, height = picture.size
             if width * height > min(PIXELS, max(small, PACKED * path.stat().st_size)):
                 raise ValueError(f"{width}x{height} pixels in {path.stat().st_size} bytes are too many to be one")
             yield picture
-    except ImportError:
-        raise
+    except ImportError as error:
+        advice = "pip install pillow-heif (or save them as JPEG)"
+        raise ImportError(
+            f"{path}: expected pillow-heif to read HEIC photographs, but it is not installed; run: {advice}"
+        ) from error
     except Exception as error:  # hostile bytes raise almost anything, memory may be short
         why = one_line(error, 160) or type(error).__name__
         raise SceneError(f"{path}: expected {expected}, but it cannot be decoded ({why}); {advice}") from error
@@ -190,17 +173,6 @@ def picture_size(path: Path) -> tuple[int, int]:
     """(width, height) of a picture, from its header."""
     with open_picture(path, "a picture", "copy it again") as picture:
         return picture.size
-
-
-def _allow_heic(path: Path) -> None:
-    """Let Pillow read HEIC files; an ImportError if pillow-heif is not installed."""
-    try:
-        importlib.import_module("pillow_heif").register_heif_opener()
-    except ImportError as error:
-        raise ImportError(
-            f"{path}: expected pillow-heif to read HEIC photographs, but it is not installed; run: pip install pillow-heif (or "
-            "save them as JPEG)"
-        ) from error
 
 
 def read_scene_json(path: str | Path, advice: str) -> Any:

@@ -21,9 +21,7 @@ from .sfm import SfmConfig, SfmRun
 
 MOST_VIEWS = 200  # that `find_points` looks at, evenly chosen: about 100,000 points of a room in some minutes
 NEIGHBOURS = 20  # views that each view is compared with: twice what COLMAP takes of a video
-SAME_WAY = (
-    0.3  # cosine of the angle between two viewing directions (73 degrees): beyond it, SIFT finds nothing in common
-)
+SAME_WAY = 0.3  # cosine of the angle between two viewing directions: beyond it, SIFT finds nothing in common
 FEWEST = 10  # points to start a field from
 AGREEING = 0.2
 """The share of the matches that must agree with the poses. Of 6 photographs with their poses 97 % agree, with poses at random
@@ -40,9 +38,6 @@ def find_points(
         config: `max_features`, `seed` and `num_threads` are used.
         most_views: use at most this many views, evenly chosen; None: all.
         progress: show a bar.
-
-    Returns:
-        The same scene with points and their colours.
 
     Raises:
         FileNotFoundError: if a picture is missing.
@@ -99,14 +94,7 @@ def find_points(
 
 
 def neighbours(cameras: list[Camera]) -> list[tuple[int, int]]:
-    """Pairs of views to compare: each with the `NEIGHBOURS` nearest ones that look the same way, up to `SAME_WAY`.
-
-    Example:
-        >>> from kfgs.cameras import Camera
-        >>> turned = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))  # looks back
-        >>> neighbours([Camera(view, torch.eye(3), 4, 4) for view in (torch.eye(4), turned, torch.eye(4))])
-        [(0, 2)]
-    """
+    """Pairs of views to compare: each with the `NEIGHBOURS` nearest ones that look the same way, up to `SAME_WAY`."""
     centres = torch.stack([camera.center for camera in cameras]).double().numpy()
     axes = torch.stack([camera.viewmat[2, :3] for camera in cameras]).double().numpy()
     near = cKDTree(centres).query(centres, k=min(4 * NEIGHBOURS, len(cameras)))[1].reshape(len(cameras), -1)
@@ -140,13 +128,11 @@ def _reconstruction(pycolmap: Any, scene: Scene, names: list[str]) -> Any:
 def _lens(camera: Camera) -> tuple[str, list[float]]:
     """COLMAP's name and parameters of a lens."""
     intrinsics = [float(camera.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
-    lens = [] if camera.distortion is None else list(camera.distortion.coefficients)
     if camera.distortion is None:
         return "PINHOLE", intrinsics
+    lens = list(camera.distortion.coefficients)
     if camera.distortion.model == "kannala_brandt":
         return "OPENCV_FISHEYE", intrinsics + lens
-    return (
-        ("OPENCV", intrinsics + lens)
-        if len(lens) == 4
-        else ("FULL_OPENCV", intrinsics + lens + [0.0] * (8 - len(lens)))
+    return "OPENCV" if len(lens) == 4 else "FULL_OPENCV", intrinsics + lens + [0.0] * (
+        8 - len(lens) if len(lens) > 4 else 0
     )

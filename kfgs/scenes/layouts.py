@@ -1,17 +1,16 @@
 """Folders with a pose for each picture: Replica (two renderings) and ScanNet.
 
-**Convention**: poses in files are camera to world, x right, y down, z forward, unless a reader says otherwise.
+**Convention**: poses in files are camera to world, x right, y down, z forward.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from torch import Tensor
 
 from .._files import file_stem, real_path
 from .depth import points_from_depth
@@ -21,17 +20,6 @@ from .scene import Scene
 
 AGAIN = "copy it again from the data set"
 MESH = "_vh_clean_2.ply"  # of ScanNet
-
-
-def intrinsics(values: Sequence[Any], where: str) -> tuple[Matrix, tuple[int, int]]:
-    """K [3, 3] and the size from width, height, fx, fy, cx, cy; a SceneError if they are not plausible numbers."""
-    numbers = [n if type(n) in (int, float) and abs(n) < MAX_NUMBER else -1 for n in values]
-    width, height, fx, fy, cx, cy = numbers
-    if min(width, height, fx, fy) <= 0 or max(width, height) > MAX_SIDE or width % 1 or height % 1:
-        raise SceneError(
-            f"{where}: expected width, height, fx, fy, cx, cy as positive numbers, got {values!r:.200}; {AGAIN}"
-        )
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64), (int(width), int(height))
 
 
 def load_nice_slam(folder: Path) -> Scene:
@@ -47,16 +35,23 @@ def load_nice_slam(folder: Path) -> Scene:
             '{"camera": {"w": 1200, "h": 680, "fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "scale": 6553.5}}'
         )
     top = read_scene_json(path, AGAIN)
-    values = top.get("camera") if isinstance(top, dict) else None
-    values = values if isinstance(values, dict) else {}
-    K, size = intrinsics([values.get(name) for name in ("w", "h", "fx", "fy", "cx", "cy")], str(path))
-    K[:2, 2] += 0.5
-    scale = values.get("scale")
-    if not isinstance(scale, int | float) or not 0 < scale < MAX_NUMBER:
-        raise SceneError(f"{path}: expected a scale of the depth pictures above 0, got {scale!r:.80}; {AGAIN}")
+    camera: Any = top.get("camera") if isinstance(top, dict) else None
+    values = [
+        camera.get(name) if isinstance(camera, dict) else None for name in ("w", "h", "fx", "fy", "cx", "cy", "scale")
+    ]
+    width, height, fx, fy, cx, cy, scale = (
+        n if type(n) in (int, float) and abs(n) < MAX_NUMBER else -1 for n in values
+    )
+    if min(width, height, fx, fy, scale) <= 0 or max(width, height) > MAX_SIDE or width % 1 or height % 1:
+        raise SceneError(
+            f"{path}: expected w, h, fx, fy, cx, cy and the scale of the depth pictures as positive numbers, got "
+            f"{values!r:.200}; {AGAIN}"
+        )
+    K = np.array([[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1]], np.float64)
     views, notes = _numbered(folder / "results", r"frame(\d+)\.(?:jpg|jpeg|png)", folder / "traj.txt")
     depths = [view.path.with_name(Path(view.name).stem.replace("frame", "depth") + ".png") for view in views]
-    return scene_of_poses(folder, views, (K, size), points_from_depth(views, depths, 1 / scale, K), notes)
+    points = points_from_depth(views, depths, 1 / scale, K)
+    return scene_of_poses(folder, views, (K, (int(width), int(height))), points, notes)
 
 
 def load_semantic_nerf(folder: Path) -> Scene:
@@ -67,21 +62,19 @@ def load_semantic_nerf(folder: Path) -> Scene:
     views, notes = _numbered(folder / "rgb", r"rgb_(\d+)\.(?:png|jpg)", folder / "traj_w_c.txt")
     for i, view in enumerate(views):
         width, height = picture_size(view.path)
-        K, size = intrinsics((width, height, width / 2, width / 2, width / 2, height / 2), str(view.path))
-        views[i] = view._replace(lens=(K, size))
+        K = np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]])
+        views[i] = view._replace(lens=(K, (width, height)))
     depths = [folder / "depth" / (Path(view.name).stem.replace("rgb", "depth") + ".png") for view in views]
-    note = (
+    notes.append(
         "no file has the intrinsics of Semantic-NeRF's renders: 90 degrees across and a centred principal point assumed"
     )
-    return scene_of_poses(folder, views, None, points_from_depth(views, depths), [*notes, note])
+    return scene_of_poses(folder, views, None, points_from_depth(views, depths), notes)
 
 
 def _numbered(folder: Path, pattern: str, poses: Path) -> tuple[list[PosedPicture], list[str]]:
     """The pictures of a folder whose number says which line of a file is their pose, and a note about other lines."""
     expected = "lines of 16 numbers, one camera-to-world matrix per picture"
     rows = read_numbers(poses, expected)
-    if rows.shape[1] == 12:
-        rows = np.concatenate([rows, np.tile([[0.0, 0, 0, 1]], (len(rows), 1))], 1)
     if rows.shape[1] != 16:
         raise SceneError(f"{poses}: expected {expected}, got lines of {rows.shape[1]}; {AGAIN}")
     matches = [match for name in list_images(folder) if (match := re.fullmatch(pattern, name, re.IGNORECASE))]
@@ -110,18 +103,19 @@ def load_scannet(folder: Path) -> Scene:
     Views whose pose is not finite (tracking was lost) are left out and noted. Points are all vertices of
     `<scene>_vh_clean_2.ply` if there is one, in its order; else they come from `depth/` and `intrinsic/intrinsic_depth.txt`.
     """
-    names, views, lost = list_images(folder / "color"), [], []
-    for name in names:
-        file = folder / "pose" / f"{file_stem(name)}.txt"
-        if file.is_file():
-            views.append(PosedPicture(name, folder / "color" / name, _square(file), str(file)))
-        else:
-            lost.append(name)
-    if not views:
+    names = list_images(folder / "color")
+    files = {name: folder / "pose" / f"{file_stem(name)}.txt" for name in names}
+    lost = [name for name in names if not files[name].is_file()]
+    if len(lost) == len(names):
         raise SceneError(
             f"{folder / 'pose'}: expected N.txt for the pictures N.jpg of {folder / 'color'} ({some(names, 3) or 'none'}), "
             "got none that fits; export the scene again with ScanNet's SensReader"
         )
+    views = [
+        PosedPicture(name, folder / "color" / name, _square(files[name]), str(files[name]))
+        for name in names
+        if name not in lost
+    ]
     file = folder / "intrinsic" / "intrinsic_color.txt"
     K = _square(file)[:3, :3]
     size, largest = max((picture_size(view.path), view.path) for view in views)  # others may be smaller copies
@@ -131,14 +125,14 @@ def load_scannet(folder: Path) -> Scene:
             f"{K[1, 2]:g}); give pictures of the size that was exported"
         )
     notes = [f"{len(lost)} pictures have no file in pose/ and were left out: {some(lost)}"] if lost else []
-    points: tuple[Tensor, Tensor] | None = None
+    points = None
     mesh, depth = next(iter(sorted(folder.glob(f"*{MESH}"))), None), folder / "intrinsic" / "intrinsic_depth.txt"
     if mesh is not None:
         try:
-            *points, told = read_points(mesh)  # type: ignore[assignment]
+            places, colors, told = read_points(mesh)
         except SceneError as error:
             raise SceneError(f"{error}; copy the mesh again, or remove it to take points from the depth") from error
-        notes += told
+        points, notes = (places, colors), notes + told
     elif depth.is_file():
         depths = [folder / "depth" / f"{file_stem(view.name)}.png" for view in views]
         points = points_from_depth(views, depths, K=_square(depth)[:3, :3])

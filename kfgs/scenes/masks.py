@@ -15,14 +15,10 @@ from .files import MASKS, ORIENTATION, SMALL, SceneError, has_alpha, list_images
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> Tensor:  # [H, W] bool
-    """Which pixels of a photo count: those of its mask that are brighter than half of the brightest one.
+    """Which pixels of a photo of (H, W) count: those of its mask that are brighter than half of the brightest one.
 
     So masks of 0 and 1, of 0 and 255, and JPEG files mean the same; what is transparent is black. If the mask is larger than
     the photo, a pixel counts if all of it does.
-
-    Args:
-        path: the mask, in any mode.
-        size: (H, W) of the photo, which has the shape of the mask.
     """
     with open_picture(path, "a mask of a photo", "write it again", small=max(SMALL, size[0] * size[1])) as picture:
         picture.getexif().pop(ORIENTATION, None)
@@ -65,8 +61,8 @@ def folder_masks(
     The mask of `left/a.jpg` is `left/a.jpg.png` or `left/a.png`; other endings of pictures are read, too.
 
     Args:
-        names: of the photos.
-        pictures: the folder that they are relative to. The masks are in it, or next to it.
+        names: of the photos, relative to `pictures`.
+        pictures: the folder of the photos; `masks` is in it or next to it.
         root: a folder whose `masks` is preferred.
     """
     places = [pictures] if pictures == root else [pictures, pictures.parent, real_path(pictures).parent]
@@ -82,27 +78,18 @@ def folder_masks(
     extra = [file for file in files if file not in taken]
     if len(extra) == len(files):
         example = f"{file_stem(names[0])}.png" if names else "NAME.png"
-        none = (
-            f"none of {len(files)} masks ({some(files, 3)}) has the name of one photo, such as {example}; none is used"
-        )
-        return None, [f"{folder}: {none}"]
+        count = f"none of {len(files)} masks ({some(files, 3)})"
+        return None, [f"{folder}: {count} has the name of one photo, such as {example}; none is used"]
     note = f"masks: {len(taken)} of {len(names)} photos have one in {folder}; black is ignored"
     more = f"; {len(extra)} more have the name of no photo, or of several: {some(extra, 3)}"
     return masks, [note + (more if extra else "")]
 
 
-def write_colmap_masks(
-    folder: Path, photos: Mapping[str, tuple[Path, Path | None]], ending: str = ".png"
-) -> str | None:
+def write_colmap_masks(folder: Path, photos: Mapping[str, tuple[Path, Path | None]]) -> str | None:
     """Write what pycolmap takes as `mask_path`: NAME.png for each photo, black where it is masked or transparent.
 
-    Args:
-        folder: to write to.
-        photos: file and mask of each photo by its name. If none has a mask or transparent pixels, nothing is written.
-        ending: what follows NAME.
-
-    Returns:
-        The folder; None if nothing was written.
+    `photos` has the file and the mask of each photo by its name. Returns the folder; None, if no photo has a mask or
+    transparent pixels.
     """
     if not any(mask is not None or has_alpha(photo) for photo, mask in photos.values()):
         return None
@@ -111,7 +98,7 @@ def write_colmap_masks(
             size = picture.height, picture.width
         alpha, kept = read_alpha(photo), torch.ones(size, dtype=torch.bool) if mask is None else read_mask(mask, size)
         kept = kept if alpha is None else kept & (alpha > 0.5)
-        place = folder / f"{name}{ending}"
+        place = folder / f"{name}.png"
         place.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(kept.numpy().astype(np.uint8) * 255).save(place)
     return str(folder)

@@ -12,21 +12,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .._check import ORIGIN
 from .._files import read_text
 from .._notes import Repair
 from .._origin import choose_origin, describe_origin, to_local
-from ..cameras.camera import Camera
+from ..cameras.camera import ROTATION_TOLERANCE, Camera
 from ..cameras.resample import fits_aspect
 from ..formats.ply import points_from_columns, read_ply
 from .files import MAX_NUMBER, SceneError, natural_key, picture_size, some
 from .scene import Scene
 
 NO_POINTS = "no points: `kfgs fit` and `kfgs color` triangulate some from the poses before they train"
-TOLERANCE = 1e-3  # of R R^T: what `Camera` accepts
 SKEW = 0.02  # largest difference of a rotation's singular values, relative: rotations that are rounded to two digits
 
 Matrix = NDArray[np.float64]
+Lens = tuple[Matrix, tuple[int, int]]  # K [3, 3] and (width, height)
+NOTHING = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)  # points and colours of a scene without any
 
 
 class PosedPicture(NamedTuple):
@@ -36,13 +36,13 @@ class PosedPicture(NamedTuple):
     path: Path
     pose: Matrix  # [4, 4] camera to world, x right, y down, z forward
     origin: str  # the file, and the line, that the pose is from; for messages
-    lens: tuple[Matrix, tuple[int, int]] | None = None  # its own K [3, 3] and (width, height); None: that of the scene
+    lens: Lens | None = None  # its own; None: that of the scene
     mask: Path | None = None  # that the scene's file names; None: that of a folder `masks`
 
 
 def is_rotation(R: Matrix) -> bool:  # [3, 3]
     """Whether `Camera` accepts a matrix, but for its handedness."""
-    return bool(np.abs(R @ R.T - np.eye(3)).max() <= TOLERANCE)
+    return bool(np.abs(R @ R.T - np.eye(3)).max() <= ROTATION_TOLERANCE)
 
 
 def mend_pose(pose: Matrix) -> tuple[Matrix | None, float | None]:  # [4, 4]
@@ -51,11 +51,6 @@ def mend_pose(pose: Matrix) -> tuple[Matrix | None, float | None]:  # [4, 4]
     Returns:
         The pose, or None if it has numbers that are not finite or plausible, or no rotation at all; and the scale that was
         removed, or None if it is unchanged. A matrix that is far from a rotation stays as it is, and `Camera` refuses it.
-
-    Example:
-        >>> pose, scale = mend_pose(np.diag([2.0, 2.0, 2.0, 1.0]))
-        >>> pose.diagonal().tolist(), scale
-        ([1.0, 1.0, 1.0, 1.0], 2.0)
     """
     if not np.isfinite(pose).all() or np.abs(pose).max() > MAX_NUMBER:
         return None, None
@@ -98,10 +93,12 @@ def as_large_as_pictures(
                 f"{path}: expected a picture in the shape of {camera.width}x{camera.height} pixels, as its camera says, got "
                 f"{width}x{height}; replace it by the picture that the camera was made for, or by a copy at another size"
             )
-        if (height, width) != camera.size:
+        if (height, width) == camera.size:
+            fitting.append(camera)
+        else:
             small = camera.width / width
             factors[f"{small:.3g} times smaller" if small >= 1 else f"{1 / small:.3g} times larger"] += 1
-        fitting.append(camera if (height, width) == camera.size else camera.resized(height, width))
+            fitting.append(camera.resized(height, width))
     if not factors:
         return fitting, []
     where = folder.name if folder is not None and paths[0].is_relative_to(folder) else "images"
@@ -113,7 +110,7 @@ def as_large_as_pictures(
 def scene_of_poses(
     folder: Path,
     views: Sequence[PosedPicture],
-    lens: tuple[Matrix, tuple[int, int]] | None = None,  # K [3, 3] and (width, height); None: each view has its own
+    lens: Lens | None = None,  # None: each view has its own
     points: tuple[Tensor, Tensor] | None = None,  # [P, 3] of the world, [P, 3] uint8
     notes: Sequence[str] = (),
 ) -> Scene:
@@ -129,9 +126,8 @@ def scene_of_poses(
         try:
             if not np.allclose(pose[3], [0, 0, 0, 1], rtol=0, atol=1e-6):
                 raise ValueError(f"pose: expected 0 0 0 1 as its last row, got {pose[3].tolist()}")
-            own = view.lens or lens
-            assert own is not None
-            cameras.append(Camera(inverse_pose(pose), torch.from_numpy(own[0]).float(), *own[1], view.name))
+            K, size = view.lens or lens or (np.eye(3), (1, 1))
+            cameras.append(Camera(inverse_pose(pose), torch.from_numpy(K).float(), *size, view.name))
         except ValueError as error:
             raise SceneError(f"{view.origin}: {error}; correct this pose") from error
         paths.append(view.path)
@@ -140,34 +136,28 @@ def scene_of_poses(
             f"{folder}: expected poses of finite numbers, none of {len(views)} is; estimate them (`kfgs sfm`)"
         )
     cameras, resized = as_large_as_pictures(cameras, paths)
-    told = [*notes, *resized, *mending_notes(lost, scaled)]
-    if points is None:
-        points, told = (torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)), [*told, NO_POINTS]
-    return assemble_scene(cameras, paths, *points, told)
+    told = [*notes, *resized, *mending_notes(lost, scaled), *([NO_POINTS] if points is None else [])]
+    return assemble_scene(cameras, paths, *(points or NOTHING), told)
 
 
 def inverse_pose(pose: Matrix) -> Tensor:  # [4, 4] camera to world -> [4, 4] world to camera
     """The inverse of a rigid motion. `Camera` refuses what is not a rotation."""
     viewmat = np.eye(4)
-    viewmat[:3, :3] = pose[:3, :3].T
-    viewmat[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    viewmat[:3, :3], viewmat[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
     return torch.from_numpy(viewmat)
 
 
 def assemble_scene(
     cameras: list[Camera], paths: list[Path], points: Tensor, colors: Tensor, notes: Sequence[str]
 ) -> Scene:
-    """A scene of cameras and points [P, 3] in float64 of the world; every view is in the `train` split."""
-    cameras, places, far = near_zero(cameras, points)
-    splits = {"train": list(range(len(cameras))), "test": []}
-    return Scene(cameras, paths, places, colors, splits, (*notes, *far)).with_near()
+    """A scene of cameras and points [P, 3] in float64 of the world, with float32 from one origin, and a note if that is far.
 
-
-def near_zero(cameras: list[Camera], points: Tensor) -> tuple[list[Camera], Tensor, list[str]]:
-    """Cameras and points [P, 3], read in float64, as a scene has them: float32 from one origin; and a note if it is far."""
-    origin = choose_origin(torch.stack([camera.center for camera in cameras]), points) if cameras else ORIGIN
+    Every view is in the `train` split.
+    """
+    origin = choose_origin(torch.stack([camera.center for camera in cameras]), points)
     local = [camera.with_origin(origin).to(torch.float32) for camera in cameras]
-    return local, to_local(points, origin), describe_origin(origin, "cameras and points")
+    far, splits = describe_origin(origin, "cameras and points"), {"train": list(range(len(cameras))), "test": []}
+    return Scene(local, paths, to_local(points, origin), colors, splits, (*notes, *far)).with_near()
 
 
 def read_numbers(path: Path, expected: str) -> Matrix:  # [rows, columns]
@@ -194,7 +184,5 @@ def read_points(path: Path) -> tuple[Tensor, Tensor, list[str]]:  # [P, 3] float
         if name in columns and columns[name].dtype.kind in "iu":
             colors[:, i] = torch.from_numpy(columns[name].clip(0, 255).astype("uint8"))
     good = torch.isfinite(points).all(1)
-    if good.all():
-        return points, colors, []
     note = f"{int((~good).sum())} of {len(points)} points of {path.name} are not finite and were left out"
-    return points[good], colors[good], [Repair(note)]
+    return points[good], colors[good], [] if good.all() else [Repair(note)]

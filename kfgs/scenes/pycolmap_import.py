@@ -26,25 +26,16 @@ FAILURES = (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OSError
 
 def import_pycolmap() -> Any:
     """The module, loaded at the first call. Raises an ImportError if it is not installed, with the install line."""
-    came: list[int] = []  # a Ctrl-C inside a C++ module that loads would become an ImportError: it comes afterwards
-    main = threading.current_thread() is threading.main_thread()
-    # pycolmap's log library prints a stack at SIGTERM: that handler is put back, too
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)} if main else {}
-    if main:
-        signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    before = signal.getsignal(signal.SIGTERM)
     try:
         import pycolmap
     except ImportError as error:
         raise ImportError(
-            "pycolmap: needed to estimate cameras and to undistort, but it cannot be imported; "
-            f"run `pip install 'pycolmap>=4.0'` ({error})"
+            "pycolmap: needed to estimate cameras, but it cannot be imported; run `pip install 'pycolmap>=4.0'` "
+            f"({error})"
         ) from error
-    finally:
-        for number, handler in handlers.items():
-            if handler is not None:
-                signal.signal(number, handler)
-        if came:
-            signal.raise_signal(signal.SIGINT)
+    if before is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, before)  # pycolmap's log library would print a stack
     return pycolmap
 
 

@@ -21,15 +21,9 @@ Split = tuple[dict[str, list[int]], list[str]]
 def make_split(count: int, rule: SplitRule) -> dict[str, list[int]]:
     """Split `count` views (in natural order of their names) by a named rule.
 
-    Args:
-        count: number of views.
-        rule: `"df3dgs"`: the paper's, every 10th view from the 1st tests, every 10th from the 6th trains, the others
-            are unused (Sec. 4.1); `"feature3dgs"`: Feature 3DGS's of Replica, every 8th from the 3rd tests, the rest trains;
-            `"holdout8"`: every 8th from the 1st tests, the rest trains; `"all"`: all train.
-
-    Example:
-        >>> make_split(20, "df3dgs")
-        {'train': [5, 15], 'test': [0, 10]}
+    `"df3dgs"`: the paper's, every 10th view from the 1st tests, every 10th from the 6th trains, the others are unused
+    (Sec. 4.1); `"feature3dgs"`: Feature 3DGS's of Replica, every 8th from the 3rd tests, the rest trains; `"holdout8"`: every 8th
+    from the 1st tests, the rest trains; `"all"`: all train.
     """
     check_choice("split", rule, RULES)
     if rule == "all":
@@ -48,12 +42,7 @@ def choose_split(count: int, video: bool = False) -> SplitRule:
 
 
 def read_split(path: Path, names: Sequence[str]) -> Split:
-    """Read a split.json: `{"train": [names], "test": [names]}`; more splits are allowed. Without test, `val` is tested.
-
-    Args:
-        path: the file.
-        names: the views of the scene in order; those in the file may lack the suffix.
-    """
+    """Read a split.json: `{"train": [names], "test": [names]}`; more splits are allowed. Without test, `val` is tested."""
     return split_by_lists(str(path), _read_lists(path, "repair the file or remove it"), names)
 
 
@@ -92,12 +81,9 @@ def _read_lists(path: Path, advice: str) -> dict[str, list[str]]:
 
 
 def split_by_lists(where: str, lists: Mapping[str, Sequence[str]], names: Sequence[str]) -> Split:
-    """Splits from lists of names. What no list has is in no split; without a list for training, it trains.
+    """Splits from lists of names, with or without their folders and suffixes; `where` is the lists' place, for messages.
 
-    Args:
-        where: the place of the lists, for messages.
-        lists: names of views by split, with or without their folders and suffixes. Without test, `val` is tested too.
-        names: the views of the scene in order.
+    What no list has is in no split; without a list for training, it trains. Without test, `val` is tested too.
     """
     known, place = Names(names, bare=True), {name: i for i, name in enumerate(names)}
     indices = {split: [place.get(known.find(name) or "") for name in listed] for split, listed in lists.items()}

@@ -25,13 +25,12 @@ from .files import (
     read_scene_json,
     some,
 )  # fmt: skip
-from .posed import NO_POINTS, PosedPicture, as_large_as_pictures, assemble_scene, mending_notes, read_points
+from .posed import NO_POINTS, NOTHING, PosedPicture, as_large_as_pictures, assemble_scene, mending_notes, read_points
 from .scene import Scene
 from .splits import split_by_lists
 from .transforms_frame import Frame
 
 _UNNAMED_POINTS = "points3d.ply"  # 3DGS and OpenGaussian write it
-_NOTHING = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)
 
 
 class _View(NamedTuple):
@@ -187,7 +186,7 @@ def load_transforms(path: Path, images: Path | None = None, *, pictures: bool = 
     views = sorted(reader.views, key=lambda view: natural_key(view.camera.name))
     cameras, paths = [view.camera for view in views], [view.path for view in views]
     if not pictures:
-        return assemble_scene(cameras, paths, *_NOTHING, reader.notes())
+        return assemble_scene(cameras, paths, *NOTHING, reader.notes())
     points, colors, told = _points(reader, first, tops[next(iter(files))], views)
     cameras, resized = as_large_as_pictures(cameras, paths, images)
     splits, held = _splits(path, views, tops[next(iter(files))])
@@ -252,7 +251,7 @@ def _points(reader: _Reader, path: Path, top: dict[str, Any], views: list[_View]
     if from_depth is not None:
         return *from_depth, [f"points from the depth pictures of {len(posed)} views"]
     lost = f"no points: ply_file_path {listed!r:.200} is not a file inside {reader.root}"
-    return *_NOTHING, [*notes, NO_POINTS if listed is None or notes else lost]
+    return *NOTHING, [*notes, NO_POINTS if listed is None or notes else lost]
 
 
 def _splits(path: Path, views: list[_View], top: dict[str, Any]) -> tuple[dict[str, list[int]], list[str]]:

@@ -22,10 +22,14 @@ from .colmap import PANORAMA
 from .files import MAX_NUMBER, MAX_SIDE, SceneError
 from .posed import Matrix, inverse_pose, mend_pose
 
-_PERSPECTIVE = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-_FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
-_COEFFICIENTS = {"PINHOLE": (), "SIMPLE_PINHOLE": (), **dict.fromkeys(_FISHEYE, ("k1", "k2", "k3", "k4"))}
-_LENS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "k1", "k2", "k3", "k4", "p1", "p2")
+_LENSES = {  # the coefficients that each camera_model has
+    **dict.fromkeys(("PINHOLE", "SIMPLE_PINHOLE"), ()),
+    **dict.fromkeys(("OPENCV_FISHEYE", "FISHEYE"), ("k1", "k2", "k3", "k4")),
+    **dict.fromkeys(("PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), ("k1", "k2", "p1", "p2", "k3")),
+    "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+}
+_COEFFICIENTS = _LENSES["FULL_OPENCV"]
+_NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", *_COEFFICIENTS)
 _CORRECT = "correct it, or take the frame out of the file"
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL axes to COLMAP's
 
@@ -54,7 +58,7 @@ class Frame:
     def broken(self) -> bool:
         """Whether its pose is missing, or a number of it or of the lens is NaN, infinite or implausible."""
         rows = self.values.get("transform_matrix")
-        numbers = [self.values.get(name) for name in _LENS]
+        numbers = [self.values.get(name) for name in _NUMBERS]
         numbers += [number for row in rows if isinstance(row, list) for number in row] if isinstance(rows, list) else []
         return rows is None or any(isinstance(n, float) and not abs(n) < MAX_NUMBER for n in numbers)
 
@@ -63,8 +67,7 @@ class Frame:
         width, height = self.number("w"), self.number("h")
         if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE and width % 1 == 0 and height % 1 == 0):
             raise self.fail("", f"w and h of 1 to {MAX_SIDE} whole pixels", (width, height), "correct the size")
-        fx = self.focal_length("x", width)
-        fy = self.focal_length("y", height)
+        fx, fy = self.focal_length("x", width), self.focal_length("y", height)
         if fx is None:
             expected = "'fl_x' or 'camera_angle_x'"
             raise self.fail("", expected, sorted(self.values), "add one at the top or in each frame")
@@ -97,44 +100,35 @@ class Frame:
         k4 is accepted only with FULL_OPENCV, where it can only mean OpenCV's.
         """
         model = "OPENCV_FISHEYE" if self.values.get("is_fisheye") is True else self.values.get("camera_model", "OPENCV")
-        if model not in _PERSPECTIVE + _FISHEYE:
-            expected = f"one of {', '.join(_PERSPECTIVE + _FISHEYE)}"
+        if model not in _LENSES:
             advice = PANORAMA if model == "EQUIRECTANGULAR" else "undistort the images first"
-            raise self.fail("camera_model", expected, model, advice)
-        k = [self.number(f"k{i}", 0.0) for i in range(1, 7)]
-        p = [self.number(f"p{i}", 0.0) for i in (1, 2)]
-        coefficients = {**{f"k{i}": value for i, value in enumerate(k, 1)}, "p1": p[0], "p2": p[1]}
-        known = _COEFFICIENTS.get(model, tuple(coefficients))
-        dropped = {name: value for name, value in coefficients.items() if value and name not in known}
-        if dropped:
+            raise self.fail("camera_model", f"one of {', '.join(_LENSES)}", model, advice)
+        values, known = {name: self.number(name, 0.0) for name in _COEFFICIENTS}, _LENSES[model]
+        other = {name: value for name, value in values.items() if value and name not in known}
+        if other:
             expected = f"only {' '.join(known) or 'zeros'} with camera_model {model}"
-            raise self.fail("", expected, dropped, "correct camera_model or remove them")
-        if model in _FISHEYE:
-            return Distortion("kannala_brandt", tuple(k[:4]))
-        if not any(k + p):
+            advice = 'correct camera_model ("FULL_OPENCV" for OpenCV\'s k4 k5 k6), or undistort the images first'
+            raise self.fail("", expected, other, advice)
+        coefficients = tuple(values[name] for name in known)
+        if "FISHEYE" in model:
+            return Distortion("kannala_brandt", coefficients)
+        if not any(coefficients):
             return None
-        if not any(k[3:]):
-            return Distortion("brown_conrady", (k[0], k[1], *p, k[2]) if k[2] else (k[0], k[1], *p))
-        if model != "FULL_OPENCV":
-            raise self.fail(
-                "", "at most k1 k2 k3 p1 p2", {"k4": k[3], "k5": k[4], "k6": k[5]},
-                'undistort the images first, or set "camera_model": "FULL_OPENCV" if these are OpenCV\'s k4 k5 k6',
-            )  # fmt: skip
-        return Distortion("brown_conrady", (k[0], k[1], *p, *k[2:]))
+        used = next(n for n in (4, 5, 8) if not any(coefficients[n:]))  # as few as kornia and OpenCV need
+        return Distortion("brown_conrady", coefficients[:used])
 
     def pose(self) -> Matrix:  # [4, 4] float64
         """Camera to world, x right, y down, z forward."""
         name, rows = "transform_matrix", self.values.get("transform_matrix")
         try:
             pose = np.array(rows, dtype=np.float64)
+            if pose.shape == (3, 4):
+                pose = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]])
+            if pose.shape != (4, 4):
+                raise ValueError(f"shape {pose.shape}")
         except (TypeError, ValueError, OverflowError) as error:
             raise self.fail(name, "4 rows of 4 numbers", rows, _CORRECT) from error
-        if pose.shape == (3, 4):
-            pose = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]])
-        if pose.shape != (4, 4):
-            raise self.fail(name, "4 rows of 4 numbers", rows, _CORRECT)
         if not np.allclose(pose[3], [0, 0, 0, 1], rtol=0, atol=1e-6):
-            raise self.fail(
-                name, "0 0 0 1 as the last row", pose[3].tolist(), "transpose the matrix, if its last column is 0 0 0 1"
-            )
+            advice = "transpose the matrix, if its last column is 0 0 0 1"
+            raise self.fail(name, "0 0 0 1 as the last row", pose[3].tolist(), advice)
         return pose @ FLIP

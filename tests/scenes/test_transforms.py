@@ -231,7 +231,7 @@ BAD = [
         {"camera_model": "EQUIRECTANGULAR"},
         ("camera_model:", "got 'EQUIRECTANGULAR'", "cut perspective views"),
     ),
-    (_frame(), {"k4": 0.1}, ("k1 k2 k3 p1 p2", '"camera_model": "FULL_OPENCV"')),
+    (_frame(), {"k4": 0.1}, ("k1 k2 p1 p2 k3", "got {'k4': 0.1}", '"FULL_OPENCV"')),
 ]
 
 
