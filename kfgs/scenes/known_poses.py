@@ -71,11 +71,10 @@ def find_points(
             for kind in ("camera", "rig", "frame", "image"):
                 for value in getattr(known, f"{kind}s").values():
                     getattr(database, f"write_{kind}")(value, **{f"use_{kind}_id": True})
-        run.stage("features", lambda: run.extract(known=True))
-        run.stage("matching", lambda: run.match_pairs([(names[a], names[b]) for a, b in neighbours(seen.cameras)]))
+        run.extract(known=True)
+        run.match_pairs([(names[a], names[b]) for a, b in neighbours(seen.cameras)])
         (run.scratch / "points").mkdir()
-        arguments = (known, run.database, str(folder), str(run.scratch / "points"), True, run.options())
-        run.stage("points", lambda: pycolmap.triangulate_points(*arguments))
+        pycolmap.triangulate_points(known, run.database, str(folder), str(run.scratch / "points"), True, run.options())
         with pycolmap.Database.open(run.database) as database:
             matches = sum(len(pair.inlier_matches) for pair in database.read_two_view_geometries()[1])
         lengths = [len(point.track.elements) for point in known.points3D.values()]

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import os
 import tempfile
-import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -68,17 +67,14 @@ class SfmReport:
     """3-D points."""
     mean_reprojection_error: float
     """Mean over the points, in pixels."""
-    seconds: dict[str, float] = field(default_factory=dict)
-    """Wall-clock time of features, matching, mapping."""
     missing: tuple[str, ...] = ()
     """Images without a pose."""
 
     def __str__(self) -> str:
         lost = f"; without a pose: {some(list(self.missing))}" if self.missing else ""
-        times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in self.seconds.items())
         return (
             f"{self.registered} of {self.total} images registered, {self.points} points, mean reprojection error "
-            f"{self.mean_reprojection_error:.2f} px ({times}){lost}"
+            f"{self.mean_reprojection_error:.2f} px{lost}"
         )
 
 
@@ -137,10 +133,9 @@ def run_sfm(
         masks = folder_masks(names, images)[0] or [None] * len(names)
         photos = {name: (images / name, mask) for name, mask in zip(names, masks, strict=True)}
         run = SfmRun(pycolmap, images, Path(scratch), config, bar, photos)
-        run.stage("features", run.extract)
-        run.stage("matching", run.match_all)
-        run.stage("mapping", run.map)
-        models = sorted(run.models, key=lambda model: -model.num_reg_images())
+        run.extract()
+        run.match_all()
+        models = sorted(run.map(), key=lambda model: -model.num_reg_images())
         sizes = [model.num_reg_images() for model in models]
         if not sizes or sizes[0] < config.min_registered * len(names):
             raise SceneError(f"{images}: {_too_few(images, sizes, names, config)}")
@@ -148,7 +143,7 @@ def run_sfm(
             models[0].write(str(folder))
         placed = {image.name for image in models[0].images.values() if image.has_pose}
         error, missing = float(models[0].compute_mean_reprojection_error()), [n for n in names if n not in placed]
-        return SfmReport(len(placed), len(names), len(models[0].points3D), error, run.seconds, tuple(missing))
+        return SfmReport(len(placed), len(names), len(models[0].points3D), error, tuple(missing))
 
 
 def link_images(images: str | Path, out: str | Path) -> bool:
@@ -171,29 +166,20 @@ class SfmRun:
     bar: Any
     photos: dict[str, tuple[Path, Path | None]]
     """The file and the mask of each image by its name."""
-    models: list[Any] = field(default_factory=list)
-    seconds: dict[str, float] = field(default_factory=dict)
 
     @property
     def database(self) -> str:
         """Where features and matches are kept."""
         return str(self.scratch / "database.db")
 
-    def stage(self, name: str, work: Callable[[], None]) -> None:
-        """Do a part of the work, and note its wall-clock time."""
-        self.bar.set_description(name)
-        start = time.perf_counter()
-        work()
-        self.seconds[name] = time.perf_counter() - start
-
     def extract(self, known: bool = False) -> None:
         """Compute features of a few images at a time, so that the bar moves and Ctrl-C works.
 
-        Args:
-            known: the database has the cameras of all images already.
+        Images of one size share the camera of the first ones, unless `known`: the database has the cameras of all already.
         """
         colmap, config, names = self.pycolmap, self.config, list(self.photos)
         colmap.set_random_seed(config.seed)
+        self.bar.set_description("features")
         self.bar.reset(total=len(names))
         single = config.single_camera and not known
         mode = colmap.CameraMode.SINGLE if single else colmap.CameraMode.PER_IMAGE
@@ -202,19 +188,18 @@ class SfmRun:
             reader["mask_path"] = masks
         options = {"num_threads": config.num_threads, "sift": {"max_num_features": config.max_features}}
         sizes = {name: _size(self.photos[name][0]) if single else (0, 0) for name in names}
-        cameras: dict[tuple[int, int], dict[str, int]] = {}  # images of one size share the camera of the first ones
         for size in Counter(sizes.values()):
-            group = [name for name in names if sizes[name] == size]
+            group, camera = [name for name in names if sizes[name] == size], dict[str, int]()
             for few in (group[i : i + 8] for i in range(0, len(group), 8)):
                 colmap.extract_features(
-                    self.database, str(self.images), image_names=few, camera_mode=mode,
-                    reader_options=reader | cameras.get(size, {}), extraction_options=options, device=colmap.Device.cpu,
+                    self.database, str(self.images), image_names=few, camera_mode=mode, reader_options=reader | camera,
+                    extraction_options=options, device=colmap.Device.cpu,
                 )  # fmt: skip
                 with colmap.Database.open(self.database) as database:
                     ids = {image.name: image.camera_id for image in database.read_all_images()}
                 placed = [ids[name] for name in few if name in ids]
                 if single and placed:
-                    cameras.setdefault(size, {"existing_camera_id": int(placed[0])})
+                    camera.setdefault("existing_camera_id", int(placed[0]))
                 self.bar.update(len(few))
         if len(ids) < min(3, len(names)):
             raise SceneError(
@@ -243,6 +228,7 @@ class SfmRun:
         self._match(self.pycolmap.match_image_pairs, {"pairing_options": options}, len(pairs))
 
     def _match(self, match: Callable[..., None], pairing: dict[str, Any], total: int) -> None:
+        self.bar.set_description("matching")
         self.bar.reset(total=total)
         self.bar.set_postfix_str("no count until all are done")  # pycolmap reports no progress meanwhile
         match(
@@ -259,15 +245,16 @@ class SfmRun:
         options.mapper.random_seed = options.triangulation.random_seed = seed
         return options
 
-    def map(self) -> None:
-        """Estimate the pose of one image after the other."""
+    def map(self) -> list[Any]:
+        """Estimate the pose of one image after the other; the models that result."""
+        self.bar.set_description("mapping")
         self.bar.reset(total=len(self.photos))
         (self.scratch / "models").mkdir()
-        found = self.pycolmap.incremental_mapping(
+        models = self.pycolmap.incremental_mapping(
             self.database, str(self.images), str(self.scratch / "models"), options=self.options(),
             initial_image_pair_callback=lambda: self.bar.update(2), next_image_callback=lambda: self.bar.update(1),
         )  # fmt: skip
-        self.models = list(found.values())
+        return list(models.values())
 
 
 def sequential_pairs(names: list[str]) -> list[tuple[str, str]]:
