@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
-from .._check import ORIGIN, as_origin, check_range, check_size, check_whole
+from .._check import ORIGIN, as_array, as_origin, check_range, check_size, check_whole
 from .._rows import check_finite
 from .bounds import robust_bounds
 from .camera import UP, Camera, at_one_origin, unit_vector
@@ -74,7 +74,7 @@ def path_cameras(
     moments = np.linspace(0, times[-1], frames)
     R = RotationSpline(times, turns)(moments).as_matrix()  # [frames, 3, 3] world to camera
     t = -np.einsum("nij,nj->ni", R, CubicSpline(times, places)(moments))  # t = -R c
-    Ks = np.stack([_numpy(key.K) for key in keys]).reshape(-1, 9)
+    Ks = np.stack([as_array(key.K).astype(np.float64) for key in keys]).reshape(-1, 9)
     Ks = np.stack([np.interp(moments, times, column) for column in Ks.T], axis=1).reshape(-1, 3, 3)
     near, origin = min(camera.near for camera in cameras), cameras[0].origin
     path = []
@@ -87,7 +87,7 @@ def path_cameras(
 
 
 def _poses(keys: Sequence[Camera]) -> tuple[Array, Rotation]:  # [k, 3], k rotations from world to camera
-    viewmats = np.stack([_numpy(key.viewmat) for key in keys])
+    viewmats = np.stack([as_array(key.viewmat).astype(np.float64) for key in keys])
     R, t = viewmats[:, :3, :3], viewmats[:, :3, 3]
     return -np.einsum("nji,nj->ni", R, t), Rotation.from_matrix(R)  # c = -R^T t
 
@@ -99,11 +99,6 @@ def _steps(places: Array, turns: Rotation) -> Array:  # [k - 1]
         extent = 1.0
     angles = (turns[1:] * turns[:-1].inv()).magnitude()
     return np.hypot(np.linalg.norm(np.diff(places, axis=0), axis=1) / extent, angles / np.pi)
-
-
-def _numpy(values: Tensor) -> Array:
-    array: Array = values.detach().double().cpu().numpy()
-    return array
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from .._check import ORIGIN, check_shapes
 from .._files import Names, file_stem
 from ..cameras.bounds import camera_extent
 from ..cameras.camera import NEAR, Camera
-from ..cameras.undistort import undistort
+from ..cameras.distortion import undistort
 from .files import SceneError, read_alpha, read_image, some
 from .masks import read_mask, shrink_mask
 
