@@ -41,7 +41,6 @@ from kfgs.evaluation import SegmentationReport, load_label_map
 from kfgs.labels import LabelSet, classify, load_label_set
 from kfgs.pipeline import score_teacher, true_labels
 from kfgs.scenes import FeatureFolder, Scene, extract_features, load_scene, read_image
-from kfgs.scenes.extract import pictures_of
 from kfgs.teachers import Teacher, load_teacher
 from kfgs.teachers.transformers_package import quiet, require_transformers
 
@@ -209,10 +208,10 @@ def labelled_tokens(backbone: Teacher, scene: Scene, labels: Path) -> tuple[Tens
         ValueError: if no training view has a label.
     """
     tokens, targets = [], []
-    for picture in pictures_of(scene, scene.views("train")):
-        path = labels / f"{picture.stem}.png"
+    for i in scene.views("train"):
+        path = labels / f"{scene.stem(i)}.png"
         if path.is_file():
-            features = backbone.encode_image(read_image(picture.path).permute(2, 0, 1))  # [C, h, w]
+            features = backbone.encode_image(read_image(scene.image_paths[i]).permute(2, 0, 1))  # [C, h, w]
             target = resize_labels(load_label_map(path), (features.shape[1], features.shape[2]))
             known = target >= 0
             tokens.append(features.permute(1, 2, 0).cpu()[known])

@@ -22,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +33,7 @@ from kfgs.cameras import resize_map
 from kfgs.fields import UpliftConfig, uplift_maps
 from kfgs.formats import read_splats
 from kfgs.quant import Codebook, GrownCodebook, PaperCodebook, fit_codebook, quantize_maps
-from kfgs.scenes import FeatureFolder, extract_features, load_scene
-from kfgs.scenes.extract import Picture, pictures_of
+from kfgs.scenes import FeatureFolder, Scene, extract_features, load_scene
 
 STAGES = ("start", "extract", "codebook", "index maps", "uplift")
 
@@ -119,12 +119,13 @@ def run_stage(args: argparse.Namespace) -> dict[str, Any]:
 
 def extract(args: argparse.Namespace) -> str:
     """Pictures to maps."""
-    pictures = pictures_of(load_scene(args.scene))
-    turns = [pictures[i % len(pictures)] for i in range(args.images)]
-    named = [Picture(f"{i:04d}", picture.path) for i, picture in enumerate(turns)]
+    scene = load_scene(args.scene)
+    turns = [i % len(scene) for i in range(args.images)]
+    cameras = [replace(scene.cameras[i], name=f"{number:04d}.png") for number, i in enumerate(turns)]
+    named = Scene(cameras, [scene.image_paths[i] for i in turns], scene.points, scene.colors)
     teacher = RandomTeacher(tuple(args.size), args.channels, args.device)
     folder = args.folder / "maps"
-    made = extract_features(teacher, named, folder, progress=True)
+    made = extract_features(teacher, named, folder, "all", progress=True)
     return f"{sum((folder / f'{stem}.npy').stat().st_size for stem in made.pictures) / 1e9:.2f} GB written"
 
 

@@ -9,8 +9,8 @@ import torch
 from PIL import Image
 from safetensors.torch import save_file
 
-from kfgs.scenes import extract_features
-from kfgs.scenes.extract import Picture
+from kfgs.cameras import Camera
+from kfgs.scenes import Scene, extract_features
 
 from .corpus import SEED, Add
 
@@ -48,8 +48,9 @@ def _written(place: Path, add: Add) -> None:
         Image.fromarray((np.arange(12 * 16 * 3).reshape(12, 16, 3) % 256).astype(np.uint8)).save(
             pictures / f"{name}.png"
         )
-    shown = [Picture(path.stem, path, (12, 16)) for path in sorted(pictures.iterdir())]
-    extract_features(_grey, shown, place)
+    paths = sorted(pictures.iterdir())
+    cameras = [Camera(torch.eye(4), torch.eye(3), 16, 12, path.name) for path in paths]
+    extract_features(_grey, Scene(cameras, paths, torch.zeros(0, 3), torch.zeros(0, 3)), place, "all")
     add("maps", place, "features.json", opens=".")
     add("manifest", place, "features.json", opens=".")
 

@@ -74,8 +74,8 @@ def path_cameras(
     moments = np.linspace(0, times[-1], frames)
     R = RotationSpline(times, turns)(moments).as_matrix()  # [frames, 3, 3] world to camera
     t = -np.einsum("nij,nj->ni", R, CubicSpline(times, places)(moments))  # t = -R c
-    Ks = np.stack([as_array(key.K).astype(np.float64) for key in keys]).reshape(-1, 9)
-    Ks = np.stack([np.interp(moments, times, column) for column in Ks.T], axis=1).reshape(-1, 3, 3)
+    lenses = np.stack([as_array(key.K).astype(np.float64).reshape(9) for key in keys], axis=1)  # [9, k]
+    Ks = np.stack([np.interp(moments, times, row) for row in lenses], axis=1).reshape(-1, 3, 3)
     near, origin = min(camera.near for camera in cameras), cameras[0].origin
     path = []
     for number in range(frames):

@@ -30,9 +30,8 @@ SHARE = 0.01  # an image belongs to a block if at least this share of the points
 class Block:
     """A box of space, and what a field of it needs.
 
-    The cores of all blocks fill space without overlap: a point lies in exactly one. Whatever can stand between a camera and the
-    core lies in the box around both, `reach`. So Gaussians of the reach and the block's views say about the core's
-    Gaussians what the whole scene would say.
+    The cores of all blocks fill space without overlap. Whatever can stand between a camera and the core lies in the box around
+    both, `reach`. So Gaussians of the reach and the block's views say about the core what the whole scene would say.
     """
 
     name: str

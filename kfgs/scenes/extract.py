@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -16,30 +15,19 @@ from tqdm import tqdm
 
 from .._check import one_line
 from .._files import as_path, digest_file, locked, read_json, write_json
-from .feature_files import ENDINGS, OWN, Size, save_feature_map
-from .files import is_inside, read_image, some
-from .scene import Scene
+from .feature_files import ENDINGS, OWN, save_feature_map
+from .files import is_inside, read_image
+from .scene import Scene, check_is_scene
 
 MANIFEST, FORMAT, LOCK = "features.json", "kfgs-features/2", ".features.lock"
 Split = str | Sequence[str] | Sequence[int]
 """The name of a split, `all`, or a list of view names or indices."""
 
 
-@dataclass(frozen=True)
-class Picture:
-    """One picture: the name of its view, its file, and its size if it is known."""
-
-    stem: str
-    """The view's name without its suffix; its map has the same stem."""
-    path: Path
-    size: Size | None = None
-    """(H, W) in pixels."""
-
-
-def pictures_of(scene: Scene, split: Split = "all") -> list[Picture]:
-    """The pictures of some views of a scene (a split, `all`, or a list of view names or indices), as they are on disk."""
-    chosen = scene.select(scene.views(split) if isinstance(split, str) else split)
-    return [Picture(chosen.stem(i), chosen.image_paths[i], chosen.cameras[i].size) for i in range(len(chosen))]
+def select_views(scene: Scene, split: Split) -> Scene:
+    """The scene with the views of a split."""
+    check_is_scene(scene)
+    return scene.select(scene.views(split) if isinstance(split, str) else split)
 
 
 @dataclass(frozen=True)
@@ -74,7 +62,7 @@ def read_manifest(folder: str | Path) -> Manifest | None:
 
 def extract_features(
     teacher: Any,
-    pictures: Scene | Sequence[Picture],
+    scene: Scene,
     folder: str | Path,
     split: Split = "train",
     *,
@@ -90,9 +78,9 @@ def extract_features(
         teacher: an object with `encode_image`, from [3, H, W] RGB in [0, 1] to [D, h, w], a `name` and perhaps `identity`
             (JSON of everything that the features depend on: weights, options), as in `kfgs.teachers`; or a function, which is
             known by its name alone.
-        pictures: a scene, whose pictures are taken as they are on disk, or a list of `Picture`.
+        scene: its pictures are taken as they are on disk.
         folder: for the maps; made if it does not exist.
-        split: of a scene: the name of a split, `all`, or a list of view names or indices.
+        split: the name of a split, `all`, or a list of view names or indices.
         overwrite: replace maps that kfgs made by another teacher (or with other weights or options).
         progress: show a progress bar.
 
@@ -104,10 +92,18 @@ def extract_features(
             one before; if the folder holds maps of another teacher or program, or another process is writing to it.
         FileNotFoundError: if a picture is missing.
     """
-    folder, (encode, identity) = as_path(folder), _as_encoder(teacher)
-    chosen = pictures_of(pictures, split) if isinstance(pictures, Scene) else pictures
-    _check_pictures(chosen)
-    _check_folder(folder, identity, chosen, overwrite)  # a folder that is refused stays as it is, without a lock file
+    folder, (encode, identity), chosen = as_path(folder), _as_encoder(teacher), select_views(scene, split)
+    pictures = {chosen.stem(i): path for i, path in enumerate(chosen.image_paths)}
+    if not pictures:
+        raise ValueError("split: expected at least one view, got none; name some")
+    for stem, path in pictures.items():
+        if not is_inside(stem):
+            raise ValueError(f"scene: expected names inside the folder, got {stem!r}; rename the picture")
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such file; expected the picture of view {stem!r}")
+    _check_folder(
+        folder, identity, list(pictures), overwrite
+    )  # a folder that is refused stays as it is, without a lock file
     with locked(folder, LOCK):
         manifest = read_manifest(folder)
         if manifest is not None and manifest.teacher != identity:
@@ -117,21 +113,21 @@ def extract_features(
         manifest = manifest or Manifest(identity)
         manifest.save(folder)
         channels: int | None = None
-        for picture in tqdm(chosen, desc="features", unit="image", disable=not progress):
-            digest, file = digest_file(picture.path), folder / f"{picture.stem}{OWN}"
-            if file.is_file() and manifest.pictures.get(picture.stem) == digest:
+        for stem, path in tqdm(pictures.items(), desc="features", unit="image", disable=not progress):
+            digest, file = digest_file(path), folder / f"{stem}{OWN}"
+            if file.is_file() and manifest.pictures.get(stem) == digest:
                 continue
             with torch.inference_mode():
-                features = encode(read_image(picture.path).permute(2, 0, 1).contiguous())
-                half = _half(features, f"teacher {identity['name']!r}", picture.path)
+                features = encode(read_image(path).permute(2, 0, 1).contiguous())
+                half = _half(features, f"teacher {identity['name']!r}", path)
             if half.shape[2] != (channels or half.shape[2]):
                 raise ValueError(
-                    f"teacher {identity['name']!r}: expected {channels} channels for {picture.path} as before, got "
-                    f"{half.shape[2]}; use one teacher with the same options for all pictures"
+                    f"teacher {identity['name']!r}: expected {channels} channels for {path} as before, got {half.shape[2]}; use "
+                    "one teacher with the same options for all pictures"
                 )
             channels = int(half.shape[2])
-            save_feature_map(folder, picture.stem, half)
-            manifest = replace(manifest, pictures={**manifest.pictures, picture.stem: digest})
+            save_feature_map(folder, stem, half)
+            manifest = replace(manifest, pictures={**manifest.pictures, stem: digest})
             manifest.save(folder)
     return manifest
 
@@ -155,24 +151,10 @@ def _as_encoder(teacher: Any) -> tuple[Callable[[Tensor], Tensor], dict[str, Any
         ) from error
 
 
-def _check_pictures(pictures: Sequence[Picture]) -> None:
-    if not isinstance(pictures, Sequence) or not all(isinstance(picture, Picture) for picture in pictures):
-        raise TypeError(f"pictures: expected a Scene or a list of Picture, got {type(pictures).__name__}; load one")
-    twice = [stem for stem, count in Counter(picture.stem for picture in pictures).items() if count > 1]
-    if not pictures or twice:
-        got = f"{some(sorted(twice))} more than once" if twice else "none"
-        raise ValueError(f"pictures: expected at least one picture, each stem once, got {got}; rename them")
-    for picture in pictures:
-        if not is_inside(picture.stem):
-            raise ValueError(f"stem: expected a name within the folder, got {picture.stem!r}; rename the picture")
-        if not picture.path.is_file():
-            raise FileNotFoundError(f"{picture.path}: no such file; expected the picture of view {picture.stem!r}")
-
-
-def _check_folder(folder: Path, identity: dict[str, Any], pictures: Sequence[Picture], overwrite: bool) -> None:
+def _check_folder(folder: Path, identity: dict[str, Any], stems: list[str], overwrite: bool) -> None:
     """Raise a ValueError if a folder holds maps of another program, or of another teacher."""
     manifest = read_manifest(folder)
-    files = (folder / f"{picture.stem}{ending}" for picture in pictures for ending in ENDINGS)
+    files = (folder / f"{stem}{ending}" for stem in stems for ending in ENDINGS)
     other = next((file for file in files if file.is_file() and (manifest is None or not file.name.endswith(OWN))), None)
     if other is not None:
         raise ValueError(

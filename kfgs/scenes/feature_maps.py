@@ -16,7 +16,7 @@ from .._files import Names, as_path
 from .._rows import EPS, row_norms
 from ..cameras.resample import fits_aspect
 from ..quant.sampling import grid_slices
-from .extract import Split, pictures_of, read_manifest
+from .extract import Split, read_manifest, select_views
 from .feature_files import AGAIN, ENDINGS, Size, StoredMap, count_bad, open_map, read_rows
 from .files import IMAGE_SUFFIXES, some
 from .scene import Scene
@@ -29,8 +29,7 @@ class FeatureFolder(Sequence[Tensor]):
 
     Known files, which may be mixed: `<stem>_fmap_CxHxW.pt` (Feature 3DGS and DF-3DGS: a tensor [D, h, w]), `<stem>.npy` and
     `<stem>.safetensors` (an array [h, w, D]; [D, h, w] is recognised by `channels` or the picture's aspect), in half, single
-    or double precision. The picture's ending may follow the stem. The map of a picture in a subfolder is in a subfolder of
-    the same name; if no view has a map there, maps are searched by the last part of their names.
+    or double precision. The picture's ending may follow the stem, as in `a.png.npy`.
 
     Maps may differ in size (pictures of several sizes), not in channels; an all-zero feature means "unknown".
 
@@ -90,8 +89,8 @@ class FeatureFolder(Sequence[Tensor]):
 
     def of(self, scene: Scene, split: Split = "train") -> FeatureFolder:
         """The maps of some views of a scene: of a split, of `all`, or of a list of view names or indices."""
-        pictures = pictures_of(scene, split)
-        stems, sizes = [picture.stem for picture in pictures], [picture.size for picture in pictures]
+        chosen = select_views(scene, split)
+        stems, sizes = [chosen.stem(i) for i in range(len(chosen))], [camera.size for camera in chosen.cameras]
         return FeatureFolder(self.path, stems, channels=self.channels, sizes=sizes)
 
     def __len__(self) -> int:
@@ -199,7 +198,8 @@ class FeatureFolder(Sequence[Tensor]):
         """
         sizes = dict(zip(self.stems, self.sizes or [None] * len(self), strict=True))
         if scene is not None:
-            sizes = {picture.stem: picture.size for picture in pictures_of(scene, split)}
+            chosen = select_views(scene, split)
+            sizes = {chosen.stem(i): camera.size for i, camera in enumerate(chosen.cameras)}
         files = self._find(list(sizes))
         problems = {stem: "expected its map, got none" for stem in sizes if stem not in files}
         shapes: dict[str, tuple[int, ...]] = {}

@@ -17,12 +17,11 @@ IMAGE = 73  # bytes of an image without 2-D points, with a name of one letter
 def models_of(path: Path) -> list[Path]:
     """The models of the first of `PLACES` that has some; in a subfolder without a number only if there is no other."""
     for folder in (path / place for place in PLACES) if path.is_dir() else ():
-        inner = [] if folder == path else [name for name in _folders(folder) if name != "models"]
-        numbered = [name for name in inner if name.isdecimal()]
-        own = [f"models/{name}" for name in _folders(folder / "models")]
-        own += [f"{name}/models/{below}" for name in numbered for below in _folders(folder / name / "models")]
-        for names in ([*numbered, *own, ""], inner):
-            models = [folder / name for name in names if has_model(folder / name)]
+        inner = [] if folder == path else [below for below in _folders(folder) if below.name != "models"]
+        numbered = [below for below in inner if below.name.isdecimal()]
+        hloc = [model for below in (folder, *numbered) for model in _folders(below / "models")]
+        for places in ([*numbered, *hloc, folder], inner):
+            models = [place for place in places if has_model(place)]
             if models:
                 return models
     return []
@@ -64,16 +63,12 @@ def count_images(model: Path) -> int:
             with binary.open("rb") as file:
                 count = int(struct.unpack("<Q", file.read(8))[0])
             return count if count * IMAGE <= binary.stat().st_size else 0
-        count = 0
-        with text.open(encoding=text_encoding(text)) as lines:
-            for line in lines:
-                if line.strip() and not line.lstrip().startswith("#"):
-                    count += 1
-                    next(lines, None)  # its 2-D points
-        return count
+        with text.open(encoding=text_encoding(text)) as lines:  # each is followed by a line of its 2-D points
+            return sum(next(lines, "") != "" for line in lines if line.strip() and not line.lstrip().startswith("#"))
     except (OSError, ValueError, struct.error):
         return 0
 
 
-def _folders(folder: Path) -> list[str]:
-    return sorted((f.name for f in folder.iterdir() if f.is_dir()), key=natural_key) if folder.is_dir() else []
+def _folders(folder: Path) -> list[Path]:
+    inner = [below for below in folder.iterdir() if below.is_dir()] if folder.is_dir() else []
+    return sorted(inner, key=lambda below: natural_key(below.name))

@@ -17,7 +17,6 @@ from PIL import Image
 import kfgs
 from kfgs.cameras import Camera
 from kfgs.scenes import FeatureFolder, Scene, extract_features
-from kfgs.scenes.extract import Picture, pictures_of
 
 STEMS = ["a", "b", "sub/c"]
 
@@ -44,24 +43,37 @@ def paint(path: Path, seed: int, size: tuple[int, int] = (6, 8)) -> None:
     Image.fromarray(values.numpy()).save(path)
 
 
+def scene_of(paths: dict[str, Path]) -> Scene:
+    """Views of 8 x 6 pixels by their stems."""
+    cameras = [Camera(torch.eye(4), torch.eye(3), 8, 6, name=f"{stem}.png") for stem in paths]
+    nothing = torch.zeros(0, 3)
+    return Scene(
+        cameras,
+        list(paths.values()),
+        nothing,
+        nothing.byte(),
+        {"train": [0, 2], "test": [1]} if len(paths) == 3 else {},
+    )
+
+
 @pytest.fixture
-def pictures(tmp_path):
-    made = [Picture(stem, tmp_path / "images" / f"{stem}.png") for stem in STEMS]
-    for i, picture in enumerate(made):
-        paint(picture.path, i)
-    return made
+def scene(tmp_path):
+    paths = {stem: tmp_path / "images" / f"{stem}.png" for stem in STEMS}
+    for i, path in enumerate(paths.values()):
+        paint(path, i)
+    return scene_of(paths)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*.npy"))}
 
 
-def test_a_map_is_the_teachers_with_channels_last_in_half_precision(pictures, tmp_path):
+def test_a_map_is_the_teachers_with_channels_last_in_half_precision(scene, tmp_path):
     teacher = Counting()
-    made = extract_features(teacher, pictures, tmp_path / "maps")
-    for picture in pictures:
-        cells = np.asarray(Image.open(picture.path), np.float64).reshape(3, 2, 4, 2, 3).mean((1, 3)) / 255
-        stored = np.load(tmp_path / "maps" / f"{picture.stem}.npy")
+    made = extract_features(teacher, scene, tmp_path / "maps", "all")
+    for stem, path in zip(STEMS, scene.image_paths, strict=True):
+        cells = np.asarray(Image.open(path), np.float64).reshape(3, 2, 4, 2, 3).mean((1, 3)) / 255
+        stored = np.load(tmp_path / "maps" / f"{stem}.npy")
         assert stored.dtype == np.float16
         expected = cells @ teacher.matrix.double().numpy().T
         np.testing.assert_allclose(stored, expected, rtol=1e-3, atol=1e-3)  # half precision has 11 bits
@@ -69,57 +81,58 @@ def test_a_map_is_the_teachers_with_channels_last_in_half_precision(pictures, tm
     assert FeatureFolder(tmp_path / "maps").identity == made.teacher == {**teacher.identity, "size": [2, 2]}
 
 
-def test_a_map_that_exists_is_not_made_again_unless_its_picture_changed(pictures, tmp_path):
+def test_a_map_that_exists_is_not_made_again_unless_its_picture_changed(scene, tmp_path):
     folder, teacher = tmp_path / "maps", Counting()
-    extract_features(teacher, pictures[:2], folder)
+    extract_features(teacher, scene, folder, [0, 1])
     whole = contents(folder)
     times = {path: path.stat().st_mtime_ns for path in folder.glob("*.npy")}
-    extract_features(teacher, pictures, folder)
+    extract_features(teacher, scene, folder, "all")
     assert teacher.calls == 3
     assert {path: path.stat().st_mtime_ns for path in times} == times
-    paint(pictures[0].path, 100)
+    paint(scene.image_paths[0], 100)
     (folder / "sub" / "c.npy").unlink()
-    extract_features(teacher, pictures, folder)
+    extract_features(teacher, scene, folder, "all")
     assert teacher.calls == 5
     assert contents(folder)["a.npy"] != whole["a.npy"]
     assert contents(folder)["b.npy"] == whole["b.npy"]
 
 
 @pytest.mark.parametrize("other", [Counting(weights="w2"), Counting(cell=1)])
-def test_another_teachers_maps_are_neither_mixed_nor_lost(other, pictures, tmp_path):
+def test_another_teachers_maps_are_neither_mixed_nor_lost(other, scene, tmp_path):
     folder = tmp_path / "maps"
-    extract_features(Counting(), pictures, folder)
+    extract_features(Counting(), scene, folder, "all")
     whole = contents(folder)
     with pytest.raises(ValueError, match=tells(f"{folder}: ", "same teacher", "overwrite")):
-        extract_features(other, pictures[:1], folder)
+        extract_features(other, scene, folder, [0])
     assert contents(folder) == whole
-    made = extract_features(other, pictures[:1], folder, overwrite=True)
+    made = extract_features(other, scene, folder, [0], overwrite=True)
     assert set(made.pictures) == {"a"}  # nothing of the first is left
     assert list(contents(folder)) == ["a.npy"]
     assert contents(folder)["a.npy"] != whole["a.npy"]
 
 
-def test_maps_of_other_programs_are_left_alone(pictures, tmp_path):
+def test_maps_of_other_programs_are_left_alone(scene, tmp_path):
     folder = tmp_path / "maps"
     folder.mkdir()
     np.save(folder / "a.npy", np.ones((3, 4, 5)))
     for overwrite in (False, True):
         with pytest.raises(ValueError, match=tells(f"{folder}: ", "a.npy", "features.json", "another folder")):
-            extract_features(Counting(), pictures, folder, overwrite=overwrite)
+            extract_features(Counting(), scene, folder, "all", overwrite=overwrite)
         assert list(folder.iterdir()) == [folder / "a.npy"]  # no lock file either
         assert np.load(folder / "a.npy").sum() == 60
     (folder / "a.npy").unlink()
-    extract_features(Counting(), pictures, folder)
+    extract_features(Counting(), scene, folder, "all")
     (folder / "b_fmap_CxHxW.pt").touch()
     with pytest.raises(ValueError, match=tells(f"{folder}: ", "b_fmap_CxHxW.pt")):
-        extract_features(Counting(), pictures, folder, overwrite=True)
+        extract_features(Counting(), scene, folder, "all", overwrite=True)
 
 
 CHILD = """
 import sys, time
 from pathlib import Path
-from kfgs.scenes import extract_features
-from kfgs.scenes.extract import Picture
+import torch
+from kfgs import Camera
+from kfgs.scenes import Scene, extract_features
 
 def slow(image):
     with open(sys.argv[2], "a") as log:
@@ -129,8 +142,9 @@ def slow(image):
     return image[:, ::2, ::2].repeat(7, 1, 1)
 
 root = Path(sys.argv[1])
-pictures = [Picture(path.stem, path) for path in sorted((root / "images").glob("*.png"))]
-extract_features(slow, pictures, root / sys.argv[4])
+paths = sorted((root / "images").glob("*.png"))
+cameras = [Camera(torch.eye(4), torch.eye(3), 8, 6, path.name) for path in paths]
+extract_features(slow, Scene(cameras, paths, torch.zeros(0, 3), torch.zeros(0, 3)), root / sys.argv[4], "all")
 """
 
 
@@ -175,64 +189,54 @@ class _Broken(Counting):
         (lambda f: f.long(), ("floats", "torch.int64")),
     ],
 )
-def test_what_a_teacher_may_not_return_is_named_and_the_maps_before_stay(change, message, pictures, tmp_path):
+def test_what_a_teacher_may_not_return_is_named_and_the_maps_before_stay(change, message, scene, tmp_path):
     with pytest.raises(ValueError, match=tells("counting", *message)):
-        extract_features(_Broken(change), pictures, tmp_path / "maps")
+        extract_features(_Broken(change), scene, tmp_path / "maps", "all")
     assert list(contents(tmp_path / "maps")) == ["a.npy"]
 
 
-def test_features_that_are_all_zero_stay_so_and_small_ones_are_kept(pictures, tmp_path):
+def test_features_that_are_all_zero_stay_so_and_small_ones_are_kept(scene, tmp_path):
     teacher = _Broken(lambda f: f.index_fill(2, torch.tensor([1]), 0) * 1e-6)
-    extract_features(teacher, pictures, tmp_path / "maps")
+    extract_features(teacher, scene, tmp_path / "maps", "all")
     stored = np.load(tmp_path / "maps" / "b.npy")
     assert not stored[:, 1].any()
     assert stored[:, [0, 2, 3]].any(-1).all()
 
 
-def test_pictures_of_other_sizes_may_have_maps_of_other_sizes(pictures, tmp_path):
-    paint(pictures[1].path, 7, (10, 12))
-    extract_features(Counting(), pictures, tmp_path / "maps")
+def test_pictures_of_other_sizes_may_have_maps_of_other_sizes(scene, tmp_path):
+    paint(scene.image_paths[1], 7, (10, 12))
+    extract_features(Counting(), scene, tmp_path / "maps", "all")
     assert [tuple(map_.shape) for map_ in FeatureFolder(tmp_path / "maps", STEMS)] == [(3, 4, 5), (5, 6, 5), (3, 4, 5)]
 
 
-def test_bad_requests_are_refused_before_any_work(pictures, tmp_path):
+def test_bad_requests_are_refused_before_any_work(scene, tmp_path):
     teacher, folder = Counting(), tmp_path / "maps"
-    with pytest.raises(ValueError, match=tells("pictures", "at least one", "none")):
-        extract_features(teacher, [], folder)
-    with pytest.raises(ValueError, match=tells("pictures", "each stem once", "a", "rename")):
-        extract_features(teacher, [pictures[0], pictures[0]], folder)
-    for stem in ("../a", "/a", ""):
-        with pytest.raises(ValueError, match=tells("stem:", f"got {stem!r}", "rename")):
-            extract_features(teacher, [Picture(stem, pictures[0].path)], folder)
+    with pytest.raises(ValueError, match=tells("split", "at least one", "none")):
+        extract_features(teacher, scene, folder, [])
+    for stem in ("../a", "/a"):
+        with pytest.raises(ValueError, match=tells("scene:", f"got {stem!r}", "rename")):
+            extract_features(teacher, scene_of({stem: scene.image_paths[0]}), folder, "all")
     with pytest.raises(FileNotFoundError, match=tells("gone.png:", "'gone'")):
-        extract_features(teacher, [Picture("gone", tmp_path / "gone.png")], folder)
+        extract_features(teacher, scene_of({"gone": tmp_path / "gone.png"}), folder, "all")
     for wrong in ("lseg", Counting):
         with pytest.raises(TypeError, match=tells("teacher:", "encode_image")):
-            extract_features(wrong, pictures, folder)
-    for wrong in ("scene", ["a"]):
-        with pytest.raises(TypeError, match=tells("pictures", "Scene")):
-            extract_features(teacher, wrong, folder)
+            extract_features(wrong, scene, folder, "all")
+    with pytest.raises(TypeError, match=tells("scene:", "Scene", "got str")):
+        extract_features(teacher, "scene", folder)
     teacher.identity = {"name": "x", "model": object()}
     with pytest.raises(TypeError, match=tells("teacher.identity:", "JSON")):
-        extract_features(teacher, pictures, folder)
+        extract_features(teacher, scene, folder, "all")
     assert teacher.calls == 0
     assert not folder.exists()
 
 
-def test_a_damaged_manifest_is_named(pictures, tmp_path):
+def test_a_damaged_manifest_is_named(scene, tmp_path):
     folder = tmp_path / "maps"
-    extract_features(Counting(), pictures, folder)
+    extract_features(Counting(), scene, folder, "all")
     for damaged in ("[]", "{", json.dumps({"format": "kfgs-features/2", "teacher": 3})):
         (folder / "features.json").write_text(damaged)
         with pytest.raises(ValueError, match=tells(folder / "features.json")):
             FeatureFolder(folder)
-
-
-@pytest.fixture
-def scene(pictures):
-    cameras = [Camera(torch.eye(4), torch.eye(3), 8, 6, name=f"{picture.stem}.png") for picture in pictures]
-    paths, nothing = [picture.path for picture in pictures], torch.zeros(0, 3)
-    return Scene(cameras, paths, nothing, nothing.byte(), {"train": [0, 2], "test": [1]})
 
 
 @pytest.mark.parametrize(
@@ -255,7 +259,7 @@ def test_a_scene_and_a_split_name_the_views_to_encode_and_to_read(split, stems, 
 def test_views_that_a_scene_does_not_have_are_named(scene, tmp_path):
     for wrong in ("val", ["x"], [7]):
         with pytest.raises(ValueError, match=tells(wrong if isinstance(wrong, str) else wrong[0])):
-            pictures_of(scene, wrong)
+            extract_features(Counting(), scene, tmp_path / "maps", wrong)
     extract_features(Counting(), scene, tmp_path / "maps")
     with pytest.raises(FileNotFoundError, match=tells("1 views", "b", "kfgs features")):
         FeatureFolder(tmp_path / "maps").of(scene, "test")
