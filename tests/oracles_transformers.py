@@ -23,14 +23,8 @@ def clip_values(hidden, state, layer, eps):
     return v, w, block
 
 
-def clip_features(hidden, state, layer, eps, *, residual):
-    v, w, block = clip_values(hidden, state, layer, eps)
-    if residual:
-        x = hidden + v
-        y = layer_norm(x, w[block + "layer_norm2.weight"], w[block + "layer_norm2.bias"], eps)
-        y = y @ w[block + "mlp.fc1.weight"].T + w[block + "mlp.fc1.bias"]
-        y = y / (1 + np.exp(-1.702 * y))  # CLIP's quick GELU
-        v = x + y @ w[block + "mlp.fc2.weight"].T + w[block + "mlp.fc2.bias"]
+def clip_features(hidden, state, layer, eps):
+    v, w, _ = clip_values(hidden, state, layer, eps)
     v = layer_norm(v, w["vision_model.post_layernorm.weight"], w["vision_model.post_layernorm.bias"], eps)
     return v[1:] @ w["visual_projection.weight"].T  # the first token is the class token
 

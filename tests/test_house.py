@@ -17,7 +17,7 @@ AIM = {  # lines of Python with docstrings (DESIGN, section 2); "base": the file
     "splat/engines": 5_300, "quant": 1_100, "cameras": 950, "base": 1_200,
 }  # fmt: skip
 NOT_YET = {  # what is above its aim: a change may lower these numbers, and never raises them
-    "cli": 2_434, "batch": 785, "pipeline": 2_478, "teachers": 2_099, "fields": 3_361, "toy": 1_229, "scenes": 4_006,
+    "cli": 2_434, "batch": 785, "pipeline": 2_478, "teachers": 1_959, "fields": 3_361, "toy": 1_196, "scenes": 4_006,
     "formats": 2_798, "splat/engines": 6_336, "quant": 1_565, "cameras": 1_072, "base": 1_478,
 }  # fmt: skip
 SCRIPTS = 4_000  # lines of the viewer's JavaScript

@@ -10,10 +10,10 @@ from transformers import CLIPTokenizer, Siglip2Tokenizer, Tipsv2Tokenizer
 LETTERS = "abcdefghijklmnopqrstuvwxyz"
 TOWER = {"hidden_size": 32, "num_hidden_layers": 2, "num_attention_heads": 2}
 CHANNELS = {
-    "clip": 24, "openclip": 24, "siglip": 32, "siglip2": 32, "siglip2-naflex": 32, "tipsv2": 32, "dinov2": 32,
+    "clip": 24, "openclip": 24, "siglip": 32, "siglip2": 32, "tipsv2": 32, "dinov2": 32,
     "dinov2-registers": 32, "dinov3": 32, "radio": 32,
 }  # fmt: skip
-KINDS = {"siglip2-naflex": "siglip2", "dinov2-registers": "dinov2"}  # others are named as their kind
+KINDS = {"dinov2-registers": "dinov2"}  # others are named as their kind
 
 
 def text(**more):
@@ -35,7 +35,6 @@ def configs() -> dict:
         "openclip": clip,
         "siglip": transformers.SiglipConfig(vision_config={**tower, "image_size": 32}, text_config=words),
         "siglip2": transformers.SiglipConfig(vision_config={**tower, "image_size": 32}, text_config=words),
-        "siglip2-naflex": transformers.Siglip2Config(vision_config={**tower, "num_patches": 16}, text_config=words),
         "tipsv2": transformers.Tipsv2Config(
             vision_config={**dino, "mlp_ratio": 2}, text_config=text(max_position_embeddings=16)
         ),
@@ -63,7 +62,7 @@ def write_teacher(folder: Path, name: str) -> Path:
     config = configs()[name]
     torch.manual_seed(sorted(CHANNELS).index(name))
     model = getattr(transformers, {
-        "CLIPConfig": "CLIPModel", "SiglipConfig": "SiglipModel", "Siglip2Config": "Siglip2Model",
+        "CLIPConfig": "CLIPModel", "SiglipConfig": "SiglipModel",
         "Tipsv2Config": "Tipsv2Model", "Dinov2Config": "Dinov2Model", "RadioConfig": "RadioModel",
         "Dinov2WithRegistersConfig": "Dinov2WithRegistersModel", "DINOv3ViTConfig": "DINOv3ViTModel",
     }[type(config).__name__])(config)  # fmt: skip

@@ -54,8 +54,7 @@ def load_teacher(name: str, weights: str | Path | None = None, **options: Any) -
     known = [option for option in inspect.signature(loader).parameters if option not in ("kind", "source", "weights")]
     for option in options:
         if option not in known:
-            has = f"the options {', '.join(known)}" if known else "no options"
-            raise ValueError(f"{option}: teacher {name!r} has {has}, but got {option}; leave it out")
+            raise ValueError(f"{option}: teacher {name!r} has the options {', '.join(known) or 'none'}; leave it out")
     return loader(weights, **options)
 
 
@@ -72,8 +71,7 @@ def check_teacher_name(name: str) -> None:
 
 def _imported(name: str, weights: str | Path | None, options: dict[str, Any]) -> Teacher:
     """The teacher `package.module:name`, with an `identity` of its name, version, weights and options if it has none."""
-    value = _find(name)
-    given = [] if weights is None else [weights]
+    value, given = _find(name), [] if weights is None else [weights]
     if inspect.isclass(value):
         try:
             value = value(*given, **options)
@@ -95,8 +93,8 @@ def _imported(name: str, weights: str | Path | None, options: dict[str, Any]) ->
         plain = {
             key: part if isinstance(part, bool | int | float | str) else str(part) for key, part in options.items()
         }
-        identity = {"name": str(teacher.name), "version": str(getattr(teacher, "version", "")), "source": name}
-        teacher.identity = {**identity, "weights": None if weights is None else str(weights), "options": plain}
+        known = {"name": str(teacher.name), "version": str(getattr(teacher, "version", "")), "source": name}
+        teacher.identity = {**known, "weights": None if weights is None else str(weights), "options": plain}
     return teacher  # type: ignore[no-any-return]
 
 

@@ -31,44 +31,6 @@ TEMPLATES: dict[str, tuple[str, ...]] = {
 }
 
 
-def embed_labels(
-    teacher: Teacher | Callable[[Tensor], Tensor],
-    names: Sequence[str],
-    *,
-    templates: str | Sequence[str] | None = None,
-    synonyms: Mapping[str, Sequence[str]] | None = None,
-) -> Tensor:  # [C, D] float32, unit rows, on the teacher's device
-    """One embedding per class: encode each word in each template as unit rows, average, and normalise.
-
-    Args:
-        teacher: a teacher with a text encoder.
-        names: C class names. One may contain synonyms as in ADE20K, "chair;armchair;seat": the first is the class's name.
-            Underscores become spaces in prompts. Repeated words count once.
-        templates: a name of `TEMPLATES`, one template, or several; `{}` is replaced by the word. None: the teacher's
-            `templates` if it has any, else bare words, as for LSeg.
-        synonyms: further words of a class, by its name.
-
-    Raises:
-        ValueError: if there is no name, one is empty or repeated, synonyms belong to no class, a template has no `{}`, or
-            the encoder's rows are not finite.
-        NotImplementedError: if the teacher has no text encoder.
-    """
-    teacher = as_teacher(teacher)
-    words, patterns = _words(names, synonyms), _templates_of(teacher, templates)
-    prompts = [[pattern.replace("{}", word) for word in group for pattern in patterns] for group in words.values()]
-    distinct = list(dict.fromkeys(prompt for group in prompts for prompt in group))
-    rows = _encode(teacher, distinct)
-    place = {prompt: i for i, prompt in enumerate(distinct)}
-    means = torch.stack([rows[[place[prompt] for prompt in group]].mean(dim=0) for group in prompts])
-    lost = row_norms(means) <= EPS
-    if bool(lost.any()):
-        raise ValueError(
-            f"names: expected prompts with a common direction, got none for {list(words)[int(lost.nonzero()[0])]!r}; "
-            "use fewer templates or synonyms"
-        )
-    return unit_rows(means)
-
-
 def make_label_set(
     teacher: Teacher | Callable[[Tensor], Tensor],
     names: Sequence[str],
@@ -79,22 +41,51 @@ def make_label_set(
 ) -> LabelSet:
     """Make classes from words: each name with its embedding by the teacher's text encoder, on the CPU.
 
-    `info` of the result records teacher and templates.
+    Each word of a class is encoded in each template, as unit rows, whose mean is normalised.
 
-    Arguments are those of `embed_labels`; `negatives` are words that a query is compared with if there is no other class
-    (LERF's canonical words), or None.
+    Args:
+        teacher: a teacher with a text encoder.
+        names: C class names. One may contain synonyms as in ADE20K, "chair;armchair;seat": the first is the class's name.
+            Underscores become spaces in prompts. Repeated words count once.
+        templates: "bare", "clip7", "tcl9", "siglip", one template, or several; `{}` is replaced by the word. None: the
+            teacher's `templates` if it has any, else bare words, as for LSeg.
+        synonyms: further words of a class, by its name.
+        negatives: words that a query is compared with if there is no other class (LERF's canonical words), or None.
+
+    Raises:
+        ValueError: if there is no name, one is empty or repeated, synonyms belong to no class, a template has no `{}`, or
+            the encoder's rows are not finite.
+        NotImplementedError: if the teacher has no text encoder.
     """
     teacher = as_teacher(teacher)
-    words = _words(names, synonyms)
-    rows = embed_labels(teacher, names, templates=templates, synonyms=synonyms)
-    against = tuple(negatives or ())
+    words, patterns = _words(names, synonyms), _templates_of(teacher, templates)
+    rows = _embed(teacher, words, patterns)
     info = {
         "teacher": identify(teacher),
-        "templates": list(_templates_of(teacher, templates)),
+        "templates": list(patterns),
         "synonyms": {name: more for name, (_, *more) in words.items() if more},
     }
-    other = embed_labels(teacher, against, templates=templates).cpu() if against else None
-    return LabelSet(tuple(words), rows.cpu(), other, against, info)
+    against = tuple(negatives or ())
+    other = _embed(teacher, _words(against, None), patterns) if against else None
+    return LabelSet(tuple(words), rows, other, against, info)
+
+
+def _embed(
+    teacher: Teacher, words: dict[str, list[str]], patterns: tuple[str, ...]
+) -> Tensor:  # [C, D] float32, unit rows
+    """The mean direction of the words of each class in all templates."""
+    prompts = [[pattern.replace("{}", word) for word in group for pattern in patterns] for group in words.values()]
+    distinct = list(dict.fromkeys(prompt for group in prompts for prompt in group))
+    rows = _encode(teacher, distinct).cpu()
+    place = {prompt: i for i, prompt in enumerate(distinct)}
+    means = torch.stack([rows[[place[prompt] for prompt in group]].mean(dim=0) for group in prompts])
+    lost = row_norms(means) <= EPS
+    if bool(lost.any()):
+        raise ValueError(
+            f"names: expected prompts with a common direction, got none for {list(words)[int(lost.nonzero()[0])]!r}; "
+            "use fewer templates or synonyms"
+        )
+    return unit_rows(means)
 
 
 def _templates_of(teacher: Teacher, templates: str | Sequence[str] | None) -> tuple[str, ...]:

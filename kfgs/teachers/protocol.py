@@ -20,12 +20,11 @@ PROMPTS_AT_ONCE = 64  # 60 MB of activations in CLIP ViT-L's text tower
 class Teacher(Protocol):
     """An image encoder, usually with a text encoder into the same space: LSeg, or a dense CLIP.
 
-    Any object with these three members is a teacher; there is no base class. Three more are used if they exist:
-    `to(device)`; `templates`, the prompts that suit its texts; and `identity`, JSON of what the features depend on, so that
-    maps of other weights are not mixed. Without `identity`, its `name` and its `version` (a text) stand for it.
+    Any object with these three members is a teacher. Three more are used if they exist: `to(device)`; `templates`, the
+    prompts that suit its texts; and `identity`, JSON of what the features depend on, so that maps of other weights are not
+    mixed. Without `identity`, its `name` and its `version` (a text) stand for it.
 
-    **Convention**: here, pictures and features have the channels first, as in encoders; kfgs's maps, in memory and on disk,
-    have them last ([h, w, D]).
+    **Convention**: here, pictures and features have the channels first; kfgs's maps have them last ([h, w, D]).
 
     Example:
         >>> class Colour:
@@ -96,12 +95,7 @@ class CallableTeacher:
         return self._images(image)
 
     def encode_text(self, prompts: Sequence[str]) -> Tensor:  # [n, D]
-        """Call the function for text.
-
-        Raises:
-            NotImplementedError: if there is none.
-            ValueError: if there are no prompts, or it does not return one row per prompt.
-        """
+        """Call the function for text; a NotImplementedError if there is none."""
         if self._text is None:
             raise NotImplementedError(
                 f"teacher {self.name!r}: expected one with a text encoder, got one without; pass text=..., or embed the "
@@ -114,11 +108,7 @@ class CallableTeacher:
 
 
 def as_teacher(source: Teacher | Callable[[Tensor], Tensor]) -> Teacher:
-    """Return a teacher unchanged; wrap a function from [3, H, W] to [D, h, w] as a teacher without text.
-
-    Raises:
-        TypeError: if it is neither, or a class instead of an object.
-    """
+    """A teacher as it is; a function from [3, H, W] to [D, h, w] as a teacher without text. Else a TypeError."""
     if isinstance(source, Teacher) and not inspect.isclass(source):
         return source
     if callable(source) and not inspect.isclass(source):

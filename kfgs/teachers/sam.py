@@ -25,17 +25,14 @@ _PREFIX = "image_encoder."
 
 
 def load_sam(source: str | Path) -> SamTeacher:
-    """Load the image encoder from a checkpoint of Segment Anything (vit_b, vit_l, vit_h, or MobileSAM).
+    """Load the image encoder from a checkpoint of Segment Anything 1 or MobileSAM, as published; nothing in it is run.
 
-    The shapes of the weights show which one it is.
-
-    Args:
-        source: `sam_vit_b_01ec64.pth`, `sam_vit_l_0b3195.pth`, `sam_vit_h_4b8939.pth` or `mobile_sam.pt` as published by
-            Meta and MobileSAM; nothing in it is run.
+    The shapes of the weights show which one it is: `sam_vit_b_01ec64.pth`, `sam_vit_l_0b3195.pth`, `sam_vit_h_4b8939.pth`
+    or `mobile_sam.pt`.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is damaged, or no checkpoint of SAM; the message names missing weights.
+        ValueError: if it is damaged, or not a checkpoint of SAM; the message names missing weights.
     """
     path = as_path(source)
     state = {
@@ -48,15 +45,17 @@ def load_sam(source: str | Path) -> SamTeacher:
             f"{path}: expected a checkpoint of Segment Anything, with weights {_PREFIX}..., got none of these; use "
             "sam_vit_b_01ec64.pth or another of SAM 1 (not 2 or 3)"
         )
-    config = _config_of(path, state)
-    if config.model_type is not None:  # TinyViT computes a table of indices that no checkpoint holds
-        encoder = Sam.from_config(config).image_encoder
-    else:
-        with torch.device("meta"):  # initialising 637 M weights takes long
-            encoder = Sam.from_config(config).image_encoder
     try:
+        config = _config_of(state)
+        # Initialising 637 M weights takes long; but TinyViT computes a table of indices that no checkpoint holds.
+        with torch.device("meta" if config.model_type is None else "cpu"):
+            encoder = Sam.from_config(config).image_encoder
         encoder.load_state_dict(state, assign=True)
-    except RuntimeError as error:  # lists all missing, unexpected and misshapen tensors
+    except (
+        KeyError,
+        ZeroDivisionError,
+        RuntimeError,
+    ) as error:  # which lists missing, unexpected and misshapen tensors
         wrong = " ".join(str(error).split())
         raise ValueError(
             f"{path}: expected the weights of SAM's image encoder, got others ({wrong:.300}); use a checkpoint of SAM 1 as it "
@@ -117,24 +116,16 @@ def _scaled(image: Tensor, longest: int) -> tuple[int, int]:
     return max(1, int(scale * H + 0.5)), max(1, int(scale * W + 0.5))
 
 
-def _config_of(path: Path, state: dict[str, Tensor]) -> SamConfig:
+def _config_of(state: dict[str, Tensor]) -> SamConfig:
     """The encoder's sizes: width, depth, heads, and which blocks see the whole picture."""
     if "patch_embed.seq.0.c.weight" in state:
         return SamConfig("mobile_sam")
-    try:
-        width = state["patch_embed.proj.weight"].shape[0]
-        blocks = {int(found[1]) for name in state if (found := re.match(r"blocks\.(\d+)\.", name))}
-        positions = {i: state[f"blocks.{i}.attn.rel_pos_h"] for i in blocks}  # [2 side - 1, channels of a head]
-        everywhere = tuple(sorted(i for i, table in positions.items() if table.shape[0] == 2 * _GRID - 1))
-        heads = width // positions[0].shape[1]
-    except (KeyError, IndexError, ZeroDivisionError) as error:
-        raise ValueError(
-            f"{path}: expected the image encoder of Segment Anything (vit_b, vit_l, vit_h or mobile_sam), got one without "
-            f"{error}; use a checkpoint of SAM 1"
-        ) from error
+    width = state["patch_embed.proj.weight"].shape[0]
+    blocks = {int(match[1]) for name in state if (match := re.match(r"blocks\.(\d+)\.", name))}
+    positions = {i: state[f"blocks.{i}.attn.rel_pos_h"] for i in blocks}  # [2 side - 1, channels of a head]
     return SamConfig(
         encoder_embed_dim=width,
         encoder_depth=len(blocks),
-        encoder_num_heads=heads,
-        encoder_global_attn_indexes=everywhere,
+        encoder_num_heads=width // positions[0].shape[1],
+        encoder_global_attn_indexes=tuple(i for i in sorted(blocks) if positions[i].shape[0] == 2 * _GRID - 1),
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -74,15 +73,8 @@ def load_openclip(kind: str, file: Path, *, activation: str) -> Any:
     file, a head has 64 channels (more in ViT-H, g and bigG), and `activation` is used: gelu, or OpenAI's quick_gelu.
 
     Raises:
-        ValueError: if the file is not a CLIP of plain vision and text transformers, is OpenAI's TorchScript archive, or is
-            damaged.
+        ValueError: if the file is not a CLIP of plain vision and text transformers, or is damaged.
     """
-    if _is_torchscript(file):
-        raise ValueError(
-            f"{file}: expected the tensors of a CLIP, got a TorchScript archive as OpenAI publishes it, which is a "
-            "program and is not run; use the hub id openai/clip-vit-base-patch16 (the weights of ViT-B-16.pt) or its like, "
-            "a folder of that, or a file of OpenCLIP"
-        )
     state = {name.removeprefix("module."): value for name, value in read_checkpoint(file).items()}
     known = read_json(file.with_name(_CONFIG)) if file.with_name(_CONFIG).is_file() else {}
     settings = known.get("model_cfg", {}) if isinstance(known, dict) else {}
@@ -118,15 +110,6 @@ def load_text_tower(source: str, state: dict[str, Tensor], heads: int) -> Any:
         config = require_transformers().CLIPTextConfig(**_text_config(state, heads, "quick_gelu"))
         mapped = {name: value for name, value in _mapped(state).items() if name.startswith("text_")}
         return load_complete("CLIPTextModelWithProjection", Path(source), None, config=config, state_dict=mapped)
-
-
-def _is_torchscript(file: Path) -> bool:
-    """Whether the file is OpenAI's TorchScript archive of CLIP."""
-    try:
-        with zipfile.ZipFile(file) as archive:
-            return any(re.fullmatch(r"[^/]+/(constants\.pkl|code/.*)", name) for name in archive.namelist())
-    except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError):
-        return False  # not a zip archive; a damaged one is explained by `read_checkpoint`
 
 
 def _sizes(state: dict[str, Tensor], tower: str, heads: int, activation: str) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .._files import as_path, digest_file, digest_value, read_json
-from .transformers_package import explained, load_complete, quiet, require_transformers
+from .transformers_package import explained, quiet, require_transformers
 from .transformers_table import TRANSFORMERS
 
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
@@ -27,7 +27,7 @@ def find_source(kind: str, source: str | Path) -> Path | str:
 
 
 def read_config(kind: str, source: Path | str, *, local_only: bool) -> tuple[str, str | None]:
-    """The model type in config.json, one of the kind's, and the hub's commit (None for a folder)."""
+    """The class of the model by config.json, one of the kind's, and the hub's commit (None for a folder)."""
     if isinstance(source, Path):
         file = source / "config.json"
         if not file.is_file():
@@ -52,23 +52,16 @@ def read_config(kind: str, source: Path | str, *, local_only: bool) -> tuple[str
             f"{source}: expected a model of type {' or '.join(map(repr, expected))} for teacher {kind!r}, got "
             f"{model_type!r}; {hint}"
         )
-    return model_type, None if isinstance(source, Path) else file.parent.name  # .../snapshots/<commit>/config.json
+    return expected[model_type], None if isinstance(
+        source, Path
+    ) else file.parent.name  # .../snapshots/<commit>/config.json
 
 
-def load_model(kind: str, source: Path | str, model_type: str, commit: str | None, *, local_only: bool) -> Any:
-    """The model in float32; every weight must come from the files, none from random initialisation."""
-    name = TRANSFORMERS[kind].models[model_type][0]
-    with explained(kind, source):
-        return load_complete(name, source, source, local_files_only=local_only, **_revision(commit))
-
-
-def load_tokenizer_of(kind: str, source: Path | str, commit: str | None, *, local_only: bool) -> Any:
+def load_tokenizer_of(kind: str, source: Path | str, **options: Any) -> Any:
     """The tokenizer in the folder of the weights."""
     transformers = require_transformers()
     with explained(kind, source, "a tokenizer"), quiet(transformers):
-        return transformers.AutoTokenizer.from_pretrained(
-            source, local_files_only=local_only, trust_remote_code=False, **_revision(commit)
-        )
+        return transformers.AutoTokenizer.from_pretrained(source, trust_remote_code=False, **options)
 
 
 def weights_of(source: Path | str, commit: str | None = None) -> str:
@@ -79,7 +72,3 @@ def weights_of(source: Path | str, commit: str | None = None) -> str:
     weights = [source] if source.is_file() else sorted(source.glob("*.safetensors")) or sorted(source.glob("*.bin"))
     configs = [folder / name for name in ("config.json", "open_clip_config.json")]
     return digest_value([[file.name, digest_file(file)] for file in [*configs, *weights] if file.is_file()])
-
-
-def _revision(commit: str | None) -> dict[str, str]:
-    return {} if commit is None else {"revision": commit}

@@ -7,15 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from .transformers_patches import (
-    Patches,
-    clip_patches,
-    last_patches,
-    naflex_patches,
-    radio_patches,
-    siglip_patches,
-    tips_patches,
-)
+from .transformers_patches import Patches, clip_patches, last_patches, radio_patches, siglip_patches
 
 Triple = tuple[float, float, float]
 
@@ -38,42 +30,25 @@ class TextRule:
 class TeacherRow:
     """One kind of teacher."""
 
-    models: dict[str, tuple[str, Patches]]  # model_type in config.json -> class of transformers, extraction of patches
+    models: dict[str, str]  # model_type in config.json -> class of transformers
+    patches: Patches
     normalisation: tuple[Triple, Triple]  # mean and standard deviation of RGB in [0, 1]
     text: TextRule | None = None  # None: no text tower in the space of the patches
     templates: str = "bare"  # the templates that suit it, by name in `prompts.TEMPLATES`
-    residual: bool = False  # whether it takes `residual=True`
     activation: str | None = None  # of files in OpenCLIP's layout that name none; None: that layout is not read
 
 
+_CLIP_MODEL, _SIGLIP_MODEL = {"clip": "CLIPModel"}, {"siglip": "SiglipModel"}
+_DINOV2_MODELS = {"dinov2": "Dinov2Model", "dinov2_with_registers": "Dinov2WithRegistersModel"}
+_LOWER, _MASKED = TextRule(lower=True, pad=True), TextRule(lower=True, pad=True, mask=True)
+
 TRANSFORMERS: dict[str, TeacherRow] = {
-    "clip": TeacherRow(
-        {"clip": ("CLIPModel", clip_patches)}, _CLIP, TextRule(), "clip7", residual=True, activation="quick_gelu"
-    ),
-    "openclip": TeacherRow(
-        {"clip": ("CLIPModel", clip_patches)}, _CLIP, TextRule(), "clip7", residual=True, activation="gelu"
-    ),
-    "siglip": TeacherRow({"siglip": ("SiglipModel", siglip_patches)}, _HALF, TextRule(lower=True, pad=True), "siglip"),
-    "siglip2": TeacherRow(  # those of fixed size are SigLIP models; the others are called NaFlex
-        {"siglip": ("SiglipModel", siglip_patches), "siglip2": ("Siglip2Model", naflex_patches)},
-        _HALF,
-        TextRule(lower=True, pad=True),
-        "siglip",
-    ),
-    "tipsv2": TeacherRow(
-        {"tipsv2": ("Tipsv2Model", tips_patches)},
-        _NONE,
-        TextRule(lower=True, pad=True, mask=True),
-        "tcl9",
-        residual=True,
-    ),
-    "dinov2": TeacherRow(
-        {
-            "dinov2": ("Dinov2Model", last_patches),
-            "dinov2_with_registers": ("Dinov2WithRegistersModel", last_patches),
-        },
-        _IMAGENET,
-    ),
-    "dinov3": TeacherRow({"dinov3_vit": ("DINOv3ViTModel", last_patches)}, _IMAGENET),
-    "radio": TeacherRow({"radio": ("RadioModel", radio_patches)}, _NONE),  # normalises inside
+    "clip": TeacherRow(_CLIP_MODEL, clip_patches, _CLIP, TextRule(), "clip7", activation="quick_gelu"),
+    "openclip": TeacherRow(_CLIP_MODEL, clip_patches, _CLIP, TextRule(), "clip7", activation="gelu"),
+    "siglip": TeacherRow(_SIGLIP_MODEL, siglip_patches, _HALF, _LOWER, "siglip"),
+    "siglip2": TeacherRow(_SIGLIP_MODEL, siglip_patches, _HALF, _LOWER, "siglip"),  # of fixed size (not NaFlex)
+    "tipsv2": TeacherRow({"tipsv2": "Tipsv2Model"}, last_patches, _NONE, _MASKED, "tcl9"),
+    "dinov2": TeacherRow(_DINOV2_MODELS, last_patches, _IMAGENET),
+    "dinov3": TeacherRow({"dinov3_vit": "DINOv3ViTModel"}, last_patches, _IMAGENET),
+    "radio": TeacherRow({"radio": "RadioModel"}, radio_patches, _NONE),  # normalises inside
 }

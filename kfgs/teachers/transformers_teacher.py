@@ -16,8 +16,9 @@ from .._check import check_choice, check_whole
 from .protocol import PROMPTS_AT_ONCE, check_picture, check_prompts
 from .tokenizer import clip_tokenizer
 from .transformers_openclip import find_openclip, load_openclip
-from .transformers_patches import Patches, patch_size
-from .transformers_source import find_source, load_model, load_tokenizer_of, read_config, weights_of
+from .transformers_package import explained, load_complete
+from .transformers_patches import patch_size
+from .transformers_source import find_source, load_tokenizer_of, read_config, weights_of
 from .transformers_table import TRANSFORMERS, TeacherRow
 
 _Tokenize = Callable[[list[str]], tuple[Tensor, Tensor]]  # n prompts -> ids [n, T], mask [n, T] (0: padding)
@@ -27,12 +28,7 @@ _TOKENIZER_FILES = ("tokenizer.json", "vocab.json", "tokenizer.model", "spiece.m
 
 
 def load_transformers_teacher(
-    kind: str,
-    source: str | Path,
-    *,
-    size: int | None = None,
-    residual: bool = False,
-    local_only: bool = False,
+    kind: str, source: str | Path, *, size: int | None = None, local_only: bool = False
 ) -> TransformersTeacher:
     """Load one of the teachers of the table `TRANSFORMERS`.
 
@@ -43,8 +39,6 @@ def load_transformers_teacher(
             programs: use `openai/clip-vit-base-patch16` on the hub, which has the same weights.
         size: resize the longer side of pictures to this number of pixels; None: do not resize. A map has one cell per
             patch, so larger pictures give finer maps.
-        residual: clip, openclip: keep the residual connection and the MLP of the last block in addition to its values (as in
-            MaskCLIP's code). tipsv2: the values of the last block instead of its attention, residual and MLP kept.
         local_only: use only the local cache for a hub id.
 
     Raises:
@@ -55,26 +49,28 @@ def load_transformers_teacher(
     row = TRANSFORMERS[kind]
     if size is not None:
         check_whole("size", size, 1)
-    if residual and not row.residual:
-        able = ", ".join(name for name, other in TRANSFORMERS.items() if other.residual)
-        raise ValueError(f"residual: expected False for teacher {kind!r}, got True; only {able} have that path")
     place = find_source(kind, source)
     openclip = find_openclip(kind, place, local_only=local_only) if row.activation is not None else None
     if openclip is not None:
-        model, model_type = load_openclip(kind, openclip, activation=str(row.activation)), "clip"
+        model = load_openclip(kind, openclip, activation=str(row.activation))
         commit = openclip.parent.name if isinstance(place, str) else None
     else:
-        model_type, commit = read_config(kind, place, local_only=local_only)
-        model = load_model(kind, place, model_type, commit, local_only=local_only)
+        name, commit = read_config(kind, place, local_only=local_only)
+        with explained(kind, place):
+            model = load_complete(name, place, place, **_from_hub(commit, local_only))
     weights = weights_of(openclip or place if isinstance(place, Path) else place, commit)
-    identity = {"name": kind, "options": {"size": size, "residual": bool(residual)}, "weights": weights}
+    identity = {"name": kind, "options": {"size": size}, "weights": weights}
     if isinstance(place, str):
         identity["source"] = place
-    tokenize = _tokenize_of(kind, place, commit, model, local_only=local_only) if row.text is not None else None
-    return TransformersTeacher(model, row, row.models[model_type][1], identity, tokenize)
+    tokenize = _tokenize_of(kind, place, _from_hub(commit, local_only), model) if row.text is not None else None
+    return TransformersTeacher(model, row, identity, tokenize)
 
 
-def _tokenize_of(kind: str, source: Path | str, commit: str | None, model: Any, *, local_only: bool) -> _Tokenize:
+def _from_hub(commit: str | None, local_only: bool) -> dict[str, Any]:
+    return {"local_files_only": local_only} | ({} if commit is None else {"revision": commit})
+
+
+def _tokenize_of(kind: str, source: Path | str, options: dict[str, Any], model: Any) -> _Tokenize:
     """The tokenizer next to the weights; if there is none and the kind uses CLIP's vocabulary, that of kfgs.
 
     It is read at the first prompt; without prompts it is not needed.
@@ -87,7 +83,7 @@ def _tokenize_of(kind: str, source: Path | str, commit: str | None, model: Any, 
     @cache
     def load() -> Any:
         if isinstance(folder, str) or any((folder / name).is_file() for name in _TOKENIZER_FILES):
-            return load_tokenizer_of(kind, folder, commit, local_only=local_only)
+            return load_tokenizer_of(kind, folder, **options)
         if row.activation is not None and words.vocab_size == _CLIP_VOCABULARY:
             return clip_tokenizer()
         raise ValueError(
@@ -126,17 +122,14 @@ class TransformersTeacher:
         templates: the name of its prompt templates.
     """
 
-    def __init__(
-        self, model: Any, row: TeacherRow, patches: Patches, identity: dict[str, Any], tokenize: _Tokenize | None
-    ) -> None:
+    def __init__(self, model: Any, row: TeacherRow, identity: dict[str, Any], tokenize: _Tokenize | None) -> None:
         self.model, self.row, self.identity = model, row, identity
         self.name: str = identity["name"]
-        self.templates = row.templates
-        self._patches, self._tokenize = patches, tokenize
+        self.templates, self._tokenize = row.templates, tokenize
 
     def __repr__(self) -> str:
-        options = ", ".join(f"{name}={value}" for name, value in self.identity["options"].items())
-        return f"TransformersTeacher({self.name!r}, {options}, device={next(self.model.parameters()).device})"
+        size, device = self.identity["options"]["size"], next(self.model.parameters()).device
+        return f"TransformersTeacher({self.name!r}, size={size}, device={device})"
 
     def to(self, device: torch.device | str) -> TransformersTeacher:
         """Move the model to a device; features are computed and returned there."""
@@ -157,7 +150,7 @@ class TransformersTeacher:
             torch.tensor(values, device=weight.device, dtype=weight.dtype) for values in self.row.normalisation
         )
         pixels = normalize_picture(pixels, mean, std)
-        tokens = self._patches(self.model, pixels, self.identity["options"]["residual"])  # [1, h*w, D]
+        tokens = self.row.patches(self.model, pixels)  # [1, h*w, D]
         return tokens[0].T.reshape(-1, height // ph, width // pw).float().contiguous()
 
     @torch.inference_mode()

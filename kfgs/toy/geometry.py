@@ -5,6 +5,7 @@ Everything is numpy float64 in world units (metres). The solids are the furnitur
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -58,17 +59,11 @@ def intersect(solid: Solid, origin: Array, directions: Array) -> Array:  # [3], 
         root = b * b - a * c
         t = (-b - np.sqrt(np.maximum(root, 0.0))) / a
         return np.where((root > 0) & (t > NEAR), t, np.inf)
-    enter = np.full(d.shape[:-1], -np.inf)
-    leave = np.full(d.shape[:-1], np.inf)
+    enter, leave = np.full(d.shape[:-1], -np.inf), np.full(d.shape[:-1], np.inf)
     for axis in range(3):
-        inverse = np.array(d[..., axis])
-        np.copyto(inverse, 1e-12, where=np.abs(inverse) < 1e-12)
-        np.divide(1.0, inverse, out=inverse)
-        middle = inverse * -o[axis]
-        reach = np.abs(inverse, out=inverse)
-        reach *= solid.half[axis]
-        np.maximum(enter, middle - reach, out=enter)
-        np.minimum(leave, np.add(middle, reach, out=middle), out=leave)
+        inverse = 1.0 / np.where(np.abs(d[..., axis]) < 1e-12, 1e-12, d[..., axis])
+        middle, reach = inverse * -o[axis], np.abs(inverse) * solid.half[axis]
+        enter, leave = np.maximum(enter, middle - reach), np.minimum(leave, middle + reach)
     return np.where((enter <= leave) & (enter > NEAR), enter, np.inf)
 
 
@@ -80,10 +75,8 @@ def normals(solid: Solid, points: Array) -> Array:  # [N, 3] -> [N, 3]
         n = local / half**2
         n /= np.linalg.norm(n, axis=-1, keepdims=True)
     else:
-        axis = np.argmax(np.abs(local) - half, axis=-1)
-        n = np.zeros_like(local)
-        rows = np.arange(len(local))
-        n[rows, axis] = np.sign(local[rows, axis])
+        face = np.arange(3) == np.argmax(np.abs(local) - half, axis=-1)[:, None]
+        n = np.where(face, np.sign(local), 0.0)
     return n @ solid.rotation().T
 
 
@@ -106,14 +99,14 @@ def project(camera: Camera, points: Array) -> tuple[Array, Array]:  # [N, 3] -> 
 
 def _window(solid: Solid, camera: Camera) -> tuple[slice, slice]:
     """The rows and columns that the solid can touch; the whole image if it reaches behind the camera."""
-    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], float)
-    corners = signs * np.array(solid.half) @ solid.rotation().T + np.array(solid.center)
-    xy, z = project(camera, corners)
+    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    xy, z = project(camera, signs * np.array(solid.half) @ solid.rotation().T + np.array(solid.center))
     if z.min() < NEAR:
         return slice(0, camera.height), slice(0, camera.width)
-    (x0, y0), (x1, y1) = xy.min(0) - 1, xy.max(0) + 1
-    rows = slice(int(np.clip(y0, 0, camera.height)), int(np.clip(y1 + 1, 0, camera.height)))
-    return rows, slice(int(np.clip(x0, 0, camera.width)), int(np.clip(x1 + 1, 0, camera.width)))
+    (x0, y0), (x1, y1) = (
+        np.clip(ends, 0, [camera.width, camera.height]).astype(int) for ends in (xy.min(0) - 1, xy.max(0) + 2)
+    )
+    return slice(y0, y1), slice(x0, x1)
 
 
 def cast(solids: Sequence[Solid], camera: Camera) -> tuple[Array, NDArray[np.int64]]:  # [H, W], [H, W]

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .geometry import Array, Solid
+from .room import ROOM
 
 
 def _dot(a: Array, b: Array) -> Array:  # [N, 3], [N, 3] -> [N]
@@ -35,10 +36,7 @@ GLOWS = (  # the two lamps of the room; they cast no shadows
     Lamp((2.42, 1.9, 1.5), 0.3, (1.10, 0.76, 0.40), 0.8),
     Lamp((-2.76, 0.55, 1.22), 0.2, (0.85, 0.58, 0.30), 0.6),
 )
-SKY, GROUND = (
-    (0.30, 0.305, 0.315),
-    (0.34, 0.32, 0.29),
-)  # what comes from everywhere: from above, and back from the floor
+SKY, GROUND = (0.30, 0.305, 0.315), (0.34, 0.32, 0.29)  # what comes from everywhere: from above, and from the floor
 NEAR = 0.22  # metres: how far a piece of furniture takes light from its surroundings
 CORNER = 0.45  # metres: the same for walls, floor and ceiling
 SHELL = ("wall", "floor", "ceiling")
@@ -66,13 +64,12 @@ def _to_surface(solid: Solid, local: Array) -> tuple[Array, Array]:  # [N, 3] ->
 
 
 def openness(
-    solids: Sequence[Solid], points: Array, outward: Array, which: NDArray[np.int64], room: tuple[float, float, float]
+    solids: Sequence[Solid], points: Array, outward: Array, which: NDArray[np.int64]
 ) -> Array:  # [N, 3], [N, 3], [N] -> [N] in [0, 1]
     """The share of the surroundings' light that reaches each place: less in corners, below and beside furniture."""
-    low, high = np.array([-room[0] / 2, -room[1] / 2, 0.0]), np.array([room[0] / 2, room[1] / 2, room[2]])
     left = np.ones(len(points))
-    for axis in range(3):
-        for side, distance in ((-1.0, points[:, axis] - low[axis]), (1.0, high[axis] - points[:, axis])):
+    for axis, (low, high) in enumerate(((-ROOM[0] / 2, ROOM[0] / 2), (-ROOM[1] / 2, ROOM[1] / 2), (0.0, ROOM[2]))):
+        for side, distance in ((-1.0, points[:, axis] - low), (1.0, high - points[:, axis])):
             facing = np.maximum(1.0 + side * outward[:, axis], 0.0) * (np.abs(outward[:, axis]) < 0.999)
             left *= 1.0 - 0.34 * facing * np.exp(-np.maximum(distance, 0.0) / CORNER)
     for i, solid in enumerate(solids):

@@ -9,13 +9,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from .._card import short_repr
 from ..cameras.camera import Camera
 from .geometry import Array, Solid, cast, normals, pixel_rays
 from .light import lamps_seen, light, openness
 from .noise import Noise
 from .patterns import evaluate
-from .room import CLASSES, ROOM
+from .room import CLASSES
 
 _SPLIT = 2  # colour samples per pixel and axis
 _EXPOSURE = 1.4
@@ -27,9 +26,6 @@ class View(NamedTuple):
     image: NDArray[np.uint8]  # [H, W, 3]
     depth: Array  # [H, W] z-depth at the pixel's centre, metres
     labels: NDArray[np.uint8]  # [H, W] class index
-
-    def __repr__(self) -> str:
-        return short_repr(self)
 
 
 def _look_at(position: Array, target: Array, roll: float) -> Array:  # [4, 4] world to camera
@@ -92,9 +88,11 @@ def surface_color(
         solid, p = solids[i], points[rows]
         n = normals(solid, p)
         axis = np.argmax(np.abs(n @ solid.rotation()), axis=-1)
-        skin, half, is_round = solid.texture, np.array(solid.half), solid.shape == "ellipsoid"
-        own = evaluate(skin, noise, solid.to_local(p), axis, half, footprint[rows], is_round=is_round)
-        bright = light(p, n, lit[rows, :-1], lit[rows, -1]) + skin.glow
+        is_round = solid.shape == "ellipsoid"
+        own = evaluate(
+            solid.texture, noise, solid.to_local(p), axis, np.array(solid.half), footprint[rows], is_round=is_round
+        )
+        bright = light(p, n, lit[rows, :-1], lit[rows, -1]) + solid.texture.glow
         color[rows] = np.square(np.clip(own, 0.0, 1.0)) * bright  # light multiplies linear values, about squares
     return np.sqrt(-np.expm1(-_EXPOSURE * color))  # bright places turn white slowly, as on film
 
@@ -106,17 +104,14 @@ def light_reaches(
     outward = np.zeros_like(points)
     for i in np.unique(which):
         outward[which == i] = normals(solids[i], points[which == i])
-    opened = openness(solids, points, outward, which, ROOM)
+    opened = openness(solids, points, outward, which)
     return np.column_stack([lamps_seen(solids, points, outward, which), opened])
 
 
 def render(solids: Sequence[Solid], noise: Noise, camera: Camera) -> View:
     """Render one view: depth and labels at pixel centres, colour averaged over 2 x 2 samples per pixel."""
     depth, index = cast(solids, camera)
-    if not np.isfinite(depth).all():
-        raise AssertionError(
-            f"{camera.name}: a ray leaves the room {ROOM}"
-        )  # the room is closed, so this is a bug of kfgs
+    assert np.isfinite(depth).all(), "the room is closed"
     origin, rays = pixel_rays(camera)
     lit = light_reaches(solids, (origin + rays * depth[..., None]).reshape(-1, 3), index.ravel())
     lit = lit.reshape(*camera.size, -1)

@@ -11,20 +11,8 @@ from .geometry import Solid
 from .patterns import Texture
 
 CLASSES = (
-    "wall",
-    "floor",
-    "ceiling",
-    "rug",
-    "table",
-    "chair",
-    "sofa",
-    "cushion",
-    "cabinet",
-    "plant",
-    "lamp",
-    "picture",
-    "door",
-)
+    "wall", "floor", "ceiling", "rug", "table", "chair", "sofa", "cushion", "cabinet", "plant", "lamp", "picture", "door",
+)  # fmt: skip
 GROUPS = (  # classes whose embeddings lie closer together
     ("wall", "ceiling", "floor", "door", "rug"),
     ("chair", "sofa", "cushion", "rug"),
@@ -50,10 +38,6 @@ def build_room(seed: int) -> list[Solid]:
         colors = tuple((float(r), float(g), float(b)) for r, g, b in hues)
         for shape, (x, y, z), half in piece["parts"]:
             skin = Texture(**{**piece["texture"], "colors": colors, "seed": int(rng.integers(2**31))})
-            center = (
-                float(at_x + np.cos(a) * x - np.sin(a) * y),
-                float(at_y + np.sin(a) * x + np.cos(a) * y),
-                at_z + z,
-            )
-            solids.append(Solid(shape, center, tuple(half), float(a), piece["label"], skin))
+            right, back = float(at_x + np.cos(a) * x - np.sin(a) * y), float(at_y + np.sin(a) * x + np.cos(a) * y)
+            solids.append(Solid(shape, (right, back, at_z + z), tuple(half), float(a), piece["label"], skin))
     return solids

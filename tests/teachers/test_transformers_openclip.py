@@ -1,7 +1,6 @@
 """CLIP in OpenCLIP's layout, against a small CLIP written with OpenCLIP's structure."""
 
 import json
-import zipfile
 
 import pytest
 import torch
@@ -96,7 +95,7 @@ def test_hub_repository_in_openclip_layout(clip, tmp_path, monkeypatch, bin):
     teacher = load_transformers_teacher("openclip", "owner/tiny-clip", local_only=True)
     assert teacher.identity == {
         "name": "openclip",
-        "options": {"size": None, "residual": False},
+        "options": {"size": None},
         "weights": f"commit {commit}",
         "source": "owner/tiny-clip",
     }
@@ -125,14 +124,3 @@ def test_other_models_are_named(tmp_path, key):
     words = ("open_clip_pytorch_model.bin:", "OpenCLIP", key, "'visual.conv1.weight'", "save_pretrained")
     with pytest.raises(ValueError, match=tells(*words)):
         load_transformers_teacher("openclip", folder)
-
-
-def test_torchscript_of_openai_is_refused_with_what_to_use(tmp_path):
-    file = tmp_path / "ViT-B-16.pt"
-    with zipfile.ZipFile(file, "w") as archive:  # what torch.jit.save writes, without its deprecation warning
-        archive.writestr("ViT-B-16/constants.pkl", b"\x80\x02).")
-        archive.writestr("ViT-B-16/data.pkl", b"\x80\x02}.")
-        archive.writestr("ViT-B-16/code/__torch__/multimodal/model.py", "class Multimodal(Module): ...")
-    words = ("TorchScript", "OpenAI", "openai/clip-vit-base-patch16")
-    with pytest.raises(ValueError, match=tells(*words)):
-        load_transformers_teacher("clip", file)

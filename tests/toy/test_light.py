@@ -7,7 +7,6 @@ from kfgs.toy.patterns import Texture
 
 SKIN = Texture("plaster", ((0.5, 0.5, 0.5), (0.6, 0.6, 0.6)))
 LAMP = LAMPS[0]
-ROOM = (6.0, 5.0, 2.9)
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -66,8 +65,8 @@ def test_no_solid_shades_itself_and_walls_cast_no_shadow():
 def test_corners_and_places_beside_furniture_are_less_open(shape):
     solid = piece(shape, z=0.3, half=(0.3, 0.3, 0.3))
     points = on_floor([0.31, 0.5, 2.0])
-    opened = openness([solid], points, np.broadcast_to(UP, points.shape), np.full(3, -1), ROOM)
+    opened = openness([solid], points, np.broadcast_to(UP, points.shape), np.full(3, -1))
     assert opened[0] < opened[1] < opened[2]
     corner = np.array([[-2.9, -2.4, 0.0], [0.0, 0.0, 0.0]])
-    dark, light = openness([], corner, np.broadcast_to(UP, corner.shape), np.full(2, -1), ROOM)
+    dark, light = openness([], corner, np.broadcast_to(UP, corner.shape), np.full(2, -1))
     assert dark < 0.8 < light <= 1.0

@@ -105,16 +105,11 @@ class LSeg(nn.Module):
         self.eval()
 
     def __repr__(self) -> str:
-        return f"LSeg({self.options}, device={self.device})"
+        return f"LSeg({self.options}, device={self._device()})"
 
     def train(self, mode: bool = True) -> LSeg:
         """Stay in evaluation mode: a teacher is not trained, and its normalisation must not follow the pictures."""
         return super().train(False)
-
-    @property
-    def device(self) -> torch.device:
-        """The device of the network."""
-        return next(self.network.parameters()).device
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -133,7 +128,7 @@ class LSeg(nn.Module):
         check_picture(image)
         window = self.network.config.window
         size = self.options.map_size(image.shape[1], image.shape[2], window=window)
-        picture = image.to(self.device, torch.float32) * 2 - 1
+        picture = image.to(self._device(), torch.float32) * 2 - 1
         if size != tuple(image.shape[1:]):
             picture = functional.interpolate(picture[None], size=size, mode="bilinear", align_corners=True)[0]
         return multi_scale_features(
@@ -154,10 +149,13 @@ class LSeg(nn.Module):
                 raise NotImplementedError(
                     "teacher 'lseg': expected one with a text tower, got one made without; load it with load_lseg"
                 )
-            self.text = self._load_text().to(self.device).eval()
-        ids = tokenize(prompts, self.network.config.context).to(self.device)
+            self.text = self._load_text().to(self._device()).eval()
+        ids = tokenize(prompts, self.network.config.context).to(self._device())
         rows = torch.cat([self.text(input_ids=part).text_embeds for part in ids.split(PROMPTS_AT_ONCE)])
         return functional.normalize(rows.float(), dim=1)
+
+    def _device(self) -> torch.device:
+        return next(self.network.parameters()).device
 
     def _head(self, x: Tensor) -> Tensor:  # [1, 3, S, S] -> [1, D, S/2, S/2] float32
         with torch.autocast(x.device.type, torch.bfloat16, enabled=self.options.precision == "bfloat16"):
@@ -182,10 +180,7 @@ def load_lseg(
     Args:
         weights: the checkpoint, or its tensors in a .pt or .safetensors file.
         fast: one run of the network per picture (`LSegOptions.fast`) instead of the paper's 26.
-        size: see `LSegOptions.size`.
-        scales: see `LSegOptions.scales`; None: the paper's, or those of `fast`.
-        flip: see `LSegOptions.flip`; None: True, or False if `fast`.
-        precision: see `LSegOptions.precision`.
+        size, scales, flip, precision: see `LSegOptions`; None: the paper's, or those of `fast`.
         config: sizes of the network, LSeg's own if None.
 
     Raises:

@@ -117,7 +117,7 @@ def test_teacher_protocol_device_and_module() -> None:
     assert isinstance(teacher, Teacher)
     assert teacher.name == "lseg"
     assert teacher.to("cpu") is teacher
-    assert teacher.device == torch.device("cpu")
+    assert teacher.encode_image(picture(8, 8)).device == torch.device("cpu")
     assert not teacher.training
     torch.nn.Sequential(teacher).train()  # as part of something that is trained
     assert not any(part.training for part in teacher.modules())
