@@ -70,7 +70,9 @@ class Commands(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         """Make the sections."""
-        return [self._section(title, [self._command(one) for one in group]) for title, group in cli.GROUPS.items()]
+        return [
+            self._section(title, [self._command(command) for command in group]) for title, group in cli.GROUPS.items()
+        ]
 
     def _command(self, command: Any) -> nodes.section:
         inside = nodes.Element()

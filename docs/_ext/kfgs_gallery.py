@@ -25,19 +25,19 @@ No executed notebook lies in `notebooks/` of this checkout. `python notebooks/ru
 def bring(notebooks: Path, pages: Path) -> list[str]:
     """Copy the notebooks to where Sphinx reads, write the list of them, and return their names."""
     paths = sorted(notebooks.glob("[0-9]*_*.ipynb"), key=lambda path: int(path.name.split("_")[0]))
-    found = {path.name: path.read_bytes() for path in paths}
+    files = {path.name: path.read_bytes() for path in paths}
     cards = []
     for path in paths:
-        card, picture = _card(path.stem, json.loads(found[path.name]))
+        card, picture = _card(path.stem, json.loads(files[path.name]))
         cards.append(card)
-        found |= picture
+        files |= picture
     for old in [*pages.glob("*.ipynb"), *pages.glob("card_*")]:
-        if old.name not in found:
+        if old.name not in files:
             old.unlink()
     names = [path.stem for path in paths]
     hidden = "```{toctree}\n:hidden:\n\n" + "\n".join(names) + "\n```\n"
     listed = "::::{grid} 1 2 2 3\n:gutter: 3\n\n" + "\n".join(cards) + "::::\n\n" + hidden if names else NONE
-    for name, content in {**found, "list.inc": listed.encode()}.items():
+    for name, content in {**files, "list.inc": listed.encode()}.items():
         if not (pages / name).is_file() or (pages / name).read_bytes() != content:  # else Sphinx reads it again
             (pages / name).write_bytes(content)
     return names
@@ -47,7 +47,7 @@ def _card(name: str, notebook: dict[str, Any]) -> tuple[str, dict[str, bytes]]:
     """A card as Markdown, and its picture as a file; no file if the notebook shows no picture."""
     texts = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "markdown"]
     title = next((line[2:] for text in texts for line in text.splitlines() if line.startswith("# ")), name)
-    question = next((found[1] for text in texts if (found := re.search(r"\*\*(.+?)\*\*", text, re.DOTALL))), "")
+    question = next((match[1] for text in texts if (match := re.search(r"\*\*(.+?)\*\*", text, re.DOTALL))), "")
     shown = [
         (cell["metadata"].get("tags", []), f"card_{name}{SUFFIXES[kind]}", data[kind])
         for cell in notebook["cells"]
@@ -55,7 +55,7 @@ def _card(name: str, notebook: dict[str, Any]) -> tuple[str, dict[str, bytes]]:
         for kind in SUFFIXES
         if kind in data
     ]
-    chosen = [one for one in shown if "thumbnail" in one[0]] or shown
+    chosen = [picture for picture in shown if "thumbnail" in picture[0]] or shown
     lines = [f":::{{grid-item-card}} {title}", f":link: {name}", ":link-type: doc"]
     picture = {chosen[-1][1]: base64.b64decode("".join(chosen[-1][2]))} if chosen else {}
     lines += [f":img-top: {file}\n:img-alt: {title}" for file in picture]

@@ -39,21 +39,23 @@ def shapes_of(function: Any) -> list[str]:
     arguments = [*tree.args.posonlyargs, *tree.args.args, *tree.args.kwonlyargs]
     end = tree.returns.end_lineno if tree.returns else None
     gives = ast.unparse(tree.returns) if tree.returns else ""
-    told = []
+    shapes = []
     for number, text in lines.items():
-        names = [one.arg for one in arguments if one.lineno == number and one.arg not in ("self", "cls")]
+        names = [
+            argument.arg for argument in arguments if argument.lineno == number and argument.arg not in ("self", "cls")
+        ]
         named = re.match(r"(\w+): (.*)", text)
         if text.startswith(("noqa", "type:")):
             continue
         if named:  # "points: [N, 3]"
-            told.append(f"``{named[1]}`` {named[2]}")
+            shapes.append(f"``{named[1]}`` {named[2]}")
         elif number == end and "->" in text:  # "[N, 3] -> [N] bool", of all that is on the line
-            told.append(re.sub(r"^->", "returns", text))
+            shapes.append(re.sub(r"^->", "returns", text))
         elif number == end and (not names or re.search("Tensor|Array|ndarray", gives)):
-            told.append(f"returns {text}")
+            shapes.append(f"returns {text}")
         elif len(names) == 1:
-            told.append(f"``{names[0]}`` {text}")
-    return told
+            shapes.append(f"``{names[0]}`` {text}")
+    return shapes
 
 
 @functools.cache  # autodoc asks for a module's comments thousands of times
@@ -66,13 +68,13 @@ def comments_of(source: str) -> dict[tuple[str, str], str]:
         for field in kind.body
         if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
     }
-    found = {}
+    comments = {}
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT and token.start[0] in fields:
             text = re.sub(r"^(type: ignore\S*|noqa\S*( \S+)?) *#? *", "", token.string.lstrip("# "))
             if text:
-                found[fields[token.start[0]]] = text
-    return found
+                comments[fields[token.start[0]]] = text
+    return comments
 
 
 read_source = ModuleAnalyzer.analyze
@@ -90,7 +92,7 @@ def add_shapes(app: Sphinx, what: str, name: str, thing: Any, options: Any, line
     for number, line in enumerate(lines):
         if not line.lstrip().startswith((">>>", "...")):
             line = re.sub(r"(?<!`)`(~[^`]*)`(?!`)", r"``\1``", line)
-            lines[number] = re.sub(r"(`[^`]*`)|\|", lambda found: found[1] or r"\|", line)
+            lines[number] = re.sub(r"(`[^`]*`)|\|", lambda match: match[1] or r"\|", line)
     if what == "attribute" or (what == "property" and "" not in lines[:-1]):  # a property may have sections
         plain[name] = list(lines)
     if what not in ("function", "method"):

@@ -1,5 +1,6 @@
 """Benchmarks that print tables: one small run of each."""
 
+import ast
 import importlib
 import json
 import re
@@ -17,6 +18,17 @@ from kfgs.scenes import load_scene
 
 ROOT = Path(__file__).resolve().parents[2]
 BENCHMARKS = ROOT / "benchmarks"
+
+
+@pytest.mark.parametrize("folder", ["benchmarks", "docs"])
+def test_what_they_import_from_kfgs_exists(folder):
+    for path in (ROOT / folder).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "kfgs":
+                module = importlib.import_module(node.module)
+                for alias in node.names:
+                    if not hasattr(module, alias.name):
+                        importlib.import_module(f"{node.module}.{alias.name}")
 
 
 def start(monkeypatch, name, *words):
