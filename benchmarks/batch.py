@@ -30,7 +30,9 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
 from small_batch import results
 
 from kfgs._files import digest_file, write_json
-from kfgs.batch import BatchOptions, SceneEntry, describe_batch, open_client, run_batch
+from kfgs.batch import BatchOptions, open_client, run_batch
+from kfgs.batch.run import describe_batch
+from kfgs.batch.scene_list import SceneEntry
 from kfgs.pipeline import ColorConfig, Uplift
 from kfgs.teachers import Teacher
 from kfgs.toy.room_folder import ToyConfig, make_toy_room

@@ -22,7 +22,8 @@ from kfgs._check import ORIGIN
 from kfgs._files import as_path, read_json
 from kfgs._origin import recounted
 from kfgs.cameras import Camera
-from kfgs.evaluation import find_points, load_label_map
+from kfgs.evaluation import find_points
+from kfgs.evaluation.label_pictures import load_label_map
 from kfgs.gaussians import Gaussians
 from kfgs.scenes import Scene, load_scene
 from kfgs.splat import rasterize

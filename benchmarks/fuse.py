@@ -24,7 +24,7 @@ from devices import add_device, device_name, wait
 
 from kfgs import FeatureFolder, Gaussians, SemanticField, Uplift, fit, load_label_set, load_scene, read_splats
 from kfgs._files import write_json
-from kfgs.evaluation import load_label_map
+from kfgs.evaluation.label_pictures import load_label_map
 from kfgs.fields import UpliftConfig, uplift_maps
 from kfgs.pipeline import score_scene, score_teacher, true_labels
 from kfgs.pipeline.maps import maps_of_views

@@ -25,7 +25,8 @@ from published.side_by_side import table_text, write_pictures
 
 from kfgs import load_label_set
 from kfgs._files import write_json
-from kfgs.evaluation import Report, TeacherAgreement, get_protocol
+from kfgs.evaluation import Report, get_protocol
+from kfgs.evaluation.teacher_agreement import TeacherAgreement
 from kfgs.evaluation.texts import as_encoder
 from kfgs.pipeline import Question, evaluate, open_question
 from kfgs.pipeline.evaluate import open_result

@@ -37,7 +37,8 @@ from torch.nn.functional import cross_entropy, linear, normalize
 
 from kfgs._files import atomic_folder, atomic_path, digest_file
 from kfgs.cameras.resample import resize_labels
-from kfgs.evaluation import SegmentationReport, load_label_map
+from kfgs.evaluation.label_pictures import load_label_map
+from kfgs.evaluation.segmentation import SegmentationReport
 from kfgs.labels import LabelSet, classify, load_label_set
 from kfgs.pipeline import score_teacher, true_labels
 from kfgs.scenes import FeatureFolder, Scene, extract_features, load_scene, read_image

@@ -10,7 +10,7 @@ import numpy as np
 from table1_rows import ROWS, fitting_seconds
 
 from kfgs._files import atomic_path, write_json
-from kfgs.evaluation import load_label_map
+from kfgs.evaluation.label_pictures import load_label_map
 from kfgs.labels import load_label_set
 from kfgs.metrics import MIB
 from kfgs.scenes import load_scene

@@ -104,7 +104,8 @@ def _measured(do: Any, args: tuple[Any, ...]) -> dict[str, Any]:
 
 def _print(name: str, field: Any, scene: Any, town: Path, blocks: Any, facts: dict[str, Any]) -> None:
     """One row: scores of a field."""
-    from kfgs.evaluation import evaluate_segmentation, find_points, score_surface
+    from kfgs.evaluation import evaluate_segmentation, find_points
+    from kfgs.evaluation.surface import score_surface
     from kfgs.labels import load_label_set
     from kfgs.pipeline import true_labels
 

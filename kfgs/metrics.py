@@ -18,7 +18,7 @@ from ._check import as_tensor, check_range, check_shapes
 from ._rows import unit_rows
 from .cameras.resample import to_bchw
 
-__all__ = ["MIB", "ConfusionMatrix", "Score", "feature_cosine", "psnr", "semantic_storage_bytes", "ssim"]
+__all__ = ["ConfusionMatrix", "feature_cosine", "psnr", "semantic_storage_bytes", "ssim"]
 
 MIB = 2**20
 """Bytes in the "MB" of Table 1."""

@@ -10,7 +10,9 @@ from small_room import fit_run, make_room
 
 from kfgs import SemanticField, load_scene
 from kfgs.cli import main
-from kfgs.evaluation import FieldMethod, KfgsPooled, LabelTruth, View, load_label_map
+from kfgs.evaluation import FieldMethod, LabelTruth, View
+from kfgs.evaluation.label_pictures import load_label_map
+from kfgs.evaluation.protocols import KfgsPooled
 from kfgs.labels import load_label_set
 from kfgs.pipeline import evaluate, open_question
 

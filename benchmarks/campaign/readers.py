@@ -31,7 +31,8 @@ def _points(path: Path) -> None:
 
 
 def _labels(path: Path) -> None:
-    from kfgs.evaluation import find_labels, load_label_map
+    from kfgs.evaluation import find_labels
+    from kfgs.evaluation.label_pictures import load_label_map
 
     maps = find_labels(path).maps
     for stem in maps:
@@ -55,7 +56,7 @@ def _picture(path: Path) -> None:
 
 
 def _label_map(path: Path) -> None:
-    from kfgs.evaluation import load_label_map
+    from kfgs.evaluation.label_pictures import load_label_map
 
     load_label_map(path)
 

@@ -5,7 +5,7 @@
 
 from typing import Any
 
-from kfgs.evaluation import PROTOCOLS as OWN
+from kfgs.evaluation.protocols import PROTOCOLS as OWN
 
 from .legaussians_masks import LEGaussiansMasks
 from .lerf_2d import LerfOvs2D

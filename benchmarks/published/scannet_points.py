@@ -11,12 +11,11 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from kfgs._check import check_choice, check_range
-from kfgs.evaluation import PointTruth
 from kfgs.evaluation.method import Method, View, best_labels, check_level
 from kfgs.evaluation.report import Report, Row, make_report, mean
 from kfgs.evaluation.scannet import nyu40_names
 from kfgs.evaluation.texts import Encode, encode_unit
-from kfgs.evaluation.truth import name_key
+from kfgs.evaluation.truth import PointTruth, name_key
 from kfgs.gaussians import Gaussians
 from kfgs.scenes.files import some
 

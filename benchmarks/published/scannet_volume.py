@@ -13,10 +13,10 @@ from torch import Tensor
 
 from kfgs._check import ORIGIN, check_choice, check_range, check_whole
 from kfgs._origin import recounted
-from kfgs.evaluation import PointTruth
 from kfgs.evaluation.method import Method, View
 from kfgs.evaluation.report import Report
 from kfgs.evaluation.texts import Encode
+from kfgs.evaluation.truth import PointTruth
 from kfgs.gaussians import Gaussians
 
 from .scannet_points import (

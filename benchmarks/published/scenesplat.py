@@ -14,11 +14,10 @@ from torch import Tensor
 
 from kfgs._check import ORIGIN, check_choice, check_whole
 from kfgs._origin import recounted
-from kfgs.evaluation import PointTruth
 from kfgs.evaluation.method import Method, View, best_labels, check_level
 from kfgs.evaluation.report import Report, Row, make_report, mean
 from kfgs.evaluation.texts import Encode, encode_unit
-from kfgs.evaluation.truth import VOID_NAMES, name_key
+from kfgs.evaluation.truth import VOID_NAMES, PointTruth, name_key
 from kfgs.metrics import ConfusionMatrix
 from kfgs.scenes import Scene
 from kfgs.scenes.files import some

@@ -2,18 +2,8 @@
 
 from .blocks import fit_blocks, join_blocks
 from .clients import open_client
-from .run import SceneResult, describe_batch, run_batch
-from .scene_list import SceneEntry, read_scenes
+from .run import run_batch
+from .scene_list import read_scenes
 from .scene_task import BatchOptions
 
-__all__ = [
-    "BatchOptions",
-    "SceneEntry",
-    "SceneResult",
-    "describe_batch",
-    "fit_blocks",
-    "join_blocks",
-    "open_client",
-    "read_scenes",
-    "run_batch",
-]
+__all__ = ["BatchOptions", "fit_blocks", "join_blocks", "open_client", "read_scenes", "run_batch"]

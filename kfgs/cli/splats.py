@@ -225,7 +225,7 @@ def convert(
             a file next to it, which kfgs finds again.
         by_class: TARGET is a folder that receives one plain .ply for each class, 05_chair.ply for class 5.
     """
-    from ..batch import describe_batch
+    from ..batch.run import describe_batch
     from ..formats import write_splats
     from ..pipeline import describe, save_labelled
 

@@ -9,7 +9,8 @@ from typing import Any
 from .._check import ORIGIN
 from .._files import check_output, write_json
 from .._origin import recounted
-from ..evaluation import Report, find_points, score_surface, score_views
+from ..evaluation import Report, find_points, score_views
+from ..evaluation.surface import score_surface
 from ..fields import SemanticField
 from ..fields.store import NAME
 from ..formats import write_splats

@@ -15,8 +15,10 @@ import torch
 
 from .._card import short_repr
 from .._files import as_path, file_stem
-from ..evaluation import FieldMethod, Labeller, Method, Report, TeacherAgreement, TeacherMethod, View
+from ..evaluation import FieldMethod, Method, Report, TeacherMethod, View
+from ..evaluation.method import Labeller
 from ..evaluation.protocols import get_protocol
+from ..evaluation.teacher_agreement import TeacherAgreement
 from ..evaluation.texts import Encode, as_encoder
 from ..evaluation.truth import ReadWhenAsked
 from ..fields import SemanticField
@@ -34,7 +36,7 @@ LabelRule = Literal["own", "nearest"]
 class Question(NamedTuple):
     """What a method is asked: the same for every method that is compared."""
 
-    protocol: Any  # of `kfgs.evaluation.PROTOCOLS`, or an object with the same members
+    protocol: Any  # of `kfgs.evaluation.protocols.PROTOCOLS`, or an object with the same members
     scene: Scene  # without distortion
     truth: Any  # what the protocol compares with
     views: Sequence[View]  # none if points are scored
@@ -60,7 +62,7 @@ def open_question(
 
     Args:
         scene: its folder.
-        protocol: a name of `kfgs.evaluation.PROTOCOLS`, or a protocol.
+        protocol: a name of `kfgs.evaluation.protocols.PROTOCOLS`, or a protocol.
         truth: where the ground truth is, if not in the scene's folder (`find_labels`, `find_points`). For
             `feature3dgs-teacher/1` the folder of the teacher's maps; None: `features/` in the scene.
         split: which views. None depends on the protocol: the test views, or all views with labels if no test view has

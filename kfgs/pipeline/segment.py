@@ -15,10 +15,10 @@ from .._check import check_range
 from .._files import Names, as_path, atomic_path, check_output, file_stem
 from ..cameras import Camera
 from ..cameras.resample import resize_labels
-from ..evaluation import SegmentationReport, evaluate_segmentation, load_label_map
+from ..evaluation import evaluate_segmentation
 from ..evaluation.coco import save_coco
-from ..evaluation.label_pictures import VOID
-from ..evaluation.segmentation import check_truth
+from ..evaluation.label_pictures import VOID, load_label_map
+from ..evaluation.segmentation import SegmentationReport, check_truth
 from ..evaluation.views import labels_of_view
 from ..fields import SemanticField
 from ..labels import LabelSet, classify

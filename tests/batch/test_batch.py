@@ -16,7 +16,9 @@ from messages import tells
 from small_batch import OPTIONS, make_rooms, one_process, results
 
 from kfgs._files import read_json
-from kfgs.batch import BatchOptions, SceneEntry, describe_batch, open_client, run_batch
+from kfgs.batch import BatchOptions, open_client, run_batch
+from kfgs.batch.run import describe_batch
+from kfgs.batch.scene_list import SceneEntry
 from kfgs.cli import main
 from kfgs.scenes import SceneError, load_scene
 from kfgs.scenes.sfm import SfmReport

@@ -3,7 +3,8 @@
 import pytest
 from messages import tells
 
-from kfgs.batch import SceneEntry, read_scenes
+from kfgs.batch import read_scenes
+from kfgs.batch.scene_list import SceneEntry
 
 
 @pytest.fixture

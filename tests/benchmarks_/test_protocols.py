@@ -11,7 +11,7 @@ from PIL import Image
 from small_room import make_room
 
 from kfgs import load_scene
-from kfgs.evaluation import load_label_map
+from kfgs.evaluation.label_pictures import load_label_map
 
 
 @pytest.fixture(scope="module")

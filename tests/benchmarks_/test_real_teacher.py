@@ -13,7 +13,7 @@ from messages import tells
 from PIL import Image
 from small_room import make_room
 
-from kfgs.evaluation import load_label_map
+from kfgs.evaluation.label_pictures import load_label_map
 from kfgs.scenes import load_scene
 from kfgs.teachers import load_teacher
 

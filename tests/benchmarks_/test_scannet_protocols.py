@@ -6,8 +6,8 @@ import torch
 from published.scannet_points import ScanNetPoints, class_indices, class_scores, scannet_classes
 from published.scannet_volume import ScanNetVolume, gaussian_truth, significance
 
-from kfgs.evaluation import PointTruth
 from kfgs.evaluation.scannet import nyu40_names
+from kfgs.evaluation.truth import PointTruth
 from kfgs.gaussians import Gaussians
 
 NYU = nyu40_names()

@@ -6,8 +6,8 @@ import torch
 from published.class_lists import load_classes
 from published.scenesplat import SceneSplatBench, match_names, vote_instances, vote_nearest
 
-from kfgs.evaluation import PointTruth
 from kfgs.evaluation.scannet import nyu40_names
+from kfgs.evaluation.truth import PointTruth
 
 LISTS = load_classes("scenesplat")
 USED = ("wall", "floor", "chair", "table", "sink")

@@ -18,6 +18,7 @@ from test_public import PACKAGES
 
 import kfgs
 from kfgs import batch
+from kfgs.batch.run import SceneResult
 from kfgs.pipeline import true_labels
 from kfgs.scenes import load_cameras
 from kfgs.viz import available
@@ -252,7 +253,7 @@ def test_the_python_of_engines_runs(tmp_path, monkeypatch):
 def test_the_python_of_many_scenes_runs(inside, monkeypatch):
     """Without processes; tests/batch makes the fields, here only the calls are checked."""
     called = []
-    result = batch.SceneResult("kitchen", value={"miou": 0.5})
+    result = SceneResult("kitchen", value={"miou": 0.5})
     monkeypatch.setattr(batch, "open_client", lambda workers: nullcontext())
     monkeypatch.setattr(batch, "run_batch", lambda *args, **kwargs: called.append((args, kwargs)) or [result])
     Path("kitchen").symlink_to("scene")

@@ -5,17 +5,9 @@ import torch.nn.functional as F
 from cases_quant import made_autoencoder
 
 from kfgs import Camera, Gaussians
-from kfgs.evaluation import (
-    FieldMethod,
-    KfgsPooled,
-    Labeller,
-    LabelTruth,
-    Method,
-    TeacherMethod,
-    View,
-    label_view,
-)
-from kfgs.evaluation.method import best_labels
+from kfgs.evaluation import FieldMethod, LabelTruth, Method, TeacherMethod, View, label_view
+from kfgs.evaluation.method import Labeller, best_labels
+from kfgs.evaluation.protocols import KfgsPooled
 from kfgs.fields import Autoencoded, Codewords, Identity, Linear, SemanticField
 from kfgs.quant import Codebook, LinearLatents
 from kfgs.scenes import FeatureFolder, save_feature_map

@@ -4,19 +4,10 @@ import pytest
 import torch
 from small_room import make_room
 
-from kfgs.evaluation import (
-    KfgsColor,
-    KfgsPooled,
-    KfgsSurface,
-    LabelTruth,
-    PointTruth,
-    TeacherMethod,
-    View,
-    evaluate_segmentation,
-    get_protocol,
-    score_surface,
-    score_views,
-)
+from kfgs.evaluation import LabelTruth, TeacherMethod, View, evaluate_segmentation, get_protocol, score_views
+from kfgs.evaluation.protocols import KfgsColor, KfgsPooled, KfgsSurface
+from kfgs.evaluation.surface import score_surface
+from kfgs.evaluation.truth import PointTruth
 from kfgs.labels import load_label_set, nearest_labels
 from kfgs.pipeline import score_teacher, true_labels
 from kfgs.scenes import FeatureFolder, load_scene

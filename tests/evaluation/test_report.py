@@ -6,8 +6,9 @@ from typing import ClassVar
 import pytest
 import torch
 
-from kfgs.evaluation import PointTruth, Report
+from kfgs.evaluation import Report
 from kfgs.evaluation.report import make_report
+from kfgs.evaluation.truth import PointTruth
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,8 @@ import torch
 from messages import tells
 from PIL import Image
 
-from kfgs.evaluation import evaluate_segmentation, load_label_map
+from kfgs.evaluation import evaluate_segmentation
+from kfgs.evaluation.label_pictures import load_label_map
 from kfgs.evaluation.segmentation import PROTOCOL
 
 

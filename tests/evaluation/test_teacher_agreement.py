@@ -4,8 +4,7 @@ import oracles_protocols as dull
 import pytest
 import torch
 
-from kfgs.evaluation import TeacherAgreement
-from kfgs.evaluation.teacher_agreement import MERGED, SIZE, ade20k_words, teacher_agreement
+from kfgs.evaluation.teacher_agreement import MERGED, SIZE, TeacherAgreement, ade20k_words, teacher_agreement
 
 
 def test_iou7_by_hand():

@@ -8,7 +8,7 @@ from PIL import Image
 
 from kfgs import Gaussians
 from kfgs.cameras import Camera
-from kfgs.evaluation import load_label_map
+from kfgs.evaluation.label_pictures import load_label_map
 from kfgs.fields import Identity, SemanticField
 from kfgs.labels import LabelSet
 from kfgs.pipeline import segment_cameras, segment_scene

@@ -7,9 +7,9 @@ from functools import partial
 from pathlib import Path
 
 from kfgs._files import as_path
-from kfgs.evaluation import PointTruth, View, find_points
+from kfgs.evaluation import View, find_points
 from kfgs.evaluation.find import read_first
-from kfgs.evaluation.truth import ReadWhenAsked
+from kfgs.evaluation.truth import PointTruth, ReadWhenAsked
 from kfgs.evaluation.views import match_views, sized_view
 from kfgs.scenes import Scene
 

@@ -17,7 +17,7 @@ from kfgs._arrays import read_array
 from kfgs._check import check_choice
 from kfgs._files import as_path
 from kfgs._origin import in_world
-from kfgs.evaluation import PointTruth
+from kfgs.evaluation.truth import PointTruth
 
 from ..class_lists import load_classes
 
