@@ -21,7 +21,8 @@ from torch import Tensor
 
 from kfgs._files import write_json
 from kfgs.evaluation.color import score_views
-from kfgs.pipeline import ColorConfig, Run, fit_color
+from kfgs.pipeline import ColorConfig, fit_color
+from kfgs.pipeline.stages import Run
 from kfgs.scenes import load_scene
 
 

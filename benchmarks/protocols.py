@@ -28,8 +28,8 @@ from kfgs._files import write_json
 from kfgs.evaluation import Report, get_protocol
 from kfgs.evaluation.teacher_agreement import TeacherAgreement
 from kfgs.evaluation.texts import as_encoder
-from kfgs.pipeline import Question, evaluate, open_question
-from kfgs.pipeline.evaluate import open_result
+from kfgs.pipeline import evaluate, open_question
+from kfgs.pipeline.evaluate import Question, open_result
 from kfgs.teachers import load_teacher
 
 

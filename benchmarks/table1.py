@@ -30,8 +30,9 @@ from table1_rows import REQUEST, RESULT, ROWS, config_of
 import kfgs
 from kfgs._files import digest_file, digest_value, read_json, write_json
 from kfgs.labels import load_label_set
-from kfgs.pipeline import ColorConfig, Run, fit_color, score_teacher, true_labels
+from kfgs.pipeline import ColorConfig, fit_color, score_teacher, true_labels
 from kfgs.pipeline.evaluate import this_machine
+from kfgs.pipeline.stages import Run
 from kfgs.scenes import FeatureFolder, load_scene
 
 HERE = Path(__file__).resolve().parent

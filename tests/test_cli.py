@@ -36,22 +36,6 @@ def test_fit_names_what_it_wrote(run):
         assert (run / name).is_file(), name
 
 
-def test_info_knows_fields_runs_scenes_and_plys(run, room, tmp_path, capsys):
-    for path in (run, run / "field.kfgs"):
-        assert main(["convert", str(path)]) == 0
-        assert "Gaussians" in capsys.readouterr().out
-    assert main(["convert", str(room)]) == 0
-    assert "9 posed images" in capsys.readouterr().out
-    shutil.copytree(run / "stages", tmp_path / "half" / "stages")
-    assert main(["convert", str(tmp_path / "half")]) == 0
-    said = capsys.readouterr().out
-    assert "unfinished run" in said
-    assert "codebook: done in" in said
-    write_ply(tmp_path / "a.ply", {"x": np.zeros(3, np.float32)})
-    assert main(["convert", str(tmp_path / "a.ply")]) == 0
-    assert "3 vertices; columns x" in capsys.readouterr().out
-
-
 def test_segment_scores_where_truth_is_known(run, room, tmp_path, capsys):
     out = tmp_path / "seg"
     assert main(["segment", str(run / "field.kfgs"), "--scene", str(room), "--out", str(out)]) == 0
@@ -92,22 +76,6 @@ def test_nothing_of_the_users_is_overwritten(run, room, tmp_path):
     before = (room / "labels" / "view_001.png").read_bytes()
     assert main(["segment", str(run / "field.kfgs"), "--scene", str(room), "--out", str(room)]) == 0
     assert (room / "labels" / "view_001.png").read_bytes() == before
-
-
-def test_a_mesh_is_refused_since_its_faces_would_be_lost(run, room, tmp_path, capsys):
-    header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-    faces = "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
-    (tmp_path / "mesh.ply").write_text(header + faces)
-    arguments = ["attach", str(run / "field.kfgs"), str(tmp_path / "mesh.ply"), "--out", str(tmp_path / "o.ply")]
-    assert main(arguments) == 1
-    assert "mesh.ply: expected nothing but points, got face" in capsys.readouterr().err
-    assert not (tmp_path / "o.ply").exists()
-
-
-def test_views_without_label_pictures_are_segmented_without_a_score(run, room, tmp_path, capsys):
-    arguments = ["segment", str(run / "field.kfgs"), "--scene", str(room), "--out", str(tmp_path)]
-    assert main([*arguments, "--split", "train"]) == 0
-    assert "trained on 6 of these views" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -154,14 +122,6 @@ def test_wrong_usage_ends_with_2():
         with pytest.raises(SystemExit) as stop:
             main(arguments)
         assert stop.value.code == 2
-
-
-def test_help_is_quick_to_ask_for_and_names_every_command():
-    code = "import sys; from kfgs.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\nprint('torch' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    for command in ("demo", "sfm", "fit", "segment", "attach", "convert"):
-        assert command in done.stdout
-    assert done.stdout.strip().endswith("False")  # no heavy import for a help text
 
 
 def test_a_progress_bar_does_not_flood_a_log():

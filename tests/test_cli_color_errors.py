@@ -24,7 +24,6 @@ ERRORS = {
             ["{field}", "{field}", "--scene", "{room}", "--out", "{o}.ply"],
             ("CLOUD:", "got {field}", "a colour splat"),
         ),
-        (["{field}", "{run}", "--scene", "{room}", "--out", "{o}.ply"], ("CLOUD:", "got {run}", "a colour splat")),
         (["{field}", "{tmp}/no.ply", "--scene", "{room}", "--out", "{o}.ply"], ("{tmp}/no.ply:", "no such file")),
         (["{field}", "{splat}", "--out", "{o}.ply"], ("--text:", "got none", "`kfgs features --words")),
         (
@@ -32,10 +31,6 @@ ERRORS = {
             ("--out:", ".compressed.ply, .ply", "got {o}.ksplat"),
         ),
         (["{field}", "{splat}", "--scene", "{room}", "--out", "{splat}"], ("--out:", "another place", "{splat}")),
-        (
-            ["{field}", "{splat}", "--scene", "{room}", "--out", "{splat}/a.ply"],
-            ("--out:", "got {splat}/a.ply", "file {splat}"),
-        ),
         (
             ["{field}", "{splat}", "--scene", "{room}", "--out", "{o}.ply", "--distance", "-1"],
             ("--distance:", "(0, inf)", "got -1.0"),
@@ -62,24 +57,14 @@ ERRORS = {
         (["{labelled}", "--out", "{o}.ply"], ("edits:", "got none", "--remove")),
         (
             ["{labelled}", "--out", "{o}.ply", "--remove", "chiar"],
-            ("--remove chiar: class:", "wall, floor", "got 'chiar'"),
+            ("class:", "wall, floor", "got 'chiar'"),
         ),
         (
             ["{labelled}", "--out", "{o}.ply", "--recolor", "chair:rde"],
             ("--recolor:", "'#c04040', 'teal'", "'rgb(192, 64, 64)'", "got 'rde'"),
         ),
         (["{labelled}", "--out", "{o}.ply", "--move", "chair:1,2"], ("--move:", "got 'chair:1,2'")),
-        (["{labelled}", "--out", "{o}.ply", "--insert", "{tmp}/no.ply"], ("--insert:", "got '{tmp}/no.ply'")),
-        (
-            ["{labelled}", "--out", "{o}.ply", "--insert", "{room}/text.npy"],
-            ("--insert {room}/text.npy: {room}/text.npy:", "compressed_ply"),
-        ),
-        (["{labelled}", "--out", "{splat}", "--insert", "{splat}"], ("--out:", "another place", "{splat}")),
         (["{labelled}", "--out", "{labelled}", "--remove", "chair"], ("--out:", "another place", "{labelled}")),
-        (
-            ["{labelled}", "--out", "{o}.ksplat", "--remove", "chair"],
-            ("--out:", ".compressed.ply, .ply", "got {o}.ksplat"),
-        ),
         (["{labelled}", "--out", "{o}", "--remove", "chair"], ("--out:", ".compressed.ply, .ply", "got {o}")),
         (
             ["{splat}", "--out", "{o}.ply", "--remove", "chair"],
@@ -88,10 +73,6 @@ ERRORS = {
         (
             ["{field}", "--out", "{o}.ply", "--remove", "chair"],
             ("SPLATS:", "got {field}", "a colour splat"),
-        ),
-        (
-            ["{labelled}", "--out", "{same}.ply", "--replay", "{same}.ply.edits.json"],
-            ("--replay:", "{same}.ply.edits.json", "{same}.ply", "got the same", "--out"),
         ),
         (
             ["{labelled}", "--out", "{taken}.ply", "--remove", "rug"],
@@ -103,15 +84,12 @@ ERRORS = {
         ),
         (
             ["{labelled}", "--out", "{o}.ply", "--remove", "chair/99"],
-            ("chair/99:", "parts of chair", "`kfgs select chair"),
+            ("--remove:", "got chair/99", "`kfgs select chair"),
         ),
-        (["{labelled}", "--out", "{o}.ply", "--replay", "{tmp}/no.json"], ("{tmp}/no.json:", "no such file")),
         (
             ["{splat}", "--out", "{o}.ply", "--replay", "{saved}"],
             ("SPLATS:", "expected a splat with classes, got {splat}", "`kfgs attach FIELD {splat} --out labelled.ply`"),
         ),
-        (["{alone}", "--out", "{o}.ply", "--replay", "{saved}"], ("SPLATS:", "{alone}.classes.json", "copy it")),
-        (["{alone}", "--out", "{o}.ply", "--remove", "chair/2"], ("SPLATS:", "{alone}.classes.json", "copy it")),
         (
             ["{labelled}", "--out", "{o}.ply", "--replay", "{room}/classes.json"],
             ("{room}/classes.json:", "'kfgs.edits'"),
@@ -122,7 +100,6 @@ ERRORS = {
         ),
     ],
     "color": [
-        (["{room}", "--out", "{splat}"], ("--out:", "{splat}", "got a file")),
         (["{room}", "--out", "{o}", "--steps", "0"], ("--steps:", "got 0")),
         (["{room}", "--out", "{o}", "--split", "val"], ("--split:", "train, test", "got 'val'")),
         (["{tmp}", "--out", "{o}"], ("{tmp}:", "COLMAP", "`kfgs sfm")),
@@ -136,7 +113,6 @@ ERRORS = {
         (["{splat}", "{o}.spz", "--plain"], ("--plain:", ".ply", "{o}.spz")),
         (["{splat}", "{o}", "--by-class"], ("SOURCE:", "expected a splat with classes")),
         (["{room}/text.npy", "{o}.ply"], ("{room}/text.npy:", "known", "compressed_ply")),
-        (["{tmp}", "{o}.ply"], ("{tmp}:", "known", "compressed_ply")),
     ],
 }
 

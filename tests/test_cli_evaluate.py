@@ -14,7 +14,7 @@ from kfgs.evaluation import FieldMethod, LabelTruth, View
 from kfgs.evaluation.label_pictures import load_label_map
 from kfgs.evaluation.protocols import KfgsPooled
 from kfgs.labels import load_label_set
-from kfgs.pipeline import evaluate, open_question
+from kfgs.pipeline import evaluate
 
 
 @pytest.fixture(scope="module")
@@ -100,25 +100,6 @@ def test_every_protocol_end_to_end(words, shown, run, room, splats, tmp_path, ca
     assert long.count("\n") >= 5
 
 
-def test_a_question_has_its_own_options(room, run):
-    with pytest.raises(TypeError, match="scene.*split.*open_question"):
-        evaluate(run, open_question(room), split="train")
-
-
-def test_label_pictures_of_test_views_are_scored_unless_a_split_is_named(room):
-    assert len(open_question(room).views) == 3
-    assert len(open_question(room, split="train").views) == 6
-    assert len(open_question(room, split="all").views) == 9
-
-
-def test_truth_elsewhere(run, room, tmp_path, capsys):
-    labels = shutil.copytree(room / "labels", tmp_path / "truth" / "labels")
-    shutil.copy(room / "classes.json", tmp_path / "truth")
-    capsys.readouterr()
-    first = scored(capsys, run)
-    assert scored(capsys, run, "--truth", labels) == scored(capsys, run, "--truth", tmp_path / "truth") == first
-
-
 def test_the_rule_for_labels_is_that_of_the_protocol_unless_asked_and_is_said(
     fused, room, words, asked, tmp_path, capsys
 ):
@@ -142,14 +123,6 @@ def test_the_rule_for_labels_is_that_of_the_protocol_unless_asked_and_is_said(
     method = FieldMethod(field, own_labels=False)
     assert evaluate(method, room, encode=words).options["labels"] == "nearest"  # it keeps its rule, unless one is asked
     assert evaluate(method, room, encode=words, labels="own").scores == expected["own"].scores
-
-
-@pytest.mark.parametrize(("split", "trained"), [("test", None), ("train", "6 of 6"), ("all", "6 of 9")])
-def test_views_that_were_trained_on_are_counted(split, trained, fused, room, words):
-    report = evaluate(fused, room, encode=words, split=split)
-    notes = [note for note in report.notes if "trained" in note]
-    assert notes == ([] if trained is None else [f"{trained} scored views were trained on"])
-    assert f"scored pictures: {len(open_question(room, split=split).views)} of 60x80 (height x width)" in report.notes
 
 
 @pytest.mark.parametrize(

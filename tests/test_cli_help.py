@@ -56,7 +56,7 @@ def test_help_is_short_and_has_no_python_in_it(command, capsys, monkeypatch):
     text = help_of(command, capsys)
     assert "None" not in text
     assert "(default: )" not in text
-    positionals = [name for name in cli._shown_names(cli.COMMANDS[command]).values() if name.isupper()]
+    positionals = [name for name in cli.shown_names(cli.COMMANDS[command]).values() if name.isupper()]
     usage = re.sub(r"[\[\]]", "", text.splitlines()[0])
     assert re.sub(r" --\S+( (?!--)\S+)?", "", usage).endswith(" ".join(positionals))
     main_options = text.split("─ options ─")[1].split("╰")[0] if "─ options ─" in text else ""
@@ -90,7 +90,7 @@ def test_command_lines_in_the_docs_are_understood(name, monkeypatch):
         assert cli.main(line[1:]) == 0, line
     assert len(called) == len(lines) + len(complete)
     for line in (line for line in map(str.split, quoted)):
-        known = cli._shown_names(cli.COMMANDS[line[1]]).values()
+        known = cli.shown_names(cli.COMMANDS[line[1]]).values()
         assert {word for word in line if word.startswith("--")} <= {*known, "--help"}, line
 
 
@@ -103,7 +103,7 @@ OF_BENCHMARKS = {"--kinds", "--quick", "--room-0", "--whole", "--atoms", "--copi
 def test_an_option_that_the_docs_name_exists(name):
     known = {"--help", "--version", cli.STRICT, *OF_OTHERS, *OF_BENCHMARKS}
     for command in cli.COMMANDS.values():
-        known |= {word for word in cli._shown_names(command).values() if word.startswith("--")}
+        known |= {word for word in cli.shown_names(command).values() if word.startswith("--")}
     text = (REPOSITORY / name).read_text(encoding="utf-8")
     named = {
         word
@@ -142,7 +142,6 @@ def test_version_and_overview(capsys):
 @pytest.mark.parametrize(
     ("line", "choices"),
     [
-        ("attach run/field.kfgs a.ply --out b.ply --by color", ["views", "distance"]),
         ("fit scene --out run --method fast", ["uplift", "paper", "paper-full", "adc", "decouple"]),
     ],
 )
@@ -154,11 +153,3 @@ def test_a_wrong_choice_is_told_the_words_that_can_be_given(line, choices, capsy
     said = capsys.readouterr()
     told = re.search(r"Expected one of \((.*?)\)", said.out + said.err)
     assert re.findall(r"'(.*?)'", told[1]) == choices
-
-
-def test_messages_name_options_as_they_are_written():
-    names = cli._shown_names(cli.COMMANDS["attach"])
-    assert cli._in_options("splat_scene: expected", names) == "--splat-scene: expected"
-    assert cli._in_options("field, text: expected: one", names) == "FIELD, --text: expected: one"
-    for message in ("a.ply: no such file", "no colon", "splats, more: expected"):
-        assert cli._in_options(message, names) == message

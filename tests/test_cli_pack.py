@@ -1,9 +1,7 @@
 """The command pack, and that other commands take its file wherever they take a field folder."""
 
 import re
-import shutil
 from dataclasses import replace
-from typing import get_args
 
 import pytest
 import torch
@@ -11,9 +9,8 @@ from cases_packed import assert_same, field
 from messages import tells
 
 from kfgs._files import digest_file
-from kfgs.cli import main, options
+from kfgs.cli import main
 from kfgs.fields import SemanticField
-from kfgs.fields.packing import PRECISIONS
 from kfgs.formats import read_splats
 from kfgs.labels import LabelSet
 
@@ -48,13 +45,6 @@ def test_a_packed_field_is_told_in_bytes_and_errors(place, tmp_path, capsys):
     assert packed.classes.names == ("wall", "chair")
 
 
-def test_the_file_holds_the_classes(place, tmp_path, capsys):
-    moved = tmp_path / f"elsewhere{ENDING}"
-    shutil.copy(place / f"room{ENDING}", moved)
-    assert main(["select", "chair", str(moved)]) == 0
-    assert "chair: " in capsys.readouterr().out
-
-
 def test_lossless_keeps_every_bit(place, tmp_path, capsys):
     out = tmp_path / f"a{ENDING}"
     assert main(["convert", str(place / "run"), str(out), "--precision", "lossless"]) == 0
@@ -72,10 +62,6 @@ def test_other_commands_take_the_file(place, tmp_path, capsys):
     assert main(["convert", str(packed), str(tmp_path / "labelled.ply")]) == 0
     labels = read_splats(tmp_path / "labelled.ply").labels
     assert torch.equal(labels, SemanticField.load(packed).classify().labels)
-
-
-def test_the_command_line_offers_the_precisions_that_there_are():
-    assert get_args(options.Precision) == ("lossless", *PRECISIONS)
 
 
 @pytest.mark.parametrize(

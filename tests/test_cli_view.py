@@ -98,23 +98,6 @@ def test_any_phrase_with_a_teacher(files, tmp_path, capsys):
     assert "'zebra crossing': score > " in said
 
 
-def test_clouds_in_different_frames_are_noted(files, tmp_path, capsys):
-    said = drawn(
-        [files / "labelled.ply", "--color", files / "color.ply", "--where", "picture", "--out", tmp_path],
-        capsys,
-    )
-    assert "another frame" not in said
-    from kfgs.formats import read_splats
-
-    splats = read_splats(files / "color.ply")
-    moved = splats.replace(means=splats.means + 1000)
-    write_splats(moved, tmp_path / "far.ply")
-    arguments = ["--color", tmp_path / "far.ply", "--where", "picture", "--out", tmp_path]
-    said = drawn([files / "labelled.ply", *arguments], capsys)
-    assert "note: only 0 of" in said
-    assert "another frame? `kfgs attach` checks and aligns" in said
-
-
 def test_a_file_to_share_needs_no_driver(room, files, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(plotter, "trouble", lambda: "the trial picture crashed")
     words = ["--scene", room, "--text", files / "text.safetensors", *LETTERS]
@@ -153,14 +136,6 @@ def test_a_run_folder_brings_its_colours_and_the_photos_of_its_scene(room, files
     assert header["title"] == "run"
 
 
-def test_no_driver_is_told_before_anything_is_read(files, monkeypatch, capsys):
-    monkeypatch.setattr(plotter, "trouble", lambda: "the trial picture crashed")
-    assert main(["view", str(files / "field.kfgs"), "--where", "picture"]) == 1
-    said = capsys.readouterr()
-    assert "3-D pictures cannot be drawn here: expected a working OpenGL, but the trial picture crashed" in said.err
-    assert said.out == ""
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -181,12 +156,3 @@ def test_wrong_input_is_told(files, tmp_path, capsys, arguments, message):
     assert message in said
     assert said.count("\n") == 1
     assert not (tmp_path / "out").exists()
-
-
-def test_interrupted_it_does_not_promise_to_go_on(files, monkeypatch, capsys):
-    def interrupt():
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(plotter, "trouble", interrupt)
-    assert main(["view", str(files / "field.kfgs"), "--where", "picture"]) == 130
-    assert capsys.readouterr().err == "interrupted\n"

@@ -1,16 +1,14 @@
-from pathlib import Path
-
 import pytest
 import torch
 from messages import tells
 
-from kfgs.cli.edit_syntax import Edits, check_parts, parse_edits
+from kfgs.cli.edit_syntax import Edits, apply_edits, parse_edits
 from kfgs.gaussians import Gaussians
-from kfgs.labels import Extract, Insert, Move, OfClass, Recolor, Remove, connected_parts
+from kfgs.labels import Extract, Move, OfClass, Recolor, Remove, connected_parts
 
 
 def read(**words):
-    return [edit for _, edit in parse_edits(Edits(**words))]
+    return parse_edits(Edits(**words))
 
 
 def test_each_option_is_the_edit_it_says():
@@ -24,16 +22,14 @@ def test_nothing_asked_is_no_edit():
     assert read() == []
 
 
-def test_the_order_does_not_depend_on_the_line(tmp_path):
-    (tmp_path / "a.ply").write_bytes(b"")
+def test_the_order_does_not_depend_on_the_line():
     words = {
-        "insert": [str(tmp_path / "a.ply")],
         "extract": ["a"],
         "remove": ["b"],
         "move": ["d:1,2,3"],
         "recolor": ["h:red", "i:blue"],
     }
-    expected = ["recolor", "recolor", "move", "remove", "extract", "insert"]
+    expected = ["recolor", "recolor", "move", "remove", "extract"]
     edits = read(**words)
     assert [edit.op for edit in edits] == expected
     assert [edit.where[0].name for edit in edits[:4]] == ["h", "i", "d", "b"]
@@ -79,9 +75,9 @@ def test_parts_are_numbered_as_select_lists_them():
         assert torch.equal(edit.apply(cloud).means, cloud.means[thing.indices])
 
 
-def test_a_part_that_select_does_not_list_is_refused():
-    with pytest.raises(ValueError, match=tells("chair/3:", "2 parts of chair", "`kfgs select chair SPLAT`")):
-        check_parts(rows(20, 60), read(remove=["chair/3"]))
+def test_a_part_beyond_the_last_is_refused():
+    with pytest.raises(ValueError, match=tells("remove:", "got chair/3", "`kfgs select chair SPLAT`")):
+        apply_edits(rows(20, 60), read(remove=["chair/3"]))
 
 
 def test_parts_that_are_removed_are_counted_together():
@@ -97,22 +93,6 @@ def test_a_class_name_may_hold_a_colon():
     assert read(move=["a:b:1,0,0"]) == [Move(OfClass("a:b"), (1.0, 0.0, 0.0))]
 
 
-def test_a_file_is_inserted_where_it_is_or_moved(tmp_path):
-    path = tmp_path / "lamp.ply"
-    path.write_bytes(b"")
-    (there,) = read(insert=[str(path)])
-    assert there == Insert(path)
-    (moved,) = read(insert=[f"{path}:1,0,-2"])
-    point = torch.tensor([[0.5, 0.5, 0.5]], dtype=torch.float64)
-    assert moved.similarity.apply(point).tolist() == [[1.5, 0.5, -1.5]]
-
-
-def test_a_file_whose_name_holds_a_colon_is_itself(tmp_path):
-    path = tmp_path / "lamp:1,0,0"
-    path.write_bytes(b"")
-    assert read(insert=[str(path)]) == [Insert(Path(path))]
-
-
 @pytest.mark.parametrize(
     ("option", "words", "message"),
     [
@@ -125,8 +105,6 @@ def test_a_file_whose_name_holds_a_colon_is_itself(tmp_path):
         ("move", "table:1,2,inf", ("move:", "expected 3", "got 'table:1,2,inf'")),
         ("remove", "chair/0", ("remove:", "got 'chair/0'", "'chair/1'")),
         ("move", "chair/00:1,0,0", ("move:", "got 'chair/00'", "'chair/1'")),
-        ("insert", "no.ply:1,0,0", ("insert:", "got 'no.ply:1,0,0'", "'no.ply'")),
-        ("insert", "no.ply", ("insert:", "got 'no.ply'")),
     ],
 )
 def test_other_words_are_refused_and_quoted(option, words, message, tmp_path, monkeypatch):
@@ -135,16 +113,9 @@ def test_other_words_are_refused_and_quoted(option, words, message, tmp_path, mo
         read(**{option: [words]})
 
 
-def test_an_insertion_with_part_of_a_translation_is_refused(tmp_path):
-    (tmp_path / "a.ply").write_bytes(b"")
-    with pytest.raises(ValueError, match=tells("insert:", "expected 3", "a.ply:1,2")):
-        read(insert=[f"{tmp_path}/a.ply:1,2"])
-
-
 def test_a_class_of_that_exact_name_wins_over_a_part():
     words = Edits(move=["chair/1/2:1,0,0"], remove=["Chair/1", "chair/2"])
-    edits = [edit for _, edit in parse_edits(words, ["chair", "chair/1"])]
-    assert edits == [
+    assert parse_edits(words, ["chair", "chair/1"]) == [
         Move(OfClass("chair/1", 1), (1.0, 0.0, 0.0)),
         Remove(OfClass("Chair/1")),
         Remove(OfClass("chair", 1)),

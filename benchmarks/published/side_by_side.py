@@ -15,7 +15,7 @@ from kfgs.evaluation.label_pictures import load_label_map
 from kfgs.evaluation.method import best_labels
 from kfgs.evaluation.teacher_agreement import ade20k_words
 from kfgs.evaluation.texts import Encode, encode_unit
-from kfgs.pipeline import Question
+from kfgs.pipeline.evaluate import Question
 from kfgs.splat import rasterize
 from kfgs.viz import overlay_labels, save_picture
 from kfgs.viz.pictures import legend_strip, picture_grid, resize_photo

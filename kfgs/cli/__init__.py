@@ -7,7 +7,6 @@ continue where they stopped) or 141 (its output was closed).
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import functools
 import inspect
@@ -18,6 +17,8 @@ import sys
 import textwrap
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import is_dataclass
+from pathlib import Path
 from typing import Any, get_type_hints
 
 import tyro
@@ -29,7 +30,7 @@ from .evaluate import evaluate
 from .features import features
 from .files import check_outputs
 from .fit import color, demo, fit, sfm
-from .output import open_streams, said_on_stderr, said_whole, say, warnings_as_notes
+from .output import notes_as_lines, say
 from .render import render
 from .segment import segment
 from .select import select
@@ -47,7 +48,6 @@ GROUPS: dict[str, tuple[Any, ...]] = {
 COMMANDS = {command.__name__: command for group in GROUPS.values() for command in group}
 RESUMED = {"demo", "features", "fit", "color", "batch"}  # commands that reuse their earlier work
 STRICT = "--strict"  # of every command that reads files
-NARROW = 40  # columns: in a few, tyro never ends
 STYLE = (
     tyro.conf.DisallowNone,
     tyro.conf.FlagCreatePairsOff,
@@ -58,31 +58,42 @@ STYLE = (
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; return the exit code."""
-    open_streams()
     # Read when torch is first imported: waiting threads sleep instead of spinning. With other busy programs this makes 25
     # training steps a second instead of one (measured on two cores).
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if not sys.stderr.isatty():  # read when tqdm is imported: a log gets two lines a minute, not ten a second
         os.environ.setdefault("TQDM_MININTERVAL", "30")
-    if shutil.get_terminal_size().columns < NARROW:
-        os.environ["COLUMNS"] = str(NARROW)
-    words, names = sys.argv[1:] if arguments is None else arguments, dict[str, str]()
+    home = str(Path.home())  # shells leave `--out=~/run` as it is
+    words = sys.argv[1:] if arguments is None else arguments
+    words = [re.sub("^(--[^=]+=)?~(?=/|$)", rf"\1{home}", word) for word in words]
+    name, *given = [word for word in words if word != STRICT] or [""]
+    command = COMMANDS.get("convert" if name == "info" else name)  # `kfgs info PATH`: convert without a target
+    names = {} if command is None else shown_names(command)
+    names |= {"classes": names.get("text", "classes"), "folder": names.get("out", "folder")}  # those of functions
 
     def failed(message: object) -> int:
-        with suppress(OSError):  # nobody can be told
-            say(f"error: {_in_options(str(message), names)}", sys.stderr)
+        say(f"error: {in_options(str(message), names)}", sys.stderr)
         return 1
 
     try:
-        return _run(words, names)
+        if command is None:
+            _answer(name)
+        elif any(word == "" or re.fullmatch("--[^=]+=", word) for word in given):
+            raise ValueError("arguments: expected a name, got an empty text; leave it out, or write . for this folder")
+        else:
+            with interruptible(), notes_as_lines(lambda note: in_options(note, names), strict=STRICT in words):
+                about = _description(command)
+                tyro.cli(documented(command), prog=f"kfgs {name}", description=about, args=given, config=STYLE)
+        sys.stdout.flush()
+        return 0
     except KeyboardInterrupt:
-        goes_on = bool(RESUMED & {*words[:1]})
-        with suppress(OSError):  # the same Ctrl-C may have ended who read it
-            say("interrupted" + ("; the same command continues where it stopped" if goes_on else ""), sys.stderr)
+        say("interrupted" + ("; the same command continues where it stopped" if name in RESUMED else ""), sys.stderr)
         return 130
-    except BrokenPipeError:
+    except BrokenPipeError:  # the reader has ended, for instance `head`
+        with suppress(OSError):  # else the interpreter tries to write what is left, and complains
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
-    except (ValueError, TypeError, OSError, ImportError, ArithmeticError) as error:
+    except (ValueError, TypeError, OSError, ImportError, ArithmeticError, NotImplementedError) as error:
         return failed(error)
     except (MemoryError, RuntimeError) as error:
         if not short_of_memory(error):
@@ -91,44 +102,28 @@ def main(arguments: list[str] | None = None) -> int:
         return failed(f"expected enough memory, but it ran out ({error_line(error)}); {advice}")
 
 
-def _run(words: list[str], names: dict[str, str]) -> int:
-    """Run the command that the words ask for; `names` receives the command-line names of its parameters."""
-    name, *given = [_expand_home(word) for word in words] or [""]
-    given, strict = [word for word in given if word != STRICT], STRICT in given
-    name = "convert" if name == "info" else name  # `kfgs info PATH`: convert without a target
-    if name not in COMMANDS:
-        told = {"-h": _overview, "--help": _overview, "--version": _version}.get(name)
-        say(told() if told else _unknown(name), None if told else sys.stderr)
-        if told:
-            return 0
+def _answer(name: str) -> None:
+    """Say what was asked for without a command: the overview, the version, or which command was probably meant."""
+    if name == "--version":
+        from .. import __version__
+
+        say(f"kfgs {__version__}")
+    elif name in ("-h", "--help"):
+        say(_overview())
+    else:
+        near = difflib.get_close_matches(name, COMMANDS, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else "`kfgs --help` lists them"
+        say(f"error: expected a command, got {repr(name) if name else 'none'}; {hint}", sys.stderr)
         raise SystemExit(2)
-    try:
-        os.getcwd()
-    except FileNotFoundError as error:  # torch's libraries would end the process
-        raise OSError("expected a working directory, got one that was deleted; change to another (cd)") from error
-    if any(word == "" or (word.startswith("--") and word.endswith("=")) for word in given):
-        raise ValueError("arguments: expected a name, got an empty text; leave it out, or write . for this folder")
-    command = documented(COMMANDS[name])
-
-    def spoken(message: str) -> str:
-        return _in_options(message, names)
-
-    with interruptible(), warnings_as_notes(spoken, strict=strict), said_on_stderr(), said_whole():
-        names |= _shown_names(command)
-        names.setdefault("classes", names.get("text", "classes"))  # the classes come from there
-        tyro.cli(command, prog=f"kfgs {name}", description=_description(command), args=given, config=STYLE)
-    return 0
 
 
 def documented(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with each option's text on one line, as tyro reads it, and with `check_outputs` before its work."""
+    """The command as tyro reads it: each option's text on one line. It refuses to write over what it reads."""
 
     @functools.wraps(command)
     def run(*arguments: Any, **options: Any) -> None:
         given = inspect.signature(command).bind(*arguments, **options).arguments
-        grouped = [vars(group) for group in given.values() if dataclasses.is_dataclass(group)]
-        named = dict(given) | {name: value for group in grouped for name, value in group.items()}
-        check_outputs(named, "features" if command.__name__ == "features" else None)
+        check_outputs(given, "features" if command is features else None)
         command(*arguments, **options)
 
     del run.__wrapped__  # tyro would read the text of the command itself
@@ -138,48 +133,19 @@ def documented(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
-def _version() -> str:
-    from .. import __version__
-
-    return f"kfgs {__version__}"
-
-
-def _expand_home(word: str) -> str:
-    """A word of the command line with `~` as the home folder: `~/scene`, `--out=~/run`."""
-    from .._files import as_path
-
-    option, _, value = word.partition("=")
-    if option.startswith("--") and value.startswith("~"):
-        return f"{option}={as_path(value)}"
-    return str(as_path(word)) if word.startswith("~") else word
-
-
 def _overview() -> str:
     """The text of `kfgs --help`: a line for each command."""
-    lines = [
-        "usage: kfgs COMMAND ...",
-        "",
-        "Decoupled semantic fields of 3-D Gaussians: distil, compress, segment, label, edit.",
-    ]
+    about = "Decoupled semantic fields of 3-D Gaussians: distil, compress, segment, label, edit."
+    lines = ["usage: kfgs COMMAND ...", "", about]
     for title, commands in GROUPS.items():
         lines += ["", f"{title}:"]
         for command in commands:
             summary = (inspect.getdoc(command) or "").split("\n\n")[0]
             lines.append(_wrap(f"  {command.__name__:<10s}{' '.join(summary.split())}", " " * 12))
-    return "\n".join(
-        [
-            *lines,
-            "",
-            "`kfgs COMMAND --help` has the options and examples; `kfgs --version` says which kfgs this is.",
-            f"{STRICT}, with any command, refuses files of which broken parts are otherwise left out with a note.",
-        ]
+    return "\n".join(lines) + (
+        "\n\n`kfgs COMMAND --help` has the options and examples; `kfgs --version` says which kfgs this is.\n"
+        f"{STRICT}, with any command, refuses files of which broken parts are otherwise left out with a note."
     )
-
-
-def _unknown(name: str) -> str:
-    near = difflib.get_close_matches(name, COMMANDS, n=1)
-    hint = f"did you mean {near[0]!r}?" if near else "`kfgs --help` lists them"
-    return f"error: expected a command, got {repr(name) if name else 'none'}; {hint}"
 
 
 def _description(command: Callable[..., None]) -> str:
@@ -195,20 +161,19 @@ def _wrap(text: str, indent: str = "") -> str:
     return textwrap.fill(text, min(100, shutil.get_terminal_size().columns) - 2, subsequent_indent=indent)
 
 
-def _shown_names(kind: Any) -> dict[str, str]:
+def shown_names(kind: Any) -> dict[str, str]:
     """The command-line names of a command's parameters, or of the fields of its options: SCENE, --splat-scene."""
-    found: dict[str, str] = {}
+    shown: dict[str, str] = {}
     for name, hint in get_type_hints(kind, include_extras=True).items():
-        if dataclasses.is_dataclass(hint):
-            found |= _shown_names(hint)
+        if is_dataclass(hint):
+            shown |= shown_names(hint)
         elif name != "return":
             positional = tyro.conf.Positional in getattr(hint, "__metadata__", ())
-            shown = name.upper() if positional else "--" + name.replace("_", "-")
-            found |= {name: shown, name.removeprefix("no_"): shown}
-    return found
+            shown[name] = name.upper() if positional else "--" + name.replace("_", "-")
+    return shown
 
 
-def _in_options(message: str, names: dict[str, str]) -> str:
+def in_options(message: str, names: dict[str, str]) -> str:
     """A message about arguments as one about options: "splat_scene: expected" becomes "--splat-scene: expected"."""
     about, colon, rest = message.partition(": ")
     arguments = about.split(", ")

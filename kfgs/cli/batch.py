@@ -56,18 +56,11 @@ def batch(
     from ..batch import BatchOptions, fit_blocks, join_blocks, open_client, read_scenes, run_batch
     from ..teachers.load import check_teacher_name
 
-    local = workers is not None and workers.isdecimal() and int(workers) > 0
-    threads = max(1, (os.cpu_count() or 1) // int(workers)) if local and workers is not None else 1
     if blocks is not None:
-        for name, value in (
-            ("teacher", teacher),
-            ("weights", weights),
-            ("text", text),
-        ):
-            if value is not None:
-                raise ValueError(
-                    f"{name}: expected none with --blocks, which takes the scene's own features/; leave it out"
-                )
+        if teacher is not None or weights is not None or text is not None:
+            raise ValueError(
+                "blocks: expected a scene with features/, got --teacher, --weights or --text; leave these out"
+            )
         with nullcontext() if workers is None else open_client(workers) as client:
             fit_blocks(scenes, out, blocks, splat=splat, client=client, report=say)
         field = join_blocks(out)
@@ -80,12 +73,10 @@ def batch(
         raise ValueError("weights: expected none without --teacher, whose weights they are; name the teacher")
     if teacher is not None:
         check_teacher_name(teacher)
-    options = BatchOptions(
-        teacher=teacher,
-        weights=weights,
-        text=None if text is None else str(text),
-        threads=threads,
-    )
+    local = int(workers) if workers is not None and workers.isdecimal() else 0
+    threads = max(1, (os.cpu_count() or 1) // local) if local else 1
+    words = None if text is None else str(text)
+    options = BatchOptions(teacher=teacher, weights=weights, text=words, threads=threads)
     with nullcontext() if workers is None else open_client(workers) as client:
         results = run_batch(entries, out, options, client=client, report=say)
     failed = [result.name for result in results if result.failure is not None]

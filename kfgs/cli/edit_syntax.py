@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from .options import Several
@@ -27,99 +26,56 @@ class Edits:
     """A class, "chair", or a part of it, "chair/2"."""
     extract: Several = ()
     """Keep only these classes, or parts of them."""
-    insert: Several = ()
-    """A splat file to add, "lamp.ply"; with a translation, "lamp.ply:1,0,0". No other edit touches it."""
 
 
-def parse_edits(asked: Edits, names: Sequence[str] = ()) -> list[tuple[str, Any]]:
-    """The edits of the options, each after its words ("--move table:1,0,0"), in the order of `Edits`.
+def parse_edits(asked: Edits, names: Sequence[str] = ()) -> list[Any]:
+    """The edits of the options, in the order of `Edits`.
 
     Parts of a class (`chair/1`) are counted after the earlier edits; removed parts of one class are counted together. If one
-    of the class `names` is `chair/1`, that class is meant.
-
-    Raises:
-        ValueError: if an option lacks its value, or the value is of another kind (the message quotes the option's text).
+    of the class `names` is `chair/1`, that class is meant. A ValueError if an option lacks its value, or it is of another kind.
     """
+    from ..labels import Extract, Move, OfClass, Recolor, Remove
     from ..labels.color import parse_color
-    from ..labels.edits import Extract, Move, Recolor, Remove
 
     known = {name.casefold() for name in names}
-    edits: list[tuple[str, Any]] = []
+
+    def where(option: str, words: str) -> OfClass:
+        name, _, part = words.rpartition("/")
+        if words.casefold() in known or not (name and part.isdecimal()):
+            return OfClass(words)
+        if int(part) == 0:
+            raise ValueError(f"{option}: expected parts counted from 1, got {words!r}; '{name}/1' is the largest")
+        return OfClass(name, int(part) - 1)
+
+    edits: list[Any] = []
     for words in asked.recolor:
         name, value = _split("recolor", words, "plant:#c04040")
-        edits.append((f"--recolor {words}", Recolor(_where("recolor", name, known), parse_color(value, "recolor"))))
+        edits.append(Recolor(where("recolor", name), parse_color(value, "recolor")))
     for words in asked.move:
         name, value = _split("move", words, "table:0.5,0,0")
-        edits.append((f"--move {words}", Move(_where("move", name, known), _three("move", words, value))))
-    removed: dict[
-        str, list[str]
-    ] = {}  # the parts of one class together: removing one changes the numbers of the others
+        edits.append(Move(where("move", name), _three("move", words, value)))
+    removed: dict[str, list[OfClass]] = {}  # by class: removing one part changes the numbers of the others
     for words in dict.fromkeys(asked.remove):
-        removed.setdefault(_where("remove", words, known).name.casefold(), []).append(words)
-    for together in removed.values():
-        edits.append((f"--remove {' '.join(together)}", Remove([_where("remove", words, known) for words in together])))
+        rule = where("remove", words)
+        removed.setdefault(str(rule.name).casefold(), []).append(rule)
+    edits += [Remove(rules) for rules in removed.values()]
     if asked.extract:
-        kept = tuple(_where("extract", words, known) for words in asked.extract)
-        edits.append((f"--extract {' '.join(asked.extract)}", Extract(kept)))
-    edits += [(f"--insert {words}", _insertion(words)) for words in asked.insert]
+        edits.append(Extract([where("extract", words) for words in asked.extract]))
     return edits
 
 
-def classes_of(edits: Sequence[Any]) -> Iterator[str | int]:
-    """The classes, by name or index, that edits need in the first splat: those before an inserted one, which may bring some."""
+def apply_edits(splats: Any, edits: Sequence[Any]) -> list[Any]:
+    """The cloud, and the cloud after each edit. A ValueError if an edit names a part of a class (`chair/6`) that is not there."""
+    states = [splats]
     for edit in edits:
-        if edit.op == "insert":
-            return
-        yield from (rule.name for rule in edit.where if rule.kind == "class")
-
-
-def check_parts(splats: Any, edits: Sequence[Any]) -> None:
-    """Raise a ValueError if an edit names a part of a class (`chair/6`) that `kfgs select` does not list."""
-    import torch
-
-    from ..labels import OfClass
-    from ..labels.components import component_numbers
-    from ..labels.parts import SPECK
-
-    rules = [rule for edit in edits for rule in getattr(edit, "where", ())]
-    for rule in (rule for rule in rules if getattr(rule, "part", None) is not None):
-        mask = OfClass(rule.name).select(splats).mask
-        sizes = torch.bincount(component_numbers(splats.means, mask, rule.distance)[mask])
-        count = int((sizes >= SPECK * sizes[0]).sum()) if len(sizes) else 0
-        if rule.part >= count:
-            raise ValueError(
-                f"{rule.name}/{rule.part + 1}: expected one of the {count} parts of {rule.name}, got no part of that number; "
-                f"`kfgs select {rule.name} SPLAT` lists them"
-            )
-
-
-def _where(option: str, words: str, names: set[str]) -> Any:
-    """A class, or one of its connected parts, as in `chair/2`."""
-    from ..labels import OfClass
-
-    name, _, part = words.rpartition("/")
-    if words.casefold() in names or not (name and part.isdecimal()):
-        return OfClass(words)
-    if int(part) == 0:
-        raise ValueError(f"{option}: expected parts counted from 1, got {words!r}; '{name}/1' is the largest")
-    return OfClass(name, int(part) - 1)
-
-
-def _insertion(words: str) -> Any:
-    import torch
-
-    from ..cameras.similarity import Similarity
-    from ..labels import Insert
-
-    path, colon, value = words.rpartition(":")
-    if Path(words).exists() or not colon:
-        path, value = words, ""
-    if not Path(path).exists():
-        raise ValueError(f"insert: expected a splat file, or one with a translation, got {words!r}; no file {path!r}")
-    if not value:
-        return Insert(Path(path))
-    shift = torch.tensor(_three("insert", words, value), dtype=torch.float64)
-    return Insert(Path(path), Similarity(1.0, torch.eye(3, dtype=torch.float64), shift))
+        for rule in getattr(edit, "where", ()):
+            if getattr(rule, "part", None) is not None and len(rule.select(states[-1])) == 0:
+                raise ValueError(
+                    f"{edit.op}: expected a part of {rule.name}, got {rule.name}/{rule.part + 1}, and there are fewer; "
+                    f"`kfgs select {rule.name} SPLAT` lists them"
+                )
+        states.append(edit.apply(states[-1]))
+    return states
 
 
 def _split(option: str, words: str, example: str) -> tuple[str, str]:

@@ -12,7 +12,7 @@ import tyro
 
 from .._files import check_output
 from .files import is_field, open_field
-from .options import Classes, Flag, Given, GivenRule, Positional
+from .options import Classes, Flag, Given, LabelRule, Positional
 from .output import say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -23,7 +23,7 @@ def evaluate(
     *,
     protocol: Annotated[str, tyro.conf.arg(metavar="NAME")] = "kfgs-pooled/1",
     truth: Given[Path] = None,
-    labels: GivenRule = None,
+    labels: Given[LabelRule] = None,
     out: Given[Path] = None,
     long: Flag = False,
     classes: Classes,
@@ -51,21 +51,19 @@ def evaluate(
 
     if out is not None:
         check_output("out", out, "a file")
-    scene, words = classes.scene, None
     loaded = open_field("field", field) if is_field(field) else None
-    if scene is None and loaded is None:
-        raise ValueError(
-            f"scene: expected a scene folder, got none, and {field} is not a field that remembers one; pass --scene"
-        )
-    if scene is None and loaded is not None:
-        scene = recall_scene(loaded.info)
-    assert scene is not None
-    rows = (scene / "text.npy").is_file() or (scene / "text.safetensors").is_file()
-    if classes.text is not None or rows or (loaded is not None and loaded.classes is not None):
-        words = replace(classes, scene=scene).load_classes(loaded)
-    question = open_question(scene, protocol, truth=truth)
+    if classes.scene is None:
+        if loaded is None:
+            raise ValueError(
+                f"scene: expected a scene folder, got none, and {field} is not a field with one; pass --scene"
+            )
+        classes = replace(classes, scene=recall_scene(loaded.info))
+    assert classes.scene is not None
+    question = open_question(classes.scene, protocol, truth=truth)
     colors = getattr(question.protocol, "of_colors", False)
-    result, command = field if colors or loaded is None else loaded, shlex.join(["kfgs", *sys.argv[1:]])
+    result = field if colors or loaded is None else loaded
+    words = None if colors else classes.load_classes(loaded)
+    command = shlex.join(["kfgs", *sys.argv[1:]])
     report = evaluate_result(result, question, encode=words, labels=labels, command=command)
     if out is not None:  # before anything is printed, whose reader may have ended
         write_json(out, report.to_json())

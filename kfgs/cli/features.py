@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from .._files import check_output
 from .files import open_field
-from .options import Classes, Flag, Given, Name, Positional, Split, Teacher, load_views
+from .options import Classes, Flag, Given, Name, Positional, Teacher, Views
 from .output import say, wrote
 
 # Heavy imports happen inside the functions, so that `kfgs --help` answers at once.
@@ -25,8 +24,7 @@ def features(
     words: Name = None,
     examples: Given[Path] = None,
     fast: Flag = False,
-    images: Given[Path] = None,
-    split: Split = "train",
+    views: Views,
     teacher: Teacher,
 ) -> None:
     """Run a teacher over a scene's pictures and store its feature maps, and embed the words that you will ask for.
@@ -55,13 +53,11 @@ def features(
             "chair;armchair;seat" is called chair. With a scene they go to SCENE/text.safetensors.
         examples: A .json file of examples, or COCO's annotations, instead of words.
         fast: One pass over each picture instead of the exact evaluation at several scales (lseg).
-        images: Folder of the pictures, if it is not SCENE/images.
-        split: Which views: train, test, all, or another split that SCENE/split.json names.
     """
     if examples is not None:
         if source is None:
             raise ValueError("source: expected the field of the examples, got none; pass RUN/field.kfgs")
-        _learn_examples(_table(out), open_field("source", source), _read_examples(examples))
+        _learn_examples(_table(out), open_field("source", source), examples)
         return
     if source is None and words is None:
         raise ValueError("source, words: expected a scene, or words to embed, got neither; see `kfgs features --help`")
@@ -69,23 +65,20 @@ def features(
     table = None if words is None else _table(out if folder is None else folder / TABLE)
     if table is not None and teacher.teacher is None:
         raise ValueError("words: expected --teacher with it, whose text encoder embeds them, got none; pass --teacher")
-    listed = None if words is None else read_words(words)
-    target = None if folder is None else folder / "features" if out is None else out
-    if target is not None:
-        check_output("out", target, "a folder")
-    scene = None if source is None else load_views(source, images, split)
+    listed = [] if words is None else read_words(words)
+    scene = None if source is None else views.load(source)
     network = teacher.load(**({"fast": True} if fast else {}))
-    written = []
     if table is not None:
-        _embed_words(network, listed or [], table)
-        written.append(table)
-    if scene is not None and target is not None:
-        _make_maps(network, scene, target, split)
+        _embed_words(network, listed, table)
+    if source is not None and folder is not None:
+        target = out or folder / "features"
+        _make_maps(network, scene, target, views.split)
         given = "" if out is None else f" --features {out}"
-        say(f"next: kfgs fit {source} --out run{given}" + ("" if split == "train" else f" --split {split}"))
-        written += [target] if network is not None else []
-    if written:
-        wrote(written)
+        say(f"next: kfgs fit {source} --out run{given}" + ("" if views.split == "train" else f" --split {views.split}"))
+        if network is not None:
+            wrote([target] if table is None else [table, target])
+    elif table is not None:
+        wrote([table])
 
 
 def _make_maps(network: Any, scene: Any, target: Path, split: str) -> None:
@@ -95,7 +88,7 @@ def _make_maps(network: Any, scene: Any, target: Path, split: str) -> None:
     if network is not None:
         extract_features(network, scene, target, split, progress=True)
         maps = FeatureFolder(target).of(scene, split)
-        say(f"{len(maps)} maps of {' x '.join(map(str, maps.shape))} by {teacher_words(maps.identity or {})}")
+        say(f"{len(maps)} maps of {' x '.join(map(str, maps.shape))} by {_teacher_words(maps.identity or {})}")
         return
     if not target.is_dir():
         raise ValueError(f"teacher: expected a teacher, or maps in {target} to check, got neither; pass --teacher")
@@ -110,17 +103,11 @@ def _make_maps(network: Any, scene: Any, target: Path, split: str) -> None:
         )
 
 
-def teacher_words(identity: dict[str, Any]) -> str:
-    """A teacher's identity in a few words: `lseg (weights 3f2a...)`."""
-    from .._check import one_line
-
-    weights, options = identity.get("weights"), identity.get("options")
-    words = [one_line(identity.get("name", "unknown"))]
-    words += [f"weights {one_line(weights)[:12]}"] if weights else []
-    words += (
-        [f"{name} {json.dumps(value)}" for name, value in sorted(options.items())] if isinstance(options, dict) else []
-    )
-    return ", ".join(words)
+def _teacher_words(identity: dict[str, Any]) -> str:
+    """A teacher's identity in a few words: `lseg, weights 3f2a..., fast true`."""
+    weights = {"weights": str(identity["weights"])[:12]} if identity.get("weights") else {}
+    words = [f"{name} {value}" for name, value in (weights | (identity.get("options") or {})).items()]
+    return ", ".join([str(identity.get("name", "unknown")), *words])
 
 
 def _table(out: Path | None) -> Path:
@@ -134,8 +121,9 @@ def _table(out: Path | None) -> Path:
 
 def _embed_words(network: Any, words: Sequence[str], table: Path) -> None:
     from ..labels.scores import CANONICAL
+    from ..teachers.prompts import make_label_set
 
-    made = text_encoder(network)(words, negatives=CANONICAL)
+    made = make_label_set(network, words, negatives=CANONICAL)
     made.save(table)
     templates = ", ".join(map(repr, made.info["templates"]))
     say(f"{len(made)} classes, {made.dim} channels each, by {made.info['teacher']['name']}, as {templates}")
@@ -143,16 +131,20 @@ def _embed_words(network: Any, words: Sequence[str], table: Path) -> None:
         say(f"  {name}: also {', '.join(more)}")
 
 
-def _learn_examples(out: Path, field: Any, examples: dict[str, Any]) -> None:
+def _learn_examples(out: Path, field: Any, path: Path) -> None:
     """Write a table of examples and, if the photographs of their views are at hand, a picture of what was shown."""
-    from ..fields import label_set_from_examples
+    from .._files import read_json
+    from ..evaluation.coco import load_coco_examples
+    from ..fields import label_set_from_examples, read_examples
     from ..viz import draw_examples, save_picture
     from ..viz.films import show_photos
 
-    scene = Classes().photos_of(field)
+    content = read_json(path)
+    coco = isinstance(content, dict) and {"images", "annotations", "categories"} <= set(content)
+    examples = load_coco_examples(path) if coco else read_examples(path)
     made = label_set_from_examples(field, examples)
     made.save(out)
-    written = [out]
+    written, scene = [out], Classes().photos_of(field)
     if scene is not None and any(hasattr(example, "view") for shown in examples.values() for example in shown):
         written.append(out.with_name(f"{out.name}.png"))
         save_picture(written[-1], draw_examples(field.cameras, examples, show_photos(scene)))
@@ -160,25 +152,10 @@ def _learn_examples(out: Path, field: Any, examples: dict[str, Any]) -> None:
     wrote(written)
 
 
-def _read_examples(path: Path) -> dict[str, Any]:
-    """The examples of a file, which may be COCO's."""
-    from .._files import read_json
-    from ..evaluation.coco import load_coco_examples
-    from ..fields import read_examples
-
-    content = read_json(path)
-    coco = isinstance(content, dict) and {"images", "annotations", "categories"} <= set(content)
-    return load_coco_examples(path) if coco else read_examples(path)
-
-
 def read_words(words: str) -> list[str]:
     """Class names from a .json list, a .txt file with a class a line, or words between commas.
 
     Text with neither ending is words, even if a folder has the same name; a file with another ending is an error.
-
-    Raises:
-        FileNotFoundError: if the file does not exist.
-        ValueError: if it is no list of words, or empty.
     """
     from .._files import read_json, read_text
 
@@ -200,16 +177,3 @@ def read_words(words: str) -> list[str]:
     if not listed:
         raise ValueError(f"words: expected at least one word, got none in {words!r}; write wall,floor or name a file")
     return listed
-
-
-def text_encoder(network: Any) -> Callable[..., Any]:
-    """A function that makes label sets of words with a teacher; it raises a ValueError if there is no text encoder."""
-    from ..teachers.prompts import make_label_set
-
-    def encode(names: Sequence[str], **options: Any) -> Any:
-        try:
-            return make_label_set(network, names, **options)
-        except NotImplementedError as error:
-            raise ValueError(str(error)) from error
-
-    return encode

@@ -2,67 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from .._files import as_path, check_output, real_path
+from .._files import check_output, real_path
 
 # Heavy imports happen inside the functions, so that `kfgs --help` answers at once.
 
-OUTPUTS = ("out", "target")
-"""Parameters that name what a command writes."""
+SCENE_PARTS = ("images", "features", "sparse", "labels", "labels_scored")
+OUTPUTS = ("out", "target")  # parameters that name what a command writes
 
 
 def check_outputs(given: Mapping[str, Any], made: str | None = None) -> None:
-    """Check that a command replaces nothing that it reads, and writes nothing among the parts of a scene.
+    """Raise a ValueError if a command would replace what it reads, or write among the parts of a scene.
 
-    Args:
-        given: its arguments by parameter.
-        made: the folder of a scene that this command makes, "features".
-
-    Raises:
-        ValueError: if the output is at such a place.
+    `given` are its arguments by parameter; it may write to the part `made`.
     """
-    read = [value for name, value in given.items() if isinstance(value, Path) and name not in OUTPUTS]
-    for name in OUTPUTS:
-        if given.get(name) is None:
-            continue
-        target = as_path(given[name])
-        spots = {real_path(target), real_path(target.parent) / target.name}  # where a link leads, and the link itself
-        above = {folder for spot in spots for folder in spot.parents}
-        for file in _files_of(read):
-            if real_path(file) in spots:
-                raise ValueError(f"{name}: expected another place than {file}, which is read; give another name")
-        for part in _parts({*read, *above}):
-            if real_path(part) in spots | above and part.name != made:
-                raise ValueError(
-                    f"{name}: expected a place apart from {part}, a part of a scene, got {target}; give another"
-                )
-
-
-def _files_of(paths: list[Path]) -> Iterator[Path]:
-    """The files that are read of some paths; the field of a run."""
     from ..fields.store import find_field
-
-    for path in paths:
-        file = find_field(path) or path
-        if file.is_file():
-            yield file
-
-
-def _parts(folders: set[Path]) -> Iterator[Path]:
-    """The folders with pictures, maps, cameras and labels of those folders that are scenes."""
     from ..scenes.load import is_scene
 
-    for scene in folders:
-        if is_scene(scene):
+    read = [value for name, value in given.items() if isinstance(value, Path) and name not in OUTPUTS]
+    for name, target in ((name, given[name]) for name in OUTPUTS if given.get(name) is not None):
+        for file in (find_field(path) or path for path in read):
+            if file.is_file() and target.is_file() and target.samefile(file):
+                raise ValueError(f"{name}: expected another place than {file}, which is read; give another name")
+        place = real_path(target)
+        for scene in (path for path in (*read, *place.parents) if is_scene(path)):
             root = scene if scene.is_dir() else scene.parent
-            yield from (root / name for name in ("images", "features", "sparse", "labels", "labels_scored"))
+            for part in (root / part for part in SCENE_PARTS if part != made):
+                if real_path(part) in (place, *place.parents):
+                    raise ValueError(
+                        f"{name}: expected a place apart from {part}, a part of a scene, got {target}; give another"
+                    )
 
 
 def check_target(name: str, target: Path) -> None:
-    """Raise a ValueError unless `target` can become a splat file; see `check_output`."""
+    """Raise a ValueError unless `target` can become a splat file."""
     from ..formats.table import formats
 
     endings = tuple(ending for kind in formats().values() if hasattr(kind, "write") for ending in kind.SUFFIXES)
@@ -95,12 +71,7 @@ def open_field(name: str, path: Path) -> Any:
 
 
 def open_splats(name: str, path: Path, *, labelled: bool = False, named: bool = False) -> Any:
-    """Read a splat file.
-
-    Raises:
-        ValueError: if the path is a semantic field, or the splat has no classes and `labelled` asks for them, or no names of
-            its classes and `named` asks for them.
-    """
+    """Read a splat file. A ValueError if it has no classes and `labelled` asks for them, or no names and `named` does."""
     from ..formats import read_splats
     from ..formats.sidecar import names_path
 
@@ -110,11 +81,11 @@ def open_splats(name: str, path: Path, *, labelled: bool = False, named: bool = 
             "`kfgs color` writes"
         )
     splats = read_splats(path)
-    if labelled and splats.labels is None:
+    if (labelled or named) and splats.labels is None:
         raise ValueError(
             f"{name}: expected a splat with classes, got {path} without; run `kfgs attach FIELD {path} --out labelled.ply`"
         )
-    if named and splats.labels is not None and not splats.names:
+    if named and not splats.names:
         raise ValueError(
             f"{name}: expected the names of its classes in {names_path(path)}, got no such file; copy it from where the "
             "splat was, or run `kfgs attach` again"

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import os
 import shlex
-import subprocess
 import sys
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from .._files import check_output, real_path, write_json
-from .options import Flag, Given, GivenMatching, Positional, SceneFolder, Split, Teacher, load_views
+from .._files import real_path, write_json
+from .options import Flag, Given, Matching, Positional, SceneFolder, Teacher, Views
 from .output import say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -25,7 +23,7 @@ def demo(out: Path = Path("kfgs_demo")) -> None:
     """See all of kfgs at work on a small room that it makes itself (about two minutes).
 
     It trains colours, makes a semantic field, segments unseen views, labels points, edits colours, and scores each against the
-    exact truth. It says at each step what it does. In a terminal with a display, it ends by opening `kfgs view`.
+    exact truth. It says at each step what it does.
 
     Examples:
         kfgs demo
@@ -36,16 +34,11 @@ def demo(out: Path = Path("kfgs_demo")) -> None:
     """
     from ..pipeline import demo as run_demo
     from ..toy.room_folder import ToyConfig
-    from ..viz.plotter import has_display
 
-    check_output("out", out, "a folder")
     room = ToyConfig(train_views=36, test_views=9)
     wrote(run_demo.run(out, room=room, report=say, progress=True))
     look = ["view", str(out / "run" / "field.kfgs"), "--scene", str(out / "scene"), "--color", str(out / "color.ply")]
     say(f'6. Look. Type "chair" there, select, edit: kfgs {shlex.join(look)}')
-    if has_display() and sys.stdin.isatty() and sys.stdout.isatty():
-        with suppress(KeyboardInterrupt):  # the viewer ends by it
-            subprocess.run([sys.executable, "-m", "kfgs", *look], check=False)
 
 
 def sfm(
@@ -53,7 +46,7 @@ def sfm(
     out: Path,
     *,
     fps: Given[float] = None,
-    matching: GivenMatching = None,
+    matching: Given[Matching] = None,
     no_single_camera: Flag = False,
     min_registered: float = 0.9,
     ignore_poses: Flag = False,
@@ -85,7 +78,6 @@ def sfm(
     from ..scenes.pictures import is_video
     from ..scenes.sfm import link_images
 
-    check_output("out", out, "a folder")
     config = SfmConfig(
         matching=matching or ("sequential" if is_video(images) else "exhaustive"),
         single_camera=not no_single_camera,
@@ -100,14 +92,12 @@ def sfm(
     for note in folder_masks(list_images(images), images)[1]:
         say(f"note: {note}")
     say(str(run_sfm(images, out, config=config, replace=replace, progress=True)))
-    written = [out / "sparse" / "0"]
-    beside = out / "images"
-    if link_images(images, out):
-        say(f"{beside} is a link to {real_path(images)}: keep the photos there")
-        written.append(beside)
-    elif real_path(beside) != real_path(images):
-        say(f"note: other commands read the pictures of these names in {beside}; --images {images} names these")
-    wrote(written)
+    linked = link_images(images, out)
+    if linked:
+        say(f"{out / 'images'} is a link to {real_path(images)}: keep the photos there")
+    elif real_path(out / "images") != real_path(images):
+        say(f"note: other commands read the pictures of these names in {out / 'images'}; --images {images} names these")
+    wrote([out / "sparse" / "0", *([out / "images"] if linked else [])])
 
 
 def _plain_pictures(images: Path, out: Path, fps: float | None) -> Path:
@@ -115,7 +105,7 @@ def _plain_pictures(images: Path, out: Path, fps: float | None) -> Path:
     from ..scenes.pictures import VIDEO_SUFFIXES, convert_heic, extract_frames, has_heic, is_video
 
     if is_video(images):
-        frames = extract_frames(images, out / "images", fps=2.0 if fps is None else fps, progress=True)
+        frames = extract_frames(images, out / "images", fps=fps or 2.0, progress=True)
         say(f"{images}: the {len(frames)} sharpest frames are in {out / 'images'}")
     elif has_heic(images):
         pictures = convert_heic(images, out / "images", progress=True)
@@ -124,9 +114,8 @@ def _plain_pictures(images: Path, out: Path, fps: float | None) -> Path:
             (out / "masks").symlink_to(real_path(masks), target_is_directory=True)
         say(f"{images}: HEIC photographs are JPEG files in {out / 'images'}, {len(pictures)} pictures in all")
     elif images.is_file():
-        raise ValueError(
-            f"images: expected a folder, or a video ({', '.join(VIDEO_SUFFIXES)}), got {images}; convert it to .mp4"
-        )
+        kinds = ", ".join(VIDEO_SUFFIXES)
+        raise ValueError(f"images: expected a folder, or a video ({kinds}), got {images}; convert it to .mp4")
     else:
         return images
     return out / "images"
@@ -141,8 +130,7 @@ def fit(
     method: Method = "uplift",
     steps: Given[int] = None,
     max_gaussians: Given[int] = None,
-    images: Given[Path] = None,
-    split: Split = "train",
+    views: Views,
     teacher: Teacher,
 ) -> None:
     """Make a semantic field of a scene and its teacher's feature maps.
@@ -168,20 +156,14 @@ def fit(
             decouple: on the raw features.
         steps: Training steps; those of the method when not given.
         max_gaussians: At most this many Gaussians in the result, 0: all of the splat; the method's when not given.
-        images: Folder of the pictures, if it is not SCENE/images.
-        split: Which views: train, test, all, or another split that SCENE/split.json names.
     """
     from ..pipeline import fit as fit_field
-    from ..pipeline import write_run_report
-    from ..pipeline.train import check_scene
+    from ..pipeline.run_report import write_run_report
     from ..scenes import FeatureFolder
 
     made_by = _method(method, splat, steps, max_gaussians)
-    check_output("out", out, "a folder")
-    as_taken = load_views(scene, images, split)
-    loaded = as_taken.undistorted()
-    chosen = loaded.views(split)
-    check_scene(loaded, chosen)
+    as_taken = views.load(scene)
+    loaded, split = as_taken.undistorted(), views.split
     network = teacher.load()
     folder = features or (scene if scene.is_dir() else scene.parent) / "features"
     if network is None and not folder.is_dir():
@@ -189,7 +171,7 @@ def fit(
             f"features: expected a folder of feature maps, got {folder}, which is none; name another, or make them with "
             "`kfgs features`"
         )
-    maps = network or FeatureFolder(folder).of(as_taken, chosen)
+    maps = network or FeatureFolder(folder).of(as_taken, split)
     field = fit_field(loaded, maps, made_by, folder=out, split=split, report=say, progress=True)
     command = f"cd {shlex.quote(os.getcwd())}\n{shlex.join(['kfgs', *sys.argv[1:]])}"
     report = write_run_report(out, field, loaded, made_by, split=split, command=command)
@@ -203,24 +185,20 @@ def _method(method: Method, splat: Path | None, steps: int | None, most: int | N
     from ..pipeline import Paper, Uplift
 
     if method == "uplift":
-        uplift = Uplift(splat)
-        options = uplift.uplift if most is None else UpliftConfig(max_gaussians=most or None)
-        return replace(
-            uplift, uplift=options, color=replace(uplift.color, training=_trained(uplift.color.training, steps))
-        )
+        made_by = Uplift(splat) if most is None else Uplift(splat, UpliftConfig(max_gaussians=most or None))
+        return replace(made_by, color=_trained(made_by.color, steps))
     if splat is not None:
         raise ValueError(f"splat: expected none with --method {method}, which trains its own Gaussians, got {splat}")
-    paper = Paper.paper() if method == "paper-full" else Paper()
-    paper = replace(paper, training=_trained(paper.training, steps, most))
+    paper = _trained(Paper.paper() if method == "paper-full" else Paper(), steps, most)
     if method == "decouple":
         return replace(paper, codebook=None, autoencoder=None)
     return replace(paper, autoencoder=None) if method == "adc" else paper
 
 
 def _trained(options: Any, steps: int | None, most: int | None = None) -> Any:
-    """The options of a training with another number of steps and Gaussians."""
-    options = options if steps is None else options.with_steps(steps)
-    return options.with_maximum(most or None)
+    """The options of `fit` or `fit_color` with another number of training steps and Gaussians."""
+    training = options.training if steps is None else options.training.with_steps(steps)
+    return replace(options, training=training.with_maximum(most or None))
 
 
 def color(
@@ -230,8 +208,7 @@ def color(
     preset: Literal["quick", "cpu", "paper"] = "cpu",
     steps: Given[int] = None,
     max_gaussians: Given[int] = None,
-    images: Given[Path] = None,
-    split: Split = "train",
+    views: Views,
 ) -> None:
     """Train a colour splat (3-D Gaussian Splatting) on a scene, and score it on the views held out.
 
@@ -245,28 +222,23 @@ def color(
             for a GPU).
         steps: Training steps; the preset's when not given.
         max_gaussians: At most this many Gaussians; the preset's when not given.
-        images: Folder of the pictures, if it is not SCENE/images.
-        split: Which views: train, test, all, or another split that SCENE/split.json names.
     """
     from ..evaluation.color import score_views
     from ..pipeline.color import ColorConfig, fit_color
     from ..pipeline.compare import PhotoPictures
 
-    check_output("out", out, "a folder")
     config = {"quick": ColorConfig.quick, "cpu": ColorConfig.cpu, "paper": ColorConfig.paper}[preset]()
-    config = replace(config, training=_trained(config.training, steps, max_gaussians))
-    loaded = load_views(scene, images, split).undistorted()
-    held_out = loaded.splits.get("test", [])
-    tested = [] if set(held_out) & set(loaded.views(split)) else [loaded.stem(i) for i in held_out]
-    gaussians = fit_color(loaded, out, config, split=split, report=say, progress=True)
+    loaded, split = views.load(scene).undistorted(), views.split
+    gaussians = fit_color(loaded, out, _trained(config, steps, max_gaussians), split=split, report=say, progress=True)
     say(repr(gaussians))
     written = [out / "color.ply"]
-    if tested:
-        beside = PhotoPictures(out / "views", tested, PICTURES)
-        scores = score_views(gaussians, loaded, "test", show=beside)
+    held_out = loaded.splits.get("test", [])
+    if held_out and not set(held_out) & set(loaded.views(split)):
+        pictures = PhotoPictures(out / "views", [loaded.stem(i) for i in held_out], PICTURES)
+        scores = score_views(gaussians, loaded, "test", show=pictures)
         write_json(out / "scores.json", {"color": scores.to_json()})
         say(str(scores))
-        written += [*beside.written, out / "scores.json"]
+        written += [*pictures.written, out / "scores.json"]
     else:
         say("note: no views are held out (split 'test', not trained on): nothing to score against")
     wrote(written)

@@ -3,54 +3,53 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
 from tyro.conf import Positional as Positional
-from tyro.constructors import PrimitiveConstructorSpec
 
 from .._notes import Repair
-from .files import open_field
 from .output import say
 
 # Heavy imports happen inside the functions, so that `kfgs --help` answers at once.
 
 T = TypeVar("T")
-_quiet = tyro.conf.arg(help_behavior_hint="")  # no "(default: None)" in the help
-Given = Annotated[T | None, _quiet]  # None when the option is not given
-Flag = Annotated[bool, _quiet]
+Given = Annotated[T | None, tyro.conf.arg(help_behavior_hint="")]  # None if the option is not given
+Flag = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
 Name = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")]
-Split = Annotated[str, tyro.conf.arg(metavar="NAME")]
 Several = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="TEXT")]
-
-
-def _choice(kind: Any) -> PrimitiveConstructorSpec[Any]:
-    """How tyro reads one word of a Literal, or None when the option is not given. On its own it counts None as a word."""
-    words = get_args(kind)
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="{" + ",".join(words) + "}",
-        instance_from_str=lambda given: given[0],
-        is_instance=lambda value: value is None or value in words,
-        str_from_instance=lambda value: [str(value)],
-        choices=words,
-    )
-
-
 By = Literal["views", "distance"]
 LabelRule = Literal["own", "nearest"]  # of `kfgs evaluate`: who says the class of a pixel
 Matching = Literal["exhaustive", "sequential"]  # of `kfgs sfm`: which pairs of pictures are compared
 Precision = Literal["lossless", "fine", "small", "tiny"]  # `fields.precision`, without its imports
 Walk = Literal["orbit", "cameras"] | Path  # paths of cameras
-GivenBy = Annotated[By | None, _choice(By), _quiet]
-GivenRule = Annotated[LabelRule | None, _choice(LabelRule), _quiet]
-GivenMatching = Annotated[Matching | None, _choice(Matching), _quiet]
-GivenWalk = Annotated[Walk | None, _quiet]
-
 SceneFolder = Annotated[
     Path, Positional, tyro.conf.arg(help="Folder with images and a COLMAP model or transforms.json.")
 ]
+
+
+@dataclass(frozen=True)
+class Views:
+    """The pictures of the scene."""
+
+    images: Given[Path] = None
+    """Folder of the pictures, if it is not SCENE/images."""
+    split: Annotated[str, tyro.conf.arg(metavar="NAME")] = "train"
+    """Which views: train, test, all, or another split that SCENE/split.json names."""
+
+    def load(self, scene: Path) -> Any:
+        """Load a scene as its pictures were taken, and print its notes."""
+        from ..scenes import load_scene
+
+        loaded = load_scene(scene, images=self.images)
+        for note in loaded.notes:
+            if self.split == "all" and "all" not in loaded.splits and note.startswith("split "):
+                note = f"split all: all {len(loaded)} views"
+            if not isinstance(note, Repair):  # those are printed already
+                say(f"note: {note}")
+        return loaded
 
 
 @dataclass(frozen=True)
@@ -87,33 +86,35 @@ class Classes:
     """Words: a table of `kfgs features --words`, or a .npy with a row for each class of the classes.json next to it; by
     default those of SCENE (text.safetensors, or text.npy and classes.json)."""
 
-    def load_scene(self) -> Any:
+    @cached_property
+    def loaded(self) -> Any:
         """The scene without distortion of its lens; None if none is given."""
         from ..scenes import load_scene
 
         return None if self.scene is None else load_scene(self.scene).undistorted()
 
     def load_classes(self, field: Any | None = None) -> Any:
-        """The label set that is named; if none is, that of the field.
+        """The label set that is named by --text, else that of the scene, else that of the field.
 
         If the scene has a `classes.json`, whose indices its label pictures hold, only these classes are taken from the
         scene's table, in their order. A table that is named by --text is used whole.
         """
         from .._files import read_json
+        from ..fields.notes import CLASSES
         from ..labels import load_label_set
 
-        listed = None if self.scene is None else self.scene / "classes.json"
+        folder = self.scene if self.scene is None or self.scene.is_dir() else self.scene.parent
         if self.text is not None:
-            beside = self.text.parent / "classes.json"
-            made = load_label_set(*((self.text,) if self.text.suffix != ".npy" else (beside, self.text)))
-            if listed is not None and listed.is_file() and tuple(read_json(listed)) != made.names:
+            beside = self.text.with_name("classes.json")
+            label_set = load_label_set(beside, self.text) if self.text.suffix == ".npy" else load_label_set(self.text)
+            listed = None if folder is None else folder / "classes.json"
+            if listed is not None and listed.is_file() and tuple(read_json(listed)) != label_set.names:
                 say(f"note: label numbers follow the class list of {self.text}, which differs from {listed}")
-            return made
-        if listed is not None and self.scene is not None:
-            rows, table = self.scene / "text.npy", self.scene / "text.safetensors"
-            words = table if table.is_file() and not rows.is_file() else rows
-            if words.is_file() or field is None or field.classes is None:
-                return load_label_set(*((words,) if words is table and not listed.is_file() else (listed, words)))
+            return label_set
+        if folder is not None:
+            for files in ([folder / name for name in names] for names in CLASSES):
+                if all(file.is_file() for file in files):
+                    return load_label_set(*files)
         if field is None or field.classes is None:
             raise ValueError(
                 "text: expected a table of words, got none; make one with `kfgs features --words chair,table --teacher NAME`, or "
@@ -127,40 +128,8 @@ class Classes:
         from ..scenes import load_scene
 
         if self.scene is not None or field is None:
-            return self.load_scene()
+            return self.loaded
         try:
             return load_scene(recall_scene(field.info)).undistorted()
         except (OSError, ValueError):
             return None
-
-    def open_field(self, name: str, path: Path) -> Any:
-        """Open a field with fused features; a trained one without them computes them from the views of --scene, if given."""
-        from ..fields import Linear, fuse_views
-
-        field = open_field(name, path)
-        fused = field.fused is not None or isinstance(field.decoder, Linear)
-        if self.scene is None or (fused and field.cameras):
-            return field
-        scene = self.load_scene()
-        trained = set(field.info.get("views", ())) or {scene.cameras[i].name for i in scene.splits.get("train", ())}
-        voting = [camera for camera in scene.cameras if camera.name in trained]
-        if not voting:
-            raise ValueError(
-                f"scene: expected the views that the field was trained on ({', '.join(sorted(trained)[:3])}, ...), got "
-                f"{len(scene.cameras)} others in {self.scene}; pass the field's own scene, or --text instead"
-            )
-        return fuse_views(field, voting)
-
-
-def load_views(scene: Path, images: Path | None, split: str) -> Any:
-    """Load a scene as its pictures were taken, and print its notes."""
-    from ..scenes import load_scene
-
-    loaded = load_scene(scene, images=images)
-    notes = tuple(note for note in loaded.notes if not isinstance(note, Repair))  # those are printed already
-    if split == "all" and "all" not in loaded.splits:
-        rule = f"split all: all {len(loaded)} views"
-        notes = tuple(rule if note.startswith("split ") else note for note in notes)
-    for note in notes:
-        say(f"note: {note}")
-    return loaded

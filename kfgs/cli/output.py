@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
 
+from .._compiling import say_compiling
 from .._notes import hear
 
 LINE, END = 2000, 600
@@ -17,56 +17,12 @@ LINE, END = 2000, 600
 
 
 def say(text: str, file: TextIO | None = None) -> None:
-    r"""Print a line at once, to standard output or a file; the place that prints.
+    r"""Print a line at once, to standard output or a file.
 
     Names from foreign files may hold anything: what is not printable is shown as Python writes it (`\x1b`), and the middle
     of a very long line is left out.
-
-    Raises:
-        BrokenPipeError: if the reader of the stream has ended, for instance `head`.
-        OSError: if the stream cannot take the line, for instance because the disk is full.
     """
-    stream = file or sys.stdout
-    with _writing(stream):
-        print("\n".join(_shown(line) for line in text.split("\n")), file=stream, flush=True)
-
-
-@contextmanager
-def said_whole() -> Iterator[None]:
-    """Write what others printed in the block when it ends, not when the interpreter does; raises as `say` does."""
-    try:
-        yield
-    finally:
-        with _writing(sys.stdout):
-            sys.stdout.flush()
-
-
-@contextmanager
-def _writing(stream: TextIO) -> Iterator[None]:
-    """Name the stream in errors of writing, and send to nowhere what it still has to write."""
-    try:
-        yield
-    except OSError as error:
-        with suppress(OSError):  # else the interpreter tries again to write what is left, and complains
-            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-        if isinstance(error, BrokenPipeError):
-            raise
-        other = "standard error" if stream is sys.stderr else getattr(stream, "name", "the output")
-        name = "standard output" if stream is sys.stdout else other
-        raise type(error)(f"{name} cannot be written ({error.strerror}); choose another place for it") from error
-
-
-def open_streams() -> None:
-    """Give closed standard streams (`2>&-`) an end that takes everything.
-
-    Otherwise the next file that is opened gets the number of the stream, and what a library says there is written into it.
-    """
-    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
-        os.set_inheritable(number, True)
-    os.close(number)
-    for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (it lives as long as the process)
+    print("\n".join(map(_shown, text.split("\n"))), file=file or sys.stdout, flush=True)
 
 
 def _shown(line: str) -> str:
@@ -78,7 +34,7 @@ def _shown(line: str) -> str:
     )
 
 
-def wrote(paths: list[Path]) -> None:
+def wrote(paths: Sequence[Path]) -> None:
     """Name the files that a command wrote."""
     say("wrote:")
     for path in paths:
@@ -87,10 +43,10 @@ def wrote(paths: list[Path]) -> None:
 
 def say_counts(labels: Any, names: Sequence[str]) -> None:
     """Print the number of Gaussians of each class, and of those without a class."""
-    for i, name in enumerate(names):
-        say(f"  {_shown(name):<16s} {int((labels == i).sum()):8d} Gaussians")
-    if bool((labels < 0).any()):
-        say(f"  {'(none)':<16s} {int((labels < 0).sum()):8d} Gaussians")
+    for i, name in [*enumerate(names), (-1, "(none)")]:
+        count = int((labels == i).sum())
+        if i >= 0 or count:
+            say(f"  {name:<16s} {count:8d} Gaussians")
 
 
 def say_lost(written: Any) -> None:
@@ -102,28 +58,20 @@ def say_lost(written: Any) -> None:
 
 
 @contextmanager
-def warnings_as_notes(spoken: Callable[[str], str], *, strict: bool = False) -> Iterator[None]:
-    """Print warnings about classes and teachers, in the words of `spoken`, and notes of readers, as notes of one line each.
+def notes_as_lines(spoken: Callable[[str], str], *, strict: bool) -> Iterator[None]:
+    """Print warnings, in the words of `spoken`, and notes of readers as lines; on stderr that kernels are compiled.
 
     With `strict`, readers refuse what they would leave out.
     """
-    with warnings.catch_warnings(), hear(lambda words: say(f"note: {words}"), strict=strict):
+
+    def note(message: Warning | str, *_: Any, **__: Any) -> None:
+        say(f"note: {spoken(str(message))}")
+
+    with (
+        warnings.catch_warnings(),
+        hear(note, strict=strict),
+        say_compiling(lambda text: say(f"note: {text}", sys.stderr)),  # next to the progress bars
+    ):
         warnings.filterwarnings("always", message="classes: ")
-
-        def note(message: Warning | str, *_: Any, **__: Any) -> None:
-            say(f"note: {spoken(str(message))}")
-
         warnings.showwarning = note
-        yield
-
-
-@contextmanager
-def said_on_stderr() -> Iterator[None]:
-    """Say on stderr when the kernels of the CPU engine are compiled, beside the progress bars."""
-    from .._compiling import say_compiling
-
-    def tell(text: str) -> None:
-        print(f"note: {text}", file=sys.stderr, flush=True)  # noqa: T201
-
-    with say_compiling(tell):
         yield

@@ -16,12 +16,10 @@ if TYPE_CHECKING:
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
-WORDS = "photo, labels, features or query=TEXT"
 KEYS = 40  # cameras of a long walk that become keys: enough to follow it, few enough to smooth out a shaking hand
 FPS = 15.0
+TITLES = {"photo": "colours", "labels": "classes"}
 FRAMES, WIDTH = 72, 480  # of a path without cameras of your own
-MOST_FRAMES = 100_000  # more than an hour of film at 25 a second
-LARGEST = 1 << 14  # pixels on a side: a square picture in floats takes 3 GB
 OVERHEAD = "ceiling"  # left out of an orbit, which looks in from above
 
 
@@ -67,30 +65,21 @@ def render(
     if out.suffix.lower() not in SUFFIXES:
         raise ValueError(f"out: expected a name that ends in .gif or .mp4, got {out.name!r}; rename it")
     check_target(out, FPS)
-    walked = read_walk(path, frames, film=True)
+    walked = read_walk(path, frames)
     field = find_field(source)
     meaning, cameras = open_meaning(field or source, classes, Teacher())
-    if (scene := classes.load_scene()) is not None:
-        cameras = scene.cameras
-    colors = open_colors(field, color, meaning)
-    semantic = meaning.gaussians
+    if classes.loaded is not None:
+        cameras = classes.loaded.cameras
+    semantic, colors = meaning.gaussians, open_colors(field, color, meaning)
     colors = None if colors is None else colors.with_origin(semantic.origin)
     if path == "orbit":
         semantic, colors = _opened(meaning.names, semantic, colors)
     words = [word.strip() for word in (show or ("labels" if colors is None else "photo,labels")).split(",")]
-    shows = {_title(word): _show(word, meaning, semantic, colors) for word in words}
+    shows = {TITLES.get(word, word.removeprefix("query=")): _show(word, meaning, semantic, colors) for word in words}
     walk = walk_of(walked, semantic if colors is None else colors, cameras, frames, width or WIDTH)
-    listed = semantic.labels.unique() if "labels" in words else None
+    names, listed = (meaning.names, semantic.labels.unique()) if "labels" in words else (None, None)
     with tqdm(total=len(walk), desc="render", unit="frame") as bar:
-        save_animation(
-            out,
-            shows,
-            walk,
-            fps=FPS,
-            names=None if listed is None else meaning.names,
-            listed=listed,
-            progress=lambda *_: bar.update(),
-        )
+        save_animation(out, shows, walk, fps=FPS, names=names, listed=listed, progress=lambda *_: bar.update())
     wrote([out])
 
 
@@ -100,82 +89,45 @@ def _opened(names: Any, semantic: Any, colors: Any) -> tuple[Any, Any]:
     from ..labels import transfer_labels
 
     box = robust_bounds(semantic.means.double(), margin=0.02)
-    label = names.index(OVERHEAD) if OVERHEAD in names else None
 
     def kept(cloud: Any) -> Any:
         inside = ((cloud.means >= box.low) & (cloud.means <= box.high)).all(dim=1)
-        if label is None:
-            return cloud.select(inside)
-        own = cloud is semantic
-        labels = semantic.labels if own else transfer_labels(semantic, cloud).labels
-        return cloud.select(inside & (labels != label))
+        if OVERHEAD in names:
+            labels = (semantic if cloud is semantic else transfer_labels(semantic, cloud)).labels
+            inside = inside & (labels != names.index(OVERHEAD))
+        return cloud.select(inside)
 
     shown = kept(semantic)
     return shown, None if colors is None else shown if colors is semantic else kept(colors)
 
 
-def read_walk(path: Walk, frames: int | None, *, film: bool = False) -> Walk | list[Camera]:
-    """Check what `walk_of` is asked for, before anything else is read; cameras of your own are read here.
+def read_walk(path: Walk, frames: int | None) -> Walk | list[Camera]:
+    """The cameras of a file or folder, with `frames` those of a smooth path through them; the name of a path as it is.
 
-    Args:
-        path: the name of a path, or a file or folder with cameras of your own.
-        frames: how many cameras; None: as many as there are.
-        film: the cameras must be of one size.
-
-    Returns:
-        The name of the path, or the cameras.
+    It is called before anything else is read.
     """
     from .._check import check_whole
+    from ..cameras import path_cameras
+    from ..scenes import load_cameras
     from ..scenes.load import is_scene
 
     if frames is not None:
-        check_whole("frames", frames, 2, MOST_FRAMES)
+        check_whole("frames", frames, 2)
     if not isinstance(path, Path):
         return path
-    if not ((path.suffix == ".json" and path.exists()) or (path.is_dir() and is_scene(path))):
+    if not (path.is_file() and path.suffix == ".json") and not (path.is_dir() and is_scene(path)):
         raise ValueError(
             "path: expected orbit, cameras, a transforms.json (a name that ends in .json), or a folder with a COLMAP model, "
             f"got {path}; `--path cameras` flies along the cameras of the field"
         )
-    return _own_walk(path, frames, film)
-
-
-def _own_walk(path: Path, frames: int | None, film: bool) -> list[Camera]:
-    """The cameras of a file or folder; with `frames`, those of a smooth path through them."""
-    from ..cameras import path_cameras
-    from ..cameras.paths import TooFewViewsError
-    from ..scenes import load_cameras
-
     own = load_cameras(path)
-    sizes = [(camera.width, camera.height) for camera in own]
-    if frames is not None:
-        sizes = sizes[:1]
-    for w, h in sizes:
-        if max(w, h) > LARGEST:
-            raise ValueError(
-                f"path: expected cameras of at most {LARGEST} x {LARGEST} pixels, got {w} x {h} in {path}; make them smaller"
-            )
-    if film and len(set(sizes)) > 1:
-        listed = " and ".join(f"{w}x{h}" for w, h in sorted(set(sizes))[:3])
-        raise ValueError(
-            f"path: expected cameras of one size for a film, got {listed} in {path}; give --frames, which takes the size of the "
-            "first"
-        )
-    if frames is None:
-        return [camera.resized(h, w) for camera, (w, h) in zip(own, sizes, strict=True)]
-    try:
-        return path_cameras(own, frames, size=sizes[0][::-1])
-    except TooFewViewsError as error:
-        got = "1" if len(own) == 1 else f"{len(own)} that are all at one place and angle"
-        raise ValueError(
-            f"frames: expected two different cameras or more to go through, got {got} in {path}; leave it out"
-        ) from error
+    return own if frames is None else path_cameras(own, frames, size=own[0].size)
 
 
 def walk_of(
     path: Walk | list[Camera], cloud: Any, cameras: list[Camera], frames: int | None, width: int = WIDTH
 ) -> list[Camera]:
-    """The cameras of a path that `read_walk` gave. Those of the scene are needed for a flight along them."""
+    """The cameras of a path that `read_walk` gave; those of the scene are needed for a flight along them."""
     from ..cameras import Orbit, orbit_cameras, path_cameras
     from ..viz.linked import upwards
 
@@ -197,27 +149,23 @@ def walk_of(
     return path_cameras(cameras, frames, every=max(1, round(len(cameras) / KEYS)), size=size)
 
 
-def _title(word: str) -> str:
-    return {"photo": "colours", "labels": "classes"}.get(word, word.removeprefix("query="))
-
-
 def _show(word: str, meaning: Any, semantic: Any, colors: Any) -> Any:
+    """The function camera -> picture of a word of --show."""
     from ..viz import show_cloud
     from ..viz.films import show_selection
 
     under = None if colors is None else show_cloud(colors, color_by="rgb")
-    if word == "photo":
-        if under is None:
-            raise ValueError("show: expected --color for photo, got none; name the colour splat of the scene")
+    if word == "photo" and under is not None:
         return under
     if word == "labels":
         return show_cloud(semantic, color_by="label", names=meaning.names)
-    if word == "features":
-        if semantic.features is None:
-            raise ValueError("show: expected a field for features, got a splat without; leave it out")
+    if word == "features" and semantic.features is not None:
         return show_cloud(semantic, color_by="feature")
     if word.startswith("query="):
         asked = meaning.ask(word.removeprefix("query="))
         say(f"{asked.words}: {len(asked.selection)} of {len(meaning.gaussians)} Gaussians, {asked.selection.summary}")
         return show_selection(meaning.gaussians, asked.selection.mask, under)
-    raise ValueError(f"show: expected {WORDS}, got {word!r}; separate them with commas")
+    raise ValueError(
+        "show: expected photo (which needs --color), labels, features (of a field) or query=TEXT, with commas between, "
+        f"got {word!r}; leave it out"
+    )

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated
+
+import tyro
 
 from .._files import check_output, file_stem, read_json, write_json
 from .files import open_field
-from .options import Classes, Flag, Given, GivenWalk, Positional, Split
+from .options import Classes, Flag, Given, Positional, Walk
 from .output import say, wrote
 from .render import read_walk, walk_of
 from .view import open_colors
-
-if TYPE_CHECKING:
-    from ..cameras import Camera
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
@@ -23,8 +22,8 @@ def segment(
     field: Positional[Path],
     out: Path,
     *,
-    split: Split = "test",
-    path: GivenWalk = None,
+    split: Annotated[str, tyro.conf.arg(metavar="NAME")] = "test",
+    path: Given[Walk] = None,
     frames: Given[int] = None,
     coco: Flag = False,
     classes: Classes,
@@ -50,68 +49,62 @@ def segment(
             and its pictures to coco/images: undistorted photographs, or with --path rendered colours.
     """
     from ..fields import recall_scene
-    from ..pipeline import score_scene, segment_scene, true_labels, write_coco
+    from ..pipeline import score_scene, segment_scene, true_labels
+    from ..pipeline.segment import write_coco
     from ..viz import plot_iou
 
     check_output("out", out, "a folder")
     if path is not None:
-        wrote(_segment_path(field, out, path, frames, coco, classes))
+        _segment_path(field, out, path, frames, coco, classes)
         return
     loaded_field = open_field("field", field)
     folder = recall_scene(loaded_field.info) if classes.scene is None else classes.scene
     classes = replace(classes, scene=folder)
-    scene, label_set = classes.load_scene(), classes.load_classes(loaded_field)
+    scene, label_set = classes.loaded, classes.load_classes(loaded_field)
     labels = next((folder / name for name in ("labels_scored", "labels") if (folder / name).is_dir()), None)
     listed = folder / "classes.json"
     if labels is not None and listed.is_file() and tuple(read_json(listed)) != label_set.names:
         say(f"note: not scored: {labels} counts the classes of {listed}, which are others")
         labels = None
     truth = {} if labels is None else true_labels(scene, labels, split)
-    seen = set(loaded_field.info.get("views", ())) & {scene.cameras[i].name for i in scene.views(split)}
+    views = {scene.stem(i): i for i in scene.views(split)}
+    seen = set(loaded_field.info.get("views", ())) & {scene.cameras[i].name for i in views.values()}
     if seen:
         say(f"note: the field was trained on {len(seen)} of these views")
     maps = segment_scene(loaded_field, scene, label_set, out, split=split, truth=truth, progress=True)
     written = [out / name for name in ("predicted", "colored", "sheets")]
     if coco:
-        views = {scene.stem(i): i for i in scene.views(split)}
         written.append(write_coco(out, maps, label_set.names, lambda stem: scene.image(views[stem])))
     if truth:
         scores = score_scene(maps, truth, label_set)
-        facts = {"truth": str(labels), "field": str(field)}
-        write_json(out / "scores.json", {"segmentation": scores.to_json(), **facts})
+        write_json(out / "scores.json", {"segmentation": scores.to_json(), "truth": str(labels), "field": str(field)})
         plot_iou(scores.iou, list(label_set.names), out / "iou.png")
-        written += [out / name for name in ("scores.json", "iou.png")]
+        written += [out / "scores.json", out / "iou.png"]
         say(str(scores))
     else:
         say(f"note: no label pictures of split {split!r} to score against")
-    wrote([path for path in written if path.exists()])
+    wrote([place for place in written if place.exists()])
 
 
-def _segment_path(field: Path, out: Path, path: Any, frames: int | None, coco: bool, classes: Classes) -> list[Path]:
-    """Segment the cameras of a path, and with --coco render the colours that they see; name what was written."""
+def _segment_path(field: Path, out: Path, path: Walk, frames: int | None, coco: bool, classes: Classes) -> None:
+    """Segment the cameras of a path, and with --coco render the colours that they see."""
     from ..fields.store import find_field
-    from ..pipeline import segment_cameras, write_coco
-    from ..pipeline.segment import picture_names
+    from ..pipeline import segment_cameras
+    from ..pipeline.segment import write_coco
     from ..viz import show_cloud
 
     own = read_walk(path, frames)
-    if isinstance(own, list):
-        picture_names(own, "path")
-    loaded = classes.open_field("field", field)
-    label_set, scene = classes.load_classes(loaded), classes.load_scene()
-    cameras = list(loaded.cameras) if scene is None else scene.cameras
-    walk: dict[str, Camera] = {
-        file_stem(camera.name): camera for camera in walk_of(own, loaded.gaussians, cameras, frames)
-    }
+    loaded = open_field("field", field)
+    cameras = list(loaded.cameras) if classes.loaded is None else classes.loaded.cameras
+    walk = {file_stem(camera.name): camera for camera in walk_of(own, loaded.gaussians, cameras, frames)}
+    label_set = classes.load_classes(loaded)
     maps = segment_cameras(loaded, list(walk.values()), label_set, out, progress=True)
     written = [out / "predicted", out / "colored"]
     if coco:
         colors = open_colors(find_field(field), None, loaded)
+        if colors is None:
+            say("note: no colour splat is known, so the annotations have no pictures; train one with `kfgs color`")
         show = None if colors is None else show_cloud(colors, color_by="rgb")
-        if show is None:
-            say(
-                "note: no colour splat is known, so there are no pictures for the annotations; train one with `kfgs color`"
-            )
-        picture: Any = None if show is None else lambda name: show(walk[name])
+        picture = None if show is None else lambda name: show(walk[name])
         written.append(write_coco(out, maps, label_set.names, picture))
-    return written
+    wrote(written)

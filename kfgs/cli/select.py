@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from .._files import atomic_folder, check_output
-from .features import text_encoder
-from .files import is_field, open_splats
+from .files import is_field, open_field, open_splats
 from .options import Classes, Given, Positional, Teacher
 from .output import say, wrote
 
@@ -45,125 +46,112 @@ def select(
         distance: Gaussians at most this far apart are one part, in world units; by default from the spacing of the scene.
     """
     from .._check import check_range
-    from ..labels import connected_parts
+    from ..labels import OfClass, Selection, connected_parts
     from ..labels.components import component_distance
 
     if out is not None:
         check_output("out", out, "a folder")
     if threshold is not None:
         check_range("threshold", threshold, 0, 1)
-    named = not is_field(source) and threshold is None  # parts are numbered as `kfgs edit` does
+    scene = classes.loaded
     if is_field(source):
-        field = classes.open_field("source", source)
-        label_set, target = ask(query, classes, teacher, field)
-        query = target if isinstance(target, str) else query
+        field = open_field("source", source)
+        query, target, label_set = _target(query, classes, teacher, field)
         selection = field.query(target, label_set, threshold)
         cloud, cameras = field.gaussians.replace(scores=selection.scores), field.cameras or None
         scene = classes.photos_of(field) if out is not None else None
     else:
-        cloud = open_splats("source", source, labelled=True, named=True)
-        selection = _of_class(cloud, query, threshold)
-        scene = classes.load_scene()
-        cameras = None if scene is None else scene.cameras
+        cloud = open_splats("source", source, named=True)
+        cameras, selection = None if scene is None else scene.cameras, OfClass(query).select(cloud)
+        if cloud.scores is not None:
+            mask = selection.mask if threshold is None else selection.mask & (cloud.scores > threshold)
+            selection = Selection(mask, cloud.scores, threshold, selection.how)
     headline = f"{query}: {len(selection)} of {len(cloud)} Gaussians, {selection.summary}"
     if out is not None and len(selection) == 0:
         say(headline)
         raise ValueError(f"query: expected Gaussians to save, got none of {query!r}; lower the threshold or drop --out")
-    joined = distance
-    if joined is None and len(selection):
-        joined = component_distance(cloud.means, selection.mask)
-    parts = connected_parts(cloud, selection, cameras, distance=joined)
-    written: list[str] = []
+    if distance is None and len(selection):
+        distance = component_distance(cloud.means, selection.mask)
+    parts = connected_parts(cloud, selection, cameras, distance=distance)
     if out is not None:  # before anything is printed, whose reader may have ended
-        with atomic_folder(out) as new:
-            _save(new, query, cloud, selection, parts)
-            _draw(new / "parts.png", query, cloud, parts, cameras, scene)
-            written += sorted(path.name for path in new.iterdir())
-        for name in {"parts.png", "selection.ply.classes.json"} - set(written):
-            (out / name).unlink(missing_ok=True)  # of an older selection
+        facts = {"query": query, "threshold": selection.threshold, "how": selection.how, "count": len(selection)}
+        written = _save(out, facts | {"parts": parts}, cloud, selection, cameras, scene)
     say(headline)
+    named = not is_field(source) and threshold is None  # parts are numbered as `kfgs edit` does
     for number, part in enumerate(parts, start=1):
         say(f"  {query}/{number}: {part!r}" if named else f"  {part!r}")
     if parts:
-        say(f"  parts are joined within {joined:.3g}; --distance changes it")
-    if parts and (left := parts[0].total - len(parts)):
-        say(f"  {left} smaller part{'s are' if left > 1 else ' is'} not listed")
+        say(f"  parts are joined within {distance:.3g}; --distance changes it")
+        left = parts[0].total - len(parts)
+        if left:
+            say(f"  {left} smaller part{'s are' if left > 1 else ' is'} not listed")
     if out is not None:
         wrote([out / name for name in written])
 
 
-def _of_class(splats: Any, name: str, threshold: float | None) -> Any:
-    """The Gaussians of a labelled splat that have a class, and a score above the threshold."""
-    from ..labels import OfClass, Selection
-
-    chosen = OfClass(name).select(splats)
-    if splats.scores is None or threshold is None:
-        return chosen if splats.scores is None else Selection(chosen.mask, splats.scores, None, chosen.how)
-    return Selection(chosen.mask & (splats.scores > threshold), splats.scores, threshold, chosen.how)
-
-
-def _save(folder: Path, query: str, cloud: Any, selection: Any, parts: list[Any]) -> None:
-    """Write a selection as numbers (JSON) and as Gaussians (PLY)."""
+def _save(folder: Path, facts: dict[str, Any], cloud: Any, selection: Any, cameras: Any, scene: Any) -> list[str]:
+    """Write a selection as numbers (JSON), as Gaussians (PLY), and as a picture of its parts over photographs."""
     from .._files import write_json
     from ..formats import write_splats
-
-    listed = [part.to_json() for part in parts]
-    facts = {"query": query, "threshold": selection.threshold, "how": selection.how, "count": len(selection)}
-    write_json(folder / "selection.json", {**facts, "parts": listed})
-    write_splats(cloud.select(selection.mask), folder / "selection.ply")
-
-
-def _draw(path: Path, query: str, gaussians: Any, parts: list[Any], cameras: Any, scene: Any) -> None:
-    """Draw the parts over photographs; without them over the cloud's own colours, if it has some."""
     from ..pipeline.label import write_parts
     from ..viz import show_cloud
     from ..viz.films import show_photos
 
-    under = None if gaussians.sh is None else show_cloud(gaussians, color_by="rgb")
+    under = None if cloud.sh is None else show_cloud(cloud, color_by="rgb")
     under = under if scene is None else show_photos(scene)
-    write_parts(path, gaussians, parts, cameras or (), under, query)
+    parts = facts["parts"]
+    with atomic_folder(folder) as new:
+        write_json(new / "selection.json", facts | {"parts": [part.to_json() for part in parts]})
+        write_splats(cloud.select(selection.mask), new / "selection.ply")
+        write_parts(new / "parts.png", cloud, parts, cameras or (), under, facts["query"])
+        written = sorted(path.name for path in new.iterdir())
+    for name in {"parts.png", "selection.ply.classes.json"} - set(written):
+        (folder / name).unlink(missing_ok=True)  # of an older selection
+    return written
 
 
-def ask(query: str, classes: Classes, teacher: Teacher, field: Any) -> tuple[Any, Any]:
-    """The label set and the target of a query: the name of a class, or the embedding of a phrase.
-
-    Without a teacher the query must be a class of the table. With a teacher it may be any phrase, embedded in the table's
-    templates; canonical negatives then come from the teacher. If the options name no table, the field's classes are used.
-    """
-    network = teacher.load()
-    if network is None:
-        label_set = classes.load_classes(field)
-        try:
-            return label_set, label_set.names[label_set.index(query)]
-        except ValueError as error:
-            raise ValueError(
-                f"{error}; for any other phrase pass --teacher and --weights, or add it to the table of words"
-            ) from error
-    known = classes.text is not None or classes.scene is not None or field.classes is not None
-    label_set = classes.load_classes(field) if known else None
-    templates = None if label_set is None else label_set.info.get("templates")
-    asked = text_encoder(network)([query], templates=templates)
-    name = asked.names[0]
-    if label_set is None:
-        return asked, name
-    note_other_teacher(asked, label_set)
-    knows = label_set.knows(name)
-    if asked.dim == label_set.dim:  # otherwise the query raises an error
-        label_set = replace(label_set, negatives=asked.negatives, negative_names=asked.negative_names, info=asked.info)
-    return label_set, label_set.names[label_set.index(name)] if knows else asked.embeddings[0]
+def _target(query: str, classes: Classes, teacher: Teacher, field: Any) -> tuple[str, Any, Any]:
+    """The query in the spelling of the table, what `SemanticField.query` asks (a class, or an embedding), and the table."""
+    label_set, embed = words_of(classes, teacher, field)
+    if embed is not None and not label_set.knows(query):
+        return query, embed(query), label_set
+    try:
+        name = label_set.names[label_set.index(query)]
+    except ValueError as error:
+        advice = "for any other phrase pass --teacher and --weights, or add it to the table of words"
+        raise ValueError(f"{error}; {advice}") from error
+    return name, name, label_set
 
 
-def note_other_teacher(asked: Any, table: Any) -> None:
-    """Print a note if a query and its table were embedded by different teachers.
+def words_of(classes: Classes, teacher: Teacher, field: Any) -> tuple[Any, Callable[[str], Any] | None]:
+    """The label set, and a function that turns a phrase into a row of the teacher's space, in the table's templates.
 
-    `SemanticField.query` checks whether the query fits the field.
+    The teacher is loaded here, so that a wrong file is reported at once. The canonical words, with which a phrase is
+    compared, are then its own. It may be asked without a table of words, too.
     """
     from ..labels.label_set import teacher_mismatch
+    from ..labels.scores import CANONICAL
+    from ..teachers.prompts import make_label_set
 
-    difference = teacher_mismatch(asked.info, table.info)
+    network = teacher.load()
+    if network is None:
+        return classes.load_classes(field), None
+    known = classes.text is not None or classes.scene is not None or field.classes is not None
+    label_set = classes.load_classes(field) if known else make_label_set(network, ["thing"], negatives=CANONICAL)
+    templates = label_set.info.get("templates")
+    asked = make_label_set(network, ["thing"], templates=templates, negatives=CANONICAL)
+    difference = teacher_mismatch(asked.info, label_set.info)
     if difference is not None:
         say(
-            f"note: --text: expected a table by the query's teacher (from --teacher and --weights), got one by another "
-            f"({difference}); they cannot be compared: use the table's teacher for the query, or pass a "
-            "table of the query's teacher as --text"
+            "note: --text: expected a table by the query's teacher (from --teacher and --weights), got one by another "
+            f"({difference}); they cannot be compared: use the table's teacher for the query, or pass a table of the "
+            "query's teacher as --text"
         )
+    if asked.dim == label_set.dim:  # otherwise the query raises an error
+        label_set = replace(label_set, negatives=asked.negatives, negative_names=asked.negative_names, info=asked.info)
+
+    @cache
+    def embed(phrase: str) -> Any:
+        return make_label_set(network, [phrase], templates=templates).embeddings[0]
+
+    return label_set, embed

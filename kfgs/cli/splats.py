@@ -4,31 +4,26 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-from .._files import check_output, real_path
-from .edit_syntax import Edits, check_parts, classes_of, parse_edits
+from .._files import check_output
+from .edit_syntax import Edits, apply_edits, parse_edits
 from .files import check_target, is_field, open_field, open_splats
-from .options import Classes, Flag, Given, GivenBy, Positional, Precision
+from .options import By, Classes, Flag, Given, Positional, Precision
 from .output import say, say_counts, say_lost, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
 TITLES = ("before", "after")
 PICTURES = 2  # views that `kfgs edit` shows
-UNITS = {
+UNITS = {  # of the error of a tensor; those of all others are shares
     "gaussians.means": "world units a coordinate",
     "gaussians.quats": "degrees",
     "gaussians.scales": "of a scale, and as much of twice the error of a coordinate",
     "seen.pixels": "of a count, and as much of a pixel",
-    "gaussians.opacities": "",
-    "gaussians.features": "",
-    "fused.latents": "",
-    "seen.agreement": "",
+    **dict.fromkeys(("gaussians.opacities", "gaussians.features", "fused.latents", "seen.agreement"), ""),
 }
-"""What the error of a tensor is measured in; that of all others is a share."""
 
 
 def attach(
@@ -36,7 +31,7 @@ def attach(
     cloud: Positional[Path],
     out: Path,
     *,
-    by: GivenBy = None,
+    by: Given[By] = None,
     distance: Given[float] = None,
     splat_scene: Given[Path] = None,
     same_frame: Flag = False,
@@ -64,17 +59,14 @@ def attach(
         splat_scene: Scene folder of the splat's own cameras, if its frame differs: cameras of the same names align the two.
         same_frame: Do not compare the frames; they are the same.
     """
-    from .._check import check_range
     from ..cameras.similarity import Similarity
     from ..formats import write_splats
-    from ..pipeline import label_cloud
     from ..pipeline.attach import attach as attach_field
+    from ..pipeline.label import label_cloud
     from ..scenes import SceneError, load_scene
 
     check_target("out", out)
-    if distance is not None:
-        check_range("distance", distance, 0, closed=(False, False))
-    loaded = classes.open_field("field", field)
+    loaded = open_field("field", field)
     label_set = classes.load_classes(loaded)
     if _of_points(cloud):
         moved, paths = label_cloud(loaded.label(label_set), cloud, out, distance=distance)
@@ -83,19 +75,23 @@ def attach(
         wrote(paths)
         return
     splats = open_splats("cloud", cloud)
-    same = Similarity.identity() if same_frame else None
-    frame = same if splat_scene is None else load_scene(splat_scene).undistorted().cameras
+    scene, cameras = classes.loaded, None
+    if scene is not None and not loaded.cameras:
+        cameras = [scene.cameras[i] for i in scene.views("train")]
+    frame: Any = Similarity.identity() if same_frame else None
+    if splat_scene is not None:
+        frame = load_scene(splat_scene).undistorted().cameras
     try:
-        labelled = attach_field(loaded, splats, label_set, frame=frame, distance=distance, by=by)
+        attached = attach_field(loaded, splats, label_set, cameras=cameras, frame=frame, distance=distance, by=by)
     except SceneError as error:
         raise SceneError(
             f"cloud: no frame found in which field and splat agree: {error} (--splat-scene gives the splat's cameras, "
             "--same-frame says that there is nothing to find)"
         ) from error
-    written = write_splats(labelled.gaussians, out, facts=labelled.facts)
-    for note in labelled.notes:
+    written = write_splats(attached.gaussians, out, facts=attached.facts)
+    for note in attached.notes:
         say(note)
-    say_counts(labelled.labels, label_set.names)
+    say_counts(attached.labels, label_set.names)
     say_lost(written)
     wrote(written.paths)
 
@@ -140,57 +136,33 @@ def edit(
 
     check_target("out", out)
     saved = check_output("out", out.with_name(f"{out.name}.edits.json"), "a file")
-    if replay is not None and real_path(replay) == real_path(saved):
-        raise ValueError(
-            f"replay: expected another file than {saved}, where the edits are saved, got the same; give --out another name"
-        )
-    for name in (part for words in edits.insert for part in (words, words.rpartition(":")[0]) if part):
-        if real_path(name) == real_path(out):
-            raise ValueError(f"out: expected another place than {name}, which is read; give another name")
     replayed = EditList() if replay is None else EditList.load(replay, anywhere=True)  # the user's own file
-    asked = parse_edits(edits)
+    rules = [rule for change in replayed for rule in getattr(change, "where", ())]
+    named = edits.recolor or edits.move or edits.remove or edits.extract or any(rule.kind == "class" for rule in rules)
+    before = open_splats("splats", splats, named=bool(named))
+    states = apply_edits(before, list(replayed))
+    asked = parse_edits(edits, states[-1].names)
     if not asked and not len(replayed):
         raise ValueError("edits: expected at least one, got none; give --remove, --recolor, --move or another")
-    by_class = [*classes_of(list(replayed)), *classes_of([change for _, change in asked])]
-    named = any(isinstance(name, str) for name in by_class)
-    before = open_splats("splats", splats, labelled=bool(by_class), named=named)
-    start, listed = replayed.apply(before), replayed
-    asked = parse_edits(edits, start.names)
-    check_parts(start, [change for _, change in asked])
-    for _, change in asked:
-        listed = listed.then(change)
     if scene is not None and before.sh is None:
         raise ValueError(f"scene: expected a splat with colours to show in it, got {before!r}; leave --scene out")
     cameras = [] if scene is None else load_scene(scene).undistorted().cameras
-    after = _apply(asked, start)
-    shown = []
-    if cameras:
-        states = list(accumulate(list(listed)[:-1], lambda cloud, change: change.apply(cloud), initial=before))[1:]
-        shown = [cameras[i] for i in views_of_change(before, after, cameras, PICTURES, between=states)]
+    states += apply_edits(states[-1], asked)[1:]
+    after = states[-1]
+    shown = [cameras[i] for i in views_of_change(before, after, cameras, PICTURES, between=states[1:-1])]
     written = write_splats(after, out)
-    paths = [*written.paths, listed.save(saved)]
+    paths = [*written.paths, EditList((*replayed, *asked)).save(saved)]
     if shown:
-        picture = out.with_name(f"{out.name}.png")
-        paths.append(write_comparison(picture, before, after, shown, titles=TITLES))
-    say(f"{len(before)} Gaussians before, {len(after)} after {len(listed)} edit(s)")
+        paths.append(write_comparison(out.with_name(f"{out.name}.png"), before, after, shown, titles=TITLES))
+    say(f"{len(before)} Gaussians before, {len(after)} after {len(states) - 1} edit(s)")
     if len(after) == 0:
         say("note: nothing is left")
     say_lost(written)
-    if cameras and not shown:
-        say("note: no view of the scene shows a change")
     if shown:
         say("before and after from " + ", ".join(camera.name for camera in shown))
+    elif cameras:
+        say("note: no view of the scene shows a change")
     wrote(paths)
-
-
-def _apply(asked: list[tuple[str, Any]], splats: Any) -> Any:
-    """Apply the edits of options: an error quotes the option's words."""
-    for words, change in asked:
-        try:
-            splats = change.apply(splats)
-        except ValueError as error:
-            raise ValueError(f"{words}: {error}") from error
-    return splats
 
 
 def convert(
@@ -227,7 +199,8 @@ def convert(
     """
     from ..batch.run import describe_batch
     from ..formats import write_splats
-    from ..pipeline import describe, save_labelled
+    from ..pipeline.describe import describe
+    from ..pipeline.label import save_labelled
 
     if target is None:
         say(describe_batch(source) or describe(source))
@@ -262,11 +235,11 @@ def _pack(source: Path, target: Path, precision: Precision) -> None:
         about = read_description(target)
         errors = about["info"]["rounded"][-1]["errors"]
         for name, size in stream_sizes(target).items():
-            error, words_of_error = errors.get(name), ""
-            if error is not None:
-                share = f"{100 * error:.2g} % of a row's typical number"
-                words_of_error = "within " + (f"{error:.3g} {UNITS[name]}" if name in UNITS else share)
-            say(f"  {name:<32s} {size:>10,d} bytes  {words_of_error}".rstrip())
+            within = ""
+            if name in errors:
+                share = f"{100 * errors[name]:.2g} % of a row's typical number"
+                within = "within " + (f"{errors[name]:.3g} {UNITS[name]}" if name in UNITS else share)
+            say(f"  {name:<32s} {size:>10,d} bytes  {within}".rstrip())
         say(f"{about['gaussians']:,} Gaussians in {target.stat().st_size / 2**20:.2f} MiB")
         say(
             "note: neighbours now lie side by side (Morton order), so indices into the old field do not fit the new one"
@@ -284,11 +257,8 @@ def _convert_by_class(source: Path, folder: Path) -> None:
     if len(splats) == 0:
         raise ValueError(f"source: expected Gaussians to divide by class, got none in {source}; name another splat")
     parts = {_file_name(label, splats.names): part for label, part in splats.by_class().items()}
-    for name in parts:
-        if real_path(folder / name) == real_path(source):
-            raise ValueError(
-                f"target: expected another folder than that of {source}, got {folder}; it would be overwritten"
-            )
+    if any((folder / name).is_file() and (folder / name).samefile(source) for name in parts):
+        raise ValueError(f"target: expected another folder than that of {source}, which is read; give another name")
     with atomic_folder(folder) as new:
         for name, part in parts.items():
             written = write_splats(part.replace(labels=None, scores=None), new / name, plain=True)
@@ -308,5 +278,4 @@ def _file_name(label: int, classes: Sequence[str]) -> str:
 
 def _bytes_of(path: Path) -> int:
     """Bytes of a file, or of all files in a folder."""
-    files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
-    return sum(file.stat().st_size for file in files)
+    return sum(file.stat().st_size for file in (path, *path.rglob("*")) if file.is_file())

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 from .._files import check_output, real_path
-from .features import text_encoder
-from .files import is_field, open_splats
+from .files import is_field, open_field, open_splats
 from .options import Classes, Given, Positional, Teacher
 from .output import say, wrote
-from .select import note_other_teacher
+from .select import words_of
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
@@ -70,7 +66,12 @@ def view(
     meaning, cameras = open_meaning(field or source, classes, teacher)
     colors = open_colors(field, color, meaning)
     state = Exploration(meaning, None if colors is meaning.gaussians else colors, cameras=cameras)
-    _note(state)
+    about = state.details().get("color")
+    if about and about["total"] - about["none"] < FEW * about["total"]:
+        say(
+            f"note: only {about['total'] - about['none']:,} of {about['total']:,} colour Gaussians lie within lambda of "
+            "the field; another frame? `kfgs attach` checks and aligns"
+        )
     if ask is not None:
         state.ask(ask)
     for line in state.lines():
@@ -85,21 +86,14 @@ def view(
                 wrote([out / "view.png"])
         return
     state.set_show(state.first_show)
-    scene = classes.photos_of(getattr(meaning, "field", None))
-    viewer = Viewer(state, title=_title(source), scene=scene, out=out)
+    path = real_path(source)  # the title tells one page from another: the run of RUN/field.kfgs, else the file
+    title = path.parent.name if path.name == "field.kfgs" else path.stem
+    viewer = Viewer(state, title=title, scene=classes.photos_of(getattr(meaning, "field", None)), out=out)
     if where == "html":
         out.mkdir(parents=True, exist_ok=True)
         wrote([viewer.save_html(out / "view.html")])
     else:
         viewer.serve(report=say)
-
-
-def _title(source: Path) -> str:
-    """What tells one page from another: the run of RUN/field.kfgs, else the file."""
-    from ..fields.store import NAME
-
-    path = real_path(source)
-    return path.parent.name if path.name == NAME else path.stem
 
 
 def open_colors(field: Path | None, color: Path | None, meaning: Any) -> Any:
@@ -125,42 +119,8 @@ def open_meaning(source: Path, classes: Classes, teacher: Teacher) -> tuple[Any,
     from ..viewer import FieldMeaning, SplatMeaning
 
     if is_field(source) or not source.exists():
-        field = classes.open_field("source", source)
-        label_set, embed = _words_of(classes.load_classes(field), teacher)
+        field = open_field("source", source)
+        label_set, embed = words_of(classes, teacher, field)
         return FieldMeaning(field, label_set, embed=embed), list(field.cameras)
-    scene = classes.load_scene()
-    return SplatMeaning(open_splats("source", source, labelled=True)), [] if scene is None else scene.cameras
-
-
-def _words_of(label_set: Any, teacher: Teacher) -> tuple[Any, Callable[[str], Any] | None]:
-    """The label set, and a function that turns a phrase into a row of the teacher's space, in the table's templates.
-
-    The teacher is loaded here, so that a wrong file is reported at once. If the table has no canonical words to compare a
-    phrase with, the teacher embeds them.
-    """
-    from ..labels.scores import CANONICAL
-
-    network = teacher.load()
-    if network is None:
-        return label_set, None
-    encode, templates = text_encoder(network), label_set.info.get("templates")
-    probe = encode(["thing"], templates=templates, negatives=CANONICAL)
-    note_other_teacher(probe, label_set)
-    if label_set.negatives is None and probe.dim == label_set.dim:
-        label_set = replace(label_set, negatives=probe.negatives, negative_names=probe.negative_names)
-
-    @functools.cache
-    def embed(phrase: str) -> Any:
-        return encode([phrase], templates=templates).embeddings[0]
-
-    return label_set, embed
-
-
-def _note(state: Any) -> None:
-    """Print a note if the clouds are probably in different frames."""
-    color = state.details().get("color")
-    if color and color["total"] - color["none"] < FEW * color["total"]:
-        say(
-            f"note: only {color['total'] - color['none']:,} of {color['total']:,} colour Gaussians lie within lambda of "
-            "the field; another frame? `kfgs attach` checks and aligns"
-        )
+    splats = open_splats("source", source, labelled=True)
+    return SplatMeaning(splats), [] if classes.loaded is None else classes.loaded.cameras

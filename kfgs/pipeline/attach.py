@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -10,7 +10,6 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from .._card import LINE, cut
 from .._check import check_choice, check_range
 from .._origin import recounted
 from ..cameras import Camera
@@ -46,11 +45,9 @@ class Attached:
     """The same as JSON; `write_splats(..., facts=)` keeps them with the class names."""
 
     def __repr__(self) -> str:
-        labelled, names = int((self.labels >= 0).sum()), len(self.gaussians.names)
-        within = f"lambda {self.transfer.distance:.4g}"
-        return cut(
-            f"Attached({labelled:,} of {len(self.gaussians):,} Gaussians labelled, {names} classes, {within})", LINE
-        )
+        labelled, within = int((self.labels >= 0).sum()), f"lambda {self.transfer.distance:.4g}"
+        total, names = len(self.gaussians), len(self.gaussians.names)
+        return f"Attached({labelled:,} of {total:,} Gaussians labelled, {names} classes, {within})"
 
     @property
     def labels(self) -> Tensor:  # [N] int64
@@ -93,32 +90,21 @@ def attach(
     Raises:
         ValueError: if `by` is unknown, cameras are missing, the splat is empty, the words have another D than
             the field, or (SceneError) no similarity fits.
-        TypeError: if `frame` is neither.
 
     Note:
         Toy room, colour field of 40,000 Gaussians, protocol `kfgs-removal/1`, the chairs: by distance 0.979 of their
         pixels are removed and 0.969 of the others unchanged; by views 0.995 and 0.970 (the same with true label maps).
         A vote of neighbours for border Gaussians, or the class of the nearest rendered surface, was worse.
     """
-    if not isinstance(field, SemanticField):
-        raise TypeError(
-            f"field: expected a SemanticField, got {type(field).__name__}; load it with SemanticField.load(path)"
-        )
     splats = read_splats(splats) if isinstance(splats, str | Path) else splats
-    cameras = cameras or field.cameras or None
-    by = by or ("distance" if cameras is None else "views")
+    cameras = list(cameras or field.cameras)
+    by = by or ("views" if cameras else "distance")
     check_choice("by", by, ("distance", "views"))
-    views = isinstance(frame, Sequence) and all(isinstance(camera, Camera) for camera in frame)
-    if not views and not isinstance(frame, Similarity | None):
-        raise TypeError(
-            f"frame: expected a Similarity, views in the splat's frame, or None, got {type(frame).__name__}; a matrix "
-            "becomes one by Similarity.from_matrix"
-        )
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
     if len(splats) == 0:
         raise ValueError("splats: expected at least one Gaussian, got none; there is nothing to label")
-    for name, needed in (('by="views"', by == "views"), ("frame", views)):
+    for name, needed in (('by="views"', by == "views"), ("frame", isinstance(frame, Sequence))):
         if needed and not cameras:
             raise ValueError(f"cameras: expected views in the field's frame (for {name}), got none; pass them as well")
     if field.fused is None and cameras:
@@ -130,49 +116,48 @@ def attach(
         labels, scores = transfer.labels, transfer.scores
         how: dict[str, Any] = {"labelled by": "distance to the field's Gaussians", "score": NEARNESS}
     else:
-        assert cameras is not None
-        labels, scores, transfer = _by_views(field, splats, semantic, classes, cameras, similarity, distance)
+        views = ((similarity.apply_to_camera(camera), field.segment(camera, classes)) for camera in cameras)
+        votes = vote_labels(splats, views, len(semantic.names), min_share=0.0)
+        hidden = votes.labels < 0
+        transfer = _carry(splats.replace(labels=votes.labels), splats.select(hidden), distance)
+        labels, scores = votes.labels.clone(), votes.shares.clone()
+        labels[hidden], scores[hidden] = transfer.labels, transfer.scores.to(scores)
         how = {
             "labelled by": f"votes of {len(cameras)} segmented views",
             "score": f"share of the votes; where no view shows a Gaussian, {NEARNESS}, to those that have a class",
             "shown": len(splats) - len(transfer.labels),
             "not shown": len(transfer.labels),
         }
-    names, carried = semantic.names, len(transfer.labels) > 0
-    counts = torch.bincount(labels + 1, minlength=len(names) + 1).tolist()
+    counts = torch.bincount(labels + 1, minlength=len(semantic.names) + 1).tolist()
     facts = {
         **how,
-        "lambda": transfer.distance if carried else None,
-        "lambda from": transfer.how if carried else None,
+        "lambda": transfer.distance if len(transfer.labels) else None,
+        "lambda from": transfer.how if len(transfer.labels) else None,
         "frame": frame_note,
         "alignment": None if alignment is None else alignment.to_json(),
         "similarity": similarity.matrix().tolist(),
-        "counts": {"none": counts[0], **dict(zip(names, counts[1:], strict=True))},
+        "counts": {"none": counts[0], **dict(zip(semantic.names, counts[1:], strict=True))},
     }
-    labelled = splats.replace(labels=labels, scores=scores.float(), names=names)
-    who = f"{how['labelled by']}: {len(splats) - counts[0]} of {len(splats)} Gaussians have a class"
-    return Attached(
-        labelled, transfer, similarity, alignment, (frame_note, who, _about(transfer, len(splats), by)), facts
-    )
+    notes = frame_note, f"{how['labelled by']}: {_about(transfer, len(splats), by)}"
+    labelled = splats.replace(labels=labels, scores=scores.float(), names=semantic.names)
+    return Attached(labelled, transfer, similarity, alignment, notes, facts)
 
 
 def _common_frame(
-    field: SemanticField,
-    splats: Gaussians,
-    cameras: Sequence[Camera] | None,
-    frame: Similarity | Sequence[Camera] | None,
+    field: SemanticField, splats: Gaussians, cameras: Sequence[Camera], frame: Similarity | Sequence[Camera] | None
 ) -> tuple[Similarity, Alignment | None, str]:
     """The similarity from the field's frame to the splat's, the alignment behind it, and a sentence about it."""
     if isinstance(frame, Similarity):
         return frame, None, "the similarity between the frames was given"
     if frame is not None:
-        assert cameras is not None
         alignment = align_by_cameras(cameras, frame)
         return alignment.similarity, alignment, f"aligned by {alignment.summary}"
-    origin = field.gaussians.origin
-    check = frames_agree(
-        *(_solid(cloud, recounted(cloud.means, cloud.origin, origin)) for cloud in (field.gaussians, splats))
-    )
+    origin, solid = field.gaussians.origin, []
+    for cloud in (field.gaussians, splats):
+        means = recounted(cloud.means, cloud.origin, origin)
+        seen = (cloud.opacities > SOLID) & means.isfinite().all(1)
+        solid.append(means[seen] if int(seen.sum()) >= 100 else means)  # all, if nearly all are faint
+    check = frames_agree(*solid)
     if check.agree:
         return Similarity.identity(), None, check.summary
     raise SceneError(
@@ -181,36 +166,8 @@ def _common_frame(
     )
 
 
-def _solid(cloud: Gaussians, means: Tensor) -> Tensor:  # [N, 3] -> [n, 3]
-    """The positions of Gaussians that are not faint; all positions if nearly all are faint."""
-    seen = (cloud.opacities > SOLID) & means.isfinite().all(1)
-    return means[seen] if int(seen.sum()) >= 100 else means
-
-
-def _by_views(
-    field: SemanticField,
-    splats: Gaussians,
-    semantic: Gaussians,
-    classes: LabelSet | None,
-    cameras: Sequence[Camera],
-    similarity: Similarity,
-    distance: float | None,
-) -> tuple[Tensor, Tensor, Transfer]:
-    """Labels [N] and scores [N] by the pixels that each Gaussian fills; and the transfer to those that no view shows."""
-
-    def segmented() -> Iterator[tuple[Camera, Tensor]]:
-        for camera in cameras:
-            yield similarity.apply_to_camera(camera), field.segment(camera, classes)
-
-    votes = vote_labels(splats, segmented(), len(semantic.names), min_share=0.0)
-    hidden = votes.labels < 0
-    carried = _carry(splats.replace(labels=votes.labels), splats.select(hidden), distance)
-    labels, scores = votes.labels.clone(), votes.shares.clone()
-    labels[hidden], scores[hidden] = carried.labels, carried.scores.to(scores)
-    return labels, scores, carried
-
-
 def _carry(source: Gaussians, target: Gaussians, distance: float | None) -> Transfer:
+    """The labels of a cloud, by distance."""
     assert source.labels is not None
     means = recounted(target.means, target.origin, source.origin)
     return nearest_labels(source.means, source.labels, means, distance)
@@ -218,10 +175,10 @@ def _carry(source: Gaussians, target: Gaussians, distance: float | None) -> Tran
 
 def _about(transfer: Transfer, total: int, by: By) -> str:
     """How many of all Gaussians got their class from the views, how many by distance, and how many got none."""
-    shown, lambda_ = total - len(transfer.labels), f"(lambda {transfer.distance:.3g})"
+    carried = f"by distance (lambda {transfer.distance:.3g})"
     if by == "distance":
-        ways = [f"{transfer.labelled:,} got a class by distance {lambda_}"]
+        ways = [f"{transfer.labelled:,} got a class {carried}"]
     else:
-        ways = [f"{shown:,} got a class by the views"]
-        ways += [f"{transfer.labelled:,} that no view shows by distance {lambda_}"] if transfer.labelled else []
-    return f"{total:,} Gaussians: {', '.join(ways)}, {transfer.orphaned:,} got none"
+        ways = [f"{total - len(transfer.labels):,} got a class by the views"]
+        ways += [f"{transfer.labelled:,} that no view shows {carried}"] if transfer.labelled else []
+    return f"of {total:,} Gaussians {', '.join(ways)}, {transfer.orphaned:,} got none"

@@ -20,7 +20,7 @@ from ..fields.checkpoint import digest_tensors
 from ..formats import write_splats
 from ..gaussians import Gaussians
 from ..scenes import Scene
-from .stages import Run, Stage, digest_pictures, digest_scene, stage_generator
+from .stages import Run, digest_pictures, digest_scene, stage_generator
 from .train import field_stage, stage_params, training_device, training_views, with_extent, with_points
 
 
@@ -54,9 +54,8 @@ class ColorConfig:
     def cpu() -> ColorConfig:
         """A schedule for two CPU cores, minutes for a room: the method of 3DGS, an eighth of its steps at three times its rates.
 
-        The first half of the steps compares pictures of half the size, which takes half of the time; the others add the
-        detail, with rates that fall to a tenth (without that, 1 dB less on room_0). Growing ends early, is limited, and
-        has a higher threshold. Opacities are not reset: there are too few steps to recover.
+        The first half of the steps compares pictures of half the size, which takes half of the time; in the others the rates
+        fall to a tenth (without that, 1 dB less on room_0). Opacities are not reset: there are too few steps to recover.
         """
         rates = Rates(5e-4, 5e-6, quats=0.003, scales=0.015, sh0=0.008, sh_rest=4e-4, final=0.1)
         densify = Densify(80, 1_800, 50, 3e-4, reset_every=0, maximum=150_000)
@@ -68,7 +67,7 @@ class ColorConfig:
         """A schedule for Gaussians to fuse features onto: two minutes on two CPU cores.
 
         Pictures stay at half size, so colours are soft, but positions and sizes of Gaussians are right within a few pixels
-        of a teacher's map. (room_0: 100,000 Gaussians; `docs/results.md` compares the mIoU with the `cpu` schedule.)
+        of a teacher's map.
         """
         densify = Densify(100, 1_200, 50, 4e-4, reset_every=0, maximum=100_000)
         training = Training(2_000, _RATES, densify, half_until=2_000, sh_degree_every=700, checkpoint_every=500)
@@ -89,16 +88,11 @@ _RATES = Rates(3.2e-4, 3.2e-6, quats=0.002, scales=0.01, sh0=0.005, sh_rest=0.00
 
 
 class TrainingPictures(Sequence[Tensor]):
-    """The training pictures at their training size: read at the first access, then kept as bytes.
+    """The pictures of some views at the sizes of their cameras: read at the first access, then kept as bytes.
 
     A picture is [h, w, 3] float32 in [0, 1], or [h, w, 4] if it has transparent pixels: colours before black, and
     opacity. A pixel is NaN if it does not count wholly (masked, or at the border of an undistorted picture). Bytes take a
     quarter of the memory: 0.9 MB for 639x479.
-
-    Args:
-        scene: the scene.
-        views: indices of its views.
-        cameras: one per view, with the training size.
     """
 
     def __init__(self, scene: Scene, views: Sequence[int], cameras: Sequence[Camera]) -> None:
@@ -120,10 +114,8 @@ class TrainingPictures(Sequence[Tensor]):
         picture, known, alpha = self._scene.image(view), self._scene.mask(view), self._scene.alpha(view)
         if alpha is not None:
             picture = torch.cat([picture, alpha[..., None]], dim=2)
-        inside = known.float()[..., None]
-        picture = resize_map(picture, size, antialias=True)
-        inside = resize_map(inside, size, antialias=True)[..., 0]
-        bytes_ = (picture.clamp(0, 1) * 255).round().to(torch.uint8)
+        bytes_ = (resize_map(picture, size, antialias=True).clamp(0, 1) * 255).round().to(torch.uint8)
+        inside = resize_map(known.float()[..., None], size, antialias=True)[..., 0]
         return bytes_, None if bool(known.all()) else inside > 1 - 1e-4
 
 
@@ -178,16 +170,11 @@ def color_stage(
     progress: Progress,
 ) -> Gaussians:
     """The Gaussians of a colour field, as a stage of a run."""
-    inputs = _inputs(run, scene, views, config, seed)
 
     def train(checkpoint: Path) -> FieldFit:
-        generator = stage_generator(seed, "color")
+        generator, degree = stage_generator(seed, "color"), config.sh_degree
         start = GaussianParams.from_points(
-            scene.points,
-            colors=scene.colors,
-            sh_degree=config.sh_degree,
-            max_points=config.max_points,
-            generator=generator,
+            scene.points, colors=scene.colors, sh_degree=degree, max_points=config.max_points, generator=generator
         )
         cameras = [scene.cameras[i] for i in views]
         if config.picture_scale != 1:
@@ -204,26 +191,23 @@ def color_stage(
             checkpoint=checkpoint,
         )
 
-    return field_stage(run, "color", inputs, train)[0].activated().detach()
+    return field_stage(run, "color", _inputs(run, scene, views, config, seed), train)[0].activated().detach()
 
 
 def find_color(run: Run, scene: Scene, views: Sequence[int], config: ColorConfig) -> tuple[Gaussians, int] | None:
-    """Gaussians and steps of the longest colour stage of this scene in the run, if it has more steps than `config`.
-
-    `fit_color` makes such a stage in the same run folder.
-    """
+    """Gaussians and steps of the longest colour stage of this scene in the run, if it has more steps than `config`."""
     free: dict[str, None] = {"config": None, "seed": None}
     wanted = json.loads(json.dumps(_inputs(run, scene, views, config, 0) | free))
-    fitting = [stage for stage in run.finished("color") if stage.inputs | free == wanted]
-    longest = max(fitting, key=_steps, default=None)
-    if longest is None or _steps(longest) <= config.training.steps:
+    fitting = {
+        int(stage.inputs["config"]["training"]["steps"]): stage
+        for stage in run.finished("color")
+        if stage.inputs | free == wanted
+    }
+    steps = max(fitting, default=0)
+    if steps <= config.training.steps:
         return None
-    run.say(f"geometry: the colours of {_steps(longest):,} steps that are in {run.folder}")
-    return stage_params(longest).activated().detach(), _steps(longest)
-
-
-def _steps(stage: Stage) -> int:
-    return int(stage.inputs["config"]["training"]["steps"])
+    run.say(f"geometry: the colours of {steps:,} steps that are in {run.folder}")
+    return stage_params(fitting[steps]).activated().detach(), steps
 
 
 def _inputs(run: Run, scene: Scene, views: Sequence[int], config: ColorConfig, seed: int) -> dict[str, Any]:

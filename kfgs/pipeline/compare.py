@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._check import check_whole
 from .._files import as_path
 from ..cameras import Camera
 from ..gaussians import Gaussians
@@ -36,16 +35,10 @@ def views_of_change(
 ) -> list[int]:
     """The viewpoints that show an edit best. Each looks in a different direction than those before it, if possible.
 
-    Args:
-        before: the scene.
-        after: the edited scene.
-        cameras: viewpoints to choose from.
-        count: the most to choose. Views without a change are never chosen; views of which more than half changes only if
-            there are too few others.
-        between: the scene after each of several edits: then each edit gets its best view first, unless a chosen view shows
-            it half as well, or it is undone later.
+    At most `count` are chosen: views without a change never, views of which more than half changes only if there are too few
+    others. `between` is the scene after each of several edits: then each edit gets its best view first, unless a chosen view
+    shows it half as well, or it is undone later.
     """
-    check_whole("count", count, 0)
     small = [camera.resized(max(1, round(PREVIEW * camera.height / camera.width)), PREVIEW) for camera in cameras]
     drawn = [[render_color(state, camera) for camera in small] for state in (before, *between, after)]
     total = _shares(drawn[0], drawn[-1])
@@ -77,14 +70,10 @@ def _ranked(shares: Sequence[float]) -> list[int]:
 def write_comparison(
     path: str | Path, before: Gaussians, after: Gaussians, cameras: Sequence[Camera], *, titles: tuple[str, str]
 ) -> Path:
-    """Draw the scene before and after from each viewpoint, one row each, into one PNG file.
-
-    Pictures less wide than the others get a white border.
-    """
+    """Draw the scene before and after from each viewpoint, one row each, into one PNG file."""
     rows = [[render_color(cloud, camera) for cloud in (before, after)] for camera in cameras]
-    path = as_path(path)
-    save_picture(path, picture_grid(rows, titles))
-    return path
+    save_picture(as_path(path), picture_grid(rows, titles))
+    return as_path(path)
 
 
 class PhotoPictures:

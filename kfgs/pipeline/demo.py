@@ -16,15 +16,8 @@ from ..fields.store import NAME
 from ..formats import write_splats
 from ..formats.ply import write_ply
 from ..gaussians import Gaussians
-from ..labels import (
-    EditList,
-    LabelSet,
-    OfClass,
-    Recolor,
-    Remove,
-    connected_parts,
-    load_label_set,
-)
+from ..labels import EditList, OfClass, Recolor, Remove, connected_parts
+from ..labels.color import parse_color
 from ..scenes import FeatureFolder, Scene, load_scene
 from ..toy.room_folder import ToyConfig, make_toy_room
 from .attach import attach
@@ -63,14 +56,11 @@ def run(
         "photo what a 2-D network would say about its pixels, with the errors of such networks."
     )
     folder = make_toy_room(out / "scene", room or ToyConfig())
-    scene = load_scene(folder)
-    classes = load_label_set(folder / "classes.json", folder / "text.npy")
-
+    scene, maps = load_scene(folder), FeatureFolder(folder / "features")
     say(
         "2. Colours. An ordinary Gaussian splat is trained on the photos. It knows nothing of chairs. If you have a splat of "
         "your own, kfgs takes that."
     )
-    maps = FeatureFolder(folder / "features").of(scene, "train")
     colors = fit_color(scene, out / "run", ColorConfig.quick(), seed=seed, report=say, progress=progress)
     quality = score_views(colors, scene)
     say(f"colours of unseen views: {quality}")
@@ -79,22 +69,20 @@ def run(
         "cancel. Then the features are compressed: a few numbers instead of 512, and neighbours that mean the same become one."
     )
     method = Uplift(colors)
-    field = fit(scene, maps, method, folder=out / "run", seed=seed, report=say, progress=progress)
+    field = fit(scene, maps.of(scene, "train"), method, folder=out / "run", seed=seed, report=say, progress=progress)
     say(field.summary())
-
     say(
         "4. Segmentation. Views that no photo shows are drawn from the field, a class for each pixel, and compared with the "
         "truth. mIoU is the mean over classes of overlap divided by union; 1 is perfect."
     )
-    truth = true_labels(scene, folder / "labels", "test")
+    assert field.classes is not None
+    classes, truth = field.classes, true_labels(scene, folder / "labels", "test")
     unseen = segment_scene(field, scene, classes, out / "segmentation", truth=truth, progress=progress)
     scores = score_scene(unseen, truth, classes)
-    test_maps = FeatureFolder(folder / "features", list(unseen))
-    size = scene.cameras[scene.views("test")[0]].size
-    teacher = score_teacher(lambda stem: test_maps[list(unseen).index(stem)], truth, classes, size)
+    seen = dict(zip(unseen, maps.of(scene, "test"), strict=True))
+    teacher = score_teacher(seen.__getitem__, truth, classes, scene.cameras[scene.views("test")[0]].size)
     say(f"unseen views: {scores}")
     say(f"the 2-D network alone, on the same views: {teacher.miou}")
-
     gaussians = field.label(classes)
     written = save_labelled(out / "gaussians.ply", gaussians, rule="fused features; score = cosine")
     surface = _label_surface(gaussians, folder, out / "surface.ply")
@@ -103,44 +91,30 @@ def run(
         f'5. Edits. The classes are carried over to the splat with the colours, and then "{REMOVED}" is a name for Gaussians: '
         f"the {REMOVED}s are removed, and the {PAINTED}s are painted red. Pictures show the views that change most."
     )
-    edited = _edit_colors(out, scene, field, colors, classes, say)
+    edited = _edit_colors(out, scene, field, colors, say)
     reports: dict[str, Any] = {"unseen_views": scores, "teacher": teacher, "surface": surface, "color": quality}
-    write_json(out / "scores.json", {name: report.to_json() for name, report in reports.items()})
-    return [
-        out / "run" / NAME,
-        *(out / "segmentation" / name for name in ("predicted", "colored", "sheets")),
-        *written,
-        out / "surface.ply",
-        *write_run_report(out / "run", field, scene, method, command="kfgs demo"),
-        *edited,
-        out / "scores.json",
-    ]
+    write_json(out / "scores.json", {name: value.to_json() for name, value in reports.items()})
+    pages = write_run_report(out / "run", field, scene, method, command="kfgs demo")
+    segmented = [out / "segmentation" / name for name in ("predicted", "colored", "sheets")]
+    return [out / "run" / NAME, *segmented, *written, out / "surface.ply", *pages, *edited, out / "scores.json"]
 
 
 def _edit_colors(
-    out: Path,
-    scene: Scene,
-    field: SemanticField,
-    colors: Gaussians,
-    classes: LabelSet,
-    say: Callable[[str], None],
+    out: Path, scene: Scene, field: SemanticField, colors: Gaussians, say: Callable[[str], None]
 ) -> list[Path]:
     """Attach the classes to the colours, remove the chairs and recolour the plants; returns the files."""
-    before = attach(field, colors, classes).gaussians
+    before = attach(field, colors).gaussians
     written = write_splats(before, out / "color.ply").paths
     for part in connected_parts(before, OfClass(REMOVED).select(before), field.cameras):
         say(f"  {REMOVED}: {part!r}")
-    edits = {
-        "removed": EditList((Remove(OfClass(REMOVED)),)),
-        "recolored": EditList((Recolor(OfClass(PAINTED), PAINT),)),
-    }
-    after = {name: edit.apply(before) for name, edit in edits.items()}
-    for name, edit in edits.items():
-        written += [*write_splats(after[name], out / f"{name}.ply").paths, edit.save(out / f"{name}.ply.edits.json")]
-        before_after = before, after[name]
-        views = views_of_change(*before_after, scene.cameras)
-        picture = out / f"{name}.png"
-        written.append(write_comparison(picture, *before_after, [scene.cameras[i] for i in views], titles=TITLES))
+    for name, edit in {
+        "removed": Remove(OfClass(REMOVED)),
+        "recolored": Recolor(OfClass(PAINTED), parse_color(PAINT)),
+    }.items():
+        after, file = edit.apply(before), out / f"{name}.ply"
+        written += [*write_splats(after, file).paths, EditList((edit,)).save(out / f"{name}.ply.edits.json")]
+        views = [scene.cameras[i] for i in views_of_change(before, after, scene.cameras)]
+        written.append(write_comparison(out / f"{name}.png", before, after, views, titles=TITLES))
     return written
 
 
@@ -148,9 +122,8 @@ def _label_surface(gaussians: Gaussians, folder: Path, out: Path) -> Report:
     """Carry the Gaussians' labels to the room's true surface points and score them (protocol `kfgs-surface/1`)."""
     assert gaussians.labels is not None
     truth = find_points(folder)
-    points, true = truth.points.float(), truth.labels
-    local = recounted(points, ORIGIN, gaussians.origin)
-    report = score_surface(gaussians.means, gaussians.labels, local, true)
+    points = truth.points.float()
+    report = score_surface(gaussians.means, gaussians.labels, recounted(points, ORIGIN, gaussians.origin), truth.labels)
     write_ply(out, {name: points[:, i].contiguous().numpy() for i, name in enumerate("xyz")})
     label_cloud(gaussians, out, out)
     return report

@@ -17,16 +17,13 @@ from ..formats import find_format, read_splats
 from ..formats.ply import read_ply
 from ..formats.table import splat_file_of
 from ..gaussians import Gaussians
-from ..scenes import FeatureFolder, Scene, SceneError, list_images, load_scene
-from ..scenes.files import some
+from ..scenes import FeatureFolder, load_scene
 from ..scenes.load import is_scene
 from .stages import Run
 
 
 def describe(path: str | Path) -> str:
-    """Describe a field, run or scene folder, a folder of feature maps, photos or scenes, a splat, or a PLY of points.
-
-    A splat is a file, or the output folder of a training program.
+    """Describe a field, run, scene, folder of feature maps, splat (also the folder of a training program), or PLY of points.
 
     Raises:
         FileNotFoundError: if the path does not exist.
@@ -48,17 +45,10 @@ def describe(path: str | Path) -> str:
     if (path / "stages").is_dir():
         lines = [f"  {one_line(stage.name)}: done in {stage.seconds:.1f} s" for stage in Run(path).finished("*")]
         return "\n".join([f"{path}: unfinished run; the same fit again continues", *lines])
-    try:
-        return _describe_scene(path, load_scene(path))
-    except SceneError as error:
-        if is_scene(path):
-            raise
-        with suppress(FileNotFoundError, ValueError, TypeError):
+    with suppress(FileNotFoundError, ValueError, TypeError):
+        if not is_scene(path):
             return _describe_maps(path)
-        return _describe_folder(path, error)
-
-
-def _describe_scene(path: Path, scene: Scene) -> str:
+    scene = load_scene(path)
     sizes = sorted({camera.size for camera in scene.cameras})
     splits = ", ".join(f"{name} {len(views)}" for name, views in scene.splits.items())
     lines = [
@@ -70,25 +60,6 @@ def _describe_scene(path: Path, scene: Scene) -> str:
         *(f"  note: {note}" for note in scene.notes),
     ]
     return "\n".join(lines)
-
-
-def _describe_folder(path: Path, error: SceneError) -> str:
-    """Photos without poses, or a folder of scenes or runs; else the error of the scene that was expected."""
-    for photos in (path / "images", path):
-        names = [name for name in list_images(photos) if "/" not in name] if photos.is_dir() else []
-        if names:
-            out = "SCENE" if photos == path else path
-            words = f"{path}: {len(names)} photos without camera poses"
-            return f"{words}\nnext: kfgs sfm {photos} --out {out}, which finds the cameras"
-    folders = sorted(folder for folder in path.iterdir() if folder.is_dir())
-    kinds = {
-        "scenes": [folder for folder in folders if is_scene(folder)],
-        "runs or fields": [folder for folder in folders if find_field(folder) is not None],
-    }
-    lines = [f"  {len(inside)} {kind}: {some([f.name for f in inside])}" for kind, inside in kinds.items() if inside]
-    if not lines:
-        raise error
-    return "\n".join([f"{path}: a folder of folders", *lines, "next: give one of them"])
 
 
 def _describe_maps(path: Path) -> str:
@@ -111,9 +82,7 @@ def _describe_splats(path: Path, splats: Gaussians) -> str:
         ends = [[say_coordinate(value, 4) for value in corner] for corner in corners.tolist()]
         lines += [f"  {axis}: {low} to {high}" for axis, low, high in zip("xyz", *ends, strict=True)]
     lines.append(f"  format: {find_format(path).NAME}")
-    labels = splats.labels
-    if labels is not None:
-        for i, name in enumerate(splats.names):
-            lines.append(f"  {name:<16s} {int((labels == i).sum()):8d} Gaussians")
-        lines.append(f"  {'(none)':<16s} {int((labels < 0).sum()):8d} Gaussians")
+    if splats.labels is not None:
+        for i, name in [*enumerate(splats.names), (-1, "(none)")]:
+            lines.append(f"  {name:<16s} {int((splats.labels == i).sum()):8d} Gaussians")
     return "\n".join(lines)

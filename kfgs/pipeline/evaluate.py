@@ -69,9 +69,7 @@ def open_question(
             some; of a teacher's maps all views.
         images: folder of the pictures.
 
-    Raises:
-        FileNotFoundError: if the scene or its truth is missing.
-        ValueError: if protocol, split or truth do not fit.
+    A FileNotFoundError if the scene or its truth is missing, a ValueError if protocol, split or truth do not fit.
     """
     protocol = get_protocol(protocol) if isinstance(protocol, str) else protocol
     folder, place = as_path(scene), None if truth is None else as_path(truth)
@@ -112,10 +110,8 @@ def evaluate(
     Raises:
         FileNotFoundError: if the result, the scene or its truth is missing.
         ValueError: if something does not fit, such as an unknown protocol, or texts without embeddings.
-        TypeError: if a protocol of Gaussians is asked about a teacher, or options of a question that is open.
+        TypeError: if a protocol of Gaussians is asked about a teacher.
     """
-    if isinstance(scene, Question) and asked:
-        raise TypeError(f"scene: expected a folder with {', '.join(asked)}, got a question; pass them to open_question")
     question = scene if isinstance(scene, Question) else open_question(scene, protocol, **asked)
     scorer, rule = question.protocol, getattr(question.protocol, "own_labels", None)
     if labels is not None and rule is None:
@@ -142,22 +138,16 @@ def evaluate(
 
 
 def open_result(path: str | Path, question: Question) -> Method | Gaussians:
-    """Read a result as a method that the question's protocol can score; for colours, Gaussians.
-
-    Raises:
-        FileNotFoundError: if it is missing.
-        TypeError: if the protocol needs Gaussians, and it is a folder of maps.
-        ValueError: if it is of no known kind.
-    """
-    path = as_path(path)
-    folder, name = find_field(path), question.protocol.name
+    """Read a result as a method that the question's protocol can score; for colours, Gaussians."""
+    path, name = as_path(path), question.protocol.name
+    field = find_field(path)
     if getattr(question.protocol, "of_colors", False):
-        splat = path if path.is_file() and folder != path else (path.parent if folder == path else path) / "color.ply"
+        splat = path if path.is_file() and field != path else (path.parent if field == path else path) / "color.ply"
         if not splat.is_file():
             raise FileNotFoundError(f"{splat}: no such file; expected a colour splat for {name}")
         return read_splats(splat)
-    if folder is not None:
-        return FieldMethod(SemanticField.load(folder))
+    if field is not None:
+        return FieldMethod(SemanticField.load(field))
     if not path.is_dir() or (path / "images").is_dir() or not any(any(path.glob(pattern)) for pattern in MAPS):
         raise ValueError(
             f"field: expected a field or a finished run of kfgs, or a folder of feature maps, got {path}; results of other "
@@ -179,11 +169,9 @@ def _read_teacher(folder: Path, scene: Scene, views: Sequence[View], *, align_co
 def _notes(views: Sequence[View], method: Any, encode: Any) -> list[str]:
     """Facts that decide how a score is to be read; what is not known is left out."""
     field = method.field if isinstance(method, FieldMethod) else None
-    notes = []
-    if field is not None and views:
-        names = field.info.get("views") or [camera.name for camera in field.cameras]
-        trained = {file_stem(str(name)) for name in names} & {view.stem for view in views}
-        notes += [f"{len(trained)} of {len(views)} scored views were trained on"] if trained else []
+    names = [] if field is None else field.info.get("views") or [camera.name for camera in field.cameras]
+    trained = {file_stem(str(name)) for name in names} & {view.stem for view in views}
+    notes = [f"{len(trained)} of {len(views)} scored views were trained on"] if trained else []
     sizes = sorted({view.camera.size for view in views}, key=lambda size: size[0] * size[1])
     if sizes:
         several = [f"{height}x{width}" for height, width in dict.fromkeys((sizes[0], sizes[-1]))]

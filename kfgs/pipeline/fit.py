@@ -6,7 +6,6 @@ checkpoint.
 
 from __future__ import annotations
 
-import math
 import shutil
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -19,7 +18,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._check import check_whole
 from .._files import check_output, folded_name, real_path, write_json
 from .._progress import Progress, as_progress
 from ..cameras import Camera
@@ -43,12 +41,9 @@ from ..formats.table import splat_file_of
 from ..gaussians import Gaussians
 from ..quant import (
     Autoencoder,
-    AutoencoderConfig,
     Codebook,
-    GrownCodebook,
     IndexMaps,
     LatentMaps,
-    PaperCodebook,
     fit_autoencoder,
     fit_codebook,
     quantize_maps,
@@ -73,7 +68,6 @@ def fit(
     split: str = "train",
     seed: int = 0,
     device: str | torch.device = "auto",
-    undistorted_features: bool = False,
     report: Callable[[str], None] | None = None,
     progress: Progress = False,
 ) -> SemanticField:
@@ -82,14 +76,13 @@ def fit(
     Args:
         scene: posed, undistorted views. If it has too few points and training needs them, they are triangulated first.
         maps: one teacher map [h, w, D] for each view of the split, in their order: a `FeatureFolder`, or tensors in memory.
-            Or a teacher, whose maps are then stored in `folder/features`.
+            Or a teacher, whose maps are then stored in `folder/features`. They are undistorted like the pictures.
         method: `Uplift()`, the default, or `Paper()`, with their options.
         folder: the run folder; it receives the stages and `field.kfgs`, in place of a field that other options made. Going
             back to the old options is quick, because stages stay. None keeps nothing.
         split: the training views; "all" trains on all views.
         seed: every random choice follows from it.
         device: where to train, see `training_device`; the other stages and the result stay on the CPU.
-        undistorted_features: the teacher saw undistorted pictures. If not, its maps are undistorted like the pictures.
         report: receives one line per stage.
         progress: True shows bars; a function receives the history rows of every trained stage as they appear.
 
@@ -97,7 +90,7 @@ def fit(
         The field; its `info` says how it was made, with the seconds of each stage.
 
     Raises:
-        TypeError: if `maps` are neither maps nor a teacher, or `progress` is neither a bool nor a function.
+        TypeError: if `maps` are neither maps nor a teacher, or `method` is neither.
         ValueError: if the counts of views and maps differ, a camera has distortion, there is no such device, a map's file is
             damaged, or another process works in the folder.
         FileNotFoundError: if a picture is missing.
@@ -105,7 +98,6 @@ def fit(
     method, progress, target = method or Uplift(), as_progress(progress), training_device(device)
     if not isinstance(method, Uplift | Paper):
         raise TypeError(f"method: expected Uplift() or Paper(), got {type(method).__name__}; pass one of them")
-    check_whole("seed", seed, -math.inf)
     views = training_views(scene, split)
     kept = None if folder is None else check_output("folder", folder, "a folder")
     if kept is not None:
@@ -116,11 +108,24 @@ def fit(
         with run.locked():
             if isinstance(method, Paper) or method.splat is None:  # else nothing is trained
                 scene = with_points(run, scene, views, seed, progress)
-            seen = maps_of_views(scene, views, maps, undistorted=undistorted_features)
+            seen = maps_of_views(scene, views, maps)
             job = _Job(run, scene, views, seen, describe_maps(run, seen), seed, target, progress)
             field, about = _uplift(job, method) if isinstance(method, Uplift) else _paper(job, method)
+            info = {
+                **about,
+                "seed": seed,
+                "views": [camera.name for camera in job.cameras],
+                "teacher_map": list(map_shape(seen)),
+                "seconds": {stage.name: round(stage.seconds, 3) for stage in run.stages},
+                "stages": [stage.folder.name for stage in run.stages],
+                "kfgs": version("kfgs"),
+            }
+            if getattr(maps, "identity", None):
+                info["teacher"] = maps.identity
+            if scene.folder is not None:
+                info["scene"] = str(real_path(scene.folder))
             classes = None if scene.folder is None else scene_classes(scene.folder, field.dim)
-            field = replace(field, info=about | _facts(job, maps), classes=classes)
+            field = replace(field, info=info, classes=classes)
             if kept is not None:
                 for name in REPORT:  # of an older field: a kill leaves no wrong report
                     (kept / name).unlink(missing_ok=True)
@@ -154,41 +159,21 @@ class _Job:
 
 def _open_maps(maps: Any, scene: Scene, split: str, folder: Path, progress: bool) -> Maps:
     """The maps of a split's views; a teacher's go to the folder. What would fail only after the first stages is an error."""
-    views = scene.views(split)
     if hasattr(maps, "encode_image"):
         extract_features(maps, as_taken(scene), folder, split=split, overwrite=True, progress=progress)
         maps = FeatureFolder(folder).of(scene, split)
     maps = as_maps(maps)
-    advice = f"read them with FeatureFolder(path).of(scene, {split!r})"
-    if len(views) != len(maps):
-        raise ValueError(
-            f"maps: expected one teacher map per view of split {split!r} ({len(views)}), got {len(maps)}; {advice}"
-        )
-    wanted = [Path(folded_name(scene.stem(i))).name for i in views]
+    wanted = [Path(folded_name(scene.stem(i))).name for i in scene.views(split)]
     given = [Path(folded_name(stem)).name for stem in getattr(maps, "stems", wanted)]
-    if given != wanted:
+    if len(wanted) != len(maps) or given != wanted:
+        got = f"{len(maps)}" if given == wanted else f"{len(maps)} ({given[0]}, ...)"
         raise ValueError(
-            f"maps: expected the maps of the views of split {split!r} in their order ({wanted[0]}, ...), got {given[0]}, ...; "
-            f"{advice}"
+            f"maps: expected one teacher map for each of the {len(wanted)} views of split {split!r}, in their order "
+            f"({wanted[0]}, ...), got {got}; read them with FeatureFolder(path).of(scene, {split!r})"
         )
     if hasattr(maps, "check_files"):
         maps.check_files()
     return maps
-
-
-def _facts(job: _Job, maps: Maps) -> dict[str, Any]:
-    """The `info` of a field about its origin."""
-    teacher, folder = getattr(maps, "identity", None), job.scene.folder
-    return {
-        "seed": job.seed,
-        "views": [camera.name for camera in job.cameras],
-        "teacher_map": list(map_shape(job.maps)),
-        **({"teacher": teacher} if teacher else {}),
-        **({} if folder is None else {"scene": str(real_path(folder))}),
-        "seconds": {stage.name: round(stage.seconds, 3) for stage in job.run.stages},
-        "stages": [stage.folder.name for stage in job.run.stages],
-        "kfgs": version("kfgs"),
-    }
 
 
 # Uplift: fuse first, compress after.
@@ -245,65 +230,53 @@ def _geometry(job: _Job, method: Uplift) -> tuple[Gaussians, dict[str, Any]]:
 
 def _paper(job: _Job, method: Paper) -> tuple[SemanticField, dict[str, Any]]:
     """Codebook, index maps, autoencoder, Gaussians trained on the latent maps, and what the views show of each Gaussian."""
-    targets: Sequence[Tensor] = KnownFeatures(job.maps)
-    decoder: Decoder = Identity(map_shape(job.maps)[-1])
+    run, maps, bars = job.run, job.maps, job.progress is True
+    targets: Sequence[Tensor] = KnownFeatures(maps)
+    decoder: Decoder = Identity(map_shape(maps)[-1])
     inputs: dict[str, Any] = {"features": job.features}
-    if method.codebook is not None:
-        codebook, book = _codebook(job, method.codebook)
-        index_maps, indexed = _index_maps(job, codebook, book)
+    if method.codebook is not None:  # Adaptive Data Compression, Sec. 3.3.1: the codebook S
+        options = method.codebook
+        book = _learn(job, "codebook", inputs, options, lambda **given: fit_codebook(maps, options, **given))
+        codebook = Codebook.load(book.folder / "codebook.safetensors")
+        indexed = run.stage(  # quantisation, Eq. 5: the index map M of every view
+            "index_maps",
+            {"features": job.features, "codebook": book.key},
+            lambda folder: quantize_maps(maps, codebook, progress=bars).save(folder / "index_maps.safetensors"),
+        )
         inputs, latents, decoder = {"index_maps": indexed.key}, codebook.codewords, Codewords(codebook)
-        if method.autoencoder is not None:
-            autoencoder, coder = _autoencoder(job, method.autoencoder, codebook, book)
+        if method.autoencoder is not None:  # Semantic Compression, Sec. 3.3.2: encoder E and decoder Psi
+            layers, learnt = method.autoencoder, {"codebook": book.key}
+            coder = _learn(
+                job, "autoencoder", learnt, layers, lambda **given: fit_autoencoder(codebook, layers, **given)
+            )
+            autoencoder = Autoencoder.load(coder.folder / "autoencoder.safetensors")
             inputs["autoencoder"], decoder = coder.key, Autoencoded(codebook, autoencoder)
             with torch.no_grad():
                 latents = autoencoder.encode(codebook.codewords)
-        targets = LatentMaps(index_maps, latents)
+        targets = LatentMaps(IndexMaps.load(indexed.folder / "index_maps.safetensors"), latents)
     params, trained = _train(job, method, targets, inputs)
     field = SemanticField(params.activated().detach(), decoder)
-
-    def fuse(folder: Path) -> None:
-        fuse_views(field, job.cameras).save(folder / NAME)
-
-    answers = job.run.stage("answers", {"field": trained.key}, fuse)
+    answers = run.stage(
+        "answers", {"field": trained.key}, lambda folder: fuse_views(field, job.cameras).save(folder / NAME)
+    )
     return SemanticField.load(answers.folder), {"method": "paper", "steps": {"field": method.training.steps}}
 
 
-def _codebook(job: _Job, options: PaperCodebook | GrownCodebook) -> tuple[Codebook, Stage]:
-    """Adaptive Data Compression, Sec. 3.3.1: the codebook S."""
+def _learn(
+    job: _Job, name: str, inputs: dict[str, Any], options: Any, learn: Callable[..., Codebook | Autoencoder]
+) -> Stage:
+    """The stage of a codebook or an autoencoder: its file, named like the stage, and its history."""
 
     def make(folder: Path) -> None:
-        made = fit_codebook(job.maps, options, generator=job.generator("codebook"), progress=job.progress)
-        made.save(folder / "codebook.safetensors")
+        made = learn(generator=job.generator(name), progress=job.progress)
+        made.save(folder / f"{name}.safetensors")
         assert made.report is not None
-        if made.report.note is not None:
-            job.run.say(f"note: {made.report.note}")
+        note = getattr(made.report, "note", None)
+        if note is not None:
+            job.run.say(f"note: {note}")
         write_json(folder / "history.json", made.report.history)
 
-    stage = job.run.stage("codebook", {"features": job.features, "config": asdict(options), "seed": job.seed}, make)
-    return Codebook.load(stage.folder / "codebook.safetensors"), stage
-
-
-def _index_maps(job: _Job, codebook: Codebook, book: Stage) -> tuple[IndexMaps, Stage]:
-    """Quantisation, Eq. 5: the index map M of every view."""
-
-    def make(folder: Path) -> None:
-        quantize_maps(job.maps, codebook, progress=job.progress is True).save(folder / "index_maps.safetensors")
-
-    stage = job.run.stage("index_maps", {"features": job.features, "codebook": book.key}, make)
-    return IndexMaps.load(stage.folder / "index_maps.safetensors"), stage
-
-
-def _autoencoder(job: _Job, options: AutoencoderConfig, codebook: Codebook, book: Stage) -> tuple[Autoencoder, Stage]:
-    """Semantic Compression, Sec. 3.3.2: encoder E and decoder Psi."""
-
-    def make(folder: Path) -> None:
-        made = fit_autoencoder(codebook, options, generator=job.generator("autoencoder"), progress=job.progress)
-        made.save(folder / "autoencoder.safetensors")
-        assert made.report is not None
-        write_json(folder / "history.json", made.report.history)
-
-    stage = job.run.stage("autoencoder", {"codebook": book.key, "config": asdict(options), "seed": job.seed}, make)
-    return Autoencoder.load(stage.folder / "autoencoder.safetensors"), stage
+    return job.run.stage(name, inputs | {"config": asdict(options), "seed": job.seed}, make)
 
 
 def _train(job: _Job, method: Paper, targets: Sequence[Tensor], inputs: dict[str, Any]) -> tuple[GaussianParams, Stage]:
@@ -315,14 +288,9 @@ def _train(job: _Job, method: Paper, targets: Sequence[Tensor], inputs: dict[str
         generator = job.generator("field")
         start = GaussianParams.from_points(job.scene.points, int(targets[0].shape[-1]), generator=generator)
         start = start.map(lambda value: value.to(job.device))
+        progress = job.progress
         return fit_field(
-            start,
-            job.cameras,
-            targets,
-            options,
-            generator=generator,
-            progress=job.progress,
-            checkpoint=checkpoint,
+            start, job.cameras, targets, options, generator=generator, progress=progress, checkpoint=checkpoint
         )
 
     return field_stage(job.run, "field", inputs, train)

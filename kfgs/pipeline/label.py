@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,10 +31,7 @@ MOST = 12  # parts in a sheet
 def save_labelled(path: str | Path, gaussians: Gaussians, *, rule: str) -> list[Path]:
     """Write labelled Gaussians as a splat in the colours of their classes, with `class_id` and `score`.
 
-    Args:
-        path: the PLY file to write; a JSON file with the class names is written next to it.
-        gaussians: with labels and class names, perhaps with scores.
-        rule: how labels and scores were found, for the JSON file.
+    `rule` says how they were found, in the JSON file with the class names that is written next to it.
     """
     assert gaussians.labels is not None
     colors = torch.from_numpy(palette(gaussians.labels, gaussians.names)).to(gaussians.means) / 255
@@ -46,19 +44,13 @@ def label_cloud(
 ) -> tuple[Transfer, list[Path]]:
     """Carry labels to the points or Gaussians of a PLY file by distance (Sec. 3.4), keeping all their other columns.
 
-    Label colours are added if the cloud has no colours; `class_id` is replaced.
-
-    Args:
-        gaussians: with labels and class names.
-        cloud: the file, in the same frame.
-        out: the PLY file to write; a JSON file with the class names is written next to it.
-        distance: lambda of Sec. 3.4, in world units; None: from the clouds' spacing.
-
-    Raises:
-        ValueError: if the file has no x, y, z, or holds more than points (faces would be lost).
+    Label colours are added if the cloud has no colours; `class_id` is replaced. A JSON file with the class names is written
+    next to `out`. `distance` is lambda, in world units; None: from the clouds' spacing. A ValueError if the file has no x, y,
+    z, or holds more than points (faces would be lost).
     """
     assert gaussians.labels is not None
-    columns, others = read_ply(cloud), other_elements(as_path(cloud))
+    cloud, out = as_path(cloud), as_path(out)
+    columns, others = read_ply(cloud), other_elements(cloud)
     if others:
         raise ValueError(
             f"{cloud}: expected nothing but points, got {', '.join(others)} too, which labelling would lose; save the "
@@ -70,9 +62,9 @@ def label_cloud(
     if not {"red", "green", "blue"} & set(columns):
         rgb = palette(moved.labels, gaussians.names)
         added |= {name: np.ascontiguousarray(rgb[:, i]) for i, name in enumerate(("red", "green", "blue"))}
-    write_ply(as_path(out), columns | added, comments=("labels carried by kfgs", *read_comments(as_path(cloud))))
+    write_ply(out, columns | added, comments=("labels carried by kfgs", *read_comments(cloud)))
     names = write_names(out, gaussians.names, **{"distance": moved.distance, "distance from": moved.how})
-    return moved, [as_path(out), names]
+    return moved, [out, names]
 
 
 def write_parts(
@@ -80,30 +72,22 @@ def write_parts(
 ) -> Path | None:
     """Draw the largest parts, each in its best view with an outline, while the rest fades; None if no view shows one.
 
-    Args:
-        path: the PNG file.
-        gaussians: the cloud that was selected in.
-        parts: from `connected_parts`, with these cameras.
-        cameras: the views.
-        under: draws the picture below, for instance `show_photos(scene)`.
-        name: of the selection; parts are named name/1, name/2.
+    `parts` are from `connected_parts`, with these cameras; `under` draws the picture below, for instance
+    `show_photos(scene)`. They are titled name/1, name/2.
     """
-    pictures, titles = [], []
+    drawn: list[tuple[str, Any]] = []
     for number, part in enumerate(parts[:MOST], start=1):
-        if part.best_view is None:
-            continue
-        camera = cameras[part.best_view.index]
-        camera = camera.resized(max(1, round(WIDTH * camera.height / camera.width)), WIDTH)
-        mask = torch.zeros(len(gaussians), dtype=torch.bool).index_fill_(0, part.indices.cpu(), True)
-        pictures.append(show_selection(gaussians, mask, under)(camera))
-        titles.append(f"{name}/{number} in {camera.name}" if camera.name else f"{name}/{number}")
-    if not pictures:
+        if part.best_view is not None:
+            camera = cameras[part.best_view.index]
+            camera = camera.resized(max(1, round(WIDTH * camera.height / camera.width)), WIDTH)
+            mask = torch.zeros(len(gaussians), dtype=torch.bool).index_fill_(0, part.indices.cpu(), True)
+            picture = show_selection(gaussians, mask, under)(camera)
+            drawn.append((f"{name}/{number}" + (f" in {camera.name}" if camera.name else ""), picture))
+    if not drawn:
         return None
-    columns = min(3, len(pictures))
-    titles += [""] * (-len(pictures) % columns)
-    pictures += [np.full((1, WIDTH, 3), 255, np.uint8)] * (-len(pictures) % columns)
-    rows = [
-        picture_grid([pictures[i : i + columns]], titles[i : i + columns]) for i in range(0, len(pictures), columns)
-    ]
-    save_picture(path, np.concatenate(rows))
+    columns = min(3, len(drawn))
+    drawn += [("", np.full((1, WIDTH, 3), 255, np.uint8))] * (-len(drawn) % columns)
+    rows = (drawn[i : i + columns] for i in range(0, len(drawn), columns))
+    grids = [picture_grid([[picture for _, picture in row]], [title for title, _ in row]) for row in rows]
+    save_picture(path, np.concatenate(grids))
     return path

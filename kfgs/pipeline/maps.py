@@ -22,12 +22,11 @@ from .stages import Run, describe_lens
 
 
 class Maps(Protocol):
-    """Teacher maps, one per view, read at each access; an all-zero feature means "unknown".
+    """Teacher maps, one per view, read at each access; an all-zero feature means "unknown". Their sizes may differ.
 
-    Six more members are used if they exist: `identity`, JSON of the teacher; `digests() -> list[list[str]] | None`, a digest
-    of each map if known without reading the files; `shape`, (h, w, D) of the first map without reading it; `check_files()`,
-    which raises before the work if a map does not fit; `grid(i, step, samples)`, see `fit_codebook`; and `blocks(i)`, the map
-    a few rows at a time. Maps may differ in size, as pictures do, but not in channels.
+    Six more members of a `FeatureFolder` are used if they exist: `identity`, JSON of the teacher; `digests()`, of each map if
+    known without reading the files; `shape`, (h, w, D) of the first map; `check_files()`, which raises before the work if a
+    map does not fit; `grid(i, step, samples)`, see `fit_codebook`; and `blocks(i)`, the map a few rows at a time.
     """
 
     @property
@@ -62,17 +61,12 @@ class MapsInMemory(Sequence[Tensor]):
 
 
 class ViewMaps:
-    """Maps of the views of a scene: without the lens, and all-zero outside the picture, where it is masked or transparent.
+    """Maps of the views of a scene: without the lens, and all-zero outside the picture, where it is masked or transparent."""
 
-    Args:
-        maps: one per view, of the pictures on disk.
-        taken: the views in the frame of the maps.
-        straighten: whether the lenses of `taken` are removed.
-    """
-
-    def __init__(self, maps: Maps, taken: Scene, straighten: bool) -> None:
-        self.maps, self._taken, self._straighten = maps, taken, straighten
+    def __init__(self, maps: Maps, views: Scene) -> None:
+        self.maps, self._taken, self._straighten = maps, as_taken(views), views.lenses is not None
         self.files = maps.files
+        self._kept: dict[tuple[int, tuple[int, int]], Tensor | None] = {}
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -82,29 +76,30 @@ class ViewMaps:
     def __len__(self) -> int:
         return len(self.maps)
 
-    def digests(self) -> list[list[str]] | None:
-        """The digests of the original maps; None if unknown."""
-        return _known_digests(self.maps)
-
     def changes(self, run: Run) -> list[list[Any] | None]:
         """What decides the change of each map: the lens, and the files of mask and transparent picture; None: nothing."""
-        lenses = [describe_lens(camera) if self._straighten else None for camera in self._taken.cameras]
-        files = [changing_files(self._taken, i) for i in range(len(self))]
-        known = iter(run.digests([file for each in files for file in each]))
-        return [
-            [lens, *(next(known)[1] for _ in each)] if each else lens for lens, each in zip(lenses, files, strict=True)
-        ]
+        changes: list[list[Any] | None] = []
+        for i, camera in enumerate(self._taken.cameras):
+            lens, files = describe_lens(camera) if self._straighten else None, changing_files(self._taken, i)
+            changes.append([lens, *(digest for _, digest in run.digests(files))] if files else lens)
+        return changes
 
     def __getitem__(self, i: int, /) -> Tensor:  # [h, w, D]
         features = self.maps[i]
         size = int(features.shape[0]), int(features.shape[1])
-        counted = self._taken.counted(i, size)
+        counted = self._counted(i, size)
         if counted is not None:  # before the lens is removed, which mixes neighbours
             features = features * counted[..., None].to(features)
-        if not self._straighten or self._taken.cameras[i].distortion is None:
+        if self._taken.cameras[i].distortion is None:
             return features
         straight, _, inside = undistort(features, self._taken.cameras[i].resized(*size))
         return straight * inside[..., None]
+
+    def _counted(self, i: int, size: tuple[int, int]) -> Tensor | None:  # [h, w] bool
+        """The pixels that are neither masked nor transparent; kept, because maps are read several times."""
+        if (i, size) not in self._kept:
+            self._kept[i, size] = self._taken.counted(i, size)
+        return self._kept[i, size]
 
 
 class KnownFeatures(Sequence[Tensor]):
@@ -133,19 +128,16 @@ def as_maps(maps: Any) -> Maps:
     return maps  # type: ignore[no-any-return]
 
 
-def maps_of_views(scene: Scene, views: Sequence[int], maps: Maps, *, undistorted: bool = False) -> Maps:
-    """Maps of some views' pictures as `ViewMaps`; unchanged if no view has a lens, a mask or transparent pixels.
-
-    Args:
-        scene: as it is rendered.
-        views: indices of the views.
-        maps: one per view, of the pictures on disk.
-        undistorted: the maps are of undistorted pictures.
-    """
+def maps_of_views(
+    scene: Scene,  # as it is rendered
+    views: Sequence[int],
+    maps: Maps,  # one per view, of the pictures on disk
+) -> Maps:
+    """Maps of some views' pictures as `ViewMaps`; unchanged if no view has a lens, a mask or transparent pixels."""
     assert len(maps) == len(views)
-    chosen, lens = scene.select(views), scene.lenses is not None and not undistorted
-    changed = lens or any(changing_files(chosen, i) for i in range(len(chosen)))
-    return ViewMaps(maps, as_taken(chosen) if lens else chosen, lens) if changed else maps
+    chosen = scene.select(views)
+    changed = chosen.lenses is not None or any(changing_files(chosen, i) for i in range(len(chosen)))
+    return ViewMaps(maps, chosen) if changed else maps
 
 
 def changing_files(scene: Scene, i: int) -> list[Path]:
@@ -156,7 +148,8 @@ def changing_files(scene: Scene, i: int) -> list[Path]:
 
 def describe_maps(run: Run, maps: Maps) -> dict[str, Any]:
     """What decides the maps, as JSON: their digests (of files only if the maps do not know them), and how they are changed."""
-    known = _known_digests(maps)
+    plain = maps.maps if isinstance(maps, ViewMaps) else maps
+    known = plain.digests() if hasattr(plain, "digests") else None
     changes = maps.changes(run) if isinstance(maps, ViewMaps) else []
     changed = any(change is not None for change in changes)
     files = run.digests(maps.files) if known is None else known
@@ -167,7 +160,3 @@ def map_shape(maps: Maps) -> tuple[int, int, int]:
     """(h, w, D) of the first map, without reading it if the maps know their shape."""
     h, w, D = maps.shape if hasattr(maps, "shape") else maps[0].shape
     return int(h), int(w), int(D)
-
-
-def _known_digests(maps: Maps) -> list[list[str]] | None:
-    return maps.digests() if hasattr(maps, "digests") else None  # type: ignore[no-any-return]

@@ -27,23 +27,21 @@ td { padding: .2em 1.2em .2em 0; border-bottom: 1px solid #ddd; vertical-align: 
 """
 
 
-def write_preview(path: Path, field: SemanticField, scene: Scene, split: str = "train", *, count: int = 3) -> bool:
-    """Draw some views, evenly spread: photograph, features as colours, and labels if the field has classes.
+def write_preview(path: Path, field: SemanticField, scene: Scene, split: str) -> bool:
+    """Draw 3 views, evenly spread: photograph, features as colours, and labels if the field has classes.
 
     Views held out (split `test`) are preferred to those of `split`. Without any photograph nothing is drawn (False).
     """
     views = [i for i in scene.views("test" if scene.splits.get("test") else split) if scene.image_paths[i].is_file()]
-    count = min(count, len(views))
-    classes, colors, rows = field.classes, FeatureColors.fit(field.features), []
-    for k in range(count):
-        view = views[(2 * k + 1) * len(views) // (2 * count)]  # not the ends, which often are alike
+    count, colors, rows = min(3, len(views)), FeatureColors.fit(field.features), []
+    for view in (views[(2 * k + 1) * len(views) // (2 * count)] for k in range(count)):  # not the ends, often alike
         camera = scene.cameras[view]
         camera = camera.resized(max(1, round(WIDTH * camera.height / camera.width)), WIDTH)
         photo = resize_photo(scene.image(view), camera.size)
         with torch.no_grad():
             rows.append([as_bytes(photo), colors(field.render(camera).map)])
-        if classes is not None:
-            rows[-1].append(overlay_labels(photo, field.segment(camera, classes).cpu(), classes.names))
+        if field.classes is not None:
+            rows[-1].append(overlay_labels(photo, field.segment(camera).cpu(), field.classes.names))
     if rows:
         titles = ("photograph", "features as colours", "labels")[: len(rows[0])]
         save_picture(path, picture_grid(rows, titles, width=WIDTH))
@@ -61,16 +59,8 @@ def write_run_report(
 ) -> list[Path]:
     """Write pictures of a fit and `report.html` into its run folder: one file without scripts, which loads nothing.
 
-    Args:
-        folder: the run folder.
-        field: what `fit` returned.
-        scene: its scene.
-        method: its method.
-        split: its training views.
-        command: the command that made it; None: the page shows the call of `fit`.
-
-    Returns:
-        The pictures (`preview.png`, and of trained stages `<stage>.png`) and the page.
+    The arguments are those of `fit`, its result, and the command that called it. Returns the pictures (`preview.png`, and of
+    trained stages `<stage>.png`) and the page.
     """
     folder, info = as_path(folder), field.info
     written = [folder / "preview.png"] if write_preview(folder / "preview.png", field, scene, split) else []
@@ -93,16 +83,16 @@ def write_run_report(
     }
     seconds = info["seconds"] | {"all": sum(info["seconds"].values())}
     title = html.escape(folder.absolute().name)
+    repeat = command or f"kfgs.fit(scene, maps, method, folder={str(folder)!r})"
+    options = html.escape(json.dumps(method.options(), indent=1))
     parts = [
         f"<h1>kfgs: {title}</h1>",
         *(_image(file) for file in written),
-        "<h2>What was fitted</h2>",
-        _table(facts.items()),
+        f"<h2>What was fitted</h2>\n{_table(facts.items())}",
         "<h2>Time of each stage</h2>",
         _table((name, f"{value:,.0f} s") for name, value in seconds.items()),
-        "<h2>How to repeat it</h2>",
-        f"<pre>{html.escape(command or f'kfgs.fit(scene, maps, method, folder={str(folder)!r})')}</pre>",
-        f"<details><summary>All options</summary><pre>{html.escape(json.dumps(method.options(), indent=1))}</pre></details>",
+        f"<h2>How to repeat it</h2>\n<pre>{html.escape(repeat)}</pre>",
+        f"<details><summary>All options</summary><pre>{options}</pre></details>",
     ]
     head = f'<meta charset="utf-8"><title>kfgs: {title}</title><style>{STYLE}</style>'
     page = f'<!doctype html>\n<html lang="en"><head>{head}</head><body>\n' + "\n".join(parts) + "\n</body></html>\n"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import torch
@@ -59,26 +60,23 @@ def segment_scene(
         The label map [H, W] of each view by its stem.
     """
     check_range("pictures", pictures, 0)
-    for stem, known in (truth or {}).items():
+    truth = truth or {}
+    for stem, known in truth.items():
         check_truth(known, len(classes), f"truth[{stem!r}]")
     views = scene.views(split)
-    cameras = {scene.stem(i): scene.cameras[i] for i in views}
-    shown = {views[i] for i in np.linspace(0, len(views) - 1, min(pictures, len(views))).round().astype(int)}
-    labels = _segment(field, cameras, classes, as_path(out), progress)
-    colors = FeatureColors.fit(field.features) if shown else None
-    for i in shown:
-        stem, photo = scene.stem(i), scene.image(i)
-        maps = {"truth": (truth or {}).get(stem), "field": labels[stem]}
-        drawn = {title: value for title, value in maps.items() if value is not None}
-        panels = {"photograph": photo} | {
-            title: overlay_labels(
-                photo, resize_labels(value, (photo.shape[0], photo.shape[1])), classes.names, legend=False
-            )
-            for title, value in drawn.items()
-        }
+    labels = _segment(field, {scene.stem(i): scene.cameras[i] for i in views}, classes, as_path(out), progress)
+    colors = FeatureColors.fit(field.features) if pictures else None
+    for k in set(np.linspace(0, len(views) - 1, min(pictures, len(views))).round().astype(int).tolist()):
+        stem, photo = scene.stem(views[k]), scene.image(views[k])
+        drawn = {"truth": truth[stem]} if stem in truth else {}
+        drawn["field"] = labels[stem]
+        panels: dict[str, Any] = {"photograph": photo}
+        for title, value in drawn.items():
+            value = resize_labels(value, (photo.shape[0], photo.shape[1]))
+            panels[title] = overlay_labels(photo, value, classes.names, legend=False)
         assert colors is not None
         with torch.no_grad():
-            panels["features as colours"] = colors(field.render(scene.cameras[i]).map)
+            panels["features as colours"] = colors(field.render(scene.cameras[views[k]]).map)
         sheet = picture_grid([list(panels.values())], list(panels), width=WIDTH)
         present = torch.cat([value.unique() for value in drawn.values()])
         legend = legend_strip(present, classes.names, sheet.shape[1])
@@ -89,7 +87,7 @@ def segment_scene(
 def segment_cameras(
     field: SemanticField, cameras: Sequence[Camera], classes: LabelSet, out: str | Path, *, progress: bool = False
 ) -> dict[str, Tensor]:
-    """Segment what any cameras see, and write label pictures. For views of a scene, `segment_scene` adds photographs.
+    """Segment what any cameras see, and write label pictures: `segment_scene` without photographs.
 
     Args:
         field: a finished field.
@@ -101,28 +99,15 @@ def segment_cameras(
 
     Returns:
         The label map [H, W] of each camera by its name, without a suffix such as .png.
-
-    Raises:
-        ValueError: if names are missing, repeated, or cannot be those of pictures; or if there are more classes
-            than a byte can hold.
-    """
-    return _segment(field, dict(zip(picture_names(cameras), cameras, strict=True)), classes, as_path(out), progress)
-
-
-def picture_names(cameras: Iterable[Camera], argument: str = "cameras") -> list[str]:
-    """The names of the cameras without suffixes, as those of pictures in an output folder.
-
-    Raises:
-        ValueError: if one is missing, repeated, or leads out of the folder. It names `argument`.
     """
     names = [file_stem(camera.name or "") for camera in cameras]
-    inside = all(not name.startswith("/") and ".." not in PurePosixPath(name).parts for name in names)
-    if "" in names or len(set(names)) != len(names) or not inside or not all(name.isprintable() for name in names):
+    outside = any(name.startswith("/") or ".." in PurePosixPath(name).parts for name in names)
+    if "" in names or len(set(names)) != len(names) or outside:
         raise ValueError(
-            f"{argument}: expected a name of its own for each, as pictures in a folder can have, got {names!r:.120}; name them "
+            f"cameras: expected a name of its own for each, as pictures in a folder can have, got {names!r:.120}; name them "
             "with replace()"
         )
-    return names
+    return _segment(field, dict(zip(names, cameras, strict=True)), classes, as_path(out), progress)
 
 
 def _segment(
@@ -165,24 +150,14 @@ def write_coco(
     names: Sequence[str],
     picture: Callable[[str], Tensor | Array] | None = None,
 ) -> Path:
-    """Write `coco/annotations.json`, and its pictures to `coco/images/`.
+    """Write label maps by name as `coco/annotations.json`, and pictures to `coco/images/`; return the folder `coco`.
 
-    The pictures are of the same camera as the labels. A photograph by a lens with distortion is not: it must be undistorted,
-    as `Scene.image` of an undistorted scene is.
-
-    Args:
-        out: receives the folder `coco`.
-        labels: the label map of each view by its name, for instance from `segment_scene` or `segment_cameras`.
-        names: the name of each class.
-        picture: gives the picture [H, W, 3] of a view by its name; None: write no pictures.
-
-    Returns:
-        The folder `coco`.
+    `picture` gives the picture [H, W, 3] of a view, without lens distortion like its labels; None writes no pictures.
     """
     folder = check_output("out", as_path(out) / "coco", "a folder")
-    for name in labels if picture is not None else ():
-        assert picture is not None
-        save_picture(folder / "images" / f"{name}.png", picture(name))
+    if picture is not None:
+        for name in labels:
+            save_picture(folder / "images" / f"{name}.png", picture(name))
     save_coco(folder / "annotations.json", {f"{name}.png": value for name, value in labels.items()}, names)
     return folder
 
@@ -204,13 +179,7 @@ def true_labels(scene: Scene, folder: str | Path, split: str) -> dict[str, Tenso
 
 
 def score_scene(labels: dict[str, Tensor], truth: dict[str, Tensor], classes: LabelSet) -> SegmentationReport:
-    """Score segmented views against their true labels (protocol `kfgs-pooled/1`). Views without truth are left out.
-
-    Args:
-        labels: the label map of each view by its stem, from `segment_scene`.
-        truth: true labels by stem, from `true_labels`.
-        classes: what the labels mean.
-    """
+    """Score label maps of `segment_scene` against `true_labels` (protocol `kfgs-pooled/1`). Views without truth are left out."""
     known = {stem: target for stem, target in truth.items() if stem in labels}
     return evaluate_segmentation(labels.__getitem__, known, classes.names)
 
@@ -220,11 +189,8 @@ def score_teacher(
 ) -> SegmentationReport:
     """Score the teacher itself: each pixel's best class by cosine, under the protocol of `score_scene`.
 
-    Args:
-        maps: returns a view's teacher map [h, w, D] by its stem, undistorted like the views.
-        truth: the result of `true_labels`.
-        classes: names and embeddings.
-        size: (height, width); the teacher's labels are resized to it before the comparison.
+    `maps` returns a view's map [h, w, D] by its stem, undistorted like the views; its labels are resized to `size`, (height,
+    width), before the comparison.
     """
 
     def predict(stem: str) -> Tensor:

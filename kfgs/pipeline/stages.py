@@ -8,10 +8,9 @@ only finished stages, and the same call continues where it stopped.
 from __future__ import annotations
 
 import hashlib
-import json
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,6 @@ from ..gaussians import Gaussians
 from ..scenes import Scene
 
 STAGE_FILE, LOCK, DIGESTS = "stage.json", ".run.lock", "digests.json"
-SHAPE = ("means", "quats", "scales", "opacities")
 STAGE_VERSION = 3
 """Part of every key: raised if the same inputs give another result in a new version, so that old stages are not reused."""
 
@@ -39,11 +37,14 @@ class Stage:
     """A finished stage: its files, and how it was made."""
 
     name: str
-    key: str
     folder: Path
     seconds: float
-    reused: bool
     inputs: dict[str, Any]
+
+    @property
+    def key(self) -> str:
+        """What later stages that depend on it have among their inputs."""
+        return self.folder.name.rpartition("-")[2]
 
     @property
     def history(self) -> list[dict[str, Any]]:
@@ -61,8 +62,8 @@ class Run:
         >>> run = Run(pathlib.Path(tempfile.mkdtemp()))
         >>> first = run.stage("hello", {"who": "world"}, lambda folder: (folder / "a").write_text("hello"))
         >>> again = run.stage("hello", {"who": "world"}, lambda folder: None)
-        >>> first.reused, again.reused, (again.folder / "a").read_text()
-        (False, True, 'hello')
+        >>> again == first, (again.folder / "a").read_text()
+        (True, 'hello')
     """
 
     folder: Path
@@ -70,26 +71,22 @@ class Run:
     stages: list[Stage] = field(default_factory=list)
 
     def stage(self, name: str, inputs: dict[str, Any], make: Callable[[Path], float | None]) -> Stage:
-        """Return the finished stage of these inputs; make it if it does not exist.
+        """Return the finished stage of these inputs (all that decides the result, as JSON); make it if it does not exist.
 
-        Args:
-            name: a word for the folder's name.
-            inputs: everything that decides the result, as JSON; for earlier stages, their keys.
-            make: fills the given folder; may return the seconds of work by an earlier, killed process.
+        `make` fills the given folder, and may return the seconds of work by an earlier, killed process.
         """
         target = self._place("stages", name, inputs)
-        if (target / STAGE_FILE).is_file():
-            stage = read_stage(target)
-            self.say(f"{name}: found in {target.name} (made in {stage.seconds:.1f} s)")
-        else:
+        finished = (target / STAGE_FILE).is_file()
+        if not finished:
             self.say(f"{name}: working")
             start = time.perf_counter()
             with atomic_folder(target) as folder, say_compiling(self.say):
                 earlier = make(folder) or 0.0
                 seconds = time.perf_counter() - start + earlier
                 write_json(folder / STAGE_FILE, {"name": name, "inputs": inputs, "seconds": seconds})
-            stage = Stage(name, target.name.rpartition("-")[2], target, seconds, False, json.loads(json.dumps(inputs)))
-            self.say(f"{name}: done in {seconds:.1f} s")
+        stage = read_stage(target)
+        took = f"{stage.seconds:.1f} s"
+        self.say(f"{name}: found in {target.name} (made in {took})" if finished else f"{name}: done in {took}")
         self.stages.append(stage)
         return stage
 
@@ -105,11 +102,9 @@ class Run:
         key = digest_value({"name": name, "inputs": inputs, "version": STAGE_VERSION})[:12]
         return self.folder / kind / f"{name}-{key}"
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
+    def locked(self) -> AbstractContextManager[None]:
         """Keep other processes from working in the folder; a ValueError if one works there already."""
-        with locked(self.folder, LOCK):
-            yield
+        return locked(self.folder, LOCK)
 
     def digests(self, paths: Sequence[Path]) -> list[list[str]]:
         """[file name, SHA-256] of each file; files of unchanged size and times are not read again."""
@@ -139,8 +134,7 @@ def read_stage(folder: Path) -> Stage:
     """A finished stage; a ValueError if its description is damaged."""
     about = read_json(folder / STAGE_FILE)
     with reading(folder / STAGE_FILE, "the description of a stage", "delete its folder, and it will be made again"):
-        name, key = str(about["name"]), folder.name.rpartition("-")[2]
-        return Stage(name, key, folder, float(about["seconds"]), True, dict(about["inputs"]))
+        return Stage(str(about["name"]), folder, float(about["seconds"]), dict(about["inputs"]))
 
 
 def stage_generator(seed: int, purpose: str) -> torch.Generator:
@@ -151,7 +145,7 @@ def stage_generator(seed: int, purpose: str) -> torch.Generator:
 
 def digest_shape(gaussians: Gaussians) -> str:
     """SHA-256 of positions, rotations, sizes and opacities, and of an origin and `antialiased` where they are set."""
-    shape = (getattr(gaussians, name) for name in SHAPE)
+    shape = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
     return digest_tensors(*shape, *origin_tensors(gaussians.origin), *[torch.tensor(True)] * gaussians.antialiased)
 
 
@@ -175,11 +169,10 @@ def origin_tensors(origin: Origin) -> list[Tensor]:  # each [3] float64
 
 def digest_pictures(run: Run, scene: Scene, views: Sequence[int]) -> dict[str, Any]:
     """What decides the training pictures of some views: files, masks, and the lenses that are removed."""
-    masks = {i: scene.masks[i] for i in views} if scene.masks is not None else {}
-    known = {i: mask for i, mask in masks.items() if mask is not None}
+    masks = {i: mask for i, mask in enumerate(scene.masks or ()) if mask is not None and i in views}
     return {
         "files": run.digests([scene.image_paths[i] for i in views]),
-        "masks": [[i, *row] for i, row in zip(known, run.digests(list(known.values())), strict=True)],
+        "masks": [[i, *row] for i, row in zip(masks, run.digests(list(masks.values())), strict=True)],
         "lenses": None if scene.lenses is None else [describe_lens(scene.lenses[i]) for i in views],
     }
 

@@ -29,25 +29,16 @@ a field that is 9 dB worse than one from triangulated points, since Gaussians as
 
 
 def training_device(device: str | torch.device = "auto") -> torch.device:
-    """The device of a name; a ValueError if it is not one, or there is no such GPU.
-
-    Args:
-        device: `auto` takes CUDA if torch sees it and an engine runs on it, else the CPU; `cpu`, `cuda`, `cuda:1`.
-    """
+    """The device of a name: `cpu`, `cuda`, `cuda:1`; `auto` takes CUDA if an engine runs on it, else the CPU."""
     if device == "auto":
         return torch.device("cuda" if torch.cuda.is_available() and available_engines("cuda") else "cpu")
-    try:
-        chosen = torch.device(device)
-    except RuntimeError as error:
-        raise ValueError(f"device: expected auto, cpu or cuda, got {device!r}; name one of them") from error
-    if chosen.type not in ("cpu", "cuda"):
-        raise ValueError(f"device: expected auto, cpu or cuda, got {device!r}; engines run on these only")
-    if chosen.type == "cuda" and (chosen.index or 0) >= torch.cuda.device_count():
-        raise ValueError(
-            f"device: expected a GPU that torch sees ({torch.cuda.device_count()} are there), got {device!r}; "
-            "use cpu, or install a torch for CUDA"
-        )
-    return chosen
+    kind, _, index = str(device).partition(":")
+    if kind == "cpu" or (kind == "cuda" and int(index or 0) < torch.cuda.device_count()):
+        return torch.device(device)
+    raise ValueError(
+        f"device: expected auto, cpu or a GPU that torch sees ({torch.cuda.device_count()} are there), got {device!r}; "
+        "use cpu, or install a torch for CUDA"
+    )
 
 
 def training_views(scene: Scene, split: str) -> list[int]:
@@ -82,11 +73,8 @@ def check_scene(scene: Scene, views: Sequence[int], few: int = FEW_POINTS) -> No
 def with_points(run: Run, scene: Scene, views: Sequence[int], seed: int, progress: Progress) -> Scene:
     """The scene, with points if it had fewer than `FEW_POINTS`: triangulated from the known poses of some of its views.
 
-    If `find_points` finds no more than there are, these stay.
-
-    Raises:
-        SceneError: if there are no points, and pictures and poses do not fit together.
-        ValueError: if no view shows the points.
+    If `find_points` finds no more than there are, these stay. A SceneError if there are none, and pictures and poses do not
+    fit together.
     """
     if len(scene.points) >= FEW_POINTS:
         return scene
@@ -94,10 +82,9 @@ def with_points(run: Run, scene: Scene, views: Sequence[int], seed: int, progres
     inputs = {"pictures": digest_pictures(run, seen, everything), "scene": digest_scene(seen, everything), "seed": seed}
 
     def make(folder: Path) -> None:
-        count = f"only {len(scene.points)} points" if len(scene.points) else "none"
         run.say(
-            f"points: the scene has {count}, and training starts from points; they are triangulated from {len(seen)} pictures "
-            "and their poses"
+            f"points: the scene has {len(scene.points)}, and training starts from points; they are triangulated from "
+            f"{len(seen)} pictures and their poses"
         )
         made = scene
         try:
@@ -123,14 +110,7 @@ def with_extent(options: Training, scene: Scene) -> Training:
 def field_stage(
     run: Run, name: str, inputs: dict[str, Any], train: Callable[[Path], FieldFit]
 ) -> tuple[GaussianParams, Stage]:
-    """Train a field as a stage of a run; after a kill it resumes from its checkpoint.
-
-    Args:
-        run: the run folder.
-        name: of the stage.
-        inputs: everything that decides the result.
-        train: fits the field, with the given file for its checkpoint.
-    """
+    """Train a field as a stage of a run; `train` gets the file for its checkpoint, from which it resumes after a kill."""
     checkpoint = run.scratch(name, inputs)
 
     def make(folder: Path) -> float:

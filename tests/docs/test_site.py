@@ -60,7 +60,7 @@ def test_every_option_of_a_command_is_in_its_table(name):
     commands = load("kfgs_commands")
     command = cli.COMMANDS[name]
     written = commands.described(command) + commands.table(command)
-    options = set(cli._shown_names(command).values())
+    options = set(cli.shown_names(command).values())
     for option in (option for option in options if option.startswith("--")):
         assert f"`{option}" in written, option
     assert written.count("\n| `") == len(options)

@@ -8,7 +8,7 @@ import torch
 from messages import tells
 from small_room import make_room
 
-from kfgs.pipeline import describe
+from kfgs.pipeline.describe import describe
 from kfgs.scenes import SceneError
 
 
@@ -21,22 +21,6 @@ def captures(tmp_path):
     shutil.copytree(folder / "flat2", folder / "lost", ignore=shutil.ignore_patterns("sparse"))
     shutil.copytree(folder / "flat2" / "images", folder / "photos")
     return folder
-
-
-def test_photos_without_poses_are_told_how_to_get_them(captures):
-    lost, photos = captures / "lost", captures / "photos"
-    told = f"{lost}: 9 photos without camera poses\nnext: kfgs sfm {lost}/images --out {lost}, which finds the cameras"
-    assert (lost / "text.npy").is_file()  # no feature map
-    assert describe(lost) == told
-    assert describe(photos).endswith(f"next: kfgs sfm {photos} --out SCENE, which finds the cameras")
-
-
-def test_a_folder_of_folders_is_counted(captures):
-    assert describe(captures).splitlines() == [
-        f"{captures}: a folder of folders",
-        "  2 scenes: flat10, flat2",
-        "next: give one of them",
-    ]
 
 
 def test_a_scene_that_cannot_be_read_says_why(captures):

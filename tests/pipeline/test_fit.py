@@ -10,25 +10,23 @@ import torch
 from messages import tells
 from small_room import FIELD, PAPER, make_room, paper, stages
 
-import kfgs
 from kfgs.cameras import Distortion
 from kfgs.cli import main
-from kfgs.fields import Clicks, Codewords, Identity, SemanticField, UpliftConfig
+from kfgs.fields import Codewords, Identity, SemanticField, UpliftConfig
 from kfgs.formats import read_splats, write_splats
 from kfgs.gaussians import Gaussians
 from kfgs.labels import load_label_set
 from kfgs.pipeline import (
     ColorConfig,
     Paper,
-    Run,
     Uplift,
     fit,
     fit_color,
     score_scene,
-    score_teacher,
     segment_scene,
     true_labels,
 )
+from kfgs.pipeline.stages import Run
 from kfgs.scenes import FeatureFolder, extract_features, load_scene
 
 QUICK = paper(training=dataclasses.replace(FIELD, steps=3))
@@ -134,11 +132,6 @@ def test_going_back_to_old_options_makes_no_stage_again(scene, maps, splat, tmp_
     assert same(again, first)
 
 
-def test_without_a_folder_nothing_is_kept(scene, maps, splat, fused):
-    field = fit(scene, maps, Uplift(splat, SMALL))
-    assert same(field, fused)
-
-
 @pytest.mark.parametrize("when", [1, 5])
 def test_killed_in_the_middle_of_the_field_it_goes_on_and_ends_the_same(when, trained, scene, maps, tmp_path):
     rows = 0
@@ -158,18 +151,6 @@ def test_killed_in_the_middle_of_the_field_it_goes_on_and_ends_the_same(when, tr
     done = ["field", "answers"]
     assert [name for name, word in seen.items() if word == "done"] == done
     assert same(resumed, trained)
-
-
-def test_killed_in_the_codebook_it_starts_that_stage_again(trained, scene, maps, tmp_path):
-    def kill(row):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        fit(scene, maps, PAPER, folder=tmp_path, progress=kill)
-    assert list((tmp_path / "stages").iterdir()) == []
-    assert torch.equal(
-        fit(scene, maps, QUICK, folder=tmp_path).decoder.codebook.codewords, trained.decoder.codebook.codewords
-    )
 
 
 def test_a_second_fit_in_the_folder_is_refused(scene, maps, splat, tmp_path):
@@ -211,7 +192,6 @@ def test_what_decides_a_stage_makes_another(scene, maps, splat, fused, runs, tmp
     cameras = [dataclasses.replace(camera, distortion=LENS) for camera in scene.cameras]
     bent = dataclasses.replace(scene, cameras=cameras).undistorted()
     assert not found(bent, maps, splat)
-    assert found(bent, maps, splat, undistorted_features=True)  # the same maps through the same cameras
 
 
 # Uplift
@@ -227,15 +207,6 @@ def test_a_splat_becomes_a_small_field_that_is_right_on_unseen_views(fused, scen
     assert score_scene(shuffled, truth, classes).accuracy.value < 0.6
     assert len(list((tmp_path / "predicted").iterdir())) == 3
     assert len(list((tmp_path / "sheets").iterdir())) == 1
-
-
-def test_every_gaussian_of_a_splat_can_be_kept(scene, maps, splat, classes):
-    field = fit(scene, maps, Uplift(splat, UpliftConfig()))
-    assert len(field) == len(splat)
-    assert torch.equal(field.gaussians.means, splat.means)
-    shown = field.seen.pixels > 0
-    assert 0.5 < shown.float().mean() <= 1
-    assert (field.classify(classes).labels[~shown] == -1).all()
 
 
 def test_without_a_splat_gaussians_are_trained_and_a_longer_colour_fit_is_taken(scene, maps, tmp_path):
@@ -282,17 +253,6 @@ def test_the_other_rows_of_table_1(row, scene, maps, trained, runs, classes):
     assert len(labels.unique()) > 2
 
 
-def test_the_extent_of_the_scene_decides_the_field(trained, runs, scene, maps, tmp_path):
-    run = shutil.copytree(runs / "paper", tmp_path / "run")
-
-    def found(extent):
-        method = paper(training=dataclasses.replace(FIELD, extent=extent))
-        return refit(scene, maps, method, folder=run)[1]["field"] == "found"
-
-    assert found(scene.extent)
-    assert not found(2 * scene.extent)
-
-
 class Mixer:
     """A teacher that counts its calls."""
 
@@ -310,13 +270,6 @@ class Mixer:
         raise NotImplementedError
 
 
-def test_another_autoencoder_shares_the_index_maps(scene, maps, tmp_path):
-    fit(scene, maps, QUICK, folder=tmp_path)
-    smaller = dataclasses.replace(QUICK, autoencoder=dataclasses.replace(QUICK.autoencoder, latent=3))
-    _, seen = refit(scene, maps, smaller, folder=tmp_path)
-    assert list(seen.values()) == ["found", "found", "done", "done", "done"]
-
-
 # What is refused
 
 
@@ -325,7 +278,7 @@ def test_bad_input_is_refused_before_any_work(scene, room, maps, splat, tmp_path
     backwards = FeatureFolder(room / "features", maps.stems[::-1])
     bent = dataclasses.replace(scene, cameras=[dataclasses.replace(c, distortion=LENS) for c in scene.cameras])
     for arguments, error, words in (
-        ((scene, two), ValueError, ("maps:", "'train'", "(6)", "got 2")),
+        ((scene, two), ValueError, ("maps:", "6 views of split 'train'", "got 2")),
         ((scene, backwards), ValueError, ("maps:", "order (view_")),
         ((bent, maps), ValueError, ("scene:", "distortion", "scene.undistorted()")),
         ((scene, "features"), TypeError, ("maps", "str", "FeatureFolder")),
@@ -348,13 +301,6 @@ def test_a_map_that_is_cut_short_is_found_before_any_work(scene, maps, tmp_path)
     with pytest.raises(ValueError, match=tells(damaged.name)):
         fit(scene, FeatureFolder(tmp_path / "maps").of(scene, "train"), PAPER, folder=tmp_path / "run")
     assert not list((tmp_path / "run").rglob("stage.json"))
-
-
-def test_pictures_that_give_no_points_are_refused(scene, maps, tmp_path):
-    nothing = dataclasses.replace(scene, points=scene.points[:0], colors=scene.colors[:0])
-    with pytest.raises(ValueError, match=tells("scene:", "agree with the poses")):
-        fit(nothing, maps, PAPER, folder=tmp_path)
-    assert not (tmp_path / "field.kfgs").exists()
 
 
 # One answer, whoever asks
@@ -387,33 +333,3 @@ def test_fit_from_the_command_line(room, splat, tmp_path, capsys):
     assert len(SemanticField.load(tmp_path / "run")) <= 900
     assert main([*words, "--max-gaussians", "0"]) == 0
     assert len(SemanticField.load(tmp_path / "run")) == len(splat)
-
-
-def test_classes_by_examples_answer_like_the_words(fused, scene, room, classes):
-    """Clicks on five pixels of floor, wall and table, read off the label pictures, find mostly what the words find."""
-    names, given = ("floor", "wall", "table"), {}
-    truth = true_labels(scene, room / "labels", "train")
-    for name in names:
-        view, labels = max(truth.items(), key=lambda pair: int((pair[1] == classes.index(name)).sum()))
-        places = (labels == classes.index(name)).nonzero()
-        places = places[torch.linspace(0, len(places) - 1, 7).long()[1:-1]]
-        given[name] = Clicks(view, [[float(x) + 0.5, float(y) + 0.5] for y, x in places.tolist()])
-    made = kfgs.label_set_from_examples(fused, given)
-    words = fused.classify(classes.select(names)).labels
-    assert (fused.classify(made).labels == words).float().mean() > 0.85
-
-
-def test_truth_is_undistorted_as_the_views_are(scene, room):
-    lens = Distortion("brown_conrady", (0.3, 0.0, 0.0, 0.0))
-    bent = dataclasses.replace(scene, cameras=[dataclasses.replace(c, distortion=lens) for c in scene.cameras])
-    plain, straight = (true_labels(s, room / "labels", "test") for s in (scene, bent.undistorted()))
-    for stem, labels in plain.items():
-        assert (labels >= 0).all()
-        assert (straight[stem] < 0).any()  # what the lens did not see
-        assert (straight[stem] != labels)[straight[stem] >= 0].float().mean() > 0.02
-
-
-def test_the_teacher_is_wrong_where_it_knows_nothing(scene, room, classes):
-    truth = true_labels(scene, room / "labels", "test")
-    nothing = score_teacher(lambda stem: torch.zeros(30, 40, 32), truth, classes, (60, 80))
-    assert nothing.accuracy.value == 0

@@ -1,19 +1,13 @@
-import dataclasses
-
 import numpy as np
 import torch
 from PIL import Image
-from small_room import make_room
 
 from kfgs.cameras import Camera
 from kfgs.formats import read_splats
 from kfgs.formats.ply import read_ply, write_ply
 from kfgs.gaussians import Gaussians
 from kfgs.labels import Selection, connected_parts
-from kfgs.pipeline import label_cloud, save_labelled
-from kfgs.pipeline.label import WIDTH, write_parts
-from kfgs.scenes import load_scene
-from kfgs.viz.films import show_photos
+from kfgs.pipeline.label import WIDTH, label_cloud, save_labelled, write_parts
 
 K = torch.tensor([[40.0, 0, 40], [0, 40, 30], [0, 0, 1]])
 
@@ -51,14 +45,6 @@ def test_each_part_is_drawn_in_its_own_view(tmp_path):
         assert drawn[middle, center].tolist() == [120] * 3  # the part keeps its colour
     assert (drawn[middle, 20] > 200).all()
     assert write_parts(tmp_path / "b.png", cloud, connected_parts(cloud, selection), views, under, "ball") is None
-
-
-def test_photographs_are_found_by_name(tmp_path):
-    scene = load_scene(make_room(tmp_path / "scene"))
-    view = scene.views("test")[0]
-    camera = scene.cameras[view]
-    np.testing.assert_allclose(show_photos(scene)(camera), scene.image(view) * 255, atol=1)
-    assert (show_photos(scene)(dataclasses.replace(camera, name="other.png")) == 200).all()
 
 
 def test_labels_are_written_and_carried_to_points(tmp_path):

@@ -65,7 +65,7 @@ def test_a_lens_passes_on_what_is_known_of_the_maps():
     features = torch.rand(6, 8, 3, generator=torch.Generator().manual_seed(0)) + 0.5
     lenses = [_lens(8, 6, None), _lens(8, 6)]
     offered = _straight(_Known([features, features]), lenses)
-    assert (offered.shape, offered.digests()) == ((6, 8, 3), [["a", "1"]])
+    assert offered.shape == (6, 8, 3)
     assert not torch.equal(offered[1], features)
     bare = _straight(_Maps([features]), lenses[:1])
-    assert (bare.shape, bare.digests(), map_shape(bare)) == ((6, 8, 3), None, (6, 8, 3))
+    assert (bare.shape, map_shape(bare)) == ((6, 8, 3), (6, 8, 3))

@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 from small_room import PAPER, make_room
 
-from kfgs.pipeline import Uplift, fit, write_run_report
-from kfgs.pipeline.run_report import WIDTH, write_preview
+from kfgs.pipeline import Uplift, fit
+from kfgs.pipeline.run_report import WIDTH, write_preview, write_run_report
 from kfgs.scenes import FeatureFolder, load_scene
 
 
@@ -40,20 +40,17 @@ def test_the_page_says_all_and_loads_nothing(run):
 
 def test_a_preview_has_a_row_for_each_view(run, tmp_path):
     _, scene, field = run
-    assert write_preview(tmp_path / "a.png", field, scene)
+    assert write_preview(tmp_path / "a.png", field, scene, "train")
     picture = np.asarray(Image.open(tmp_path / "a.png"))
     height = round(WIDTH * scene.cameras[0].height / scene.cameras[0].width)
     assert picture.shape[1] == pytest.approx(3 * WIDTH, abs=30)
     assert 3 * height < picture.shape[0] < 3 * height + 150
-    assert write_preview(tmp_path / "b.png", field, scene, count=1)
-    with Image.open(tmp_path / "b.png") as one:
-        assert one.height < 0.6 * len(picture)
 
 
 def test_without_photographs_there_is_a_page_still(run, tmp_path):
     folder, scene, field = run
     gone = dataclasses.replace(scene, image_paths=[tmp_path / path.name for path in scene.image_paths])
-    assert write_preview(tmp_path / "a.png", field, gone) is False
+    assert write_preview(tmp_path / "a.png", field, gone, "train") is False
     paths = write_run_report(folder, field, gone, Uplift())
     assert "kfgs.fit(scene, maps, " in paths[-1].read_text()
     assert "&quot;uplift&quot;: {" in paths[-1].read_text()

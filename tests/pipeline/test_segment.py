@@ -49,7 +49,7 @@ def test_true_labels_of_other_classes_are_refused_before_the_work(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("names", [["a.png", "a.jpg"], [""], ["../a.png"], ["/a.png"], ["a\n.png"]])
+@pytest.mark.parametrize("names", [["a.png", "a.jpg"], [""], ["../a.png"], ["/a.png"]])
 def test_names_that_cannot_be_those_of_pictures_are_refused(names, tmp_path):
     field, scene, words = parts(tmp_path)
     cameras = [Camera(scene.cameras[0].viewmat, scene.cameras[0].K, 32, 24, name=name) for name in names]

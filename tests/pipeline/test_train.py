@@ -16,11 +16,6 @@ def test_auto_is_the_gpu_if_there_is_one():
     assert training_device("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def test_a_named_device_is_taken():
-    assert training_device("cpu") == torch.device("cpu")
-    assert training_device(torch.device("cpu")) == torch.device("cpu")
-
-
 @pytest.mark.parametrize("device", ["gpu", "mps", "cuda:99"])
 def test_what_is_not_there_is_refused(device):
     with pytest.raises(ValueError, match=tells("device:", f"got {device!r}")):
