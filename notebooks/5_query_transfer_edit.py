@@ -55,8 +55,8 @@ print(colors)
 
 # %%
 camera = scene.cameras[scene.views("test")[0]]
-found = {"cosine": field.query(thing, classes, score="cosine"), "relevancy": field.query(thing, classes)}
-for name, selection in found.items():
+answers = {"cosine": field.query(thing, classes, score="cosine"), "relevancy": field.query(thing, classes)}
+for name, selection in answers.items():
     print(f"{name:<10} {len(selection):5d} Gaussians, gamma {selection.threshold:.3f}: {selection.how}")
 
 
@@ -64,27 +64,27 @@ def draw(cloud, color_by):
     return viz.draw_view(camera, lambda plotter: viz.add_cloud(plotter, cloud, color_by=color_by, style="gaussians"))
 
 
-row = [scene.image(scene.views("test")[0]), *(draw(field.gaussians, one.scores) for one in found.values())]
-Image.fromarray(viz.picture_grid([row], ["photograph", *found], width=320))
+row = [scene.image(scene.views("test")[0]), *(draw(field.gaussians, answer.scores) for answer in answers.values())]
+Image.fromarray(viz.picture_grid([row], ["photograph", *answers], width=320))
 
 # %% [markdown]
 # The scores of all Gaussians: the chairs' cosines form a hill of their own, and $\gamma$ lies in the gap before it.
 
 # %%
-viz.plot_scores(found["cosine"], out / "scores.png")
+viz.plot_scores(answers["cosine"], out / "scores.png")
 Shown(out / "scores.png", width=560)
 
 # %% [markdown]
 # ## One chair after the other
 #
 # `connected_parts` takes a selection apart into things: each has a box, a size, and the view that shows it best. Parts that
-# are nearer than `distance` (0.15 m here) are one thing. Walls and ceiling are left out, to look into the room.
+# are nearer than `distance` (0.1 m here) are one thing. Walls and ceiling are left out, to look into the room.
 
 # %% tags=["thumbnail"]
 cameras = [scene.cameras[i] for i in scene.views("train")]
-things = kfgs.connected_parts(field.gaussians, found["relevancy"], cameras, distance=0.15)
-for number, one in enumerate(things, start=1):
-    print(f"{thing} {number}: {one!r}")
+things = kfgs.connected_parts(field.gaussians, answers["relevancy"], cameras, distance=0.1)
+for number, part in enumerate(things, start=1):
+    print(f"{thing} {number}: {part!r}")
 semantic = field.label(classes)
 hidden = torch.tensor([-1, *(classes.index(name) for name in shell if classes.knows(name))])
 inside = semantic.select(~torch.isin(semantic.labels, hidden))
@@ -93,7 +93,7 @@ orbit = Orbit(frames=1, size=(450, 640), elevation_degrees=50, start_degrees=120
 
 
 def draw_things(plotter):
-    boxes = [one.box for one in things]
+    boxes = [part.box for part in things]
     viz.add_cloud(plotter, inside, style="gaussians")
     viz.add_boxes(plotter, boxes, names=[f"{thing} {i}" for i in range(1, len(boxes) + 1)], up=up.tolist())
 
@@ -182,8 +182,8 @@ Image.fromarray(viz.picture_grid(rows, ("before", f"no {thing}, {painted} in red
 # %%
 low, high = (corner.tolist() for corner in things[0].extent)
 first = OfClass(thing).select(labelled) & InBox(low, high).select(labelled)
-one = kfgs.EditList().then(kfgs.Recolor(first, "teal"))
-states = {"before": one.undo(), f"one {thing} painted": one}
+painting = kfgs.EditList().then(kfgs.Recolor(first, "teal"))
+states = {"before": painting.undo(), f"one {thing} painted": painting}
 view = cameras[things[0].best_view.index]
 row = [viz.show_cloud(edit.apply(labelled), **picture)(view) for edit in states.values()]
 written = kfgs.write_splats(edited, out / "edited.ply")
