@@ -50,15 +50,10 @@ def read_arrays(
 ) -> dict[str, Array]:
     """Read all arrays of an `.npz` file, by name.
 
-    Args:
-        path: the file.
-        expected: what should be there, for the message.
-        advice: the end of the message.
-        most: bytes that the arrays and their headers may have together; None: what `most_unpacked` allows.
-
     Raises:
-        FileNotFoundError: if there is no such file.
-        FileError: if it is not an `.npz` file of numbers and texts, is damaged, or unpacks to more than `most` bytes.
+        FileNotFoundError: if there is no such file. `expected` and `advice` are parts of the messages.
+        FileError: if it is not an `.npz` file of numbers and texts, is damaged, or unpacks to more than `most` bytes (None:
+            what `most_unpacked` allows).
     """
     with reading(path, expected, advice), zipfile.ZipFile(path) as archive:
         entries = archive.infolist()
@@ -97,10 +92,8 @@ def read_safetensors(
 
     Args:
         path: the file.
-        expected: what should be there, for the message.
-        advice: the end of the message.
-        kfgs: the kind and the version that the metadata must state under "kfgs" and "version"; checked before tensors
-            are read.
+        expected, advice: parts of the messages.
+        kfgs: the kind and the version that the metadata must state under "kfgs" and "version".
 
     Raises:
         FileNotFoundError: if there is no such file.

@@ -35,11 +35,7 @@ def check_shapes(*arguments: tuple[str, Any, str | tuple[str | int, ...]]) -> di
     Args:
         arguments: triples `(name, tensor, spec)`; `spec` holds one word per axis, or is a tuple of words and numbers: a
             letter or word binds a size at its first appearance, a number must match exactly. A tensor that is None is
-            skipped.
-
-    Raises:
-        TypeError: if an argument has no shape.
-        ValueError: if an axis disagrees; the message names the argument that bound the size.
+            skipped. A ValueError about an axis that disagrees names the argument that bound the size.
 
     Example:
         >>> import torch

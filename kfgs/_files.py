@@ -22,7 +22,7 @@ from ._stems import Names as Names
 from ._stems import file_stem as file_stem
 from ._stems import folded_name as folded_name
 
-ASIDE = ".kfgs-new-"  # begins the name of the folder in which a file is written; one that a killed process left may be deleted
+ASIDE = ".kfgs-new-"  # begins the name of the folder in which a file is written; what a kill left may be deleted
 UNNAMED = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)  # errors that Python raises without a file
 
 
@@ -71,10 +71,7 @@ def check_output(name: str, path: str | Path, kind: Literal["a file", "a folder"
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Give a path of the same name in a hidden folder to write a file to, and move it to `path` if the block succeeds.
 
-    Folders above `path` are made. If `path` is a link, the new file takes its place.
-
-    Raises:
-        OSError: if it cannot be written, or the disk is full; the error names `path`.
+    Folders above `path` are made. If `path` is a link, the new file takes its place. An OSError names `path`.
     """
     target = as_path(path)
     with _aside(target) as place:
@@ -88,10 +85,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Give a hidden folder to fill, and move it to `path` in one step if the block succeeds.
 
     If `path` is a folder with files already, the new files move there one by one; the others stay. Folders that must
-    always be read whole (the stages of a run) are therefore never written twice.
-
-    Raises:
-        OSError: if it cannot be written, or the disk is full; the error names `path`.
+    always be read whole (the stages of a run) are therefore never written twice. An OSError names `path`.
     """
     target = real_path(path)
     with _aside(target) as place:
@@ -180,12 +174,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def read_text(path: str | Path, expected: str = "a text file") -> str:
-    """Read a text in UTF-8 or UTF-16, with or without a byte-order mark.
-
-    Raises:
-        FileNotFoundError: if there is no such file; the message says what was `expected`.
-        ValueError: if it is in another encoding.
-    """
+    """Read a text in UTF-8 or UTF-16, with or without a byte-order mark; a ValueError if it has another encoding."""
     path = as_path(path)
     if not os.path.isfile(path):  # Path.is_file raises for a name that is too long for the disk
         raise FileNotFoundError(f"{path}: no such file; expected {expected} there")

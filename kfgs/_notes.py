@@ -1,7 +1,6 @@
 """What a reader did about content that it could not use as it is: it leaves it out and notes it, or it refuses the file.
 
-Readers call `tell`. The command line listens with `hear`: it prints notes, and its `--strict` makes them errors. If nobody
-listens, each note is logged once, as a warning of the logger "kfgs".
+Readers call `tell`. The command line listens with `hear`. If nobody listens, each note is logged once ("kfgs").
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from contextlib import contextmanager
 
 
 class Repair(str):
-    """A note about something broken that a reader left out or mended. `tell_repairs` tells it, or makes an error of it."""
+    """A note about something broken that a reader left out or mended."""
 
 
 _listeners: list[Callable[[str], None]] = []

@@ -13,14 +13,9 @@ from torch import Tensor
 from ._check import ORIGIN
 
 Origin = tuple[float, float, float]
-FAR = 1000
-"""Sizes of a scene between it and zero. float32 has 2^23 steps: beyond, a scene is fewer than 8,000 of them wide, and a pixel
-of a picture of 1,000 moves by a tenth."""
-FAR_UNITS = 10_000
-"""World units. From here on a step of float32 is a millimetre, if the unit is a metre. A scene that is itself larger than a
-tenth of the distance stays: there is little to gain."""
-ONE_PLACE = 1e-6
-"""Of the distance to zero: what spreads less stands in one place up to rounding, and says nothing about a scale."""
+FAR = 1000  # sizes of a scene between it and zero: beyond, float32 has fewer than 8,000 of its steps across the scene
+FAR_UNITS = 10_000  # world units: beyond, a step of float32 is a millimetre, if the unit is a metre
+ONE_PLACE = 1e-6  # of the distance to zero: what spreads less stands in one place up to rounding, and has no scale
 
 
 def choose_origin(*places: Tensor) -> Origin:  # each [N, 3]
@@ -68,9 +63,8 @@ def in_world(points: Tensor) -> Tensor:  # [N, 3] float64
 
 def describe_origin(origin: Origin, what: str) -> list[str]:
     """A note for people; none if coordinates are counted from zero."""
-    if origin == ORIGIN:
-        return []
-    numbers = ", ".join(f"{value:.15g}" for value in origin)
-    return [
-        f"coordinates of {what} are counted from the origin ({numbers}), because float32 has 7 digits; answers are in the world"
-    ]
+    place = ", ".join(f"{value:.15g}" for value in origin)
+    note = (
+        f"coordinates of {what} are counted from the origin ({place}): float32 has 7 digits; answers are in the world"
+    )
+    return [] if origin == ORIGIN else [note]

@@ -38,12 +38,8 @@ def folded_name(name: str) -> str:
 class Names:
     r"""Names of files or views, which may be asked for in other spellings. Every reader of names in kfgs uses this rule.
 
-    A name is looked up as it is, then folded (`folded_name`), then without its ending, then without its first folders. The
-    first way that fits anything decides; if it fits several names, none is found.
-
-    Args:
-        names: all different.
-        bare: a name may also be asked for without its folders.
+    A name is looked up as it is, then folded (`folded_name`), then without its ending, then without its first folders, and
+    if `bare` without all of them. The first way that fits anything decides; if it fits several names, none is found.
 
     Example:
         >>> names = Names(["images/A.jpg", "images/b.png"])

@@ -70,10 +70,6 @@ class SamTeacher:
 
     The longer side of a picture is resized to 1024, the picture is padded to a square at the bottom or right, and the
     padding is cut from the map, as in Feature 3DGS: a picture wider than high gives [256, int(64 H / W + 0.5), 64].
-
-    Attributes:
-        encoder: kornia's image encoder, in evaluation mode.
-        identity: name and a digest of the weights.
     """
 
     name = "sam"

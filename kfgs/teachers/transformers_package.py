@@ -15,13 +15,10 @@ from .._card import error_line
 
 
 def require_transformers() -> Any:
-    """Import the package transformers.
+    """Import the package transformers; an ImportError if it is missing or broken.
 
     If torchvision is installed but does not import (built for another torch), every model class of transformers fails with
     a misleading message, so torchvision is checked first.
-
-    Raises:
-        ImportError: if transformers is missing or broken, or torchvision is broken.
     """
     try:
         if importlib.util.find_spec("torchvision") is not None:

@@ -114,12 +114,6 @@ class TransformersTeacher:
 
     A picture is resized (bilinear, antialiased) so that both sides are multiples of the patch size, normalised as the
     model was trained, and gives one feature per patch.
-
-    Attributes:
-        model: the model of transformers, in evaluation mode.
-        name: the kind, a name of the table.
-        identity: name, options, and a digest of the weights or the hub's commit.
-        templates: the name of its prompt templates.
     """
 
     def __init__(self, model: Any, row: TeacherRow, identity: dict[str, Any], tokenize: _Tokenize | None) -> None:
@@ -155,12 +149,7 @@ class TransformersTeacher:
 
     @torch.inference_mode()
     def encode_text(self, prompts: Sequence[str]) -> Tensor:  # -> [n, D]
-        """One unit row per prompt.
-
-        Raises:
-            NotImplementedError: if the model has no text tower in the space of its patches.
-            ValueError: if there are no prompts, one is too long, or there is no tokenizer.
-        """
+        """One unit row per prompt; a NotImplementedError if the model has no text tower in the space of its patches."""
         rule = self.row.text
         if rule is None or self._tokenize is None:
             able = [name for name, row in TRANSFORMERS.items() if row.text]
@@ -184,8 +173,6 @@ def fit_patches(size: tuple[int, int], patch: tuple[int, int], longest: int | No
     Example:
         >>> fit_patches((480, 640), (14, 14), None)  # 34.3 and 45.7 patches
         (476, 644)
-        >>> fit_patches((480, 640), (16, 16), 320)
-        (240, 320)
     """
     scale = 1.0 if longest is None else longest / max(size)
     height, width = (max(1, int(side * scale / cell + 0.5)) * cell for side, cell in zip(size, patch, strict=True))

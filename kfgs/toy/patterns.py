@@ -8,23 +8,60 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from .noise import Array, Noise, hashed
-
+Array = NDArray[np.float64]
 Color = tuple[float, float, float]
+LATTICE = 48  # random values along each edge of the noise volume, mirrored beyond it
+
+
+class Noise:
+    """Band-limited value noise in [-1, 1] over R^3: a random lattice, interpolated trilinearly by `grid_sample`."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        values = rng.uniform(-1.0, 1.0, (1, 1, LATTICE, LATTICE, LATTICE))
+        self.volume = torch.from_numpy(values.astype(np.float32))
+
+    def layer(self, points: Array, wavelength: float) -> Array:  # [N, 3] -> [N]
+        """One octave: lattice points `wavelength` / 2 metres apart."""
+        grid = torch.from_numpy((points * (4.0 / (wavelength * (LATTICE - 1)))).astype(np.float32))
+        out = torch.nn.functional.grid_sample(
+            self.volume, grid[None, None, None], mode="bilinear", padding_mode="reflection", align_corners=True
+        )
+        return out.flatten().double().numpy()
+
+    def fractal(
+        self, points: Array, wavelength: float, footprint: Array, octaves: int = 6, gain: float = 0.7
+    ) -> Array:  # [N, 3], [N] -> [N]
+        """Octaves from `wavelength` down; those near the size of a pixel (`footprint`, metres) are faded."""
+        total = np.zeros(len(points))
+        weight = 1.0
+        for octave in range(octaves):
+            fade = np.clip((wavelength / footprint - 1.0) / 2.0, 0.0, 1.0)
+            if weight * fade.max(initial=0.0) > 0:
+                total += weight * fade * self.layer(points + 0.37 * octave, wavelength)
+            weight, wavelength = weight * gain, wavelength / 2.13  # not 2: the mirrored periods must not line up
+        return total
+
+
+def hashed(cells: NDArray[np.int64], seed: int) -> Array:  # [N, n] -> [N] in [0, 1)
+    """A fixed random number for each integer cell."""
+    mixed = np.full(len(cells), seed * 7919 + 17, np.uint64)
+    for column in cells.astype(np.uint64).T:
+        mixed = (mixed ^ column) * np.uint64(0x9E3779B97F4A7C15)
+        mixed ^= mixed >> np.uint64(29)
+    return (mixed >> np.uint64(11)).astype(np.float64) / 2.0**53
 
 
 @dataclass(frozen=True)
 class Texture:
     """The material of one object: its pattern, two or more colours (RGB in [0, 1]), its size in metres, its seed."""
 
-    kind: Literal[
-        "plaster", "sprigs", "weave", "stripes", "planks", "wood", "panel", "books", "rug", "leaves", "hills", "shapes"
-    ]
+    kind: str  # a name of PATTERNS
     colors: tuple[Color, ...]
     scale: float = 0.2
     seed: int = 0
@@ -41,7 +78,6 @@ class Spots(NamedTuple):
     axis: NDArray[np.int64]  # [N] the face's normal axis
     grain: Array  # [N] fine noise
     footprint: Array  # [N] metres a pixel covers
-
     fibres: Array  # [N, 3] where to read noise that is drawn out along the longest edge
     place: Array  # [N, 3] where to read other noise
 
@@ -157,9 +193,8 @@ def _books(texture: Texture, noise: Noise, spots: Spots) -> Array:
     spines = np.array(texture.colors[2:])
     spine = spines[(tone * len(spines)).astype(int)] * (0.85 + 0.3 * height)[:, None]
     rounding = 1.0 - 1.6 * (at - np.floor(at) - 0.5) ** 2
-    label = _cover(
-        v - (0.1 + 0.1 * tone), 0.012 + 0.02 * float(hashed(np.array([[3]]), texture.seed)[0]), spots.footprint
-    )
+    width = 0.012 + 0.02 * float(hashed(np.array([[3]]), texture.seed)[0])
+    label = _cover(v - (0.1 + 0.1 * tone), width, spots.footprint)
     spine = _mix(spine * rounding[:, None], (0.82, 0.78, 0.68), 0.7 * label)
     top = spots.edge[:, 1] * (0.35 + 0.5 * height) - v
     shadow = _mix(0.25 * color, spine, np.clip(top / spots.footprint + 0.5, 0.0, 1.0))
@@ -228,15 +263,8 @@ def _hills(texture: Texture, noise: Noise, spots: Spots) -> Array:
         at = np.stack([u + 3.0 * k, np.full_like(u, 0.4 + k), np.zeros_like(u)], -1)
         ridge = h * (0.18 - 0.3 * k) + 0.07 * noise.fractal(at, 0.7, np.full(len(u), 1e-3), octaves=4, gain=0.45)
         share = np.clip((ridge - v) / spots.footprint + 0.5, 0.0, 1.0)
-        color = _mix(
-            color,
-            _mix(
-                np.broadcast_to(np.array(tone), color.shape),
-                (0.93, 0.92, 0.88),
-                0.35 * np.clip((ridge - v) / (0.5 * h), 0.0, 1.0),
-            ),
-            share,
-        )
+        haze = 0.35 * np.clip((ridge - v) / (0.5 * h), 0.0, 1.0)
+        color = _mix(color, _mix(np.broadcast_to(np.array(tone), color.shape), (0.93, 0.92, 0.88), haze), share)
     return color
 
 
@@ -259,19 +287,9 @@ def _shapes(texture: Texture, noise: Noise, spots: Spots) -> Array:
 
 
 PATTERNS: dict[str, Callable[[Texture, Noise, Spots], Array]] = {
-    "plaster": _plaster,
-    "sprigs": _sprigs,
-    "weave": _weave,
-    "stripes": _stripes,
-    "planks": _planks,
-    "wood": _wood,
-    "panel": _panel,
-    "books": _books,
-    "rug": _rug,
-    "leaves": _leaves,
-    "hills": _framed(_hills),
-    "shapes": _framed(_shapes),
-}
+    "plaster": _plaster, "sprigs": _sprigs, "weave": _weave, "stripes": _stripes, "planks": _planks, "wood": _wood,
+    "panel": _panel, "books": _books, "rug": _rug, "leaves": _leaves, "hills": _framed(_hills), "shapes": _framed(_shapes),
+}  # fmt: skip
 
 
 def evaluate(

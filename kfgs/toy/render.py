@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from .geometry import Array, Solid, cast, normals, pixel_rays
 from .light import lamps_seen, light, openness
-from .noise import Noise
-from .patterns import evaluate
+from .patterns import Noise, evaluate
 from .room import CLASSES
 
 _SPLIT = 2  # colour samples per pixel and axis

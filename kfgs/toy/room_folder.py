@@ -20,9 +20,9 @@ from tqdm import tqdm
 from .._check import check_size, check_whole
 from .._files import as_path, atomic_folder, check_output, read_json, write_json
 from ..cameras.camera import Camera
-from .colmap import write_model
-from .geometry import Array, Solid, normals, sample_surface, visible
-from .noise import Noise
+from ..scenes.pycolmap_import import import_pycolmap
+from .geometry import Array, Solid, normals, project, sample_surface, visible
+from .patterns import Noise
 from .render import View, light_reaches, render, surface_color, walk_cameras
 from .room import CLASSES, build_room
 from .teacher import class_embeddings, teacher_features
@@ -192,4 +192,39 @@ def _write_geometry(
     outliers = max(1, len(rows) // 200)
     placed[:outliers] *= rng.uniform(3.0, 20.0, (outliers, 1))  # mismatches triangulate far behind the walls
     errors = PIXEL_NOISE * rng.standard_normal((*observed.shape, 2))
-    write_model(folder / "sparse" / "0", cameras, placed, np.round(color * 255).astype(np.uint8), observed, errors)
+    _write_model(folder / "sparse" / "0", cameras, placed, np.round(color * 255).astype(np.uint8), observed, errors)
+
+
+def _write_model(
+    folder: Path,
+    cameras: Sequence[Camera],  # one shared K
+    points: Array,  # [P, 3]
+    colors: NDArray[np.uint8],  # [P, 3]
+    seen: NDArray[np.bool_],  # [P, C] which camera observes which point
+    pixel_noise: Array,  # [P, C, 2] added to the observed pixels
+) -> None:
+    """Write `cameras.bin`, `images.bin` and `points3D.bin` (one shared PINHOLE camera) into `folder` through pycolmap."""
+    pycolmap = import_pycolmap()
+    first = cameras[0]
+    K = first.K.double().numpy()
+    model = pycolmap.Reconstruction()
+    params = [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])]
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(model="PINHOLE", width=first.width, height=first.height, params=params, camera_id=1)
+    )
+    tracks = [pycolmap.Track() for _ in points]
+    residuals = np.linalg.norm(pixel_noise, axis=-1)
+    for number, camera in enumerate(cameras):
+        E = camera.viewmat.double().numpy()
+        image = pycolmap.Image(name=camera.name, camera_id=1, image_id=number + 1)
+        rows = np.flatnonzero(seen[:, number])
+        xy = project(camera, points[rows])[0] + pixel_noise[rows, number]
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(at) for at in xy])
+        for place, row in enumerate(rows):
+            tracks[row].add_element(number + 1, place)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(E[:3, :3]), E[:3, 3]))
+    for i, track in enumerate(tracks):
+        point_id = model.add_point3D(points[i], track, colors[i])
+        model.points3D[point_id].error = float(residuals[i][seen[i]].mean())
+    folder.mkdir(parents=True)
+    model.write(folder)

@@ -224,7 +224,7 @@ def test_pictures_are_rich_enough_for_structure_from_motion(tmp_path):
     """Every one of six neighbouring views of the default size registers."""
     from skimage.io import imsave
 
-    from kfgs.toy.noise import Noise
+    from kfgs.toy.patterns import Noise
     from kfgs.toy.render import render
     from kfgs.toy.room import build_room
 

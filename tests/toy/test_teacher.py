@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from kfgs.toy.noise import Noise
+from kfgs.toy.patterns import Noise
 from kfgs.toy.render import render, walk_cameras
 from kfgs.toy.room import CLASSES, GROUPS, build_room
 from kfgs.toy.teacher import class_embeddings, teacher_features

@@ -51,14 +51,7 @@ def network_from_state(state: Mapping[str, Tensor], config: LSegConfig, *, sourc
 
     float32 tensors are used as they are, not copied, so those of a memory-mapped file are read when first needed;
     others are cast to float32. The position embeddings are resized to the window's grid, bilinear, align_corners=False.
-
-    Args:
-        state: tensors by name, with or without LSeg's prefix `net.`.
-        config: sizes.
-        source: the file's name, for messages.
-
-    Raises:
-        ValueError: if tensors are missing, unknown, of another shape or no floats.
+    A ValueError names tensors of `source` that are missing, unknown, of another shape or no floats.
     """
     state = _stripped(state)
     with torch.device("meta"):
@@ -76,12 +69,7 @@ def network_from_state(state: Mapping[str, Tensor], config: LSegConfig, *, sourc
 
 
 def text_from_state(state: Mapping[str, Tensor], config: LSegConfig, *, source: str) -> Any:
-    """The text tower of a checkpoint, which is CLIP ViT-B/32's, as transformers' CLIPTextModelWithProjection.
-
-    Raises:
-        ImportError: if transformers is missing.
-        ValueError: if the file holds no text tower, or a damaged one.
-    """
+    """The text tower of a checkpoint, which is CLIP ViT-B/32's, as transformers' CLIPTextModelWithProjection."""
     every = _stripped(state)
     tower = {name.removeprefix(_TEXT): value for name, value in every.items() if name.startswith(_TEXT)}
     if not tower:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -79,11 +80,7 @@ class LSeg(nn.Module):
 
     Features are the *sum* over scales, not normalised, as the paper's script writes them: kfgs compares by cosine.
 
-    Args:
-        network: the image network, in evaluation mode.
-        options: how pictures are evaluated.
-        load_text: loads the text tower at the first prompt; None: the teacher has no text encoder.
-        weights: computes the SHA-256 of the weights; called when `identity` is first read.
+    `load_text` is called at the first prompt, `weights` (their SHA-256) when `identity` is first read.
     """
 
     name = "lseg"
@@ -115,16 +112,15 @@ class LSeg(nn.Module):
     def identity(self) -> dict[str, Any]:
         """JSON of what decides the features: options, SHA-256 of the checkpoint (taken once), sizes if not LSeg's own."""
         self._weights = self._weights or self._digest()
-        known: dict[str, Any] = {"name": self.name, "options": _plain(self.options), "weights": self._weights}
-        return known if self.network.config == LSegConfig() else known | {"config": _plain(self.network.config)}
+        config = self.network.config
+        parts = {"options": self.options} | ({} if config == LSegConfig() else {"config": config})
+        known = {name: asdict(part) for name, part in parts.items()}
+        # as JSON has it, lists for tuples, so that a manifest read again is equal
+        return json.loads(json.dumps({"name": self.name, "weights": self._weights} | known))  # type: ignore[no-any-return]
 
     @torch.no_grad()
     def encode_image(self, image: Tensor) -> Tensor:  # [3, H, W] RGB in [0, 1] -> [D, h, w] float32
-        """Features of one picture, at the size `options.map_size`.
-
-        The picture is resized to it (bilinear, corners aligned, no antialiasing, as in the paper's script), and
-        evaluated in windows; see `windows.multi_scale_features`.
-        """
+        """Features of one picture, resized to `options.map_size` as in the paper's script (bilinear, corners aligned)."""
         check_picture(image)
         window = self.network.config.window
         size = self.options.map_size(image.shape[1], image.shape[2], window=window)
@@ -137,12 +133,7 @@ class LSeg(nn.Module):
 
     @torch.no_grad()
     def encode_text(self, prompts: Sequence[str]) -> Tensor:  # -> [n, D] float32
-        """One unit row per prompt, as it stands: LSeg is given bare labels, without a sentence around them.
-
-        Raises:
-            ValueError: if there are none, or one is too long.
-            NotImplementedError: if the teacher was made without text.
-        """
+        """One unit row per prompt, as it stands: LSeg is given bare labels, without a sentence around them."""
         check_prompts(prompts)
         if self.text is None:
             if self._load_text is None:
@@ -196,8 +187,3 @@ def load_lseg(
 
     network = network_from_state(read_checkpoint(weights), config, source=source)
     return LSeg(network, options, load_text=load_text, weights=partial(digest_file, weights))
-
-
-def _plain(values: LSegOptions | LSegConfig) -> dict[str, Any]:
-    """Fields as JSON has them: lists for tuples, so that a manifest read again is equal."""
-    return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(values).items()}

@@ -59,11 +59,10 @@ def multi_scale_features(
     scales: Sequence[float],
     flip: bool,
 ) -> Tensor:  # [D, H, W]
-    """Sum over scales of the features of a picture, each scale averaged over overlapping windows and flips.
+    """*Sum* over scales of the features of a picture, each scale averaged over overlapping windows and flips.
 
-    At each scale the picture is resized (bilinear, corners aligned; see `scaled_size`), filled up with black on the right
-    and below to at least a window, and cut into windows (see `window_starts`); one over the border is filled up with black,
-    not moved inwards.
+    At each scale the picture is resized (bilinear, corners aligned; see `scaled_size`) and cut into windows (see
+    `window_starts`); one over the border is filled up with black, not moved inwards.
 
     Args:
         picture: the picture, of any size.
@@ -71,9 +70,6 @@ def multi_scale_features(
         window: side of a window, pixels.
         scales: 1 is a long side of 13/12 window.
         flip: average with the features of the mirrored window.
-
-    Returns:
-        A *sum* over scales, as in the script; not normalised.
     """
     _, H, W = picture.shape
     result: Tensor | None = None
@@ -83,27 +79,16 @@ def multi_scale_features(
         rows, columns = _parts(h, H, window), _parts(w, W, window)
         for row in rows:
             for column in columns:
-                features = _features(_cut(image, row.start, column.start, window), head, flip)
+                inside = image[..., row.start : row.start + window, column.start : column.start + window]
+                right, below = window - inside.shape[-1], window - inside.shape[-2]
+                crop = functional.pad(inside, (0, right, 0, below), value=_PADDING)
+                output = head(crop)
+                features = (output.lerp(head(crop.flip(-1)).flip(-1), 0.5) if flip else output)[0]
                 if result is None:
                     result = features.new_zeros(features.shape[0], H, W)
                 _add_(result, features, row, column)
     assert result is not None, "at least one scale"
     return result
-
-
-def _features(image: Tensor, head: Callable[[Tensor], Tensor], flip: bool) -> Tensor:  # [D, S/2, S/2]
-    """The network's output for a window, averaged with that of the mirrored window."""
-    features = head(image)
-    if flip:
-        features = features.lerp(head(image.flip(-1)).flip(-1), 0.5)
-    return features[0]
-
-
-def _cut(image: Tensor, top: int, left: int, window: int) -> Tensor:  # [1, 3, window, window]
-    """A window of a picture, with black where it reaches over the border."""
-    inside = image[..., top : top + window, left : left + window]
-    below, right = window - inside.shape[-2], window - inside.shape[-1]
-    return functional.pad(inside, (0, right, 0, below), value=_PADDING)
 
 
 def _add_(result: Tensor, features: Tensor, row: _Part, column: _Part) -> None:
