@@ -103,26 +103,20 @@ def undistort(
     return result, replace(camera, distortion=None), recorded
 
 
-def undistort_labels(
-    labels: Tensor,  # [H, W] integer
-    camera: Camera,
-    fill: int = -1,
-) -> Tensor:  # [H, W], dtype of labels
-    """Remove the lens from a label map: each pixel takes the label of the nearest distorted pixel, unrecorded ones `fill`.
+def undistort_labels(labels: Tensor, camera: Camera) -> Tensor:  # [H, W] integer -> [H, W], dtype of labels
+    """Remove the lens from a label map: each pixel takes the label of the nearest distorted pixel, unrecorded ones -1.
 
     Indexed directly, because kornia's `remap` takes floating point only.
     """
     check_shapes(("labels", labels, f"{camera.height} {camera.width}"))
-    if labels.is_floating_point() or labels.dtype == torch.bool:
-        raise TypeError(f"labels: expected integers, got {labels.dtype}; convert them with .long()")
-    if fill < torch.iinfo(labels.dtype).min:
-        raise ValueError(f"fill: expected a value that {labels.dtype} can hold, got {fill}; pass labels.long()")
+    if labels.is_floating_point() or not torch.iinfo(labels.dtype).min:
+        raise TypeError(f"labels: expected signed integers, got {labels.dtype}; convert them with .long()")
     if camera.distortion is None:
         return labels
     x, y, recorded = _source_positions(camera, torch.promote_types(camera.K.dtype, torch.float32), labels.device)
     rows = (y + 0.5).floor().long().clamp(0, camera.height - 1)
     columns = (x + 0.5).floor().long().clamp(0, camera.width - 1)
-    return labels[rows, columns].where(recorded, fill)
+    return labels[rows, columns].where(recorded, -1)
 
 
 def _source_positions(

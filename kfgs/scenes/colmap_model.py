@@ -79,10 +79,8 @@ def model_suffix(folder: Path) -> str | None:
 def read_model(path: str | Path) -> ColmapModel:
     """Read a COLMAP model, binary or, if there is none, text.
 
-    Checked are each count against the size of the file, its exact end, camera models and the number of their parameters,
-    sizes, names inside the image folder, and ids that are unique and refer to something that exists. Poses without finite
-    numbers and a unit quaternion become None; points that are not finite, and entries of tracks that lead to no 2-D point
-    (of deleted images), are left out and noted.
+    What does not fit together is refused. Poses without finite numbers and a unit quaternion become None; points that are not
+    finite, and entries of tracks that lead to no 2-D point (of deleted images), are left out and noted.
     """
     folder = as_path(path)
     if not folder.is_dir():

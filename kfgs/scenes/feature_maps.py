@@ -25,13 +25,11 @@ from .scene import Scene
 class FeatureFolder(Sequence[Tensor]):
     """The teacher's feature maps of some views: item i is view i's map, [h, w, D] float32, read from disk at each access.
 
-    `FeatureFolder(path).of(scene, "train")` has the maps of a scene's split, for `fit`.
+    `FeatureFolder(path).of(scene, "train")` has the maps of a scene's split, for `fit`. An all-zero feature means "unknown".
 
     Known files, which may be mixed: `<stem>_fmap_CxHxW.pt` (Feature 3DGS and DF-3DGS: a tensor [D, h, w]), `<stem>.npy` and
     `<stem>.safetensors` (an array [h, w, D]; [D, h, w] is recognised by `channels` or the picture's aspect), in half, single
-    or double precision. The picture's ending may follow the stem, as in `a.png.npy`.
-
-    Maps may differ in size (pictures of several sizes), not in channels; an all-zero feature means "unknown".
+    or double precision. The picture's ending may follow the stem, as in `a.png.npy`. Maps may differ in size.
 
     Args:
         path: the folder.
@@ -42,18 +40,16 @@ class FeatureFolder(Sequence[Tensor]):
     Raises:
         NotADirectoryError: if `path` is not a folder.
         FileNotFoundError: if views have no map; the message names them.
-        ValueError: if `stems` is empty or repeats one. When a map is read: if it cannot be read, is not finite, or has other
-            channels than the first; the message names the file.
-        TypeError: when a map is read: if the file holds anything but one tensor.
+        ValueError, TypeError: if `stems` is empty or repeats one. When a map is read: if it cannot be read, is not one dense
+            tensor of finite floats, or has other channels than the first; the message names the file.
 
     Example:
         >>> import tempfile
         >>> from kfgs.scenes import save_feature_map
         >>> folder = tempfile.mkdtemp()
         >>> _ = save_feature_map(folder, "view_0", torch.ones(3, 4, 8))
-        >>> maps = FeatureFolder(folder)
-        >>> len(maps), maps.shape, maps[0].dtype
-        (1, (3, 4, 8), torch.float32)
+        >>> FeatureFolder(folder).shape
+        (3, 4, 8)
     """
 
     def __init__(
@@ -75,12 +71,9 @@ class FeatureFolder(Sequence[Tensor]):
             raise TypeError(f"stems: expected a list of image stems, got the text {stems!r}; put it into a list")
         self.stems = sorted(self._listed) if stems is None else list(stems)
         """The names of the views."""
-        twice = [stem for stem, count in Counter(self.stems).items() if count > 1]
-        if not self.stems or twice:
-            got = f"{some(twice)} more than once" if twice else "none"
-            raise ValueError(
-                f"stems (in {self.path}): expected at least one view, each once, got {got}; name the views"
-            )
+        if not self.stems or len(set(self.stems)) < len(self.stems):
+            got = some(self.stems) or "none"
+            raise ValueError(f"stems (in {self.path}): expected at least one view, each once, got {got}; correct them")
         self.channels, self.sizes = channels, None if sizes is None else list(sizes)
         if self.sizes is not None and len(self.sizes) != len(self):
             raise ValueError(f"sizes: expected {len(self)} (one per view), got {len(self.sizes)}; give one for each")
@@ -189,12 +182,8 @@ class FeatureFolder(Sequence[Tensor]):
         """Check the map of every view; says why a map cannot be used, by its file (if there is none, by the view).
 
         There is none; it cannot be read or is not a map of floats; it has other channels than most; it looks transposed; it
-        has NaN or infinite values, or only zeros.
-
-        Args:
-            scene: whose views to check; None: those of this folder.
-            split: of the scene, as in `of`.
-            values: False checks only shape and type, in milliseconds.
+        has NaN or infinite values, or only zeros. `scene` and `split` say whose views (None: those of this folder);
+        `values=False` checks only shape and type, in milliseconds.
         """
         sizes = dict(zip(self.stems, self.sizes or [None] * len(self), strict=True))
         if scene is not None:

@@ -226,9 +226,6 @@ def frames_agree(
     The clouds agree if 80 % of the points of one and 30 % of the other are near, and if they do not fit better a little
     elsewhere: least squares on point-to-plane distances moves 90 % of the points by less than 0.5 % of the size (0.9 %, if
     85 % of both are near).
-
-    Raises:
-        ValueError: if shapes disagree, a cloud has fewer than two points, or a number is not finite.
     """
     src, dst = as_tensor("src", src), as_tensor("dst", dst)
     check_shapes(("src", src, "N 3"), ("dst", dst, "M 3"))

@@ -36,12 +36,11 @@ def load_nice_slam(folder: Path) -> Scene:
         )
     top = read_scene_json(path, AGAIN)
     camera: Any = top.get("camera") if isinstance(top, dict) else None
-    values = [
+    values: list[Any] = [
         camera.get(name) if isinstance(camera, dict) else None for name in ("w", "h", "fx", "fy", "cx", "cy", "scale")
     ]
-    width, height, fx, fy, cx, cy, scale = (
-        n if type(n) in (int, float) and abs(n) < MAX_NUMBER else -1 for n in values
-    )
+    numbers: list[Any] = [n if type(n) in (int, float) and abs(n) < MAX_NUMBER else -1 for n in values]
+    width, height, fx, fy, cx, cy, scale = numbers
     if min(width, height, fx, fy, scale) <= 0 or max(width, height) > MAX_SIDE or width % 1 or height % 1:
         raise SceneError(
             f"{path}: expected w, h, fx, fy, cx, cy and the scale of the depth pictures as positive numbers, got "

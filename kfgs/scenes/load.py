@@ -71,22 +71,7 @@ def load_cameras(path: str | Path) -> list[Camera]:
     """The cameras of a scene, or of a camera path of your own, in natural order of their names, without lens distortion.
 
     The pictures of a COLMAP model or a transforms.json are not needed. A frame of a transforms.json needs no `file_path`
-    either; its number is then its name.
-
-    Raises:
-        FileNotFoundError: if there is no such file or folder.
-        SceneError: if there are no cameras, or they cannot be used.
-
-    Example:
-        >>> import json, tempfile
-        >>> pose = [[1, 0, 0, 0.5], [0, 0, -1, -2], [0, 1, 0, 1.2], [0, 0, 0, 1]]  # camera to world; it looks along y
-        >>> values = {"w": 640, "h": 480, "camera_angle_x": 1.0, "frames": [{"transform_matrix": pose}]}
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     file = Path(folder, "my_cameras.json")
-        ...     _ = file.write_text(json.dumps(values))
-        ...     (camera,) = load_cameras(file)
-        >>> camera.name, camera.size, camera.center
-        ('0000.png', (480, 640), tensor([ 0.5000, -2.0000,  1.2000]))
+    either; its number is then its name. A SceneError if there are no cameras, or they cannot be used.
     """
     path = as_path(path)
     model = find_model(path)
@@ -171,14 +156,15 @@ def find_images(root: Path, model: Path) -> Path:
     folders = above(model)
     dense = [folder for folder in folders if folder.name in ("dense", "distorted")]  # pictures of their own
     places = list(dict.fromkeys((*dense, root, *folders)))
-    for folder in places:
-        if (folder / "images").is_dir():
-            return folder / "images"
-    for folder in places:
-        smaller = [inner for inner in folder.glob("images_*") if inner.is_dir() and inner.name[7:].isdecimal()]
-        if smaller:
-            return min(smaller, key=lambda inner: natural_key(inner.name))
-    return next((folder / "input" for folder in dense if (folder / "input").is_dir()), root)
+    full = [folder / "images" for folder in places]
+    small = [
+        inner
+        for folder in places
+        for inner in sorted(folder.glob("images_*"), key=lambda inner: natural_key(inner.name))
+        if inner.name[7:].isdecimal()
+    ]
+    undistorted = [folder / "input" for folder in dense]
+    return next((folder for folder in (*full, *small, *undistorted) if folder.is_dir()), root)
 
 
 def _with_split(scene: Scene, path: Path, split: SplitChoice) -> Scene:

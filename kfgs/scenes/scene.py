@@ -171,10 +171,9 @@ class Scene:
 
     @property
     def extent(self) -> float:
-        """1.1 times the largest distance of a training camera from the training cameras' mean, in world units.
+        """1.1 times the largest distance of a training camera from the training cameras' mean; see `camera_extent`.
 
-        3DGS scales the steps of positions with this length. If the `train` split is empty, all views count. If all cameras
-        stand in one place, it is the median distance to the points, or 1 without points.
+        3DGS scales the steps of positions with this length. If the `train` split is empty, all views count.
         """
         chosen = self.splits.get("train") or range(len(self))
         return camera_extent([self.cameras[i] for i in chosen], self.points)

@@ -158,19 +158,15 @@ def load_transforms(path: Path, images: Path | None = None, *, pictures: bool = 
     Without `w, h` each frame has the size of its own picture, without `cx, cy` its centre.
 
     A frame whose file is missing, or whose pose or lens has NaN or infinite numbers, is left out and noted. A scale of a pose
-    is removed. Image files outside the scene folder are read. Points are those of `ply_file_path` inside the folder, else of
-    `points3d.ply`, else from `depth_file_path` (millimetres, or `integer_depth_scale`) if no lens is distorted. What is
-    black in a `mask_path` is ignored (`Scene.masks`).
+    is removed. Points are those of `ply_file_path` inside the folder, else of `points3d.ply`, else from `depth_file_path`
+    (millimetres, or `integer_depth_scale`) if no lens is distorted. What is black in a `mask_path` is ignored. Splits come from
+    the file's lists (`train_filenames`, ...) or from Blender's files; else all views train.
 
     Args:
         path: the file, or a folder with `transforms.json` or `transforms_train.json`.
         images: where to look for image files before the scene folder. Other sizes than the file says resize the cameras.
         pictures: False reads cameras alone, also of frames without an image file; a frame without `file_path` is named by its
             number, `0007.png`.
-
-    Returns:
-        The scene. Splits come from the file (`train_filenames`, `val_filenames`, `test_filenames`; what none of them names is
-        in no split) or from Blender's files; without test views, the validation views are tested. Else all views train.
     """
     files = _files(path)
     first = next(iter(files.values()))

@@ -126,5 +126,5 @@ def test_undistort_refusals():
         undistort_labels(torch.zeros(HEIGHT, WIDTH, 1, dtype=torch.int64), camera)
     with pytest.raises(TypeError, match=tells("labels:", "got torch.float32")):
         undistort_labels(torch.zeros(HEIGHT, WIDTH), camera)
-    with pytest.raises(ValueError, match=tells("fill:", "torch.uint8", "got -1", "labels.long")):
+    with pytest.raises(TypeError, match=tells("labels:", "signed", "torch.uint8", ".long()")):
         undistort_labels(torch.zeros(HEIGHT, WIDTH, dtype=torch.uint8), camera)
