@@ -20,7 +20,6 @@ peak is that of torch's float32 matrix product with as many threads, multiply an
 
 **Peers** (looked up in the package index in November 2026, Python 3.11, Linux x86-64):
 
-- the SIMD prototype and its pure-torch, tile-batched engine: measured where `../shared/reference/engine_prototype` exists;
 - gsplat 1.5.3: a wheel of CUDA sources, compiled with nvcc at first use; its torch fallback needs nerfacc and two CUDA
   kernels to list and composite. Nothing runs on a CPU; on a GPU it is measured;
 - taichi-splatting 0.13.0 (with taichi 1.7.4): installs, but its rasteriser is written with shared memory and warp votes,
@@ -30,7 +29,7 @@ peak is that of torch's float32 matrix product with as many threads, multiply an
 - splatkit 0.1.0: trains through gsplat; nerfview 0.1.3: a viewer, without a rasteriser; `brush` in the index is a laboratory's
   logger, and the rasteriser of that name is a program in Rust without a package;
 - torch-splatting, opensplat, diff-gaussian-rasterization: not in the index. OpenSplat's CPU rasteriser needs a C++
-  compiler and torch-splatting a checkout; `reference/engine.md` has what they took on such a machine.
+  compiler and torch-splatting a checkout.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ from devices import CPU, add_device
 from engines_machine import describe, measure, measure_peak, peak_memory
 from engines_report import write_curves, write_tables
 from engines_runners import Calls, Case, Inputs, calls, count_pairs, engine_names, missing, prepare
-from engines_step import kfgs_step, prototype_step
+from engines_step import kfgs_step
 
 SIZES = (320, 240), (480, 360), (640, 480), (1280, 960)
 SLICES = {
@@ -169,11 +168,9 @@ def time_step(case: Case, threads: int, repeats: int, device: torch.device = CPU
     whole: dict[Any, Any] = {}
     stages: dict[Any, Any] = {}
     for engine in engine_names(device):
-        if not engine.startswith("kfgs ") and engine != "prototype":
+        if not engine.startswith("kfgs "):
             continue
-        step, parts = (
-            prototype_step(inputs) if engine == "prototype" else kfgs_step(engine.removeprefix("kfgs "), inputs)
-        )
+        step, parts = kfgs_step(engine.removeprefix("kfgs "), inputs)
         whole[engine] = step["step"]
         if engine != "kfgs reference":
             stages |= {(engine, name): call for name, call in parts.items()}

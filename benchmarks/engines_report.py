@@ -108,18 +108,12 @@ def _steps(report: Report) -> list[str]:
     lines = ["", "## A whole training step", "", "Projection, binning, compositing, L1 loss, backward, fused Adam."]
     rows, stages = [], []
     for entry in report["steps"]:
-        base = entry["step"].get("prototype")
         for engine, times in entry["step"].items():
-            ratio = (
-                "-"
-                if base is None
-                else f"{times['median'] / base['median']:.2f} ({times['least'] / base['least']:.2f})"
-            )
-            rows.append([_case(entry["case"]), str(entry["threads"]), engine, _ms(times), ratio])
+            rows.append([_case(entry["case"]), str(entry["threads"]), engine, _ms(times)])
         for engine, parts in entry["stages"].items():
             total = {key: sum(times[key] for times in parts.values()) for key in ("median", "least")}
             stages.append([str(entry["threads"]), engine, *(_ms(times) for times in parts.values()), _ms(total)])
-    lines += _table(["N, size, channels", "threads", "engine", "ms", "times the prototype's"], rows)
+    lines += _table(["N, size, channels", "threads", "engine", "ms"], rows)
     names = next((list(parts) for entry in report["steps"] for parts in entry["stages"].values()), [])
     return [*lines, "", "Its stages, each called alone:", *_table(["threads", "engine", *names, "sum"], stages)]
 
@@ -170,7 +164,7 @@ def _whole(report: Report, part: str) -> list[str]:
 
 
 def _throughput(report: Report) -> list[str]:
-    engines = [engine for engine in _engines(report) if engine in ("kfgs numba", "kfgs triton", "prototype")]
+    engines = [engine for engine in _engines(report) if engine in ("kfgs numba", "kfgs triton")]
     rows = []
     for entry in report["cases"]:
         channels, peak = entry["case"][1], report["peak"][str(entry["threads"])]["flops"]
