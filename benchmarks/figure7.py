@@ -19,8 +19,8 @@ from torch import Tensor
 from kfgs._rows import unit_rows
 from kfgs.fields import SemanticField
 from kfgs.scenes import FeatureFolder, load_scene
-from kfgs.viz import FeatureColors, save_picture
-from kfgs.viz.pictures import picture_grid
+from kfgs.viz import FeatureColors
+from kfgs.viz.pictures import picture_grid, save_picture
 
 PIXELS = 20_000  # of a rendered map: 512 channels of it take 40 MB
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from table1_rows import ROWS, fitting_seconds
 
 from kfgs._files import atomic_path, write_json
@@ -14,9 +16,9 @@ from kfgs.evaluation.label_pictures import load_label_map
 from kfgs.labels import load_label_set
 from kfgs.metrics import MIB
 from kfgs.scenes import load_scene
-from kfgs.viz import overlay_labels, plot_quality_storage, save_picture
-from kfgs.viz.pictures import legend_strip, picture_grid
-from kfgs.viz.plots import finish
+from kfgs.viz import overlay_labels
+from kfgs.viz.pictures import legend_strip, picture_sheet, save_picture
+from kfgs.viz.plots import INK, LINES, finish, new_figure
 
 COLUMNS = 5  # of the picture of labels
 HEAD = (
@@ -147,11 +149,42 @@ def draw_labels(out: Path, folder: Path, truth: str, results: list[dict[str, Any
             maps[ROWS[request["row"]].title.strip("*")] = load_label_map(labels)
     pictures = [photo, *(overlay_labels(photo, labels, names, legend=False) for labels in maps.values())]
     titles = [f"photo {stem}", *maps]
-    pictures += [photo * 0 + 1] * (-len(pictures) % COLUMNS)
-    titles += [""] * (len(pictures) - len(titles))
-    sheets = [
-        picture_grid([pictures[i : i + COLUMNS]], titles[i : i + COLUMNS], width=320)
-        for i in range(0, len(pictures), COLUMNS)
-    ]
+    sheet = picture_sheet(pictures, titles, COLUMNS, width=320)
     present = np.concatenate([labels.numpy().ravel() for labels in maps.values()])
-    save_picture(out / "labels.png", np.concatenate([*sheets, legend_strip(present, names, sheets[0].shape[1])]))
+    save_picture(out / "labels.png", np.concatenate([sheet, legend_strip(present, names, sheet.shape[1])]))
+
+
+def plot_quality_storage(
+    points: Mapping[str, tuple[float, float]],
+    *,
+    reference: Mapping[str, tuple[float, float]] | None = None,
+) -> Figure:
+    """Draw segmentation quality against size: mIoU in per cent over MiB (logarithmic), with the name of each point.
+
+    Args:
+        points: name to (storage in MiB, mIoU in [0, 1]).
+        reference: published points, drawn hollow: for instance rows of Table 1, whose "MB" are MiB.
+
+    Raises:
+        ValueError: if there is no point, a size is not positive, or an mIoU lies outside [0, 1].
+    """
+    rows = [*points.items(), *(reference or {}).items()]
+    if not rows or not all(mib > 0 and 0 <= miou <= 1 for _, (mib, miou) in rows):
+        raise ValueError(f"points: expected names with (MiB above 0, mIoU in [0, 1]), got {dict(rows)}; correct them")
+    figure = new_figure(7.6, 5.2)
+    axes = figure.add_subplot()
+    for group, color, marker, label in ((points, LINES[0], "o", "measured"), (reference, "none", "s", "reference")):
+        if group:
+            x, y = zip(*group.values(), strict=True)
+            axes.scatter(x, 100 * np.array(y), s=55, color=color, edgecolor=INK, marker=marker, label=label, zorder=3)
+    axes.set_xscale("log")
+    axes.margins(x=0.3, y=0.12)
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.set(xlabel="storage in MiB", ylabel="mIoU in %", title="Quality against storage")
+    axes.grid(alpha=0.3, which="both")
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
+    for name, (mib, miou) in rows:  # to the left of its point if the next one to the right is close
+        close = any(0 < np.log10(x / mib) < 0.5 and abs(y - miou) < 0.03 for _, (x, y) in rows)
+        shift, side = (-8, "right") if close else (8, "left")
+        axes.annotate(name, (mib, 100 * miou), (shift, 0), textcoords="offset points", ha=side, va="center", fontsize=9)
+    return figure

@@ -30,7 +30,6 @@ question = "dark sage"  # the green of leaves
 # %%
 from dataclasses import replace
 
-import numpy as np
 import torch
 from PIL import Image
 
@@ -163,8 +162,8 @@ for i in test[:2]:
         camera, lambda plotter: viz.add_cloud(plotter, cloud, color_by=found.scores, style="gaussians", clim=(0, 1))
     )
     rows.append([photo, labels, scores])
-sheet = viz.picture_grid(rows, ["unseen picture", "segmented", question], width=320)
-Image.fromarray(np.concatenate([sheet, viz.legend_strip(torch.arange(len(phrases)), phrases, sheet.shape[1])]))
+titles = ["unseen picture", "segmented", question]
+Image.fromarray(viz.picture_grid(rows, titles, width=320, names=phrases))
 
 # %% [markdown]
 # ## Further

@@ -18,12 +18,12 @@ from kfgs import ToyConfig, make_toy_room
 data = Path(os.environ.get("KFGS_NOTEBOOK_DATA", "data"))
 folder = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6))  # yours: folder = Path("my/scene")
 features, names, text = folder / "features", folder / "classes.json", folder / "text.npy"
-out = data / "compared"
 
 # %%
 from dataclasses import replace
 
-from IPython.display import Image as Shown
+import matplotlib.pyplot as plt
+from PIL import Image
 
 import kfgs
 from kfgs import viz
@@ -97,8 +97,7 @@ for name, found in labels.items():
     share = ((found != truth) & (truth >= 0)).float().mean()
     mistakes = found.where(found != truth, -1)  # a mistake has the colour of the wrong class
     pictures[f"{name}: {share:.1%} wrong"] = viz.overlay_labels(photo, mistakes, classes.names, legend=False)
-viz.save_picture(out / "errors.png", viz.picture_grid([[*pictures.values()]], [*pictures], width=320))
-Shown(out / "errors.png", width=1000)
+Image.fromarray(viz.picture_grid([[*pictures.values()]], [*pictures], width=320))
 
 # %% [markdown]
 # ## Quality and size
@@ -111,8 +110,14 @@ Shown(out / "errors.png", width=1000)
 # %%
 sizes = [field.storage() for field in fields.values()] + [len(scene) * maps[0].numel() * 2]
 points = {name: (size / 2**20, reports[name].value) for name, size in zip(reports, sizes, strict=True)}
-viz.plot_quality_storage(points, out / "storage.png")
-Shown(out / "storage.png", width=600)
+figure, axes = plt.subplots(figsize=(7, 4))
+for name, (mib, miou) in points.items():
+    axes.scatter(mib, 100 * miou)
+    axes.annotate(name, (mib, 100 * miou), (8, 0), textcoords="offset points", va="center")
+axes.set(xscale="log", xlabel="storage in MiB", ylabel="mIoU in %", title="quality and size")
+axes.margins(x=0.2)
+axes.grid(alpha=0.3, which="both")
+plt.show()
 
 # %% [markdown]
 # Take *fused* if you have, or can train, sharp Gaussians of the scene. Take the paper's method to compare with the paper, or

@@ -36,8 +36,6 @@ examples = {
 # %%
 from dataclasses import replace
 
-import numpy as np
-import torch
 from PIL import Image
 
 import kfgs
@@ -78,8 +76,8 @@ rows = []
 for i in scene.views("test")[1:3]:
     photo, labels = scene.image(i), field.segment(scene.cameras[i], classes)
     rows += [photo, viz.overlay_labels(photo, labels, classes.names, alpha=0.7, legend=False)]
-sheet = viz.picture_grid([rows], ["unseen picture", "classes by example"] * 2, width=288)
-Image.fromarray(np.concatenate([sheet, viz.legend_strip(torch.arange(len(classes)), classes.names, sheet.shape[1])]))
+titles = ["unseen picture", "classes by example"] * 2
+Image.fromarray(viz.picture_grid([rows], titles, width=288, names=classes.names))
 
 # %% [markdown]
 # A thing that was not shown, like the cabinet or the door, is given the class of what is most like it.

@@ -7,8 +7,8 @@ import torch
 
 from kfgs.cameras import Camera
 from kfgs.gaussians import Gaussians
-from kfgs.viz import available, make_plotter
-from kfgs.viz.plotter import trouble
+from kfgs.viz import make_plotter
+from kfgs.viz.plotter import available, trouble
 
 C0 = 0.28209479177387814
 

@@ -18,7 +18,8 @@ from kfgs.formats import write_splats
 from kfgs.scenes import load_scene
 from kfgs.splat import rgb_to_sh0
 from kfgs.teachers.prompts import make_label_set
-from kfgs.viz import available, palette, plotter
+from kfgs.viz import palette, plotter
+from kfgs.viz.plotter import available
 
 LETTERS = ["--teacher", "cases_text:TEACHER"]
 

@@ -11,8 +11,9 @@ from kfgs._origin import choose_origin, to_world
 from kfgs.cameras import Orbit, orbit_cameras, path_cameras
 from kfgs.cameras.similarity import Similarity
 from kfgs.formats.ply import read_ply, write_ply
-from kfgs.labels import InBox, InSphere, Move, OfClass, OrientedBox, Selection, connected_parts
+from kfgs.labels import InBox, Move, OfClass, OrientedBox, Selection, connected_parts
 from kfgs.labels.edit_list import join
+from kfgs.labels.selection import InSphere
 from kfgs.scenes import align_by_cameras
 from kfgs.splat.transform import transform_gaussians
 

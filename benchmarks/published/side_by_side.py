@@ -17,8 +17,8 @@ from kfgs.evaluation.teacher_agreement import ade20k_words
 from kfgs.evaluation.texts import Encode, encode_unit
 from kfgs.pipeline.evaluate import Question
 from kfgs.splat import rasterize
-from kfgs.viz import overlay_labels, save_picture
-from kfgs.viz.pictures import legend_strip, picture_grid, resize_photo
+from kfgs.viz import overlay_labels
+from kfgs.viz.pictures import legend_strip, picture_grid, resize_photo, save_picture
 
 from .mask_truth import MaskTruth
 

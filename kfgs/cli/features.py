@@ -136,8 +136,9 @@ def _learn_examples(out: Path, field: Any, path: Path) -> None:
     from .._files import read_json
     from ..evaluation.coco import load_coco_examples
     from ..fields import label_set_from_examples, read_examples
-    from ..viz import draw_examples, save_picture
+    from ..viz import draw_examples
     from ..viz.films import show_photos
+    from ..viz.pictures import save_picture
 
     content = read_json(path)
     coco = isinstance(content, dict) and {"images", "annotations", "categories"} <= set(content)

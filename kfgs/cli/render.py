@@ -59,12 +59,10 @@ def render(
 
     from ..fields.store import find_field
     from ..viz import save_animation
-    from ..viz.films import SUFFIXES, check_target
+    from ..viz.films import check_target
 
     check_output("out", out, "a file")
-    if out.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"out: expected a name that ends in .gif or .mp4, got {out.name!r}; rename it")
-    check_target(out, FPS)
+    check_target(out, FPS, "out")
     walked = read_walk(path, frames)
     field = find_field(source)
     meaning, cameras = open_meaning(field or source, classes, Teacher())

@@ -6,7 +6,7 @@ from .edits import Duplicate, Extract, Move, Opacity, Recolor, Remove
 from .label_set import LabelSet, load_label_set
 from .parts import OrientedBox, Part, connected_parts
 from .scores import relevancy
-from .selection import InBox, InSphere, OfClass, OfIndex, Selection
+from .selection import InBox, OfClass, Selection
 from .transfer import Transfer, nearest_labels, transfer_labels
 
 __all__ = [
@@ -14,12 +14,10 @@ __all__ = [
     "EditList",
     "Extract",
     "InBox",
-    "InSphere",
     "Insert",
     "LabelSet",
     "Move",
     "OfClass",
-    "OfIndex",
     "Opacity",
     "OrientedBox",
     "Part",

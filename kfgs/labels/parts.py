@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -69,7 +69,8 @@ class OrientedBox:
         return self.center + (signs * self.half) @ self.axes
 
 
-class BestView(NamedTuple):
+@dataclass(frozen=True)
+class BestView:
     """The camera that shows a part largest."""
 
     camera: str  # its name
@@ -112,7 +113,7 @@ class Part:
             "box": {name: value.tolist() for name, value in vars(self.box).items()},
             "extent": [corner.tolist() for corner in self.extent],
             "volume": self.box.volume,
-            "best_view": None if self.best_view is None else self.best_view._asdict(),
+            "best_view": None if self.best_view is None else vars(self.best_view).copy(),
             "how": self.how,
             "indices": self.indices.tolist(),
         }

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,8 +13,8 @@ from .._files import as_path
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..splat import rasterize
-from ..viz import save_picture
-from ..viz.pictures import picture_grid
+from ..viz.linked import evenly
+from ..viz.pictures import picture_grid, save_picture
 
 PREVIEW = 96  # pixels: width of the renderings that choose the viewpoints
 VISIBLE = 8 / 255  # a pixel has changed if a channel changed by more than this
@@ -82,8 +81,7 @@ class PhotoPictures:
     def __init__(self, folder: Path, stems: Sequence[str], count: int) -> None:
         """Draw `count` of the views, evenly spread, into `folder/<stem>.png`."""
         self.folder, self.written = folder, list[Path]()
-        places = np.linspace(0, len(stems) - 1, min(count, len(stems))).round().astype(int)
-        self._chosen = {stems[i] for i in places}
+        self._chosen = {stems[i] for i in evenly(len(stems), count)}
 
     def __call__(self, stem: str, rendered: Tensor, taken: Tensor) -> None:
         """Draw the view if it was chosen."""

@@ -20,9 +20,9 @@ from ..formats.sidecar import write_names
 from ..gaussians import Gaussians
 from ..labels import Part, Transfer, nearest_labels
 from ..splat import rgb_to_sh0
-from ..viz import palette, save_picture
+from ..viz import palette
 from ..viz.films import Show, show_selection
-from ..viz.pictures import picture_grid
+from ..viz.pictures import picture_sheet, save_picture
 
 WIDTH = 360  # pixels of a picture of a part
 MOST = 12  # parts in a sheet
@@ -85,9 +85,6 @@ def write_parts(
             drawn.append((f"{name}/{number}" + (f" in {camera.name}" if camera.name else ""), picture))
     if not drawn:
         return None
-    columns = min(3, len(drawn))
-    drawn += [("", np.full((1, WIDTH, 3), 255, np.uint8))] * (-len(drawn) % columns)
-    rows = (drawn[i : i + columns] for i in range(0, len(drawn), columns))
-    grids = [picture_grid([[picture for _, picture in row]], [title for title, _ in row]) for row in rows]
-    save_picture(path, np.concatenate(grids))
+    titles, pictures = zip(*drawn, strict=True)
+    save_picture(path, picture_sheet(pictures, titles, 3))
     return path

@@ -14,8 +14,8 @@ from .._files import as_path, atomic_path
 from ..fields import SemanticField
 from ..fields.store import NAME
 from ..scenes import Scene
-from ..viz import FeatureColors, overlay_labels, plot_history, save_picture
-from ..viz.pictures import as_bytes, picture_grid, resize_photo
+from ..viz import FeatureColors, overlay_labels, plot_history
+from ..viz.pictures import as_bytes, picture_grid, resize_photo, save_picture
 from .methods import Paper, Uplift
 from .stages import read_stage
 

@@ -25,9 +25,10 @@ from ..fields import SemanticField
 from ..labels import LabelSet, classify
 from ..labels.questions import class_rows
 from ..scenes import Scene, list_images
-from ..viz import FeatureColors, overlay_labels, palette, save_picture
+from ..viz import FeatureColors, overlay_labels, palette
+from ..viz.linked import evenly
 from ..viz.palette import UNLABELLED
-from ..viz.pictures import Array, legend_strip, picture_grid
+from ..viz.pictures import Array, legend_strip, picture_grid, save_picture
 
 WIDTH = 480  # pixels of a picture in a sheet
 
@@ -66,7 +67,7 @@ def segment_scene(
     views = scene.views(split)
     labels = _segment(field, {scene.stem(i): scene.cameras[i] for i in views}, classes, as_path(out), progress)
     colors = FeatureColors.fit(field.features) if pictures else None
-    for k in set(np.linspace(0, len(views) - 1, min(pictures, len(views))).round().astype(int).tolist()):
+    for k in evenly(len(views), pictures).tolist():
         stem, photo = scene.stem(views[k]), scene.image(views[k])
         drawn = {"truth": truth[stem]} if stem in truth else {}
         drawn["field"] = labels[stem]

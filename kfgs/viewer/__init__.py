@@ -2,8 +2,8 @@
 
 from .meaning import FieldMeaning as FieldMeaning
 from .meaning import SplatMeaning as SplatMeaning
-from .state import Exploration
+from .state import Exploration as Exploration
 from .viewer import Viewer, explore
 from .window import Explorer
 
-__all__ = ["Exploration", "Explorer", "Viewer", "explore"]
+__all__ = ["Explorer", "Viewer", "explore"]

@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 
-from .._files import as_path, atomic_path
+from .._files import atomic_path
 from ..scenes import Scene
+from ..viz.pictures import check_suffix
 from .pack import pack_scene
 from .state import Exploration
 
@@ -86,9 +87,7 @@ def save_html(exploration: Exploration, path: str | Path, *, title: str = "kfgs"
 
     The page opens with the question, gamma and lambda of the exploration. `scene` has the photos of its cameras.
     """
-    target = as_path(path)
-    if target.suffix.lower() != ".html":
-        raise ValueError(f"path: expected a name that ends in .html, got {target.name!r}; rename it")
+    target = check_suffix(path, ".html")
     packed = pack_scene(exploration, title=title, scene=scene)
     header = json.dumps(packed.header, separators=(",", ":")).replace("<", "\\u003c")  # names may contain "</script>"
     data = f"""\

@@ -6,12 +6,12 @@ from .colors import FeatureColors
 from .examples import draw_examples
 from .films import save_animation, show_cloud
 from .frusta import add_cameras
-from .legends import add_legend, add_scalar_bar
+from .legends import add_legend
 from .linked import add_transfer, linked_clouds
 from .palette import palette
-from .pictures import legend_strip, overlay_labels, picture_grid, save_picture
-from .plots import plot_history, plot_iou, plot_quality_storage, plot_scores
-from .plotter import available, draw_view, look_through, make_plotter
+from .pictures import overlay_labels, picture_grid
+from .plots import plot_history, plot_iou, plot_scores
+from .plotter import draw_view, look_through, make_plotter
 
 __all__ = [
     "FeatureColors",
@@ -19,12 +19,9 @@ __all__ = [
     "add_cameras",
     "add_cloud",
     "add_legend",
-    "add_scalar_bar",
     "add_transfer",
-    "available",
     "draw_examples",
     "draw_view",
-    "legend_strip",
     "linked_clouds",
     "look_through",
     "make_plotter",
@@ -33,10 +30,8 @@ __all__ = [
     "picture_grid",
     "plot_history",
     "plot_iou",
-    "plot_quality_storage",
     "plot_scores",
     "save_animation",
-    "save_picture",
     "show_cloud",
     "to_pyvista",
 ]

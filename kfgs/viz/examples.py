@@ -14,7 +14,7 @@ from .._check import as_array, check_shapes, check_whole
 from ..cameras import Camera
 from ..cameras.camera import view_named
 from .palette import palette
-from .pictures import LEGEND_INK, LEGEND_PAPER, Array, as_bytes, legend_strip, picture_grid
+from .pictures import LEGEND_INK, LEGEND_PAPER, Array, as_bytes, legend_strip, picture_sheet
 
 COLUMNS = 3
 MOST = 48  # views in one picture: of a data set with thousands, nobody looks at all
@@ -57,12 +57,8 @@ def draw_examples(
         raise ValueError("examples: expected at least one in a view, got none; pass Clicks, a Box or a Mask")
     views = list(shown.values())[:MOST]
     pictures = [_marked(camera, photo(camera), marks, width) for camera, marks in views]
-    columns = min(COLUMNS, len(pictures))
-    titles = [camera.name for camera, _ in views] + [""] * (-len(pictures) % columns)
-    pictures += [np.full((1, width, 3), 255, np.uint8)] * (-len(pictures) % columns)
-    starts = range(0, len(pictures), columns)
-    rows = [picture_grid([pictures[i : i + columns]], titles[i : i + columns]) for i in starts]
-    return np.concatenate([*rows, legend_strip(np.arange(len(examples)), list(examples), rows[0].shape[1])])
+    sheet = picture_sheet(pictures, [camera.name for camera, _ in views], COLUMNS)
+    return np.concatenate([sheet, legend_strip(np.arange(len(examples)), list(examples), sheet.shape[1])])
 
 
 def _marked(camera: Camera, photo: Tensor | Array, marks: list[tuple[Any, Color]], width: int) -> Array:

@@ -17,14 +17,14 @@ from PIL import Image
 from torch import Tensor
 
 from .._check import check_choice, check_range, check_shapes
-from .._files import as_path, atomic_path
+from .._files import atomic_path
 from ..cameras import Camera
 from ..gaussians import Gaussians, check_gaussians
 from ..labels.color import parse_color
 from ..scenes import Scene
 from ..splat import rasterize
 from .colors import Array, FeatureColors, cloud_colors, color_by_default
-from .pictures import as_bytes, legend_strip, picture_grid, resize_photo
+from .pictures import as_bytes, check_suffix, legend_strip, picture_grid, resize_photo
 
 Show = Callable[[Camera], Any]
 ColorBy = Literal["label", "rgb", "feature", "opacity"]
@@ -149,11 +149,10 @@ def save_animation(
     return target
 
 
-def check_target(path: str | Path, fps: float) -> Path:
+def check_target(path: str | Path, fps: float, name: str = "path") -> Path:
     """Check the target before the first frame is drawn."""
-    target, suffix = as_path(path), as_path(path).suffix.lower()
-    if suffix not in SUFFIXES:
-        raise ValueError(f"path: expected a name that ends in .gif or .mp4, got {target.name!r}; rename it")
+    target = check_suffix(path, *SUFFIXES, name=name)
+    suffix = target.suffix.lower()
     check_range("fps", fps, 0.01, 50 if suffix == ".gif" else 240)  # a GIF counts to 655 seconds
     if suffix == ".mp4":
         _ffmpeg()

@@ -83,7 +83,6 @@ def draw_legend(
     With a width, entries go from left to right and wrap. Without, there is one per line, in columns of at most `height`.
     """
     present = [int(label) for label in np.unique(as_array(labels, "labels"))]
-    check_names(present, names)
     swatches = palette(np.array(present), names)
     font = ImageFont.load_default(size=size)
     gap, line = size // 2, round(size * 1.6)
@@ -119,9 +118,7 @@ def save_picture(
     Raises:
         ValueError: if the name does not end in .png, or the array is not a picture.
     """
-    target, values = as_path(path), as_array(picture, "picture")
-    if target.suffix.lower() != ".png":
-        raise ValueError(f"path: expected a name that ends in .png, got {target.name!r}; rename it")
+    target, values = check_suffix(path, ".png"), as_array(picture, "picture")
     if values.dtype != np.uint8 and not np.issubdtype(values.dtype, np.floating):
         raise ValueError(f"picture: expected uint8 or floats, got {values.dtype}; colour labels with palette()")
     if values.ndim not in (2, 3) or (values.ndim == 3 and values.shape[2] not in (3, 4)) or 0 in values.shape:
@@ -135,14 +132,16 @@ def picture_grid(
     titles: Sequence[str] = (),
     *,
     width: int | None = None,
+    names: Sequence[str] = (),
 ) -> Array:  # [h, w, 3] uint8
-    """Lay pictures out in rows, with a title over each column.
+    """Lay pictures out in rows, with a title over each column, and a legend below.
 
     Args:
         rows: R rows of C pictures. Smaller ones stand in the middle of their row and column.
         titles: C titles, or none.
         width: width of each picture in pixels; all pictures are resized to it and to the proportions of the first in their
             row. Shrinking averages pixels. Enlarging repeats them, so that a coarse map looks coarse.
+        names: the classes of the legend; () draws none.
 
     Raises:
         ValueError: if there is no picture, rows or titles differ in number, or `width` is not a positive whole number.
@@ -176,12 +175,30 @@ def picture_grid(
     draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(size=letters)
     for j, title in enumerate(titles):
         draw.text((GAP + j * (width + GAP) + width / 2, head / 2), title, fill=LEGEND_INK, font=font, anchor="mm")
-    return np.asarray(canvas)
+    drawn = np.asarray(canvas)
+    return np.concatenate([drawn, legend_strip(np.arange(len(names)), names, drawn.shape[1])]) if len(names) else drawn
+
+
+def picture_sheet(pictures: Sequence[Array], titles: Sequence[str], columns: int, *, width: int | None = None) -> Array:
+    """Pictures in rows of at most `columns`, each with its own title."""
+    columns = min(columns, len(pictures))
+    blank = [np.full((1, pictures[0].shape[1], 3), 255, np.uint8)] * (-len(pictures) % columns)
+    cells, words = [*pictures, *blank], [*titles, *[""] * len(blank)]
+    starts = range(0, len(cells), columns)
+    return np.concatenate([picture_grid([cells[i : i + columns]], words[i : i + columns], width=width) for i in starts])
 
 
 def resize_photo(photo: Tensor, size: tuple[int, int]) -> Tensor:  # [H, W, 3] -> [h, w, 3]
     """Resize a photograph to (height, width): each new pixel is the mean of the old ones it covers."""
     return interpolate(photo.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0)
+
+
+def check_suffix(path: str | Path, *endings: str, name: str = "path") -> Path:
+    """The path; a ValueError unless its name ends in one of these."""
+    target = as_path(path)
+    if target.suffix.lower() not in endings:
+        raise ValueError(f"{name}: expected a name that ends in {' or '.join(endings)}, got {target.name!r}; rename it")
+    return target
 
 
 def as_bytes(picture: Tensor | Array) -> Array:
@@ -190,14 +207,6 @@ def as_bytes(picture: Tensor | Array) -> Array:
     if values.dtype == np.uint8:
         return values
     return np.asarray(np.round(np.clip(np.nan_to_num(values, nan=0.0), 0, 1) * 255), dtype=np.uint8)
-
-
-def check_names(labels: Sequence[int], names: Sequence[str]) -> None:
-    """Raise a ValueError if a label has no name."""
-    if labels and max(labels) >= len(names):
-        raise ValueError(
-            f"names: expected a name for every label up to {max(labels)}, got {len(names)} names; pass all class names"
-        )
 
 
 def _resize_alike(pictures: list[Array], width: int) -> list[Array]:

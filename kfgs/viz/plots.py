@@ -1,4 +1,4 @@
-"""Four plots with matplotlib: histories, IoU by class, scores of a query, quality against storage.
+"""Three plots with matplotlib: histories, IoU by class, scores of a query.
 
 Every function returns its figure, and writes it as a PNG file if given a path that ends in .png.
 """
@@ -14,10 +14,11 @@ import numpy as np
 from torch import Tensor
 
 from .._check import as_array, check_shapes
-from .._files import as_path, atomic_path
+from .._files import atomic_path
 from ..labels import Selection
 from .colors import Array
 from .palette import palette
+from .pictures import check_suffix
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -159,44 +160,6 @@ def plot_scores(selection: Selection, path: str | Path | None = None) -> Figure:
     return finish(figure, path)
 
 
-def plot_quality_storage(
-    points: Mapping[str, tuple[float, float]],
-    path: str | Path | None = None,
-    *,
-    reference: Mapping[str, tuple[float, float]] | None = None,
-) -> Figure:
-    """Draw segmentation quality against size: mIoU in per cent over MiB (logarithmic), with the name of each point.
-
-    Args:
-        points: name to (storage in MiB, mIoU in [0, 1]).
-        path: the file.
-        reference: published points, drawn hollow: for instance rows of Table 1, whose "MB" are MiB.
-
-    Raises:
-        ValueError: if there is no point, a size is not positive, or an mIoU lies outside [0, 1].
-    """
-    rows = [*points.items(), *(reference or {}).items()]
-    if not rows or not all(mib > 0 and 0 <= miou <= 1 for _, (mib, miou) in rows):
-        raise ValueError(f"points: expected names with (MiB above 0, mIoU in [0, 1]), got {dict(rows)}; correct them")
-    figure = new_figure(7.6, 5.2)
-    axes = figure.add_subplot()
-    for group, color, marker, label in ((points, LINES[0], "o", "measured"), (reference, "none", "s", "reference")):
-        if group:
-            x, y = zip(*group.values(), strict=True)
-            axes.scatter(x, 100 * np.array(y), s=55, color=color, edgecolor=INK, marker=marker, label=label, zorder=3)
-    axes.set_xscale("log")
-    axes.margins(x=0.3, y=0.12)
-    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.set(xlabel="storage in MiB", ylabel="mIoU in %", title="Quality against storage")
-    axes.grid(alpha=0.3, which="both")
-    _legend_below(axes)
-    for name, (mib, miou) in rows:  # to the left of its point if the next one to the right is close
-        close = any(0 < np.log10(x / mib) < 0.5 and abs(y - miou) < 0.03 for _, (x, y) in rows)
-        shift, side = (-8, "right") if close else (8, "left")
-        axes.annotate(name, (mib, 100 * miou), (shift, 0), textcoords="offset points", ha=side, va="center", fontsize=9)
-    return finish(figure, path)
-
-
 def new_figure(width: float, height: float) -> Figure:
     """An empty figure without matplotlib's global state; sizes in inches."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -210,9 +173,7 @@ def new_figure(width: float, height: float) -> Figure:
 def finish(figure: Figure, path: str | Path | None) -> Figure:
     """The figure, written as a PNG file, whole or not at all, if there is a path."""
     if path is not None:
-        if as_path(path).suffix.lower() != ".png":
-            raise ValueError(f"path: expected a name that ends in .png, got {as_path(path).name!r}; rename it")
-        with atomic_path(path) as temporary:
+        with atomic_path(check_suffix(path, ".png")) as temporary:
             # tight: otherwise labels next to square pictures are cut
             figure.savefig(temporary, format="png", bbox_inches="tight")
     return figure

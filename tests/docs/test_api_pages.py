@@ -21,7 +21,7 @@ from kfgs import batch
 from kfgs.batch.run import SceneResult
 from kfgs.pipeline import true_labels
 from kfgs.scenes import load_cameras
-from kfgs.viz import available
+from kfgs.viz.plotter import available
 
 RUN_BATCH = batch.run_batch
 

@@ -13,7 +13,6 @@ from kfgs.labels import (
     EditList,
     Extract,
     Insert,
-    InSphere,
     Move,
     OfClass,
     Opacity,
@@ -21,6 +20,7 @@ from kfgs.labels import (
     Remove,
 )
 from kfgs.labels.edit_list import OPS
+from kfgs.labels.selection import InSphere
 
 ROTATION = torch.tensor([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 PLACE = Similarity(0.5, ROTATION, torch.tensor([1.0, 2.0, 3.0]))

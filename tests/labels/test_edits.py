@@ -4,8 +4,9 @@ import torch
 from messages import tells
 
 from kfgs import Gaussians
-from kfgs.labels import Extract, OfClass, OfIndex, Opacity, Recolor, Remove
+from kfgs.labels import Extract, OfClass, Opacity, Recolor, Remove
 from kfgs.labels.color import parse_color, recolor
+from kfgs.labels.selection import OfIndex
 from kfgs.splat import rgb_to_sh0
 
 CLASSES = ("wall", "chair", "plant")

@@ -5,7 +5,8 @@ from messages import tells
 
 from kfgs import Gaussians
 from kfgs.cameras import Camera
-from kfgs.labels import Duplicate, Move, OfClass, OfIndex
+from kfgs.labels import Duplicate, Move, OfClass
+from kfgs.labels.selection import OfIndex
 from kfgs.splat import covariance_3d, evaluate_sh, rasterize
 
 MOTIONS = (

@@ -10,8 +10,8 @@ from oracles_selection import rotation
 from scipy.spatial.transform import Rotation
 
 from kfgs.gaussians import Gaussians
-from kfgs.labels import InBox, InSphere, OfClass, OfIndex, OrientedBox, Selection
-from kfgs.labels.selection import KINDS, read_object
+from kfgs.labels import InBox, OfClass, OrientedBox, Selection
+from kfgs.labels.selection import KINDS, InSphere, OfIndex, read_object
 
 NAMES = ("wall", "Chair", "plant")
 

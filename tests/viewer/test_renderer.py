@@ -8,7 +8,8 @@ from cases_web import PAPER, needs_chromium, numbers, psnr
 from small_room import make_room
 
 from kfgs.cameras import Camera
-from kfgs.labels import Duplicate, Move, OfIndex, Opacity, Recolor, Remove
+from kfgs.labels import Duplicate, Move, Opacity, Recolor, Remove
+from kfgs.labels.selection import OfIndex
 from kfgs.splat import rasterize
 from kfgs.viewer import Exploration
 from kfgs.viewer.pack import pack_scene

@@ -14,8 +14,8 @@ from kfgs.formats import read_splats
 from kfgs.splat import rasterize
 from kfgs.viewer import Exploration, Explorer, SplatMeaning, explore
 from kfgs.viewer.window import REST, _Controls
-from kfgs.viz import available, palette
-from kfgs.viz.plotter import trouble
+from kfgs.viz import palette
+from kfgs.viz.plotter import available, trouble
 
 NAMES = ("wall", "chair", "table", "sofa", "lamp")
 TITLE, LEGEND = 30, 120  # pixels that a title and a legend cover

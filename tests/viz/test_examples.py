@@ -7,8 +7,8 @@ from cases_viz import some_camera
 from messages import tells
 
 from kfgs.fields import Box, Clicks, Mask, Picked
-from kfgs.viz import draw_examples, legend_strip, palette
-from kfgs.viz.pictures import GAP
+from kfgs.viz import draw_examples, palette
+from kfgs.viz.pictures import GAP, legend_strip
 
 WIDTH = 320
 NAMES = ["chair", "wall", "plant"]

@@ -4,7 +4,8 @@ import torch
 from cases_viz import some_gaussians, some_plotter
 from messages import tells
 
-from kfgs.viz import add_cloud, add_legend, add_scalar_bar, palette
+from kfgs.viz import add_cloud, add_legend, palette
+from kfgs.viz.legends import add_scalar_bar
 from kfgs.viz.pictures import draw_legend
 
 NAMES = [f"class {i}" for i in range(18)]

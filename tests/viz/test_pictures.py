@@ -4,8 +4,8 @@ import torch
 from messages import tells
 from PIL import Image
 
-from kfgs.viz import legend_strip, overlay_labels, palette, save_picture
-from kfgs.viz.pictures import GAP, draw_legend, picture_grid
+from kfgs.viz import overlay_labels, palette
+from kfgs.viz.pictures import GAP, draw_legend, legend_strip, picture_grid, save_picture
 
 
 def two_halves(height=20, width=60):

@@ -6,10 +6,9 @@ from PIL import Image
 
 from kfgs.labels import Selection
 from kfgs.labels.scores import select_by_similarity
-from kfgs.viz import palette, plot_history, plot_iou, plot_quality_storage, plot_scores
+from kfgs.viz import palette, plot_history, plot_iou, plot_scores
 
 HISTORY = [{"epoch": i, "size": 8 + 2 * i, "loss": 1 / (i + 1), "coverage": i / 9, "note": "text"} for i in range(10)]
-TABLE_1 = {"Feature 3DGS": (1175.2, 0.739), "just decouple": (59.4, 0.735), "decouple+ADC": (57.6, 0.779)}
 
 
 def picture(path):
@@ -114,19 +113,6 @@ def test_equal_scores_are_drawn():
     assert axes.get_title() == "7 of 7 selected (100.0%)\nall"
 
 
-def test_points_lie_where_they_should_with_their_names(tmp_path):
-    figure = plot_quality_storage({"ours": (13.0, 0.766)}, tmp_path / "a.png", reference=TABLE_1)
-    axes = figure.axes[0]
-    measured, published = axes.collections
-    np.testing.assert_allclose(measured.get_offsets(), [(13.0, 76.6)])
-    np.testing.assert_allclose(published.get_offsets(), [(1175.2, 73.9), (59.4, 73.5), (57.6, 77.9)])
-    assert len(published.get_facecolor()) == 0  # hollow
-    assert axes.get_xscale() == "log"
-    assert [text.get_text() for text in axes.texts] == ["ours", *TABLE_1]
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["measured", "reference"]
-    assert (picture(tmp_path / "a.png").max(axis=2) < 100).sum() > 500
-
-
 def test_wrong_input_is_named(tmp_path):
     path = tmp_path / "a.png"
     for rows in ([], [{"epoch": 0, "note": "x"}]):
@@ -142,9 +128,6 @@ def test_wrong_input_is_named(tmp_path):
         plot_iou(torch.tensor([torch.nan]), ["a"], path)
     with pytest.raises(ValueError, match=tells("selection:", "got none")):
         plot_scores(Selection.of(torch.zeros(0, dtype=torch.bool)), path)
-    for points in ({}, {"x": (13.0, 76.6)}, {"x": (0.0, 0.5)}):
-        with pytest.raises(ValueError, match=tells("points:", "MiB above 0", "mIoU in [0, 1]")):
-            plot_quality_storage(points, path)
     with pytest.raises(ValueError, match=tells("path:", ".png", "got 'a.pdf'")):
         plot_history(HISTORY, tmp_path / "a.pdf")
     assert list(tmp_path.iterdir()) == []

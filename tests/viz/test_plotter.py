@@ -9,8 +9,8 @@ from cases_viz import some_camera, some_gaussians, some_plotter
 from messages import tells
 
 from kfgs.cameras import Camera
-from kfgs.viz import add_cloud, available, draw_view, look_through, make_plotter, plotter
-from kfgs.viz.plotter import camera_of
+from kfgs.viz import add_cloud, draw_view, look_through, make_plotter, plotter
+from kfgs.viz.plotter import available, camera_of
 
 
 @pytest.fixture
