@@ -26,7 +26,9 @@ def interruptible() -> Iterator[None]:
 
     A C++ module that loads (torch, numpy, pycolmap) aborts, or fails with an ImportError, when Python raises in it.
     """
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before: dict[int, Any] = {signal.SIGINT: signal.getsignal(signal.SIGINT)}
+    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+        before[signal.SIGTERM] = signal.SIG_DFL
     usual = before[signal.SIGINT] in (signal.default_int_handler, end_at_once)
     if not usual or threading.current_thread() is not threading.main_thread():
         yield
@@ -42,9 +44,8 @@ def interruptible() -> Iterator[None]:
             at = at.f_back
         signal.default_int_handler(number, frame)
 
-    for number, handler in before.items():
-        if number == signal.SIGINT or handler is signal.SIG_DFL:
-            signal.signal(number, interrupt)
+    for number in before:
+        signal.signal(number, interrupt)
     try:
         yield
     except Exception as error:
