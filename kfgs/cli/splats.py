@@ -99,9 +99,10 @@ def attach(
 def _of_points(path: Path) -> bool:
     """Whether a file is a PLY without Gaussians."""
     from ..formats import find_format
-    from ..formats.ply import read_ply
+    from ..formats.ply import vertex_columns
 
-    return path.is_file() and not is_field(path) and find_format(path).NAME == "ply" and "scale_0" not in read_ply(path)
+    plain = path.is_file() and not is_field(path) and find_format(path).NAME == "ply"
+    return plain and "scale_0" not in vertex_columns(path)
 
 
 def edit(

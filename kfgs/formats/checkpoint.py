@@ -2,8 +2,7 @@
 
 Both hold raw values: scales are logarithms, opacities logits, quaternions (w, x, y, z). gsplat's are in `splats`: means,
 scales, quats, opacities, sh0, shN. Nerfstudio's are in `pipeline`, under names that end in `gauss_params.means` (older ones:
-`_model.means`) and so on. Its colours are features_dc and features_rest; without the latter they are logits of colours. This
-is what the programs' own code writes; no file by the programs was at hand.
+`_model.means`) and so on; its colours are features_dc and features_rest, and without the latter logits of colours.
 
 **Frame**: nerfstudio trains in a frame of its own, x' = scale (R x + t), and writes it to `dataparser_transforms.json` in the
 folder above the checkpoint; it is undone here. The result is the frame of the data before its `applied_transform`, if
@@ -38,9 +37,8 @@ _EXPECTED = "a checkpoint of gsplat (with 'splats') or of nerfstudio's splatfact
 
 def matches(head: bytes) -> bool:
     """A zip file whose first entry is a pickle, as torch writes them."""
-    return head.startswith(b"PK\x03\x04") and head[30 : 30 + int.from_bytes(head[26:28], "little")].endswith(
-        b"/data.pkl"
-    )
+    name = head[30 : 30 + int.from_bytes(head[26:28], "little")]
+    return head.startswith(b"PK\x03\x04") and name.endswith(b"/data.pkl")
 
 
 def read(path: Path) -> Gaussians:

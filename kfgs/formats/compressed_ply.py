@@ -7,8 +7,7 @@ each. Fields begin at the high bit. `sh`, only with higher harmonics, has a byte
 4 in steps of 1/32. Axes are those of the 3DGS PLY. Files of SuperSplat before version 2 have no colour bounds: their bytes
 go from 0 to 1. Viewers check the elements and allow no labels, so labels go to a separate file.
 
-**Why not a library**: gsply 0.4.6 truncates values instead of rounding, which doubles the errors, and reads opacities of 0
-and 1 as logits of -10 and 10. The tests use it as an independent reader and writer.
+**Why not a library**: gsply 0.4.6 truncates values instead of rounding, which doubles the errors.
 """
 
 from __future__ import annotations

@@ -78,10 +78,6 @@ def morton_order(means: Tensor) -> Tensor:  # [N, 3] finite -> [N] int64
 
     A code interleaves 21 bits each of x, y and z, scaled to the cloud's bounds (Morton 1966), with x in the lowest bit.
     Equal codes keep their order, so a sorted cloud does not change.
-
-    Example:
-        >>> morton_order(torch.tensor([[1.0, 1.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])).tolist()
-        [3, 2, 1, 0]
     """
     if not len(means):
         return torch.zeros(0, dtype=torch.int64, device=means.device)
@@ -150,8 +146,7 @@ def fit_palette(rows: Tensor, size: int) -> tuple[Tensor, Tensor]:  # [N, D] -> 
     """Choose at most `size` rows that represent all rows, by k-means in two levels without random numbers.
 
     The rows are divided into about sqrt(size) groups, and each group gets a share of the palette in proportion to its
-    rows. A pass then computes 2 N sqrt(size) distances instead of N size. Starting rows are evenly spaced, so pass rows in
-    an order with similar neighbours. With `size` of N or more, nothing is lost.
+    rows: 2 N sqrt(size) distances instead of N size. Starting rows are evenly spaced, so similar rows should be neighbours.
     """
     if len(rows) <= size:
         return rows, torch.arange(len(rows))

@@ -13,8 +13,7 @@
 **Convention**: glTF has x right, y up, z back; the 3DGS PLY has x right, y down, z forward. Reading and writing turn all
 values, harmonics too, by 180 degrees around x, so a scene stands upright in any viewer.
 
-**Why not a library**: pygltflib 1.16.5 reads the JSON, but not accessors, buffers and this extension, and accepts files
-with accessors that reach beyond their buffers. The tests use it as an independent reader and writer.
+**Why not a library**: pygltflib 1.16.5 reads the JSON, but not accessors, buffers and this extension.
 """
 
 from __future__ import annotations
@@ -32,27 +31,14 @@ from ..gaussians import Gaussians
 from ..splat.transform import transform_gaussians
 from .gltf_document import MAGIC as GLB
 from .gltf_document import BufferWriter, Document
-from .values import (
-    EXACT,
-    SH_C0,
-    UP_AND_BACK,
-    flip_axes,
-    positive_scales,
-    unit_quats,
-    up_to_degree_3,
-    whole_labels,
-)
+from .values import EXACT, SH_C0, UP_AND_BACK, flip_axes, positive_scales, unit_quats, up_to_degree_3, whole_labels
 
 NAME = "gltf"
 SUFFIXES = (".glb", ".gltf")
 HOLDS = frozenset({"labels", "origin", "harmonics"})
 EXTENSION = "KHR_gaussian_splatting"
-_WRITTEN = {
-    "kernel": "ellipse",
-    "colorSpace": "srgb_rec709_display",
-    "projection": "perspective",
-    "sortingMethod": "cameraDistance",
-}
+_WRITTEN = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+_WRITTEN |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
 _UNDERSTOOD = (EXTENSION, "KHR_mesh_quantization")
 _POINTS = 0
 _LEAST_BYTES = 8  # bytes per Gaussian: with fewer, the file shows one buffer many times
@@ -75,7 +61,7 @@ def read(path: Path) -> Gaussians:
         )
     parts: list[Gaussians] = []
     for mesh, matrix in document.placed_meshes():
-        for primitive in document.item("meshes", mesh).get("primitives", []):
+        for primitive in document.root["meshes"][mesh]["primitives"]:
             if EXTENSION not in primitive.get("extensions", {}):
                 continue
             part = _read_primitive(path, document, primitive)
@@ -116,12 +102,8 @@ def write(path: Path, g: Gaussians) -> list[str]:
         attributes["_CLASS_ID"] = writer.add(g.labels.numpy().astype(np.float32))
         if g.scores is not None:
             attributes["_SCORE"] = writer.add(g.scores.numpy())
-    primitive = {
-        "mode": _POINTS,
-        "attributes": attributes,
-        "extensions": {EXTENSION: _WRITTEN},
-        "extras": {"kfgs": {"classes": list(g.names)}},
-    }
+    primitive = {"mode": _POINTS, "attributes": attributes, "extensions": {EXTENSION: _WRITTEN}}
+    primitive["extras"] = {"kfgs": {"classes": list(g.names)}}
     root = {
         "asset": {"version": "2.0", "generator": "kfgs"},
         "extensionsUsed": [EXTENSION],

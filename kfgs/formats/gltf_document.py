@@ -47,21 +47,14 @@ class Document:
         if self.root["asset"]["version"].split(".")[0] != "2":
             raise ValueError(f"asset.version {self.root['asset']['version']!r:.40}, not 2.0")
 
-    def item(self, kind: str, index: Any) -> Any:
-        """One entry of a list at the top of the document, for example of "nodes"."""
-        items = self.root.get(kind, [])
-        if type(index) is not int or not 0 <= index < len(items):
-            raise ValueError(f"there is no {kind}[{index!r:.40}], {len(items)} are listed")
-        return items[index]
-
     def values(self, index: Any, width: int, count: int | None) -> NDArray[np.float32]:  # [N, width]
         """The values of an accessor of a known width and count (None: any); normalised integers become [-1, 1] or [0, 1]."""
-        accessor = self.item("accessors", index)
+        accessor = self.root["accessors"][index]
         rows, dtype = accessor["count"], np.dtype(_COMPONENTS[accessor["componentType"]])
         if _WIDTHS.get(accessor["type"]) != width or count not in (None, rows) or "sparse" in accessor:
             got = f"{accessor['type']!r:.20} of {rows!r:.20}" + " (sparse)" * ("sparse" in accessor)
             raise ValueError(f"accessors[{index}] is {got}, expected {count or 'some'} of {width} numbers, not sparse")
-        view = self.item("bufferViews", accessor["bufferView"])
+        view = self.root["bufferViews"][accessor["bufferView"]]
         buffer, start, length = self._buffer(view["buffer"]), view.get("byteOffset", 0), view["byteLength"]
         step = view.get("byteStride", 0) or width * dtype.itemsize
         if not 0 <= start <= start + length <= len(buffer) or step < width * dtype.itemsize:
@@ -76,7 +69,7 @@ class Document:
 
     def _buffer(self, index: Any) -> memoryview:
         if index not in self._buffers:
-            buffer = self.item("buffers", index)
+            buffer = self.root["buffers"][index]
             length, uri = buffer["byteLength"], buffer.get("uri")
             content = self._binary if uri is None and index == 0 else self._fetch(uri, length)
             if not 0 <= length <= len(content):
@@ -108,11 +101,11 @@ class Document:
         """
         nodes, scenes = self.root["nodes"], self.root.get("scenes")
         below = {child for node in nodes for child in node.get("children", [])}
-        roots = self.item("scenes", self.root.get("scene", 0))["nodes"] if scenes else set(range(len(nodes))) - below
+        roots = self.root["scenes"][self.root.get("scene", 0)]["nodes"] if scenes else set(range(len(nodes))) - below
         waiting, met = [(root, torch.eye(4, dtype=torch.float64)) for root in reversed(list(roots))], 0
         while waiting:
             index, above = waiting.pop()
-            node, met = self.item("nodes", index), met + 1
+            node, met = self.root["nodes"][index], met + 1
             if met > len(nodes):  # in glTF a node has one parent
                 raise ValueError("its nodes are not a tree")
             matrix = above @ _matrix(node)

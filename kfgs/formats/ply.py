@@ -75,6 +75,12 @@ def read_ply_elements(path: str | Path) -> dict[str, Columns]:
         return {element.name: _read_rows(file, element, header.order) for element in header.elements}
 
 
+def vertex_columns(path: str | Path) -> list[str]:
+    """Names of the columns of the vertex table, which is not read."""
+    with _opened(path) as (_, header):
+        return [prop.name for prop in header.vertex().properties]
+
+
 def other_elements(path: str | Path) -> list[str]:
     """Names of the non-empty elements after the vertices, for instance the faces of a mesh; `read_ply` skips them."""
     with _opened(path) as (_, header):

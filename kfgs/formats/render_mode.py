@@ -1,15 +1,8 @@
-"""The kind of rendering that a cloud was trained for, as its file says: antialiased, as flat surfels, or unknown to kfgs.
+"""How a cloud was trained to be drawn, as its file says: antialiased, as flat surfels, or in a way that kfgs does not know.
 
-`Gaussians.antialiased`: trained with the filter of Mip-Splatting, so what a renderer widens on the screen must become fainter;
-kfgs draws it so. Surfels were trained as 2-D Gaussians: kfgs reads them as flat 3-D ones, and says so.
-
-- PLY and compressed PLY, in comments: `SplatRenderMode: default`, `mip` or `2dgs` (Brush), `antialiased 1` or `0` and
-  `postshot.anti_aliasing=1` or `0` (Postshot). A PLY without `scale_2` has surfels, one with `filter_3D` is Mip-Splatting's;
-- SOG, in `meta.json`: `"antialias": true` (the specification), `"model": "antialiased"` or `"2dgs"` (splat-transform);
-- SPZ: a flag for antialiased, no place for surfels;
-- checkpoints, in the settings next to them: `rasterize_mode` (nerfstudio), `antialiased` (gsplat).
-
-Other formats store neither.
+`Gaussians.antialiased`: with the filter of Mip-Splatting, so what a renderer widens on the screen must become fainter. Surfels
+(2DGS) are read as flat 3-D Gaussians, and a note says so. PLY files of Brush and Postshot say it in comments, SOG in
+`meta.json`, SPZ in a flag, checkpoints in the settings next to them; other formats do not store it.
 """
 
 from __future__ import annotations
@@ -24,12 +17,11 @@ from .._notes import tell
 from ..gaussians import Gaussians
 
 FLAT = 1e-3  # a surfel's thickness, times its shorter side: far below a pixel where the side is one
+# Against rays that intersect them (17 pixels wide, 1/30 of the depth): alpha is off by 0.02 at 30 degrees, 0.04 at 75, 0.5 at 89.
 AS_FLAT = (
     "2-D Gaussians (2DGS): drawn as flat 3-D ones, which differ if seen nearly from their edge, or from nearer than ten times "
     "their size"
 )
-"""Against the intersection of rays with them (a standard deviation of 17 pixels, 1/30 of the depth): alpha differs by at most
-0.02 at 30 degrees, 0.04 at 75, 0.5 at 89; with 1/6 of the depth by 0.1 at 30 degrees and 0.18 at 75."""
 
 
 class Mode(NamedTuple):
@@ -41,13 +33,12 @@ class Mode(NamedTuple):
 
 
 _PLAIN, _MIP, _SURFELS = Mode(), Mode(antialiased=True), Mode(surfels=True)
-_MODES = {
+_MODES = {  # what a file may say, by the word that announces it
     "splatrendermode:": {"default": _PLAIN, "mip": _MIP, "2dgs": _SURFELS},
     "antialiased": {"0": _PLAIN, "1": _MIP},
     "postshot.anti_aliasing": {"0": _PLAIN, "1": _MIP},
     "model": {"default": _PLAIN, "antialiased": _MIP, "2dgs": _SURFELS},
 }
-"""What a file may say, by the word that announces it."""
 
 
 def mode_from_comments(comments: Iterable[str]) -> Mode:

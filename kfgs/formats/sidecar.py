@@ -29,7 +29,7 @@ def labels_path(path: str | Path) -> Path:
 
 
 def origin_path(path: str | Path) -> Path:
-    """`scene.splat` -> `scene.splat.origin.json`: where in the world the (0, 0, 0) of a file lies that holds float32 only."""
+    """`scene.splat` -> `scene.splat.origin.json`: where the (0, 0, 0) of a file that holds float32 only lies in the world."""
     return as_path(path).with_name(as_path(path).name + ".origin.json")
 
 

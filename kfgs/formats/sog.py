@@ -6,8 +6,7 @@ alpha. `scales`: indices into a codebook of natural logarithms. `sh0`: indices i
 as alpha. `shN_labels`: which row of `shN_centroids`, 64 to a line, holds the higher harmonics, as indices into a third
 codebook. Axes are those of the 3DGS PLY. The format cannot store labels, so they go to a separate file.
 
-**Why not a library**: gsply 0.4.6 reads SOG but does not write it, and unpacks a zip entry to any size it claims. The tests
-use it as an independent reader.
+**Why not a library**: gsply 0.4.6 reads SOG but does not write it, and unpacks a zip entry to any size it claims.
 """
 
 from __future__ import annotations

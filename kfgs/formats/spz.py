@@ -9,9 +9,8 @@ in version 1); alphas, 255 steps of opacity; colors, 255 steps of f_dc from -0.5
 
 **Convention**: SPZ's own axes are x right, y up, z back (RUB) against x right, y down, z forward (RDF) of the 3DGS PLY.
 
-**Why not a library**: Niantic's Python binding is not in the package index (in 2026 `spz` 0.0.1 there has another author,
-and a wheel for Python 3.13 only). gsply 0.4.6 does not convert the axes, drops flags and extension records, and unpacks a
-gzip stream to any size. The tests use it as an independent reader and writer.
+**Why not a library**: Niantic's binding is not in the package index. gsply 0.4.6 does not convert the axes, drops flags and
+extension records, and unpacks a gzip stream to any size.
 """
 
 from __future__ import annotations
@@ -34,15 +33,7 @@ from .._arrays import most_unpacked
 from .._files import atomic_path
 from ..gaussians import Gaussians
 from .encodings import join_largest, split_largest
-from .values import (
-    UP_AND_BACK,
-    check_count,
-    describe_coarse,
-    describe_cut,
-    flip_axes,
-    unit_quats,
-    up_to_degree_3,
-)
+from .values import UP_AND_BACK, check_count, describe_coarse, describe_cut, flip_axes, unit_quats, up_to_degree_3
 
 NAME = "spz"
 SUFFIXES = (".spz",)

@@ -175,11 +175,6 @@ def check_splats(gaussians: Gaussians) -> None:
 
     A quaternion of length 0 is refused, too: other programs divide by its length. In a file, it is read as no rotation.
     Opacities of exactly 0 and 1 are allowed: the PLY, which stores logits, keeps them within 1e-7.
-
-    Raises:
-        ValueError: if a value is NaN or infinite, a quaternion is 0, a scale is not positive, an opacity lies outside [0, 1],
-            a label is below -1 or none of the named classes, or a score is not finite; or a column is not of numbers, or has
-            the name under which labels are stored.
     """
     g = gaussians.detach()
     for name, (expected, rule) in _RULES.items():

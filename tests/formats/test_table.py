@@ -52,10 +52,6 @@ def test_the_ending_chooses_the_format(tmp_path, file, name):
     assert written.paths == [tmp_path / file]
 
 
-def test_a_format_can_be_named(tmp_path):
-    write_splats(_cloud(labels=False), tmp_path / "noending", format="spz")
-
-
 def test_what_is_lost_is_said(tmp_path):
     cloud = _cloud().replace(sh=torch.zeros(9, 16, 3), features=torch.zeros(9, 4))
     lost = write_splats(cloud.replace(extra={"id": np.arange(9)}), tmp_path / "a.splat").lost
@@ -74,8 +70,6 @@ def test_bad_requests_are_named(tmp_path):
         read_splats(tmp_path)
     with pytest.raises(ValueError, match=tells("path:", "got 'a.obj'")):
         write_splats(_cloud(), tmp_path / "a.obj")
-    with pytest.raises(ValueError, match=tells("format:", "got 'obj'")):
-        write_splats(_cloud(), tmp_path / "a.ply", format="obj")
     with pytest.raises(ValueError, match=tells("path:", "got 'a.ksplat'")):  # read only
         write_splats(_cloud(), tmp_path / "a.ksplat")
     assert [file.name for file in tmp_path.iterdir()] == ["a.txt"]
