@@ -98,11 +98,10 @@ def attach(
 
 def _of_points(path: Path) -> bool:
     """Whether a file is a PLY without Gaussians."""
-    from ..formats import find_format
-    from ..formats.ply import vertex_columns
+    from ..formats import find_format, ply
 
     plain = path.is_file() and not is_field(path) and find_format(path).NAME == "ply"
-    return plain and "scale_0" not in vertex_columns(path)
+    return plain and "scale_0" not in ply.vertex_columns(path)
 
 
 def edit(
