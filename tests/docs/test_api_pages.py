@@ -157,7 +157,9 @@ def test_what_users_are_shown_to_import_is_on_a_page_with_an_example(path):
     names = set().union(*(names_of_kfgs(ast.parse(code)) for code in read_code(path)))
     assert names
     for name in sorted(names):
-        assert name.rpartition(".")[0] in ("kfgs", *PACKAGES), f"{name}: import it from its package"
+        if name.rpartition(".")[0] not in ("kfgs", *PACKAGES):  # rarely needed: from its module, which may change
+            assert callable(value_of(name))
+            continue
         entry = entry_of(name)
         assert entry is not None, f"{name}: no entry on an API page"
         assert has_example(entry), f"{name}: no example"
