@@ -28,15 +28,12 @@ AGREEING = 0.2
 1 %, with inverted ones 4 %, with the axes of another convention none."""
 
 
-def find_points(
-    scene: Scene, *, config: SfmConfig | None = None, most_views: int | None = MOST_VIEWS, progress: bool = False
-) -> Scene:
+def find_points(scene: Scene, *, config: SfmConfig | None = None, progress: bool = False) -> Scene:
     """Triangulate points from a scene's own poses. They replace the points that it has.
 
     Args:
-        scene: posed views, with or without lens.
+        scene: posed views, with or without lens; at most `MOST_VIEWS` of them are looked at, evenly chosen.
         config: `max_features`, `seed` and `num_threads` are used.
-        most_views: use at most this many views, evenly chosen; None: all.
         progress: show a bar.
 
     Raises:
@@ -45,7 +42,7 @@ def find_points(
         ImportError: if pycolmap is not installed.
     """
     check_is_scene(scene)
-    count = len(scene) if most_views is None else min(most_views, len(scene))
+    count = min(MOST_VIEWS, len(scene))
     if count < 2:
         raise SceneError(f"scene: expected at least 2 views to triangulate points, got {count}; add pictures")
     seen = scene.select(np.linspace(0, len(scene) - 1, count).round().astype(int).tolist())
