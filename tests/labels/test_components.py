@@ -63,18 +63,6 @@ def test_memory_stays_bounded_where_thousands_lie_in_range():
         tracemalloc.stop()
 
 
-def test_order_and_motion_do_not_matter():
-    points = torch.from_numpy(clumps(300, 9, 0.05, 1))
-    mask = torch.ones(300, dtype=torch.bool)
-    numbers = component_numbers(points, mask, 0.2)
-    order = torch.randperm(300, generator=torch.Generator().manual_seed(0))
-    shuffled = component_numbers(points[order], mask, 0.2)
-    same = lambda labels: labels[:, None] == labels[None]  # noqa: E731
-    assert same(shuffled).equal(same(numbers[order]))
-    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64))[0]
-    assert component_numbers(points @ turn.T + 5, mask, 0.2).equal(numbers)
-
-
 def grid(origin, n=5, step=0.1):
     x, y = torch.meshgrid(torch.arange(n) * step, torch.arange(n) * step, indexing="ij")
     return torch.stack([x, y, torch.zeros_like(x)], dim=-1).reshape(-1, 3) + torch.tensor(origin)

@@ -176,9 +176,3 @@ def test_an_edit_that_fails_is_numbered():
         EditList([Remove("chair"), Opacity("chair", 0.5)]).apply(scene())
     with pytest.raises(ValueError, match=tells("edits[0] (remove):", "class:", "wall, chair, plant", "got 'chiar'")):
         EditList([Remove("chiar")]).apply(scene())
-
-
-def test_lists_of_something_else():
-    for wrong in (Remove("chair"), [Remove("chair"), "chair"]):
-        with pytest.raises(TypeError, match=tells("edits:", "Remove")):
-            EditList(wrong)

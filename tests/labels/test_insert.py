@@ -37,10 +37,6 @@ def test_the_lower_degree_is_filled_up_and_looks_as_before(first, second):
     assert both.means.equal(torch.cat([a.means, b.means]))
 
 
-def test_what_is_inserted_is_drawn_as_the_scene_is():
-    assert join(splats(2).replace(antialiased=True), splats(1)).antialiased is True
-
-
 def test_classes_are_the_same_when_their_names_are():
     a = splats(3, labels=[0, 1, -1], classes=("wall", "chair"))
     b = splats(4, labels=[2, 0, -1, 1], classes=("chair", "wall", "vase", "never used"), seed=1)

@@ -1,6 +1,5 @@
 import dataclasses
 
-import numpy as np
 import pytest
 import torch
 from messages import tells
@@ -166,23 +165,3 @@ def test_words_of_other_channels_are_refused_before_any_view_is_drawn(monkeypatc
         ValueError, match=tells("classes:", "[C, 5]", "got (2, 7)", "examples", "kfgs features FIELD --examples")
     ):
         field().label(shown)
-
-
-def test_arrays_are_taken_as_tensors_are():
-    for target, negatives in ((ROWS[0], "auto"), (PHRASE, ROWS[1:])):
-        expected = make_question(target, FULL, negatives, 6, {})
-        array = negatives if isinstance(negatives, str) else negatives.numpy()
-        found = make_question(target.double().numpy(), FULL, array, 6, {})
-        assert found.row.equal(expected.row)
-        assert found.negatives.equal(expected.negatives)
-    assert class_rows(ROWS.numpy(), 6, {}).equal(ROWS)
-    with pytest.raises(TypeError, match=tells("classes", "LabelSet", "list")):
-        class_rows(["chair"], 6, {})
-
-
-def test_classes_may_be_a_list_of_rows():
-    assert torch.equal(class_rows(ROWS.tolist(), 6, {}), ROWS)
-    assert torch.equal(class_rows(np.eye(3, 6, dtype=np.float32), 6, {}), ROWS)
-    for wrong in (["chair", "table"], [[1.0], [1.0, 2.0]], 5j):
-        with pytest.raises(TypeError, match=tells("classes", "LabelSet", type(wrong).__name__, "make_label_set")):
-            class_rows(wrong, 6, {})

@@ -156,19 +156,6 @@ def test_algebra_by_hand(combine, mask, scores):
     assert "score > 0.5 (a)" in result.how
 
 
-def test_laws_of_the_algebra():
-    a, b, c = some(0), some(1), some(2)
-    for left, right in (
-        (~(a & b), ~a | ~b),
-        (~(a | b), ~a & ~b),
-        (~~a, a),
-        (a & (b | c), (a & b) | (a & c)),
-    ):
-        assert left.mask.equal(right.mask)
-        torch.testing.assert_close(left.scores, right.scores)
-    assert len(a | ~a) == 40
-
-
 def test_wrong_selections_are_named():
     a = some(0)
     with pytest.raises(ValueError, match=tells("other:", "40 Gaussians", "39")):

@@ -396,9 +396,3 @@ def test_the_page_opens_as_python_left_it(browser, tmp_path):
         assert page.get_attribute(".kfgs", "data-theme") == "dark"
         assert page.locator(".top .choice [aria-pressed=true]").inner_text() == "Colour"
         assert page.locator("button[aria-label='Undo']").is_disabled()
-
-
-def test_other_names_are_refused(state, tmp_path):
-    with pytest.raises(ValueError, match=r"path: expected a name that ends in .html, got 'scene.ply'"):
-        save_html(state, tmp_path / "scene.ply")
-    assert list(tmp_path.iterdir()) == []

@@ -11,9 +11,7 @@ from cases_explorer import (
     cloud,
     codebook,
     field,
-    linear,
     splat_file,
-    stored,
 )
 from messages import tells
 
@@ -82,30 +80,6 @@ def test_a_class_is_answered_as_query_answers_its_name(mode, how):
 
 
 @KINDS
-def test_a_class_selects_what_it_is_the_label_of(mode, how):
-    """With the other classes as negatives and gamma 0.5 both say: more like it than like any other."""
-    (source, views), _ = asked_and_answering(mode, how)
-    made = FieldMeaning(source, classes(), cameras=views)
-    for index, name in enumerate(NAMES):
-        assert torch.equal(made.ask(name).selection.mask, made.gaussians.labels == index)
-
-
-def test_the_answers_of_a_fused_field_by_hand():
-    made, given = FieldMeaning(field("fused"), classes()), classes()
-    features = (field("fused").features @ linear().basis.T).double().numpy()
-    words = given.embeddings.double().numpy()
-    for index, name in enumerate(NAMES):
-        chosen = []
-        for i, feature in enumerate(features):
-            length = np.linalg.norm(feature)
-            cosines = [feature @ word / max(length, 1e-30) / np.linalg.norm(word) for word in words]
-            if length > 0 and cosines[index] > max(cosines[:index] + cosines[index + 1 :]):
-                chosen.append(i)
-        assert made.ask(name).selection.indices.tolist() == chosen
-        assert len(chosen) > 0
-
-
-@KINDS
 def test_a_phrase_is_told_from_the_canonical_words(mode, how):
     (source, views), answering = asked_and_answering(mode, how)
     given = classes()
@@ -138,16 +112,6 @@ def test_a_field_without_answers_finds_them_from_its_own_cameras():
     same_answer(opened.ask("chair"), fuse_views(field(), cameras()).query("chair", classes()))
 
 
-@pytest.mark.parametrize("mode", ["adc+sc", "fused"])
-def test_a_field_is_asked_by_the_classes_that_it_remembers(mode, tmp_path):
-    made = stored(tmp_path, mode)
-    opened = FieldMeaning(made, embed=embed)
-    assert opened.names == NAMES
-    for name in NAMES:
-        same_answer(opened.ask(name), made.query(name))
-    same_answer(opened.ask("a red thing"), made.query(embed("a red thing")))
-
-
 def test_a_field_that_remembers_no_classes_needs_some():
     with pytest.raises(ValueError, match=tells("classes:", "got none")):
         FieldMeaning(field())
@@ -162,16 +126,6 @@ def test_words_that_cannot_be_answered():
     short = FieldMeaning(field(), classes(), embed=lambda words: torch.ones(DIM - 1))
     with pytest.raises(ValueError, match=tells("embed:", "[16]", "'sofa'", "got (15,)")):
         short.ask("sofa")
-
-
-def test_classes_of_another_teacher():
-    wide = replace(classes(negatives=False), embeddings=torch.ones(4, DIM + 1))
-    with pytest.raises(ValueError, match=tells("classes:", "[C, 16]", "got (4, 17)")):
-        FieldMeaning(field(), wide, cameras=cameras())
-    ours = replace(field("decouple"), info={"teacher": {"name": "lseg"}})
-    with pytest.warns(UserWarning, match=tells("classes:", "'lseg'", "'clip'")) as warned:
-        FieldMeaning(ours, replace(classes(), info={"teacher": {"name": "clip"}})).ask("chair")
-    assert len(warned) == 1  # not again at every question
 
 
 LABELS = [1, 1, 3, -1, 0]

@@ -8,8 +8,6 @@ from cases_web import PAPER, needs_chromium, numbers, psnr
 from small_room import make_room
 
 from kfgs.cameras import Camera
-from kfgs.labels import Duplicate, Move, Opacity, Recolor, Remove
-from kfgs.labels.selection import OfIndex
 from kfgs.splat import rasterize
 from kfgs.viewer import Exploration
 from kfgs.viewer.pack import pack_scene
@@ -116,16 +114,6 @@ def test_scores_of_the_labels_and_of_a_question(viewer, state):
     state.ask(None)
 
 
-def test_hidden_classes(viewer, state):
-    camera = state.cameras[4]
-    state.set_distance(0.2)
-    count = len(state.meaning.names)
-    for hidden in ([0, 2], [-1], [-1, 1, 3]):
-        flags = [int(label in hidden) for label in (*range(count), -1)]
-        truth = drawn(state, camera, keep=~np.isin(state.labels("color"), hidden))
-        assert psnr(viewer.picture(camera, hidden=flags, **{"lambda": 0.2}), truth) > ENOUGH
-
-
 def test_the_semantic_side(viewer, state):
     camera = state.cameras[5]
     state.set_show("labels")
@@ -171,42 +159,8 @@ def test_what_is_not_selected_dims(viewer, state):
     state.ask(None)
 
 
-EDIT = """(edits) => {
-  const done = (cloud, {rows, ...edit}) => cloud.edited({...edit, rows: {color: Uint32Array.from(rows)}});
-  renderer.update(edits.reduce(done, new kfgs.Cloud(packed, "color")));
-}"""
-
-
 def every(n, third):
     return list(range(0, n, third))
-
-
-@pytest.mark.parametrize(
-    "edits",
-    [
-        (Remove, {}),
-        (Opacity, {"factor": 0.3}),
-        (Move, {"translation": [0.3, -0.2, 0.1]}),
-        (Duplicate, {"translation": [0.3, -0.2, 0.1]}),
-        (Recolor, {"rgb": [0.75, 0.25, 0.1]}),
-        (Recolor, {"rgb": [1.0, 1.0, 1.0]}),
-        (Recolor, {"rgb": [0.02, 0.02, 0.1]}),
-    ],
-    ids=["remove", "opacity", "move", "duplicate", "recolor", "white", "dark"],
-)
-def test_an_edit_is_that_of_python(viewer, state, edits):
-    kind, values = edits
-    camera, cloud = state.cameras[0], state.cloud("color")
-    rows = every(len(cloud), 3)
-    viewer.run(EDIT, [{"op": kind.op, "rows": rows, **values}])
-    edited = kind(OfIndex(tuple(rows)), **values).apply(cloud)
-    truth = rasterize(edited, camera, background=PAPER).map.clamp(0, 1).numpy()
-    before = rasterize(cloud, camera, background=PAPER).map.clamp(0, 1).numpy()
-    picture = viewer.picture(camera)
-    assert psnr(picture, truth) > ENOUGH
-    assert psnr(picture, truth) > psnr(picture, before) + 3
-    viewer.run(EDIT, [])
-    assert psnr(viewer.picture(camera), before) > ENOUGH
 
 
 @pytest.mark.parametrize("side", ["color", "semantic"])
@@ -262,18 +216,3 @@ def test_two_clouds_beside_each_other(viewer, state):
     half = camera.width // 2
     assert np.array_equal(split[:, :half], color[:, :half])
     assert np.array_equal(split[:, half:], semantic[:, half:])
-
-
-MOVING = """async (camera) => {
-  const taken = [];
-  for (renderer.level = 0; renderer.level < 5; renderer.level++) {
-    renderer.setCamera({...camera});
-    renderer.timing = true;  // the level stays
-    renderer.draw({moving: true});
-    while (renderer.sides.color.fresh !== renderer.sides.color.asked) await new Promise((done) => setTimeout(done, 1));
-    renderer.draw({moving: true});
-    taken.push(base64(shown()));
-  }
-  [renderer.level, renderer.timing] = [0, false];
-  return taken;
-}"""

@@ -4,14 +4,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from cases_explorer import LINE, MODES, cameras, cloud, field, grid, grid_clouds, line, splat_file
-from cases_explorer import classes as some_classes
+from cases_explorer import LINE, cameras, cloud, grid, grid_clouds, line, splat_file
 from messages import tells
 
 from kfgs.cameras import Distortion
-from kfgs.fields import fuse_views
 from kfgs.labels import nearest_labels
-from kfgs.viewer.meaning import FieldMeaning, SplatMeaning
+from kfgs.viewer.meaning import SplatMeaning
 from kfgs.viewer.state import Exploration
 
 
@@ -32,16 +30,6 @@ def test_the_colour_side_is_labelled_as_transfer_labels_does(distance):
     known = (semantic.labels == 1)[sources] & reached
     expected_scores = torch.where(known, scores[sources], torch.nan)
     np.testing.assert_array_equal(made.scores("color"), expected_scores.double().numpy())
-
-
-def test_ties_are_many_and_the_distances_those_of_transfer_labels():
-    semantic, color = grid_clouds()
-    expected = nearest_labels(semantic.means, semantic.labels, color.means, 1000.0)
-    far = torch.cdist(color.means.double(), semantic.means[semantic.labels >= 0].double())
-    assert int(((far == far.amin(dim=1, keepdim=True)).sum(dim=1) > 1).sum()) > 100
-    made = grid()
-    assert made.source.tolist() == expected.sources.tolist()
-    np.testing.assert_array_equal(made.far.astype(np.float32), expected.distances.numpy())
 
 
 def test_lambda_without_a_number_is_that_of_transfer_labels():
@@ -78,19 +66,6 @@ def test_gamma_selects_on_both_sides():
     assert not made.selected("color").any()
     made.set_gamma(1 + 1e-8)  # a slider's rounding
     assert made.gamma == 1.0
-
-
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("views", [(), tuple(cameras())], ids=["own", "views"])
-def test_any_gamma_of_a_field_is_that_of_query(mode, views):
-    given = some_classes(1, negatives=False)
-    answering = fuse_views(field(mode), views) if views else field(mode)
-    state = Exploration(FieldMeaning(field(mode), given, cameras=views))
-    state.ask("wall")
-    low, high = state.gamma_range
-    for share in (0, 0.3, 0.9, 1):
-        state.set_gamma(low + share * (high - low))
-        assert state.selected("semantic").tolist() == answering.query("wall", given, state.gamma).mask.tolist()
 
 
 def test_a_question_comes_and_goes():

@@ -6,14 +6,10 @@ from messages import tells
 
 from kfgs.cameras import Camera, project_points
 from kfgs.cameras.camera import Distortion
-from kfgs.labels import nearest_labels
 from kfgs.splat.covariance import covariance_3d
 from kfgs.viz import (
     FeatureColors,
-    add_cameras,
     add_cloud,
-    add_legend,
-    add_transfer,
     look_through,
     palette,
     to_pyvista,
@@ -176,37 +172,6 @@ def test_look_through_refuses_a_distorting_lens(plotter):
         look_through(plotter, bent)
 
 
-def test_scene_of_everything_is_not_blank(plotter):
-    src, dst = some_gaussians(80, 1), some_gaussians(50, 2)
-    transfer = nearest_labels(src.means, src.labels, dst.means)
-    background = plotter.screenshot(return_img=True).reshape(-1, 3)
-    add_cloud(plotter, src)
-    add_cloud(plotter, dst, color_by="rgb")
-    add_transfer(plotter, src, dst, transfer)
-    add_cameras(plotter, [some_camera()], color="white")
-    add_legend(plotter, src.labels, [f"class {i}" for i in range(5)])
-    plotter.reset_camera()
-    picture = plotter.screenshot(return_img=True).reshape(-1, 3)
-    assert len(np.unique(background, axis=0)) == 1
-    assert len(np.unique(picture, axis=0)) > 10
-    assert (picture != background).any(axis=1).mean() > 0.05
-
-
-def test_opacities_are_exchanged_with_the_colours():
-    gaussians = some_gaussians()
-    with some_plotter() as plotter:
-        actor = add_cloud(plotter, gaussians, style="gaussians")
-        look_through(plotter, some_camera())
-        plotter.screenshot(return_img=True)  # drawn once, so back to front
-        colors = np.arange(180, dtype=np.uint8).reshape(60, 3)
-        opacities = np.linspace(0, 1, 60)
-        recolor_cloud(actor, colors, opacities)
-        cloud = data(actor)
-        assert not np.array_equal(cloud["index"], np.arange(60))
-        np.testing.assert_array_equal(cloud["rgb"], colors[cloud["index"]])
-        np.testing.assert_array_equal(cloud["opacity"], opacities.astype(np.float32)[cloud["index"]])
-
-
 def test_what_there_is_decides_the_colours_when_nothing_is_asked_for():
     cloud = some_gaussians(30)
     labelled = cloud.replace(labels=torch.arange(30) % 3)
@@ -266,25 +231,3 @@ def test_a_floater_does_not_set_the_camera(style):
             assert plotter.camera.distance < 10
             assert picture.any(axis=2).mean() > 0.05
             assert plotter.camera.clipping_range[1] > 700  # the floater is small, but not cut off
-
-
-def test_other_actors_are_framed_with_the_middle_of_clouds():
-    import pyvista as pv
-
-    with some_plotter() as plotter:
-        add_cloud(plotter, with_floaters())
-        add_cloud(plotter, with_floaters().replace(means=with_floaters().means + 5))
-        plotter.add_mesh(pv.Cube(center=(-19.5, 0, 0)))
-        plotter.screenshot(return_img=True)
-        # x from -20 to 6, y and z from -1 to 6
-        assert plotter.camera.focal_point == pytest.approx((-7, 2.5, 2.5), abs=0.1)
-        assert plotter.camera.parallel_scale == pytest.approx(np.linalg.norm([26, 7, 7]) / 2, rel=0.02)
-
-
-def test_a_box_of_the_caller_stays():
-    with some_plotter() as plotter:
-        add_cloud(plotter, with_floaters())
-        plotter.screenshot(return_img=True)
-        plotter.reset_camera(bounds=(0, 10, 0, 10, 0, 10))
-        assert plotter.camera.focal_point == (5, 5, 5)
-        assert plotter.camera.parallel_scale == pytest.approx(np.sqrt(300) / 2)

@@ -12,7 +12,7 @@ from PIL import Image
 from kfgs.cameras import Camera
 from kfgs.gaussians import Gaussians
 from kfgs.splat import rasterize
-from kfgs.viz import FeatureColors, palette, save_animation, show_cloud
+from kfgs.viz import palette, save_animation, show_cloud
 from kfgs.viz.films import OUTLINE, show_selection
 
 C0 = 0.28209479177387814
@@ -50,12 +50,6 @@ def test_rgb_is_what_the_rasteriser_draws():
     assert np.abs(seen - drawn).max() <= 0.51
     expected = 0.99 * 255 * (0.5 + C0 * np.array([0.5, -0.5, 0.2]))
     assert np.abs(seen - expected).max() <= 1
-
-
-def test_features_are_shown_through_the_scenes_colours():
-    colors = FeatureColors.fit(torch.randn(50, 4, generator=torch.Generator().manual_seed(0)))
-    seen = show_cloud(wall(), color_by="feature", feature_colors=colors, background="black")(some_camera())
-    assert np.abs(seen - 0.99 * colors(wall().features).astype(float)).max() <= 1
 
 
 def test_without_labels_a_cloud_is_shown_in_rgb_and_a_camera_of_any_precision_will_do():

@@ -117,12 +117,6 @@ def test_a_large_photo_is_averaged_and_keeps_its_proportions():
     assert (sheet[GAP : GAP + 3, GAP : GAP + 2] == 50).all()
 
 
-def test_the_first_picture_gives_the_proportions():
-    high, wide = np.full((4, 2, 3), 10, np.uint8), np.full((2, 4, 3), 90, np.uint8)
-    assert picture_grid([[high, wide]], width=8).shape == (2 * GAP + 16, 3 * GAP + 16, 3)
-    assert picture_grid([[wide, high]], width=8).shape == (2 * GAP + 4, 3 * GAP + 16, 3)
-
-
 def test_rows_of_several_shapes_keep_them():
     """A landscape above a portrait: without a width in the middle, with one each row in its own proportions."""
     wide, high = np.full((2, 4, 3), 90, np.uint8), np.full((4, 2, 3), 10, np.uint8)
@@ -134,17 +128,6 @@ def test_rows_of_several_shapes_keep_them():
     assert picture_grid([[wide], [high]], width=8).shape == (3 * GAP + 4 + 16, 2 * GAP + 8, 3)
     mixed = picture_grid([[wide, high]])[GAP:-GAP, GAP:-GAP, 0]
     assert mixed[:, :4].tolist() == [[255] * 4, [90] * 4, [90] * 4, [255] * 4]
-
-
-def test_floats_and_bytes_of_the_own_size_stay_as_they_are():
-    rows = [[torch.rand(5, 7, 3, generator=torch.Generator().manual_seed(0)), np.full((5, 7, 3), 9, np.uint8)]]
-    assert (picture_grid(rows, width=7) == picture_grid(rows)).all()
-
-
-@pytest.mark.parametrize("width", [0, 2.5])
-def test_a_width_is_a_positive_whole_number(width):
-    with pytest.raises(ValueError, match=tells("width:", f"got {width}")):
-        picture_grid([[np.zeros((2, 2, 3))]], width=width)
 
 
 @pytest.mark.parametrize(

@@ -106,13 +106,6 @@ def test_no_score_is_lost(gamma):
     assert (bars(axes, 0)[2].sum(), bars(axes, 1)[2].sum()) == (int((~mask).sum()), int(mask.sum()))
 
 
-def test_equal_scores_are_drawn():
-    axes = plot_scores(Selection.of(torch.ones(7, dtype=torch.bool), "all")).axes[0]
-    assert bars(axes, 1)[2].sum() == 7
-    assert len(axes.lines) == 0  # no threshold
-    assert axes.get_title() == "7 of 7 selected (100.0%)\nall"
-
-
 def test_wrong_input_is_named(tmp_path):
     path = tmp_path / "a.png"
     for rows in ([], [{"epoch": 0, "note": "x"}]):

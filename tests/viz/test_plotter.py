@@ -4,7 +4,6 @@ import sys
 
 import numpy as np
 import pytest
-import torch
 from cases_viz import some_camera, some_gaussians, some_plotter
 from messages import tells
 
@@ -52,16 +51,6 @@ def test_without_opengl_a_plotter_says_what_to_install(bare):
         with pytest.raises(RuntimeError, match=tells("OpenGL", "status -11", "crashed", "apt-get install libegl1")):
             make()
     assert len(runs) == 1  # asked once
-
-
-def test_camera_of_is_look_through_backwards():
-    camera = some_camera()  # off-centre, two focal lengths, turned
-    with some_plotter() as window:
-        look_through(window, camera)
-        seen = camera_of(window, near=0.05)
-    assert (seen.size, seen.near) == (camera.size, 0.05)
-    torch.testing.assert_close(seen.viewmat, camera.viewmat, rtol=0, atol=1e-12)
-    torch.testing.assert_close(seen.K, camera.K, rtol=1e-12, atol=1e-9)
 
 
 def test_camera_of_projects_as_vtk_does_whatever_turned_the_view():
