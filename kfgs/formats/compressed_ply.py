@@ -24,7 +24,7 @@ from ..gaussians import Gaussians
 from .encodings import pack_smallest_three, unpack_smallest_three
 from .ply import Columns, read_comments, read_ply_elements, write_ply_elements
 from .render_mode import comments_of_mode, mode_from_comments, with_mode
-from .values import SH_C0, describe_coarse, positive_scales, up_to_degree_3
+from .values import SH_C0, describe_coarse, describe_cut, positive_scales, up_to_degree_3
 
 NAME = "compressed_ply"
 SUFFIXES = (".compressed.ply",)
@@ -106,7 +106,16 @@ def write(path: Path, g: Gaussians) -> list[str]:
         steps_of_rest = np.clip(np.floor((rest / (2 * SH_LIMIT) + 0.5) * 256), 0, 255).astype(np.uint8)
         elements["sh"] = {f"f_rest_{i}": np.ascontiguousarray(column) for i, column in enumerate(steps_of_rest.T)}
     write_ply_elements(path, elements, comments=("written by kfgs", *comments_of_mode(g)))
-    return describe_coarse(g, half_steps(means, _STEPS), ".compressed.ply") + _describe_cut(g, rgb)
+    lost = describe_coarse(g, half_steps(means, _STEPS), ".compressed.ply")
+    lost += describe_cut(g.scales.log(), -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT, "scales", ".compressed.ply")
+    lost += describe_cut(g.sh[:, 1:], -SH_LIMIT, SH_LIMIT, "higher harmonics", ".compressed.ply")
+    errors = half_steps(rgb, _COLOR_STEPS)
+    if rough := int((errors > _ROUGH).any(1).sum()):
+        lost.append(
+            f"base colours of {rough:,} Gaussians, by up to {errors.max():.3g} (1 is white): others near them have colours "
+            "far outside 0 to 1"
+        )
+    return lost
 
 
 def half_steps(values: NDArray[np.float64], steps: NDArray[np.float32]) -> NDArray[np.float64]:  # [N, 3]
@@ -177,20 +186,3 @@ def _columns(element: str, columns: Columns, names: Sequence[str], kind: str) ->
     if wrong:
         raise ValueError(f"expected {kind} {', '.join(wrong)} in {element!r}, got {', '.join(columns)!r:.80}")
     return [columns[name] for name in names]
-
-
-def _describe_cut(g: Gaussians, rgb: NDArray[np.float64]) -> list[str]:  # rgb: [N, 3]
-    """Describe the values that the fixed ranges cut off, and colours rounded because others of their chunk are far off."""
-    assert g.sh is not None
-    lost = []
-    if small := int((g.scales.log().abs() > LOG_SCALE_LIMIT).any(1).sum()):
-        lost.append(f"scales of {small} Gaussians: .compressed.ply holds e^-20 to e^20")
-    if large := int((g.sh[:, 1:].abs() > SH_LIMIT).any(2).any(1).sum()):
-        lost.append(f"strong higher harmonics of {large} Gaussians: .compressed.ply holds -4 to 4")
-    errors = half_steps(rgb, _COLOR_STEPS)
-    if rough := int((errors > _ROUGH).any(1).sum()):
-        lost.append(
-            f"base colours of {rough:,} Gaussians, by up to {errors.max():.3g} (1 is white): others near them have colours "
-            "far outside 0 to 1"
-        )
-    return lost

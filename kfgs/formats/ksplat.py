@@ -22,22 +22,10 @@ from .values import SH_C0, positive_scales
 NAME = "ksplat"
 SUFFIXES = (".ksplat",)
 _HEADER_BYTES, _SECTION_BYTES = 4096, 1024
-_HEADER = struct.Struct("<BB2xIIIIH14xff")
+_HEADER = struct.Struct("<BB2xI8xIH14xff")  # version, sections, Gaussians, level of compression, range of harmonics
 _SECTION = struct.Struct("<IIIIfH2xI4xIIH")
 _MAX_DEGREE = 2
 _SH_RANGE = (-1.5, 1.5)  # of level 2, if the header gives none
-
-
-class _Header(NamedTuple):
-    major: int
-    minor: int
-    sections: int  # for which there is room
-    used: int
-    capacity: int  # Gaussians for which there is room
-    size: int  # Gaussians
-    level: int  # of compression
-    low: float  # range of the harmonics of level 2
-    high: float
 
 
 class _Section(NamedTuple):
@@ -61,12 +49,13 @@ def matches(head: bytes) -> bool:
 def read(path: Path) -> Gaussians:
     """Read a .ksplat file of compression level 0, 1 or 2 and harmonics of degree 0 to 2."""
     data = path.read_bytes()
-    h = _Header(*_HEADER.unpack_from(data))
-    if h.major != 0 or h.minor < 1 or h.level > 2:
-        raise ValueError(f"version {h.major}.{h.minor}, level {h.level}; expected 0.1 or later, and level 0 to 2")
-    start = _HEADER_BYTES + h.sections * _SECTION_BYTES
+    major, minor, count, promised, level, low, high = _HEADER.unpack_from(data)
+    if major != 0 or minor < 1 or level > 2:
+        raise ValueError(f"version {major}.{minor}, level {level}; expected 0.1 or later, and level 0 to 2")
+    sh_range = (low, high) if low < high and np.isfinite([low, high]).all() else _SH_RANGE
+    start = _HEADER_BYTES + count * _SECTION_BYTES
     if start > len(data):
-        raise ValueError(f"{h.sections} sections are promised in {len(data)} bytes: it is truncated")
+        raise ValueError(f"{count} sections are promised in {len(data)} bytes: it is truncated")
     sections = [_Section(*_SECTION.unpack_from(data, at)) for at in range(_HEADER_BYTES, start, _SECTION_BYTES)]
     degree, parts = max((s.degree for s in sections if s.size), default=0), list[Gaussians]()
     for section in sections:
@@ -75,18 +64,20 @@ def read(path: Path) -> Gaussians:
                 f"a section has {section.size} Gaussians of degree {section.degree}; expected at most {section.capacity} "
                 f"of degree 0 to {_MAX_DEGREE}"
             )
-        part, start = _read_section(data, start, section, h, degree)
+        part, start = _read_section(data, start, section, level, sh_range, degree)
         parts.append(part)
     size = sum(map(len, parts))
-    if size != h.size or start != len(data) or not parts:
-        raise ValueError(f"expected {h.size} Gaussians in {len(data)} bytes, got {size} in {start}")
+    if size != promised or start != len(data) or not parts:
+        raise ValueError(f"expected {promised} Gaussians in {len(data)} bytes, got {size} in {start}")
     return Gaussians.cat(parts)
 
 
-def _read_section(data: bytes, start: int, s: _Section, h: _Header, degree: int) -> tuple[Gaussians, int]:
+def _read_section(
+    data: bytes, start: int, s: _Section, level: int, sh_range: tuple[float, float], degree: int
+) -> tuple[Gaussians, int]:
     """The Gaussians of a section, its harmonics padded to `degree`, and the byte after it."""
-    wide, sh_type = {0: ("<f4", "<f4"), 1: ("<f2", "<f2"), 2: ("<f2", "u1")}[h.level]
-    fields = [("means", "<u2" if h.level else "<f4", 3), ("scales", wide, 3), ("quats", wide, 4), ("rgba", "u1", 4)]
+    wide, sh_type = {0: ("<f4", "<f4"), 1: ("<f2", "<f2"), 2: ("<f2", "u1")}[level]
+    fields = [("means", "<u2" if level else "<f4", 3), ("scales", wide, 3), ("quats", wide, 4), ("rgba", "u1", 4)]
     record = np.dtype([*fields, ("sh", sh_type, 3 * ((s.degree + 1) ** 2 - 1))])
     centres_at = start + 4 * s.partial_buckets
     rows_at = centres_at + s.bucket_bytes * s.buckets
@@ -97,7 +88,7 @@ def _read_section(data: bytes, start: int, s: _Section, h: _Header, degree: int)
         )
     rows = np.frombuffer(data, record, s.size, rows_at)
     means = rows["means"].astype(np.float32)
-    if h.level > 0 and s.size:
+    if level > 0 and s.size:
         lengths = np.frombuffer(data, "<u4", s.partial_buckets, start)
         if s.bucket_bytes != 12:
             raise ValueError(f"a bucket's centre has {s.bucket_bytes} bytes, not 12")
@@ -107,9 +98,8 @@ def _read_section(data: bytes, start: int, s: _Section, h: _Header, degree: int)
             offsets = (means - quantum) * np.float32(s.block_size / 2 / quantum)
             means = offsets.astype(np.float64) + centres[_buckets(s, lengths)]
     quats, sh = rows["quats"].astype(np.float32), rows["sh"].astype(np.float32)
-    if h.level == 2:
-        low, high = (h.low, h.high) if h.low < h.high and np.isfinite([h.low, h.high]).all() else _SH_RANGE
-        sh = np.float32(low) + sh * np.float32((high - low) / 255)
+    if level == 2:
+        sh = np.float32(sh_range[0]) + sh * np.float32((sh_range[1] - sh_range[0]) / 255)
     rgba = torch.from_numpy(rows["rgba"].astype(np.float32)) / 255
     rest = np.zeros((s.size, (degree + 1) ** 2 - 1, 3), np.float32)
     for first, last in ((0, 3), (3, 8))[: s.degree if s.size else 0]:  # the degree of an empty section has no meaning

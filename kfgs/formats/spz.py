@@ -19,7 +19,7 @@ import gzip
 import io
 import struct
 import zlib
-from math import exp, floor, log2, sqrt
+from math import floor, log2, sqrt
 from pathlib import Path
 from typing import NamedTuple
 
@@ -49,7 +49,6 @@ _RECORD = struct.Struct("<II")
 _PART = 1 << 20  # bytes that are unpacked at once
 _DC = 0.5 / 0.15  # the degree-0 coefficient of byte 255
 _LOG_SCALES = (-10.0, 255 / 16 - 10)
-_HALF_STEP = exp(1 / 32)  # of a scale
 _MAX_FIXED = (1 << 23) - 1
 _COMMON_BITS, _STEPS = 12, 14  # bits that every writer uses; a small cloud gets 2^14 steps across
 
@@ -138,10 +137,7 @@ def write(path: Path, g: Gaussians) -> list[str]:
     lost = describe_coarse(g, 0.5 * 2.0**-bits, ".spz")
     lost += describe_cut(g.sh[:, :1], -_DC, _DC, "colours", ".spz")
     lost += describe_cut(g.sh[:, 1:], -1.0, 127 / 128, "higher harmonics", ".spz")
-    low, high = (exp(end) for end in _LOG_SCALES)
-    if cut := int(((g.scales < low / _HALF_STEP) | (g.scales > high * _HALF_STEP)).any(1).sum()):
-        lost.append(f"the extent of {cut} Gaussians: .spz holds {low:.1e} to {high:.0f} units along an axis")
-    return lost
+    return lost + describe_cut(g.scales.log(), *_LOG_SCALES, "scales", ".spz")
 
 
 def choose_fractional_bits(means: Tensor) -> int:  # means: [N, 3]

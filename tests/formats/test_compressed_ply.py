@@ -148,8 +148,8 @@ def test_what_lies_beyond_the_ranges_is_told(tmp_path):
     assert written.lost == (
         "4 features per Gaussian: .compressed.ply has no place for them",
         "the columns id: .compressed.ply has no place for them",
-        "scales of 1 Gaussians: .compressed.ply holds e^-20 to e^20",
-        "strong higher harmonics of 1 Gaussians: .compressed.ply holds -4 to 4",
+        "scales of 1 of 20 Gaussians beyond what .compressed.ply holds: cut off",
+        "higher harmonics of 1 of 20 Gaussians beyond what .compressed.ply holds: cut off",
     )
     order, stated = written.order, precision("compressed_ply", odd)
     assert stated.sh_rest >= 5

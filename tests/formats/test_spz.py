@@ -184,7 +184,7 @@ def test_what_is_lost_is_said(tmp_path):
     lost = write_splats(splats, tmp_path / "a.spz").lost
     assert any("9 features per Gaussian: .spz has no place" in words for words in lost)
     assert any("the columns height, score" in words for words in lost)  # a score without labels is a column
-    assert any("the extent of 1 Gaussians: .spz holds 4.5e-05 to 379 units" in words for words in lost)
+    assert any("scales of 1 of 40 Gaussians beyond what .spz holds" in words for words in lost)
     back, stated = read(tmp_path / "a.spz"), precision("spz", cloud)
     assert stated.scales > 400
     assert stated.sh0 == pytest.approx(5 - 0.5 / 0.15, rel=1e-3)
