@@ -8,7 +8,6 @@ from oracles_precision import assert_within, precision, rotation_angles
 from kfgs import Gaussians
 from kfgs.formats import read_splats, write_splats
 from kfgs.formats.compressed_ply import read, write
-from kfgs.formats.encodings import morton_order
 from kfgs.formats.ply import read_ply_elements, write_ply_elements
 
 
@@ -155,21 +154,6 @@ def test_what_lies_beyond_the_ranges_is_told(tmp_path):
     assert stated.sh_rest >= 5
     back = read(tmp_path / "a.compressed.ply")
     assert_within(back, odd.select(order), stated._replace(means=stated.means[order]))
-
-
-def test_labels_stay_with_their_gaussians(tmp_path):
-    cloud = _cloud(600, 0).replace(labels=torch.arange(600) % 7 - 1)
-    score = np.linspace(0, 1, 600, dtype=np.float32)
-    order = write_splats(cloud.replace(scores=score, names=tuple("abcdef")), tmp_path / "a.compressed.ply").order
-    assert torch.equal(order, morton_order(cloud.means))
-    back = read_splats(tmp_path / "a.compressed.ply")
-    near = torch.cdist(back.means, cloud.means).argmin(1)
-    assert (near == order).float().mean() > 0.99
-    assert torch.equal(back.labels, cloud.labels[order])
-    assert back.names == tuple("abcdef")
-    np.testing.assert_array_equal(back.scores, score[order.numpy()])
-    stated = precision("compressed_ply", cloud)
-    assert_within(back, cloud.select(order), stated._replace(means=stated.means[order]))
 
 
 def _damage(elements, what):

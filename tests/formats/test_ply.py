@@ -176,27 +176,6 @@ def test_several_elements_survive_the_file(tmp_path):
         read_ply_elements(tmp_path / "short.ply")
 
 
-@pytest.mark.parametrize("layout", ["ascii", "binary_big_endian"])
-def test_several_elements_of_other_layouts(tmp_path, layout):
-    names = {"float32": "float", "float64": "double", "uint32": "uint", "int16": "short", "uint8": "uchar"}
-    head, body = f"ply\nformat {layout} 1.0\n", b""
-    for element, columns in TABLES.items():
-        head += f"element {element} {len(next(iter(columns.values())))}\n"
-        head += "".join(f"property {names[values.dtype.name]} {name}\n" for name, values in columns.items())
-        for row in zip(*columns.values(), strict=True):
-            if layout == "ascii":
-                body += (" ".join(repr(value.item()) for value in row) + "\n").encode()
-            else:
-                body += b"".join(np.array(value, value.dtype.newbyteorder(">")).tobytes() for value in row)
-    (tmp_path / "a.ply").write_bytes(head.encode() + b"end_header\n" + body)
-    _assert_same(read_ply_elements(tmp_path / "a.ply"), TABLES)
-
-
-def test_a_comment_may_speak_of_the_header(tmp_path):
-    write_ply(tmp_path / "a.ply", {"x": np.float32([1, 2])}, comments=("before end_header there is this",))
-    assert read_ply(tmp_path / "a.ply")["x"].tolist() == [1, 2]
-
-
 @pytest.mark.parametrize("label", [0.5, 1e300])
 def test_labels_that_are_no_whole_numbers_are_named(tmp_path, label):
     path = tmp_path / "a.ply"

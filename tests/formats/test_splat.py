@@ -4,7 +4,7 @@ import torch
 from oracles_precision import rotation_angles
 
 from kfgs import Gaussians
-from kfgs.formats import read_splats, write_splats
+from kfgs.formats import read_splats
 from kfgs.formats.splat import read, write
 
 
@@ -38,16 +38,6 @@ def test_rotations_about_an_axis_are_exact(tmp_path):
     assert rotation_angles(read(tmp_path / "a.splat").quats.numpy(), cloud.quats.numpy()).max() == 0
     stored = np.fromfile(tmp_path / "a.splat", np.uint8).reshape(8, 32)[:, 28:]
     assert set(stored.ravel()) == {0, 128}  # -1 has a byte, +1 has none: a viewer that does not normalise is right too
-
-
-def test_labels_go_beside(tmp_path):
-    splats = _cloud().replace(labels=torch.arange(500) % 3 - 1).replace(scores=np.ones(500), names=("rug", "sofa"))
-    written = write_splats(splats, tmp_path / "a.splat")
-    assert len(written.paths) == 3
-    assert written.lost == ()
-    back = read_splats(tmp_path / "a.splat")
-    assert back.labels.tolist() == splats.labels.tolist()
-    assert back.names == ("rug", "sofa")
 
 
 def test_an_empty_file_is_an_empty_cloud(tmp_path):

@@ -113,49 +113,6 @@ def test_the_order_of_a_file_is_told(tmp_path, file, labels):
         assert torch.equal(back.labels, cloud.labels[order])
 
 
-def _with(name, row, value):
-    """A cloud with one value exchanged."""
-    cloud = _cloud()
-    values = getattr(cloud, name).clone()
-    values[row] = value
-    return cloud.replace(**{name: values})
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        (
-            "means",
-            float("nan"),
-            ("means:", "got [nan, nan, nan]"),
-        ),
-        ("means", float("inf"), ("means:", "finite", "inf")),
-        ("quats", float("-inf"), ("quats:", "finite", "-inf")),
-        ("scales", 0.0, ("scales:", "above 0", "got [0.0, 0.0, 0.0] at 3")),
-        ("scales", -1.0, ("scales:", "above 0")),
-        ("scales", float("inf"), ("scales:", "above 0")),
-        (
-            "opacities",
-            1.01,
-            ("opacities:", "1.0099"),
-        ),
-        ("opacities", -0.01, ("opacities:", "0 to 1")),
-        ("opacities", float("nan"), ("opacities:", "0 to 1")),
-        (
-            "sh",
-            float("nan"),
-            ("sh:", "got [nan, nan, nan]"),
-        ),
-        ("labels", -2, ("labels:", "-1", "2147483647", "got [-2] at 3")),
-    ],
-)
-@pytest.mark.parametrize("file", ["a.ply", "a.spz"])
-def test_what_readers_refuse_is_not_written(tmp_path, file, name, value, message):
-    with pytest.raises(ValueError, match=tells(*message)):
-        write_splats(_with(name, 3, value), tmp_path / file)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_features_scores_and_labels_beyond_the_names_are_checked(tmp_path):
     path, cloud = tmp_path / "a.ply", _cloud()
     with pytest.raises(ValueError, match=tells("features:", "got [inf, inf]")):
