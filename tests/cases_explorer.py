@@ -14,7 +14,7 @@ from kfgs.gaussians import Gaussians
 from kfgs.labels import LabelSet
 from kfgs.quant.codebook import Codebook
 from kfgs.quant.linear import fit_linear_latents
-from kfgs.splat import rgb_to_sh0
+from kfgs.splat.sh import rgb_to_sh0
 from kfgs.viewer.meaning import SplatMeaning
 from kfgs.viewer.state import Exploration
 

@@ -12,7 +12,7 @@ import torch
 
 from kfgs.gaussians import Gaussians
 from kfgs.scenes import load_scene
-from kfgs.splat import rgb_to_sh0
+from kfgs.splat.sh import rgb_to_sh0
 from kfgs.viewer import Exploration, SplatMeaning
 from kfgs.viewer.page import inline_script
 from kfgs.viz import palette

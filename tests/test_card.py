@@ -14,7 +14,6 @@ from kfgs.fields import Autoencoded
 from kfgs.labels import EditList, LabelSet, Remove, Selection
 from kfgs.quant import Codebook, LinearLatents
 from kfgs.quant.codebook import CodebookReport, Nearest
-from kfgs.splat.engines.contract import Cloud, Composited, Pinhole, Splats
 
 
 def test_a_card_escapes_everything_and_leaves_out_what_is_none():
@@ -62,14 +61,7 @@ def test_paths_and_rows_say_what_they_are():
 def test_long_content_makes_no_long_line():
     long = "a long name " * 40
     splats = Gaussians(torch.rand(50, 3), torch.rand(50, 4), torch.rand(50, 3), torch.rand(50))
-    engine = [
-        Cloud(torch.rand(50, 3), torch.rand(50, 4), torch.rand(50, 3), torch.rand(50)),
-        Pinhole(torch.eye(4), torch.eye(3), 4, 3, 0.2, 0.3),
-        Splats(torch.rand(50, 2), torch.rand(50, 3), torch.rand(50), torch.rand(50, 9), torch.rand(9), None),
-        Composited(torch.rand(9, 9, 9), torch.rand(9, 9), torch.zeros(900, dtype=torch.int32)),
-    ]
     for thing in (
-        *engine,
         LabelSet((long, long + "2"), torch.eye(2)),
         Camera(torch.eye(4), torch.eye(3), 4, 3, name=long + "\n"),
         splats.replace(names=(long,), extra={long: np.zeros(50)}),

@@ -16,7 +16,7 @@ from kfgs.cli import main
 from kfgs.fields import Identity, SemanticField
 from kfgs.formats import write_splats
 from kfgs.scenes import load_scene
-from kfgs.splat import rgb_to_sh0
+from kfgs.splat.sh import rgb_to_sh0
 from kfgs.teachers.prompts import make_label_set
 from kfgs.viz import palette, plotter
 from kfgs.viz.plotter import available

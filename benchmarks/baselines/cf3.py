@@ -22,7 +22,8 @@ from kfgs.fields import GaussianParams, Training, UpliftConfig, fit_field, uplif
 from kfgs.gaussians import Gaussians
 from kfgs.metrics import semantic_storage_bytes
 from kfgs.quant.fit_autoencoder import quick_on_a_cpu
-from kfgs.splat import covariance_3d, rasterize, sum_pixels
+from kfgs.splat import covariance_3d, rasterize
+from kfgs.splat.views import sum_pixels
 
 from .common import Clock, Fitted, Task, seeded, within
 from .langsplat import Autoencoder

@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 from .._check import check_range
 from ..cameras import resize_map
 from ..cameras.resample import from_bchw, to_bchw
-from ..splat.engines.table import choose, load, offers
+from ..splat.engines.table import compiled_losses
 
 Loss = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(rendered map [H, W, D], its alpha [H, W], target [h, w, D]) -> a scalar."""
@@ -39,9 +39,9 @@ def l1_loss(
     """
     rendered = _resized(rendered, target)
     channels = target.shape[2]
-    chosen = _engine_with("absolute", rendered, target)
-    if chosen is not None:
-        return _Compiled.apply(rendered, target, load(chosen).absolute)
+    compiled = _compiled(rendered, target)
+    if compiled is not None:
+        return _Compiled.apply(rendered, target, compiled.absolute)
     known = _known(target)
     difference = torch.where(known[..., None], rendered - target, 0)
     return difference.abs().sum() / (known.sum() * channels).clamp_min(1)
@@ -80,9 +80,9 @@ class ColorLoss:
         if self.ssim_weight == 0 or min(target.shape[:2]) < SSIM_WINDOW:
             return l1_loss(rendered, alpha, target)
         picture = _resized(rendered, target)
-        chosen = _engine_with("similarity", picture, target, self.engine)
-        if chosen is not None and not bool(target.sum().isnan()):  # no unknown pixel: one walk for both parts
-            mixture = _mixture(chosen, (-self.ssim_weight, 1 - self.ssim_weight))
+        compiled = _compiled(picture, target, self.engine)
+        if compiled is not None and not bool(target.sum().isnan()):  # no unknown pixel: one walk for both parts
+            mixture = _mixture(compiled, (-self.ssim_weight, 1 - self.ssim_weight))
             return self.ssim_weight + _Compiled.apply(picture, target, mixture)
         dissimilar = 1 - mean_similarity(picture, target, self.engine)
         return (1 - self.ssim_weight) * l1_loss(picture, alpha, target) + self.ssim_weight * dissimilar
@@ -105,9 +105,9 @@ def mean_similarity(
         counted = torch.nn.functional.max_pool2d(holes, SSIM_WINDOW, stride=1)[0, 0] == 0  # [H - 10, W - 10]
         if not bool(counted.any()):
             return picture.new_ones(())
-    chosen = _engine_with("similarity", picture, target, engine)
-    if chosen is not None:
-        return _Compiled.apply(picture, target, _mixture(chosen, (1.0, 0.0), counted))
+    compiled = _compiled(picture, target, engine)
+    if compiled is not None:
+        return _Compiled.apply(picture, target, _mixture(compiled, (1.0, 0.0), counted))
     similarity = from_bchw(ssim(to_bchw(picture), to_bchw(target), SSIM_WINDOW, eps=0.0, padding="valid"))
     return similarity.mean() if counted is None else similarity[counted].mean()
 
@@ -119,11 +119,9 @@ def _resized(rendered: Tensor, target: Tensor) -> Tensor:  # [H, W, D], [h, w, D
     return resize_map(rendered, (height, width))
 
 
-def _engine_with(name: str, picture: Tensor, target: Tensor, engine: str = "auto") -> str | None:
-    """The engine whose compiled function compares the two; None if torch must: these give no gradient in the target."""
-    chosen = choose(engine, picture.device.type, picture.dtype)
-    alike = (picture.dtype, picture.device) == (target.dtype, target.device)
-    return chosen if offers(chosen, name) and alike and not target.requires_grad else None
+def _compiled(picture: Tensor, target: Tensor, engine: str = "auto") -> Any:
+    """The compiled losses, which compare the two; None if torch must: these give no gradient in the target."""
+    return compiled_losses(picture, target) if engine in ("auto", "numba") and not target.requires_grad else None
 
 
 def _known(target: Tensor) -> Tensor:  # [H, W, D] -> [H, W] bool
@@ -147,12 +145,12 @@ class _Compiled(torch.autograd.Function):
         return slope if slope.device.type == "cpu" and float(grad) == 1 else grad * slope, None, None
 
 
-def _mixture(engine: str, mix: tuple[float, float], counted: Tensor | None = None) -> Callable[..., Any]:
+def _mixture(compiled: Any, mix: tuple[float, float], counted: Tensor | None = None) -> Callable[..., Any]:
     """Compares as mix[0] SSIM + mix[1] mean absolute difference."""
 
     def compare(picture: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         window = get_gaussian_kernel1d(SSIM_WINDOW, SSIM_SIGMA, dtype=torch.float64)[0].to(picture.dtype)
-        similar, absolute, slope = load(engine).similarity(picture, target, counted, window, SSIM_CONSTANTS, mix)
+        similar, absolute, slope = compiled.similarity(picture, target, counted, window, SSIM_CONSTANTS, mix)
         return mix[0] * similar + mix[1] * absolute, slope
 
     return compare

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from ..cameras import Camera, resize_map
 from ..gaussians import Gaussians
-from ..splat import rasterize, sum_pixels
+from ..splat import rasterize
+from ..splat.views import sum_pixels
 from .working_maps import WorkingMaps, shrink_map
 
 NEIGHBOURS = 17  # a Gaussian and its 16 nearest, whose corrections are judged together

@@ -11,7 +11,7 @@ from .._card import short_repr
 from .._check import as_tensor, check_shapes
 from .._rows import EPS, check_directions, row_norms, unit_embeddings, unit_rows
 from ..quant.codebook import Codebook
-from ..splat.engines.table import choose, load, offers
+from ..splat.engines.table import compiled_losses
 
 if TYPE_CHECKING:
     from ..quant.autoencoder import Autoencoder
@@ -77,10 +77,11 @@ def pixel_codewords(
         centres = None
         if autoencoder is not None and not exact:
             centres = autoencoder.encode(codebook.codewords).to(rows)
-        layers = None if autoencoder is None else _score_layers(rows, codebook, autoencoder, centres)
-        if layers is not None:
-            own = torch.arange(codebook.size, device=rows.device)
-            winners, leads = load(choose("auto", rows.device.type, rows.dtype)).decide(layers, own, rows[which])
+        compiled, layers = compiled_losses(rows), None
+        if autoencoder is not None and compiled is not None:
+            layers = _score_layers(rows, codebook, autoencoder, centres)
+        if compiled is not None and layers is not None:
+            winners, leads = compiled.decide(layers, rows[which])
             out[which] = winners
             which = which[~(leads > LEAD)]
         for part in which.split(PIXELS):
@@ -106,14 +107,11 @@ def _score_layers(
     autoencoder: Autoencoder,
     centres: Tensor | None,  # [K, d] the codewords' latents, if the nearest of them is wanted
 ) -> tuple[tuple[Tensor, Tensor], ...] | None:
-    """Linear layers whose largest output is the codeword of a latent; None if no engine evaluates them for these rows.
+    """Linear layers whose largest output is the codeword of a latent; None if the decoder has another type than the rows.
 
     With a decoder W h + b and unit codewords C, argmax over C (W h) + C b: one layer in place of the last one and of the
     comparison. The nearest latent is argmax over 2 c·x - |c|^2; the constant makes the largest output positive.
     """
-    plain = rows.dtype in (torch.float32, torch.float64)
-    if not plain or not offers(choose("auto", rows.device.type, rows.dtype), "decide"):
-        return None
     if centres is not None:
         squares = centres.square().sum(dim=-1)
         return ((2 * centres, 2 * squares.max() - squares),)

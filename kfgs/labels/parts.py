@@ -15,7 +15,7 @@ from .._origin import to_world
 from .._rows import check_finite
 from ..cameras import Camera
 from ..gaussians import Gaussians, check_gaussians
-from ..splat import sum_pixels
+from ..splat.views import sum_pixels
 from .components import component_numbers
 from .selection import Selection
 

@@ -19,7 +19,7 @@ from ..formats.ply_3dgs import label_column
 from ..formats.sidecar import write_names
 from ..gaussians import Gaussians
 from ..labels import Part, Transfer, nearest_labels
-from ..splat import rgb_to_sh0
+from ..splat.sh import rgb_to_sh0
 from ..viz import palette
 from ..viz.films import Show, show_selection
 from ..viz.pictures import picture_sheet, save_picture

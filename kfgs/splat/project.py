@@ -13,9 +13,8 @@ from .._check import check_range
 from ..cameras.camera import Camera
 from ..cameras.projection import camera_to_pixel, projection_jacobian, world_to_camera
 from ..gaussians import Gaussians
-from .engines import ops
-from .engines.contract import ALPHA_MIN
-from .engines.table import choose_compiled
+from .engines.contract import ALPHA_MIN, Cloud, Pinhole
+from .engines.table import choose_fused
 
 FIELD_OF_VIEW_MARGIN = 1.3
 """Limit of the linearisation, in half fields of view (3DGS). Beyond it, the linear footprint of a Gaussian beside the
@@ -88,12 +87,11 @@ def project(
         camera = camera.to(gaussians.means)
     values = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
     to_camera = torch.is_grad_enabled() and (camera.viewmat.requires_grad or camera.K.requires_grad)
-    compiled = choose_compiled(engine, "project", "gaussians", *values)
-    if compiled and not to_camera:
-        tensors = (value.contiguous() for value in (*values, camera.viewmat, camera.K))
-        options = camera.width, camera.height, near, low_pass, compiled
-        means2d, conics, depths, opacities, extents, index = ops.project(*tensors, *options)
-        projected = Projected(means2d, conics, depths, opacities, extents.detach(), index)
+    fused = choose_fused(engine, *values)
+    if fused and not to_camera:
+        cloud = Cloud(*(value.contiguous() for value in values))
+        pinhole = Pinhole(camera.viewmat, camera.K, camera.width, camera.height, near, low_pass)
+        projected = Projected(*fused.project(cloud, pinhole))
     else:
         projected = _project(gaussians, camera, near, low_pass)
     return _compensate(projected, camera, low_pass) if gaussians.antialiased else projected

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from .._check import check_shapes
-from .engines import check_sizes, ops
+from .engines import check_sizes
 from .engines.contract import ALPHA_MIN, Tiles
-from .engines.table import choose_compiled
+from .engines.table import choose_fused
 from .project import Projected, pixel_box
 
 __all__ = ["Tiles", "bin_tiles"]
@@ -46,10 +46,9 @@ def bin_tiles(projected: Projected, width: int, height: int, tile_size: int = 16
         ("projected.extents", projected.extents, "M 2"),
     )
     check_sizes(width, height, tile_size)
-    compiled = choose_compiled(engine, "bin", "projected", *projected[:5])
-    if compiled:
-        tensors = (value.contiguous() for value in projected[:5])
-        rows, offsets = ops.bin_tiles(*tensors, width, height, tile_size, compiled)
+    fused = choose_fused(engine, *projected[:5])
+    if fused:
+        rows, offsets = fused.bin(*(value.contiguous() for value in projected[:5]), (width, height, tile_size))
     else:
         rows, offsets = _bin(projected, width, height, tile_size)
     return Tiles(rows, offsets, width, height, tile_size)

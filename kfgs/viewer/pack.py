@@ -21,7 +21,7 @@ from .._rows import check_finite
 from ..formats.encodings import pack_smallest_three
 from ..gaussians import Gaussians
 from ..scenes import Scene
-from ..splat import SH_C0
+from ..splat.sh import SH_C0
 from ..viz.colors import COLORMAP, Array
 from ..viz.films import show_photos
 from ..viz.linked import upwards

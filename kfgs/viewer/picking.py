@@ -15,7 +15,8 @@ from .._check import check_shapes, check_whole
 from ..cameras import Camera
 from ..cameras.projection import world_to_camera
 from ..gaussians import Gaussians
-from ..splat import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, project
+from ..splat import ALPHA_MIN, project
+from ..splat.engines.contract import ALPHA_MAX, TRANSMITTANCE_MIN
 from ..splat.project import FIELD_OF_VIEW_MARGIN
 from ..viz.gaussian_actor import LOW_PASS
 

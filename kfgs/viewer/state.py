@@ -13,7 +13,7 @@ from .._check import as_array, check_choice, check_range
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels.transfer import Sources, positions
-from ..splat import sh0_to_rgb
+from ..splat.sh import sh0_to_rgb
 from ..viz.colors import Array, FeatureColors, cloud_colors
 from ..viz.palette import UNLABELLED, palette
 from ..viz.pictures import as_bytes

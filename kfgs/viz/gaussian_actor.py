@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..cameras.camera import NEAR
-from ..splat.engines import ALPHA_MAX, ALPHA_MIN
+from ..splat.engines.contract import ALPHA_MAX, ALPHA_MIN
 from ..splat.project import FIELD_OF_VIEW_MARGIN
 from .plotter import draw_mesh
 

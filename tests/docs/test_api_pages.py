@@ -12,7 +12,6 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
-import torch
 from small_room import make_desk
 from test_public import PACKAGES
 
@@ -201,7 +200,7 @@ def encode():
 
 AS_THEY_STAND = ["index", "howto/teacher", "howto/edit", "howto/export", "quickstart"]
 ELSEWHERE = {"guide": "test_readme.py"}
-WITH_DATA = {"protocols", "engines", "howto/batch"}  # the three tests below
+WITH_DATA = {"protocols", "howto/batch"}  # the two tests below
 
 
 @pytest.mark.parametrize("page", AS_THEY_STAND)
@@ -225,31 +224,6 @@ def test_the_python_of_protocols_runs(inside, encode, capsys):
     exec(block, known)
     said = capsys.readouterr().out
     assert re.match(r"mIoU 0\.\d{3}, accuracy 0\.\d{3} \(kfgs-pooled/1\)\n", said)
-
-
-class Renderer(torch.nn.Module):
-    """Two Gaussians as parameters, as docs/engines.md has a module."""
-
-    def __init__(self):
-        super().__init__()
-        self.means = torch.nn.Parameter(torch.tensor([[0.0, 0, 4], [0.5, 0, 5]]))
-
-    def forward(self, viewmat, K):
-        quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1)
-        cloud = kfgs.Gaussians(self.means, quats, torch.full((2, 3), 0.2), torch.full((2,), 0.9), features=torch.eye(2))
-        return kfgs.rasterize(cloud, kfgs.Camera(viewmat, K, 24, 18)).map
-
-
-def test_the_python_of_engines_runs(tmp_path, monkeypatch):
-    """All but a call of the compiled function, which needs a C++ compiler; tests/splat/test_ops.py compiles it."""
-    monkeypatch.chdir(tmp_path)
-    K = torch.tensor([[20.0, 0, 12], [0, 20, 9], [0, 0, 1]])
-    module = Renderer()
-    known = {"module": module, "viewmat": torch.eye(4), "K": K}
-    [block] = blocks_of("engines")
-    exec(block, known)
-    loaded = torch.export.load("renderer.pt2").module()
-    torch.testing.assert_close(loaded(torch.eye(4), K), module(torch.eye(4), K))
 
 
 def test_the_python_of_many_scenes_runs(inside, monkeypatch):

@@ -11,7 +11,7 @@ from kfgs.evaluation.truth import PointTruth
 from kfgs.labels import load_label_set, nearest_labels
 from kfgs.pipeline import score_teacher, true_labels
 from kfgs.scenes import FeatureFolder, load_scene
-from kfgs.splat import rgb_to_sh0
+from kfgs.splat.sh import rgb_to_sh0
 
 NAMES = ("a", "b", "c")
 

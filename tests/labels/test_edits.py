@@ -7,7 +7,7 @@ from kfgs import Gaussians
 from kfgs.labels import Extract, OfClass, Opacity, Recolor, Remove
 from kfgs.labels.color import parse_color, recolor
 from kfgs.labels.selection import OfIndex
-from kfgs.splat import rgb_to_sh0
+from kfgs.splat.sh import rgb_to_sh0
 
 CLASSES = ("wall", "chair", "plant")
 

@@ -13,6 +13,7 @@ from messages import tells
 
 from kfgs.splat import Tiles, accumulate_pixels, available_engines, bin_tiles, composite
 from kfgs.splat.engines import table
+from kfgs.splat.engines.contract import Engine
 
 ENGINES = available_engines("cpu")  # what runs on a GPU is asked the same in test_triton.py
 OTHERS = [name for name in ENGINES if name != "reference"]
@@ -441,14 +442,32 @@ def test_auto_takes_the_first_engine_for_the_cpu():
 
 
 @pytest.fixture
-def _without_numba(monkeypatch):
-    absent = table._Entry("kfgs.splat.engines.absent", "surely_not_installed", "pip install surely")
-    monkeypatch.setitem(table._ENGINES, "numba", absent)
-    for function in (table.load, table._choose):
+def other_engines(monkeypatch):
+    """The table, which a test may change."""
+    monkeypatch.setattr(table, "_ENGINES", dict(table._ENGINES))
+    for function in (table.load, table.choose):
         function.cache_clear()
-    yield
-    for function in (table.load, table._choose):
+    yield table._ENGINES
+    for function in (table.load, table.choose):
         function.cache_clear()
+
+
+@pytest.fixture
+def _without_numba(other_engines):
+    other_engines["numba"] = table._Entry("kfgs.splat.engines.absent", "surely_not_installed", "cpu")
+
+
+@pytest.fixture
+def single(other_engines, monkeypatch):
+    """An engine for float32 alone, before all others."""
+    engine, module = Engine(), types.ModuleType("single_precision")
+    engine.dtypes, engine.devices, module.ENGINE = (torch.float32,), ("cpu",), engine
+    module.__spec__ = importlib.machinery.ModuleSpec("single_precision", None)
+    monkeypatch.setitem(sys.modules, "single_precision", module)
+    others = dict(other_engines)
+    other_engines.clear()
+    other_engines.update({"single": table._Entry("single_precision", "torch", "cpu"), **others})
+    return engine
 
 
 @pytest.mark.usefixtures("_without_numba")
@@ -456,7 +475,9 @@ def test_missing_engine_raises_with_the_install_line_and_auto_goes_on():
     projected, features = random_splats(20, 16, 16, seed=24)
     assert "numba" not in available_engines()
     assert available_engines("cpu") == ["reference"]
-    with pytest.raises(ImportError, match=tells("engine:", "surely_not_installed", "`pip install surely`")):
+    with pytest.raises(
+        ImportError, match=tells("engine:", "surely_not_installed", "`pip install surely_not_installed`")
+    ):
         _run(projected, features, 16, 16, engine="numba")
     maps, _ = _run(projected, features, 16, 16)
     assert torch.equal(maps, _run(projected, features, 16, 16, engine="reference")[0])
@@ -473,21 +494,11 @@ def test_engine_must_run_on_the_device():
         table.choose("numba", "cuda", torch.float32)
 
 
-def test_auto_passes_over_an_engine_that_does_not_know_the_dtype(monkeypatch):
-    single = types.ModuleType("single_precision")
-    single.DTYPES, single.devices = (torch.float32,), lambda: ("cpu",)
-    monkeypatch.setitem(sys.modules, "single_precision", single)
-    single.__spec__ = importlib.machinery.ModuleSpec("single_precision", None)
-    entry = table._Entry("single_precision", "torch", "pip install torch")
-    monkeypatch.setattr(table, "_ENGINES", {"single": entry, **table._ENGINES})
-    for function in (table.load, table._choose):
-        function.cache_clear()
-    assert table.choose("auto", "cpu", torch.float32) == "single"
-    assert table.choose("auto", "cpu", torch.float64) == ENGINES[0]
+def test_auto_passes_over_an_engine_that_does_not_know_the_dtype(single):
+    assert table.choose("auto", "cpu", torch.float32) is single
+    assert table.choose("auto", "cpu", torch.float64) is table.load(ENGINES[0])
     with pytest.raises(ValueError, match=tells("engine:", "torch.float64", "got 'single'", "torch.float32", "'auto'")):
         table.choose("single", "cpu", torch.float64)
-    for function in (table.load, table._choose):
-        function.cache_clear()
 
 
 def test_shapes_must_agree():
@@ -534,14 +545,3 @@ def test_malformed_tiles_are_refused(rows, offsets, message):
     tiles = Tiles(torch.tensor(rows), torch.tensor(offsets), 32, 16, 16)
     with pytest.raises(ValueError, match=tells(*message)):
         composite(*projected[:2], projected.opacities, features, tiles)
-
-
-@pytest.mark.parametrize("name", ["means2d", "conics", "features"])
-def test_an_array_is_refused_by_name(name):
-    means2d, conics, opacities, tiles = _stack([0.5, 0.5], torch.float32)
-    values = {"means2d": means2d, "conics": conics, "opacities": opacities, "features": opacities[:, None]}
-    values[name] = values[name].numpy()
-    with pytest.raises(TypeError, match=tells(name, "ndarray", "torch.as_tensor")):
-        composite(**values, tiles=tiles)
-    with pytest.raises(TypeError, match=tells("tiles.rows", "ndarray", "bin")):
-        composite(means2d, conics, opacities, opacities[:, None], tiles._replace(rows=tiles.rows.numpy()))

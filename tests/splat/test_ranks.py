@@ -5,8 +5,8 @@ import torch
 from cases_splat import a_camera, gaussians_before, random_splats
 from messages import tells
 
-from kfgs.splat import Tiles, available_engines, bin_tiles, composite, rank_channels, rasterize, rasterize_labels
-from kfgs.splat.engines import ops
+from kfgs.splat import Tiles, available_engines, bin_tiles, composite, rasterize, rasterize_labels
+from kfgs.splat.engines import rank_channels
 
 ENGINES = [name for name in available_engines("cpu") if name != "triton"]
 DTYPES = [torch.float32, torch.float64]
@@ -212,14 +212,6 @@ def test_from_gaussians_and_a_camera(engine):
     assert not found.scores.requires_grad
     near = rasterize_labels(gaussians, camera, engine=engine, near=5.0)
     assert near.alphas.equal(rasterize(gaussians, camera, engine=engine, near=5.0).alpha)
-
-
-@pytest.mark.skipif("numba" not in ENGINES, reason="needs numba")
-def test_operator_passes_opcheck():
-    footprints, features, tiles = scene(5)
-    background, index = torch.zeros(5), torch.arange(40)
-    arguments = (*footprints, features, background, index, *tiles, 2, False, "numba")
-    torch.library.opcheck(ops.rank, arguments, test_utils=("test_schema", "test_faketensor"))
 
 
 @pytest.mark.parametrize("top", [0, 6, 1.5])

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from kfgs.cameras.camera import Camera, Distortion
 from kfgs.gaussians import Gaussians
-from kfgs.splat import SH_C0, rasterize, rasterize_labels
+from kfgs.splat import rasterize, rasterize_labels
+from kfgs.splat.sh import SH_C0
 
 
 def _rotation(seed=0):

@@ -5,8 +5,9 @@ import torch
 from messages import tells
 from scipy.spatial.transform import Rotation
 
-from kfgs.splat import SH_C0, evaluate_sh, rgb_to_sh0, rotate_sh, sh0_to_rgb
+from kfgs.splat import evaluate_sh
 from kfgs.splat.engines import ops
+from kfgs.splat.sh import SH_C0, rgb_to_sh0, rotate_sh, sh0_to_rgb
 
 
 def _directions(N=50, seed=0):

@@ -10,7 +10,7 @@ from messages import tells
 
 from kfgs.formats import read_splats
 from kfgs.labels import EditList, Selection, connected_parts
-from kfgs.splat import rgb_to_sh0
+from kfgs.splat.sh import rgb_to_sh0
 from kfgs.viewer import Exploration, FieldMeaning
 from kfgs.viewer.picking import views_seeing
 from kfgs.viewer.session import Session

@@ -13,7 +13,8 @@ from PIL import Image
 
 pytest.importorskip("anywidget")
 
-from kfgs.splat import rasterize, rgb_to_sh0
+from kfgs.splat import rasterize
+from kfgs.splat.sh import rgb_to_sh0
 from kfgs.viewer import Exploration, FieldMeaning, Viewer, explore, pack
 
 

@@ -1,28 +1,4 @@
-"""What every compositing engine promises: its functions, the tuples they pass, and three constants.
-
-An engine is one module on plain tensors that knows nothing of autograd, with
-
-    DTYPES, devices() -> the floating-point types it computes in, and names of the device types it runs on
-    forward(splats, tiles) -> Composited
-    backward(grads, wanted, splats, tiles, result) -> gradients of the first five tensors of `splats`, empty where not wanted
-        grads: of the loss in maps and alphas; wanted: five bools; result: what `forward` returned
-    accumulate(means2d, conics, opacities, pixels [H, W, D], tiles) -> sums [M, D], weights [M]
-
-and, if it can do better than kornia and torch,
-
-    project(cloud, pinhole) -> the six tensors of `kfgs.splat.Projected`
-    project_backward(grads, cloud, pinhole, index) -> gradients of the four tensors of `cloud`, zero for what was culled
-        grads: of the loss in means2d, conics, depths and opacities; index: the last result of `project`
-    shade(sh [N, K, 3], means, center [3], index) -> colours [M, 3], as `kfgs.splat.evaluate_sh` has them
-    shade_backward(grad, sh, means, center, index) -> gradients of sh and means, zero for what was not seen
-    bin(means2d, conics, depths, opacities, extents, width, height, tile_size) -> rows, offsets of `Tiles`
-    rank(splats, tiles, top, early) -> Ranked: the channels with the largest sums, without writing the sums; no background
-
-`ops` makes operators of these. The reference engine is plain torch under autograd: it has `composite(splats, tiles)`
-instead of forward and backward. No function takes more than eight parameters, except compiled kernels: a launch of Triton
-takes flat pointers, and numba's kernels take flat arrays. The schemas of operators are flat, too.
-
-The tensors an engine receives are contiguous, of one dtype and on one device.
+"""What every engine promises: the class `Engine`, the tuples it takes and gives, and three constants.
 
 1. Pixel (row i, column j) is sampled at (x, y) = (j + 0.5, i + 0.5). With d = (x, y) - mean and the conic (a, b, c), the
    density is exp(-0.5 (a dx^2 + 2 b dx dy + c dy^2)).
@@ -33,33 +9,23 @@ The tensors an engine receives are contiguous, of one dtype and on one device.
    output, forward and backward, on one machine.
 4. maps = sum of weight * features + T * background, alphas = 1 - T, with T the transmittance the pixel ended with.
    Both are differentiable in means2d, conics, opacities, features and background; the gradient through a Gaussian is
-   zero at pixels where its alpha is clamped or it is skipped. The decision where to stop has no gradient.
+   zero at pixels where its alpha is clamped or it is skipped. The decision where to stop has no gradient. Compiled engines
+   have no gradient of the gradient.
 5. D is any size from 1, chosen at run time. M = 0 or an empty tile gives the background, alpha 0.
-6. dtype in = dtype out. A conic that is not positive definite draws nothing on the compiled engines. Their rows and
-   index must lie within what there is. This is checked on the CPU only: on a GPU the check would cost a wait.
-   The CPU engines work in float64 too, so that `gradcheck` runs on them. No device moves, no
-   printing, no edits to the caller's tensors.
-7. `accumulate` finds weights^T · pixels (for uplifting and pruning) and the sums of the weights in one walk over the view.
-8. `rank` finds, at each pixel, the `top` channels with the largest sums of weight * features, the largest first, and of
-   equal sums the lowest channel first. Where nothing is drawn, labels are -1 and scores 0. On the CPU the scores are the
-   bits of `maps`. With `early` and one channel wanted, an engine may stop at a pixel where the sum of the best channel is
-   positive and no other can overtake it: the label is the same, score and alpha are those reached there.
+6. dtype in = dtype out. A conic that is not positive definite draws nothing on the compiled engines. The CPU engines work
+   in float64 too, so that `gradcheck` runs on them. No device moves, no printing, no edits to the caller's tensors.
 
 Two engines differ by rounding only. Thresholds make that visible at a few pixels where alpha lies on 1/255, or T' on
 1e-4: two opaque hits give T' = (1 - 0.99)^2, which is just below 1e-4 in float32 and just above it in float64.
-
-An engine may also have `absolute`, the mean absolute difference of two maps and its gradient, and `similarity`, SSIM and the
-same difference of two pictures and a gradient, with the arguments and results of the functions in `cpu/absolute.py` and
-`cpu/ssim.py`. The losses use them; with the other engines torch's operations and kornia's SSIM. It may
-have `decide`, the largest output of a perceptron, as in `cpu/perceptron.py`: the exact decoding of a label map uses it, else
-torch decodes.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from ..._card import short_repr
 
@@ -81,9 +47,6 @@ class Cloud(NamedTuple):
     scales: Tensor  # [N, 3] standard deviations
     opacities: Tensor  # [N]
 
-    def __repr__(self) -> str:
-        return short_repr(self)
-
 
 class Pinhole(NamedTuple):
     """The camera and the options of `project`."""
@@ -95,9 +58,6 @@ class Pinhole(NamedTuple):
     near: float  # smallest depth
     low_pass: float  # added variance, pixels^2
 
-    def __repr__(self) -> str:
-        return short_repr(self)
-
 
 class Splats(NamedTuple):
     """The M projected Gaussians and what they show."""
@@ -108,9 +68,6 @@ class Splats(NamedTuple):
     features: Tensor  # [N, D]
     background: Tensor  # [D]
     index: Tensor | None  # type: ignore[assignment]  # [M] int64, the row of `features` of each; None: row m of Gaussian m
-
-    def __repr__(self) -> str:
-        return short_repr(self)
 
 
 class Tiles(NamedTuple):
@@ -135,6 +92,14 @@ class Tiles(NamedTuple):
         return -(-self.height // self.tile_size), -(-self.width // self.tile_size)
 
 
+class Composited(NamedTuple):
+    """The results of `CompiledEngine.forward`."""
+
+    maps: Tensor  # [H, W, D]
+    alphas: Tensor  # [H, W]
+    trace: Tensor  # one int32 tensor of the engine's own, for its backward pass
+
+
 class Ranked(NamedTuple):
     """The best channels of each pixel: classes, if the features are scores of classes."""
 
@@ -153,12 +118,86 @@ class Ranked(NamedTuple):
         return Ranked(labels.masked_fill(empty, -1), scores.masked_fill(empty, 0), alphas)
 
 
-class Composited(NamedTuple):
-    """The results of `forward`."""
+class Engine:
+    """Compositing on one kind of device. Tensors come contiguous, of one dtype and on one device."""
 
-    maps: Tensor  # [H, W, D]
-    alphas: Tensor  # [H, W]
-    trace: Tensor  # one int32 tensor of the engine's own, for its backward pass
+    devices: tuple[str, ...]
+    """Types of the devices that it runs on."""
+    dtypes: tuple[torch.dtype, ...] = (torch.float32, torch.float64)
+    """The types that it computes in."""
+    fused = False
+    """Whether it also has `project`, `shade` and `bin`. For the others kornia and torch do these."""
 
-    def __repr__(self) -> str:
-        return short_repr(self)
+    def composite(self, splats: Splats, tiles: Tiles) -> tuple[Tensor, Tensor]:  # maps [H, W, D], alphas [H, W]
+        """Composite as this file says, differentiable."""
+        raise NotImplementedError
+
+    def accumulate(
+        self, means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Tensor, tiles: Tiles
+    ) -> tuple[Tensor, Tensor]:  # sums [M, D], weights [M]
+        """weights^T · pixels [H, W, D] and the sums of the weights, in one walk over the view; without gradient."""
+        raise NotImplementedError
+
+    def rank(self, splats: Splats, tiles: Tiles, top: int, early: bool) -> Ranked:
+        """The `top` channels with the largest sums of weight * features at each pixel; without gradient or background.
+
+        The largest comes first, of equal sums the lowest channel. Where nothing is drawn, labels are -1 and scores 0. On the
+        CPU the scores are the bits of `maps`. With `early` and one channel wanted, an engine may stop at a pixel where the
+        best sum is positive and no other can overtake it: the label is the same, score and alpha are those reached there.
+        """
+        return Ranked.of_map(*self.composite(splats, tiles), top)
+
+    def project(self, cloud: Cloud, pinhole: Pinhole) -> tuple[Tensor, ...]:
+        """The six tensors of `kfgs.splat.Projected`, differentiable in the cloud."""
+        raise NotImplementedError
+
+    def shade(self, sh: Tensor, means: Tensor, center: Tensor, index: Tensor) -> Tensor:  # [M, 3]
+        """Colours of the rows `index` [M] of `sh` [N, K, 3] and `means` [N, 3] from `center` [3], as `evaluate_sh` has them."""
+        raise NotImplementedError
+
+    def bin(
+        self,
+        means2d: Tensor,  # [M, 2]
+        conics: Tensor,  # [M, 3]
+        depths: Tensor,  # [M]
+        opacities: Tensor,  # [M]
+        extents: Tensor,  # [M, 2]
+        size: tuple[int, int, int],  # width, height, tile size
+    ) -> tuple[Tensor, Tensor]:
+        """`rows` and `offsets` of `Tiles`."""
+        raise NotImplementedError
+
+
+class CompiledEngine(Engine):
+    """An engine whose kernels compute their own gradients."""
+
+    def forward(self, splats: Splats, tiles: Tiles) -> Composited:
+        """Composite, and keep what `backward` needs."""
+        raise NotImplementedError
+
+    def backward(
+        self, grads: tuple[Tensor, Tensor], wanted: list[bool], splats: Splats, tiles: Tiles, result: Composited
+    ) -> list[Tensor | None]:
+        """Gradients of the first five tensors of `splats` (None where not wanted), given those in maps and alphas."""
+        raise NotImplementedError
+
+    def composite(self, splats: Splats, tiles: Tiles) -> tuple[Tensor, Tensor]:
+        """Composite as this file says, differentiable once."""
+        return _Composite.apply(self, tiles, *splats)
+
+
+class _Composite(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, engine: CompiledEngine, tiles: Tiles, *splats: Tensor) -> tuple[Tensor, Tensor]:
+        result = engine.forward(Splats(*splats), tiles)
+        ctx.engine, ctx.size = engine, tiles[2:]
+        ctx.save_for_backward(*splats, *tiles[:2], *result)
+        return result.maps, result.alphas
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_maps: Tensor, grad_alphas: Tensor) -> tuple[Tensor | None, ...]:
+        saved = ctx.saved_tensors
+        splats, tiles, result = Splats(*saved[:6]), Tiles(*saved[6:8], *ctx.size), Composited(*saved[8:])
+        grads = grad_maps.contiguous(), grad_alphas.contiguous()
+        return None, None, *ctx.engine.backward(grads, ctx.needs_input_grad[2:7], splats, tiles, result), None

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from .contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Splats, Tiles
+from .contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Engine, Splats, Tiles
 
 CHUNK = 64
 """Gaussians of a tile composited at once; pixels that stop are noticed between chunks."""
@@ -33,38 +33,32 @@ class _Chunk(NamedTuple):
     stopped: Tensor  # [B, P] pixels that had stopped before
 
 
-def composite(splats: Splats, tiles: Tiles) -> tuple[Tensor, Tensor]:  # maps [H, W, D], alphas [H, W]
-    """Composite as the contract says; called through `kfgs.splat.engines.composite`."""
-    *footprints, features, background, index = splats
-    features = features if index is None else features[index]
-    sums, transmittance = _Composite.apply(*footprints, features, tiles)
-    sums = sums + transmittance[..., None] * background
-    return _to_image(sums, tiles), 1 - _to_image(transmittance[..., None], tiles)[..., 0]
+class ReferenceEngine(Engine):
+    """Compositing as the contract states it."""
 
+    devices = "cpu", "cuda"
 
-DTYPES = torch.float32, torch.float64
+    def composite(self, splats: Splats, tiles: Tiles) -> tuple[Tensor, Tensor]:
+        *footprints, features, background, index = splats
+        features = features if index is None else features[index]
+        sums, transmittance = _Composite.apply(*footprints, features, tiles)
+        sums = sums + transmittance[..., None] * background
+        return _to_image(sums, tiles), 1 - _to_image(transmittance[..., None], tiles)[..., 0]
 
-
-def devices() -> tuple[str, ...]:
-    """Where the engine runs."""
-    return "cpu", "cuda"
-
-
-def accumulate(
-    means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Tensor, tiles: Tiles
-) -> tuple[Tensor, Tensor]:  # sums [M, D], weights [M]
-    """Sum pixels into the Gaussians by compositing weight, in one walk over the chunks."""
-    signal = _to_tiles(torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=2), tiles)  # [T, P, D + 1]
-    T, P = signal.shape[:2]
-    transmittance, stopped = pixels.new_ones(T, P), torch.zeros(T, P, dtype=torch.bool, device=pixels.device)
-    sums = pixels.new_zeros(len(means2d), signal.shape[2])
-    for batch in _batches(tiles):
-        for tile, which, present in _front_to_back(tiles, batch, stopped):
-            chunk = _Chunk(tile, which, present, transmittance[tile], stopped[tile])
-            splats = (value[which] for value in (means2d, conics, opacities))
-            weights, transmittance[tile], stopped[tile] = _weigh_chunk(chunk, tiles, chunk.transmittance, *splats)
-            sums.index_add_(0, which.flatten(), (weights.mT @ signal[tile]).flatten(0, 1))
-    return sums[:, :-1], sums[:, -1]
+    def accumulate(
+        self, means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Tensor, tiles: Tiles
+    ) -> tuple[Tensor, Tensor]:
+        signal = _to_tiles(torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=2), tiles)  # [T, P, D + 1]
+        T, P = signal.shape[:2]
+        transmittance, stopped = pixels.new_ones(T, P), torch.zeros(T, P, dtype=torch.bool, device=pixels.device)
+        sums = pixels.new_zeros(len(means2d), signal.shape[2])
+        for batch in _batches(tiles):
+            for tile, which, present in _front_to_back(tiles, batch, stopped):
+                chunk = _Chunk(tile, which, present, transmittance[tile], stopped[tile])
+                splats = (value[which] for value in (means2d, conics, opacities))
+                weights, transmittance[tile], stopped[tile] = _weigh_chunk(chunk, tiles, chunk.transmittance, *splats)
+                sums.index_add_(0, which.flatten(), (weights.mT @ signal[tile]).flatten(0, 1))
+        return sums[:, :-1], sums[:, -1]
 
 
 class _Composite(torch.autograd.Function):
@@ -203,3 +197,6 @@ def _to_tiles(image: Tensor, tiles: Tiles) -> Tensor:  # [H, W, D] -> [T, P, D]
     padded = image.new_zeros(rows * side, columns * side, image.shape[2])
     padded[: tiles.height, : tiles.width] = image
     return padded.view(rows, side, columns, side, -1).transpose(1, 2).reshape(rows * columns, side * side, -1)
+
+
+ENGINE = ReferenceEngine()

@@ -18,20 +18,21 @@ import torch
 from torch import Tensor
 
 from ..._check import check_choice
+from .contract import Engine
 
 
 class _Entry(NamedTuple):
-    module: str
-    needs: str  # the package it imports
-    install: str  # how to get that
+    module: str  # has the engine as ENGINE
+    needs: str  # the package it imports; also what pip installs
+    device: str | None  # for which "auto" takes it; None: any
 
 
 _ENGINES = {
-    "triton": _Entry("kfgs.splat.engines.triton.engine", "triton", "pip install triton"),
-    "numba": _Entry("kfgs.splat.engines.cpu.engine", "numba", "pip install numba"),
-    "reference": _Entry("kfgs.splat.engines.reference", "torch", "pip install torch"),
+    "triton": _Entry("kfgs.splat.engines.triton.engine", "triton", "cuda"),
+    "numba": _Entry("kfgs.splat.engines.cpu.engine", "numba", "cpu"),
+    "reference": _Entry("kfgs.splat.engines.reference", "torch", None),
 }
-"""In order of preference: `engine="auto"` takes the first that knows the device and can be imported."""
+"""In order of preference: `engine="auto"` takes the first that knows the device and the dtype, and can be imported."""
 
 
 def available_engines(device: str | None = None) -> list[str]:
@@ -45,12 +46,19 @@ def available_engines(device: str | None = None) -> list[str]:
     return names if device is None else [name for name in names if _serves(name, device)]
 
 
+def _serves(name: str, device: str) -> bool:
+    try:
+        return _ENGINES[name].device in (device, None) and device in load(name).devices
+    except ImportError:  # installed, but broken on this machine
+        return False
+
+
 _FLAGS = RLock()  # guards the flags of dlopen; an engine may load another
 
 
 @cache
-def load(name: str) -> ModuleType:
-    """The engine's module.
+def load(name: str) -> Engine:
+    """The engine of a name.
 
     Raises:
         ImportError: if the package that it needs cannot be used, with the line that installs it.
@@ -58,12 +66,13 @@ def load(name: str) -> ModuleType:
     entry = _ENGINES[name]
     try:
         with _own_symbols():
-            return import_module(entry.module)
+            engine: Engine = import_module(entry.module).ENGINE
     except ImportError as error:
         raise ImportError(
             f"engine: expected {entry.needs} for engine {name!r}, but it cannot be imported ({error}); "
-            f"install it with `{entry.install}`, or choose one of {available_engines()}"
+            f"install it with `pip install {entry.needs}`, or choose one of {available_engines()}"
         ) from error
+    return engine
 
 
 @contextmanager
@@ -90,78 +99,44 @@ def _own_symbols() -> Iterator[None]:
             sys.setdlopenflags(flags)
 
 
-def choose(engine: str, device: str, dtype: torch.dtype) -> str:
-    """The engine's name for tensors of a device and a dtype: the fastest one for them if it is "auto".
+@cache
+def choose(engine: str, device: str, dtype: torch.dtype) -> Engine:
+    """The engine for tensors of a device and a dtype: the fastest one for them if it is "auto".
 
     Raises:
         ValueError: if there is no such engine, or it does not run on the device or in the dtype.
         ImportError: if the named engine's package is missing.
     """
-    return _choose(engine, device, dtype)
-
-
-@cache
-def _choose(engine: str, device: str, dtype: torch.dtype) -> str:
     if engine == "auto":
-        known = (name for name in available_engines(device) if dtype in load(name).DTYPES)
-        return next(known, "reference")  # which says what it wants instead
+        known = (load(name) for name in available_engines(device) if dtype in load(name).dtypes)
+        return next(known, load("reference"))
     check_choice("engine", engine, ["auto", *_ENGINES])
-    devices = load(engine).devices()
-    if device not in devices:
+    chosen = load(engine)
+    if device not in chosen.devices:
         raise ValueError(
-            f"engine: expected one that runs on {device} (from means2d), got {engine!r} for {', '.join(devices)}; "
+            f"engine: expected one that runs on {device} (from means2d), got {engine!r} for {', '.join(chosen.devices)}; "
             "use engine='auto'"
         )
-    if dtype not in load(engine).DTYPES:
-        kinds = " or ".join(map(str, load(engine).DTYPES))
+    if dtype not in chosen.dtypes:
+        kinds = " or ".join(map(str, chosen.dtypes))
         raise ValueError(
             f"engine: expected one for {dtype} (from means2d), got {engine!r} for {kinds}; convert the Gaussians with "
             ".to(), or use engine='auto'"
         )
-    return engine
+    return chosen
 
 
-def choose_compiled(engine: str, function: str, name: str, *tensors: Tensor) -> str | None:
-    """The engine that projects or bins these tensors itself. None: kornia's and torch's functions do it.
+def choose_fused(engine: str, *tensors: Tensor) -> Engine | None:
+    """The engine, if it projects, shades and bins these tensors itself. None: kornia's and torch's functions do it."""
+    chosen = choose(engine, tensors[0].device.type, tensors[0].dtype)
+    return chosen if chosen.fused and len({value.dtype for value in tensors}) == 1 else None
 
-    Args:
-        engine: a name, or "auto".
-        function: "project" or "bin".
-        name: of the tensors in a message.
-        tensors: the data.
 
-    Raises:
-        ValueError: as `choose`, and if a named engine gets tensors that are not all float32 or all float64.
-        ImportError: if the named engine's package is missing.
-    """
-    dtype = tensors[0].dtype if engine == "auto" else torch.float32  # a named engine's errors are raised below
-    chosen = choose(engine, tensors[0].device.type, dtype)
-    if not offers(chosen, function):
+def compiled_losses(*tensors: Tensor) -> ModuleType | None:
+    """`cpu.losses`, numba's loops over maps for losses and decoders. None: torch and kornia must compute on these tensors."""
+    kinds = {(value.device.type, value.dtype) for value in tensors}
+    if len(kinds) > 1 or not choose("auto", *kinds.pop()).fused:
         return None
-    kinds = {value.dtype for value in tensors}
-    known = len(kinds) == 1 and kinds <= {torch.float32, torch.float64}
-    if engine != "auto" and not known:
-        raise ValueError(
-            f"{name}: expected all in float32 or all in float64 for engine {engine!r}, got "
-            f"{', '.join(sorted(map(str, kinds)))}; convert them with .to(torch.float32)"
-        )
-    return chosen if known else None
+    from .cpu import losses
 
-
-def offers(name: str, function: str) -> bool:
-    """Whether an engine has a function that is optional."""
-    return hasattr(load(name), function)
-
-
-# torch.compiler.assume_constant_result sets the same attribute, but imports the compiler.
-choose._dynamo_marked_constant = True  # type: ignore[attr-defined]
-offers._dynamo_marked_constant = True  # type: ignore[attr-defined]
-
-
-def _serves(name: str, device: str) -> bool:
-    """Whether "auto" may take an engine for a device: not if it runs there only for tests."""
-    try:
-        engine = load(name)
-        return device in engine.devices() and device not in getattr(engine, "PROOFS", ())
-    except ImportError:  # installed, but broken on this machine
-        return False
+    return losses

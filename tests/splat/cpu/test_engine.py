@@ -32,9 +32,9 @@ from kfgs.splat.engines.cpu.square import (  # noqa: E402
     LANES,
     PIXELS,
     SQUARE_SIDE,
-    STATE,
     X,
     Y,
+    make_square,
     pack_rows,
     row_length,
     start_square,
@@ -116,10 +116,11 @@ def _pack(projected, dtype):
 @numba.njit
 def _look(rows, length, box, epsilon, touched, drawn):
     """The blocks that each Gaussian is said to touch, and the pixels of each block where it is drawn, as bits."""
-    state, corners = np.empty(STATE, rows.dtype), np.empty(2 * BLOCKS, rows.dtype)
-    start_square(state, corners, box)
+    square = make_square(rows)
+    start_square(square, box)
+    state = square.state
     for m in range(len(touched)):
-        touched[m] = touched_blocks(rows, m * length, corners, epsilon)
+        touched[m] = touched_blocks(rows, m * length, square.corners, epsilon)
         for block in range(BLOCKS):
             x, y = load(state, X + block * LANES), load(state, Y + block * LANES)
             _, _, _, alpha = weigh_pixels(rows, m * length, x, y)
@@ -355,7 +356,7 @@ def test_few_and_many_channels_are_done_alike(channels, narrow, monkeypatch):
     """The kernels for few channels and those for many, on what both can do."""
     projected, features = random_splats(300, 45, 37, seed=7, channels=channels)
     expected = _gradients(projected, features, 45, 37)
-    monkeypatch.setattr(numba_cpu, "NARROW_CHANNELS", narrow)
+    monkeypatch.setattr(numba_cpu, "MOST_CHANNELS", narrow)
     for a, b in zip(_gradients(projected, features, 45, 37), expected, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-11)
 
@@ -416,7 +417,7 @@ def test_nothing_is_looked_at_behind_what_is_opaque():
     opacities[opaque : opaque + 3] = 0.98
     splats = Splats(means2d, conics, opacities, features, torch.zeros(1), None)
     tiles = _everywhere(count, 16, 16, 16)
-    _, alphas, trace = numba_cpu.forward(splats, tiles)
+    _, alphas, trace = numba_cpu.ENGINE.forward(splats, tiles)
     assert float(alphas.min()) > 0.999
     looked_at = trace[-count - 1]  # one tile of one square: how many, and then the blocks of each
     assert int(looked_at) == 2 * CHUNK
@@ -668,7 +669,7 @@ def test_a_warm_start_compiles_nothing():
         if not built:
             break
     assert built == []
-    assert {"pack_rows", "composite_narrow", "differentiate_narrow", "gather_gradients"} <= set(loaded)
+    assert {"pack_rows", "composite_band", "differentiate_band", "gather_gradients"} <= set(loaded)
 
 
 def test_a_block_is_a_vector():

@@ -10,7 +10,6 @@ from kfgs.splat import bin_tiles
 numba = pytest.importorskip("numba")
 
 from kfgs.splat.engines.cpu import tiles as numba_tiles  # noqa: E402
-from kfgs.splat.engines.cpu import tiles_kernels as kernels  # noqa: E402
 
 DTYPES = [torch.float32, torch.float64]
 NAN, INF = float("nan"), float("inf")
@@ -142,28 +141,3 @@ def test_malformed_gaussians_are_as_harmless_as_in_torch(dtype):
         assert (tiles.offsets.diff() >= 0).all()
         assert ((tiles.rows >= 0) & (tiles.rows < 80)).all()
         assert _same(type(_splats(0, dtype))(*projected), 90, 60, 16), f"seed {seed}"
-
-
-def _visited(conic, mean, opacity, tiles):
-    """How many of tiles x tiles tiles of 16 pixels are looked at, once a long Gaussian's rows are cut."""
-    a, b, c = conic
-    reach = 2 * np.log(255 * opacity)
-    ellipse = kernels._enlarge(a, b, c, reach + 1e-4, reach)
-    assert ellipse[2] > 0
-    return sum(stop - start for start, stop in (
-        kernels._cut(ellipse, mean, 16 * tile + 0.5 - mean, 0, tiles, 16) for tile in range(tiles)
-    ))  # fmt: skip
-
-
-@pytest.mark.parametrize("angle", [0.02, 0.4, np.pi / 4, 1.2, 1.55, 2.5])
-def test_a_needle_costs_as_many_tests_as_it_crosses_tiles(angle):
-    for tiles in (16, 64, 256):
-        mean = 8.0 * tiles
-        along = torch.tensor([np.cos(angle), np.sin(angle)]) * 4 * tiles
-        cov = along[:, None] * along + 0.3 * torch.eye(2)
-        one = torch.ones(1).double()
-        projected = splats_from(torch.full((1, 2), mean).double(), cov[None], one, 0.9 * one, torch.float64)
-        found = bin_tiles(projected, 16 * tiles, 16 * tiles, engine="numba").rows
-        visited = _visited(projected.conics[0].tolist(), mean, 0.9, tiles)
-        assert len(found) <= visited <= len(found) + 4
-        assert visited < 3.5 * tiles  # of tiles^2

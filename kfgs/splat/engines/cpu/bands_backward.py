@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from numba import njit
 
 from . import narrow as narrow
 from . import wide as wide
-from .bands import whole_planes
+from .bands import SIXTEEN, Picture, Trace, read_block
 from .cache import cached_njit
 from .simd import LANES, add_dot, load, load_many, spread, spread_many, store, store_many, transpose
 from .square import (
@@ -19,17 +18,13 @@ from .square import (
     INLINE,
     OPTIONS,
     PIXELS,
-    STATE,
-    Picture,
+    Rows,
     View,
     aligned,
-    read_block,
-    square_box,
+    make_square,
+    squares_of,
     start_square,
 )
-
-SIXTEEN = (0,) * LANES
-"""A block's pixels, or as many channels."""
 
 
 @njit(**INLINE)
@@ -45,7 +40,13 @@ def _read_pixels(values: Any, width: int, box: Any, block: int, scratch: Any) ->
 
 @njit(**INLINE)
 def _start_backward(
-    planes: Any, box: Any, block: int, pictures: Any, background: Any, scratch: Any, keep: bool
+    planes: Any,
+    box: Any,
+    block: int,
+    images: Any,  # maps and the loss's gradient in them, as pictures; transmittances; the loss's gradient in the alphas
+    background: Any,
+    scratch: Any,
+    keep: bool,
 ) -> None:
     """Fill the planes BEHIND and SHARE of one block, and GRADS if they are to be kept; 0 outside of the box.
 
@@ -53,7 +54,7 @@ def _start_backward(
     SHARE = grad_alpha - background . grad, and all weights times their slopes are
     maps . grad - T background . grad + alphas SHARE.
     """
-    maps, grad_maps, finals, grad_alphas = pictures
+    maps, grad_maps, finals, grad_alphas = images
     p = block * LANES
     total, through = spread(planes, 0), spread(planes, 0)
     for channel in range(0, maps.channels, LANES):
@@ -71,110 +72,57 @@ def _start_backward(
 
 
 @cached_njit(**OPTIONS)
-def differentiate_narrow(
+def differentiate_band(
     band: int,
     view: View,
-    rows: Any,
-    length: int,
-    passes: Any,
-    background: Any,
-    images: Any,
-    trace: Any,
-    slots: Any,
-    firsts: Any,
-    out: Any,
+    rows: Rows,
+    passes: Any,  # narrow.Passes; None with many channels
+    source: Any,  # wide.Source; None with few channels, which are packed
+    background: Any,  # D numbers, and zeros up to a whole vector
+    images: tuple[Any, Any, Any],  # maps, the loss's gradient in them, and that in the alphas, all flat
+    trace: Trace,
+    slots: Any,  # [P] from `number_slots`
+    firsts: Any,  # [B + 1], where the bands' rows begin
+    out: Any,  # written: rows of as many numbers as packed ones; with many channels of LANES numbers and padded D
+    geometry: bool,  # whether the moments are wanted; with few channels they come anyway
 ) -> None:
-    """Sum the gradients of one band's tiles into its own rows of `out`, with few channels.
-
-    Args:
-        band: which.
-        view: the tiles.
-        rows: packed Gaussians with their features.
-        length: of a packed row, and of a gradient row.
-        passes: from `plan_passes`.
-        background: D numbers, and zeros up to a whole vector.
-        images: maps, the loss's gradient in them, transmittances, the loss's gradient in the alphas, all flat.
-        trace: of the forward pass.
-        slots: [P] from `number_slots`.
-        firsts: [B + 1], where the bands' rows begin.
-        out: [R * length], written.
-    """
-    maps, grad_maps, finals, grad_alphas = images
-    channels, width = len(maps) // len(finals), view.width
-    grads = Picture(grad_maps, width, channels)
-    pictures = Picture(maps, width, channels), grads, finals, grad_alphas
-    state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
-    planes = aligned((2 + whole_planes(passes, channels)) * PIXELS, rows)
-    planes[:] = 0
-    weights, scratch = aligned(PIXELS, rows), aligned(LANES * LANES, rows)
-    squares = view.across**2
-    drawn = trace[squares * (len(view.offsets) - 1) :]
-    own = out[firsts[band] * length : firsts[band + 1] * length]
+    """Sum the gradients of one band's tiles into its own rows of `out`."""
+    maps, grad_maps, grad_alphas = images
+    channels = len(maps) // len(trace.finals)
+    stride, square = wide.padded_length(channels), make_square(rows.values)
+    grads = Picture(grad_maps, view.width, channels)
+    pictures = Picture(maps, view.width, channels), grads, trace.finals, grad_alphas
+    scratch = aligned(LANES * LANES, rows.values)
+    if passes is not None:
+        row = rows.length
+        planes, weights = (
+            aligned((2 + max(passes.channels, stride)) * PIXELS, rows.values),
+            aligned(PIXELS, rows.values),
+        )
+        planes[:] = 0
+    if source is not None:
+        row = LANES + stride
+        planes, square_grads = aligned(2 * PIXELS, rows.values), aligned(PIXELS * stride, rows.values)
+        slopes, kept = aligned((CHUNK + 3) * LANES, rows.values), wide.make_kept(rows.values)
+    own = out[firsts[band] * row : firsts[band + 1] * row]
     own[:] = 0
-    for tile in range(view.bounds[band], view.bounds[band + 1]):
-        start, end = view.offsets[tile], view.offsets[tile + 1]
-        for square in range(squares):
-            looked_at = trace[tile * squares + square]
-            box = square_box(view, tile, square)
-            if looked_at == 0 or box[0] >= box[2] or box[1] >= box[3]:
-                continue
-            start_square(state, corners, box)
+    for place in squares_of(view, band):
+        seen = trace.seen[place.number]
+        if seen == 0:
+            continue
+        start_square(square, place.box)
+        span = place.start, place.start + seen, place.trace
+        if passes is not None:
             for block in range(BLOCKS):
-                _start_backward(planes, box, block, pictures, background, scratch, True)
-            span = start, start + looked_at, start * squares + square * (end - start)
-            packed = rows, length, view.order
-            narrow.differentiate_square(packed, span, state, passes, planes, weights, drawn, slots, own)
-
-
-@cached_njit(**OPTIONS)
-def differentiate_wide(
-    band: int,
-    view: View,
-    rows: Any,
-    length: int,
-    source: Any,
-    background: Any,
-    images: Any,
-    trace: Any,
-    slots: Any,
-    firsts: Any,
-    out: Any,
-    geometry: bool,
-) -> None:
-    """As `differentiate_narrow`, with many channels: the Gaussians are packed without features.
-
-    `source` is the features (flat), where each Gaussian's row begins, and D. Rows of `out` have LANES + padded D numbers,
-    of which the first are the moments, if `geometry` asks for them.
-    """
-    maps, grad_maps, finals, grad_alphas = images
-    channels, width = source[2], view.width
-    stride = wide.padded_length(channels)
-    grads = Picture(grad_maps, width, channels)
-    pictures = Picture(maps, width, channels), grads, finals, grad_alphas
-    state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
-    planes, square_grads = aligned(2 * PIXELS, rows), aligned(PIXELS * stride, rows)
-    scratch, slopes = aligned(LANES * LANES, rows), aligned((CHUNK + 3) * LANES, rows)
-    kept = wide.make_kept(rows)
-    hits, counts = np.empty(BLOCKS * CHUNK, np.int32), np.empty(BLOCKS, np.int32)
-    squares = view.across**2
-    drawn = trace[squares * (len(view.offsets) - 1) :]
-    own = out[firsts[band] * (LANES + stride) : firsts[band + 1] * (LANES + stride)]
-    own[:] = 0
-    for tile in range(view.bounds[band], view.bounds[band + 1]):
-        start, end = view.offsets[tile], view.offsets[tile + 1]
-        for square in range(squares):
-            looked_at = trace[tile * squares + square]
-            box = square_box(view, tile, square)
-            if looked_at == 0 or box[0] >= box[2] or box[1] >= box[3]:
-                continue
-            start_square(state, corners, box)
+                _start_backward(planes, place.box, block, pictures, background, scratch, True)
+            narrow.differentiate_square(rows, span, square, passes, planes, weights, trace.drawn, slots, own)
+        if source is not None:
             for block in range(BLOCKS):
                 if geometry:
-                    _start_backward(planes, box, block, pictures, background, scratch, False)
+                    _start_backward(planes, place.box, block, pictures, background, scratch, False)
                 for channel in range(0, channels, LANES):
-                    read_block(grads, box, block, channel, square_grads, block * LANES * stride + channel, stride)
-            span = start, start + looked_at, start * squares + square * (end - start)
-            packed, room = (rows, length, view.order), (kept, slopes, hits, counts)
+                    at = block * LANES * stride + channel
+                    read_block(grads, place.box, block, channel, square_grads, at, stride)
             wide.differentiate_square(
-                packed, span, state, source, square_grads, planes, room, drawn, slots, own, geometry
+                rows, span, square, source, square_grads, planes, kept, slopes, trace.drawn, slots, own, geometry
             )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -23,10 +22,9 @@ SOURCES = crc32(b"".join(file.read_bytes() for file in _FILES))
 def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """`numba.njit(cache=True)` for kernels that call functions of other files.
 
-    Numba's cache looks only at the date of the kernel's own file. If a file that it inlines changes, numba would go on
-    with the old code. It offers no way to add to its key, so this sets a private attribute. (A default argument that
-    holds the checksum would work too, but then Python resolves every call of a cached kernel, in 0.1 ms.) If no folder
-    for the cache can be written, each process compiles the kernel for itself.
+    Numba's cache looks only at the date of the kernel's own file. If a file that it inlines changes, numba would use the old
+    code. It offers no way to add to its key, so this sets a private attribute. If no folder for the cache can be written,
+    each process compiles the kernel for itself.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
@@ -44,8 +42,8 @@ def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 class _Kept(IndexDataCacheFile):  # type: ignore[misc]
     """A kernel's files in the cache: those that cannot be read are made again, and those that cannot be written are missed.
 
-    Numba writes its index before the kernel. If the disk is full between them, or the process is killed, the index leads to
-    the code of an earlier kernel, so the code says what it is of.
+    Numba writes its index before the kernel. If the process is killed between them, the index leads to the code of an
+    earlier kernel, so the code says what it is of.
     """
 
     said = False
@@ -58,23 +56,20 @@ class _Kept(IndexDataCacheFile):  # type: ignore[misc]
 
     def load(self, key: Any) -> Any:
         try:
-            checksum, content = super().load(key)
-            stamp, made_for, data = pickle.loads(content) if crc32(content) == checksum else (None, None, None)
+            made_for, data = super().load(key)
         except Exception:  # there is none (None cannot be unpacked), or it is cut off
             return None
-        return data if (stamp, made_for) == (self._source_stamp, key) else None
+        return data if made_for == (self._source_stamp, key) else None
 
     def save(self, key: Any, data: Any) -> None:
-        content = self._dump((self._source_stamp, key, data))
         try:
-            super().save(key, (crc32(content), content))
+            super().save(key, ((self._source_stamp, key), data))
         except OSError as error:
             if not _Kept.said:
                 _Kept.said = True
                 warnings.warn(
-                    f"{self._cache_path}: expected space for compiled kernels, got {error.strerror or error}; kfgs continues, "
-                    "and every process compiles them again, which takes a minute or two. Free some space there, or set "
-                    "NUMBA_CACHE_DIR to another folder",
+                    f"{self._cache_path}: expected space for compiled kernels, got {error.strerror or error}; every process "
+                    "will compile them again, for a minute or two. Free some space, or set NUMBA_CACHE_DIR to another folder",
                     RuntimeWarning,
                     stacklevel=2,
                 )

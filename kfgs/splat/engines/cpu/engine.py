@@ -1,215 +1,189 @@
-"""The CPU engine: compositing compiled by numba, with its own backward pass. README.md explains its parts."""
+"""The CPU engine: kernels compiled by numba, with their own backward passes. README.md explains its parts."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..contract import Composited, Ranked, Splats, Tiles
-from . import square, wide
-from .absolute import absolute
-from .bands import accumulate_band, composite_narrow, composite_wide
-from .bands_backward import differentiate_narrow, differentiate_wide
-from .memory import take_memory
-from .narrow import FIRST, MOMENTS, plan_passes
-from .perceptron import decide
-from .project import project, project_backward
-from .ranks import find_candidates, rank_narrow, rank_wide
-from .shade import shade, shade_backward
+from ..contract import Cloud, CompiledEngine, Composited, Pinhole, Ranked, Splats, Tiles
+from . import square
+from .bands import Trace, accumulate_band, composite_band
+from .bands_backward import differentiate_band
+from .memory import flat, take_memory
+from .narrow import MOMENTS, MOST_CHANNELS, Passes, plan_passes
+from .project import project
+from .ranks import find_candidates, rank_band
+from .shade import shade
 from .simd import LANES
 from .slots import chain_slots, gather_gradients, gather_sums, number_slots
-from .square import SQUARE_SIDE, View, pack_rows
-from .ssim import similarity
+from .square import SQUARE_SIDE, Rows, View, pack_rows
 from .threads import run_bands
 from .tiles import bin
+from .wide import Source
 
-row_length, padded_length = square.row_length.py_func, wide.padded_length.py_func  # one call is not worth compiling
-
-__all__ = [
-    "absolute",
-    "accumulate",
-    "backward",
-    "bin",
-    "decide",
-    "devices",
-    "forward",
-    "project",
-    "project_backward",
-    "rank",
-    "shade",
-    "shade_backward",
-    "similarity",
-]
+row_length = square.row_length.py_func  # one call is not worth compiling
 
 MOST_BANDS, PAIRS_PER_BAND = 32, 2048
 """The most bands, and the fewest pairs of a band. More bands keep more threads busy, but give more Gaussians a gradient row
 in several bands."""
 
-NARROW_CHANNELS = len(FIRST) + LANES
-"""The most channels that are summed in registers, one vector each; more are multiplied as small matrices."""
+
+class NumbaEngine(CompiledEngine):
+    """The engine that `kfgs.splat` takes on a CPU."""
+
+    devices = ("cpu",)
+    fused = True
+
+    def project(self, cloud: Cloud, pinhole: Pinhole) -> tuple[Tensor, ...]:
+        return project(cloud, pinhole)
+
+    def shade(self, sh: Tensor, means: Tensor, center: Tensor, index: Tensor) -> Tensor:
+        return shade(sh, means, center, index)
+
+    def bin(
+        self,
+        means2d: Tensor,
+        conics: Tensor,
+        depths: Tensor,
+        opacities: Tensor,
+        extents: Tensor,
+        size: tuple[int, int, int],
+    ) -> tuple[Tensor, Tensor]:
+        return bin(means2d, conics, depths, opacities, extents, size)
+
+    def forward(self, splats: Splats, tiles: Tiles) -> Composited:
+        view, channels = _view(tiles), splats.features.shape[1]
+        maps = take_memory(splats.features, view.height, view.width, channels)
+        alphas = splats.features.new_empty(view.height, view.width)
+        trace, parts = _make_trace(view, splats)
+        parts.seen[:] = 0
+        rows = _pack(splats, view, parts.packed)
+        background = _padded(splats.background)
+        shared = view, rows, *_channels_plan(splats), background, flat(maps), flat(alphas), parts
+        run_bands(composite_band, len(view.bounds) - 1, *shared)
+        return Composited(maps, alphas, trace)
+
+    def backward(
+        self, grads: tuple[Tensor, Tensor], wanted: list[bool], splats: Splats, tiles: Tiles, result: Composited
+    ) -> list[Tensor | None]:
+        view, channels = _view(tiles), splats.features.shape[1]
+        bands, M = len(view.bounds) - 1, len(splats.means2d)
+        slots, firsts, total, chains = _number(view, M)
+        trace = _read_trace(result.trace, view, splats)
+        rows = Rows(trace.packed, row_length(_packed(channels)), view.order)
+        passes, source = _channels_plan(splats)
+        length, column = (rows.length, MOMENTS) if passes else (LANES + _whole(channels), LANES)
+        out = take_memory(splats.means2d, total * length).numpy()
+        images = flat(result.maps), flat(grads[0]), flat(grads[1])
+        shared = view, rows, passes, source, _padded(splats.background), images, trace, slots, firsts, out
+        run_bands(differentiate_band, bands, *shared, any(wanted[:3]))
+        found: list[Tensor | None] = [torch.empty_like(value) for value in splats[:3]]
+        found.append(torch.zeros_like(splats.features))
+        index, targets = _index(splats), tuple(flat(value) for value in found if value is not None)
+        shares = bands if bool((index[1:] > index[:-1]).all()) else 1  # two Gaussians that show one row must not meet
+        layout, values = (length, column, channels), (flat(splats.conics), flat(splats.opacities))
+        run_bands(gather_gradients, shares, shares, values, chains, out, layout, index, targets)
+        light = torch.from_numpy(trace.finals).view_as(result.alphas)[..., None]
+        found.append((grads[0] * light).sum((0, 1)) if wanted[4] else None)
+        return [value if want else None for value, want in zip(found, wanted, strict=True)]
+
+    def accumulate(
+        self, means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Tensor, tiles: Tiles
+    ) -> tuple[Tensor, Tensor]:
+        channels, view = pixels.shape[2], _view(tiles)
+        bands, M = len(view.bounds) - 1, len(means2d)
+        slots, firsts, total, chains = _number(view, M)
+        none = means2d.new_empty(M, 0)
+        rows = _pack(Splats(means2d, conics, opacities, none, means2d.new_empty(0), None), view)
+        length = _whole(channels + 1)
+        out = take_memory(pixels, total * length).numpy()
+        run_bands(accumulate_band, bands, view, rows, flat(pixels), channels, slots, firsts, out)
+        sums, weights = pixels.new_empty(M, channels), pixels.new_empty(M)
+        run_bands(gather_sums, bands, bands, chains, out, length, sums.numpy(), weights.numpy())
+        return sums, weights
+
+    def rank(self, splats: Splats, tiles: Tiles, top: int, early: bool) -> Ranked:
+        features, channels, view = splats.features, splats.features.shape[1], _view(tiles)
+        bands, size = len(view.bounds) - 1, (view.height, view.width)
+        labels = take_memory(torch.empty(0, dtype=torch.int64), *size, top)
+        scores, alphas = take_memory(features, *size, top), take_memory(features, *size)
+        rows = _pack(splats, view)
+        passes, source = _channels_plan(splats)
+        few = len(splats.means2d) if top == 1 and passes else 0
+        candidates = np.empty(few, np.uint64), flat(features.new_empty(2 * few))
+        run_bands(find_candidates, bands, bands, flat(features), channels, _index(splats), *candidates)
+        shared = view, rows, passes, source, channels, candidates, early
+        run_bands(rank_band, bands, *shared, (flat(labels), flat(scores), flat(alphas)))
+        return Ranked(labels, scores, alphas)
 
 
-DTYPES = torch.float32, torch.float64
+ENGINE = NumbaEngine()
 
 
-def devices() -> tuple[str, ...]:
-    """Where the engine runs."""
-    return ("cpu",)
-
-
-def forward(splats: Splats, tiles: Tiles) -> Composited:
-    """Composite as the contract says."""
-    means2d, conics, opacities, features, background, index = splats
-    channels, view = features.shape[1], _view(tiles)
-    bands = len(view.bounds) - 1
-    maps = take_memory(features, view.height, view.width, channels)
-    alphas = features.new_empty(view.height, view.width)
-    trace, packed, finals, ends = _make_trace(view, means2d, channels)
-    ends[: view.across**2 * (len(view.offsets) - 1)] = 0
-    footprints = _flat(means2d), _flat(conics), _flat(opacities)
-    run_bands(pack_rows, bands, bands, footprints, _flat(features), _packed(channels), _index(index), packed)
-    images, length = (_flat(maps), _flat(alphas), finals), row_length(_packed(channels))
-    behind = _padded(background, padded_length(channels))
-    if channels <= NARROW_CHANNELS:
-        passes = plan_passes(channels)
-        run_bands(composite_narrow, bands, view, packed, length, passes, behind, images, ends)
-    else:
-        shared = (view, packed, length, _flat(features), _begins(index, len(means2d), channels), behind, images, ends)
-        run_bands(composite_wide, bands, *shared)
-    return Composited(maps, alphas, trace)
-
-
-def backward(
-    grads: Sequence[Tensor], wanted: Sequence[bool], splats: Splats, tiles: Tiles, result: Composited
-) -> list[Tensor]:
-    """Gradients as the contract says, given those in the maps and in the alphas."""
-    means2d, conics, opacities, features, background, index = splats
-    channels, view = features.shape[1], _view(tiles)
-    bands = len(view.bounds) - 1
-    slots, firsts, total, chains = _number(view, len(means2d))
-    packed, finals, ends = _read_trace(result.trace, view, means2d, channels)
-    images = _flat(result.maps), _flat(grads[0]), finals, _flat(grads[1])
-    length, behind = row_length(_packed(channels)), _padded(background, padded_length(channels))
-    row, column = (length, MOMENTS) if channels <= NARROW_CHANNELS else (LANES + padded_length(channels), LANES)
-    out = take_memory(means2d, total * row).numpy()
-    if channels <= NARROW_CHANNELS:
-        passes = plan_passes(channels)
-        run_bands(differentiate_narrow, bands, view, packed, length, passes, behind, images, ends, slots, firsts, out)
-    else:
-        source = _flat(features), _begins(index, len(means2d), channels), channels
-        shared = (view, packed, length, source, behind, images, ends, slots, firsts, out, any(wanted[:3]))
-        run_bands(differentiate_wide, bands, *shared)
-    found = [*(torch.empty_like(value) for value in splats[:3]), torch.zeros_like(features)]
-    which, layout = _index(index), (row, column, channels)
-    shares = bands if _increasing(which) else 1  # two Gaussians that show the same row must not meet
-    values, targets = (_flat(conics), _flat(opacities)), tuple(_flat(value) for value in found)
-    run_bands(gather_gradients, shares, shares, values, chains, out, layout, which, targets)
-    light = torch.from_numpy(finals).view_as(result.alphas)[..., None]
-    found.append((grads[0] * light).sum((0, 1)) if wanted[4] else background)
-    return [value if want else value.new_empty(0) for value, want in zip(found, wanted, strict=True)]
-
-
-def accumulate(
-    means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Tensor, tiles: Tiles
-) -> tuple[Tensor, Tensor]:  # sums [M, D], weights [M]
-    """Sum pixels into the Gaussians by compositing weight, in one walk."""
-    channels, view = pixels.shape[2], _view(tiles)
-    bands = len(view.bounds) - 1
-    slots, firsts, total, chains = _number(view, len(means2d))
-    packed = torch.empty(len(means2d) * row_length(0), dtype=pixels.dtype).numpy()
-    splats = _flat(means2d), _flat(conics), _flat(opacities)
-    run_bands(pack_rows, bands, bands, splats, packed[:0], 0, _index(None), packed)
-    length = padded_length(channels + 1)
-    out = take_memory(pixels, total * length).numpy()
-    shared = (view, packed, row_length(0), _flat(pixels), channels, slots, firsts, out)
-    run_bands(accumulate_band, bands, *shared)
-    sums, weights = pixels.new_empty(len(means2d), channels), pixels.new_empty(len(means2d))
-    run_bands(gather_sums, bands, bands, chains, out, length, sums.numpy(), weights.numpy())
-    return sums, weights
-
-
-def rank(splats: Splats, tiles: Tiles, top: int, early: bool) -> Ranked:
-    """The best channels of each pixel, as the contract says."""
-    means2d, conics, opacities, features, _, index = splats
-    channels, view = features.shape[1], _view(tiles)
-    bands = len(view.bounds) - 1
-    size = view.height, view.width
-    labels = take_memory(torch.empty(0, dtype=torch.int64), *size, top)
-    scores, alphas = take_memory(features, *size, top), take_memory(features, *size)
-    length = row_length(_packed(channels))
-    packed = take_memory(means2d, len(means2d) * length).numpy()
-    footprints = _flat(means2d), _flat(conics), _flat(opacities)
-    run_bands(pack_rows, bands, bands, footprints, _flat(features), _packed(channels), _index(index), packed)
-    images = _flat(labels), _flat(scores), _flat(alphas)
-    if channels <= NARROW_CHANNELS:
-        some = len(means2d) if top == 1 else 0
-        contest = np.empty(some, np.uint64), _flat(features.new_empty(2 * some))
-        run_bands(find_candidates, bands, bands, _flat(features), channels, _index(index), *contest)
-        shared = (view, packed, length, plan_passes(channels), channels, contest, early, images)
-        run_bands(rank_narrow, bands, *shared)
-    else:
-        begins = _begins(index, len(means2d), channels)
-        run_bands(rank_wide, bands, view, packed, length, _flat(features), begins, channels, images)
-    return Ranked(labels, scores, alphas)
-
-
-def _flat(tensor: Tensor) -> np.ndarray:
-    """The tensor's memory as numpy sees it, in one dimension."""
-    return tensor.detach().contiguous().view(-1).numpy()
+def _whole(channels: int) -> int:
+    """Channels in whole vectors, as `wide.padded_length` has it."""
+    return -(-channels // LANES) * LANES
 
 
 def _packed(channels: int) -> int:
     """How many channels are packed with their Gaussian."""
-    return channels if channels <= NARROW_CHANNELS else 0
+    return channels if channels <= MOST_CHANNELS else 0
 
 
-def _make_trace(view: View, like: Tensor, channels: int) -> tuple[Tensor, np.ndarray, np.ndarray, np.ndarray]:
-    """One int32 tensor with what the backward pass needs from the forward pass, and its parts.
-
-    First the packed Gaussians, on whole cache lines. Then the transmittance of each pixel (1 - alpha would keep few digits of
-    it). Then, for each tile and square, how many Gaussians were looked at, and in which blocks each was drawn.
-    """
-    squares = view.across**2
-    numbers = sum(_floats(view, like, channels)) * like.element_size() // 4
-    length = numbers + squares * (len(view.offsets) - 1 + len(view.order))
-    trace = take_memory(torch.empty(0, dtype=torch.int32), length)
-    return trace, *_read_trace(trace, view, like, channels)
+def _pack(splats: Splats, view: View, packed: np.ndarray | None = None) -> Rows:
+    """The packed Gaussians, written to `packed` if it is given."""
+    channels, bands = _packed(splats.features.shape[1]), len(view.bounds) - 1
+    length = row_length(channels)
+    packed = take_memory(splats.means2d, len(splats.means2d) * length).numpy() if packed is None else packed
+    footprints = flat(splats.means2d), flat(splats.conics), flat(splats.opacities)
+    run_bands(pack_rows, bands, bands, footprints, flat(splats.features), channels, _index(splats), packed)
+    return Rows(packed, length, view.order)
 
 
-def _read_trace(trace: Tensor, view: View, like: Tensor, channels: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The packed Gaussians, the transmittances and the rest of a trace."""
-    packed, pixels = _floats(view, like, channels)
-    numbers = (packed + pixels) * like.element_size() // 4
-    floats = trace.numpy()[:numbers].view(like.detach().numpy().dtype)
-    return floats[:packed], floats[packed:], trace.numpy()[numbers:]
+def _channels_plan(splats: Splats) -> tuple[Passes | None, Source | None]:
+    """How few channels are cut, or where many channels lie."""
+    channels = splats.features.shape[1]
+    if channels <= MOST_CHANNELS:
+        return plan_passes(channels), None
+    shown = _index(splats) if splats.index is not None else np.arange(len(splats.means2d))
+    return None, Source(flat(splats.features), shown * channels, channels)
 
 
-def _floats(view: View, like: Tensor, channels: int) -> tuple[int, int]:
+def _make_trace(view: View, splats: Splats) -> tuple[Tensor, Trace]:
+    """One int32 tensor with what the backward pass needs from the forward pass, and its parts."""
+    squares, floats = view.across**2, sum(_floats(view, splats))
+    numbers = floats * splats.means2d.element_size() // 4
+    trace = take_memory(
+        torch.empty(0, dtype=torch.int32), numbers + squares * (len(view.offsets) - 1 + len(view.order))
+    )
+    return trace, _read_trace(trace, view, splats)
+
+
+def _read_trace(trace: Tensor, view: View, splats: Splats) -> Trace:
+    """The parts of the tensor. The packed Gaussians are first, on whole cache lines."""
+    packed, pixels = _floats(view, splats)
+    numbers = (packed + pixels) * splats.means2d.element_size() // 4
+    floats, squares = flat(trace)[:numbers].view(flat(splats.means2d).dtype), view.across**2 * (len(view.offsets) - 1)
+    return Trace(floats[:packed], floats[packed:], *np.split(flat(trace)[numbers:], [squares]))
+
+
+def _floats(view: View, splats: Splats) -> tuple[int, int]:
     """How many numbers of the data's type are in a trace: packed Gaussians, and pixels."""
-    return len(like) * row_length(_packed(channels)), view.width * view.height
+    return len(splats.means2d) * row_length(_packed(splats.features.shape[1])), view.width * view.height
 
 
-def _index(index: Tensor | None) -> np.ndarray:
-    return np.empty(0, np.int64) if index is None else index.numpy()
+def _index(splats: Splats) -> np.ndarray:
+    return np.empty(0, np.int64) if splats.index is None else splats.index.numpy()
 
 
-def _increasing(index: np.ndarray) -> bool:
-    return bool((index[1:] > index[:-1]).all())
-
-
-def _begins(index: Tensor | None, count: int, channels: int) -> np.ndarray:
-    """Where each Gaussian's row of features begins, [M] int64."""
-    return channels * (np.arange(count) if index is None else index.numpy())
-
-
-def _padded(background: Tensor, channels: int) -> np.ndarray:
-    behind = np.zeros(channels, background.detach().numpy().dtype)
-    behind[: len(background)] = background.detach().numpy()
-    return behind
+def _padded(background: Tensor) -> np.ndarray:
+    """The background and zeros up to a whole vector."""
+    out = np.zeros(_whole(len(background)), flat(background).dtype)
+    out[: len(background)] = flat(background)
+    return out
 
 
 def _view(tiles: Tiles) -> View:

@@ -65,6 +65,11 @@ def take_memory(like: Tensor, *shape: int) -> Tensor:
     return torch.from_numpy(buffer[skip : skip + size].view(dtype).reshape(shape))
 
 
+def flat(tensor: Tensor) -> np.ndarray:
+    """The tensor's memory as numpy sees it, in one dimension."""
+    return tensor.detach().contiguous().view(-1).numpy()
+
+
 def free_memory() -> None:
     """Free the memory that this thread keeps for its next frames: up to 1 GiB of unused maps and gradients."""
     _kept.buffers.clear()

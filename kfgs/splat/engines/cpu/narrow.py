@@ -2,13 +2,13 @@
 
 Forward, the Gaussians of a block are walked with the block's transmittance and sums in registers. Backward, the blocks
 of a Gaussian are walked with the Gaussian's gradients in registers: sums over pixels are made once for all blocks. The
-first channels are done in the same pass as the weights; a wider map goes on with the weights, LANES channels at a time.
+first channels are done in the same pass as the weights; a wider map then uses the weights for LANES channels at a time.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -17,7 +17,7 @@ from ..contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from .simd import (
     LANES,
     add_dot,
-    add_scaled,
+    add_outer,
     any_of,
     fetch,
     load,
@@ -46,6 +46,8 @@ from .square import (
     LIGHT,
     PIXELS,
     PREFETCH_AHEAD,
+    Rows,
+    Square,
     X,
     Y,
     list_hits,
@@ -60,9 +62,12 @@ slope of the loss in log(alpha). The features' gradients follow."""
 FEW, FIRST, GROUP = (0,) * 4, (0,) * (LANES - MOMENTS), (0,) * LANES
 """Channels per pass: the compiler knows a tuple's length. FIRST fills a row with the moments; FEW is enough for colours."""
 
+MOST_CHANNELS = len(FIRST) + LANES
+"""The most channels that are summed in registers, one vector each; more are multiplied as small matrices (`wide`)."""
+
 CONTEST_CHUNK, CHECK_EVERY = 32, 8
 """Where only the largest channel is wanted: as CHUNK, because half of the blocks are decided after so many; and after how many
-Gaussians of a block it is asked."""
+Gaussians of a block this is tested."""
 
 MOST_DRAWN = math.ceil(math.log(TRANSMITTANCE_MIN) / math.log1p(-ALPHA_MIN))
 """The most Gaussians that a pixel draws, 2,345: each takes at least ALPHA_MIN of its light."""
@@ -72,52 +77,55 @@ BEHIND, SHARE, GRADS = 0, PIXELS, 2 * PIXELS
 from its features; and the loss's gradient in each channel."""
 
 
-def plan_passes(channels: int) -> tuple[tuple[int, ...], tuple[int, ...], int]:
-    """The first pass's tuple, one that is empty if there is no other pass, and the channels of all passes."""
+class Passes(NamedTuple):
+    """How the channels are cut."""
+
+    first: tuple[int, ...]  # as long as the first pass has channels
+    more: tuple[int, ...]  # empty if there is no other pass
+    channels: int  # of all passes
+
+
+def plan_passes(channels: int) -> Passes:
+    """One pass for few channels; else LANES channels in each pass after the first."""
     if channels <= len(FEW):
-        return FEW, (), len(FEW)
+        return Passes(FEW, (), len(FEW))
     rest = -(-max(channels - len(FIRST), 0) // LANES) * LANES
-    return FIRST, (0,) if rest else (), len(FIRST) + rest
+    return Passes(FIRST, (0,) if rest else (), len(FIRST) + rest)
+
+
+class Contest(NamedTuple):
+    """When a block is done although light is left: the largest channel is wanted, and no other can overtake it."""
+
+    count: int  # planes of the sums that compete
+    favour: (
+        Any  # the most by which a Gaussian of weight 1 favours one channel over another; infinite: sums are wanted too
+    )
+    rounding: Any  # the most by which rounding does, see `round_off`
 
 
 @njit(**INLINE)
 def composite_square(
-    packed: Any,
-    span: tuple[int, int, int],
-    state: Any,
-    dark: Any,
-    passes: Any,
-    scratch: Any,
-    trace: Any,
-    columns: Any,
-    contest: Any,
+    rows: Rows,
+    span: tuple[int, int, int],  # where the square's list begins and ends, and where its trace begins
+    square: Square,
+    dark: Any,  # bits of blocks without pixels
+    passes: Passes,
+    sums: Any,  # [channels * PIXELS], added to
+    weights: Any,  # [CHUNK * LANES], scratch
+    trace: Any,  # written: bits of the blocks in which each Gaussian changed the light; None: there is no backward pass
+    columns: Any,  # four channels to composite in place of the first four; None: all
+    contest: Any,  # Contest, or None: all Gaussians count
 ) -> int:
-    """Composite a square's Gaussians; returns where in the list it was done.
-
-    Args:
-        packed: rows, their length, and the list of the Gaussians' numbers.
-        span: where the square's list begins and ends, and where its trace begins.
-        state: the square's planes, see `start_square`.
-        dark: bits of blocks without pixels.
-        passes: from `plan_passes`.
-        scratch: corners; sums, one plane per channel; weights [CHUNK * LANES]; hits [BLOCKS * CHUNK]; counts [BLOCKS].
-        trace: written: the blocks in which each Gaussian changed the light, as bits; None: there is no backward pass.
-        columns: four channels to composite in place of the first four; None: all.
-        contest: None, or, where the largest channel may be all that is wanted: how many planes of the sums compete; the most
-            by which a Gaussian of weight 1 favours one channel over another; and the most by which rounding does
-            (`round_off`). A block is done when no channel can overtake. An infinite favour: the sums are wanted, too.
-    """
-    rows, length, order = packed
+    """Composite a square's Gaussians; returns where in the list it was done."""
     start, end, into = span
-    corners, _, _, hits, counts = scratch
     position = start
-    step = CHUNK if contest is None or contest[1] == np.inf else CONTEST_CHUNK
+    step = CHUNK if contest is None or contest.favour == np.inf else CONTEST_CHUNK
     while position < end and dark != ALL_BLOCKS:
         stop = min(position + step, end)
-        list_hits(rows, length, order, (position, stop, into + position - start), dark, corners, hits, counts, trace)
+        list_hits(rows, (position, stop), dark, square, trace, into + position - start)
         for block in range(BLOCKS):
-            if counts[block] and not _composite_block(
-                packed, state, block, passes, scratch, trace, into - start, columns, contest
+            if square.counts[block] and not _composite_block(
+                rows, square, block, passes, sums, weights, trace, into - start, columns, contest
             ):
                 dark |= np.uint32(1) << np.uint32(block)
         position = stop
@@ -126,33 +134,41 @@ def composite_square(
 
 @njit(**INLINE)
 def _composite_block(
-    packed: Any, state: Any, block: int, passes: Any, scratch: Any, trace: Any, into: int, columns: Any, contest: Any
+    rows: Rows,
+    square: Square,
+    block: int,
+    passes: Passes,
+    sums: Any,
+    weights: Any,
+    trace: Any,
+    into: int,
+    columns: Any,
+    contest: Any,
 ) -> bool:
     """Composite the listed Gaussians into one block; returns whether some pixel has not stopped and is not decided."""
-    rows, length, order = packed
-    first, more, channels = passes
-    _, sums, weights, hits, counts = scratch
-    p, listed, count = block * LANES, block * CHUNK, counts[block]
+    values, length, order = rows
+    state, hits, first = square.state, square.hits, passes.first
+    p, listed, count = block * LANES, block * CHUNK, square.counts[block]
     bit = np.uint32(1) << np.uint32(block)
     x, y, light, final = load(state, X + p), load(state, Y + p), load(state, LIGHT + p), load(state, FINAL + p)
     total = load_many(first, sums, p, PIXELS)
     for k in range(count):
         j = np.int64(fetch(hits, listed + k))
         at = np.int64(fetch(order, j)) * length
-        _, _, _, alpha = weigh_pixels(rows, at, x, y)
+        _, _, _, alpha = weigh_pixels(values, at, x, y)
         before = light
         weight = alpha * light
-        light = light * (1 - alpha)  # falls on after a pixel has stopped, so that it never starts again
+        light = light * (1 - alpha)  # falls further after a pixel has stopped, so that it never starts again
         drawn = light >= TRANSMITTANCE_MIN
         weight = select(drawn, weight, 0)
         final = select(drawn, light, final)
         if columns is None:
-            total = add_scaled(total, weight, spread_many(first, rows, at + FEATURES, 1))
+            total = add_outer(total, (weight,), spread_many(first, values, at + FEATURES, 1))
         else:
-            total = add_scaled(total, weight, _spread_columns(rows, at + FEATURES, columns))
-        if len(more) > 0:
+            total = add_outer(total, (weight,), _spread_columns(values, at + FEATURES, columns))
+        if len(passes.more) > 0:
             store(weights, k * LANES, weight)
-        if columns is not None and contest[1] < np.inf and k % CHECK_EVERY == CHECK_EVERY - 1:
+        if columns is not None and contest.favour < np.inf and k % CHECK_EVERY == CHECK_EVERY - 1:
             store_many(sums, p, PIXELS, total)
             if not any_of((light >= TRANSMITTANCE_MIN) & _undecided(sums, p, light, contest)):
                 break
@@ -162,17 +178,22 @@ def _composite_block(
     store(state, LIGHT + p, light)
     store(state, FINAL + p, final)
     store_many(sums, p, PIXELS, total)
-    if len(more) > 0:
-        for channel in range(len(first), channels, LANES):
-            _add_group(packed, FEATURES + channel, hits, listed, count, weights, sums, channel * PIXELS + p)
+    if len(passes.more) > 0:
+        for channel in range(len(first), passes.channels, LANES):
+            plane = channel * PIXELS + p
+            total = load_many(GROUP, sums, plane, PIXELS)
+            for k in range(count):
+                at = np.int64(fetch(order, np.int64(fetch(hits, listed + k)))) * length + FEATURES + channel
+                total = add_outer(total, (load(weights, k * LANES),), spread_many(GROUP, values, at, 1))
+            store_many(sums, plane, PIXELS, total)
     going = light >= TRANSMITTANCE_MIN
-    if contest is not None and contest[1] < np.inf:
+    if contest is not None and contest.favour < np.inf:
         going = going & _undecided(sums, p, light, contest)
     return any_of(going)
 
 
 @njit(**INLINE)
-def _undecided(sums: Any, p: int, light: Any, contest: tuple[int, Any, Any]) -> Any:
+def _undecided(sums: Any, p: int, light: Any, contest: Contest) -> Any:
     """Pixels of a block where another channel may still become the largest, or where the best is not positive yet."""
     count, favour, rounding = contest
     best, second = load(sums, p), spread(sums, -np.inf)
@@ -207,62 +228,40 @@ def _spread_columns(rows: Any, at: int, columns: Any) -> Any:
 
 
 @njit(**INLINE)
-def _add_group(
-    packed: Any, column: int, hits: Any, listed: int, count: int, weights: Any, sums: Any, into: int
-) -> None:
-    """Add weights times features for LANES channels of a block."""
-    rows, length, order = packed
-    total = load_many(GROUP, sums, into, PIXELS)
-    for k in range(count):
-        at = np.int64(fetch(order, np.int64(fetch(hits, listed + k)))) * length + column
-        total = add_scaled(total, load(weights, k * LANES), spread_many(GROUP, rows, at, 1))
-    store_many(sums, into, PIXELS, total)
-
-
-@njit(**INLINE)
 def differentiate_square(
-    packed: Any,
-    span: tuple[int, int, int],
-    state: Any,
-    passes: Any,
-    planes: Any,
-    weights: Any,
-    trace: Any,
-    slots: Any,
-    out: Any,
+    rows: Rows,
+    span: tuple[
+        int, int, int
+    ],  # where the square's list begins, where the forward pass was done, where its trace begins
+    square: Square,
+    passes: Passes,
+    planes: Any,  # BEHIND, SHARE and GRADS
+    weights: Any,  # [PIXELS], scratch for the passes after the first
+    trace: Any,  # bits of the blocks in which each Gaussian changed the light
+    slots: Any,  # the row of `out` of each place in the list
+    out: Any,  # gradient rows, as long as packed ones
 ) -> None:
     """Add the gradients of one square's pixels to the rows of its Gaussians.
 
     Front to back, like the forward pass. What lies behind is the whole minus what was in front, so alphas need not be stored.
-
-    Args:
-        packed: rows, their length, and the list of the Gaussians' numbers.
-        span: where the square's list begins, where the forward pass was done, and where its trace begins.
-        state: the square's planes, see `start_square`.
-        passes: from `plan_passes`.
-        planes: BEHIND, SHARE and GRADS.
-        weights: [PIXELS], for the passes after the first.
-        trace: the blocks in which each Gaussian changed the light.
-        slots: where in `out` the row of each place in the list begins.
-        out: gradient rows, as long as packed ones.
     """
-    rows, length, order = packed
+    values, length, order = rows
     start, end, into = span
-    first, more, channels = passes
+    state, first = square.state, passes.first
     for j in range(start, end):
         touched = np.uint32(fetch(trace, into + j - start))
         if touched == 0:
             continue
-        prefetch(rows, np.int64(fetch(order, min(j + PREFETCH_AHEAD, end - 1))) * length)
+        prefetch(values, np.int64(fetch(order, min(j + PREFETCH_AHEAD, end - 1))) * length)
         at = np.int64(fetch(order, j)) * length
-        zero = spread(rows, 0)
+        zero = spread(values, 0)
         v_1, v_x, v_y, v_xx, v_xy, v_yy = zero, zero, zero, zero, zero, zero
-        by_channel = zero_many(first, rows)
+        by_channel = zero_many(first, values)
         remaining = touched
         while remaining:
             p = trailing_zeros(remaining) * LANES
             remaining &= remaining - np.uint32(1)
-            dx, dy, full, alpha = weigh_pixels(rows, at, load(state, X + p), load(state, Y + p))
+            dx, dy, full, alpha = weigh_pixels(values, at, load(state, X + p), load(state, Y + p))
             light = load(state, LIGHT + p)
             weight = alpha * light
             clear = 1 - alpha
@@ -271,13 +270,13 @@ def differentiate_square(
             drawn = light >= TRANSMITTANCE_MIN
             weight = select(drawn, weight, 0)
             grads = load_many(first, planes, GRADS + p, PIXELS)
-            slope = add_dot(load(planes, SHARE + p), grads, spread_many(first, rows, at + FEATURES, 1))
-            by_channel = add_scaled(by_channel, weight, grads)
-            if len(more) > 0:
+            slope = add_dot(load(planes, SHARE + p), grads, spread_many(first, values, at + FEATURES, 1))
+            by_channel = add_outer(by_channel, (weight,), grads)
+            if len(passes.more) > 0:
                 store(weights, p, weight)
-                for channel in range(len(first), channels, LANES):
+                for channel in range(len(first), passes.channels, LANES):
                     others = load_many(GROUP, planes, GRADS + channel * PIXELS + p, PIXELS)
-                    slope = add_dot(slope, others, spread_many(GROUP, rows, at + FEATURES + channel, 1))
+                    slope = add_dot(slope, others, spread_many(GROUP, values, at + FEATURES + channel, 1))
             own = weight * slope
             behind = load(planes, BEHIND + p) - own
             store(planes, BEHIND + p, behind)
@@ -289,8 +288,8 @@ def differentiate_square(
         row = np.int64(fetch(slots, j)) * length
         sums = sum_many((v_1, v_x, v_y, v_xx, v_xy, v_yy) + by_channel)  # noqa: RUF005, numba does not unpack
         store(out, row, load(out, row) + sums)
-        if len(more) > 0:
-            for channel in range(len(first), channels, LANES):
+        if len(passes.more) > 0:
+            for channel in range(len(first), passes.channels, LANES):
                 place = row + MOMENTS + channel
                 sums = _sum_group(weights, planes, GRADS + channel * PIXELS, touched)
                 store(out, place, load(out, place) + sums)
@@ -303,51 +302,38 @@ def _sum_group(weights: Any, planes: Any, start: int, touched: Any) -> Any:
     while touched:
         p = trailing_zeros(touched) * LANES
         touched &= touched - np.uint32(1)
-        total = add_scaled(total, load(weights, p), load_many(GROUP, planes, start + p, PIXELS))
+        total = add_outer(total, (load(weights, p),), load_many(GROUP, planes, start + p, PIXELS))
     return sum_many(total)
 
 
 @njit(**INLINE)
 def accumulate_square(
-    packed: Any,
-    span: tuple[int, int],
-    state: Any,
-    dark: Any,
-    corners: Any,
-    planes: Any,
-    weights: Any,
-    slots: Any,
-    width: int,
-    out: Any,
+    rows: Rows,
+    span: tuple[int, int],  # where the square's list begins and ends
+    square: Square,
+    dark: Any,  # bits of blocks without pixels
+    planes: Any,  # what is summed: a multiple of LANES planes
+    weights: Any,  # [PIXELS], scratch
+    slots: Any,  # the row of `out` of each place in the list
+    width: int,  # of a row of `out`, as many numbers as there are planes
+    out: Any,  # added to
 ) -> None:
-    """Add weights times planes to the rows of one square's Gaussians: the contract's point 7.
-
-    Args:
-        packed: rows, their length, and the list of the Gaussians' numbers.
-        span: where the square's list begins and ends.
-        state: the square's planes, see `start_square`.
-        dark: bits of blocks without pixels.
-        corners: see `touched_blocks`.
-        planes: what is summed, a multiple of LANES planes.
-        weights: [PIXELS], scratch.
-        slots: where in `out` the row of each place in the list begins.
-        width: of a row of `out`, as many numbers as there are planes.
-        out: sums.
-    """
-    rows, length, order = packed
-    epsilon = rows.dtype.type(np.finfo(rows.dtype).eps)
+    """Add weights times planes to the rows of one square's Gaussians (`Engine.accumulate`)."""
+    values, length, order = rows
+    state = square.state
+    epsilon = values.dtype.type(np.finfo(values.dtype).eps)
     for j in range(span[0], span[1]):
         if dark == ALL_BLOCKS:
             break
-        prefetch(rows, np.int64(fetch(order, min(j + PREFETCH_AHEAD, span[1] - 1))) * length)
+        prefetch(values, np.int64(fetch(order, min(j + PREFETCH_AHEAD, span[1] - 1))) * length)
         at = np.int64(fetch(order, j)) * length
-        touched = touched_blocks(rows, at, corners, epsilon) & ~dark
+        touched = touched_blocks(values, at, square.corners, epsilon) & ~dark
         remaining = touched
         while remaining:
             block = trailing_zeros(remaining)
             p = block * LANES
             remaining &= remaining - np.uint32(1)
-            _, _, _, alpha = weigh_pixels(rows, at, load(state, X + p), load(state, Y + p))
+            _, _, _, alpha = weigh_pixels(values, at, load(state, X + p), load(state, Y + p))
             light = load(state, LIGHT + p)
             light_behind = light * (1 - alpha)
             drawn = light_behind >= TRANSMITTANCE_MIN

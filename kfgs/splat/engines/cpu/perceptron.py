@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from .cache import cached_njit
+from .memory import flat
 from .simd import (
     LANES,
     add_outer,
@@ -46,20 +47,12 @@ SHARE = 4096
 
 @torch.no_grad()
 def decide(
-    layers: Sequence[tuple[Tensor, Tensor]],  # weight [out, in], bias [out]
-    groups: Tensor,  # [K]
-    rows: Tensor,  # [N, in]
+    layers: Sequence[tuple[Tensor, Tensor]],  # at least one: weight [out, in], bias [out]; the last has K outputs
+    rows: Tensor,  # [N, in] float32 or float64 on the CPU
 ) -> tuple[Tensor, Tensor]:  # [N] int64, [N]
-    """Which of K outputs is the largest, and how clearly: (largest - largest of another group) / largest.
+    """Which of K outputs is the largest, of equal ones the lowest, and how clearly: (largest - second) / largest.
 
-    Args:
-        layers: at least one, contiguous and of the rows' dtype; the last has K outputs.
-        groups: outputs of one group answer the same, whole numbers below 2^24.
-        rows: inputs, float32 or float64 on the CPU.
-
-    Returns:
-        The output, of equal ones the lowest, and its lead: 0 where the largest output is not positive, infinite where all
-        outputs are of one group.
+    This lead is 0 where the largest output is not positive, and infinite if K is 1.
     """
     kind = rows.detach().numpy().dtype
     shapes, numbers, begin = [], [], 0
@@ -73,25 +66,22 @@ def decide(
         begin += padded * (into + 1)
     table = np.array(shapes, np.int64)
     winners, leads = torch.empty(len(rows), dtype=torch.int64), rows.new_empty(len(rows))
-    found = winners.numpy(), leads.numpy()
-    flat, names = rows.detach().contiguous().view(-1).numpy(), groups.detach().numpy().astype(kind)
-    run_bands(_decide_band, -(-len(rows) // SHARE), table, np.concatenate(numbers), names, flat, found)
+    outs, results = len(layers[-1][1]), (winners.numpy(), leads.numpy())
+    run_bands(_decide_band, -(-len(rows) // SHARE), table, np.concatenate(numbers), outs, flat(rows), results)
     return winners, leads
 
 
 @cached_njit(**OPTIONS)
-def _decide_band(band: int, table: Any, numbers: Any, groups: Any, rows: Any, found: Any) -> None:
-    """Decide the rows of one share.
-
-    Args:
-        band: which share.
-        table: [L, 4], of each layer the inputs, the padded outputs, and where weights and biases begin.
-        numbers: weights, UNITS outputs together as [in, UNITS], and biases.
-        groups: [K].
-        rows: [N * in].
-        found: outputs and leads [N], written.
-    """
-    winners, leads = found
+def _decide_band(
+    band: int,
+    table: Any,  # [L, 4], of each layer the inputs, the padded outputs, and where weights and biases begin
+    numbers: Any,  # weights, UNITS outputs together as [in, UNITS], and biases
+    outs: int,  # K
+    rows: Any,  # [N * in]
+    results: Any,  # outputs and leads [N], written
+) -> None:
+    """Decide the rows of one share."""
+    winners, leads = results
     total, width = len(winners), table[0, 0]
     widest = max(table[:, 0].max(), table[:, 1].max())
     inputs, outputs = aligned(widest * ROWS, numbers), aligned(widest * ROWS, numbers)
@@ -103,17 +93,13 @@ def _decide_band(band: int, table: Any, numbers: Any, groups: Any, rows: Any, fo
                 put(inputs, i * ROWS + p, fetch(rows, row * width + i))
         for layer in range(len(table)):
             into, out, weights, biases = table[layer, 0], table[layer, 1], table[layer, 2], table[layer, 3]
-            count = 0
+            count, floor = 0, 0.0 if layer > 0 else -np.inf
             for i in range(into):
-                if layer > 0:
-                    x, y = maximum(load(inputs, i * ROWS), 0), maximum(load(inputs, i * ROWS + LANES), 0)
-                    store(inputs, i * ROWS, x)
-                    store(inputs, i * ROWS + LANES, y)
-                    put(active, count, i)
-                    if any_of((x > 0) | (y > 0)):
-                        count += 1
-                else:
-                    put(active, count, i)
+                x, y = maximum(load(inputs, i * ROWS), floor), maximum(load(inputs, i * ROWS + LANES), floor)
+                store(inputs, i * ROWS, x)
+                store(inputs, i * ROWS + LANES, y)
+                put(active, count, i)
+                if any_of((x > floor) | (y > floor)):
                     count += 1
             one = spread(numbers, 1)
             for unit in range(0, out, UNITS):
@@ -127,15 +113,12 @@ def _decide_band(band: int, table: Any, numbers: Any, groups: Any, rows: Any, fo
             inputs, outputs = outputs, inputs
         for half in range(0, ROWS, LANES):
             best, second = spread(numbers, -np.inf), spread(numbers, -np.inf)
-            which, group = spread(numbers, 0), spread(numbers, groups[0])
-            for k in range(len(groups)):
-                value, name = load(inputs, k * ROWS + half), fetch(groups, k)
+            which = spread(numbers, 0)
+            for k in range(outs):
+                value = load(inputs, k * ROWS + half)
                 better = value > best
-                other = (group < name) | (group > name)
-                beaten = select(better, best, value)
-                second = select(other, maximum(second, beaten), second)
+                second = maximum(second, select(better, best, value))
                 best, which = select(better, value, best), select(better, k, which)
-                group = select(better, name, group)
             lead = select(best > 0, (best - second) / best, 0)
             store(outputs, 0, which)
             store(outputs, LANES, lead)

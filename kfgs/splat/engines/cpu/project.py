@@ -7,85 +7,67 @@ number of threads.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from ..contract import Cloud, Pinhole
+from .memory import flat
 from .project_backward import differentiate_band
-from .project_forward import project_band
-from .project_math import make_lens
-from .reach import find_reach
-from .threads import run_bands
+from .project_forward import make_lens, project_band
+from .threads import find_reach, run_bands
 
-__all__ = ["project", "project_backward"]
+__all__ = ["project"]
 
 _SHARE = 16384
 """Gaussians of a band: few, so that all threads end together, but many compared with the cost of a call."""
 
 
-@torch.no_grad()
 def project(cloud: Cloud, pinhole: Pinhole) -> tuple[Tensor, ...]:
     """Project and cull: means2d [M, 2], conics [M, 3], depths [M], opacities [M], extents [M, 2] and index [M]."""
-    means = cloud.means
-    N = len(means)
-    bands = _bands(N)
-    shapes = (N, 2), (N, 3), (N,), (N,), (N, 2)
-    scratch = [*(means.new_empty(shape) for shape in shapes), means.new_empty(N, dtype=torch.int64)]
-    counts = np.empty(bands, np.int64)
-    lens = make_lens(pinhole)
-    run_bands(
-        project_band,
-        bands,
-        bands,
-        lens,
-        flat_arrays(*cloud),
-        find_reach(cloud.opacities),
-        flat_arrays(*scratch),
-        counts,
-    )
-
-    ends = np.cumsum(counts)
-    outputs = [value.new_empty((int(ends[-1]), *value.shape[1:])) for value in scratch]
-
-    def collect(band: int) -> None:
-        begin, count = N * band // bands, int(counts[band])
-        for value, output in zip(scratch, outputs, strict=True):
-            _array(output)[ends[band] - count : ends[band]] = _array(value)[begin : begin + count]
-
-    run_bands(collect, bands)
-    return tuple(outputs)
+    return _Project.apply(pinhole, *cloud)  # type: ignore[no-any-return]
 
 
-@torch.no_grad()
-def project_backward(grads: Sequence[Tensor], cloud: Cloud, pinhole: Pinhole, index: Tensor) -> list[Tensor]:
-    """Gradients of the loss in the cloud, given those in means2d, conics, depths and opacities."""
-    bands, out = _bands(len(cloud.means)), [torch.empty_like(value) for value in cloud]
-    lens = make_lens(pinhole)
-    run_bands(
-        differentiate_band,
-        bands,
-        bands,
-        lens,
-        flat_arrays(*cloud[:3]),
-        _array(index),
-        flat_arrays(*grads),
-        flat_arrays(*out),
-    )
-    return out
+class _Project(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, pinhole: Pinhole, *values: Tensor) -> tuple[Tensor, ...]:
+        cloud = Cloud(*values)
+        means, N = cloud.means, len(cloud.means)
+        bands = _bands(N)
+        shapes = (N, 2), (N, 3), (N,), (N,), (N, 2)
+        scratch = [*(means.new_empty(shape) for shape in shapes), means.new_empty(N, dtype=torch.int64)]
+        counts, arrays = np.empty(bands, np.int64), tuple(flat(value) for value in scratch)
+        gaussians = tuple(flat(value) for value in cloud)
+        run_bands(
+            project_band, bands, bands, make_lens(pinhole), gaussians, find_reach(cloud.opacities), arrays, counts
+        )
+        ends = np.cumsum(counts)
+        outputs = [value.new_empty((int(ends[-1]), *value.shape[1:])) for value in scratch]
+
+        def collect(band: int) -> None:
+            begin, count = N * band // bands, int(counts[band])
+            for value, output in zip(scratch, outputs, strict=True):
+                output.numpy()[ends[band] - count : ends[band]] = value.numpy()[begin : begin + count]
+
+        run_bands(collect, bands)
+        ctx.pinhole = pinhole
+        ctx.save_for_backward(*cloud, outputs[5])
+        ctx.mark_non_differentiable(*outputs[4:])
+        return tuple(outputs)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        *cloud, index = ctx.saved_tensors
+        bands, out = _bands(len(cloud[0])), [torch.empty_like(value) for value in cloud]
+        given, targets = tuple(flat(grad) for grad in grads[:4]), tuple(flat(value) for value in out)
+        gaussians = tuple(flat(value) for value in cloud[:3])
+        run_bands(differentiate_band, bands, bands, make_lens(ctx.pinhole), gaussians, flat(index), given, targets)
+        return None, *out
 
 
 def _bands(count: int) -> int:
     return max(1, -(-count // _SHARE))
-
-
-def _array(tensor: Tensor) -> np.ndarray:
-    """The tensor's memory as numpy sees it."""
-    return tensor.detach().numpy()
-
-
-def flat_arrays(*tensors: Tensor) -> tuple[np.ndarray, ...]:
-    """Contiguous tensors as one-dimensional arrays on the same memory."""
-    return tuple(_array(tensor.view(-1)) for tensor in tensors)

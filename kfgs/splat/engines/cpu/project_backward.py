@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from .cache import cached_njit
-from .project_math import (
+from .project_forward import (
     BATCH,
     MEAN,
     OPTIONS,
@@ -37,22 +37,12 @@ def differentiate_band(
     band: int,
     bands: int,
     lens: Lens,
-    gaussians: tuple[Any, Any, Any],
-    index: Any,
-    grads: tuple[Any, Any, Any, Any],
-    out: tuple[Any, Any, Any, Any],
+    gaussians: tuple[Any, Any, Any],  # means [3 N], quats [4 N], scales [3 N]
+    index: Any,  # [M] int64, increasing: the visible Gaussians
+    grads: tuple[Any, Any, Any, Any],  # of the loss in means2d [2 M], conics [3 M], depths [M] and opacities [M]
+    out: tuple[Any, Any, Any, Any],  # gradients in means [3 N], quats [4 N], scales [3 N] and opacities [N], written
 ) -> None:
-    """Write one share of the rows of the gradients: those of the visible Gaussians, and zeros between them.
-
-    Args:
-        band: which.
-        bands: into how many equal shares the N Gaussians are cut.
-        lens: the camera and the options.
-        gaussians: means [3 N], quats [4 N], scales [3 N].
-        index: [M] int64, increasing: the visible Gaussians.
-        grads: of the loss in means2d [2 M], conics [3 M], depths [M] and opacities [M].
-        out: gradients in means [3 N], quats [4 N], scales [3 N] and opacities [N], written.
-    """
+    """Write one of `bands` equal shares of the rows of the gradients: the visible Gaussians', and zeros between them."""
     means, quats, scales = gaussians
     grad_means2d, grad_conics, grad_depths, grad_opacities = grads
     out_means, out_quats, out_scales, out_opacities = out

@@ -1,7 +1,7 @@
 """The compiled kernels over a band of tiles that rank channels: composite class scores, and keep each pixel's best classes.
 
 The sums of a square stay in cache, and only the best classes and their scores are written. There is no backward pass, so
-nothing is traced. The sums are those of `composite_narrow` and `composite_wide`, to the bit.
+nothing is traced. The sums are those of `composite_band`, to the bit.
 
 If labels alone are wanted, a block of pixels is done when its best classes lead by more than the light that is left could
 change: after about half of its Gaussians.
@@ -20,6 +20,7 @@ from numba import njit
 
 from . import narrow as narrow
 from . import wide as wide
+from .bands import SIXTEEN
 from .cache import cached_njit
 from .simd import LANES, fetch, load, load_many, put, select, spread, store, store_many, transpose
 from .square import (
@@ -30,30 +31,26 @@ from .square import (
     INLINE,
     OPTIONS,
     PIXELS,
-    STATE,
+    Rows,
     View,
     aligned,
-    square_box,
+    make_square,
+    squares_of,
     start_square,
 )
 
-FEW, SIXTEEN = narrow.FEW, (0,) * LANES
-"""A block's pixels, or as many channels."""
-
 
 @njit(**INLINE)
-def _rank_block(planes: Any, place: int, stride: int, channels: int, final: Any, ranked: Any, columns: Any) -> None:
-    """The best channels of a block's 16 pixels, the best first; of equal ones the lowest first.
-
-    Args:
-        planes: channel c of the pixels is the vector at place + c * stride.
-        place: see `planes`.
-        stride: see `planes`.
-        channels: how many there are, at least 1.
-        final: the pixels' transmittance: 1 where nothing was drawn, and the channels are then -1.
-        ranked: channels and sums [top * LANES] each, written; numbers of the data's type, exact below 2^24.
-        columns: [channels], how the channels are named.
-    """
+def _rank_block(
+    planes: Any,  # channel c of the pixels is the vector at place + c * stride
+    place: int,
+    stride: int,
+    channels: int,  # how many there are, at least 1
+    final: Any,  # the pixels' transmittance: 1 where nothing was drawn, and the channels are then -1
+    ranked: Any,  # channels and sums [top * LANES] each, written; numbers of the data's type, exact below 2^24
+    columns: Any,  # [channels], how the channels are named
+) -> None:
+    """The best channels of a block's 16 pixels, the best first; of equal ones the lowest first."""
     names, values = ranked
     drawn = final < 1
     last, chosen = spread(planes, np.inf), spread(planes, -1)
@@ -125,11 +122,7 @@ def find_candidates(band: int, bands: int, features: Any, channels: int, index: 
 def _gather_columns(
     contest: Any, order: Any, start: int, end: int, channels: int, columns: Any
 ) -> tuple[int, float, float]:
-    """Write the channels that may win among some Gaussians, in order.
-
-    Returns:
-        How many there are, the largest favour and the largest feature, without its sign.
-    """
+    """Write the channels that may win among some Gaussians; returns how many, and the largest favour and absolute feature."""
     masks, favours = contest
     mask, favour, peak = np.uint64(0), 0.0, 0.0
     for j in range(start, end):
@@ -144,92 +137,57 @@ def _gather_columns(
 
 
 @cached_njit(**OPTIONS)
-def rank_narrow(
-    band: int, view: View, rows: Any, length: int, passes: Any, channels: int, contest: Any, early: bool, images: Any
+def rank_band(
+    band: int,
+    view: View,
+    rows: Rows,
+    passes: Any,  # narrow.Passes; None with many channels
+    source: Any,  # wide.Source; None with few channels, which are packed
+    channels: int,  # D
+    candidates: Any,  # masks and favours from `find_candidates`; empty: every channel may be among the best
+    early: bool,  # stop where the best channel is certain: scores and alphas are then not complete
+    images: Any,  # labels and scores [H * W * top] and alphas [H * W], written
 ) -> None:
-    """Rank the tiles of one band, with few channels.
-
-    Args:
-        band: which.
-        view: the tiles.
-        rows: packed Gaussians with their features.
-        length: of a packed row.
-        passes: from `plan_passes`.
-        channels: D.
-        contest: masks and favours from `find_candidates`; empty: every channel may be among the best.
-        early: stop where the best channel is certain. Scores and alphas are then not complete.
-        images: labels and scores [H * W * top] and alphas [H * W], written.
-    """
-    top = len(images[0]) // len(images[2])
-    state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
-    sums, weights = aligned(passes[2] * PIXELS, rows), aligned(CHUNK * LANES, rows)
-    hits, counts = np.empty(BLOCKS * CHUNK, np.int32), np.empty(BLOCKS, np.int32)
-    ranked = aligned(top * LANES, rows), aligned(top * LANES, rows)
-    every, some = np.arange(channels), np.zeros(channels + len(FEW), np.int64)
-    for tile in range(view.bounds[band], view.bounds[band + 1]):
-        start, end = view.offsets[tile], view.offsets[tile + 1]
-        few, favour, peak = channels, np.inf, 0.0
-        if len(contest[0]):
-            few, favour, peak = _gather_columns(contest, view.order, start, end, channels, some)
-        favour, rounding = rows.dtype.type(favour if early else np.inf), narrow.round_off(end - start, peak, rows)
-        for square in range(view.across**2):
-            box = square_box(view, tile, square)
-            if box[0] >= box[2] or box[1] >= box[3]:
-                continue
-            dark = start_square(state, corners, box)
-            packed, span, scratch = (
-                (rows, length, view.order),
-                (start, end, start),
-                (corners, sums, weights, hits, counts),
-            )
-            if few <= len(FEW) < channels:
-                count, names = few, some
-                sums[: len(FEW) * PIXELS] = 0
-                four, plan = (some[0], some[1], some[2], some[3]), (FEW, (), len(FEW))
-                narrow.composite_square(packed, span, state, dark, plan, scratch, None, four, (few, favour, rounding))
-            else:
-                count, names = channels, every
-                sums[:] = 0
-                narrow.composite_square(
-                    packed, span, state, dark, passes, scratch, None, None, (channels, favour, rounding)
-                )
-            for block in range(BLOCKS):
-                p = block * LANES
-                _rank_block(sums, p, PIXELS, count, load(state, FINAL + p), ranked, names)
-                _write_ranks(ranked, state[FINAL + p : FINAL + p + LANES], box, block, images, view.width)
-
-
-@cached_njit(**OPTIONS)
-def rank_wide(
-    band: int, view: View, rows: Any, length: int, features: Any, begins: Any, channels: int, images: Any
-) -> None:
-    """As `rank_narrow`, with many channels: the Gaussians are packed without features.
-
-    The features are flat; the row that Gaussian m shows begins at `begins[m]`.
-    """
+    """Rank the channels at the pixels of one band."""
     top, stride = len(images[0]) // len(images[2]), wide.padded_length(channels)
-    state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
-    sums, planes = aligned(PIXELS * stride, rows), aligned(stride * LANES, rows)
-    kept = wide.make_kept(rows)
-    hits, counts = np.empty(BLOCKS * CHUNK, np.int32), np.empty(BLOCKS, np.int32)
-    ranked = aligned(top * LANES, rows), aligned(top * LANES, rows)
-    every = np.arange(channels)
-    for tile in range(view.bounds[band], view.bounds[band + 1]):
-        start, end = view.offsets[tile], view.offsets[tile + 1]
-        for square in range(view.across**2):
-            box = square_box(view, tile, square)
-            if box[0] >= box[2] or box[1] >= box[3]:
-                continue
-            dark = start_square(state, corners, box)
-            packed, source = (rows, length, view.order), (features, begins, channels)
-            scratch = corners, sums, kept, hits, counts
-            _, filled = wide.composite_square(packed, (start, end, start), state, dark, source, scratch, None)
-            for block in range(BLOCKS):
-                p = block * LANES
-                final = load(state, FINAL + p)
+    square = make_square(rows.values)
+    ranked = aligned(top * LANES, rows.values), aligned(top * LANES, rows.values)
+    every, some = np.arange(channels), np.zeros(channels + len(narrow.FEW), np.int64)
+    if passes is not None:
+        sums, weights = aligned(passes.channels * PIXELS, rows.values), aligned(CHUNK * LANES, rows.values)
+    if source is not None:
+        sums, planes = aligned(PIXELS * stride, rows.values), aligned(stride * LANES, rows.values)
+        kept = wide.make_kept(rows.values)
+    for place in squares_of(view, band):
+        dark = start_square(square, place.box)
+        span, count, names = (place.start, place.end, place.start), channels, every
+        if passes is not None:
+            few, favour, peak = channels, np.inf, 0.0
+            if len(candidates[0]):
+                few, favour, peak = _gather_columns(candidates, view.order, place.start, place.end, channels, some)
+            favour = rows.values.dtype.type(favour if early else np.inf)
+            rounding = narrow.round_off(place.end - place.start, peak, rows.values)
+            if few <= len(narrow.FEW) < channels:
+                count, names = few, some
+                sums[: len(narrow.FEW) * PIXELS] = 0
+                columns, plan = (some[0], some[1], some[2], some[3]), narrow.Passes(narrow.FEW, (), len(narrow.FEW))
+                contest = narrow.Contest(few, favour, rounding)
+                narrow.composite_square(rows, span, square, dark, plan, sums, weights, None, columns, contest)
+            else:
+                sums[:] = 0
+                contest = narrow.Contest(channels, favour, rounding)
+                narrow.composite_square(rows, span, square, dark, passes, sums, weights, None, None, contest)
+        if source is not None:
+            _, filled = wide.composite_square(rows, span, square, dark, source, sums, kept, None)
+        for block in range(BLOCKS):
+            p = block * LANES
+            final = load(square.state, FINAL + p)
+            if passes is not None:
+                _rank_block(sums, p, PIXELS, count, final, ranked, names)
+            if source is not None:
                 if (filled >> np.uint32(block)) & 1:
                     for channel in range(0, stride, LANES):
                         pixels = load_many(SIXTEEN, sums, p * stride + channel, stride)
                         store_many(planes, channel * LANES, LANES, transpose(pixels))
                 _rank_block(planes, 0, LANES, channels, final, ranked, every)
-                _write_ranks(ranked, state[FINAL + p : FINAL + p + LANES], box, block, images, view.width)
+            _write_ranks(ranked, square.state[FINAL + p : FINAL + p + LANES], place.box, block, images, view.width)

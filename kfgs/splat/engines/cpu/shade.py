@@ -11,40 +11,46 @@ import numpy as np
 import torch
 from numba import njit
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from ...sh import C1, C2, C3, SH_C0
 from .cache import cached_njit
-from .memory import take_memory
-from .project import flat_arrays
-from .project_math import OPTIONS, PLAIN
+from .memory import flat, take_memory
+from .project_forward import OPTIONS, PLAIN
 from .threads import run_bands
 
-__all__ = ["shade", "shade_backward"]
+__all__ = ["shade"]
 
 _SHARE = 8192  # Gaussians of a band
 _SHORTEST = 1e-12  # a direction is divided by its length or by this, as torch's `normalize` does
 
 
-@torch.no_grad()
 def shade(sh: Tensor, means: Tensor, center: Tensor, index: Tensor) -> Tensor:
     """Colours [M, 3] of the rows `index` [M] of the coefficients [N, K, 3], seen from `center` [3]."""
-    out = sh.new_empty(len(index), 3)
-    _run(_shade_band, index, int(sh.shape[1]), sh, means, center, index, out)
-    return out
+    return _Shade.apply(sh, means, center, index)  # type: ignore[no-any-return]
 
 
-@torch.no_grad()
-def shade_backward(grad: Tensor, sh: Tensor, means: Tensor, center: Tensor, index: Tensor) -> list[Tensor]:
-    """Gradients in the coefficients and the means, given that in the colours; zero for what was not seen."""
-    out = take_memory(sh, *sh.shape).zero_(), take_memory(means, *means.shape).zero_()
-    _run(_differentiate_band, index, int(sh.shape[1]), grad, sh, means, center, index, *out)
-    return list(out)
+class _Shade(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, sh: Tensor, means: Tensor, center: Tensor, index: Tensor) -> Tensor:
+        ctx.save_for_backward(sh, means, center, index)
+        out = sh.new_empty(len(index), 3)
+        _run(_shade_band, index, sh.shape[1], sh, means, center, index, out)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        sh, means, _, index = ctx.saved_tensors
+        out = take_memory(sh, *sh.shape).zero_(), take_memory(means, *means.shape).zero_()  # zero for what was not seen
+        _run(_differentiate_band, index, sh.shape[1], grad, *ctx.saved_tensors, *out)
+        return *out, None, None
 
 
 def _run(kernel: Any, index: Tensor, K: int, *tensors: Tensor) -> None:
     """Run a kernel over equal shares of the visible Gaussians."""
     bands = max(1, -(-len(index) // _SHARE))
-    run_bands(kernel, bands, bands, K, *flat_arrays(*tensors))
+    run_bands(kernel, bands, bands, int(K), *(flat(tensor) for tensor in tensors))
 
 
 @cached_njit(fastmath=PLAIN, **OPTIONS)
@@ -61,16 +67,7 @@ def _shade_band(band: int, bands: int, K: int, sh: Any, means: Any, center: Any,
 
 @cached_njit(fastmath=PLAIN, **OPTIONS)
 def _differentiate_band(
-    band: int,
-    bands: int,
-    K: int,
-    grads: Any,
-    sh: Any,
-    means: Any,
-    center: Any,
-    index: Any,
-    out_sh: Any,
-    out_means: Any,
+    band: int, bands: int, K: int, grads: Any, sh: Any, means: Any, center: Any, index: Any, out_sh: Any, out_means: Any
 ) -> None:
     count = len(index)
     basis, by_basis, slopes = np.empty(16, sh.dtype), np.empty(16, sh.dtype), np.empty(3, sh.dtype)

@@ -18,12 +18,11 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import types
+from numba import njit, types
 from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
@@ -32,7 +31,6 @@ __all__ = [
     "LANES",
     "add_dot",
     "add_outer",
-    "add_scaled",
     "any_of",
     "bits",
     "exp2",
@@ -123,8 +121,8 @@ def _spread(builder: Any, value: Any) -> Any:
 
 
 def _as_vector(context: Any, builder: Any, value: Any, kind: Any, element: Any) -> Any:
-    """The value itself if it is a vector, else the number in every lane."""
-    if isinstance(kind, VectorType):
+    """The value itself if it is a vector or a mask, else the number in every lane."""
+    if isinstance(kind, VectorType | MaskType):
         return value
     return _spread(builder, context.cast(builder, value, kind, element))
 
@@ -158,62 +156,41 @@ def _element_of(kinds: tuple[Any, ...]) -> Any:
 # Operators ------------------------------------------------------------------------------------------------------------
 
 
-_OPERATORS = {
-    "+": operator.add,
-    "-": operator.sub,
-    "*": operator.mul,
-    "/": operator.truediv,
-    "<": operator.lt,
-    "<=": operator.le,
-    ">": operator.gt,
-    ">=": operator.ge,
-}
+def _register(symbol: Any, method: str, *comparison: str) -> None:
+    """Lower an operator of vectors and numbers, or of masks, to `builder.method(*comparison, x, y)`."""
+    of_masks = method in ("and_", "or_")
 
-
-def _register_operator(symbol: Any, compute: Callable[..., Any], *, gives_mask: bool) -> None:
     @infer_global(symbol)
     class _Template(AbstractTemplate):
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
+            if of_masks:
+                return signature(_MASK, *args) if args == (_MASK, _MASK) else None
             element = _element_of(args) if len(args) == 2 else None
-            return element and signature(_MASK if gives_mask else VectorType(element), *args)
+            return element and signature(_MASK if comparison else VectorType(element), *args)
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        element = _element_of(sig.args)
+        element = None if of_masks else _element_of(sig.args)
         x, y = (_as_vector(context, builder, *pair, element) for pair in zip(args, sig.args, strict=True))
-        return compute(builder, x, y)
+        return getattr(builder, method)(*comparison, x, y)
 
-    for left, right in ((VectorType, VectorType), (VectorType, types.Number), (types.Number, VectorType)):
-        lower_builtin(symbol, left, right)(lower)
-
-
-def _compute(name: str) -> Callable[..., Any]:
-    return lambda builder, x, y: getattr(builder, name)(x, y)
+    vectors = (VectorType, VectorType), (VectorType, types.Number), (types.Number, VectorType)
+    for kinds in ((MaskType, MaskType),) if of_masks else vectors:
+        lower_builtin(symbol, *kinds)(lower)
 
 
-def _compare(name: str) -> Callable[..., Any]:
-    return lambda builder, x, y: builder.fcmp_ordered(name, x, y)
-
-
-for _symbol, _name in zip("+-*/", ("fadd", "fsub", "fmul", "fdiv"), strict=True):
-    _register_operator(_OPERATORS[_symbol], _compute(_name), gives_mask=False)
-for _symbol in ("<", "<=", ">", ">="):
-    _register_operator(_OPERATORS[_symbol], _compare(_symbol), gives_mask=True)
-
-
-def _register_mask_operator(symbol: Any, name: str) -> None:
-    @infer_global(symbol)
-    class _Template(AbstractTemplate):
-        def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
-            masks = len(args) == 2 and all(isinstance(kind, MaskType) for kind in args)
-            return signature(_MASK, *args) if masks else None
-
-    @lower_builtin(symbol, MaskType, MaskType)
-    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return getattr(builder, name)(*args)
-
-
-_register_mask_operator(operator.and_, "and_")
-_register_mask_operator(operator.or_, "or_")
+for _symbol, _lowered in {
+    operator.add: ("fadd",),
+    operator.sub: ("fsub",),
+    operator.mul: ("fmul",),
+    operator.truediv: ("fdiv",),
+    operator.lt: ("fcmp_ordered", "<"),
+    operator.le: ("fcmp_ordered", "<="),
+    operator.gt: ("fcmp_ordered", ">"),
+    operator.ge: ("fcmp_ordered", ">="),
+    operator.and_: ("and_",),
+    operator.or_: ("or_",),
+}.items():
+    _register(_symbol, *_lowered)
 
 
 # Memory ---------------------------------------------------------------------------------------------------------------
@@ -446,15 +423,10 @@ def bits(typing: Any, mask: Any) -> Any:
     return types.uint32(mask), generate
 
 
-@intrinsic
-def any_of(typing: Any, mask: Any) -> Any:
+@njit(forceinline=True)
+def any_of(mask: Any) -> bool:
     """Whether some lane of the mask holds."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        whole = ir.IntType(LANES)
-        return builder.icmp_unsigned("!=", builder.bitcast(args[0], whole), ir.Constant(whole, 0))
-
-    return types.boolean(mask), generate
+    return bits(mask) != 0  # type: ignore[no-any-return]
 
 
 @intrinsic
@@ -612,19 +584,6 @@ def zero_many(typing: Any, like: Any, array: Any) -> Any:
         return context.make_tuple(builder, kind, [_number(array.dtype, 0.0)] * kind.count)
 
     return kind(like, array), generate
-
-
-@intrinsic
-def add_scaled(typing: Any, sums: Any, factor: Any, vectors: Any) -> Any:
-    """sums[k] + factor * vectors[k]."""
-    element = sums.dtype.element
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        rows = (cgutils.unpack_tuple(builder, args[i], sums.count) for i in (0, 2))
-        added = [_fma(builder, element, args[1], vector, total) for total, vector in zip(*rows, strict=True)]
-        return context.make_tuple(builder, sums, added)
-
-    return sums(sums, factor, vectors), generate
 
 
 @intrinsic

@@ -16,17 +16,15 @@ from .square import INLINE, OPTIONS, PREFETCH_AHEAD, View, aligned
 
 
 @cached_njit(**OPTIONS)
-def number_slots(band: int, view: View, slots: Any, owners: Any, counts: Any, total: int) -> None:
-    """Number the distinct Gaussians of one band, in order of appearance.
-
-    Args:
-        band: which.
-        view: the tiles.
-        slots: [P], written: the number of each pair's Gaussian.
-        owners: [P], written from the band's first pair on: the Gaussian of each number.
-        counts: [B], written: how many there are.
-        total: M.
-    """
+def number_slots(
+    band: int,
+    view: View,
+    slots: Any,  # [P], written: the number of each pair's Gaussian
+    owners: Any,  # [P], written from the band's first pair on: the Gaussian of each number
+    counts: Any,  # [B], written: how many there are
+    total: int,  # M
+) -> None:
+    """Number the distinct Gaussians of one band, in order of appearance."""
     known = np.full(total, -1, np.int32)
     first, count = view.offsets[view.bounds[band]], 0
     for pair in range(first, view.offsets[view.bounds[band + 1]]):
@@ -66,21 +64,18 @@ def _sum_chain(row: int, following: Any, out: Any, width: int, total: Any) -> No
 
 @cached_njit(**OPTIONS)
 def gather_gradients(
-    band: int, bands: int, splats: Any, chains: Any, out: Any, layout: tuple[int, int, int], index: Any, grads: Any
+    band: int,
+    bands: int,  # one if two Gaussians may show the same row of features
+    splats: Any,  # conics [M * 3] and opacities [M]
+    chains: Any,  # heads and following, from `chain_slots`
+    out: Any,  # gradient rows
+    layout: tuple[int, int, int],  # length of a gradient row, the column where the features begin, and D
+    index: Any,  # [M], the features' row of each Gaussian; empty if row m belongs to Gaussian m
+    grads: Any,  # of means2d [M * 2], conics [M * 3] and opacities [M], written; of features [N * D], added to
 ) -> None:
     """Sum all rows of each Gaussian of one share, and turn moments into gradients.
 
     The power of the density is -0.5 (a dx^2 + 2 b dx dy + c dy^2) with d = pixel - mean, and v its slope.
-
-    Args:
-        band: which share.
-        bands: how many shares; one if two Gaussians may show the same row of features.
-        splats: conics [M * 3] and opacities [M].
-        chains: heads and following, from `chain_slots`.
-        out: gradient rows.
-        layout: length of a gradient row, the column where the features begin, and D.
-        index: [M], the features' row of each Gaussian; empty if row m belongs to Gaussian m.
-        grads: of means2d [M * 2], conics [M * 3] and opacities [M], written; of features [N * D], added to.
     """
     conics, opacities = splats
     heads, following = chains

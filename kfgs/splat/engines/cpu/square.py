@@ -11,13 +11,13 @@ a (dx + (b / a) dy)^2 + (c - b^2 / a) dy^2: both terms are positive, so that nee
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 
 from ..contract import ALPHA_MAX, ALPHA_MIN
-from .bits import WORDS, transpose_bits
 from .cache import cached_njit
 from .simd import (
     LANES,
@@ -65,9 +65,12 @@ STATE = 4 * PIXELS
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 INLINE: dict[str, Any] = OPTIONS | {"forceinline": True}
 
-_LISTED = 32
-"""Gaussians whose bits are listed together."""
+_LISTED, _WORDS = 32, 8
+"""Gaussians whose bits are listed together, and the 64-bit words that hold these."""
 _SIXTEEN_BITS = np.uint64(0xFFFF)
+_1, _2, _4, _8, _16, _32 = (np.uint64(1 << k) for k in range(6))
+_BITS, _PAIRS = np.uint64(0x0000555500005555), np.uint64(0x0000000033333333)
+_NIBBLES, _BYTES = np.uint64(0x0F0F0F0F0F0F0F0F), np.uint64(0x00FF00FF00FF00FF)
 
 LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 _LOG2_E = math.log2(math.e)
@@ -89,18 +92,16 @@ def row_length(channels: int) -> int:
 
 
 @cached_njit(**OPTIONS)
-def pack_rows(band: int, bands: int, splats: Any, features: Any, channels: int, index: Any, rows: Any) -> None:
-    """Pack one share of the Gaussians.
-
-    Args:
-        band: which share.
-        bands: how many shares.
-        splats: means2d [M * 2], conics [M * 3] and opacities [M].
-        features: [N * D].
-        channels: D; 0 if the features stay where they are.
-        index: [M], the features' row of each Gaussian; empty if row m belongs to Gaussian m.
-        rows: [M * row_length(D)], written; 0 beyond the features.
-    """
+def pack_rows(
+    band: int,
+    bands: int,
+    splats: Any,  # means2d [M * 2], conics [M * 3] and opacities [M]
+    features: Any,  # [N * D]
+    channels: int,  # D; 0 if the features stay where they are
+    index: Any,  # [M] the features' row of each Gaussian; empty if row m belongs to Gaussian m
+    rows: Any,  # [M * row_length(D)], written; 0 beyond the features
+) -> None:
+    """Pack one of `bands` equal shares of the Gaussians."""
     means2d, conics, opacities = splats
     count, length = len(opacities), row_length(channels)
     lanes = lanes_below(rows, channels % LANES)
@@ -137,20 +138,60 @@ class View(NamedTuple):
     across: int  # squares along a tile's side, as far as the image reaches
 
 
-@njit(**INLINE)
-def square_box(view: View, tile: int, square: int) -> tuple[int, int, int, int]:
-    """Left, top, right and bottom pixel of a square of a tile, cut off at the tile's and the image's border."""
+class Rows(NamedTuple):
+    """The packed Gaussians, and the tiles' lists of them."""
+
+    values: Any  # [M * length]
+    length: int  # of a row
+    order: Any  # [P] the Gaussians' numbers, tile by tile, front to back
+
+
+class Square(NamedTuple):
+    """The working memory for one square; see `start_square` and `list_hits`."""
+
+    state: Any  # [STATE]
+    corners: Any  # [2 * BLOCKS] x of each block's first pixel centre, then y
+    hits: Any  # [BLOCKS * CHUNK] int32, the places in the list that touch each block
+    counts: Any  # [BLOCKS] int32, how many
+
+
+class Place(NamedTuple):
+    """Where a square lies in the image and in the lists."""
+
+    number: int  # of all squares
+    box: tuple[int, int, int, int]  # left, top, right and bottom pixel, cut off at the tile's and the image's border
+    start: int  # its Gaussians are order[start:end]
+    end: int
+    trace: int  # where its part of the trace begins
+
+
+@njit(**OPTIONS)
+def squares_of(view: View, band: int) -> Iterator[Place]:
+    """The squares of a band's tiles, front to back."""
     columns = (view.width + view.tile_size - 1) // view.tile_size
-    tile_x, tile_y = tile % columns * view.tile_size, tile // columns * view.tile_size
-    left, top = tile_x + square % view.across * SQUARE_SIDE, tile_y + square // view.across * SQUARE_SIDE
-    right = min(left + SQUARE_SIDE, tile_x + view.tile_size, view.width)
-    bottom = min(top + SQUARE_SIDE, tile_y + view.tile_size, view.height)
-    return left, top, right, bottom
+    for tile in range(view.bounds[band], view.bounds[band + 1]):
+        start, end = view.offsets[tile], view.offsets[tile + 1]
+        tile_x, tile_y = tile % columns * view.tile_size, tile // columns * view.tile_size
+        for square in range(view.across**2):
+            left, top = tile_x + square % view.across * SQUARE_SIDE, tile_y + square // view.across * SQUARE_SIDE
+            right = min(left + SQUARE_SIDE, tile_x + view.tile_size, view.width)
+            bottom = min(top + SQUARE_SIDE, tile_y + view.tile_size, view.height)
+            if left < right and top < bottom:
+                trace = start * view.across**2 + square * (end - start)
+                yield Place(tile * view.across**2 + square, (left, top, right, bottom), start, end, trace)
 
 
 @njit(**INLINE)
-def start_square(state: Any, corners: Any, box: tuple[int, int, int, int]) -> Any:
+def make_square(like: Any) -> Square:
+    """Memory for squares of the array's type."""
+    hits, counts = np.empty(BLOCKS * CHUNK, np.int32), np.empty(BLOCKS, np.int32)
+    return Square(aligned(STATE, like), aligned(2 * BLOCKS, like), hits, counts)
+
+
+@njit(**INLINE)
+def start_square(square: Square, box: tuple[int, int, int, int]) -> Any:
     """Place the pixel centres, with no light outside of the box; returns the bits of the blocks without any pixel."""
+    state, corners = square.state, square.corners
     left, top, right, bottom = box
     dark = np.uint32(0)
     for block in range(BLOCKS):
@@ -168,17 +209,11 @@ def start_square(state: Any, corners: Any, box: tuple[int, int, int, int]) -> An
 
 @njit(**INLINE)
 def touched_blocks(rows: Any, at: int, corners: Any, epsilon: Any) -> Any:
-    """Bits of the blocks where alpha may reach ALPHA_MIN, of one packed Gaussian.
+    """Bits of the blocks where alpha may reach ALPHA_MIN, of the packed Gaussian at rows[at:].
 
     The smallest value of the form over the rectangle of a block's pixel centres is compared with that of ALPHA_MIN, all
     blocks at once. The form is convex and 0 at the mean. If the mean lies outside, the minimum is on one of the (at most
-    two) sides that face it: on each, the minimum of a parabola, clamped to the side.
-
-    Args:
-        rows: packed Gaussians.
-        at: where the Gaussian begins.
-        corners: [2 * BLOCKS], x of each block's first pixel centre, then y.
-        epsilon: the rounding unit of the rows' type.
+    two) sides that face it: on each, the minimum of a parabola, clamped to the side. `epsilon` is the type's rounding unit.
     """
     square, lean, rest = fetch(rows, at + SQUARE), fetch(rows, at + LEAN), fetch(rows, at + REST)
     left = load(corners, 0) - fetch(rows, at + MEAN_X)
@@ -210,55 +245,27 @@ def weigh_pixels(rows: Any, at: int, x: Any, y: Any) -> tuple[Any, Any, Any, Any
 
 
 @njit(**INLINE)
-def list_bits(touched: Any, j: int, hits: Any, counts: Any) -> None:
-    """Append place j to the lists of the blocks whose bits are set."""
-    while touched:
-        block = trailing_zeros(touched)
-        touched &= touched - np.uint32(1)
-        number = fetch(counts, block)
-        put(hits, block * CHUNK + number, j)
-        put(counts, block, number + 1)
+def list_hits(rows: Rows, span: tuple[int, int], dark: Any, square: Square, trace: Any, into: int) -> None:
+    """List, for each block of a square, the places in span that touch it, without the blocks whose bits are in `dark`.
 
-
-@njit(**INLINE)
-def list_hits(
-    rows: Any,
-    length: int,
-    order: Any,
-    span: tuple[int, int, int],
-    dark: Any,
-    corners: Any,
-    hits: Any,
-    counts: Any,
-    trace: Any,
-) -> None:
-    """List, for each block that has light, which Gaussians touch it.
-
-    Args:
-        rows: packed Gaussians.
-        length: of a packed row.
-        order: the Gaussians' numbers.
-        span: which places in `order` (first, one past the last), and where the square's trace begins.
-        dark: bits of blocks to leave out.
-        corners: see `touched_blocks`.
-        hits: [BLOCKS * CHUNK] int32, written: places in `order`.
-        counts: [BLOCKS], written.
-        trace: written: the touched blocks' bits of each Gaussian; None: there is no backward pass.
+    The touched blocks' bits of each Gaussian are kept in trace[into:]; None: there is no backward pass.
     """
-    first, stop, into = span
-    epsilon = rows.dtype.type(np.finfo(rows.dtype).eps)
+    values, length, order = rows
+    first, stop = span
+    epsilon = values.dtype.type(np.finfo(values.dtype).eps)
+    hits, counts = square.hits, square.counts
     counts[:] = 0
-    words = np.zeros(WORDS, np.uint64)
+    words = np.zeros(_WORDS, np.uint64)
     for begin in range(first, stop, _LISTED):
         words[:] = 0
         for j in range(begin, min(begin + _LISTED, stop)):
-            prefetch(rows, np.int64(fetch(order, min(j + PREFETCH_AHEAD, stop - 1))) * length)
-            touched = touched_blocks(rows, np.int64(fetch(order, j)) * length, corners, epsilon) & ~dark
+            prefetch(values, np.int64(fetch(order, min(j + PREFETCH_AHEAD, stop - 1))) * length)
+            touched = touched_blocks(values, np.int64(fetch(order, j)) * length, square.corners, epsilon) & ~dark
             if trace is not None:
                 put(trace, into + j - first, touched)
             k = j - begin
             put(words, k // 4, fetch(words, k // 4) | (np.uint64(touched) << np.uint64(k % 4 * BLOCKS)))
-        transpose_bits(words)
+        _transpose_bits(words)
         for block in range(BLOCKS):
             shift = np.uint64(block % 4 * BLOCKS)
             low = (fetch(words, block // 4) >> shift) & _SIXTEEN_BITS
@@ -271,54 +278,27 @@ def list_hits(
             put(counts, block, number)
 
 
-class Picture(NamedTuple):
-    """A map as a flat array."""
-
-    values: Any  # [H * W * D]
-    width: int
-    channels: int
-
-
 @njit(**INLINE)
-def read_block(picture: Picture, box: Any, block: int, channel: int, into: Any, place: int, stride: int) -> None:
-    """Copy LANES channels of a block's pixels; 0 outside of the box and beyond the last channel.
+def _transpose_bits(words: Any) -> None:
+    """Turn the blocks of each of 16 Gaussians into the Gaussians of each of 16 blocks: first for 16 of them, then for 16 more.
 
-    Args:
-        picture: the map.
-        box: left, top, right and bottom of the square.
-        block: which of its blocks.
-        channel: the first channel.
-        into: written: pixel p goes to into[place + p * stride:].
-        place: see `into`.
-        stride: see `into`.
+    Four words hold a square matrix of 16 x 16 bits, row by row, four rows in each. Its off-diagonal quarters change places,
+    then those of each quarter, and so on.
     """
-    values, width, channels = picture
-    lanes = lanes_below(values, channels - channel)
-    left, top = box[0] + block % BLOCK_SIDE * BLOCK_SIDE, box[1] + block // BLOCK_SIDE * BLOCK_SIDE
-    columns, rows = min(box[2] - left, BLOCK_SIDE), min(box[3] - top, BLOCK_SIDE)
-    if columns == BLOCK_SIDE and rows == BLOCK_SIDE:
-        for y in range(BLOCK_SIDE):
-            at = ((top + y) * width + left) * channels + channel
-            for x in range(BLOCK_SIDE):
-                store(into, place + (y * BLOCK_SIDE + x) * stride, load_part(values, at + x * channels, lanes))
-        return
-    for y in range(BLOCK_SIDE):
-        for x in range(BLOCK_SIDE):
-            if x < columns and y < rows:
-                at = ((top + y) * width + left + x) * channels + channel
-                store(into, place + (y * BLOCK_SIDE + x) * stride, load_part(values, at, lanes))
-            else:
-                store(into, place + (y * BLOCK_SIDE + x) * stride, 0)
+    for half in range(0, _WORDS, 4):
+        a, b, c, d = words[half], words[half + 1], words[half + 2], words[half + 3]
+        t, u = ((a >> _8) ^ c) & _BYTES, ((b >> _8) ^ d) & _BYTES
+        a, b, c, d = a ^ (t << _8), b ^ (u << _8), c ^ t, d ^ u
+        t, u = ((a >> _4) ^ b) & _NIBBLES, ((c >> _4) ^ d) & _NIBBLES
+        a, b, c, d = a ^ (t << _4), b ^ t, c ^ (u << _4), d ^ u
+        words[half], words[half + 1] = _transpose_word(a), _transpose_word(b)
+        words[half + 2], words[half + 3] = _transpose_word(c), _transpose_word(d)
 
 
 @njit(**INLINE)
-def write_block(picture: Picture, box: Any, block: int, channel: int, source: Any, place: int, stride: int) -> None:
-    """The inverse of `read_block`: writes nothing outside of the box or beyond the last channel."""
-    values, width, channels = picture
-    lanes = lanes_below(values, channels - channel)
-    left, top = box[0] + block % BLOCK_SIDE * BLOCK_SIDE, box[1] + block // BLOCK_SIDE * BLOCK_SIDE
-    for y in range(min(box[3] - top, BLOCK_SIDE)):
-        at = ((top + y) * width + left) * channels + channel
-        for x in range(min(box[2] - left, BLOCK_SIDE)):
-            vector = load(source, place + (y * BLOCK_SIDE + x) * stride)
-            store_part(values, at + x * channels, lanes, vector)
+def _transpose_word(word: Any) -> Any:
+    """The last two steps, within four rows."""
+    t = ((word >> _2) ^ (word >> _32)) & _PAIRS
+    word = word ^ (t << _2) ^ (t << _32)
+    t = ((word >> _1) ^ (word >> _16)) & _BITS
+    return word ^ (t << _1) ^ (t << _16)

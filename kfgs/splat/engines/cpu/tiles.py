@@ -11,9 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .radix import sort_rows
-from .reach import find_reach
-from .threads import run_bands
+from .threads import find_reach, run_bands
 from .tiles_kernels import find_pairs, list_rows
 
 __all__ = ["bin", "depth_order"]
@@ -29,21 +27,20 @@ def bin(
     depths: Tensor,  # [M]
     opacities: Tensor,  # [M]
     extents: Tensor,  # [M, 2]
-    width: int,
-    height: int,
-    tile_size: int,
+    size: tuple[int, int, int],  # width, height, tile size
 ) -> tuple[Tensor, Tensor]:  # rows [P] int32, offsets [T + 1] int64
     """List the Gaussians of every tile, as `kfgs.splat.bin_tiles` says."""
+    width, height, tile_size = size
     M, tiles = len(depths), -(-width // tile_size) * -(-height // tile_size)
     bands = max(1, -(-M // _SHARE))
     values = (value.detach().view(-1).numpy() for value in (means2d, conics, extents))
     splats = *values, find_reach(opacities)
-    picture, eps = (width, height, tile_size), float(torch.finfo(means2d.dtype).eps)
+    eps = float(torch.finfo(means2d.dtype).eps)
     order, counts = depth_order(depths), np.zeros((bands, tiles), np.int32)
     pairs: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def find(band: int) -> None:
-        pairs[band] = find_pairs(band, bands, order, splats, eps, picture, counts[band])
+        pairs[band] = find_pairs(band, bands, order, splats, eps, size, counts[band])
 
     run_bands(find, bands)
     offsets = np.zeros(tiles + 1, np.int64)
@@ -55,6 +52,15 @@ def bin(
 
 
 def depth_order(depths: Tensor) -> np.ndarray:  # [M] -> [M] int32
-    """The rows by depth; equal depths by row. NaN comes last, as torch sorts."""
+    """The rows by depth; equal depths by row. NaN comes last, as torch sorts.
+
+    A float32's bits (of a number that is not negative they are in the numbers' order) and its row are one uint64, which
+    numpy sorts by vector instructions: a third of the time of a stable sort of the rows.
+    """
     values = depths.detach().numpy()
-    return sort_rows(values.view(np.uint32 if values.itemsize == 4 else np.uint64))
+    if values.dtype != np.float32 or bool((values < 0).any()):
+        return torch.sort(depths.detach(), stable=True).indices.numpy().astype(np.int32)
+    keys = np.abs(values).view(np.uint32).astype(np.uint64) << np.uint64(32)  # -0 is 0
+    keys |= np.arange(len(values), dtype=np.uint64)
+    keys.sort()
+    return keys.astype(np.uint32).view(np.int32)  # the lower half

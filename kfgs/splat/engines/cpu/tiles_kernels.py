@@ -2,13 +2,11 @@
 
 Most Gaussians lie in boxes of at most 2 x 2 tiles. These are tested together: batches of BATCH Gaussians are gathered into
 planes (entry i of plane p is `state[p + i]`), and one loop without branches tests four tiles for 8 or 16 Gaussians at a
-time. In a larger box each row of tiles is first cut to where the ellipse is, so that a long needle costs no more than the
-tiles it crosses.
+time. The tiles of a larger box are tested BATCH at a time.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -22,14 +20,6 @@ _LEFT, _RIGHT, _TOP, _BOTTOM, _HIT = (k * BATCH for k in range(8, 13))  # the bo
 _TILE_X, _TILE_Y, _TOUCHED = (k * BATCH for k in range(16, 19))  # tiles of one Gaussian
 _STATE = 19 * BATCH
 
-_WIDE = 8
-"""A row of more tiles than this is cut to where the ellipse is; testing a shorter one costs less."""
-
-_ROUNDING = 1e-6
-"""Relative, of the float64 arithmetic that cuts a row of tiles."""
-_FLAT, _HUGE = 1e-9, 1e30
-"""No row is cut where the determinant has lost its digits, a c - b^2 <= 1e-9 a c, or for a level beyond 1e30."""
-
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}  # no fused multiply-add: torch rounds each product
 
 
@@ -37,26 +27,15 @@ _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}  # no fused m
 def find_pairs(
     band: int,
     bands: int,
-    order: Any,
-    splats: tuple[Any, Any, Any, Any],
-    eps: float,
-    picture: tuple[int, int, int],
-    counts: Any,
-) -> tuple[Any, Any]:
-    """Find the tiles of one share of the Gaussians.
-
-    Args:
-        band: which.
-        bands: into how many equal shares the M Gaussians are cut.
-        order: [M] int32, rows by depth.
-        splats: means2d [2 M], conics [3 M], extents [2 M] and reach [M], 2 ln(opacity / ALPHA_MIN).
-        eps: of the dtype.
-        picture: width, height and tile size, pixels.
-        counts: [T] int32 of zeros, written: how many Gaussians of this share touch each tile.
-
-    Returns:
-        Tiles and rows, int32, of the pairs, front to back.
-    """
+    order: Any,  # [M] int32, rows by depth
+    splats: tuple[
+        Any, Any, Any, Any
+    ],  # means2d [2 M], conics [3 M], extents [2 M] and reach [M], 2 ln(opacity / ALPHA_MIN)
+    eps: float,  # of the dtype
+    picture: tuple[int, int, int],  # width, height and tile size, pixels
+    counts: Any,  # [T] int32 of zeros, written: how many Gaussians of this share touch each tile
+) -> tuple[Any, Any]:  # tiles and rows, int32, of the pairs, front to back
+    """Find the tiles of one of `bands` equal shares of the Gaussians."""
     width, height, side = picture
     columns = (width + side - 1) // side
     tiles = columns * ((height + side - 1) // side)
@@ -75,15 +54,13 @@ def find_pairs(
 
 
 @cached_njit(**_OPTIONS)
-def list_rows(tiles: Any, which: Any, starts: Any, rows: Any) -> None:
-    """Write the rows of one share's pairs into the tiles' lists.
-
-    Args:
-        tiles: of the pairs, from `find_pairs`.
-        which: the pairs' rows.
-        starts: [T] int64, where the share's part of each tile's list begins; changed.
-        rows: [P] int32, written.
-    """
+def list_rows(
+    tiles: Any,  # of the pairs, from `find_pairs`
+    which: Any,  # the pairs' rows
+    starts: Any,  # [T] int64, where the share's part of each tile's list begins; changed
+    rows: Any,  # [P] int32, written
+) -> None:
+    """Write the rows of one share's pairs into the tiles' lists."""
     for p in range(len(tiles)):
         tile = max(tiles[p], 0)
         at = max(starts[tile], 0)
@@ -168,13 +145,8 @@ def _span(mean: Any, extent: Any, pixels: Any, half: Any, one: Any, per_side: An
 def _touches(form: tuple[Any, Any, Any, Any, Any, Any, Any, Any], left: Any, top: Any, length: Any) -> bool:
     """Whether the form's least value over a square of pixel centres is within its limit; NaN is not.
 
-    See `_touches_tile` of `kfgs.splat.tiles`, whose arithmetic this is.
-
-    Args:
-        form: a, 2 b, c, -b / a, -b / c, reach, the limit's relative slack, and 1.
-        left: of the square, relative to the mean.
-        top: likewise.
-        length: of the square's sides.
+    See `_touches_tile` of `kfgs.splat.tiles`, whose arithmetic this is. The form is a, 2 b, c, -b / a, -b / c, reach, the
+    limit's relative slack, and 1; the square's left and top are relative to the mean.
     """
     a, b2, c, along_x, along_y, reach, slack, one = form
     none = one - one
@@ -185,15 +157,10 @@ def _touches(form: tuple[Any, Any, Any, Any, Any, Any, Any, Any], left: Any, top
     on_x = a * near_x * near_x + b2 * near_x * at_y + c * at_y * at_y
     on_y = a * at_x * at_x + b2 * at_x * near_y + c * near_y * near_y
     known = (lean_x == lean_x) & (lean_y == lean_y) & (on_x == on_x) & (on_y == on_y)
-    limit = _limit(a, b2, c, reach, slack, one, max(-left, right), max(-top, bottom))
-    return known & (min(on_x, on_y) <= limit)
-
-
-@njit(inline="always", **_OPTIONS)
-def _limit(a: Any, b2: Any, c: Any, reach: Any, slack: Any, one: Any, far_x: Any, far_y: Any) -> Any:
-    """2 ln(255 opacity), and what an engine's rounding may add where the form's terms are largest and cancel worst."""
+    # what an engine's rounding may add where the form's terms are largest and cancel worst
+    far_x, far_y = max(-left, right), max(-top, bottom)
     terms = a * far_x * far_x + abs(b2) * far_x * far_y + c * far_y * far_y
-    return reach + slack * (terms + abs(reach) + one)
+    return known & (min(on_x, on_y) <= reach + slack * (terms + abs(reach) + one))
 
 
 @njit(**_OPTIONS)
@@ -222,20 +189,13 @@ def _test_box(
 ) -> int:
     """Append the tiles of the batch's Gaussian k, whose box may be of any size; returns their new number."""
     kind = state.dtype.type
-    half, length, one, slack = kind(0.5), kind(side - 1), kind(1), kind(8 * eps)
+    length, one, slack = kind(side - 1), kind(1), kind(8 * eps)
     x, y, a, b, c = state[_X + k], state[_Y + k], state[_A + k], state[_B + k], state[_C + k]
     form = a, b + b, c, -b / a, -b / c, state[_REACH + k], slack, one
     left, right, top, bottom = box
-    far_x = max(x - (left * side + half), right * side - half - x)
-    far_y = max(y - (top * side + half), bottom * side - half - y)
-    ellipse = 0.0, 0.0, 0.0, 0.0, 0.0
-    if right - left > _WIDE:
-        limit = np.float64(_limit(a, b + b, c, state[_REACH + k], slack, one, kind(far_x), kind(far_y)))
-        ellipse = _enlarge(np.float64(a), np.float64(b), np.float64(c), limit, np.float64(state[_REACH + k]))
     count = 0
     for tile_y in range(top, bottom):
-        start, stop = _cut(ellipse, np.float64(x), tile_y * side + 0.5 - np.float64(y), left, right, side)
-        for tile_x in range(start, stop):
+        for tile_x in range(left, right):
             state[_TILE_X + max(count, 0)], state[_TILE_Y + max(count, 0)] = tile_x, tile_y
             count += 1
             if count == BATCH:
@@ -258,57 +218,3 @@ def _append_touched(
         tiles[max(end, 0)] = int(state[_TILE_Y + i]) * columns + int(state[_TILE_X + i])
         end += state[_TOUCHED + i] > 0
     return end
-
-
-@njit(**_OPTIONS)
-def _enlarge(a: float, b: float, c: float, limit: float, reach: float) -> tuple[float, float, float, float, float]:
-    """The ellipse a x^2 + 2 b x y + c y^2 = level that holds every tile that is touched, given the largest limit of any.
-
-    Returns:
-        a, b, the determinant, the level, and y of the rightmost point; all 0 if rounding leaves them unknown.
-    """
-    det = a * c - b * b
-    # Beyond this level rounding, at most half of what the limit allows for it, cannot bring a tile below the limit.
-    level = (2 * limit - reach) * (1 + _ROUNDING)
-    if not (a > 0 and c > 0 and det > _FLAT * a * c and 0 < level < _HUGE):
-        return 0.0, 0.0, 0.0, 0.0, 0.0
-    lean = -b / c * math.sqrt(c * level / det)
-    return (a, b, det, level, lean) if abs(lean) < _HUGE else (0.0, 0.0, 0.0, 0.0, 0.0)
-
-
-@njit(**_OPTIONS)
-def _cut(
-    ellipse: tuple[float, float, float, float, float], x: float, top: float, left: int, right: int, side: int
-) -> tuple[int, int]:
-    """Cut a row of tiles, [left, right), to those that the ellipse touches.
-
-    At height d_y over the mean the ellipse reaches from (-b d_y - root) / a to (-b d_y + root) / a with
-    root^2 = a level - d_y^2 det. Its rightmost point is at d_y = lean, its leftmost at -lean; where these lie beside the
-    row, the row's points furthest right and left are on the side that is nearer.
-
-    Args:
-        ellipse: from `_enlarge`.
-        x: of the mean, pixels.
-        top: the row's first pixel centres, relative to the mean.
-        left: first tile.
-        right: one past the last tile.
-        side: of a tile, pixels.
-    """
-    a, b, det, level, lean = ellipse
-    if not det > 0:
-        return left, right
-    bottom = top + (side - 1)
-    high, low = min(max(lean, top), bottom), min(max(-lean, top), bottom)
-    root_high, root_low = a * level - high * high * det, a * level - low * low * det
-    if not (root_high >= 0 and root_low >= 0):
-        return left, left
-    reach_right = (-b * high + math.sqrt(root_high)) / a
-    reach_left = (-b * low - math.sqrt(root_low)) / a
-    begin = (x + reach_left - _ROUNDING * (1 + abs(reach_left)) + 0.5 - side) / side  # its last pixel centre
-    end = (x + reach_right + _ROUNDING * (1 + abs(reach_right)) - 0.5) / side  # its first
-    start, stop = left, right
-    if begin > left:
-        start = math.ceil(min(begin, np.float64(right)))
-    if end < right - 1:
-        stop = int(max(end, -1.0) + 1)
-    return start, stop

@@ -7,7 +7,7 @@ the registers: 4 x 4 vectors, so that 8 loads feed 16 multiplications. Channels 
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -16,7 +16,6 @@ from ..contract import ALPHA_MAX, TRANSMITTANCE_MIN
 from .simd import (
     LANES,
     add_outer,
-    add_scaled,
     any_of,
     fetch,
     lanes_below,
@@ -32,6 +31,7 @@ from .simd import (
     store,
     store_many,
     sum_many,
+    trailing_zeros,
     zero_many,
 )
 from .square import (
@@ -42,10 +42,11 @@ from .square import (
     INLINE,
     LIGHT,
     PIXELS,
+    Rows,
+    Square,
     X,
     Y,
     aligned,
-    list_bits,
     list_hits,
     weigh_pixels,
 )
@@ -61,51 +62,56 @@ def padded_length(channels: int) -> int:
     return -(-channels // LANES) * LANES
 
 
+class Source(NamedTuple):
+    """The features, which stay where they are."""
+
+    values: Any  # [N * D]
+    begins: Any  # [M], where each Gaussian's row begins: its number times D, by way of the index
+    channels: int  # D
+
+
+class Kept(NamedTuple):
+    """What `weigh_block` keeps of the Gaussians that a block draws; room for three more, for products take four at a time."""
+
+    weights: Any  # [(CHUNK + 3) * LANES]
+    ratios: Any  # the same of alpha / (1 - alpha), 0 where alpha has no gradient
+    places: Any  # [CHUNK] in the list
+    begins: Any  # [CHUNK] in the features
+
+
 @njit(**INLINE)
-def make_kept(like: Any) -> tuple[Any, Any, Any, Any]:
-    """Room for what `weigh_block` keeps; three more, because products take four Gaussians at a time."""
+def make_kept(like: Any) -> Kept:
+    """Memory of the array's type."""
     numbers = aligned(2 * (CHUNK + 3) * LANES, like)
-    places = np.empty(2 * CHUNK, np.int64)
-    return numbers[: (CHUNK + 3) * LANES], numbers[(CHUNK + 3) * LANES :], places[:CHUNK], places[CHUNK:]
+    half = (CHUNK + 3) * LANES
+    return Kept(numbers[:half], numbers[half:], np.empty(CHUNK, np.int64), np.empty(CHUNK, np.int64))
 
 
 @njit(**INLINE)
-def weigh_block(
-    packed: Any, block: int, state: Any, hits: Any, count: int, sources: Any, kept: Any
-) -> tuple[int, bool]:
+def weigh_block(rows: Rows, block: int, square: Square, begins: Any, kept: Kept) -> tuple[int, bool]:
     """Composite the listed Gaussians into a block's transmittance, keeping those that are drawn.
-
-    Args:
-        packed: rows, their length, and the list of the Gaussians' numbers.
-        block: which.
-        state: the square's planes; LIGHT and FINAL move on.
-        hits: see `list_hits`.
-        count: Gaussians listed for the block.
-        sources: where in the features each Gaussian's row begins: its number times D, by way of the index.
-        kept: written: weights and ratios alpha / (1 - alpha) [CHUNK * LANES] (a ratio is 0 where alpha has no gradient),
-            places in the list and places in the features [CHUNK].
 
     Returns:
         How many Gaussians are drawn, and whether some pixel has not stopped.
     """
-    rows, length, order = packed
-    weights, ratios, places, begins = kept
+    values, length, order = rows
+    state = square.state
     p, listed, drawn_count = block * LANES, block * CHUNK, 0
     x, y, light, final = load(state, X + p), load(state, Y + p), load(state, LIGHT + p), load(state, FINAL + p)
-    for k in range(count):
-        j = np.int64(fetch(hits, listed + k))
+    for k in range(square.counts[block]):
+        j = np.int64(fetch(square.hits, listed + k))
         number = np.int64(fetch(order, j))
-        _, _, full, alpha = weigh_pixels(rows, number * length, x, y)
+        _, _, full, alpha = weigh_pixels(values, number * length, x, y)
         weight = alpha * light
         clear = 1 - alpha
         light = light * clear
         drawn = light >= TRANSMITTANCE_MIN
         weight = select(drawn, weight, 0)
         final = select(drawn, light, final)
-        store(weights, drawn_count * LANES, weight)
-        store(ratios, drawn_count * LANES, select(drawn & (full <= ALPHA_MAX), alpha * reciprocal(clear), 0))
-        put(places, drawn_count, j)
-        put(begins, drawn_count, fetch(sources, number))
+        store(kept.weights, drawn_count * LANES, weight)
+        store(kept.ratios, drawn_count * LANES, select(drawn & (full <= ALPHA_MAX), alpha * reciprocal(clear), 0))
+        put(kept.places, drawn_count, j)
+        put(kept.begins, drawn_count, fetch(begins, number))
         if any_of(weight > 0):
             drawn_count += 1
     store(state, LIGHT + p, light)
@@ -115,21 +121,16 @@ def weigh_block(
 
 @njit(**INLINE)
 def add_colors(
-    sums: Any, into: int, stride: int, weights: Any, features: Any, begins: Any, count: int, channels: int, fresh: bool
+    sums: Any,  # rows of `stride` numbers, one per pixel; the block's begin at `into`
+    into: int,
+    stride: int,
+    kept: Kept,
+    source: Source,
+    count: int,  # Gaussians
+    fresh: bool,  # whether there is nothing in `sums` yet
 ) -> None:
-    """sums[pixel, c] += weights[k, pixel] features[k, c] for a block's 16 pixels.
-
-    Args:
-        sums: rows of `stride` numbers, one per pixel.
-        into: where the block's first row begins.
-        stride: between rows.
-        weights: [count, LANES].
-        features: flat.
-        begins: [count], where in `features` each Gaussian's row begins.
-        count: Gaussians.
-        channels: D.
-        fresh: whether there is nothing in `sums` yet.
-    """
+    """sums[pixel, c] += weights[k, pixel] features[k, c] for a block's 16 pixels."""
+    weights, begins, features, channels = kept.weights, kept.begins, source.values, source.channels
     whole = channels // STEP * STEP
     for pixel in range(0, LANES, 4):
         row = into + pixel * stride
@@ -171,28 +172,27 @@ def store_tile(values: Any, start: int, stride: int, tile: Any) -> None:
 
 @njit(**INLINE)
 def composite_square(
-    packed: Any, span: tuple[int, int, int], state: Any, dark: Any, wide: Any, scratch: Any, trace: Any
+    rows: Rows,
+    span: tuple[int, int, int],  # where the square's list begins and ends, and where its trace begins
+    square: Square,
+    dark: Any,  # bits of blocks without pixels
+    source: Source,
+    sums: Any,  # [PIXELS, padded D] in the order of blocks, written
+    kept: Kept,
+    trace: Any,  # written: bits of the blocks that each Gaussian touches; None: there is no backward pass
 ) -> tuple[int, Any]:
-    """Composite a square's Gaussians; returns where in the list it stopped, and a bit mask of the blocks with sums.
-
-    The arguments are those of `narrow.composite_square`, but `wide` is features (flat), where each Gaussian's row begins,
-    and D; `scratch` is corners, sums [PIXELS, padded D] in the order of blocks, kept (see `weigh_block`), hits and counts.
-    """
-    rows, length, order = packed
-    features, sources, channels = wide
+    """Composite a square's Gaussians; returns where in the list it stopped, and a bit mask of the blocks with sums."""
     start, end, into = span
-    corners, sums, kept, hits, counts = scratch
-    stride = padded_length(channels)
+    stride = padded_length(source.channels)
     position, filled = start, np.uint32(0)
     while position < end and dark != ALL_BLOCKS:
         stop = min(position + CHUNK, end)
-        list_hits(rows, length, order, (position, stop, into + position - start), dark, corners, hits, counts, trace)
+        list_hits(rows, (position, stop), dark, square, trace, into + position - start)
         for block in range(BLOCKS):
-            if counts[block]:
+            if square.counts[block]:
                 bit = np.uint32(1) << np.uint32(block)
-                count, lit = weigh_block(packed, block, state, hits, counts[block], sources, kept)
-                place, fresh = block * LANES * stride, (filled & bit) == 0
-                add_colors(sums, place, stride, kept[0], features, kept[3], count, channels, fresh)
+                count, lit = weigh_block(rows, block, square, source.begins, kept)
+                add_colors(sums, block * LANES * stride, stride, kept, source, count, (filled & bit) == 0)
                 filled |= bit
                 if not lit:
                     dark |= bit
@@ -202,64 +202,52 @@ def composite_square(
 
 @njit(**INLINE)
 def differentiate_square(
-    packed: Any,
-    span: tuple[int, int, int],
-    state: Any,
-    wide: Any,
-    grads: Any,
-    planes: Any,
-    scratch: Any,
-    trace: Any,
-    slots: Any,
-    out: Any,
-    geometry: bool,
+    rows: Rows,
+    span: tuple[
+        int, int, int
+    ],  # where the square's list begins, where the forward pass was done, where its trace begins
+    square: Square,
+    source: Source,
+    grads: Any,  # [PIXELS, padded D] the loss's gradient in the maps, in the order of blocks, 0 outside of the image
+    planes: Any,  # the loss that comes from what is still behind, then the slope in a weight apart from its features
+    kept: Kept,
+    slopes: Any,  # [(CHUNK + 3) * LANES], scratch
+    trace: Any,  # bits of the blocks that each Gaussian may be drawn in
+    slots: Any,  # the row of `out` of each place in the list
+    out: Any,  # gradient rows: LANES numbers, of which the first are the moments, then padded D
+    geometry: bool,  # whether the moments are wanted
 ) -> None:
-    """Add the gradients of one square's pixels to the rows of its Gaussians.
-
-    Args:
-        packed: rows, their length, and the list of the Gaussians' numbers.
-        span: where the square's list begins, where the forward pass was done, and where its trace begins.
-        state: the square's planes, see `start_square`.
-        wide: features (flat), where each Gaussian's row begins, and D.
-        grads: the loss's gradient in the maps, [PIXELS, padded D] in the order of blocks, 0 outside of the image.
-        planes: the loss that comes from what is still behind, then the slope in a weight apart from its features.
-        scratch: kept, see `weigh_block`; slopes [(CHUNK + 3) * LANES]; hits; counts.
-        trace: the blocks that each Gaussian may be drawn in.
-        slots: the row of `out` of each place in the list.
-        out: gradient rows: LANES numbers, of which the first are the moments, then padded D.
-        geometry: whether the moments are wanted.
-    """
-    features, _, channels = wide
-    kept, slopes, hits, counts = scratch
+    """Add the gradients of one square's pixels to the rows of its Gaussians."""
     start, end, into = span
-    stride = padded_length(channels)
+    stride = padded_length(source.channels)
+    hits, counts = square.hits, square.counts
     for position in range(start, end, CHUNK):
-        stop = min(position + CHUNK, end)
-        list_traced(position, stop, into - start, hits, counts, trace)
+        counts[:] = 0
+        for j in range(position, min(position + CHUNK, end)):  # list again what the forward pass found
+            touched = np.uint32(fetch(trace, into + j - start))
+            while touched:
+                block = trailing_zeros(touched)
+                touched &= touched - np.uint32(1)
+                number = fetch(counts, block)
+                put(hits, block * CHUNK + number, j)
+                put(counts, block, number + 1)
         for block in range(BLOCKS):
             if counts[block] == 0:
                 continue
-            count, _ = weigh_block(packed, block, state, hits, counts[block], wide[1], kept)
+            count, _ = weigh_block(rows, block, square, source.begins, kept)
             corner = block * LANES * stride
             if geometry:
-                multiply_features(slopes, features, kept[3], grads, corner, stride, count, channels)
-                add_moments(packed, block, state, planes, kept, slopes, count, slots, LANES + stride, out)
+                multiply_features(slopes, source, kept.begins, grads, corner, stride, count)
+                add_moments(rows, block, square.state, planes, kept, slopes, count, slots, LANES + stride, out)
             add_features(out, LANES + stride, slots, kept, grads, corner, stride, count)
 
 
 @njit(**INLINE)
-def list_traced(first: int, stop: int, into: int, hits: Any, counts: Any, trace: Any) -> None:
-    """List again, for each block, the Gaussians that the forward pass found to touch it."""
-    counts[:] = 0
-    for j in range(first, stop):
-        list_bits(np.uint32(fetch(trace, into + j)), j, hits, counts)
-
-
-@njit(**INLINE)
 def multiply_features(
-    slopes: Any, features: Any, begins: Any, grads: Any, corner: int, stride: int, count: int, channels: int
+    slopes: Any, source: Source, begins: Any, grads: Any, corner: int, stride: int, count: int
 ) -> None:
     """slopes[k, pixel] = sum_c features[k, c] grads[pixel, c] for a block's 16 pixels, 4 Gaussians at a time."""
+    features, channels = source.values, source.channels
     for k in range(0, count, 4):
         last = count - 1
         four = (
@@ -298,11 +286,11 @@ def _multiply_quad(features: Any, four: Any, grads: Any, row: int, stride: int, 
 
 @njit(**INLINE)
 def add_moments(
-    packed: Any,
+    rows: Rows,
     block: int,
     state: Any,
     planes: Any,
-    kept: Any,
+    kept: Kept,
     slopes: Any,
     count: int,
     slots: Any,
@@ -310,7 +298,7 @@ def add_moments(
     out: Any,
 ) -> None:
     """Add the sums of v, v dx, v dy, v dx^2, v dx dy, v dy^2 over a block to the Gaussians' rows, front to back."""
-    rows, length, order = packed
+    values, length, order = rows
     weights, ratios, places, _ = kept
     p = block * LANES
     x, y = load(state, X + p), load(state, Y + p)
@@ -318,7 +306,7 @@ def add_moments(
     for k in range(count):
         j = np.int64(fetch(places, k))
         at = np.int64(fetch(order, j)) * length
-        dx, dy = x - fetch(rows, at), y - fetch(rows, at + 1)
+        dx, dy = x - fetch(values, at), y - fetch(values, at + 1)
         own = load(weights, k * LANES) * (load(slopes, k * LANES) + share)
         behind = behind - own
         ratio = load(ratios, k * LANES)
@@ -331,7 +319,9 @@ def add_moments(
 
 
 @njit(**INLINE)
-def add_features(out: Any, width: int, slots: Any, kept: Any, grads: Any, corner: int, stride: int, count: int) -> None:
+def add_features(
+    out: Any, width: int, slots: Any, kept: Kept, grads: Any, corner: int, stride: int, count: int
+) -> None:
     """out[k, c] += weights[k, pixel] grads[pixel, c], summed over a block's 16 pixels, 4 Gaussians at a time."""
     weights, _, places, _ = kept
     whole = stride // STEP * STEP
@@ -366,4 +356,4 @@ def add_features(out: Any, width: int, slots: Any, kept: Any, grads: Any, corner
 @njit(**INLINE)
 def _add_vectors(out: Any, place: int, vectors: Any) -> None:
     """Add neighbouring vectors to what is there."""
-    store_many(out, place, LANES, add_scaled(vectors, spread(out, 1), load_many(vectors, out, place, LANES)))
+    store_many(out, place, LANES, add_outer(vectors, (spread(out, 1),), load_many(vectors, out, place, LANES)))

@@ -9,7 +9,6 @@ With TRITON_INTERPRET=1 in the environment before triton is imported, the same k
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, NamedTuple
 
@@ -17,12 +16,10 @@ import torch
 import triton
 from torch import Tensor
 
-from ..contract import Composited, Ranked, Splats, Tiles
+from ..contract import CompiledEngine, Composited, Ranked, Splats, Tiles
 from .kernels import accumulate_kernel, composite_kernel
 from .kernels_backward import differentiate_kernel
 from .kernels_rank import rank_kernel
-
-__all__ = ["accumulate", "backward", "devices", "forward", "rank"]
 
 INTERPRETED = not isinstance(composite_kernel, triton.JITFunction)
 """Whether triton interprets the kernels. They then run in numpy, on the CPU."""
@@ -62,121 +59,97 @@ SMALLEST = 16
 MOST_RANKED = 64
 """Most channels that a pixel keeps in registers; for more of them the map is sorted."""
 
-DTYPES = (torch.float32,)
-PROOFS = ("cpu",)
-"""Where the engine runs only to show that it is right: triton's interpreter is slow."""
 
+class TritonEngine(CompiledEngine):
+    """The engine that `kfgs.splat` takes on a GPU."""
 
-def devices() -> tuple[str, ...]:
-    """Device types the engine runs on: "cuda", and "cpu" where triton interprets."""
-    return ("cuda", "cpu") if INTERPRETED else ("cuda",)
+    devices = ("cuda", "cpu") if INTERPRETED else ("cuda",)
+    dtypes = (torch.float32,)
 
+    def forward(self, splats: Splats, tiles: Tiles) -> Composited:
+        """Composite as the contract says.
 
-def forward(splats: Splats, tiles: Tiles) -> Composited:
-    """Composite as the contract says.
-
-    The trace, [2 * H * W], is how many Gaussians of its tile's list each pixel passed before it stopped, and the
-    bits of its final transmittance, of which 1 - alpha would keep few digits behind what is opaque.
-
-    Raises:
-        ValueError: if the tensors are not float32, or not on a device that the kernels run on.
-    """
-    means2d, conics, opacities, features, background, index = splats
-    rows, offsets, width, height, tile_size = tiles
-    _check(means2d=means2d, conics=conics, opacities=opacities, features=features, background=background)
-    D = features.shape[1]
-    maps, alphas = features.new_empty(height, width, D), features.new_empty(height, width)
-    trace = torch.empty(2, height, width, dtype=torch.int32, device=features.device)
-    stops, lights = trace[0], trace[1].view(torch.float32)
-    if len(rows) == 0:
-        stops.zero_()
-        lights.fill_(1.0)
-        return Composited(maps.copy_(background.expand_as(maps)), alphas.zero_(), trace.view(-1))
-    options = launch_options("composite", D, tile_size)
-    grid = _programs(options, tiles), -(-D // options["BLOCK"])
-    with _on(means2d):
-        composite_kernel[grid](
-            means2d, conics, opacities, features, background, index, rows, offsets,
-            maps, alphas, stops, lights, width, height, tiles.grid[1], D, **options,
-        )  # fmt: skip
-    return Composited(maps, alphas, trace.view(-1))
-
-
-def backward(
-    grads: Sequence[Tensor], wanted: Sequence[bool], splats: Splats, tiles: Tiles, result: Composited
-) -> list[Tensor]:
-    """Gradients as the contract says, given those in the maps and in the alphas.
-
-    Raises:
-        ValueError: as `forward`.
-    """
-    (grad_maps, grad_alphas), (maps, alphas, trace) = grads, result
-    means2d, conics, opacities, features, background, index = splats
-    rows, offsets, width, height, tile_size = tiles
-    _check(grad_maps=grad_maps, grad_alphas=grad_alphas, means2d=means2d, features=features)
-    of_splats, of_features = any(wanted[:3]), bool(wanted[3])
-    trace = trace.view(2, height, width)
-    stops, lights = trace[0], trace[1].view(torch.float32)
-    computed = (of_splats, of_splats, of_splats, of_features)
-    found = [torch.zeros_like(v) if c else v.new_empty(0) for v, c in zip(splats[:4], computed, strict=True)]
-    if (of_splats or of_features) and len(rows):
+        The trace, [2 * H * W], is how many Gaussians of its tile's list each pixel passed before it stopped, and the
+        bits of its final transmittance, of which 1 - alpha would keep few digits behind what is opaque.
+        """
+        means2d, conics, opacities, features, background, index = splats
+        rows, offsets, width, height, tile_size = tiles
         D = features.shape[1]
-        options = launch_options("differentiate", D, tile_size)
-        with _on(means2d):
-            differentiate_kernel[(_programs(options, tiles),)](
-                means2d, conics, opacities, features, index, rows, offsets, maps, alphas, stops,
-                grad_maps.contiguous(), grad_alphas.contiguous(), *found,
-                width, height, tiles.grid[1], D, **options, OF_SPLATS=of_splats, OF_FEATURES=of_features,
-            )  # fmt: skip
-    found.append(torch.einsum("hwd,hw->d", grad_maps, lights) if wanted[4] else background.new_empty(0))
-    return [grad if want else grad.new_empty(0) for grad, want in zip(found, wanted, strict=True)]
-
-
-def accumulate(
-    means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Tensor, tiles: Tiles
-) -> tuple[Tensor, Tensor]:  # sums [M, D], weights [M]
-    """Sum pixels into the Gaussians by compositing weight, in one walk.
-
-    Raises:
-        ValueError: as `forward`.
-    """
-    _check(means2d=means2d, conics=conics, opacities=opacities, pixels=pixels)
-    rows, offsets, width, height, tile_size = tiles
-    M, D = len(opacities), pixels.shape[2]
-    sums, weights = pixels.new_zeros(M, D), pixels.new_zeros(M)
-    if len(rows):
-        options = launch_options("accumulate", D, tile_size)
+        maps, alphas = features.new_empty(height, width, D), features.new_empty(height, width)
+        trace = torch.empty(2, height, width, dtype=torch.int32, device=features.device)
+        stops, lights = trace[0], trace[1].view(torch.float32)
+        if len(rows) == 0:
+            stops.zero_()
+            lights.fill_(1.0)
+            return Composited(maps.copy_(background.expand_as(maps)), alphas.zero_(), trace.view(-1))
+        options = launch_options("composite", D, tile_size)
         grid = _programs(options, tiles), -(-D // options["BLOCK"])
         with _on(means2d):
-            accumulate_kernel[grid](
-                means2d, conics, opacities, pixels.contiguous(), rows, offsets, sums, weights,
-                width, height, tiles.grid[1], D, **options,
+            composite_kernel[grid](
+                means2d, conics, opacities, features, background, index, rows, offsets,
+                maps, alphas, stops, lights, width, height, tiles.grid[1], D, **options,
             )  # fmt: skip
-    return sums, weights
+        return Composited(maps, alphas, trace.view(-1))
+
+    def backward(
+        self, grads: tuple[Tensor, Tensor], wanted: list[bool], splats: Splats, tiles: Tiles, result: Composited
+    ) -> list[Tensor | None]:
+        (grad_maps, grad_alphas), (maps, alphas, trace) = grads, result
+        means2d, conics, opacities, features, _, index = splats
+        rows, offsets, width, height, tile_size = tiles
+        of_splats, of_features = any(wanted[:3]), bool(wanted[3])
+        trace = trace.view(2, height, width)
+        stops, lights = trace[0], trace[1].view(torch.float32)
+        computed = (of_splats, of_splats, of_splats, of_features)
+        found = [torch.zeros_like(v) if c else v.new_empty(0) for v, c in zip(splats[:4], computed, strict=True)]
+        if (of_splats or of_features) and len(rows):
+            D = features.shape[1]
+            options = launch_options("differentiate", D, tile_size)
+            with _on(means2d):
+                differentiate_kernel[(_programs(options, tiles),)](
+                    means2d, conics, opacities, features, index, rows, offsets, maps, alphas, stops,
+                    grad_maps, grad_alphas, *found,
+                    width, height, tiles.grid[1], D, **options, OF_SPLATS=of_splats, OF_FEATURES=of_features,
+                )  # fmt: skip
+        found.append(torch.einsum("hwd,hw->d", grad_maps, lights))
+        return [grad if want else None for grad, want in zip(found, wanted, strict=True)]
+
+    def accumulate(
+        self, means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Tensor, tiles: Tiles
+    ) -> tuple[Tensor, Tensor]:
+        rows, offsets, width, height, tile_size = tiles
+        M, D = len(opacities), pixels.shape[2]
+        sums, weights = pixels.new_zeros(M, D), pixels.new_zeros(M)
+        if len(rows):
+            options = launch_options("accumulate", D, tile_size)
+            grid = _programs(options, tiles), -(-D // options["BLOCK"])
+            with _on(means2d):
+                accumulate_kernel[grid](
+                    means2d, conics, opacities, pixels, rows, offsets, sums, weights,
+                    width, height, tiles.grid[1], D, **options,
+                )  # fmt: skip
+        return sums, weights
+
+    def rank(self, splats: Splats, tiles: Tiles, top: int, early: bool) -> Ranked:
+        """The best channels of each pixel, as the contract says; `early` makes no difference."""
+        means2d, conics, opacities, features, _, index = splats
+        rows, offsets, width, height, tile_size = tiles
+        if top > MOST_RANKED:
+            return super().rank(splats, tiles, top, early)
+        labels = torch.full((height, width, top), -1, dtype=torch.int64, device=features.device)
+        scores, alphas = features.new_zeros(height, width, top), features.new_zeros(height, width)
+        if len(rows):
+            D = features.shape[1]
+            options = launch_options("rank", D, tile_size) | {"TOP": triton.next_power_of_2(top)}
+            with _on(means2d):
+                rank_kernel[(_programs(options, tiles),)](
+                    means2d, conics, opacities, features, index, rows, offsets, labels, scores, alphas,
+                    width, height, tiles.grid[1], D, top, **options,
+                )  # fmt: skip
+        return Ranked(labels, scores, alphas)
 
 
-def rank(splats: Splats, tiles: Tiles, top: int, early: bool) -> Ranked:
-    """The best channels of each pixel, as the contract says; `early` makes no difference.
-
-    Raises:
-        ValueError: as `forward`.
-    """
-    means2d, conics, opacities, features, _, index = splats
-    rows, offsets, width, height, tile_size = tiles
-    _check(means2d=means2d, conics=conics, opacities=opacities, features=features)
-    if top > MOST_RANKED:
-        return Ranked.of_map(*forward(splats, tiles)[:2], top)
-    labels = torch.full((height, width, top), -1, dtype=torch.int64, device=features.device)
-    scores, alphas = features.new_zeros(height, width, top), features.new_zeros(height, width)
-    if len(rows):
-        D = features.shape[1]
-        options = launch_options("rank", D, tile_size) | {"TOP": triton.next_power_of_2(top)}
-        with _on(means2d):
-            rank_kernel[(_programs(options, tiles),)](
-                means2d, conics, opacities, features, index, rows, offsets, labels, scores, alphas,
-                width, height, tiles.grid[1], D, top, **options,
-            )  # fmt: skip
-    return Ranked(labels, scores, alphas)
+ENGINE = TritonEngine()
 
 
 def launch_options(kernel: str, channels: int, tile_size: int) -> dict[str, Any]:
@@ -209,17 +182,3 @@ def _programs(options: dict[str, Any], tiles: Tiles) -> int:
 def _on(tensor: Tensor) -> AbstractContextManager[Any]:
     """Triton launches on the current GPU: make it the tensor's."""
     return torch.cuda.device(tensor.device) if tensor.is_cuda else nullcontext()
-
-
-def _check(**tensors: Tensor) -> None:
-    for name, value in tensors.items():
-        if value.dtype != torch.float32:
-            raise ValueError(
-                f"{name}: expected torch.float32 for engine 'triton', got {value.dtype}; convert it with "
-                ".to(torch.float32), or use engine='numba' or engine='reference'"
-            )
-        if value.device.type not in devices():
-            raise ValueError(
-                f"{name}: expected a tensor on {' or '.join(devices())} for engine 'triton', got one on {value.device}; "
-                "move it with .to('cuda'), or set TRITON_INTERPRET=1 before Python starts"
-            )

@@ -1,4 +1,4 @@
-"""The compiled SSIM: borders of shares and pictures, and bits that do not depend on threads."""
+"""The compiled losses: odd sizes, unknown pixels, borders of shares, and bits that do not depend on threads."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from oracles_color import ssim_windows
 
 pytest.importorskip("numba")
 
-from kfgs.splat.engines.cpu.ssim import similarity
+from kfgs.splat.engines.cpu.losses import absolute, similarity
 
 CONSTANTS = 0.01**2, 0.03**2
 
@@ -77,3 +77,20 @@ def test_flat_pictures_are_finite():
     value, _, slope = similarity(black, black, None, window(black.dtype), CONSTANTS)
     assert float(value) == pytest.approx(1.0)
     assert not slope.any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("unknown", [0.0, 0.01, 0.5, 1.0])
+@pytest.mark.parametrize("size", [(1, 1, 1), (3, 5, 9), (130, 150, 3), (64, 40, 64)])
+def test_absolute_difference_and_gradient(size, unknown, dtype):
+    g = torch.Generator().manual_seed(size[0])
+    a, b = (torch.randn(size, generator=g, dtype=dtype) for _ in range(2))
+    a[::3] = b[::3]  # no difference: no slope
+    b[torch.rand(size[:2], generator=g) < unknown, 0] = torch.nan
+    leaf, known = a.clone().requires_grad_(), ~b.isnan().any(dim=2, keepdim=True)
+    expected = torch.where(known, leaf - b, 0).abs().sum() / (known.sum() * size[2]).clamp_min(1)
+    expected.backward()
+    value, slope = absolute(a, b)
+    rtol = 1e-5 if dtype == torch.float32 else 1e-12
+    torch.testing.assert_close(value, expected.detach(), rtol=rtol, atol=0)
+    torch.testing.assert_close(slope, leaf.grad, rtol=rtol, atol=0)

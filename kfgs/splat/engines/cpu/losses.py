@@ -1,6 +1,8 @@
-"""SSIM of two pictures, their mean absolute difference, and the gradient of a mixture of both, compiled by numba.
+"""The compiled losses of training: mean absolute difference, SSIM, and their gradients.
 
-Channels stay side by side, so a vector holds neighbouring numbers. Each row of windows is blurred downwards, then along;
+Not part of an engine: `kfgs.splat.engines.table.compiled_losses` gives this module to who trains or decodes on a CPU.
+
+In SSIM channels stay side by side, so a vector holds neighbouring numbers. Each row of windows is blurred downwards, then along;
 the gradient takes the same two steps back. A blurred row stays in cache. No two shares of rows write the same memory.
 """
 
@@ -14,9 +16,11 @@ from numba import njit
 from torch import Tensor
 
 from .cache import cached_njit
-from .memory import take_memory
+from .memory import flat, take_memory
+from .perceptron import decide
 from .simd import (
     LANES,
+    bits,
     fetch,
     fma,
     lanes_below,
@@ -33,36 +37,80 @@ from .simd import (
 from .square import INLINE, OPTIONS, aligned
 from .threads import run_bands
 
-__all__ = ["similarity"]
+__all__ = ["absolute", "decide", "similarity"]
 
 WINDOW = 11
 """Pixels of the Gaussian window's side."""
 
 _LAST = WINDOW - 1
-_BAND = 32  # rows of a share
+_BAND = 32  # rows of a share of SSIM
+_SHARE = 8192  # pixels of a share of the absolute difference
+_ALL = np.uint32(0xFFFF)
+
+
+@torch.no_grad()
+def absolute(
+    picture: Tensor,  # [H, W, D] contiguous, float32 or float64 on the CPU
+    target: Tensor,  # [H, W, D] likewise; a pixel with NaN in a channel is unknown and does not count
+) -> tuple[Tensor, Tensor]:  # [], [H, W, D]
+    """The mean of |picture - target| over the known pixels' channels (0 if none is known), and its gradient in `picture`."""
+    channels, pixels = picture.shape[2], picture.shape[0] * picture.shape[1]
+    a, out, bands = flat(picture), take_memory(picture, *picture.shape), max(1, -(-pixels // _SHARE))
+    sums, counts = np.zeros(bands), np.zeros(bands, np.int64)
+    slope = a.dtype.type(1 / max(1, len(a)))
+    run_bands(absolute_band, bands, bands, a, flat(target), channels, slope, flat(out), sums, counts)
+    known = max(1, int(counts.sum()))
+    if known < pixels:
+        out *= pixels / known
+    return picture.new_tensor(sums.sum() / (known * channels)), out
+
+
+@cached_njit(**OPTIONS)
+def absolute_band(
+    band: int,
+    bands: int,
+    picture: Any,  # [H W D]
+    target: Any,  # [H W D]
+    channels: int,
+    slope: Any,  # of a positive difference
+    out: Any,  # [H W D], written: slope, -slope or 0
+    sums: Any,  # [bands], written: of the absolute differences
+    counts: Any,  # [bands], written: known pixels
+) -> None:
+    """A share of the pixels."""
+    pixels = len(out) // channels
+    for pixel in range(pixels * band // bands, pixels * (band + 1) // bands):
+        first, last = pixel * channels, (pixel + 1) * channels
+        apart, nothing, known = spread(out, 0), spread(out, 0), True
+        for at in range(first, last, LANES):
+            inside = lanes_below(out, last - at)
+            a, b = load_part(picture, at, inside), load_part(target, at, inside)
+            difference = a - b
+            apart = apart + maximum(difference, b - a)
+            known = known and bits(b <= b) == _ALL
+            store_part(out, at, inside, select(difference > 0, slope, select(difference < 0, -slope, nothing)))
+        if known:
+            sums[band] += float(sum_lanes(apart))
+            counts[band] += 1
+        else:
+            out[first:last] = 0
 
 
 @torch.no_grad()
 def similarity(
-    picture: Tensor,  # [H, W, D]
-    target: Tensor,  # [H, W, D]
-    counted: Tensor | None,  # [H - 10, W - 10] bool
+    picture: Tensor,  # [H, W, D] contiguous, float32 or float64 on the CPU, at least 11 pixels on each side
+    target: Tensor,  # [H, W, D] likewise
+    counted: Tensor | None,  # [H - 10, W - 10] bool, which windows count, at least one; None = all
     window: Tensor,  # [11] weights of the window along an axis; symmetric, sum 1
-    constants: tuple[float, float],
+    constants: tuple[float, float],  # (K1 peak)^2 and (K2 peak)^2, which keep flat windows finite
     mix: tuple[float, float] = (1.0, 0.0),
 ) -> tuple[Tensor, Tensor, Tensor]:  # [], [], [H, W, D]
     """Mean SSIM over the (counted) windows inside the picture, mean absolute difference, and a gradient in `picture`.
 
-    Args:
-        picture: contiguous float32 or float64 on the CPU, at least 11 pixels on each side.
-        target: of the same shape and dtype, contiguous.
-        counted: which windows count, at least one; None = all.
-        window: of the picture's dtype.
-        constants: (K1 peak)^2 and (K2 peak)^2, which keep flat windows finite.
-        mix: the gradient is that of mix[0] times the SSIM plus mix[1] times the absolute difference.
+    The gradient is that of mix[0] times the SSIM plus mix[1] times the absolute difference.
     """
     height, width, channels = picture.shape
-    a, b = (value.detach().view(-1).numpy() for value in (picture, target))
+    a, b = flat(picture), flat(target)
     rows, across = height - _LAST, (width - _LAST) * channels
     padded = -(-across // LANES) * LANES
     kind = a.dtype.type
@@ -172,26 +220,14 @@ def spread_band(
     band: int,
     bands: int,
     window: Any,  # [11]
-    factors: tuple[Any, Any],
+    factors: tuple[Any, Any],  # of the slopes and of the sign of the difference
     shape: Shape,
     pictures: Any,  # two [H W D]
     slopes: Any,  # [3 * (H - 10) * padded]
     out: Any,  # [H W D], written
-    sums: Any,  # [bands], written
+    sums: Any,  # [bands], written: the absolute difference
 ) -> None:
-    """Carry the windows' slopes back to a share of the picture's rows, and add those of the absolute difference.
-
-    Args:
-        band: which share.
-        bands: how many shares.
-        window: weights.
-        factors: of the slopes and of the sign of the difference.
-        shape: of the pictures.
-        pictures: the picture and the target.
-        slopes: from `compare_band`.
-        out: the gradient.
-        sums: of the absolute difference over the share.
-    """
+    """Carry the windows' slopes back to a share of the picture's rows, and add those of the absolute difference."""
     picture, target = pictures
     height, length, channels, padded = shape
     rows, first = height - 10, 10 * channels
