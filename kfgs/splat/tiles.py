@@ -48,7 +48,7 @@ def bin_tiles(projected: Projected, width: int, height: int, tile_size: int = 16
     check_sizes(width, height, tile_size)
     fused = choose_fused(engine, *projected[:5])
     if fused:
-        rows, offsets = fused.bin(*(value.contiguous() for value in projected[:5]), (width, height, tile_size))
+        rows, offsets = fused.bin(*(value.contiguous() for value in projected[:5]), size=(width, height, tile_size))
     else:
         rows, offsets = _bin(projected, width, height, tile_size)
     return Tiles(rows, offsets, width, height, tile_size)

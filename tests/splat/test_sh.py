@@ -6,7 +6,7 @@ from messages import tells
 from scipy.spatial.transform import Rotation
 
 from kfgs.splat import evaluate_sh
-from kfgs.splat.engines import ops
+from kfgs.splat.engines.table import load
 from kfgs.splat.sh import SH_C0, rgb_to_sh0, rotate_sh, sh0_to_rgb
 
 
@@ -147,7 +147,7 @@ def test_compiled_colours_and_gradients_are_those_of_evaluate_sh(K):
     sh, means, center = _seen(K)
     index = torch.tensor([0, 3, 4, 11, 19])
     expected = evaluate_sh(sh[index], means[index] - center)
-    found = ops.shade(sh, means, center, index, "numba")
+    found = load("numba").shade(sh, means, center, index)
     assert bool((expected == 0).any()), "no channel is clamped"
     torch.testing.assert_close(found, expected)
     weights = torch.linspace(-1, 1, 15, dtype=torch.float64).view(5, 3)
@@ -160,17 +160,17 @@ def test_compiled_colours_and_gradients_are_those_of_evaluate_sh(K):
 def test_compiled_colours_in_single_precision_are_close_and_repeat():
     sh, means, center = _seen(16, torch.float32, 30_000)  # several bands
     index = torch.arange(0, 30_000, 2)
-    found = ops.shade(sh, means, center, index, "numba")
+    found = load("numba").shade(sh, means, center, index)
     exact = evaluate_sh(sh[index].double(), (means[index] - center).double()).float()
     torch.testing.assert_close(found, exact, rtol=1e-5, atol=1e-5)
-    assert torch.equal(found, ops.shade(sh, means, center, index, "numba"))
+    assert torch.equal(found, load("numba").shade(sh, means, center, index))
 
 
 def test_a_gaussian_at_the_camera_is_shaded():
     sh, means, _ = _seen(9)
     center = means[2].detach().clone()
     expected = evaluate_sh(sh[2:3], means[2:3] - center)
-    found = ops.shade(sh, means, center, torch.tensor([2]), "numba")
+    found = load("numba").shade(sh, means, center, torch.tensor([2]))
     torch.testing.assert_close(found, expected)
     (got,) = torch.autograd.grad(found.sum(), means)
     (wanted,) = torch.autograd.grad(expected.sum(), means)

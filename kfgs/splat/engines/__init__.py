@@ -162,7 +162,7 @@ def _check_splats(
             f"{offsets[:8].tolist()} ... {ends[1]}; {again}"
         )
     tiles = tiles._replace(rows=tiles.rows.contiguous(), offsets=offsets.contiguous())
-    return Splats(*(value.contiguous() for value in values), index), tiles
+    return Splats(*[value.contiguous() for value in values], index=index), tiles
 
 
 def _check_alike(name: str, value: Tensor, means2d: Tensor) -> None:

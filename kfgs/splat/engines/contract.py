@@ -155,16 +155,8 @@ class Engine:
         """Colours of the rows `index` [M] of `sh` [N, K, 3] and `means` [N, 3] from `center` [3], as `evaluate_sh` has them."""
         raise NotImplementedError
 
-    def bin(
-        self,
-        means2d: Tensor,  # [M, 2]
-        conics: Tensor,  # [M, 3]
-        depths: Tensor,  # [M]
-        opacities: Tensor,  # [M]
-        extents: Tensor,  # [M, 2]
-        size: tuple[int, int, int],  # width, height, tile size
-    ) -> tuple[Tensor, Tensor]:
-        """`rows` and `offsets` of `Tiles`."""
+    def bin(self, *projected: Tensor, size: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
+        """`rows` and `offsets` of `Tiles`, of the first five tensors of `Projected`; width, height and tile size."""
         raise NotImplementedError
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..contract import Cloud, CompiledEngine, Composited, Pinhole, Ranked, Splats, Tiles
+from ..contract import CompiledEngine, Composited, Ranked, Splats, Tiles
 from . import square
 from .bands import Trace, accumulate_band, composite_band
 from .bands_backward import differentiate_band
@@ -36,23 +36,7 @@ class NumbaEngine(CompiledEngine):
 
     devices = ("cpu",)
     fused = True
-
-    def project(self, cloud: Cloud, pinhole: Pinhole) -> tuple[Tensor, ...]:
-        return project(cloud, pinhole)
-
-    def shade(self, sh: Tensor, means: Tensor, center: Tensor, index: Tensor) -> Tensor:
-        return shade(sh, means, center, index)
-
-    def bin(
-        self,
-        means2d: Tensor,
-        conics: Tensor,
-        depths: Tensor,
-        opacities: Tensor,
-        extents: Tensor,
-        size: tuple[int, int, int],
-    ) -> tuple[Tensor, Tensor]:
-        return bin(means2d, conics, depths, opacities, extents, size)
+    project, shade, bin = staticmethod(project), staticmethod(shade), staticmethod(bin)  # type: ignore[assignment]
 
     def forward(self, splats: Splats, tiles: Tiles) -> Composited:
         view, channels = _view(tiles), splats.features.shape[1]

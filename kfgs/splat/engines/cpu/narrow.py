@@ -96,7 +96,7 @@ def plan_passes(channels: int) -> Passes:
 class Contest(NamedTuple):
     """When a block is done although light is left: the largest channel is wanted, and no other can overtake it."""
 
-    count: int  # planes of the sums that compete
+    planes: int  # of the sums, which compete
     favour: (
         Any  # the most by which a Gaussian of weight 1 favours one channel over another; infinite: sums are wanted too
     )
@@ -165,7 +165,10 @@ def _composite_block(
         if columns is None:
             total = add_outer(total, (weight,), spread_many(first, values, at + FEATURES, 1))
         else:
-            total = add_outer(total, (weight,), _spread_columns(values, at + FEATURES, columns))
+            a, b = fetch(values, at + FEATURES + columns[0]), fetch(values, at + FEATURES + columns[1])
+            c, d = fetch(values, at + FEATURES + columns[2]), fetch(values, at + FEATURES + columns[3])
+            chosen = spread(values, a), spread(values, b), spread(values, c), spread(values, d)
+            total = add_outer(total, (weight,), chosen)
         if len(passes.more) > 0:
             store(weights, k * LANES, weight)
         if columns is not None and contest.favour < np.inf and k % CHECK_EVERY == CHECK_EVERY - 1:
@@ -195,9 +198,9 @@ def _composite_block(
 @njit(**INLINE)
 def _undecided(sums: Any, p: int, light: Any, contest: Contest) -> Any:
     """Pixels of a block where another channel may still become the largest, or where the best is not positive yet."""
-    count, favour, rounding = contest
+    planes, favour, rounding = contest
     best, second = load(sums, p), spread(sums, -np.inf)
-    for k in range(1, count):
+    for k in range(1, planes):
         value = load(sums, k * PIXELS + p)
         second = maximum(second, minimum(best, value))
         best = maximum(best, value)
@@ -213,18 +216,6 @@ def round_off(count: int, peak: Any, like: Any) -> Any:
     """
     kind = np.finfo(like.dtype)
     return like.dtype.type(4 * (min(count, MOST_DRAWN) + 4) * float(kind.eps) * max(float(peak), float(kind.tiny)))
-
-
-@njit(**INLINE)
-def _spread_columns(rows: Any, at: int, columns: Any) -> Any:
-    """Four numbers of a row, each in every lane of a vector."""
-    a, b, c, d = columns
-    return (
-        spread(rows, fetch(rows, at + a)),
-        spread(rows, fetch(rows, at + b)),
-        spread(rows, fetch(rows, at + c)),
-        spread(rows, fetch(rows, at + d)),
-    )
 
 
 @njit(**INLINE)

@@ -11,7 +11,7 @@ Indices are not checked and do not wrap around: the caller must keep them inside
 contiguous and one-dimensional, of float32 or float64, and the vector's element type is that of the array. No operation
 is reordered or contracted, so the same expression gives the same bits wherever it stands.
 
-Prefetching aside, an operation on vectors is a Python operator or one of the functions of `__all__`.
+Prefetching aside, an operation on vectors is a Python operator or a function of this file.
 """
 
 from __future__ import annotations
@@ -26,38 +26,6 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
-
-__all__ = [
-    "LANES",
-    "add_dot",
-    "add_outer",
-    "any_of",
-    "bits",
-    "exp2",
-    "fetch",
-    "fma",
-    "lanes_below",
-    "load",
-    "load_many",
-    "load_part",
-    "maximum",
-    "minimum",
-    "prefetch",
-    "put",
-    "reciprocal",
-    "regroup",
-    "select",
-    "spread",
-    "spread_many",
-    "store",
-    "store_many",
-    "store_part",
-    "sum_lanes",
-    "sum_many",
-    "trailing_zeros",
-    "transpose",
-    "zero_many",
-]
 
 LANES = 16
 """Numbers per vector: a block of 4 x 4 pixels, and one AVX-512 register of float32."""
@@ -249,26 +217,16 @@ def store_part(typing: Any, array: Any, index: Any, mask: Any, vector: Any) -> A
     return types.void(array, types.intp, mask, vector), generate
 
 
-@intrinsic
-def fetch(typing: Any, array: Any, index: Any) -> Any:
+@njit(forceinline=True)
+def fetch(array: Any, index: int) -> Any:
     """array[index], without looking whether the index is negative."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.load(_pointer(context, builder, sig.args[0], *args))
-
-    return array.dtype(array, types.intp), generate
+    return array[np.uint64(index)]
 
 
-@intrinsic
-def put(typing: Any, array: Any, index: Any, value: Any) -> Any:
+@njit(forceinline=True)
+def put(array: Any, index: int, value: Any) -> None:
     """array[index] = value, without looking whether the index is negative."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        number = context.cast(builder, args[2], sig.args[2], array.dtype)
-        builder.store(number, _pointer(context, builder, sig.args[0], args[0], args[1]))
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, value), generate
+    array[np.uint64(index)] = value
 
 
 @intrinsic

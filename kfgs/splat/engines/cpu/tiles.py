@@ -27,6 +27,7 @@ def bin(
     depths: Tensor,  # [M]
     opacities: Tensor,  # [M]
     extents: Tensor,  # [M, 2]
+    *,
     size: tuple[int, int, int],  # width, height, tile size
 ) -> tuple[Tensor, Tensor]:  # rows [P] int32, offsets [T + 1] int64
     """List the Gaussians of every tile, as `kfgs.splat.bin_tiles` says."""

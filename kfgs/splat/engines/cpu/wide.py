@@ -135,13 +135,19 @@ def add_colors(
     for pixel in range(0, LANES, 4):
         row = into + pixel * stride
         for channel in range(0, whole, STEP):
+            at = row + channel
             total = zero_many(SIXTEEN, sums)
             if not fresh:
-                total = load_tile(sums, row + channel, stride)
+                a, b = load_many(FOUR, sums, at, LANES), load_many(FOUR, sums, at + stride, LANES)
+                c, d = load_many(FOUR, sums, at + 2 * stride, LANES), load_many(FOUR, sums, at + 3 * stride, LANES)
+                total = a + b + c + d
             for k in range(count):
                 values = load_many(FOUR, features, fetch(begins, k) + channel, LANES)
                 total = add_outer(total, spread_many(FOUR, weights, k * LANES + pixel, 1), values)
-            store_tile(sums, row + channel, stride, total)
+            store_many(sums, at, LANES, total[0:4])
+            store_many(sums, at + stride, LANES, total[4:8])
+            store_many(sums, at + 2 * stride, LANES, total[8:12])
+            store_many(sums, at + 3 * stride, LANES, total[12:16])
         for channel in range(whole, channels, LANES):
             lanes = lanes_below(sums, channels - channel)
             column = zero_many(FOUR, sums)
@@ -151,23 +157,6 @@ def add_colors(
                 value = load_part(features, fetch(begins, k) + channel, lanes)
                 column = add_outer(column, spread_many(FOUR, weights, k * LANES + pixel, 1), (value,))
             store_many(sums, row + channel, stride, column)
-
-
-@njit(**INLINE)
-def load_tile(values: Any, start: int, stride: int) -> Any:
-    """4 rows of 4 vectors."""
-    a, b = load_many(FOUR, values, start, LANES), load_many(FOUR, values, start + stride, LANES)
-    c, d = load_many(FOUR, values, start + 2 * stride, LANES), load_many(FOUR, values, start + 3 * stride, LANES)
-    return a + b + c + d
-
-
-@njit(**INLINE)
-def store_tile(values: Any, start: int, stride: int, tile: Any) -> None:
-    """The inverse of `load_tile`."""
-    store_many(values, start, LANES, tile[0:4])
-    store_many(values, start + stride, LANES, tile[4:8])
-    store_many(values, start + 2 * stride, LANES, tile[8:12])
-    store_many(values, start + 3 * stride, LANES, tile[12:16])
 
 
 @njit(**INLINE)

@@ -153,12 +153,9 @@ ENGINE = TritonEngine()
 
 
 def launch_options(kernel: str, channels: int, tile_size: int) -> dict[str, Any]:
-    """The sizes a kernel is compiled for, and its warps.
+    """The sizes a kernel of `LAUNCHES` is compiled for, and its warps.
 
-    Args:
-        kernel: a key of `LAUNCHES`.
-        channels: how many there are.
-        tile_size: side of a tile, pixels; a tile of more than the table's pixels is shared by several programs.
+    Several programs share a tile of more pixels than the table has.
     """
     launch = LAUNCHES[kernel]
     pixels = min(launch.pixels, max(SMALLEST, triton.next_power_of_2(tile_size**2)))
