@@ -34,8 +34,9 @@ def unit_embeddings(embeddings: Tensor, name: str = "embeddings") -> Tensor:  # 
     if bool(empty.any()):
         row = int(empty.nonzero()[0])
         length = float(embeddings[row].double().norm())
+        got = f"a length of {length:.3g}" if length else "all zeros"
         raise ValueError(
-            f"{name}: expected rows longer than {EPS:g}, got a length of {length:.3g} in row {row}; drop or replace that class"
+            f"{name}: expected rows longer than {EPS:g}, got {got} in row {row}; drop or replace that class"
         )
     return unit_rows(embeddings.detach())
 
