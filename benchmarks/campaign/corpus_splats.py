@@ -39,9 +39,9 @@ def make(folder: Path, add: Add) -> None:
         place = folder / name
         place.mkdir(parents=True)
         path = place / f"a{module.SUFFIXES[0]}"
-        for file in write_splats(cloud(), path).paths[0 if module.HOLDS_LABELS else 1 :]:
+        for file in write_splats(cloud(), path).paths[0 if "labels" in module.HOLDS else 1 :]:
             add("splats", place, file.name, opens=path.name)
-        if not module.HOLDS_LABELS:  # their digest would refuse every mutant
+        if "labels" not in module.HOLDS:  # their digest would refuse every mutant
             alone = folder / f"{name}-alone"
             alone.mkdir()
             write_splats(cloud(labels=False), alone / path.name)

@@ -15,12 +15,9 @@ CODES = 256  # numbers in a codebook: an index is one byte
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # the other components, by the index of the largest
 _BITS = 21  # per axis: three fill 63 bits of a Morton code
 _SPREAD = (  # (shift, mask): bit i of a 21-bit number goes to bit 3 i, in halves
-    (32, 0x001F00000000FFFF),
-    (16, 0x001F0000FF0000FF),
-    (8, 0x100F00F00F00F00F),
-    (4, 0x10C30C30C30C30C3),
+    (32, 0x001F00000000FFFF), (16, 0x001F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
     (2, 0x1249249249249249),
-)
+)  # fmt: skip
 _PASSES = 10  # of Lloyd's algorithm on the line
 _EVEN = 64  # numbers that start evenly spaced over the whole range, so that outliers get some
 _BINS = 512  # of the density of values

@@ -76,11 +76,7 @@ def read(path: Path) -> Gaussians:
 
 
 def write(path: Path, g: Gaussians) -> list[str]:
-    """Write one primitive with float32 values, with labels, scores and class names.
-
-    Raises:
-        ValueError: if the cloud is empty, has labels beyond 2^24, or is too large for a .glb.
-    """
+    """Write one primitive with float32 values. A ValueError if it is empty, has labels beyond 2^24, or fills 4 GiB."""
     if len(g) == 0:
         raise ValueError("gaussians: expected at least one Gaussian, got none; glTF has no empty accessors, write .ply")
     g = flip_axes(g, UP_AND_BACK)

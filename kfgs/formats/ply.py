@@ -61,9 +61,7 @@ class _Header(NamedTuple):
 def read_ply(path: str | Path) -> Columns:
     """Read the vertex table of a PLY file as columns of N values each.
 
-    Raises:
-        FileNotFoundError: if there is no such file.
-        FileError: if it is not a PLY file with scalar vertex properties, or is shorter than its header says.
+    A FileError if it is not a PLY file with scalar vertex properties, or is shorter than its header says.
     """
     with _opened(path) as (file, header):
         return _read_rows(file, header.vertex(), header.order)
@@ -94,11 +92,7 @@ def read_comments(path: str | Path) -> list[str]:
 
 
 def write_ply(path: str | Path, columns: Columns, *, comments: tuple[str, ...] = ()) -> None:
-    """Write columns of equal length as the vertex table of a binary little-endian PLY file, atomically.
-
-    Raises:
-        ValueError: if the columns have several lengths, or a type or name that PLY has no words for.
-    """
+    """Write columns of one length, with types that PLY has, as the vertex table of a little-endian file, atomically."""
     write_ply_elements(path, {"vertex": columns}, comments=comments)
 
 

@@ -84,11 +84,7 @@ def _numbered(columns: Columns, group: str, counts: tuple[int, ...]) -> list[str
 
 
 def gaussians_from_columns(path: Path, columns: Columns) -> Gaussians:
-    """Read a 3DGS vertex table (values activated on the way); `path` is for messages.
-
-    Raises:
-        ValueError: if a column of the 3DGS layout is missing, or numbered columns have gaps or an odd count.
-    """
+    """Read a 3DGS vertex table (values activated on the way); `path` is for notes. A ValueError if its columns are odd."""
     if {"scale_0", "scale_1"} <= columns.keys():  # 2DGS has no third; `with_mode` makes it thin
         columns = {"scale_2": np.minimum(columns["scale_0"], columns["scale_1"]), **columns}
     needed = ["x", "y", "z", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]

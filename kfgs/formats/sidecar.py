@@ -66,10 +66,8 @@ def write_sidecar(path: Path, gaussians: Gaussians, facts: Mapping[str, Any], ho
 def read_sidecar(path: Path, gaussians: Gaussians) -> Gaussians:
     """Add labels, names and the origin from the files next to a splat file; those in the splat file have priority.
 
-    If `path` is a link, files next to the link come first, then those next to the file that it leads to.
-
-    Raises:
-        FileError: if such a file is damaged, or its labels belong to another version of the splat file.
+    If `path` is a link, files next to the link come first, then those next to the file that it leads to. A FileError if one
+    is damaged, or belongs to another version of the splat file.
     """
     labels, origin, names = (_next_to(path, name) for name in (labels_path, origin_path, names_path))
     digest = None

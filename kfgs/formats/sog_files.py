@@ -68,11 +68,7 @@ class SogFiles:
                 return np.asarray(image.convert("RGBA"))
 
     def read_meta(self) -> SogMeta:
-        """Read and check `meta.json`.
-
-        Raises:
-            ValueError: if a value is of another kind, or the count cannot be true. KeyErrors name keys that are missing.
-        """
+        """Read and check `meta.json`. A ValueError if the count cannot be true; a KeyError names a key that is missing."""
         meta = parse_json(self.read(META, _META_BYTES))
         if meta.get("version") != 2:
             raise ValueError(f"SOG version {meta.get('version', 1)!r:.40}; export it as version 2")

@@ -105,9 +105,7 @@ def write(path: Path, g: Gaussians) -> list[str]:
     """Write version 4 with the finest positions that the cloud's extent allows.
 
     A step of a position is 2^-12 world units: larger for a cloud that reaches beyond 2048 units, smaller for a small one.
-
-    Raises:
-        ValueError: if the cloud reaches further than 24 bits hold.
+    A ValueError if the cloud reaches further than 24 bits hold.
     """
     bits = choose_fractional_bits(g.means)
     if bits < 0:

@@ -77,11 +77,7 @@ def formats() -> dict[str, ModuleType]:
 def find_format(path: str | Path) -> ModuleType:
     """The format of a file: by its content, or by its name if the content has no mark (``.splat``).
 
-    Of the output folder of a training program it is the format of its newest splat.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is none of the known formats.
+    Of the output folder of a training program it is the format of its newest splat. A ValueError if it is none of them.
     """
     path, known = splat_file_of(path), formats()
     if not path.exists():
@@ -92,11 +88,9 @@ def find_format(path: str | Path) -> ModuleType:
                 head = file.read(_HEAD_BYTES).removeprefix(BOM_UTF8)
         except OSError as error:  # Python names no file if reading fails
             raise type(error)(f"{path}: expected a splat file that can be read ({error.strerror})") from error
-        lower = path.name.lower()
-        by_name = [
-            module for module in known.values() if lower.endswith(module.SUFFIXES) and not hasattr(module, "MAGIC")
-        ]
-        candidates = [module for module in known.values() if module.matches(head)] or by_name
+        named = [module for module in known.values() if path.name.lower().endswith(module.SUFFIXES)]
+        unmarked = [module for module in named if not hasattr(module, "MAGIC")]
+        candidates = [module for module in known.values() if module.matches(head)] or unmarked
         if candidates:
             return candidates[0]
     elif (path / META).is_file():

@@ -59,13 +59,10 @@ def leave_out_broken(path: Path, g: Gaussians, *, strict: bool) -> tuple[Gaussia
     """Leave out the Gaussians that cannot be drawn, with their labels and columns: NaN, infinity, and rows of zeros.
 
     Rows of zeros, which truncated exports have, have no rotation and repeat each other. Another quaternion of length 0 is
-    read as no rotation: rasterisers do the same. Each kind is noted.
+    read as no rotation: rasterisers do the same. Each kind is noted. A ValueError if nothing is left, or if `strict`.
 
     Returns:
         The others, and which rows of the file they are.
-
-    Raises:
-        ValueError: if nothing is left, or `strict` and something is broken.
     """
     if not len(g):
         return g, torch.ones(0, dtype=torch.bool)
