@@ -55,7 +55,7 @@ def test_no_features_give_no_labels():
     [
         (torch.ones(4, 3), torch.eye(2), ("embeddings:", "[C, D]", "D = 3", "got (2, 2)")),
         (torch.ones(4, 3), torch.empty(0, 3), ("embeddings:", "class", "got (0, 3)")),
-        (torch.ones(4, 2), torch.tensor([[1.0, 0.0], [0.0, 0.0]]), ("embeddings:", "a length of 0", "row 1")),
+        (torch.ones(4, 2), torch.tensor([[1.0, 0.0], [0.0, 0.0]]), ("embeddings:", "row 1", "drop")),
         (torch.tensor([[1.0, 1.0], [math.nan, 0.0]]), torch.eye(2), ("features:", "row 1", "got NaN")),
         (torch.ones(1, 2), torch.tensor([[math.inf, 0.0]]), ("embeddings:", "got NaN")),
     ],
