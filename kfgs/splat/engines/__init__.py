@@ -97,12 +97,8 @@ def accumulate_pixels(
     importance need them. Both results come from one walk over the view, and carry no gradient.
 
     Args:
-        means2d: as in `composite`.
-        conics: as in `composite`.
-        opacities: as in `composite`.
+        means2d, conics, opacities, tiles, engine: as in `composite`.
         pixels: one signal per pixel, any number of channels.
-        tiles: from `bin_tiles` on the same Gaussians.
-        engine: as in `composite`.
 
     Returns:
         The sums, and the sum of each Gaussian's weights: divide by it for a mean.

@@ -58,11 +58,7 @@ _FLAGS = RLock()  # guards the flags of dlopen; an engine may load another
 
 @cache
 def load(name: str) -> Engine:
-    """The engine of a name.
-
-    Raises:
-        ImportError: if the package that it needs cannot be used, with the line that installs it.
-    """
+    """The engine of a name; an ImportError with the line that installs its package if that cannot be used."""
     entry = _ENGINES[name]
     try:
         with _own_symbols():

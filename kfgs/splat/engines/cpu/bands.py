@@ -65,13 +65,22 @@ class Trace(NamedTuple):
 def read_block(picture: Picture, box: Any, block: int, channel: int, into: Any, place: int, stride: int) -> None:
     """Copy LANES channels of a block's pixel p to into[place + p * stride:]; 0 beyond the box and the last channel."""
     values, width, channels = picture
+    lanes = lanes_below(values, channels - channel)
     left, top = box[0] + block % BLOCK_SIDE * BLOCK_SIDE, box[1] + block // BLOCK_SIDE * BLOCK_SIDE
+    columns, rows = min(box[2] - left, BLOCK_SIDE), min(box[3] - top, BLOCK_SIDE)
+    if columns == BLOCK_SIDE and rows == BLOCK_SIDE:
+        for y in range(BLOCK_SIDE):
+            at = ((top + y) * width + left) * channels + channel
+            for x in range(BLOCK_SIDE):
+                store(into, place + (y * BLOCK_SIDE + x) * stride, load_part(values, at + x * channels, lanes))
+        return
     for y in range(BLOCK_SIDE):
-        at = ((top + y) * width + left) * channels + channel
         for x in range(BLOCK_SIDE):
-            known = channels - channel if left + x < box[2] and top + y < box[3] else 0
-            vector = load_part(values, at + x * channels, lanes_below(values, known))
-            store(into, place + (y * BLOCK_SIDE + x) * stride, vector)
+            if x < columns and y < rows:
+                at = ((top + y) * width + left + x) * channels + channel
+                store(into, place + (y * BLOCK_SIDE + x) * stride, load_part(values, at, lanes))
+            else:
+                store(into, place + (y * BLOCK_SIDE + x) * stride, 0)
 
 
 @njit(**INLINE)

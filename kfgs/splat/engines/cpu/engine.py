@@ -64,15 +64,15 @@ class NumbaEngine(CompiledEngine):
         images = flat(result.maps), flat(grads[0]), flat(grads[1])
         shared = view, rows, passes, source, _padded(splats.background), images, trace, slots, firsts, out
         run_bands(differentiate_band, bands, *shared, any(wanted[:3]))
-        found: list[Tensor | None] = [torch.empty_like(value) for value in splats[:3]]
-        found.append(torch.zeros_like(splats.features))
-        index, targets = _index(splats), tuple(flat(value) for value in found if value is not None)
+        results: list[Tensor | None] = [torch.empty_like(value) for value in splats[:3]]
+        results.append(torch.zeros_like(splats.features))
+        index, targets = _index(splats), tuple(flat(value) for value in results if value is not None)
         shares = bands if bool((index[1:] > index[:-1]).all()) else 1  # two Gaussians that show one row must not meet
         layout, values = (length, column, channels), (flat(splats.conics), flat(splats.opacities))
         run_bands(gather_gradients, shares, shares, values, chains, out, layout, index, targets)
         light = torch.from_numpy(trace.finals).view_as(result.alphas)[..., None]
-        found.append((grads[0] * light).sum((0, 1)) if wanted[4] else None)
-        return [value if want else None for value, want in zip(found, wanted, strict=True)]
+        results.append((grads[0] * light).sum((0, 1)) if wanted[4] else None)
+        return [value if want else None for value, want in zip(results, wanted, strict=True)]
 
     def accumulate(
         self, means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Tensor, tiles: Tiles

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from .cache import cached_njit
 from .memory import flat, take_memory
-from .perceptron import decide
+from .perceptron import decide as decide
 from .simd import (
     LANES,
     bits,
@@ -37,14 +37,13 @@ from .simd import (
 from .square import INLINE, OPTIONS, aligned
 from .threads import run_bands
 
-__all__ = ["absolute", "decide", "similarity"]
-
 WINDOW = 11
 """Pixels of the Gaussian window's side."""
 
 _LAST = WINDOW - 1
 _BAND = 32  # rows of a share of SSIM
 _SHARE = 8192  # pixels of a share of the absolute difference
+_RUN = 64 * LANES  # numbers that are summed in the maps' own precision
 _ALL = np.uint32(0xFFFF)
 
 
@@ -77,23 +76,34 @@ def absolute_band(
     sums: Any,  # [bands], written: of the absolute differences
     counts: Any,  # [bands], written: known pixels
 ) -> None:
-    """A share of the pixels."""
+    """A share of the pixels, as numbers in a row; where pixels are unknown, once more one by one."""
     pixels = len(out) // channels
-    for pixel in range(pixels * band // bands, pixels * (band + 1) // bands):
-        first, last = pixel * channels, (pixel + 1) * channels
-        apart, nothing, known = spread(out, 0), spread(out, 0), True
-        for at in range(first, last, LANES):
-            inside = lanes_below(out, last - at)
+    first, last = pixels * band // bands, pixels * (band + 1) // bands
+    total, seen, nothing = 0.0, _ALL, spread(out, 0)
+    for begin in range(first * channels, last * channels, _RUN):
+        apart, end = spread(out, 0), min(begin + _RUN, last * channels)
+        for at in range(begin, end, LANES):
+            inside = lanes_below(out, end - at)
             a, b = load_part(picture, at, inside), load_part(target, at, inside)
             difference = a - b
+            seen &= bits(b <= b)
             apart = apart + maximum(difference, b - a)
-            known = known and bits(b <= b) == _ALL
             store_part(out, at, inside, select(difference > 0, slope, select(difference < 0, -slope, nothing)))
+        total += float(sum_lanes(apart))
+    sums[band], counts[band] = total, last - first
+    if seen == _ALL:
+        return
+    sums[band] = 0
+    for pixel in range(first, last):
+        size, known = 0.0, True
+        for at in range(pixel * channels, (pixel + 1) * channels):
+            size += abs(fetch(picture, at) - fetch(target, at))
+            known = known and not np.isnan(fetch(target, at))
         if known:
-            sums[band] += float(sum_lanes(apart))
-            counts[band] += 1
+            sums[band] += size
         else:
-            out[first:last] = 0
+            out[pixel * channels : (pixel + 1) * channels] = 0
+            counts[band] -= 1
 
 
 @torch.no_grad()
@@ -170,7 +180,7 @@ def compare_band(
     v_square, v_ab = aligned(room, window), aligned(room, window)
     for values in (v_a, v_b, v_square, v_ab):
         values[:] = 0
-    found = aligned(padded, window)
+    similar = aligned(padded, window)
     total = 0.0
     for i in range(rows * band // bands, rows * (band + 1) // bands):
         for j in range(0, length, LANES):
@@ -198,7 +208,7 @@ def compare_band(
             under_light, under_structure = squares + constants[0], m_square - squares + constants[1]
             scale = 1 / (under_light * under_structure)
             value = light * structure * scale
-            store(found, j, value)
+            store(similar, j, value)
             difference = (under_structure - under_light) * scale  # 1 / under_light - 1 / under_structure
             store(slopes, by_a + j, (m_b * (structure - light) * scale - m_a * value * difference) * 2)
             store(slopes, by_square + j, value * under_light * scale * -1)
@@ -206,12 +216,12 @@ def compare_band(
         if counted.size:
             for j in range(across):
                 if not counted[i, j]:
-                    put(found, j, 0)
+                    put(similar, j, 0)
                     put(slopes, by_a + j, 0)
                     put(slopes, by_square + j, 0)
                     put(slopes, by_ab + j, 0)
         for j in range(across):
-            total += fetch(found, j)
+            total += fetch(similar, j)
     sums[band] = total
 
 

@@ -52,7 +52,13 @@ def take_memory(like: Tensor, *shape: int) -> Tensor:
     size = math.prod(shape) * like.element_size()
     if size < SMALLEST_KEPT or not _COUNTS:
         return like.new_empty(shape)
-    buffer = _find(size)
+    buffers, buffer = _kept.buffers, None
+    for i in range(len(buffers)):  # an unused one that is large enough, and at most twice too large, becomes the latest
+        # Two references: the list and the call. A tensor on the buffer would be a third.
+        if size + CACHE_LINE <= buffers[i].nbytes <= 2 * (size + CACHE_LINE) and sys.getrefcount(buffers[i]) == 2:
+            buffers.append(buffers.pop(i))
+            buffer = buffers[-1]
+            break
     if buffer is None:
         buffer = np.empty(size + CACHE_LINE, np.uint8)  # numpy asks Linux for large pages, and torch does not
         if size <= MOST_KEPT:
@@ -73,14 +79,3 @@ def flat(tensor: Tensor) -> np.ndarray:
 def free_memory() -> None:
     """Free the memory that this thread keeps for its next frames: up to 1 GiB of unused maps and gradients."""
     _kept.buffers.clear()
-
-
-def _find(size: int) -> np.ndarray | None:
-    """An unused kept buffer that is large enough, and at most twice too large; it becomes the latest one."""
-    buffers = _kept.buffers
-    for i in range(len(buffers)):
-        # Two references: the list and the call. A tensor on the buffer would be a third.
-        if size + CACHE_LINE <= buffers[i].nbytes <= 2 * (size + CACHE_LINE) and sys.getrefcount(buffers[i]) == 2:
-            buffers.append(buffers.pop(i))
-            return buffers[-1]
-    return None

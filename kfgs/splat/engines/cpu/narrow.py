@@ -97,9 +97,7 @@ class Contest(NamedTuple):
     """When a block is done although light is left: the largest channel is wanted, and no other can overtake it."""
 
     planes: int  # of the sums, which compete
-    favour: (
-        Any  # the most by which a Gaussian of weight 1 favours one channel over another; infinite: sums are wanted too
-    )
+    favour: Any  # of one channel over another, the most of a Gaussian of weight 1; infinite: sums are wanted, too
     rounding: Any  # the most by which rounding does, see `round_off`
 
 

@@ -35,8 +35,6 @@ from .simd import (
 from .square import OPTIONS, aligned
 from .threads import run_bands
 
-__all__ = ["decide"]
-
 TWO, EIGHT, SIXTEEN = (0,) * 2, (0,) * 8, (0,) * 16
 UNITS, ROWS = len(EIGHT), len(TWO) * LANES
 """Units and rows whose sums are in registers together: 8 x 2 vectors."""

@@ -20,8 +20,6 @@ from .project_backward import differentiate_band
 from .project_forward import make_lens, project_band
 from .threads import find_reach, run_bands
 
-__all__ = ["project"]
-
 _SHARE = 16384
 """Gaussians of a band: few, so that all threads end together, but many compared with the cost of a call."""
 

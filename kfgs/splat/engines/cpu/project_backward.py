@@ -64,8 +64,13 @@ def differentiate_band(
         beyond = index[begin + count - 1] + 1
         _clear(out, row, beyond)
         for k in range(count):
-            _scatter(state, k, index[begin + k], out_means, out_quats, out_scales)
-            out_opacities[index[begin + k]] = grad_opacities[begin + k]
+            at = max(index[begin + k], 0)  # the gradients replaced the values in the planes
+            for j in range(3):
+                out_means[3 * at + j] = state[MEAN + j * BATCH + k]
+                out_scales[3 * at + j] = state[SCALE + j * BATCH + k]
+            for j in range(4):
+                out_quats[4 * at + j] = state[QUAT + j * BATCH + k]
+            out_opacities[at] = grad_opacities[begin + k]
         row = beyond
         begin += count
     _clear(out, row, last)
@@ -79,17 +84,6 @@ def _clear(out: tuple[Any, Any, Any, Any], first: int, last: int) -> None:
     quats[4 * first : 4 * last] = 0
     scales[3 * first : 3 * last] = 0
     opacities[first:last] = 0
-
-
-@njit(**OPTIONS)
-def _scatter(state: Any, slot: int, row: int, means: Any, quats: Any, scales: Any) -> None:
-    """Copy one Gaussian's gradients from the planes of its values, which they replaced."""
-    slot, row = max(slot, 0), max(row, 0)
-    for k in range(3):
-        means[3 * row + k] = state[MEAN + k * BATCH + slot]
-        scales[3 * row + k] = state[SCALE + k * BATCH + slot]
-    for k in range(4):
-        quats[4 * row + k] = state[QUAT + k * BATCH + slot]
 
 
 @njit(inline="always", fastmath=PLAIN, **OPTIONS)

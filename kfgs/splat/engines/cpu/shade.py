@@ -19,8 +19,6 @@ from .memory import flat, take_memory
 from .project_forward import OPTIONS, PLAIN
 from .threads import run_bands
 
-__all__ = ["shade"]
-
 _SHARE = 8192  # Gaussians of a band
 _SHORTEST = 1e-12  # a direction is divided by its length or by this, as torch's `normalize` does
 

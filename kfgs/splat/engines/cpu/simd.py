@@ -217,16 +217,26 @@ def store_part(typing: Any, array: Any, index: Any, mask: Any, vector: Any) -> A
     return types.void(array, types.intp, mask, vector), generate
 
 
-@njit(forceinline=True)
-def fetch(array: Any, index: int) -> Any:
+@intrinsic
+def fetch(typing: Any, array: Any, index: Any) -> Any:
     """array[index], without looking whether the index is negative."""
-    return array[np.uint64(index)]
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.load(_pointer(context, builder, sig.args[0], *args))
+
+    return array.dtype(array, types.intp), generate
 
 
-@njit(forceinline=True)
-def put(array: Any, index: int, value: Any) -> None:
+@intrinsic
+def put(typing: Any, array: Any, index: Any, value: Any) -> Any:
     """array[index] = value, without looking whether the index is negative."""
-    array[np.uint64(index)] = value
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        number = context.cast(builder, args[2], sig.args[2], array.dtype)
+        builder.store(number, _pointer(context, builder, sig.args[0], args[0], args[1]))
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, value), generate
 
 
 @intrinsic

@@ -14,8 +14,6 @@ from torch import Tensor
 from .threads import find_reach, run_bands
 from .tiles_kernels import find_pairs, list_rows
 
-__all__ = ["bin", "depth_order"]
-
 _SHARE = 8192
 """Gaussians of a band: few, so that all threads end together, but many compared with the tiles' counters."""
 
