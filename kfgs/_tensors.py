@@ -12,11 +12,7 @@ from torch import Tensor
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
-    """Write tensors from any device, with texts in the header, in their order (safetensors alone would shuffle them).
-
-    Raises:
-        SafetensorError: if the file cannot be written; `atomic_path` makes an OSError of it.
-    """
+    """Write tensors from any device, with texts in the header, in their order (safetensors alone would shuffle them)."""
     whole = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     save_file(whole, path, metadata=None if metadata is None else dict(metadata))
     if metadata is None or len(metadata) < 2:
