@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from kfgs.pipeline.train import training_device
-from kfgs.quant import FeatureMaps
+from kfgs.quant.sampling import FeatureMaps
 
 CPU = torch.device("cpu")
 

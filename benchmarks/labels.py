@@ -28,7 +28,7 @@ from kfgs.fields import Autoencoded, Linear, SemanticField
 from kfgs.labels import classify, relevancy
 from kfgs.labels.classify import pixel_codewords
 from kfgs.labels.scores import LOGIT_SCALE
-from kfgs.quant import Autoencoder, Codebook, LinearLatents
+from kfgs.quant import Autoencoder, Codebook
 from kfgs.scenes import load_scene
 from kfgs.splat import bin_tiles, project, rasterize, rasterize_labels
 
@@ -111,7 +111,7 @@ def random_linear(count: int, rows: Tensor, g: torch.Generator) -> SemanticField
     cloud = room(count, LINEAR)
     noise = 0.1 * torch.randn(count, LINEAR, generator=g)
     latents = torch.nn.functional.normalize(rows @ basis)[boxes(cloud.means) % len(rows)] + noise
-    return SemanticField(cloud.replace(features=latents), Linear(LinearLatents(basis)))
+    return SemanticField(cloud.replace(features=latents), Linear(basis))
 
 
 def boxes(means: Tensor) -> Tensor:
@@ -158,7 +158,7 @@ def compare(field: SemanticField, camera: Camera, rows: Tensor, repeats: int) ->
             measure(
                 "text query, score of each pixel",
                 lambda: compared(field, camera, next(old_texts)),
-                lambda: field.score_pixels(camera, next(new_texts)[0], None, negatives=rows[1:5]).scores[..., 0],
+                lambda: scored(field, camera, next(new_texts)[0], rows[1:5]),
                 repeats,
                 "blended scores, not scores of blended features",
             ),
@@ -212,6 +212,13 @@ def blended(field: SemanticField, camera: Camera, rows: Tensor, top: int = 1) ->
         else:
             most, index = (value[..., :top] for value in seen.sort(dim=-1, descending=True, stable=True))
         return winners[index].masked_fill(most <= 0, -1)
+
+
+def scored(field: SemanticField, camera: Camera, text: Tensor, negatives: Tensor) -> Tensor:  # [H, W]
+    """How well each pixel fits a text: the mean score of the Gaussians that it shows, by how much it shows of each."""
+    scores = field.query(text, None, 0.0, negatives=negatives).scores
+    shown = rasterize_labels(field.gaussians.replace(features=scores[:, None].contiguous(), sh=None), camera)
+    return shown.scores[..., 0] / shown.alphas.clamp_min(1e-6)
 
 
 def similar(field: SemanticField, camera: Camera, rows: Tensor) -> Tensor:

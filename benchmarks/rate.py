@@ -29,7 +29,6 @@ from kfgs.fields import Linear
 from kfgs.fields.packing import SMALL, Rounding
 from kfgs.fields.store import SUFFIX
 from kfgs.pipeline import true_labels
-from kfgs.quant import LinearLatents
 
 FACTORS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 2, 4)
 """Of all errors of the precision "small": the curve. Angles stop at 30 degrees, shares at 1."""
@@ -116,7 +115,7 @@ def packed(room: Room, field: SemanticField, out: Path) -> list[Point]:
 def carried(room: Room, field: SemanticField, out: Path) -> list[Point]:
     """PLY, SPZ and SOG."""
     assert isinstance(field.decoder, Linear)
-    basis = field.decoder.latents.basis
+    basis = field.decoder.basis
     C = len(room.classes)
     labels = field.classify(room.classes).labels
     cloud = field.gaussians.replace(labels=labels, sh=torch.zeros(len(field), 1, 3))
@@ -138,13 +137,13 @@ def carried(room: Room, field: SemanticField, out: Path) -> list[Point]:
             points.append(Point("PLY, latents as columns", "ply", size_of(*own, bare), **found, load_ms=took))
             continue
         votes = torch.nn.functional.one_hot(back.labels.clamp_min(0), C).float() * (back.labels >= 0)[:, None]
-        alone = SemanticField(back.replace(features=votes), Linear(LinearLatents(torch.eye(C))))
+        alone = SemanticField(back.replace(features=votes), Linear(torch.eye(C)))
         points.append(
             Point(f"{ending.upper()}, labels", ending, size_of(*own), **room.score(alone, torch.eye(C)), load_ms=took)
         )
         kept = load_file(beside)
         latents = kept["latents"].float() if order is None else kept["latents"].float()[order]
-        whole = SemanticField(back.replace(features=latents), Linear(LinearLatents(kept["basis"].float())))
+        whole = SemanticField(back.replace(features=latents), Linear(kept["basis"].float()))
         name = f"{ending.upper()} + float16 latents"
         points.append(Point(name, ending, size_of(*own, beside), **room.score(whole), load_ms=took))
     return points

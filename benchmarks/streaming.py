@@ -150,13 +150,8 @@ def uplift(args: argparse.Namespace) -> str:
     scene, maps = load_scene(args.scene).undistorted(), FeatureFolder(args.folder / "maps")
     cameras = [scene.cameras[i % len(scene.cameras)] for i in range(len(maps))]
     splat, config = read_splats(args.splat), UpliftConfig.field()
-    gaussians = uplift_maps(splat.to(args.device), cameras, maps, config, progress=True, report=print_line).gaussians
+    gaussians = uplift_maps(splat.to(args.device), cameras, maps, config, progress=True).gaussians
     return f"{len(gaussians)} Gaussians, {gaussians.features.shape[1]} latents"
-
-
-def print_line(text: str) -> None:
-    """Say what happens beside the bar."""
-    print(text, file=sys.stderr)
 
 
 def highest_memory() -> int:

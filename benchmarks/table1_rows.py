@@ -266,7 +266,7 @@ def field_codec(field: SemanticField) -> Callable[[torch.Tensor], torch.Tensor] 
     """What a field's compression alone makes of features; None if it stores them as they are."""
     decoder = field.decoder
     if isinstance(decoder, Linear):
-        return lambda rows: decoder.latents.decode(decoder.latents.encode(rows))
+        return lambda rows: decoder.decode(decoder.encode(rows))
     book, network = (getattr(decoder, name, None) for name in ("codebook", "autoencoder"))
     if book is None:
         return None

@@ -5,7 +5,7 @@ import torch
 from kfgs import Camera, Gaussians
 from kfgs.fields import Linear, SemanticField
 from kfgs.labels import LabelSet
-from kfgs.quant import fit_linear_latents
+from kfgs.quant.linear import fit_linear_latents
 
 DIM = 24
 NAMES = ("wall", "chair", "table", "lamp", "boat")
@@ -43,4 +43,4 @@ def scene(things, seed=0, words=None, teacher="toy", noise=0.05):
         cameras.append(Camera(pose, K, 40, 30, f"at the {name}"))
     info = {"teacher": {"name": teacher}}
     words = table(info=info) if words is None else words
-    return SemanticField(cloud, Linear(linear), tuple(cameras), words, info)
+    return SemanticField(cloud, Linear(linear.basis), tuple(cameras), words, info)

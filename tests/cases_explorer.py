@@ -77,7 +77,7 @@ def field(mode="adc+sc", n=80, seed=0):
         features=features,
     )
     if mode == "fused":
-        return SemanticField(gaussians, Linear(linear()))
+        return SemanticField(gaussians, Linear(linear().basis))
     if mode == "decouple":
         return SemanticField(gaussians, Identity(DIM))
     trained = Autoencoded(codebook(), autoencoder()) if mode == "adc+sc" else Codewords(codebook())

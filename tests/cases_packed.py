@@ -8,7 +8,8 @@ from cases_quant import made_autoencoder
 from scipy.spatial.transform import Rotation
 
 from kfgs import Camera, Gaussians
-from kfgs.fields import Autoencoded, Codewords, Identity, Linear, Seen, SemanticField
+from kfgs.fields import Autoencoded, Codewords, Identity, Linear, SemanticField
+from kfgs.fields.semantic_field import Seen
 from kfgs.labels import LabelSet
 from kfgs.quant import Codebook, LinearLatents
 
@@ -46,12 +47,12 @@ def field(method="fused", n=300, seed=0, **changes):
                   for pairs in (((DIM, 8), (8, 4)), ((4, 8), (8, DIM)))]  # fmt: skip
         decoder = Autoencoded(codebook, made_autoencoder(*(tuple(pairs) for pairs in layers), low=-0.5, high=0.75))
     if method == "fused":
-        decoder = Linear(_basis(d, g))
+        decoder = Linear(_basis(d, g).basis)
     gaussians = Gaussians(**cloud | changes)
     seen = Seen(torch.rand(n, generator=g) * 5000, torch.rand(n, generator=g))
     if method != "fused":
         latents = torch.randn(n, 6, generator=g) * torch.rand(n, 1, generator=g)
-        fused = SemanticField(gaussians.replace(features=latents), Linear(_basis(6, g)), seen=seen)
+        fused = SemanticField(gaussians.replace(features=latents), Linear(_basis(6, g).basis), seen=seen)
     pose = torch.eye(4)
     pose[:3, :3] = torch.from_numpy(Rotation.from_euler("xyz", [0.1, 0.5, 1.0]).as_matrix()).float()
     K = torch.tensor([[40.0, 0, 20], [0, 41, 8], [0, 0, 1]])

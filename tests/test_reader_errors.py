@@ -16,7 +16,8 @@ from kfgs.evaluation.scannet import load_scannet_points
 from kfgs.fields import read_examples
 from kfgs.formats.ply import write_ply
 from kfgs.labels import load_label_set
-from kfgs.quant import Autoencoder, Codebook, IndexMaps
+from kfgs.quant import Autoencoder, Codebook
+from kfgs.quant.maps import IndexMaps
 from kfgs.scenes import SceneError, read_image
 
 HUGE = 10**400  # a whole number that no float holds

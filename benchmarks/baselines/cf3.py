@@ -21,7 +21,7 @@ from kfgs.cameras import Camera
 from kfgs.fields import GaussianParams, Training, UpliftConfig, fit_field, uplift_maps
 from kfgs.gaussians import Gaussians
 from kfgs.metrics import semantic_storage_bytes
-from kfgs.quant.fit_autoencoder import quick_on_a_cpu
+from kfgs.quant.autoencoder import quick_on_a_cpu
 from kfgs.splat import covariance_3d, rasterize
 from kfgs.splat.views import sum_pixels
 

@@ -16,7 +16,7 @@ from torch.nn.functional import cosine_similarity, mse_loss
 
 from kfgs._rows import unit_rows
 from kfgs.cameras.resample import resize_labels
-from kfgs.quant.fit_autoencoder import quick_on_a_cpu
+from kfgs.quant.autoencoder import quick_on_a_cpu
 
 from .common import FLOAT, Clock, Fitted, KeptMaps, Task, is_shown, sample_rows, seeded
 from .methods import RenderedMethod

@@ -44,12 +44,12 @@ def fit(task: Task, config: PlainUpliftConfig) -> Fitted:
         found = uplift_maps(
             task.frozen, task.cameras, task.maps, options, generator=task.generator(), progress=task.progress
         )
-    basis, own = found.decoder.latents.basis, found.gaussians.features
+    basis, own = found.decoder.basis, found.gaussians.features
     assert own is not None
     method = RenderedMethod("plain uplift", found.gaussians, LinearDecoder(basis))
     storage = storage_bytes(len(own), own.shape[1], len(basis))
     tensors = {"features": own, "basis": basis}
-    latents = found.decoder.latents
+    latents = found.decoder
     return Fitted(
         method,
         str(own.shape[1]),

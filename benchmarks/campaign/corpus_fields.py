@@ -9,8 +9,9 @@ import numpy as np
 import torch
 
 from kfgs.cameras import Camera
-from kfgs.fields import Autoencoded, Codewords, Linear, Seen, SemanticField
+from kfgs.fields import Autoencoded, Codewords, Linear, SemanticField
 from kfgs.fields.checkpoint import write_checkpoint
+from kfgs.fields.semantic_field import Seen
 from kfgs.formats import write_splats
 from kfgs.gaussians import Gaussians
 from kfgs.labels import (
@@ -25,7 +26,8 @@ from kfgs.labels import (
     Recolor,
     Remove,
 )
-from kfgs.quant import Autoencoder, Codebook, IndexMaps, LinearLatents
+from kfgs.quant import Autoencoder, Codebook
+from kfgs.quant.maps import IndexMaps
 
 from .corpus import SEED, Add
 from .corpus_splats import cloud
@@ -45,7 +47,7 @@ def tiny_field(method: str = "fused", n: int = 16) -> SemanticField:
         random(n, 3), random(n, 4), torch.exp(random(n, 3) - 3), torch.rand(n, generator=g) * 0.9 + 0.05,
         features=random(n, d),
     )  # fmt: skip
-    linear, book, fused = Linear(LinearLatents(torch.linalg.qr(random(DIM, 3)).Q)), Codebook(random(5, DIM)), None
+    linear, book, fused = Linear(torch.linalg.qr(random(DIM, 3)).Q), Codebook(random(5, DIM)), None
     decoder: Linear | Codewords | Autoencoded = linear if method == "fused" else Codewords(book)
     if method == "adc+sc":
         layers = {"encoder.0": (random(2, DIM), random(2)), "decoder.0": (random(DIM, 2), random(DIM))}

@@ -108,7 +108,7 @@ def _autoencoder(path: Path) -> None:
 
 
 def _index_maps(path: Path) -> None:
-    from kfgs.quant import IndexMaps
+    from kfgs.quant.maps import IndexMaps
 
     IndexMaps.load(path)
 

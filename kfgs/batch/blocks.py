@@ -20,7 +20,7 @@ from .._card import error_line
 from .._check import as_array
 from .._files import Names, as_path, check_output, digest_file, digest_value, locked, read_json, real_path, write_json
 from .._origin import to_world
-from ..fields import SemanticField, join_fields, sample_latents, scene_classes
+from ..fields import SemanticField, fused, notes, uplift
 from ..formats import read_splats, write_splats
 from ..formats.table import splat_file_of
 from ..gaussians import Gaussians
@@ -66,7 +66,7 @@ def fit_blocks(
         method: how; its `max_gaussians` is per block.
         splat: Gaussians of the whole scene; each block gets those that it needs. None: each block trains its own.
         latents: numbers per Gaussian, in all blocks; or those of other blocks (`latents.safetensors`) with the same teacher:
-            then the fields of both scenes mean the same, and `fields.join_fields` joins them.
+            then the fields of both scenes mean the same, and `fields.fused.join_fields` joins them.
         client: a `distributed.Client` (`open_client`); None: one block after the other in this process.
         report: called with a line per block.
 
@@ -123,7 +123,7 @@ def _cut(source: Path, out: Path, count: int, splat: str | Path | None, latents:
     elif read_json(out / BLOCKS) != facts:
         raise ValueError(f"out: expected a new folder, or one with these blocks, got {out} with others; choose another")
     if not (out / LATENTS).is_file():
-        (sample_latents(maps, count=latents) if isinstance(latents, int) else latents).save(out / LATENTS)
+        (uplift.sample_latents(maps, count=latents) if isinstance(latents, int) else latents).save(out / LATENTS)
     if todo:
         write_parts(model, {out / block.name / "sparse/0": block.views for block in todo})
     for block in todo:
@@ -206,8 +206,8 @@ def join_blocks(
             [np.min([c[0] for c in boxes.values()], 0), np.max([c[1] for c in boxes.values()], 0)] if boxes else "none"
         )
         raise ValueError(f"low, high: expected a box with Gaussians, got none in it; all of them lie in {where}")
-    field, scene = join_fields(parts), real_path(root / described["scene"])
-    return replace(field, info=field.info | {"scene": str(scene)}, classes=scene_classes(scene, field.dim))
+    field, scene = fused.join_fields(parts), real_path(root / described["scene"])
+    return replace(field, info=field.info | {"scene": str(scene)}, classes=notes.scene_classes(scene, field.dim))
 
 
 def _places(gaussians: Gaussians) -> Any:  # [N, 3]

@@ -18,7 +18,7 @@ from torch import Tensor
 from .._check import check_whole
 from .._files import as_path, read_json, write_json
 from .._notes import is_strict
-from ..fields import scene_classes
+from ..fields.notes import scene_classes
 from ..labels import LabelSet, load_label_set
 from ..pipeline import Paper, Uplift, fit, score_scene, segment_scene, true_labels
 from ..pipeline.train import training_device

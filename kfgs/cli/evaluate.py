@@ -45,7 +45,7 @@ def evaluate(
         long: Say how it was measured, and print every row.
     """
     from .._files import write_json
-    from ..fields import recall_scene
+    from ..fields.notes import recall_scene
     from ..pipeline import evaluate as evaluate_result
     from ..pipeline import open_question
 

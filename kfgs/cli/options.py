@@ -124,7 +124,7 @@ class Classes:
 
     def photos_of(self, field: Any | None) -> Any:
         """The scene of --scene or of the field, for its photographs; None if there is none, or it is gone."""
-        from ..fields import recall_scene
+        from ..fields.notes import recall_scene
         from ..scenes import load_scene
 
         if self.scene is not None or field is None:

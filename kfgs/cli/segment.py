@@ -48,7 +48,7 @@ def segment(
         coco: Write coco/annotations.json (COCO's run lengths, areas and boxes; one annotation for each class of each picture)
             and its pictures to coco/images: undistorted photographs, or with --path rendered colours.
     """
-    from ..fields import recall_scene
+    from ..fields.notes import recall_scene
     from ..pipeline import score_scene, segment_scene, true_labels
     from ..pipeline.segment import write_coco
     from ..viz import plot_iou

@@ -13,12 +13,14 @@ from typing import Any, ClassVar, Protocol, Self
 import torch
 from torch import Tensor
 
+from .._card import short_repr
 from .._rows import EPS, check_directions, row_norms, unit_rows
 from ..labels.classify import pixel_codewords
 from ..quant import Autoencoder, Codebook, LinearLatents
 from .votes import Votes, divide_votes, similarity_votes
 
 CHUNK = 8192  # latents decoded at once: the decoder's widest layer then holds 32 MB
+Ranks = tuple[Tensor, Tensor]  # [..., top] int64, [..., top]: the best classes and their scores; -1 and 0 for none
 
 
 class Decoder(Protocol):
@@ -46,6 +48,7 @@ class Decoder(Protocol):
 
     def decode(self, latents: Tensor) -> Tensor:  # [..., d] -> [..., D]
         """Features in the teacher's space."""
+        return latents
 
     def cosines(self, latents: Tensor, rows: Tensor) -> Tensor:  # [N, d], [M, D] of length 1 -> [N, M]
         """The cosine of each Gaussian with each row; 0 for an all-zero latent."""
@@ -58,15 +61,16 @@ class Decoder(Protocol):
         self,
         pixels: Tensor,  # [..., d] rendered latents
         rows: Tensor,  # [C, D] of length 1
-        top: int = 1,
-        covered: Tensor | None = None,  # [...] bool
-    ) -> tuple[Tensor, Tensor]:  # [..., top] int64, [..., top]
+        top: int,
+        covered: Tensor,  # [...] bool, where anything is drawn
+    ) -> Ranks:
         """The most similar classes of each pixel, the best first, and their cosines; -1 and 0 where nothing is known."""
         cosines = torch.cat([self.cosines(part, rows) for part in pixels.reshape(-1, self.latent).split(CHUNK)])
         return _best(pixels, cosines, top, covered)
 
     def to_tensors(self) -> dict[str, Tensor]:
         """What `make_decoder` reads."""
+        return {}
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
         """On another device or in another dtype, as `Tensor.to`."""
@@ -92,9 +96,6 @@ class Identity(Decoder):
     def latent(self) -> int:
         return self.channels
 
-    def decode(self, latents: Tensor) -> Tensor:
-        return latents
-
     def cosines(self, latents: Tensor, rows: Tensor) -> Tensor:
         check_directions("gaussians.features", latents)
         return torch.cat([unit_rows(part) @ rows.T for part in latents.split(CHUNK)])
@@ -102,47 +103,30 @@ class Identity(Decoder):
     def votes(self, latents: Tensor, rows: Tensor) -> Votes | None:
         return similarity_votes(latents, rows)
 
-    def to_tensors(self) -> dict[str, Tensor]:
-        return {}
-
 
 @dataclass(frozen=True, eq=False)
-class Linear(Decoder):
+class Linear(LinearLatents, Decoder):
     """Latents are linear in the feature, f = B z: a cosine is one product of d numbers, and a blend means what it shows.
 
     Each Gaussian divides one vote among the classes (`divide_votes`); a pixel takes the class with most blended votes. With
     `paper`, it takes the class most similar to the rendered feature.
     """
 
-    latents: LinearLatents
     paper: bool = False
     name = "fused"
-
-    @property
-    def dim(self) -> int:
-        return self.latents.dim
-
-    @property
-    def latent(self) -> int:
-        return self.latents.latent
+    __repr__ = short_repr
 
     @property
     def parameters(self) -> int:
-        return self.latents.basis.numel()
-
-    def decode(self, latents: Tensor) -> Tensor:
-        return self.latents.decode(latents)
-
-    def cosines(self, latents: Tensor, rows: Tensor) -> Tensor:
-        return self.latents.cosines(latents, rows)
+        return self.basis.numel()
 
     def votes(self, latents: Tensor, rows: Tensor) -> Votes | None:
         if self.paper:
-            return similarity_votes(latents, self.latents.encode(rows))
+            return similarity_votes(latents, self.encode(rows))
         return divide_votes(self.cosines(latents, rows), latents.any(dim=1))
 
     def to_tensors(self) -> dict[str, Tensor]:
-        return {"linear.basis": self.latents.basis}
+        return {"linear.basis": self.basis}
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,18 +152,13 @@ class Codewords(Decoder):
     def parameters(self) -> int:
         return self.codebook.codewords.numel()
 
-    def decode(self, latents: Tensor) -> Tensor:
-        return latents
-
     def cosines(self, latents: Tensor, rows: Tensor) -> Tensor:
         return _quantised_cosines(self, latents, rows)
 
     def votes(self, latents: Tensor, rows: Tensor) -> Votes | None:
         return None if self.paper else similarity_votes(latents, rows)
 
-    def label_pixels(
-        self, pixels: Tensor, rows: Tensor, top: int = 1, covered: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def label_pixels(self, pixels: Tensor, rows: Tensor, top: int, covered: Tensor) -> Ranks:
         if not self.paper:
             return _best(pixels, unit_rows(pixels).flatten(0, -2) @ rows.T, top, covered)
         index = pixel_codewords(pixels, self.codebook, covered=covered)
@@ -202,13 +181,6 @@ class Autoencoded(Decoder):
     paper: bool = False
     name = "decouple+ADC+SC"
 
-    def __post_init__(self) -> None:
-        if self.autoencoder.dim != self.codebook.dim:
-            raise ValueError(
-                f"autoencoder: expected {self.codebook.dim} decoded channels (from codebook), got {self.autoencoder.dim}; "
-                "pass the autoencoder that was fitted to this codebook"
-            )
-
     @property
     def dim(self) -> int:
         return self.codebook.dim
@@ -221,15 +193,20 @@ class Autoencoded(Decoder):
     def parameters(self) -> int:
         return self.autoencoder.decoder_parameters + self.codebook.codewords.numel()
 
+    def __post_init__(self) -> None:
+        if self.autoencoder.dim != self.codebook.dim:
+            raise ValueError(
+                f"autoencoder: expected {self.codebook.dim} decoded channels (from codebook), got {self.autoencoder.dim}; "
+                "pass the autoencoder that was fitted to this codebook"
+            )
+
     def decode(self, latents: Tensor) -> Tensor:
         return self.autoencoder.decode(latents)
 
     def cosines(self, latents: Tensor, rows: Tensor) -> Tensor:
         return _quantised_cosines(self, latents, rows)
 
-    def label_pixels(
-        self, pixels: Tensor, rows: Tensor, top: int = 1, covered: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def label_pixels(self, pixels: Tensor, rows: Tensor, top: int, covered: Tensor) -> Ranks:
         index = pixel_codewords(pixels, self.codebook, self.autoencoder, exact=self.paper, covered=covered)
         return _look_up(index, self.codebook, rows, top)
 
@@ -241,7 +218,7 @@ class Autoencoded(Decoder):
 def make_decoder(tensors: Mapping[str, Tensor], channels: int) -> Decoder:
     """The decoder of `Decoder.to_tensors`, for Gaussians with this many channels. Other names are ignored."""
     if "linear.basis" in tensors:
-        return Linear(LinearLatents(tensors["linear.basis"]))
+        return Linear(tensors["linear.basis"])
     if "codebook.codewords" not in tensors:
         return Identity(channels)
     codebook, prefix = Codebook(tensors["codebook.codewords"]), "autoencoder."
@@ -256,17 +233,14 @@ def _quantised_cosines(decoder: Codewords | Autoencoded, latents: Tensor, rows: 
     return per_codeword[index] * latents.any(dim=1)[:, None]
 
 
-def _best(pixels: Tensor, cosines: Tensor, top: int, covered: Tensor | None) -> tuple[Tensor, Tensor]:
+def _best(pixels: Tensor, cosines: Tensor, top: int, covered: Tensor) -> Ranks:
     """The `top` largest of the cosines [n, C] of pixels [..., d]; ties go to the lowest class."""
     scores, labels = cosines.sort(dim=1, descending=True, stable=True)
-    empty = (row_norms(pixels) <= EPS)[..., None]
-    if covered is not None:
-        empty = empty | ~covered[..., None]
-    shape = *pixels.shape[:-1], top
+    empty, shape = ((row_norms(pixels) <= EPS) | ~covered)[..., None], (*pixels.shape[:-1], top)
     return labels[:, :top].reshape(shape).masked_fill(empty, -1), scores[:, :top].reshape(shape).masked_fill(empty, 0)
 
 
-def _look_up(index: Tensor, codebook: Codebook, rows: Tensor, top: int) -> tuple[Tensor, Tensor]:
+def _look_up(index: Tensor, codebook: Codebook, rows: Tensor, top: int) -> Ranks:
     """The best classes of each pixel's codeword, given its index, -1 for none."""
     similarity = codebook.unit @ rows.T.to(codebook.unit)  # [K, C]
     scores, labels = similarity.sort(dim=1, descending=True, stable=True)

@@ -58,8 +58,8 @@ def densify(
     options: Densify,
     *,
     extent: float,
-    prune_large: bool = False,
-    generator: torch.Generator | None = None,
+    prune_large: bool,
+    generator: torch.Generator,
 ) -> Densified:
     """One round of adaptive density control.
 
@@ -75,7 +75,7 @@ def densify(
         options: thresholds.
         extent: size of the scene, world units.
         prune_large: in 3DGS true only after the first reset of opacities.
-        generator: draws the children's positions (on its own device); None draws the same ones each time.
+        generator: draws the children's positions (on its own device).
 
     Note:
         3DGS intends to prune Gaussians larger than 20 pixels on screen, but sets their radii to zero before the test, so
@@ -83,7 +83,10 @@ def densify(
     """
     values = params.map(torch.Tensor.detach)
     scales = values.log_scales.exp().amax(dim=1)
-    growing = _within_budget(gradient >= options.gradient, gradient, options.maximum)
+    growing = gradient >= options.gradient
+    if options.maximum is not None and len(params) + int(growing.sum()) > options.maximum:  # each adds one Gaussian
+        strongest = torch.where(growing, gradient, -torch.inf).argsort(descending=True, stable=True)
+        growing[strongest[max(0, options.maximum - len(params)) :]] = False
     large = scales > options.percent_dense * extent
     kept = (~(growing & large)).nonzero()[:, 0]
     cloned = (growing & ~large).nonzero()[:, 0]
@@ -94,7 +97,12 @@ def densify(
     grown = values.map(lambda value: value[source])
     if len(parents):
         first = len(kept) + len(cloned)
-        grown.means[first:] = _sample(values, parents, generator)
+        drawn, means = values.map(lambda value: value[parents]), values.means[parents]
+        noise = torch.randn(means.shape, dtype=means.dtype, device=generator.device, generator=generator).to(
+            means.device
+        )
+        rotation = quaternion_to_rotation_matrix(drawn.quats)  # wxyz, normalises
+        grown.means[first:] = means + (rotation @ (noise * drawn.log_scales.exp())[:, :, None])[:, :, 0]
         grown.log_scales[first:] -= math.log(SPLIT_SHRINK)
 
     stays = grown.logit_opacities.sigmoid() >= options.prune_opacity
@@ -106,23 +114,3 @@ def densify(
 def lowered_opacities(logit_opacities: Tensor, opacity: float) -> Tensor:  # [N] -> [N]
     """The opacity reset of 3DGS: logits lowered to at most that of `opacity`."""
     return logit_opacities.detach().clamp(max=math.log(opacity / (1 - opacity)))
-
-
-def _within_budget(growing: Tensor, gradient: Tensor, maximum: int | None) -> Tensor:  # [N] bool
-    """Keep of `growing` only as many as `maximum` allows (each adds one Gaussian), the strongest first."""
-    if maximum is None or len(growing) + int(growing.sum()) <= maximum:
-        return growing
-    strength = torch.where(growing, gradient, -torch.inf)
-    strongest = strength.argsort(descending=True, stable=True)[: max(0, maximum - len(growing))]
-    allowed = torch.zeros_like(growing)
-    allowed[strongest] = True
-    return allowed
-
-
-def _sample(values: GaussianParams, rows: Tensor, generator: torch.Generator | None) -> Tensor:  # [n, 3]
-    """One draw from each of the given Gaussians (rows may repeat)."""
-    generator = generator or torch.Generator().manual_seed(0)
-    means = values.means[rows]
-    noise = torch.randn(means.shape, dtype=means.dtype, device=generator.device, generator=generator).to(means.device)
-    rotation = quaternion_to_rotation_matrix(values.quats[rows])  # wxyz, normalises
-    return means + (rotation @ (noise * values.log_scales[rows].exp())[:, :, None])[:, :, 0]

@@ -17,8 +17,7 @@ from .._files import as_path, read_json
 from .._rows import EPS, row_norms, unit_rows
 from ..cameras import Camera
 from ..cameras.camera import view_named
-from ..gaussians import as_rows
-from ..labels import LabelSet
+from ..labels import LabelSet, Selection
 from ..labels.run_lengths import decode_rle
 from .semantic_field import SemanticField
 
@@ -52,17 +51,8 @@ class Mask:
     __repr__ = short_repr
 
 
-@dataclass(frozen=True, eq=False)
-class Picked:
-    """Gaussians of the field that belong to a class."""
-
-    indices: Sequence[int] | Tensor
-    """Which, or a mask [N]."""
-
-    __repr__ = short_repr
-
-
-Example = Clicks | Box | Mask | Picked
+Example = Clicks | Box | Mask | Selection | Tensor
+"""Pixels of a view; or Gaussians of the field: a selection, a mask [N] or indices."""
 
 
 def label_set_from_examples(field: SemanticField, examples: Mapping[str, Example | Sequence[Example]]) -> LabelSet:
@@ -71,20 +61,20 @@ def label_set_from_examples(field: SemanticField, examples: Mapping[str, Example
     A class's row is the mean direction of the features of its examples: of the field rendered at the pixels, or of the
     Gaussians. Every example has the same weight, whatever its number of pixels.
 
+    Args:
+        field: that knows the views.
+        examples: by class name, one or several: `Clicks`, `Box` or `Mask`, or some Gaussians of the field (a `Selection`, a
+            mask [N] or a tensor of indices).
+
     Raises:
         ValueError: if there is no class, or one has no example, a view is unknown, a point lies outside its view, or the
             field shows nothing there.
     """
-    if not isinstance(examples, Mapping) or not examples:
-        kind = ValueError if isinstance(examples, Mapping) else TypeError
-        raise kind(
-            f"examples: expected a dict with examples by class name, got {type(examples).__name__} {examples!r:.40}"
-        )
     shown = {name: [given] if isinstance(given, Example) else list(given) for name, given in examples.items()}
+    if not shown or not all(shown.values()):
+        raise ValueError(f"examples: expected at least one for each class, got {examples!r:.80}; show one")
     rows = []
     for name, given in shown.items():
-        if not given:
-            raise ValueError(f"examples[{name!r}]: expected at least one example, got none; show one")
         directions = [_direction(field, example, f"examples[{name!r}][{i}]") for i, example in enumerate(given)]
         rows.append(unit_rows(torch.stack(directions).mean(dim=0)))
     info: dict[str, Any] = {"examples": {name: len(given) for name, given in shown.items()}}
@@ -93,60 +83,13 @@ def label_set_from_examples(field: SemanticField, examples: Mapping[str, Example
     return LabelSet(tuple(shown), torch.stack(rows), info=info)
 
 
-def read_examples(path: str | Path) -> dict[str, list[Example]]:
-    """Read examples from JSON: {"chair": [{"view": "a.png", "points": [[x, y], ...]}, {"view": "b.png", "box": [x0, y0, x1, y1]},
-    {"gaussians": [3, 14]}], ...}.
-
-    A mask is {"view": "c.png", "segmentation": {"size": [H, W], "counts": ...}} with COCO's run lengths: an entry of Segment
-    Anything's list of masks with the view added. {"view": "c.png", "masks": "c.json", "index": 3} takes mask 3, counted from
-    0, of such a list (or of the `annotations`) in a file beside this one.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it has another content.
-    """
-    content, folder = read_json(path), as_path(path).parent
-
-    masks_of = functools.cache(lambda name: read_json(folder / name))  # one file may have the masks of many examples
-
-    def read(entry: dict[str, Any]) -> Example:
-        if "gaussians" in entry:
-            return Picked([int(index) for index in entry["gaussians"]])
-        view = str(entry["view"])
-        if "points" in entry:
-            return Clicks(view, [(float(x), float(y)) for x, y in entry["points"]])
-        if "box" in entry:
-            x0, y0, x1, y1 = map(float, entry["box"])
-            return Box(view, (x0, y0, x1, y1))
-        if "masks" in entry:
-            masks = masks_of(entry["masks"])
-            entry = (masks["annotations"] if isinstance(masks, dict) else masks)[entry["index"]]
-        return Mask(view, decode_rle(entry["segmentation"]))
-
-    if not isinstance(content, dict) or not all(isinstance(shown, list) for shown in content.values()):
-        raise ValueError(
-            f'{path}: expected an object of lists of examples by class name, {{"chair": [...]}}; correct it'
-        )
-    examples: dict[str, list[Example]] = {name: [] for name in content}
-    for name, i, entry in ((name, i, entry) for name, shown in content.items() for i, entry in enumerate(shown)):
-        try:
-            examples[name].append(read(entry))
-        except (TypeError, LookupError, ValueError, OverflowError) as error:
-            why = f"{type(error).__name__}: {error}" if isinstance(error, LookupError) else str(error)
-            raise ValueError(
-                f"{path}: {name!r}[{i}]: expected an example, got {entry!r:.60} ({why}); see kfgs features --help"
-            ) from error
-    return examples
-
-
 def _direction(field: SemanticField, example: Example, name: str) -> Tensor:  # [D] of length 1
     """The mean direction of the features of one example."""
-    if isinstance(example, Picked):
-        features = field.own_features(as_rows(f"{name}.indices", example.indices, len(field)))
+    if isinstance(example, Selection | Tensor):
+        features = field.own_features(example)
     else:
         camera = view_named(field.cameras, example.view, name)
-        pixels = _pixels(camera, example, name)
-        rendering = field.render(camera)
+        pixels, rendering = _pixels(camera, example, name), field.render(camera)
         features = field.decode(rendering.map[pixels.to(rendering.alpha.device) & (rendering.alpha > 0)])
     known = features[row_norms(features) > EPS]
     if len(known) == 0:
@@ -170,3 +113,44 @@ def _pixels(camera: Camera, example: Clicks | Box | Mask, name: str) -> Tensor: 
             raise ValueError(f"{name}: expected points within {size}, got ({x:g}, {y:g})")
         chosen[int(y), int(x)] = True
     return chosen
+
+
+def read_examples(path: str | Path) -> dict[str, list[Example]]:
+    """Read examples from JSON: {"chair": [{"view": "a.png", "points": [[x, y], ...]}, {"view": "b.png", "box": [x0, y0, x1, y1]},
+    {"gaussians": [3, 14]}], ...}.
+
+    A mask is {"view": "c.png", "segmentation": {"size": [H, W], "counts": ...}} with COCO's run lengths: an entry of Segment
+    Anything's list of masks with the view added. {"view": "c.png", "masks": "c.json", "index": 3} takes mask 3, counted from
+    0, of such a list (or of the `annotations`) in a file in the same folder.
+    """
+    content, folder = read_json(path), as_path(path).parent
+    masks_of = functools.cache(lambda name: read_json(folder / name))  # one file may have the masks of many examples
+
+    def read(entry: dict[str, Any]) -> Example:
+        if "gaussians" in entry:
+            return torch.tensor([int(index) for index in entry["gaussians"]])
+        view = str(entry["view"])
+        if "points" in entry:
+            return Clicks(view, [(float(x), float(y)) for x, y in entry["points"]])
+        if "box" in entry:
+            x0, y0, x1, y1 = map(float, entry["box"])
+            return Box(view, (x0, y0, x1, y1))
+        if "masks" in entry:
+            masks = masks_of(entry["masks"])
+            entry = (masks["annotations"] if isinstance(masks, dict) else masks)[entry["index"]]
+        return Mask(view, decode_rle(entry["segmentation"]))
+
+    if not isinstance(content, dict) or not all(isinstance(shown, list) for shown in content.values()):
+        raise ValueError(
+            f'{path}: expected an object of lists of examples by class name, {{"chair": [...]}}; correct it'
+        )
+    examples: dict[str, list[Example]] = {name: [] for name in content}
+    for name, i, entry in ((name, i, entry) for name, shown in content.items() for i, entry in enumerate(shown)):
+        try:
+            examples[name].append(read(entry))
+        except (TypeError, LookupError, ValueError, OverflowError, RuntimeError) as error:
+            why = f"{type(error).__name__}: {error}" if isinstance(error, LookupError) else str(error)
+            raise ValueError(
+                f"{path}: {name!r}[{i}]: expected an example, got {entry!r:.60} ({why}); see kfgs features --help"
+            ) from error
+    return examples

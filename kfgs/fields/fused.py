@@ -1,8 +1,7 @@
 """Fused features of a trained field: the mean of the rendered features at the pixels that show a Gaussian; and joined fields.
 
 Training constrains only blends of Gaussians, so the latent of a single Gaussian may decode to something that no view shows.
-The mean over its pixels, weighted by w = T alpha, does not have this problem. It is computed once, when a field is finished;
-later no camera is needed.
+The mean over its pixels, weighted by w = T alpha, does not have this problem. It is computed once, when a field is finished.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from .._rows import EPS, row_norms, unit_rows
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels.classify import nearest_codeword
-from ..quant import fit_linear_latents
+from ..quant.linear import fit_linear_latents
 from ..splat import average_views, rasterize
 from .decoders import Autoencoded, Codewords, Linear
 from .semantic_field import Seen, SemanticField
@@ -28,37 +27,30 @@ PIXELS = 80_000  # most pixels of a view that are rendered
 
 
 def fuse_views(field: SemanticField, cameras: Sequence[Camera]) -> SemanticField:
-    """Render a trained field from each camera, quantise the pixels, and average them onto the Gaussians that they show.
+    """Render a trained field from its training cameras, quantise the pixels, and average them onto the Gaussians they show.
 
     The result is the field with these `cameras` and the averages as `fused`. A field with a `Linear` decoder is fused
-    already, and gets the cameras alone.
-
-    Args:
-        field: a trained field; without a codebook, rendered features are averaged without quantising.
-        cameras: at least one; the training cameras.
+    already, and gets the cameras alone. Without a codebook, rendered features are averaged without quantising.
     """
     if not cameras:
         raise ValueError("cameras: expected at least one, got none; pass those that the field was trained with")
-    decoder = field.decoder
+    decoder, gaussians = field.decoder, field.gaussians
     if isinstance(decoder, Linear):
         return replace(field, cameras=tuple(cameras))
-    gaussians, table, centres = field.gaussians, None, None
     with torch.no_grad():
         if isinstance(decoder, Codewords | Autoencoded):
             latents = fit_linear_latents(decoder.codebook.unit, keep=KEEP, maximum=MOST)
             table = latents.encode(decoder.codebook.unit).to(gaussians.means)
         else:
             latents = fit_linear_latents(unit_rows(field.features), gaussians.opacities, keep=KEEP, maximum=MOST)
+        centres = None
         if isinstance(decoder, Autoencoded):
             centres = decoder.autoencoder.encode(decoder.codebook.codewords).to(gaussians.means)
 
         def encode(pixels: Tensor) -> Tensor:  # [n, d] -> [n, e]
-            if table is None:
-                return latents.encode(unit_rows(pixels))
-            if centres is not None:
-                return table[nearest_codeword(pixels, centres)]
-            assert isinstance(decoder, Codewords)
-            return table[decoder.codebook.quantize(pixels)]
+            if isinstance(decoder, Codewords):
+                return table[decoder.codebook.quantize(pixels)]
+            return latents.encode(unit_rows(pixels)) if centres is None else table[nearest_codeword(pixels, centres)]
 
         def show(camera: Camera) -> tuple[Camera, Tensor]:  # [H, W, e]
             rendering = rasterize(gaussians, camera)
@@ -67,36 +59,24 @@ def fuse_views(field: SemanticField, cameras: Sequence[Camera]) -> SemanticField
             something = rendering.alpha > 0 if centres is not None else row_norms(pixels).view(camera.size) > EPS
             return camera, rows.view(*camera.size, -1) * something[..., None]
 
-        small = [_shrunk(camera) for camera in cameras]
+        small = []
+        for camera in cameras:
+            factor = min(1.0, (PIXELS / (camera.width * camera.height)) ** 0.5)
+            small.append(camera.resized(max(1, round(camera.height * factor)), max(1, round(camera.width * factor))))
         mean = average_views(gaussians, map(show, small))
         scale = sum(a.width * a.height for a in cameras) / max(1, sum(b.width * b.height for b in small))
         seen = Seen(mean.weights * scale, row_norms(mean.values).clamp_max(1))
-    fused = SemanticField(gaussians.replace(features=mean.values), Linear(latents), seen=seen)
+    fused = SemanticField(gaussians.replace(features=mean.values), Linear(latents.basis), seen=seen)
     return replace(field, cameras=tuple(cameras), seen=seen, fused=fused)
 
 
-def _shrunk(camera: Camera) -> Camera:
-    factor = min(1.0, (PIXELS / (camera.width * camera.height)) ** 0.5)
-    return camera.resized(max(1, round(camera.height * factor)), max(1, round(camera.width * factor)))
-
-
 def join_fields(fields: Sequence[SemanticField]) -> SemanticField:
-    """Fused fields with the same linear latents as one field; views that several fields have are kept once.
-
-    Raises:
-        ValueError: if there is no field, or one was not fused, or has other latents than the first.
-    """
-    if not fields:
-        raise ValueError("fields: expected at least one, got none")
-    first = fields[0]
-    bases = [part.decoder.to_tensors().get("linear.basis") for part in fields]
-    for i, (part, basis) in enumerate(zip(fields, bases, strict=True)):
-        if basis is None or bases[0] is None or part.seen is None:
-            raise ValueError(f"fields[{i}]: expected a fused field, got {part!r}; fit it with the default method")
-        if not torch.equal(basis, bases[0]):
-            raise ValueError(
-                f"fields[{i}]: expected the latents of fields[0], got others; fit both with the same ones (`sample_latents`)"
-            )
+    """Fused fields with the same linear latents (`sample_latents`) as one; views that several fields have are kept once."""
+    first, bases = fields[0], [part.decoder.to_tensors().get("linear.basis") for part in fields]
+    if any(basis is None or bases[0] is None or not torch.equal(basis, bases[0]) for basis in bases):
+        raise ValueError(
+            "fields: expected fused fields with the same latents, got others; fit them with the same ones (`sample_latents`)"
+        )
     cameras = {camera.name: camera for part in fields for camera in part.cameras}
     views = list(dict.fromkeys(name for part in fields for name in part.info.get("views", ())))
     return replace(

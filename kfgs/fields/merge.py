@@ -10,7 +10,7 @@ from torch import Tensor
 
 from .._check import check_range, check_shapes, check_whole
 from ..gaussians import Gaussians
-from ..quant import spherical_kmeans
+from ..quant.kmeans import spherical_kmeans
 from ..splat import covariance_3d
 
 CLUSTERS = 64
@@ -57,14 +57,11 @@ def merge_gaussians(
 
     Args:
         gaussians: N Gaussians with features.
-        weights: of the Gaussians, usually the pixels that each fills in the training views.
+        weights: of the Gaussians, usually the pixels that each fills in the training views. Those without are dropped.
         maximum: most Gaussians of the result.
-        faint: share of all weight that is dropped, in [0, 1). Gaussians without weight are always dropped.
+        faint: share of all weight that is dropped, in [0, 1).
         clusters: groups of features.
         generator: draws the first centres of k-means; None: seed 0.
-
-    Raises:
-        ValueError: if there are no features, shapes disagree, or no Gaussian has enough weight.
     """
     check_shapes(("gaussians.means", gaussians.means, "N 3"), ("weights", weights, "N"))
     check_whole("maximum", maximum, 1)

@@ -13,15 +13,14 @@ CLASSES = ("classes.json", "text.npy"), ("classes.json", "text.safetensors"), ("
 
 def scene_classes(scene: Path, channels: int | None = None) -> LabelSet | None:
     """The label set in a scene folder; None if there is none, it cannot be read, or it has other channels than the features."""
-    for names in CLASSES:
-        files = [scene / name for name in names]
-        if all(file.is_file() for file in files):
-            try:
-                classes = load_label_set(*files)
-            except (ValueError, OSError):  # said when classes are asked for; a long fit does not fail at its end
-                return None
-            return classes if channels in (None, classes.embeddings.shape[1]) else None
-    return None
+    files = next((names for names in CLASSES if all((scene / name).is_file() for name in names)), None)
+    if files is None:
+        return None
+    try:
+        classes = load_label_set(*(scene / name for name in files))
+    except (ValueError, OSError):  # said when classes are asked for; a long fit does not fail at its end
+        return None
+    return classes if channels in (None, classes.embeddings.shape[1]) else None
 
 
 def recall_scene(info: dict[str, Any]) -> Path:

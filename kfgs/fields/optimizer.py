@@ -14,10 +14,10 @@ _MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 class FieldOptimizer:
-    """Adam with one learning rate per kind of parameter, and moments that stay with their Gaussians.
+    """torch's fused Adam with one learning rate per kind of parameter, and moments that stay with their Gaussians.
 
     `params` holds the leaf tensors that are being trained. Growing or pruning keeps the moments of every Gaussian that
-    stays; new ones start at 0 (as in 3DGS). torch's Adam does the arithmetic, fused.
+    stays; new ones start at 0 (as in 3DGS).
     """
 
     def __init__(self, params: GaussianParams, training: Training, *, extent: float) -> None:
@@ -77,9 +77,9 @@ class FieldOptimizer:
         """Exchange the opacities and forget their moments, which belong to the old values."""
         leaf = self.params.logit_opacities
         leaf.data.copy_(logit_opacities)
-        for name, value in self._adam.state.get(leaf, {}).items():
-            if name in _MOMENTS:
-                value.zero_()
+        for moment in _MOMENTS:
+            if moment in self._adam.state.get(leaf, {}):
+                self._adam.state[leaf][moment].zero_()
 
     def state(self) -> dict[str, Any]:
         """Moments and step counts of Adam; empty before the first step."""

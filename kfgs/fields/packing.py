@@ -71,14 +71,6 @@ PRECISIONS = {"fine": FINE, "small": SMALL, "tiny": TINY}
 Precision = Literal["fine", "small", "tiny"] | Rounding
 
 
-class Packed(NamedTuple):
-    """What a file holds of a packed field."""
-
-    streams: dict[str, Tensor]  # uint8
-    entries: dict[str, Entry]
-    errors: dict[str, float]  # the largest, by tensor
-
-
 class _Place(NamedTuple):
     """Where the Gaussians are on the grid of the means; what is predicted from neighbours needs it."""
 
@@ -86,11 +78,13 @@ class _Place(NamedTuple):
     before: Array  # [N] int64: the row that each one is predicted from; N for none
 
 
-def pack(tensors: dict[str, Tensor], precision: Precision) -> Packed:
-    """Round and compress; Gaussians are sorted along a Morton curve. What has no coding (labels, cameras) stays exact.
+def pack(
+    tensors: dict[str, Tensor], precision: Precision
+) -> tuple[dict[str, Tensor], dict[str, Entry], dict[str, float]]:
+    """Round and compress: streams (uint8), their entries, and the largest error of each tensor.
 
-    Raises:
-        ValueError: if a number is not finite or too large to be rounded, an opacity lies outside [0, 1], or a scale is negative.
+    Gaussians are sorted along a Morton curve. What has no coding (labels, cameras) stays exact. A ValueError names a tensor
+    that cannot be rounded: a number is not finite or too large, an opacity lies outside [0, 1], or a scale is negative.
     """
     if isinstance(precision, str):
         check_choice("precision", precision, PRECISIONS)
@@ -124,7 +118,7 @@ def pack(tensors: dict[str, Tensor], precision: Precision) -> Packed:
         streams[name] = torch.from_numpy(np.frombuffer(packed if shorter else plain, np.uint8).copy())
         errors |= {name: entry.pop("error")} if "error" in entry else {}
         entries[name] = entry | {"shape": list(value.shape), "compressed": shorter}
-    return Packed(streams, entries, errors)
+    return streams, entries, errors
 
 
 def unpack(streams: dict[str, Tensor], entries: dict[str, Entry]) -> dict[str, Tensor]:

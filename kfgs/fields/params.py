@@ -21,6 +21,7 @@ from ..splat.sh import rgb_to_sh0
 # Bounds of a point's spacing: near-duplicates would give specks, and a lonely point a giant Gaussian.
 SMALLEST_SPACING = 0.01  # times the median spacing
 LARGEST_SPACING_QUANTILE = 0.99
+OUTLIER_RANGE = 4.0  # times the 0.95 quantile of the distances from the median: points farther out are dropped
 _NAMES = ("means", "quats", "log_scales", "logit_opacities", "features", "sh0", "sh_rest")
 
 
@@ -142,31 +143,22 @@ class GaussianParams:
         sh_degree: int = 3,
         initial_opacity: float = 0.1,
         max_points: int | None = None,
-        outlier_range: float = 4.0,
         generator: torch.Generator | None = None,
     ) -> GaussianParams:
         """Put one round Gaussian on each point, with the distance of its three nearest neighbours as its width (3DGS).
 
-        The standard deviation is the root mean square of the three distances, clamped between `SMALLEST_SPACING` times its
-        median and its 0.99 quantile, so that near-duplicates and lonely points do no harm. Features start at 0 and
-        rotations at the identity. With `colors` it becomes a colour field: each Gaussian has its point's colour from all
-        directions.
-
-        Structure from motion leaves points far outside a scene (30 times its size is common). A point is dropped if its
-        distance from the coordinate-wise median exceeds `outlier_range` times the 0.95 quantile of these distances.
+        Features start at 0 and rotations at the identity. With `colors` it becomes a colour field: each Gaussian has its
+        point's colour from all directions. Structure from motion leaves points far outside a scene (30 times its size is
+        common): a point is dropped if its distance from the median exceeds 4 times the 0.95 quantile of these distances.
 
         Args:
-            points: the cloud, usually `Scene.points`.
+            points: the cloud, usually `Scene.points`; at least two different ones.
             channels: D, the number of features per Gaussian; leave it out with `colors`.
             colors: of the points, usually `Scene.colors`; None starts a field of features.
             sh_degree: highest degree of the spherical harmonics of a colour field, 0 to 3.
             initial_opacity: in (0, 1).
             max_points: keep a random subset of at most this many (after outliers are dropped).
-            outlier_range: infinity keeps every point.
             generator: draws the subset; None draws the same one each time.
-
-        Raises:
-            ValueError: for points that are not finite or not at least two different ones, or options out of range.
 
         Example:
             >>> cube = torch.tensor([[x, y, z] for x in (0., 1.) for y in (0., 1.) for z in (0., 1.)])
@@ -177,16 +169,18 @@ class GaussianParams:
             got = "neither" if channels is None else "both"
             raise ValueError(f"channels, colors: expected one of them, got {got}; a field has features or colours")
         points = as_tensor("points", points, floating=True).detach()
-        colors = None if colors is None else as_tensor("colors", colors).to(points.device)
+        if colors is not None:
+            colors = as_tensor("colors", colors).to(points.device)
+            colors = colors.double() / 255 if colors.dtype == torch.uint8 else colors
         check_shapes(("points", points, "P 3"), ("colors", colors, "P 3"))
         check_whole("channels", 1 if channels is None else channels, 1)
         check_whole("sh_degree", sh_degree, 0, 3)
         check_range("initial_opacity", initial_opacity, 0, 1, closed=(False, False))
-        if not outlier_range > 0:
-            raise ValueError(f"outlier_range: expected a positive number (or infinity), got {outlier_range!r}")
         if not bool(torch.isfinite(points).all()):
             raise ValueError("points: expected finite numbers, got others; drop those rows first")
-        kept = _inliers(points, outlier_range).nonzero()[:, 0]
+        if colors is not None and not bool(((colors >= 0) & (colors <= 1)).all()):
+            raise ValueError("colors: expected uint8, or numbers in [0, 1], got others; divide by 255")
+        kept = _inliers(points).nonzero()[:, 0]
         if max_points is not None and len(kept) > max_points:
             check_whole("max_points", max_points, 2)
             generator = generator or torch.Generator().manual_seed(0)
@@ -199,38 +193,22 @@ class GaussianParams:
             log_scales=point_spacing(points).log()[:, None].repeat(1, 3),
             logit_opacities=points.new_full((n,), math.log(initial_opacity / (1 - initial_opacity))),
             features=None if channels is None else points.new_zeros(n, channels),
-            sh0=None if colors is None else rgb_to_sh0(_unit_colors(colors[kept]).to(points)),
+            sh0=None if colors is None else rgb_to_sh0(colors[kept].to(points)),
             sh_rest=points.new_zeros(n, (sh_degree + 1) ** 2 - 1, 3) if colors is not None and sh_degree else None,
         )
 
 
-def _unit_colors(colors: Tensor) -> Tensor:  # [P, 3] -> [P, 3] in [0, 1]
-    if colors.dtype == torch.uint8:
-        return colors.double() / 255
-    if not colors.is_floating_point() or not bool(((colors >= 0) & (colors <= 1)).all()):
-        raise ValueError(
-            f"colors: expected uint8, or floating point in [0, 1], got {colors.dtype} with other values; divide by 255"
-        )
-    return colors
-
-
-def _inliers(points: Tensor, outlier_range: float) -> Tensor:  # [P, 3] -> [P] bool
-    """The points within `outlier_range` times the 0.95 quantile of the distances from the median."""
+def _inliers(points: Tensor) -> Tensor:  # [P, 3] -> [P] bool
+    """The points within `OUTLIER_RANGE` times the 0.95 quantile of the distances from the median."""
     if len(points) == 0:
         return torch.zeros(0, dtype=torch.bool, device=points.device)
     distance = (points - points.median(dim=0).values).norm(dim=1)
     radius = float(np.quantile(distance.cpu().double().numpy(), 0.95))  # torch.quantile stops at 16M elements
-    return distance <= outlier_range * radius if radius > 0 else torch.ones_like(distance, dtype=torch.bool)
+    return distance <= OUTLIER_RANGE * radius if radius > 0 else torch.ones_like(distance, dtype=torch.bool)
 
 
 def point_spacing(points: Tensor) -> Tensor:  # [P, 3] -> [P] world units
-    """Root mean square distance to the three nearest other positions (or fewer), clamped to bounds.
-
-    Equal points are one position and share its spacing.
-
-    Raises:
-        ValueError: if there are not at least two different points.
-    """
+    """Root mean square distance to the three nearest other positions, clamped to bounds. Equal points are one position."""
     cloud, where = np.unique(points.detach().cpu().double().numpy(), axis=0, return_inverse=True)
     if len(cloud) < 2:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""The finished semantic field: Gaussians with latents, their decoder, and the questions that it answers."""
+"""The finished semantic field: Gaussians with latents, their decoder, and the questions that it answers (Sec. 3.4)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-from .._card import html_card, short_repr
+from .._card import html_card
 from .._check import as_tensor, check_shapes, check_whole
 from .._rows import unit_embeddings, unit_rows
 from ..cameras import Camera
@@ -20,7 +20,7 @@ from ..labels.classify import Classification
 from ..labels.questions import Classes, Negatives, check_rows, class_rows, make_question
 from ..labels.scores import Score, select_by_similarity
 from ..metrics import MIB, semantic_storage_bytes
-from ..splat import Ranked, Rendering, rasterize, rasterize_labels
+from ..splat import Ranked, Rendering, rasterize
 from .decoders import Decoder
 from .packing import Precision
 from .store import load_field, save_field
@@ -35,9 +35,6 @@ class Seen(NamedTuple):
 
     pixels: Tensor  # [N] number of pixels that it fills, in all training views
     agreement: Tensor  # [N] in [0, 1]: length of the mean of the unit features at its pixels
-
-    def __repr__(self) -> str:
-        return short_repr(self)
 
     def to(self, *args: Any, **kwargs: Any) -> Seen:
         """Both on another device or in another dtype, as `torch.Tensor.to`."""
@@ -67,16 +64,18 @@ class SemanticField:
     info: dict[str, Any] = field(default_factory=dict)
     """The origin of the field, as JSON."""
     seen: Seen | None = None
-    """How well the training views show each Gaussian."""
+    """How well the training views show each Gaussian: `pixels` that it fills, and their `agreement` in [0, 1]."""
     fused: SemanticField | None = None
     """The fused features of a trained field (`fuse_views`), with a `Linear` decoder."""
 
     def __post_init__(self) -> None:
         if self.gaussians.features is None:
             raise ValueError("gaussians: expected features [N, d], got None; fit them with fit_field")
-        rows = "gaussians.features", self.gaussians.features, ("N", self.decoder.latent)
-        seen = () if self.seen is None else (("seen.pixels", self.seen[0], "N"), ("seen.agreement", self.seen[1], "N"))
-        check_shapes(rows, *seen)
+        check_shapes(
+            ("gaussians.features", self.gaussians.features, ("N", self.decoder.latent)),
+            ("seen.pixels", self.seen and self.seen.pixels, "N"),
+            ("seen.agreement", self.seen and self.seen.agreement, "N"),
+        )
         if self.fused is not None and (len(self.fused) != len(self) or self.fused.dim != self.dim):
             raise ValueError(f"fused: expected a field of the same Gaussians and teacher, got {self.fused!r}")
 
@@ -114,21 +113,29 @@ class SemanticField:
         channels = f"{self.features.shape[1]} channels for {self.dim}"
         return f"SemanticField({self.decoder.name}: {len(self)} Gaussians, {channels})"
 
-    def _repr_html_(self) -> str:
-        teacher = self.info.get("teacher")
-        facts = {
-            "method": self.decoder.name,
-            "Gaussians": len(self),
-            "channels": f"{self.features.shape[1]} for {self.dim} of the teacher",
+    def _facts(self) -> dict[str, Any]:
+        teacher, rounded = self.info.get("teacher"), self.info.get("rounded", ())
+        return {
+            "size as Table 1 counts it": f"{self.storage() / MIB:.2f} MiB",
             "teacher": teacher.get("name") if isinstance(teacher, dict) else None,
             "training views": len(self.cameras),
-            "classes": None if self.classes is None else len(self.classes),
-            "size as Table 1 counts it": f"{self.storage() / MIB:.2f} MiB",
+            "classes": None if self.classes is None else f"{len(self.classes)}, with their text table",
+            "rounded": ", ".join(str(entry["precision"]) for entry in rounded) or None,
         }
-        return html_card("SemanticField", facts)
+
+    def _repr_html_(self) -> str:
+        channels = f"{self.features.shape[1]} for {self.dim} of the teacher"
+        counts = {"method": self.decoder.name, "Gaussians": len(self), "channels": channels}
+        return html_card("SemanticField", counts | self._facts())
+
+    def summary(self) -> str:
+        """A few lines of text: counts, channels, size, origin."""
+        plain = {name: value for name, value in self.info.items() if not isinstance(value, list | dict)}
+        facts = {name: value for name, value in (self._facts() | plain).items() if value is not None}
+        return "\n".join([repr(self), *(f"  {name}: {value}" for name, value in facts.items())])
 
     def to(self, *args: Any, **kwargs: Any) -> SemanticField:
-        """The field on another device or in another dtype, as `torch.Tensor.to`; pass cameras there afterwards, too."""
+        """The field on another device or in another dtype, as `torch.Tensor.to`; cameras that you pass must be there, too."""
         parts = {name: getattr(self, name) for name in ("gaussians", "decoder", "seen", "fused")}
         moved = {name: part.to(*args, **kwargs) for name, part in parts.items() if part is not None}
         return replace(self, **moved, cameras=tuple(camera.to(*args, **kwargs) for camera in self.cameras))
@@ -148,14 +155,8 @@ class SemanticField:
 
     def decode(self, latents: Tensor) -> Tensor:  # [..., d] -> [..., D]
         """Decode latents to the teacher's space (Psi of Sec. 3.3.2, or B z); features are returned unchanged."""
-        latents = as_tensor("latents", latents, floating=True)
-        if latents.ndim == 0 or latents.shape[-1] != self.decoder.latent:
-            raise ValueError(
-                f"latents: expected [..., {self.decoder.latent}] (from gaussians), got {tuple(latents.shape)}; pass maps or "
-                "features of this field"
-            )
         with torch.no_grad():
-            return self.decoder.decode(latents)
+            return self.decoder.decode(as_tensor("latents", latents, floating=True))
 
     def feature_map(self, camera: Camera) -> Tensor:  # [H, W, D]
         """Render the teacher's features from a viewpoint. 512 channels at 640x480 take 630 MB."""
@@ -164,18 +165,14 @@ class SemanticField:
     # Answers
 
     def cosines(self, rows: Tensor) -> Tensor:  # [M, D] -> [N, M]
-        """The cosine of each Gaussian's feature with some rows in the teacher's space; 0 if nothing is known about it.
-
-        Raises:
-            ValueError: if there is no row, shapes disagree, or a row is all-zero.
-        """
+        """The cosine of each Gaussian's feature with some rows in the teacher's space; 0 if nothing is known about it."""
         rows = as_tensor("rows", rows, floating=True)
         check_rows("rows", rows, ("M",), self.dim)
         source = self._source
         with torch.no_grad():
             return source.decoder.cosines(source.features, unit_embeddings(rows, "rows").to(source.features))
 
-    def own_features(self, rows: Tensor) -> Tensor:  # [n] int64 -> [n, D]
+    def own_features(self, rows: Any) -> Tensor:  # [n, D]
         """The features of some Gaussians, all-zero if unknown. Rows and errors: see `Gaussians.select`."""
         latents = self._source.features[as_rows("rows", rows, len(self)).to(self.features.device)]
         return self._source.decode(latents) * latents.any(dim=1)[:, None]
@@ -183,11 +180,8 @@ class SemanticField:
     def classify(self, classes: Classes | None = None) -> Classification:
         """The class of each Gaussian by max-similarity (Sec. 3.4), and its cosine with that class.
 
-        Args:
-            classes: a label set, or embeddings [C, D]; None: the field's own.
-
-        Returns:
-            Labels [N], -1 if nothing is known about the Gaussian, and scores [N]. A tie goes to the lowest class.
+        `classes` are a label set, or embeddings [C, D]; None: the field's own. Labels [N] are -1 where nothing is known about
+        the Gaussian. A tie goes to the lowest class.
         """
         scores, labels = self.cosines(self._rows(classes)).max(dim=1)
         return Classification(labels.masked_fill(~self.known, -1), scores.masked_fill(~self.known, 0))
@@ -219,13 +213,11 @@ class SemanticField:
             threshold: gamma. None: 0.5 for a relevancy, else derived from the scores; `how` of the result explains it.
             negatives: "classes", "canonical" (words of the classes' table), "none", rows [M, D], or "auto" as above.
             score: "relevancy" or "cosine". None: relevancy if there are negatives.
-
-        Raises:
-            ValueError: if there is no such class, shapes disagree, a row is all-zero, or an option is unknown.
         """
         if score == "cosine" and isinstance(negatives, str) and negatives == "auto":
             negatives = "none"
-        source, classes = self._source, self.classes if classes is None else classes
+        source = self if self.fused is None else self.fused
+        classes = self.classes if classes is None else classes
         question = make_question(target, classes, negatives, source.decoder.dim, self.info)
         latents, rows = source.features, question.rows
         named = isinstance(target, str) and isinstance(negatives, str)  # the rows of a label set are checked
@@ -246,23 +238,8 @@ class SemanticField:
             Labels and scores [H, W, top], the best first; -1 and 0 where there is no class. And the opacity [H, W]. Scores are
             blended votes, from 0 to 1; of a field with codewords, cosines of the pixel's codeword with the classes; where
             features are compared, numbers that only compare the classes of one pixel.
-
-        Raises:
-            ValueError: if shapes disagree, or `top` is not from 1 to C.
         """
         return self._rank(camera, classes, top, early=False)
-
-    def score_pixels(
-        self, camera: Camera, target: str | Tensor, classes: Classes | None = None, **options: Any
-    ) -> Ranked:
-        """How well each pixel fits one thing: the mean score of the Gaussians that it shows, by how much it shows of each.
-
-        The arguments are those of `query`, but no threshold. Scores [H, W, 1] are by default relevancies, above 0.5 where the
-        target fits best; labels are 0, and -1 where nothing was drawn.
-        """
-        scores = self.query(target, classes, 0.0, **options).scores
-        shown = rasterize_labels(self.gaussians.replace(features=scores[:, None].contiguous(), sh=None), camera)
-        return shown._replace(scores=shown.scores / shown.alphas[..., None].clamp_min(1e-6))
 
     # Size and files
 
@@ -272,21 +249,6 @@ class SemanticField:
         Without an autoencoder, the table counts no codebook; here it counts, because labelling needs it. `fused` does not.
         """
         return semantic_storage_bytes(len(self), self.features.shape[1], 0, self.decoder.parameters)
-
-    def summary(self) -> str:
-        """A few lines of text: counts, channels, size, origin."""
-        facts = {name: value for name, value in self.info.items() if not isinstance(value, list | dict)}
-        teacher = self.info.get("teacher")
-        if isinstance(teacher, dict):
-            facts = {"teacher": teacher.get("name"), **facts}
-        if self.classes is not None:
-            facts["classes"] = f"{len(self.classes)}, with their text table"
-        if isinstance(rounded := self.info.get("rounded"), list):
-            facts["rounded"] = ", ".join(
-                str(entry.get("precision"))[:20] for entry in rounded if isinstance(entry, dict)
-            )
-        first = f"{self!r}\n  size as Table 1 counts it: {self.storage() / MIB:.2f} MiB"
-        return "\n".join([first, *(f"  {name}: {value}" for name, value in facts.items())])
 
     def save(self, path: str | Path, precision: Precision | None = None) -> None:
         """Write one file, whole or not at all; an older field is replaced.

@@ -25,7 +25,6 @@ from ..cameras import Camera
 from ..gaussians import TENSORS as CLOUD
 from ..gaussians import Gaussians
 from ..labels import LabelSet
-from ..quant import LinearLatents
 from ..scenes.files import PIXELS
 from .decoders import Linear, make_decoder
 from .packing import Precision, pack, unpack
@@ -47,13 +46,11 @@ def find_field(path: str | Path) -> Path | None:
 
 
 def check_place(path: Path) -> None:
-    """Raise a ValueError unless a field may be written to `path`: a file of ours, also a damaged one, or nothing."""
+    """An error unless a field may be written to `path`: a file of ours, also a damaged one, or nothing."""
     if path.suffix != SUFFIX:
         raise ValueError(f"path: expected a name that ends in {SUFFIX}, got {path}; give another")
     if path.exists() and not path.is_file():
-        raise FileExistsError(
-            f"path: expected a new file or an older field at {path}, got something else; give another"
-        )
+        raise FileExistsError(f"path: expected a new file or an older field at {path}, got a folder; give another")
 
 
 def save_field(path: str | Path, parts: Mapping[str, Any], precision: Precision | None = None) -> None:
@@ -92,12 +89,7 @@ def load_field(path: str | Path) -> tuple[dict[str, Any], Any, dict[str, Any] | 
 
 
 def read_description(path: str | Path) -> dict[str, Any]:
-    """The JSON of a field: `gaussians`, `cameras`, `info`, `sha256`, and `packed` of a packed one. No number is read.
-
-    Raises:
-        FileNotFoundError: if there is nothing.
-        ValueError: if it is not a field.
-    """
+    """The JSON of a field: `gaussians`, `cameras`, `info`, `sha256`, and `packed` of a packed one. No number is read."""
     path = _field_file(path)
     with reading(path, WHAT, AGAIN), safe_open(path, framework="pt") as file:
         return _description(file)
@@ -151,7 +143,7 @@ def _to_tensors(path: Path, parts: Mapping[str, Any]) -> tuple[dict[str, Tensor]
     tensors = {f"gaussians.{name}": value for name, value in values if value is not None}
     tensors |= parts["decoder"].to_tensors()
     if parts["fused"] is not None:
-        tensors |= {"fused.latents": parts["fused"].features, "fused.basis": parts["fused"].decoder.latents.basis}
+        tensors |= {"fused.latents": parts["fused"].features, "fused.basis": parts["fused"].decoder.basis}
     if parts["seen"] is not None:
         tensors |= {f"seen.{name}": value for name, value in parts["seen"]._asdict().items()}
     if cameras:
@@ -208,4 +200,4 @@ def _from_tensors(
     if "fused.latents" not in tensors:
         return parts, seen, None
     fused = gaussians.replace(features=tensors["fused.latents"])
-    return parts, seen, {"gaussians": fused, "decoder": Linear(LinearLatents(tensors["fused.basis"]))}
+    return parts, seen, {"gaussians": fused, "decoder": Linear(tensors["fused.basis"])}

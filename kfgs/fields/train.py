@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +15,19 @@ from tqdm.auto import tqdm
 
 from .._card import short_repr
 from .._check import ORIGIN, as_tensor
-from .._files import as_path
+from .._files import as_path, digest_value
 from .._progress import Progress, as_progress
 from ..cameras import Camera
 from ..cameras.bounds import camera_extent
 from ..gaussians import FACTS
 from ..splat import rasterize
-from .checkpoint import identify_fit, read_checkpoint, write_checkpoint
+from .checkpoint import digest_tensors, read_checkpoint, write_checkpoint
 from .densify import GradientStatistics, densify, lowered_opacities
 from .loss import ColorLoss, Loss, l1_loss
 from .optimizer import FieldOptimizer
 from .params import GaussianParams
 from .training import Training, check_extent
 from .working_maps import shrink_camera, shrink_map
-
-WARM_UP_SIZE = 16  # pixels: more than a window of SSIM
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,28 +63,33 @@ def fit_field(
         params: the start; not changed. They decide dtype and device of the fit. Without an origin they are counted from that
             of the cameras, as the points of a scene are.
         cameras: C posed cameras without distortion.
-        targets: one map per camera, of any size, NaN where nothing is known (`l1_loss`); read one at a time
-            and only by `len` and index, so they may live on disk.
-        training: the paper's values when not given. If its `extent` is None, the extent of `cameras` takes its place, which is
+        targets: one map per camera, of any size, NaN where nothing is known; read one at a time, so they may live on disk.
+        training: the paper's values when not given. If its `extent` is None, that of the cameras takes its place:
             1.1 times their largest distance from their mean.
         loss: compares a rendered map, its alpha and the target. For colours, `ColorLoss`.
         generator: draws the views' order and the places of split Gaussians; None stands for seed 0.
-        progress: True shows a bar with loss, number of Gaussians and time left. A function is called with each new row of
-            the history. To stop early, raise from it; a checkpoint stays behind.
+        progress: True shows a bar. A function is called with each new row of the history; to stop early, raise from it; a
+            checkpoint stays behind.
         checkpoint: a file that is written every `checkpoint_every` steps and at the end. If it exists, the fit
             continues from it, and its result is bit for bit that of an undisturbed run (on one machine's CPU; a GPU adds
             gradients up in no fixed order).
 
     Raises:
-        TypeError: if `params`, a target or `progress` has another type.
-        ValueError: if the cameras' extent is 0 or not finite, counts or shapes disagree, a camera has distortion, the
-            checkpoint belongs to another fit, or no Gaussian is left.
+        ValueError: if the cameras' extent is 0, counts or shapes disagree, a camera has distortion, the checkpoint belongs
+            to another fit, or no Gaussian is left.
         FloatingPointError: if the loss is no longer finite.
         FileNotFoundError: if something else deletes the checkpoint's folder meanwhile; noticed at the next checkpoint.
     """
     training, progress = training or Training(), as_progress(progress)
     generator = generator or torch.Generator().manual_seed(0)
-    _check_views(params, cameras, targets)
+    if not isinstance(params, GaussianParams) or not len(params):
+        got = "no Gaussian" if isinstance(params, GaussianParams) else type(params).__name__
+        raise TypeError(f"params: expected GaussianParams, got {got}; GaussianParams.from_points makes them")
+    if not cameras or len(cameras) != len(targets):
+        raise ValueError(
+            f"targets: expected one map per camera ({len(cameras)}, at least one), got {len(targets)}; pass the views that "
+            "have maps"
+        )
     if params.origin == ORIGIN:
         params = replace(params, origin=cameras[0].origin)
     cameras = [camera.with_origin(params.origin) for camera in cameras]
@@ -94,13 +97,11 @@ def fit_field(
         training = replace(training, extent=float(check_extent(camera_extent(cameras, params.means))))
     trainer = Trainer(params, cameras, targets, training, loss, generator)
     path = as_path(checkpoint) if checkpoint is not None else None
-    identity = {} if path is None else identify_fit(params, cameras, targets, training, loss, generator)
-    if path is not None and path.exists():
-        trainer.restore_(read_checkpoint(path, identity))
     if path is not None:
+        identity = trainer.identity()
+        if path.exists():
+            trainer.restore_(read_checkpoint(path, identity))
         path.parent.mkdir(parents=True, exist_ok=True)
-    if trainer.step < training.steps:
-        trainer.warm_up()
     with tqdm(
         total=training.steps, initial=trainer.step, disable=progress is not True, desc="field", unit="step"
     ) as bar:
@@ -134,7 +135,7 @@ class Trainer:
         self._cameras, self._targets, self._loss = cameras, targets, loss
         self._training, self._extent, self._generator = training, training.extent, generator
         self._render_cameras: dict[tuple[int, bool], Camera] = {}
-        self._sh_start = params.used_sh_degree()  # of the start, so a resumed fit finds the same
+        self._sh_start = params.used_sh_degree()  # of the start, so a resumed fit has the same
         self.optimizer = FieldOptimizer(params, training, extent=self._extent)
         self.statistics = GradientStatistics.zeros(params)
         self.history: list[dict[str, Any]] = []
@@ -164,28 +165,17 @@ class Trainer:
         self._losses = 0.0
         return row
 
-    def warm_up(self) -> None:
-        """Compute the gradients of a tiny view and forget them: kernels are compiled or loaded now, not in step 1."""
-        params = self.optimizer.params
-        camera = self._cameras[0].to(params.means).resized(WARM_UP_SIZE, WARM_UP_SIZE)
-        rendering = rasterize(params.activated(), camera, engine=self._training.engine)
-        loss = self._loss if isinstance(self._loss, ColorLoss) else l1_loss  # not a caller's own one: it may keep count
-        value = loss(rendering.map, rendering.alpha, torch.zeros_like(rendering.map))
-        if value.requires_grad:
-            value.backward()
-        self.optimizer.forget_()
-
     def _learn_(self) -> None:
         """Follow the gradients of the next view; keep those of the places in the picture, which densifying needs."""
         if not self._queue:
             device = self._generator.device
             self._queue = torch.randperm(len(self._cameras), generator=self._generator, device=device).tolist()
-        view = self._queue.pop()
+        view, training = self._queue.pop(), self._training
         target, half = self._target(view)
         camera = self._camera(view, target, half)
-        every = self._training.sh_degree_every
+        every = training.sh_degree_every
         gaussians = self.optimizer.params.activated(self._sh_start + self.step // every if every else 3)
-        rendering = rasterize(gaussians, camera, engine=self._training.engine)
+        rendering = rasterize(gaussians, camera, engine=training.engine)
         means2d = rendering.projected.means2d
         if means2d.requires_grad:
             means2d.retain_grad()
@@ -199,19 +189,20 @@ class Trainer:
         self._losses += value
         if loss.requires_grad:  # not so when the view shows no Gaussian
             loss.backward()
-            if means2d.grad is not None and self._training.densify and self.step < self._training.densify.stop:
+            if means2d.grad is not None and training.densify and self.step < training.densify.stop:
                 self.statistics.add_(rendering.projected.index, means2d.grad, camera.size)
         self.optimizer.step_(self.step)
 
     def _densify_(self) -> None:
         options = self._training.densify
         assert options is not None
+        gradient, prune_large = self.statistics.mean(), 0 < options.reset_every < self.step
         grown = densify(
             self.optimizer.params,
-            self.statistics.mean(),
+            gradient,
             options,
             extent=self._extent,
-            prune_large=0 < options.reset_every < self.step,
+            prune_large=prune_large,
             generator=self._generator,
         )
         if len(grown.params) == 0:
@@ -224,21 +215,21 @@ class Trainer:
 
     def _target(self, view: int) -> tuple[Tensor, bool]:  # [h, w, D]
         """The map of a view, and whether it was halved."""
-        target = as_tensor(f"targets[{view}]", self._targets[view], floating=True)
+        target, size = as_tensor(f"targets[{view}]", self._targets[view], floating=True), self._cameras[view].size
         channels = self.optimizer.params.channels
-        clear = isinstance(self._loss, ColorLoss) and target.ndim == 3 and target.shape[2] == channels + 1
+        clear = isinstance(self._loss, ColorLoss) and target.shape[2:] == (channels + 1,)
         if target.ndim != 3 or (target.shape[2] != channels and not clear):
             raise ValueError(
                 f"targets[{view}]: expected [h, w, D] with D = {channels} (from params), got {tuple(target.shape)}; "
                 "start from GaussianParams.from_points(points, D)"
             )
         target = target.to(self.optimizer.params.means)
-        if self.step > self._training.half_until or min(self._cameras[view].size) < 2:
+        if self.step > self._training.half_until or min(size) < 2:
             return target, False
-        if tuple(target.shape[:2]) != self._cameras[view].size:
+        if tuple(target.shape[:2]) != size:
             raise ValueError(
-                f"targets[{view}]: expected {self._cameras[view].size} pixels as the camera has (half_until asks "
-                f"for it), got {tuple(target.shape[:2])}; resize the camera, or leave half_until at 0"
+                f"targets[{view}]: expected {size} pixels as the camera has (half_until asks for it), got "
+                f"{tuple(target.shape[:2])}; resize the camera, or leave half_until at 0"
             )
         return shrink_map(target, 2), True
 
@@ -251,6 +242,21 @@ class Trainer:
                 camera = camera.resized(min(height, camera.height), min(width, camera.width))
             self._render_cameras[view, half] = shrink_camera(camera, 2) if half else camera
         return self._render_cameras[view, half]
+
+    def identity(self) -> dict[str, str]:
+        """A digest of each input of the fit, before its first step. Of the targets, only their number and the first map count."""
+        params, cameras, targets = self.optimizer.params, self._cameras, self._targets
+        views = [tensor for camera in cameras for tensor in (camera.viewmat, camera.K)]
+        facts = [(camera.size, camera.near) for camera in cameras]
+        options = {name: value for name, value in asdict(self._training).items() if name != "checkpoint_every"}
+        return {
+            "params": digest_tensors(*params.to_tensors().values()) + digest_value([params.origin, params.antialiased]),
+            "cameras": digest_tensors(*views) + digest_value(facts),
+            "targets": digest_tensors(as_tensor("targets[0]", targets[0], floating=True)) + str(len(targets)),
+            "training": digest_value(options),
+            "generator": digest_tensors(self._generator.get_state()),
+            "loss": getattr(self._loss, "__qualname__", None) or repr(self._loss),
+        }
 
     def state(self) -> dict[str, Any]:
         """Everything that `restore_` needs: tensors, numbers, lists and dictionaries."""
@@ -272,22 +278,3 @@ class Trainer:
         self.statistics = GradientStatistics(*(value.to(now.means) for value in state["statistics"].values()))
         self._generator.set_state(state["generator"])
         self.step, self._queue, self.history, self._losses, self._seconds = state["progress"]
-
-
-def _check_views(params: GaussianParams, cameras: Sequence[Camera], targets: Sequence[Tensor]) -> None:
-    if not isinstance(params, GaussianParams):
-        hint = "GaussianParams.from_gaussians or GaussianParams.from_points makes them"
-        raise TypeError(f"params: expected GaussianParams, got {type(params).__name__}; {hint}")
-    if len(params) == 0:
-        raise ValueError("params: expected at least one Gaussian, got none; start from GaussianParams.from_points")
-    if len(cameras) == 0 or len(cameras) != len(targets):
-        raise ValueError(
-            f"targets: expected one map per camera ({len(cameras)}, at least one), got {len(targets)}; "
-            "pass the views that have maps"
-        )
-    for camera in cameras:
-        if camera.distortion is not None:
-            raise ValueError(
-                f"cameras: expected cameras without distortion, got {camera.distortion.model} (camera {camera.name!r}); "
-                "undistort the images first with kfgs.cameras.undistort, which returns the camera to use"
-            )

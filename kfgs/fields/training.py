@@ -116,18 +116,17 @@ class Training:
 
     @staticmethod
     def paper() -> Training:
-        """The published values."""
+        """The published values, which are the defaults."""
         return Training()
 
     @staticmethod
     def cpu() -> Training:
         """A short run for a CPU: a fifteenth of the steps, a schedule compressed to match, and faster learning rates.
 
-        The rates are higher because few steps must bring features from 0 to their values and Gaussians to their places.
-        Maps are rendered at twice the target's size: a field trained at the target's size looks worse if rendered larger.
-        The threshold for growing is higher than the paper's, because few small views are overfitted soon. Opacities are
-        not reset: there are too few steps to recover. (Toy room, 24 views of 48x64, ideal labels, 1,000 steps: test mIoU
-        0.77 at scale 1 and 2e-4, 0.79 at 1 and 6e-4, 0.89 at 2 and 6e-4.)
+        Few steps must bring features from 0 to their values. Maps are rendered at twice the target's size: a field trained at
+        the target's size looks worse if rendered larger. The threshold for growing is higher than the paper's, because few small
+        views are overfitted soon. Opacities are not reset: there are too few steps to recover. (Toy room, 1,000 steps: test mIoU
+        0.77 at scale 1 and gradient 2e-4, 0.79 at 1 and 6e-4, 0.89 at 2 and 6e-4.)
         """
         return Training(
             steps=2_000,

@@ -7,30 +7,34 @@ reconstruction technique (SIRT, Gilbert 1972) remove that: render, compare with 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 from tqdm import tqdm
 
 from .._check import check_range, check_whole
 from .._progress import as_bar
 from .._rows import row_norms, unit_rows
-from ..cameras import Camera
+from ..cameras import Camera, resize_map
 from ..formats.values import check_splats
 from ..gaussians import Gaussians
-from ..quant import FeatureMaps
+from ..quant.kmeans import cap
 from ..quant.linear import LinearLatents, fit_linear_latents
+from ..quant.sampling import FeatureMaps
+from ..splat import Tiles, accumulate_pixels, bin_tiles, composite, project
 from .decoders import Linear
 from .merge import FAINT, merge_gaussians
 from .semantic_field import Seen, SemanticField
-from .uplift_passes import average, correct, per_weight, some
-from .working_maps import WorkingMaps, working_directions
+from .working_maps import WorkingMaps, shrink_map, working_directions
 
 SPARSE = 0.3  # share of the views' pixels: a splat of the scene fills nearly all of them
+NEIGHBOURS = 17  # a Gaussian and its 16 nearest, whose corrections are judged together
 
 
 @dataclass(frozen=True)
@@ -53,8 +57,7 @@ class UpliftConfig:
     """Before merging, the faintest Gaussians, which together fill this share of all pixels, are dropped (`merge_gaussians`)."""
 
     def __post_init__(self) -> None:
-        if self.max_gaussians is not None:
-            check_whole("max_gaussians", self.max_gaussians, 1)
+        check_whole("max_gaussians", 1 if self.max_gaussians is None else self.max_gaussians, 1)
         check_range("keep", self.keep, 0, 1, closed=(False, True))
         check_range("faint", self.faint, 0, 1, closed=(True, False))
         check_whole("max_latents", self.max_latents, 1)
@@ -77,7 +80,6 @@ def uplift_maps(
     generator: torch.Generator | None = None,
     scratch: Path | None = None,
     progress: bool = False,
-    report: Callable[[str], None] | None = None,
 ) -> SemanticField:
     """Average feature maps onto Gaussians by rendering weight, correct for blending, and keep few linear latents.
 
@@ -95,23 +97,20 @@ def uplift_maps(
         scratch: a folder for these files, used for these maps only; files of a killed process are used again. The caller
             deletes it. None: a temporary folder.
         progress: show a bar.
-        report: called with a line per step.
 
     Returns:
         A field with a `Linear` decoder. Latents are all-zero where no view shows the Gaussian. `seen.agreement` of merged
-        Gaussians is the mean over their members.
+        Gaussians is the mean over their members. `info["note"]` warns if the Gaussians fill little of the views.
 
     Raises:
-        TypeError: if `progress` is a function: there are no rows to call it with.
         ValueError: if counts or shapes disagree, `write_splats` would refuse the Gaussians, a map is not finite, no map has
             features, or no view shows any Gaussian.
 
     Note:
         To continue by training, start `fit_field` with `GaussianParams.from_gaussians(field.gaussians)` and the maps
-        `field.decoder.latents.encode(unit features)`.
+        `field.decoder.encode(unit features)`.
     """
     config, progress, count = config or UpliftConfig(), as_bar(progress), len(cameras)
-    say = report if report is not None else lambda text: None
     if count == 0 or count != len(maps):
         raise ValueError(
             f"maps: expected one per camera ({count}, at least one), got {len(maps)}; pass the views that have maps"
@@ -131,29 +130,100 @@ def uplift_maps(
                     "cameras: expected views that show the Gaussians, got none that does; do both share one frame?"
                 )
             filled = float(shown.sum()) / sum(camera.width * camera.height for camera in cameras)
-            if filled < SPARSE:
-                say(f"note: the Gaussians fill {filled:.0%} of the views; are they in the cameras' frame?")
             means = per_weight(sums.sum(0))
             agreement = row_norms(means).clamp_max(1)
             if latents is None:
-                options: dict[str, Any] = {"keep": config.keep, "maximum": config.max_latents}
-                fitted = fit_linear_latents(unit_rows(means), _capped(shown), **options).basis
-                views.project(fitted)
+                weights = cap(shown, shown[shown > 0])
+                fitted = fit_linear_latents(
+                    unit_rows(means), weights, keep=config.keep, maximum=config.max_latents
+                ).basis
+                views.basis = fitted
                 sums = torch.cat([sums[..., :-1] @ fitted, sums[..., -1:]], dim=-1)
                 latents = LinearLatents((directions.double() @ fitted.double()).to(directions))
-            say(f"fused {count} maps of {latents.dim} channels as {latents.latent} latents")
             for _ in range(config.corrections):
                 sums = correct(cloud, sums, views, bar)
             if config.max_gaussians is not None:
                 cloud = cloud.replace(features=per_weight(sums.sum(0)))
                 merged = merge_gaussians(cloud, shown, config.max_gaussians, faint=config.faint, generator=generator)
-                say(f"{len(merged.gaussians)} of {len(cloud)} Gaussians left")
-                agreement = merged.pool(agreement * shown) / some(merged.weights)
+                agreement = merged.pool(agreement * shown) / _some(merged.weights)
                 cloud, shown, sums = merged.gaussians, merged.weights, torch.stack([merged.pool(half) for half in sums])
                 if config.corrections:
                     sums = correct(cloud, sums, views, bar)
+    note = f"the Gaussians fill {filled:.0%} of the views; are they in the cameras' frame?"
+    info = {"note": note} if filled < SPARSE else {}
     fused = cloud.replace(features=per_weight(sums.sum(0)))
-    return SemanticField(fused, Linear(latents), tuple(cameras), seen=Seen(shown, agreement))
+    return SemanticField(fused, Linear(latents.basis), tuple(cameras), info=info, seen=Seen(shown, agreement))
+
+
+def average(cloud: Gaussians, views: WorkingMaps, bar: Any) -> tuple[Tensor, Tensor]:  # [2, N, d' + 1], [N]
+    """Sums of features and weights, over the even and the odd views, and the number of pixels that each Gaussian fills."""
+    sums, shown = cloud.means.new_zeros(2, len(cloud), views.channels + 1), torch.zeros_like(cloud.opacities)
+    for i in range(len(views)):
+        view, half = views[i], sums[i % 2]
+        projected = project(cloud, view.camera)
+        tiles = bin_tiles(projected, view.camera.width, view.camera.height)
+        before = half[:, -1].clone()
+        splats = projected.means2d, projected.conics, projected.opacities
+        half.index_add_(0, projected.index, _sum_known(splats, tiles, view.map))
+        shown += view.scale * (half[:, -1] - before)
+        bar.update()
+    return sums, shown
+
+
+def correct(cloud: Gaussians, sums: Tensor, views: WorkingMaps, bar: Any) -> Tensor:  # sums: [2, N, d + 1]
+    """One pass of SIRT: correct each Gaussian's feature by the weighted mean of the difference at its pixels, without noise.
+
+    The even and the odd views make one reconstruction each. Signal is the part of the two corrections that agrees among
+    neighbours (`reliability`); both take the reliable share. Returns the corrected sums.
+    """
+    halves, lacking = per_weight(sums), torch.zeros_like(sums)
+    for i in range(len(views)):
+        view = views[i]
+        projected = project(cloud, view.camera)
+        tiles = bin_tiles(projected, view.camera.width, view.camera.height)
+        splats = projected.means2d, projected.conics, projected.opacities
+        rendered, alpha = composite(*splats, halves[i % 2], tiles, index=projected.index)
+        covered = shrink_map(alpha[..., None], view.factor)  # the rest of the pixel is empty: no Gaussian explains it
+        difference = covered * view.map - shrink_map(rendered, view.factor)
+        lacking[i % 2].index_add_(0, projected.index, _sum_known(splats, tiles, difference))
+        bar.update()
+    corrections, weights = per_weight(lacking), sums[..., -1:]
+    places = cloud.means.cpu().double().numpy()
+    near = cKDTree(places).query(places, k=[*range(1, min(NEIGHBOURS, len(places)) + 1)], workers=-1)[1]
+    nearest = torch.from_numpy(np.asarray(near)).to(cloud.means.device)
+    share = reliability(corrections[0], corrections[1], nearest)[:, None]
+    return torch.cat([(halves + share * corrections) * weights, weights], dim=-1)
+
+
+def reliability(first: Tensor, second: Tensor, near: Tensor) -> Tensor:  # [N, d] x 2, [N, k] -> [N] in [0, 1]
+    """The share of signal in the mean of two independent estimates: 2 r / (1 + r), the Spearman-Brown formula.
+
+    r is the common part of the estimates, sum of products over mean sum of squares, over a Gaussian and its neighbours.
+    Negative values become 0; so do those of Gaussians that one half of the views does not show.
+    """
+    products = (first * second).sum(1)[near].sum(1)
+    squares = (first.square().sum(1) + second.square().sum(1))[near].sum(1) / 2
+    r = (products / _some(squares)).clamp(0, 1)
+    return 2 * r / (1 + r)
+
+
+def per_weight(sums: Tensor) -> Tensor:  # [..., d + 1] -> [..., d]
+    """Means of sums whose last column is the weight; 0 without weight."""
+    return sums[..., :-1] / _some(sums[..., -1:])
+
+
+def _some(weights: Tensor) -> Tensor:
+    """Weights to divide by: 0 becomes the smallest normal number."""
+    return weights.clamp_min(torch.finfo(weights.dtype).tiny)
+
+
+def _sum_known(
+    splats: tuple[Tensor, Tensor, Tensor], tiles: Tiles, signal: Tensor
+) -> Tensor:  # [h, w, c] -> [M, c + 1]
+    """Sums of a view's known pixels by rendering weight w = T alpha and, in the last column, of these weights."""
+    known = ~signal[..., :1].isnan()
+    both = torch.cat([torch.where(known, signal, 0), known.to(signal)], dim=-1)
+    return accumulate_pixels(*splats, resize_map(both, (tiles.height, tiles.width)).contiguous(), tiles)[0]
 
 
 def sample_latents(maps: FeatureMaps, *, count: int = 32, views: int = 256) -> LinearLatents:
@@ -163,15 +233,5 @@ def sample_latents(maps: FeatureMaps, *, count: int = 32, views: int = 256) -> L
         maps: of all scenes together, or of all parts of a scene.
         count: of the latents; fewer if features have fewer channels.
         views: most maps that are read, evenly chosen.
-
-    Raises:
-        ValueError: if a map is not finite, or all are zero.
     """
     return LinearLatents(working_directions(maps, count, views))
-
-
-def _capped(weights: Tensor) -> Tensor:
-    """Weights capped at their 0.99 quantile, so that a few wall-sized Gaussians do not decide all latents."""
-    sample = weights[weights > 0]
-    sample = sample[:: max(1, len(sample) // 100_000)]
-    return weights.clamp_max(torch.quantile(sample, 0.99))

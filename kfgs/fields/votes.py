@@ -11,7 +11,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .._card import short_repr
 from .._rows import row_norms
 from ..cameras import Camera
 from ..gaussians import Gaussians
@@ -27,9 +26,6 @@ class Votes(NamedTuple):
 
     classes: Tensor  # [W] int64, which
     shares: Tensor  # [N, W], positive; 0 of a Gaussian about which nothing is known
-
-    def __repr__(self) -> str:
-        return short_repr(self)
 
 
 def divide_votes(cosines: Tensor, known: Tensor) -> Votes:  # [N, C], [N] bool

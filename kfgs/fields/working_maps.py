@@ -6,20 +6,19 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from .._arrays import read_arrays
 from .._check import check_shapes
 from .._files import atomic_path
 from .._rows import ENCODE, EPS, check_directions, row_norms, unit_rows
 from ..cameras import Camera
 from ..cameras.resample import from_bchw, to_bchw
-from ..quant import FeatureMaps
 from ..quant.linear import principal_directions
-from ..quant.sampling import read_blocks, read_grid
+from ..quant.sampling import FeatureMaps, all_zero, read_blocks, read_grid
 
 WORKING = 64
 """Number of working directions. For room_0's maps they keep 98.8 % of the energy; the rest is noise of single pixels. The
@@ -41,6 +40,15 @@ def shrink_camera(camera: Camera, divisor: int) -> Camera:
     return replace(camera, K=camera.K * factors, width=camera.width // divisor, height=camera.height // divisor)
 
 
+class WorkingView(NamedTuple):
+    """A view at its working size."""
+
+    camera: Camera
+    map: Tensor  # [h, w, d], NaN where nothing is known
+    factor: int  # from the map's size to the camera's
+    scale: float  # original pixels that a pixel of the camera covers
+
+
 class WorkingMaps:
     """The maps at their working size, in few directions, each in a file."""
 
@@ -54,10 +62,11 @@ class WorkingMaps:
     ) -> None:
         self._cameras, self._maps, self._directions, self._pixels = cameras, maps, directions, pixels
         self._temporary = tempfile.TemporaryDirectory(prefix="kfgs_") if scratch is None else None
-        self._folder = Path(self._temporary.name) if scratch is None and self._temporary else Path(scratch or "")
-        self._basis: Tensor | None = None
+        self._folder = Path(scratch if self._temporary is None else self._temporary.name)  # type: ignore[arg-type]
+        self.basis: Tensor | None = None
+        """[d', d]: from now on return maps in these directions, given in the working directions."""
 
-    def __enter__(self) -> WorkingMaps:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -70,41 +79,27 @@ class WorkingMaps:
     @property
     def channels(self) -> int:
         """Number of current directions."""
-        return int((self._directions if self._basis is None else self._basis).shape[1])
+        return int((self._directions if self.basis is None else self.basis).shape[1])
 
-    def project(self, basis: Tensor) -> None:  # [d', d]
-        """From now on return maps in these directions, given in the working directions."""
-        self._basis = basis
-
-    def __getitem__(self, i: int) -> tuple[Camera, Tensor, int, float]:
-        """The working camera, the map [h, w, d] (NaN if unknown), the divisor from a rendering to the map's size, and the
-        number of original pixels that a working pixel covers.
-        """
-        kept, shape = self._keep(i)
-        h, w, _ = kept.shape
-        camera = self._cameras[i]
-        largest = min(camera.height // h, camera.width // w)
-        factor = max(1, min(largest, int((self._pixels / (h * w)) ** 0.5)))
-        features = kept if self._basis is None else kept @ self._basis
-        # (width, height) of the whole picture in working pixels: not whole if some at the right or bottom were left over
-        span = shape.flip(0) / (int(shape[0]) // h) * factor / torch.tensor([camera.width, camera.height])
-        K = camera.K.to(features) * torch.cat([span, torch.ones(1)]).to(features)[:, None]
-        working = replace(camera.to(features), K=K, width=w * factor, height=h * factor)
-        return working, features, factor, 1 / float(span.prod())
-
-    def _keep(self, i: int) -> tuple[Tensor, Tensor]:  # [h, w, d'], [2]
-        """The map in the working directions, and its original (height, width); made once, then read from its file."""
+    def __getitem__(self, i: int) -> WorkingView:
         file = self._folder / f"{i}.npz"
         if not file.is_file():
-            rows, shape = self._make(i)
+            made, size = self._make(i)
             with atomic_path(file) as path, path.open("wb") as opened:
                 # not rounded, so that a run that continues gives the same bits
-                np.savez(opened, rows=rows.cpu().numpy(), shape=np.asarray(shape))
-            return rows, torch.tensor(shape, dtype=torch.float64)
-        arrays = read_arrays(file)
-        return torch.from_numpy(arrays["rows"]).to(self._directions), torch.from_numpy(arrays["shape"]).double()
+                np.savez(opened, rows=made.cpu().numpy(), shape=np.asarray(size))
+        with np.load(file) as arrays:
+            rows, shape = torch.from_numpy(arrays["rows"]).to(self._directions), torch.from_numpy(arrays["shape"])
+        (h, w, _), camera = rows.shape, self._cameras[i]
+        factor = max(1, min(camera.height // h, camera.width // w, int((self._pixels / (h * w)) ** 0.5)))
+        features = rows if self.basis is None else rows @ self.basis
+        # (width, height) of the whole picture in working pixels: not whole if some at the right or bottom were left over
+        span = shape.double().flip(0) / (int(shape[0]) // h) * factor / torch.tensor([camera.width, camera.height])
+        K = camera.K.to(features) * torch.cat([span, torch.ones(1)]).to(features)[:, None]
+        working = replace(camera.to(features), K=K, width=w * factor, height=h * factor)
+        return WorkingView(working, features, factor, 1 / float(span.prod()))
 
-    def _make(self, i: int) -> tuple[Tensor, tuple[int, int]]:  # [h, w, d']
+    def _make(self, i: int) -> tuple[Tensor, tuple[int, int]]:  # [h, w, d'], and the map's own (height, width)
         """Read a map as unit features in the working directions, and shrink it to its working size."""
         parts, masks = [], []
         for block in read_blocks(self._maps, i):  # [r, w, D]
@@ -127,19 +122,13 @@ class WorkingMaps:
 
 def working_directions(maps: FeatureMaps, count: int = WORKING, most: int = LOOKED_AT[0]) -> Tensor:  # [D, d']
     """The main `count` directions of unit features, from samples of at most `most` evenly spread maps."""
-    if len(maps) == 0:
-        raise ValueError("maps: expected at least one, got none; pass the maps of the training views")
-    moment = None
+    moment: Tensor | None = None
     for i in sorted({round(i) for i in np.linspace(0, len(maps) - 1, min(most, len(maps)))}):
         rows = read_grid(maps, i, LOOKED_AT[1]).float()
         check_shapes((f"maps[{i}]", rows, ("n", "D" if moment is None else len(moment))))
         check_directions(f"maps[{i}]", rows, advice=ENCODE)
         rows = unit_rows(rows) * (row_norms(rows) > EPS)[:, None]
         moment = rows.T @ rows if moment is None else moment + rows.T @ rows
-    assert moment is not None
-    values, directions = principal_directions(moment)
-    if not float(values[0]) > 0:
-        raise ValueError(
-            f"maps: expected nonzero features (longer than {EPS:g}), got {len(maps)} maps without; check the teacher"
-        )
-    return directions[:, :count].float()
+    if moment is None or not bool(moment.any()):
+        raise all_zero(len(maps))
+    return principal_directions(moment)[1][:, :count].float()

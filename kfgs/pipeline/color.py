@@ -15,8 +15,9 @@ from .._check import check_range, check_whole
 from .._files import check_output
 from .._progress import Progress, as_progress
 from ..cameras import Camera, resize_map
-from ..fields import ColorLoss, Densify, FieldFit, GaussianParams, Rates, Training, fit_field
+from ..fields import ColorLoss, Densify, GaussianParams, Rates, Training, fit_field
 from ..fields.checkpoint import digest_tensors
+from ..fields.train import FieldFit
 from ..formats import write_splats
 from ..gaussians import Gaussians
 from ..scenes import Scene

@@ -21,33 +21,18 @@ from torch import Tensor
 from .._files import check_output, folded_name, real_path, write_json
 from .._progress import Progress, as_progress
 from ..cameras import Camera
-from ..fields import (
-    Autoencoded,
-    Codewords,
-    Decoder,
-    FieldFit,
-    GaussianParams,
-    Identity,
-    SemanticField,
-    fit_field,
-    fuse_views,
-    scene_classes,
-    uplift_maps,
-)
+from ..fields import Autoencoded, Codewords, GaussianParams, Identity, SemanticField, fit_field, fuse_views, uplift_maps
 from ..fields.checkpoint import digest_tensors
+from ..fields.decoders import Decoder
+from ..fields.notes import scene_classes
 from ..fields.store import NAME, check_place
+from ..fields.train import FieldFit
 from ..formats import read_splats, write_splats
 from ..formats.table import splat_file_of
 from ..gaussians import Gaussians
-from ..quant import (
-    Autoencoder,
-    Codebook,
-    IndexMaps,
-    LatentMaps,
-    fit_autoencoder,
-    fit_codebook,
-    quantize_maps,
-)
+from ..quant import Autoencoder, Codebook, LatentMaps, fit_autoencoder, fit_codebook, quantize_maps
+from ..quant.maps import IndexMaps
+from ..quant.maps import IndexMaps
 from ..scenes import FeatureFolder, Scene, extract_features
 from ..scenes.scene import as_taken
 from .color import color_stage, find_color
@@ -198,8 +183,12 @@ def _uplift(job: _Job, method: Uplift) -> tuple[SemanticField, dict[str, Any]]:
             generator=job.generator("uplift"),
             scratch=scratch,
             progress=job.progress is True,
-            report=job.run.report,
         )
+        job.run.say(
+            f"{field.dim} channels as {field.decoder.latent} latents; {len(field)} of {len(geometry)} Gaussians left"
+        )
+        if "note" in field.info:
+            job.run.say(f"note: {field.info['note']}")
         field.save(folder / NAME)
 
     stage = job.run.stage("uplift", inputs, make)

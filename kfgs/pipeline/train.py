@@ -16,7 +16,8 @@ from .._files import write_json
 from .._progress import Progress
 from .._tensors import save_tensors
 from ..cameras.projection import project_points
-from ..fields import FieldFit, GaussianParams, Training
+from ..fields import GaussianParams, Training
+from ..fields.train import FieldFit
 from ..fields.training import check_extent
 from ..scenes import Scene, SceneError, SfmConfig, find_points
 from ..scenes.scene import check_is_scene

@@ -39,9 +39,8 @@ class CodebookReport:
     coverage: float
     """Share of the sampled features whose similarity to their codeword is at least `alpha`."""
     mean_similarity: float
-    """Mean similarity of the sampled features to their codeword."""
     alpha: float
-    """The similarity for `coverage`: `expand_below`, or the one that the data reached."""
+    """`expand_below`, or the similarity that a share `coverage` of the features has reached."""
     note: str | None
     """One line of advice if the book is full or covers too little; None if all is well."""
 
@@ -51,9 +50,6 @@ class CodebookReport:
 @dataclass(frozen=True, eq=False)
 class Codebook(Stored):
     """K features of a teacher that stand for all others, compared by cosine similarity: only their directions count.
-
-    Raises:
-        ValueError: if there is no codeword, or one is all-zero or not finite.
 
     Example:
         >>> book = Codebook(torch.tensor([[2.0, 0.0], [0.0, 3.0]]))
@@ -68,14 +64,11 @@ class Codebook(Stored):
     def __post_init__(self) -> None:
         object.__setattr__(self, "codewords", as_tensor("codewords", self.codewords, floating=True))
         check_shapes(("codewords", self.codewords, "K D"))
-        if self.size < 1:
-            raise ValueError("codewords: expected at least one row, got none; fit a codebook with fit_codebook")
         norms = row_norms(self.codewords.detach())
         bad = (~(torch.isfinite(norms) & (norms > EPS))).nonzero()[:, 0].tolist()
-        if bad:
-            raise ValueError(
-                f"codewords: expected rows of a finite length above {EPS:g}, got others in rows {bad[:8]}; leave them out"
-            )
+        if bad or not len(norms):
+            got = f"others in rows {bad[:8]}" if bad else "none"
+            raise ValueError(f"codewords: expected rows of a finite length above {EPS:g}, got {got}; fit them again")
 
     __repr__ = short_repr
 
@@ -129,34 +122,6 @@ class Codebook(Stored):
         return features
 
 
-def share_above(similarity: Tensor, alpha: float) -> float:
-    """The share of features that are at least `alpha` similar."""
-    return float((similarity >= alpha).double().mean())
-
-
-def fitted(
-    codewords: Tensor,  # [K, D]
-    history: list[dict[str, Any]],
-    nearest: Nearest,  # of the sampled features [n]
-    alpha: float,
-    *,
-    asked: bool,
-    full: bool,
-    enough: float,
-) -> Codebook:
-    """A codebook with its report. `asked`: alpha is an option; `enough`: the share of features that should reach it."""
-    size, coverage = len(codewords), share_above(nearest.similarity, alpha)
-    note = f"{100 * coverage:.0f} % of the features are {alpha:.2f} similar to their codeword"
-    if full and not (asked and coverage >= enough):
-        note = f"the codebook is full ({size} codewords): {note}; raise maximum for finer codewords"
-        note += ", or lower expand_below" if asked else ""
-    else:
-        note = f"{size} codewords, low coverage: {note}; lower expand_below" if asked and coverage < enough else ""
-    usage = torch.bincount(nearest.codeword, minlength=size).cpu()
-    mean = float(nearest.similarity.mean(dtype=torch.float64))
-    return Codebook(codewords, CodebookReport(history, usage, coverage, mean, alpha, note or None))
-
-
 def compare(
     features: Tensor,  # [..., D]
     unit: Tensor,  # [K, D] unit rows
@@ -182,3 +147,31 @@ def compare(
             length[here] = row_norms(part)
     shape = features.shape[:-1]
     return index.view(shape), product.view(shape), length.view(shape)
+
+
+def share_above(similarity: Tensor, alpha: float) -> float:
+    """The share of features that are at least `alpha` similar."""
+    return float((similarity >= alpha).double().mean())
+
+
+def with_report(
+    codewords: Tensor,  # [K, D]
+    history: list[dict[str, Any]],
+    nearest: Nearest,  # of the sampled features [n]
+    alpha: float,
+    *,
+    asked: bool,
+    full: bool,
+    enough: float,
+) -> Codebook:
+    """A codebook with its report. `asked`: alpha is an option; `enough`: the share of features that should reach it."""
+    size, coverage, note = len(codewords), share_above(nearest.similarity, alpha), None
+    reached = f"{100 * coverage:.0f} % of the features are {alpha:.2f} similar to their codeword"
+    if full and not (asked and coverage >= enough):
+        note = f"the codebook is full ({size} codewords): {reached}; raise maximum for finer codewords"
+        note += ", or lower expand_below" if asked else ""
+    elif asked and coverage < enough:
+        note = f"{size} codewords, low coverage: {reached}; lower expand_below"
+    usage = torch.bincount(nearest.codeword, minlength=size).cpu()
+    mean = float(nearest.similarity.mean(dtype=torch.float64))
+    return Codebook(codewords, CodebookReport(history, usage, coverage, mean, alpha, note))

@@ -24,11 +24,11 @@ def fit_codebook(
     """Fit a codebook to the feature maps of a scene.
 
     Args:
-        maps: one map per image, read one at a time. Sizes may differ, D may not. All-zero features are left out everywhere;
-            half precision is computed in float32.
+        maps: one map per image, read one at a time. Sizes may differ, D may not. All-zero features are left out; half
+            precision is computed in float32.
         options: `GrownCodebook` (also if None), kfgs's own, reads each map once; `PaperCodebook` (Eq. 5-9) once per epoch.
-        generator: draws the first directions of splits, or the order of the images; None stands for a fresh one with seed
-            0. On a CPU the same generator state gives the same bits.
+        generator: draws the first directions of splits, or the order of the images; None: seed 0. On a CPU the same state
+            gives the same bits.
         progress: True shows a bar; a function is called with each record as it is written to the history.
 
     Returns:
@@ -45,7 +45,7 @@ def fit_codebook(
 
     def read(i: int) -> Tensor:  # [n, D] nonzero, in at least single precision
         features = read_grid(maps, i, samples)
-        channels.append(features.shape[1])
+        channels.append(features.shape[-1])
         check_shapes((f"maps[{i}]", features, ("n", channels[0])))
         # row by row, whatever memory they come in: sums over another layout differ in their last bits
         features = features.to(torch.promote_types(features.dtype, torch.float32)).contiguous()
@@ -53,5 +53,5 @@ def fit_codebook(
         check_directions(f"maps[{i}]", features, norms, ENCODE)
         return features if bool((norms > EPS).all()) else features[norms > EPS]
 
-    generator = torch.Generator().manual_seed(0) if generator is None else generator
+    generator = generator or torch.Generator().manual_seed(0)
     return options.fit(read, count, generator, as_progress(progress))

@@ -12,11 +12,11 @@ from tqdm import tqdm
 
 from .._check import check_range, check_whole
 from .._progress import Progress
-from .._rows import EPS, unit_rows
-from .codebook import Codebook, Nearest, fitted, share_above
+from .._rows import unit_rows
+from .codebook import Codebook, Nearest, share_above, with_report
 from .kmeans import Cells, refine
 from .paper import prune
-from .sampling import SAMPLES
+from .sampling import SAMPLES, all_zero
 
 POOL = 32_768  # features that codewords grow on: 67 MB of 512 channels in float32, 365 of each of 90 maps
 CODEWORD_RMS = 0.5  # of a codeword's channels: in mode adc the field learns them at absolute rates made for [0, 1]
@@ -29,11 +29,10 @@ POWER_STEPS = 6  # of the power iteration for a cell's widest direction
 
 @dataclass(frozen=True)
 class GrownCodebook:
-    """A codebook that grows by splitting cells; the data decide how far.
+    """A codebook that grows by splitting cells (`grow`); the data decide how far.
 
-    A pool of features is taken evenly from the maps. Codewords grow on it (`grow`), and those that are too similar are
-    dropped (Eq. 9). A codeword is the mean direction of its cell, scaled to channels of root mean square `CODEWORD_RMS`.
-    Only directions count: scaling a feature by a positive factor changes nothing but rounding.
+    A pool of features is taken evenly from the maps; only their directions count. Codewords that are too similar are dropped
+    (Eq. 9). A codeword is the mean direction of its cell, scaled to channels of root mean square `CODEWORD_RMS`.
     """
 
     maximum: int = 255
@@ -68,9 +67,7 @@ class GrownCodebook:
         bar = tqdm(range(maps), desc="codebook", disable=progress is not True)
         pool = torch.cat([unit_rows(read(i)) for i in bar])
         if len(pool) == 0:
-            raise ValueError(
-                f"maps: expected nonzero features (longer than {EPS:g}), got {maps} maps without; check the teacher"
-            )
+            raise all_zero(maps)
         grown = grow(pool, self.maximum, alpha=self.expand_below, coverage=self.coverage, generator=generator)
         cells = grown.cells
         stays = prune(cells.centres, threshold=self.prune_above)
@@ -80,25 +77,25 @@ class GrownCodebook:
         alpha = self.expand_below
         if alpha is None:
             alpha = float(cells.similarity.sort().values[int((1 - self.coverage) * (len(pool) - 1))])
-        history = [
-            {"epoch": i, **record, "pruned": 0, "coverage": share_above(similarity, alpha)}
-            for i, (record, similarity) in enumerate(zip(grown.history, grown.similarity, strict=True))
-        ]
+        history: list[dict[str, Any]] = []
+        for epoch, (size, added, similarity) in enumerate(grown.rounds):
+            record: dict[str, Any] = {"epoch": epoch, "size": size, "added": added, "pruned": 0}
+            record |= {"coverage": share_above(similarity, alpha), "mean_similarity": float(similarity.mean())}
+            history.append(record)
         history[-1] |= {"size": len(cells.centres), "pruned": pruned}
         if callable(progress):
             for record in history:
                 progress(dict(record))
         codewords = cells.centres * (CODEWORD_RMS * cells.centres.shape[1] ** 0.5)
         nearest, asked = Nearest(cells.index, cells.similarity), self.expand_below is not None
-        return fitted(codewords, history, nearest, alpha, asked=asked, full=grown.full, enough=self.coverage)
+        return with_report(codewords, history, nearest, alpha, asked=asked, full=grown.full, enough=self.coverage)
 
 
 class Grown(NamedTuple):
     """The result of `grow`."""
 
     cells: Cells
-    history: list[dict[str, Any]]  # per round: size, added, mean_similarity before it grew
-    similarity: list[Tensor]  # [n] of each round, before it grew
+    rounds: list[tuple[int, int, Tensor]]  # size after, codewords added, and the features' similarities [n] before
     full: bool  # whether a split that pays was left out because the book was full
 
 
@@ -120,8 +117,7 @@ def grow(
     """
     least = max(2.0, LEAST_SHARE * len(unit) / maximum)
     cells = refine(unit, unit_rows(unit.sum(dim=0, keepdim=True)), 0)
-    history: list[dict[str, Any]] = []
-    similarity: list[Tensor] = []
+    rounds: list[tuple[int, int, Tensor]] = []
     while True:
         K = len(cells.centres)
         halves, gain = _halves(unit, cells, least, generator)
@@ -131,16 +127,12 @@ def grow(
             pays &= _mean((cells.similarity >= alpha).to(mean), cells.index, K) < coverage
         room = min(maximum - K, max(1, K // 2))
         chosen = mean.masked_fill(~pays, torch.inf).argsort(stable=True)[: min(room, int(pays.sum()))]
-        record = {"size": K + len(chosen), "added": len(chosen), "mean_similarity": float(cells.similarity.mean())}
-        history.append(record)
-        similarity.append(cells.similarity)
+        rounds.append((K + len(chosen), len(chosen), cells.similarity))
         if len(chosen) == 0:
-            break
+            return Grown(refine(unit, cells.centres, LAST_ROUNDS), rounds, bool(pays.any()))
         centres = cells.centres.clone()
         centres[chosen] = halves[0, chosen]
         cells = refine(unit, torch.cat([centres, halves[1, chosen]]), ROUNDS)
-    full = bool(pays.any())
-    return Grown(refine(unit, cells.centres, LAST_ROUNDS), history, similarity, full)
 
 
 def _halves(unit: Tensor, cells: Cells, least: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:

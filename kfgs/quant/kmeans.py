@@ -7,9 +7,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .._card import short_repr
 from .._check import check_shapes, check_whole
 from .._rows import EPS, row_norms, unit_rows
+
+CHUNK = 16_384  # features compared with the centres at a time
 
 
 class Cells(NamedTuple):
@@ -18,9 +19,6 @@ class Cells(NamedTuple):
     centres: Tensor  # [K, D] unit rows
     index: Tensor  # type: ignore[assignment]  # [n] int64
     similarity: Tensor  # [n]
-
-    def __repr__(self) -> str:
-        return short_repr(self)
 
 
 def spherical_kmeans(
@@ -34,41 +32,43 @@ def spherical_kmeans(
     """Group features by direction: each joins the centre of largest cosine; a centre is the mean direction of its features.
 
     The first centres are drawn in proportion to the weights, capped at their 0.99 quantile, so that one huge weight does not
-    draw all of them. An all-zero feature goes to group 0 and moves no centre. K may be smaller than `clusters` if there are
-    fewer features.
+    draw all of them. An all-zero feature goes to group 0 and moves no centre. With fewer features than `clusters`, K is smaller.
 
     Raises:
         ValueError: if shapes disagree, or every weighted feature is zero.
     """
     check_shapes(("features", features, "n D"), ("weights", weights, "n"))
     check_whole("clusters", clusters, 1)
-    generator = generator or torch.Generator().manual_seed(0)
-    rows = unit_rows(features)
-    counted = (weights > 0) & (row_norms(features) > EPS)
+    rows, counted = unit_rows(features), (weights > 0) & (row_norms(features) > EPS)
     candidates = int(counted.sum())
     if candidates == 0:
         raise ValueError(
             f"features: expected a nonzero row with a weight, got {len(features)} without; check the teacher"
         )
-    some = weights[counted]
-    some = some[:: max(1, len(some) // 100_000)]  # torch.quantile refuses more than 16 million
-    capped = weights.clamp_max(torch.quantile(some.double(), 0.99)) * counted
+    capped = cap(weights, weights[counted].double()) * counted
+    generator = generator or torch.Generator().manual_seed(0)
     first = torch.multinomial(capped.cpu().double(), min(clusters, candidates), generator=generator)
     return refine(rows, rows[first.to(rows.device)], rounds, weights=capped)
+
+
+def cap(weights: Tensor, positive: Tensor) -> Tensor:
+    """Weights capped at the 0.99 quantile of the positive ones, so that a few wall-sized Gaussians do not decide alone."""
+    sample = positive[:: max(1, len(positive) // 100_000)]  # torch.quantile refuses more than 16 million
+    return weights.clamp_max(torch.quantile(sample, 0.99))
 
 
 def refine(unit: Tensor, centres: Tensor, rounds: int, *, weights: Tensor | None = None) -> Cells:
     """Rounds of averaging and assignment, from given centres; a centre that loses all its features stays where it is."""
     cells = nearest_cells(unit, centres)
+    rows = unit if weights is None else unit * weights[:, None].to(unit)
     for _ in range(rounds):
-        rows = unit if weights is None else unit * weights[:, None].to(unit)
         sums = torch.zeros_like(centres).index_add_(0, cells.index, rows)  # repeatable on a CPU
         centres = torch.where(row_norms(sums)[:, None] > EPS, unit_rows(sums), cells.centres)
         cells = nearest_cells(unit, centres)
     return cells
 
 
-def nearest_cells(unit: Tensor, centres: Tensor, *, chunk: int = 16_384) -> Cells:
+def nearest_cells(unit: Tensor, centres: Tensor) -> Cells:
     """Eq. 5 for unit rows. Ties go to the lowest index."""
-    best = [(part @ centres.T).max(dim=1) for part in unit.split(chunk)]
+    best = [(part @ centres.T).max(dim=1) for part in unit.split(CHUNK)]
     return Cells(centres, torch.cat([b.indices for b in best]), torch.cat([b.values for b in best]))

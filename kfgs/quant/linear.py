@@ -27,13 +27,9 @@ class LinearLatents(Stored):
     kind = "linear latents"
 
     def __post_init__(self) -> None:
-        sizes = check_shapes(("basis", self.basis, "D d"))
-        if not 1 <= sizes["d"] <= sizes["D"]:
-            raise ValueError(
-                f"basis: expected [D, d] with 1 <= d <= D, got {tuple(self.basis.shape)}; one column per latent"
-            )
+        check_shapes(("basis", self.basis, "D d"))
         gram = self.basis.detach().T @ self.basis.detach()
-        if not bool((gram - torch.eye(sizes["d"]).to(gram)).abs().max() < 1e-3):
+        if not self.latent or not bool((gram - torch.eye(self.latent).to(gram)).abs().max() < 1e-3):
             raise ValueError("basis: expected orthonormal columns, got others; make one with fit_linear_latents")
 
     __repr__ = short_repr
@@ -69,8 +65,7 @@ def principal_directions(moment: Tensor) -> tuple[Tensor, Tensor]:  # [D, D] sum
     values, vectors = torch.linalg.eigh(moment.double())
     values, vectors = values.flip(0).clamp_min(0), vectors.flip(1)
     largest = vectors.abs().argmax(dim=0)
-    signs = torch.sign(vectors[largest, torch.arange(len(largest), device=largest.device)])
-    return values, vectors * signs
+    return values, vectors * torch.sign(vectors[largest, torch.arange(len(largest), device=largest.device)])
 
 
 def fit_linear_latents(
@@ -78,7 +73,6 @@ def fit_linear_latents(
     weights: Tensor | None = None,  # [n]
     *,
     keep: float = 0.99,
-    minimum: int = 1,
     maximum: int | None = None,
 ) -> LinearLatents:
     """The fewest latents that keep a stated share of the features' variation about their mean direction.
@@ -87,17 +81,16 @@ def fit_linear_latents(
         features: longer rows have more weight; normalise rows for equal weights.
         weights: of the rows; 1 if None.
         keep: share in (0, 1] of the energy beyond the first direction that the other latents must hold.
-        minimum: the fewest latents.
-        maximum: the most latents, even if `minimum` is larger; None: D.
+        maximum: the most latents; None: D.
 
     Raises:
         ValueError: if shapes disagree, an option is out of range, a number is not finite, or there is nothing but zeros.
     """
     features = as_tensor("features", features, floating=True)
     sizes = check_shapes(("features", features, "n D"), ("weights", weights, "n"))
+    maximum = sizes["D"] if maximum is None else maximum
     check_range("keep", keep, 0, 1, closed=(False, True))
-    check_whole("minimum", minimum, 1)
-    check_whole("maximum", sizes["D"] if maximum is None else maximum, 1)
+    check_whole("maximum", maximum, 1)
     rows = features.double()
     moment = rows.T @ (rows if weights is None else rows * weights.double()[:, None])
     if not bool(torch.isfinite(moment).all()):
@@ -110,5 +103,4 @@ def fit_linear_latents(
     further = 0
     if len(beyond) and float(beyond[-1]) > 0:
         further = int((beyond < keep * beyond[-1]).sum()) + 1  # the first that hold enough
-    most = sizes["D"] if maximum is None else min(sizes["D"], maximum)
-    return LinearLatents(vectors[:, : min(most, max(minimum, 1 + further))].to(features))
+    return LinearLatents(vectors[:, : min(maximum, 1 + further)].to(features))

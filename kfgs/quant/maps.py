@@ -24,25 +24,17 @@ class IndexMaps(Stored, Sequence[NDArray[Any]]):
 
     The number K itself marks a hole: a pixel whose feature was all-zero, about which nothing is known. uint8 up to 255
     codewords, uint16 up to 65,535. Sizes may differ between images.
-
-    Args:
-        maps: whole numbers in [0, size], one [h, w] array per image.
-        size: the number of codewords, K.
-
-    Raises:
-        ValueError: if a map is not [h, w], or holds anything but numbers of codewords and holes.
     """
 
     kind = "index maps"
 
     def __init__(self, maps: Sequence[NDArray[Any]], size: int) -> None:
+        """Whole numbers in [0, size], one array per image; `size` is the number of codewords, K."""
         if not 1 <= size <= 65_535:
             raise ValueError(f"size: expected 1 to 65535 codewords (two bytes a pixel), got {size}; lower K_max")
         self.size, self._maps = size, list[NDArray[Any]]()
         for i, indices in enumerate(maps):
             check_shapes((f"maps[{i}]", indices, "h w"))
-            if not np.issubdtype(indices.dtype, np.integer):
-                raise ValueError(f"maps[{i}]: expected whole numbers, got {indices.dtype}; use Codebook.quantize")
             if indices.size and not (indices.min() >= 0 and indices.max() <= size):
                 raise ValueError(
                     f"maps[{i}]: expected numbers from 0 to {size} (size, a hole), got {indices.min()} to "
@@ -76,23 +68,16 @@ class IndexMaps(Stored, Sequence[NDArray[Any]]):
 
 
 class LatentMaps(Sequence[Tensor]):
-    """The maps F_l = S'[M] that the field learns (Sec. 3.3.2), each made when it is read; holes are NaN.
-
-    Args:
-        index_maps: M, per image.
-        latents: of the codewords: latents S', or the codewords themselves.
-
-    Raises:
-        ValueError: if `latents` does not have a row per codeword.
-    """
+    """The maps F_l = S'[M] that the field learns (Sec. 3.3.2), each made when it is read; holes are NaN."""
 
     def __init__(self, index_maps: IndexMaps, latents: Tensor) -> None:  # [K, d]
+        """`latents`: those of the codewords, S', or the codewords themselves."""
         check_shapes(("latents", latents, (index_maps.size, "d")))
-        self.index_maps, self.latents = index_maps, latents
+        self.index_maps = index_maps
         self._rows = torch.cat([latents, torch.full_like(latents[:1], torch.nan)])
 
     def __repr__(self) -> str:
-        return f"LatentMaps({len(self)} maps, {self.latents.shape[1]} channels)"
+        return f"LatentMaps({len(self)} maps, {self._rows.shape[1]} channels)"
 
     def __len__(self) -> int:
         return len(self.index_maps)

@@ -13,11 +13,12 @@ from tqdm import tqdm
 from .._check import check_range, check_whole
 from .._progress import Progress
 from .._rows import EPS, row_norms, unit_rows
-from .codebook import Codebook, Nearest, fitted, share_above
-from .sampling import SAMPLES, farthest_points
+from .codebook import Codebook, Nearest, share_above, with_report
+from .sampling import SAMPLES, all_zero
 
 BETAS = (0.9, 0.999)  # Adam's usual decay rates; the paper names none
 ADAM_EPS = 1e-9  # the released script's
+BLOCK = 2048  # rows of a similarity matrix in memory at a time
 ENOUGH = 0.9  # share of covered features below which a full book is worth a note
 
 
@@ -72,9 +73,7 @@ class PaperCodebook:
         """See `fit_codebook`."""
         first = next((features for features in map(read, range(maps)) if len(features)), None)
         if first is None:
-            raise ValueError(
-                f"maps: expected nonzero features (longer than {EPS:g}), got {maps} maps without; check the teacher"
-            )
+            raise all_zero(maps)
         joins = self.joins_per_image or max(1, -(-(self.maximum - self.initial) // maps))
         book = EvolvingCodebook(first[farthest_points(first, self.initial)], self, joins)
         history: list[dict[str, Any]] = []
@@ -101,15 +100,46 @@ class PaperCodebook:
         codebook = Codebook(book.rows)
         index, last = zip(*(codebook.nearest(read(i)) for i in range(maps)), strict=True)
         nearest, full = Nearest(torch.cat(index), torch.cat(last)), codebook.size >= self.maximum
-        return fitted(codebook.codewords, history, nearest, self.expand_below, asked=True, full=full, enough=ENOUGH)
+        return with_report(
+            codebook.codewords, history, nearest, self.expand_below, asked=True, full=full, enough=ENOUGH
+        )
+
+
+def farthest_points(features: Tensor, count: int) -> Tensor:  # [n, D] -> [min(count, nonzero rows)] int64
+    """Pick the `count` most diverse features: farthest-point sampling with cosine similarity as the measure.
+
+    The first two are the least similar pair of all (the earlier one first), then `expand` continues: each further one is the
+    feature whose largest similarity to those already picked is smallest. Ties go to the lowest row; all-zero rows are never
+    picked. When nothing else is left, an equal feature may be picked; pruning (Eq. 9) takes it out again.
+    """
+    rows = (row_norms(features) > EPS).nonzero()[:, 0]
+    unit = unit_rows(features[rows])
+    if len(rows) < 2:
+        return rows
+    picked = torch.tensor(_least_similar_pair(unit)[:count], device=rows.device)
+    largest = (unit @ unit[picked].T).amax(dim=1)
+    largest[picked] = torch.inf  # never twice
+    return rows[torch.cat([picked, expand(unit, largest, threshold=torch.inf, room=count - len(picked))])]
+
+
+def _least_similar_pair(unit: Tensor) -> tuple[int, int]:  # [n, D], n >= 2
+    """Rows i < j of the smallest inner product: the upper triangle, one block of rows at a time."""
+    least, pair = float("inf"), (0, 1)
+    for start in range(0, len(unit) - 1, BLOCK):
+        similarity = unit[start : start + BLOCK] @ unit[start:].T  # [b, n - start], starts on the diagonal
+        square = similarity[:, : len(similarity)]
+        square.masked_fill_(torch.ones_like(square, dtype=torch.bool).tril(), torch.inf)
+        row, column = divmod(int(similarity.argmin()), similarity.shape[1])
+        if float(similarity[row, column]) < least:
+            least, pair = float(similarity[row, column]), (start + row, start + column)
+    return pair
 
 
 class EvolvingCodebook:
     """Codewords that are optimised by Adam (Kingma & Ba 2015), join and are dropped.
 
     Each row has its own moments and step count. torch.optim.Adam counts steps for the whole matrix, so a row that joins late
-    would start with wrongly corrected moments and a jump of about three learning rates; and a changed number of rows would
-    lose all moments. For rows that are there from the start the two agree.
+    would start with a jump of about three learning rates. For rows that are there from the start the two agree.
     """
 
     def __init__(self, codewords: Tensor, options: PaperCodebook, joins: int) -> None:  # [K, D]
@@ -162,17 +192,11 @@ def expand(features: Tensor, similarity: Tensor, *, threshold: float, room: int)
     """Choose the features that join the codebook because no codeword is similar enough to them (Eq. 8).
 
     The least similar feature joins first; similarities are then updated, and so on until every feature is at least
-    `threshold` similar to a codeword, or `room` have joined: farthest-point sampling that starts from the codebook. So each
-    feature is below the threshold at the moment it joins, and near-duplicates never fill the book.
-
-    Args:
-        features: of one image; all-zero rows never join.
-        similarity: of each feature with its codeword.
-        threshold: the paper's alpha.
-        room: how many may join.
+    `threshold` (alpha) similar to a codeword, or `room` have joined: farthest-point sampling that starts from the codebook. So
+    each feature is below the threshold at the moment it joins, and near-duplicates never fill the book.
 
     Returns:
-        Rows of `features` in the order of joining, perhaps none. Ties go to the lowest row.
+        Rows of `features` in the order of joining. Ties go to the lowest row; all-zero rows never join.
 
     Note:
         The paper admits in batches every feature below alpha; its released script takes the least similar ones without
@@ -215,15 +239,12 @@ def class_balanced_loss(
     codewords: Tensor,  # [K, D]
     index: Tensor,  # [n] int64
 ) -> tuple[Tensor, Tensor]:  # [], [K, D] its gradient by the codewords
-    """Mean over the classes present of the mean cosine distance within the class (Eq. 6-7).
+    """Mean over the T classes present of the mean cosine distance within the class (Eq. 6-7).
 
-    A class is a codeword that has features. With unit features u and the mean m of those of one class,
-    mean(1 - cos(u, s)) = 1 - m . s/|s|, so one matrix product gives both the loss and its gradient
+    A class is a codeword that has features. With the mean m of its unit features, mean(1 - cos(u, s)) = 1 - m . s/|s|, so one
+    matrix product gives both the loss and its gradient, without autograd (the tests compare them):
 
-        dL/ds = -(m - (m . s/|s|) s/|s|) / (T |s|),
-
-    without a loop over classes and without autograd (checked against autograd in the tests). No features: loss and gradient
-    are 0. An all-zero feature counts as similarity 0; leave it out beforehand.
+        dL/ds = -(m - (m . s/|s|) s/|s|) / (T |s|).
     """
     n, K = len(features), len(codewords)
     counts = torch.bincount(index, minlength=K)

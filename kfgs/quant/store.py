@@ -1,4 +1,4 @@
-"""Saving of learnt things: named tensors in one .safetensors file, whose header names the kind of thing. No pickle."""
+"""Files of learnt things: named tensors in one .safetensors file, whose header names the kind of thing. No pickle."""
 
 from __future__ import annotations
 
@@ -17,12 +17,9 @@ VERSION = "1"  # of all these files
 
 
 class Stored:
-    """Gives a dataclass of tensors `to`, `save` and `load`; `kind` goes into the file's header.
+    """Gives a dataclass of tensors `to`, `save` and `load`. Another class has its own `state_dict` and `from_state_dict`."""
 
-    A class that is not a dataclass writes its own `state_dict` and `from_state_dict`.
-    """
-
-    kind: str
+    kind: str  # as the file's header names it
 
     def state_dict(self) -> dict[str, Any]:
         """The tensors by name, as `torch.nn.Module` has it."""
@@ -46,12 +43,7 @@ class Stored:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read what `save` wrote.
-
-        Raises:
-            FileNotFoundError: if there is no such file.
-            ValueError: if the file is damaged, or of another kind or version.
-        """
+        """Read what `save` wrote; an error names a file that is missing, damaged, or of another kind."""
         expected = f"a kfgs {cls.kind} (.safetensors)"
         tensors, _ = read_safetensors(path, expected, "pass another file", kfgs=(cls.kind, VERSION))
         with reading(path, expected):

@@ -34,7 +34,7 @@ def draw_examples(
 
     Args:
         cameras: the views of the field (`field.cameras`). Pixels of examples are counted in their sizes.
-        examples: as for `label_set_from_examples`. Those that are Gaussians (`Picked`) lie in no view and are left out.
+        examples: as for `label_set_from_examples`. Those that are Gaussians lie in no view and are left out.
         photo: the picture of a view, in any size, for instance `lambda camera: scene.image(index[camera.name])`.
         width: width of a view in the picture, pixels.
 
@@ -49,7 +49,7 @@ def draw_examples(
     for label, (name, given) in enumerate(examples.items()):
         color = tuple(palette(np.array([label]), list(examples))[0].tolist())
         for i, example in enumerate(given if isinstance(given, Sequence) else [given]):
-            if hasattr(example, "indices"):
+            if not hasattr(example, "view"):
                 continue
             camera = view_named(cameras, example.view, f"examples[{name!r}][{i}]")
             shown.setdefault(id(camera), (camera, []))[1].append((example, color))

@@ -13,7 +13,7 @@ from small_room import make_room
 
 from kfgs.fields import GaussianParams
 from kfgs.formats import write_splats
-from kfgs.quant import IndexMaps
+from kfgs.quant.maps import IndexMaps
 from kfgs.scenes import load_scene
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -9,7 +9,7 @@ from kfgs.evaluation import FieldMethod, LabelTruth, Method, TeacherMethod, View
 from kfgs.evaluation.method import Labeller, best_labels
 from kfgs.evaluation.protocols import KfgsPooled
 from kfgs.fields import Autoencoded, Codewords, Identity, Linear, SemanticField
-from kfgs.quant import Codebook, LinearLatents
+from kfgs.quant import Codebook
 from kfgs.scenes import FeatureFolder, save_feature_map
 
 DIM = 6
@@ -24,7 +24,7 @@ def _field(mode: str) -> SemanticField:
     features = torch.cat([torch.eye(3, DIM) * torch.tensor([[1.0], [2.0], [0.5]]), torch.zeros(1, DIM)])
     decoder = Identity(DIM)
     if mode == "fused":
-        decoder = Linear(LinearLatents(torch.eye(DIM, 4)))
+        decoder = Linear(torch.eye(DIM, 4))
         features = features[:, :4]
     if mode in ("codebook", "autoencoder"):
         decoder = Codewords(Codebook(torch.eye(3, DIM) * 3))

@@ -5,7 +5,7 @@ import torch
 from cases_blobs import scene
 
 from kfgs import label_set_from_examples
-from kfgs.fields import Box, Clicks, Mask, Picked
+from kfgs.fields import Box, Clicks, Mask
 
 FIELD = scene([("chair", 0.0), ("lamp", 0.0)])
 (VIEW,) = (camera for camera in FIELD.cameras if camera.name == "at the chair")  # 40 x 30; the chair is in its middle
@@ -22,7 +22,7 @@ def shown(times, field=FIELD):
 
 
 def test_clicks_boxes_masks_and_gaussians_find_the_chair():
-    made = label_set_from_examples(FIELD, {**shown(1), "d": Picked([0, 1])})
+    made = label_set_from_examples(FIELD, {**shown(1), "d": torch.tensor([0, 1])})
     cosines = made.embeddings @ made.embeddings.T
     assert made.names == ("a", "b", "c", "d")
     assert float(cosines.min()) > 0.9  # all show the chair
@@ -38,7 +38,7 @@ def test_clicks_boxes_masks_and_gaussians_find_the_chair():
         Clicks(VIEW, [[1, 1000]]),
         Box(VIEW, [5, 5, 4, 4]),
         Mask(VIEW, torch.ones(3, 3, dtype=torch.bool)),
-        Picked([10**6]),
+        torch.tensor([10**6]),
     ],
 )
 def test_wrong_examples_are_named(wrong):

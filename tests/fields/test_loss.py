@@ -1,11 +1,10 @@
 import numpy as np
 import pytest
 import torch
-from messages import tells
 from oracles_color import ssim_windows
 
-from kfgs.fields import ColorLoss, l1_loss, loss
-from kfgs.fields.loss import mean_similarity
+from kfgs.fields import ColorLoss, loss
+from kfgs.fields.loss import l1_loss, mean_similarity
 from kfgs.metrics import ssim
 
 
@@ -34,12 +33,6 @@ def test_the_similarity_is_that_of_the_engine(engine, compiled, monkeypatch):
     measured = float(ColorLoss(1.0, engine)(a, a[..., 0], b))
     assert bool(calls) == compiled
     assert measured == pytest.approx(1 - ssim_windows(a, b).mean(), abs=1e-12)
-
-
-def test_an_unknown_engine_is_refused():
-    a, b = pictures()
-    with pytest.raises(ValueError, match="engine: expected one of"):
-        ColorLoss(1.0, "cuda")(a, a[..., 0], b)
 
 
 def test_similarity_is_the_mean_over_windows(path):
@@ -110,11 +103,6 @@ def test_color_loss_mixes_l1_and_dissimilarity():
     assert float(ColorLoss(0.2)(a[:10], a[:10, :, 0], b[:10])) == float(l1_loss(a[:10], a[:10, :, 0], b[:10]))
 
 
-def test_a_weight_outside_0_and_1_is_refused():
-    with pytest.raises(ValueError, match=tells("ssim_weight:", "[0, 1]", "got 1.5")):
-        ColorLoss(1.5)
-
-
 def test_the_opacity_of_a_photograph_is_a_channel_more(path):
     """The same as the loss of two pictures with four channels, with gradients in the colours and in the opacity."""
     a, b = pictures()
@@ -132,7 +120,7 @@ def test_the_opacity_of_a_photograph_is_a_channel_more(path):
 @pytest.mark.parametrize("measure", [l1_loss, ColorLoss()])
 def test_maps_of_other_channels_are_refused(measure, channels):
     a, _ = pictures()
-    with pytest.raises(ValueError, match=rf"rendered: expected \[H, W, D\] with D = {channels}"):
+    with pytest.raises(ValueError, match=rf"rendered: expected \[H, W, {channels}\]"):
         measure(a, a[..., 0], torch.zeros(23, 31, channels, dtype=a.dtype))
 
 
@@ -143,28 +131,3 @@ def test_a_target_that_needs_a_gradient_gets_one(measure):
     (found,) = torch.autograd.grad(measure(a, a[..., 0], b), b)
     (expected,) = torch.autograd.grad(measure(b, b[..., 0], a), b)
     torch.testing.assert_close(found, expected)
-
-
-@pytest.mark.parametrize("measure", [l1_loss, ColorLoss()])
-def test_a_target_of_another_dtype(measure):
-    a, b = pictures()
-    assert float(measure(a.float(), a[..., 0], b)) == pytest.approx(float(measure(a, a[..., 0], b)), abs=1e-6)
-
-
-@pytest.mark.parametrize("value", [torch.nan, torch.inf])
-@pytest.mark.parametrize("measure", [l1_loss, ColorLoss()])
-def test_a_picture_that_is_not_finite_has_no_finite_loss(measure, value):
-    a, b = pictures()
-    a[5, 6, 1] = value
-    assert not measure(a, a[..., 0], b).isfinite()
-
-
-@pytest.mark.parametrize("measure", [l1_loss, ColorLoss()])
-def test_gradients_of_two_passes_are_added(measure):
-    a, b = pictures(400, 330)  # as large as memory that is used again
-    a.requires_grad_()
-    (once,) = torch.autograd.grad(measure(a, a[..., 0], b), a)
-    once, value = once.clone(), measure(a, a[..., 0], b)
-    value.backward(retain_graph=True)
-    value.backward()
-    assert a.grad.equal(2 * once)

@@ -55,22 +55,6 @@ def test_every_group_follows_adam_at_its_rate():
         np.testing.assert_allclose(getattr(optimizer.params, name).detach().numpy(), expected, rtol=1e-9, err_msg=name)
 
 
-def test_means_rate_ends():
-    optimizer = FieldOptimizer(params(), CONFIG, extent=2.0)
-    assert optimizer.means_lr(0) == pytest.approx(3.2e-4)
-    assert optimizer.means_lr(50) == pytest.approx(3.2e-5)
-    assert optimizer.means_lr(100) == pytest.approx(3.2e-6)
-
-
-def test_the_start_is_not_changed():
-    start = params()
-    before = {name: value.clone() for name, value in start.to_tensors().items()}
-    optimizer = FieldOptimizer(start, CONFIG, extent=1.0)
-    give_gradients(optimizer, 1)
-    optimizer.step_(1)
-    assert all(torch.equal(before[name], value) for name, value in start.to_tensors().items())
-
-
 def test_moments_follow_their_gaussians():
     """Reordering and dropping Gaussians changes nothing for those that stay."""
     source = torch.tensor([4, 0, 2])
@@ -112,24 +96,6 @@ def test_setting_opacities_forgets_only_their_moments():
     assert not state["logit_opacities.exp_avg"].any()
     assert not state["logit_opacities.exp_avg_sq"].any()
     assert state["means.exp_avg"].all()
-
-
-def test_state_round_trip_continues_bit_for_bit():
-    one = FieldOptimizer(params(dtype=torch.float32), CONFIG, extent=1.0)
-
-    def advance(optimizer, step):
-        for name, value in optimizer.params.to_tensors().items():
-            value.grad = gradient(name, step, value.shape).float()
-        optimizer.step_(step)
-
-    for step in (1, 2):
-        advance(one, step)
-    other = FieldOptimizer(one.params, CONFIG, extent=1.0)
-    other.load_state_(one.state())
-    for step in (3, 4):
-        advance(one, step)
-        advance(other, step)
-    assert all(torch.equal(getattr(one.params, name), value) for name, value in other.params.to_tensors().items())
 
 
 def test_rates_fall_in_the_second_half_to_their_final_share():

@@ -1,5 +1,3 @@
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -48,11 +46,6 @@ def test_far_outliers_are_dropped_and_change_no_spacing():
     with_far = GaussianParams.from_points(torch.cat([inside, far]), 2)
     assert torch.equal(with_far.means, inside)
     torch.testing.assert_close(with_far.log_scales, GaussianParams.from_points(inside, 2).log_scales)
-    assert len(GaussianParams.from_points(torch.cat([inside, far]), 2, outlier_range=math.inf)) == 420
-
-
-def test_a_room_without_outliers_keeps_every_point():
-    assert len(GaussianParams.from_points(cloud(2000), 1)) == 2000
 
 
 def test_a_lone_survivor_gets_no_giant_gaussian():
@@ -102,7 +95,6 @@ def test_subset_is_seeded_and_of_the_asked_size():
     [
         ({"initial_opacity": 1.0}, ("initial_opacity:", "(0, 1)", "got 1.0")),
         ({"channels": 0}, ("channels:", "got 0")),
-        ({"outlier_range": 0.0}, ("outlier_range:", "got 0.0")),
         ({"points": torch.full((4, 3), torch.nan)}, ("points:", "finite", "got others")),
         ({"points": torch.ones(4, 2)}, ("points:", "[P, 3]", "got (4, 2)")),
     ],
@@ -150,14 +142,6 @@ def test_the_degree_in_use_is_the_highest_that_is_not_all_zero():
     assert GaussianParams.from_points(cloud(10), 3).used_sh_degree() == 0
     empty = params.map(lambda value: value[:0])
     assert empty.used_sh_degree() == 0
-
-
-def test_tensors_round_trip_and_missing_name():
-    params = GaussianParams.from_points(cloud(10), 3)
-    again = GaussianParams.from_tensors(params.to_tensors())
-    assert all(
-        torch.equal(a, b) for a, b in zip(params.to_tensors().values(), again.to_tensors().values(), strict=True)
-    )
 
 
 def test_a_colour_field_shows_its_points_colours():
@@ -239,8 +223,8 @@ def test_a_field_has_features_or_colours(change, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"colors": torch.full((10, 3), 2.0)}, ("colors:", "uint8", "[0, 1]", "got torch.float32")),
-        ({"colors": torch.zeros(10, 3, dtype=torch.int64)}, ("colors:", "uint8", "got torch.int64")),
+        ({"colors": torch.full((10, 3), 2.0)}, ("colors:", "uint8", "[0, 1]", "divide by 255")),
+        ({"colors": torch.full((10, 3), 128)}, ("colors:", "uint8", "[0, 1]", "divide by 255")),
         ({"colors": torch.zeros(9, 3)}, ("colors:", "[P, 3]", "P = 10", "got (9, 3)")),
         ({"colors": None}, ("channels, colors:", "got neither")),
         ({"channels": 3}, ("channels, colors:", "got both")),
@@ -250,12 +234,3 @@ def test_a_field_has_features_or_colours(change, message):
 def test_wrong_colours(change, message):
     with pytest.raises(ValueError, match=tells(*message)):
         GaussianParams.from_points(cloud(10), **({"colors": torch.zeros(10, 3)} | change))
-
-
-def test_points_and_colors_may_be_arrays_or_lists():
-    points, colors = cloud(20).double().numpy(), np.full((20, 3), 128, dtype=np.uint8)
-    found = GaussianParams.from_points(points, colors=colors)
-    assert found.means.dtype == torch.float64
-    same = GaussianParams.from_points(torch.from_numpy(points), colors=torch.from_numpy(colors))
-    assert all(torch.equal(value, same.to_tensors()[name]) for name, value in found.to_tensors().items())
-    assert GaussianParams.from_points([[0, 0, 0], [1, 0, 0]], 2).means.tolist() == [[0, 0, 0], [1, 0, 0]]

@@ -1,7 +1,6 @@
 import shutil
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from cases_training import changed
@@ -9,7 +8,8 @@ from messages import tells
 
 from kfgs import Camera, Gaussians, rasterize
 from kfgs.cameras import Distortion, resize_map
-from kfgs.fields import GaussianParams, Training, fit_field, l1_loss
+from kfgs.fields import GaussianParams, Training, fit_field
+from kfgs.fields.loss import l1_loss
 
 HEIGHT, WIDTH, CHANNELS = 24, 32, 3
 K = torch.tensor([[30.0, 0, 16.3], [0, 31.0, 11.6], [0, 0, 1]])
@@ -224,14 +224,6 @@ def test_an_antialiased_cloud_is_trained_as_it_is_drawn(tmp_path):
         fit_field(replace(params, antialiased=False), cameras, targets, config, checkpoint=path)
 
 
-def test_a_finished_checkpoint_returns_at_once(tmp_path):
-    cameras, targets = scene(3)
-    path = tmp_path / "fit.pt"
-    done = fit_field(start(), cameras, targets, SHORT, checkpoint=path)
-    again = fit_field(start(), cameras, targets, SHORT, checkpoint=path, progress=lambda row: 1 / 0)
-    assert same(done.params, again.params)
-
-
 def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
     cameras, targets = scene(3)
     path = tmp_path / "fit.pt"
@@ -333,10 +325,10 @@ def test_wrong_arguments():
         fit_field(start(channels=5), cameras, targets, SHORT)
     with pytest.raises(ValueError, match=tells("extent:", "got 0.0")):
         changed(SHORT, extent=0.0)
-    with pytest.raises(ValueError, match=tells("params:", "got none")):
+    with pytest.raises(TypeError, match=tells("params:", "got no Gaussian")):
         fit_field(start().map(lambda value: value[:0]), cameras, targets, SHORT)
     bent = replace(cameras[0], distortion=Distortion("brown_conrady", (0.1, 0.0, 0.0, 0.0)))
-    with pytest.raises(ValueError, match=tells("cameras:", "got brown_conrady")):
+    with pytest.raises(ValueError, match=tells("camera:", "got brown_conrady")):
         fit_field(start(), [bent], targets[:1], SHORT)
 
 
@@ -366,31 +358,9 @@ def test_losing_every_gaussian_says_so():
         fit_field(start(), cameras, targets, config)
 
 
-def test_targets_may_be_arrays(tmp_path):
-    cameras, targets = scene(2)
-    short = changed(SHORT, steps=5)
-    path = tmp_path / "fit.pt"
-    found = fit_field(start(), cameras, [target.numpy() for target in targets], short, checkpoint=path)
-    assert same(found.params, fit_field(start(), cameras, targets, short).params)
-    with pytest.raises(TypeError, match=tells("targets[", "str")):
-        fit_field(start(), cameras, ["a.npy", "b.npy"], short)
-
-
 def test_a_scene_without_size_needs_an_extent():
     camera = look_at_origin(0.0)
     params = start(2).map(lambda value: value)
     params = replace(params, means=camera.center.repeat(len(params), 1))
     with pytest.raises(ValueError, match=tells("cameras", "extent of 0", "Training(extent=...)")):
         fit_field(params, [camera], [torch.zeros(4, 4, CHANNELS)], changed(SHORT, extent=None))
-
-
-def test_progress_is_a_truth_value_or_a_function(capfd):
-    cameras, targets = scene(1)
-    for shown in (1, np.True_):
-        fit_field(start(), cameras, targets, changed(SHORT, steps=2), progress=shown)
-        assert "field" in capfd.readouterr().err
-    for hidden in (0, np.False_):
-        fit_field(start(), cameras, targets, changed(SHORT, steps=2), progress=hidden)
-        assert "field" not in capfd.readouterr().err
-    with pytest.raises(TypeError, match=tells("progress", "'bar'", "function")):
-        fit_field(start(), cameras, targets, SHORT, progress="bar")

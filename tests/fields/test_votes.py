@@ -6,10 +6,9 @@ import pytest
 import torch
 from cases_quant import made_autoencoder
 from cases_splat import a_camera, gaussians_before
-from messages import tells
 
 from kfgs.fields import Autoencoded, Identity, Linear, SemanticField
-from kfgs.quant import Codebook, LinearLatents
+from kfgs.quant import Codebook
 from kfgs.splat import rasterize
 
 DIM, CLASSES = 16, 7
@@ -29,7 +28,7 @@ def fused(unknown=20, latents=6):
     features = cloud.features.clone()
     features[:unknown] = 0
     basis = torch.linalg.qr(torch.randn(DIM, latents, generator=torch.Generator().manual_seed(3))).Q
-    return SemanticField(cloud.replace(features=features), Linear(LinearLatents(basis)))
+    return SemanticField(cloud.replace(features=features), Linear(basis))
 
 
 def uncompressed():
@@ -140,24 +139,3 @@ def test_votes_follow_features_that_are_changed_in_place():
     after = field.segment(camera(), texts())
     assert after.equal(changed.segment(camera(), texts()))
     assert not after.equal(before)
-
-
-@pytest.mark.parametrize("make", [fused, uncompressed, quantised])
-def test_scores_of_one_text_are_means_of_the_gaussians_scores(make):
-    field = make()
-    found = field.score_pixels(camera(), texts()[0], negatives=texts(5))
-    scores = field.query(texts()[0], threshold=0.5, negatives=texts(5)).scores
-    seen = rasterize(field.gaussians.replace(features=scores[:, None]), camera())
-    drawn = seen.alpha > 0
-    assert found.scores.shape == (44, 60, 1)
-    torch.testing.assert_close(found.scores[..., 0][drawn], (seen.map[..., 0] / seen.alpha)[drawn])
-    assert (found.scores[~drawn] == 0).all()
-    assert found.scores.max() <= 1 + 1e-5
-    assert found.labels[..., 0].equal(drawn.long() - 1)
-
-
-def test_wrong_arguments():
-    with pytest.raises(ValueError, match=tells("top:", "7", "8")):
-        fused().rank(camera(), texts(), top=8)
-    with pytest.raises(ValueError, match=tells("embeddings:", "all zeros")):
-        fused().paper.segment(camera(), torch.zeros(2, DIM))

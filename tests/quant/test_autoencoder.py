@@ -78,7 +78,7 @@ def test_bad_input(tmp_path):
         Autoencoder.from_state_dict({name: value for name, value in state.items() if name != "decoder.1.bias"})
     with pytest.raises(ValueError, match=tells("tensors:", "got others")):
         Autoencoder.from_state_dict(state | {"encoder.1.weight": torch.zeros(3, 4)})
-    with pytest.raises(ValueError, match=tells("tensors:", "encoder.0.weight", "['range']")):
+    with pytest.raises(ValueError, match=tells("tensors:", "encoder.0.weight")):
         Autoencoder.from_state_dict({"range": torch.tensor([0.0, 1.0])})
     Codebook(torch.eye(3)).save(tmp_path / "book.safetensors")
     with pytest.raises(ValueError, match=tells("book.safetensors:", "got codebook")):

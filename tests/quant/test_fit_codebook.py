@@ -122,15 +122,6 @@ def test_never_more_than_the_maximum(step_every):
     assert fit.report.coverage < 1
 
 
-def test_final_numbers_are_those_of_the_final_codebook():
-    maps, *_ = scene(noise=0.4)
-    fit = fit_codebook(maps, PaperCodebook(maximum=10, epochs=2))
-    similarity = torch.cat([fit.nearest(m).similarity.flatten() for m in maps])
-    assert fit.report.coverage == pytest.approx((similarity >= 0.9).double().mean().item())
-    assert fit.report.mean_similarity == pytest.approx(similarity.double().mean().item())
-    assert int(fit.report.usage.sum()) == similarity.numel()
-
-
 def test_zero_features_are_left_out():
     maps, *_ = scene(classes=3)
     clean = fit_codebook(maps, PaperCodebook(initial=3, epochs=1))
@@ -140,19 +131,6 @@ def test_zero_features_are_left_out():
     assert fit.report.coverage == 1.0
     assert fit.size == clean.size
     assert all(math.isfinite(value) for value in fit.report.history[0].values())
-
-
-def test_grids_that_are_none_are_refused():
-    class Wrong(OnDisk):
-        def grid(self, i, step, samples):
-            return self.maps[i]
-
-    with pytest.raises(ValueError, match=tells("maps.grid(0):", "[n, D]", "got (9, 12, 24)")):
-        fit_codebook(Wrong(scene()[0]))
-    maps = scene()[0]
-    maps[2] = torch.full((9, 12, 24), torch.nan)
-    with pytest.raises(ValueError, match=tells("maps[2]:", "got NaN")):
-        fit_codebook(OnDisk(maps))
 
 
 def test_paper_has_the_papers_values():

@@ -50,7 +50,7 @@ def test_never_more_than_the_maximum_and_full_says_that_more_would_pay():
     unit, _ = mixture([100] * 10)
     grown = run(unit, maximum=7)
     assert (len(grown.cells.centres), grown.full) == (7, True)
-    assert [record["size"] for record in grown.history][-1] == 7
+    assert grown.rounds[-1][:2] == (7, 0)
     assert not run(unit, maximum=10).full
 
 

@@ -1,9 +1,7 @@
 import pytest
 import torch
-from messages import tells
 
-from kfgs.quant import spherical_kmeans
-from kfgs.quant.kmeans import refine
+from kfgs.quant.kmeans import refine, spherical_kmeans
 
 
 def generator(seed=0):
@@ -57,26 +55,6 @@ def test_features_without_weight_or_length_move_nothing_but_get_a_group():
     torch.testing.assert_close(found.centres, alone.centres)
     assert torch.equal(found.index[:30], alone.index)
     assert found.index[30:32].tolist() == [0, 0]
-
-
-def test_a_seed_fixes_the_result_and_seed_0_is_the_default():
-    rows = torch.randn(200, 6, generator=generator(5))
-    weights = torch.rand(200, generator=generator(6))
-    default, zero = spherical_kmeans(rows, weights, 8), spherical_kmeans(rows, weights, 8, generator=generator(0))
-    assert torch.equal(default.index, zero.index)
-    assert torch.equal(default.centres, zero.centres)
-    other = spherical_kmeans(rows, weights, 8, generator=generator(1))
-    assert not torch.equal(default.centres, other.centres)
-
-
-def test_wrong_input_is_named():
-    for features, weights in ((torch.zeros(3, 2), torch.ones(3)), (torch.ones(3, 2), torch.zeros(3))):
-        with pytest.raises(ValueError, match=tells("features:", "zero", "weight", "got 3")):
-            spherical_kmeans(features, weights, 2)
-    with pytest.raises(ValueError, match=tells("weights:", "[n]", "n = 3", "got (2,)")):
-        spherical_kmeans(torch.ones(3, 2), torch.ones(2), 2)
-    with pytest.raises(ValueError, match=tells("clusters:", "got 0")):
-        spherical_kmeans(torch.ones(3, 2), torch.ones(3), 0)
 
 
 def test_a_centre_without_features_stays():

@@ -6,7 +6,7 @@ import torch
 from cases_viz import some_camera
 from messages import tells
 
-from kfgs.fields import Box, Clicks, Mask, Picked
+from kfgs.fields import Box, Clicks, Mask
 from kfgs.viz import draw_examples, palette
 from kfgs.viz.pictures import GAP, legend_strip
 
@@ -33,7 +33,7 @@ def test_points_boxes_and_masks_lie_where_they_were_shown_in_the_colours_of_thei
     mask[80:100, 110:150] = True
     examples = {
         "chair": Clicks("one", [(20.5, 30.5)]),
-        "wall": [Box("a/one.png", (50, 10, 90, 60)), Picked([1])],
+        "wall": [Box("a/one.png", (50, 10, 90, 60)), torch.tensor([1])],
         "plant": [Mask(ONE, mask)],
     }
     picture = draw_examples([ONE, TWO], examples, grey, width=WIDTH)
@@ -63,7 +63,7 @@ def test_pictures_of_any_size_are_laid_out_three_in_a_row():
     ("examples", "error", "message"),
     [
         ({}, ValueError, ("examples:", "in a view", "got none", "Clicks")),
-        ({"chair": Picked([1])}, ValueError, ("examples:", "in a view", "got none")),
+        ({"chair": torch.tensor([1])}, ValueError, ("examples:", "in a view", "got none")),
         (
             {"chair": Clicks("three.png", [(1, 1)])},
             ValueError,
