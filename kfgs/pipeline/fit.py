@@ -32,7 +32,6 @@ from ..formats.table import splat_file_of
 from ..gaussians import Gaussians
 from ..quant import Autoencoder, Codebook, LatentMaps, fit_autoencoder, fit_codebook, quantize_maps
 from ..quant.maps import IndexMaps
-from ..quant.maps import IndexMaps
 from ..scenes import FeatureFolder, Scene, extract_features
 from ..scenes.scene import as_taken
 from .color import color_stage, find_color
