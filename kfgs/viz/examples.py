@@ -49,7 +49,7 @@ def draw_examples(
     for label, (name, given) in enumerate(examples.items()):
         color = tuple(palette(np.array([label]), list(examples))[0].tolist())
         for i, example in enumerate(given if isinstance(given, Sequence) else [given]):
-            if not hasattr(example, "view"):
+            if isinstance(example, Tensor) or not hasattr(example, "view"):
                 continue
             camera = view_named(cameras, example.view, f"examples[{name!r}][{i}]")
             shown.setdefault(id(camera), (camera, []))[1].append((example, color))
