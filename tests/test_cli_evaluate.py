@@ -143,7 +143,7 @@ def test_the_rule_for_labels_is_that_of_the_protocol_unless_asked_and_is_said(
         ("{room} --scene {room}", "expected a field or a finished run of kfgs"),
         ("nothing --scene {room}", "expected a field or a finished run of kfgs"),
         ("{splats}/before.ply --scene {room}", "benchmarks/protocols.py"),
-        ("{room}/features --scene {bare}", "--text: expected text embeddings, got none"),
+        ("{room}/features --scene {bare}", "--text: expected a table of words, got none"),
     ],
 )
 def test_mistakes_are_named(words, message, run, room, splats, tmp_path, capsys):

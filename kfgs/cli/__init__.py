@@ -65,7 +65,7 @@ def main(arguments: list[str] | None = None) -> int:
         os.environ.setdefault("TQDM_MININTERVAL", "30")
     home = str(Path.home())  # shells leave `--out=~/run` as it is
     words = sys.argv[1:] if arguments is None else arguments
-    words = [re.sub("^(--[^=]+=)?~(?=/|$)", rf"\1{home}", word) for word in words]
+    words = [re.sub("^(--[^=]+=|)~(?=/|$)", lambda start: start[1] + home, word) for word in words]
     name, *given = [word for word in words if word != STRICT] or [""]
     command = COMMANDS.get("convert" if name == "info" else name)  # `kfgs info PATH`: convert without a target
     names = {} if command is None else shown_names(command)

@@ -66,12 +66,14 @@ def features(
     if table is not None and teacher.teacher is None:
         raise ValueError("words: expected --teacher with it, whose text encoder embeds them, got none; pass --teacher")
     listed = [] if words is None else read_words(words)
+    target = None if folder is None else out or folder / "features"
+    if target is not None:
+        check_output("out", target, "a folder")
     scene = None if source is None else views.load(source)
     network = teacher.load(**({"fast": True} if fast else {}))
     if table is not None:
         _embed_words(network, listed, table)
-    if source is not None and folder is not None:
-        target = out or folder / "features"
+    if target is not None:
         _make_maps(network, scene, target, views.split)
         given = "" if out is None else f" --features {out}"
         say(f"next: kfgs fit {source} --out run{given}" + ("" if views.split == "train" else f" --split {views.split}"))

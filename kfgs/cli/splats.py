@@ -137,9 +137,8 @@ def edit(
     check_target("out", out)
     saved = check_output("out", out.with_name(f"{out.name}.edits.json"), "a file")
     replayed = EditList() if replay is None else EditList.load(replay, anywhere=True)  # the user's own file
-    rules = [rule for change in replayed for rule in getattr(change, "where", ())]
-    named = edits.recolor or edits.move or edits.remove or edits.extract or any(rule.kind == "class" for rule in rules)
-    before = open_splats("splats", splats, named=bool(named))
+    by_class = any(rule.kind == "class" for change in replayed for rule in getattr(change, "where", ()))
+    before = open_splats("splats", splats, named=replay is None or by_class)
     states = apply_edits(before, list(replayed))
     asked = parse_edits(edits, states[-1].names)
     if not asked and not len(replayed):
@@ -241,9 +240,7 @@ def _pack(source: Path, target: Path, precision: Precision) -> None:
                 within = "within " + (f"{errors[name]:.3g} {UNITS[name]}" if name in UNITS else share)
             say(f"  {name:<32s} {size:>10,d} bytes  {within}".rstrip())
         say(f"{about['gaussians']:,} Gaussians in {target.stat().st_size / 2**20:.2f} MiB")
-        say(
-            "note: neighbours now lie side by side (Morton order), so indices into the old field do not fit the new one"
-        )
+        say("note: neighbours now lie side by side (Morton order): indices into the old field do not fit the new one")
     wrote([target])
 
 
