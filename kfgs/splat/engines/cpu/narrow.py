@@ -116,13 +116,13 @@ def composite_square(
 ) -> int:
     """Composite a square's Gaussians; returns where in the list it was done."""
     start, end, into = span
-    position = start
+    position, counts = start, square.counts
     step = CHUNK if contest is None or contest.favour == np.inf else CONTEST_CHUNK
     while position < end and dark != ALL_BLOCKS:
         stop = min(position + step, end)
         list_hits(rows, (position, stop), dark, square, trace, into + position - start)
         for block in range(BLOCKS):
-            if square.counts[block] and not _composite_block(
+            if counts[block] and not _composite_block(
                 rows, square, block, passes, sums, weights, trace, into - start, columns, contest
             ):
                 dark |= np.uint32(1) << np.uint32(block)

@@ -173,12 +173,12 @@ def composite_square(
     """Composite a square's Gaussians; returns where in the list it stopped, and a bit mask of the blocks with sums."""
     start, end, into = span
     stride = padded_length(source.channels)
-    position, filled = start, np.uint32(0)
+    position, filled, counts = start, np.uint32(0), square.counts
     while position < end and dark != ALL_BLOCKS:
         stop = min(position + CHUNK, end)
         list_hits(rows, (position, stop), dark, square, trace, into + position - start)
         for block in range(BLOCKS):
-            if square.counts[block]:
+            if counts[block]:
                 bit = np.uint32(1) << np.uint32(block)
                 count, lit = weigh_block(rows, block, square, source.begins, kept)
                 add_colors(sums, block * LANES * stride, stride, kept, source, count, (filled & bit) == 0)
