@@ -116,7 +116,7 @@ def test_saving_replaces_an_older_field_and_nothing_else(tmp_path):
     with pytest.raises(ValueError, match=tells("path:", ".kfgs")):
         field().save(tmp_path / "folder")
     (tmp_path / "folder.kfgs").mkdir()
-    with pytest.raises(FileExistsError, match=tells("path:", "something else")):
+    with pytest.raises(FileExistsError, match=tells("path:", "got a folder")):
         field().save(tmp_path / "folder.kfgs")
 
 
