@@ -158,7 +158,8 @@ def _check_splats(
             f"{offsets[:8].tolist()} ... {ends[1]}; {again}"
         )
     tiles = tiles._replace(rows=tiles.rows.contiguous(), offsets=offsets.contiguous())
-    return Splats(*[value.contiguous() for value in values], index=index), tiles
+    means2d, conics, opacities, features, background = [value.contiguous() for value in values]
+    return Splats(means2d, conics, opacities, features, background, index), tiles
 
 
 def _check_alike(name: str, value: Tensor, means2d: Tensor) -> None:
