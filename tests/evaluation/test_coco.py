@@ -48,7 +48,7 @@ def test_coco(tmp_path: Path) -> None:
         ({"segmentation": [[1, 2, 3, 4]]}, ("annotation 9", "polygons")),
         ({"segmentation": []}, ("annotation 9", "polygons")),
         ({"segmentation": {"size": [4, 3], "counts": [12]}}, ("annotation 9", "size [4, 3]", "[3, 4]")),
-        ({"segmentation": {"size": [3, 4], "counts": [2]}}, ("annotation 9", "add up to 3 x 4")),
+        ({"segmentation": {"size": [3, 4], "counts": [2]}}, ("annotation 9", "fill [3, 4] pixels")),
         ({"segmentation": {"size": [3, 4], "counts": "zz"}}, ("annotation 9", "polygons")),
         ({"segmentation": [[0, 0, 1, 0, 1, 1e30]]}, ("annotation 9", "100000 pixels")),
         ({"segmentation": [[5, 0, 7, 0, 7, 2]]}, ("annotation 9", "outside the image of 4x3")),

@@ -62,7 +62,7 @@ def load_scenesplat_points(path: str | Path, benchmark: str | None = None) -> Po
     labels = _labels(file, len(points), len(names), benchmark)
     objects = file.with_name("instance.npy")
     instances = _labels(objects, len(points), None, benchmark) if objects.is_file() else None
-    return PointTruth(in_world(torch.from_numpy(points).double()), labels, dict(enumerate(names)), instances)
+    return PointTruth(in_world(torch.from_numpy(points.astype(np.float64))), labels, dict(enumerate(names)), instances)
 
 
 def _find(folder: Path, benchmark: str | None) -> Path:
