@@ -13,7 +13,7 @@ from kfgs._tensors import save_tensors
 from kfgs.evaluation.coco import load_coco_labels
 from kfgs.evaluation.replica import load_replica_points
 from kfgs.evaluation.scannet import load_scannet_points
-from kfgs.fields import read_examples
+from kfgs.fields.examples import read_examples
 from kfgs.formats.ply import write_ply
 from kfgs.labels import load_label_set
 from kfgs.quant import Autoencoder, Codebook
@@ -23,14 +23,6 @@ from kfgs.scenes import SceneError, read_image
 HUGE = 10**400  # a whole number that no float holds
 
 
-@pytest.mark.parametrize("content", [HUGE, [0.5, HUGE], {"camera": {"w": HUGE}}])
-def test_whole_numbers_of_hundreds_of_digits_are_no_json(tmp_path, content):
-    file = tmp_path / "clicks.json"
-    file.write_text(json.dumps({"chair": [{"view": "a", "points": [[content, 1]]}]}))
-    with pytest.raises(ValueError, match=tells(file, "401 digits")):
-        read_examples(file)
-
-
 @pytest.mark.parametrize(
     "example",
     [
@@ -38,6 +30,7 @@ def test_whole_numbers_of_hundreds_of_digits_are_no_json(tmp_path, content):
         {"gaussians": ["a"]},
         {"view": "a", "points": ["12", "x"]},
         {"view": "a", "points": [[1, 2, 3]]},
+        {"view": "a", "points": [[HUGE, 1]]},
         {"view": "a", "box": "abcd"},
         {"view": "a"},
         {"points": [[1, 2]]},
@@ -57,7 +50,7 @@ def test_coordinates_beyond_every_float(tmp_path):
     images = [{"id": 1, "file_name": "a.png", "width": 8, "height": 6}]
     whole = {"images": images, "categories": [{"id": 1, "name": "chair"}], "annotations": [annotation]}
     (tmp_path / "annotations.json").write_text(json.dumps(whole))
-    with pytest.raises(ValueError, match=tells("annotations.json", "digits")):
+    with pytest.raises(ValueError, match=tells("annotations.json", "annotation 1", "too large")):
         dict(load_coco_labels(tmp_path / "annotations.json").maps)
 
 

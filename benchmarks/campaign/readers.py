@@ -90,7 +90,7 @@ def _words(path: Path) -> None:
 
 
 def _examples(path: Path) -> None:
-    from kfgs.fields import read_examples
+    from kfgs.fields.examples import read_examples
 
     read_examples(path)
 

@@ -63,7 +63,7 @@ def project_points(
     Args:
         camera: the camera; its distortion is applied.
         points: world coordinates; NaN and infinity count as not visible.
-        near: depth that a point must exceed, in world units.
+        near: depth that a point must exceed, in world units; `camera.near` is for drawing and is not used here.
 
     Returns:
         Pixels (x, y), with (0, 0) for points not in front of the camera; depths along the optical axis, in world units; and

@@ -92,8 +92,8 @@ class Similarity:
 
     def between_worlds(self, src: Origin, dst: Origin) -> Similarity:
         """The same motion in the world, of a similarity of coordinates that are counted from an origin on each side."""
-        far, near = (torch.tensor(origin, dtype=torch.float64) for origin in (src, dst))
-        return replace(self, translation=self.translation + near - self.scale * (self.rotation @ far))
+        source, target = (torch.tensor(origin, dtype=torch.float64) for origin in (src, dst))
+        return replace(self, translation=self.translation + target - self.scale * (self.rotation @ source))
 
     def apply_to_camera(self, camera: Camera) -> Camera:
         """The camera that takes the same picture of the moved scene.

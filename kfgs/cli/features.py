@@ -137,7 +137,7 @@ def _learn_examples(out: Path, field: Any, path: Path) -> None:
     """Write a table of examples and, if the photographs of their views are at hand, a picture of what was shown."""
     from .._files import read_json
     from ..evaluation.coco import load_coco_examples
-    from ..fields import label_set_from_examples, read_examples
+    from ..fields.examples import label_set_from_examples, read_examples
     from ..viz import draw_examples
     from ..viz.films import show_photos
     from ..viz.pictures import save_picture

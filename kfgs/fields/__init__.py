@@ -1,7 +1,7 @@
 """Fields of Gaussians: raw parameters, their training, and the finished semantic field (Sec. 3.2)."""
 
 from .decoders import Autoencoded, Codewords, Identity, Linear
-from .examples import Box, Clicks, Mask, label_set_from_examples, read_examples
+from .examples import Box, Clicks, Mask, label_set_from_examples
 from .fused import fuse_views
 from .loss import ColorLoss
 from .merge import merge_gaussians
@@ -30,6 +30,5 @@ __all__ = [
     "fuse_views",
     "label_set_from_examples",
     "merge_gaussians",
-    "read_examples",
     "uplift_maps",
 ]

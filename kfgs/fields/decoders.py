@@ -27,7 +27,7 @@ class Decoder(Protocol):
     """The meaning of d numbers per Gaussian (and per rendered pixel) in a teacher's space of D channels.
 
     With `paper`, pixels get their classes as Sec. 3.4 is printed: render the latent map, decode every pixel, quantise it with
-    the codebook, look up. By default each decoder uses what is better or quicker and stated in its docstring.
+    the codebook (if there is one), look up. By default each decoder uses what is better or quicker and stated in its docstring.
     """
 
     name: ClassVar[str]

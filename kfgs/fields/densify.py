@@ -25,7 +25,7 @@ class GradientStatistics(NamedTuple):
     @staticmethod
     def zeros(params: GaussianParams) -> GradientStatistics:
         """Statistics of no view."""
-        return GradientStatistics(*(params.means.new_zeros(len(params), requires_grad=False) for _ in range(2)))
+        return GradientStatistics(*(params.means.new_zeros(len(params)) for _ in range(2)))
 
     def add_(
         self,

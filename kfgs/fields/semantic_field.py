@@ -216,7 +216,7 @@ class SemanticField:
         """
         if score == "cosine" and isinstance(negatives, str) and negatives == "auto":
             negatives = "none"
-        source = self if self.fused is None else self.fused
+        source = self._source
         classes = self.classes if classes is None else classes
         question = make_question(target, classes, negatives, source.decoder.dim, self.info)
         latents, rows = source.features, question.rows

@@ -174,7 +174,7 @@ class Trainer:
         target, half = self._target(view)
         camera = self._camera(view, target, half)
         every = training.sh_degree_every
-        gaussians = self.optimizer.params.activated(self._sh_start + self.step // every if every else 3)
+        gaussians = self.optimizer.params.activated(self._sh_start + self.step // every if every else None)
         rendering = rasterize(gaussians, camera, engine=training.engine)
         means2d = rendering.projected.means2d
         if means2d.requires_grad:

@@ -27,7 +27,8 @@ from ..gaussians import Gaussians
 from ..quant.kmeans import cap
 from ..quant.linear import LinearLatents, fit_linear_latents
 from ..quant.sampling import FeatureMaps
-from ..splat import Tiles, accumulate_pixels, bin_tiles, composite, project
+from ..splat import accumulate_pixels, bin_tiles, composite, project
+from ..splat.views import divide_sums, sum_pixels
 from .decoders import Linear
 from .merge import FAINT, merge_gaussians
 from .semantic_field import Seen, SemanticField
@@ -145,7 +146,7 @@ def uplift_maps(
             if config.max_gaussians is not None:
                 cloud = cloud.replace(features=per_weight(sums.sum(0)))
                 merged = merge_gaussians(cloud, shown, config.max_gaussians, faint=config.faint, generator=generator)
-                agreement = merged.pool(agreement * shown) / _some(merged.weights)
+                agreement = divide_sums(merged.pool(agreement * shown), merged.weights)
                 cloud, shown, sums = merged.gaussians, merged.weights, torch.stack([merged.pool(half) for half in sums])
                 if config.corrections:
                     sums = correct(cloud, sums, views, bar)
@@ -160,12 +161,9 @@ def average(cloud: Gaussians, views: WorkingMaps, bar: Any) -> tuple[Tensor, Ten
     sums, shown = cloud.means.new_zeros(2, len(cloud), views.channels + 1), torch.zeros_like(cloud.opacities)
     for i in range(len(views)):
         view, half = views[i], sums[i % 2]
-        projected = project(cloud, view.camera)
-        tiles = bin_tiles(projected, view.camera.width, view.camera.height)
-        before = half[:, -1].clone()
-        splats = projected.means2d, projected.conics, projected.opacities
-        half.index_add_(0, projected.index, _sum_known(splats, tiles, view.map))
-        shown += view.scale * (half[:, -1] - before)
+        index, total, _ = sum_pixels(cloud, view.camera, _known(view.map, view.camera.size))
+        half.index_add_(0, index, total)
+        shown.index_add_(0, index, view.scale * total[:, -1])
         bar.update()
     return sums, shown
 
@@ -185,7 +183,8 @@ def correct(cloud: Gaussians, sums: Tensor, views: WorkingMaps, bar: Any) -> Ten
         rendered, alpha = composite(*splats, halves[i % 2], tiles, index=projected.index)
         covered = shrink_map(alpha[..., None], view.factor)  # the rest of the pixel is empty: no Gaussian explains it
         difference = covered * view.map - shrink_map(rendered, view.factor)
-        lacking[i % 2].index_add_(0, projected.index, _sum_known(splats, tiles, difference))
+        total, _ = accumulate_pixels(*splats, _known(difference, view.camera.size), tiles)
+        lacking[i % 2].index_add_(0, projected.index, total)
         bar.update()
     corrections, weights = per_weight(lacking), sums[..., -1:]
     places = cloud.means.cpu().double().numpy()
@@ -203,27 +202,19 @@ def reliability(first: Tensor, second: Tensor, near: Tensor) -> Tensor:  # [N, d
     """
     products = (first * second).sum(1)[near].sum(1)
     squares = (first.square().sum(1) + second.square().sum(1))[near].sum(1) / 2
-    r = (products / _some(squares)).clamp(0, 1)
+    r = divide_sums(products, squares).clamp(0, 1)
     return 2 * r / (1 + r)
 
 
 def per_weight(sums: Tensor) -> Tensor:  # [..., d + 1] -> [..., d]
     """Means of sums whose last column is the weight; 0 without weight."""
-    return sums[..., :-1] / _some(sums[..., -1:])
+    return divide_sums(sums[..., :-1], sums[..., -1:])
 
 
-def _some(weights: Tensor) -> Tensor:
-    """Weights to divide by: 0 becomes the smallest normal number."""
-    return weights.clamp_min(torch.finfo(weights.dtype).tiny)
-
-
-def _sum_known(
-    splats: tuple[Tensor, Tensor, Tensor], tiles: Tiles, signal: Tensor
-) -> Tensor:  # [h, w, c] -> [M, c + 1]
-    """Sums of a view's known pixels by rendering weight w = T alpha and, in the last column, of these weights."""
+def _known(signal: Tensor, size: tuple[int, int]) -> Tensor:  # [h, w, c] -> [H, W, c + 1]
+    """A map in a camera's size, 0 where it is unknown, and which pixels are known as its last channel."""
     known = ~signal[..., :1].isnan()
-    both = torch.cat([torch.where(known, signal, 0), known.to(signal)], dim=-1)
-    return accumulate_pixels(*splats, resize_map(both, (tiles.height, tiles.width)).contiguous(), tiles)[0]
+    return resize_map(torch.cat([torch.where(known, signal, 0), known.to(signal)], dim=-1), size).contiguous()
 
 
 def sample_latents(maps: FeatureMaps, *, count: int = 32, views: int = 256) -> LinearLatents:

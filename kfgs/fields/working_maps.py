@@ -94,7 +94,12 @@ class WorkingMaps:
         factor = max(1, min(camera.height // h, camera.width // w, int((self._pixels / (h * w)) ** 0.5)))
         features = rows if self.basis is None else rows @ self.basis
         # (width, height) of the whole picture in working pixels: not whole if some at the right or bottom were left over
-        span = shape.double().flip(0) / (int(shape[0]) // h) * factor / torch.tensor([camera.width, camera.height])
+        span = (
+            shape.double().flip(0)
+            / self._shrinkage(*shape.tolist())
+            * factor
+            / torch.tensor([camera.width, camera.height])
+        )
         K = camera.K.to(features) * torch.cat([span, torch.ones(1)]).to(features)[:, None]
         working = replace(camera.to(features), K=K, width=w * factor, height=h * factor)
         return WorkingView(working, features, factor, 1 / float(span.prod()))
@@ -111,13 +116,17 @@ class WorkingMaps:
             parts.append((features @ self._directions) / lengths.clamp_min(EPS)[..., None] * masks[-1])
         rows, known = torch.cat(parts), torch.cat(masks)
         height, width = rows.shape[:2]
-        shrink = 1
-        while (height // shrink) * (width // shrink) > self._pixels and shrink < min(height, width):
-            shrink += 1
-        if shrink > 1:
+        if (shrink := self._shrinkage(height, width)) > 1:
             rows, share = shrink_map(rows, shrink), shrink_map(known.to(rows), shrink)
             rows, known = rows / share.clamp_min(EPS), share > 0.5
         return torch.where(known, rows, torch.nan).contiguous(), (height, width)
+
+    def _shrinkage(self, height: int, width: int) -> int:
+        """By which whole number a map is shrunk to have at most so many pixels."""
+        shrink = 1
+        while (height // shrink) * (width // shrink) > self._pixels and shrink < min(height, width):
+            shrink += 1
+        return shrink
 
 
 def working_directions(maps: FeatureMaps, count: int = WORKING, most: int = LOOKED_AT[0]) -> Tensor:  # [D, d']

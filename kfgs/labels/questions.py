@@ -75,7 +75,7 @@ def make_question(
         if table is None:
             got = f"{type(classes).__name__}; pass one, or an embedding"
             raise ValueError(f"classes: expected a LabelSet to look {target!r} up in, got {got}")
-        index = table.names.index(target) if target in table.names else table.index(target)
+        index = table.index(target)
         row, words = table.embeddings[index], table.names[index]
     else:
         row, words = as_tensor("embedding", target, floating=True), "embedding"

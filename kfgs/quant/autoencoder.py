@@ -1,4 +1,4 @@
-"""The scene's autoencoder (Sec. 3.3.2): codewords from D to d numbers and back, trained on the codewords alone (Eq. 10)."""
+"""The scene's autoencoder (Sec. 3.3.2): codewords from D to d numbers and back, trained on them and on blends (Eq. 10)."""
 
 from __future__ import annotations
 

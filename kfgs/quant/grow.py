@@ -36,7 +36,7 @@ class GrownCodebook:
     """
 
     maximum: int = 255
-    """The most codewords (K_max). 255 and holes still fit one byte per pixel; 1,024 won 1.7 points in mode adc on room_0."""
+    """The most codewords (K_max). 255 and holes still fit one byte per pixel; 1,024 won 1.7 points of `adc` on room_0."""
     expand_below: float | None = None
     """The similarity that features should reach (alpha, Eq. 8). None grows as long as a split pays and reports the
     similarity that a share `coverage` of the features has reached."""

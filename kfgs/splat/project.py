@@ -11,10 +11,10 @@ from torch import Tensor
 from .._card import short_repr
 from .._check import check_range
 from ..cameras.camera import Camera
-from ..cameras.projection import camera_to_pixel, projection_jacobian, world_to_camera
+from ..cameras.projection import camera_to_pixel, projection_jacobian, refuse_distortion, world_to_camera
 from ..gaussians import Gaussians
 from .engines.contract import ALPHA_MIN, Cloud, Pinhole
-from .engines.table import choose_fused
+from .engines.table import choose_projecting
 
 FIELD_OF_VIEW_MARGIN = 1.3
 """Limit of the linearisation, in half fields of view (3DGS). Beyond it, the linear footprint of a Gaussian beside the
@@ -77,21 +77,17 @@ def project(
     near = camera.near if near is None else near
     check_range("near", near, 0, closed=(False, False))
     check_range("low_pass", low_pass, 0, closed=(True, False))
-    if camera.distortion is not None:
-        raise ValueError(
-            f"camera: expected a camera without distortion, got {camera.distortion.model} (camera {camera.name!r}); "
-            "undistort the images first with kfgs.cameras.undistort, which returns the camera to use"
-        )
+    refuse_distortion(camera)
     camera = camera.with_origin(gaussians.origin)
     if any(m.dtype != gaussians.means.dtype or m.device != gaussians.means.device for m in (camera.viewmat, camera.K)):
         camera = camera.to(gaussians.means)
     values = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
     to_camera = torch.is_grad_enabled() and (camera.viewmat.requires_grad or camera.K.requires_grad)
-    fused = choose_fused(engine, *values)
-    if fused and not to_camera:
+    projecting = choose_projecting(engine, *values)
+    if projecting and not to_camera:
         cloud = Cloud(*(value.contiguous() for value in values))
         pinhole = Pinhole(camera.viewmat, camera.K, camera.width, camera.height, near, low_pass)
-        projected = Projected(*fused.project(cloud, pinhole))
+        projected = Projected(*projecting.project(cloud, pinhole))
     else:
         projected = _project(gaussians, camera, near, low_pass)
     return _compensate(projected, camera, low_pass) if gaussians.antialiased else projected

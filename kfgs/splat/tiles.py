@@ -8,7 +8,7 @@ from torch import Tensor
 from .._check import check_shapes
 from .engines import check_sizes
 from .engines.contract import ALPHA_MIN, Tiles
-from .engines.table import choose_fused
+from .engines.table import choose_projecting
 from .project import Projected, pixel_box
 
 __all__ = ["Tiles", "bin_tiles"]
@@ -46,9 +46,11 @@ def bin_tiles(projected: Projected, width: int, height: int, tile_size: int = 16
         ("projected.extents", projected.extents, "M 2"),
     )
     check_sizes(width, height, tile_size)
-    fused = choose_fused(engine, *projected[:5])
-    if fused:
-        rows, offsets = fused.bin(*(value.contiguous() for value in projected[:5]), size=(width, height, tile_size))
+    projecting = choose_projecting(engine, *projected[:5])
+    if projecting:
+        rows, offsets = projecting.bin(
+            *(value.contiguous() for value in projected[:5]), size=(width, height, tile_size)
+        )
     else:
         rows, offsets = _bin(projected, width, height, tile_size)
     return Tiles(rows, offsets, width, height, tile_size)

@@ -36,7 +36,7 @@ class ViewAverage(NamedTuple):
         return short_repr(self)
 
 
-class Votes(NamedTuple):
+class ViewVotes(NamedTuple):
     """The outcome of a vote."""
 
     labels: Tensor  # [N] int64, -1 = no view shows this Gaussian, or the views do not agree on it
@@ -93,7 +93,7 @@ def average_views(
             weights.index_add_(0, index, weight)
     if sums is None:
         raise ValueError("views: expected at least one camera, got none; pass those that the field was trained on")
-    return ViewAverage(_per_weight(sums, weights[:, None]), weights)
+    return ViewAverage(divide_sums(sums, weights[:, None]), weights)
 
 
 def vote_labels(
@@ -103,7 +103,7 @@ def vote_labels(
     *,
     min_share: float = MIN_SHARE,
     engine: str = "auto",
-) -> Votes:
+) -> ViewVotes:
     """Label each Gaussian with the class that most of its rendering weight falls on. Ties go to the lowest class.
 
     Args:
@@ -132,9 +132,10 @@ def vote_labels(
             votes.index_add_(0, index, total)
     weights = votes.sum(1)
     best, labels = votes.max(1)
-    shares = _per_weight(best, weights)
-    return Votes(torch.where((weights > 0) & (shares >= min_share), labels, -1), shares, weights)
+    shares = divide_sums(best, weights)
+    return ViewVotes(torch.where((weights > 0) & (shares >= min_share), labels, -1), shares, weights)
 
 
-def _per_weight(sums: Tensor, weights: Tensor) -> Tensor:
+def divide_sums(sums: Tensor, weights: Tensor) -> Tensor:
+    """Means of sums; 0 without weight."""
     return sums / weights.clamp_min(torch.finfo(weights.dtype).tiny)

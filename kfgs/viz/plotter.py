@@ -19,6 +19,7 @@ from .._check import ORIGIN, check_whole
 from .._origin import Origin
 from ..cameras import Camera
 from ..cameras.camera import NEAR
+from ..cameras.projection import refuse_distortion
 from ..gaussians import Gaussians, check_gaussians
 from ..splat.engines import available_engines
 
@@ -143,8 +144,7 @@ def look_through(plotter: pv.Plotter, camera: Camera) -> None:
     Raises:
         ValueError: if the camera's lens distorts.
     """
-    if camera.distortion is not None:
-        raise ValueError(f"camera: expected a pinhole camera, got distortion {camera.distortion}; undistort it first")
+    refuse_distortion(camera)
     camera = placed(plotter, camera)
     K, E = camera.K.detach().double().cpu(), camera.viewmat.detach().double().cpu()
     fx, fy, cx, cy = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])

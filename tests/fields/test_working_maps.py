@@ -1,9 +1,10 @@
 import numpy as np
+import pytest
 import torch
 from oracles_color import block_means
 
 from kfgs import Camera, Gaussians, rasterize
-from kfgs.fields.working_maps import shrink_camera, shrink_map
+from kfgs.fields.working_maps import WorkingMaps, shrink_camera, shrink_map
 
 
 def test_blocks_are_averaged_and_the_rest_dropped():
@@ -44,3 +45,21 @@ def test_the_shrunken_camera_sees_the_shrunken_picture():
     ).map  # the wrong reading: dropped pixels squeezed in
     assert (seen - expected).abs().mean() < 0.01
     assert (squeezed - expected).abs().mean() > 1.5 * (seen - expected).abs().mean()
+
+
+@pytest.mark.parametrize(("height", "width"), [(107, 107), (90, 120), (48, 64)])
+def test_the_working_camera_has_the_pixels_of_the_shrunken_map(height, width):
+    """107 pixels are shrunk by 12 to 8 blocks, of which 11 pixels are left over: 107 // 8 is 13."""
+    K = torch.tensor([[100.0, 0, width / 2], [0, 100.0, height / 2], [0, 0, 1]])
+    camera = Camera(torch.eye(4), K, width, height)
+    shrink = next(k for k in range(1, 200) if (height // k) * (width // k) <= 64)
+    with WorkingMaps([camera], [torch.rand(height, width, 3) + 0.1], torch.eye(3), 64, None) as views:
+        for view in (views[0], views[0]):  # made, and read from its file
+            assert view.map.shape[:2] == (height // shrink, width // shrink)
+            torch.testing.assert_close(
+                view.camera.K,
+                torch.diag(torch.tensor([1 / shrink, 1 / shrink, 1.0]))
+                @ K
+                * torch.tensor([[view.factor], [view.factor], [1.0]]),
+            )
+            assert view.scale == pytest.approx((shrink / view.factor) ** 2)

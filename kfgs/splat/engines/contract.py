@@ -125,7 +125,7 @@ class Engine:
     """Types of the devices that it runs on."""
     dtypes: tuple[torch.dtype, ...] = (torch.float32, torch.float64)
     """The types that it computes in."""
-    fused = False
+    projects = False
     """Whether it also has `project`, `shade` and `bin`. For the others kornia and torch do these."""
 
     def composite(self, splats: Splats, tiles: Tiles) -> tuple[Tensor, Tensor]:  # maps [H, W, D], alphas [H, W]

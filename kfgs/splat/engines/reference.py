@@ -74,7 +74,7 @@ class _Composite(torch.autograd.Function):
         stopped = torch.zeros(T, P, dtype=torch.bool, device=features.device)
         splats = (means2d, conics, opacities, features)
         ctx.save_for_backward(*splats)
-        ctx.tile_grid, ctx.chunks = tiles, []
+        ctx.tiles, ctx.chunks = tiles, []
         for batch in _batches(tiles):
             for tile, rows, present in _front_to_back(tiles, batch, stopped):
                 chunk = _Chunk(tile, rows, present, transmittance[tile], stopped[tile])
@@ -96,7 +96,7 @@ class _Composite(torch.autograd.Function):
             inputs = [chunk.transmittance, *(value[chunk.rows] for value in splats)]
             with torch.enable_grad():
                 inputs = [value.detach().requires_grad_() for value in inputs]
-                seen, transmittance, _ = _composite_chunk(chunk, ctx.tile_grid, *inputs)
+                seen, transmittance, _ = _composite_chunk(chunk, ctx.tiles, *inputs)
             given, *local = torch.autograd.grad(
                 (seen, transmittance), inputs, (grad_sums[chunk.tiles], grad_transmittance[chunk.tiles])
             )

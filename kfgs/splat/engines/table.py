@@ -122,16 +122,16 @@ def choose(engine: str, device: str, dtype: torch.dtype) -> Engine:
     return chosen
 
 
-def choose_fused(engine: str, *tensors: Tensor) -> Engine | None:
+def choose_projecting(engine: str, *tensors: Tensor) -> Engine | None:
     """The engine, if it projects, shades and bins these tensors itself. None: kornia's and torch's functions do it."""
     chosen = choose(engine, tensors[0].device.type, tensors[0].dtype)
-    return chosen if chosen.fused and len({value.dtype for value in tensors}) == 1 else None
+    return chosen if chosen.projects and len({value.dtype for value in tensors}) == 1 else None
 
 
 def compiled_losses(*tensors: Tensor) -> ModuleType | None:
     """`cpu.losses`, numba's loops over maps for losses and decoders. None: torch and kornia must compute on these tensors."""
     kinds = {(value.device.type, value.dtype) for value in tensors}
-    if len(kinds) > 1 or not choose("auto", *kinds.pop()).fused:
+    if len(kinds) > 1 or not choose("auto", *kinds.pop()).projects:
         return None
     from .cpu import losses
 

@@ -35,7 +35,7 @@ class NumbaEngine(CompiledEngine):
     """The engine that `kfgs.splat` takes on a CPU."""
 
     devices = ("cpu",)
-    fused = True
+    projects = True
     project, shade, bin = staticmethod(project), staticmethod(shade), staticmethod(bin)  # type: ignore[assignment]
 
     def forward(self, splats: Splats, tiles: Tiles) -> Composited:
