@@ -61,7 +61,7 @@ ERRORS = {
         ),
         (
             ["{labelled}", "--out", "{o}.ply", "--recolor", "chair:rde"],
-            ("--recolor:", "'#c04040', 'teal'", "'rgb(192, 64, 64)'", "got 'rde'"),
+            ("--recolor:", "'#c04040' or 'teal'", "got 'rde'"),
         ),
         (["{labelled}", "--out", "{o}.ply", "--move", "chair:1,2"], ("--move:", "got 'chair:1,2'")),
         (["{labelled}", "--out", "{labelled}", "--remove", "chair"], ("--out:", "another place", "{labelled}")),

@@ -118,9 +118,9 @@ def open_meaning(source: Path, classes: Classes, teacher: Teacher) -> tuple[Any,
     """The answers to questions, and the cameras of the scene (those that a field was trained on)."""
     from ..viewer import FieldMeaning, SplatMeaning
 
+    cameras = [] if classes.loaded is None else classes.loaded.cameras
     if is_field(source) or not source.exists():
         field = open_field("source", source)
         label_set, embed = words_of(classes, teacher, field)
-        return FieldMeaning(field, label_set, embed=embed), list(field.cameras)
-    splats = open_splats("source", source, labelled=True)
-    return SplatMeaning(splats), [] if classes.loaded is None else classes.loaded.cameras
+        return FieldMeaning(field, label_set, embed=embed), list(field.cameras) or cameras
+    return SplatMeaning(open_splats("source", source, labelled=True)), cameras

@@ -335,7 +335,7 @@ def test_unknown_engine_is_refused():
 
 def test_compiled_engine_refuses_other_dtypes():
     half = _balls([[0.0, 0, 2]], dtype=torch.float16)
-    with pytest.raises(ValueError, match=tells("gaussians:", "float32", "float64", "got torch.float16")):
+    with pytest.raises(ValueError, match=tells("engine:", "for torch.float16", "torch.float32 or torch.float64")):
         project_by(half, _straight(), engine="numba")
 
 

@@ -106,8 +106,8 @@ def accumulate_pixels(
     Raises:
         ValueError: as `composite`, and if `pixels` is not as large as the image of `tiles`.
     """
-    check_shapes(("pixels", pixels, (tiles.height, tiles.width, "D")))
     splats, tiles = _check_splats(means2d, conics, opacities, means2d, tiles, None, None)
+    check_shapes(("pixels", pixels, (tiles.height, tiles.width, "D")))
     _check_alike("pixels", pixels, means2d)
     chosen = choose(engine, means2d.device.type, means2d.dtype)
     return chosen.accumulate(*splats[:3], pixels.contiguous(), tiles)
