@@ -87,6 +87,8 @@ def as_tensor(name: str, value: Any, *, floating: bool = False) -> Tensor:
 
 def _from_numbers(name: str, value: Any, floating: bool) -> Tensor:
     """Lists, and whatever NumPy calls an array. Our own sequences, which may read a file for each item, are refused."""
+    if isinstance(value, np.ma.MaskedArray):
+        raise TypeError(f"{name}: expected numbers without a mask, got a masked array; fill it with .filled(number)")
     is_list = isinstance(value, list | tuple | range | numbers.Real)
     array = np.empty(0, dtype=object)
     if is_list or hasattr(value, "__array__"):

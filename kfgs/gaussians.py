@@ -199,10 +199,9 @@ def as_rows(name: str, which: Any, count: int) -> Tensor:  # [count] bool, or [n
         raise ValueError(f"{name}: expected a mask [N] with N = {count}, got {tuple(rows.shape)}")
     if rows.is_floating_point():
         raise TypeError(f"{name}: expected a mask or whole numbers, got {rows.dtype}; compare first, as in x > 0.5")
-    if rows.ndim == 0:
-        rows = rows.reshape(-1)
-        if not -count <= int(rows) < count:
-            raise IndexError(f"{name}: expected an index below {count} (the number of Gaussians), got {int(rows)}")
+    rows = rows.reshape(-1) if rows.ndim == 0 else rows
+    if rows.dtype != torch.bool and bool((wrong := (rows < -count) | (rows >= count)).any()):
+        raise IndexError(f"{name}: expected indices below {count} (the number of Gaussians), got {int(rows[wrong][0])}")
     return rows
 
 

@@ -124,6 +124,7 @@ def test_arrays_become_tensors_that_share_their_memory():
         ({"a": 1.0}, ("dict", "torch.as_tensor")),
         (SimpleNamespace(codewords=1), ("SimpleNamespace", ".codewords")),
         (None, ("NoneType",)),
+        (np.ma.array([[99.0]], mask=True), ("masked array", ".filled")),
     ],
 )
 def test_what_is_no_tensor_is_refused_with_advice(value, advice):

@@ -146,6 +146,8 @@ def test_brackets_take_one_index_and_slices_like_a_list():
     assert gaussians[::-1].labels.tolist() == [2, 1, 0, -1]
     assert len(gaussians[3:1]) == len(gaussians[[]]) == 0
     assert [len(one) for one in gaussians] == [1, 1, 1, 1]
+    with pytest.raises(IndexError, match=tells("which", 4, "got 9")):
+        gaussians[torch.tensor([0, 9])]
     with pytest.raises(IndexError, match=tells("which", 4, "got 4")):
         gaussians[4]
     with pytest.raises(TypeError, match=tells("which", "float32", "mask")):

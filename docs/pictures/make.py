@@ -178,7 +178,7 @@ def draw_lambda(demo: Demo) -> None:
     source = labelled[labelled.labels != demo.words.index("plant")]
     target, shown, titles = demo.splat, [], []
     for distance in (0.02, 0.1, 0.8):
-        carried = transfer_labels(source, source.labels, target, distance).labels
+        carried = transfer_labels(source, target, distance).labels
         shown.append(show_cloud(target.replace(labels=carried), color_by="label", names=demo.words.names)(demo.large))
         titles.append(f"lambda {distance:.2f}: {(carried >= 0).float().mean():.0%} labelled")
     save("site_lambda.jpg", shown, titles)

@@ -18,7 +18,6 @@ import textwrap
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import is_dataclass
-from pathlib import Path
 from typing import Any, get_type_hints
 
 import tyro
@@ -63,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if not sys.stderr.isatty():  # read when tqdm is imported: a log gets two lines a minute, not ten a second
         os.environ.setdefault("TQDM_MININTERVAL", "30")
-    home = str(Path.home())  # shells leave `--out=~/run` as it is
+    home = os.path.expanduser("~")  # shells leave `--out=~/run` as it is
     words = sys.argv[1:] if arguments is None else arguments
     words = [re.sub("^(--[^=]+=|)~(?=/|$)", lambda start: start[1] + home, word) for word in words]
     name, *given = [word for word in words if word != STRICT] or [""]
@@ -76,6 +75,8 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
 
     try:
+        if os.stat(".").st_nlink == 0:  # torch's libraries would end the process
+            raise OSError("expected a working directory, got one that was deleted; change to another (cd)")
         if command is None:
             _answer(name)
         elif any(word == "" or re.fullmatch("--[^=]+=", word) for word in given):
@@ -93,7 +94,7 @@ def main(arguments: list[str] | None = None) -> int:
         with suppress(OSError):  # else the interpreter tries to write what is left, and complains
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
-    except (ValueError, TypeError, OSError, ImportError, ArithmeticError, NotImplementedError) as error:
+    except (ValueError, TypeError, OSError, ImportError, IndexError, ArithmeticError, NotImplementedError) as error:
         return failed(error)
     except (MemoryError, RuntimeError) as error:
         if not short_of_memory(error):
@@ -123,7 +124,9 @@ def documented(command: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(command)
     def run(*arguments: Any, **options: Any) -> None:
         given = inspect.signature(command).bind(*arguments, **options).arguments
-        check_outputs(given, "features" if command is features else None)
+        groups = [vars(value) for value in given.values() if is_dataclass(value)]
+        named = given | {name: value for group in groups for name, value in group.items()}
+        check_outputs(named, "features" if command is features else None)
         command(*arguments, **options)
 
     del run.__wrapped__  # tyro would read the text of the command itself

@@ -10,7 +10,8 @@ from .._files import check_output, real_path
 
 # Heavy imports happen inside the functions, so that `kfgs --help` answers at once.
 
-SCENE_PARTS = ("images", "features", "sparse", "labels", "labels_scored")
+PICTURES = ("images", "images_2", "images_4", "images_8", "color", "results", "rgb", "train", "val", "test")
+SCENE_PARTS = ("features", "sparse", "labels", "labels_scored", "masks", "depth", "pose", *PICTURES)
 OUTPUTS = ("out", "target")  # parameters that name what a command writes
 
 
@@ -65,7 +66,7 @@ def open_field(name: str, path: Path) -> Any:
     if field is None:
         what = "a file" if path.is_file() else "a folder without one" if path.is_dir() else "no such file"
         raise ValueError(
-            f"{name}: expected a field (RUN/field.kfgs, or the run folder), got {path}, {what}; make one with `kfgs fit`"
+            f"{name}: expected a field (RUN/field.kfgs, or RUN), got {path}, {what}; make one with `kfgs fit`"
         )
     return SemanticField.load(field)
 
@@ -76,10 +77,7 @@ def open_splats(name: str, path: Path, *, labelled: bool = False, named: bool = 
     from ..formats.sidecar import names_path
 
     if is_field(path):
-        raise ValueError(
-            f"{name}: expected a splat file, got {path}, a semantic field; pass a colour splat, for example what "
-            "`kfgs color` writes"
-        )
+        raise ValueError(f"{name}: expected a splat file, got {path}, a semantic field; pass what `kfgs color` writes")
     splats = read_splats(path)
     if (labelled or named) and splats.labels is None:
         raise ValueError(

@@ -234,10 +234,8 @@ def _pack(source: Path, target: Path, precision: Precision) -> None:
         about = read_description(target)
         errors = about["info"]["rounded"][-1]["errors"]
         for name, size in stream_sizes(target).items():
-            within = ""
-            if name in errors:
-                share = f"{100 * errors[name]:.2g} % of a row's typical number"
-                within = "within " + (f"{errors[name]:.3g} {UNITS[name]}" if name in UNITS else share)
+            unit = UNITS.get(name, "of a row's typical number")
+            within = f"within {errors[name]:.3g} {unit}" if name in errors else ""
             say(f"  {name:<32s} {size:>10,d} bytes  {within}".rstrip())
         say(f"{about['gaussians']:,} Gaussians in {target.stat().st_size / 2**20:.2f} MiB")
         say("note: neighbours now lie side by side (Morton order): indices into the old field do not fit the new one")

@@ -22,7 +22,7 @@ from ..labels import Part, Transfer, nearest_labels
 from ..splat.sh import rgb_to_sh0
 from ..viz import palette
 from ..viz.films import Show, show_selection
-from ..viz.pictures import picture_sheet, save_picture
+from ..viz.pictures import check_suffix, picture_sheet, save_picture
 
 WIDTH = 360  # pixels of a picture of a part
 MOST = 12  # parts in a sheet
@@ -49,7 +49,7 @@ def label_cloud(
     z, or holds more than points (faces would be lost).
     """
     assert gaussians.labels is not None
-    cloud, out = as_path(cloud), as_path(out)
+    cloud, out = as_path(cloud), check_suffix(out, ".ply", name="out")
     columns, others = read_ply(cloud), other_elements(cloud)
     if others:
         raise ValueError(

@@ -1,5 +1,7 @@
 import numpy as np
+import pytest
 import torch
+from messages import tells
 from PIL import Image
 
 from kfgs.cameras import Camera
@@ -64,3 +66,11 @@ def test_labels_are_written_and_carried_to_points(tmp_path):
     assert columns["mine"].tolist() == [0, 1, 2]
     assert {"red", "green", "blue"} <= set(columns)
     assert [file.name for file in files] == ["labelled.ply", "labelled.ply.classes.json"]
+
+
+def test_labelled_points_are_a_ply(tmp_path):
+    cloud = balls((0.0, 0, 0)).replace(labels=torch.tensor([0]), names=("wall",))
+    points = {name: np.zeros(3, np.float32) for name in "xyz"}
+    write_ply(tmp_path / "points.ply", points)
+    with pytest.raises(ValueError, match=tells("out:", ".ply", "points.spz")):
+        label_cloud(cloud, tmp_path / "points.ply", tmp_path / "points.spz")
