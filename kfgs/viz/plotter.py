@@ -101,7 +101,7 @@ def make_plotter(
     check_whole("height", height, 1)
     check_whole("width", width, 1)
     require()
-    # Mesa's software driver loads its own LLVM. Loading numba's or triton's after it can crash Python, before it works
+    # Mesa's software driver loads its own LLVM; loading triton's after it, as torch's optimisers do, can crash Python
     available_engines("cpu")
     import pyvista as pv
 

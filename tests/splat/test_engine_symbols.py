@@ -1,5 +1,7 @@
 import os
+import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from threading import Event, Thread
 
@@ -15,7 +17,6 @@ DEEPBIND = getattr(os, "RTLD_DEEPBIND", 0)
     ("maps", "added"), [("7f00 /usr/lib/libLLVM-15.so.1", DEEPBIND), ("7f00 /usr/lib/libc.so.6", 0)]
 )
 def test_engines_keep_to_their_own_symbols_only_beside_another_llvm(monkeypatch, maps, added):
-    """That it saves Python from a segfault is shown by tests/viz/test_headless.py."""
     before, real = sys.getdlopenflags(), Path.read_text
     monkeypatch.setattr(Path, "read_text", lambda path, **_: maps if str(path).startswith("/proc") else real(path))
     with table._own_symbols():
@@ -60,3 +61,12 @@ def test_two_threads_that_load_at_once_leave_the_flags_as_they_were(monkeypatch)
         after = sys.getdlopenflags()
         sys.setdlopenflags(before)  # or a failure here would reach the other tests
     assert after == before
+
+
+@pytest.mark.skipif(find_spec("triton") is None, reason="triton is not installed")
+def test_triton_is_loaded_before_a_picture_is_drawn():
+    """If torch's optimisers load it after Mesa's LLVM and pycolmap, Python ends with a segfault (notebook 7)."""
+    code = (
+        "import sys; from kfgs.splat import available_engines; available_engines('cpu'); assert 'triton' in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -48,7 +48,10 @@ def available_engines(device: str | None = None) -> list[str]:
 
 def _serves(name: str, device: str) -> bool:
     try:
-        return _ENGINES[name].device in (device, None) and device in load(name).devices
+        return device in load(name).devices and _ENGINES[name].device in (
+            device,
+            None,
+        )  # loads triton for viz/plotter.py
     except ImportError:  # installed, but broken on this machine
         return False
 
