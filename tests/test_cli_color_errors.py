@@ -22,7 +22,7 @@ ERRORS = {
         ),
         (
             ["{field}", "{field}", "--scene", "{room}", "--out", "{o}.ply"],
-            ("CLOUD:", "got {field}", "a colour splat"),
+            ("CLOUD:", "got {field}", "kfgs color"),
         ),
         (["{field}", "{tmp}/no.ply", "--scene", "{room}", "--out", "{o}.ply"], ("{tmp}/no.ply:", "no such file")),
         (["{field}", "{splat}", "--out", "{o}.ply"], ("--text:", "got none", "`kfgs features --words")),
@@ -72,7 +72,7 @@ ERRORS = {
         ),
         (
             ["{field}", "--out", "{o}.ply", "--remove", "chair"],
-            ("SPLATS:", "got {field}", "a colour splat"),
+            ("SPLATS:", "got {field}", "kfgs color"),
         ),
         (
             ["{labelled}", "--out", "{taken}.ply", "--remove", "rug"],
