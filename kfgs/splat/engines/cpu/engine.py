@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..contract import CompiledEngine, Composited, Ranked, Splats, Tiles
-from . import square
+from . import square, wide
 from .bands import Trace, accumulate_band, composite_band
 from .bands_backward import differentiate_band
 from .memory import flat, take_memory
@@ -22,9 +22,8 @@ from .slots import chain_slots, gather_gradients, gather_sums, number_slots
 from .square import SQUARE_SIDE, Rows, View, pack_rows
 from .threads import run_bands
 from .tiles import bin
-from .wide import Source
 
-row_length = square.row_length.py_func  # one call is not worth compiling
+row_length, padded_length = square.row_length.py_func, wide.padded_length.py_func  # a call is not worth compiling
 
 MOST_BANDS, PAIRS_PER_BAND = 32, 2048
 """The most bands, and the fewest pairs of a band. More bands keep more threads busy, but give more Gaussians a gradient row
@@ -59,7 +58,7 @@ class NumbaEngine(CompiledEngine):
         trace = _read_trace(result.trace, view, splats)
         rows = Rows(trace.packed, row_length(_packed(channels)), view.order)
         passes, source = _channels_plan(splats)
-        length, column = (rows.length, MOMENTS) if passes else (LANES + _whole(channels), LANES)
+        length, column = (rows.length, MOMENTS) if passes else (LANES + padded_length(channels), LANES)
         out = take_memory(splats.means2d, total * length).numpy()
         images = flat(result.maps), flat(grads[0]), flat(grads[1])
         shared = view, rows, passes, source, _padded(splats.background), images, trace, slots, firsts, out
@@ -82,7 +81,7 @@ class NumbaEngine(CompiledEngine):
         slots, firsts, total, chains = _number(view, M)
         none = means2d.new_empty(M, 0)
         rows = _pack(Splats(means2d, conics, opacities, none, means2d.new_empty(0), None), view)
-        length = _whole(channels + 1)
+        length = padded_length(channels + 1)
         out = take_memory(pixels, total * length).numpy()
         run_bands(accumulate_band, bands, view, rows, flat(pixels), channels, slots, firsts, out)
         sums, weights = pixels.new_empty(M, channels), pixels.new_empty(M)
@@ -107,11 +106,6 @@ class NumbaEngine(CompiledEngine):
 ENGINE = NumbaEngine()
 
 
-def _whole(channels: int) -> int:
-    """Channels in whole vectors, as `wide.padded_length` has it."""
-    return -(-channels // LANES) * LANES
-
-
 def _packed(channels: int) -> int:
     """How many channels are packed with their Gaussian."""
     return channels if channels <= MOST_CHANNELS else 0
@@ -127,13 +121,13 @@ def _pack(splats: Splats, view: View, packed: np.ndarray | None = None) -> Rows:
     return Rows(packed, length, view.order)
 
 
-def _channels_plan(splats: Splats) -> tuple[Passes | None, Source | None]:
+def _channels_plan(splats: Splats) -> tuple[Passes | None, wide.Source | None]:
     """How few channels are cut, or where many channels lie."""
     channels = splats.features.shape[1]
     if channels <= MOST_CHANNELS:
         return plan_passes(channels), None
     shown = _index(splats) if splats.index is not None else np.arange(len(splats.means2d))
-    return None, Source(flat(splats.features), shown * channels, channels)
+    return None, wide.Source(flat(splats.features), shown * channels, channels)
 
 
 def _make_trace(view: View, splats: Splats) -> tuple[Tensor, Trace]:
@@ -165,7 +159,7 @@ def _index(splats: Splats) -> np.ndarray:
 
 def _padded(background: Tensor) -> np.ndarray:
     """The background and zeros up to a whole vector."""
-    out = np.zeros(_whole(len(background)), flat(background).dtype)
+    out = np.zeros(padded_length(len(background)), flat(background).dtype)
     out[: len(background)] = flat(background)
     return out
 
