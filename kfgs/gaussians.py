@@ -16,7 +16,6 @@ from ._check import ORIGIN, as_array, as_origin, as_tensor, check_shapes
 Array = np.ndarray[Any, Any]
 TENSORS = ("means", "quats", "scales", "opacities", "features", "sh", "labels", "scores")
 SHAPES = ("N 3", "N 4", "N 3", "N", "N D", "N K 3", "N", "N")
-FACTS = ("origin", "antialiased")  # what says how the tensors are drawn
 
 
 @dataclass(frozen=True, eq=False)

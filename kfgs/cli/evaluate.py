@@ -6,13 +6,10 @@ import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
-
-import tyro
 
 from .._files import check_output
 from .files import is_field, open_field
-from .options import Classes, Flag, Given, LabelRule, Positional
+from .options import Classes, Flag, Given, LabelRule, Positional, Word
 from .output import say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -21,7 +18,7 @@ from .output import say, wrote
 def evaluate(
     field: Positional[Path],
     *,
-    protocol: Annotated[str, tyro.conf.arg(metavar="NAME")] = "kfgs-pooled/1",
+    protocol: Word = "kfgs-pooled/1",
     truth: Given[Path] = None,
     labels: Given[LabelRule] = None,
     out: Given[Path] = None,

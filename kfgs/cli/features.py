@@ -77,10 +77,8 @@ def features(
         _make_maps(network, scene, target, views.split)
         given = "" if out is None else f" --features {out}"
         say(f"next: kfgs fit {source} --out run{given}" + ("" if views.split == "train" else f" --split {views.split}"))
-        if network is not None:
-            wrote([target] if table is None else [table, target])
-    elif table is not None:
-        wrote([table])
+    if network is not None:
+        wrote([place for place in (table, target) if place is not None])
 
 
 def _make_maps(network: Any, scene: Any, target: Path, split: str) -> None:
@@ -135,6 +133,8 @@ def _embed_words(network: Any, words: Sequence[str], table: Path) -> None:
 
 def _learn_examples(out: Path, field: Any, path: Path) -> None:
     """Write a table of examples and, if the photographs of their views are at hand, a picture of what was shown."""
+    from torch import Tensor
+
     from .._files import read_json
     from ..evaluation.coco import load_coco_examples
     from ..fields.examples import label_set_from_examples, read_examples
@@ -148,7 +148,7 @@ def _learn_examples(out: Path, field: Any, path: Path) -> None:
     made = label_set_from_examples(field, examples)
     made.save(out)
     written, scene = [out], Classes().photos_of(field)
-    if scene is not None and any(hasattr(example, "view") for shown in examples.values() for example in shown):
+    if scene is not None and any(not isinstance(example, Tensor) for shown in examples.values() for example in shown):
         written.append(out.with_name(f"{out.name}.png"))
         save_picture(written[-1], draw_examples(field.cameras, examples, show_photos(scene)))
     say(f"{len(made)} classes, {made.dim} channels each, by examples: {', '.join(made.names)}")

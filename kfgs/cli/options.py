@@ -18,6 +18,7 @@ from .output import say
 T = TypeVar("T")
 Given = Annotated[T | None, tyro.conf.arg(help_behavior_hint="")]  # None if the option is not given
 Flag = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
+Word = Annotated[str, tyro.conf.arg(metavar="NAME")]
 Name = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")]
 Several = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="TEXT")]
 By = Literal["views", "distance"]
@@ -36,7 +37,7 @@ class Views:
 
     images: Given[Path] = None
     """Folder of the pictures, if it is not SCENE/images."""
-    split: Annotated[str, tyro.conf.arg(metavar="NAME")] = "train"
+    split: Word = "train"
     """Which views: train, test, all, or another split that SCENE/split.json names."""
 
     def load(self, scene: Path) -> Any:

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
 
-import tyro
-
-from .._files import check_output, file_stem, read_json, write_json
+from .._files import check_output, read_json, write_json
 from .files import open_field
-from .options import Classes, Flag, Given, Positional, Walk
+from .options import Classes, Flag, Given, Positional, Walk, Word
 from .output import say, wrote
 from .render import read_walk, walk_of
 from .view import open_colors
@@ -22,7 +19,7 @@ def segment(
     field: Positional[Path],
     out: Path,
     *,
-    split: Annotated[str, tyro.conf.arg(metavar="NAME")] = "test",
+    split: Word = "test",
     path: Given[Walk] = None,
     frames: Given[int] = None,
     coco: Flag = False,
@@ -96,15 +93,16 @@ def _segment_path(field: Path, out: Path, path: Walk, frames: int | None, coco: 
     own = read_walk(path, frames)
     loaded = open_field("field", field)
     cameras = list(loaded.cameras) if classes.loaded is None else classes.loaded.cameras
-    walk = {file_stem(camera.name): camera for camera in walk_of(own, loaded.gaussians, cameras, frames)}
+    walk = walk_of(own, loaded.gaussians, cameras, frames)
     label_set = classes.load_classes(loaded)
-    maps = segment_cameras(loaded, list(walk.values()), label_set, out, progress=True)
+    maps = segment_cameras(loaded, walk, label_set, out, progress=True)
     written = [out / "predicted", out / "colored"]
     if coco:
         colors = open_colors(find_field(field), None, loaded)
         if colors is None:
             say("note: no colour splat is known, so the annotations have no pictures; train one with `kfgs color`")
         show = None if colors is None else show_cloud(colors, color_by="rgb")
-        picture = None if show is None else lambda name: show(walk[name])
+        views = dict(zip(maps, walk, strict=True))
+        picture = None if show is None else lambda name: show(views[name])
         written.append(write_coco(out, maps, label_set.names, picture))
     wrote(written)

@@ -53,7 +53,6 @@ def select(
         check_output("out", out, "a folder")
     if threshold is not None:
         check_range("threshold", threshold, 0, 1)
-    scene = classes.loaded
     if is_field(source):
         field = open_field("source", source)
         query, target, label_set = _target(query, classes, teacher, field)
@@ -61,7 +60,7 @@ def select(
         cloud, cameras = field.gaussians.replace(scores=selection.scores), field.cameras or None
         scene = classes.photos_of(field) if out is not None else None
     else:
-        cloud = open_splats("source", source, named=True)
+        scene, cloud = classes.loaded, open_splats("source", source, named=True)
         cameras, selection = None if scene is None else scene.cameras, OfClass(query).select(cloud)
         if cloud.scores is not None:
             mask = selection.mask if threshold is None else selection.mask & (cloud.scores > threshold)

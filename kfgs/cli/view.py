@@ -48,7 +48,7 @@ def view(
             scene, too.
         out: Folder for saved pictures and selections.
     """
-    from ..fields.store import find_field
+    from ..fields.store import NAME, find_field
     from ..viewer import Exploration, Explorer, Viewer
     from ..viz.plotter import has_display, require
 
@@ -87,7 +87,7 @@ def view(
         return
     state.set_show(state.first_show)
     path = real_path(source)  # the title tells one page from another: the run of RUN/field.kfgs, else the file
-    title = path.parent.name if path.name == "field.kfgs" else path.stem
+    title = path.parent.name if path.name == NAME else path.stem
     viewer = Viewer(state, title=title, scene=classes.photos_of(getattr(meaning, "field", None)), out=out)
     if where == "html":
         out.mkdir(parents=True, exist_ok=True)

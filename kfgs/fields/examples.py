@@ -17,6 +17,7 @@ from .._files import as_path, read_json
 from .._rows import EPS, row_norms, unit_rows
 from ..cameras import Camera
 from ..cameras.camera import view_named
+from ..gaussians import as_rows
 from ..labels import LabelSet, Selection
 from ..labels.run_lengths import decode_rle
 from .semantic_field import SemanticField
@@ -86,7 +87,7 @@ def label_set_from_examples(field: SemanticField, examples: Mapping[str, Example
 def _direction(field: SemanticField, example: Example, name: str) -> Tensor:  # [D] of length 1
     """The mean direction of the features of one example."""
     if isinstance(example, Selection | Tensor):
-        features = field.own_features(example)
+        features = field.own_features(as_rows(name, example, len(field)))
     else:
         camera = view_named(field.cameras, example.view, name)
         pixels, rendering = _pixels(camera, example, name), field.render(camera)

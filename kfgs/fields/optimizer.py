@@ -49,10 +49,6 @@ class FieldOptimizer:
         for name, group in self._groups.items():
             group["lr"] = self.means_lr(step) if name == "means" else self._rates[name] * factor
         self._adam.step()
-        self.forget_()
-
-    def forget_(self) -> None:
-        """Drop the gradients."""
         self._adam.zero_grad(set_to_none=True)
 
     def replace_(

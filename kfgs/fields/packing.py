@@ -101,11 +101,11 @@ def pack(
     extent = float(np.ptp(means, axis=0).max()) if len(means) else 0.0
     step = max(2 * chosen.means * radius, extent / CELLS) or 1.0
     origin = means.min(0) if len(means) else np.zeros(3)
-    order = np.argsort(morton_codes(np.round((means - origin) / step).astype(np.uint64)), kind="stable")
+    cells = np.round((means - origin) / step).astype(np.int64)
+    order = np.argsort(morton_codes(cells.astype(np.uint64)), kind="stable")
     quats = unit_quats(torch.from_numpy(arrays["gaussians.quats"])).numpy()
     arrays["gaussians.quats"], arrays["gaussians.scales"] = _nearest_turn(quats, scales)
-    cells = np.round((means[order] - origin) / step).astype(np.int64)
-    place = _Place(cells, _find_before(cells))
+    place = _Place(cells[order], _find_before(cells[order]))
     streams, entries, fused = dict[str, Tensor](), dict[str, Entry](), "linear.basis" in tensors
     errors: dict[str, float] = {}
     for name, value in tensors.items():

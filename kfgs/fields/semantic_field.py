@@ -183,8 +183,8 @@ class SemanticField:
         `classes` are a label set, or embeddings [C, D]; None: the field's own. Labels [N] are -1 where nothing is known about
         the Gaussian. A tie goes to the lowest class.
         """
-        scores, labels = self.cosines(self._rows(classes)).max(dim=1)
-        return Classification(labels.masked_fill(~self.known, -1), scores.masked_fill(~self.known, 0))
+        (scores, labels), unknown = self.cosines(self._rows(classes)).max(dim=1), ~self.known
+        return Classification(labels.masked_fill(unknown, -1), scores.masked_fill(unknown, 0))
 
     def label(self, classes: Classes | None = None) -> Gaussians:
         """The Gaussians with the labels and scores of `classify`, and the names of the classes, if they are known."""

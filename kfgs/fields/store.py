@@ -136,7 +136,7 @@ def _to_tensors(path: Path, parts: Mapping[str, Any]) -> tuple[dict[str, Tensor]
     if isinstance(scene := info.get("scene"), str):
         info = {**info, "scene": Path(os.path.relpath(real_path(scene), real_path(path.parent))).as_posix()}
     try:
-        json.dumps(info, allow_nan=False)
+        info = json.loads(json.dumps(info, allow_nan=False))
     except (TypeError, ValueError) as error:
         raise ValueError(f"info: expected what JSON can hold, got {error}; use strings and finite numbers") from error
     values = ((name, getattr(gaussians, name)) for name in CLOUD)

@@ -19,7 +19,6 @@ from .._files import as_path, digest_value
 from .._progress import Progress, as_progress
 from ..cameras import Camera
 from ..cameras.bounds import camera_extent
-from ..gaussians import FACTS
 from ..splat import rasterize
 from .checkpoint import digest_tensors, read_checkpoint, write_checkpoint
 from .densify import GradientStatistics, densify, lowered_opacities
@@ -271,8 +270,8 @@ class Trainer:
     def restore_(self, state: dict[str, Any]) -> None:
         """Continue from a `state`; also restores that of the fit's generator."""
         now = self.optimizer.params
-        facts: dict[str, Any] = {name: getattr(now, name) for name in FACTS}
-        params = replace(GaussianParams.from_tensors(state["params"]).map(lambda value: value.to(now.means)), **facts)
+        tensors: dict[str, Any] = {name: value.to(now.means) for name, value in state["params"].items()}
+        params = replace(now, **tensors)
         self.optimizer = FieldOptimizer(params, self._training, extent=self._extent)
         self.optimizer.load_state_(state["adam"])
         self.statistics = GradientStatistics(*(value.to(now.means) for value in state["statistics"].values()))

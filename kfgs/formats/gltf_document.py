@@ -101,11 +101,11 @@ class Document:
         """
         nodes, scenes = self.root["nodes"], self.root.get("scenes")
         below = {child for node in nodes for child in node.get("children", [])}
-        roots = self.root["scenes"][self.root.get("scene", 0)]["nodes"] if scenes else set(range(len(nodes))) - below
+        roots = scenes[self.root.get("scene", 0)]["nodes"] if scenes else set(range(len(nodes))) - below
         waiting, met = [(root, torch.eye(4, dtype=torch.float64)) for root in reversed(list(roots))], 0
         while waiting:
             index, above = waiting.pop()
-            node, met = self.root["nodes"][index], met + 1
+            node, met = nodes[index], met + 1
             if met > len(nodes):  # in glTF a node has one parent
                 raise ValueError("its nodes are not a tree")
             matrix = above @ _matrix(node)

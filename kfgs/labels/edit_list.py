@@ -88,7 +88,7 @@ class EditList:
         edits = self.edits
         if not isinstance(edits, list | tuple) or not all(isinstance(edit, Edit) for edit in edits):
             raise TypeError(f"edits: expected a list of edits, got {edits!r:.80}; write it as [Remove('chair')]")
-        object.__setattr__(self, "edits", tuple(edits))
+        set_fields(self, edits=tuple(edits))
 
     def __repr__(self) -> str:
         return f"EditList({len(self)} edits: {cut(', '.join(map(repr, self.edits[:9])), 140)})"

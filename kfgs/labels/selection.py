@@ -55,8 +55,7 @@ class Selection:
         return cls(mask, mask.to(torch.get_default_dtype()), None, how)
 
     def __post_init__(self) -> None:
-        for name in ("mask", "scores"):
-            object.__setattr__(self, name, as_tensor(name, getattr(self, name)))
+        set_fields(self, mask=as_tensor("mask", self.mask), scores=as_tensor("scores", self.scores))
         check_shapes(("mask", self.mask, "N"), ("scores", self.scores, "N"))
         if self.mask.dtype != torch.bool:
             raise TypeError(f"mask: expected a boolean mask, got {self.mask.dtype}; compare first, as in labels == 3")

@@ -71,7 +71,7 @@ def write_comparison(
 ) -> Path:
     """Draw the scene before and after from each viewpoint, one row each, into one PNG file."""
     rows = [[render_color(cloud, camera) for cloud in (before, after)] for camera in cameras]
-    save_picture(as_path(path), picture_grid(rows, titles))
+    save_picture(path, picture_grid(rows, titles))
     return as_path(path)
 
 

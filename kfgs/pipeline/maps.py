@@ -78,11 +78,11 @@ class ViewMaps:
 
     def changes(self, run: Run) -> list[list[Any] | None]:
         """What decides the change of each map: the lens, and the files of mask and transparent picture; None: nothing."""
-        changes: list[list[Any] | None] = []
-        for i, camera in enumerate(self._taken.cameras):
-            lens, files = describe_lens(camera) if self._straighten else None, changing_files(self._taken, i)
-            changes.append([lens, *(digest for _, digest in run.digests(files))] if files else lens)
-        return changes
+        files = [changing_files(self._taken, i) for i in range(len(self))]
+        digests = (digest for _, digest in run.digests([file for group in files for file in group]))
+        lenses = [describe_lens(camera) if self._straighten else None for camera in self._taken.cameras]
+        pairs = zip(lenses, files, strict=True)
+        return [[lens, *(next(digests) for _ in group)] if group else lens for lens, group in pairs]
 
     def __getitem__(self, i: int, /) -> Tensor:  # [h, w, D]
         features = self.maps[i]

@@ -101,16 +101,14 @@ def extract_features(
             raise ValueError(f"scene: expected names inside the folder, got {stem!r}; rename the picture")
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such file; expected the picture of view {stem!r}")
-    _check_folder(
-        folder, identity, list(pictures), overwrite
-    )  # a folder that is refused stays as it is, without a lock file
+    # A folder that is refused stays as it is, without a lock file.
+    _check_folder(folder, identity, list(pictures), overwrite)
     with locked(folder, LOCK):
-        manifest = read_manifest(folder)
-        if manifest is not None and manifest.teacher != identity:
+        manifest = read_manifest(folder) or Manifest(identity)
+        if manifest.teacher != identity:
             for stem in filter(is_inside, manifest.pictures):
                 (folder / f"{stem}{OWN}").unlink(missing_ok=True)
-            manifest = None
-        manifest = manifest or Manifest(identity)
+            manifest = Manifest(identity)
         manifest.save(folder)
         channels: int | None = None
         for stem, path in tqdm(pictures.items(), desc="features", unit="image", disable=not progress):

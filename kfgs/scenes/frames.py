@@ -105,8 +105,8 @@ def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
         )
     similarity, good, size = None, np.zeros(len(A), dtype=bool), sizes[0]
     for trial in sizes:
-        start = _start(A, B, turns, MAX_ERROR * trial)
-        if start is not None and good.sum() < least:
+        start = _start(A, B, turns, MAX_ERROR * trial) if good.sum() < least else None
+        if start is not None:
             fit, fits = _refine(start, A, B, turns, trial)
             spread = np.ptp(B[fits], axis=0).max(initial=0.0) if fits.any() else 0.0
             if spread > TRIPOD * trial and fits.sum() > good.sum():  # at one place any scale fits
@@ -165,11 +165,11 @@ def _start(A: Array, B: Array, turns: Array, reach: float) -> Similarity | None:
 
 def _refine(similarity: Similarity, A: Array, B: Array, turns: Array, size: float) -> tuple[Similarity, Array]:
     """Least squares over the cameras that fit, repeated until they stay the same; gives the fit and these cameras."""
-    limit, before = MAX_ERROR * size, None
+    limit, before = MAX_ERROR * size, np.zeros(len(A), dtype=bool)
+    errors, angles = _errors(similarity, A, B, turns)
     for _ in range(10):
-        errors, angles = _errors(similarity, A, B, turns)
         good = (errors <= limit) & (angles <= MAX_ANGLE)
-        if good.sum() < 2 or (before is not None and bool((good == before).all())):
+        if good.sum() < 2 or bool((good == before).all()):
             break
         a, b = A[good] - A[good].mean(0), B[good] - B[good].mean(0)
         widths = np.linalg.svd(a, compute_uv=False)
@@ -180,8 +180,8 @@ def _refine(similarity: Similarity, A: Array, B: Array, turns: Array, size: floa
             similarity = Similarity(scale, torch.from_numpy(R), torch.from_numpy(shift))
         else:
             similarity = fit_similarity(torch.from_numpy(A[good]), torch.from_numpy(B[good]))
-        typical = float(np.median(_errors(similarity, A, B, turns)[0][good]))
-        limit, before = min(MAX_ERROR * size, SIGMAS * typical + ROUNDING * size), good
+        errors, angles = _errors(similarity, A, B, turns)
+        limit, before = min(MAX_ERROR * size, SIGMAS * float(np.median(errors[good])) + ROUNDING * size), good
     return similarity, good
 
 

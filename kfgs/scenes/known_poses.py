@@ -129,6 +129,6 @@ def _lens(camera: Camera) -> tuple[str, list[float]]:
     lens = list(camera.distortion.coefficients)
     if camera.distortion.model == "kannala_brandt":
         return "OPENCV_FISHEYE", intrinsics + lens
-    return "OPENCV" if len(lens) == 4 else "FULL_OPENCV", intrinsics + lens + [0.0] * (
-        8 - len(lens) if len(lens) > 4 else 0
-    )
+    if len(lens) == 4:
+        return "OPENCV", intrinsics + lens
+    return "FULL_OPENCV", intrinsics + lens + [0.0] * (8 - len(lens))

@@ -125,7 +125,7 @@ def load_scannet(folder: Path) -> Scene:
         )
     notes = [f"{len(lost)} pictures have no file in pose/ and were left out: {some(lost)}"] if lost else []
     points = None
-    mesh, depth = next(iter(sorted(folder.glob(f"*{MESH}"))), None), folder / "intrinsic" / "intrinsic_depth.txt"
+    mesh, depth = min(folder.glob(f"*{MESH}"), default=None), folder / "intrinsic" / "intrinsic_depth.txt"
     if mesh is not None:
         try:
             places, colors, told = read_points(mesh)

@@ -57,14 +57,14 @@ def load_scene(
     check_choice("split", split, ("auto", "file", *RULES))
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such folder; expected a scene there")
-    root = _root(path)
+    root, model = _root(path), find_model(path)
     if images is not None and not as_path(images).is_dir() and (root / images).is_dir():
         images = root / images
     with _naming(root):
-        scene = replace(_load_views(path, None if images is None else as_path(images)), folder=root)
+        scene = replace(_load_views(path, model, None if images is None else as_path(images)), folder=root)
         scene = _with_masks(scene, root)
     tell_repairs(str(path), scene.notes, strict, SceneError)
-    return _with_split(scene, path, split)
+    return _with_split(scene, path, root, model, split)
 
 
 def load_cameras(path: str | Path) -> list[Camera]:
@@ -110,8 +110,7 @@ def _with_masks(scene: Scene, root: Path) -> Scene:
     return scene
 
 
-def _load_views(path: Path, images: Path | None) -> Scene:
-    model = find_model(path)
+def _load_views(path: Path, model: Path | None, images: Path | None) -> Scene:
     if model is not None:
         scene = load_colmap(model, images or find_images(path, model))
         return replace(scene, notes=(*scene.notes, *choice_note(path, model)))
@@ -167,8 +166,8 @@ def find_images(root: Path, model: Path) -> Path:
     return next((folder for folder in (*full, *small, *undistorted) if folder.is_dir()), root)
 
 
-def _with_split(scene: Scene, path: Path, split: SplitChoice) -> Scene:
-    model, names, root = find_model(path), [camera.name for camera in scene.cameras], _root(path)
+def _with_split(scene: Scene, path: Path, root: Path, model: Path | None, split: SplitChoice) -> Scene:
+    names = [camera.name for camera in scene.cameras]
     homes = [root] if model is None else list(dict.fromkeys((model, root, *above(model)[: 4 if model == path else 0])))
     file = next((home / "split.json" for home in homes if (home / "split.json").is_file()), root / "split.json")
     chosen = None

@@ -20,9 +20,8 @@ from ..cameras.distortion import undistort
 from .files import SceneError, read_alpha, read_image, some
 from .masks import read_mask, shrink_mask
 
-NEAR_SHARE = (
-    0.1  # of the extent: 3DGS's near plane of 0.2 suits cameras 2 m apart; in smaller scenes it must be smaller
-)
+# Of the extent: 3DGS's near plane of 0.2 suits cameras 2 m apart; in smaller scenes it must be smaller.
+NEAR_SHARE = 0.1
 ROUNDING = 1e-3  # a pixel that takes less than this from masked ones, when a lens is removed, takes nothing
 
 
@@ -119,7 +118,7 @@ class Scene:
 
     def image(self, i: int) -> Tensor:  # [H, W, 3] in [0, 1]
         """Read the picture of view `i`; in an undistorted scene the lens is removed on the way. Transparent pixels are black."""
-        lens = self.cameras[i] if self.lenses is None else self.lenses[i]
+        lens = (self.lenses or self.cameras)[i]
         image = read_image(self.image_paths[i], "black")
         if image.shape[:2] != lens.size:
             raise SceneError(
@@ -130,7 +129,7 @@ class Scene:
 
     def mask(self, i: int) -> Tensor:  # [H, W] bool
         """Which pixels of view `i` count: not those that are black in its mask, nor those beyond an undistorted picture."""
-        lens = self.cameras[i] if self.lenses is None else self.lenses[i]
+        lens = (self.lenses or self.cameras)[i]
         path = None if self.masks is None else self.masks[i]
         mask = torch.ones(lens.size, dtype=torch.bool) if path is None else read_mask(path, lens.size)
         if self.lenses is None:

@@ -92,7 +92,7 @@ class SamTeacher:
         weight = next(self.encoder.parameters())
         height, width = _scaled(image, _SIDE)
         pixels = resize_picture(image.to(weight.device, weight.dtype), (height, width))[None]
-        mean, std = (torch.tensor(values, device=weight.device, dtype=weight.dtype) / 255 for values in (_MEAN, _STD))
+        mean, std = (weight.new_tensor(values) / 255 for values in (_MEAN, _STD))
         pixels = pad(normalize_picture(pixels, mean, std), (0, _SIDE - width, 0, _SIDE - height))
         rows, columns = _scaled(image, _GRID)
         return self.encoder(pixels)[0, :, :rows, :columns].float().contiguous()

@@ -140,9 +140,7 @@ class TransformersTeacher:
             (int(image.shape[1]), int(image.shape[2])), (ph, pw), self.identity["options"]["size"]
         )
         pixels = resize_picture(image.to(weight.device, weight.dtype), (height, width))[None]
-        mean, std = (
-            torch.tensor(values, device=weight.device, dtype=weight.dtype) for values in self.row.normalisation
-        )
+        mean, std = map(weight.new_tensor, self.row.normalisation)
         pixels = normalize_picture(pixels, mean, std)
         tokens = self.row.patches(self.model, pixels)  # [1, h*w, D]
         return tokens[0].T.reshape(-1, height // ph, width // pw).float().contiguous()

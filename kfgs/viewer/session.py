@@ -90,7 +90,7 @@ class Session:
 
     def _describe(self, args: dict[str, Any], _: bytes) -> Answer:
         cameras = self.state.cameras
-        places = evenly(len(cameras), MOST_VIEWS).tolist() if cameras else []
+        places = evenly(len(cameras), MOST_VIEWS).tolist()
         sights = views_seeing(self.state.cloud(args["side"]), args["index"], [cameras[i] for i in places])
         return {"views": [asdict(sight) | {"index": places[sight.index]} for sight in sights]}, b""
 
@@ -149,7 +149,7 @@ def save_selection(
     details = state.details() | {"parts": {}}
     for side, mask in masks.items():
         details[side]["selected"] = int(mask.sum())
-    places = evenly(len(state.cameras), MOST_VIEWS).tolist() if state.cameras else []
+    places = evenly(len(state.cameras), MOST_VIEWS).tolist()
     views = [state.cameras[place] for place in places] or None
     for side in chosen:
         known = clouds[side].scores
