@@ -250,3 +250,9 @@ def test_damaged_bytes_are_a_value_error(tmp_path, method, precision):
         path.write_bytes(damaged[: int(random.integers(len(data)))] if trial % 10 == 0 else damaged)
         with pytest.raises(ValueError, match=r"a\.kfgs: expected"):
             SemanticField.load(path)
+
+
+def test_info_with_numbers_for_keys_is_read_back_as_json_has_it(tmp_path):
+    replace(field("fused"), info={10: 1, 9: 2}).save(tmp_path / "a.kfgs")
+    read = SemanticField.load(tmp_path / "a.kfgs").info
+    assert (read["10"], read["9"]) == (1, 2)
