@@ -125,6 +125,8 @@ class Engine:
     """Types of the devices that it runs on."""
     dtypes: tuple[torch.dtype, ...] = (torch.float32, torch.float64)
     """The types that it computes in."""
+    tile_size = 16
+    """Side of the tiles that it composites fastest, pixels."""
     projects = False
     """Whether it also has `project`, `shade` and `bin`. For the others kornia and torch do these."""
 

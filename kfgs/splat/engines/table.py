@@ -131,7 +131,8 @@ def choose_projecting(engine: str, *tensors: Tensor) -> Engine | None:
 def compiled_losses(*tensors: Tensor) -> ModuleType | None:
     """`cpu.losses`, numba's loops over maps for losses and decoders. None: torch and kornia must compute on these tensors."""
     kinds = {(value.device.type, value.dtype) for value in tensors}
-    if len(kinds) > 1 or not choose("auto", *kinds.pop()).projects:
+    device, dtype = kinds.pop()
+    if kinds or device != "cpu" or not choose("auto", device, dtype).projects:
         return None
     from .cpu import losses
 
