@@ -26,7 +26,7 @@ def _device(name: str) -> torch.device:
         device = training_device(name)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error).removeprefix("device: ")) from error
-    if device.type == "cuda":
+    if device.index is not None:
         torch.cuda.set_device(device)
     return device
 

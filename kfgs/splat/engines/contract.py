@@ -77,7 +77,7 @@ class Tiles(NamedTuple):
     beyond the image where its size is no multiple of the tile's.
     """
 
-    rows: Tensor  # [P] int32
+    rows: Tensor  # [P] int32; on a GPU, some that no tile owns may follow
     offsets: Tensor  # [T + 1] int64
     width: int  # pixels
     height: int  # pixels

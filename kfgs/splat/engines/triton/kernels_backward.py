@@ -98,8 +98,9 @@ def differentiate_kernel(
         passed = 1.0 - alpha
         left = light[None, :] * tl.cumprod(passed, 0)
         light = tl.minimum(light, tl.min(left, 0))
-        weight = alpha * (left / passed)
-        odds = tl.where(full <= MOST, alpha / passed, 0.0)
+        odds = alpha / passed
+        weight = odds * left
+        odds = tl.where(full <= MOST, odds, 0.0)
         shown_row = find_features(row, listed, index)
         slope = tl.zeros((CHUNK, PIXELS), tl.float32) + share[None, :]
         for start in range(0, channels, BLOCK):
@@ -109,7 +110,10 @@ def differentiate_kernel(
                 shown = load_block(features, shown_row, listed, channel, channels)
                 slope = tl.dot(shown, tl.trans(grad), slope, input_precision=PRECISION)
             if OF_FEATURES:
-                part = sum_pixels(weight, grad, CHUNK, PIXELS, BLOCK, PRECISION)
+                if BLOCK > 16:
+                    part = tl.dot(weight, grad, input_precision=PRECISION)
+                else:
+                    part = sum_pixels(weight, grad, CHUNK, PIXELS, BLOCK, PRECISION)
                 there = listed[:, None] & (channel < channels)[None, :]
                 into = grad_features + shown_row[:, None] * channels + channel[None, :]
                 tl.atomic_add(into, part, mask=there, sem="relaxed")

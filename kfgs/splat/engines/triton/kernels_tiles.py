@@ -31,21 +31,21 @@ def find_box(m, there, means2d, extents, width, height, SIDE: tl.constexpr):
 
 
 @triton.jit(do_not_specialize=["count", "width", "height"])
-def count_kernel(means2d, extents, hits, count, width, height, SIDE: tl.constexpr, BLOCK: tl.constexpr):
-    """How many tiles the box of each of the `count` Gaussians has."""
-    m = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    there = m < count
+def count_kernel(order, means2d, extents, hits, count, width, height, SIDE: tl.constexpr, BLOCK: tl.constexpr):
+    """How many tiles the box of each of the `count` Gaussians has, front to back."""
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    there = i < count
+    m = tl.load(order + i, mask=there, other=0)
     _, _, _, across, _, down = find_box(m, there, means2d, extents, width, height, SIDE)
-    tl.store(hits + m, across.to(tl.int64) * down, mask=there)
+    tl.store(hits + i, across.to(tl.int64) * down, mask=there)
 
 
 @triton.jit(do_not_specialize=["total", "count", "width", "height", "columns", "none"])
 def list_kernel(
-    ends, means2d, conics, depths, opacities, extents, rows, keys,
+    order, ends, means2d, conics, opacities, extents, rows, tiles,
     total, count, width, height, columns, none, SIDE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write the row and the key of each of the `total` candidates: its tile, `none` where alpha stays below 1/255, then its
-    depth, whose bits are in order.
+    """Write the row and the tile of each of the `total` candidates; the tile is `none` where alpha stays below 1/255.
 
     `ends` says where the candidates of a Gaussian end; which Gaussian a candidate belongs to is found by halving.
     """
@@ -58,9 +58,9 @@ def list_kernel(
         before = tl.load(ends + middle, mask=there, other=0) <= p
         low, high = tl.where(before, tl.minimum(middle + 1, high), low), tl.where(before, high, middle)
         width_left = (width_left + 1) // 2
-    m = low
+    m = tl.load(order + low, mask=there, other=0)
     x, y, left, across, top, down = find_box(m, there, means2d, extents, width, height, SIDE)
-    step = (p - (tl.load(ends + m, mask=there, other=0) - across.to(tl.int64) * down)).to(tl.int32)
+    step = (p - (tl.load(ends + low, mask=there, other=0) - across.to(tl.int64) * down)).to(tl.int32)
     across = tl.maximum(across, 1)
     column, line = left + step % across, top + step // across
 
@@ -82,6 +82,4 @@ def list_kernel(
     terms = a * far_x * far_x + 2.0 * tl.abs(b) * far_x * far_y + c * far_y * far_y
     touched = smallest <= reach + EPSILON * (terms + tl.abs(reach) + 1.0)
     tl.store(rows + p, m.to(tl.int32), mask=there)
-    bits = load(depths, m, there).to(tl.int32, bitcast=True).to(tl.int64)
-    tile = tl.where(touched, line * columns + column, none).to(tl.int64)
-    tl.store(keys + p, (tile << 32) + tl.where(bits < 0, -(bits & 0x7FFFFFFF), bits), mask=there)
+    tl.store(tiles + p, tl.where(touched, line * columns + column, none).to(tiles.dtype.element_ty), mask=there)
