@@ -36,13 +36,7 @@ def l1_loss(
     the mean, and learning rates and densification threshold of 3DGS are made for a mean. Pixels with NaN in any channel of
     the target are unknown and do not count.
     """
-    difference = _resized(rendered, target) - target
-    total, count = torch.linalg.vector_norm(difference, 1), torch.tensor(target.numel())
-    if bool(total.isnan()):
-        known = _known(target)
-        total = torch.linalg.vector_norm(torch.where(known[..., None], difference, 0), 1)
-        count = (known.sum() * target.shape[2]).clamp_min(1)
-    return total / count
+    return _Absolute.apply(_resized(rendered, target), target)  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True)
@@ -103,6 +97,27 @@ def _resized(rendered: Tensor, target: Tensor) -> Tensor:  # [H, W, D], [h, w, D
 
 def _known(target: Tensor) -> Tensor:  # [H, W, D] -> [H, W] bool
     return ~target.amax(dim=2).isnan()  # amax returns NaN; 9 times faster than isnan().any(dim=2) of 64 channels
+
+
+class _Absolute(torch.autograd.Function):
+    """The mean absolute difference. Its slope takes the memory of the difference; autograd would take three times as much."""
+
+    @staticmethod
+    def forward(ctx: Any, picture: Tensor, target: Tensor) -> Tensor:
+        difference, count = picture - target, target.numel()
+        total = difference.abs().sum()
+        if bool(total.isnan()):
+            known = _known(target)
+            difference[~known] = 0
+            total, count = difference.abs().sum(), max(1, int(known.sum())) * target.shape[2]
+        ctx.save_for_backward(difference.sign_().mul_(1 / max(1, count)))
+        return total / max(1, count)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor | None]:
+        slope = grad * ctx.saved_tensors[0]
+        return slope, -slope if ctx.needs_input_grad[1] else None
 
 
 class _Similarity(torch.autograd.Function):
