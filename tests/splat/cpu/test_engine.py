@@ -417,10 +417,10 @@ def test_nothing_is_looked_at_behind_what_is_opaque():
     opacities[opaque : opaque + 3] = 0.98
     splats = Splats(means2d, conics, opacities, features, torch.zeros(1), None)
     tiles = _everywhere(count, 16, 16, 16)
-    _, alphas, trace = numba_cpu.ENGINE.forward(splats, tiles)
+    result = numba_cpu.ENGINE.forward(splats, tiles)
+    alphas = result.alphas
     assert float(alphas.min()) > 0.999
-    looked_at = trace[-count - 1]  # one tile of one square: how many, and then the blocks of each
-    assert int(looked_at) == 2 * CHUNK
+    assert result.seen.tolist() == [2 * CHUNK]  # of the one square
     features = torch.full((count, 1), float("nan"))  # what is behind is not even read
     features[: 2 * CHUNK] = 1
     maps, _ = composite(means2d, conics, opacities, features, tiles, engine="numba")
