@@ -1,6 +1,5 @@
 """Kernels on disk: taken from there when nothing has changed, compiled again otherwise, and quick to call."""
 
-import importlib.util
 import json
 import os
 import subprocess
@@ -9,7 +8,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from zlib import crc32
 
-import numpy as np
 import pytest
 
 pytest.importorskip("numba")
@@ -145,27 +143,10 @@ def test_a_damaged_cache_is_made_again(tmp_path):
         assert [_drive(tmp_path) for _ in range(2)] == [(0, ""), (1, "")]
 
 
-def _load(file):
-    spec = importlib.util.spec_from_file_location("copied_numba_cache", file)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_sources_are_all_files_of_the_engines(tmp_path):
-    files = [*sorted(FILE.parent.glob("*.py")), *sorted(FILE.parent.parent.glob("*.py"))]
-    assert {"engine.py", "simd.py", "contract.py"} < {file.name for file in files}
+def test_sources_are_all_files_of_the_engines():
+    files = [file for folder in FILE.parents[:3] for file in sorted(folder.glob("*.py"))]
+    assert {"engine.py", "simd.py", "contract.py", "sh.py"} < {file.name for file in files}
     assert crc32(b"".join(file.read_bytes() for file in files)) == numba_cache.SOURCES
-    copy = tmp_path / FILE.name
-    copy.write_bytes(FILE.read_bytes())
-    stamps = [_load(copy).SOURCES]
-    other = tmp_path / "other.py"
-    for text in ("x = 1", "x = 2"):
-        other.write_text(text)
-        stamps.append(_load(copy).SOURCES)
-    assert len(set(stamps)) == 3
-    os.utime(other, (1, 1))  # a copy or a checkout changes times, not contents
-    assert stamps[-1] == _load(copy).SOURCES
 
 
 def test_another_numba_costs_the_cache_alone(monkeypatch):
@@ -194,43 +175,11 @@ def test_without_a_place_to_write_to_it_is_compiled_in_memory():
     assert double.stats.cache_path is None
 
 
-def test_options_are_passed_on():
-    @numba_cache.cached_njit(nogil=True, error_model="numpy")
-    def divide(x, y):
-        return x / y
-
-    assert np.isinf(divide(1.0, 0.0))  # with numba's own error model, Python's error
-
-
 def test_no_kernel_goes_around():
     """Numba's own cache would miss a change of a file that is inlined."""
     files = [path for path in sorted(FILE.parent.glob("*.py")) if path != FILE]
     assert len(files) > 10
     assert [path.name for path in files if "cache=True" in path.read_text()] == []
-
-
-SORT = """
-import numpy as np
-from numba import njit
-from kfgs._compiling import say_compiling
-from kfgs.splat.engines.cpu.tiles_kernels import list_rows
-
-made = {}
-exec("def double(x): return 2 * x", made)  # a function of no module
-for kind in (np.int32, np.int64):  # two compilations, one line
-    with say_compiling(print):
-        njit(made["double"])(kind(1))
-        list_rows(*np.zeros((4, 1), kind))
-"""
-
-
-def test_the_first_process_says_that_it_compiles(tmp_path):
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    said = [
-        subprocess.run([sys.executable, "-c", SORT], env=environment, capture_output=True, text=True, check=True).stdout
-        for _ in range(2)
-    ]
-    assert said == [f"{COMPILING}\n", ""]
 
 
 COMMAND = """
