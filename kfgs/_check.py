@@ -49,8 +49,8 @@ def check_shapes(*arguments: tuple[str, Any, str | tuple[str | int, ...]]) -> di
         if value is None:
             continue
         axes = _axes(spec)
+        expected_shape = f"[{', '.join(map(str, axes))}]"
         if not hasattr(value, "shape"):
-            expected_shape = f"[{', '.join(map(str, axes))}]"
             got = f"{type(value).__name__}; {_instead(value)}"
             raise TypeError(f"{name}: expected a tensor of shape {expected_shape}, got {got}")
         shape = tuple(value.shape)  # no int(): a size may be a symbol while torch.compile or torch.export traces
@@ -62,7 +62,6 @@ def check_shapes(*arguments: tuple[str, Any, str | tuple[str | int, ...]]) -> di
         if wrong:
             known = [f"{a} = {sizes[a]} (from {bound_by[a]})" for a in axes if isinstance(a, str) and a in sizes]
             where = f" with {', '.join(known)}" if known else ""
-            expected_shape = f"[{', '.join(map(str, axes))}]"
             raise ValueError(f"{name}: expected {expected_shape}{where}, got {shape}; pass a tensor of that shape")
         for axis, size in zip(axes, shape, strict=True):
             if isinstance(axis, str) and axis not in sizes:
@@ -70,10 +69,7 @@ def check_shapes(*arguments: tuple[str, Any, str | tuple[str | int, ...]]) -> di
     return sizes
 
 
-@functools.cache
-def _axes(spec: str | tuple[str | int, ...]) -> list[str | int]:
-    words = spec.split() if isinstance(spec, str) else spec
-    return [int(axis) if isinstance(axis, str) and axis.isdigit() else axis for axis in words]
+_axes = functools.cache(lambda s: [int(a) if str(a).isdigit() else a for a in (s.split() if isinstance(s, str) else s)])
 
 
 def as_tensor(name: str, value: Any, *, floating: bool = False) -> Tensor:
