@@ -8,17 +8,6 @@ from collections.abc import Sequence
 SHOWN = 20  # names listed in a message
 
 
-def class_index(name: str, names: Sequence[str], otherwise: str = "take one of these classes") -> int:
-    """The label of a class: its place in `names`, as `class_indices` finds it; a ValueError if there are several."""
-    labels = class_indices(name, names, otherwise)
-    if len(labels) > 1:
-        raise ValueError(
-            f"class: expected one class called {name!r}, got {len(labels)} (labels {', '.join(map(str, labels))}); "
-            "rename all but one, or ask for one by its index"
-        )
-    return labels[0]
-
-
 def class_indices(name: str, names: Sequence[str], otherwise: str = "take one of these classes") -> tuple[int, ...]:
     """The labels of a class, ascending. There are several if several classes have the same name.
 
@@ -31,6 +20,8 @@ def class_indices(name: str, names: Sequence[str], otherwise: str = "take one of
         >>> class_indices("chair", ["chair", "wall", "chair"]), class_indices("Wall", ["chair", "wall"])
         ((0, 2), (1,))
     """
+    if not isinstance(name, str):
+        raise TypeError(f"class: expected a name, got {type(name).__name__}; an index needs no look-up")
     folded = {known for known in names if known.casefold() == name.casefold()}
     spelled = name if name in names else folded.pop() if len(folded) == 1 else None
     if spelled is not None:

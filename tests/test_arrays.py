@@ -1,4 +1,4 @@
-"""Files of arrays that others wrote: what they state is compared with what they hold."""
+"""Files of arrays that others wrote: what is damaged, or states more than it holds, is one error."""
 
 import io
 import json
@@ -39,7 +39,6 @@ LIES = {
     "long header": npy(b"{'descr': '<f4', 'fortran_order': False, 'shape': (" + b"1," * 9000 + b"), }", version=(2, 0)),
     "null bytes": npy(b"\0" * 64),
     "no text": npy(bytes(range(128, 256))),
-    "other version": npy(stated("<f4", "(3,)"), b"\0" * 12, version=(3, 0)),
     "structured": npy(b"{'descr': [('a', '<f4')], 'fortran_order': False, 'shape': (3,), }", b"\0" * 12),
     "nothing wide": npy(stated("<U0", "(4611686018427387904,)")),
     "dates": npy(stated("<M8[s]", "(1,)"), b"\0" * 8),
@@ -50,18 +49,19 @@ LIES = {
 
 
 @pytest.mark.parametrize("lie", LIES.values(), ids=LIES)
-def test_a_header_that_lies_is_found_before_memory_is_asked_for(tmp_path, lie):
-    file = tmp_path / "text.npy"
-    file.write_bytes(lie)
-    tracemalloc.start()
-    try:
-        with pytest.raises(FileError, match=tells(file, "numbers", "cannot be read", "again")) as caught:
-            read_array(file)
-        assert tracemalloc.get_traced_memory()[1] < 20_000_000
-    finally:
-        tracemalloc.stop()
-    assert len(str(caught.value)) < 500
-    assert "\n" not in str(caught.value)
+def test_a_header_that_lies_costs_no_memory(tmp_path, lie):
+    (tmp_path / "a.npy").write_bytes(lie)
+    zipped(tmp_path, {"class_id.npy": lie})
+    for read, file in ((read_array, tmp_path / "a.npy"), (read_arrays, tmp_path / "a.npz")):
+        tracemalloc.start()
+        try:
+            with pytest.raises(FileError, match=tells(file, "cannot be read", "again")) as caught:
+                read(file)
+            assert tracemalloc.get_traced_memory()[1] < 20_000_000
+        finally:
+            tracemalloc.stop()
+        assert len(str(caught.value)) < 500
+        assert "\n" not in str(caught.value)
 
 
 def test_pickled_objects_are_never_loaded(tmp_path):
@@ -72,11 +72,10 @@ def test_pickled_objects_are_never_loaded(tmp_path):
             return (made.mkdir, ())
 
     np.save(file, np.array([Harmful(), 1], dtype=object), allow_pickle=True)
-    with pytest.raises(FileError, match=tells(file, "pickled objects", "never loaded")):
-        read_array(file)
     np.savez(tmp_path / "a.npz", a=np.array([Harmful()], dtype=object))
-    with pytest.raises(FileError, match=tells("a.npz", "pickled objects", "never loaded")):
-        read_arrays(tmp_path / "a.npz")
+    for read, name in ((read_array, "a.npy"), (read_arrays, "a.npz")):
+        with pytest.raises(FileError, match=tells(name, "cannot be read")):
+            read(tmp_path / name)
     assert not made.exists()
 
 
@@ -120,18 +119,6 @@ def test_archives_are_read_as_numpy_wrote_them(tmp_path):
     assert found["a"].tolist() == [0, 1, 2, 3]
     assert str(found["name"]) == "abc"
     assert found["none"].shape == (0, 3)
-
-
-@pytest.mark.parametrize("lie", LIES.values(), ids=LIES)
-def test_a_lying_array_in_an_archive_is_found(tmp_path, lie):
-    file = zipped(tmp_path, {"class_id.npy": lie})
-    tracemalloc.start()
-    try:
-        with pytest.raises(FileError, match=tells(file, "cannot be read", "again")):
-            read_arrays(file)
-        assert tracemalloc.get_traced_memory()[1] < 20_000_000
-    finally:
-        tracemalloc.stop()
 
 
 def test_an_archive_unpacks_to_no_more_than_allowed(tmp_path):

@@ -19,7 +19,7 @@ from kfgs.scenes import load_scene
 from kfgs.splat.sh import rgb_to_sh0
 from kfgs.teachers.prompts import make_label_set
 from kfgs.viz import palette, plotter
-from kfgs.viz.plotter import available
+from kfgs.viz.plotter import trouble
 
 LETTERS = ["--teacher", "cases_text:TEACHER"]
 
@@ -54,7 +54,7 @@ def no_display(monkeypatch):
 
 
 def drawn(arguments, capsys):
-    if not available():
+    if trouble():
         pytest.skip("no OpenGL here")
     code = main(["view", *map(str, arguments)])
     said = capsys.readouterr()

@@ -17,8 +17,8 @@ ROOT = Path(kfgs.__file__).parent
 
 # From the bottom up. Places of one row never import each other; evaluation lies under pipeline, which scores with it.
 FLOORS = (
-    {"_card", "_names", "_stems"},
-    {"_check", "_compiling", "_files", "_interrupts", "_notes", "_progress", "_rows", "_tensors"},
+    {"_card", "_names"},
+    {"_check", "_files", "_interrupts", "_notes", "_progress", "_rows", "_tensors"},
     {"_arrays", "_origin"},
     {"_torch_files", "gaussians", "cameras"},
     {"splat", "quant", "metrics"},

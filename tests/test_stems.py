@@ -2,7 +2,7 @@
 
 import pytest
 
-from kfgs._stems import Names
+from kfgs._files import Names
 
 
 @pytest.mark.parametrize(

@@ -225,20 +225,21 @@ def color(
     """
     from ..evaluation.color import score_views
     from ..pipeline.color import ColorConfig, fit_color
-    from ..pipeline.compare import PhotoPictures
+    from ..pipeline.compare import draw_photos
+    from ..viz.linked import evenly
 
-    config = {"quick": ColorConfig.quick, "cpu": ColorConfig.cpu, "paper": ColorConfig.paper}[preset]()
+    config = {"quick": ColorConfig.quick, "cpu": ColorConfig.cpu, "paper": ColorConfig}[preset]()
     loaded, split = views.load(scene).undistorted(), views.split
     gaussians = fit_color(loaded, out, _trained(config, steps, max_gaussians), split=split, report=say, progress=True)
     say(repr(gaussians))
     written = [out / "color.ply"]
     held_out = loaded.splits.get("test", [])
     if held_out and not set(held_out) & set(loaded.views(split)):
-        pictures = PhotoPictures(out / "views", [loaded.stem(i) for i in held_out], PICTURES)
-        scores = score_views(gaussians, loaded, "test", show=pictures)
+        scores = score_views(gaussians, loaded, "test")
         write_json(out / "scores.json", {"color": scores.to_json()})
         say(str(scores))
-        written += [*pictures.written, out / "scores.json"]
+        shown = [held_out[k] for k in evenly(len(held_out), PICTURES)]
+        written += [*draw_photos(gaussians, loaded, shown, out / "views"), out / "scores.json"]
     else:
         say("note: no views are held out (split 'test', not trained on): nothing to score against")
     wrote(written)

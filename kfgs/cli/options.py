@@ -74,7 +74,7 @@ class Teacher:
                 )
             return None
         teacher = load_teacher(self.teacher, self.weights, **options)
-        return teacher.to(training_device("auto")) if hasattr(teacher, "to") else teacher
+        return teacher.to(training_device()) if hasattr(teacher, "to") else teacher
 
 
 @dataclass(frozen=True)

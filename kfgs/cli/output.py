@@ -9,8 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
 
-from .._compiling import say_compiling
-from .._notes import hear
+from .._notes import Wait, hear
 
 LINE, END = 2000, 600
 """Most characters of a printed line, and how many of them are from its end, where an error says what to do."""
@@ -59,19 +58,15 @@ def say_lost(written: Any) -> None:
 
 @contextmanager
 def notes_as_lines(spoken: Callable[[str], str], *, strict: bool) -> Iterator[None]:
-    """Print warnings, in the words of `spoken`, and notes of readers as lines; on stderr that kernels are compiled.
+    """Print warnings, in the words of `spoken`, and notes of readers and engines, as lines.
 
     With `strict`, readers refuse what they would leave out.
     """
 
     def note(message: Warning | str, *_: Any, **__: Any) -> None:
-        say(f"note: {spoken(str(message))}")
+        say(f"note: {spoken(str(message))}", sys.stderr if isinstance(message, Wait) else None)
 
-    with (
-        warnings.catch_warnings(),
-        hear(note, strict=strict),
-        say_compiling(lambda text: say(f"note: {text}", sys.stderr)),  # next to the progress bars
-    ):
+    with warnings.catch_warnings(), hear(note, strict=strict):
         warnings.filterwarnings("always", message="classes: ")
         warnings.showwarning = note
         yield

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from .._files import check_output, read_json, write_json
+from .._files import check_output, write_json
 from .files import open_field
 from .options import Classes, Flag, Given, Positional, Walk, Word
 from .output import say, wrote
@@ -47,7 +47,7 @@ def segment(
     """
     from ..fields.notes import recall_scene
     from ..pipeline import score_scene, segment_scene, true_labels
-    from ..pipeline.segment import write_coco
+    from ..pipeline.segment import scored_labels, write_coco
     from ..viz import plot_iou
 
     check_output("out", out, "a folder")
@@ -58,11 +58,7 @@ def segment(
     folder = recall_scene(loaded_field.info) if classes.scene is None else classes.scene
     classes = replace(classes, scene=folder)
     scene, label_set = classes.loaded, classes.load_classes(loaded_field)
-    labels = next((folder / name for name in ("labels_scored", "labels") if (folder / name).is_dir()), None)
-    listed = folder / "classes.json"
-    if labels is not None and listed.is_file() and tuple(read_json(listed)) != label_set.names:
-        say(f"note: not scored: {labels} counts the classes of {listed}, which are others")
-        labels = None
+    labels = scored_labels(folder, label_set, say)
     truth = {} if labels is None else true_labels(scene, labels, split)
     views = {scene.stem(i): i for i in scene.views(split)}
     seen = set(loaded_field.info.get("views", ())) & {scene.cameras[i].name for i in views.values()}

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 from .._files import check_output
-from .edit_syntax import Edits, apply_edits, parse_edits
+from .edit_syntax import Edits, parse_edits
 from .files import check_target, is_field, open_field, open_splats
 from .options import By, Classes, Flag, Given, Positional, Precision
 from .output import say, say_counts, say_lost, wrote
@@ -139,21 +140,20 @@ def edit(
     replayed = EditList() if replay is None else EditList.load(replay, anywhere=True)  # the user's own file
     by_class = any(rule.kind == "class" for change in replayed for rule in getattr(change, "where", ()))
     before = open_splats("splats", splats, named=replay is None or by_class)
-    states = apply_edits(before, list(replayed))
+    states = list(accumulate(replayed, _apply, initial=before))
     asked = parse_edits(edits, states[-1].names)
     if not asked and not len(replayed):
         raise ValueError("edits: expected at least one, got none; give --remove, --recolor, --move or another")
     if scene is not None and before.sh is None:
         raise ValueError(f"scene: expected a splat with colours to show in it, got {before!r}; leave --scene out")
     cameras = [] if scene is None else load_scene(scene).undistorted().cameras
-    states += apply_edits(states[-1], asked)[1:]
-    after = states[-1]
-    shown = [cameras[i] for i in views_of_change(before, after, cameras, PICTURES, between=states[1:-1])]
+    *states, after = [*states[:-1], *accumulate(asked, _apply, initial=states[-1])]
+    shown = [cameras[i] for i in views_of_change(before, after, cameras, PICTURES, between=states[1:])]
     written = write_splats(after, out)
     paths = [*written.paths, EditList((*replayed, *asked)).save(saved)]
     if shown:
         paths.append(write_comparison(out.with_name(f"{out.name}.png"), before, after, shown, titles=TITLES))
-    say(f"{len(before)} Gaussians before, {len(after)} after {len(states) - 1} edit(s)")
+    say(f"{len(before)} Gaussians before, {len(after)} after {len(states)} edit(s)")
     if len(after) == 0:
         say("note: nothing is left")
     say_lost(written)
@@ -162,6 +162,10 @@ def edit(
     elif cameras:
         say("note: no view of the scene shows a change")
     wrote(paths)
+
+
+def _apply(cloud: Any, edit: Any) -> Any:
+    return edit.apply(cloud)
 
 
 def convert(

@@ -51,7 +51,6 @@ def fit(
     folder: str | Path | None = None,
     split: str = "train",
     seed: int = 0,
-    device: str | torch.device = "auto",
     report: Callable[[str], None] | None = None,
     progress: Progress = False,
 ) -> SemanticField:
@@ -66,20 +65,20 @@ def fit(
             back to the old options is quick, because stages stay. None keeps nothing.
         split: the training views; "all" trains on all views.
         seed: every random choice follows from it.
-        device: where to train, see `training_device`; the other stages and the result stay on the CPU.
         report: receives one line per stage.
         progress: True shows bars; a function receives the history rows of every trained stage as they appear.
 
     Returns:
-        The field; its `info` says how it was made, with the seconds of each stage.
+        The field, on the CPU; its `info` says how it was made, with the seconds of each stage. Training takes place on the
+        GPU if there is one (`CUDA_VISIBLE_DEVICES=""` hides it).
 
     Raises:
         TypeError: if `maps` are neither maps nor a teacher, or `method` is neither.
-        ValueError: if the counts of views and maps differ, a camera has distortion, there is no such device, a map's file is
-            damaged, or another process works in the folder.
+        ValueError: if the counts of views and maps differ, a camera has distortion, a map's file is damaged, or another process
+            works in the folder.
         FileNotFoundError: if a picture is missing.
     """
-    method, progress, target = method or Uplift(), as_progress(progress), training_device(device)
+    method, progress = method or Uplift(), as_progress(progress)
     if not isinstance(method, Uplift | Paper):
         raise TypeError(f"method: expected Uplift() or Paper(), got {type(method).__name__}; pass one of them")
     views = training_views(scene, split)
@@ -93,7 +92,7 @@ def fit(
             if isinstance(method, Paper) or method.splat is None:  # else nothing is trained
                 scene = with_points(run, scene, views, seed, progress)
             seen = maps_of_views(scene, views, maps)
-            job = _Job(run, scene, views, seen, describe_maps(run, seen), seed, target, progress)
+            job = _Job(run, scene, views, seen, describe_maps(run, seen), seed, progress)
             field, about = _uplift(job, method) if isinstance(method, Uplift) else _paper(job, method)
             info = {
                 **about,
@@ -128,7 +127,6 @@ class _Job:
     features: dict[str, Any]
     """What decides the maps, as JSON."""
     seed: int
-    device: torch.device
     progress: Progress
 
     @property
@@ -206,7 +204,7 @@ def _geometry(job: _Job, method: Uplift) -> tuple[Gaussians, dict[str, Any]]:
     if longer is not None:
         gaussians, steps = longer
     else:
-        options = method.color, job.seed, job.device, job.progress
+        options = method.color, job.seed, job.progress
         gaussians, steps = color_stage(job.run, job.scene, job.views, *options), method.color.training.steps
         if not (job.run.folder / "color.ply").exists():
             write_splats(gaussians, job.run.folder / "color.ply")
@@ -275,7 +273,7 @@ def _train(job: _Job, method: Paper, targets: Sequence[Tensor], inputs: dict[str
     def train(checkpoint: Path) -> FieldFit:
         generator = job.generator("field")
         start = GaussianParams.from_points(job.scene.points, int(targets[0].shape[-1]), generator=generator)
-        start = start.map(lambda value: value.to(job.device))
+        start = start.map(lambda value: value.to(training_device()))
         progress = job.progress
         return fit_field(
             start, job.cameras, targets, options, generator=generator, progress=progress, checkpoint=checkpoint

@@ -19,7 +19,6 @@ import torch
 from torch import Tensor
 
 from .._arrays import reading
-from .._compiling import say_compiling
 from .._files import atomic_folder, digest_file, digest_value, locked, read_json, real_path, write_json
 from .._origin import Origin
 from ..cameras import Camera
@@ -80,7 +79,7 @@ class Run:
         if not finished:
             self.say(f"{name}: working")
             start = time.perf_counter()
-            with atomic_folder(target) as folder, say_compiling(self.say):
+            with atomic_folder(target) as folder:
                 earlier = make(folder) or 0.0
                 seconds = time.perf_counter() - start + earlier
                 write_json(folder / STAGE_FILE, {"name": name, "inputs": inputs, "seconds": seconds})
