@@ -101,14 +101,6 @@ def test_a_writer_that_fails_leaves_nothing(tmp_path, write):
     assert list((tmp_path / "out").iterdir()) == []
 
 
-def test_a_link_is_replaced_and_what_it_leads_to_stays(tmp_path):
-    (tmp_path / "theirs").write_text("theirs")
-    (tmp_path / "a").symlink_to("theirs")
-    write_json(tmp_path / "a", 1)
-    assert (tmp_path / "theirs").read_text() == "theirs"
-    assert not (tmp_path / "a").is_symlink()
-
-
 def test_permissions_are_those_of_any_new_file(tmp_path):
     code = """
 import os, pathlib, sys
@@ -134,19 +126,6 @@ def test_errors_of_writing_name_the_output(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match=tells(tmp_path / "file" / "a")), atomic_path(tmp_path / "file" / "a"):
         pass
-
-
-def test_two_writers_of_one_file_both_succeed(tmp_path):
-    code = (
-        "import sys; from kfgs._files import write_json\nfor i in range(200): write_json('a', [int(sys.argv[1])] * 100)"
-    )
-    writers = [subprocess.Popen([sys.executable, "-c", code, str(i)], cwd=tmp_path) for i in range(2)]
-    values = set()
-    while any(writer.poll() is None for writer in writers):
-        if (tmp_path / "a").exists():
-            values.add(len(set(read_json(tmp_path / "a"))))
-    assert [writer.returncode for writer in writers] == [0, 0]
-    assert values <= {1}
 
 
 # Outputs and paths
@@ -226,13 +205,6 @@ def test_the_second_process_is_told_and_a_kill_frees_the_lock(tmp_path):
         pass
 
 
-def test_calls_of_one_process_exclude_each_other(tmp_path):
-    with locked(tmp_path, "lock"), pytest.raises(ValueError, match="in use"), locked(tmp_path, "lock"):
-        pass
-    with locked(tmp_path, "lock"), locked(tmp_path, "other"):
-        pass
-
-
 # JSON, texts, digests, words
 
 
@@ -242,11 +214,10 @@ def test_json_round_trip(tmp_path):
     assert read_json(tmp_path / "deep" / "value.json") == value
 
 
-@pytest.mark.parametrize("number", [math.nan, math.inf])
-def test_json_refuses_what_json_cannot_hold(tmp_path, number):
+def test_json_refuses_what_json_cannot_hold(tmp_path):
     write_json(tmp_path / "value.json", 1)
     with pytest.raises(ValueError, match="JSON"):
-        write_json(tmp_path / "value.json", {"loss": number})
+        write_json(tmp_path / "value.json", {"loss": math.nan})
     assert read_json(tmp_path / "value.json") == 1
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import traceback
 import uuid
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -15,7 +16,7 @@ from typing import Any
 import torch
 
 from .._card import cut, error_line
-from .._files import InUseError, check_output, digest_value, locked, read_json, write_json
+from .._files import check_output, digest_value, locked, read_json, write_json
 from .._notes import hear
 from ..pipeline import Uplift
 from .scene_list import check_scenes
@@ -171,25 +172,15 @@ def describe_batch(folder: Path) -> str | None:
     states = [state for file in sorted(folder.glob(f"*/{STATE}")) if (state := read_state(file.parent)) is not None]
     if not states:
         return None
-    unfinished = "stopped"
-    try:
-        with locked(folder, LOCK):
-            pass
-    except InUseError:
-        unfinished = "at work"
-    lines, counts, scores = [f"{folder}: a batch"], dict[str, int](), list[float]()
+    lines, ends = [f"{folder}: a batch"], list[str]()
     for state in states:
-        ended = "finished" if state.value else "failed" if state.failure else unfinished
-        counts[ended] = counts.get(ended, 0) + 1
+        ends.append("finished" if state.value else "failed" if state.failure else "unfinished")
         miou = state.value["miou"] if state.value else None
-        scores += [] if miou is None else [miou]
-        score = "" if miou is None else f", mIoU {miou:.3f}"
-        where = "" if state.value else f" in {state.step}"
-        lines.append(f"  {state.name}: {ended}{where}, {sum(state.seconds.values()):.0f} s{score}")
+        what = f" in {state.step}" if state.value is None else "" if miou is None else f", mIoU {miou:.3f}"
+        lines.append(f"  {state.name}: {ends[-1]}{what}, {sum(state.seconds.values()):.0f} s")
         lines += [f"    {cut(state.failure, MESSAGE)}"] if state.failure else []
-    words = [f"{count} {ended}" for ended, count in counts.items()]
+    scores = [state.value["miou"] for state in states if state.value and state.value["miou"] is not None]
+    words = [f"{count} {ended}" for ended, count in Counter(ends).items()]
     words += [f"mean mIoU {sum(scores) / len(scores):.3f} of {len(scores)}"] if scores else []
-    lines.append(f"{len(states)} scene{'s' if len(states) != 1 else ''}: {', '.join(words)}")
-    if counts.keys() & {"stopped", "failed"}:
-        lines.append("next: the same `kfgs batch` again continues with scenes that are not finished")
+    lines.append(f"{len(states)} scene{'s' * (len(states) != 1)}: {', '.join(words)}")
     return "\n".join(lines)

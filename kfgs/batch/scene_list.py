@@ -9,7 +9,6 @@ from pathlib import Path
 from .._check import one_line
 from .._files import as_path, read_text, real_path
 
-SHOWN = 5  # lines named in an error
 NAME = re.compile(r"[^\s./\\][^/\\\0-\x1f]*")  # a folder of that name can be made anywhere, and is not hidden
 
 
@@ -46,8 +45,7 @@ def read_scenes(path: str | Path) -> dict[str, str]:
                 faults.append(f"line {number}: {name!r} is line {first[name]}'s name; write `NAME = SCENE`")
             scenes[name] = str(place)
     if faults or not scenes:
-        more = [f"and {len(faults) - SHOWN} more"] if len(faults) > SHOWN else []
-        got = "; ".join(faults[:SHOWN] + more) or "no scene"
+        got = "; ".join(faults) or "no scene"
         raise ValueError(f"{path}: expected an existing scene and a new name in each line, got {got}")
     return scenes
 

@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -69,17 +70,10 @@ def make_scene(
     step: Callable[[str], AbstractContextManager[None]],
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Make the field of a scene, segment its test views and score them.
+    """Make the field of a scene or a folder of photos in the folder `run`, segment its test views and score them.
 
-    Args:
-        source: a scene, or a folder of photos.
-        run: receives what is made.
-        options: what to do.
-        step: a context for each step of the work.
-        say: receives notes.
-
-    Returns:
-        `gaussians`, `latents`, and `miou` (None without true labels).
+    `step` is a context for each step of the work, `say` receives notes. Returns `gaussians`, `latents`, and `miou` (None
+    without true labels).
     """
     maps = source / "features"
     with step("cameras"):
@@ -89,7 +83,8 @@ def make_scene(
     if options.teacher is not None:
         maps = run / "features"
         with step("features"):
-            extract_features(_teacher(options), scene, maps)
+            given = tuple(options.teacher_options.items())
+            extract_features(_teacher(options.teacher, options.weights, given), scene, maps)
     elif not maps.is_dir():
         raise SceneError(f"{source}: expected feature maps in features/, got none; name a teacher (--teacher)")
     with step("fit"):
@@ -117,8 +112,6 @@ def make_scene(
 
 def _load(source: Path, posed: Path, config: SfmConfig, say: Callable[[str], None]) -> Scene:
     """The scene; if it has no poses, they are estimated from its photos and written to `posed`."""
-    if not source.is_dir():
-        raise FileNotFoundError(f"{source}: no such folder; expected a scene or photos there")
     if is_scene(source):
         return load_scene(source)
     photos = next((place for place in (source / "images", source) if place.is_dir() and list_images(place)), None)
@@ -146,15 +139,8 @@ def stamps(folder: Path, skip: str | None = None) -> list[list[Any]]:
     return [[name, file.stat().st_size, file.stat().st_mtime_ns] for name, file in files if file.is_file()]
 
 
-_loaded: dict[str, Teacher] = {}
-
-
-def _teacher(options: BatchOptions) -> Teacher:
+@lru_cache(maxsize=1)
+def _teacher(name: str, weights: str | None, options: tuple[tuple[str, Any], ...]) -> Teacher:
     """The teacher of this worker process, loaded once."""
-    assert options.teacher is not None
-    key = repr((options.teacher, options.weights, options.teacher_options))
-    if key not in _loaded:
-        _loaded.clear()
-        teacher = load_teacher(options.teacher, options.weights, **options.teacher_options)
-        _loaded[key] = teacher.to(training_device()) if hasattr(teacher, "to") else teacher
-    return _loaded[key]
+    teacher = load_teacher(name, weights, **dict(options))
+    return teacher.to(training_device()) if hasattr(teacher, "to") else teacher

@@ -21,7 +21,12 @@ def say(text: str, file: TextIO | None = None) -> None:
     Names from foreign files may hold anything: what is not printable is shown as Python writes it (`\x1b`), and the middle
     of a very long line is left out.
     """
-    print("\n".join(map(_shown, text.split("\n"))), file=file or sys.stdout, flush=True)
+    try:
+        print("\n".join(map(_shown, text.split("\n"))), file=file or sys.stdout, flush=True)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, "standard output") from error
 
 
 def _shown(line: str) -> str:

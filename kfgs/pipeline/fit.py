@@ -32,10 +32,11 @@ from ..formats.table import splat_file_of
 from ..gaussians import Gaussians
 from ..quant import Autoencoder, Codebook, LatentMaps, fit_autoencoder, fit_codebook, quantize_maps
 from ..quant.maps import IndexMaps
+from ..quant.sampling import FeatureMaps
 from ..scenes import FeatureFolder, Scene, extract_features
 from ..scenes.scene import as_taken
 from .color import color_stage, find_color
-from .maps import KnownFeatures, Maps, as_maps, describe_maps, map_shape, maps_of_views
+from .maps import KnownFeatures, as_maps, describe_maps, map_shape, maps_of_views
 from .methods import Paper, Uplift
 from .stages import Run, Stage, digest_cameras, digest_scene, digest_shape, stage_generator
 from .train import field_stage, training_device, training_views, with_extent, with_points
@@ -123,7 +124,7 @@ class _Job:
     run: Run
     scene: Scene
     views: list[int]
-    maps: Maps
+    maps: FeatureMaps
     features: dict[str, Any]
     """What decides the maps, as JSON."""
     seed: int
@@ -139,7 +140,7 @@ class _Job:
         return stage_generator(self.seed, stage)
 
 
-def _open_maps(maps: Any, scene: Scene, split: str, folder: Path, progress: bool) -> Maps:
+def _open_maps(maps: Any, scene: Scene, split: str, folder: Path, progress: bool) -> FeatureMaps:
     """The maps of a split's views; a teacher's go to the folder. What would fail only after the first stages is an error."""
     if hasattr(maps, "encode_image"):
         extract_features(maps, as_taken(scene), folder, split=split, overwrite=True, progress=progress)

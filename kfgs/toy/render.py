@@ -76,6 +76,7 @@ def surface_color(
     solids: Sequence[Solid],
     noise: Noise,
     points: Array,  # [N, 3]
+    outward: Array,  # [N, 3] unit normals
     which: NDArray[np.int64],  # [N]
     footprint: Array,  # [N] metres a pixel covers
     lit: Array,  # [N, L + 1] from `light_reaches`
@@ -84,8 +85,7 @@ def surface_color(
     color = np.zeros((len(points), 3))
     for i in np.unique(which):
         rows = np.flatnonzero(which == i)
-        solid, p = solids[i], points[rows]
-        n = normals(solid, p)
+        solid, p, n = solids[i], points[rows], outward[rows]
         axis = np.argmax(np.abs(n @ solid.rotation()), axis=-1)
         is_round = solid.shape == "ellipsoid"
         own = evaluate(
@@ -97,14 +97,18 @@ def surface_color(
 
 
 def light_reaches(
-    solids: Sequence[Solid], points: Array, which: NDArray[np.int64]
-) -> Array:  # [N, 3], [N] -> [N, L + 1]
+    solids: Sequence[Solid], points: Array, outward: Array, which: NDArray[np.int64]
+) -> Array:  # [N, 3], [N, 3], [N] -> [N, L + 1]
     """The share of each lamp that each point sees, and how open its surroundings are."""
+    opened = openness(solids, points, outward, which)
+    return np.column_stack([lamps_seen(solids, points, outward, which), opened])
+
+
+def _normals(solids: Sequence[Solid], points: Array, which: NDArray[np.int64]) -> Array:  # [N, 3], [N] -> [N, 3]
     outward = np.zeros_like(points)
     for i in np.unique(which):
         outward[which == i] = normals(solids[i], points[which == i])
-    opened = openness(solids, points, outward, which)
-    return np.column_stack([lamps_seen(solids, points, outward, which), opened])
+    return outward
 
 
 def render(solids: Sequence[Solid], noise: Noise, camera: Camera) -> View:
@@ -112,18 +116,15 @@ def render(solids: Sequence[Solid], noise: Noise, camera: Camera) -> View:
     depth, index = cast(solids, camera)
     assert np.isfinite(depth).all(), "the room is closed"
     origin, rays = pixel_rays(camera)
-    lit = light_reaches(solids, (origin + rays * depth[..., None]).reshape(-1, 3), index.ravel())
-    lit = lit.reshape(*camera.size, -1)
-    lit = lit.repeat(_SPLIT, axis=0).repeat(_SPLIT, axis=1)
+    points, which = (origin + rays * depth[..., None]).reshape(-1, 3), index.ravel()
+    shares = light_reaches(solids, points, _normals(solids, points, which), which)
+    lit = shares.reshape(*camera.size, -1).repeat(_SPLIT, axis=0).repeat(_SPLIT, axis=1).reshape(-1, shares.shape[-1])
 
     fine = camera.resized(camera.height * _SPLIT, camera.width * _SPLIT)
     fine_depth, fine_index = cast(solids, fine)
-    _, fine_rays = pixel_rays(fine)
-    points = origin + fine_rays * fine_depth[..., None]
-    footprint = fine_depth / float(camera.K[0, 0])
-    color = surface_color(
-        solids, noise, points.reshape(-1, 3), fine_index.ravel(), footprint.ravel(), lit.reshape(-1, lit.shape[-1])
-    )
+    points, which = (origin + pixel_rays(fine)[1] * fine_depth[..., None]).reshape(-1, 3), fine_index.ravel()
+    footprint = (fine_depth / float(camera.K[0, 0])).ravel()
+    color = surface_color(solids, noise, points, _normals(solids, points, which), which, footprint, lit)
     color = color.reshape(camera.height, _SPLIT, camera.width, _SPLIT, 3).mean((1, 3))
     classes = np.array([CLASSES.index(solid.label) for solid in solids], np.uint8)
     return View(np.round(color * 255).astype(np.uint8), depth, classes[index])

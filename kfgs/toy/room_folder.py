@@ -186,7 +186,8 @@ def _write_geometry(
     chance = np.minimum(seen.sum(-1), 8.0) + 1e-3  # SfM finds what many views share
     rows = rng.choice(len(points), config.sparse_points, replace=False, p=chance / chance.sum())
     near, sides, owner = points[rows], outward[rows], which[rows]
-    color = surface_color(solids, noise, near, owner, np.full(len(rows), 0.01), light_reaches(solids, near, owner))
+    lit = light_reaches(solids, near, sides, owner)
+    color = surface_color(solids, noise, near, sides, owner, np.full(len(rows), 0.01), lit)
     observed = np.stack([visible(solids, camera, near, sides) for camera in cameras], axis=-1)
     placed = near + POINT_NOISE * rng.standard_normal(near.shape)
     outliers = max(1, len(rows) // 200)

@@ -202,10 +202,10 @@ def test_jobs_of_slurm(tmp_path, monkeypatch):
         (tmp_path / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     handler = signal.getsignal(signal.SIGINT)
-    with dask.config.set({"jobqueue.slurm.memory": "8GB"}), open_client("slurm:gpu:1", threads=3) as dask_client:
+    with dask.config.set({"jobqueue.slurm.memory": "8GB"}), open_client("slurm:gpu:1") as dask_client:
         assert dask_client.submit(len, "job").result(timeout=100) == 3
     assert signal.getsignal(signal.SIGINT) is handler
-    for part in ("#SBATCH -p gpu", "#SBATCH --cpus-per-task=3", "#SBATCH --mem=8G", "--nthreads 1"):
+    for part in ("#SBATCH -p gpu", "#SBATCH --cpus-per-task=1", "#SBATCH --mem=8G", "--nthreads 1"):
         assert part in script.read_text()
 
 
