@@ -107,8 +107,8 @@ def test_a_disk_that_takes_no_more_is_one_message_with_the_file(name, splat, tmp
 def test_the_second_fit_and_the_second_color_are_told_who_works_there(room, run, capsys):
     before = files(run)
     hold = (
-        "import sys, pathlib; from kfgs.pipeline.stages import Run\n"
-        "with Run(pathlib.Path(sys.argv[1])).locked(): print('held', flush=True); sys.stdin.read()"
+        "import sys, pathlib; from kfgs._files import locked\n"
+        "with locked(pathlib.Path(sys.argv[1]), '.run.lock'): print('held', flush=True); sys.stdin.read()"
     )
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen([sys.executable, "-c", hold, run], **pipes) as first:

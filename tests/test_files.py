@@ -128,6 +128,19 @@ def test_errors_of_writing_name_the_output(tmp_path, monkeypatch):
         pass
 
 
+def test_two_writers_of_one_file_both_succeed(tmp_path):
+    code = (
+        "import sys; from kfgs._files import write_json\nfor i in range(200): write_json('a', [int(sys.argv[1])] * 100)"
+    )
+    writers = [subprocess.Popen([sys.executable, "-c", code, str(i)], cwd=tmp_path) for i in range(2)]
+    values = set()
+    while any(writer.poll() is None for writer in writers):
+        if (tmp_path / "a").exists():
+            values.add(len(set(read_json(tmp_path / "a"))))
+    assert [writer.returncode for writer in writers] == [0, 0]
+    assert values <= {1}
+
+
 # Outputs and paths
 
 

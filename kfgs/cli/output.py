@@ -1,4 +1,4 @@
-"""The output of commands: lines, files written, counts of Gaussians, and warnings as notes."""
+"""The output of commands: lines, files written, and warnings as notes."""
 
 from __future__ import annotations
 
@@ -43,14 +43,6 @@ def wrote(paths: Sequence[Path]) -> None:
     say("wrote:")
     for path in paths:
         say(f"  {path}" + (f"  ({sum(1 for p in path.iterdir())} files)" if path.is_dir() else ""))
-
-
-def say_counts(labels: Any, names: Sequence[str]) -> None:
-    """Print the number of Gaussians of each class, and of those without a class."""
-    for i, name in [*enumerate(names), (-1, "(none)")]:
-        count = int((labels == i).sum())
-        if i >= 0 or count:
-            say(f"  {name:<16s} {count:8d} Gaussians")
 
 
 def say_lost(written: Any) -> None:

@@ -12,7 +12,7 @@ from .._files import check_output
 from .edit_syntax import Edits, parse_edits
 from .files import check_target, is_field, open_field, open_splats
 from .options import By, Classes, Flag, Given, Positional, Precision
-from .output import say, say_counts, say_lost, wrote
+from .output import say, say_lost, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
@@ -63,6 +63,7 @@ def attach(
     from ..cameras.similarity import Similarity
     from ..formats import write_splats
     from ..pipeline.attach import attach as attach_field
+    from ..pipeline.describe import count_lines
     from ..pipeline.label import label_cloud
     from ..scenes import SceneError, load_scene
 
@@ -72,7 +73,7 @@ def attach(
     if _of_points(cloud):
         moved, paths = label_cloud(loaded.label(label_set), cloud, out, distance=distance)
         say(str(moved))
-        say_counts(moved.labels, label_set.names)
+        say("\n".join(count_lines(moved.labels, label_set.names)))
         wrote(paths)
         return
     splats = open_splats("cloud", cloud)
@@ -92,7 +93,7 @@ def attach(
     written = write_splats(attached.gaussians, out, facts=attached.facts)
     for note in attached.notes:
         say(note)
-    say_counts(attached.labels, label_set.names)
+    say("\n".join(count_lines(attached.labels, label_set.names)))
     say_lost(written)
     wrote(written.paths)
 

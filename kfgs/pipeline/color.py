@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_range, check_whole
-from .._files import check_output
+from .._files import check_output, locked
 from .._progress import Progress, as_progress
 from ..cameras import Camera, resize_map
 from ..fields import ColorLoss, Densify, GaussianParams, Rates, Training, fit_field
@@ -21,7 +21,7 @@ from ..fields.train import FieldFit
 from ..formats import write_splats
 from ..gaussians import Gaussians
 from ..scenes import Scene
-from .stages import Run, digest_pictures, digest_scene, stage_generator
+from .stages import LOCK, Run, digest_pictures, digest_scene, stage_generator
 from .train import field_stage, stage_params, training_device, training_views, with_extent, with_points
 
 
@@ -146,7 +146,7 @@ def fit_color(
     config, progress = config or ColorConfig(), as_progress(progress)
     views = training_views(scene, split)
     run = Run(check_output("folder", folder, "a folder"), report)
-    with run.locked():
+    with locked(run.folder, LOCK):
         scene = with_points(run, scene, views, seed, progress)
         gaussians = color_stage(run, scene, views, config, seed, progress)
         write_splats(gaussians, run.folder / "color.ply")

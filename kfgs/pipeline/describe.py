@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from .._card import say_coordinate
 from .._check import one_line
@@ -82,7 +84,10 @@ def _describe_splats(path: Path, splats: Gaussians) -> str:
         ends = [[say_coordinate(value, 4) for value in corner] for corner in corners.tolist()]
         lines += [f"  {axis}: {low} to {high}" for axis, low, high in zip("xyz", *ends, strict=True)]
     lines.append(f"  format: {find_format(path).NAME}")
-    if splats.labels is not None:
-        for i, name in [*enumerate(splats.names), (-1, "(none)")]:
-            lines.append(f"  {name:<16s} {int((splats.labels == i).sum()):8d} Gaussians")
-    return "\n".join(lines)
+    return "\n".join([*lines, *([] if splats.labels is None else count_lines(splats.labels, splats.names))])
+
+
+def count_lines(labels: Tensor, names: Sequence[str]) -> list[str]:  # labels: [N]
+    """A line with the number of Gaussians of each class, and of those without a class."""
+    counts = [(name, int((labels == i).sum())) for i, name in [*enumerate(names), (-1, "(none)")]]
+    return [f"  {name:<16s} {count:8d} Gaussians" for name, count in counts]

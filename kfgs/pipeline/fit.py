@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._files import check_output, folded_name, real_path, write_json
+from .._files import check_output, folded_name, locked, real_path, write_json
 from .._progress import Progress, as_progress
 from ..cameras import Camera
 from ..fields import Autoencoded, Codewords, GaussianParams, Identity, SemanticField, fit_field, fuse_views, uplift_maps
@@ -38,7 +38,7 @@ from ..scenes.scene import as_taken
 from .color import color_stage, find_color
 from .maps import KnownFeatures, as_maps, describe_maps, map_shape, maps_of_views
 from .methods import Paper, Uplift
-from .stages import Run, Stage, digest_cameras, digest_scene, digest_shape, stage_generator
+from .stages import LOCK, Run, Stage, digest_cameras, digest_scene, digest_shape, stage_generator
 from .train import field_stage, training_device, training_views, with_extent, with_points
 
 REPORT = ("report.html", "preview.png", "codebook.png", "field.png")  # what `write_run_report` writes
@@ -89,7 +89,7 @@ def fit(
     with nullcontext(kept) if kept is not None else TemporaryDirectory(prefix="kfgs-") as place:
         run = Run(Path(place), report)
         maps = _open_maps(maps, scene, split, run.folder / "features", progress is True)
-        with run.locked():
+        with locked(run.folder, LOCK):
             if isinstance(method, Paper) or method.splat is None:  # else nothing is trained
                 scene = with_points(run, scene, views, seed, progress)
             seen = maps_of_views(scene, views, maps)
