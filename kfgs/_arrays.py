@@ -1,18 +1,23 @@
-"""Read arrays and tensors from files that others wrote: `.npy`, `.npz`, `.safetensors`.
+"""Read arrays and tensors from files that others wrote: `.npy`, `.npz`, `.safetensors`; write the last.
 
 Nothing pickled is ever loaded, and an archive unpacks to a limited size. What is wrong with a file becomes one `FileError`.
 """
 
 from __future__ import annotations
 
+import json
+import struct
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor
 
 from ._check import one_line
 from ._files import as_path
@@ -85,8 +90,6 @@ def read_safetensors(
         FileNotFoundError: if there is no such file.
         FileError: if it is another file, damaged, cut short, or of another kind or version.
     """
-    from safetensors import safe_open  # imports torch
-
     with reading(path, expected, advice), safe_open(path, framework="pt") as file:
         metadata = dict(file.metadata() or {})
         kind, version = (metadata.get(key) for key in ("kfgs", "version"))
@@ -96,6 +99,22 @@ def read_safetensors(
     if kind == kfgs[0]:
         what, advice = f"version {one_line(version)}", "use the kfgs that wrote it"
     raise FileError(f"{path}: expected a kfgs {kfgs[0]}, version {kfgs[1]}, got {what}; {advice}")
+
+
+def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
+    """Write tensors from any device, with texts in the header, in their order (safetensors alone would shuffle them)."""
+    whole = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    save_file(whole, path, metadata=None if metadata is None else dict(metadata))
+    if metadata is None or len(metadata) < 2:
+        return
+    with path.open("r+b") as file:
+        (length,) = struct.unpack("<Q", file.read(8))
+        header = json.loads(file.read(length))
+        header["__metadata__"] = dict(metadata)
+        ordered = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+        assert len(ordered) <= length, "the same texts in another order"
+        file.seek(8)
+        file.write(ordered.ljust(length))
 
 
 @contextmanager

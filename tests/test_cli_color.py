@@ -188,19 +188,6 @@ def test_edits_are_replayed_to_the_same_bytes_from_anywhere(labelled, tmp_path, 
     assert [edit["op"] for edit in edits] == ["move", "remove", "remove"]
 
 
-@pytest.mark.parametrize("name", ["a.spz", "a.splat", "a.sog", "a.glb"])
-def test_convert_keeps_classes(labelled, tmp_path, name, capsys):
-    assert main(["convert", str(labelled), str(tmp_path / "new" / name)]) == 0
-    said = capsys.readouterr().out
-    assert "KiB -> " in said
-    before, after = read_splats(labelled), read_splats(tmp_path / "new" / name)
-    assert after.names == before.names
-    counts = [torch.bincount(one.labels + 1, minlength=14).tolist() for one in (before, after)]
-    assert counts[0] == counts[1]
-    for path in (tmp_path / "new").iterdir():
-        assert str(path) in said
-
-
 def test_convert_by_class_writes_a_plain_file_for_each_class(labelled, tmp_path, capsys):
     cloud, out = read_splats(labelled), tmp_path / "objects"
     words = ["convert", str(labelled), str(out), "--by-class"]

@@ -142,19 +142,6 @@ def test_an_empty_path_is_not_the_current_folder(words, tmp_path, capsys, monkey
     assert not list(tmp_path.iterdir())
 
 
-def test_a_table_that_is_read_is_not_replaced(room, run, tmp_path, capsys):
-    table = tmp_path / "words.npy"
-    shutil.copy(room / "text.npy", table)
-    refused(["evaluate", run, "--text", table, "--out", table], capsys, "--out", "another place", table)
-    assert table.read_bytes() == (room / "text.npy").read_bytes()
-
-
-def test_nothing_is_written_among_smaller_photos(room, run, capsys):
-    words = ["segment", run, "--scene", room, "--path", "orbit", "--out", room / "images_2"]
-    refused(words, capsys, "--out", "apart from", "images_2")
-    assert not (room / "images_2").exists()
-
-
 def test_closed_streams_are_no_error():
     closed = f"{sys.executable} -m kfgs --version >&- 2>&-"
     assert subprocess.run(["sh", "-c", closed], check=False).returncode == 0

@@ -58,14 +58,6 @@ def count(truth, names, name):
     return int((truth == names.index(name)).sum())
 
 
-def test_words_of_a_file_or_between_commas(tmp_path):
-    assert read_words(" wall, chair;seat ,") == ["wall", "chair;seat"]
-    (tmp_path / "a.txt").write_text("\ufeffwall\n\n chair;seat\n")
-    assert read_words(str(tmp_path / "a.txt")) == ["wall", "chair;seat"]
-    (tmp_path / "a.json").write_text('["wall", "chair, big"]')
-    assert read_words(str(tmp_path / "a.json")) == ["wall", "chair, big"]
-
-
 def test_words_are_words_whatever_lies_in_the_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "chair").mkdir()

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from kfgs import Camera, Gaussians, read_splats, transfer_labels, write_splats
+from kfgs import Camera, Gaussians, read_splats, write_splats
 from kfgs._origin import choose_origin, to_world
 from kfgs.cameras.similarity import Similarity
 from kfgs.formats.ply import read_ply, write_ply
-from kfgs.labels import InBox, Move, OfClass, OrientedBox, Selection, connected_parts
+from kfgs.labels import InBox, Move, OfClass, OrientedBox
 from kfgs.labels.edit_list import join
 from kfgs.labels.selection import InSphere
 from kfgs.scenes import align_by_cameras
@@ -107,27 +107,6 @@ def test_places_of_a_rule_are_those_of_the_world(tmp_path):
     ball = np.linalg.norm(world - UTM, axis=1) <= 0.8
     assert 0 < ball.sum() < len(ball)
     assert InSphere(tuple(UTM), 0.8).select(splats).mask.tolist() == ball.tolist()
-
-
-def test_parts_and_selections_answer_in_the_world(tmp_path):
-    world = far_file(tmp_path / "far.ply")
-    gaussians = read_splats(tmp_path / "far.ply")
-    chosen = Selection.of(torch.ones(len(gaussians), dtype=torch.bool))
-    (part,) = connected_parts(gaussians, chosen, distance=5.0)
-    np.testing.assert_allclose(part.centroid.numpy(), world.mean(0), atol=1e-4, rtol=0)
-    np.testing.assert_allclose(part.extent[0].numpy(), world.min(0), atol=1e-4, rtol=0)
-    np.testing.assert_allclose(part.box.center.numpy(), world.mean(0), atol=1, rtol=0)
-    assert f"{world.mean(0)[1]:.2f}" in repr(part)
-
-
-def test_labels_pass_between_clouds_of_different_origins():
-    source, _ = cloud(seed=1)
-    target, _ = cloud(seed=2)
-    near = transfer_labels(source, target)
-    a, b = tuple(UTM), tuple(UTM + np.array([12, -8, 3]))
-    far = transfer_labels(source.replace(origin=a), target.replace(origin=a).with_origin(b))
-    assert torch.equal(near.labels, far.labels)
-    torch.testing.assert_close(near.scores, far.scores, rtol=1e-3, atol=1e-3)
 
 
 def test_edits_and_joins_stay_in_the_world(tmp_path):

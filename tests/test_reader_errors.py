@@ -8,7 +8,7 @@ import torch
 from messages import tells
 from PIL import Image
 
-from kfgs._tensors import save_tensors
+from kfgs._arrays import save_tensors
 from kfgs.evaluation.coco import load_coco_labels
 from kfgs.fields.examples import read_examples
 from kfgs.labels import load_label_set

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -61,7 +60,7 @@ def attach(
         same_frame: Do not compare the frames; they are the same.
     """
     from ..cameras.similarity import Similarity
-    from ..formats import write_splats
+    from ..formats import find_format, ply, write_splats
     from ..pipeline.attach import attach as attach_field
     from ..pipeline.describe import count_lines
     from ..pipeline.label import label_cloud
@@ -70,7 +69,8 @@ def attach(
     check_target("out", out)
     loaded = open_field("field", field)
     label_set = classes.load_classes(loaded)
-    if _of_points(cloud):
+    plain = cloud.is_file() and not is_field(cloud) and find_format(cloud).NAME == "ply"
+    if plain and "scale_0" not in ply.vertex_columns(cloud):  # points
         moved, paths = label_cloud(loaded.label(label_set), cloud, out, distance=distance)
         say(str(moved))
         say("\n".join(count_lines(moved.labels, label_set.names)))
@@ -96,14 +96,6 @@ def attach(
     say("\n".join(count_lines(attached.labels, label_set.names)))
     say_lost(written)
     wrote(written.paths)
-
-
-def _of_points(path: Path) -> bool:
-    """Whether a file is a PLY without Gaussians."""
-    from ..formats import find_format, ply
-
-    plain = path.is_file() and not is_field(path) and find_format(path).NAME == "ply"
-    return plain and "scale_0" not in ply.vertex_columns(path)
 
 
 def edit(
@@ -256,7 +248,10 @@ def _convert_by_class(source: Path, folder: Path) -> None:
     splats = open_splats("source", source, labelled=True)
     if len(splats) == 0:
         raise ValueError(f"source: expected Gaussians to divide by class, got none in {source}; name another splat")
-    parts = {_file_name(label, splats.names): part for label, part in splats.by_class().items()}
+    parts = {}
+    for label, part in splats.by_class().items():  # numbers keep names apart that a file's name cannot hold
+        word = re.sub(r"[^\w-]+", "_", splats.names[label] if 0 <= label < len(splats.names) else "").strip("_")[:80]
+        parts[f"{label:02d}{word and '_'}{word}.ply" if label >= 0 else "unlabelled.ply"] = part
     if any((folder / name).is_file() and (folder / name).samefile(source) for name in parts):
         raise ValueError(f"target: expected another folder than that of {source}, which is read; give another name")
     with atomic_folder(folder) as new:
@@ -266,14 +261,6 @@ def _convert_by_class(source: Path, folder: Path) -> None:
         say(f"{name}: {len(part)} Gaussians")
     say_lost(written)
     wrote([folder / name for name in parts])
-
-
-def _file_name(label: int, classes: Sequence[str]) -> str:
-    """`05_chair.ply` for class 5; the number keeps names apart that differ only in what a file's name cannot hold."""
-    if label < 0:
-        return "unlabelled.ply"
-    word = re.sub(r"[^\w-]+", "_", classes[label]).strip("_")[:80] if label < len(classes) else ""
-    return f"{label:02d}_{word}.ply" if word else f"{label:02d}.ply"
 
 
 def _bytes_of(path: Path) -> int:

@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from .._card import cut, say_coordinate
-from .._check import as_tensor, check_range, check_shapes, check_whole
-from .._names import class_indices
+from .._check import as_tensor, check_range, check_shapes, check_whole, class_indices
 from .._origin import to_world
 from .._rows import check_finite
 from ..cameras.similarity import Similarity

@@ -49,7 +49,16 @@ def describe(path: str | Path) -> str:
         return "\n".join([f"{path}: unfinished run; the same fit again continues", *lines])
     with suppress(FileNotFoundError, ValueError, TypeError):
         if not is_scene(path):
-            return _describe_maps(path)
+            maps = FeatureFolder(path)
+            h, w, D = maps.shape
+            about = maps.identity or {"name": "another program"}
+            lines = [
+                f"{path}: {len(maps)} feature maps by {one_line(about.get('name', 'an unknown teacher'))}",
+                f"  {h} x {w} cells, {D} channels",
+                f"  {sum(file.stat().st_size for file in maps.files) / 1e6:,.1f} MB",
+                *(f"  {one_line(name)}: {one_line(value, 200)}" for name, value in about.items() if name != "name"),
+            ]
+            return "\n".join(lines)
     scene = load_scene(path)
     sizes = sorted({camera.size for camera in scene.cameras})
     splits = ", ".join(f"{name} {len(views)}" for name, views in scene.splits.items())
@@ -60,19 +69,6 @@ def describe(path: str | Path) -> str:
         f"  splits: {splits}",
         f"  extent: {scene.extent:.3f} world units",
         *(f"  note: {note}" for note in scene.notes),
-    ]
-    return "\n".join(lines)
-
-
-def _describe_maps(path: Path) -> str:
-    maps = FeatureFolder(path)
-    h, w, D = maps.shape
-    about = maps.identity or {"name": "another program"}
-    lines = [
-        f"{path}: {len(maps)} feature maps by {one_line(about.get('name', 'an unknown teacher'))}",
-        f"  {h} x {w} cells, {D} channels",
-        f"  {sum(file.stat().st_size for file in maps.files) / 1e6:,.1f} MB",
-        *(f"  {one_line(name)}: {one_line(value, 200)}" for name, value in about.items() if name != "name"),
     ]
     return "\n".join(lines)
 

@@ -84,12 +84,13 @@ def write_run_report(
     title = html.escape(folder.absolute().name)
     repeat = command or f"kfgs.fit(scene, maps, method, folder={str(folder)!r})"
     options = html.escape(json.dumps(method.options(), indent=1))
+    pictures = {file.stem: base64.b64encode(file.read_bytes()).decode("ascii") for file in written}
     cells = (
         f"<tr><td>{html.escape(name)}</td><td>{html.escape(str(value))}</td></tr>" for name, value in facts.items()
     )
     parts = [
         f"<h1>kfgs: {title}</h1>",
-        *(_image(file) for file in written),
+        *(f'<h2>{name}</h2>\n<img alt="{name}" src="data:image/png;base64,{data}">' for name, data in pictures.items()),
         "<h2>What was fitted, and the time of each stage</h2>\n<table>",
         *cells,
         f"</table>\n<h2>How to repeat it</h2>\n<pre>{html.escape(repeat)}</pre>",
@@ -100,8 +101,3 @@ def write_run_report(
     with atomic_path(folder / "report.html") as temporary:
         temporary.write_text(page, encoding="utf-8")
     return [*written, folder / "report.html"]
-
-
-def _image(file: Path) -> str:
-    data = base64.b64encode(file.read_bytes()).decode("ascii")
-    return f'<h2>{file.stem}</h2>\n<img alt="{file.stem}" src="data:image/png;base64,{data}">'

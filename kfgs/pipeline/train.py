@@ -10,11 +10,10 @@ from typing import Any
 
 import torch
 
-from .._arrays import read_safetensors
+from .._arrays import read_safetensors, save_tensors
 from .._check import ORIGIN, as_origin
 from .._files import write_json
 from .._progress import Progress
-from .._tensors import save_tensors
 from ..cameras.projection import project_points
 from ..fields import GaussianParams, Training
 from ..fields.train import FieldFit

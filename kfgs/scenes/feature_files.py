@@ -36,13 +36,8 @@ def open_map(
     """Map a file into memory without reading its values.
 
     Feature 3DGS writes [D, h, w], kfgs [h, w, D]. In other files a known number of channels decides, then the aspect of the
-    picture; if both orders fit, it is [h, w, D]. If nothing is known, a first axis of twice the others' size is D.
-
-    Args:
-        file: the map.
-        channels: D, if it is known.
-        size: of the view's picture, if it is known.
-        own: kfgs wrote the map.
+    picture; if both fit, [h, w, D]. If nothing is known, a first axis of twice the others' size is D. `size` is that
+    of the view's picture; `own` says that kfgs wrote the map.
     """
     try:
         values = _load(file)

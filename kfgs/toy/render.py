@@ -27,19 +27,6 @@ class View(NamedTuple):
     labels: NDArray[np.uint8]  # [H, W] class index
 
 
-def _look_at(position: Array, target: Array, roll: float) -> Array:  # [4, 4] world to camera
-    """The pose (x right, y down, z forward) at `position` looking at `target`; z is up in the world, roll in radians."""
-    forward = (target - position) / np.linalg.norm(target - position)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    down = np.cross(forward, right)
-    c, s = np.cos(roll), np.sin(roll)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = np.stack([c * right + s * down, c * down - s * right, forward])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ position
-    return viewmat
-
-
 def intrinsics(height: int, width: int) -> Array:  # [3, 3]
     """The toy camera's K: 71 degrees wide, fx != fy, principal point off the centre by (+3.5, -2.5) / 256 widths.
 
@@ -65,7 +52,15 @@ def walk_cameras(train_views: int, test_views: int, size: tuple[int, int]) -> tu
         position = np.array([2.15 * np.cos(a), 1.75 * np.sin(a), 1.5 + 0.2 * np.sin(3 * a + 0.5) + 0.25 * lift])
         height = 1.0 + 0.3 * np.sin(2 * a + 0.4) + 0.95 * lift
         target = np.array([0.55 * np.cos(2 * a + 1.0), 0.45 * np.sin(3 * a), height])
-        viewmat = _look_at(position, target - 0.35 * position * [1, 1, 0], 0.05 * float(np.sin(5 * a)))
+        ahead = target - 0.35 * position * [1, 1, 0] - position
+        forward, roll = ahead / np.linalg.norm(ahead), 0.05 * float(np.sin(5 * a))
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        down = np.cross(forward, right)
+        c, s = np.cos(roll), np.sin(roll)
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = np.stack([c * right + s * down, c * down - s * right, forward])
+        viewmat[:3, 3] = -viewmat[:3, :3] @ position
         name = f"view_{number:03d}.png"
         K = torch.from_numpy(intrinsics(*size))
         cameras.append(Camera(torch.from_numpy(viewmat), K, width=size[1], height=size[0], name=name))

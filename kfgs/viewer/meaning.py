@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .._names import class_indices
+from .._check import class_indices
 from ..cameras import Camera
 from ..fields import Linear, SemanticField, fuse_views
 from ..gaussians import Gaussians
