@@ -138,9 +138,11 @@ def attach(
         "similarity": similarity.matrix().tolist(),
         "counts": {"none": counts[0], **dict(zip(semantic.names, counts[1:], strict=True))},
     }
-    shown, near = len(splats) - len(transfer.labels), f"by distance (lambda {transfer.distance:.3g})"
-    ways = [f"{shown:,} got a class by the views"] if by == "views" else []
-    ways += [f"{transfer.labelled:,} got a class {near}"] if by == "distance" or transfer.labelled else []
+    carried = f"by distance (lambda {transfer.distance:.3g})"
+    ways = [f"{transfer.labelled:,} got a class {carried}"]
+    if by == "views":
+        ways = [f"{len(splats) - len(transfer.labels):,} got a class by the views"]
+        ways += [f"{transfer.labelled:,} that no view shows {carried}"] if transfer.labelled else []
     ways.append(f"{transfer.orphaned:,} got none")
     notes = frame_note, f"{how['labelled by']}: of {len(splats):,} Gaussians {', '.join(ways)}"
     labelled = splats.replace(labels=labels, scores=scores.float(), names=semantic.names)
