@@ -135,10 +135,6 @@ class _Job:
         """The cameras of the views."""
         return [self.scene.cameras[i] for i in self.views]
 
-    def generator(self, stage: str) -> torch.Generator:
-        """The random numbers of a stage."""
-        return stage_generator(self.seed, stage)
-
 
 def _open_maps(maps: Any, scene: Scene, split: str, folder: Path, progress: bool) -> FeatureMaps:
     """The maps of a split's views; a teacher's go to the folder. What would fail only after the first stages is an error."""
@@ -178,7 +174,7 @@ def _uplift(job: _Job, method: Uplift) -> tuple[SemanticField, dict[str, Any]]:
             job.maps,
             options,
             latents=method.latents,
-            generator=job.generator("uplift"),
+            generator=stage_generator(job.seed, "uplift"),
             scratch=scratch,
             progress=job.progress is True,
         )
@@ -255,7 +251,7 @@ def _learn(
     """The stage of a codebook or an autoencoder: its file, named like the stage, and its history."""
 
     def make(folder: Path) -> None:
-        made = learn(generator=job.generator(name), progress=job.progress)
+        made = learn(generator=stage_generator(job.seed, name), progress=job.progress)
         made.save(folder / f"{name}.safetensors")
         assert made.report is not None
         note = getattr(made.report, "note", None)
@@ -272,7 +268,7 @@ def _train(job: _Job, method: Paper, targets: Sequence[Tensor], inputs: dict[str
     inputs |= {"scene": digest_scene(job.scene, job.views), "config": asdict(options), "seed": job.seed}
 
     def train(checkpoint: Path) -> FieldFit:
-        generator = job.generator("field")
+        generator = stage_generator(job.seed, "field")
         start = GaussianParams.from_points(job.scene.points, int(targets[0].shape[-1]), generator=generator)
         start = start.map(lambda value: value.to(training_device()))
         progress = job.progress

@@ -27,22 +27,16 @@ class View(NamedTuple):
     labels: NDArray[np.uint8]  # [H, W] class index
 
 
-def intrinsics(height: int, width: int) -> Array:  # [3, 3]
-    """The toy camera's K: 71 degrees wide, fx != fy, principal point off the centre by (+3.5, -2.5) / 256 widths.
-
-    This is deliberate: code that assumes a centred principal point or square pixels fails visibly on this scene.
-    """
-    unit = width / 256.0
-    fx = 180.0 * unit
-    return np.array([[fx, 0, width / 2 + 3.5 * unit], [0, 1.02 * fx, height / 2 - 2.5 * unit], [0, 0, 1.0]])
-
-
 def walk_cameras(train_views: int, test_views: int, size: tuple[int, int]) -> tuple[list[Camera], list[bool]]:
     """Cameras in the order of the walk, named `view_000.png` and so on, and which of them are for testing.
 
     Training cameras divide the walk evenly; each test camera stands half-way between two of them. The walk goes around
-    the room twice, first high and looking up, then low and looking down, so that most surfaces are seen often.
+    the room twice, first high and looking up, then low and looking down, so that most surfaces are seen often. Pictures are
+    71 degrees wide; fx != fy, and the principal point is off the centre, so that code that assumes otherwise fails visibly.
     """
+    height, width = size
+    unit, fx = width / 256.0, 180.0 * (width / 256.0)
+    K = [[fx, 0, width / 2 + 3.5 * unit], [0, 1.02 * fx, height / 2 - 2.5 * unit], [0, 0, 1]]
     steps = [(i / train_views, False) for i in range(train_views)]
     steps += [((j * train_views // test_views + 0.5) / train_views, True) for j in range(test_views)]
     cameras = []
@@ -50,8 +44,8 @@ def walk_cameras(train_views: int, test_views: int, size: tuple[int, int]) -> tu
         a = 4 * np.pi * turn
         lift = np.sin(a / 2)  # above 0 in the first round, below in the second
         position = np.array([2.15 * np.cos(a), 1.75 * np.sin(a), 1.5 + 0.2 * np.sin(3 * a + 0.5) + 0.25 * lift])
-        height = 1.0 + 0.3 * np.sin(2 * a + 0.4) + 0.95 * lift
-        target = np.array([0.55 * np.cos(2 * a + 1.0), 0.45 * np.sin(3 * a), height])
+        aim = 1.0 + 0.3 * np.sin(2 * a + 0.4) + 0.95 * lift  # its height
+        target = np.array([0.55 * np.cos(2 * a + 1.0), 0.45 * np.sin(3 * a), aim])
         ahead = target - 0.35 * position * [1, 1, 0] - position
         forward, roll = ahead / np.linalg.norm(ahead), 0.05 * float(np.sin(5 * a))
         right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -62,8 +56,7 @@ def walk_cameras(train_views: int, test_views: int, size: tuple[int, int]) -> tu
         viewmat[:3, :3] = np.stack([c * right + s * down, c * down - s * right, forward])
         viewmat[:3, 3] = -viewmat[:3, :3] @ position
         name = f"view_{number:03d}.png"
-        K = torch.from_numpy(intrinsics(*size))
-        cameras.append(Camera(torch.from_numpy(viewmat), K, width=size[1], height=size[0], name=name))
+        cameras.append(Camera(torch.from_numpy(viewmat), torch.tensor(K, dtype=torch.float64), width, height, name))
     return cameras, [test for _, test in sorted(steps)]
 
 
