@@ -49,7 +49,7 @@ def tell(note: str) -> None:
         _listeners[-1](note)
     elif note not in _logged:
         _logged.add(note)
-        logging.getLogger("kfgs").warning(note)
+        logging.getLogger("kfgs").log(logging.INFO if isinstance(note, Wait) else logging.WARNING, note)
 
 
 def is_strict() -> bool:
