@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import functools
 import math
 import numbers
 from collections.abc import Iterable, Sequence
@@ -49,7 +48,8 @@ def check_shapes(*arguments: tuple[str, Any, str | tuple[str | int, ...]]) -> di
     for name, value, spec in arguments:
         if value is None:
             continue
-        axes = _axes(spec)
+        words = spec.split() if isinstance(spec, str) else spec
+        axes = [int(axis) if isinstance(axis, str) and axis.isdigit() else axis for axis in words]
         expected_shape = f"[{', '.join(map(str, axes))}]"
         if not hasattr(value, "shape"):
             got = f"{type(value).__name__}; {_instead(value)}"
@@ -68,9 +68,6 @@ def check_shapes(*arguments: tuple[str, Any, str | tuple[str | int, ...]]) -> di
             if isinstance(axis, str) and axis not in sizes:
                 sizes[axis], bound_by[axis] = size, name
     return sizes
-
-
-_axes = functools.cache(lambda s: [int(a) if str(a).isdigit() else a for a in (s.split() if isinstance(s, str) else s)])
 
 
 def as_tensor(name: str, value: Any, *, floating: bool = False) -> Tensor:
