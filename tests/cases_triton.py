@@ -2,6 +2,7 @@
 
     TRITON_INTERPRET=1 python tests/cases_triton.py run cpu     # the kernels in numpy
     python tests/cases_triton.py run cuda                       # on a GPU
+    python tests/cases_triton.py run cuda 2/6                   # the third of six shares of that
     python tests/cases_triton.py compile                        # for GPUs that are not there
 
 Triton decides at its import whether it interprets, and pytest may have imported it before: hence the process.
@@ -282,6 +283,18 @@ def compare(actual: dict[str, Tensor], expected: dict[str, Tensor]) -> dict[str,
     return facts
 
 
+def find_faults(name: str, facts: dict[str, Any]) -> dict[str, Any]:
+    """What is wrong with the facts of a case: errors beyond their limits, what is not so, and what is missing."""
+    kind = name.split(",")[0]
+    flat, sloped = {
+        "frame": (("map", "alpha"), (*OF_FRAME, "means2d")),
+        "projection": ((*PROJECTED, *OF_PROJECTION), ()),
+    }.get(kind, (("maps", "alphas"), (*GRADS, "sums", "weights")))
+    limits = dict.fromkeys(flat, 1e-5) | dict.fromkeys(sloped, 1e-4)
+    wrong = {key: fact for key, fact in facts.items() if not (fact <= limits[key] if key in limits else fact is True)}
+    return wrong | {key: None for key in limits if key not in facts}
+
+
 def largest(value: Tensor) -> float:
     """The largest absolute value, 0 of nothing."""
     return float(value.detach().abs().max()) if value.numel() else 0.0
@@ -400,10 +413,10 @@ def main() -> None:
     warnings.simplefilter("ignore", RuntimeWarning)  # the interpreter's, about NaN and infinity
     if sys.argv[1] == "run":
         device = sys.argv[2]
-        results = {name: _attempt(run_case, case, device) for name, case in CASES.items()}
-        results["frame"] = _attempt(run_frame, device)
-        for name, sizes in PROJECTIONS.items():
-            results[f"projection, {name}"] = _attempt(run_projection, *sizes, device)
+        runs = {name: (run_case, case, device) for name, case in CASES.items()} | {"frame": (run_frame, device)}
+        runs |= {f"projection, {name}": (run_projection, *sizes, device) for name, sizes in PROJECTIONS.items()}
+        first, step = map(int, sys.argv[3].split("/")) if len(sys.argv) > 3 else (0, 1)
+        results = {name: _attempt(*runs[name]) for name in list(runs)[first::step]}
     else:
         results = {name: _attempt(compile_ahead, build) for name, build in BUILDS.items()}
     print(json.dumps(results))
