@@ -26,10 +26,14 @@ def _device(name: str) -> torch.device:
         os.environ["CUDA_VISIBLE_DEVICES"] = ""  # kfgs would train on a GPU that it sees
     try:
         device = torch.device(name)
-        if device.type == "cuda" and device.index is not None:
-            torch.cuda.set_device(device)
-    except (RuntimeError, AssertionError) as error:
+    except RuntimeError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
+    if device.type == "cuda" and (device.index or 0) < torch.cuda.device_count():
+        torch.cuda.set_device(device.index or 0)
+    elif device.type != "cpu":
+        raise argparse.ArgumentTypeError(
+            f"expected cpu or a GPU, of which torch sees {torch.cuda.device_count()}; got {name}"
+        )
     return device
 
 

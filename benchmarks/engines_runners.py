@@ -171,7 +171,7 @@ def count_pairs(inputs: Inputs) -> Pairs:
     p, tiles = inputs.projected, inputs.tiles
     arrays = (v.detach().cpu().numpy() for v in (p.means2d, p.conics, p.opacities, tiles.rows, tiles.offsets))
     composited = _count(*arrays, tiles.width, tiles.height, tiles.tile_size)
-    return Pairs(len(p.index), len(tiles.rows), int(composited))
+    return Pairs(len(p.index), int(tiles.offsets[-1]), int(composited))
 
 
 @numba.njit(error_model="numpy")

@@ -57,8 +57,7 @@ def project(
         camera: without distortion; cast to the Gaussians' dtype and device.
         near: smallest depth that is drawn, world units; None: the camera's.
         low_pass: variance in pixels^2 added on both axes, so that nothing is smaller than a pixel.
-        engine: as in `composite`. "numba", which "auto" takes on the CPU, is compiled; all others use kornia's functions
-            under autograd.
+        engine: as in `composite`. "reference" uses kornia's functions under autograd; the others are compiled.
 
     Returns:
         The M visible Gaussians; M = 0 is possible.

@@ -29,11 +29,10 @@ def bin_tiles(
         width: of the image, pixels.
         height: of the image, pixels.
         tile_size: side of a tile, pixels; None: what is fastest for the engine.
-        engine: as in `composite`. "numba", which "auto" takes on the CPU, finds the same lists with compiled code; all
-            others use torch.
+        engine: as in `composite`. "reference" uses torch; the others find the same lists with compiled code.
 
     Returns:
-        The P (tile, Gaussian) pairs, grouped by tile; equally deep Gaussians are in order of their index.
+        The (tile, Gaussian) pairs, grouped by tile; equally deep Gaussians are in order of their index.
 
     Raises:
         ValueError: if shapes disagree or a size is not a positive whole number, or the engine is unknown or cannot work on these

@@ -124,7 +124,7 @@ def choose(engine: str, device: str, dtype: torch.dtype) -> Engine:
 def choose_projecting(engine: str, *tensors: Tensor) -> Engine | None:
     """The engine, if it projects, shades and bins these tensors itself. None: kornia's and torch's functions do it."""
     chosen = choose(engine, tensors[0].device.type, tensors[0].dtype)
-    return chosen if chosen.projects and len({value.dtype for value in tensors}) == 1 else None
+    return chosen if chosen.projects and len({(value.device, value.dtype) for value in tensors}) == 1 else None
 
 
 def compiled_similarity(*tensors: Tensor) -> Callable[..., tuple[Tensor, Tensor]] | None:

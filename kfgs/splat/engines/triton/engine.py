@@ -9,13 +9,13 @@ With TRITON_INTERPRET=1 in the environment before triton is imported, the same k
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import torch
 import triton
 from torch import Tensor
 
-from ...sh import evaluate_sh
 from ..contract import CompiledEngine, Composited, Ranked, Splats, Tiles
 from .kernels import accumulate_kernel, composite_kernel
 from .kernels_backward import differentiate_kernel
@@ -47,7 +47,7 @@ LAUNCHES = {
     "differentiate": (Launch(64, 16, 16, 2), Launch(64, 16, 32, 2)),
 }
 """For up to `SMALLEST` channels, and for more: the fastest of some twenty each on an H200 (110,000 Gaussians, 640x480, 9 and 512
-channels). A warp has 32 threads, so each thread holds a chunk of one pixel, and no running product or sum crosses threads.
+channels). A warp has 32 threads, so each holds a chunk of one pixel or two, and no running product or sum crosses threads.
 Some registers spill; programs with fewer of them, or with twice the pixels, took longer."""
 
 SMALLEST = 16
@@ -62,13 +62,9 @@ class TritonEngine(CompiledEngine):
 
     devices = ("cuda", "cpu") if INTERPRETED else ("cuda",)
     dtypes = (torch.float32,)
-    tile_size = 8  # of 16, half of a program's pixels would not be reached by a Gaussian of its list
+    tile_size = 8  # a Gaussian reaches fewer of the pixels of a larger tile, and all of them are computed
     projects = True
     project, bin = staticmethod(project), staticmethod(bin)  # type: ignore[assignment]
-
-    def shade(self, sh: Tensor, means: Tensor, center: Tensor, index: Tensor) -> Tensor:
-        # index_select: its gradient takes half the time of that of an index in brackets
-        return evaluate_sh(sh.index_select(0, index), means.index_select(0, index) - center)
 
     def forward(self, splats: Splats, tiles: Tiles) -> Composited:
         """Composite as the contract says.
@@ -105,20 +101,24 @@ class TritonEngine(CompiledEngine):
         trace = trace.view(2, height, width)
         stops, lights = trace[0], trace[1].view(torch.float32)
         M = len(means2d) if of_splats else 0
-        parts = means2d.new_zeros(6 * M).split((2 * M, 3 * M, M))  # launching a kernel takes longer than filling
-        found = [part.view(M, *value.shape[1:]) for part, value in zip(parts, splats[:3], strict=True)]
-        found.append(torch.zeros_like(features) if of_features else features.new_empty(0))
+        room = (
+            -(-M // 4) * 4
+        )  # each part starts at a multiple of 16 bytes; for other starts the kernel is compiled anew
+        parts = means2d.new_zeros(6 * room).split((2 * room, 3 * room, room))  # one kernel fills them
+        shapes = [(M, *value.shape[1:]) for value in splats[:3]]
+        results = [part[: math.prod(shape)].view(shape) for part, shape in zip(parts, shapes, strict=True)]
+        results.append(torch.zeros_like(features) if of_features else features.new_empty(0))
         if (of_splats or of_features) and len(rows):
             D = features.shape[1]
             options = launch_options("differentiate", D, tile_size)
             with on_device(means2d):
                 differentiate_kernel[(_programs(options, tiles),)](
                     means2d, conics, opacities, features, index, rows, offsets, maps, alphas, stops,
-                    grad_maps, grad_alphas, *found,
+                    grad_maps, grad_alphas, *results,
                     width, height, tiles.grid[1], D, **options, OF_SPLATS=of_splats, OF_FEATURES=of_features,
                 )  # fmt: skip
-        found.append(torch.einsum("hwd,hw->d", grad_maps, lights) if wanted[4] else lights)
-        return [grad if want else None for grad, want in zip(found, wanted, strict=True)]
+        of_background = torch.einsum("hwd,hw->d", grad_maps, lights) if wanted[4] else None
+        return [grad if want else None for grad, want in zip((*results, of_background), wanted, strict=True)]
 
     def accumulate(
         self, means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Tensor, tiles: Tiles

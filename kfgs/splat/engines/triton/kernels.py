@@ -3,7 +3,7 @@
 A program works on PIXELS pixels of one tile (PARTS programs share a tile), and on CHUNK Gaussians of the tile's list at
 a time. Everything that depends on both lies in [CHUNK, PIXELS]: Triton spreads the last axis over the threads, so each
 thread holds its pixel's whole chunk, and the product of transmittances runs in registers. What goes over the channels
-is a matrix product of such a block with BLOCK channels, on the tensor cores.
+is a matrix product of such a block with BLOCK channels, on the tensor cores if there are many channels.
 
 Positions in a tile's list count from its start, in int32; memory offsets that channels multiply are int64.
 """

@@ -5,7 +5,7 @@
 import triton
 import triton.language as tl
 
-from .kernels_project import LEAST, ROUNDING, load
+from .kernels_project import LARGEST, LEAST, ROUNDING, load
 
 EPSILON = tl.constexpr(8 * 2.0**-23)  # room for rounding, as `bin_tiles` leaves it
 
@@ -16,7 +16,7 @@ def find_span(mean, extent, size, SIDE: tl.constexpr):
     slack = ROUNDING * (tl.abs(mean) + extent)
     first = tl.maximum(tl.ceil(mean - extent - 0.5 - slack), 0.0)
     last = tl.minimum(tl.floor(mean + extent - 0.5 + slack) + 1.0, size.to(tl.float32))
-    filled = last > first
+    filled = (last > first) & (tl.abs(mean) <= LARGEST) & (extent <= LARGEST)
     begin = tl.where(filled, first, 0.0).to(tl.int32) // SIDE
     return begin, tl.where(filled, (tl.where(filled, last, 1.0).to(tl.int32) - 1) // SIDE + 1 - begin, 0)
 
@@ -40,24 +40,24 @@ def count_kernel(order, means2d, extents, hits, count, width, height, SIDE: tl.c
     tl.store(hits + i, across.to(tl.int64) * down, mask=there)
 
 
-@triton.jit(do_not_specialize=["total", "count", "width", "height", "columns", "none"])
+@triton.jit(do_not_specialize=["total", "count", "width", "height", "columns", "no_tile"])
 def list_kernel(
     order, ends, means2d, conics, opacities, extents, rows, tiles,
-    total, count, width, height, columns, none, SIDE: tl.constexpr, BLOCK: tl.constexpr,
+    total, count, width, height, columns, no_tile, SIDE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write the row and the tile of each of the `total` candidates; the tile is `none` where alpha stays below 1/255.
+    """Write the row and the tile of each of the `total` candidates; the tile is `no_tile` where alpha stays below 1/255.
 
     `ends` says where the candidates of a Gaussian end; which Gaussian a candidate belongs to is found by halving.
     """
     p = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     there = p < total
     low, high = p * 0, p * 0 + count - 1
-    width_left = count
-    while width_left > 1:
+    owners_left = count
+    while owners_left > 1:
         middle = (low + high) // 2
         before = tl.load(ends + middle, mask=there, other=0) <= p
         low, high = tl.where(before, tl.minimum(middle + 1, high), low), tl.where(before, high, middle)
-        width_left = (width_left + 1) // 2
+        owners_left = (owners_left + 1) // 2
     m = tl.load(order + low, mask=there, other=0)
     x, y, left, across, top, down = find_box(m, there, means2d, extents, width, height, SIDE)
     step = (p - (tl.load(ends + low, mask=there, other=0) - across.to(tl.int64) * down)).to(tl.int32)
@@ -82,4 +82,4 @@ def list_kernel(
     terms = a * far_x * far_x + 2.0 * tl.abs(b) * far_x * far_y + c * far_y * far_y
     touched = smallest <= reach + EPSILON * (terms + tl.abs(reach) + 1.0)
     tl.store(rows + p, m.to(tl.int32), mask=there)
-    tl.store(tiles + p, tl.where(touched, line * columns + column, none).to(tiles.dtype.element_ty), mask=there)
+    tl.store(tiles + p, tl.where(touched, line * columns + column, no_tile).to(tiles.dtype.element_ty), mask=there)

@@ -66,7 +66,7 @@ def bin(
 ) -> tuple[Tensor, Tensor]:
     """Rows [P] and offsets [T + 1] of `Tiles`: the pairs in order of depth, sorted by tile.
 
-    On a GPU the rows of candidates that touch no tile follow at the end: the host would have to wait for where to cut.
+    The rows of candidates that touch no tile follow at the end: the host would have to wait before it could cut them off.
     """
     width, height, side = size
     columns, M, device = -(-width // side), len(depths), depths.device
@@ -84,4 +84,4 @@ def bin(
         )  # fmt: skip
     tiles, by_tile = tiles.sort(stable=True)
     offsets = torch.searchsorted(tiles, torch.arange(count + 1, dtype=kind, device=device))
-    return rows[by_tile if device.type == "cuda" else by_tile[: int(offsets[-1])]], offsets
+    return rows[by_tile], offsets
