@@ -35,12 +35,12 @@ def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
         temporary.write_bytes(buffer.getbuffer())
 
 
-def read_checkpoint(path: Path, identity: dict[str, str]) -> dict[str, Any]:
+def read_checkpoint(path: Path, identity: str) -> dict[str, Any]:
     """Read the file; a ValueError if it is damaged, or belongs to a fit with other inputs."""
     with reading(path, "a checkpoint of kfgs", AGAIN):
-        state = torch.load(path, map_location="cpu", weights_only=True)
-        known = dict(state["identity"])
-    if differing := sorted(name for name in identity | known if identity.get(name) != known.get(name)):
-        got = f"one with other {', '.join(differing)}; {AGAIN}"
+        state = dict(torch.load(path, map_location="cpu", weights_only=True))
+        known = state["identity"]
+    if known != identity:
+        got = f"one with other Gaussians, views, options, loss or seed; {AGAIN}"
         raise ValueError(f"checkpoint: expected one of this very fit at {path}, got {got}")
-    return dict(state)
+    return state

@@ -236,19 +236,15 @@ class Trainer:
             self._render_cameras[view, half] = shrink_camera(camera, 2) if half else camera
         return self._render_cameras[view, half]
 
-    def identity(self) -> dict[str, str]:
-        """A digest of each input of the fit, before its first step. Of the targets, only their number and the first map count."""
+    def identity(self) -> str:
+        """A digest of the inputs of the fit, before its first step. Of the targets, only their number and the first map count."""
         params, options = self.optimizer.params, asdict(replace(self._training, checkpoint_every=1))
         views = [tensor for camera in self._cameras for tensor in (camera.viewmat, camera.K)]
-        inputs: dict[str, tuple[list[Tensor], Any]] = {
-            "params": ([*params.to_tensors().values()], [params.origin, params.antialiased]),
-            "cameras": (views, [(camera.size, camera.near) for camera in self._cameras]),
-            "targets": ([as_tensor("targets[0]", self._targets[0], floating=True)], len(self._targets)),
-            "training": ([], options),
-            "generator": ([self._generator.get_state()], None),
-            "loss": ([], getattr(self._loss, "__qualname__", None) or repr(self._loss)),
-        }
-        return {name: digest_tensors(*tensors) + digest_value(rest) for name, (tensors, rest) in inputs.items()}
+        first = as_tensor("targets[0]", self._targets[0], floating=True)
+        tensors = digest_tensors(*params.to_tensors().values(), *views, first, self._generator.get_state())
+        loss = getattr(self._loss, "__qualname__", None) or repr(self._loss)
+        sizes = [len(self._targets), *((camera.size, camera.near) for camera in self._cameras)]
+        return digest_value([tensors, params.origin, params.antialiased, sizes, options, loss])
 
     def state(self) -> dict[str, Any]:
         """Everything that `restore_` needs: tensors, numbers, lists and dictionaries."""

@@ -30,7 +30,7 @@ from ..quant.sampling import FeatureMaps
 from ..splat import accumulate_pixels, bin_tiles, composite, project
 from ..splat.views import divide_sums, sum_pixels
 from .decoders import Linear
-from .merge import FAINT, merge_gaussians
+from .merge import merge_gaussians
 from .semantic_field import Seen, SemanticField
 from .working_maps import WorkingMaps, shrink_map, working_directions
 
@@ -54,16 +54,12 @@ class UpliftConfig:
     pixels: int = 80_000
     """Most pixels of a working view. Views are rendered at the largest whole multiple of the map's size within it; larger maps
     are shrunk by a whole factor."""
-    faint: float = FAINT
-    """Before merging, the faintest Gaussians, which together fill this share of all pixels, are dropped (`merge_gaussians`)."""
 
     def __post_init__(self) -> None:
         check_whole("max_gaussians", 1 if self.max_gaussians is None else self.max_gaussians, 1)
         check_range("keep", self.keep, 0, 1, closed=(False, True))
-        check_range("faint", self.faint, 0, 1, closed=(True, False))
-        check_whole("max_latents", self.max_latents, 1)
-        check_whole("corrections", self.corrections, 0)
-        check_whole("pixels", self.pixels, 64)
+        for name, least in {"max_latents": 1, "corrections": 0, "pixels": 64}.items():
+            check_whole(name, getattr(self, name), least)
 
     @staticmethod
     def field(**changes: Any) -> UpliftConfig:
@@ -134,10 +130,8 @@ def uplift_maps(
             means = per_weight(sums.sum(0))
             agreement = row_norms(means).clamp_max(1)
             if latents is None:
-                weights = cap(shown, shown[shown > 0])
-                fitted = fit_linear_latents(
-                    unit_rows(means), weights, keep=config.keep, maximum=config.max_latents
-                ).basis
+                weights, keep = cap(shown, shown[shown > 0]), config.keep
+                fitted = fit_linear_latents(unit_rows(means), weights, keep=keep, maximum=config.max_latents).basis
                 views.basis = fitted
                 sums = torch.cat([sums[..., :-1] @ fitted, sums[..., -1:]], dim=-1)
                 latents = LinearLatents((directions.double() @ fitted.double()).to(directions))
@@ -145,7 +139,7 @@ def uplift_maps(
                 sums = correct(cloud, sums, views, bar)
             if config.max_gaussians is not None:
                 cloud = cloud.replace(features=per_weight(sums.sum(0)))
-                merged = merge_gaussians(cloud, shown, config.max_gaussians, faint=config.faint, generator=generator)
+                merged = merge_gaussians(cloud, shown, config.max_gaussians, generator=generator)
                 agreement = divide_sums(merged.pool(agreement * shown), merged.weights)
                 cloud, shown, sums = merged.gaussians, merged.weights, torch.stack([merged.pool(half) for half in sums])
                 if config.corrections:

@@ -93,13 +93,9 @@ class WorkingMaps:
         (h, w, _), camera = rows.shape, self._cameras[i]
         factor = max(1, min(camera.height // h, camera.width // w, int((self._pixels / (h * w)) ** 0.5)))
         features = rows if self.basis is None else rows @ self.basis
-        # (width, height) of the whole picture in working pixels: not whole if some at the right or bottom were left over
-        span = (
-            shape.double().flip(0)
-            / self._shrinkage(*shape.tolist())
-            * factor
-            / torch.tensor([camera.width, camera.height])
-        )
+        # the whole picture in working pixels: not a whole number if some at the right or bottom were left over
+        whole = factor * shape.double().flip(0) / self._shrinkage(*shape.tolist())
+        span = whole / torch.tensor([camera.width, camera.height])
         K = camera.K.to(features) * torch.cat([span, torch.ones(1)]).to(features)[:, None]
         working = replace(camera.to(features), K=K, width=w * factor, height=h * factor)
         return WorkingView(working, features, factor, 1 / float(span.prod()))
