@@ -106,10 +106,7 @@ def test_lines_stay_short_and_cards_are_tables():
     viewmat[2, 3] = 3.0
     camera = Camera(viewmat, torch.tensor([[30.0, 0, 15], [0, 30, 10], [0, 0, 1]]), 30, 20)
     rendering = rasterize(cloud, camera, engine="reference")
-    results = [
-        Nearest(torch.rand(900), torch.rand(900)),
-        CodebookReport([{"a": 1.0}] * 99, torch.rand(9), 1, 1, 1, None),
-    ]
+    results = [Nearest(torch.rand(900), torch.rand(900)), CodebookReport([{"a": 1.0}] * 99, torch.rand(9), 1, 1)]
     for thing in (
         book,
         autoencoder,
@@ -125,7 +122,7 @@ def test_lines_stay_short_and_cards_are_tables():
         assert "\n" not in repr(thing)
     assert repr(autoencoder) == "Autoencoder(512 channels to 9 latents and back, widths [512, 64, 9, 64, 512])"
     for card, facts in (
-        (field._repr_html_(), ("&lt;lseg&gt;", "decouple+ADC+SC", " for 512 of the teacher")),
+        (field._repr_html_(), ("&lt;lseg&gt;", "decouple+ADC+SC", " for 512)")),
         (book._repr_html_(), (">300<", "[300, 512] float32")),
         (rendering._repr_html_(), ("30 x 20", "9")),
     ):

@@ -37,8 +37,8 @@ def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
 
 def read_checkpoint(path: Path, identity: str) -> dict[str, Any]:
     """Read the file; a ValueError if it is damaged, or belongs to a fit with other inputs."""
-    with reading(path, "a checkpoint of kfgs", AGAIN):
-        state = dict(torch.load(path, map_location="cpu", weights_only=True))
+    with reading(path, "a checkpoint of kfgs", AGAIN), path.open("rb") as file:
+        state = dict(torch.load(file, map_location="cpu", weights_only=True))
         known = state["identity"]
     if known != identity:
         got = f"one with other Gaussians, views, options, loss or seed; {AGAIN}"

@@ -69,8 +69,9 @@ class Decoder(Protocol):
         """The most similar classes of each pixel, the best first, and their cosines; -1 and 0 where nothing is known."""
         cosines = torch.cat([self.cosines(part, rows) for part in pixels.reshape(-1, self.latent).split(CHUNK)])
         scores, labels = cosines.sort(dim=1, descending=True, stable=True)  # ties go to the lowest class
-        empty, shape = ((row_norms(pixels) <= EPS) | ~covered)[..., None], (*pixels.shape[:-1], top)
-        return labels[:, :top].reshape(shape).masked_fill(empty, -1), scores[:, :top].reshape(shape).masked_fill(empty, 0)
+        empty = ((row_norms(pixels) <= EPS) | ~covered)[..., None]
+        labels, scores = (best[:, :top].reshape(*pixels.shape[:-1], top) for best in (labels, scores))
+        return labels.masked_fill(empty, -1), scores.masked_fill(empty, 0)
 
     def to_tensors(self) -> dict[str, Tensor]:
         """What `make_decoder` reads."""
@@ -172,8 +173,9 @@ class Codewords(_Quantised):
         return None if self.paper else similarity_votes(latents, rows)
 
     def label_pixels(self, pixels: Tensor, rows: Tensor, top: int, covered: Tensor) -> Ranks:
-        rule = super() if self.paper else Identity(self.dim)
-        return rule.label_pixels(pixels, rows, top, covered)
+        if self.paper:
+            return super().label_pixels(pixels, rows, top, covered)
+        return Identity(self.dim).label_pixels(pixels, rows, top, covered)
 
 
 @dataclass(frozen=True, eq=False)

@@ -97,7 +97,8 @@ def densify(
     grown = values.map(lambda value: value[source])
     if len(parents):
         first = len(kept) + len(cloned)
-        means, rotation = values.means[parents], quaternion_to_rotation_matrix(values.quats[parents])  # wxyz, normalises
+        means = values.means[parents]
+        rotation = quaternion_to_rotation_matrix(values.quats[parents])  # wxyz, normalises
         noise = torch.randn(means.shape, dtype=means.dtype, device=generator.device, generator=generator)
         away = noise.to(means.device) * values.log_scales[parents].exp()
         grown.means[first:] = means + (rotation @ away[:, :, None])[:, :, 0]

@@ -151,6 +151,6 @@ def read_examples(path: str | Path) -> dict[str, list[Example]]:
                 examples[name].append(read(entry))
     except (AttributeError, TypeError, LookupError, ValueError, OverflowError, RuntimeError) as error:
         why = f"{type(error).__name__}: {error}" if isinstance(error, LookupError) else str(error)
-        expected = 'an object of lists of examples by class name, {"chair": [...]}'
+        expected = 'an example, in an object of lists by class name, {"chair": [...]}'
         raise ValueError(f"{path}: {where}expected {expected}, got others ({why}); see kfgs features --help") from error
     return examples

@@ -78,4 +78,3 @@ class FieldOptimizer:
 
 def _leaf(value: Tensor) -> Tensor:
     return value.detach().clone().requires_grad_(True)
-

@@ -222,9 +222,9 @@ def fit_autoencoder(
     made.requires_grad_(False)
     with torch.no_grad():
         latents = _normalised_latents(made, norms, target, freeze=True)
-        low = float(latents.min())
-        high = max(float(latents.max()), low + SMALLEST)
-        made.range = torch.tensor([low, high], dtype=torch.float64, device=target.device)
+        least = float(latents.min())
+        ends = [least, max(float(latents.max()), least + SMALLEST)]
+        made.range = torch.tensor(ends, dtype=torch.float64, device=target.device)
         decoded = made.decode(made.encode(codebook.codewords))
         recovered = codebook.quantize(decoded) == torch.arange(codebook.size, device=decoded.device)
         loss = row_norms(decoded - codebook.unit).mean()

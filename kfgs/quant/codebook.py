@@ -23,7 +23,8 @@ class Nearest(NamedTuple):
     codeword: Tensor  # [...] int64
     similarity: Tensor  # [...] cosine with that codeword, in [-1, 1] up to rounding
 
-    __repr__ = short_repr
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,8 +39,8 @@ def plot_history(history: Sequence[Row] | Mapping[str, Sequence[Row]], path: str
     Numbers that are always 0 are left out, and so are `seconds`, a nearly straight line.
 
     Args:
-        history: rows with `step` (or `iteration`, `epoch`, `round`) and numbers: `FieldFit.history`, `Codebook.report.history`; or
-            several histories by name, which get a line each.
+        history: rows with `step` (or `iteration`, `epoch`, `round`) and numbers: `FieldFit.history`,
+            `Codebook.report.history`; or several histories by name, which get a line each.
         path: the file.
 
     Raises:

@@ -24,17 +24,6 @@ def path(request, monkeypatch):
     return request.param
 
 
-@pytest.mark.parametrize(("engine", "compiled"), [("numba", True), ("auto", True), ("reference", False)])
-def test_the_similarity_is_that_of_the_engine(engine, compiled, monkeypatch):
-    cpu = pytest.importorskip("kfgs.splat.engines.cpu.losses")
-    calls, own = [], cpu.similarity
-    monkeypatch.setattr(cpu, "similarity", lambda *arguments: calls.append(1) or own(*arguments))
-    a, b = pictures()
-    measured = float(ColorLoss(1.0, engine)(a, a[..., 0], b))
-    assert bool(calls) == compiled
-    assert measured == pytest.approx(1 - ssim_windows(a, b).mean(), abs=1e-12)
-
-
 def test_similarity_is_the_mean_over_windows(path):
     a, b = pictures()
     assert float(mean_similarity(a, b)) == pytest.approx(ssim_windows(a, b).mean(), abs=1e-12)

@@ -226,8 +226,8 @@ def test_a_field_has_features_or_colours(change, message):
         ({"colors": torch.full((10, 3), 2.0)}, ("colors:", "uint8", "[0, 1]", "divide by 255")),
         ({"colors": torch.full((10, 3), 128)}, ("colors:", "uint8", "[0, 1]", "divide by 255")),
         ({"colors": torch.zeros(9, 3)}, ("colors:", "[P, 3]", "P = 10", "got (9, 3)")),
-        ({"colors": None}, ("channels, colors:", "got neither")),
-        ({"channels": 3}, ("channels, colors:", "got both")),
+        ({"colors": None}, ("features, sh0:", "got neither")),
+        ({"channels": 3}, ("features, sh0:", "got both")),
         ({"sh_degree": 4}, ("sh_degree:", "[0, 3]", "got 4")),
     ],
 )

@@ -220,8 +220,6 @@ def test_an_antialiased_cloud_is_trained_as_it_is_drawn(tmp_path):
     assert fit.history[0]["loss"] < 1e-6  # it draws what it began as
     assert fit.params.antialiased
     assert fit_field(params, cameras, targets, config, checkpoint=path).params.antialiased  # as the file has it
-    with pytest.raises(ValueError, match="other params"):
-        fit_field(replace(params, antialiased=False), cameras, targets, config, checkpoint=path)
 
 
 def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
@@ -229,22 +227,19 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
     path = tmp_path / "fit.pt"
     short = changed(SHORT, steps=5)
     fit_field(start(), cameras, targets, short, checkpoint=path)
-    with pytest.raises(ValueError, match=tells("checkpoint:", "training", "delete")):
-        fit_field(start(), cameras, targets, changed(short, features_rate=0.1), checkpoint=path)
-    with pytest.raises(ValueError, match=tells("checkpoint:", "cameras, targets", "delete")):
-        fit_field(start(), cameras[:2], targets[:2], short, checkpoint=path)
-    nearer = [replace(camera, near=0.1) for camera in cameras]
-    with pytest.raises(ValueError, match=tells("checkpoint:", "cameras;", "delete")):
-        fit_field(start(), nearer, targets, short, checkpoint=path)
-    with pytest.raises(ValueError, match=tells("checkpoint:", "generator, params, training")):
-        fit_field(
-            start(61),
-            cameras,
-            targets,
-            changed(short, extent=3.0),
-            checkpoint=path,
-            generator=torch.Generator().manual_seed(9),
-        )
+    same = {"params": start(), "cameras": cameras, "targets": targets, "training": short}
+    for other in (
+        {"training": changed(short, features_rate=0.1)},
+        {"cameras": cameras[:2], "targets": targets[:2]},
+        {"cameras": [replace(camera, near=0.1) for camera in cameras]},
+        {"targets": [target + 1 for target in targets]},
+        {"params": start(61)},
+        {"params": replace(start(), antialiased=True)},
+        {"loss": lambda rendered, alpha, target: rendered.mean()},
+        {"generator": torch.Generator().manual_seed(9)},
+    ):
+        with pytest.raises(ValueError, match=tells("checkpoint:", "this very fit", "delete")):
+            fit_field(**(same | other), checkpoint=path)
     how_often = changed(short, checkpoint_every=2)  # changes no result
     assert len(fit_field(start(), cameras, targets, how_often, checkpoint=path).history) == 1
 
