@@ -205,13 +205,12 @@ class SemanticField:
             negatives = "none"
         source = self._source
         classes = self.classes if classes is None else classes
-        question = make_question(target, classes, negatives, source.decoder.dim, self.info)
-        latents, rows = source.features, question.rows
+        rows, latents = make_question(target, classes, negatives, self.dim, self.info), source.features
         named = isinstance(target, str) and isinstance(negatives, str)  # the rows of a label set are checked
         unit = unit_rows(rows) if named else unit_embeddings(rows, "embedding, negatives")
         with torch.no_grad():
             cosines = source.decoder.cosines(latents, unit.to(latents))
-        against = None if question.negatives is None else cosines[:, 1:]
+        against = cosines[:, 1:] if len(rows) > 1 else None
         return select_by_similarity(cosines[:, 0], against, threshold, latents.any(dim=1), score)
 
     def segment(self, camera: Camera, classes: Classes | None = None) -> Tensor:  # [H, W] int64

@@ -66,6 +66,8 @@ class LabelSet:
 
     def index(self, name: str) -> int:
         """The label of a class; for an unknown name, a ValueError lists similar names."""
+        if self.names.count(name) == 1:
+            return self.names.index(name)
         return class_index(name, self.names, "add its embedding to the classes")
 
     def knows(self, name: str) -> bool:
