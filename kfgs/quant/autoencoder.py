@@ -276,13 +276,13 @@ def _normalised_latents(
     With `freeze`, its statistics over these rows become part of the linear layers.
     """
     for layer, (scale, shift) in zip(made.encoder[:-1], norms, strict=True):
-        rows = layer(rows)
-        mean, deviation = rows.mean(dim=0), (rows.var(dim=0, correction=0) + NORM_EPS).sqrt()
-        rows = torch.relu((rows - mean) / deviation * scale + shift)
+        sums = layer(rows)
+        mean, deviation = sums.mean(dim=0), (sums.var(dim=0, correction=0) + NORM_EPS).sqrt()
         if freeze:
             gain = scale / deviation
             layer.weight.mul_(gain[:, None])
             layer.bias.sub_(mean).mul_(gain).add_(shift)
+        rows = torch.relu(layer(rows) if freeze else (sums - mean) / deviation * scale + shift)
     return unit_latents(made.encoder[-1](rows))
 
 

@@ -234,7 +234,9 @@ def class_balanced_loss(
     """Mean over the T classes present of the mean cosine distance within the class (Eq. 6-7).
 
     A class is a codeword that has features. With the mean m of its unit features, mean(1 - cos(u, s)) = 1 - m . s/|s|, so one
-    matrix product of the features is enough.
+    matrix product gives both the loss and its gradient, without autograd (the tests compare them):
+
+        dL/ds = -(m - (m . s/|s|) s/|s|) / (T |s|).
     """
     n, K = len(features), len(codewords)
     counts = torch.bincount(index, minlength=K)
@@ -245,7 +247,8 @@ def class_balanced_loss(
     inverse = 1.0 / (row_norms(features).clamp_min(EPS) * counts[index])
     weights[index, torch.arange(n, device=index.device)] = inverse.to(weights.dtype)
     means = weights @ features  # [K, D] mean of the unit features of each class
-    with torch.enable_grad():
-        leaf = codewords.detach().requires_grad_()
-        loss = ((1.0 - (means * unit_rows(leaf)).sum(dim=1)) * (counts > 0)).sum() / T
-    return loss.detach(), torch.autograd.grad(loss, leaf)[0]
+    norms = row_norms(codewords).clamp_min(EPS)[:, None]
+    unit = codewords / norms
+    similarity = (means * unit).sum(dim=1, keepdim=True)  # [K, 1]
+    loss = ((1.0 - similarity[:, 0]) * (counts > 0)).sum() / T
+    return loss, (similarity * unit - means) / (norms * T)

@@ -79,16 +79,6 @@ def test_children_are_drawn_from_their_parent():
     torch.testing.assert_close(grown.params.means.T.cov(), expected, atol=0.025, rtol=0)
 
 
-def test_split_is_seeded():
-    start, hot = params([0.5]), torch.tensor([HOT])
-
-    def means(seed):
-        return densify(start, hot, CONFIG, extent=EXTENT, seed=seed).params.means
-
-    assert torch.equal(means(1), means(1))
-    assert not torch.equal(means(1), means(2))
-
-
 def test_faint_ones_are_dropped():
     start = params([0.05, 0.05, 0.05], [0.004, 0.006, 0.5])
     grown = densify(start, torch.full((3,), COLD), CONFIG, extent=EXTENT)

@@ -64,20 +64,6 @@ def test_gradient_of_the_similarity_is_that_of_finite_differences(path):
     assert torch.autograd.gradcheck(lambda x: mean_similarity(x, b), a.clone().requires_grad_())
 
 
-def test_compiled_and_kornias_gradients_agree_in_float32(monkeypatch):
-    pytest.importorskip("numba")
-    gradients = []
-    for compiled in (True, False):
-        if not compiled:
-            monkeypatch.setattr(loss, "compiled_losses", lambda *tensors: None)
-        a, b = pictures(90, 75, torch.float32)
-        value = mean_similarity(a.requires_grad_(), b)
-        value.backward()
-        gradients.append((float(value.detach()), a.grad))
-    assert gradients[0][0] == pytest.approx(gradients[1][0], abs=1e-6)
-    torch.testing.assert_close(gradients[0][1], gradients[1][1], rtol=2e-4, atol=2e-8)
-
-
 def test_nothing_known_is_no_loss(path):
     a, b = pictures()
     assert float(mean_similarity(a, b * torch.nan)) == 1.0
