@@ -28,8 +28,8 @@ from ..pipeline import Uplift, fit
 from ..pipeline.maps import maps_of_views
 from ..quant import LinearLatents
 from ..scenes import FeatureFolder, Scene, SceneError, load_scene
-from ..scenes.blocks import Block, partition, write_parts
-from ..scenes.colmap_model import read_whole_model
+from ..scenes.blocks import Block, partition, write_part
+from ..scenes.colmap_model import read_model
 from ..scenes.masks import picture_folder
 from ..scenes.sub_models import find_model
 from .run import run_tasks
@@ -105,7 +105,8 @@ def _cut(source: Path, out: Path, count: int, splat: str | Path | None, latents:
     maps = maps_of_views(whole, whole.views("train"), FeatureFolder(source / "features").of(whole, "train"))
     if isinstance(latents, LinearLatents) and latents.dim != maps[0].shape[2]:
         raise ValueError(f"latents: expected those of features with {maps[0].shape[2]} channels, got {latents.dim}")
-    blocks, training = partition(read_whole_model(model), count), set(whole.views("train"))
+    content, training = read_model(model), set(whole.views("train"))
+    blocks = partition(content, count)
     unseen = next((block.name for block in blocks if not training & _views_of(whole, block)), None)
     if unseen is not None:
         raise SceneError(f"{unseen}: expected training views that see it, got none; ask for fewer blocks than {count}")
@@ -124,9 +125,8 @@ def _cut(source: Path, out: Path, count: int, splat: str | Path | None, latents:
         raise ValueError(f"out: expected a new folder, or one with these blocks, got {out} with others; choose another")
     if not (out / LATENTS).is_file():
         (uplift.sample_latents(maps, count=latents) if isinstance(latents, int) else latents).save(out / LATENTS)
-    if todo:
-        write_parts(model, {out / block.name / "sparse/0": block.views for block in todo})
     for block in todo:
+        write_part(out / block.name / "sparse/0", content, block.views)
         _write_block(out / block.name, block, whole, cloud)
     return [block.name for block in blocks]
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,13 +11,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from .._check import check_whole
-from .._files import as_path, atomic_folder
+from .._files import atomic_folder
 from ..cameras.bounds import robust_bounds
 from .colmap_model import ColmapModel
 from .files import SceneError
-from .pycolmap_import import quiet_pycolmap, scene_errors, without_rigs
 
 Array = NDArray[np.float64]
 Box = tuple[tuple[float, ...], tuple[float, ...]]  # low and high corner, world units
@@ -100,29 +99,26 @@ def partition(model: ColmapModel, count: int) -> list[Block]:
     return blocks
 
 
-def write_parts(model: str | Path, parts: Mapping[Path, Iterable[str]]) -> None:
-    """Write COLMAP models with some of the images of another, and the points that at least two of them see.
-
-    `parts` has the folder of each new model, with the names of its images. The model, which `read_whole_model` accepts, is read
-    once, as that of a city has gigabytes; then memory holds it, and a copy from which one part is made.
-    """
-    model = as_path(model)
-    with (
-        without_rigs(model) as safe,
-        quiet_pycolmap() as pycolmap,
-        scene_errors(f"{model}: expected a model that pycolmap can read", "write it again with COLMAP"),
-    ):
-        whole = pycolmap.Reconstruction(str(safe))
-        frames = {image.name: image.frame_id for image in whole.images.values()}
-        for folder, names in parts.items():
-            missing = set(names) - frames.keys()
-            if missing:
-                raise SceneError(f"parts: expected images of {model}, got {min(missing)!r}; correct the name")
-            part = copy.deepcopy(whole)
-            for frame in set(frames.values()) - {frames[name] for name in names}:
-                part.deregister_frame(frame)
-            with atomic_folder(folder) as place:
-                part.write(str(place))
+def write_part(folder: Path, model: ColmapModel, names: Iterable[str]) -> None:
+    """Write a COLMAP model with some of the images of another, and the points that at least two of them see; no 2-D points."""
+    chosen, known = set(names), {image.name for image in model.images.values()}
+    if not chosen <= known:
+        raise SceneError(f"names: expected images of the model, got {min(chosen - known)!r}; correct the name")
+    images = {key: image for key, image in model.images.items() if image.name in chosen}
+    seen, counts = np.unique(np.concatenate([np.unique(i.observed) for i in images.values()]), return_counts=True)
+    kept = np.isin(model.point_ids, seen[counts > 1])
+    cameras, lines = {i.camera_id: model.cameras[i.camera_id] for i in images.values()}, list[str]()
+    for key, image in images.items():
+        assert image.pose is not None  # of an image that sees a block
+        x, y, z, w = Rotation.from_matrix(image.pose[:3, :3]).as_quat().tolist()
+        numbers = " ".join(map(repr, (w, x, y, z, *image.pose[:3, 3].tolist())))
+        lines.append(f"{key} {numbers} {image.camera_id} {image.name}\n\n")
+    with atomic_folder(folder) as place:
+        (place / "images.txt").write_text("".join(lines), encoding="utf-8")
+        heads = [(f"{key} {c.model} {c.width} {c.height}", c.params) for key, c in cameras.items()]
+        (place / "cameras.txt").write_text("".join(f"{head} {' '.join(map(repr, params))}\n" for head, params in heads))
+        rows = np.column_stack([model.point_ids[kept], model.points[kept], model.colors[kept]])
+        np.savetxt(place / "points3D.txt", rows, "%d %.17g %.17g %.17g %d %d %d 0")
 
 
 def _within(points: NDArray[Any], core: Array) -> NDArray[np.bool_]:

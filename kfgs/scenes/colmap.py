@@ -9,12 +9,10 @@ from pathlib import Path
 import torch
 
 from .._files import Names
-from .._notes import Repair
 from ..cameras.camera import Camera, Distortion, DistortionModel
-from .colmap_files import CAMERA_MODELS
-from .colmap_model import ColmapImage, ColmapModel, read_model
+from .colmap_model import CAMERA_MODELS, ColmapImage, ColmapModel, read_model
 from .files import SceneError, find_pictures, list_images, natural_key, some
-from .posed import NO_POINTS, NOTHING, as_large_as_pictures, assemble_scene
+from .posed import NO_POINTS, NOTHING, as_large_as_pictures, assemble_scene, mending_notes
 from .scene import Scene
 
 # COLMAP's model: (our lens, its number of coefficients). COLMAP's own order after the intrinsics is ours in each case:
@@ -90,12 +88,10 @@ def colmap_cameras(path: Path) -> Scene:
 
 
 def _posed(model: ColmapModel) -> tuple[list[ColmapImage], list[str]]:
-    """The images with a pose and a lens, in natural order of names, and notes about the others and all that is broken."""
+    """The images with a pose, in natural order of names, and notes about the others and all that is broken."""
     views = sorted(model.images.values(), key=lambda image: natural_key(image.name))
     lost = [image.name for image in views if image.pose is None]
-    notes = [Repair(f"{len(lost)} images of the model have no pose and were left out: {some(lost)}")] if lost else []
-    whole = [image for image in views if image.pose is not None and model.cameras[image.camera_id].usable]
-    return whole, [*notes, *model.notes]
+    return [image for image in views if image.pose is not None], [*mending_notes(lost, {}), *model.notes]
 
 
 def _cameras(path: Path, model: ColmapModel, images: list[ColmapImage]) -> list[Camera]:

@@ -7,17 +7,13 @@ the first PNG that Pillow writes corrupts the heap and aborts the process. So th
 from __future__ import annotations
 
 import signal
-import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import PIL.Image  # noqa: F401  # see above: the order matters
 
-from .._files import real_path
-from .colmap_model import FILES, model_suffix
 from .files import SceneError
 
 # Exceptions of pycolmap for unusable input (a failed CHECK is a ValueError, a missing id an IndexError).
@@ -61,16 +57,3 @@ def scene_errors(what: str, advice: str) -> Iterator[None]:
     except FAILURES as error:
         lines = str(error).strip().splitlines()
         raise SceneError(f"{what} ({type(error).__name__}: {lines[0] if lines else 'no text'}); {advice}") from error
-
-
-@contextmanager
-def without_rigs(model: Path) -> Iterator[Path]:
-    """A folder with links to the cameras, images and points of a model, which `read_whole_model` has checked.
-
-    Rigs and frames are left out: the images file has every pose, and pycolmap never returns from random bytes in frames.bin.
-    """
-    with tempfile.TemporaryDirectory(prefix="kfgs-model-") as scratch:
-        for name in FILES:
-            file = real_path(model / f"{name}.{model_suffix(model)}")
-            (Path(scratch) / file.name).symlink_to(file)
-        yield Path(scratch)

@@ -8,7 +8,7 @@ from messages import tells
 from small_room import make_room
 
 from kfgs.scenes import SceneError, load_scene
-from kfgs.scenes.blocks import Block, partition, write_parts
+from kfgs.scenes.blocks import Block, partition, write_part
 from kfgs.scenes.colmap_model import read_model
 
 
@@ -63,17 +63,24 @@ def test_a_block_survives_json(room):
 
 
 def test_a_part_of_a_model_is_a_model(room, tmp_path):
-    block = partition(read_model(room / "sparse/0"), 4)[1]
-    views = block.views[:4]
-    write_parts(room / "sparse/0", {tmp_path / "part": views})
+    model = read_model(room / "sparse/0")
+    views = partition(model, 4)[1].views[:4]
+    write_part(tmp_path / "part", model, views)
     whole, part = load_scene(room), read_model(tmp_path / "part")
+    counts = np.unique(
+        np.concatenate([i.observed for i in model.images.values() if i.name in views]), return_counts=True
+    )
+    assert part.point_ids.tolist() == [i for i, n in zip(*counts, strict=True) if i >= 0 and n > 1]
+    rows = np.searchsorted(model.point_ids, part.point_ids)
+    assert np.array_equal(part.points, model.points[rows])
+    assert np.array_equal(part.colors, model.colors[rows])
     assert {image.name for image in part.images.values()} == set(views)
     poses = {image.name: image.pose for image in part.images.values()}
     for camera in whole.cameras:
         if camera.name in poses:
             np.testing.assert_allclose(poses[camera.name], camera.viewmat.numpy(), atol=1e-6)
-    with pytest.raises(SceneError, match=tells("parts", "nobody.png")):
-        write_parts(room / "sparse/0", {tmp_path / "other": ["nobody.png"]})
+    with pytest.raises(SceneError, match=tells("names", "nobody.png")):
+        write_part(tmp_path / "other", model, ["nobody.png"])
     assert not (tmp_path / "other").exists()
 
 
