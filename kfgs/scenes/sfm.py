@@ -19,7 +19,6 @@ from .colmap import LENSES
 from .colmap_model import has_model
 from .files import SceneError, list_images, picture_size, some
 from .masks import folder_masks, write_colmap_masks
-from .pictures import heic_names
 from .pycolmap_import import quiet_pycolmap, scene_errors
 
 OVERLAP = 10  # next images that one of a video is compared with, and as many at distances 1, 2, 4, ... (as COLMAP)
@@ -115,11 +114,11 @@ def run_sfm(
             f"out: expected a scene folder without a model, got one in {model}; name another folder, or pass replace=True "
             "(--replace) to give up that model"
         )
-    heic, names = heic_names(images), list_images(images)
+    names, heic = list_images(images), list_images(images, (".heic", ".heif"))
     if heic:
         raise SceneError(
-            f"{images}: expected pictures that pycolmap reads, got HEIC photographs ({some(heic, 3)}); make JPEG files of them: "
-            "`kfgs sfm` does, and kfgs.scenes.pictures.convert_heic(images, out)"
+            f"{images}: expected pictures that pycolmap reads, got HEIC photographs ({some(heic, 3)}); save them as JPEG, with "
+            "their EXIF: `magick mogrify -format jpg *.heic`, in the app of the phone, or in its settings before the next photo"
         )
     if len(names) < 3:
         raise SceneError(f"{images}: expected at least 3 images (PNG, JPEG, TIFF, WebP), got {len(names)}; add views")

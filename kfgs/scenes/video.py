@@ -1,4 +1,4 @@
-"""Pictures for structure from motion that no folder of images holds yet: sharp frames of a video, and HEIC photographs."""
+"""The sharp frames of a video, for structure from motion."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from PIL import Image
 from tqdm import tqdm
 
 from .._check import check_range, one_line
-from .._files import as_path, atomic_folder, check_output, digest_file, file_stem, read_json, real_path, write_json
-from .files import HEIC_SUFFIXES, ORIENTATION, PIXELS, SceneError, list_images, open_picture, some
+from .._files import as_path, atomic_folder, check_output, digest_file, read_json, real_path, write_json
+from .files import PIXELS, SceneError, list_images, some
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 SOURCE = "source.json"  # in the folder of the pictures: what they were made of
@@ -32,17 +32,6 @@ def is_video(path: str | Path) -> bool:
     """Whether a path is a file with the ending of a video."""
     path = as_path(path)
     return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
-
-
-def has_heic(folder: str | Path) -> bool:
-    """Whether a folder has HEIC photographs without a JPEG or PNG of the same name."""
-    return bool(heic_names(as_path(folder)))
-
-
-def heic_names(folder: Path) -> list[str]:
-    """The HEIC files of a folder that no other picture has the name of, in natural order."""
-    others = {file_stem(name) for name in list_images(folder)}
-    return [name for name in list_images(folder, HEIC_SUFFIXES) if file_stem(name) not in others]
 
 
 def extract_frames(video: str | Path, out: str | Path, *, fps: float = 2.0, progress: bool = False) -> list[Path]:
@@ -63,7 +52,14 @@ def extract_frames(video: str | Path, out: str | Path, *, fps: float = 2.0, prog
     if not video.is_file():
         raise FileNotFoundError(f"{video}: no such file; expected a video there")
     source = {"video": video.name, "sha256": digest_file(video), "fps": fps}
-    if not _made_before(out, source):
+    check_output("out", out, "a folder")
+    held = sorted(file.name for file in out.iterdir()) if out.exists() else []
+    if held and (SOURCE not in held or read_json(out / SOURCE) != source):
+        raise FileExistsError(
+            f"{out}: expected a new or empty folder for the pictures, got one with {some(held, 3)}; name another scene folder "
+            "(--out)"
+        )
+    if not held:
         with atomic_folder(out) as folder, tqdm(disable=not progress, unit="frame", desc="frames") as bar:
             for count, frame in enumerate(_sharpest(video, fps, bar), 1):
                 Image.fromarray(frame).save(folder / f"frame_{count:05d}.jpg", quality=QUALITY, subsampling=0)
@@ -118,53 +114,3 @@ def _decode(video: Path) -> Iterator[tuple[Frame, float]]:
         raise SceneError(
             f"{video}: expected a video that ffmpeg can decode, got an error ({one_line(error, 160)}); convert it to MP4 (H.264)"
         ) from error
-
-
-def convert_heic(images: str | Path, out: str | Path, *, progress: bool = False) -> list[Path]:
-    """Write the HEIC photographs of a folder as JPEG files, or PNG if some of it is transparent, and links to its other pictures.
-
-    What an earlier call made of the same photographs is kept. Returns all pictures in `out`.
-
-    Raises:
-        FileExistsError: if `out` holds something else.
-        SceneError: if a photograph cannot be decoded, or two have the same name before the suffix.
-        ImportError: if pillow-heif is not installed.
-    """
-    images, out = as_path(images), as_path(out)
-    names, others = heic_names(images), list_images(images)
-    stems = [file_stem(name) for name in names]
-    twice = [name for name, stem in zip(names, stems, strict=True) if stems.count(stem) > 1]
-    if twice:  # both would be the same JPEG file
-        raise SceneError(
-            f"{images}: expected HEIC photographs with names that differ before the suffix, got {some(twice)}; rename them"
-        )
-    source = {"images": [[name, digest_file(images / name)] for name in names], "others": others}
-    if not _made_before(out, source):
-        with atomic_folder(out) as folder:
-            for name in [*names, *others]:
-                (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            for name in tqdm(names, disable=not progress, unit="image", desc="HEIC"):
-                with open_picture(images / name, "a HEIC photograph") as picture:
-                    exif = picture.getexif()  # with the focal length, from which COLMAP starts
-                    exif.pop(ORIENTATION, None)  # pillow-heif has turned the picture
-                    if picture.mode == "RGBA" and np.asarray(picture.getchannel("A")).min() < 255:
-                        picture.save(folder / f"{file_stem(name)}.png", exif=exif)
-                    else:
-                        jpeg = folder / f"{file_stem(name)}.jpg"
-                        picture.convert("RGB").save(jpeg, quality=QUALITY, subsampling=0, exif=exif)
-            for name in others:
-                (folder / name).symlink_to(real_path(images / name))
-            write_json(folder / SOURCE, source)
-    return [out / name for name in list_images(out)]
-
-
-def _made_before(out: Path, source: dict[str, Any]) -> bool:
-    """Whether `out` holds the pictures of this source; a FileExistsError if it holds anything else."""
-    check_output("out", out, "a folder")
-    held = sorted(file.name for file in out.iterdir()) if out.exists() else []
-    if held and (SOURCE not in held or read_json(out / SOURCE) != source):
-        raise FileExistsError(
-            f"{out}: expected a new or empty folder for the pictures, got one with {some(held, 3)}; name another scene folder "
-            "(--out)"
-        )
-    return bool(held)
