@@ -25,7 +25,6 @@ NO_POINTS = "no points: `kfgs fit` and `kfgs color` triangulate some from the po
 SKEW = 0.02  # largest difference of a rotation's singular values, relative: rotations that are rounded to two digits
 
 Matrix = NDArray[np.float64]
-NOTHING = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)  # points and colours of a scene without any
 
 
 @dataclass
@@ -65,21 +64,7 @@ def mend_pose(pose: Matrix | None) -> tuple[Matrix | None, float | None]:  # [4,
     return mended, float(sizes.mean())
 
 
-def mending_notes(lost: list[str], scaled: dict[str, float]) -> list[str]:
-    """Notes about views that were left out, and about those whose pose was mended, with the scale of each."""
-    notes = []
-    if lost:
-        notes.append(f"{len(lost)} views have no pose or lens of finite numbers and were left out: {some(lost)}")
-    if scaled:
-        low, high = f"{min(scaled.values()):.6g}", f"{max(scaled.values()):.6g}"
-        sizes = low if low == high else f"{low} to {high}"
-        notes.append(
-            f"{len(scaled)} poses have a scale ({sizes}) or a rounded rotation, which was removed: {some(list(scaled))}"
-        )
-    return [Repair(note) for note in notes]
-
-
-def as_large_as_pictures(
+def _as_large_as_pictures(
     cameras: Sequence[Camera], paths: Sequence[Path], folder: Path | None = None
 ) -> tuple[list[Camera], list[str]]:
     """Each camera in the size of its own picture, which may be a resized copy (`images_4`), and a note if some are."""
@@ -114,7 +99,7 @@ def scene_of_poses(
     *,
     pictures: bool = True,
 ) -> Scene:
-    """A scene of pictures with poses; views without a pose (not finite) are left out and noted.
+    """A scene of pictures with poses, all in the `train` split; views without a pose (not finite) are left out and noted.
 
     Cameras get the size of their pictures, whose files need not be there without `pictures`. `images` is a folder that the user
     gave, for a note.
@@ -142,10 +127,25 @@ def scene_of_poses(
         )
     paths, masks, resized = [view.path for view in kept], [view.mask for view in kept], list[str]()
     if pictures:
-        cameras, resized = as_large_as_pictures(cameras, paths, images)
-    told = [*notes, *resized, *mending_notes(lost, scaled), *([NO_POINTS] if points is None else [])]
-    scene = assemble_scene(cameras, paths, *(points or NOTHING), told)
-    return replace(scene, masks=masks if any(masks) else None)
+        cameras, resized = _as_large_as_pictures(cameras, paths, images)
+    told = [*notes, *resized, *([NO_POINTS] if points is None else [])]
+    if lost:
+        told.append(Repair(f"{len(lost)} views have no pose or lens of finite numbers and were left out: {some(lost)}"))
+    if scaled:
+        low, high = f"{min(scaled.values()):.6g}", f"{max(scaled.values()):.6g}"
+        sizes, names = low if low == high else f"{low} to {high}", some(list(scaled))
+        told.append(
+            Repair(f"{len(scaled)} poses have a scale ({sizes}) or a rounded rotation, which was removed: {names}")
+        )
+    places, colors = points or (torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))
+    origin = choose_origin(torch.stack([camera.center for camera in cameras]), places)
+    local = [camera.with_origin(origin).to(torch.float32) for camera in cameras]
+    told, splits = (
+        [*told, *describe_origin(origin, "cameras and points")],
+        {"train": list(range(len(local))), "test": []},
+    )
+    scene = Scene(local, paths, to_local(places, origin), colors, splits, tuple(told))
+    return replace(scene.with_near(), masks=masks if any(masks) else None)
 
 
 def inverse_pose(pose: Matrix) -> Matrix:  # [4, 4] -> [4, 4]
@@ -153,19 +153,6 @@ def inverse_pose(pose: Matrix) -> Matrix:  # [4, 4] -> [4, 4]
     inverse = np.eye(4)
     inverse[:3, :3], inverse[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
     return inverse
-
-
-def assemble_scene(
-    cameras: list[Camera], paths: list[Path], points: Tensor, colors: Tensor, notes: Sequence[str]
-) -> Scene:
-    """A scene of cameras and points [P, 3] in float64 of the world, with float32 from one origin, and a note if that is far.
-
-    Every view is in the `train` split.
-    """
-    origin = choose_origin(torch.stack([camera.center for camera in cameras]), points)
-    local = [camera.with_origin(origin).to(torch.float32) for camera in cameras]
-    far, splits = describe_origin(origin, "cameras and points"), {"train": list(range(len(cameras))), "test": []}
-    return Scene(local, paths, to_local(points, origin), colors, splits, (*notes, *far)).with_near()
 
 
 def read_numbers(path: Path, expected: str) -> Matrix:  # [rows, columns]
