@@ -12,6 +12,7 @@ import mmap
 import re
 import struct
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,7 @@ CAMERA_MODELS: dict[str, str] = {
     "EQUIRECTANGULAR": "w h",
 }
 QUATERNION_SLACK = 0.1  # text files are rounded; a norm farther from 1 means a wrong byte
+LEAST_BYTES = 73  # of an image without 2-D points, with a name of one letter
 _BROKEN = re.compile(r"[+-]?(nan\(\w*\)|1\.#\w+)", re.IGNORECASE)  # numbers that are none, as Windows writes them
 
 Ints = NDArray[np.int64]
@@ -95,6 +97,18 @@ class ColmapModel:
 def has_model(path: str | Path) -> bool:
     """Whether a folder holds a COLMAP cameras or images file, whole or not."""
     return any((as_path(path) / f"{name}.{suffix}").is_file() for name in FILES[:2] for suffix in ("bin", "txt"))
+
+
+def count_images(model: Path) -> int:
+    """The number of images in a model, without reading them; 0 if it is damaged."""
+    file, lines = model / "images.bin", _lines(model / "images.txt")
+    with suppress(OSError, ValueError):
+        if file.is_file():
+            with file.open("rb") as head:
+                count = int.from_bytes(head.read(8), "little")
+            return count if count * LEAST_BYTES <= file.stat().st_size else 0
+        return sum(next(lines, "") != "" for _ in filter(_is_record, lines))
+    return 0
 
 
 def read_model(path: str | Path) -> ColmapModel:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -18,7 +16,7 @@ from .files import SceneError, natural_key, picture_size, some
 from .layouts import LAYOUTS, find_layout
 from .masks import check_mask, folder_masks, picture_folder
 from .scene import Scene
-from .splits import RULES, choose_split, make_split, read_lists, read_split
+from .splits import RULES, choose_split, make_split, read_split
 from .sub_models import above, choice_note, find_model
 from .transforms import load_transforms
 
@@ -41,7 +39,7 @@ def load_scene(
             next to the model or above it, else the first of `images_2`, `images_4`, ..., else the scene folder.
         split: `"auto"`: split.json, else lists of names (`test.txt`, `train_list.txt`, ...), else the split of the
             transforms.json, else `"df3dgs"` for the videos of Replica, `"holdout8"` from 8 images, below 8 `"all"`; `"file"`:
-            split.json; or a rule of `make_split`.
+            split.json or such lists; or a rule of `make_split`.
         strict: refuse a scene of which something broken was left out or mended; else the notes say it.
 
     Returns:
@@ -60,9 +58,8 @@ def load_scene(
     root, model = _root(path), find_model(path)
     if images is not None and not as_path(images).is_dir() and (root / images).is_dir():
         images = root / images
-    with _naming(root):
-        scene = replace(_load_views(path, model, None if images is None else as_path(images)), folder=root)
-        scene = _with_masks(scene, root)
+    scene = replace(_load_views(path, model, None if images is None else as_path(images)), folder=root)
+    scene = _with_masks(scene, root)
     tell_repairs(str(path), scene.notes, strict, SceneError)
     return _with_split(scene, path, root, model, split)
 
@@ -77,25 +74,13 @@ def load_cameras(path: str | Path) -> list[Camera]:
     model = find_model(path)
     if model is None and not (path.exists() and _is_transforms(path)):
         return load_scene(path).undistorted().cameras
-    with _naming(path):
-        scene = load_transforms(path, pictures=False) if model is None else colmap_cameras(model)
+    scene = load_transforms(path, pictures=False) if model is None else colmap_cameras(model)
     tell_repairs(str(path), scene.notes, False, SceneError)
     return scene.undistorted().cameras
 
 
 def _root(path: Path) -> Path:
     return path if path.is_dir() else path.parent
-
-
-@contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Errors of cameras that do not fit together name the scene."""
-    try:
-        yield
-    except SceneError as error:
-        if str(path) in str(error):
-            raise
-        raise SceneError(f"{path}: {error}") from error
 
 
 def _with_masks(scene: Scene, root: Path) -> Scene:
@@ -169,21 +154,19 @@ def find_images(root: Path, model: Path) -> Path:
 def _with_split(scene: Scene, path: Path, root: Path, model: Path | None, split: SplitChoice) -> Scene:
     names = [camera.name for camera in scene.cameras]
     homes = [root] if model is None else list(dict.fromkeys((model, root, *above(model)[: 4 if model == path else 0])))
-    file = next((home / "split.json" for home in homes if (home / "split.json").is_file()), root / "split.json")
-    chosen = None
-    if split == "file" or (split == "auto" and file.is_file()):
-        chosen = read_split(file, names)
-    elif split == "auto":
-        chosen = next((lists for home in homes if (lists := read_lists(home, names)) is not None), None)
-    if chosen is not None:
-        return replace(scene, splits=chosen[0], notes=(*scene.notes, *chosen[1]))
+    if split in ("auto", "file"):
+        chosen = next((lists for home in homes if (lists := read_split(home, names)) is not None), None)
+        if chosen is not None:
+            return replace(scene, splits=chosen[0], notes=(*scene.notes, *chosen[1]))
+    if split == "file":
+        raise FileNotFoundError(
+            f"{root / 'split.json'}: no such file; expected the names of training and test views there"
+        )
     if split == "auto" and (scene.splits.get("test") or len(scene.splits["train"]) < len(scene)):  # of its own lists
         return scene
-    rule = split
-    if split == "auto":
-        layout = None if model is not None else find_layout(root)
-        rule = choose_split(len(scene), layout is not None and layout.video)
-    splits = make_split(len(scene), rule)  # type: ignore[arg-type]  # "file" was read above
+    layout = None if model is not None else find_layout(root)
+    rule = choose_split(len(scene), layout is not None and layout.video) if split == "auto" else split
+    splits = make_split(len(scene), rule)
     note = f"split {rule}: {len(splits['train'])} of {len(scene)} views train, {len(splits['test'])} test"
     if not splits["train"]:
         raise SceneError(

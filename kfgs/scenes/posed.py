@@ -144,7 +144,10 @@ def scene_of_poses(
         [*told, *describe_origin(origin, "cameras and points")],
         {"train": list(range(len(local))), "test": []},
     )
-    scene = Scene(local, paths, to_local(places, origin), colors, splits, tuple(told))
+    try:
+        scene = Scene(local, paths, to_local(places, origin), colors, splits, tuple(told))
+    except SceneError as error:  # names that do not differ
+        raise SceneError(f"{path}: {error}") from error
     return replace(scene.with_near(), masks=masks if any(masks) else None)
 
 
