@@ -36,24 +36,17 @@ def import_pycolmap() -> Any:
 
 
 @contextmanager
-def quiet_pycolmap() -> Iterator[Any]:
-    """Pycolmap without its log: failures come as exceptions. The log level is restored afterwards."""
+def quiet_pycolmap(what: str = "pycolmap: expected input that it can use", advice: str = "check it") -> Iterator[Any]:
+    """Pycolmap without its log. Its failures become a SceneError that begins with `what` and ends with `advice`."""
     pycolmap = import_pycolmap()
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = 3  # fatal
     try:
         yield pycolmap
-    finally:
-        pycolmap.logging.minloglevel = before
-
-
-@contextmanager
-def scene_errors(what: str, advice: str) -> Iterator[None]:
-    """Turn pycolmap's exceptions into a SceneError that begins with `what` and ends with `advice`."""
-    try:
-        yield
     except SceneError:
         raise
     except FAILURES as error:
         lines = str(error).strip().splitlines()
         raise SceneError(f"{what} ({type(error).__name__}: {lines[0] if lines else 'no text'}); {advice}") from error
+    finally:
+        pycolmap.logging.minloglevel = before

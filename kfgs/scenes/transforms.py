@@ -221,10 +221,12 @@ def _points(
     unit = Frame(path, "top level", top).number("integer_depth_scale", MILLIMETRE)  # world units per step
     if not unit > 0:
         raise SceneError(f"{path}: integer_depth_scale: expected a number above 0, got {unit:g}; correct it")
-    points_and_colors = points_from_depth(views, unit)
-    if points_and_colors is None and listed is not None and not notes:
-        notes.append(f"ply_file_path {listed!r:.200} is not a file inside {reader.root}")
-    return points_and_colors, notes
+    found = points_from_depth(views, unit)
+    if found is not None:
+        notes = [f"points from the depth pictures of {sum(view.depth is not None for view in views)} views"]
+    elif listed is not None and not notes:
+        notes = [f"ply_file_path {listed!r:.200} is not a file inside {reader.root}"]
+    return found, notes
 
 
 def _splits(path: Path, names: list[str], lists: dict[str, Any]) -> tuple[dict[str, list[int]], list[str]]:
