@@ -66,13 +66,13 @@ def load_colmap(path: Path, images: Path) -> Scene:
         f"{len(missing)} of {len(names)} posed images have no file in {images}: {some(missing)}{near}": missing,
         f"{len(extra)} image files in {images} have no pose in the model: {some(extra)}": extra,
     }
-    found = [view for view in views if view.name in files or view.pose is None]
-    for view in found:
+    chosen = [view for view in views if view.name in files or view.pose is None]
+    for view in chosen:
         view.name = given.get(view.name, view.name)
         view.path = images / view.name
     points = (torch.from_numpy(model.points), torch.from_numpy(model.colors)) if len(model.points) else None
     notes = [*model.notes, *(note for note, lost_names in told.items() if lost_names)]
-    return scene_of_poses(path, found, points, notes, images)
+    return scene_of_poses(path, chosen, points, notes, images)
 
 
 def colmap_cameras(path: Path) -> Scene:

@@ -221,12 +221,12 @@ def _points(
     unit = Frame(path, "top level", top).number("integer_depth_scale", MILLIMETRE)  # world units per step
     if not unit > 0:
         raise SceneError(f"{path}: integer_depth_scale: expected a number above 0, got {unit:g}; correct it")
-    found = points_from_depth(views, unit)
-    if found is not None:
+    lifted = points_from_depth(views, unit)
+    if lifted is not None:
         notes = [f"points from the depth pictures of {sum(view.depth is not None for view in views)} views"]
     elif listed is not None and not notes:
         notes = [f"ply_file_path {listed!r:.200} is not a file inside {reader.root}"]
-    return found, notes
+    return lifted, notes
 
 
 def _splits(path: Path, names: list[str], lists: dict[str, Any]) -> tuple[dict[str, list[int]], list[str]]:
