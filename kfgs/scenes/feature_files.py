@@ -113,15 +113,18 @@ def save_feature_map(path: str | Path, stem: str, features: Tensor) -> Path:  # 
     """Write one view's map as kfgs stores it: `<stem>.npy`, float16 [h, w, D]; the file appears whole or not at all.
 
     Raises:
-        ValueError: if `features` is not [h, w, D], or not finite in float16 (largest value 65504).
+        ValueError: if `features` is not [h, w, D], not finite in float16 (largest value 65504), or becomes all-zero there in
+            some cells but not before (below 6e-8).
     """
     features = as_tensor("features", features, floating=True)
     check_shapes(("features", features, "h w D"))
     half = features.detach().to(torch.float16).cpu().contiguous()
-    if count_bad(half):
+    empty = ~half.any(-1)
+    if 0 in half.shape or count_bad(half) or bool(features[empty.to(features.device)].any()):
+        low, high = (float(end) for end in features.aminmax()) if features.numel() else (0.0, 0.0)
         raise ValueError(
-            f"features: expected finite values below 65504 (they are stored as float16), got others for {stem!r}; "
-            "normalise the rows"
+            f"features: expected finite values below 65504 and, where they are not all zero, above 6e-8 (they are stored as "
+            f"float16), got {tuple(half.shape)} from {low:g} to {high:g} for {stem!r}; bring the rows to unit length"
         )
     target = as_path(path) / f"{stem}{OWN}"
     with atomic_path(target) as temporary, temporary.open("wb") as file:
