@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -113,11 +113,11 @@ def _cut(source: Path, out: Path, count: int, splat: str | Path | None, latents:
     todo = [block for block in blocks if not (out / block.name / BLOCK).is_file()]
     cloud = read_splats(splat) if todo and splat is not None else None
     facts = {
-        "format": "kfgs.blocks/2",
+        "format": "kfgs.blocks/3",
         "scene": os.path.relpath(real_path(source), real_path(out)),
         "splat": None if splat is None else digest_file(splat_file_of(splat)),
         "latents": latents if isinstance(latents, int) else digest_value(latents.basis.tolist()),
-        "blocks": [block.to_json() for block in blocks],
+        "blocks": [asdict(block) for block in blocks],
     }
     if not (out / BLOCKS).is_file():
         write_json(out / BLOCKS, facts)  # first, so that another cut is refused even if this one is killed
@@ -145,12 +145,12 @@ def _write_block(folder: Path, block: Block, whole: Scene, cloud: Gaussians | No
     if cloud is not None:
         means, radii = _places(cloud), REACH * as_array(cloud.scales).max(1)
         write_splats(cloud.select(torch.from_numpy(block.needs(means, radii))), folder / SPLAT)
-    write_json(folder / BLOCK, block.to_json())  # last: the folder is complete
+    write_json(folder / BLOCK, asdict(block))  # last: the folder is complete
 
 
 def _fit_block(folder: Path, method: Uplift) -> dict[str, Any]:
     """Fit the field of one block, and keep its core; the facts about it, as `core.json` has them."""
-    block, scene = Block.from_json(read_json(folder / BLOCK)), load_scene(folder)
+    block, scene = Block(**read_json(folder / BLOCK)), load_scene(folder)
     splat = read_splats(folder / SPLAT) if (folder / SPLAT).is_file() else None
     facts: dict[str, Any] = {"gaussians": 0, "box": None, "seconds": 0.0, "options": digest_value(method.options())}
     (folder / FACTS).unlink(missing_ok=True)  # a fit that is killed leaves a block that is not fitted

@@ -6,8 +6,8 @@ import importlib
 import math
 from collections.abc import Iterator
 from contextlib import closing
+from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -60,8 +60,8 @@ def extract_frames(video: str | Path, out: str | Path, *, fps: float = 2.0, prog
             "(--out)"
         )
     if not held:
-        with atomic_folder(out) as folder, tqdm(disable=not progress, unit="frame", desc="frames") as bar:
-            for count, frame in enumerate(_sharpest(video, fps, bar), 1):
+        with atomic_folder(out) as folder:
+            for count, frame in enumerate(_sharpest(video, fps, progress), 1):
                 Image.fromarray(frame).save(folder / f"frame_{count:05d}.jpg", quality=QUALITY, subsampling=0)
             if not any(folder.iterdir()):
                 raise SceneError(f"{video}: expected a video with frames, got none; does it play?")
@@ -75,22 +75,12 @@ def sharpness(frame: Frame) -> float:
     return float(laplacian(grey[None, None], kernel_size=3, normalized=False).var())
 
 
-def _sharpest(video: Path, fps: float, bar: Any) -> Iterator[Frame]:
+def _sharpest(video: Path, fps: float, progress: bool) -> Iterator[Frame]:
     """The sharpest frame of each interval, one after the other; two frames are in memory."""
-    best: tuple[int, float, Frame] | None = None
-    for number, (frame, rate) in enumerate(_decode(video)):
-        bar.update()
-        interval = math.floor(number * fps / rate)
-        if number % max(1, round(rate / fps / CANDIDATES)) and (best is None or best[0] == interval):
-            continue
-        score = sharpness(frame)
-        if best is not None and best[0] != interval:
-            yield best[2]
-            best = None
-        if best is None or score > best[1]:
-            best = interval, score, frame
-    if best is not None:
-        yield best[2]
+    frames = enumerate(tqdm(_decode(video), disable=not progress, unit="frame", desc="frames"))
+    some = ((i / rate, frame) for i, (frame, rate) in frames if i % max(1, round(rate / fps / CANDIDATES)) == 0)
+    for _, group in groupby(some, lambda pair: math.floor(pair[0] * fps)):
+        yield max((frame for _, frame in group), key=sharpness)
 
 
 def _decode(video: Path) -> Iterator[tuple[Frame, float]]:
