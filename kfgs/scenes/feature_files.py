@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .._arrays import FileError, read_array, read_safetensors
+from .._arrays import read_array, read_safetensors, reading
 from .._check import as_tensor, check_shapes
 from .._files import as_path, atomic_path
 from ..cameras.resample import fits_aspect
@@ -44,13 +44,18 @@ def open_map(
         size: of the view's picture, if it is known.
         own: kfgs wrote the map.
     """
-    try:
-        values = _load(file)
-    except FileError:
-        raise
-    except Exception as error:  # a damaged pickle raises almost anything: struct.error, KeyError, EOFError, ...
-        reason = str(error).split(". ")[0].strip()[:120]
-        raise ValueError(f"{file}: expected a feature map, but it cannot be read ({reason}); {AGAIN}") from error
+    if file.name.endswith(OWN):
+        values: Any = read_array(file, "a feature map", AGAIN)
+    else:
+        with reading(file, "a feature map", AGAIN):
+            if file.name.endswith(SAFETENSORS):
+                (values,) = read_safetensors(file)[0].values()
+            else:
+                values = torch.load(file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file))
+            if isinstance(values, Tensor) and values.layout == torch.strided:
+                if values.untyped_storage().nbytes() < values.numel() * values.element_size():
+                    raise ValueError("its values repeat")  # a few bytes on disk that would fill the memory
+                values = values.detach()  # saved by a training run, it may ask for gradients
     if not isinstance(values, np.ndarray) and not (isinstance(values, Tensor) and values.layout == torch.strided):
         kind = type(values).__name__
         raise TypeError(f"{file}: expected one dense tensor of features, got a {kind}; save the tensor alone")
@@ -70,20 +75,6 @@ def open_map(
     if not turned:
         return values
     return values.permute(1, 2, 0) if isinstance(values, Tensor) else values.transpose(1, 2, 0)
-
-
-def _load(file: Path) -> Any:
-    if file.name.endswith(OWN):
-        return read_array(file, "a feature map", AGAIN)
-    if file.name.endswith(SAFETENSORS):
-        (tensor,) = read_safetensors(file, "a feature map", AGAIN)[0].values()
-        return tensor
-    values = torch.load(file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file))
-    if not isinstance(values, Tensor) or values.layout != torch.strided:
-        return values
-    if values.untyped_storage().nbytes() < values.numel() * values.element_size():
-        raise ValueError("its values repeat")  # a few bytes on disk that would fill the memory
-    return values.detach()  # saved by a training run, it may ask for gradients
 
 
 def read_rows(
