@@ -101,7 +101,7 @@ def _of_points(path: Path) -> bool:
     from ..formats import find_format, ply
 
     plain = path.is_file() and not is_field(path) and find_format(path).NAME == "ply"
-    return plain and "scale_0" not in ply.vertex_columns(path)
+    return plain and "scale_0" not in str(ply.read_header(path).elements[:1])
 
 
 def edit(
