@@ -101,7 +101,9 @@ def _of_points(path: Path) -> bool:
     from ..formats import find_format, ply
 
     plain = path.is_file() and not is_field(path) and find_format(path).NAME == "ply"
-    return plain and "scale_0" not in str(ply.read_header(path).elements[:1])
+    return plain and "scale_0" not in {
+        row.name for table in ply.read_header(path).elements[:1] for row in table.properties
+    }
 
 
 def edit(

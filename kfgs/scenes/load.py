@@ -21,7 +21,7 @@ from .sub_models import above, choice_note, find_model
 from .transforms import load_transforms
 
 _TRANSFORMS = ("transforms.json", "transforms_train.json")
-SplitChoice = Literal["auto", "file", "df3dgs", "feature3dgs", "holdout8", "all"]
+SplitChoice = Literal["auto", "df3dgs", "feature3dgs", "holdout8", "all"]
 
 
 def load_scene(
@@ -38,8 +38,8 @@ def load_scene(
         images: the image folder, also by its name in the scene folder; cameras are resized to its pictures. None: `images/`
             next to the model or above it, else the first of `images_2`, `images_4`, ..., else the scene folder.
         split: `"auto"`: split.json, else lists of names (`test.txt`, `train_list.txt`, ...), else the split of the
-            transforms.json, else `"df3dgs"` for the videos of Replica, `"holdout8"` from 8 images, below 8 `"all"`; `"file"`:
-            split.json or such lists; or a rule of `make_split`.
+            transforms.json, else `"df3dgs"` for the videos of Replica, `"holdout8"` from 8 images, below 8 `"all"`; or a rule
+            of `make_split`.
         strict: refuse a scene of which something broken was left out or mended; else the notes say it.
 
     Returns:
@@ -47,12 +47,12 @@ def load_scene(
         (`Scene.with_near`). Its `notes` list missing files and assumptions.
 
     Raises:
-        FileNotFoundError: if there is no such folder, no image folder, or (`split="file"`) no split.json.
+        FileNotFoundError: if there is no such folder, or no image folder.
         SceneError: if there is no scene, or it cannot be used.
         ValueError: if `split` is unknown.
     """
     path = as_path(path)
-    check_choice("split", split, ("auto", "file", *RULES))
+    check_choice("split", split, ("auto", *RULES))
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such folder; expected a scene there")
     root, model = _root(path), find_model(path)
@@ -154,16 +154,12 @@ def find_images(root: Path, model: Path) -> Path:
 def _with_split(scene: Scene, path: Path, root: Path, model: Path | None, split: SplitChoice) -> Scene:
     names = [camera.name for camera in scene.cameras]
     homes = [root] if model is None else list(dict.fromkeys((model, root, *above(model)[: 4 if model == path else 0])))
-    if split in ("auto", "file"):
+    if split == "auto":
         chosen = next((lists for home in homes if (lists := read_split(home, names)) is not None), None)
         if chosen is not None:
             return replace(scene, splits=chosen[0], notes=(*scene.notes, *chosen[1]))
-    if split == "file":
-        raise FileNotFoundError(
-            f"{root / 'split.json'}: no such file; expected the names of training and test views there"
-        )
-    if split == "auto" and (scene.splits.get("test") or len(scene.splits["train"]) < len(scene)):  # of its own lists
-        return scene
+        if scene.splits.get("test") or len(scene.splits["train"]) < len(scene):  # of its own lists
+            return scene
     layout = None if model is not None else find_layout(root)
     rule = choose_split(len(scene), layout is not None and layout.video) if split == "auto" else split
     splits = make_split(len(scene), rule)

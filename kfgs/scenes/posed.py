@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -68,7 +67,7 @@ def _as_large_as_pictures(
     cameras: Sequence[Camera], paths: Sequence[Path], folder: Path | None = None
 ) -> tuple[list[Camera], list[str]]:
     """Each camera in the size of its own picture, which may be a resized copy (`images_4`), and a note if some are."""
-    fitting, factors = [], Counter[str]()
+    fitting = []
     for camera, path in zip(cameras, paths, strict=True):
         width, height = picture_size(path)
         if not fits_aspect((height, width), camera.size):
@@ -76,18 +75,14 @@ def _as_large_as_pictures(
                 f"{path}: expected a picture in the shape of {camera.width}x{camera.height} pixels, as its camera says, got "
                 f"{width}x{height}; replace it by the picture that the camera was made for, or by a copy at another size"
             )
-        if (height, width) == camera.size:
-            fitting.append(camera)
-        else:
-            small = camera.width / width
-            factors[f"{small:.3g} times smaller" if small >= 1 else f"{1 / small:.3g} times larger"] += 1
-            fitting.append(camera.resized(height, width))
-    if not factors:
+        fitting.append(camera if (height, width) == camera.size else camera.resized(height, width))
+    other = [i for i, camera in enumerate(cameras) if camera is not fitting[i]]
+    if not other:
         return fitting, []
     where = folder.name if folder is not None and paths[0].is_relative_to(folder) else "images"
-    count = "" if factors.total() == len(paths) else f"{factors.total()} of {len(paths)} "
-    sizes = some([factor for factor, _ in factors.most_common()], 3)
-    return fitting, [f"{where}: {count}pictures are {sizes} than the model says; cameras were resized to them"]
+    small = f"{paths[other[0]].name} is {cameras[other[0]].width / fitting[other[0]].width:.3g} times smaller"
+    count = f"{len(other)} of {len(paths)} pictures have other sizes than the model says"
+    return fitting, [f"{where}: {count} ({small}); cameras were resized to them"]
 
 
 def scene_of_poses(

@@ -187,9 +187,6 @@ def test_the_split_file_wins(tmp_path: Path) -> None:
     assert scene.splits == {"train": [2, 10], "test": [0]}
     assert any("1 names in" in note and "rgb_99" in note for note in scene.notes)
     assert load_scene(tmp_path, split="holdout8").splits["test"] == [0, 8, 16]
-    (tmp_path / "split.json").unlink()
-    with pytest.raises(FileNotFoundError, match=tells("split.json:")):
-        load_scene(tmp_path, split="file")
 
 
 def test_what_cannot_be_loaded_is_named(tmp_path: Path) -> None:
