@@ -30,8 +30,8 @@ from ..quant import LinearLatents
 from ..scenes import FeatureFolder, Scene, SceneError, load_scene
 from ..scenes.blocks import Block, partition, write_part
 from ..scenes.colmap_model import read_model
+from ..scenes.load import find_model
 from ..scenes.masks import picture_folder
-from ..scenes.sub_models import find_model
 from .run import run_tasks
 
 BLOCKS, BLOCK, CORE, FACTS, LATENTS, SPLAT = (

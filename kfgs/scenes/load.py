@@ -12,14 +12,16 @@ from .._files import as_path, real_path
 from .._notes import tell_repairs
 from ..cameras.camera import Camera
 from .colmap import colmap_cameras, load_colmap
+from .colmap_model import count_images, has_model
 from .files import SceneError, natural_key, picture_size, some
 from .layouts import LAYOUTS, find_layout
 from .masks import check_mask, folder_masks, picture_folder
 from .scene import Scene
 from .splits import RULES, choose_split, make_split, read_split
-from .sub_models import above, choice_note, find_model
 from .transforms import load_transforms
 
+PLACES = ("sparse", "colmap/sparse", "dense/sparse", "distorted/sparse", "colmap_ground_truth", ".")
+"""Folders of models, asked in this order; a model may also lie in their subfolders `N`, `N/models/M` and `models/M`."""
 _TRANSFORMS = ("transforms.json", "transforms_train.json")
 SplitChoice = Literal["auto", "df3dgs", "feature3dgs", "holdout8", "all"]
 
@@ -97,8 +99,14 @@ def _with_masks(scene: Scene, root: Path) -> Scene:
 
 def _load_views(path: Path, model: Path | None, images: Path | None) -> Scene:
     if model is not None:
-        scene = load_colmap(model, images or find_images(path, model))
-        return replace(scene, notes=(*scene.notes, *choice_note(path, model)))
+        scene = load_colmap(model, images or _find_images(path, model))
+        counts = {other: f"{other.relative_to(path)} with {count_images(other)} images" for other in _models_of(path)}
+        used, others = counts.pop(model), some(list(counts.values()))
+        if not counts:
+            return scene
+        advice = f"to use another, give its folder as the scene, as in {next(iter(counts))}"
+        note = f"{used} is used, the largest of several models; there is {others} too: {advice}"
+        return replace(scene, notes=(*scene.notes, note))
     if _is_transforms(path):
         return load_transforms(path, images)
     layout = find_layout(path)
@@ -135,9 +143,9 @@ def _advice(path: Path) -> str:
     return f"estimate the cameras first: `kfgs sfm {shlex.quote(str(path))} --out scene/`, or run_sfm"
 
 
-def find_images(root: Path, model: Path) -> Path:
+def _find_images(root: Path, model: Path) -> Path:
     """The folder with the pictures of a scene's model; see `load_scene`."""
-    folders = above(model)
+    folders = _above(model)
     dense = [folder for folder in folders if folder.name in ("dense", "distorted")]  # pictures of their own
     places = list(dict.fromkeys((*dense, root, *folders)))
     full = [folder / "images" for folder in places]
@@ -153,7 +161,7 @@ def find_images(root: Path, model: Path) -> Path:
 
 def _with_split(scene: Scene, path: Path, root: Path, model: Path | None, split: SplitChoice) -> Scene:
     names = [camera.name for camera in scene.cameras]
-    homes = [root] if model is None else list(dict.fromkeys((model, root, *above(model)[: 4 if model == path else 0])))
+    homes = [root] if model is None else list(dict.fromkeys((model, root, *_above(model)[: 4 if model == path else 0])))
     if split == "auto":
         chosen = next((lists for home in homes if (lists := read_split(home, names)) is not None), None)
         if chosen is not None:
@@ -169,3 +177,35 @@ def _with_split(scene: Scene, path: Path, root: Path, model: Path | None, split:
             f'{root}: expected at least 6 views for the split {rule!r}, got {len(scene)}; use split="all" or "holdout8"'
         )
     return replace(scene, splits=splits, notes=(*scene.notes, note))
+
+
+def _models_of(path: Path) -> list[Path]:
+    """The models of the first of `PLACES` that has some; in a subfolder without a number only if there is no other."""
+    for folder in (path / place for place in PLACES) if path.is_dir() else ():
+        inner = [] if folder == path else [below for below in _folders(folder) if below.name != "models"]
+        numbered = [below for below in inner if below.name.isdecimal()]
+        hloc = [model for below in (folder, *numbered) for model in _folders(below / "models")]
+        for places in ([*numbered, *hloc, folder], inner):
+            if models := [place for place in places if has_model(place)]:
+                return models
+    return []
+
+
+def find_model(path: Path) -> Path | None:
+    """The COLMAP model that `load_scene` reads in a scene folder, the one with most images; None if there is none."""
+    return max(_models_of(path), key=count_images, default=None)  # the first of equal ones
+
+
+def _above(model: Path) -> list[Path]:
+    """The folders above a model that may be its scene, nearest first: two, or all up to the one that holds `PLACES`."""
+    parents = list(real_path(model).parents)[:6]
+    names = [folder.name for folder in parents]
+    if "sparse" not in names:
+        return parents[:2]
+    count = names.index("sparse") + 2
+    return parents[: count + (names[count - 1 : count] in (["colmap"], ["dense"], ["distorted"]))]
+
+
+def _folders(folder: Path) -> list[Path]:
+    inner = [below for below in folder.iterdir() if below.is_dir()] if folder.is_dir() else []
+    return sorted(inner, key=lambda below: natural_key(below.name))
