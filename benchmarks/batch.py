@@ -32,7 +32,6 @@ from small_batch import results
 from kfgs._files import digest_file, write_json
 from kfgs.batch import BatchOptions, open_client, run_batch
 from kfgs.batch.run import describe_batch
-from kfgs.batch.scene_list import SceneEntry
 from kfgs.pipeline import ColorConfig, Uplift
 from kfgs.teachers import Teacher
 from kfgs.toy.room_folder import ToyConfig, make_toy_room
@@ -86,7 +85,7 @@ def kill_some(client, kills: int, seed: int, stop: threading.Event, log: list[st
         print(f"  killed process {pid}", flush=True)
 
 
-def measure(scenes: list[SceneEntry], out: Path, options: BatchOptions, workers: int, kills: int = 0) -> float:
+def measure(scenes: dict[str, str], out: Path, options: BatchOptions, workers: int, kills: int = 0) -> float:
     """Seconds of a batch without the start of its workers."""
     with open_client(workers) as client:
         client.run(_warm)
@@ -122,9 +121,9 @@ def main() -> None:
     rooms = [ToyConfig(seed=seed, **(size if given.small else {})) for seed in range(given.rooms)]
     base = given.out.absolute()
     folders = [make_toy_room(base / f"room_{room.seed}", room) for room in rooms]
-    scenes = [SceneEntry(folder.name, str(folder)) for folder in folders]
+    scenes = {folder.name: str(folder) for folder in folders}
     if given.room_0 is not None:
-        scenes.append(SceneEntry("real", str(given.room_0.absolute())))
+        scenes["real"] = str(given.room_0.absolute())
     color = dataclasses.replace(ColorConfig.quick(), training=ColorConfig.quick().training.with_steps(given.steps))
     os.environ["PYTHONPATH"] = os.pathsep.join(
         [str(Path(__file__).parent), *sys.path[:1], os.environ.get("PYTHONPATH", "")]

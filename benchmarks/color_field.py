@@ -47,7 +47,7 @@ def main() -> None:
         if row["step"] % 250 == 0:
             print(f"{row}, load {loads[-1]:.1f}", flush=True)
 
-    trained = fit_color(scene, args.out, config, report=print, progress=tell, device=args.device)
+    trained = fit_color(scene, args.out, config, report=print, progress=tell)
     took = sum(stage.seconds for stage in Run(args.out).finished("color"))
     chosen = [scene.stem(i) for i in scene.views("test")]
     chosen = chosen[:: max(1, len(chosen) // max(1, args.pictures))][: args.pictures]

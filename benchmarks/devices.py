@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from collections.abc import Callable
 from typing import Any
@@ -10,7 +11,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kfgs.pipeline.train import training_device
 from kfgs.quant.sampling import FeatureMaps
 
 CPU = torch.device("cpu")
@@ -18,16 +18,18 @@ CPU = torch.device("cpu")
 
 def add_device(parser: argparse.ArgumentParser) -> None:
     """Add the option `--device`; its value is a `torch.device`, and a GPU that is named becomes torch's current one."""
-    parser.add_argument("--device", type=_device, default=CPU, help="cpu (the default), cuda or cuda:1")
+    parser.add_argument("--device", type=_device, default="cpu", help="cpu (the default), cuda or cuda:1")
 
 
 def _device(name: str) -> torch.device:
+    if name == "cpu":
+        os.environ["CUDA_VISIBLE_DEVICES"] = ""  # kfgs would train on a GPU that it sees
     try:
-        device = training_device(name)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error).removeprefix("device: ")) from error
-    if device.type == "cuda":
-        torch.cuda.set_device(device)
+        device = torch.device(name)
+        if device.type == "cuda":
+            torch.cuda.set_device(device)
+    except (RuntimeError, AssertionError) as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
     return device
 
 

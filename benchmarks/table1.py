@@ -81,10 +81,8 @@ def find_splat(args: argparse.Namespace) -> tuple[Path, float | None]:
         return args.splat, None
     if all(ROWS[key].mode for key in args.rows):  # the paper's own rows need none
         return args.out / "none", None
-    config = (
-        ColorConfig.geometry() if args.quick else ColorConfig.paper() if args.preset == "paper" else ColorConfig.cpu()
-    )
-    fit_color(load_scene(args.scene).undistorted(), args.out / "color", config, report=print, device=args.device)
+    config = ColorConfig.geometry() if args.quick else ColorConfig() if args.preset == "paper" else ColorConfig.cpu()
+    fit_color(load_scene(args.scene).undistorted(), args.out / "color", config, report=print)
     return args.out / "color" / "color.ply", sum(stage.seconds for stage in Run(args.out / "color").finished("color"))
 
 

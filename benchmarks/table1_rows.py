@@ -32,7 +32,6 @@ from kfgs.fields import Linear, SemanticField, Training
 from kfgs.formats import read_splats
 from kfgs.labels import LabelSet, load_label_set
 from kfgs.pipeline import Paper, Uplift, fit, true_labels
-from kfgs.pipeline.maps import Maps
 from kfgs.pipeline.segment import save_label_map
 from kfgs.scenes import FeatureFolder, Scene, load_scene
 
@@ -141,7 +140,7 @@ class Room:
         self.scene: Scene = load_scene(folder).undistorted()
         self.classes: LabelSet = load_label_set(folder / "classes.json", folder / "text.npy")
         self.features = features
-        self.maps: Maps = FeatureFolder(features).of(self.scene, "train")
+        self.maps = FeatureFolder(features).of(self.scene, "train")
         views = [View(self.scene.stem(i), self.scene.cameras[i]) for i in self.scene.views("test")]
         self.views = views[::every]
         found = true_labels(self.scene, folder / truth, "test")

@@ -1,20 +1,23 @@
-"""Read arrays and tensors from files that others wrote: `.npy`, `.npz`, `.safetensors`.
+"""Read arrays and tensors from files that others wrote: `.npy`, `.npz`, `.safetensors`; write the last.
 
-A header can state any size. Here each is compared with the bytes that are there before memory is asked for, and nothing
-pickled is ever loaded. What is wrong with a file becomes one `FileError`.
+Nothing pickled is ever loaded, and an archive unpacks to a limited size. What is wrong with a file becomes one `FileError`.
 """
 
 from __future__ import annotations
 
-import math
+import json
+import struct
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor
 
 from ._check import one_line
 from ._files import as_path
@@ -39,10 +42,8 @@ def read_array(path: str | Path, expected: str = "an .npy file of numbers", advi
         FileNotFoundError: if there is no such file. `expected` and `advice` are parts of the messages.
         FileError: if it is not a `.npy` file of numbers, is damaged or cut short, or states more values than it has.
     """
-    with reading(path, expected, advice), as_path(path).open("rb") as file:
-        _check_header(file, as_path(path).stat().st_size)
-        array: Array = np.load(as_path(path), mmap_mode="r", allow_pickle=False)
-        return array
+    with reading(path, expected, advice):
+        return _numbers(np.load(as_path(path), mmap_mode="r", allow_pickle=False))
 
 
 def read_arrays(
@@ -56,29 +57,19 @@ def read_arrays(
             what `most_unpacked` allows).
     """
     with reading(path, expected, advice), zipfile.ZipFile(path) as archive:
-        entries = archive.infolist()
-        total = sum(entry.file_size for entry in entries)
+        total = sum(entry.file_size for entry in archive.infolist())
         most = most_unpacked(as_path(path).stat().st_size) if most is None else most
         if total > most:
             raise ValueError(f"it would unpack to {total} bytes, expected at most {most}")
-        for entry in entries:
-            with archive.open(entry) as file:
-                _check_header(file, entry.file_size)
         with np.load(as_path(path), allow_pickle=False) as arrays:
-            return dict(arrays)
+            return {name: _numbers(array) for name, array in arrays.items()}
 
 
-def _check_header(file: IO[bytes], size: int) -> None:
-    """Raise a ValueError unless a `.npy` file of `size` bytes holds the numbers or texts that its header states."""
-    version = np.lib.format.read_magic(file)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(file)
-    if dtype.hasobject:
-        raise ValueError("it holds pickled objects, which are never loaded")
-    stated, rest = math.prod(shape) * dtype.itemsize, size - file.tell()
-    lies = stated > rest or min(shape, default=1) < 0 or (dtype.itemsize == 0 and math.prod(shape) > 1)
-    if lies or version > (2, 0) or dtype.kind not in "biufcU":
-        raise ValueError(f"its header states numbers or texts {one_line(shape)} of {dtype}, {rest} bytes follow")
+def _numbers(array: Any) -> Array:
+    """An array of numbers or texts that numpy read, as it is; a ValueError for anything else."""
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "biufcU" or array.nbytes < array.size:
+        raise ValueError(f"it holds {getattr(array, 'dtype', 'several arrays')}, not numbers or texts")
+    return array
 
 
 def read_safetensors(
@@ -99,8 +90,6 @@ def read_safetensors(
         FileNotFoundError: if there is no such file.
         FileError: if it is another file, damaged, cut short, or of another kind or version.
     """
-    from safetensors import safe_open  # imports torch
-
     with reading(path, expected, advice), safe_open(path, framework="pt") as file:
         metadata = dict(file.metadata() or {})
         kind, version = (metadata.get(key) for key in ("kfgs", "version"))
@@ -110,6 +99,22 @@ def read_safetensors(
     if kind == kfgs[0]:
         what, advice = f"version {one_line(version)}", "use the kfgs that wrote it"
     raise FileError(f"{path}: expected a kfgs {kfgs[0]}, version {kfgs[1]}, got {what}; {advice}")
+
+
+def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
+    """Write tensors from any device, with texts in the header, in their order (safetensors alone would shuffle them)."""
+    whole = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    save_file(whole, path, metadata=None if metadata is None else dict(metadata))
+    if metadata is None or len(metadata) < 2:
+        return
+    with path.open("r+b") as file:
+        (length,) = struct.unpack("<Q", file.read(8))
+        header = json.loads(file.read(length))
+        header["__metadata__"] = dict(metadata)
+        ordered = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+        assert len(ordered) <= length, "the same texts in another order"
+        file.seek(8)
+        file.write(ordered.ljust(length))
 
 
 @contextmanager

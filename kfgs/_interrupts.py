@@ -26,10 +26,7 @@ def interruptible() -> Iterator[None]:
 
     A C++ module that loads (torch, numpy, pycolmap) aborts, or fails with an ImportError, when Python raises in it.
     """
-    before: dict[int, Any] = {signal.SIGINT: signal.getsignal(signal.SIGINT)}
-    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
-        before[signal.SIGTERM] = signal.SIG_DFL
-    usual = before[signal.SIGINT] in (signal.default_int_handler, end_at_once)
+    usual = signal.getsignal(signal.SIGINT) in (signal.default_int_handler, end_at_once)
     if not usual or threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -37,15 +34,14 @@ def interruptible() -> Iterator[None]:
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         came.append(number)
-        at = frame
-        while at is not None:
-            if (at.f_code.co_filename, at.f_code.co_name) == IMPORTS:
+        while frame is not None:
+            if (frame.f_code.co_filename, frame.f_code.co_name) == IMPORTS:
                 end_at_once()
-            at = at.f_back
-        signal.default_int_handler(number, frame)
+            frame = frame.f_back
+        raise KeyboardInterrupt
 
-    for number in before:
-        signal.signal(number, interrupt)
+    stops = (signal.SIGINT, signal.SIGTERM) if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL else (signal.SIGINT,)
+    before = {number: signal.signal(number, interrupt) for number in stops}
     try:
         yield
     except Exception as error:

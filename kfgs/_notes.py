@@ -1,6 +1,7 @@
 """What a reader did about content that it could not use as it is: it leaves it out and notes it, or it refuses the file.
 
-Readers call `tell`. The command line listens with `hear`. If nobody listens, each note is logged once ("kfgs").
+Readers call `tell`, and so does the CPU engine before it compiles. The command line listens with `hear`. If nobody listens,
+each note is logged once ("kfgs").
 """
 
 from __future__ import annotations
@@ -12,6 +13,10 @@ from contextlib import contextmanager
 
 class Repair(str):
     """A note about something broken that a reader left out or mended."""
+
+
+class Wait(str):
+    """A note that something takes long; commands print it next to the progress bars."""
 
 
 _listeners: list[Callable[[str], None]] = []
@@ -44,7 +49,7 @@ def tell(note: str) -> None:
         _listeners[-1](note)
     elif note not in _logged:
         _logged.add(note)
-        logging.getLogger("kfgs").warning(note)
+        logging.getLogger("kfgs").log(logging.INFO if isinstance(note, Wait) else logging.WARNING, note)
 
 
 def is_strict() -> bool:

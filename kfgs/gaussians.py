@@ -94,11 +94,6 @@ class Gaussians:
         """None: without it, NumPy would look into g[0][0][0]... for numbers."""
         raise TypeError("gaussians: expected an array, got Gaussians, which hold several; use to_numpy()")
 
-    @property
-    def gaussians(self) -> Gaussians:
-        """The cloud itself, so that `read_splats(...).gaussians` works."""
-        return self
-
     def _tensors(self) -> dict[str, Tensor]:
         values = {name: getattr(self, name) for name in TENSORS}
         return {name: value for name, value in values.items() if value is not None}

@@ -8,7 +8,7 @@ import torch
 from kfgs.cameras import Camera
 from kfgs.gaussians import Gaussians
 from kfgs.viz import make_plotter
-from kfgs.viz.plotter import available, trouble
+from kfgs.viz.plotter import trouble
 
 C0 = 0.28209479177387814
 
@@ -40,7 +40,7 @@ def some_camera(height=120, width=160):
 
 @contextmanager
 def some_plotter(background="black"):
-    if not available():
+    if trouble():
         pytest.skip(trouble())
     plotter = make_plotter(120, 160, background=background, off_screen=True)
     try:

@@ -17,7 +17,6 @@ from kfgs.toy.room_folder import make_toy_room
 
 COLOR = dataclasses.replace(
     ColorConfig.quick(),
-    max_points=600,
     training=changed(ColorConfig.quick().training.with_steps(24), maximum=800, checkpoint_every=8),
 )
 METHOD = Uplift(color=COLOR)

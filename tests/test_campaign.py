@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -88,53 +87,3 @@ def test_each_fault_of_a_reader_is_found_with_its_mutant(tmp_path, monkeypatch):
     kept = {path.name: path.read_bytes() for path in (tmp_path / "out" / "findings").rglob("*words.txt")}
     assert all(data == mutants[int(name.split("-")[1])] for name, data in kept.items())
     assert len(kept) >= len(FAULTS)
-
-
-def test_mutants_follow_from_seed_case_and_number(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    from campaign.files import make_mutant
-
-    data = b'{"version": 1, "edits": [{"op": "remove", "where": {"class": "chair"}}]}'
-    one, again = ([make_mutant(data, "a", 3, number) for number in range(300)] for _ in range(2))
-    assert one == again
-    assert len(set(one)) > 200
-    assert one != [make_mutant(data, "a", 4, number) for number in range(300)]
-    parsed = 0
-    for mutant in one:
-        with suppress(ValueError, RecursionError):
-            json.loads(mutant)
-            parsed += 1
-    assert 100 < parsed < 290  # structure-aware ones beside blind ones
-
-
-def test_containers_come_back_and_keep_lengths_and_checksums(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    import numpy as np
-    from campaign.containers import open_container
-    from PIL import Image
-
-    np.savez(tmp_path / "a.npz", a=np.arange(5))
-    np.save(tmp_path / "a.npy", np.arange(5))
-    Image.new("RGB", (4, 3)).save(tmp_path / "a.png")
-    for path in tmp_path.iterdir():
-        container = open_container(path.read_bytes())
-        path.write_bytes(container.close(container.parts))
-    assert np.load(tmp_path / "a.npz")["a"].tolist() == np.load(tmp_path / "a.npy").tolist() == [0, 1, 2, 3, 4]
-    container = open_container((tmp_path / "a.png").read_bytes())
-    longer = [(name, body + b"\0" * (name == "IHDR")) for name, body in container.parts]
-    (tmp_path / "a.png").write_bytes(container.close(longer))
-    with Image.open(tmp_path / "a.png") as picture:
-        picture.load()  # the checksum fits
-
-
-def test_a_second_start_goes_on(tmp_path):
-    code = """
-import functools
-files.make_corpus = functools.cache(files.make_corpus)
-for most in (20, 10):
-    files.run_files(Record(record.folder, record.scratch), seed=2, seconds=60, only="words", most=most, batch=10)
-"""
-    lines = run(code, tmp_path)
-    words, names = "fields/classes/words.txt", "fields/classes/classes.json (words)"
-    assert [(line["case"], line["first"]) for line in lines] == [(words, 0), (names, 0), (words, 10)]
-    assert findings(lines) == []

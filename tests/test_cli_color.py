@@ -17,9 +17,8 @@ from kfgs.cli import main
 from kfgs.fields import SemanticField, fuse_views
 from kfgs.formats import read_splats
 from kfgs.formats.ply import read_ply
-from kfgs.labels import EditList, load_label_set
+from kfgs.labels import load_label_set
 from kfgs.pipeline.color import TrainingPictures
-from kfgs.pipeline.compare import views_of_change
 from kfgs.scenes import load_scene
 from kfgs.splat import rasterize
 
@@ -151,20 +150,6 @@ def test_select_counts_places_and_saves(labelled, room, tmp_path, capsys):
     assert set(saved.labels.tolist()) == {index}
 
 
-def test_select_asks_a_field_by_text(field, truth, room, capsys):
-    names = json.loads((room / "classes.json").read_text())
-    arguments = ["select", "lamp", str(field)]
-    assert main([*arguments, "--text", str(room / "text.npy")]) == 0
-    said = capsys.readouterr().out
-    # Each Gaussian carries its class's own embedding.
-    assert f"lamp: {int((truth == names.index('lamp')).sum())} of 4000 Gaussians" in said
-    assert "12 negatives" in said
-    assert main(["select", "lamp", str(field), "--scene", str(room)]) == 0
-    said = capsys.readouterr().out
-    assert "own latent" not in said
-    assert "lamp/1" not in said  # what `kfgs edit` calls so are parts of a label
-
-
 def by_name(path):
     """The cloud, and a mask for each class."""
     cloud = read_splats(path)
@@ -201,38 +186,6 @@ def test_edits_are_replayed_to_the_same_bytes_from_anywhere(labelled, tmp_path, 
     assert main([*arguments, "--remove", "chair"]) == 0
     edits = json.loads((tmp_path / "c" / "e.ply.edits.json").read_text())["edits"]
     assert [edit["op"] for edit in edits] == ["move", "remove", "remove"]
-
-
-def test_edit_shows_before_and_after(labelled, room, tmp_path, capsys):
-    out = tmp_path / "e.spz"
-    arguments = ["edit", str(labelled), "--out", str(out), "--remove", "table", "--scene", str(room)]
-    assert main(arguments) == 0
-    said = capsys.readouterr().out
-    assert "before and after from view_" in said
-    picture = np.asarray(Image.open(tmp_path / "e.spz.png")).astype(int)
-    left, right = picture[-66:-6, 6:86], picture[-66:-6, 92:172]
-    assert (np.abs(left - right).max(-1) > 8).mean() > 0.02
-    (tmp_path / "e.spz.png").unlink()
-    assert main([*arguments, "--recolor", "lamp:#00ff00"]) == 0
-    chosen = capsys.readouterr().out.split("before and after from ")[1].splitlines()[0].split(", ")
-    before, edits = read_splats(labelled), EditList.load(tmp_path / "e.spz.edits.json")
-    cameras = load_scene(room).cameras
-    states = [before, *(EditList(edits.edits[: i + 1]).apply(before) for i in range(2))]
-    expected = views_of_change(states[0], states[-1], cameras, 2, between=states[1:-1])
-    assert chosen == [cameras[i].name for i in expected]
-
-
-@pytest.mark.parametrize("name", ["a.spz", "a.splat", "a.sog", "a.glb"])
-def test_convert_keeps_classes(labelled, tmp_path, name, capsys):
-    assert main(["convert", str(labelled), str(tmp_path / "new" / name)]) == 0
-    said = capsys.readouterr().out
-    assert "KiB -> " in said
-    before, after = read_splats(labelled), read_splats(tmp_path / "new" / name)
-    assert after.names == before.names
-    counts = [torch.bincount(one.labels + 1, minlength=14).tolist() for one in (before, after)]
-    assert counts[0] == counts[1]
-    for path in (tmp_path / "new").iterdir():
-        assert str(path) in said
 
 
 def test_convert_by_class_writes_a_plain_file_for_each_class(labelled, tmp_path, capsys):

@@ -84,7 +84,7 @@ ERRORS = {
         ),
         (
             ["{labelled}", "--out", "{o}.ply", "--remove", "chair/99"],
-            ("--remove:", "got chair/99", "`kfgs select chair"),
+            ("part:", "got chair/99", "`kfgs select`"),
         ),
         (
             ["{splat}", "--out", "{o}.ply", "--replay", "{saved}"],

@@ -14,7 +14,7 @@ from kfgs.evaluation import FieldMethod, LabelTruth, View
 from kfgs.evaluation.label_pictures import load_label_map
 from kfgs.evaluation.protocols import KfgsPooled
 from kfgs.labels import load_label_set
-from kfgs.pipeline import evaluate
+from kfgs.pipeline import evaluate, open_question
 
 
 @pytest.fixture(scope="module")
@@ -116,13 +116,16 @@ def test_the_rule_for_labels_is_that_of_the_protocol_unless_asked_and_is_said(
         assert kept["scores"] == dict(expected[rule].scores)
         assert kept["options"]["labels"] == rule
         assert ("labels=nearest" in said.splitlines()[0]) == (rule == "nearest")
-    published = evaluate(fused, room, "feature3dgs-teacher", encode=words)
-    own = evaluate(fused, room, "feature3dgs-teacher", encode=words, labels="own")
+    question = open_question(room, "feature3dgs-teacher")
+    published, own = (evaluate(fused, question, encode=words, labels=rule) for rule in (None, "own"))
     assert (published.options["labels"], published.changed) == ("nearest", ("texts",))
     assert (own.options["labels"], own.changed) == ("own", ("texts", "labels"))
     method = FieldMethod(field, own_labels=False)
-    assert evaluate(method, room, encode=words).options["labels"] == "nearest"  # it keeps its rule, unless one is asked
-    assert evaluate(method, room, encode=words, labels="own").scores == expected["own"].scores
+    pooled = open_question(room)
+    assert (
+        evaluate(method, pooled, encode=words).options["labels"] == "nearest"
+    )  # it keeps its rule, unless one is asked
+    assert evaluate(method, pooled, encode=words, labels="own").scores == expected["own"].scores
 
 
 @pytest.mark.parametrize(

@@ -107,8 +107,8 @@ def test_a_disk_that_takes_no_more_is_one_message_with_the_file(name, splat, tmp
 def test_the_second_fit_and_the_second_color_are_told_who_works_there(room, run, capsys):
     before = files(run)
     hold = (
-        "import sys, pathlib; from kfgs.pipeline.stages import Run\n"
-        "with Run(pathlib.Path(sys.argv[1])).locked(): print('held', flush=True); sys.stdin.read()"
+        "import sys, pathlib; from kfgs._files import locked\n"
+        "with locked(pathlib.Path(sys.argv[1]), '.run.lock'): print('held', flush=True); sys.stdin.read()"
     )
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen([sys.executable, "-c", hold, run], **pipes) as first:
@@ -140,19 +140,6 @@ def test_an_empty_path_is_not_the_current_folder(words, tmp_path, capsys, monkey
     monkeypatch.chdir(tmp_path)
     refused(words, capsys, "empty", "write . for this folder")
     assert not list(tmp_path.iterdir())
-
-
-def test_a_table_that_is_read_is_not_replaced(room, run, tmp_path, capsys):
-    table = tmp_path / "words.npy"
-    shutil.copy(room / "text.npy", table)
-    refused(["evaluate", run, "--text", table, "--out", table], capsys, "--out", "another place", table)
-    assert table.read_bytes() == (room / "text.npy").read_bytes()
-
-
-def test_nothing_is_written_among_smaller_photos(room, run, capsys):
-    words = ["segment", run, "--scene", room, "--path", "orbit", "--out", room / "images_2"]
-    refused(words, capsys, "--out", "apart from", "images_2")
-    assert not (room / "images_2").exists()
 
 
 def test_closed_streams_are_no_error():

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from cases_packed import assert_same, field
+from cases_packed import field
 from messages import tells
 
 from kfgs._files import digest_file
@@ -43,13 +43,6 @@ def test_a_packed_field_is_told_in_bytes_and_errors(place, tmp_path, capsys):
     assert "Morton order" in said
     assert str(out) in said
     assert packed.classes.names == ("wall", "chair")
-
-
-def test_lossless_keeps_every_bit(place, tmp_path, capsys):
-    out = tmp_path / f"a{ENDING}"
-    assert main(["convert", str(place / "run"), str(out), "--precision", "lossless"]) == 0
-    assert "within" not in capsys.readouterr().out
-    assert_same(SemanticField.load(place / "run"), SemanticField.load(out))
 
 
 def test_other_commands_take_the_file(place, tmp_path, capsys):

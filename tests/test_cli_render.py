@@ -50,14 +50,6 @@ def test_each_path_makes_a_film(run, tmp_path, path, capsys):
     assert (made[0] != made[1]).any()
 
 
-def test_four_things_side_by_side(run, tmp_path, capsys):
-    out = tmp_path / "a.gif"
-    show = "photo,labels,features,query=chair"
-    assert film(run / "field.kfgs", "--out", out, "--path", "cameras", "--show", show) == 0
-    assert "chair: " in capsys.readouterr().out
-    assert frames(out)[0].shape[1] > 4 * 480
-
-
 def test_a_labelled_splat(run, tmp_path):
     scene = load_scene(run.parent / "scene")
     colors = read_splats(run / "color.ply")

@@ -107,15 +107,6 @@ def test_a_path_through_the_cameras_of_a_scene_without_pictures(desk, tmp_path):
 PLACES = ("expected orbit, cameras, a transforms.json (a name that ends in .json), or a folder with a COLMAP model,",)
 
 
-def test_cameras_of_your_own_are_checked_before_the_field_is_opened(tmp_path, capsys):
-    (tmp_path / "broken.json").write_text("{")
-    words = ["--path", str(tmp_path / "broken.json"), "--out", str(tmp_path / "o")]
-    assert main(["segment", str(tmp_path / "no_field"), *words]) == 1
-    assert "broken.json:" in capsys.readouterr().err
-    assert main(["render", str(tmp_path / "no_field"), *words[:-1], str(tmp_path / "a.gif")]) == 1
-    assert "broken.json:" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("words", "parts"),
     [

@@ -28,6 +28,12 @@ def test_a_reader_that_ends_is_no_error(words, tmp_path):
     assert shell(line, tmp_path) == (0, "", "141\n")
 
 
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="Linux")
+def test_a_full_disk_below_the_output_is_named(tmp_path):
+    code, _, error = shell(f"{KFGS} --help > /dev/full", tmp_path)
+    assert (code, error) == (1, "error: [Errno 28] No space left on device: 'standard output'\n")
+
+
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory):
     folder = make_desk(tmp_path_factory.mktemp("desk"))

@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from cases_teach import TinyLSeg, save_checkpoint, shrink_door
+from cases_teach import TinyLSeg, save_checkpoint
 from PIL import Image
 from small_room import make_room
 
@@ -19,23 +19,13 @@ QUICK = ["--steps", "3", "--method", "adc"]
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory):
+def scene(tmp_path_factory):
     return make_room(tmp_path_factory.mktemp("room") / "scene")
 
 
 @pytest.fixture(scope="module")
-def scene(request, tmp_path_factory):
-    """12 real photographs of a door, taken through a lens; the toy room where they are missing. No test changes it."""
-    try:
-        source = request.getfixturevalue("shared_data") / "lund_door"
-    except pytest.skip.Exception:
-        return request.getfixturevalue("room")
-    return shrink_door(source, tmp_path_factory.mktemp("door") / "scene")
-
-
-@pytest.fixture(scope="module")
 def pictures(scene):
-    """The training pictures by their stems: 10 of the door, 6 of the room."""
+    """The training pictures by their stems."""
     loaded = load_scene(scene)
     return {loaded.stem(i): loaded.image_paths[i] for i in loaded.views("train")}
 

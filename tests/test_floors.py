@@ -17,8 +17,8 @@ ROOT = Path(kfgs.__file__).parent
 
 # From the bottom up. Places of one row never import each other; evaluation lies under pipeline, which scores with it.
 FLOORS = (
-    {"_card", "_names", "_stems"},
-    {"_check", "_compiling", "_files", "_interrupts", "_notes", "_progress", "_rows", "_tensors"},
+    {"_card"},
+    {"_check", "_files", "_interrupts", "_notes", "_progress", "_rows"},
     {"_arrays", "_origin"},
     {"_torch_files", "gaussians", "cameras"},
     {"splat", "quant", "metrics"},
@@ -157,17 +157,10 @@ def test_no_file_imports_a_later_file_of_its_package():
     ("file", "source", "message"),
     [
         ("kfgs/splat/tiles.py", "from ..quant import Codebook", "imports kfgs.quant"),
-        ("kfgs/metrics.py", "from .splat.sh import evaluate_sh", "imports kfgs.splat.sh"),
-        ("kfgs/quant/codebook.py", "import kfgs.fields.params", "imports kfgs.fields.params"),
         ("kfgs/quant/codebook.py", "def f():\n    from .. import metrics", "tiles.py|imports kfgs.metrics"),
         ("kfgs/gaussians.py", "from kfgs import Scene", "imports kfgs,"),
         ("kfgs/quant/codebook.py", "importlib.import_module('kfgs.fields.params')", "imports kfgs.fields.params"),
-        ("kfgs/scenes/sfm.py", "import_module('transformers')", "imports transformers, whose place is kfgs/teachers/"),
         ("kfgs/cameras/__init__.py", "from ..gaussians import Gaussians", "imports kfgs.gaussians"),
-        ("kfgs/splat/engines/cpu/engine.py", "from ....scenes.scene import Scene", "imports kfgs.scenes.scene"),
-        ("kfgs/labels/edit.py", "from ..scenes import Scene", "imports kfgs.scenes"),
-        ("kfgs/viz/clouds.py", "from ..fields import params", "imports kfgs.fields"),
-        ("kfgs/evaluation/report.py", "from ..pipeline import Run", "imports kfgs.pipeline"),
         (
             "kfgs/labels/edit.py",
             "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from ..fields import params",
@@ -176,10 +169,6 @@ def test_no_file_imports_a_later_file_of_its_package():
         ("kfgs/attic/old.py", "from .. import metrics", "'attic' or 'metrics' has no floor"),
         ("kfgs/labels/edit.py", "import pyvista as pv", "imports pyvista, whose place is kfgs/viz/"),
         ("kfgs/viz/clouds.py", "def f():\n    from pycolmap import Camera", "imports pycolmap, whose place is kfgs/sc"),
-        ("kfgs/splat/tiles.py", "import numba", "imports numba, whose place is kfgs/splat/engines/"),
-        ("kfgs/pipeline/fit.py", "from ..batch import run_batch", "imports kfgs.batch"),
-        ("kfgs/pipeline/fit.py", "import distributed", "imports distributed, whose place is kfgs/batch/"),
-        ("kfgs/scenes/sfm.py", "import transformers.models", "imports transformers, whose place is kfgs/teachers/"),
     ],
 )
 def test_a_breach_is_found(file, source, message):
@@ -197,10 +186,7 @@ def test_a_breach_is_found(file, source, message):
             "from ..cameras import Camera\nfrom .params import GaussianParams\nfrom .. import metrics",
         ),
         ("kfgs/viz/clouds.py", "if typing.TYPE_CHECKING:\n    from ..fields import SemanticField\nimport pyvista"),
-        ("kfgs/splat/engines/cpu/engine.py", "import numba\nfrom ...tiles import Tiles"),
-        ("kfgs/cli.py", "from .pipeline import fit"),
         ("kfgs/__main__.py", "from . import __version__\nfrom .cli import main"),
-        ("kfgs/pipeline/fit.py", "from ..evaluation import PROTOCOL"),
     ],
 )
 def test_what_the_house_allows(file, source):

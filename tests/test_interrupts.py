@@ -41,10 +41,6 @@ def test_while_the_command_line_itself_loads(tmp_path):
     assert run(tmp_path, "--help") == (130, "interrupted\n")
 
 
-def test_after_the_command_has_ended(tmp_path):
-    assert run(tmp_path, "--version", code=BEFORE + "atexit.register(ctrl_c)\n" + RUN) == (130, "interrupted\n")
-
-
 def test_a_shell_that_ignores_ctrl_c_for_its_jobs_is_obeyed():
     code = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n" + RUN
     end = "\nassert signal.getsignal(signal.SIGINT) is signal.SIG_IGN"

@@ -1,7 +1,6 @@
 """Damaged files that a campaign found: each is refused by an error that names it, never by another one."""
 
 import json
-import struct
 
 import numpy as np
 import pytest
@@ -9,12 +8,9 @@ import torch
 from messages import tells
 from PIL import Image
 
-from kfgs._tensors import save_tensors
+from kfgs._arrays import save_tensors
 from kfgs.evaluation.coco import load_coco_labels
-from kfgs.evaluation.replica import load_replica_points
-from kfgs.evaluation.scannet import load_scannet_points
 from kfgs.fields.examples import read_examples
-from kfgs.formats.ply import write_ply
 from kfgs.labels import load_label_set
 from kfgs.quant import Autoencoder, Codebook
 from kfgs.quant.maps import IndexMaps
@@ -76,39 +72,6 @@ def test_class_names_that_repeat_name_the_file(tmp_path):
     np.save(tmp_path / "text.npy", np.ones((2, 3), np.float32))
     with pytest.raises(ValueError, match=tells("classes.json", "different", "chair")):
         load_label_set(tmp_path / "classes.json", tmp_path / "text.npy")
-
-
-def _scan(folder, columns):
-    file = folder / "scene0000_00_vh_clean_2.labels.ply"
-    write_ply(file, columns | {"label": np.array([1, 2], np.uint16)})
-    return file
-
-
-def test_a_scan_without_positions_is_named(tmp_path):
-    file = _scan(tmp_path, {axis: np.zeros(2, np.float32) for axis in "xz"})
-    with pytest.raises(ValueError, match=tells(file, "y missing")):
-        load_scannet_points(file)
-
-
-def _mesh(folder, face):
-    head = (
-        "ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-    )
-    faces = "property list uchar int vertex_indices\nproperty int object_id\nend_header\n"
-    body = np.zeros((3, 3), "<f4").tobytes() + struct.pack("<B3ii", 3, 0, 1, 2, 7)
-    path = folder / "mesh_semantic.ply"
-    path.write_bytes((head + face + faces).encode() + body)
-    return path
-
-
-def test_replica_without_positions_is_named(tmp_path):
-    path = _mesh(tmp_path, "element face 1\n")
-    path.write_bytes(path.read_bytes().replace(b"float y", b"float v"))
-    (tmp_path / "info_semantic.json").write_text(
-        '{"classes": [{"id": 1, "name": "a"}], "objects": [{"id": 7, "class_id": 1}]}'
-    )
-    with pytest.raises(ValueError, match=tells(path.name, "y")):
-        load_replica_points(path)
 
 
 @pytest.mark.parametrize("ending", ["png", "gif", "tiff"])

@@ -50,7 +50,7 @@ def fit_blocks(
     method: Uplift | None = None,
     *,
     splat: str | Path | None = None,
-    latents: int | LinearLatents = 32,
+    latents: int = 32,
     client: Any = None,
     report: Callable[[str], None] | None = None,
 ) -> dict[str, dict[str, Any]]:
@@ -65,8 +65,7 @@ def fit_blocks(
         count: how many blocks.
         method: how; its `max_gaussians` is per block.
         splat: Gaussians of the whole scene; each block gets those that it needs. None: each block trains its own.
-        latents: numbers per Gaussian, in all blocks; or those of other blocks (`latents.safetensors`) with the same teacher:
-            then the fields of both scenes mean the same, and `fields.fused.join_fields` joins them.
+        latents: numbers per Gaussian, the same in all blocks.
         client: a `distributed.Client` (`open_client`); None: one block after the other in this process.
         report: called with a line per block.
 
@@ -77,8 +76,7 @@ def fit_blocks(
     Raises:
         SceneError: if the model has no tracks, or fewer points than blocks, or no training view sees a block.
         FileNotFoundError: if views have no maps.
-        ValueError: if `out` has other blocks, or latents do not fit the maps; or if a block failed: the others are finished
-            then.
+        ValueError: if `out` has other blocks, or if a block failed: the others are finished then.
     """
     root, say = check_output("out", out, "a folder").absolute(), report or (lambda text: None)
     with locked(root, ".blocks.lock"):
@@ -97,14 +95,12 @@ def fit_blocks(
     return results
 
 
-def _cut(source: Path, out: Path, count: int, splat: str | Path | None, latents: int | LinearLatents) -> list[str]:
+def _cut(source: Path, out: Path, count: int, splat: str | Path | None, latents: int) -> list[str]:
     """Write the scene folder of each block, unless an earlier call has; their names."""
     model, whole = find_model(source), load_scene(source)
     if model is None:
         raise SceneError(f"scene: expected a folder with a COLMAP model, got {source}; make one with `kfgs sfm`")
     maps = maps_of_views(whole, whole.views("train"), FeatureFolder(source / "features").of(whole, "train"))
-    if isinstance(latents, LinearLatents) and latents.dim != maps[0].shape[2]:
-        raise ValueError(f"latents: expected those of features with {maps[0].shape[2]} channels, got {latents.dim}")
     content, training = read_model(model), set(whole.views("train"))
     blocks = partition(content, count)
     unseen = next((block.name for block in blocks if not training & _views_of(whole, block)), None)
@@ -116,7 +112,7 @@ def _cut(source: Path, out: Path, count: int, splat: str | Path | None, latents:
         "format": "kfgs.blocks/3",
         "scene": os.path.relpath(real_path(source), real_path(out)),
         "splat": None if splat is None else digest_file(splat_file_of(splat)),
-        "latents": latents if isinstance(latents, int) else digest_value(latents.basis.tolist()),
+        "latents": latents,
         "blocks": [asdict(block) for block in blocks],
     }
     if not (out / BLOCKS).is_file():
@@ -124,7 +120,7 @@ def _cut(source: Path, out: Path, count: int, splat: str | Path | None, latents:
     elif read_json(out / BLOCKS) != facts:
         raise ValueError(f"out: expected a new folder, or one with these blocks, got {out} with others; choose another")
     if not (out / LATENTS).is_file():
-        (uplift.sample_latents(maps, count=latents) if isinstance(latents, int) else latents).save(out / LATENTS)
+        uplift.sample_latents(maps, count=latents).save(out / LATENTS)
     for block in todo:
         write_part(out / block.name / "sparse/0", content, block.views)
         _write_block(out / block.name, block, whole, cloud)
@@ -202,9 +198,7 @@ def join_blocks(
             inside = ((means >= box[0]) & (means <= box[1])).all(1)
             parts += [part.select(torch.from_numpy(inside))] if inside.any() else []
     if not parts:
-        where = (
-            [np.min([c[0] for c in boxes.values()], 0), np.max([c[1] for c in boxes.values()], 0)] if boxes else "none"
-        )
+        where = {name: corners.round(3).tolist() for name, corners in boxes.items()}
         raise ValueError(f"low, high: expected a box with Gaussians, got none in it; all of them lie in {where}")
     field, scene = fused.join_fields(parts), real_path(root / described["scene"])
     return replace(field, info=field.info | {"scene": str(scene)}, classes=notes.scene_classes(scene, field.dim))

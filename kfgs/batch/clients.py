@@ -13,13 +13,11 @@ from typing import Any
 
 from tqdm import tqdm
 
-from .._check import check_whole
-
 START = "60s"  # to wait for a scheduler
 
 
 @contextmanager
-def open_client(workers: int | str = 1, *, threads: int = 1) -> Iterator[Any]:
+def open_client(workers: int | str = 1) -> Iterator[Any]:
     """A `distributed.Client` whose workers run one task at a time; what was started is ended again.
 
     Args:
@@ -27,7 +25,6 @@ def open_client(workers: int | str = 1, *, threads: int = 1) -> Iterator[Any]:
             `tcp://host:8786`, whose workers have one thread each (`dask worker --nthreads 1`); or `slurm:PARTITION:N`: N jobs
             of dask-jobqueue, which are submitted again if they end early. Memory, time and other options of the jobs are
             read from its configuration (`~/.config/dask/jobqueue.yaml`).
-        threads: processors of each job of Slurm.
 
     Raises:
         ImportError: if Dask, or for Slurm dask-jobqueue, is missing.
@@ -39,7 +36,6 @@ def open_client(workers: int | str = 1, *, threads: int = 1) -> Iterator[Any]:
     number = jobs if address.startswith("slurm:") else address
     if "://" not in address and not (number.isdecimal() and int(number) > 0):
         raise ValueError(f"workers: expected a number, tcp://HOST:8786 or slurm:PARTITION:NUMBER, got {address!r}")
-    check_whole("threads", threads, 1)
     try:
         import dask
         from distributed import Client, LocalCluster
@@ -67,7 +63,7 @@ def open_client(workers: int | str = 1, *, threads: int = 1) -> Iterator[Any]:
             raise OSError(
                 "workers: expected Slurm's sbatch on this machine, got none; start it where jobs are submitted"
             )
-        cluster: Any = SLURMCluster(queue=partition, cores=1, job_cpu=threads, processes=1)
+        cluster: Any = SLURMCluster(queue=partition, cores=1, processes=1)
         cluster.adapt(minimum=int(number), maximum=int(number))  # also replaces jobs that ended
     else:
         cluster = LocalCluster(

@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 import traceback
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
@@ -15,10 +16,10 @@ from typing import Any
 import torch
 
 from .._card import cut, error_line
-from .._files import InUseError, check_output, digest_value, locked, read_json, write_json
+from .._files import check_output, digest_value, locked, read_json, write_json
 from .._notes import hear
 from ..pipeline import Uplift
-from .scene_list import SceneEntry, as_entries
+from .scene_list import check_scenes
 from .scene_task import BatchOptions, make_scene, stamps
 
 STATE, LOG, LOCK, TOPIC = "state.json", "log.txt", ".batch.lock", "kfgs-batch/2"
@@ -44,7 +45,7 @@ class SceneResult:
 
 
 def run_batch(
-    scenes: Iterable[str | Path | SceneEntry],
+    scenes: Mapping[str, str | Path],
     out: str | Path,
     options: BatchOptions | None = None,
     *,
@@ -59,7 +60,7 @@ def run_batch(
     continue, and the same call again tries it again.
 
     Args:
-        scenes: folders, or entries (`read_scenes`); each with a COLMAP model, a transforms.json, or photos.
+        scenes: folders by the names of their runs (`read_scenes`); each with a COLMAP model, a transforms.json, or photos.
         out: the folder of the runs. Paths must mean the same in all workers.
         options: what is done with each scene.
         client: a `distributed.Client` whose workers run one task at a time (`open_client`); None: one scene after the other
@@ -70,13 +71,13 @@ def run_batch(
         A result per scene, in their order.
 
     Raises:
-        ValueError: if there are no scenes, two have the same name, a run would be in the folder of a scene, or another batch
-            works in the folder `out`.
+        ValueError: if there are no scenes, a run would be in the folder of a scene, or another batch works in `out`.
         OSError: if `out` cannot be written to.
     """
     root = check_output("out", out, "a folder").absolute()
-    entries, options, say = as_entries(scenes, root), options or BatchOptions(), report or (lambda line: None)
-    tasks = {entry.name: (entry, root, options, say if client is None else None) for entry in entries}
+    places, options, say = check_scenes(scenes, root), options or BatchOptions(), report or (lambda line: None)
+    told = say if client is None else None
+    tasks = {name: (source, root / name, options, told) for name, source in places.items()}
     results = dict[str, SceneResult]()
     with locked(root, LOCK):
         for name, result in run_tasks(_run_scene, tasks, client, say):
@@ -88,7 +89,7 @@ def run_batch(
                 if known is not None:
                     write_json(root / name / STATE, asdict(result))
             results[name] = result
-    return [results[entry.name] for entry in entries]
+    return [results[name] for name in places]
 
 
 def run_tasks(
@@ -111,9 +112,8 @@ def run_tasks(
         yield futures[future], future.exception() or future.result()
 
 
-def _run_scene(entry: SceneEntry, root: Path, options: BatchOptions, report: Report | None) -> SceneResult:
+def _run_scene(source: Path, run: Path, options: BatchOptions, report: Report | None) -> SceneResult:
     """The task of a scene. An error of its work is part of the result."""
-    run, source = root / entry.name, Path(entry.source)
     known = read_state(run)
     if known is None and run.is_dir() and any(run.iterdir()):
         raise FileExistsError(f"{run}: expected a new folder, or a run of kfgs batch, got other files; move them")
@@ -123,13 +123,13 @@ def _run_scene(entry: SceneEntry, root: Path, options: BatchOptions, report: Rep
     key = digest_value([marks, plain, version("kfgs")])
     if known is not None and known.key == key and known.value is not None:
         return known
-    state = SceneResult(entry.name, key)
+    state = SceneResult(run.name, key)
     write_json(run / STATE, asdict(state))
 
     def say(line: str) -> None:
         with (run / LOG).open("a", encoding="utf-8") as file:
             file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line}\n")
-        (report or _tell_client)(f"{entry.name}: {line.splitlines()[0]}")
+        (report or _tell_client)(f"{run.name}: {line.splitlines()[0]}")
 
     @contextmanager
     def step(name: str) -> Iterator[None]:
@@ -172,25 +172,15 @@ def describe_batch(folder: Path) -> str | None:
     states = [state for file in sorted(folder.glob(f"*/{STATE}")) if (state := read_state(file.parent)) is not None]
     if not states:
         return None
-    unfinished = "stopped"
-    try:
-        with locked(folder, LOCK):
-            pass
-    except InUseError:
-        unfinished = "at work"
-    lines, counts, scores = [f"{folder}: a batch"], dict[str, int](), list[float]()
+    lines, ends = [f"{folder}: a batch"], list[str]()
     for state in states:
-        ended = "finished" if state.value else "failed" if state.failure else unfinished
-        counts[ended] = counts.get(ended, 0) + 1
+        ends.append("finished" if state.value else "failed" if state.failure else "unfinished")
         miou = state.value["miou"] if state.value else None
-        scores += [] if miou is None else [miou]
-        score = "" if miou is None else f", mIoU {miou:.3f}"
-        where = "" if state.value else f" in {state.step}"
-        lines.append(f"  {state.name}: {ended}{where}, {sum(state.seconds.values()):.0f} s{score}")
+        what = f" in {state.step}" if state.value is None else "" if miou is None else f", mIoU {miou:.3f}"
+        lines.append(f"  {state.name}: {ends[-1]}{what}, {sum(state.seconds.values()):.0f} s")
         lines += [f"    {cut(state.failure, MESSAGE)}"] if state.failure else []
-    words = [f"{count} {ended}" for ended, count in counts.items()]
+    scores = [state.value["miou"] for state in states if state.value and state.value["miou"] is not None]
+    words = [f"{count} {ended}" for ended, count in Counter(ends).items()]
     words += [f"mean mIoU {sum(scores) / len(scores):.3f} of {len(scores)}"] if scores else []
-    lines.append(f"{len(states)} scene{'s' if len(states) != 1 else ''}: {', '.join(words)}")
-    if counts.keys() & {"stopped", "failed"}:
-        lines.append("next: the same `kfgs batch` again continues with scenes that are not finished")
+    lines.append(f"{len(states)} scene{'s' * (len(states) != 1)}: {', '.join(words)}")
     return "\n".join(lines)

@@ -5,22 +5,22 @@ Each step calls the function that does it for a single scene, and these find wha
 
 from __future__ import annotations
 
-import os
+import glob
 import shutil
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
-
-from torch import Tensor
 
 from .._check import check_whole
 from .._files import as_path, read_json, write_json
 from .._notes import is_strict
 from ..fields.notes import scene_classes
-from ..labels import LabelSet, load_label_set
+from ..labels import load_label_set
 from ..pipeline import Paper, Uplift, fit, score_scene, segment_scene, true_labels
+from ..pipeline.segment import scored_labels
 from ..pipeline.train import training_device
 from ..scenes import FeatureFolder, Scene, SceneError, SfmConfig, extract_features, list_images, load_scene, run_sfm
 from ..scenes.load import is_scene
@@ -70,17 +70,10 @@ def make_scene(
     step: Callable[[str], AbstractContextManager[None]],
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Make the field of a scene, segment its test views and score them.
+    """Make the field of a scene or a folder of photos in the folder `run`, segment its test views and score them.
 
-    Args:
-        source: a scene, or a folder of photos.
-        run: receives what is made.
-        options: what to do.
-        step: a context for each step of the work.
-        say: receives notes.
-
-    Returns:
-        `gaussians`, `latents`, and `miou` (None without true labels).
+    `step` is a context for each step of the work, `say` receives notes. Returns `gaussians`, `latents`, and `miou` (None
+    without true labels).
     """
     maps = source / "features"
     with step("cameras"):
@@ -90,7 +83,8 @@ def make_scene(
     if options.teacher is not None:
         maps = run / "features"
         with step("features"):
-            extract_features(_teacher(options), scene, maps)
+            given = tuple(options.teacher_options.items())
+            extract_features(_teacher(options.teacher, options.weights, given), scene, maps)
     elif not maps.is_dir():
         raise SceneError(f"{source}: expected feature maps in features/, got none; name a teacher (--teacher)")
     with step("fit"):
@@ -103,7 +97,8 @@ def make_scene(
         return value
     with step("segment"):
         scene, shown = scene.undistorted(), "test" if scene.splits.get("test") else "train"
-        truth = _truth(source, scene, shown, classes, say)
+        known = scored_labels(source, classes, say)
+        truth = {} if known is None else true_labels(scene, known, shown)
         labels = segment_scene(
             made, scene, classes, run / "segmented", split=shown, pictures=options.pictures, truth=truth
         )
@@ -117,8 +112,6 @@ def make_scene(
 
 def _load(source: Path, posed: Path, config: SfmConfig, say: Callable[[str], None]) -> Scene:
     """The scene; if it has no poses, they are estimated from its photos and written to `posed`."""
-    if not source.is_dir():
-        raise FileNotFoundError(f"{source}: no such folder; expected a scene or photos there")
     if is_scene(source):
         return load_scene(source)
     photos = next((place for place in (source / "images", source) if place.is_dir() and list_images(place)), None)
@@ -139,39 +132,15 @@ def _load(source: Path, posed: Path, config: SfmConfig, say: Callable[[str], Non
     return load_scene(posed, images=photos)
 
 
-def _truth(source: Path, scene: Scene, split: str, classes: LabelSet, say: Callable[[str], None]) -> dict[str, Tensor]:
-    """The true labels of a split, if the scene has any and they count the same classes."""
-    folder = next((source / name for name in ("labels_scored", "labels") if (source / name).is_dir()), None)
-    listed = source / "classes.json"
-    if folder is not None and listed.is_file() and tuple(read_json(listed)) != classes.names:
-        say(f"note: not scored: the labels mean the classes of {listed}, and the text table has others")
-        return {}
-    return {} if folder is None else true_labels(scene, folder, split)
-
-
 def stamps(folder: Path, skip: str | None = None) -> list[list[Any]]:
-    """[name, size, time] of each file below a folder. Links are followed, but no folder is listed twice."""
-    rows, seen = list[list[Any]](), set[str]()
-    for here, folders, names in os.walk(folder, followlinks=True):
-        seen.add(os.path.realpath(here))
-        known = seen | {os.path.join(os.path.realpath(folder), skip or ".")}
-        folders[:] = [name for name in sorted(folders) if os.path.realpath(os.path.join(here, name)) not in known]
-        for file in (Path(here, name) for name in sorted(names)):
-            if file.is_file():
-                info = file.stat()
-                rows.append([file.relative_to(folder).as_posix(), info.st_size, info.st_mtime_ns])
-    return rows
+    """[name, size, time] of each file below a folder, those of links to folders included; `skip` is a part to leave out."""
+    names = sorted(glob.glob("**", root_dir=folder, recursive=True, include_hidden=True))
+    files = [(name, folder / name) for name in names if skip is None or Path(name).parts[:1] != (skip,)]
+    return [[name, file.stat().st_size, file.stat().st_mtime_ns] for name, file in files if file.is_file()]
 
 
-_loaded: dict[str, Teacher] = {}
-
-
-def _teacher(options: BatchOptions) -> Teacher:
+@lru_cache(maxsize=1)
+def _teacher(name: str, weights: str | None, options: tuple[tuple[str, Any], ...]) -> Teacher:
     """The teacher of this worker process, loaded once."""
-    assert options.teacher is not None
-    key = repr((options.teacher, options.weights, options.teacher_options))
-    if key not in _loaded:
-        _loaded.clear()
-        teacher = load_teacher(options.teacher, options.weights, **options.teacher_options)
-        _loaded[key] = teacher.to(training_device("auto")) if hasattr(teacher, "to") else teacher
-    return _loaded[key]
+    teacher = load_teacher(name, weights, **dict(options))
+    return teacher.to(training_device()) if hasattr(teacher, "to") else teacher

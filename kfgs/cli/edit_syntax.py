@@ -64,21 +64,6 @@ def parse_edits(asked: Edits, names: Sequence[str] = ()) -> list[Any]:
     return edits
 
 
-def apply_edits(splats: Any, edits: Sequence[Any]) -> list[Any]:
-    """The cloud, and the cloud after each edit. A ValueError if an edit names a part of a class (`chair/6`) that is not there."""
-    from ..labels import OfClass, connected_parts
-
-    states = [splats]
-    for edit in edits:
-        for rule in (rule for rule in getattr(edit, "where", ()) if getattr(rule, "part", None) is not None):
-            parts = connected_parts(states[-1], OfClass(rule.name).select(states[-1]), distance=rule.distance)
-            if rule.part >= len(parts):
-                got = f"{rule.name}/{rule.part + 1}; `kfgs select {rule.name} SPLAT` lists them"
-                raise ValueError(f"{edit.op}: expected one of {len(parts)} parts of {rule.name}, got {got}")
-        states.append(edit.apply(states[-1]))
-    return states
-
-
 def _split(option: str, words: str, example: str) -> tuple[str, str]:
     name, colon, value = words.rpartition(":")
     if not (name and colon and value):

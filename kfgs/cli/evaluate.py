@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 from .._files import check_output
@@ -42,7 +41,6 @@ def evaluate(
         long: Say how it was measured, and print every row.
     """
     from .._files import write_json
-    from ..fields.notes import recall_scene
     from ..pipeline import evaluate as evaluate_result
     from ..pipeline import open_question
 
@@ -54,7 +52,7 @@ def evaluate(
             raise ValueError(
                 f"scene: expected a scene folder, got none, and {field} is not a field with one; pass --scene"
             )
-        classes = replace(classes, scene=recall_scene(loaded.info))
+        classes = classes.of(loaded)
     assert classes.scene is not None
     question = open_question(classes.scene, protocol, truth=truth)
     colors = getattr(question.protocol, "of_colors", False)

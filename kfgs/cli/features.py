@@ -88,7 +88,11 @@ def _make_maps(network: Any, scene: Any, target: Path, split: str) -> None:
     if network is not None:
         extract_features(network, scene, target, split, progress=True)
         maps = FeatureFolder(target).of(scene, split)
-        say(f"{len(maps)} maps of {' x '.join(map(str, maps.shape))} by {_teacher_words(maps.identity or {})}")
+        identity = maps.identity or {}
+        weights = {"weights": str(identity["weights"])[:12]} if identity.get("weights") else {}
+        words = [f"{name} {value}" for name, value in (weights | (identity.get("options") or {})).items()]
+        teacher = ", ".join([str(identity.get("name", "unknown")), *words])
+        say(f"{len(maps)} maps of {' x '.join(map(str, maps.shape))} by {teacher}")
         return
     if not target.is_dir():
         raise ValueError(f"teacher: expected a teacher, or maps in {target} to check, got neither; pass --teacher")
@@ -101,13 +105,6 @@ def _make_maps(network: Any, scene: Any, target: Path, split: str) -> None:
             f"out: expected a map that fits for each of the {count} views of split {split!r}, got {len(problems)} that are "
             "missing or do not fit (named above); make these maps again, or name the photos to use in SCENE/split.json"
         )
-
-
-def _teacher_words(identity: dict[str, Any]) -> str:
-    """A teacher's identity in a few words: `lseg, weights 3f2a..., fast true`."""
-    weights = {"weights": str(identity["weights"])[:12]} if identity.get("weights") else {}
-    words = [f"{name} {value}" for name, value in (weights | (identity.get("options") or {})).items()]
-    return ", ".join([str(identity.get("name", "unknown")), *words])
 
 
 def _table(out: Path | None) -> Path:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .._files import real_path, write_json
-from .options import Flag, Given, Matching, Positional, SceneFolder, Teacher, Views
+from .options import Flag, Given, Matching, Positional, SceneFolder, Views
 from .output import say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -116,7 +116,6 @@ def fit(
     steps: Given[int] = None,
     max_gaussians: Given[int] = None,
     views: Views,
-    teacher: Teacher,
 ) -> None:
     """Make a semantic field of a scene and its teacher's feature maps.
 
@@ -128,7 +127,6 @@ def fit(
     Examples:
         kfgs fit scene/ --out run/ --splat my.ply
         kfgs fit scene/ --out run/ --features maps/
-        kfgs fit scene/ --out run/ --teacher mine:colors    # makes the maps, in OUT/features
         kfgs fit scene/ --out run/ --splat my.ply --max-gaussians 0    # keeps every Gaussian of the splat
         kfgs fit scene/ --out run/ --method paper
 
@@ -149,14 +147,13 @@ def fit(
     made_by = _method(method, splat, steps, max_gaussians)
     as_taken = views.load(scene)
     loaded, split = as_taken.undistorted(), views.split
-    network = teacher.load()
     folder = features or (scene if scene.is_dir() else scene.parent) / "features"
-    if network is None and not folder.is_dir():
+    if not folder.is_dir():
         raise ValueError(
             f"features: expected a folder of feature maps, got {folder}, which is none; name another, or make them with "
             "`kfgs features`"
         )
-    maps = network or FeatureFolder(folder).of(as_taken, split)
+    maps = FeatureFolder(folder).of(as_taken, split)
     field = fit_field(loaded, maps, made_by, folder=out, split=split, report=say, progress=True)
     command = f"cd {shlex.quote(os.getcwd())}\n{shlex.join(['kfgs', *sys.argv[1:]])}"
     report = write_run_report(out, field, loaded, made_by, split=split, command=command)
@@ -210,20 +207,21 @@ def color(
     """
     from ..evaluation.color import score_views
     from ..pipeline.color import ColorConfig, fit_color
-    from ..pipeline.compare import PhotoPictures
+    from ..pipeline.compare import draw_photos
+    from ..viz.linked import evenly
 
-    config = {"quick": ColorConfig.quick, "cpu": ColorConfig.cpu, "paper": ColorConfig.paper}[preset]()
+    config = {"quick": ColorConfig.quick, "cpu": ColorConfig.cpu, "paper": ColorConfig}[preset]()
     loaded, split = views.load(scene).undistorted(), views.split
     gaussians = fit_color(loaded, out, _trained(config, steps, max_gaussians), split=split, report=say, progress=True)
     say(repr(gaussians))
     written = [out / "color.ply"]
     held_out = loaded.splits.get("test", [])
     if held_out and not set(held_out) & set(loaded.views(split)):
-        pictures = PhotoPictures(out / "views", [loaded.stem(i) for i in held_out], PICTURES)
-        scores = score_views(gaussians, loaded, "test", show=pictures)
+        scores = score_views(gaussians, loaded, "test")
         write_json(out / "scores.json", {"color": scores.to_json()})
         say(str(scores))
-        written += [*pictures.written, out / "scores.json"]
+        shown = [held_out[k] for k in evenly(len(held_out), PICTURES)]
+        written += [*draw_photos(gaussians, loaded, shown, out / "views"), out / "scores.json"]
     else:
         say("note: no views are held out (split 'test', not trained on): nothing to score against")
     wrote(written)

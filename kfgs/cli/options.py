@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -74,7 +74,7 @@ class Teacher:
                 )
             return None
         teacher = load_teacher(self.teacher, self.weights, **options)
-        return teacher.to(training_device("auto")) if hasattr(teacher, "to") else teacher
+        return teacher.to(training_device()) if hasattr(teacher, "to") else teacher
 
 
 @dataclass(frozen=True)
@@ -86,6 +86,12 @@ class Classes:
     text: Given[Path] = None
     """Words: a table of `kfgs features --words`, or a .npy with a row for each class of the classes.json next to it; by
     default those of SCENE (text.safetensors, or text.npy and classes.json)."""
+
+    def of(self, field: Any) -> Classes:
+        """The same with the scene that a field remembers, if none is given."""
+        from ..fields.notes import recall_scene
+
+        return self if self.scene is not None else replace(self, scene=recall_scene(field.info))
 
     @cached_property
     def loaded(self) -> Any:
@@ -125,12 +131,9 @@ class Classes:
 
     def photos_of(self, field: Any | None) -> Any:
         """The scene of --scene or of the field, for its photographs; None if there is none, or it is gone."""
-        from ..fields.notes import recall_scene
-        from ..scenes import load_scene
-
         if self.scene is not None or field is None:
             return self.loaded
         try:
-            return load_scene(recall_scene(field.info)).undistorted()
+            return self.of(field).loaded
         except (OSError, ValueError):
             return None

@@ -1,4 +1,4 @@
-"""The output of commands: lines, files written, counts of Gaussians, and warnings as notes."""
+"""The output of commands: lines, files written, and warnings as notes."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
 
-from .._compiling import say_compiling
-from .._notes import hear
+from .._notes import Wait, hear
 
 LINE, END = 2000, 600
 """Most characters of a printed line, and how many of them are from its end, where an error says what to do."""
@@ -22,7 +21,12 @@ def say(text: str, file: TextIO | None = None) -> None:
     Names from foreign files may hold anything: what is not printable is shown as Python writes it (`\x1b`), and the middle
     of a very long line is left out.
     """
-    print("\n".join(map(_shown, text.split("\n"))), file=file or sys.stdout, flush=True)
+    try:
+        print("\n".join(map(_shown, text.split("\n"))), file=file or sys.stdout, flush=True)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, "standard output") from error
 
 
 def _shown(line: str) -> str:
@@ -41,14 +45,6 @@ def wrote(paths: Sequence[Path]) -> None:
         say(f"  {path}" + (f"  ({sum(1 for p in path.iterdir())} files)" if path.is_dir() else ""))
 
 
-def say_counts(labels: Any, names: Sequence[str]) -> None:
-    """Print the number of Gaussians of each class, and of those without a class."""
-    for i, name in [*enumerate(names), (-1, "(none)")]:
-        count = int((labels == i).sum())
-        if i >= 0 or count:
-            say(f"  {name:<16s} {count:8d} Gaussians")
-
-
 def say_lost(written: Any) -> None:
     """Report what the format of a splat file (`Written`) could not store, and whether it reordered the Gaussians."""
     for words in written.lost:
@@ -59,19 +55,15 @@ def say_lost(written: Any) -> None:
 
 @contextmanager
 def notes_as_lines(spoken: Callable[[str], str], *, strict: bool) -> Iterator[None]:
-    """Print warnings, in the words of `spoken`, and notes of readers as lines; on stderr that kernels are compiled.
+    """Print warnings, in the words of `spoken`, and notes of readers and engines, as lines.
 
     With `strict`, readers refuse what they would leave out.
     """
 
     def note(message: Warning | str, *_: Any, **__: Any) -> None:
-        say(f"note: {spoken(str(message))}")
+        say(f"note: {spoken(str(message))}", sys.stderr if isinstance(message, Wait) else None)
 
-    with (
-        warnings.catch_warnings(),
-        hear(note, strict=strict),
-        say_compiling(lambda text: say(f"note: {text}", sys.stderr)),  # next to the progress bars
-    ):
+    with warnings.catch_warnings(), hear(note, strict=strict):
         warnings.filterwarnings("always", message="classes: ")
         warnings.showwarning = note
         yield

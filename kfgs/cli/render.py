@@ -31,7 +31,6 @@ def render(
     show: Given[str] = None,
     color: Given[Path] = None,
     frames: Given[int] = None,
-    width: Given[int] = None,
     classes: Classes,
 ) -> None:
     """Make a film of a field or a labelled splat: an orbit, or a flight along its cameras or your own.
@@ -52,7 +51,6 @@ def render(
         show: What stands side by side, with commas between: photo (the colours), labels, features, query=TEXT. By default
             photo,labels, or labels if there are no colours.
         color: Colour splat in the same frame; by default that of the run, or that which the field was made on.
-        width: Width of each picture in pixels, by default 480; your own cameras keep theirs.
         frames: Number of pictures; by default 72, or one for each camera of your own.
     """
     from tqdm import tqdm
@@ -74,7 +72,7 @@ def render(
         semantic, colors = _opened(meaning.names, semantic, colors)
     words = [word.strip() for word in (show or ("labels" if colors is None else "photo,labels")).split(",")]
     shows = {TITLES.get(word, word.removeprefix("query=")): _show(word, meaning, semantic, colors) for word in words}
-    walk = walk_of(walked, semantic if colors is None else colors, cameras, frames, width or WIDTH)
+    walk = walk_of(walked, semantic if colors is None else colors, cameras, frames)
     names, listed = (meaning.names, semantic.labels.unique()) if "labels" in words else (None, None)
     with tqdm(total=len(walk), desc="render", unit="frame") as bar:
         save_animation(out, shows, walk, fps=FPS, names=names, listed=listed, progress=lambda *_: bar.update())
@@ -122,9 +120,7 @@ def read_walk(path: Walk, frames: int | None) -> Walk | list[Camera]:
     return own if frames is None else path_cameras(own, frames, size=own[0].size)
 
 
-def walk_of(
-    path: Walk | list[Camera], cloud: Any, cameras: list[Camera], frames: int | None, width: int = WIDTH
-) -> list[Camera]:
+def walk_of(path: Walk | list[Camera], cloud: Any, cameras: list[Camera], frames: int | None) -> list[Camera]:
     """The cameras of a path that `read_walk` gave; those of the scene are needed for a flight along them."""
     from ..cameras import Orbit, orbit_cameras, path_cameras
     from ..viz.linked import upwards
@@ -135,7 +131,7 @@ def walk_of(
         return [replace(camera, near=near) for camera in path]
     frames = frames or FRAMES
     if path == "orbit":
-        size = (round(width * 3 / 4), width)
+        size = (round(WIDTH * 3 / 4), WIDTH)
         orbit = Orbit(frames=frames, size=size, elevation_degrees=45, zoom=1.5, cut=0.6)
         return orbit_cameras(cloud.means, orbit, up=upwards(cameras), origin=cloud.origin)
     if not cameras:
@@ -143,7 +139,7 @@ def walk_of(
             f"scene: expected --scene for --path {path}, whose cameras it needs, got none; or take an orbit"
         )
     cameras = [camera.with_origin(cloud.origin) for camera in cameras]
-    size = (max(1, round(width * cameras[0].height / cameras[0].width)), width)
+    size = (max(1, round(WIDTH * cameras[0].height / cameras[0].width)), WIDTH)
     return path_cameras(cameras, frames, every=max(1, round(len(cameras) / KEYS)), size=size)
 
 

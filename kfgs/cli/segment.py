@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
-from .._files import check_output, read_json, write_json
+from .._files import check_output, write_json
 from .files import open_field
 from .options import Classes, Flag, Given, Positional, Walk, Word
 from .output import say, wrote
@@ -45,9 +44,8 @@ def segment(
         coco: Write coco/annotations.json (COCO's run lengths, areas and boxes; one annotation for each class of each picture)
             and its pictures to coco/images: undistorted photographs, or with --path rendered colours.
     """
-    from ..fields.notes import recall_scene
     from ..pipeline import score_scene, segment_scene, true_labels
-    from ..pipeline.segment import write_coco
+    from ..pipeline.segment import scored_labels, write_coco
     from ..viz import plot_iou
 
     check_output("out", out, "a folder")
@@ -55,14 +53,10 @@ def segment(
         _segment_path(field, out, path, frames, coco, classes)
         return
     loaded_field = open_field("field", field)
-    folder = recall_scene(loaded_field.info) if classes.scene is None else classes.scene
-    classes = replace(classes, scene=folder)
+    classes = classes.of(loaded_field)
     scene, label_set = classes.loaded, classes.load_classes(loaded_field)
-    labels = next((folder / name for name in ("labels_scored", "labels") if (folder / name).is_dir()), None)
-    listed = folder / "classes.json"
-    if labels is not None and listed.is_file() and tuple(read_json(listed)) != label_set.names:
-        say(f"note: not scored: {labels} counts the classes of {listed}, which are others")
-        labels = None
+    assert classes.scene is not None
+    labels = scored_labels(classes.scene, label_set, say)
     truth = {} if labels is None else true_labels(scene, labels, split)
     views = {scene.stem(i): i for i in scene.views(split)}
     seen = set(loaded_field.info.get("views", ())) & {scene.cameras[i].name for i in views.values()}

@@ -136,9 +136,10 @@ def words_of(classes: Classes, teacher: Teacher, field: Any) -> tuple[Any, Calla
     if network is None:
         return classes.load_classes(field), None
     known = classes.text is not None or classes.scene is not None or field.classes is not None
-    label_set = classes.load_classes(field) if known else make_label_set(network, ["thing"], negatives=CANONICAL)
-    templates = label_set.info.get("templates")
+    label_set = classes.load_classes(field) if known else None
+    templates = None if label_set is None else label_set.info.get("templates")
     asked = make_label_set(network, ["thing"], templates=templates, negatives=CANONICAL)
+    label_set = label_set or asked
     difference = teacher_mismatch(asked.info, label_set.info)
     if difference is not None:
         say(

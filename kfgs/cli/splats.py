@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 from .._files import check_output
-from .edit_syntax import Edits, apply_edits, parse_edits
+from .edit_syntax import Edits, parse_edits
 from .files import check_target, is_field, open_field, open_splats
 from .options import By, Classes, Flag, Given, Positional, Precision
-from .output import say, say_counts, say_lost, wrote
+from .output import say, say_lost, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
@@ -60,18 +60,22 @@ def attach(
         same_frame: Do not compare the frames; they are the same.
     """
     from ..cameras.similarity import Similarity
-    from ..formats import write_splats
+    from ..formats import find_format, ply, write_splats
     from ..pipeline.attach import attach as attach_field
+    from ..pipeline.describe import count_lines
     from ..pipeline.label import label_cloud
     from ..scenes import SceneError, load_scene
 
     check_target("out", out)
     loaded = open_field("field", field)
     label_set = classes.load_classes(loaded)
-    if _of_points(cloud):
+    plain = cloud.is_file() and not is_field(cloud) and find_format(cloud).NAME == "ply"
+    if plain and "scale_0" not in {
+        row.name for table in ply.read_header(cloud).elements[:1] for row in table.properties
+    }:  # points
         moved, paths = label_cloud(loaded.label(label_set), cloud, out, distance=distance)
         say(str(moved))
-        say_counts(moved.labels, label_set.names)
+        say("\n".join(count_lines(moved.labels, label_set.names)))
         wrote(paths)
         return
     splats = open_splats("cloud", cloud)
@@ -91,19 +95,9 @@ def attach(
     written = write_splats(attached.gaussians, out, facts=attached.facts)
     for note in attached.notes:
         say(note)
-    say_counts(attached.labels, label_set.names)
+    say("\n".join(count_lines(attached.labels, label_set.names)))
     say_lost(written)
     wrote(written.paths)
-
-
-def _of_points(path: Path) -> bool:
-    """Whether a file is a PLY without Gaussians."""
-    from ..formats import find_format, ply
-
-    plain = path.is_file() and not is_field(path) and find_format(path).NAME == "ply"
-    return plain and "scale_0" not in {
-        row.name for table in ply.read_header(path).elements[:1] for row in table.properties
-    }
 
 
 def edit(
@@ -141,21 +135,20 @@ def edit(
     replayed = EditList() if replay is None else EditList.load(replay, anywhere=True)  # the user's own file
     by_class = any(rule.kind == "class" for change in replayed for rule in getattr(change, "where", ()))
     before = open_splats("splats", splats, named=replay is None or by_class)
-    states = apply_edits(before, list(replayed))
+    states = list(accumulate(replayed, _apply, initial=before))
     asked = parse_edits(edits, states[-1].names)
     if not asked and not len(replayed):
         raise ValueError("edits: expected at least one, got none; give --remove, --recolor, --move or another")
     if scene is not None and before.sh is None:
         raise ValueError(f"scene: expected a splat with colours to show in it, got {before!r}; leave --scene out")
     cameras = [] if scene is None else load_scene(scene).undistorted().cameras
-    states += apply_edits(states[-1], asked)[1:]
-    after = states[-1]
-    shown = [cameras[i] for i in views_of_change(before, after, cameras, PICTURES, between=states[1:-1])]
+    *states, after = [*states[:-1], *accumulate(asked, _apply, initial=states[-1])]
+    shown = [cameras[i] for i in views_of_change(before, after, cameras, PICTURES, between=states[1:])]
     written = write_splats(after, out)
     paths = [*written.paths, EditList((*replayed, *asked)).save(saved)]
     if shown:
         paths.append(write_comparison(out.with_name(f"{out.name}.png"), before, after, shown, titles=TITLES))
-    say(f"{len(before)} Gaussians before, {len(after)} after {len(states) - 1} edit(s)")
+    say(f"{len(before)} Gaussians before, {len(after)} after {len(states)} edit(s)")
     if len(after) == 0:
         say("note: nothing is left")
     say_lost(written)
@@ -164,6 +157,10 @@ def edit(
     elif cameras:
         say("note: no view of the scene shows a change")
     wrote(paths)
+
+
+def _apply(cloud: Any, edit: Any) -> Any:
+    return edit.apply(cloud)
 
 
 def convert(
@@ -253,7 +250,10 @@ def _convert_by_class(source: Path, folder: Path) -> None:
     splats = open_splats("source", source, labelled=True)
     if len(splats) == 0:
         raise ValueError(f"source: expected Gaussians to divide by class, got none in {source}; name another splat")
-    parts = {_file_name(label, splats.names): part for label, part in splats.by_class().items()}
+    parts = {}
+    for label, part in splats.by_class().items():  # numbers keep names apart that a file's name cannot hold
+        word = re.sub(r"[^\w-]+", "_", splats.names[label] if 0 <= label < len(splats.names) else "").strip("_")[:80]
+        parts[f"{label:02d}{word and '_'}{word}.ply" if label >= 0 else "unlabelled.ply"] = part
     if any((folder / name).is_file() and (folder / name).samefile(source) for name in parts):
         raise ValueError(f"target: expected another folder than that of {source}, which is read; give another name")
     with atomic_folder(folder) as new:
@@ -263,14 +263,6 @@ def _convert_by_class(source: Path, folder: Path) -> None:
         say(f"{name}: {len(part)} Gaussians")
     say_lost(written)
     wrote([folder / name for name in parts])
-
-
-def _file_name(label: int, classes: Sequence[str]) -> str:
-    """`05_chair.ply` for class 5; the number keeps names apart that differ only in what a file's name cannot hold."""
-    if label < 0:
-        return "unlabelled.ply"
-    word = re.sub(r"[^\w-]+", "_", classes[label]).strip("_")[:80] if label < len(classes) else ""
-    return f"{label:02d}_{word}.ply" if word else f"{label:02d}.ply"
 
 
 def _bytes_of(path: Path) -> int:

@@ -17,10 +17,9 @@ import zstandard
 from safetensors import safe_open
 from torch import Tensor
 
-from .._arrays import reading
+from .._arrays import reading, save_tensors
 from .._check import ORIGIN, as_origin
 from .._files import as_path, atomic_path, parse_json, real_path
-from .._tensors import save_tensors
 from ..cameras import Camera
 from ..gaussians import TENSORS as CLOUD
 from ..gaussians import Gaussians

@@ -12,12 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._arrays import read_array, read_safetensors, reading
+from .._arrays import read_array, read_safetensors, reading, save_tensors
 from .._card import cut
-from .._check import as_tensor, check_shapes
+from .._check import as_tensor, check_shapes, class_indices
 from .._files import as_path, atomic_path, parse_json, read_json
-from .._names import class_index
-from .._tensors import save_tensors
 
 KIND, VERSION = "label set", "1"  # of the metadata's "kfgs" and "version"
 SUFFIX = ".safetensors"
@@ -66,7 +64,7 @@ class LabelSet:
 
     def index(self, name: str) -> int:
         """The label of a class; for an unknown name, a ValueError lists similar names."""
-        return class_index(name, self.names, "add its embedding to the classes")
+        return class_indices(name, self.names, "add its embedding to the classes")[0]
 
     def knows(self, name: str) -> bool:
         """Whether `index` finds a class of that name."""

@@ -121,7 +121,7 @@ class Part:
 
 def connected_parts(
     gaussians: Gaussians,
-    selection: Selection,
+    selection: Selection | Tensor,  # or a mask [N]
     cameras: Sequence[Camera] | None = None,
     *,
     distance: float | None = None,
@@ -139,6 +139,7 @@ def connected_parts(
         most: the most parts to return.
     """
     check_gaussians(gaussians)
+    selection = selection if isinstance(selection, Selection) else Selection.of(selection)
     check_shapes(("gaussians.means", gaussians.means, "N 3"), ("selection.mask", selection.mask, "N"))
     check_whole("most", most, 1)
     if distance is not None:

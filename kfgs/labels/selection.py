@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from .._card import cut, say_coordinate
-from .._check import as_tensor, check_range, check_shapes, check_whole
-from .._names import class_indices
+from .._check import as_tensor, check_range, check_shapes, check_whole, class_indices
 from .._origin import to_world
 from .._rows import check_finite
 from ..cameras.similarity import Similarity
@@ -128,7 +127,7 @@ class OfClass(Where):
     name: str | int
     """A name (exact, or else without regard to case; an unknown one is an error), or an index, -1 for those without a label."""
     part: int | None = None
-    """Which connected part: 0 is the largest, one past the last selects nothing. None: all of the class."""
+    """Which connected part: 0 is the largest, one past the last is an error. None: all of the class."""
     distance: float | None = None
     """Gaussians at most this far apart are in one part, world units; None takes it from their spacing."""
 
@@ -143,13 +142,17 @@ class OfClass(Where):
     def _find(self, gaussians: Gaussians) -> tuple[Tensor, str]:
         labels = gaussians.labels
         if labels is None:
-            need = f"labels to find class {self.name!r} by"
-            raise ValueError(f"gaussians.labels: expected {need}, got None; attach a semantic field first")
+            raise ValueError(f"gaussians.labels: expected some for {self.name!r}, got None; attach a field first")
         indices = class_indices(self.name, gaussians.names) if isinstance(self.name, str) else (self.name,)
         mask, how = torch.isin(labels, torch.tensor(indices, device=labels.device)), f"label {self.name}"
-        if self.part is not None and bool(mask.any()):
+        if self.part is not None:
             parts = component_numbers(gaussians.means, mask, self.distance)
-            mask, how = parts == self.part, f"{how}; part {self.part + 1} of {int(parts.max()) + 1}"
+            count = len(parts[mask].unique())
+            if self.part >= count:
+                raise ValueError(
+                    f"part: expected 1 to {count}, got {self.name}/{self.part + 1}; `kfgs select` lists them"
+                )
+            mask, how = parts == self.part, f"{how}; part {self.part + 1} of {count}"
         return mask, how
 
 

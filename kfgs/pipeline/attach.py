@@ -138,7 +138,13 @@ def attach(
         "similarity": similarity.matrix().tolist(),
         "counts": {"none": counts[0], **dict(zip(semantic.names, counts[1:], strict=True))},
     }
-    notes = frame_note, f"{how['labelled by']}: {_about(transfer, len(splats), by)}"
+    carried = f"by distance (lambda {transfer.distance:.3g})"
+    ways = [f"{transfer.labelled:,} got a class {carried}"]
+    if by == "views":
+        ways = [f"{len(splats) - len(transfer.labels):,} got a class by the views"]
+        ways += [f"{transfer.labelled:,} that no view shows {carried}"] if transfer.labelled else []
+    ways.append(f"{transfer.orphaned:,} got none")
+    notes = frame_note, f"{how['labelled by']}: of {len(splats):,} Gaussians {', '.join(ways)}"
     labelled = splats.replace(labels=labels, scores=scores.float(), names=semantic.names)
     return Attached(labelled, transfer, similarity, alignment, notes, facts)
 
@@ -171,14 +177,3 @@ def _carry(source: Gaussians, target: Gaussians, distance: float | None) -> Tran
     assert source.labels is not None
     means = recounted(target.means, target.origin, source.origin)
     return nearest_labels(source.means, source.labels, means, distance)
-
-
-def _about(transfer: Transfer, total: int, by: By) -> str:
-    """How many of all Gaussians got their class from the views, how many by distance, and how many got none."""
-    carried = f"by distance (lambda {transfer.distance:.3g})"
-    if by == "distance":
-        ways = [f"{transfer.labelled:,} got a class {carried}"]
-    else:
-        ways = [f"{total - len(transfer.labels):,} got a class by the views"]
-        ways += [f"{transfer.labelled:,} that no view shows {carried}"] if transfer.labelled else []
-    return f"of {total:,} Gaussians {', '.join(ways)}, {transfer.orphaned:,} got none"

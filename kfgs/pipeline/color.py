@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_range, check_whole
-from .._files import check_output
+from .._files import check_output, locked
 from .._progress import Progress, as_progress
 from ..cameras import Camera, resize_map
 from ..fields import ColorLoss, Densify, GaussianParams, Rates, Training, fit_field
@@ -21,13 +21,13 @@ from ..fields.train import FieldFit
 from ..formats import write_splats
 from ..gaussians import Gaussians
 from ..scenes import Scene
-from .stages import Run, digest_pictures, digest_scene, stage_generator
+from .stages import LOCK, Run, digest_pictures, digest_scene, stage_generator
 from .train import field_stage, stage_params, training_device, training_views, with_extent, with_points
 
 
 @dataclass(frozen=True)
 class ColorConfig:
-    """Options of `fit_color`; the defaults are those of 3DGS."""
+    """Options of `fit_color`; the defaults are those of 3DGS: 30,000 steps at full size, hours on a CPU."""
 
     sh_degree: int = 3
     """Highest degree of the spherical harmonics, 0 to 3: how colour changes with the direction of sight."""
@@ -35,21 +35,12 @@ class ColorConfig:
     """Train with pictures at this fraction of their size, at most 1."""
     ssim_weight: float = 0.2
     """Lambda of 3DGS: the share of 1 - SSIM in the loss, the rest being L1."""
-    max_points: int | None = None
-    """Start from at most this many of the scene's points, drawn at random; None = all."""
     training: Training = field(default_factory=Training)
 
     def __post_init__(self) -> None:
         check_whole("sh_degree", self.sh_degree, 0, 3)
         check_range("picture_scale", self.picture_scale, 0, 1, closed=(False, True))
         check_range("ssim_weight", self.ssim_weight, 0, 1)
-        if self.max_points is not None:
-            check_whole("max_points", self.max_points, 2)
-
-    @staticmethod
-    def paper() -> ColorConfig:
-        """The schedule of 3DGS: 30,000 steps at full size; hours on a CPU."""
-        return ColorConfig()
 
     @staticmethod
     def cpu() -> ColorConfig:
@@ -127,7 +118,6 @@ def fit_color(
     *,
     split: str = "train",
     seed: int = 0,
-    device: str | torch.device = "auto",
     report: Callable[[str], None] | None = None,
     progress: Progress = False,
 ) -> Gaussians:
@@ -143,46 +133,40 @@ def fit_color(
         config: the schedule; None: that of 3DGS.
         split: the training views; "all" trains on all views.
         seed: every random choice follows from it.
-        device: where to train, see `training_device`; the result lies on the CPU.
         report: receives one line per stage.
         progress: True shows a bar; a function receives the rows of the history as they appear.
 
+    Returns:
+        The Gaussians, on the CPU. Training takes place on the GPU if there is one.
+
     Raises:
-        ValueError: if a camera has distortion, there is no such device, the scene's points are out of sight, the
-            split has no views, or another process works in `folder`.
+        ValueError: if a camera has distortion, the scene's points are out of sight, the split has no views, or another
+            process works in `folder`.
     """
-    config, progress, target = config or ColorConfig.paper(), as_progress(progress), training_device(device)
+    config, progress = config or ColorConfig(), as_progress(progress)
     views = training_views(scene, split)
     run = Run(check_output("folder", folder, "a folder"), report)
-    with run.locked():
+    with locked(run.folder, LOCK):
         scene = with_points(run, scene, views, seed, progress)
-        gaussians = color_stage(run, scene, views, config, seed, target, progress)
+        gaussians = color_stage(run, scene, views, config, seed, progress)
         write_splats(gaussians, run.folder / "color.ply")
     return gaussians
 
 
 def color_stage(
-    run: Run,
-    scene: Scene,
-    views: Sequence[int],
-    config: ColorConfig,
-    seed: int,
-    device: torch.device,
-    progress: Progress,
+    run: Run, scene: Scene, views: Sequence[int], config: ColorConfig, seed: int, progress: Progress
 ) -> Gaussians:
     """The Gaussians of a colour field, as a stage of a run."""
 
     def train(checkpoint: Path) -> FieldFit:
         generator, degree = stage_generator(seed, "color"), config.sh_degree
-        start = GaussianParams.from_points(
-            scene.points, colors=scene.colors, sh_degree=degree, max_points=config.max_points, generator=generator
-        )
+        start = GaussianParams.from_points(scene.points, colors=scene.colors, sh_degree=degree, generator=generator)
         cameras = [scene.cameras[i] for i in views]
         if config.picture_scale != 1:
             sizes = [[max(1, round(n * config.picture_scale)) for n in camera.size] for camera in cameras]
             cameras = [camera.resized(*size) for camera, size in zip(cameras, sizes, strict=True)]
         return fit_field(
-            start.map(lambda value: value.to(device)),
+            start.map(lambda value: value.to(training_device())),
             cameras,
             TrainingPictures(scene, views, cameras),
             with_extent(config.training, scene),

@@ -12,8 +12,8 @@ from torch import Tensor
 from .._files import as_path
 from ..cameras import Camera
 from ..gaussians import Gaussians
+from ..scenes import Scene
 from ..splat import rasterize
-from ..viz.linked import evenly
 from ..viz.pictures import picture_grid, save_picture
 
 PREVIEW = 96  # pixels: width of the renderings that choose the viewpoints
@@ -75,17 +75,10 @@ def write_comparison(
     return as_path(path)
 
 
-class PhotoPictures:
-    """A callback for `score_views` that draws some renderings side by side with their photographs."""
-
-    def __init__(self, folder: Path, stems: Sequence[str], count: int) -> None:
-        """Draw `count` of the views, evenly spread, into `folder/<stem>.png`."""
-        self.folder, self.written = folder, list[Path]()
-        self._chosen = {stems[i] for i in evenly(len(stems), count)}
-
-    def __call__(self, stem: str, rendered: Tensor, taken: Tensor) -> None:
-        """Draw the view if it was chosen."""
-        if stem in self._chosen:
-            path = self.folder / f"{stem}.png"
-            save_picture(path, picture_grid([[taken, rendered]], ("photograph", "colour field")))
-            self.written.append(path)
+def draw_photos(gaussians: Gaussians, scene: Scene, views: Sequence[int], folder: Path) -> list[Path]:
+    """Draw views of a colour field next to their photographs, into `folder/<stem>.png`; the files."""
+    written = [folder / f"{scene.stem(i)}.png" for i in views]
+    for i, path in zip(views, written, strict=True):
+        pair = [scene.image(i), render_color(gaussians, scene.cameras[i])]
+        save_picture(path, picture_grid([pair], ("photograph", "colour field")))
+    return written

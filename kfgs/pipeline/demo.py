@@ -9,7 +9,7 @@ from typing import Any
 from .._check import ORIGIN
 from .._files import check_output, write_json
 from .._origin import recounted
-from ..evaluation import Report, find_points, score_views
+from ..evaluation import find_points, score_views
 from ..evaluation.surface import score_surface
 from ..fields import SemanticField
 from ..fields.store import NAME
@@ -85,7 +85,13 @@ def run(
     say(f"the 2-D network alone, on the same views: {teacher.miou}")
     gaussians = field.label(classes)
     written = save_labelled(out / "gaussians.ply", gaussians, rule="fused features; score = cosine")
-    surface = _label_surface(gaussians, folder, out / "surface.ply")
+    assert gaussians.labels is not None
+    known = find_points(folder)  # the room's true surface; protocol `kfgs-surface/1`
+    points = known.points.float()
+    local = recounted(points, ORIGIN, gaussians.origin)
+    surface = score_surface(gaussians.means, gaussians.labels, local, known.labels)
+    write_ply(out / "surface.ply", {name: points[:, i].contiguous().numpy() for i, name in enumerate("xyz")})
+    label_cloud(gaussians, out / "surface.ply", out / "surface.ply")
     say(f"surface points: {surface}")
     say(
         f'5. Edits. The classes are carried over to the splat with the colours, and then "{REMOVED}" is a name for Gaussians: '
@@ -116,14 +122,3 @@ def _edit_colors(
         views = [scene.cameras[i] for i in views_of_change(before, after, scene.cameras)]
         written.append(write_comparison(out / f"{name}.png", before, after, views, titles=TITLES))
     return written
-
-
-def _label_surface(gaussians: Gaussians, folder: Path, out: Path) -> Report:
-    """Carry the Gaussians' labels to the room's true surface points and score them (protocol `kfgs-surface/1`)."""
-    assert gaussians.labels is not None
-    truth = find_points(folder)
-    points = truth.points.float()
-    report = score_surface(gaussians.means, gaussians.labels, recounted(points, ORIGIN, gaussians.origin), truth.labels)
-    write_ply(out, {name: points[:, i].contiguous().numpy() for i, name in enumerate("xyz")})
-    label_cloud(gaussians, out, out)
-    return report

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from .._card import say_coordinate
 from .._check import one_line
@@ -47,7 +49,16 @@ def describe(path: str | Path) -> str:
         return "\n".join([f"{path}: unfinished run; the same fit again continues", *lines])
     with suppress(FileNotFoundError, ValueError, TypeError):
         if not is_scene(path):
-            return _describe_maps(path)
+            maps = FeatureFolder(path)
+            h, w, D = maps.shape
+            about = maps.identity or {"name": "another program"}
+            lines = [
+                f"{path}: {len(maps)} feature maps by {one_line(about.get('name', 'an unknown teacher'))}",
+                f"  {h} x {w} cells, {D} channels",
+                f"  {sum(file.stat().st_size for file in maps.files) / 1e6:,.1f} MB",
+                *(f"  {one_line(name)}: {one_line(value, 200)}" for name, value in about.items() if name != "name"),
+            ]
+            return "\n".join(lines)
     scene = load_scene(path)
     sizes = sorted({camera.size for camera in scene.cameras})
     splits = ", ".join(f"{name} {len(views)}" for name, views in scene.splits.items())
@@ -62,19 +73,6 @@ def describe(path: str | Path) -> str:
     return "\n".join(lines)
 
 
-def _describe_maps(path: Path) -> str:
-    maps = FeatureFolder(path)
-    h, w, D = maps.shape
-    about = maps.identity or {"name": "another program"}
-    lines = [
-        f"{path}: {len(maps)} feature maps by {one_line(about.get('name', 'an unknown teacher'))}",
-        f"  {h} x {w} cells, {D} channels",
-        f"  {sum(file.stat().st_size for file in maps.files) / 1e6:,.1f} MB",
-        *(f"  {one_line(name)}: {one_line(value, 200)}" for name, value in about.items() if name != "name"),
-    ]
-    return "\n".join(lines)
-
-
 def _describe_splats(path: Path, splats: Gaussians) -> str:
     lines = [f"{path}: {splats!r}"]
     if len(splats):
@@ -82,7 +80,10 @@ def _describe_splats(path: Path, splats: Gaussians) -> str:
         ends = [[say_coordinate(value, 4) for value in corner] for corner in corners.tolist()]
         lines += [f"  {axis}: {low} to {high}" for axis, low, high in zip("xyz", *ends, strict=True)]
     lines.append(f"  format: {find_format(path).NAME}")
-    if splats.labels is not None:
-        for i, name in [*enumerate(splats.names), (-1, "(none)")]:
-            lines.append(f"  {name:<16s} {int((splats.labels == i).sum()):8d} Gaussians")
-    return "\n".join(lines)
+    return "\n".join([*lines, *([] if splats.labels is None else count_lines(splats.labels, splats.names))])
+
+
+def count_lines(labels: Tensor, names: Sequence[str]) -> list[str]:  # labels: [N]
+    """A line with the number of Gaussians of each class, and of those without a class."""
+    counts = [(name, int((labels == i).sum())) for i, name in [*enumerate(names), (-1, "(none)")]]
+    return [f"  {name:<16s} {count:8d} Gaussians" for name, count in counts]

@@ -85,34 +85,29 @@ def open_question(
 
 def evaluate(
     field: str | Path | SemanticField | Method | Gaussians,
-    scene: str | Path | Question,
-    protocol: Any = "kfgs-pooled/1",
+    question: Question,
     *,
     encode: Encode | LabelSet | None = None,
     labels: LabelRule | None = None,
     command: str = "",
-    **asked: Any,
 ) -> Report:
-    """Score a result in a scene under a protocol.
+    """Score a result under a protocol.
 
     Args:
         field: a field or run of kfgs, a folder of a teacher's feature maps, or any `Method`. For `kfgs-color/1` Gaussians with
             colours, a splat, or a run that has one.
-        scene: its folder; or a question that was opened before (`open_question`), to ask several methods the same.
-        protocol: as in `open_question`; a question has its own.
+        question: from `open_question`; several results can be asked the same.
         encode: a label set, or the teacher's text encoder. Not needed for colours. `feature3dgs-teacher/1` asks the classes of
             a label set, and LSeg's words of a text encoder.
         labels: how a field of kfgs decides the class of a pixel: `own` is `SemanticField.segment`; `nearest` is the text with
             the largest cosine, as for other methods. None: `own` in kfgs's protocols, `nearest` in those of others.
         command: kept in the report.
-        **asked: `truth`, `split` and `images`, as in `open_question`; not with a question.
 
     Raises:
-        FileNotFoundError: if the result, the scene or its truth is missing.
-        ValueError: if something does not fit, such as an unknown protocol, or texts without embeddings.
+        FileNotFoundError: if the result is missing.
+        ValueError: if something does not fit, such as texts without embeddings.
         TypeError: if a protocol of Gaussians is asked about a teacher.
     """
-    question = scene if isinstance(scene, Question) else open_question(scene, protocol, **asked)
     scorer, rule = question.protocol, getattr(question.protocol, "own_labels", None)
     if labels is not None and rule is None:
         raise ValueError(f"labels: expected none with {scorer.name}, which takes no class per pixel, got {labels!r}")

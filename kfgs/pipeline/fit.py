@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._files import check_output, folded_name, real_path, write_json
+from .._files import check_output, folded_name, locked, real_path, write_json
 from .._progress import Progress, as_progress
 from ..cameras import Camera
 from ..fields import Autoencoded, Codewords, GaussianParams, Identity, SemanticField, fit_field, fuse_views, uplift_maps
@@ -32,12 +32,13 @@ from ..formats.table import splat_file_of
 from ..gaussians import Gaussians
 from ..quant import Autoencoder, Codebook, LatentMaps, fit_autoencoder, fit_codebook, quantize_maps
 from ..quant.maps import IndexMaps
+from ..quant.sampling import FeatureMaps
 from ..scenes import FeatureFolder, Scene, extract_features
 from ..scenes.scene import as_taken
 from .color import color_stage, find_color
-from .maps import KnownFeatures, Maps, as_maps, describe_maps, map_shape, maps_of_views
+from .maps import KnownFeatures, as_maps, describe_maps, map_shape, maps_of_views
 from .methods import Paper, Uplift
-from .stages import Run, Stage, digest_cameras, digest_scene, digest_shape, stage_generator
+from .stages import LOCK, Run, Stage, digest_cameras, digest_scene, digest_shape, stage_generator
 from .train import field_stage, training_device, training_views, with_extent, with_points
 
 REPORT = ("report.html", "preview.png", "codebook.png", "field.png")  # what `write_run_report` writes
@@ -51,7 +52,6 @@ def fit(
     folder: str | Path | None = None,
     split: str = "train",
     seed: int = 0,
-    device: str | torch.device = "auto",
     report: Callable[[str], None] | None = None,
     progress: Progress = False,
 ) -> SemanticField:
@@ -66,20 +66,20 @@ def fit(
             back to the old options is quick, because stages stay. None keeps nothing.
         split: the training views; "all" trains on all views.
         seed: every random choice follows from it.
-        device: where to train, see `training_device`; the other stages and the result stay on the CPU.
         report: receives one line per stage.
         progress: True shows bars; a function receives the history rows of every trained stage as they appear.
 
     Returns:
-        The field; its `info` says how it was made, with the seconds of each stage.
+        The field, on the CPU; its `info` says how it was made, with the seconds of each stage. Training takes place on the
+        GPU if there is one (`CUDA_VISIBLE_DEVICES=""` hides it).
 
     Raises:
         TypeError: if `maps` are neither maps nor a teacher, or `method` is neither.
-        ValueError: if the counts of views and maps differ, a camera has distortion, there is no such device, a map's file is
-            damaged, or another process works in the folder.
+        ValueError: if the counts of views and maps differ, a camera has distortion, a map's file is damaged, or another process
+            works in the folder.
         FileNotFoundError: if a picture is missing.
     """
-    method, progress, target = method or Uplift(), as_progress(progress), training_device(device)
+    method, progress = method or Uplift(), as_progress(progress)
     if not isinstance(method, Uplift | Paper):
         raise TypeError(f"method: expected Uplift() or Paper(), got {type(method).__name__}; pass one of them")
     views = training_views(scene, split)
@@ -89,11 +89,11 @@ def fit(
     with nullcontext(kept) if kept is not None else TemporaryDirectory(prefix="kfgs-") as place:
         run = Run(Path(place), report)
         maps = _open_maps(maps, scene, split, run.folder / "features", progress is True)
-        with run.locked():
+        with locked(run.folder, LOCK):
             if isinstance(method, Paper) or method.splat is None:  # else nothing is trained
                 scene = with_points(run, scene, views, seed, progress)
             seen = maps_of_views(scene, views, maps)
-            job = _Job(run, scene, views, seen, describe_maps(run, seen), seed, target, progress)
+            job = _Job(run, scene, views, seen, describe_maps(run, seen), seed, progress)
             field, about = _uplift(job, method) if isinstance(method, Uplift) else _paper(job, method)
             info = {
                 **about,
@@ -124,11 +124,10 @@ class _Job:
     run: Run
     scene: Scene
     views: list[int]
-    maps: Maps
+    maps: FeatureMaps
     features: dict[str, Any]
     """What decides the maps, as JSON."""
     seed: int
-    device: torch.device
     progress: Progress
 
     @property
@@ -136,12 +135,8 @@ class _Job:
         """The cameras of the views."""
         return [self.scene.cameras[i] for i in self.views]
 
-    def generator(self, stage: str) -> torch.Generator:
-        """The random numbers of a stage."""
-        return stage_generator(self.seed, stage)
 
-
-def _open_maps(maps: Any, scene: Scene, split: str, folder: Path, progress: bool) -> Maps:
+def _open_maps(maps: Any, scene: Scene, split: str, folder: Path, progress: bool) -> FeatureMaps:
     """The maps of a split's views; a teacher's go to the folder. What would fail only after the first stages is an error."""
     if hasattr(maps, "encode_image"):
         extract_features(maps, as_taken(scene), folder, split=split, overwrite=True, progress=progress)
@@ -179,7 +174,7 @@ def _uplift(job: _Job, method: Uplift) -> tuple[SemanticField, dict[str, Any]]:
             job.maps,
             options,
             latents=method.latents,
-            generator=job.generator("uplift"),
+            generator=stage_generator(job.seed, "uplift"),
             scratch=scratch,
             progress=job.progress is True,
         )
@@ -206,7 +201,7 @@ def _geometry(job: _Job, method: Uplift) -> tuple[Gaussians, dict[str, Any]]:
     if longer is not None:
         gaussians, steps = longer
     else:
-        options = method.color, job.seed, job.device, job.progress
+        options = method.color, job.seed, job.progress
         gaussians, steps = color_stage(job.run, job.scene, job.views, *options), method.color.training.steps
         if not (job.run.folder / "color.ply").exists():
             write_splats(gaussians, job.run.folder / "color.ply")
@@ -256,7 +251,7 @@ def _learn(
     """The stage of a codebook or an autoencoder: its file, named like the stage, and its history."""
 
     def make(folder: Path) -> None:
-        made = learn(generator=job.generator(name), progress=job.progress)
+        made = learn(generator=stage_generator(job.seed, name), progress=job.progress)
         made.save(folder / f"{name}.safetensors")
         assert made.report is not None
         note = getattr(made.report, "note", None)
@@ -273,9 +268,9 @@ def _train(job: _Job, method: Paper, targets: Sequence[Tensor], inputs: dict[str
     inputs |= {"scene": digest_scene(job.scene, job.views), "config": asdict(options), "seed": job.seed}
 
     def train(checkpoint: Path) -> FieldFit:
-        generator = job.generator("field")
+        generator = stage_generator(job.seed, "field")
         start = GaussianParams.from_points(job.scene.points, int(targets[0].shape[-1]), generator=generator)
-        start = start.map(lambda value: value.to(job.device))
+        start = start.map(lambda value: value.to(training_device()))
         progress = job.progress
         return fit_field(
             start, job.cameras, targets, options, generator=generator, progress=progress, checkpoint=checkpoint

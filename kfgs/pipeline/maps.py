@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,57 +15,18 @@ from .._files import digest_value
 from .._rows import EPS, row_norms
 from ..cameras import undistort
 from ..fields.checkpoint import digest_tensors
+from ..quant.sampling import FeatureMaps
 from ..scenes import Scene
 from ..scenes.files import has_alpha
 from ..scenes.scene import as_taken
 from .stages import Run, describe_lens
 
 
-class Maps(Protocol):
-    """Teacher maps, one per view, read at each access; an all-zero feature means "unknown". Their sizes may differ.
-
-    Six more members of a `FeatureFolder` are used if they exist: `identity`, JSON of the teacher; `digests()`, of each map if
-    known without reading the files; `shape`, (h, w, D) of the first map; `check_files()`, which raises before the work if a
-    map does not fit; `grid(i, step, samples)`, see `fit_codebook`; and `blocks(i)`, the map a few rows at a time.
-    """
-
-    @property
-    def files(self) -> Sequence[Path]:
-        """The file of each view."""
-        ...
-
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, i: int, /) -> Tensor:  # [h, w, D]
-        ...
-
-
-class MapsInMemory(Sequence[Tensor]):
-    """Maps that are tensors or arrays: they have no files, and their values are digested."""
-
-    files: Sequence[Path] = ()
-
-    def __init__(self, maps: Sequence[Any]) -> None:
-        self._maps = [as_tensor(f"maps[{i}]", value, floating=True) for i, value in enumerate(maps)]
-
-    def __len__(self) -> int:
-        return len(self._maps)
-
-    def __getitem__(self, i: int) -> Tensor:  # type: ignore[override]  # [h, w, D]
-        return self._maps[i]
-
-    def digests(self) -> list[list[str]]:
-        """A number and the SHA-256 of the values of each map."""
-        plain = (value.float() if value.dtype == torch.bfloat16 else value for value in self._maps)
-        return [[f"map {i}", digest_tensors(value)] for i, value in enumerate(plain)]
-
-
 class ViewMaps:
     """Maps of the views of a scene: without the lens, and all-zero outside the picture, where it is masked or transparent."""
 
-    def __init__(self, maps: Maps, views: Scene) -> None:
+    def __init__(self, maps: FeatureMaps, views: Scene) -> None:
         self.maps, self._taken, self._straighten = maps, as_taken(views), views.lenses is not None
-        self.files = maps.files
         self._kept: dict[tuple[int, tuple[int, int]], Tensor | None] = {}
 
     @property
@@ -105,7 +66,7 @@ class ViewMaps:
 class KnownFeatures(Sequence[Tensor]):
     """Raw maps as targets of a field: unknown pixels are NaN, which the loss ignores."""
 
-    def __init__(self, maps: Maps) -> None:
+    def __init__(self, maps: FeatureMaps) -> None:
         self.maps = maps
 
     def __len__(self) -> int:
@@ -116,11 +77,14 @@ class KnownFeatures(Sequence[Tensor]):
         return features.masked_fill(row_norms(features.float())[..., None] <= EPS, torch.nan)
 
 
-def as_maps(maps: Any) -> Maps:
-    """Maps as they are; a list of tensors or arrays, or one array of all maps, as `MapsInMemory`; else a TypeError."""
+def as_maps(maps: Any) -> FeatureMaps:
+    """Maps as they are, those of a list or of one array as tensors; a TypeError if they are something else.
+
+    Members of a `FeatureFolder` are used if they exist: `identity`, `files`, `shape`, `check_files()`, `grid` and `blocks`.
+    """
     if isinstance(maps, list | tuple) or (isinstance(maps, Tensor | np.ndarray) and maps.ndim == 4):
-        return MapsInMemory(maps)  # type: ignore[return-value, arg-type]
-    if not (hasattr(maps, "files") and hasattr(maps, "__getitem__")):
+        return [as_tensor(f"maps[{i}]", value, floating=True) for i, value in enumerate(maps)]
+    if not hasattr(maps, "__getitem__") or isinstance(maps, str | Mapping | Tensor | np.ndarray):
         raise TypeError(
             f"maps: expected teacher maps, got {type(maps).__name__}; read them with FeatureFolder(path).of(scene), or pass a "
             "list of tensors [h, w, D], or a teacher"
@@ -131,8 +95,8 @@ def as_maps(maps: Any) -> Maps:
 def maps_of_views(
     scene: Scene,  # as it is rendered
     views: Sequence[int],
-    maps: Maps,  # one per view, of the pictures on disk
-) -> Maps:
+    maps: FeatureMaps,  # one per view, of the pictures on disk
+) -> FeatureMaps:
     """Maps of some views' pictures as `ViewMaps`; unchanged if no view has a lens, a mask or transparent pixels."""
     assert len(maps) == len(views)
     chosen = scene.select(views)
@@ -146,17 +110,19 @@ def changing_files(scene: Scene, i: int) -> list[Path]:
     return [*([] if mask is None else [mask]), *([picture] if has_alpha(picture) else [])]
 
 
-def describe_maps(run: Run, maps: Maps) -> dict[str, Any]:
-    """What decides the maps, as JSON: their digests (of files only if the maps do not know them), and how they are changed."""
+def describe_maps(run: Run, maps: FeatureMaps) -> dict[str, Any]:
+    """What decides the maps, as JSON: digests of their files, or else of their values, and how they are changed."""
     plain = maps.maps if isinstance(maps, ViewMaps) else maps
-    known = plain.digests() if hasattr(plain, "digests") else None
+    if hasattr(plain, "files"):
+        digests = run.digests(plain.files)
+    else:
+        digests = [[f"map {i}", digest_tensors(plain[i].double())] for i in range(len(plain))]
     changes = maps.changes(run) if isinstance(maps, ViewMaps) else []
     changed = any(change is not None for change in changes)
-    files = run.digests(maps.files) if known is None else known
-    return {"files": files, "changes": digest_value(changes) if changed else None}
+    return {"files": digests, "changes": digest_value(changes) if changed else None}
 
 
-def map_shape(maps: Maps) -> tuple[int, int, int]:
+def map_shape(maps: FeatureMaps) -> tuple[int, int, int]:
     """(h, w, D) of the first map, without reading it if the maps know their shape."""
-    h, w, D = maps.shape if hasattr(maps, "shape") else maps[0].shape
+    h, w, D = getattr(maps, "shape", None) or maps[0].shape
     return int(h), int(w), int(D)

@@ -25,15 +25,10 @@ class Uplift:
     uplift: UpliftConfig = field(default_factory=UpliftConfig.field)
     """How to average. `UpliftConfig()` keeps every Gaussian of the splat."""
     color: ColorConfig = field(default_factory=ColorConfig.geometry)
-    """How to train Gaussians if there is no splat. If `fit_color` trained for longer in the same run folder, its
-    Gaussians are used instead."""
+    """How to train Gaussians if there is no splat; `ColorConfig()` is the published schedule. If `fit_color` trained for longer
+    in the same run folder, its Gaussians are used instead."""
     latents: LinearLatents | None = None
     """Latents of other fields (`fields.sample_latents`), which this one shall share; None: its own."""
-
-    @staticmethod
-    def paper() -> Uplift:
-        """Gaussians are trained with the published schedule of 3DGS: 30,000 steps at full size."""
-        return Uplift(color=ColorConfig.paper())
 
     def options(self) -> dict[str, Any]:
         """The options as JSON, without the Gaussians and latents."""

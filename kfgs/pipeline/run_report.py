@@ -5,19 +5,17 @@ from __future__ import annotations
 import base64
 import html
 import json
-from collections.abc import Iterable
 from pathlib import Path
 
 import torch
 
-from .._files import as_path, atomic_path
+from .._files import as_path, atomic_path, read_json
 from ..fields import SemanticField
 from ..fields.store import NAME
 from ..scenes import Scene
 from ..viz import FeatureColors, overlay_labels, plot_history
 from ..viz.pictures import as_bytes, picture_grid, resize_photo, save_picture
 from .methods import Paper, Uplift
-from .stages import read_stage
 
 WIDTH = 400  # pixels of a picture
 STYLE = """
@@ -64,10 +62,10 @@ def write_run_report(
     """
     folder, info = as_path(folder), field.info
     written = [folder / "preview.png"] if write_preview(folder / "preview.png", field, scene, split) else []
-    for stage in (read_stage(folder / "stages" / name) for name in info["stages"]):
-        if stage.name in ("codebook", "field"):
-            written.append(folder / f"{stage.name}.png")
-            plot_history(stage.history, written[-1])
+    for stage in info["stages"]:
+        if (name := stage.rpartition("-")[0]) in ("codebook", "field"):
+            written.append(folder / f"{name}.png")
+            plot_history(read_json(folder / "stages" / stage / "history.json"), written[-1])
     facts = {
         "scene": f"{scene.folder or 'in memory'}: {len(scene)} views, {len(info['views'])} of them used",
         "teacher": (info.get("teacher") or {}).get("name", "not known"),
@@ -81,17 +79,21 @@ def write_run_report(
         "seed": info["seed"],
         "kfgs, torch": f"{info['kfgs']}, {torch.__version__}",
     }
-    seconds = info["seconds"] | {"all": sum(info["seconds"].values())}
+    seconds = info["seconds"] | {"all stages": sum(info["seconds"].values())}
+    facts |= {name: f"{value:,.0f} s" for name, value in seconds.items()}
     title = html.escape(folder.absolute().name)
     repeat = command or f"kfgs.fit(scene, maps, method, folder={str(folder)!r})"
     options = html.escape(json.dumps(method.options(), indent=1))
+    pictures = {file.stem: base64.b64encode(file.read_bytes()).decode("ascii") for file in written}
+    cells = (
+        f"<tr><td>{html.escape(name)}</td><td>{html.escape(str(value))}</td></tr>" for name, value in facts.items()
+    )
     parts = [
         f"<h1>kfgs: {title}</h1>",
-        *(_image(file) for file in written),
-        f"<h2>What was fitted</h2>\n{_table(facts.items())}",
-        "<h2>Time of each stage</h2>",
-        _table((name, f"{value:,.0f} s") for name, value in seconds.items()),
-        f"<h2>How to repeat it</h2>\n<pre>{html.escape(repeat)}</pre>",
+        *(f'<h2>{name}</h2>\n<img alt="{name}" src="data:image/png;base64,{data}">' for name, data in pictures.items()),
+        "<h2>What was fitted, and the time of each stage</h2>\n<table>",
+        *cells,
+        f"</table>\n<h2>How to repeat it</h2>\n<pre>{html.escape(repeat)}</pre>",
         f"<details><summary>All options</summary><pre>{options}</pre></details>",
     ]
     head = f'<meta charset="utf-8"><title>kfgs: {title}</title><style>{STYLE}</style>'
@@ -99,13 +101,3 @@ def write_run_report(
     with atomic_path(folder / "report.html") as temporary:
         temporary.write_text(page, encoding="utf-8")
     return [*written, folder / "report.html"]
-
-
-def _table(rows: Iterable[tuple[str, object]]) -> str:
-    cells = (f"<tr><td>{html.escape(name)}</td><td>{html.escape(str(value))}</td></tr>" for name, value in rows)
-    return "<table>\n" + "\n".join(cells) + "\n</table>"
-
-
-def _image(file: Path) -> str:
-    data = base64.b64encode(file.read_bytes()).decode("ascii")
-    return f'<h2>{file.stem}</h2>\n<img alt="{file.stem}" src="data:image/png;base64,{data}">'

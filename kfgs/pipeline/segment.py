@@ -13,7 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._check import check_range
-from .._files import Names, as_path, atomic_path, check_output, file_stem
+from .._files import Names, as_path, atomic_path, check_output, file_stem, read_json
 from ..cameras import Camera
 from ..cameras.resample import resize_labels
 from ..evaluation import evaluate_segmentation
@@ -160,6 +160,16 @@ def write_coco(
         for name in labels:
             save_picture(folder / "images" / f"{name}.png", picture(name))
     save_coco(folder / "annotations.json", {f"{name}.png": value for name, value in labels.items()}, names)
+    return folder
+
+
+def scored_labels(scene: Path, classes: LabelSet, say: Callable[[str], None]) -> Path | None:
+    """The folder of a scene's label pictures; None if there is none, or, with a note, if they count other classes."""
+    folder = next((scene / name for name in ("labels_scored", "labels") if (scene / name).is_dir()), None)
+    listed = scene / "classes.json"
+    if folder is not None and listed.is_file() and tuple(read_json(listed)) != classes.names:
+        say(f"note: not scored: {folder} counts the classes of {listed}, which are others")
+        return None
     return folder
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,8 +18,7 @@ import torch
 from torch import Tensor
 
 from .._arrays import reading
-from .._compiling import say_compiling
-from .._files import atomic_folder, digest_file, digest_value, locked, read_json, real_path, write_json
+from .._files import atomic_folder, digest_file, digest_value, read_json, real_path, write_json
 from .._origin import Origin
 from ..cameras import Camera
 from ..fields.checkpoint import digest_tensors
@@ -45,12 +43,6 @@ class Stage:
     def key(self) -> str:
         """What later stages that depend on it have among their inputs."""
         return self.folder.name.rpartition("-")[2]
-
-    @property
-    def history(self) -> list[dict[str, Any]]:
-        """The history rows of its training; empty if it has none."""
-        path = self.folder / "history.json"
-        return list(read_json(path)) if path.is_file() else []
 
 
 @dataclass
@@ -80,7 +72,7 @@ class Run:
         if not finished:
             self.say(f"{name}: working")
             start = time.perf_counter()
-            with atomic_folder(target) as folder, say_compiling(self.say):
+            with atomic_folder(target) as folder:
                 earlier = make(folder) or 0.0
                 seconds = time.perf_counter() - start + earlier
                 write_json(folder / STAGE_FILE, {"name": name, "inputs": inputs, "seconds": seconds})
@@ -101,10 +93,6 @@ class Run:
     def _place(self, kind: str, name: str, inputs: dict[str, Any]) -> Path:
         key = digest_value({"name": name, "inputs": inputs, "version": STAGE_VERSION})[:12]
         return self.folder / kind / f"{name}-{key}"
-
-    def locked(self) -> AbstractContextManager[None]:
-        """Keep other processes from working in the folder; a ValueError if one works there already."""
-        return locked(self.folder, LOCK)
 
     def digests(self, paths: Sequence[Path]) -> list[list[str]]:
         """[file name, SHA-256] of each file; files of unchanged size and times are not read again."""

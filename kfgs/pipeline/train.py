@@ -10,11 +10,10 @@ from typing import Any
 
 import torch
 
-from .._arrays import read_safetensors
+from .._arrays import read_safetensors, save_tensors
 from .._check import ORIGIN, as_origin
 from .._files import write_json
 from .._progress import Progress
-from .._tensors import save_tensors
 from ..cameras.projection import project_points
 from ..fields import GaussianParams, Training
 from ..fields.train import FieldFit
@@ -29,17 +28,9 @@ FEW_POINTS = 100
 a field that is 9 dB worse than one from triangulated points, since Gaussians as large as the scene must be split first."""
 
 
-def training_device(device: str | torch.device = "auto") -> torch.device:
-    """The device of a name: `cpu`, `cuda`, `cuda:1`; `auto` takes CUDA if an engine runs on it, else the CPU."""
-    if device == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() and available_engines("cuda") else "cpu")
-    kind, _, index = str(device).partition(":")
-    if kind == "cpu" or (kind == "cuda" and int(index or 0) < torch.cuda.device_count()):
-        return torch.device(device)
-    raise ValueError(
-        f"device: expected auto, cpu or a GPU that torch sees ({torch.cuda.device_count()} are there), got {device!r}; "
-        "use cpu, or install a torch for CUDA"
-    )
+def training_device() -> torch.device:
+    """CUDA if an engine runs on it, else the CPU. The variable CUDA_VISIBLE_DEVICES chooses a GPU, or with "" none."""
+    return torch.device("cuda" if torch.cuda.is_available() and available_engines("cuda") else "cpu")
 
 
 def training_views(scene: Scene, split: str) -> list[int]:

@@ -9,9 +9,8 @@ from typing import Any, Self
 
 from torch import Tensor
 
-from .._arrays import read_safetensors, reading
+from .._arrays import read_safetensors, reading, save_tensors
 from .._files import atomic_path
-from .._tensors import save_tensors
 
 VERSION = "1"  # of all these files
 

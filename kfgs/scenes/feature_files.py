@@ -36,13 +36,8 @@ def open_map(
     """Map a file into memory without reading its values.
 
     Feature 3DGS writes [D, h, w], kfgs [h, w, D]. In other files a known number of channels decides, then the aspect of the
-    picture; if both orders fit, or nothing is known, it is [h, w, D].
-
-    Args:
-        file: the map.
-        channels: D, if it is known.
-        size: of the view's picture, if it is known.
-        own: kfgs wrote the map.
+    picture; if both fit, [h, w, D]. If nothing is known, a first axis of twice the others' size is D. `size` is that
+    of the view's picture; `own` says that kfgs wrote the map.
     """
     if file.name.endswith(OWN):
         values: Any = read_array(file, "a feature map", AGAIN)
@@ -70,8 +65,10 @@ def open_map(
         turned = False
     elif channels in (first, last) and first != last:
         turned = first == channels
+    elif size is None:
+        turned = channels is None and first >= 2 * max(middle, last)
     else:
-        turned = size is not None and not fits_aspect((first, middle), size) and fits_aspect((middle, last), size)
+        turned = not fits_aspect((first, middle), size) and fits_aspect((middle, last), size)
     if not turned:
         return values
     return values.permute(1, 2, 0) if isinstance(values, Tensor) else values.transpose(1, 2, 0)

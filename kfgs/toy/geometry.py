@@ -145,7 +145,8 @@ def visible(
 ) -> NDArray[np.bool_]:  # [N, 3], [N, 3] -> [N]
     """Which surface points (with their normals) a camera sees: inside the image, facing it, nothing in between."""
     xy, z = project(camera, points)
-    origin, _ = pixel_rays(camera.resized(1, 1))
+    E = camera.viewmat.double().numpy()
+    origin = -E[:3, :3].T @ E[:3, 3]
     inside = (z > NEAR) & (xy >= 0).all(-1) & (xy < [camera.width, camera.height]).all(-1)
     rows = np.flatnonzero(inside & (((origin - points) * outward).sum(-1) > 0))
     seen = np.zeros(len(points), bool)

@@ -43,12 +43,6 @@ SHELL = ("wall", "floor", "ceiling")
 FLAT = (*SHELL, "rug", "picture", "door")  # too thin, or too large, to cast a shadow that is seen
 
 
-def _reaching(points: Array, solid: Solid, reach: float) -> NDArray[np.int64]:
-    """The rows of the points within `reach` of the solid's bounding ball."""
-    away = points - np.array(solid.center)
-    return np.flatnonzero(_dot(away, away) < (float(np.linalg.norm(solid.half)) + reach) ** 2)
-
-
 def _to_surface(solid: Solid, local: Array) -> tuple[Array, Array]:  # [N, 3] -> [N], [N, 3]
     """Distance to the solid (0 inside) and the direction towards it, in its axes."""
     half = np.array(solid.half)
@@ -75,8 +69,8 @@ def openness(
     for i, solid in enumerate(solids):
         if solid.label in FLAT:
             continue
-        rows = _reaching(points, solid, 3 * NEAR)
-        rows = rows[which[rows] != i]
+        away, reach = points - np.array(solid.center), float(np.linalg.norm(solid.half)) + 3 * NEAR
+        rows = np.flatnonzero((_dot(away, away) < reach**2) & (which != i))
         distance, way = _to_surface(solid, solid.to_local(points[rows]))
         facing = 0.5 + 0.5 * _dot(way, outward[rows] @ solid.rotation())
         left[rows] *= 1.0 - 0.75 * facing * np.exp(-distance / NEAR)

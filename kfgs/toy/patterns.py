@@ -83,7 +83,7 @@ class Spots(NamedTuple):
 
 
 def _ramp(colors: tuple[tuple[float, float, float], ...], value: Array) -> Array:  # [N] in [0, 1] -> [N, 3]
-    """Piecewise linear colours over [0, 1]."""
+    """Piecewise linear colours over [0, 1]; the first and the last beyond."""
     stops = np.linspace(0.0, 1.0, len(colors))
     return np.stack([np.interp(value, stops, [c[i] for c in colors]) for i in range(3)], axis=-1)
 
@@ -99,7 +99,7 @@ def _mix(below: Array, above: Array | tuple[float, ...], share: Array) -> Array:
 
 def _plaster(texture: Texture, noise: Noise, spots: Spots) -> Array:
     cloud = noise.fractal(spots.place, 0.9, spots.footprint, octaves=2)
-    return _ramp(texture.colors[:2], np.clip(0.5 + 0.4 * cloud, 0.0, 1.0))
+    return _ramp(texture.colors[:2], 0.5 + 0.4 * cloud)
 
 
 def _sprigs(texture: Texture, noise: Noise, spots: Spots) -> Array:
@@ -129,7 +129,7 @@ def _threads(texture: Texture, noise: Noise, spots: Spots, wavelength: float) ->
 
 
 def _weave(texture: Texture, noise: Noise, spots: Spots) -> Array:
-    return _ramp(texture.colors, np.clip(0.5 + 0.3 * _threads(texture, noise, spots, texture.scale), 0.0, 1.0))
+    return _ramp(texture.colors, 0.5 + 0.3 * _threads(texture, noise, spots, texture.scale))
 
 
 def _stripes(texture: Texture, noise: Noise, spots: Spots) -> Array:
@@ -151,7 +151,7 @@ def _fibre_tone(texture: Texture, noise: Noise, spots: Spots) -> Array:  # [N] i
 
 
 def _wood(texture: Texture, noise: Noise, spots: Spots) -> Array:
-    return _ramp(texture.colors, np.clip(_fibre_tone(texture, noise, spots), 0.0, 1.0))
+    return _ramp(texture.colors, _fibre_tone(texture, noise, spots))
 
 
 def _planks(texture: Texture, noise: Noise, spots: Spots) -> Array:
@@ -160,7 +160,7 @@ def _planks(texture: Texture, noise: Noise, spots: Spots) -> Array:
     row = np.floor(v / s).astype(np.int64)
     along = u / (9.0 * s) + hashed(row[:, None], texture.seed)
     tone = hashed(np.stack([row, np.floor(along).astype(np.int64)], -1), texture.seed)
-    color = _ramp(texture.colors, np.clip(0.1 + 0.65 * tone + 0.25 * spots.grain, 0.0, 1.0))
+    color = _ramp(texture.colors, 0.1 + 0.65 * tone + 0.25 * spots.grain)
     joint = np.maximum(
         _cover((v / s - np.round(v / s)) * s, 0.003, spots.footprint),
         _cover((along - np.round(along)) * 9.0 * s, 0.002, spots.footprint),
@@ -170,8 +170,7 @@ def _planks(texture: Texture, noise: Noise, spots: Spots) -> Array:
 
 def _panel(texture: Texture, noise: Noise, spots: Spots) -> Array:
     """A door or a drawer's front: a frame around a sunken panel, and a knob of the last colour."""
-    tone = np.clip(_fibre_tone(texture, noise, spots), 0.0, 1.0)
-    color = _ramp(texture.colors[:-1], tone)
+    color = _ramp(texture.colors[:-1], _fibre_tone(texture, noise, spots))
     inset = (spots.edge - np.abs(spots.plane)).min(-1)  # metres from the nearest edge of the face
     broad = spots.edge.min(-1) > 0.15  # the narrow sides have no panel
     color = color * (1.0 - broad * 0.4 * _cover(inset - texture.scale, 0.006, spots.footprint))[:, None]
@@ -182,7 +181,7 @@ def _panel(texture: Texture, noise: Noise, spots: Spots) -> Array:
 
 def _books(texture: Texture, noise: Noise, spots: Spots) -> Array:
     """A bookcase: wood, and on the front a shelf of books whose spines have the later colours."""
-    color = _ramp(texture.colors[:2], np.clip(_fibre_tone(texture, noise, spots), 0.0, 1.0))
+    color = _ramp(texture.colors[:2], _fibre_tone(texture, noise, spots))
     inset = (spots.edge - np.abs(spots.plane)).min(-1)
     front = (spots.axis == 0) * np.clip((inset - 0.025) / spots.footprint + 0.5, 0.0, 1.0)
     u, v = spots.plane.T
@@ -206,7 +205,7 @@ def _rug(texture: Texture, noise: Noise, spots: Spots) -> Array:
     pile = noise.fractal(spots.place, 0.09, spots.footprint, octaves=3)
     u, v = (spots.plane + 0.006 * pile[:, None]).T
     s = texture.scale
-    color = _ramp(texture.colors[:2], np.clip(0.5 + 0.35 * _threads(texture, noise, spots, 0.06), 0.0, 1.0))
+    color = _ramp(texture.colors[:2], 0.5 + 0.35 * _threads(texture, noise, spots, 0.06))
     one, two = u / s + 0.62 * v / s, u / s - 0.62 * v / s
     cell = np.stack([np.floor(one).astype(np.int64), np.floor(two).astype(np.int64)], -1)
     lines = np.maximum(*(_cover((k - np.round(k)) * s * 0.85, 0.011, spots.footprint) for k in (one, two)))
@@ -237,7 +236,7 @@ def _leaves(texture: Texture, noise: Noise, spots: Spots) -> Array:
         tone = np.where(closer, hashed(other, texture.seed + 3), tone)
         nearest = np.minimum(nearest, distance)
     body = np.clip((second - nearest) / 0.45, 0.0, 1.0)
-    return _ramp(texture.colors, np.clip(body * (0.45 + 0.55 * tone), 0.0, 1.0))
+    return _ramp(texture.colors, body * (0.45 + 0.55 * tone))
 
 
 def _framed(inside: Callable[[Texture, Noise, Spots], Array]) -> Callable[[Texture, Noise, Spots], Array]:

@@ -27,35 +27,16 @@ class View(NamedTuple):
     labels: NDArray[np.uint8]  # [H, W] class index
 
 
-def _look_at(position: Array, target: Array, roll: float) -> Array:  # [4, 4] world to camera
-    """The pose (x right, y down, z forward) at `position` looking at `target`; z is up in the world, roll in radians."""
-    forward = (target - position) / np.linalg.norm(target - position)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    down = np.cross(forward, right)
-    c, s = np.cos(roll), np.sin(roll)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = np.stack([c * right + s * down, c * down - s * right, forward])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ position
-    return viewmat
-
-
-def intrinsics(height: int, width: int) -> Array:  # [3, 3]
-    """The toy camera's K: 71 degrees wide, fx != fy, principal point off the centre by (+3.5, -2.5) / 256 widths.
-
-    This is deliberate: code that assumes a centred principal point or square pixels fails visibly on this scene.
-    """
-    unit = width / 256.0
-    fx = 180.0 * unit
-    return np.array([[fx, 0, width / 2 + 3.5 * unit], [0, 1.02 * fx, height / 2 - 2.5 * unit], [0, 0, 1.0]])
-
-
 def walk_cameras(train_views: int, test_views: int, size: tuple[int, int]) -> tuple[list[Camera], list[bool]]:
     """Cameras in the order of the walk, named `view_000.png` and so on, and which of them are for testing.
 
     Training cameras divide the walk evenly; each test camera stands half-way between two of them. The walk goes around
-    the room twice, first high and looking up, then low and looking down, so that most surfaces are seen often.
+    the room twice, first high and looking up, then low and looking down, so that most surfaces are seen often. Pictures are
+    71 degrees wide; fx != fy, and the principal point is off the centre, so that code that assumes otherwise fails visibly.
     """
+    height, width = size
+    unit, fx = width / 256.0, 180.0 * (width / 256.0)
+    K = [[fx, 0, width / 2 + 3.5 * unit], [0, 1.02 * fx, height / 2 - 2.5 * unit], [0, 0, 1]]
     steps = [(i / train_views, False) for i in range(train_views)]
     steps += [((j * train_views // test_views + 0.5) / train_views, True) for j in range(test_views)]
     cameras = []
@@ -63,12 +44,19 @@ def walk_cameras(train_views: int, test_views: int, size: tuple[int, int]) -> tu
         a = 4 * np.pi * turn
         lift = np.sin(a / 2)  # above 0 in the first round, below in the second
         position = np.array([2.15 * np.cos(a), 1.75 * np.sin(a), 1.5 + 0.2 * np.sin(3 * a + 0.5) + 0.25 * lift])
-        height = 1.0 + 0.3 * np.sin(2 * a + 0.4) + 0.95 * lift
-        target = np.array([0.55 * np.cos(2 * a + 1.0), 0.45 * np.sin(3 * a), height])
-        viewmat = _look_at(position, target - 0.35 * position * [1, 1, 0], 0.05 * float(np.sin(5 * a)))
+        aim = 1.0 + 0.3 * np.sin(2 * a + 0.4) + 0.95 * lift  # its height
+        target = np.array([0.55 * np.cos(2 * a + 1.0), 0.45 * np.sin(3 * a), aim])
+        ahead = target - 0.35 * position * [1, 1, 0] - position
+        forward, roll = ahead / np.linalg.norm(ahead), 0.05 * float(np.sin(5 * a))
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        down = np.cross(forward, right)
+        c, s = np.cos(roll), np.sin(roll)
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = np.stack([c * right + s * down, c * down - s * right, forward])
+        viewmat[:3, 3] = -viewmat[:3, :3] @ position
         name = f"view_{number:03d}.png"
-        K = torch.from_numpy(intrinsics(*size))
-        cameras.append(Camera(torch.from_numpy(viewmat), K, width=size[1], height=size[0], name=name))
+        cameras.append(Camera(torch.from_numpy(viewmat), torch.tensor(K, dtype=torch.float64), width, height, name))
     return cameras, [test for _, test in sorted(steps)]
 
 
@@ -76,6 +64,7 @@ def surface_color(
     solids: Sequence[Solid],
     noise: Noise,
     points: Array,  # [N, 3]
+    outward: Array,  # [N, 3] unit normals
     which: NDArray[np.int64],  # [N]
     footprint: Array,  # [N] metres a pixel covers
     lit: Array,  # [N, L + 1] from `light_reaches`
@@ -84,8 +73,7 @@ def surface_color(
     color = np.zeros((len(points), 3))
     for i in np.unique(which):
         rows = np.flatnonzero(which == i)
-        solid, p = solids[i], points[rows]
-        n = normals(solid, p)
+        solid, p, n = solids[i], points[rows], outward[rows]
         axis = np.argmax(np.abs(n @ solid.rotation()), axis=-1)
         is_round = solid.shape == "ellipsoid"
         own = evaluate(
@@ -97,14 +85,18 @@ def surface_color(
 
 
 def light_reaches(
-    solids: Sequence[Solid], points: Array, which: NDArray[np.int64]
-) -> Array:  # [N, 3], [N] -> [N, L + 1]
+    solids: Sequence[Solid], points: Array, outward: Array, which: NDArray[np.int64]
+) -> Array:  # [N, 3], [N, 3], [N] -> [N, L + 1]
     """The share of each lamp that each point sees, and how open its surroundings are."""
+    opened = openness(solids, points, outward, which)
+    return np.column_stack([lamps_seen(solids, points, outward, which), opened])
+
+
+def _normals(solids: Sequence[Solid], points: Array, which: NDArray[np.int64]) -> Array:  # [N, 3], [N] -> [N, 3]
     outward = np.zeros_like(points)
     for i in np.unique(which):
         outward[which == i] = normals(solids[i], points[which == i])
-    opened = openness(solids, points, outward, which)
-    return np.column_stack([lamps_seen(solids, points, outward, which), opened])
+    return outward
 
 
 def render(solids: Sequence[Solid], noise: Noise, camera: Camera) -> View:
@@ -112,18 +104,15 @@ def render(solids: Sequence[Solid], noise: Noise, camera: Camera) -> View:
     depth, index = cast(solids, camera)
     assert np.isfinite(depth).all(), "the room is closed"
     origin, rays = pixel_rays(camera)
-    lit = light_reaches(solids, (origin + rays * depth[..., None]).reshape(-1, 3), index.ravel())
-    lit = lit.reshape(*camera.size, -1)
-    lit = lit.repeat(_SPLIT, axis=0).repeat(_SPLIT, axis=1)
+    points, which = (origin + rays * depth[..., None]).reshape(-1, 3), index.ravel()
+    shares = light_reaches(solids, points, _normals(solids, points, which), which)
+    lit = shares.reshape(*camera.size, -1).repeat(_SPLIT, axis=0).repeat(_SPLIT, axis=1).reshape(-1, shares.shape[-1])
 
     fine = camera.resized(camera.height * _SPLIT, camera.width * _SPLIT)
     fine_depth, fine_index = cast(solids, fine)
-    _, fine_rays = pixel_rays(fine)
-    points = origin + fine_rays * fine_depth[..., None]
-    footprint = fine_depth / float(camera.K[0, 0])
-    color = surface_color(
-        solids, noise, points.reshape(-1, 3), fine_index.ravel(), footprint.ravel(), lit.reshape(-1, lit.shape[-1])
-    )
+    points, which = (origin + pixel_rays(fine)[1] * fine_depth[..., None]).reshape(-1, 3), fine_index.ravel()
+    footprint = (fine_depth / float(camera.K[0, 0])).ravel()
+    color = surface_color(solids, noise, points, _normals(solids, points, which), which, footprint, lit)
     color = color.reshape(camera.height, _SPLIT, camera.width, _SPLIT, 3).mean((1, 3))
     classes = np.array([CLASSES.index(solid.label) for solid in solids], np.uint8)
     return View(np.round(color * 255).astype(np.uint8), depth, classes[index])

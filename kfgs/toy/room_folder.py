@@ -23,7 +23,7 @@ from ..cameras.camera import Camera
 from ..scenes.pycolmap_import import import_pycolmap
 from .geometry import Array, Solid, normals, project, sample_surface, visible
 from .patterns import Noise
-from .render import View, light_reaches, render, surface_color, walk_cameras
+from .render import light_reaches, render, surface_color, walk_cameras
 from .room import CLASSES, build_room
 from .teacher import class_embeddings, teacher_features
 
@@ -94,6 +94,8 @@ def make_toy_room(
     Raises:
         FileExistsError: if `path` holds anything else.
     """
+    from skimage.io import imsave
+
     path, config = as_path(path), config or ToyConfig()
     about = {"version": VERSION, "config": json.loads(json.dumps(asdict(config)))}
     if embeddings_of is not None:
@@ -114,10 +116,15 @@ def make_toy_room(
         for name in ("images", "labels", "depth", "features"):
             (folder / name).mkdir()
         embeddings = class_embeddings(config.feature_dim, config.seed if embeddings_of is None else embeddings_of)
-        for camera in tqdm(cameras, desc="toy room", disable=not progress):
-            view = render(solids, noise, camera)
-            _write_view(folder, Path(camera.name).stem, view, embeddings, config)
         stems = [Path(camera.name).stem for camera in cameras]
+        for stem, camera in zip(stems, tqdm(cameras, desc="toy room", disable=not progress), strict=True):
+            view = render(solids, noise, camera)
+            imsave(folder / "images" / f"{stem}.png", view.image, check_contrast=False)
+            imsave(folder / "labels" / f"{stem}.png", view.labels, check_contrast=False)
+            np.save(folder / "depth" / f"{stem}.npy", view.depth.astype(np.float32))
+            rng = np.random.default_rng([config.seed, 4, zlib.crc32(stem.encode())])  # errors follow from seed and name
+            features = teacher_features(view.labels, view.image, embeddings, config.feature_size, rng)
+            torch.save(torch.from_numpy(features), folder / "features" / f"{stem}_fmap_CxHxW.pt")
         split = {
             "train": [stem for stem, test in zip(stems, testing, strict=True) if not test],
             "test": [stem for stem, test in zip(stems, testing, strict=True) if test],
@@ -128,18 +135,6 @@ def make_toy_room(
         _write_geometry(folder, solids, noise, cameras, np.array(testing), config)
         write_json(folder / "toy.json", about)
     return path
-
-
-def _write_view(folder: Path, stem: str, view: View, embeddings: NDArray[np.float32], config: ToyConfig) -> None:
-    """Image, labels, depth and features of one view; their errors depend only on the seed and the name."""
-    from skimage.io import imsave
-
-    imsave(folder / "images" / f"{stem}.png", view.image, check_contrast=False)
-    imsave(folder / "labels" / f"{stem}.png", view.labels, check_contrast=False)
-    np.save(folder / "depth" / f"{stem}.npy", view.depth.astype(np.float32))
-    rng = np.random.default_rng([config.seed, 4, zlib.crc32(stem.encode())])
-    features = teacher_features(view.labels, view.image, embeddings, config.feature_size, rng)
-    torch.save(torch.from_numpy(features), folder / "features" / f"{stem}_fmap_CxHxW.pt")
 
 
 def _visible_surface(
@@ -186,7 +181,8 @@ def _write_geometry(
     chance = np.minimum(seen.sum(-1), 8.0) + 1e-3  # SfM finds what many views share
     rows = rng.choice(len(points), config.sparse_points, replace=False, p=chance / chance.sum())
     near, sides, owner = points[rows], outward[rows], which[rows]
-    color = surface_color(solids, noise, near, owner, np.full(len(rows), 0.01), light_reaches(solids, near, owner))
+    lit = light_reaches(solids, near, sides, owner)
+    color = surface_color(solids, noise, near, sides, owner, np.full(len(rows), 0.01), lit)
     observed = np.stack([visible(solids, camera, near, sides) for camera in cameras], axis=-1)
     placed = near + POINT_NOISE * rng.standard_normal(near.shape)
     outliers = max(1, len(rows) // 200)

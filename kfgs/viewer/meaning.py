@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .._names import class_index, class_indices
+from .._check import class_indices
 from ..cameras import Camera
 from ..fields import Linear, SemanticField, fuse_views
 from ..gaussians import Gaussians
@@ -77,7 +77,7 @@ class FieldMeaning:
         words = words if words in self.names else words.strip()
         known = self._classes.knows(words)
         if known:
-            words = self.names[class_index(words, self.names)]
+            words = self.names[self._classes.index(words)]
         if words not in self._answers:
             target = words if known else self._phrase(words)
             selection = self.field.query(target, self._classes)

@@ -17,7 +17,8 @@ from .palette import UNLABELLED, palette
 from .pictures import as_bytes
 
 Array = np.ndarray[Any, Any]
-ColorBy = Literal["label", "rgb", "view", "opacity", "feature"]
+CloudColor = Literal["label", "rgb", "feature", "opacity"]
+ColorBy = CloudColor | Literal["view"]
 COLORMAP = "cividis"  # brightness rises evenly; looks the same to colour-blind eyes
 
 
@@ -102,7 +103,7 @@ def cloud_colors(
     if color_by is None:
         color_by = color_by_default(gaussians)
     if isinstance(color_by, str):
-        check_choice("color_by", color_by, get_args(ColorBy))
+        check_choice("color_by", color_by, ("view", *get_args(CloudColor)))
         return _named(gaussians, color_by, feature_colors, clim)
     values = as_array(color_by, "color_by")
     if values.ndim == 2:
@@ -118,7 +119,7 @@ def cloud_colors(
     return CloudColors(palette(values), "label", values.astype(np.int64), None)
 
 
-def color_by_default(gaussians: Gaussians) -> Literal["label", "rgb", "feature", "opacity"]:
+def color_by_default(gaussians: Gaussians) -> CloudColor:
     """The default of `color_by`: classes, else colours, else features, else opacity."""
     if gaussians.labels is not None:
         return "label"

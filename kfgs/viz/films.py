@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -23,11 +23,10 @@ from ..gaussians import Gaussians, check_gaussians
 from ..labels.color import parse_color
 from ..scenes import Scene
 from ..splat import rasterize
-from .colors import Array, FeatureColors, cloud_colors, color_by_default
+from .colors import Array, CloudColor, FeatureColors, cloud_colors, color_by_default
 from .pictures import as_bytes, check_suffix, legend_strip, picture_grid, resize_photo
 
 Show = Callable[[Camera], Any]
-ColorBy = Literal["label", "rgb", "feature", "opacity"]
 SUFFIXES = (".gif", ".mp4")
 OUTLINE = (213, 94, 0)  # vermilion of Okabe and Ito
 FADED = 0.7  # share of white in what is not selected
@@ -36,7 +35,7 @@ FADED = 0.7  # share of white in what is not selected
 def show_cloud(
     gaussians: Gaussians,
     *,
-    color_by: ColorBy | None = None,
+    color_by: CloudColor | None = None,
     feature_colors: FeatureColors | None = None,
     background: str | Sequence[float] = "white",
     names: Sequence[str] | None = None,
@@ -50,7 +49,7 @@ def show_cloud(
     """
     check_gaussians(gaussians)
     color_by = color_by or color_by_default(gaussians)
-    check_choice("color_by", color_by, ("label", "rgb", "feature", "opacity"))
+    check_choice("color_by", color_by, get_args(CloudColor))
     if len(gaussians) == 0:
         raise ValueError("gaussians: expected at least one Gaussian to draw, got none; widen the selection")
     painted = gaussians.detach().replace(features=None)

@@ -67,11 +67,6 @@ def trouble() -> str:
     return f"the trial picture failed with exit status {result.returncode} ({last})"
 
 
-def available() -> bool:
-    """Whether 3-D pictures can be drawn here. The first call takes a second or two, later ones nothing."""
-    return not trouble()
-
-
 def require() -> None:
     """Raise a RuntimeError if nothing can be drawn here; VTK would crash."""
     if trouble():

@@ -18,7 +18,6 @@ from small_batch import OPTIONS, make_rooms, one_process, results
 from kfgs._files import read_json
 from kfgs.batch import BatchOptions, open_client, run_batch
 from kfgs.batch.run import describe_batch
-from kfgs.batch.scene_list import SceneEntry
 from kfgs.cli import main
 from kfgs.scenes import SceneError, load_scene
 from kfgs.scenes.sfm import SfmReport
@@ -64,7 +63,7 @@ def test_killed_workers_change_no_byte_and_a_second_batch_does_nothing(rooms, al
     runs, killed, said = rooms[0].parent / "runs", [], []
     (tmp_path / "broken").mkdir()
     deadly = dataclasses.replace(OPTIONS, teacher_options={"deadly": str(tmp_path)})
-    scenes = [tmp_path / "broken", *rooms]
+    scenes = {folder.name: folder for folder in (tmp_path / "broken", *rooms)}
     killer = threading.Thread(target=kill_fit, args=(client, runs / "room1", killed))
     killer.start()
     first = run_batch(scenes, runs, deadly, client=client, report=said.append)
@@ -93,22 +92,22 @@ def test_a_failed_scene_is_tried_again_and_others_are_not_touched(rooms, tmp_pat
     photo = scene.image_paths[scene.views("train")[0]]
     good = photo.read_bytes()
     photo.write_bytes(b"damaged")
-    first = run_batch([room], runs, dataclasses.replace(OPTIONS, strict=True))[0]
+    first = run_batch({"room": room}, runs, dataclasses.replace(OPTIONS, strict=True))[0]
     assert first.value is None
     assert photo.name in first.failure
     assert "1 failed" in describe_batch(runs)
     photo.write_bytes(good)
-    second = run_batch([room], runs, OPTIONS)[0]
+    second = run_batch({"room": room}, runs, OPTIONS)[0]
     assert second.failure is None
     assert "1 finished, mean mIoU" in describe_batch(runs)
     kept = (runs / "room/segmented").stat().st_mtime_ns
     text = dataclasses.replace(OPTIONS, pictures=1)  # another option: the field is found, the views are drawn again
-    third = run_batch([room], runs, text)[0]
+    third = run_batch({"room": room}, runs, text)[0]
     assert third.value == second.value
     assert third.seconds["fit"] < second.seconds["fit"]
     assert any((runs / "room/segmented/sheets").iterdir())
     assert kept != (runs / "room/segmented").stat().st_mtime_ns
-    gone = run_batch([room], tmp_path / "gone", dataclasses.replace(OPTIONS, discard_features=True))[0]
+    gone = run_batch({"room": room}, tmp_path / "gone", dataclasses.replace(OPTIONS, discard_features=True))[0]
     assert gone.failure is None
     assert not list((tmp_path / "gone/room/features").glob("*.npy"))
 
@@ -126,7 +125,7 @@ def test_photos_get_their_cameras_first(rooms, tmp_path, monkeypatch):
     photos = tmp_path / "photos"
     shutil.copytree(rooms[0] / "images", photos)
     for _ in range(2):
-        result = run_batch([photos], tmp_path / "runs", OPTIONS, report=said.append)[0]
+        result = run_batch({"photos": photos}, tmp_path / "runs", OPTIONS, report=said.append)[0]
         assert result.failure is None, result.failure
     assert calls == [("photos", 1)]
     assert any(f"note: no poses in {photos}: " in line for line in said)
@@ -140,29 +139,29 @@ def test_an_error_of_sfm_says_where_its_options_are(rooms, tmp_path, monkeypatch
 
     monkeypatch.setattr("kfgs.batch.scene_task.run_sfm", fails)
     photos = shutil.copytree(rooms[0] / "images", tmp_path / "photos")
-    failure = run_batch([photos], tmp_path / "runs", OPTIONS)[0].failure
+    failure = run_batch({"photos": photos}, tmp_path / "runs", OPTIONS)[0].failure
     assert f"`kfgs sfm {photos} --out SCENE`, and put SCENE into the list" in failure
     assert "expected 6 images, got 2" in failure
 
 
 def test_what_lies_in_the_way_is_not_touched(rooms, tmp_path):
     for scenes, out, parts in (
-        ([rooms[0], SceneEntry("room0", "x")], tmp_path, ("scenes", "different names", "room0")),
-        ([rooms[0]], rooms[0].parent, ("out", "apart from all scenes", "room0")),
-        ([], tmp_path, ("scenes", "no scene")),
+        ({"..": rooms[0]}, tmp_path, ("scenes", "names of their runs", "'..'")),
+        ({"room0": rooms[0]}, rooms[0].parent, ("out", "apart from all scenes", "room0")),
+        ({}, tmp_path, ("scenes", "read_scenes")),
     ):
         with pytest.raises(ValueError, match=tells(*parts)):
             run_batch(scenes, out, OPTIONS)
     (tmp_path / "runs/room0").mkdir(parents=True)
     (tmp_path / "runs/room0/state.json").write_text('{"of": "another program"}')
-    result = run_batch([rooms[0]], tmp_path / "runs", OPTIONS)[0]
+    result = run_batch({"room0": rooms[0]}, tmp_path / "runs", OPTIONS)[0]
     assert "expected a new folder, or a run of kfgs batch" in result.failure
     assert (tmp_path / "runs/room0/state.json").read_text() == '{"of": "another program"}'
 
 
 def test_maps_and_options_are_checked(rooms, tmp_path):
     room = shutil.copytree(rooms[0], tmp_path / "room", ignore=shutil.ignore_patterns("features"))
-    assert "name a teacher (--teacher)" in run_batch([room], tmp_path / "runs", BatchOptions())[0].failure
+    assert "name a teacher (--teacher)" in run_batch({"room": room}, tmp_path / "runs", BatchOptions())[0].failure
     with pytest.raises(ValueError, match="threads"):
         BatchOptions(threads=0)
     (tmp_path / "table.safetensors").touch()
@@ -203,10 +202,10 @@ def test_jobs_of_slurm(tmp_path, monkeypatch):
         (tmp_path / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     handler = signal.getsignal(signal.SIGINT)
-    with dask.config.set({"jobqueue.slurm.memory": "8GB"}), open_client("slurm:gpu:1", threads=3) as dask_client:
+    with dask.config.set({"jobqueue.slurm.memory": "8GB"}), open_client("slurm:gpu:1") as dask_client:
         assert dask_client.submit(len, "job").result(timeout=100) == 3
     assert signal.getsignal(signal.SIGINT) is handler
-    for part in ("#SBATCH -p gpu", "#SBATCH --cpus-per-task=3", "#SBATCH --mem=8G", "--nthreads 1"):
+    for part in ("#SBATCH -p gpu", "#SBATCH --cpus-per-task=1", "#SBATCH --mem=8G", "--nthreads 1"):
         assert part in script.read_text()
 
 
@@ -221,5 +220,5 @@ def test_threads_of_the_caller_stay(tmp_path):
     torch.set_num_threads(1)
     (tmp_path / "nothing").mkdir()
     options = BatchOptions(threads=2)
-    assert run_batch([tmp_path / "nothing"], tmp_path / "runs", options)[0].failure is not None
+    assert run_batch({"nothing": tmp_path / "nothing"}, tmp_path / "runs", options)[0].failure is not None
     assert torch.get_num_threads() == 1

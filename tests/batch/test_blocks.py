@@ -14,7 +14,6 @@ from kfgs._files import read_json, write_json
 from kfgs.batch import fit_blocks, join_blocks
 from kfgs.cli import main
 from kfgs.fields import SemanticField, UpliftConfig, uplift_maps
-from kfgs.fields.fused import join_fields
 from kfgs.fields.notes import recall_scene
 from kfgs.formats import read_splats, write_splats
 from kfgs.gaussians import Gaussians
@@ -136,15 +135,6 @@ def test_masks_go_with_the_photos(town, splat, tmp_path):
     for name in ("block00", "block01"):
         part = load_scene(tmp_path / "blocks" / name)
         assert all(part.mask(i).sum() == 60 * 50 for i in range(len(part)))
-
-
-def test_two_cities_with_the_same_latents_join(city, town, splat, tmp_path):
-    latents = LinearLatents.load(city / "latents.safetensors")
-    fit_blocks(town, tmp_path, 2, EVERY, splat=splat, latents=latents)
-    both = join_fields([join_blocks(city), join_blocks(tmp_path)])
-    assert len(both) == 2 * len(join_blocks(city))
-    with pytest.raises(ValueError, match=tells("latents", "24 channels", "got 7")):
-        fit_blocks(town, tmp_path / "x", 2, EVERY, splat=splat, latents=LinearLatents(torch.eye(7)[:, :3]))
 
 
 def test_what_cannot_be_cut(tmp_path, town):

@@ -4,7 +4,6 @@ import pytest
 from messages import tells
 
 from kfgs.batch import read_scenes
-from kfgs.batch.scene_list import SceneEntry
 
 
 @pytest.fixture
@@ -20,11 +19,9 @@ def listed(tmp_path):
 
 
 def test_folders_are_relative_to_the_list_and_name_their_runs(listed, tmp_path):
-    entries = read_scenes(
-        listed(f"# captures\n\nkitchen\n{tmp_path}/hall/  # a comment\nwith blank\nup = attic/images\n")
-    )
-    assert entries[:3] == [SceneEntry(name, str(tmp_path / name)) for name in ("kitchen", "hall", "with blank")]
-    assert entries[3] == SceneEntry("up", str(tmp_path / "attic" / "images"))
+    text = f"# captures\n\nkitchen\n{tmp_path}/hall/  # a comment\nwith blank\nup = attic/images\n"
+    places = {"kitchen": "kitchen", "hall": "hall", "with blank": "with blank", "up": "attic/images"}
+    assert read_scenes(listed(text)) == {name: str(tmp_path / place) for name, place in places.items()}
 
 
 def test_all_wrong_lines_are_named(listed):
@@ -47,9 +44,11 @@ def test_an_empty_list_is_refused(listed, text):
 def test_lists_of_other_systems_are_read(listed, tmp_path):
     path = listed("")
     path.write_bytes(b"\xef\xbb\xbfkitchen\r\n\r\n")
-    assert read_scenes(path) == [SceneEntry("kitchen", str(tmp_path / "kitchen"))]
+    assert read_scenes(path) == {"kitchen": str(tmp_path / "kitchen")}
     path.write_bytes("K\u00fcche\r\n".encode("latin-1"))
     with pytest.raises(ValueError, match=tells("scenes.txt", "UTF-8")):
         read_scenes(path)
     with pytest.raises(FileNotFoundError, match=tells("no such file", "a folder per line")):
         read_scenes(tmp_path / "none.txt")
+    with pytest.raises(ValueError, match=tells("expected a text file", "got a folder")):
+        read_scenes(tmp_path)

@@ -20,7 +20,7 @@ from kfgs import batch
 from kfgs.batch.run import SceneResult
 from kfgs.pipeline import true_labels
 from kfgs.scenes import load_cameras
-from kfgs.viz.plotter import available
+from kfgs.viz.plotter import trouble
 
 RUN_BATCH = batch.run_batch
 
@@ -168,7 +168,7 @@ def test_what_users_are_shown_to_import_is_on_a_page_with_an_example(path):
 def test_the_examples_of_a_page_run(topic, request):
     if topic == "view":
         pytest.importorskip("anywidget")
-        if not available():
+        if trouble():
             pytest.skip("nothing can be drawn here")
     request.getfixturevalue("inside")
     said = []

@@ -69,6 +69,7 @@ def test_parts_largest_first():
     assert [part.how for part in found] == ["given; part 1 of 2", "given; part 2 of 2"]
     assert found[1].centroid.tolist() == pytest.approx([1, 0.3, 4])
     assert len(connected_parts(gaussians, chosen(gaussians), distance=3.0)) == 1
+    assert len(connected_parts(gaussians, chosen(gaussians).mask, distance=3.0)) == 1
     assert len(connected_parts(gaussians, chosen(gaussians), distance=0.3, most=1)) == 1
     assert len(connected_parts(gaussians, chosen(gaussians), distance=0.3, smallest=5)) == 1
     nothing = Selection(torch.zeros(10, dtype=torch.bool), torch.zeros(10), 0.7, "given")

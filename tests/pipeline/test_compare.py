@@ -9,7 +9,6 @@ from PIL import Image
 from kfgs.cameras import Camera
 from kfgs.gaussians import Gaussians
 from kfgs.pipeline.compare import (
-    PhotoPictures,
     render_color,
     views_of_change,
     write_comparison,
@@ -97,18 +96,3 @@ def test_the_comparison_holds_both_renderings(tmp_path):
     np.testing.assert_allclose(picture[bottom - 48 : bottom, 6:70], left, atol=1)
     np.testing.assert_allclose(picture[bottom - 48 : bottom, 76:140], right, atol=1)
     assert picture.shape == (bottom + 6, 146, 3)
-
-
-def test_pictures_beside_photographs_are_evenly_spread(tmp_path):
-    stems = [f"v{i}" for i in range(9)]
-    taken, rendered = torch.zeros(20, 30, 3), torch.ones(20, 30, 3)
-    for count, expected in ((0, []), (1, ["v0"]), (3, ["v0", "v4", "v8"]), (99, stems)):
-        show = PhotoPictures(tmp_path / str(count), stems, count)
-        for stem in stems:
-            show(stem, rendered, taken)
-        assert [path.stem for path in show.written] == expected
-        assert sorted(path.stem for path in (tmp_path / str(count)).glob("*.png")) == expected
-    picture = np.asarray(Image.open(tmp_path / "1" / "v0.png"))
-    assert (picture[-26:-6, 6:36] == 0).all()  # the photograph is left
-    assert (picture[-26:-6, 42:72] == 255).all()
-    assert PhotoPictures(tmp_path, [], 4).written == []

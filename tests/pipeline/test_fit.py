@@ -10,6 +10,7 @@ import torch
 from messages import tells
 from small_room import FIELD, PAPER, make_room, paper, stages
 
+from kfgs._files import read_json
 from kfgs.cameras import Distortion
 from kfgs.cli import main
 from kfgs.fields import Codewords, Identity, SemanticField, UpliftConfig
@@ -110,7 +111,7 @@ def test_the_run_folder_holds_every_stage_and_the_field(trained, runs):
     assert same(loaded, trained)
     assert loaded.info["method"] == "paper"
     assert loaded.features.shape[1] == 4
-    losses = [row["loss"] for row in Run(run).finished("field")[0].history]
+    losses = [row["loss"] for row in read_json(Run(run).finished("field")[0].folder / "history.json")]
     assert losses[-1] < 0.7 * losses[0]
 
 

@@ -1,4 +1,4 @@
-"""Where a field is trained."""
+"""Scenes that cannot be trained on are refused before the work."""
 
 from pathlib import Path
 
@@ -8,18 +8,8 @@ from messages import tells
 
 from kfgs.cameras import Camera
 from kfgs.pipeline import fit_color
-from kfgs.pipeline.train import FEW_POINTS, check_scene, training_device
+from kfgs.pipeline.train import FEW_POINTS, check_scene
 from kfgs.scenes import Scene
-
-
-def test_auto_is_the_gpu_if_there_is_one():
-    assert training_device("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
-
-
-@pytest.mark.parametrize("device", ["gpu", "mps", "cuda:99"])
-def test_what_is_not_there_is_refused(device):
-    with pytest.raises(ValueError, match=tells("device:", f"got {device!r}")):
-        training_device(device)
 
 
 def scene_with(points: torch.Tensor) -> Scene:

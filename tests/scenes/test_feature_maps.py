@@ -232,6 +232,7 @@ def test_sizes_of_pictures_or_channels_tell_the_order_of_the_axes(tmp_path):
     assert torch.equal(maps[0], want)
     assert torch.equal(maps[1:][0], want)
     assert torch.equal(FeatureFolder(tmp_path, ["a"], channels=20)[0], want)
+    assert torch.equal(FeatureFolder(tmp_path, ["a"])[0], want)  # 20 channels of 6 x 8: nothing else is likely
 
 
 @pytest.mark.parametrize("kind", FILES)

@@ -15,7 +15,7 @@ from kfgs.splat import rasterize
 from kfgs.viewer import Exploration, Explorer, SplatMeaning, explore
 from kfgs.viewer.window import REST, _Controls
 from kfgs.viz import palette
-from kfgs.viz.plotter import available, trouble
+from kfgs.viz.plotter import trouble
 
 NAMES = ("wall", "chair", "table", "sofa", "lamp")
 TITLE, LEGEND = 30, 120  # pixels that a title and a legend cover
@@ -24,7 +24,7 @@ CAMERA = some_camera().resized(240, 320)
 
 @pytest.fixture
 def explorer(tmp_path):
-    if not available():
+    if trouble():
         pytest.skip(trouble())
     semantic = some_gaussians().replace(sh=None, scores=torch.linspace(0.2, 1, 60), names=NAMES)
     color = some_gaussians(90, seed=1).replace(features=None, labels=None)
@@ -147,7 +147,7 @@ def test_keys_sliders_and_clicks_call_the_explorer(explorer, tmp_path):
 
 
 def test_explore_draws_a_field_or_a_splat(tmp_path):
-    if not available():
+    if trouble():
         pytest.skip(trouble())
     with explore(field("fused"), classes=classes(), cameras=cameras(), where="picture", height=60) as view:
         assert view.ask("chair").words == "chair"
@@ -168,6 +168,6 @@ def test_what_cannot_be_explored_is_named(monkeypatch):
         explore(some_gaussians(), where="tv")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    if available():
+    if not trouble():
         with pytest.raises(RuntimeError, match=tells("where:", "display", "'browser'")):
             explore(some_gaussians(), where="window")

@@ -9,7 +9,7 @@ from messages import tells
 
 from kfgs.cameras import Camera
 from kfgs.viz import add_cloud, draw_view, look_through, make_plotter, plotter
-from kfgs.viz.plotter import available, camera_of
+from kfgs.viz.plotter import camera_of, trouble
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def test_without_opengl_a_plotter_says_what_to_install(bare):
         return subprocess.CompletedProcess(args, -11, "", "")
 
     bare.setattr(subprocess, "run", crash)
-    assert not available()
+    assert trouble()
     for make in (make_plotter, lambda: draw_view(some_camera(), print)):
         with pytest.raises(RuntimeError, match=tells("OpenGL", "status -11", "crashed", "apt-get install libegl1")):
             make()

@@ -14,7 +14,6 @@ import pytest
 
 pytest.importorskip("numba")
 
-from kfgs._compiling import COMPILING
 from kfgs.splat.engines.cpu import cache as numba_cache
 
 FILE = Path(numba_cache.__file__)
@@ -212,13 +211,13 @@ def test_no_kernel_goes_around():
 SORT = """
 import numpy as np
 from numba import njit
-from kfgs._compiling import say_compiling
+from kfgs._notes import hear
 from kfgs.splat.engines.cpu.tiles_kernels import list_rows
 
 made = {}
 exec("def double(x): return 2 * x", made)  # a function of no module
-for kind in (np.int32, np.int64):  # two compilations, one line
-    with say_compiling(print):
+with hear(print):
+    for kind in (np.int32, np.int64):  # two compilations, one line
         njit(made["double"])(kind(1))
         list_rows(*np.zeros((4, 1), kind))
 """
@@ -230,7 +229,7 @@ def test_the_first_process_says_that_it_compiles(tmp_path):
         subprocess.run([sys.executable, "-c", SORT], env=environment, capture_output=True, text=True, check=True).stdout
         for _ in range(2)
     ]
-    assert said == [f"{COMPILING}\n", ""]
+    assert said == [f"{numba_cache.COMPILING}\n", ""]
 
 
 COMMAND = """
@@ -255,5 +254,5 @@ def test_every_command_says_on_stderr_that_it_compiles(tmp_path):
         subprocess.run([sys.executable, "-c", COMMAND], env=environment, capture_output=True, text=True, check=True)
         for _ in range(2)
     ]
-    line = f"note: {COMPILING}\n"
+    line = f"note: {numba_cache.COMPILING}\n"
     assert [(done.stdout, done.stderr) for done in ran] == [("sorted\n", line), ("sorted\n", "")]

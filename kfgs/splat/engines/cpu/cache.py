@@ -12,7 +12,7 @@ from numba import njit
 from numba.core import event
 from numba.core.caching import IndexDataCacheFile
 
-from kfgs._compiling import tell_compiling
+from kfgs._notes import Wait, tell
 
 _HERE = Path(__file__).parent
 _FILES = [file for folder in (_HERE, _HERE.parent) for file in sorted(folder.glob("*.py"))]  # contract.py is above
@@ -75,13 +75,16 @@ class _Kept(IndexDataCacheFile):  # type: ignore[misc]
                 )
 
 
+COMPILING = "compiling kernels of the CPU engine (seconds each, a minute or two in all; each only once on this machine)"
+
+
 class _Compiling(event.Listener):
     """Tells when one of kfgs's kernels is about to be compiled."""
 
     def on_start(self, event: event.Event) -> None:
         function = getattr(event.data["dispatcher"], "py_func", None)
         if (getattr(function, "__module__", None) or "").startswith("kfgs."):
-            tell_compiling()
+            tell(Wait(COMPILING))
 
     def on_end(self, event: event.Event) -> None:
         pass
