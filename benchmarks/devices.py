@@ -26,7 +26,7 @@ def _device(name: str) -> torch.device:
         os.environ["CUDA_VISIBLE_DEVICES"] = ""  # kfgs would train on a GPU that it sees
     try:
         device = torch.device(name)
-        if device.type == "cuda":
+        if device.type == "cuda" and device.index is not None:
             torch.cuda.set_device(device)
     except (RuntimeError, AssertionError) as error:
         raise argparse.ArgumentTypeError(str(error)) from error

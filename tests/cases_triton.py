@@ -23,7 +23,7 @@ import torch
 from cases_splat import a_camera, gaussians_before, random_splats
 from torch import Tensor
 
-from kfgs.splat import Tiles, accumulate_pixels, bin_tiles, composite, rasterize
+from kfgs.splat import Projected, Tiles, accumulate_pixels, bin_tiles, composite, project, rasterize
 from kfgs.splat.engines import rank_channels
 from kfgs.splat.engines.contract import Splats
 
@@ -175,9 +175,7 @@ def check_ranks(inputs: list[Tensor], index: Tensor | None, tiles: Tiles, *, tie
     chosen = truth.gather(2, many.labels.cpu().clamp_min(0))
     facts["sorted maps: labels"] = largest((chosen - ordered) * drawn) <= 1e-5
     facts["sorted maps: scores"] = largest(many.scores - found.scores) <= 1e-5
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the interpreter's, about NaN
-        nothing = rank_channels(*inputs[:3], inputs[3] * torch.nan, tiles, index=index, engine="triton")
+    nothing = rank_channels(*inputs[:3], inputs[3] * torch.nan, tiles, index=index, engine="triton")
     facts["no label out of range"] = bool((nothing.labels == -1).all())
     if ties:  # sums of halves, quarters and so on are exact
         same = rank_channels(*inputs[:3], torch.ones_like(inputs[3]), tiles, top=channels, index=index, engine="triton")
@@ -232,6 +230,45 @@ def run_frame(device: str) -> dict[str, float | bool]:
     return facts
 
 
+PROJECTED = ("means2d", "conics", "depths", "opacities", "extents")
+OF_PROJECTION = ("grad of means", "grad of quats", "grad of scales", "grad of opacities")
+PROJECTIONS = {"thin": (0.0, 5), "as usual": (0.3, 8), "wide": (1.0, 16)}  # low_pass, tile_size
+
+
+def run_projection(low_pass: float, tile_size: int, device: str) -> dict[str, float | bool]:
+    """The projection, its gradient and the lists of tiles, of a cloud that has every reason for culling."""
+    camera = a_camera(dtype=torch.float32)
+    cloud = gaussians_before(camera, 150, seed=7, spread=2.5, channels=3).to(torch.float32)
+    means, quats, scales, opacities = (getattr(cloud, name).clone() for name in OF_FRAME[:4])
+    means[:20] = camera.center - 2 * (means[:20] - camera.center)  # behind the camera
+    means[20], scales[21], quats[22], opacities[23], opacities[24] = float("nan"), float("inf"), 0.0, 0.0, 1 / 256
+    leaves = means, quats, scales, opacities
+
+    def run(dtype: torch.dtype, place: str, engine: str) -> tuple[Projected, dict[str, Tensor]]:
+        given = [value.to(place, dtype).requires_grad_() for value in leaves]
+        shown = cloud.to(place, dtype).replace(**dict(zip(OF_FRAME[:4], given, strict=True)))
+        seen = project(shown, camera, low_pass=low_pass, engine=engine)
+        g = torch.Generator().manual_seed(8)
+        cotangents = [torch.randn(150, *value.shape[1:], generator=g)[seen.index.cpu()].to(value) for value in seen[:4]]
+        grads = torch.autograd.grad(seen[:4], given, cotangents)
+        named = dict(zip(PROJECTED, seen, strict=False)) | dict(zip(OF_PROJECTION, grads, strict=True))
+        return seen, {name: value.detach() for name, value in named.items()}
+
+    (seen, actual), (truth, expected) = run(torch.float32, device, "triton"), run(torch.float64, "cpu", "reference")
+    facts = {
+        name: largest((actual[name].cpu().double() - value) / (1 + value.abs())) for name, value in expected.items()
+    }
+    for name in OF_PROJECTION:
+        facts[name] = largest(actual[name].cpu().double() - expected[name]) / largest(expected[name])
+    seen = Projected(*(value.detach() for value in seen))
+    tiles = bin_tiles(seen, camera.width, camera.height, tile_size, engine="triton")
+    lists = bin_tiles(Projected(*(v.cpu() for v in seen)), camera.width, camera.height, tile_size, engine="reference")
+    facts["the same are seen"] = torch.equal(seen.index.cpu(), truth.index) and 30 < len(truth.index) < 120
+    facts["offsets"] = torch.equal(tiles.offsets.cpu(), lists.offsets)
+    facts["rows"] = torch.equal(tiles.rows.cpu()[: len(lists.rows)], lists.rows) and len(lists.rows) > 50
+    return facts
+
+
 def compare(actual: dict[str, Tensor], expected: dict[str, Tensor]) -> dict[str, float | bool]:
     """The error of each result: the first two's as it is, the others' relative to the largest number."""
     facts: dict[str, float | bool] = {}
@@ -261,6 +298,7 @@ class Build(NamedTuple):
 
 
 KERNELS = ("composite", "accumulate", "differentiate", "rank")
+OTHERS = ("see", "project", "differentiate_projection", "count", "list")  # a Gaussian, or a candidate, for each thread
 BUILDS = {
     **{f"{kernel}, 512 channels, sm_{cc}": Build(kernel, 512, cc) for kernel in KERNELS for cc in (80, 90, 100)},
     "differentiate, 130 channels, sm_90": Build("differentiate", 130, 90),
@@ -269,7 +307,17 @@ BUILDS = {
     "rank, 1 channel, tiles of 5": Build("rank", 1, 80, tile_size=5, indexed=False),
     "differentiate, 1 channel, tiles of 5": Build("differentiate", 1, 80, tile_size=5, indexed=False),
     "differentiate, 9 channels, tiles of 2": Build("differentiate", 9, 90, tile_size=2),
+    **{f"{kernel}, sm_90": Build(kernel, 0, 90) for kernel in OTHERS},
 }
+OF_SEE = (
+    "ends",
+    "means2d",
+    "conics",
+    "depths",
+    "out_opacities",
+    "extents",
+    "index",
+)  # arguments that the first call lacks
 
 
 def compile_ahead(build: Build) -> dict[str, Any]:
@@ -278,32 +326,49 @@ def compile_ahead(build: Build) -> dict[str, Any]:
     from triton.backends.compiler import GPUTarget
     from triton.compiler import ASTSource
 
-    from kfgs.splat.engines.triton import engine as triton_gpu
-    from kfgs.splat.engines.triton import kernels as triton_kernels
-    from kfgs.splat.engines.triton import kernels_backward as triton_kernels_backward
-    from kfgs.splat.engines.triton import kernels_rank as triton_kernels_rank
+    from kfgs.splat.engines.triton import (
+        engine,
+        kernels,
+        kernels_backward,
+        kernels_project,
+        kernels_rank,
+        kernels_tiles,
+    )
 
     kernel = {
-        "composite": triton_kernels.composite_kernel,
-        "accumulate": triton_kernels.accumulate_kernel,
-        "differentiate": triton_kernels_backward.differentiate_kernel,
-        "rank": triton_kernels_rank.rank_kernel,
+        "composite": kernels.composite_kernel,
+        "accumulate": kernels.accumulate_kernel,
+        "differentiate": kernels_backward.differentiate_kernel,
+        "rank": kernels_rank.rank_kernel,
+        "see": kernels_project.project_kernel,
+        "project": kernels_project.project_kernel,
+        "differentiate_projection": kernels_project.differentiate_projection_kernel,
+        "count": kernels_tiles.count_kernel,
+        "list": kernels_tiles.list_kernel,
     }[build.kernel]
-    sizes = triton_gpu.launch_options(build.kernel, build.channels, build.tile_size)
+    sizes = {"BLOCK": 128, "num_warps": 4, "num_stages": 1, "enable_fp_fusion": True}
+    if build.kernel in engine.LAUNCHES:
+        sizes = engine.launch_options(build.kernel, build.channels, build.tile_size)
     options = {name: sizes.pop(name) for name in ("num_warps", "num_stages", "enable_fp_fusion")}
-    if build.kernel == "differentiate":
-        sizes |= {"OF_SPLATS": True, "OF_FEATURES": True}
-    if build.kernel == "rank":
-        sizes |= {"TOP": 4}
+    sizes |= {
+        "differentiate": {"OF_SPLATS": True, "OF_FEATURES": True},
+        "rank": {"TOP": 4},
+        "see": dict.fromkeys(OF_SEE),
+        "differentiate_projection": {"grad_depths": None},
+        "count": {"SIDE": 8},
+        "list": {"SIDE": 8},
+    }.get(build.kernel, {})
     if build.channels == 1:  # as triton does with an argument that is 1
         sizes["channels"] = 1
     if not build.indexed and build.kernel != "accumulate":
         sizes["index"] = None
-    types = {"index": "*i64", "rows": "*i32", "offsets": "*i64", "stops": "*i32", "labels": "*i64"}
-    types |= dict.fromkeys(("width", "height", "columns", "channels", "top"), "i32") | dict.fromkeys(sizes, "constexpr")
+    types = {"index": "*i64", "rows": "*i32", "offsets": "*i64", "stops": "*i32", "labels": "*i64", "order": "*i64"}
+    types |= {"hits": "*i64", "tiles": "*i16", "kept": "*i32", "ends": "*i64" if build.kernel == "list" else "*i32"}
+    types |= dict.fromkeys(("width", "height", "columns", "channels", "top", "count", "total", "none"), "i32")
+    types |= dict.fromkeys(("near", "low_pass"), "fp32") | dict.fromkeys(sizes, "constexpr")
     signature = {name: types.get(name, "*fp32") for name in kernel.arg_names}
     aligned = {(k,): [["tt.divisibility", 16]] for k, of in enumerate(signature.values()) if of.startswith("*")}
-    if build.channels % 16 == 0:  # and with one that 16 divides
+    if build.channels and build.channels % 16 == 0:  # and with one that 16 divides
         aligned[(kernel.arg_names.index("channels"),)] = [["tt.divisibility", 16]]
     target = GPUTarget("cuda", build.capability, 32)
     compiled = triton.compile(ASTSource(kernel, signature, sizes, aligned), target=target, options=options)
@@ -332,10 +397,13 @@ def _read_resources(cubin: bytes, tool: Path) -> dict[str, int]:
 
 def main() -> None:
     torch.set_num_threads(1)
+    warnings.simplefilter("ignore", RuntimeWarning)  # the interpreter's, about NaN and infinity
     if sys.argv[1] == "run":
         device = sys.argv[2]
         results = {name: _attempt(run_case, case, device) for name, case in CASES.items()}
         results["frame"] = _attempt(run_frame, device)
+        for name, sizes in PROJECTIONS.items():
+            results[f"projection, {name}"] = _attempt(run_projection, *sizes, device)
     else:
         results = {name: _attempt(compile_ahead, build) for name, build in BUILDS.items()}
     print(json.dumps(results))

@@ -13,8 +13,6 @@ from typing import Any
 
 from tqdm import tqdm
 
-START = "60s"  # to wait for a scheduler
-
 
 @contextmanager
 def open_client(workers: int | str = 1) -> Iterator[Any]:
@@ -43,11 +41,10 @@ def open_client(workers: int | str = 1) -> Iterator[Any]:
         raise ImportError(f"workers: expected Dask, got {error}; pip install 'kfgs[batch]'") from error
     if "://" in address:
         try:
-            client = Client(address, timeout=START, set_as_default=False)
+            client = Client(address, timeout="60s", set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
-            raise OSError(
-                f"workers: expected a scheduler that answers at {address}, got {error}; start `dask scheduler`"
-            ) from error
+            got = f"{error}; start `dask scheduler` there"
+            raise OSError(f"workers: expected a scheduler that answers at {address}, got {got}") from error
         with client:
             yield client
         return
@@ -74,9 +71,7 @@ def open_client(workers: int | str = 1) -> Iterator[Any]:
             silence_logs=logging.CRITICAL,
             preload=[__name__],  # each worker calls dask_setup
         )
-    patience = {
-        "distributed.deploy.lost-worker-timeout": "10 minutes"
-    }  # a new worker imports for longer than Dask's 15 s
+    patience = {"distributed.deploy.lost-worker-timeout": "10 minutes"}  # a new worker imports for longer than 15 s
     try:
         with dask.config.set(patience), cluster, Client(cluster, set_as_default=False) as client:
             yield client

@@ -24,7 +24,6 @@ from .scene_task import BatchOptions, make_scene, stamps
 
 STATE, LOG, LOCK, TOPIC = "state.json", "log.txt", ".batch.lock", "kfgs-batch/2"
 MESSAGE = 600  # characters of a failure: sfm's message is long, and its end is advice
-Report = Callable[[str], None]
 
 
 @dataclass
@@ -50,7 +49,7 @@ def run_batch(
     options: BatchOptions | None = None,
     *,
     client: Any = None,
-    report: Report | None = None,
+    report: Callable[[str], None] | None = None,
 ) -> list[SceneResult]:
     """Find cameras, make features, fit, segment and score many scenes. What is done is not repeated.
 
@@ -93,7 +92,7 @@ def run_batch(
 
 
 def run_tasks(
-    function: Callable[..., Any], tasks: Mapping[str, tuple[Any, ...]], client: Any, report: Report
+    function: Callable[..., Any], tasks: Mapping[str, tuple[Any, ...]], client: Any, report: Callable[[str], None]
 ) -> Iterator[tuple[str, Any]]:
     """Call a function with each task's arguments, here or in Dask's workers; yields (name, result or error) as they end."""
     if client is None:
@@ -112,7 +111,7 @@ def run_tasks(
         yield futures[future], future.exception() or future.result()
 
 
-def _run_scene(source: Path, run: Path, options: BatchOptions, report: Report | None) -> SceneResult:
+def _run_scene(source: Path, run: Path, options: BatchOptions, report: Callable[[str], None] | None) -> SceneResult:
     """The task of a scene. An error of its work is part of the result."""
     known = read_state(run)
     if known is None and run.is_dir() and any(run.iterdir()):

@@ -26,9 +26,7 @@ def read_scenes(path: str | Path) -> dict[str, str]:
     """
     path = as_path(path)
     if path.is_dir():
-        raise ValueError(
-            f"{path}: expected a text file with a scene in each line, got a folder; write its name into one"
-        )
+        raise ValueError(f"{path}: expected a text file with a scene in each line, got a folder; write one")
     lines = read_text(path, "a list of scenes, a folder per line,").splitlines()
     texts = {number: re.sub(r"(^|\s)#.*", "", line).strip() for number, line in enumerate(lines, start=1)}
     scenes, faults, first = dict[str, str](), list[str](), dict[str, int]()
@@ -58,7 +56,5 @@ def check_scenes(scenes: Mapping[str, str | Path], out: Path) -> dict[str, Path]
     sources = set(map(real_path, places.values()))
     for run in (real_path(out) / name for name in places):
         if sources & {run, *run.parents}:
-            raise ValueError(
-                f"out: expected a folder apart from all scenes, got {out}, which puts {run.name!r} into one"
-            )
+            raise ValueError(f"out: expected a folder apart from all scenes, got {out}; {run.name!r} would lie in one")
     return places

@@ -117,9 +117,7 @@ def _load(source: Path, posed: Path, config: SfmConfig, say: Callable[[str], Non
     photos = next((place for place in (source / "images", source) if place.is_dir() and list_images(place)), None)
     if photos is None:
         raise SceneError(f"{source}: expected a COLMAP model, a transforms.json or photos, got none of them")
-    say(
-        f"note: no poses in {source}: no COLMAP model and no transforms.json; its cameras are found from the photos (sfm)"
-    )
+    say(f"note: no poses in {source}: no COLMAP model, no transforms.json; sfm finds its cameras from the photos")
     facts, noted = {"photos": stamps(photos), "config": asdict(config)}, posed / "sfm.json"
     if not noted.is_file() or read_json(noted) != facts:
         try:

@@ -53,7 +53,13 @@ def parse_edits(asked: Edits, names: Sequence[str] = ()) -> list[Any]:
         edits.append(Recolor(where("recolor", name), parse_color(value, "recolor")))
     for words in asked.move:
         name, value = _split("move", words, "table:0.5,0,0")
-        edits.append(Move(where("move", name), _three("move", words, value)))
+        try:
+            numbers = tuple(float(part) for part in value.split(","))
+        except ValueError:
+            numbers = ()
+        if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
+            raise ValueError(f"move: expected 3 numbers between commas after the colon, got {words!r}; write it so")
+        edits.append(Move(where("move", name), numbers))
     removed: dict[str, list[OfClass]] = {}  # by class: removing one part changes the numbers of the others
     for words in dict.fromkeys(asked.remove):
         rule = where("remove", words)
@@ -71,13 +77,3 @@ def _split(option: str, words: str, example: str) -> tuple[str, str]:
             f"{option}: expected a class and a value, as in {example!r}, got {words!r}; put a colon between"
         )
     return name, value
-
-
-def _three(option: str, words: str, value: str) -> tuple[float, ...]:
-    try:
-        numbers = [float(part) for part in value.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) != 3 or not all(math.isfinite(number) for number in numbers):
-        raise ValueError(f"{option}: expected 3 numbers between commas after the colon, got {words!r}; write it so")
-    return tuple(numbers)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +53,8 @@ def features(
         examples: A .json file of examples, or COCO's annotations, instead of words.
         fast: One pass over each picture instead of the exact evaluation at several scales (lseg).
     """
+    from ..teachers.prompts import make_label_set
+
     if examples is not None:
         if source is None:
             raise ValueError("source: expected the field of the examples, got none; pass RUN/field.kfgs")
@@ -72,7 +73,12 @@ def features(
     scene = None if source is None else views.load(source)
     network = teacher.load(**({"fast": True} if fast else {}))
     if table is not None:
-        _embed_words(network, listed, table)
+        made = make_label_set(network, listed)
+        made.save(table)
+        templates = ", ".join(map(repr, made.info["templates"]))
+        say(f"{len(made)} classes, {made.dim} channels each, by {made.info['teacher']['name']}, as {templates}")
+        for name, more in made.info["synonyms"].items():
+            say(f"  {name}: also {', '.join(more)}")
     if target is not None:
         _make_maps(network, scene, target, views.split)
         given = "" if out is None else f" --features {out}"
@@ -114,18 +120,6 @@ def _table(out: Path | None) -> Path:
         raise ValueError(f"out: expected a file whose name ends in .safetensors, got {table}; give another name")
     check_output("out", table, "a file")
     return table
-
-
-def _embed_words(network: Any, words: Sequence[str], table: Path) -> None:
-    from ..labels.scores import CANONICAL
-    from ..teachers.prompts import make_label_set
-
-    made = make_label_set(network, words, negatives=CANONICAL)
-    made.save(table)
-    templates = ", ".join(map(repr, made.info["templates"]))
-    say(f"{len(made)} classes, {made.dim} channels each, by {made.info['teacher']['name']}, as {templates}")
-    for name, more in made.info["synonyms"].items():
-        say(f"  {name}: also {', '.join(more)}")
 
 
 def _learn_examples(out: Path, field: Any, path: Path) -> None:

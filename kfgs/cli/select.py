@@ -55,8 +55,14 @@ def select(
         check_range("threshold", threshold, 0, 1)
     if is_field(source):
         field = open_field("source", source)
-        query, target, label_set = _target(query, classes, teacher, field)
-        selection = field.query(target, label_set, threshold)
+        label_set, embed = words_of(classes, teacher, field)
+        phrase = None if embed is None or label_set.knows(query) else embed(query)
+        try:
+            query = query if phrase is not None else label_set.names[label_set.index(query)]
+        except ValueError as error:
+            advice = "for any other phrase pass --teacher and --weights, or add it to the table of words"
+            raise ValueError(f"{error}; {advice}") from error
+        selection = field.query(query if phrase is None else phrase, label_set, threshold)
         cloud, cameras = field.gaussians.replace(scores=selection.scores), field.cameras or None
         scene = classes.photos_of(field) if out is not None else None
     else:
@@ -109,19 +115,6 @@ def _save(folder: Path, facts: dict[str, Any], cloud: Any, selection: Any, camer
     return written
 
 
-def _target(query: str, classes: Classes, teacher: Teacher, field: Any) -> tuple[str, Any, Any]:
-    """The query in the spelling of the table, what `SemanticField.query` asks (a class, or an embedding), and the table."""
-    label_set, embed = words_of(classes, teacher, field)
-    if embed is not None and not label_set.knows(query):
-        return query, embed(query), label_set
-    try:
-        name = label_set.names[label_set.index(query)]
-    except ValueError as error:
-        advice = "for any other phrase pass --teacher and --weights, or add it to the table of words"
-        raise ValueError(f"{error}; {advice}") from error
-    return name, name, label_set
-
-
 def words_of(classes: Classes, teacher: Teacher, field: Any) -> tuple[Any, Callable[[str], Any] | None]:
     """The label set, and a function that turns a phrase into a row of the teacher's space, in the table's templates.
 
@@ -129,7 +122,6 @@ def words_of(classes: Classes, teacher: Teacher, field: Any) -> tuple[Any, Calla
     compared, are then its own. It may be asked without a table of words, too.
     """
     from ..labels.label_set import teacher_mismatch
-    from ..labels.scores import CANONICAL
     from ..teachers.prompts import make_label_set
 
     network = teacher.load()
@@ -138,7 +130,7 @@ def words_of(classes: Classes, teacher: Teacher, field: Any) -> tuple[Any, Calla
     known = classes.text is not None or classes.scene is not None or field.classes is not None
     label_set = classes.load_classes(field) if known else None
     templates = None if label_set is None else label_set.info.get("templates")
-    asked = make_label_set(network, ["thing"], templates=templates, negatives=CANONICAL)
+    asked = make_label_set(network, ["thing"], templates=templates)
     label_set = label_set or asked
     difference = teacher_mismatch(asked.info, label_set.info)
     if difference is not None:
@@ -152,6 +144,6 @@ def words_of(classes: Classes, teacher: Teacher, field: Any) -> tuple[Any, Calla
 
     @cache
     def embed(phrase: str) -> Any:
-        return make_label_set(network, [phrase], templates=templates).embeddings[0]
+        return make_label_set(network, [phrase], templates=templates, negatives=None).embeddings[0]
 
     return label_set, embed

@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 from .._check import check_range, check_shapes
 from ..cameras import resize_map
 from ..cameras.resample import from_bchw, to_bchw
-from ..splat.engines.table import compiled_losses
+from ..splat.engines.table import compiled_similarity
 
 Loss = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(rendered map [H, W, D], its alpha [H, W], target [h, w, D]) -> a scalar."""
@@ -36,13 +36,7 @@ def l1_loss(
     the mean, and learning rates and densification threshold of 3DGS are made for a mean. Pixels with NaN in any channel of
     the target are unknown and do not count.
     """
-    rendered = _resized(rendered, target)
-    compiled = _compiled(rendered, target)
-    if compiled is not None:
-        return _Compiled.apply(rendered, target, compiled.absolute)
-    known = _known(target)
-    difference = torch.where(known[..., None], rendered - target, 0)
-    return difference.abs().sum() / (known.sum() * target.shape[2]).clamp_min(1)
+    return _Absolute.apply(_resized(rendered, target), target)  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True)
@@ -73,10 +67,6 @@ class ColorLoss:
         if self.ssim_weight == 0 or min(target.shape[:2]) < SSIM_WINDOW:
             return l1_loss(rendered, alpha, target)
         picture = _resized(rendered, target)
-        compiled = _compiled(picture, target, self.engine)
-        if compiled is not None and not bool(target.sum().isnan()):  # no unknown pixel: one walk for both parts
-            mixture = _mixture(compiled, (-self.ssim_weight, 1 - self.ssim_weight))
-            return self.ssim_weight + _Compiled.apply(picture, target, mixture)
         dissimilar = 1 - mean_similarity(picture, target, self.engine)
         return (1 - self.ssim_weight) * l1_loss(picture, alpha, target) + self.ssim_weight * dissimilar
 
@@ -93,9 +83,9 @@ def mean_similarity(picture: Tensor, target: Tensor, engine: str = "auto") -> Te
         counted = torch.nn.functional.max_pool2d(holes, SSIM_WINDOW, stride=1)[0, 0] == 0  # [H - 10, W - 10]
         if not bool(counted.any()):
             return picture.new_ones(())
-    compiled = _compiled(picture, target, engine)
-    if compiled is not None:
-        return _Compiled.apply(picture, target, _mixture(compiled, (1.0, 0.0), counted))
+    compiled = compiled_similarity(picture, target) if engine in ("auto", "numba") else None
+    if compiled is not None and not target.requires_grad:  # it gives no gradient in the target
+        return _Similarity.apply(picture, target, counted, compiled)
     similarity = from_bchw(ssim(to_bchw(picture), to_bchw(target), SSIM_WINDOW, eps=0.0, padding="valid"))
     return similarity.mean() if counted is None else similarity[counted].mean()
 
@@ -105,38 +95,45 @@ def _resized(rendered: Tensor, target: Tensor) -> Tensor:  # [H, W, D], [h, w, D
     return resize_map(rendered, (target.shape[0], target.shape[1]))
 
 
-def _compiled(picture: Tensor, target: Tensor, engine: str = "auto") -> Any:
-    """The compiled losses, which compare the two; None if torch must: these give no gradient in the target."""
-    return compiled_losses(picture, target) if engine in ("auto", "numba") and not target.requires_grad else None
-
-
 def _known(target: Tensor) -> Tensor:  # [H, W, D] -> [H, W] bool
     return ~target.amax(dim=2).isnan()  # amax returns NaN; 9 times faster than isnan().any(dim=2) of 64 channels
 
 
-class _Compiled(torch.autograd.Function):
-    """A comparison of a picture with its target, whose value and slope are computed together."""
+class _Absolute(torch.autograd.Function):
+    """The mean absolute difference. Its slope takes the memory of the difference; autograd would take three times as much."""
 
     @staticmethod
-    def forward(ctx: Any, picture: Tensor, target: Tensor, compare: Callable[..., tuple[Tensor, Tensor]]) -> Tensor:
-        value, slope = compare(picture.contiguous(), target.contiguous())
-        ctx.save_for_backward(slope)
-        return value
+    def forward(ctx: Any, picture: Tensor, target: Tensor) -> Tensor:
+        difference, count = picture - target, target.numel()
+        total = difference.abs().sum()
+        if bool(total.isnan()):
+            known = _known(target)
+            difference[~known] = 0
+            total, count = difference.abs().sum(), max(1, int(known.sum())) * target.shape[2]
+        ctx.save_for_backward(difference.sign_().mul_(1 / max(1, count)))
+        return total / max(1, count)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        """The slope times the loss's gradient, which is 1 if nothing follows the loss: then the slope itself, without a copy."""
-        (slope,) = ctx.saved_tensors
-        return slope if slope.device.type == "cpu" and float(grad) == 1 else grad * slope, None, None
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor | None]:
+        slope = grad * ctx.saved_tensors[0]
+        return slope, -slope if ctx.needs_input_grad[1] else None
 
 
-def _mixture(compiled: Any, mix: tuple[float, float], counted: Tensor | None = None) -> Callable[..., Any]:
-    """Compares as mix[0] SSIM + mix[1] mean absolute difference."""
+class _Similarity(torch.autograd.Function):
+    """The engine's SSIM, whose value and slope are computed together."""
 
-    def compare(picture: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    @staticmethod
+    def forward(
+        ctx: Any, picture: Tensor, target: Tensor, counted: Tensor | None, compiled: Callable[..., Any]
+    ) -> Tensor:
         window = get_gaussian_kernel1d(SSIM_WINDOW, SSIM_SIGMA, dtype=torch.float64)[0].to(picture.dtype)
-        similar, absolute, slope = compiled.similarity(picture, target, counted, window, SSIM_CONSTANTS, mix)
-        return mix[0] * similar + mix[1] * absolute, slope
+        value, slope = compiled(picture.contiguous(), target.contiguous(), counted, window, SSIM_CONSTANTS)
+        ctx.save_for_backward(slope)
+        return value  # type: ignore[no-any-return]
 
-    return compare
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
+        (slope,) = ctx.saved_tensors
+        return grad * slope, None, None, None

@@ -11,7 +11,6 @@ from .._card import short_repr
 from .._check import as_tensor, check_shapes
 from .._rows import EPS, check_directions, row_norms, unit_embeddings, unit_rows
 from ..quant.codebook import Codebook
-from ..splat.engines.table import compiled_losses
 
 if TYPE_CHECKING:
     from ..quant.autoencoder import Autoencoder
@@ -77,14 +76,11 @@ def pixel_codewords(
         centres = None
         if autoencoder is not None and not exact:
             centres = autoencoder.encode(codebook.codewords).to(rows)
-        compiled, layers = compiled_losses(rows), None
-        if autoencoder is not None and compiled is not None:
-            layers = _score_layers(rows, codebook, autoencoder, centres)
-        if compiled is not None and layers is not None:
-            winners, leads = compiled.decide(layers, rows[which])
-            out[which] = winners
-            which = which[~(leads > LEAD)]
+        layers = None if autoencoder is None or not exact else _score_layers(rows, codebook, autoencoder)
         for part in which.split(PIXELS):
+            if layers is not None:
+                out[part], leads = _decide(layers, rows[part])
+                part = part[~(leads > LEAD)]
             if centres is not None:
                 out[part] = nearest_codeword(rows[part], centres)
             else:
@@ -105,16 +101,12 @@ def _score_layers(
     rows: Tensor,  # [n, d]
     codebook: Codebook,
     autoencoder: Autoencoder,
-    centres: Tensor | None,  # [K, d] the codewords' latents, if the nearest of them is wanted
 ) -> tuple[tuple[Tensor, Tensor], ...] | None:
     """Linear layers whose largest output is the codeword of a latent; None if the decoder has another type than the rows.
 
     With a decoder W h + b and unit codewords C, argmax over C (W h) + C b: one layer in place of the last one and of the
-    comparison. The nearest latent is argmax over 2 c·x - |c|^2; the constant makes the largest output positive.
+    comparison.
     """
-    if centres is not None:
-        squares = centres.square().sum(dim=-1)
-        return ((2 * centres, 2 * squares.max() - squares),)
     networks: Any = autoencoder.decoder
     decoder = [(layer.weight.detach(), layer.bias.detach()) for layer in networks]
     weight, bias = decoder[-1]
@@ -122,3 +114,12 @@ def _score_layers(
         return None
     unit = codebook.unit.to(rows)
     return *decoder[:-1], (unit @ weight, unit @ bias)
+
+
+def _decide(layers: tuple[tuple[Tensor, Tensor], ...], rows: Tensor) -> tuple[Tensor, Tensor]:  # [n] int64, [n]
+    """The largest output (linear layers, ReLU between) and how clearly: (largest - second) / largest, 0 if not positive."""
+    for k, (weight, bias) in enumerate(layers):
+        rows = torch.addmm(bias, rows.relu_() if k else rows, weight.T)
+    best, winners = rows.max(dim=1)
+    second = rows.scatter_(1, winners[:, None], -torch.inf).amax(dim=1)
+    return winners, torch.where(best > 0, (best - second) / best, 0)

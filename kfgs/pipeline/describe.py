@@ -18,7 +18,6 @@ from ..fields.store import find_field
 from ..formats import find_format, read_splats
 from ..formats.ply import read_ply
 from ..formats.table import splat_file_of
-from ..gaussians import Gaussians
 from ..scenes import FeatureFolder, load_scene
 from ..scenes.load import is_scene
 from .stages import Run
@@ -43,7 +42,14 @@ def describe(path: str | Path) -> str:
             if "scale_0" not in columns:
                 count = len(next(iter(columns.values())))
                 return f"{path}: PLY with {count} vertices; columns {', '.join(columns)}"
-        return _describe_splats(path, read_splats(path))
+        splats = read_splats(path)
+        lines = [f"{path}: {splats!r}"]
+        if len(splats):
+            corners = to_world(torch.stack(splats.means.aminmax(dim=0)), splats.origin)
+            ends = [[say_coordinate(value, 4) for value in corner] for corner in corners.tolist()]
+            lines += [f"  {axis}: {low} to {high}" for axis, low, high in zip("xyz", *ends, strict=True)]
+        lines.append(f"  format: {find_format(path).NAME}")
+        return "\n".join([*lines, *([] if splats.labels is None else count_lines(splats.labels, splats.names))])
     if (path / "stages").is_dir():
         lines = [f"  {one_line(stage.name)}: done in {stage.seconds:.1f} s" for stage in Run(path).finished("*")]
         return "\n".join([f"{path}: unfinished run; the same fit again continues", *lines])
@@ -71,16 +77,6 @@ def describe(path: str | Path) -> str:
         *(f"  note: {note}" for note in scene.notes),
     ]
     return "\n".join(lines)
-
-
-def _describe_splats(path: Path, splats: Gaussians) -> str:
-    lines = [f"{path}: {splats!r}"]
-    if len(splats):
-        corners = to_world(torch.stack(splats.means.aminmax(dim=0)), splats.origin)
-        ends = [[say_coordinate(value, 4) for value in corner] for corner in corners.tolist()]
-        lines += [f"  {axis}: {low} to {high}" for axis, low, high in zip("xyz", *ends, strict=True)]
-    lines.append(f"  format: {find_format(path).NAME}")
-    return "\n".join([*lines, *([] if splats.labels is None else count_lines(splats.labels, splats.names))])
 
 
 def count_lines(labels: Tensor, names: Sequence[str]) -> list[str]:  # labels: [N]

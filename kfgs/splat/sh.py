@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import pi, sqrt
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -113,26 +114,26 @@ def _sphere(count: int) -> Tensor:  # [count, 3] float64
 def _basis(directions: Tensor, K: int) -> Tensor:  # [N, 3] -> [N, K]
     """The first K real spherical harmonics of each direction."""
     x, y, z = torch.nn.functional.normalize(directions, dim=1).unbind(1)
-    terms = [torch.full_like(x, SH_C0)]
+    terms = [torch.full_like(x, SH_C0)] * K
+    fill_harmonics(terms, K, x, y, z)
+    return torch.stack(terms, dim=1)
+
+
+def fill_harmonics(basis: Any, K: int, x: Any, y: Any, z: Any) -> None:
+    """Write all of the first K real spherical harmonics but the constant one; the CPU engine compiles this for numbers."""
     if K > 1:
-        terms += [-C1 * y, C1 * z, -C1 * x]
+        basis[1], basis[2], basis[3] = -C1 * y, C1 * z, -C1 * x
     if K > 4:
         xx, yy, zz = x * x, y * y, z * z
-        terms += [
-            C2[0] * x * y,
-            -C2[0] * y * z,
-            C2[1] * (2 * zz - xx - yy),
-            -C2[0] * x * z,
-            C2[2] * (xx - yy),
-        ]
+        basis[4], basis[5] = C2[0] * x * y, -C2[0] * y * z
+        basis[6] = C2[1] * (2 * zz - xx - yy)
+        basis[7], basis[8] = -C2[0] * x * z, C2[2] * (xx - yy)
     if K > 9:
-        terms += [
-            -C3[0] * y * (3 * xx - yy),
-            C3[1] * x * y * z,
-            -C3[2] * y * (4 * zz - xx - yy),
-            C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
-            -C3[2] * x * (4 * zz - xx - yy),
-            C3[4] * z * (xx - yy),
-            -C3[0] * x * (xx - 3 * yy),
-        ]
-    return torch.stack(terms, dim=1)
+        xx, yy, zz = x * x, y * y, z * z
+        basis[9] = -C3[0] * y * (3 * xx - yy)
+        basis[10] = C3[1] * x * y * z
+        basis[11] = -C3[2] * y * (4 * zz - xx - yy)
+        basis[12] = C3[3] * z * (2 * zz - 3 * xx - 3 * yy)
+        basis[13] = -C3[2] * x * (4 * zz - xx - yy)
+        basis[14] = C3[4] * z * (xx - yy)
+        basis[15] = -C3[0] * x * (xx - 3 * yy)

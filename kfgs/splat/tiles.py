@@ -8,14 +8,16 @@ from torch import Tensor
 from .._check import check_shapes
 from .engines import check_sizes
 from .engines.contract import ALPHA_MIN, Tiles
-from .engines.table import choose_projecting
+from .engines.table import choose, choose_projecting
 from .project import Projected, pixel_box
 
 __all__ = ["Tiles", "bin_tiles"]
 
 
 @torch.no_grad()
-def bin_tiles(projected: Projected, width: int, height: int, tile_size: int = 16, *, engine: str = "auto") -> Tiles:
+def bin_tiles(
+    projected: Projected, width: int, height: int, tile_size: int | None = None, *, engine: str = "auto"
+) -> Tiles:
     """List the Gaussians of every tile.
 
     A Gaussian is listed if alpha reaches 1/255 somewhere in the rectangle spanned by the tile's pixel centres: the smallest
@@ -26,7 +28,7 @@ def bin_tiles(projected: Projected, width: int, height: int, tile_size: int = 16
         projected: M projected Gaussians in increasing order of index, as `project` returns them.
         width: of the image, pixels.
         height: of the image, pixels.
-        tile_size: side of a tile, pixels.
+        tile_size: side of a tile, pixels; None: what is fastest for the engine.
         engine: as in `composite`. "numba", which "auto" takes on the CPU, finds the same lists with compiled code; all
             others use torch.
 
@@ -45,6 +47,8 @@ def bin_tiles(projected: Projected, width: int, height: int, tile_size: int = 16
         ("projected.opacities", projected.opacities, "M"),
         ("projected.extents", projected.extents, "M 2"),
     )
+    if tile_size is None:
+        tile_size = choose(engine, projected.means2d.device.type, projected.means2d.dtype).tile_size
     check_sizes(width, height, tile_size)
     projecting = choose_projecting(engine, *projected[:5])
     if projecting:

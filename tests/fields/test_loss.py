@@ -20,13 +20,13 @@ def path(request, monkeypatch):
     if request.param == "compiled":
         pytest.importorskip("numba")
     else:
-        monkeypatch.setattr(loss, "compiled_losses", lambda *tensors: None)
+        monkeypatch.setattr(loss, "compiled_similarity", lambda *tensors: None)
     return request.param
 
 
 @pytest.mark.parametrize(("engine", "compiled"), [("numba", True), ("auto", True), ("reference", False)])
 def test_the_similarity_is_that_of_the_engine(engine, compiled, monkeypatch):
-    cpu = pytest.importorskip("kfgs.splat.engines.cpu.losses")
+    cpu = pytest.importorskip("kfgs.splat.engines.cpu.similarity")
     calls, own = [], cpu.similarity
     monkeypatch.setattr(cpu, "similarity", lambda *arguments: calls.append(1) or own(*arguments))
     a, b = pictures()
@@ -80,7 +80,7 @@ def test_compiled_and_kornias_gradients_agree_in_float32(monkeypatch):
     gradients = []
     for compiled in (True, False):
         if not compiled:
-            monkeypatch.setattr(loss, "compiled_losses", lambda *tensors: None)
+            monkeypatch.setattr(loss, "compiled_similarity", lambda *tensors: None)
         a, b = pictures(90, 75, torch.float32)
         value = mean_similarity(a.requires_grad_(), b)
         value.backward()

@@ -167,13 +167,6 @@ def test_a_score_that_is_no_number_is_not_overlooked(engine, value):
     assert_early(footprints, some, tiles, engine)
 
 
-@every_engine
-def test_gaussians_that_share_a_row_of_scores(engine):
-    footprints, features, tiles = scene(30)
-    index = torch.arange(40) % 7
-    assert_ranked(footprints, features[:9].contiguous(), tiles, engine, 2, index)
-
-
 @pytest.mark.parametrize("channels", [3, 30])
 @every_engine
 def test_an_index_with_gaps_in_memory(engine, channels):

@@ -8,7 +8,7 @@ from cases_splat import TOLERANCE, a_camera, gaussians_before
 from messages import tells
 from scipy.spatial.transform import Rotation
 
-from kfgs.cameras.camera import Camera, Distortion
+from kfgs.cameras.camera import Camera
 from kfgs.gaussians import Gaussians
 from kfgs.splat import rasterize, rasterize_labels
 from kfgs.splat.sh import SH_C0
@@ -104,28 +104,11 @@ def test_scaling_the_world_changes_depth_only():
     torch.testing.assert_close(a.projected.depths, 10 * b.projected.depths)
 
 
-def test_order_of_the_gaussians_does_not_matter():
-    camera = a_camera()
-    gaussians = gaussians_before(camera, 40, seed=5)
-    order = torch.randperm(40, generator=torch.Generator().manual_seed(0))
-    a, b = rasterize(gaussians, camera), rasterize(gaussians.select(order), camera)
-    torch.testing.assert_close(a.map, b.map, rtol=0, atol=1e-12)
-    torch.testing.assert_close(a.alpha, b.alpha, rtol=0, atol=1e-12)
-
-
 def test_sign_of_the_quaternion_does_not_matter():
     camera = a_camera()
     gaussians = gaussians_before(camera, 40, seed=6)
     flipped = gaussians.replace(quats=-gaussians.quats)
     torch.testing.assert_close(rasterize(flipped, camera).map, rasterize(gaussians, camera).map, rtol=0, atol=1e-12)
-
-
-def test_linear_in_features():
-    camera = a_camera()
-    gaussians = gaussians_before(camera, 40, seed=7)
-    f, g = gaussians.features, gaussians.features.flip(0)
-    parts = [rasterize(gaussians.replace(features=v), camera).map for v in (f, g, 2 * f - g)]
-    torch.testing.assert_close(parts[2], 2 * parts[0] - parts[1], rtol=0, atol=1e-12)
 
 
 def test_gaussians_behind_the_camera_do_not_show():
@@ -137,14 +120,6 @@ def test_gaussians_behind_the_camera_do_not_show():
     assert len(rendering.projected.index) == 0
     assert torch.equal(rendering.map, background.expand(18, 24, 3))
     assert (rendering.alpha == 0).all()
-
-
-def test_near_plane_is_the_callers():
-    camera = a_camera()
-    gaussians = gaussians_before(camera, 20, seed=13)
-    depths = rasterize(gaussians, camera, near=4.0).projected.depths
-    assert (depths > 4).all()
-    assert (rasterize(gaussians, camera).projected.depths < 4).any()
 
 
 def test_colour_is_seen_from_the_camera():
@@ -216,18 +191,6 @@ def test_something_to_render_is_needed():
     camera = a_camera()
     with pytest.raises(ValueError, match=tells("gaussians:", "got neither", "gaussians.replace()")):
         rasterize(gaussians_before(camera, 3, seed=0).replace(features=None), camera)
-
-
-def test_camera_with_distortion_is_refused():
-    camera = replace(a_camera(), distortion=Distortion("kannala_brandt", (0.1, 0.0, 0.0, 0.0)))
-    with pytest.raises(ValueError, match=tells("camera:", "got kannala_brandt")):
-        rasterize(gaussians_before(camera, 3, seed=0), camera)
-
-
-def test_background_has_one_value_per_channel():
-    camera = a_camera()
-    with pytest.raises(ValueError, match=tells("background:", "[D]", "D = 3", "got (4,)")):
-        rasterize(gaussians_before(camera, 3, seed=0), camera, background=torch.zeros(4).double())
 
 
 def test_arguments_of_another_kind_and_mixed_types_are_named():

@@ -21,6 +21,7 @@ from kfgs.splat.engines.triton import engine as triton_gpu  # noqa: E402 - only 
 ROOT = Path(__file__).resolve().parents[2]
 LIMITS = dict.fromkeys(("maps", "alphas"), 1e-5) | dict.fromkeys((*cases_triton.GRADS, "sums", "weights"), 1e-4)
 FRAME_LIMITS = dict.fromkeys(("map", "alpha"), 1e-5) | dict.fromkeys((*cases_triton.OF_FRAME, "means2d"), 1e-4)
+PROJECTION_LIMITS = dict.fromkeys(cases_triton.PROJECTED, 1e-5) | dict.fromkeys(cases_triton.OF_PROJECTION, 1e-5)
 """Largest errors against the reference engine in float64: of values of about 1, and relative to the largest gradient."""
 
 every_case = pytest.mark.parametrize("case", cases_triton.CASES)
@@ -60,6 +61,14 @@ def test_interpreted_frame_agrees_with_the_reference(interpreted):
     _assert_agrees(interpreted["frame"], FRAME_LIMITS)
 
 
+every_projection = pytest.mark.parametrize("case", cases_triton.PROJECTIONS)
+
+
+@every_projection
+def test_interpreted_projection_and_tiles_agree_with_kornia_and_torch(interpreted, case):
+    _assert_agrees(interpreted[f"projection, {case}"], PROJECTION_LIMITS)
+
+
 @pytest.fixture(scope="module")
 def on_gpu():
     return _report("run", "cuda")
@@ -73,6 +82,10 @@ class TestOnGpu:
 
     def test_frame_agrees_with_the_reference(self, on_gpu):
         _assert_agrees(on_gpu["frame"], FRAME_LIMITS)
+
+    @every_projection
+    def test_projection_and_tiles_agree_with_kornia_and_torch(self, on_gpu, case):
+        _assert_agrees(on_gpu[f"projection, {case}"], PROJECTION_LIMITS)
 
     def test_is_what_auto_takes(self):
         inputs, index, tiles, *_ = cases_triton.make_scene(cases_triton.CASES["indexed"], "cuda")
@@ -107,15 +120,12 @@ def test_kernels_compile_ahead_of_time(compiled, build):
     facts = compiled[build]
     assert "failed" not in facts, facts["failed"]
     assert facts["cubin"] > 1000
-    assert facts["products"], "expected a product on the tensor cores"
+    assert bool(facts["products"]) == (cases_triton.BUILDS[build].channels > 16), "wide products take the tensor cores"
     assert facts["shared"] <= 99 * 1024  # what a program may have on GPUs of sm_86, sm_89 and sm_120
     if "stack" in facts:
-        assert facts["stack"] <= 128, "registers spill"  # bytes; without care for them it was over a thousand
-
-
-@pytest.mark.parametrize(("capability", "product"), [(80, "mma.sync"), (90, "wgmma.mma_async"), (100, "tcgen05.mma")])
-def test_wide_compositing_uses_the_tensor_cores_of_each_generation(compiled, capability, product):
-    assert compiled[f"composite, 512 channels, sm_{capability}"]["products"] == [product]
+        assert facts["stack"] <= 700, (
+            "registers spill"
+        )  # bytes; twice as many took longer on an H200, a few hundred did not
 
 
 # the host side --------------------------------------------------------------------------------------------------------
@@ -123,7 +133,7 @@ def test_wide_compositing_uses_the_tensor_cores_of_each_generation(compiled, cap
 
 @pytest.mark.parametrize(
     ("tile_size", "parts", "pixels", "warps"),
-    [(1, 1, 16, 1), (5, 1, 32, 1), (8, 1, 64, 2), (12, 1, 256, 8), (16, 1, 256, 8), (32, 4, 256, 8), (20, 2, 256, 8)],
+    [(1, 1, 16, 1), (5, 1, 32, 1), (8, 1, 64, 2), (12, 3, 64, 2), (16, 4, 64, 2), (20, 7, 64, 2)],
 )
 def test_a_tile_is_cut_into_programs(tile_size, parts, pixels, warps):
     options = triton_gpu.launch_options("differentiate", 3, tile_size)
@@ -131,7 +141,7 @@ def test_a_tile_is_cut_into_programs(tile_size, parts, pixels, warps):
     assert parts * pixels >= tile_size**2
 
 
-@pytest.mark.parametrize(("channels", "block"), [(1, 16), (16, 16), (17, 32), (40, 64), (512, 64)])
+@pytest.mark.parametrize(("channels", "block"), [(1, 16), (16, 16), (17, 32), (40, 64), (512, 128)])
 def test_channels_are_cut_into_blocks(channels, block):
     assert triton_gpu.launch_options("composite", channels, 16)["BLOCK"] == block
 

@@ -8,11 +8,15 @@ from kfgs.splat import average_views, vote_labels
 
 
 def camera(size=8, name="front"):
-    K = torch.tensor([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1.0]])
-    return Camera(torch.eye(4), K, size, size, name)
+    return _camera(size, size, size, name)
 
 
-def cloud(means, opacity=0.9, scale=0.15):
+def _camera(width=32, height=24, focal=30.0, name=""):
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    return Camera(torch.eye(4), K, width, height, name)
+
+
+def cloud(means, opacity=0.9, scale=0.1):
     means = torch.tensor(means)
     n = len(means)
     quats = torch.tensor([[1.0, 0, 0, 0]]).expand(n, 4)
@@ -58,22 +62,11 @@ def test_wrong_input_is_named():
         average_views(gaussians, [(camera(), torch.zeros(8, 8, 2)), (camera(name="second"), torch.zeros(8, 8, 3))])
 
 
-def _camera(width: int = 32, height: int = 24) -> Camera:
-    K = torch.tensor([[30.0, 0.0, width / 2], [0.0, 30.0, height / 2], [0.0, 0.0, 1.0]])
-    return Camera(torch.eye(4), K, width, height)
-
-
-def _cloud(*xyz: tuple[float, float, float], opacity: float = 0.9, scale: float = 0.1) -> Gaussians:
-    n = len(xyz)
-    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1)
-    return Gaussians(torch.tensor(xyz), quats, torch.full((n, 3), scale), torch.full((n,), opacity))
-
-
 def test_each_gaussian_takes_the_class_of_the_pixels_that_show_it():
-    cloud = _cloud((-0.5, 0.0, 2.0), (0.5, 0.0, 2.0), (0.0, 0.0, -2.0))  # left, right, behind the camera
+    gaussians = cloud([(-0.5, 0.0, 2.0), (0.5, 0.0, 2.0), (0.0, 0.0, -2.0)])  # left, right, behind the camera
     labels = torch.zeros(24, 32, dtype=torch.int64)
     labels[:, 16:] = 2
-    votes = vote_labels(cloud, [(_camera(), labels)], 3)
+    votes = vote_labels(gaussians, [(_camera(), labels)], 3)
     assert votes.labels.tolist() == [0, 2, -1]
     assert votes.shares.tolist() == pytest.approx([1.0, 1.0, 0.0], abs=1e-3)
     assert votes.weights[2] == 0
@@ -81,40 +74,40 @@ def test_each_gaussian_takes_the_class_of_the_pixels_that_show_it():
 
 def test_what_stands_behind_has_no_say_about_pixels_it_does_not_show():
     front, back = (0.0, 0.0, 2.0), (0.0, 0.0, 4.0)
-    cloud = _cloud(front, back, opacity=0.99, scale=0.5)
-    votes = vote_labels(cloud, [(_camera(), torch.ones(24, 32, dtype=torch.int64))], 2)
+    gaussians = cloud([front, back], opacity=0.99, scale=0.5)
+    votes = vote_labels(gaussians, [(_camera(), torch.ones(24, 32, dtype=torch.int64))], 2)
     assert votes.weights[1] < 0.2 * votes.weights[0]
 
 
 def test_the_majority_of_views_wins_and_unlabelled_pixels_do_not_vote():
-    cloud = _cloud((0.0, 0.0, 2.0))
+    gaussians = cloud([(0.0, 0.0, 2.0)])
     maps = [torch.full((24, 32), label) for label in (1, 0, 1, 1, -1, -1, -1)]
-    votes = vote_labels(cloud, [(_camera(), m) for m in maps], 2)
+    votes = vote_labels(gaussians, [(_camera(), m) for m in maps], 2)
     assert votes.labels.tolist() == [1]
     assert float(votes.shares) == pytest.approx(3 / 4, abs=1e-5)
 
 
 def test_a_divided_vote_gives_no_label_unless_asked_to():
     views = [(_camera(), torch.full((24, 32), label)) for label in (1, 0, 1, 0, 1)]
-    cloud = _cloud((0.0, 0.0, 2.0))
-    assert vote_labels(cloud, views, 2).labels.tolist() == [-1]
-    assert vote_labels(cloud, views, 2, min_share=0).labels.tolist() == [1]
+    gaussians = cloud([(0.0, 0.0, 2.0)])
+    assert vote_labels(gaussians, views, 2).labels.tolist() == [-1]
+    assert vote_labels(gaussians, views, 2, min_share=0).labels.tolist() == [1]
     with pytest.raises(ValueError, match=tells("min_share:", "got 1.5")):
-        vote_labels(cloud, views, 2, min_share=1.5)
+        vote_labels(gaussians, views, 2, min_share=1.5)
 
 
 def test_votes_are_the_sums_of_compositing_weights():
-    cloud = _cloud((0.1, 0.0, 2.0), opacity=0.5)
+    gaussians = cloud([(0.1, 0.0, 2.0)], opacity=0.5)
     camera = _camera()
-    votes = vote_labels(cloud, [(camera, torch.zeros(24, 32, dtype=torch.int64))], 1)
+    votes = vote_labels(gaussians, [(camera, torch.zeros(24, 32, dtype=torch.int64))], 1)
     # one Gaussian alone: the sum over pixels of o * exp(-d^2 / (2 s^2)) is o * 2 pi s^2 up to the cut at 1/255
     s2 = (0.1 * 30 / 2) ** 2 + 0.3
     assert float(votes.weights) == pytest.approx(0.5 * 2 * torch.pi * s2, rel=0.03)
 
 
 def test_bad_input_is_named():
-    cloud = _cloud((0.0, 0.0, 2.0))
+    gaussians = cloud([(0.0, 0.0, 2.0)])
     with pytest.raises(ValueError, match=tells("views:", "(24, 32)", "got (3, 3)")):
-        vote_labels(cloud, [(_camera(), torch.zeros(3, 3, dtype=torch.int64))], 2)
+        vote_labels(gaussians, [(_camera(), torch.zeros(3, 3, dtype=torch.int64))], 2)
     with pytest.raises(ValueError, match=tells("views:", "below 2", "up to 5")):
-        vote_labels(cloud, [(_camera(), torch.full((24, 32), 5))], 2)
+        vote_labels(gaussians, [(_camera(), torch.full((24, 32), 5))], 2)

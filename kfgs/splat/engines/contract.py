@@ -77,7 +77,7 @@ class Tiles(NamedTuple):
     beyond the image where its size is no multiple of the tile's.
     """
 
-    rows: Tensor  # [P] int32
+    rows: Tensor  # [P] int32; on a GPU, some that no tile owns may follow
     offsets: Tensor  # [T + 1] int64
     width: int  # pixels
     height: int  # pixels
@@ -125,6 +125,8 @@ class Engine:
     """Types of the devices that it runs on."""
     dtypes: tuple[torch.dtype, ...] = (torch.float32, torch.float64)
     """The types that it computes in."""
+    tile_size = 16
+    """Side of the tiles that it composites fastest, pixels."""
     projects = False
     """Whether it also has `project`, `shade` and `bin`. For the others kornia and torch do these."""
 
@@ -163,12 +165,12 @@ class Engine:
 class CompiledEngine(Engine):
     """An engine whose kernels compute their own gradients."""
 
-    def forward(self, splats: Splats, tiles: Tiles) -> Composited:
-        """Composite, and keep what `backward` needs."""
+    def forward(self, splats: Splats, tiles: Tiles) -> Any:
+        """A named tuple of tensors: `maps`, `alphas`, and what `backward` needs."""
         raise NotImplementedError
 
     def backward(
-        self, grads: tuple[Tensor, Tensor], wanted: list[bool], splats: Splats, tiles: Tiles, result: Composited
+        self, grads: tuple[Tensor, Tensor], wanted: list[bool], splats: Splats, tiles: Tiles, result: Any
     ) -> list[Tensor | None]:
         """Gradients of the first five tensors of `splats` (None where not wanted), given those in maps and alphas."""
         raise NotImplementedError
@@ -182,7 +184,7 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, engine: CompiledEngine, tiles: Tiles, *splats: Tensor) -> tuple[Tensor, Tensor]:
         result = engine.forward(Splats(*splats), tiles)
-        ctx.engine, ctx.size = engine, tiles[2:]
+        ctx.engine, ctx.size, ctx.kind = engine, tiles[2:], type(result)
         ctx.save_for_backward(*splats, *tiles[:2], *result)
         return result.maps, result.alphas
 
@@ -190,6 +192,6 @@ class _Composite(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_maps: Tensor, grad_alphas: Tensor) -> tuple[Tensor | None, ...]:
         saved = ctx.saved_tensors
-        splats, tiles, result = Splats(*saved[:6]), Tiles(*saved[6:8], *ctx.size), Composited(*saved[8:])
+        splats, tiles, result = Splats(*saved[:6]), Tiles(*saved[6:8], *ctx.size), ctx.kind(*saved[8:])
         grads = grad_maps.contiguous(), grad_alphas.contiguous()
         return None, None, *ctx.engine.backward(grads, ctx.needs_input_grad[2:7], splats, tiles, result), None

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from threading import RLock
-from types import ModuleType
 from typing import NamedTuple
 
 import torch
@@ -128,11 +127,12 @@ def choose_projecting(engine: str, *tensors: Tensor) -> Engine | None:
     return chosen if chosen.projects and len({value.dtype for value in tensors}) == 1 else None
 
 
-def compiled_losses(*tensors: Tensor) -> ModuleType | None:
-    """`cpu.losses`, numba's loops over maps for losses and decoders. None: torch and kornia must compute on these tensors."""
+def compiled_similarity(*tensors: Tensor) -> Callable[..., tuple[Tensor, Tensor]] | None:
+    """Numba's SSIM with its gradient, `cpu.similarity`. None: kornia must compare these tensors."""
     kinds = {(value.device.type, value.dtype) for value in tensors}
-    if len(kinds) > 1 or not choose("auto", *kinds.pop()).projects:
+    device, dtype = kinds.pop()
+    if kinds or device != "cpu" or not choose("auto", device, dtype).projects:
         return None
-    from .cpu import losses
+    from .cpu.similarity import similarity
 
-    return losses
+    return similarity

@@ -1,6 +1,5 @@
 """Kernels on disk: taken from there when nothing has changed, compiled again otherwise, and quick to call."""
 
-import importlib.util
 import json
 import os
 import subprocess
@@ -9,7 +8,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from zlib import crc32
 
-import numpy as np
 import pytest
 
 pytest.importorskip("numba")
@@ -144,27 +142,10 @@ def test_a_damaged_cache_is_made_again(tmp_path):
         assert [_drive(tmp_path) for _ in range(2)] == [(0, ""), (1, "")]
 
 
-def _load(file):
-    spec = importlib.util.spec_from_file_location("copied_numba_cache", file)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_sources_are_all_files_of_the_engines(tmp_path):
-    files = [*sorted(FILE.parent.glob("*.py")), *sorted(FILE.parent.parent.glob("*.py"))]
-    assert {"engine.py", "simd.py", "contract.py"} < {file.name for file in files}
+def test_sources_are_all_files_of_the_engines():
+    files = [file for folder in FILE.parents[:3] for file in sorted(folder.glob("*.py"))]
+    assert {"engine.py", "simd.py", "contract.py", "sh.py"} < {file.name for file in files}
     assert crc32(b"".join(file.read_bytes() for file in files)) == numba_cache.SOURCES
-    copy = tmp_path / FILE.name
-    copy.write_bytes(FILE.read_bytes())
-    stamps = [_load(copy).SOURCES]
-    other = tmp_path / "other.py"
-    for text in ("x = 1", "x = 2"):
-        other.write_text(text)
-        stamps.append(_load(copy).SOURCES)
-    assert len(set(stamps)) == 3
-    os.utime(other, (1, 1))  # a copy or a checkout changes times, not contents
-    assert stamps[-1] == _load(copy).SOURCES
 
 
 def test_another_numba_costs_the_cache_alone(monkeypatch):
@@ -191,14 +172,6 @@ def test_without_a_place_to_write_to_it_is_compiled_in_memory():
     double = numba_cache.cached_njit()(names["double"])
     assert double(21) == 42
     assert double.stats.cache_path is None
-
-
-def test_options_are_passed_on():
-    @numba_cache.cached_njit(nogil=True, error_model="numpy")
-    def divide(x, y):
-        return x / y
-
-    assert np.isinf(divide(1.0, 0.0))  # with numba's own error model, Python's error
 
 
 def test_no_kernel_goes_around():

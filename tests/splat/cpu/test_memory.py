@@ -126,22 +126,6 @@ def test_a_copy_does_not_hold_memory():
     assert (copies[0] == 3).all()
 
 
-def test_memory_much_larger_or_too_small_is_left_alone():
-    place = take_memory(LIKE, 4 * SIZE).data_ptr()
-    small = take_memory(LIKE, SIZE)
-    assert not place <= small.data_ptr() < place + 16 * SIZE
-    del small
-    assert take_memory(LIKE, 2 * SIZE + 1000).data_ptr() == place  # more than half of it
-    assert len(numba_memory._kept.buffers) == 2
-
-
-def test_little_memory_comes_from_torch():
-    take_memory(LIKE, 255)
-    assert numba_memory._kept.buffers == []
-    take_memory(LIKE, 256)
-    assert len(numba_memory._kept.buffers) == 1
-
-
 def test_no_more_is_kept_than_allowed(monkeypatch):
     monkeypatch.setattr(numba_memory, "MOST_KEPT", 50_000)  # two buffers of 20 kB
     tensors = [take_memory(LIKE, SIZE).fill_(i) for i in range(5)]
@@ -169,19 +153,6 @@ def test_nothing_is_kept_where_references_are_not_counted(monkeypatch):
     monkeypatch.setattr(numba_memory, "_COUNTS", False)
     assert take_memory(LIKE, SIZE).shape == (SIZE,)
     assert numba_memory._kept.buffers == []
-
-
-def test_what_was_used_last_is_kept_longest(monkeypatch):
-    monkeypatch.setattr(numba_memory, "MOST_KEPT", 50_000)
-    first, second = take_memory(LIKE, SIZE), take_memory(LIKE, SIZE)
-    place = first.data_ptr()
-    del first
-    again = take_memory(LIKE, SIZE)
-    assert again.data_ptr() == place
-    third = take_memory(LIKE, SIZE)  # the second makes room
-    del again
-    assert take_memory(LIKE, SIZE).data_ptr() == place
-    assert len({place, second.data_ptr(), third.data_ptr()}) == 3
 
 
 def test_each_thread_has_its_own():

@@ -17,43 +17,26 @@ from llvmlite import binding  # noqa: E402
 
 from kfgs.splat import bin_tiles, composite  # noqa: E402
 from kfgs.splat.engines.cpu import engine as numba_cpu  # noqa: E402
-from kfgs.splat.engines.cpu import simd as numba_simd  # noqa: E402
 from kfgs.splat.engines.cpu import square as numba_square  # noqa: E402
 from kfgs.splat.engines.cpu.simd import (  # noqa: E402
     LANES,
-    add_dot,
-    add_outer,
-    any_of,
     bits,
     exp2,
     fetch,
     fma,
     lanes_below,
     load,
-    load_many,
     load_part,
     maximum,
     minimum,
-    prefetch,
-    put,
     reciprocal,
-    regroup,
     select,
-    spread,
-    spread_many,
     store,
-    store_many,
     store_part,
-    sum_lanes,
-    sum_many,
-    trailing_zeros,
-    transpose,
-    zero_many,
 )
 
 every_dtype = pytest.mark.parametrize("dtype", [np.float32, np.float64])
 
-THREE, FOUR, SIX, SIXTEEN = (0,) * 3, (0,) * 4, (0,) * 6, (0,) * 16
 CANARY = -77.0
 
 
@@ -185,11 +168,6 @@ def test_vectors_of_two_types_do_not_mix():
 
 
 @numba.njit
-def _copy(x, i, out, j):
-    store(out, j, load(x, i))
-
-
-@numba.njit
 def _copy_part(x, i, out, j, count):
     lanes = lanes_below(x, count)
     store_part(out, j, lanes, load_part(x, i, lanes))
@@ -198,16 +176,6 @@ def _copy_part(x, i, out, j, count):
 @numba.njit
 def _read_part(x, i, count, out):
     store(out, 0, load_part(x, i, lanes_below(x, count)))
-
-
-@every_dtype
-@pytest.mark.parametrize(("i", "j"), [(0, 0), (3, 21), (7, 1)])
-def test_load_and_store_move_a_vector_from_anywhere(dtype, i, j):
-    x, out = _random(dtype, 3 * LANES), np.full(3 * LANES, CANARY, dtype)
-    _copy(x, i, out, j)
-    expected = np.full(3 * LANES, CANARY, dtype)
-    expected[j : j + LANES] = x[i : i + LANES]
-    np.testing.assert_array_equal(out, expected)
 
 
 @every_dtype
@@ -240,59 +208,6 @@ def test_parts_may_end_where_memory_ends(dtype):
             _copy_part(last, len(last) - count, last, len(last) - count, count)
         os._exit(0)
     assert os.waitpid(child, 0)[1] == 0
-
-
-@numba.njit
-def _scalars(x, integers, out):
-    inside = x[4:]
-    out[0] = fetch(inside, 1)
-    out[1] = fetch(inside, -2)
-    put(x, 9, 0.1)
-    put(x[10:], -10, 7)
-    put(integers, 1, np.uint32(0xFFFFFFFE))
-    prefetch(x, 3)
-    prefetch(x, -(1 << 40))
-    prefetch(x, 1 << 40)
-    store(out, 2, 2)
-    store(out, 2 + LANES, spread(x, 0.1))
-
-
-@every_dtype
-def test_single_numbers(dtype):
-    x, integers, out = _random(dtype, 16), np.zeros(3, np.int32), np.empty(2 + 2 * LANES, dtype)
-    before = x.copy()
-    _scalars(x, integers, out)
-    assert out[:2].tolist() == before[[5, 2]].tolist()
-    before[9], before[0] = 0.1, 7
-    np.testing.assert_array_equal(x, before)
-    assert integers.tolist() == [0, -2, 0]
-    np.testing.assert_array_equal(out[2:], np.repeat(np.array([2, 0.1], dtype), LANES))
-
-
-# masks ----------------------------------------------------------------------------------------------------------------
-
-
-@numba.njit
-def _masks(x, count):
-    lanes = lanes_below(x, count)
-    return bits(lanes), any_of(lanes)
-
-
-@numba.njit
-def _lowest(number):
-    return trailing_zeros(np.uint32(number))
-
-
-@pytest.mark.parametrize("count", [-100, -1, 0, 1, 2, 15, 16, 17, 1 << 40])
-def test_lanes_below(count):
-    holds = np.arange(LANES) < count
-    for x in (np.zeros(1, np.float32), np.zeros(1)):
-        assert _masks(x, count) == (_as_bits(holds), bool(holds.any()))
-
-
-def test_trailing_zeros():
-    numbers = [(1 << high) | (1 << low) for low in range(32) for high in range(low, 32)]
-    assert [_lowest(number) for number in numbers] == [(number & -number).bit_length() - 1 for number in numbers]
 
 
 # functions of one vector ----------------------------------------------------------------------------------------------
@@ -335,99 +250,6 @@ def test_exp2_of_whole_numbers_is_exact(dtype):
 def test_reciprocal_keeps_its_stated_error(dtype, largest):
     x = np.concatenate([10 ** np.random.default_rng(0).uniform(-3, 3, 400_000), [0.001, 0.01, 0.5, 1, 2, 1000]])
     assert _largest_error(_reciprocals, lambda v: 1 / v, x.astype(dtype)) <= largest
-
-
-# across the lanes -----------------------------------------------------------------------------------------------------
-
-
-@numba.njit
-def _across(x, out):
-    store(out, 0, sum_lanes(load(x, LANES)))
-    store_many(out, LANES, LANES, transpose(load_many(SIXTEEN, x, 0, LANES)))
-    store_many(out, 17 * LANES, LANES, regroup(load_many(FOUR, x, 0, LANES)))
-
-
-@every_dtype
-def test_sum_transpose_and_regroup(dtype):
-    x, out = np.arange(LANES * LANES).astype(dtype), np.empty(21 * LANES, dtype)
-    _across(x, out)
-    square = x.reshape(LANES, LANES)
-    out = out.reshape(-1, LANES)
-    assert (out[0] == square[1].sum()).all()
-    np.testing.assert_array_equal(out[1:17], square.T)
-    quarters = square[:4].reshape(4, 4, LANES // 4)
-    np.testing.assert_array_equal(out[17:], quarters.swapaxes(0, 1).reshape(4, LANES))
-
-
-@numba.njit
-def _sums(like, x, out):
-    store(out, 0, sum_many(load_many(like, x, 0, LANES)))
-
-
-@pytest.mark.parametrize(
-    ("dtype", "counts"),
-    [(np.float32, range(1, LANES + 1)), (np.float64, (1, 2, 5, 10, LANES))],
-    ids=["single", "double"],
-)
-def test_sums_of_several_vectors(dtype, counts):
-    x, out = _whole(dtype, LANES, LANES), np.empty(LANES, dtype)
-    for count in counts:
-        _sums((0,) * count, x.ravel(), out)
-        np.testing.assert_array_equal(out, np.where(np.arange(LANES) < count, x.sum(axis=1), 0), f"{count} vectors")
-
-
-# several vectors ------------------------------------------------------------------------------------------------------
-
-
-@numba.njit
-def _move_many(x, i, from_stride, out, j, to_stride):
-    store_many(out, j, to_stride, load_many(THREE, x, i, from_stride))
-
-
-@numba.njit
-def _spread_many(x, i, stride, out):
-    store_many(out, 0, LANES, spread_many(THREE, x, i, stride))
-
-
-@every_dtype
-@pytest.mark.parametrize("stride", [1, 5, LANES, 3 * LANES, -4])
-def test_several_vectors_are_moved_by_strides(dtype, stride):
-    start = 2 * -min(stride, 0)
-    x, out = _random(dtype, 200), np.full(200, CANARY, dtype)
-    _move_many(x, start, stride, out, 7, LANES + 3)
-    expected = np.full(200, CANARY, dtype)
-    for k in range(3):
-        expected[7 + k * (LANES + 3) :][:LANES] = x[start + k * stride :][:LANES]
-    np.testing.assert_array_equal(out, expected)
-    _spread_many(x, start, stride, out)
-    np.testing.assert_array_equal(out[: 3 * LANES], np.repeat(x[[start + k * stride for k in range(3)]], LANES))
-
-
-@numba.njit
-def _products(x, y, z, out):
-    left, right = load_many(THREE, x, 0, LANES), load_many(THREE, y, 0, LANES)
-    pair = right[0], right[1]
-    sums = load_many(SIX, z, 0, LANES)
-    store_many(out, 0, LANES, add_outer(left, (load(z, 0),), right))
-    store_many(out, 3 * LANES, LANES, add_outer(sums, left, pair))
-    store(out, 9 * LANES, add_dot(load(z, 0), left, right))
-    store_many(out, 10 * LANES, LANES, zero_many(THREE, x))
-
-
-@every_dtype
-def test_products_of_several_vectors(dtype):
-    x, y, z = _whole(dtype, 3, LANES), _whole(dtype, 3, LANES, seed=1), _whole(dtype, 6, LANES, seed=2)
-    out = np.full((13, LANES), CANARY, dtype)
-    _products(x.ravel(), y.ravel(), z.ravel(), out.reshape(-1))
-    np.testing.assert_array_equal(out[:3], x + z[0] * y)
-    np.testing.assert_array_equal(out[3:9], z + np.array([x[i] * y[j] for i in range(3) for j in range(2)]))
-    np.testing.assert_array_equal(out[9], z[0] + (x * y).sum(axis=0))
-    assert not out[10:].any()
-
-
-def test_every_operation_is_tested():
-    own = {name for name, value in vars(numba_simd).items() if getattr(value, "__module__", "") == numba_simd.__name__}
-    assert {name for name in own if not name.startswith("_") and not name.endswith("Type")} <= set(globals())
 
 
 # machine code ---------------------------------------------------------------------------------------------------------

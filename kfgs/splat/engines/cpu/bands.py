@@ -55,7 +55,6 @@ class Picture(NamedTuple):
 class Trace(NamedTuple):
     """What the forward pass leaves for the backward pass."""
 
-    packed: Any  # [M * length] packed rows
     finals: Any  # [H * W] transmittance of each pixel; 1 - alpha would keep few digits of it
     seen: Any  # int32, for each square how many Gaussians of its list were looked at
     drawn: Any  # int32, for each square and Gaussian of its list the blocks in which it was drawn, as bits
@@ -68,19 +67,12 @@ def read_block(picture: Picture, box: Any, block: int, channel: int, into: Any, 
     lanes = lanes_below(values, channels - channel)
     left, top = box[0] + block % BLOCK_SIDE * BLOCK_SIDE, box[1] + block // BLOCK_SIDE * BLOCK_SIDE
     columns, rows = min(box[2] - left, BLOCK_SIDE), min(box[3] - top, BLOCK_SIDE)
-    if columns == BLOCK_SIDE and rows == BLOCK_SIDE:
-        for y in range(BLOCK_SIDE):
-            at = ((top + y) * width + left) * channels + channel
-            for x in range(BLOCK_SIDE):
-                store(into, place + (y * BLOCK_SIDE + x) * stride, load_part(values, at + x * channels, lanes))
-        return
+    nothing = lanes_below(values, 0)
     for y in range(BLOCK_SIDE):
+        at = ((top + y) * width + left) * channels + channel
         for x in range(BLOCK_SIDE):
-            if x < columns and y < rows:
-                at = ((top + y) * width + left + x) * channels + channel
-                store(into, place + (y * BLOCK_SIDE + x) * stride, load_part(values, at, lanes))
-            else:
-                store(into, place + (y * BLOCK_SIDE + x) * stride, 0)
+            wanted = lanes if x < columns and y < rows else nothing
+            store(into, place + (y * BLOCK_SIDE + x) * stride, load_part(values, at + x * channels, wanted))
 
 
 @njit(**INLINE)
@@ -106,7 +98,7 @@ def composite_band(
     background: Any,  # D numbers, and zeros up to a whole vector
     maps: Any,  # [H * W * D], written
     alphas: Any,  # [H * W], written
-    trace: Trace,  # all but the packed rows is written
+    trace: Trace,  # written
 ) -> None:
     """Composite the tiles of one band."""
     channels = len(maps) // len(alphas)

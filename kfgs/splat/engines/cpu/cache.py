@@ -15,7 +15,7 @@ from numba.core.caching import IndexDataCacheFile
 from kfgs._notes import Wait, tell
 
 _HERE = Path(__file__).parent
-_FILES = [file for folder in (_HERE, _HERE.parent) for file in sorted(folder.glob("*.py"))]  # contract.py is above
+_FILES = [file for folder in (_HERE, *_HERE.parents[:2]) for file in sorted(folder.glob("*.py"))]  # sh.py is above
 SOURCES = crc32(b"".join(file.read_bytes() for file in _FILES))
 
 

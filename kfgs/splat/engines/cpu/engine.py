@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..contract import CompiledEngine, Composited, Ranked, Splats, Tiles
+from ..contract import CompiledEngine, Ranked, Splats, Tiles
 from . import square, wide
 from .bands import Trace, accumulate_band, composite_band
 from .bands_backward import differentiate_band
@@ -30,6 +30,17 @@ MOST_BANDS, PAIRS_PER_BAND = 32, 2048
 in several bands."""
 
 
+class Traced(NamedTuple):
+    """What `forward` returns, and keeps for `backward`."""
+
+    maps: Tensor  # [H, W, D]
+    alphas: Tensor  # [H, W]
+    packed: Tensor  # the packed Gaussians
+    finals: Tensor  # [H, W], and the rest of `bands.Trace`
+    seen: Tensor
+    drawn: Tensor
+
+
 class NumbaEngine(CompiledEngine):
     """The engine that `kfgs.splat` takes on a CPU."""
 
@@ -37,31 +48,30 @@ class NumbaEngine(CompiledEngine):
     projects = True
     project, shade, bin = staticmethod(project), staticmethod(shade), staticmethod(bin)  # type: ignore[assignment]
 
-    def forward(self, splats: Splats, tiles: Tiles) -> Composited:
+    def forward(self, splats: Splats, tiles: Tiles) -> Traced:
         view, channels = _view(tiles), splats.features.shape[1]
-        maps = take_memory(splats.features, view.height, view.width, channels)
-        alphas = splats.features.new_empty(view.height, view.width)
-        trace, parts = _make_trace(view, splats)
-        parts.seen[:] = 0
-        rows = _pack(splats, view, parts.packed)
-        background = _padded(splats.background)
-        shared = view, rows, *_channels_plan(splats), background, flat(maps), flat(alphas), parts
-        run_bands(composite_band, len(view.bounds) - 1, *shared)
-        return Composited(maps, alphas, trace)
+        size, squares, whole = (view.height, view.width), view.across**2, torch.empty(0, dtype=torch.int32)
+        maps, finals = take_memory(splats.features, *size, channels), take_memory(splats.features, *size)
+        seen = whole.new_zeros(squares * (len(view.offsets) - 1))
+        drawn, alphas = take_memory(whole, squares * len(view.order)), torch.empty_like(finals)
+        rows = _pack(splats, view)
+        shared = view, rows, *_channels_plan(splats), _padded(splats.background)
+        traces = Trace(flat(finals), flat(seen), flat(drawn))
+        run_bands(composite_band, len(view.bounds) - 1, *shared, flat(maps), flat(alphas), traces)
+        return Traced(maps, alphas, torch.from_numpy(rows.values), finals, seen, drawn)
 
     def backward(
-        self, grads: tuple[Tensor, Tensor], wanted: list[bool], splats: Splats, tiles: Tiles, result: Composited
+        self, grads: tuple[Tensor, Tensor], wanted: list[bool], splats: Splats, tiles: Tiles, result: Traced
     ) -> list[Tensor | None]:
         view, channels = _view(tiles), splats.features.shape[1]
         bands, M = len(view.bounds) - 1, len(splats.means2d)
         slots, firsts, total, chains = _number(view, M)
-        trace = _read_trace(result.trace, view, splats)
-        rows = Rows(trace.packed, row_length(_packed(channels)), view.order)
+        rows = Rows(flat(result.packed), row_length(_packed(channels)), view.order)
         passes, source = _channels_plan(splats)
         length, column = (rows.length, MOMENTS) if passes else (LANES + padded_length(channels), LANES)
         out = take_memory(splats.means2d, total * length).numpy()
-        images = flat(result.maps), flat(grads[0]), flat(grads[1])
-        shared = view, rows, passes, source, _padded(splats.background), images, trace, slots, firsts, out
+        images, traces = (flat(result.maps), flat(grads[0]), flat(grads[1])), Trace(*map(flat, result[3:]))
+        shared = view, rows, passes, source, _padded(splats.background), images, traces, slots, firsts, out
         run_bands(differentiate_band, bands, *shared, any(wanted[:3]))
         results: list[Tensor | None] = [torch.empty_like(value) for value in splats[:3]]
         results.append(torch.zeros_like(splats.features))
@@ -69,8 +79,7 @@ class NumbaEngine(CompiledEngine):
         shares = bands if bool((index[1:] > index[:-1]).all()) else 1  # two Gaussians that show one row must not meet
         layout, values = (length, column, channels), (flat(splats.conics), flat(splats.opacities))
         run_bands(gather_gradients, shares, shares, values, chains, out, layout, index, targets)
-        light = torch.from_numpy(trace.finals).view_as(result.alphas)[..., None]
-        results.append((grads[0] * light).sum((0, 1)) if wanted[4] else None)
+        results.append((grads[0] * result.finals[..., None]).sum((0, 1)) if wanted[4] else None)
         return [value if want else None for value, want in zip(results, wanted, strict=True)]
 
     def accumulate(
@@ -111,11 +120,10 @@ def _packed(channels: int) -> int:
     return channels if channels <= MOST_CHANNELS else 0
 
 
-def _pack(splats: Splats, view: View, packed: np.ndarray | None = None) -> Rows:
-    """The packed Gaussians, written to `packed` if it is given."""
+def _pack(splats: Splats, view: View) -> Rows:
     channels, bands = _packed(splats.features.shape[1]), len(view.bounds) - 1
     length = row_length(channels)
-    packed = take_memory(splats.means2d, len(splats.means2d) * length).numpy() if packed is None else packed
+    packed = take_memory(splats.means2d, len(splats.means2d) * length).numpy()
     footprints = flat(splats.means2d), flat(splats.conics), flat(splats.opacities)
     run_bands(pack_rows, bands, bands, footprints, flat(splats.features), channels, _index(splats), packed)
     return Rows(packed, length, view.order)
@@ -128,29 +136,6 @@ def _channels_plan(splats: Splats) -> tuple[Passes | None, wide.Source | None]:
         return plan_passes(channels), None
     shown = _index(splats) if splats.index is not None else np.arange(len(splats.means2d))
     return None, wide.Source(flat(splats.features), shown * channels, channels)
-
-
-def _make_trace(view: View, splats: Splats) -> tuple[Tensor, Trace]:
-    """One int32 tensor with what the backward pass needs from the forward pass, and its parts."""
-    squares, floats = view.across**2, sum(_floats(view, splats))
-    numbers = floats * splats.means2d.element_size() // 4
-    trace = take_memory(
-        torch.empty(0, dtype=torch.int32), numbers + squares * (len(view.offsets) - 1 + len(view.order))
-    )
-    return trace, _read_trace(trace, view, splats)
-
-
-def _read_trace(trace: Tensor, view: View, splats: Splats) -> Trace:
-    """The parts of the tensor. The packed Gaussians are first, on whole cache lines."""
-    packed, pixels = _floats(view, splats)
-    numbers = (packed + pixels) * splats.means2d.element_size() // 4
-    floats, squares = flat(trace)[:numbers].view(flat(splats.means2d).dtype), view.across**2 * (len(view.offsets) - 1)
-    return Trace(floats[:packed], floats[packed:], *np.split(flat(trace)[numbers:], [squares]))
-
-
-def _floats(view: View, splats: Splats) -> tuple[int, int]:
-    """How many numbers of the data's type are in a trace: packed Gaussians, and pixels."""
-    return len(splats.means2d) * row_length(_packed(splats.features.shape[1])), view.width * view.height
 
 
 def _index(splats: Splats) -> np.ndarray:

@@ -60,7 +60,8 @@ class _Project(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         *cloud, index = ctx.saved_tensors
-        bands, out = _bands(len(cloud[0])), [torch.empty_like(value) for value in cloud]
+        kind = flat(cloud[0]).dtype  # numpy's zeros: pages of new memory are not cleared again
+        bands, out = _bands(len(index)), [torch.from_numpy(np.zeros(value.shape, kind)) for value in cloud]
         given, targets = tuple(flat(grad) for grad in grads[:4]), tuple(flat(value) for value in out)
         gaussians = tuple(flat(value) for value in cloud[:3])
         run_bands(differentiate_band, bands, bands, make_lens(ctx.pinhole), gaussians, flat(index), given, targets)

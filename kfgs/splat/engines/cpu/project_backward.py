@@ -38,17 +38,15 @@ def differentiate_band(
     bands: int,
     lens: Lens,
     gaussians: tuple[Any, Any, Any],  # means [3 N], quats [4 N], scales [3 N]
-    index: Any,  # [M] int64, increasing: the visible Gaussians
+    index: Any,  # [M] int64: the visible Gaussians
     grads: tuple[Any, Any, Any, Any],  # of the loss in means2d [2 M], conics [3 M], depths [M] and opacities [M]
     out: tuple[Any, Any, Any, Any],  # gradients in means [3 N], quats [4 N], scales [3 N] and opacities [N], written
 ) -> None:
-    """Write one of `bands` equal shares of the rows of the gradients: the visible Gaussians', and zeros between them."""
+    """Write the rows of the gradients of one of `bands` equal shares of the visible Gaussians."""
     means, quats, scales = gaussians
     grad_means2d, grad_conics, grad_depths, grad_opacities = grads
     out_means, out_quats, out_scales, out_opacities = out
-    row, last = len(out_opacities) * band // bands, len(out_opacities) * (band + 1) // bands
-    begin: Any = np.searchsorted(index, row)
-    end: Any = np.searchsorted(index, last)
+    begin, end = len(index) * band // bands, len(index) * (band + 1) // bands
     state = np.zeros(_STATE, means.dtype)
     while begin < end:
         count = min(BATCH, end - begin)
@@ -61,8 +59,6 @@ def differentiate_band(
                 state[_GRAD_CONIC + j * BATCH + k] = grad_conics[3 * m + j]
             state[_GRAD_DEPTH + k] = grad_depths[m]
         _differentiate_batch(state, lens)
-        beyond = index[begin + count - 1] + 1
-        _clear(out, row, beyond)
         for k in range(count):
             at = max(index[begin + k], 0)  # the gradients replaced the values in the planes
             for j in range(3):
@@ -71,19 +67,7 @@ def differentiate_band(
             for j in range(4):
                 out_quats[4 * at + j] = state[QUAT + j * BATCH + k]
             out_opacities[at] = grad_opacities[begin + k]
-        row = beyond
         begin += count
-    _clear(out, row, last)
-
-
-@njit(**OPTIONS)
-def _clear(out: tuple[Any, Any, Any, Any], first: int, last: int) -> None:
-    """Zero some rows."""
-    means, quats, scales, opacities = out
-    means[3 * first : 3 * last] = 0
-    quats[4 * first : 4 * last] = 0
-    scales[3 * first : 3 * last] = 0
-    opacities[first:last] = 0
 
 
 @njit(inline="always", fastmath=PLAIN, **OPTIONS)

@@ -13,7 +13,7 @@ from numba import njit
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ...sh import C1, C2, C3, SH_C0
+from ...sh import C1, C2, C3, SH_C0, fill_harmonics
 from .cache import cached_njit
 from .memory import flat, take_memory
 from .project_forward import OPTIONS, PLAIN
@@ -21,6 +21,7 @@ from .threads import run_bands
 
 _SHARE = 8192  # Gaussians of a band
 _SHORTEST = 1e-12  # a direction is divided by its length or by this, as torch's `normalize` does
+_fill_harmonics = njit(fastmath=PLAIN, **OPTIONS)(fill_harmonics)
 
 
 def shade(sh: Tensor, means: Tensor, center: Tensor, index: Tensor) -> Tensor:
@@ -54,11 +55,11 @@ def _run(kernel: Any, index: Tensor, K: int, *tensors: Tensor) -> None:
 @cached_njit(fastmath=PLAIN, **OPTIONS)
 def _shade_band(band: int, bands: int, K: int, sh: Any, means: Any, center: Any, index: Any, out: Any) -> None:
     count = len(index)
-    basis = np.empty(16, sh.dtype)
+    basis = np.full(16, SH_C0, sh.dtype)
     for m in range(count * band // bands, count * (band + 1) // bands):
         row = max(index[m], 0)
         x, y, z, _ = _direction(means, center, row)
-        _harmonics(basis, K, x, y, z)
+        _fill_harmonics(basis, K, x, y, z)
         for c in range(3):
             out[3 * m + c] = max(_color(basis, sh, row, K, c), basis.dtype.type(0))
 
@@ -68,12 +69,12 @@ def _differentiate_band(
     band: int, bands: int, K: int, grads: Any, sh: Any, means: Any, center: Any, index: Any, out_sh: Any, out_means: Any
 ) -> None:
     count = len(index)
-    basis, by_basis, slopes = np.empty(16, sh.dtype), np.empty(16, sh.dtype), np.empty(3, sh.dtype)
+    basis, by_basis, slopes = np.full(16, SH_C0, sh.dtype), np.empty(16, sh.dtype), np.empty(3, sh.dtype)
     zero = sh.dtype.type(0)
     for m in range(count * band // bands, count * (band + 1) // bands):
         row = max(index[m], 0)
         x, y, z, scale = _direction(means, center, row)
-        _harmonics(basis, K, x, y, z)
+        _fill_harmonics(basis, K, x, y, z)
         by_basis[:K] = 0
         for c in range(3):
             grad = grads[3 * m + c] if _color(basis, sh, row, K, c) >= zero else zero
@@ -107,28 +108,6 @@ def _color(basis: Any, sh: Any, row: int, K: int, c: int) -> Any:
     for k in range(K):
         total += basis[k] * sh[3 * (row * K + k) + c]
     return total + basis.dtype.type(0.5)
-
-
-@njit(fastmath=PLAIN, **OPTIONS)
-def _harmonics(basis: Any, K: int, x: Any, y: Any, z: Any) -> None:
-    """The first K real spherical harmonics of a direction."""
-    basis[0] = SH_C0
-    if K > 1:
-        basis[1], basis[2], basis[3] = -C1 * y, C1 * z, -C1 * x
-    if K > 4:
-        xx, yy, zz = x * x, y * y, z * z
-        basis[4], basis[5] = C2[0] * x * y, -C2[0] * y * z
-        basis[6] = C2[1] * (2 * zz - xx - yy)
-        basis[7], basis[8] = -C2[0] * x * z, C2[2] * (xx - yy)
-    if K > 9:
-        xx, yy, zz = x * x, y * y, z * z
-        basis[9] = -C3[0] * y * (3 * xx - yy)
-        basis[10] = C3[1] * x * y * z
-        basis[11] = -C3[2] * y * (4 * zz - xx - yy)
-        basis[12] = C3[3] * z * (2 * zz - 3 * xx - 3 * yy)
-        basis[13] = -C3[2] * x * (4 * zz - xx - yy)
-        basis[14] = C3[4] * z * (xx - yy)
-        basis[15] = -C3[0] * x * (xx - 3 * yy)
 
 
 @njit(fastmath=PLAIN, **OPTIONS)

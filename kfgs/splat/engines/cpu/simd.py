@@ -18,6 +18,9 @@ from __future__ import annotations
 
 import math
 import operator
+from collections.abc import Iterator
+from functools import update_wrapper
+from inspect import Signature
 from typing import Any
 
 import numpy as np
@@ -88,15 +91,34 @@ def _spread(builder: Any, value: Any) -> Any:
     return builder.shuffle_vector(first, ir.Constant(kind, ir.Undefined), _constant(ir.VectorType(_I32, LANES), 0))
 
 
-def _as_vector(context: Any, builder: Any, value: Any, kind: Any, element: Any) -> Any:
-    """The value itself if it is a vector or a mask, else the number in every lane."""
-    if isinstance(kind, VectorType | MaskType):
-        return value
-    return _spread(builder, context.cast(builder, value, kind, element))
+def _as_vectors(context: Any, builder: Any, kinds: Any, values: Any, element: Any) -> list[Any]:
+    """Vectors and masks as they are, numbers in every lane."""
+    return [
+        value
+        if isinstance(kind, VectorType | MaskType)
+        else _spread(builder, context.cast(builder, value, kind, element))
+        for kind, value in zip(kinds, values, strict=True)
+    ]
 
 
 def _pointer(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
     return builder.gep(context.make_array(kind)(context, builder, array).data, [index])
+
+
+def _pointers(context: Any, builder: Any, kind: Any, array: Any, index: Any, stride: Any, count: int) -> Iterator[Any]:
+    """Of array[index], array[index + stride], ..."""
+    pointer = _pointer(context, builder, kind, array, index)
+    for _ in range(count):
+        yield pointer
+        pointer = builder.gep(pointer, [stride])
+
+
+def _load(builder: Any, element: Any, pointer: Any) -> Any:
+    return builder.load(builder.bitcast(pointer, _vector(element).as_pointer()), align=element.bitwidth // 8)
+
+
+def _store(builder: Any, element: Any, vector: Any, pointer: Any) -> None:
+    builder.store(vector, builder.bitcast(pointer, vector.type.as_pointer()), align=element.bitwidth // 8)
 
 
 def _call(builder: Any, name: str, result: Any, *arguments: Any) -> Any:
@@ -106,7 +128,7 @@ def _call(builder: Any, name: str, result: Any, *arguments: Any) -> Any:
 
 
 def _suffix(element: Any) -> str:
-    return f"v{LANES}f{32 if element == types.float32 else 64}"
+    return f"v{LANES}f{element.bitwidth}"
 
 
 def _fma(builder: Any, element: Any, x: Any, y: Any, z: Any) -> Any:
@@ -114,11 +136,51 @@ def _fma(builder: Any, element: Any, x: Any, y: Any, z: Any) -> Any:
     return _call(builder, f"llvm.fmuladd.{_suffix(element)}", _vector(element), x, y, z)
 
 
-def _element_of(kinds: tuple[Any, ...]) -> Any:
-    """The element type of the vectors among the arguments; None where there is none, or what else comes is no number."""
-    elements = {kind.element for kind in kinds if isinstance(kind, VectorType)}
+def _shuffle(builder: Any, x: Any, y: Any, order: list[int]) -> Any:
+    """Lanes of x (0 to LANES - 1) and y (LANES and up) in the given order."""
+    return builder.shuffle_vector(x, y, ir.Constant(ir.VectorType(_I32, LANES), order))
+
+
+def _common(*kinds: Any) -> Any:
+    """The type of the vectors among the arguments; None where there is none, or what else comes is no number."""
+    vectors = {kind for kind in kinds if isinstance(kind, VectorType)}
     numbers = all(isinstance(kind, VectorType | types.Number) for kind in kinds)
-    return elements.pop() if len(elements) == 1 and numbers else None
+    return vectors.pop() if len(vectors) == 1 and numbers else None
+
+
+def _of_array(*kinds: Any) -> Any:
+    """The vector type of the array among the arguments."""
+    return next(VectorType(kind.dtype) for kind in kinds if isinstance(kind, types.Array))
+
+
+def _several_of_array(like: Any, array: Any, *rest: Any) -> Any:
+    return types.UniTuple(VectorType(array.dtype), len(like))
+
+
+def _operation(result: Any) -> Any:
+    """A function of compiled code, written as what it lowers to: `lower(context, builder, kinds, *arguments)`.
+
+    `result` gives the type of its value for the arguments' types `kinds`, or None for arguments that it does not take; or
+    is that type. Integers come as 64-bit ones.
+    """
+
+    def decorate(lower: Any) -> Any:
+        def define(typing: Any, *kinds: Any) -> Any:
+            kinds = tuple(types.int64 if isinstance(kind, types.Integer) else kind for kind in kinds)
+            kind = result if isinstance(result, types.Type) else result(*kinds)
+
+            def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+                value = lower(context, builder, kinds, *args)
+                return context.get_dummy_value() if value is None else value
+
+            return kind and (kind(*kinds), generate)
+
+        update_wrapper(define, lower)
+        parameters = list(Signature.from_callable(lower).parameters.values())[2:]  # `kinds` stands for `typing`
+        define.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
+        return intrinsic(define)
+
+    return decorate
 
 
 # Operators ------------------------------------------------------------------------------------------------------------
@@ -133,13 +195,12 @@ def _register(symbol: Any, method: str, *comparison: str) -> None:
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
             if of_masks:
                 return signature(_MASK, *args) if args == (_MASK, _MASK) else None
-            element = _element_of(args) if len(args) == 2 else None
-            return element and signature(_MASK if comparison else VectorType(element), *args)
+            kind = _common(*args) if len(args) == 2 else None
+            return kind and signature(_MASK if comparison else kind, *args)
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        element = None if of_masks else _element_of(sig.args)
-        x, y = (_as_vector(context, builder, *pair, element) for pair in zip(args, sig.args, strict=True))
-        return getattr(builder, method)(*comparison, x, y)
+        element = None if of_masks else _common(*sig.args).element
+        return getattr(builder, method)(*comparison, *_as_vectors(context, builder, sig.args, args, element))
 
     vectors = (VectorType, VectorType), (VectorType, types.Number), (types.Number, VectorType)
     for kinds in ((MaskType, MaskType),) if of_masks else vectors:
@@ -164,140 +225,85 @@ for _symbol, _lowered in {
 # Memory ---------------------------------------------------------------------------------------------------------------
 
 
-@intrinsic
-def load(typing: Any, array: Any, index: Any) -> Any:
+@_operation(_of_array)
+def load(context: Any, builder: Any, kinds: Any, array: Any, index: Any) -> Any:
     """The vector of array[index], ..., array[index + LANES - 1]."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointer = _pointer(context, builder, sig.args[0], *args)
-        return builder.load(
-            builder.bitcast(pointer, _vector(array.dtype).as_pointer()), align=array.dtype.bitwidth // 8
-        )
-
-    return VectorType(array.dtype)(array, types.intp), generate
+    return _load(builder, kinds[0].dtype, _pointer(context, builder, kinds[0], array, index))
 
 
-@intrinsic
-def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
+@_operation(types.void)
+def store(context: Any, builder: Any, kinds: Any, array: Any, index: Any, value: Any) -> None:
     """Write a vector, or a number LANES times, to array[index], ..., array[index + LANES - 1]."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        vector = _as_vector(context, builder, args[2], sig.args[2], array.dtype)
-        pointer = _pointer(context, builder, sig.args[0], args[0], args[1])
-        builder.store(vector, builder.bitcast(pointer, vector.type.as_pointer()), align=array.dtype.bitwidth // 8)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, value), generate
+    (vector,) = _as_vectors(context, builder, kinds[2:], [value], kinds[0].dtype)
+    _store(builder, kinds[0].dtype, vector, _pointer(context, builder, kinds[0], array, index))
 
 
-@intrinsic
-def load_part(typing: Any, array: Any, index: Any, mask: Any) -> Any:
+@_operation(_of_array)
+def load_part(context: Any, builder: Any, kinds: Any, array: Any, index: Any, mask: Any) -> Any:
     """array[index + i] in the lanes i of the mask, which alone are read; 0 in the others."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        zero, size = _number(array.dtype, 0.0), ir.Constant(_I32, array.dtype.bitwidth // 8)
-        place = builder.bitcast(_pointer(context, builder, array, args[0], args[1]), zero.type.as_pointer())
-        name = f"llvm.masked.load.{_suffix(array.dtype)}.p0"
-        return _call(builder, name, zero.type, place, size, args[2], zero)
-
-    return VectorType(array.dtype)(array, types.intp, mask), generate
+    zero, size = _number(kinds[0].dtype, 0.0), ir.Constant(_I32, kinds[0].dtype.bitwidth // 8)
+    place = builder.bitcast(_pointer(context, builder, kinds[0], array, index), zero.type.as_pointer())
+    return _call(builder, f"llvm.masked.load.{_suffix(kinds[0].dtype)}.p0", zero.type, place, size, mask, zero)
 
 
-@intrinsic
-def store_part(typing: Any, array: Any, index: Any, mask: Any, vector: Any) -> Any:
+@_operation(types.void)
+def store_part(context: Any, builder: Any, kinds: Any, array: Any, index: Any, mask: Any, vector: Any) -> None:
     """Write the lanes i of the mask to array[index + i], and nothing else."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        size = ir.Constant(_I32, array.dtype.bitwidth // 8)
-        place = builder.bitcast(_pointer(context, builder, array, args[0], args[1]), args[3].type.as_pointer())
-        name = f"llvm.masked.store.{_suffix(array.dtype)}.p0"
-        _call(builder, name, ir.VoidType(), args[3], place, size, args[2])
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, mask, vector), generate
+    size = ir.Constant(_I32, kinds[0].dtype.bitwidth // 8)
+    place = builder.bitcast(_pointer(context, builder, kinds[0], array, index), vector.type.as_pointer())
+    _call(builder, f"llvm.masked.store.{_suffix(kinds[0].dtype)}.p0", ir.VoidType(), vector, place, size, mask)
 
 
-@intrinsic
-def fetch(typing: Any, array: Any, index: Any) -> Any:
+@_operation(lambda array, index: array.dtype)
+def fetch(context: Any, builder: Any, kinds: Any, array: Any, index: Any) -> Any:
     """array[index], without looking whether the index is negative."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.load(_pointer(context, builder, sig.args[0], *args))
-
-    return array.dtype(array, types.intp), generate
+    return builder.load(_pointer(context, builder, kinds[0], array, index))
 
 
-@intrinsic
-def put(typing: Any, array: Any, index: Any, value: Any) -> Any:
+@_operation(types.void)
+def put(context: Any, builder: Any, kinds: Any, array: Any, index: Any, value: Any) -> None:
     """array[index] = value, without looking whether the index is negative."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        number = context.cast(builder, args[2], sig.args[2], array.dtype)
-        builder.store(number, _pointer(context, builder, sig.args[0], args[0], args[1]))
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, value), generate
+    number = context.cast(builder, value, kinds[2], kinds[0].dtype)
+    builder.store(number, _pointer(context, builder, kinds[0], array, index))
 
 
-@intrinsic
-def prefetch(typing: Any, array: Any, index: Any) -> Any:
+@_operation(types.void)
+def prefetch(context: Any, builder: Any, kinds: Any, array: Any, index: Any) -> None:
     """Ask for the cache line of array[index]; any index is allowed."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointer = builder.bitcast(_pointer(context, builder, sig.args[0], *args), ir.IntType(8).as_pointer())
-        read, keep, data = (ir.Constant(_I32, number) for number in (0, 3, 1))
-        _call(builder, "llvm.prefetch.p0", ir.VoidType(), pointer, read, keep, data)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp), generate
+    pointer = builder.bitcast(_pointer(context, builder, kinds[0], array, index), ir.IntType(8).as_pointer())
+    read, keep, data = (ir.Constant(_I32, number) for number in (0, 3, 1))
+    _call(builder, "llvm.prefetch.p0", ir.VoidType(), pointer, read, keep, data)
 
 
 # Arithmetic -----------------------------------------------------------------------------------------------------------
 
 
-@intrinsic
-def spread(typing: Any, array: Any, value: Any) -> Any:
+@_operation(lambda array, value: VectorType(array.dtype))
+def spread(context: Any, builder: Any, kinds: Any, array: Any, value: Any) -> Any:
     """The number in every lane of a vector of the array's type."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _as_vector(context, builder, args[1], sig.args[1], array.dtype)
-
-    return VectorType(array.dtype)(array, value), generate
+    return _as_vectors(context, builder, kinds[1:], [value], kinds[0].dtype)[0]
 
 
-@intrinsic
-def lanes_below(typing: Any, array: Any, count: Any) -> Any:
+@_operation(_MASK)
+def lanes_below(context: Any, builder: Any, kinds: Any, array: Any, count: Any) -> Any:
     """Mask of the first `count` lanes; the array is of any type."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        kind = ir.VectorType(_I64, LANES)
-        return builder.icmp_signed("<", ir.Constant(kind, list(range(LANES))), _spread(builder, args[1]))
-
-    return _MASK(array, types.int64), generate
+    return builder.icmp_signed(
+        "<", ir.Constant(ir.VectorType(_I64, LANES), list(range(LANES))), _spread(builder, count)
+    )
 
 
-@intrinsic
-def fma(typing: Any, x: Any, y: Any, z: Any) -> Any:
+@_operation(_common)
+def fma(context: Any, builder: Any, kinds: Any, x: Any, y: Any, z: Any) -> Any:
     """X y + z, rounded once where the processor has such an instruction."""
-    element = _element_of((x, y, z))
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        vectors = (_as_vector(context, builder, *pair, element) for pair in zip(args, sig.args, strict=True))
-        return _fma(builder, element, *vectors)
-
-    return (VectorType(element)(x, y, z), generate) if element else None
+    element = _common(*kinds).element
+    return _fma(builder, element, *_as_vectors(context, builder, kinds, (x, y, z), element))
 
 
 def _choice(comparison: str) -> Any:
-    @intrinsic
-    def choose(typing: Any, x: Any, y: Any) -> Any:
-        element = _element_of((x, y))
-
-        def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            a, b = (_as_vector(context, builder, *pair, element) for pair in zip(args, sig.args, strict=True))
-            return builder.select(builder.fcmp_ordered(comparison, a, b), a, b)
-
-        return (VectorType(element)(x, y), generate) if element else None
+    @_operation(_common)
+    def choose(context: Any, builder: Any, kinds: Any, x: Any, y: Any) -> Any:
+        a, b = _as_vectors(context, builder, kinds, (x, y), _common(*kinds).element)
+        return builder.select(builder.fcmp_ordered(comparison, a, b), a, b)
 
     return choose
 
@@ -306,16 +312,10 @@ minimum = _choice("<")  # of a NaN and a number: the second argument
 maximum = _choice(">")
 
 
-@intrinsic
-def select(typing: Any, mask: Any, x: Any, y: Any) -> Any:
+@_operation(lambda mask, x, y: _common(x, y))
+def select(context: Any, builder: Any, kinds: Any, mask: Any, x: Any, y: Any) -> Any:
     """Lane by lane: x where the mask holds, else y."""
-    element = _element_of((x, y))
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        a, b = (_as_vector(context, builder, *pair, element) for pair in zip(args[1:], sig.args[1:], strict=True))
-        return builder.select(args[0], a, b)
-
-    return (VectorType(element)(mask, x, y), generate) if element else None
+    return builder.select(mask, *_as_vectors(context, builder, kinds[1:], (x, y), _common(*kinds[1:]).element))
 
 
 _EXP2 = {  # 2^f = 1 + c1 f + c2 f^2 + ... on |f| <= 1/2
@@ -333,62 +333,48 @@ _EXP2 = {  # 2^f = 1 + c1 f + c2 f^2 + ... on |f| <= 1/2
 }
 
 
-@intrinsic
-def exp2(typing: Any, x: Any) -> Any:
+@_operation(_common)
+def exp2(context: Any, builder: Any, kinds: Any, x: Any) -> Any:
     """2^x for |x| < 126, with a relative error below 2e-7 (float64: 4e-16); any number for other x.
 
     With n = round(x), 2^x = 2^n 2^(x - n): a polynomial, and n added to the exponent's bits.
     """
-    element = x.element
-    mantissa = 23 if element == types.float32 else 52
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        integers = _integers(element)
-        rounder = _number(element, 1.5 * 2**mantissa)  # adding it leaves round(x) in the lowest bits
-        shifted = builder.fadd(args[0], rounder)
-        f = builder.fsub(args[0], builder.fsub(shifted, rounder))
-        power = _number(element, _EXP2[element][-1])
-        for coefficient in _EXP2[element][-2::-1]:
-            power = _fma(builder, element, power, f, _number(element, coefficient))
-        exponent = builder.shl(builder.bitcast(shifted, integers), _constant(integers, mantissa))
-        return builder.bitcast(builder.add(builder.bitcast(power, integers), exponent), args[0].type)
-
-    return x(x), generate
+    element = kinds[0].element
+    mantissa, integers = 23 if element == types.float32 else 52, _integers(element)
+    rounder = _number(element, 1.5 * 2**mantissa)  # adding it leaves round(x) in the lowest bits
+    shifted = builder.fadd(x, rounder)
+    f = builder.fsub(x, builder.fsub(shifted, rounder))
+    power = _number(element, _EXP2[element][-1])
+    for coefficient in _EXP2[element][-2::-1]:
+        power = _fma(builder, element, power, f, _number(element, coefficient))
+    exponent = builder.shl(builder.bitcast(shifted, integers), _constant(integers, mantissa))
+    return builder.bitcast(builder.add(builder.bitcast(power, integers), exponent), x.type)
 
 
-@intrinsic
-def reciprocal(typing: Any, x: Any) -> Any:
+@_operation(_common)
+def reciprocal(context: Any, builder: Any, kinds: Any, x: Any) -> Any:
     """1 / x for x in [0.001, 1000], with a relative error below 2e-7; exactly rounded for float64.
 
     Newton's iteration doubles the correct bits of a first guess read off the exponent: cheaper than a division.
     """
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        if x.element == types.float64:
-            return builder.fdiv(_number(x.element, 1.0), args[0])
-        integers = _integers(x.element)
-        guess = builder.bitcast(
-            builder.sub(_constant(integers, 0x7EF311C3), builder.bitcast(args[0], integers)), args[0].type
-        )
-        minus_x = builder.fsub(_number(x.element, -0.0), args[0])
-        for _ in range(3):
-            guess = builder.fmul(guess, _fma(builder, x.element, minus_x, guess, _number(x.element, 2.0)))
-        return guess
-
-    return x(x), generate
+    element = kinds[0].element
+    if element == types.float64:
+        return builder.fdiv(_number(element, 1.0), x)
+    integers = _integers(element)
+    guess = builder.bitcast(builder.sub(_constant(integers, 0x7EF311C3), builder.bitcast(x, integers)), x.type)
+    minus_x = builder.fsub(_number(element, -0.0), x)
+    for _ in range(3):
+        guess = builder.fmul(guess, _fma(builder, element, minus_x, guess, _number(element, 2.0)))
+    return guess
 
 
 # Across the lanes -----------------------------------------------------------------------------------------------------
 
 
-@intrinsic
-def bits(typing: Any, mask: Any) -> Any:
+@_operation(types.uint32)
+def bits(context: Any, builder: Any, kinds: Any, mask: Any) -> Any:
     """The mask as a number: bit i is lane i."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.zext(builder.bitcast(args[0], ir.IntType(LANES)), _I32)
-
-    return types.uint32(mask), generate
+    return builder.zext(builder.bitcast(mask, ir.IntType(LANES)), _I32)
 
 
 @njit(forceinline=True)
@@ -397,188 +383,115 @@ def any_of(mask: Any) -> bool:
     return bits(mask) != 0  # type: ignore[no-any-return]
 
 
-@intrinsic
-def trailing_zeros(typing: Any, number: Any) -> Any:
+@_operation(types.int64)
+def trailing_zeros(context: Any, builder: Any, kinds: Any, number: Any) -> Any:
     """Position of the lowest bit that is set; the number is not 0."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.zext(builder.cttz(args[0], ir.Constant(_I1, 1)), _I64)
-
-    return types.int64(types.uint32), generate
+    return builder.cttz(number, ir.Constant(_I1, 1))
 
 
-@intrinsic
-def sum_lanes(typing: Any, x: Any) -> Any:
+@_operation(lambda x: x.element)
+def sum_lanes(context: Any, builder: Any, kinds: Any, x: Any) -> Any:
     """The sum of a vector's numbers: pairs half a vector apart first."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        total, width = args[0], LANES
-        while width > 1:
-            width //= 2
-            order = [(i + width) % LANES for i in range(LANES)]
-            total = builder.fadd(total, _shuffle(builder, total, total, order))
-        return builder.extract_element(total, ir.Constant(_I32, 0))
-
-    return x.element(x), generate
+    width = LANES
+    while width > 1:
+        width //= 2
+        x = builder.fadd(x, _shuffle(builder, x, x, [(i + width) % LANES for i in range(LANES)]))
+    return builder.extract_element(x, ir.Constant(_I32, 0))
 
 
-def _shuffle(builder: Any, x: Any, y: Any, order: list[int]) -> Any:
-    """Lanes of x (0 to LANES - 1) and y (LANES and up) in the given order."""
-    return builder.shuffle_vector(x, y, ir.Constant(ir.VectorType(_I32, LANES), order))
-
-
-@intrinsic
-def sum_many(typing: Any, vectors: Any) -> Any:
+@_operation(lambda vectors: vectors.dtype)
+def sum_many(context: Any, builder: Any, kinds: Any, vectors: Any) -> Any:
     """Vector whose lane i is the sum of the i-th of up to LANES vectors; 0 in the lanes beyond.
 
     Neighbours are added pairwise, then pairs, and so on, each time with half of the lanes of both: about 4 operations
     per sum, where one sum after another would take 8.
     """
-    element = vectors.dtype.element
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        rows = cgutils.unpack_tuple(builder, args[0], vectors.count)
-        rows += [_number(element, 0.0)] * (LANES - len(rows))
-        step = 1
-        while len(rows) > 1:  # lanes with the bit `step` set come from the second vector
-            kept = [i if not i & step else LANES + (i ^ step) for i in range(LANES)]
-            other = [i ^ step if not i & step else LANES + i for i in range(LANES)]
-            rows = [
-                builder.fadd(_shuffle(builder, x, y, kept), _shuffle(builder, x, y, other))
-                for x, y in zip(rows[::2], rows[1::2], strict=True)
-            ]
-            step *= 2
-        return rows[0]
-
-    return vectors.dtype(vectors), generate
+    rows = cgutils.unpack_tuple(builder, vectors)
+    rows += [_number(kinds[0].dtype.element, 0.0)] * (LANES - len(rows))
+    step = 1
+    while len(rows) > 1:  # lanes with the bit `step` set come from the second vector
+        kept = [i if not i & step else LANES + (i ^ step) for i in range(LANES)]
+        other = [i ^ step if not i & step else LANES + i for i in range(LANES)]
+        pairs = zip(rows[::2], rows[1::2], strict=True)
+        rows = [builder.fadd(_shuffle(builder, x, y, kept), _shuffle(builder, x, y, other)) for x, y in pairs]
+        step *= 2
+    return rows[0]
 
 
-@intrinsic
-def transpose(typing: Any, rows: Any) -> Any:
+@_operation(lambda rows: rows)
+def transpose(context: Any, builder: Any, kinds: Any, rows: Any) -> Any:
     """LANES vectors, lane j of the i-th from lane i of the j-th."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        vectors, step = cgutils.unpack_tuple(builder, args[0], LANES), 1
-        while step < LANES:  # swap the off-diagonal squares of side `step`
-            upper = [i if not i & step else LANES + i - step for i in range(LANES)]
-            lower = [i + step if not i & step else LANES + i for i in range(LANES)]
-            for i in range(LANES):
-                if not i & step:
-                    x, y = vectors[i], vectors[i + step]
-                    vectors[i], vectors[i + step] = _shuffle(builder, x, y, upper), _shuffle(builder, x, y, lower)
-            step *= 2
-        return context.make_tuple(builder, rows, vectors)
-
-    return rows(rows), generate
+    vectors, step = cgutils.unpack_tuple(builder, rows), 1
+    while step < LANES:  # swap the off-diagonal squares of side `step`
+        upper = [i if not i & step else LANES + i - step for i in range(LANES)]
+        lower = [i + step if not i & step else LANES + i for i in range(LANES)]
+        for i in range(LANES):
+            if not i & step:
+                x, y = vectors[i], vectors[i + step]
+                vectors[i], vectors[i + step] = _shuffle(builder, x, y, upper), _shuffle(builder, x, y, lower)
+        step *= 2
+    return context.make_tuple(builder, kinds[0], vectors)
 
 
-@intrinsic
-def regroup(typing: Any, rows: Any) -> Any:
+@_operation(lambda rows: rows)
+def regroup(context: Any, builder: Any, kinds: Any, rows: Any) -> Any:
     """Four vectors of four quarters each: quarter j of the i-th comes from quarter i of the j-th."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        a, b, c, d = cgutils.unpack_tuple(builder, args[0], 4)
-        quarter, vectors = LANES // 4, []
-        for i in range(4):
-            mine = list(range(i * quarter, (i + 1) * quarter))
-            pair = mine + [LANES + lane for lane in mine]
-            left = _shuffle(builder, a, b, pair * 2)
-            right = _shuffle(builder, c, d, pair * 2)
-            half = LANES // 2
-            vectors.append(_shuffle(builder, left, right, [*range(half), *range(LANES + half, 2 * LANES)]))
-        return context.make_tuple(builder, rows, vectors)
-
-    return rows(rows), generate
+    a, b, c, d = cgutils.unpack_tuple(builder, rows)
+    quarter, half, vectors = LANES // 4, LANES // 2, []
+    for i in range(4):
+        mine = list(range(i * quarter, (i + 1) * quarter))
+        pair = mine + [LANES + lane for lane in mine]
+        left, right = _shuffle(builder, a, b, pair * 2), _shuffle(builder, c, d, pair * 2)
+        vectors.append(_shuffle(builder, left, right, [*range(half), *range(LANES + half, 2 * LANES)]))
+    return context.make_tuple(builder, kinds[0], vectors)
 
 
 # Several vectors in registers: tuples whose length is known when compiling ---------------------------------------------
 
 
-def _several(element: Any, count: int) -> Any:
-    return types.UniTuple(VectorType(element), count)
-
-
-@intrinsic
-def load_many(typing: Any, like: Any, array: Any, index: Any, stride: Any) -> Any:
+@_operation(_several_of_array)
+def load_many(context: Any, builder: Any, kinds: Any, like: Any, array: Any, index: Any, stride: Any) -> Any:
     """As many vectors as the tuple `like` is long, the k-th from array[index + k stride]."""
-    kind = _several(array.dtype, len(like))
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointer, vectors = _pointer(context, builder, array, args[1], args[2]), []
-        for _ in range(kind.count):
-            place = builder.bitcast(pointer, _vector(array.dtype).as_pointer())
-            vectors.append(builder.load(place, align=array.dtype.bitwidth // 8))
-            pointer = builder.gep(pointer, [args[3]])
-        return context.make_tuple(builder, kind, vectors)
-
-    return kind(like, array, types.intp, types.intp), generate
+    pointers = _pointers(context, builder, kinds[1], array, index, stride, len(kinds[0]))
+    vectors = [_load(builder, kinds[1].dtype, pointer) for pointer in pointers]
+    return context.make_tuple(builder, _several_of_array(*kinds), vectors)
 
 
-@intrinsic
-def store_many(typing: Any, array: Any, index: Any, stride: Any, vectors: Any) -> Any:
+@_operation(types.void)
+def store_many(context: Any, builder: Any, kinds: Any, array: Any, index: Any, stride: Any, vectors: Any) -> None:
     """Write the k-th vector to array[index + k stride]."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointer = _pointer(context, builder, array, args[0], args[1])
-        for vector in cgutils.unpack_tuple(builder, args[3], vectors.count):
-            builder.store(vector, builder.bitcast(pointer, vector.type.as_pointer()), align=array.dtype.bitwidth // 8)
-            pointer = builder.gep(pointer, [args[2]])
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, types.intp, vectors), generate
+    pointers = _pointers(context, builder, kinds[0], array, index, stride, len(kinds[3]))
+    for vector, pointer in zip(cgutils.unpack_tuple(builder, vectors), pointers, strict=True):
+        _store(builder, kinds[0].dtype, vector, pointer)
 
 
-@intrinsic
-def spread_many(typing: Any, like: Any, array: Any, index: Any, stride: Any) -> Any:
+@_operation(_several_of_array)
+def spread_many(context: Any, builder: Any, kinds: Any, like: Any, array: Any, index: Any, stride: Any) -> Any:
     """As many vectors as the tuple `like` is long, the k-th full of array[index + k stride]."""
-    kind = _several(array.dtype, len(like))
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointer, vectors = _pointer(context, builder, array, args[1], args[2]), []
-        for _ in range(kind.count):
-            vectors.append(_spread(builder, builder.load(pointer)))
-            pointer = builder.gep(pointer, [args[3]])
-        return context.make_tuple(builder, kind, vectors)
-
-    return kind(like, array, types.intp, types.intp), generate
+    pointers = _pointers(context, builder, kinds[1], array, index, stride, len(kinds[0]))
+    vectors = [_spread(builder, builder.load(pointer)) for pointer in pointers]
+    return context.make_tuple(builder, _several_of_array(*kinds), vectors)
 
 
-@intrinsic
-def zero_many(typing: Any, like: Any, array: Any) -> Any:
+@_operation(_several_of_array)
+def zero_many(context: Any, builder: Any, kinds: Any, like: Any, array: Any) -> Any:
     """As many vectors of zeros of the array's type as the tuple `like` is long."""
-    kind = _several(array.dtype, len(like))
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return context.make_tuple(builder, kind, [_number(array.dtype, 0.0)] * kind.count)
-
-    return kind(like, array), generate
+    zeros = [_number(kinds[1].dtype, 0.0)] * len(kinds[0])
+    return context.make_tuple(builder, _several_of_array(*kinds), zeros)
 
 
-@intrinsic
-def add_outer(typing: Any, sums: Any, left: Any, right: Any) -> Any:
+@_operation(lambda sums, left, right: sums)
+def add_outer(context: Any, builder: Any, kinds: Any, sums: Any, left: Any, right: Any) -> Any:
     """sums[i n + j] + left[i] * right[j], with n = len(right)."""
-    element, n = sums.dtype.element, right.count
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        totals, x, y = (
-            cgutils.unpack_tuple(builder, arg, kind.count) for arg, kind in zip(args, sig.args, strict=True)
-        )
-        added = [_fma(builder, element, x[k // n], y[k % n], total) for k, total in enumerate(totals)]
-        return context.make_tuple(builder, sums, added)
-
-    return sums(sums, left, right), generate
+    element, n = kinds[0].dtype.element, len(kinds[2])
+    totals, x, y = (cgutils.unpack_tuple(builder, value) for value in (sums, left, right))
+    added = [_fma(builder, element, x[k // n], y[k % n], total) for k, total in enumerate(totals)]
+    return context.make_tuple(builder, kinds[0], added)
 
 
-@intrinsic
-def add_dot(typing: Any, start: Any, left: Any, right: Any) -> Any:
+@_operation(lambda start, left, right: start)
+def add_dot(context: Any, builder: Any, kinds: Any, start: Any, left: Any, right: Any) -> Any:
     """Start + left[0] right[0] + left[1] right[1] + ..., one after another."""
-    element = start.element
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        total = args[0]
-        rows = (cgutils.unpack_tuple(builder, args[i], left.count) for i in (1, 2))
-        for x, y in zip(*rows, strict=True):
-            total = _fma(builder, element, x, y, total)
-        return total
-
-    return start(start, left, right), generate
+    for x, y in zip(*(cgutils.unpack_tuple(builder, value) for value in (left, right)), strict=True):
+        start = _fma(builder, kinds[0].element, x, y, start)
+    return start

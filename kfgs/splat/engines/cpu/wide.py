@@ -15,6 +15,7 @@ from numba import njit
 from ..contract import ALPHA_MAX, TRANSMITTANCE_MIN
 from .simd import (
     LANES,
+    add_dot,
     add_outer,
     any_of,
     fetch,
@@ -52,8 +53,6 @@ from .square import (
 )
 
 FOUR, SIXTEEN = (0,) * 4, (0,) * 16
-STEP = 4 * LANES
-"""Channels of one piece."""
 
 
 @njit(**INLINE)
@@ -130,33 +129,13 @@ def add_colors(
     fresh: bool,  # whether there is nothing in `sums` yet
 ) -> None:
     """sums[pixel, c] += weights[k, pixel] features[k, c] for a block's 16 pixels."""
-    weights, begins, features, channels = kept.weights, kept.begins, source.values, source.channels
-    whole = channels // STEP * STEP
-    for pixel in range(0, LANES, 4):
-        row = into + pixel * stride
-        for channel in range(0, whole, STEP):
-            at = row + channel
-            total = zero_many(SIXTEEN, sums)
-            if not fresh:
-                a, b = load_many(FOUR, sums, at, LANES), load_many(FOUR, sums, at + stride, LANES)
-                c, d = load_many(FOUR, sums, at + 2 * stride, LANES), load_many(FOUR, sums, at + 3 * stride, LANES)
-                total = a + b + c + d
-            for k in range(count):
-                values = load_many(FOUR, features, fetch(begins, k) + channel, LANES)
-                total = add_outer(total, spread_many(FOUR, weights, k * LANES + pixel, 1), values)
-            store_many(sums, at, LANES, total[0:4])
-            store_many(sums, at + stride, LANES, total[4:8])
-            store_many(sums, at + 2 * stride, LANES, total[8:12])
-            store_many(sums, at + 3 * stride, LANES, total[12:16])
-        for channel in range(whole, channels, LANES):
-            lanes = lanes_below(sums, channels - channel)
-            column = zero_many(FOUR, sums)
-            if not fresh:
-                column = load_many(FOUR, sums, row + channel, stride)
-            for k in range(count):
-                value = load_part(features, fetch(begins, k) + channel, lanes)
-                column = add_outer(column, spread_many(FOUR, weights, k * LANES + pixel, 1), (value,))
-            store_many(sums, row + channel, stride, column)
+    for channel in range(0, source.channels, LANES):
+        lanes, at = lanes_below(sums, source.channels - channel), into + channel
+        total = zero_many(SIXTEEN, sums) if fresh else load_many(SIXTEEN, sums, at, stride)
+        for k in range(count):
+            value = load_part(source.values, fetch(kept.begins, k) + channel, lanes)
+            total = add_outer(total, spread_many(SIXTEEN, kept.weights, k * LANES, 1), (value,))
+        store_many(sums, at, stride, total)
 
 
 @njit(**INLINE)
@@ -311,38 +290,10 @@ def add_moments(
 def add_features(
     out: Any, width: int, slots: Any, kept: Kept, grads: Any, corner: int, stride: int, count: int
 ) -> None:
-    """out[k, c] += weights[k, pixel] grads[pixel, c], summed over a block's 16 pixels, 4 Gaussians at a time."""
-    weights, _, places, _ = kept
-    whole = stride // STEP * STEP
-    for k in range(0, count, 4):
-        n = min(4, count - k)
-        for i in range(n, 4):  # what fills up the four weighs nothing
-            store(weights, (k + i) * LANES, 0)
-        r0 = np.int64(fetch(slots, np.int64(fetch(places, k)))) * width + LANES
-        r1 = np.int64(fetch(slots, np.int64(fetch(places, k + min(1, n - 1))))) * width + LANES
-        r2 = np.int64(fetch(slots, np.int64(fetch(places, k + min(2, n - 1))))) * width + LANES
-        r3 = np.int64(fetch(slots, np.int64(fetch(places, k + min(3, n - 1))))) * width + LANES
-        for channel in range(0, whole, STEP):
-            total = zero_many(SIXTEEN, out)
-            for pixel in range(LANES):
-                values = load_many(FOUR, grads, corner + pixel * stride + channel, LANES)
-                total = add_outer(total, spread_many(FOUR, weights, k * LANES + pixel, LANES), values)
-            _add_vectors(out, r0 + channel, total[0:4])
-            _add_vectors(out, r1 + channel, total[4:8])
-            _add_vectors(out, r2 + channel, total[8:12])
-            _add_vectors(out, r3 + channel, total[12:16])
-        for channel in range(whole, stride, LANES):
-            column = zero_many(FOUR, out)
-            for pixel in range(LANES):
-                value = load(grads, corner + pixel * stride + channel)
-                column = add_outer(column, spread_many(FOUR, weights, k * LANES + pixel, LANES), (value,))
-            _add_vectors(out, r0 + channel, column[0:1])
-            _add_vectors(out, r1 + channel, column[1:2])
-            _add_vectors(out, r2 + channel, column[2:3])
-            _add_vectors(out, r3 + channel, column[3:4])
-
-
-@njit(**INLINE)
-def _add_vectors(out: Any, place: int, vectors: Any) -> None:
-    """Add neighbouring vectors to what is there."""
-    store_many(out, place, LANES, add_outer(vectors, (spread(out, 1),), load_many(vectors, out, place, LANES)))
+    """out[k, c] += weights[k, pixel] grads[pixel, c], summed over a block's 16 pixels."""
+    for channel in range(0, stride, LANES):
+        pixels = load_many(SIXTEEN, grads, corner + channel, stride)
+        for k in range(count):
+            place = np.int64(fetch(slots, np.int64(fetch(kept.places, k)))) * width + LANES + channel
+            total = add_dot(spread(out, 0), spread_many(SIXTEEN, kept.weights, k * LANES, 1), pixels)
+            store(out, place, load(out, place) + total)

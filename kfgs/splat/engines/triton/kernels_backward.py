@@ -74,7 +74,7 @@ def differentiate_kernel(
 ):  # fmt: skip
     """Add the gradients that PIXELS pixels give to the Gaussians of their tile, and to the features these show.
 
-    Any number of channels: each chunk goes over them in blocks, once for D and, after that, once for the features.
+    Any number of channels: each chunk goes over them in blocks.
     """
     tile, pixel, x, y, inside = place_pixels(columns, width, height, SIDE, PARTS, PIXELS)
     listed_rows, count = find_list(tile, rows, offsets)
@@ -98,24 +98,26 @@ def differentiate_kernel(
         passed = 1.0 - alpha
         left = light[None, :] * tl.cumprod(passed, 0)
         light = tl.minimum(light, tl.min(left, 0))
-        weight = alpha * (left / passed)
-        odds = tl.where(full <= MOST, alpha / passed, 0.0)
+        odds = alpha / passed
+        weight = odds * left
+        odds = tl.where(full <= MOST, odds, 0.0)
         shown_row = find_features(row, listed, index)
-        if OF_FEATURES:
-            for start in range(0, channels, BLOCK):
-                channel = start + tl.arange(0, BLOCK)
-                grad = load_block(grad_maps, pixel, inside, channel, channels)
-                part = sum_pixels(weight, grad, CHUNK, PIXELS, BLOCK, PRECISION)
+        slope = tl.zeros((CHUNK, PIXELS), tl.float32) + share[None, :]
+        for start in range(0, channels, BLOCK):
+            channel = start + tl.arange(0, BLOCK)
+            grad = load_block(grad_maps, pixel, inside, channel, channels)
+            if OF_SPLATS:
+                shown = load_block(features, shown_row, listed, channel, channels)
+                slope = tl.dot(shown, tl.trans(grad), slope, input_precision=PRECISION)
+            if OF_FEATURES:
+                if BLOCK > 16:
+                    part = tl.dot(weight, grad, input_precision=PRECISION)
+                else:
+                    part = sum_pixels(weight, grad, CHUNK, PIXELS, BLOCK, PRECISION)
                 there = listed[:, None] & (channel < channels)[None, :]
                 into = grad_features + shown_row[:, None] * channels + channel[None, :]
                 tl.atomic_add(into, part, mask=there, sem="relaxed")
         if OF_SPLATS:
-            slope = tl.zeros((CHUNK, PIXELS), tl.float32) + share[None, :]
-            for start in range(0, channels, BLOCK):
-                channel = start + tl.arange(0, BLOCK)
-                shown = load_block(features, shown_row, listed, channel, channels)
-                grad = load_block(grad_maps, pixel, inside, channel, channels)
-                slope = tl.dot(shown, tl.trans(grad), slope, input_precision=PRECISION)
             own = weight * slope
             rest = behind[None, :] - tl.cumsum(own, 0)
             behind -= tl.sum(own, 0)

@@ -1,4 +1,4 @@
-"""The compiled losses: odd sizes, unknown pixels, borders of shares, and bits that do not depend on threads."""
+"""The compiled SSIM: odd sizes, counted windows, borders of shares, and bits that do not depend on threads."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from oracles_color import ssim_windows
 
 pytest.importorskip("numba")
 
-from kfgs.splat.engines.cpu.losses import absolute, similarity
+from kfgs.splat.engines.cpu.similarity import similarity
 
 CONSTANTS = 0.01**2, 0.03**2
 
@@ -29,7 +29,7 @@ def pictures(height, width, channels=3, dtype=torch.float64):
 )
 def test_value_at_awkward_sizes(height, width, channels):
     a, b = pictures(height, width, channels)
-    value, _, slope = similarity(a, b, None, window(a.dtype), CONSTANTS)
+    value, slope = similarity(a, b, None, window(a.dtype), CONSTANTS)
     assert float(value) == pytest.approx(ssim_windows(a, b).mean(), abs=1e-12)
     assert slope.shape == a.shape
     for i, j in (
@@ -47,11 +47,11 @@ def test_value_at_awkward_sizes(height, width, channels):
 def test_only_counted_windows_count():
     a, b = pictures(40, 33)
     counted = torch.rand(30, 23, generator=torch.Generator().manual_seed(5)) < 0.3
-    value, _, slope = similarity(a, b, counted, window(a.dtype), CONSTANTS)
+    value, slope = similarity(a, b, counted, window(a.dtype), CONSTANTS)
     assert float(value) == pytest.approx(ssim_windows(a, b)[counted.numpy()].mean(), abs=1e-12)
     one = torch.zeros_like(counted)
     one[4, 7] = True
-    _, _, slope = similarity(a, b, one, window(a.dtype), CONSTANTS)
+    _, slope = similarity(a, b, one, window(a.dtype), CONSTANTS)
     touched = (slope != 0).any(dim=2).nonzero()
     np.testing.assert_array_equal(touched.amin(dim=0), [4, 7])
     np.testing.assert_array_equal(touched.amax(dim=0), [14, 17])
@@ -67,30 +67,13 @@ def test_bits_do_not_depend_on_the_number_of_threads():
             found.append(similarity(a, b, None, window(a.dtype), CONSTANTS))
     finally:
         torch.set_num_threads(threads)
-    for value, _, slope in found[1:]:
+    for value, slope in found[1:]:
         assert torch.equal(value, found[0][0])
-        assert torch.equal(slope, found[0][2])
+        assert torch.equal(slope, found[0][1])
 
 
 def test_flat_pictures_are_finite():
     black = torch.zeros(20, 20, 3)
-    value, _, slope = similarity(black, black, None, window(black.dtype), CONSTANTS)
+    value, slope = similarity(black, black, None, window(black.dtype), CONSTANTS)
     assert float(value) == pytest.approx(1.0)
     assert not slope.any()
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("unknown", [0.0, 0.01, 0.5, 1.0])
-@pytest.mark.parametrize("size", [(1, 1, 1), (3, 5, 9), (130, 150, 3), (64, 40, 64)])
-def test_absolute_difference_and_gradient(size, unknown, dtype):
-    g = torch.Generator().manual_seed(size[0])
-    a, b = (torch.randn(size, generator=g, dtype=dtype) for _ in range(2))
-    a[::3] = b[::3]  # no difference: no slope
-    b[torch.rand(size[:2], generator=g) < unknown, 0] = torch.nan
-    leaf, known = a.clone().requires_grad_(), ~b.isnan().any(dim=2, keepdim=True)
-    expected = torch.where(known, leaf - b, 0).abs().sum() / (known.sum() * size[2]).clamp_min(1)
-    expected.backward()
-    value, slope = absolute(a, b)
-    rtol = 1e-5 if dtype == torch.float32 else 1e-12
-    torch.testing.assert_close(value, expected.detach(), rtol=rtol, atol=0)
-    torch.testing.assert_close(slope, leaf.grad, rtol=rtol, atol=0)
