@@ -1,6 +1,29 @@
-"""Clouds of a small room without symmetry, sampled as differently as two fields of one scene are."""
+"""Small clouds; and those of a small room without symmetry, sampled as differently as two fields of one scene are."""
 
 import torch
+
+from kfgs.gaussians import Gaussians
+
+
+def balls(means, labels=None, **changes):
+    """Small balls at the given places."""
+    means = torch.as_tensor(means, dtype=torch.float32)
+    n = len(means)
+    return Gaussians(
+        means=means,
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        scales=torch.full((n, 3), 0.05),
+        opacities=torch.full((n,), 0.9),
+        labels=None if labels is None else torch.as_tensor(labels, dtype=torch.int64),
+    ).replace(**changes)
+
+
+def random_cloud(n, coefficients=4, seed=0, dtype=torch.float32, **changes):
+    """Gaussians of any direction, all of whose numbers lie in [0.1, 0.9]."""
+    generator = torch.Generator().manual_seed(seed)
+    draw = lambda *shape: (0.1 + 0.8 * torch.rand(*shape, generator=generator, dtype=torch.float64)).to(dtype)  # noqa: E731
+    sh = draw(n, coefficients, 3) if coefficients else None
+    return Gaussians(draw(n, 3), draw(n, 4), draw(n, 3), draw(n), sh=sh).replace(**changes)
 
 
 def surface(count, seed):

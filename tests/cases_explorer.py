@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import torch
+from cases_clouds import balls as cloud
 from cases_quant import made_autoencoder
 
 from kfgs._rows import unit_rows
@@ -109,19 +110,6 @@ def cameras(count=3):
         K = torch.tensor([[40.0, 0, 21], [0, 44, 13], [0, 0, 1]])
         made.append(Camera(viewmat, K, 40, 28, f"view_{i}"))
     return made
-
-
-def cloud(means, labels=None, **changes):
-    """Small balls at the given places."""
-    means = torch.as_tensor(means, dtype=torch.float32)
-    n = len(means)
-    return Gaussians(
-        means=means,
-        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
-        scales=torch.full((n, 3), 0.05),
-        opacities=torch.full((n,), 0.9),
-        labels=None if labels is None else torch.as_tensor(labels, dtype=torch.int64),
-    ).replace(**changes)
 
 
 def grid_clouds(seed=0, sources=150, targets=400):

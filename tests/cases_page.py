@@ -2,6 +2,7 @@
 
 import numpy as np
 import torch
+from cases_web import SECONDS
 
 from kfgs.gaussians import Gaussians
 from kfgs.viewer import Exploration, SplatMeaning
@@ -33,3 +34,36 @@ def exploration(names=NAMES):
     score = np.linspace(0.05, 0.95, len(semantic), dtype=np.float32)
     file = semantic.replace(scores=score, names=names)
     return Exploration(SplatMeaning(file), _cloud(150, 0.6, 2), distance=0.4)
+
+
+def mask(page, side, kind="selected"):
+    return np.array(page.evaluate(f"[...viewer.model.{kind}('{side}')]"), bool)
+
+
+def agree(page, state):
+    """Gaussian by Gaussian, and in the counts of the class list."""
+    details = state.details()
+    for side in state.sides:
+        np.testing.assert_array_equal(mask(page, side), state.selected(side))
+        labels, counts = page.evaluate(f"[[...viewer.model.labels('{side}')], viewer.model.counts('{side}')]")
+        np.testing.assert_array_equal(np.array(labels), state.labels(side))
+        assert counts["classes"] == [count for _, count in details[side]["classes"]]
+        assert [counts[key] for key in ("total", "selected", "none")] == [
+            details[side][key] for key in ("total", "selected", "none")
+        ]
+
+
+def errors_of(page):
+    """What goes wrong in a tab from now on, as a list that grows; it waits patiently for a busy machine."""
+    errors = []
+    page.set_default_timeout(1000 * SECONDS)
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
+    return errors
+
+
+def set_slider(page, name, value):
+    """Type the value beside a slider."""
+    field = page.locator(f".slider:has(#{name}) input.number")
+    field.fill(value if isinstance(value, str) else repr(value))
+    field.press("Enter")

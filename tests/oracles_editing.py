@@ -1,37 +1,10 @@
 """Surface clouds of the toy room from its own ground truth, and densities by brute force."""
 
-import math
-
 import numpy as np
 import torch
 from PIL import Image
 
 from kfgs.gaussians import Gaussians
-
-
-def density(gaussians: Gaussians, point) -> float:
-    """The sum of o exp(-d^2 / 2) at one point, from the definition of the Mahalanobis distance, term by term."""
-    total = 0.0
-    for mean, quat, scale, opacity in zip(
-        gaussians.means.double().numpy(),
-        gaussians.quats.double().numpy(),
-        gaussians.scales.double().numpy(),
-        gaussians.opacities.double().numpy(),
-        strict=True,
-    ):
-        w, x, y, z = quat / np.linalg.norm(quat)
-        R = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        covariance = R @ np.diag(scale**2) @ R.T
-        offset = np.asarray(point, float) - mean
-        value = opacity * math.exp(-0.5 * offset @ np.linalg.inv(covariance) @ offset)
-        total += value if value >= 1 / 255 else 0.0
-    return total
 
 
 def paint_room(folder, scene, *, voxel: float = 0.04, stride: int = 1) -> Gaussians:

@@ -1,10 +1,10 @@
 """How the palette's table was made and is measured: colours that differ for three kinds of eyes."""
 
 import numpy as np
-from skimage.color import deltaE_ciede2000, rgb2lab
+from skimage.color import rgb2lab
 
 GREY, BLACK, WHITE = [128, 128, 128], [0, 0, 0], [255, 255, 255]
-# Found by a random search: one colour at a time was replaced by the best of 120 others, for the smallest of `distances`
+# Found by a random search: one colour at a time was replaced by the best of 120 others, for the smallest CIEDE2000 distance
 _FIRST = """
 f1ea0b 8000d7 6c3200 9be5ff ed6a31 0088ff eee1e4 ff22c1 573852 c2a2ff
 766800 62a271 084682 1c5b33 f5a40a ad4f58 dceac8 f0989f 027280 00ff8f
@@ -36,13 +36,6 @@ def seen(rgb8):
 def worst_distance(a, b):
     """Smallest of the three eyes' CIE76 distances between colours a [N, 3] and b [M, 3] -> [N, M]."""
     return np.linalg.norm(seen(a)[:, :, None] - seen(b)[:, None, :], axis=-1).min(axis=0)
-
-
-def distances(colors, share=1.0, over=GREY):
-    """CIEDE2000 of all pairs of some colours and grey, mixed with a picture's grey: for each kind of eye, [N + 1, N + 1]."""
-    lab = seen(share * np.array([*colors, GREY], dtype=float) + (1 - share) * np.array(over))
-    pairs = [deltaE_ciede2000(one[:, None], one[None]) for one in lab]
-    return {eye: pair + np.diag(np.full(len(pair), np.inf)) for eye, pair in zip(EYES, pairs, strict=True)}
 
 
 def make_palette(size=256, step=15):

@@ -67,6 +67,10 @@ class ColorLoss:
         if self.ssim_weight == 0 or min(target.shape[:2]) < SSIM_WINDOW:
             return l1_loss(rendered, alpha, target)
         picture = _resized(rendered, target)
+        compiled = _compiled(picture, target, self.engine)
+        if compiled is not None and not bool(target.sum().isnan()):  # no unknown pixel: one walk for both slopes
+            mix = -self.ssim_weight, 1 - self.ssim_weight
+            return self.ssim_weight + _Similarity.apply(picture, target, None, mix, compiled)
         dissimilar = 1 - mean_similarity(picture, target, self.engine)
         return (1 - self.ssim_weight) * l1_loss(picture, alpha, target) + self.ssim_weight * dissimilar
 
@@ -83,9 +87,8 @@ def mean_similarity(picture: Tensor, target: Tensor, engine: str = "auto") -> Te
         counted = torch.nn.functional.max_pool2d(holes, SSIM_WINDOW, stride=1)[0, 0] == 0  # [H - 10, W - 10]
         if not bool(counted.any()):
             return picture.new_ones(())
-    compiled = compiled_similarity(picture, target) if engine in ("auto", "numba") else None
-    if compiled is not None and not target.requires_grad:  # it gives no gradient in the target
-        return _Similarity.apply(picture, target, counted, compiled)
+    if (compiled := _compiled(picture, target, engine)) is not None:
+        return _Similarity.apply(picture, target, counted, (1.0, 0.0), compiled)  # type: ignore[no-any-return]
     similarity = from_bchw(ssim(to_bchw(picture), to_bchw(target), SSIM_WINDOW, eps=0.0, padding="valid"))
     return similarity.mean() if counted is None else similarity[counted].mean()
 
@@ -93,6 +96,11 @@ def mean_similarity(picture: Tensor, target: Tensor, engine: str = "auto") -> Te
 def _resized(rendered: Tensor, target: Tensor) -> Tensor:  # [H, W, D], [h, w, D] -> [h, w, D]
     check_shapes(("rendered", rendered, ("H", "W", target.shape[2])))  # compiled code would read beyond the smaller one
     return resize_map(rendered, (target.shape[0], target.shape[1]))
+
+
+def _compiled(picture: Tensor, target: Tensor, engine: str) -> Callable[..., Any] | None:
+    """The engine's SSIM; None if kornia's must be used, as for a gradient in the target."""
+    return compiled_similarity(picture, target) if engine in ("auto", "numba") and not target.requires_grad else None
 
 
 def _known(target: Tensor) -> Tensor:  # [H, W, D] -> [H, W] bool
@@ -104,14 +112,13 @@ class _Absolute(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, picture: Tensor, target: Tensor) -> Tensor:
-        difference, count = picture - target, target.numel()
-        total = difference.abs().sum()
-        if bool(total.isnan()):
+        difference, count = picture - target, max(1, target.numel())
+        if bool((total := difference.abs().sum()).isnan()):
             known = _known(target)
             difference[~known] = 0
             total, count = difference.abs().sum(), max(1, int(known.sum())) * target.shape[2]
-        ctx.save_for_backward(difference.sign_().mul_(1 / max(1, count)))
-        return total / max(1, count)
+        ctx.save_for_backward(difference.sign_().mul_(1 / count))
+        return total / count
 
     @staticmethod
     @once_differentiable
@@ -121,19 +128,16 @@ class _Absolute(torch.autograd.Function):
 
 
 class _Similarity(torch.autograd.Function):
-    """The engine's SSIM, whose value and slope are computed together."""
+    """mix[0] times the engine's SSIM plus mix[1] times the mean absolute difference, and their slope in one walk."""
 
     @staticmethod
-    def forward(
-        ctx: Any, picture: Tensor, target: Tensor, counted: Tensor | None, compiled: Callable[..., Any]
-    ) -> Tensor:
+    def forward(ctx: Any, picture: Tensor, target: Tensor, counted: Any, mix: Any, compiled: Any) -> Tensor:
         window = get_gaussian_kernel1d(SSIM_WINDOW, SSIM_SIGMA, dtype=torch.float64)[0].to(picture.dtype)
-        value, slope = compiled(picture.contiguous(), target.contiguous(), counted, window, SSIM_CONSTANTS)
+        similar, slope = compiled(picture.contiguous(), target.contiguous(), counted, window, SSIM_CONSTANTS, mix)
         ctx.save_for_backward(slope)
-        return value  # type: ignore[no-any-return]
+        return mix[0] * similar + mix[1] * (picture - target).abs().mean() if mix[1] else mix[0] * similar
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
-        (slope,) = ctx.saved_tensors
-        return grad * slope, None, None, None
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        return grad * ctx.saved_tensors[0], None, None, None, None

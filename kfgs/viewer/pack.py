@@ -170,7 +170,7 @@ def rounded_far(far: Array, given: float) -> Array:  # [N] float64 -> [N] float3
     """
     nearest = far.astype(np.float32)
     down = np.where(nearest > far, np.nextafter(nearest, np.float32(-np.inf)), nearest)
-    wrong = (down < given) & (far >= given)
+    wrong = (down.astype(np.float64) < given) & (far >= given)  # not as float32, to which NumPy would round `given`
     return np.where(wrong, np.nextafter(down, np.float32(np.inf)), down).astype(np.float32)
 
 

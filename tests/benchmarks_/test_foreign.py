@@ -1,5 +1,6 @@
 """Fields of other programs. No samples could be had: the files are written here in the layouts of those programs."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,8 @@ from cases_foreign import (
     save_legaussians,
     save_ply,
 )
-from messages import tells
+from messages import refused, tells
+from pickled import Call
 from published.foreign import (
     load_feature3dgs,
     load_foreign,
@@ -33,6 +35,7 @@ from published.foreign import (
 from torch import nn
 
 from kfgs.evaluation import Method
+from kfgs.formats.ply import read_ply, write_ply
 
 
 def test_feature_3dgs(tmp_path: Path) -> None:
@@ -84,8 +87,7 @@ def test_df_3dgs_with_its_autoencoder(tmp_path: Path) -> None:
     features, seen = rendered(values)
     check_method(method, text, 0, decoded(torch.as_tensor(features).float()), seen, decoded(values))
     torch.save(decoder_of((8, 20)).state_dict(), file)
-    with pytest.raises(ValueError, match=tells("latest_AE_ckpt.pth", "9 inputs", "another run")):
-        load_feature3dgs(tmp_path, decoder=file)
+    refused(lambda: load_feature3dgs(tmp_path, decoder=file), "latest_AE_ckpt.pth", "9 inputs", "another run")
 
 
 def test_langsplat(tmp_path: Path) -> None:
@@ -114,8 +116,10 @@ def test_langsplat(tmp_path: Path) -> None:
         check_method(method, text, level, decode(features), seen, own)
     found = load_foreign(tmp_path / "output/figurines", tmp_path / "best_ckpt.pth")
     assert (found.name, found.levels) == ("LangSplat", 3)
-    with pytest.raises(ValueError, match=tells("best_ckpt.pth", "with_file")):
-        load_foreign(tmp_path / "output/figurines")
+    refused(lambda: load_foreign(tmp_path / "output/figurines"), "best_ckpt.pth", "with_file")
+    save_ply(tmp_path / "output/figurines/point_cloud/iteration_30000/point_cloud.ply", {})  # the run of the colours
+    found = load_foreign(tmp_path / "output/figurines", tmp_path / "best_ckpt.pth")
+    assert torch.equal(found.gaussian_cosines(text).nan_to_num(), method.gaussian_cosines(text).nan_to_num())
     one = load_langsplat([tmp_path / "output/figurines_2"], tmp_path / "best_ckpt.pth", 30000)
     assert one.levels == 1
     torch.testing.assert_close(one.cosines(VIEW, text)[0], method.cosines(VIEW, text)[1], equal_nan=True)
@@ -136,10 +140,7 @@ def test_langsplat_v2(tmp_path: Path) -> None:
     check_method(method, text, 0, features @ codes, seen, weights @ codes)
     assert load_langsplat_v2([path], top=2).parts[0].values.count_nonzero(1).tolist() == [2] * N
     two = save_capture(tmp_path / "two/chkpnt10000.pth", [logits, torch.cat([book, book])])
-    with pytest.raises(
-        ValueError, match=tells("chkpnt10000.pth", "one codebook [1, 16, D]", "[2, 16, 9]", "vq_layer_num")
-    ):
-        load_langsplat_v2(two)
+    refused(lambda: load_langsplat_v2(two), "chkpnt10000.pth", "one codebook [1, 16, D]", "[2, 16, 9]", "vq_layer_num")
 
 
 def test_occam_whose_levels_lost_other_gaussians(tmp_path: Path) -> None:
@@ -162,8 +163,7 @@ def test_occam_whose_levels_lost_other_gaussians(tmp_path: Path) -> None:
     assert load_occam(tmp_path / "chkpnt30000_langfeat_2.pth").levels == 1
     assert load_foreign(tmp_path).levels == 2
     assert load_foreign(tmp_path / "chkpnt30000_langfeat_2.pth").levels == 1
-    with pytest.raises(ValueError, match=tells("with_file", "none with Occam")):
-        load_foreign(tmp_path, tmp_path / "x.pth")
+    refused(lambda: load_foreign(tmp_path, tmp_path / "x.pth"), "with_file", "none with Occam")
 
 
 @pytest.mark.parametrize("kind", ["checkpoint", "ply"])
@@ -181,8 +181,7 @@ def test_legaussians(tmp_path: Path, kind: str) -> None:
             tmp_path / "chkpnt30000.pth",
         )  # fmt: skip
     method = load_legaussians_field(tmp_path, tmp_path / "codebook.pt", channels=10)
-    with pytest.raises(FileNotFoundError, match=tells("with_file", "codebook")):
-        load_foreign(tmp_path)
+    refused(lambda: load_foreign(tmp_path), "with_file", "codebook", error=FileNotFoundError)
     torch.save({"embedding.weight": random_rows(5, 600)}, tmp_path / "wide.pt")
     assert load_foreign(tmp_path, tmp_path / "wide.pt").name == "LEGaussians"
 
@@ -212,15 +211,30 @@ def test_splats_with_features(tmp_path: Path) -> None:
     for method in (load_splat_features(own, column="lang_"), load_splat_features(bare, tmp_path / "lang.pth")):
         check_method(method, text, 0, shown, seen, values.numpy())
     assert load_foreign(bare, tmp_path / "lang.npy").dim == 6
-    with pytest.raises(ValueError, match=tells("bare.ply", "semantic_0", "with_file")):
-        load_foreign(bare)
+    refused(lambda: load_foreign(bare), "bare.ply", "semantic_0", "with_file")
     near = load_splat_features(bare, tmp_path / "lang.npy", name="SceneSplat")
     assert (near.name, near.dim) == ("SceneSplat", 6)
     np.testing.assert_allclose(near.gaussian_cosines(text), method.gaussian_cosines(text), atol=2e-3)  # half precision
     np.save(tmp_path / "lang.npy", values[1:].numpy())
     with pytest.raises(ValueError, match=tells("lang.npy", f"[{N}, D]", f"[{N - 1}, 6]", "bare.ply")):
         load_splat_features(bare, tmp_path / "lang.npy")
-    with pytest.raises(ValueError, match=tells("own.ply", "semantic_0", "lang_0", "column=")):
-        load_splat_features(own)
-    with pytest.raises(ValueError, match=tells("text", "[K, 6]", "(3, 9)", "encoder")):
-        near.cosines(VIEW, random_rows(K, 9))
+    refused(lambda: load_splat_features(own), "own.ply", "semantic_0", "lang_0", "column=")
+    refused(lambda: near.cosines(VIEW, random_rows(K, 9)), "text", "[K, 6]", "(3, 9)", "encoder")
+
+
+def test_features_keep_step_with_the_gaussians_that_are_left_of_a_real_splat(tmp_path: Path, shared_data: Path) -> None:
+    columns = read_ply(shared_data / "splats/inria_9080.ply")
+    columns["y"][[7, 8, 4000]] = np.nan
+    write_ply(tmp_path / "a.ply", columns)
+    values, text = random_rows(len(columns["y"]), 6), random_rows(K, 6, seed=5)
+    np.save(tmp_path / "lang.npy", values.numpy())
+    found = load_splat_features(tmp_path / "a.ply", tmp_path / "lang.npy").gaussian_cosines(text)[0]
+    expected = cosines_of(np.delete(values.numpy(), [7, 8, 4000], axis=0), text.double().numpy())
+    np.testing.assert_allclose(found.numpy(), expected, atol=2e-5)
+    refused(lambda: load_feature3dgs(tmp_path / "a.ply"), "a.ply", "semantic_0", "trained with features")
+
+
+def test_nothing_in_a_checkpoint_is_run(tmp_path: Path) -> None:
+    torch.save((Call(os.system, f"touch {tmp_path}/mark"), 30000), tmp_path / "chkpnt30000_langfeat_1.pth")
+    refused(lambda: load_occam(tmp_path), "chkpnt30000_langfeat_1.pth", "Nothing was run")
+    assert not (tmp_path / "mark").exists()

@@ -74,31 +74,3 @@ def test_the_whole_protocol_against_loops(name, seed, apart):
     assert report["mIoU"] == pytest.approx(np.mean(ious), abs=2e-3)  # float32 at the silhouette's threshold
     assert report["Acc@0.25"] == np.mean(np.array(ious) > 0.25)
     assert report["Acc@0.5"] == np.mean(np.array(ious) > 0.5)
-
-
-def _line(levels):
-    """Two texts' cosines with Gaussians on a line, by level; a relevancy is sigmoid(10 (cosine - 0.2))."""
-    cloud = cases.spread_gaussians(np.random.default_rng(0), len(levels[0]))
-    cloud = cloud.replace(means=torch.tensor([[float(i), 0, 3] for i in range(len(levels[0]))]))
-    own = {"mug": np.array(levels), **{text: np.where(np.isnan(levels), np.nan, 0.2) for text in CANONICAL}}
-    return cases.Numbers(list(own), own=own, gaussians=cloud)
-
-
-def test_each_level_has_its_own_gaussians_by_hand():
-    nan = np.nan
-    # level 0 knows Gaussians 0 to 2, level 1 knows 3 and 4: no Gaussian is known in both
-    method = _line([[0.3, 0.1, 0.1, nan, nan], [nan, nan, nan, 0.4, 0.1]])
-    found = LerfOvs3D.dr_splat().select(method, ["mug"], method.encode)["mug"]
-    assert found.tolist() == [False, False, False, True, False]  # sigmoid(2) of level 1 beats sigmoid(1)
-    fixed = LerfOvs3D(selection="relevancy", threshold=0.5, level=0).select(method, ["mug"], method.encode)["mug"]
-    assert fixed.tolist() == [True, False, False, False, False]
-    smooth = LerfOvs3D(selection="smoothed", threshold=0.6, neighbours=2)
-    # level 1: 0.881 and 0.269, each averaged with both (0.575): 0.728 > 0.422, stretched to 1 and 0
-    assert smooth.select(method, ["mug"], method.encode)["mug"].tolist() == [False, False, False, True, False]
-    # level 0 wins by its one Gaussian of 0.9 until it is blended with its neighbour: 0.999, 0.018 give 0.754, level 1 has 0.953
-    method = _line([[0.9, -0.2, nan, nan, nan], [nan, nan, nan, 0.5, 0.5]])
-    assert (
-        smooth.select(method, ["mug"], method.encode)["mug"].tolist() == [False] * 5
-    )  # a flat level: nothing above its mean
-    plain = LerfOvs3D.dr_splat().select(method, ["mug"], method.encode)["mug"]
-    assert plain.tolist() == [True, False, False, False, False]

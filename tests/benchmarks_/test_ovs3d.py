@@ -4,8 +4,7 @@ import oracles_protocols as dull
 import pytest
 import torch
 from published.mask_truth import MaskAndBoxes, MaskTruth
-from published.ovs3d import OVS3DClosed, OVS3DStability, OVS3DThreshold, one_hot_accuracy
-from published.stable_threshold import stable_mask
+from published.ovs3d import OVS3DClosed, OVS3DStability, OVS3DThreshold
 
 from kfgs.labels.scores import CANONICAL
 
@@ -56,12 +55,6 @@ def test_closed_against_loops(seed):
     assert report["mIoU"] > 0.05
 
 
-def test_accuracy_by_hand():
-    masks = [torch.tensor([[True, True, False, False]]), torch.tensor([[False, True, False, True]])]
-    assert one_hot_accuracy(torch.tensor([[0, 0, 1, 1]]), masks) == 0.5  # two masks, and none, are never a label's
-    assert one_hot_accuracy(torch.tensor([[0, 0, -1, 1]]), masks) == 0.75
-
-
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("filter", ["langsplat", "langsplatv2"])
 def test_threshold_against_loops(filter, seed):
@@ -78,17 +71,6 @@ def test_threshold_against_loops(filter, seed):
             plainly.append(dull.iou(best > 0.55, _small(mask)))
     assert stretched["mIoU"] == pytest.approx(np.mean(want), abs=1e-9)
     assert plain["mIoU"] == pytest.approx(np.mean(plainly), abs=1e-9)
-
-
-def test_a_stable_threshold_by_hand():
-    """A quarter of the pixels score 0, a quarter 1, and half lie between 0.2 and 0.4, where the mask shrinks by 2.5 per unit
-    of threshold. From 0.41 to 0.99 nothing changes: the middle is 0.70."""
-    level = torch.zeros(1, 20, 20)
-    level[:, :5], level[:, 5:15] = 1.0, torch.linspace(0.2, 0.4, 200).view(10, 20)
-    found = stable_mask(level)
-    assert found.threshold == pytest.approx(0.70, abs=0.01)
-    assert found.mask[0, :5].all()
-    assert found.mask.sum() == 100
 
 
 @pytest.mark.parametrize("seed", range(4))

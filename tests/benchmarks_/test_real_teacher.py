@@ -1,6 +1,5 @@
 """The real teacher for experiments, with a tiny backbone of random weights and the smallest room."""
 
-import importlib
 import json
 import re
 import shutil
@@ -8,31 +7,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import real_teacher
 import torch
-from messages import tells
+from messages import refused, tells
 from PIL import Image
 from small_room import make_room
+
+pytest.importorskip("transformers", reason='the backbone needs `pip install "kfgs[hf]"`')
+from tiny_transformers import write_teacher
 
 from kfgs.evaluation.label_pictures import load_label_map
 from kfgs.scenes import load_scene
 from kfgs.teachers import load_teacher
 
-ROOT = Path(__file__).resolve().parents[2]
-if not (ROOT / "benchmarks" / "real_teacher.py").is_file():  # a source distribution comes without it
-    pytest.skip("no folder benchmarks", allow_module_level=True)
-pytest.importorskip("transformers", reason='the backbone needs `pip install "kfgs[hf]"`')
-
-
-@pytest.fixture
-def module(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    return importlib.import_module("real_teacher")
+ROOT = Path(real_teacher.__file__).parents[1]
 
 
 @pytest.fixture(scope="session")
 def backbone(tmp_path_factory):
-    from tiny_transformers import write_teacher
-
     return write_teacher(tmp_path_factory.mktemp("dinov2"), "dinov2")
 
 
@@ -41,9 +33,9 @@ def room(tmp_path_factory):
     return make_room(tmp_path_factory.mktemp("room"))
 
 
-def run(module, monkeypatch, *arguments):
+def run(monkeypatch, *arguments):
     monkeypatch.setattr("sys.argv", ["real_teacher.py", *map(str, arguments)])
-    module.main()
+    real_teacher.main()
 
 
 def generator():
@@ -59,38 +51,37 @@ def three_classes():
 
 
 @pytest.mark.parametrize("whiten", [False, True])
-def test_head_tells_classes_apart_from_raw_tokens(module, whiten):
+def test_head_tells_classes_apart_from_raw_tokens(whiten):
     tokens, labels = three_classes()
     text = torch.randn(3, 16, generator=generator())
-    weight, bias = module.fit_head(tokens, labels, text, whiten=whiten, steps=200, generator=generator())
+    weight, bias = real_teacher.fit_head(tokens, labels, text, whiten=whiten, steps=200, generator=generator())
     cosines = torch.cosine_similarity((tokens @ weight.T + bias)[:, None], text, dim=-1)
     assert (cosines.argmax(1) == labels).float().mean() > 0.99
 
 
-def test_void_is_not_learnt(module, backbone, room, tmp_path):
+def test_void_is_not_learnt(backbone, room, tmp_path):
     scene, teacher = load_scene(room), load_teacher("dinov2", backbone, size=80)
     train = [scene.stem(i) for i in scene.views("train")]
     for stem in train[:2]:  # the others have no label picture
         labels = np.array(Image.open(room / "labels" / f"{stem}.png"))
         labels[:, :40] = 255
         Image.fromarray(labels).save(tmp_path / f"{stem}.png")
-    tokens, found = module.labelled_tokens(teacher, scene, tmp_path)
+    tokens, found = real_teacher.labelled_tokens(teacher, scene, tmp_path)
     assert tokens.shape == (2 * 8 * 5, 32)  # the right half of 8 x 10 patches of 8 x 8 in each of the two
     truth = load_label_map(room / "labels" / f"{train[0]}.png")
     rows = [int((i + 0.5) * 60 / 8) for i in range(8)]
     assert found[:40].tolist() == [int(truth[row, 8 * j + 4]) for row in rows for j in range(5, 10)]
     picture = teacher.encode_image(scene.image(scene.views("train")[0]).permute(2, 0, 1))
     assert torch.equal(tokens[:40], picture[:, :, 5:].flatten(1).T)
-    with pytest.raises(ValueError, match=tells("label", "training", "got none")):
-        module.labelled_tokens(teacher, scene, tmp_path / "none")
+    refused(lambda: real_teacher.labelled_tokens(teacher, scene, tmp_path / "none"), "label", "training", "got none")
 
 
-def test_commands_make_the_maps_that_the_teacher_makes(module, backbone, room, tmp_path, monkeypatch, capsys):
+def test_commands_make_the_maps_that_the_teacher_makes(backbone, room, tmp_path, monkeypatch, capsys):
     weights = shutil.copytree(backbone, tmp_path / "weights")
     head, out = weights / "head.safetensors", tmp_path / "maps"
-    run(module, monkeypatch, "head", room, weights, head, "--size", 80)
+    run(monkeypatch, "head", room, weights, head, "--size", 80)
     assert "head.safetensors: 480 tokens" in capsys.readouterr().out
-    run(module, monkeypatch, "maps", room, weights, head, out, "--truth", "labels")
+    run(monkeypatch, "maps", room, weights, head, out, "--truth", "labels")
     said = capsys.readouterr().out
     scene = load_scene(room)
     truth = torch.cat([load_label_map(room / "labels" / f"{scene.stem(i)}.png").flatten() for i in scene.views("test")])
@@ -104,7 +95,7 @@ def test_commands_make_the_maps_that_the_teacher_makes(module, backbone, room, t
     assert (len(manifest["pictures"]), manifest["teacher"]) == (9, teacher.identity)
     stored = np.load(out / f"{scene.stem(0)}.npy")
     assert (stored.dtype, stored.shape) == (np.float16, (8, 10, 32))
-    picture, (weight, bias, size) = scene.image(0).permute(2, 0, 1), module.load_head(head)
+    picture, (weight, bias, size) = scene.image(0).permute(2, 0, 1), real_teacher.load_head(head)
     expected = load_teacher("dinov2", backbone, size=size).encode_image(picture).permute(1, 2, 0) @ weight.T + bias
     np.testing.assert_allclose(stored, expected, rtol=1e-3, atol=1e-3)  # half precision
     torch.testing.assert_close(teacher.encode_image(picture).permute(1, 2, 0), expected)

@@ -4,7 +4,7 @@ import oracles_protocols as dull
 import pytest
 import torch
 from published.class_lists import load_classes
-from published.scenesplat import SceneSplatBench, match_names, vote_instances, vote_nearest
+from published.scenesplat import SceneSplatBench, match_names
 
 from kfgs.evaluation.scannet import nyu40_names
 from kfgs.evaluation.truth import PointTruth
@@ -37,12 +37,17 @@ def _expected(method, truth, texts, classes, protocol):
     means = method.gaussians.means.tolist()
     keep = [i for i in range(len(labels)) if labels[i] >= 0 or not protocol.drop_unknown]
     pred = dull.vote_nearest(truth.points.tolist(), [means[i] for i in keep], labels[keep], protocol.neighbours)
+    if protocol.within_instances:
+        for instance in range(6):  # the lowest of the most frequent
+            inside = truth.instances.numpy() == instance
+            pred[inside] = np.bincount(pred[inside] + 1).argmax() - 1
     gt = [classes.index(truth.names[i]) if truth.names.get(i) in classes else -1 for i in truth.labels.tolist()]
     return pred, np.array(gt)
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"neighbours": 3, "drop_unknown": True}, {"least_cosine": 0.35, "neighbours": 5}]
+    "options",
+    [{"within_instances": True}, {"neighbours": 3, "drop_unknown": True}, {"least_cosine": 0.35, "neighbours": 5}],
 )
 def test_several_scenes_share_one_matrix(options):
     classes, dropped = LISTS["scannet20"]["classes"], LISTS["scannet20"]["dropped"]
@@ -77,17 +82,6 @@ def test_holicity_asks_six_prompts_for_four_classes():
     assert report["f-mIoU"] == report["mIoU"]
 
 
-def test_votes_by_hand():
-    means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [9, 0, 0]])
-    labels = torch.tensor([2, 1, -1, -1])
-    points = torch.tensor([[0.4, 0, 0], [9.0, 0, 0]])
-    assert vote_nearest(points, means, labels, 2).tolist() == [1, -1]  # a tie goes to the lowest
-    assert vote_nearest(points, means, labels, 3).tolist() == [1, -1]  # and "none" loses it
-    assert vote_nearest(points, means[:0], labels[:0]).tolist() == [-1, -1]
-    labels, instances = torch.tensor([0, 1, 1, 2, 3]), torch.tensor([4, 4, 4, -1, 0])
-    assert vote_instances(labels, instances).tolist() == [1, 1, 1, 2, 3]
-
-
 def _named(labels, names):
     return PointTruth(torch.zeros(len(labels), 3), torch.tensor(labels), names)
 
@@ -95,9 +89,9 @@ def _named(labels, names):
 NYU40 = nyu40_names()
 
 
-@pytest.mark.parametrize(("benchmark", "ceiling"), [("scannet20", -1), ("matterport21", 20)])
-def test_all_names_of_scannet_find_their_class(benchmark, ceiling):
-    classes = LISTS[benchmark]["classes"]
+@pytest.mark.parametrize(("name", "ceiling"), [("scannet20", -1), ("matterport21", 20)])
+def test_all_names_of_scannet_find_their_class(name, ceiling):
+    classes = LISTS[name]["classes"]
     # ids of NYU40: wall, showercurtain, otherfurniture, ceiling, blinds (twice), none, not in the table
     found = match_names(_named([1, 28, 39, 22, 13, 13, 0, 77], NYU40), classes)
     assert found.labels.tolist() == [0, 15, 19, ceiling, -1, -1, -1, -1]

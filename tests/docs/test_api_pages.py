@@ -19,7 +19,6 @@ import kfgs
 from kfgs import batch
 from kfgs.batch.run import SceneResult
 from kfgs.pipeline import true_labels
-from kfgs.scenes import load_cameras
 from kfgs.viz.plotter import trouble
 
 RUN_BATCH = batch.run_batch
@@ -241,30 +240,12 @@ def test_the_python_of_many_scenes_runs(inside, monkeypatch):
     assert "join_blocks(" in join
 
 
-def test_the_file_of_cameras_on_the_page_of_export_can_be_read(tmp_path):
-    (text,) = re.findall(
-        r"```json\n(.*?)```", (PAGES.parent / "howto/export.md").read_text(encoding="utf-8"), re.DOTALL
-    )
-    (tmp_path / "my_cameras.json").write_text(text)
-    first, second = load_cameras(tmp_path / "my_cameras.json")
-    assert first.size == (480, 640)
-    assert second.center.tolist() == pytest.approx([1.0, -2.0, 1.2])
-    assert second.viewmat[1:3, :3].tolist() == [[0, 0, -1], [0, 1, 0]]  # down is -z, it looks along y
-
-
 def test_no_page_has_python_that_no_test_runs():
     pages = [path for path in PAGES.parent.rglob("*.md") if not {"_build", "_ext"} & set(path.parts)]
     have = {
         path.relative_to(PAGES.parent).with_suffix("").as_posix() for path in pages if "```python\n" in path.read_text()
     }
     assert have == {*AS_THEY_STAND, *ELSEWHERE, *WITH_DATA}
-
-
-def test_every_page_is_listed_and_asks_a_question():
-    index = (PAGES / "index.md").read_text(encoding="utf-8")
-    for topic in TOPICS:
-        question = re.search(r"^\*\*(.+\?)\*\*$", (PAGES / f"{topic}.md").read_text(encoding="utf-8"), re.M)[1]
-        assert f"]({topic}.md) | {question} |" in index
 
 
 def test_values_on_the_pages_are_those_of_the_code():

@@ -18,45 +18,27 @@ if not EXTENSIONS.is_dir():
 pytest.importorskip("sphinx", reason='the site needs: pip install "kfgs[docs]"')
 
 
-@pytest.fixture(autouse=True)
-def extensions(monkeypatch):
+@pytest.fixture
+def load(monkeypatch):
+    """Imports an extension of the site."""
     monkeypatch.syspath_prepend(str(EXTENSIONS))
-    yield
+    yield importlib.import_module
     for name in [name for name in sys.modules if name.startswith("kfgs_")]:
         del sys.modules[name]
 
 
-def load(name):
-    return importlib.import_module(name)
-
-
-@pytest.mark.parametrize(
-    ("page", "outside"),
-    [
-        ('<script src="https://a.org/b.js"></script>', ["<script> https://a.org/b.js"]),
-        ('<link href="//a.org/b.css">', ["<link> //a.org/b.css"]),
-        ('<img src="http://a.org/b.png">', ["<img> http://a.org/b.png"]),
-        ('<a href="https://a.org">a link is followed by a click</a><img src="_images/b.png">', []),
-    ],
-)
-def test_what_a_page_would_load_from_elsewhere_is_found(page, outside):
+def test_what_a_page_or_a_style_sheet_would_load_from_elsewhere_is_found(load):
+    page = """<script src="https://a.org/b.js"></script><link href="//a.org/b.css"><img src="http://a.org/b.png">
+        <a href="https://a.org">a link is followed by a click</a><img src="_images/b.png">"""
+    outside = ["<script> https://a.org/b.js", "<link> //a.org/b.css", "<img> http://a.org/b.png"]
     assert load("kfgs_offline").find_outside(page) == outside
-
-
-@pytest.mark.parametrize(
-    ("sheet", "outside"),
-    [
-        ("@import 'https://a.org/b.css';", ["https://a.org/b.css"]),
-        ("p { background: url(//a.org/b.png) }", ["//a.org/b.png"]),
-        ("/* https://a.org */ p { background: url(b.png) url('data:image/svg+xml;//') }", []),
-    ],
-)
-def test_what_a_style_sheet_would_load_from_elsewhere_is_found(sheet, outside):
-    assert load("kfgs_offline").find_outside_style(sheet) == outside
+    sheet = """@import 'https://a.org/b.css'; p { background: url(//a.org/b.png) }
+        /* https://a.org */ p { background: url(b.png) url('data:image/svg+xml;//') }"""
+    assert load("kfgs_offline").find_outside_style(sheet) == ["https://a.org/b.css", "//a.org/b.png"]
 
 
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))
-def test_every_option_of_a_command_is_in_its_table(name):
+def test_every_option_of_a_command_is_in_its_table(name, load):
     commands = load("kfgs_commands")
     command = cli.COMMANDS[name]
     written = commands.described(command) + commands.table(command)
@@ -69,7 +51,7 @@ def test_every_option_of_a_command_is_in_its_table(name):
     assert "%%" not in written
 
 
-def test_shapes_beside_arguments_are_read_and_other_comments_are_not():
+def test_shapes_beside_arguments_are_read_and_other_comments_are_not(load):
     shapes = load("kfgs_shapes").shapes_of
 
     def scored(
@@ -86,23 +68,6 @@ def test_shapes_beside_arguments_are_read_and_other_comments_are_not():
     assert shapes(inspect.signature) == []
 
 
-def test_comments_beside_the_fields_of_a_class_are_read():
-    source = (
-        "class Seen(NamedTuple):\n"
-        "    pixels: Tensor  # [N] of all views\n"
-        "    index: Tensor  # type: ignore[assignment]  # [M] int64\n"
-        "    bare: int\n"
-        "    def read(self):\n"
-        "        inside: int = 1  # a comment of the body\n"
-        "other: int = 2  # of the module\n"
-    )
-    found = load("kfgs_shapes").comments_of(source)
-    assert found == {("Seen", "pixels"): "[N] of all views", ("Seen", "index"): "[M] int64"}
-    analyzer = importlib.import_module("sphinx.pycode").ModuleAnalyzer.for_string(source, "seen")
-    load("kfgs_shapes").analyze(analyzer)
-    assert analyzer.attr_docs["Seen", "pixels"] == ["[N] of all views", ""]
-
-
 def notebook_of(title, *pictures, tagged=None):
     cells = [{"cell_type": "markdown", "metadata": {}, "source": [f"# {title}\n", "\n", "**What is\n", "it?** More."]}]
     for picture in pictures:
@@ -112,7 +77,7 @@ def notebook_of(title, *pictures, tagged=None):
     return json.dumps({"cells": cells})
 
 
-def test_notebooks_come_into_the_gallery_and_go_with_their_file(tmp_path):
+def test_notebooks_come_into_the_gallery_and_go_with_their_file(tmp_path, load):
     bring = load("kfgs_gallery").bring
     notebooks, pages = tmp_path / "notebooks", tmp_path / "gallery"
     notebooks.mkdir()

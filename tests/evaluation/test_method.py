@@ -3,11 +3,11 @@ import pytest
 import torch
 import torch.nn.functional as F
 from cases_quant import made_autoencoder
+from messages import refused
 
 from kfgs import Camera, Gaussians
-from kfgs.evaluation import FieldMethod, LabelTruth, Method, TeacherMethod, View, label_view
+from kfgs.evaluation import FieldMethod, Method, TeacherMethod, View, label_view
 from kfgs.evaluation.method import Labeller, best_labels
-from kfgs.evaluation.protocols import KfgsPooled
 from kfgs.fields import Autoencoded, Codewords, Identity, Linear, SemanticField
 from kfgs.quant import Codebook
 from kfgs.scenes import FeatureFolder, save_feature_map
@@ -63,6 +63,7 @@ def test_a_field_labels_pixels_as_segment_does(mode):
     plain = FieldMethod(field, "x", own_labels=False)
     assert torch.equal(label_view(plain, VIEW, ROWS), best_labels(plain.cosines(VIEW, ROWS)[0]))
     assert plain.name == "x"
+    refused(lambda: label_view(plain, VIEW, ROWS, 1), "level: expected 0 to 0", "levels of 'x'", "got 1")
 
 
 @pytest.mark.parametrize("align_corners", [False, True])
@@ -86,34 +87,9 @@ def test_a_teacher_reads_a_folder(tmp_path):
     save_feature_map(tmp_path, "a", values)
     found = TeacherMethod(FeatureFolder(tmp_path)).cosines(VIEW, ROWS)[0]
     torch.testing.assert_close(found, F.normalize(values, dim=-1) @ ROWS.T, atol=2e-3, rtol=0)  # half precision
-    with pytest.raises(KeyError, match="expected a picture that has a map, got 'b'"):
-        TeacherMethod(FeatureFolder(tmp_path)).cosines(View("b", VIEW.camera), ROWS)
-
-
-def test_a_teacher_has_no_gaussians():
+    half = TeacherMethod({"a": values.half()}).cosines(VIEW, ROWS)[0]  # is computed in single precision
+    torch.testing.assert_close(half, TeacherMethod({"a": values.half().float()}).cosines(VIEW, ROWS)[0])
     with pytest.raises(TypeError, match="expected one with Gaussians, got the teacher 'teacher'"):
         TeacherMethod({}).gaussian_cosines(ROWS)
-
-
-def test_a_level_that_a_method_does_not_have_is_named():
-    with pytest.raises(ValueError, match="expected 0 to 0 .the levels of 'kfgs fused'., got 1; choose one"):
-        label_view(FieldMethod(_field("fused")), VIEW, ROWS, 1)
-
-
-def test_half_precision_is_computed_in_single():
-    features = torch.randn(5, 7, DIM, generator=torch.Generator().manual_seed(1)).half()
-    found = TeacherMethod({"a": features}).cosines(VIEW, ROWS)
-    torch.testing.assert_close(found, TeacherMethod({"a": features.float()}).cosines(VIEW, ROWS))
-
-
-def test_ties_and_unknown_places():
-    nan = float("nan")
-    cosines = torch.tensor([[[0.5, 0.5, 0.1]], [[nan, nan, nan]], [[nan, -0.2, nan]]])
-    assert best_labels(cosines).tolist() == [[0], [-1], [1]]
-
-
-def test_a_field_agrees_with_its_own_segmentation():
-    field, rows = _field("fused"), torch.eye(DIM)[:3]
-    truth = LabelTruth(("a", "b", "c"), {"a": field.segment(VIEW.camera, rows)})
-    report = KfgsPooled().score(FieldMethod(field), truth, [VIEW], lambda texts: rows)
-    assert (report.value, report.method) == (1, "kfgs fused")
+    with pytest.raises(KeyError, match="expected a picture that has a map, got 'b'"):
+        TeacherMethod(FeatureFolder(tmp_path)).cosines(View("b", VIEW.camera), ROWS)

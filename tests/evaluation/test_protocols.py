@@ -4,7 +4,7 @@ import pytest
 import torch
 from small_room import make_room
 
-from kfgs.evaluation import LabelTruth, TeacherMethod, View, evaluate_segmentation, get_protocol, score_views
+from kfgs.evaluation import LabelTruth, TeacherMethod, View, get_protocol, score_views
 from kfgs.evaluation.protocols import KfgsColor, KfgsPooled, KfgsSurface
 from kfgs.evaluation.surface import score_surface
 from kfgs.evaluation.truth import PointTruth
@@ -40,29 +40,6 @@ def test_pooled_is_evaluate_segmentation():
         KfgsPooled().score(method, truth, views[:1] + views[2:], method.encode)
 
 
-def test_surface_neither_asks_nor_scores_names_that_mean_no_class():
-    rng = np.random.default_rng(2)
-    own = {name: rng.uniform(size=(1, 60)) for name in NAMES}
-    method = cases.Numbers(NAMES, own=own, gaussians=cases.spread_gaussians(rng, 60))
-    points = method.gaussians.means[rng.integers(0, 60, 90)]
-    ids = torch.from_numpy(rng.choice([2, 5, 7, 9], 90))
-    names = {2: "a", 5: "b", 9: "c"}
-    want = KfgsSurface().score(method, PointTruth(points, ids, names), (), method.encode)  # 7 has no name: not scored
-    asked = []
-
-    def encode(texts):
-        asked.extend(texts)
-        return method.encode(texts)
-
-    found = KfgsSurface().score(method, PointTruth(points, ids, {**names, 7: "Unlabelled"}), (), encode)
-    assert asked == ["a", "b", "c"]
-    assert (found.scores, found.rows) == (want.scores, want.rows)
-    assert want.notes == ()
-    assert found.notes == (f"not scored, no class: Unlabelled ({int((ids == 7).sum())} points)",)
-    with pytest.raises(ValueError, match="truth: expected names of classes, got void"):
-        KfgsSurface().score(method, PointTruth(points, ids, {7: "void"}), (), method.encode)
-
-
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
     return make_room(tmp_path_factory.mktemp("own") / "room")
@@ -83,26 +60,38 @@ def test_the_teacher_scores_as_the_demo_says(room):
     assert report["accuracy"] == pytest.approx(want.accuracy.value)
 
 
-def test_surface_carries_labels_to_points():
-    rng = np.random.default_rng(1)
+def test_surface_carries_labels_to_points_and_leaves_out_what_means_no_class():
+    rng, asked, names = np.random.default_rng(1), [], {2: "a", 5: "b", 9: "c"}
     own = {name: rng.uniform(size=(1, 50)) for name in NAMES}
     for values in own.values():
         values[:, :5] = np.nan
     method = cases.Numbers(NAMES, own=own, gaussians=cases.spread_gaussians(rng, 50))
     points = method.gaussians.means[rng.integers(0, 50, 80)] + 0.05 * torch.randn(80, 3)
-    ids = torch.from_numpy(rng.choice([0, 2, 5, 9], 80))
-    report = KfgsSurface().score(method, PointTruth(points, ids, {2: "a", 5: "b", 9: "c"}), (), method.encode)
+    ids = torch.from_numpy(rng.choice([0, 2, 5, 7, 9], 80))
+
+    def encode(texts):
+        asked.extend(texts)
+        return method.encode(texts)
+
+    report = KfgsSurface().score(method, PointTruth(points, ids, {**names, 7: "Unlabelled"}), (), encode)
     labels = np.argmax([own[n][0] for n in NAMES], 0)
     labels[:5] = -1
     moved = nearest_labels(method.gaussians.means, torch.from_numpy(labels), points)
-    right = [moved.labels[i] == {2: 0, 5: 1, 9: 2}[int(t)] for i, t in enumerate(ids) if t > 0]
-    assert report["agreement"] == pytest.approx(np.mean(right))
+    right = [moved.labels[i] == {2: 0, 5: 1, 9: 2}[int(t)] for i, t in enumerate(ids) if int(t) in names]
+    assert (report["agreement"], asked) == (pytest.approx(np.mean(right)), ["a", "b", "c"])
+    assert report.notes == (f"not scored, no class: Unlabelled ({int((ids == 7).sum())} points)",)
+    unnamed = KfgsSurface().score(method, PointTruth(points, ids, names), (), method.encode)
+    assert (unnamed.scores, unnamed.rows, unnamed.notes) == (report.scores, report.rows, ())
+    with pytest.raises(ValueError, match="truth: expected names of classes, got void"):
+        KfgsSurface().score(method, PointTruth(points, ids, {7: "void"}), (), method.encode)
     assert str(report).endswith("(kfgs-surface/1)")
     with pytest.raises(TypeError, match="expected one with Gaussians"):
         KfgsSurface().score(TeacherMethod({}), PointTruth(points, ids, {2: "a"}), (), method.encode)
     found = score_surface(method.gaussians.means, torch.from_numpy(labels), points, torch.zeros(80).long())
     assert str(found).endswith("(kfgs-surface/1)")
     assert found.rows[0]["points"] == 80
+    none = score_surface(torch.zeros(3, 3), torch.full((3,), -1), torch.zeros(2, 3), torch.tensor([0, 1]))
+    assert (none.value, none.rows[0]["labelled"], none.rows[0]["points"]) == (0, 0, 2)  # without a label no agreement
     with pytest.raises(ValueError, match="expected some point with a class"):
         score_surface(method.gaussians.means, torch.from_numpy(labels), points, torch.full((80,), -1))
 
@@ -129,15 +118,3 @@ def test_protocols_are_found_by_name():
         get_protocol("kfgs-poled")
     with pytest.raises(TypeError, match="threshold"):
         get_protocol("kfgs-pooled", threshold=0.5)
-
-
-def test_a_named_score_is_short_and_its_text_long():
-    report = evaluate_segmentation(lambda stem: torch.tensor([[0, 1]]), {"a": torch.tensor([[0, 0]])}, ["x", "y"])
-    assert str(report.miou) == "mIoU 0.250 (kfgs-pooled/1)"
-    assert report.miou.text.startswith("mIoU 0.2500 (kfgs-pooled/1: one confusion matrix")
-
-
-@pytest.mark.parametrize("count", [0, 3])
-def test_surface_without_a_label_has_no_agreement(count):
-    found = score_surface(torch.zeros(count, 3), torch.full((count,), -1), torch.zeros(2, 3), torch.tensor([0, 1]))
-    assert (found.value, found.rows[0]["labelled"], found.rows[0]["points"]) == (0, 0, 2)

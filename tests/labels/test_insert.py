@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 import torch
-from messages import tells
+from cases_clouds import random_cloud
+from messages import refused
 
-from kfgs import Gaussians
 from kfgs.cameras import Similarity
 from kfgs.formats import write_splats
 from kfgs.labels import Insert
@@ -12,17 +12,8 @@ from kfgs.splat import evaluate_sh, transform_gaussians
 
 
 def splats(n, coefficients=1, labels=None, classes=(), extra=None, seed=0, dtype=torch.float32):
-    draw = np.random.default_rng(seed)
-    random = lambda *shape: torch.from_numpy(draw.uniform(0.1, 0.9, shape)).to(dtype)  # noqa: E731
-    gaussians = Gaussians(
-        means=random(n, 3),
-        quats=random(n, 4),
-        scales=random(n, 3),
-        opacities=random(n),
-        sh=random(n, coefficients, 3) if coefficients else None,
-        labels=None if labels is None else torch.tensor(labels),
-    )
-    return gaussians.replace(extra=extra or {}, names=tuple(classes))
+    labels = None if labels is None else torch.tensor(labels)
+    return random_cloud(n, coefficients, seed, dtype, labels=labels, names=tuple(classes), extra=extra or {})
 
 
 @pytest.mark.parametrize(("first", "second"), [(16, 4), (1, 16), (4, 4)])
@@ -70,11 +61,13 @@ def test_what_one_cloud_lacks_is_filled():
     assert join(splats(2, dtype=torch.float64), splats(1)).sh.dtype == torch.float64
 
 
-def test_clouds_that_cannot_be_joined_are_refused():
-    with pytest.raises(ValueError, match=tells("sh:", "got none", "inserted")):
-        join(splats(2), splats(1, coefficients=0))
-    with pytest.raises(ValueError, match=tells("sh:", "got none", "scene")):
-        join(splats(2, coefficients=0), splats(1))
+def test_what_cannot_be_joined_or_inserted_is_refused():
+    refused(lambda: join(splats(2), splats(1, coefficients=0)), "sh:", "got none", "inserted")
+    refused(lambda: join(splats(2, coefficients=0), splats(1)), "sh:", "got none", "scene")
+    refused(lambda: Insert(""), "source:", "path", "got ''", error=TypeError)
+    refused(lambda: Insert("a.ply", "far"), "similarity", "got", error=TypeError)
+    matrix = Similarity(2.0, torch.eye(3), torch.ones(3)).matrix()
+    assert Insert("a.ply", matrix.tolist()).similarity.scale == pytest.approx(2)
 
 
 def test_insert_reads_the_file_and_places_it(tmp_path):
@@ -94,12 +87,3 @@ def test_insert_reads_the_file_and_places_it(tmp_path):
     assert len(scene) == 4
     stays = Insert(tmp_path / "vase.ply").apply(scene)
     torch.testing.assert_close(stays.means[4:], object_.means)
-
-
-def test_wrong_input_is_named():
-    with pytest.raises(TypeError, match=tells("source:", "path", "got ''")):
-        Insert("")
-    with pytest.raises(TypeError, match=tells("similarity", "got")):
-        Insert("a.ply", "far")
-    matrix = Similarity(2.0, torch.eye(3), torch.ones(3)).matrix()
-    assert Insert("a.ply", matrix.tolist()).similarity.scale == pytest.approx(2)

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 import torch
-from messages import tells
+from cases_clouds import random_cloud
+from messages import refused
 
-from kfgs import Gaussians
 from kfgs.labels import Duplicate, Move
 from kfgs.splat import covariance_3d, evaluate_sh
 
@@ -15,18 +15,10 @@ MOTIONS = (
 )
 
 
-def scene(n=10, seed=1):
-    rng = np.random.default_rng(seed)
-    draw = lambda *shape: torch.from_numpy(rng.uniform(0.1, 0.9, shape))  # noqa: E731
-    gaussians = Gaussians(
-        means=draw(n, 3) * 2,
-        quats=draw(n, 4) - 0.5,
-        scales=draw(n, 3) * 0.2,
-        opacities=draw(n),
-        sh=draw(n, 16, 3) - 0.5,
-        labels=torch.arange(n) % 2,
-    )
-    return gaussians.replace(scores=rng.uniform(size=n), names=("wall", "chair"))
+def scene(n=10):
+    made = random_cloud(n, 16, seed=1, dtype=torch.float64, labels=torch.arange(n) % 2, names=("wall", "chair"))
+    quats, scores = made.quats - 0.5, torch.linspace(0.2, 1, n)
+    return made.replace(means=2 * made.means, quats=quats, scales=0.2 * made.scales, sh=made.sh - 0.5, scores=scores)
 
 
 def oracle_matrix(motion):
@@ -43,6 +35,9 @@ def test_move_against_the_equation(motion):
     splats = scene()
     g, mask = splats, splats.labels == 1
     moved = Move("chair", **motion).apply(splats)
+    assert moved[~mask].means.equal(g[~mask].means)
+    assert moved[~mask].sh.equal(g[~mask].sh)
+    assert moved.labels.equal(g.labels)
     R, s = oracle_matrix(motion), motion.get("scale", 1.0)
     x, o = g.means[mask].numpy(), g.opacities[mask].numpy()
     pivot = motion.get("pivot", (o[:, None] * x).sum(0) / o.sum())
@@ -50,24 +45,12 @@ def test_move_against_the_equation(motion):
     np.testing.assert_allclose(moved.means[mask].numpy(), expected, atol=1e-12)
     before, after = (covariance_3d(c.quats[mask], c.scales[mask]).numpy() for c in (g, moved))
     np.testing.assert_allclose(after, s * s * R @ before @ R.T, atol=1e-7)
+    assert moved.opacities.equal(g.opacities)
     directions = torch.from_numpy(np.random.default_rng(0).normal(size=(5, 3)))
     turn = torch.from_numpy(R)
     torch.testing.assert_close(
         evaluate_sh(moved.sh[mask], directions @ turn.T), evaluate_sh(g.sh[mask], directions), atol=1e-6, rtol=0
     )
-
-
-@pytest.mark.parametrize("motion", MOTIONS)
-def test_move_leaves_the_rest_the_order_and_the_input(motion):
-    splats = scene()
-    copy = splats.means.clone()
-    moved = Move("chair", **motion).apply(splats)
-    rest = splats.labels == 0
-    for name in ("means", "quats", "scales", "sh", "opacities"):
-        assert getattr(moved, name)[rest].equal(getattr(splats, name)[rest])
-    assert moved.labels.equal(splats.labels)
-    assert moved.opacities.equal(splats.opacities)
-    assert splats.means.equal(copy)
 
 
 def test_duplicates_follow_the_originals_with_their_labels_and_columns():
@@ -84,28 +67,20 @@ def test_duplicates_follow_the_originals_with_their_labels_and_columns():
     assert doubled.names == splats.names
 
 
-@pytest.mark.parametrize(
-    ("make", "error", "message"),
-    [
-        (lambda: Move("a", (1, 2)), ValueError, ("translation:", "3 numbers", "got (1, 2)")),
-        (lambda: Move("a", scale=0), ValueError, ("scale:", "got 0")),
-        (lambda: Move("a", rotation=(1, 2, 3)), ValueError, ("rotation:", "('z', 90)", "got (1, 2, 3)")),
-        (lambda: Move("a", rotation="z"), ValueError, ("rotation:", "got 'z'")),
-        (lambda: Move("a", rotation=("w", 90)), ValueError, ("axis:", "3 numbers", "got 'w'")),
-        (lambda: Move("a", rotation=((0, 0, 0), 90)), ValueError, ("axis", "got (0, 0, 0)")),
-        (lambda: Move("a", rotation=("z", "90")), TypeError, ("degrees:", "got '90'")),
-        (lambda: Duplicate("a", pivot="corner"), ValueError, ("pivot:", "3 numbers", "got 'corner'")),
-    ],
-)
-def test_wrong_input_is_named(make, error, message):
-    with pytest.raises(error, match=tells(*message)):
-        make()
+def test_wrong_input_is_named():
+    refused(lambda: Move("a", (1, 2)), "translation:", "3 numbers", "got (1, 2)")
+    refused(lambda: Move("a", scale=0), "scale:", "got 0")
+    refused(lambda: Move("a", rotation=(1, 2, 3)), "rotation:", "('z', 90)", "got (1, 2, 3)")
+    refused(lambda: Move("a", rotation="z"), "rotation:", "got 'z'")
+    refused(lambda: Move("a", rotation=("w", 90)), "axis:", "3 numbers", "got 'w'")
+    refused(lambda: Move("a", rotation=((0, 0, 0), 90)), "axis", "got (0, 0, 0)")
+    refused(lambda: Move("a", rotation=("z", "90")), "degrees:", "got '90'", error=TypeError)
+    refused(lambda: Duplicate("a", pivot="corner"), "pivot:", "3 numbers", "got 'corner'")
 
 
 def test_the_centroid_of_what_is_invisible_is_the_plain_mean():
-    splats = scene()
-    moved = Move("chair", rotation=("z", 90), scale=2.0).apply(splats.replace(opacities=torch.zeros(10).double()))
-    chair = splats.labels == 1
+    splats = scene().replace(opacities=torch.zeros(10).double())
+    moved, chair = Move("chair", rotation=("z", 90), scale=2.0).apply(splats), splats.labels == 1
     torch.testing.assert_close(moved.means[chair].mean(dim=0), splats.means[chair].mean(dim=0))
 
 
@@ -113,10 +88,8 @@ def test_the_centroid_of_what_is_invisible_is_the_plain_mean():
     "edit",
     [
         Move("chair", (1e39, 0, 0)),
-        Move("chair", (1e38, 0, 0)),
         Move("chair", (0, 1e9, 0)),
         Move("chair", scale=1e200),
-        Move("chair", scale=1e30),
         Move("chair", scale=3, pivot=(1e38, 0, 3e38)),
         Move("chair", scale=1e-60),
         Duplicate("chair", (0, -1e39, 0)),
@@ -126,5 +99,4 @@ def test_the_centroid_of_what_is_invisible_is_the_plain_mean():
 def test_what_leaves_the_range_of_float32_is_an_error(edit):
     splats = scene()
     splats = splats.to(torch.float32)
-    with pytest.raises(ValueError, match=tells("expected positions and scales that", "float32", "after scale", "less")):
-        edit.apply(splats)
+    refused(lambda: edit.apply(splats), "expected positions and scales that", "float32", "after scale", "less")

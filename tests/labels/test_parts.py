@@ -3,10 +3,10 @@ import math
 
 import pytest
 import torch
-from messages import tells
+from cases_clouds import balls
+from messages import refused, tells
 
 from kfgs.cameras import Camera
-from kfgs.gaussians import Gaussians
 from kfgs.labels import Selection, connected_parts
 from kfgs.splat import rasterize
 
@@ -20,24 +20,12 @@ def camera(z=0.0, name="", turned=False, width=40, height=32):
     return Camera(E, K, width, height, name)
 
 
-def balls(means, opacity=0.95, scale=0.12):
-    means = torch.tensor(means)
-    n = len(means)
-    colours = torch.zeros(n, 1, 3)
-    return Gaussians(
-        means,
-        torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
-        torch.full((n, 3), scale),
-        torch.full((n,), opacity),
-        sh=colours,
-    )
-
-
 def scene():
     """Two rows of balls at z = 4, five on the left and four on the right, and one behind the left ones."""
     left = [[-1.0, 0.2 * i, 4.0] for i in range(5)]
     right = [[1.0, 0.2 * i, 4.0] for i in range(4)]
-    return balls([*left, *right, [-1.2, 0.4, 4.9]])
+    made = balls([*left, *right, [-1.2, 0.4, 4.9]], sh=torch.zeros(10, 1, 3))
+    return made.replace(opacities=torch.full((10,), 0.95), scales=torch.full((10, 3), 0.12))
 
 
 def chosen(gaussians, n=9):
@@ -72,19 +60,17 @@ def test_parts_largest_first():
     assert len(connected_parts(gaussians, chosen(gaussians).mask, distance=3.0)) == 1
     assert len(connected_parts(gaussians, chosen(gaussians), distance=0.3, most=1)) == 1
     assert len(connected_parts(gaussians, chosen(gaussians), distance=0.3, smallest=5)) == 1
+    specks = balls([[0.05 * i, 0.0, 4.0] for i in range(60)] + [[9.0, 9 + 0.05 * i, 4.0] for i in range(3)])
+    for n, smallest, counts in (
+        (63, None, [60, 3]),
+        (62, None, [60]),
+        (62, 1, [60, 2]),
+    ):  # by default 5 % of the largest
+        rule = {} if smallest is None else {"smallest": smallest}
+        found = connected_parts(specks[:n], Selection.of(torch.ones(n, dtype=torch.bool)), distance=0.1, **rule)
+        assert [part.count for part in found] == counts
     nothing = Selection(torch.zeros(10, dtype=torch.bool), torch.zeros(10), 0.7, "given")
     assert connected_parts(gaussians, nothing, [camera()]) == []
-
-
-def test_specks_are_left_out_unless_asked_for():
-    n = 60
-    gaussians = balls([*[[0.05 * i, 0.0, 4.0] for i in range(n)], [9.0, 9.0, 4.0], [9.05, 9.0, 4.0], [9.1, 9.0, 4.0]])
-    everything = Selection.of(torch.ones(n + 3, dtype=torch.bool))
-    counts = lambda *a, **k: [part.count for part in connected_parts(*a, distance=0.1, **k)]  # noqa: E731
-    assert counts(gaussians, everything) == [60, 3]  # 5 % of 60 is kept
-    fewer, mask = gaussians.select(torch.arange(n + 2)), Selection.of(everything.mask[: n + 2])
-    assert counts(fewer, mask) == [60]
-    assert counts(fewer, mask, smallest=1) == [60, 2]
 
 
 def test_the_nearer_camera_sees_it_best_and_the_one_behind_not_at_all():
@@ -127,9 +113,6 @@ def test_wrong_input_is_named():
     with pytest.raises(ValueError, match=tells("selection.mask:", "[N]", "N = 10", "gaussians.means", "got (4,)")):
         connected_parts(gaussians, Selection.of(torch.ones(4, dtype=torch.bool)))
     broken = gaussians.replace(means=gaussians.means.clone().index_fill_(0, torch.tensor([1]), math.nan))
-    with pytest.raises(ValueError, match=tells("means:", "got NaN", "row 1")):
-        connected_parts(broken, chosen(gaussians))
-    with pytest.raises(ValueError, match=tells("most:", "got 0")):
-        connected_parts(gaussians, chosen(gaussians), most=0)
-    with pytest.raises(ValueError, match=tells("distance:", "(0, inf)", "got 0")):
-        connected_parts(gaussians, chosen(gaussians), distance=0)
+    refused(lambda: connected_parts(broken, chosen(gaussians)), "means:", "got NaN", "row 1")
+    refused(lambda: connected_parts(gaussians, chosen(gaussians), most=0), "most:", "got 0")
+    refused(lambda: connected_parts(gaussians, chosen(gaussians), distance=0), "distance:", "(0, inf)", "got 0")

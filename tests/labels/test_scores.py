@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from messages import tells
+from messages import refused
 
 from kfgs.labels import relevancy
 from kfgs.labels.scores import select_by_similarity, similarity_threshold
@@ -22,6 +22,9 @@ def test_relevancy_is_the_least_pairwise_softmax():
     similarity = torch.rand(50, generator=generator, dtype=torch.float64) * 2 - 1
     negatives = torch.rand(50, 4, generator=generator, dtype=torch.float64) * 2 - 1
     np.testing.assert_allclose(relevancy(similarity, negatives), oracle(similarity, negatives), rtol=1e-12)
+    assert select_by_similarity(similarity).scores.equal(similarity)  # without negatives the cosine
+    assert select_by_similarity(similarity, negatives).scores.equal(relevancy(similarity, negatives))
+    assert select_by_similarity(similarity, negatives, score="cosine").scores.equal(similarity)
 
 
 def test_what_knows_nothing_is_not_selected_and_shapes_no_gamma():
@@ -39,34 +42,15 @@ def test_a_threshold_on_the_relevancy_is_strict():
     assert select_by_similarity(similarity, negatives, 0.1).mask.tolist() == [True, True, True]
 
 
-def cosines(n=40, m=5, seed=0):
-    values = torch.rand(n, 1 + m, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * 2 - 1
-    return values[:, 0], values[:, 1:]
-
-
-def test_defaults_are_the_relevancy_with_negatives_and_the_cosine_without():
-    similarity, negatives = cosines()
-    assert select_by_similarity(similarity).scores.equal(similarity)
-    assert select_by_similarity(similarity, negatives).scores.equal(relevancy(similarity, negatives))
-    assert select_by_similarity(similarity, negatives, score="cosine").scores.equal(similarity)
-
-
 def test_wrong_input_is_named():
-    similarity, negatives = cosines()
-    with pytest.raises(ValueError, match=tells("negatives:", "got none")):
-        relevancy(torch.ones(3), torch.ones(3, 0))
-    with pytest.raises(ValueError, match=tells("negatives:", "[N, M]", "N = 3", "got (4, 1)")):
-        relevancy(torch.ones(3), torch.ones(4, 1))
-    with pytest.raises(ValueError, match=tells("similarity:", "got NaN", "row 1")):
-        select_by_similarity(torch.tensor([0.0, math.nan]))
-    with pytest.raises(ValueError, match=tells("threshold:", "[0, 1]", "got -0.5")):
-        select_by_similarity(similarity, negatives, -0.5)
-    with pytest.raises(ValueError, match=tells("threshold:", "[-1, 1]", "got 1.5")):
-        select_by_similarity(similarity, threshold=1.5)
-    with pytest.raises(ValueError, match=tells("score:", "'cosine', 'relevancy'", "got 'dot'")):
-        select_by_similarity(similarity, score="dot")
-    with pytest.raises(ValueError, match=tells("negatives", "got none")):
-        select_by_similarity(similarity, score="relevancy")
+    similarity, negatives = torch.rand(3), torch.rand(3, 2)
+    refused(lambda: relevancy(torch.ones(3), torch.ones(3, 0)), "negatives:", "got none")
+    refused(lambda: relevancy(torch.ones(3), torch.ones(4, 1)), "negatives:", "[N, M]", "N = 3", "got (4, 1)")
+    refused(lambda: select_by_similarity(torch.tensor([0.0, math.nan])), "similarity:", "got NaN", "row 1")
+    refused(lambda: select_by_similarity(similarity, negatives, -0.5), "threshold:", "[0, 1]", "got -0.5")
+    refused(lambda: select_by_similarity(similarity, threshold=1.5), "threshold:", "[-1, 1]", "got 1.5")
+    refused(lambda: select_by_similarity(similarity, score="dot"), "score:", "'cosine', 'relevancy'", "got 'dot'")
+    refused(lambda: select_by_similarity(similarity, score="relevancy"), "negatives", "got none")
 
 
 def mixture(parts, seed=0):
@@ -107,16 +91,6 @@ def test_most_of_the_scene_can_be_the_target_if_it_stands_apart():
     assert how.startswith("gap at")
     too_much = similarity_threshold(mixture([*rest, (0.85, 0.02, 40000)]))[0]
     assert too_much > 0.85  # 83 % are no target, but what the rest is to
-
-
-def test_two_values_are_cut_in_the_middle():
-    threshold, _ = similarity_threshold(torch.tensor([0.2] * 30 + [0.8] * 10))
-    assert threshold == pytest.approx(0.5, abs=0.02)
-
-
-def test_copying_the_scores_does_not_move_the_threshold():
-    scores = mixture([(0.4, 0.05, 900), (0.8, 0.02, 60)])
-    assert similarity_threshold(scores.repeat(7))[0] == pytest.approx(similarity_threshold(scores)[0], abs=1e-12)
 
 
 def test_equal_or_no_scores_select_nothing():

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from messages import tells
+from messages import refused, tells
 from safetensors.torch import save_file
 
 from kfgs.teachers.checkpoint import read_checkpoint
 
-DTYPES = [
+DTYPES = (
     torch.float32,
     torch.float16,
     torch.bfloat16,
@@ -21,7 +21,7 @@ DTYPES = [
     torch.uint8,
     torch.bool,
     torch.complex64,
-]
+)
 
 
 def make_state() -> dict[str, torch.Tensor]:
@@ -68,20 +68,18 @@ WRAPPED = {
 }
 
 
-@pytest.mark.parametrize("wrap", WRAPPED)
+@pytest.mark.parametrize("wrap", [*WRAPPED, "safetensors"])
 @pytest.mark.parametrize("zipped", [True, False], ids=["zip", "legacy"])
 def test_reads_what_torch_saves(tmp_path: Path, wrap: str, zipped: bool) -> None:
-    """Files of torch before 1.6 are read if they name no class."""
+    """Files of torch before 1.6 are read if they name no class; safetensors by content, whatever their name."""
     if not zipped and wrap in ("lightning", "extras"):
         return
     state = make_state()
-    torch.save(WRAPPED[wrap](state), tmp_path / "a.ckpt", _use_new_zipfile_serialization=zipped)
-    assert_same(read_checkpoint(tmp_path / "a.ckpt"), state)
-
-
-def test_reads_safetensors_by_content(tmp_path: Path) -> None:
-    state = {name: torch.rand(3, 4) for name in "ab"}
-    save_file(state, tmp_path / "a.ckpt")
+    if wrap == "safetensors":
+        state = {"a": torch.rand(3, 4), "b": torch.ones(2)}
+        save_file(state, tmp_path / "a.ckpt")
+    else:
+        torch.save(WRAPPED[wrap](state), tmp_path / "a.ckpt", _use_new_zipfile_serialization=zipped)
     assert_same(read_checkpoint(tmp_path / "a.ckpt"), state)
 
 
@@ -133,12 +131,10 @@ def test_every_truncation_and_many_flips_give_one_line(tmp_path: Path) -> None:
 )
 def test_what_torch_saves_beside_state_dicts_is_named(tmp_path: Path, value: object, match: str) -> None:
     torch.save(value, tmp_path / "a.pt")
-    with pytest.raises(ValueError, match=tells(*match)):
-        read_checkpoint(tmp_path / "a.pt")
+    refused(lambda: read_checkpoint(tmp_path / "a.pt"), *match)
 
 
 def test_no_file_and_folder(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=tells("a.ckpt:", "checkpoint", "no such file")):
         read_checkpoint(tmp_path / "a.ckpt")
-    with pytest.raises(ValueError, match=tells("checkpoint", "got a folder", "weights")):
-        read_checkpoint(tmp_path)
+    refused(lambda: read_checkpoint(tmp_path), "checkpoint", "got a folder", "weights")

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 from cases_text import DIM, MUTE, TEACHER, letters
-from messages import tells
+from messages import refused, tells
 from oracles_words import ensemble
 
 from kfgs.labels import LabelSet, load_label_set
@@ -29,13 +29,6 @@ def test_rows_are_the_mean_direction_of_words_in_templates(templates):
     expected = np.stack([ensemble(one, group, written) for group in words])
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6)
     assert found.dtype == torch.float32
-
-
-def test_templates_are_those_of_the_literature():
-    assert TEMPLATES["bare"] == ("{}",)
-    assert [len(TEMPLATES[name]) for name in ("clip7", "tcl9", "siglip")] == [7, 9, 1]
-    assert TEMPLATES["tcl9"][:7] == TEMPLATES["clip7"]
-    assert all(template.count("{}") == 1 for group in TEMPLATES.values() for template in group)
 
 
 def test_a_teacher_may_say_which_templates_suit_it():
@@ -101,8 +94,7 @@ def test_a_label_set_knows_what_made_it(tmp_path):
     ],
 )
 def test_wrong_words_and_templates_are_named(names, options, message):
-    with pytest.raises(ValueError, match=tells(*message)):
-        embed_labels(TEACHER, names, **options)
+    refused(lambda: embed_labels(TEACHER, names, **options), *message)
 
 
 def test_wrong_rows_are_named():
@@ -114,11 +106,9 @@ def test_wrong_rows_are_named():
     opposite = {"up": [1.0, 0.0], "down": [-1.0, 0.0]}
     with pytest.raises(ValueError, match=tells("names:", "got none", "'up'")):
         embed_labels(teacher(lambda prompts: torch.tensor([opposite[word] for word in prompts])), ["up;down"])
-    with pytest.raises(NotImplementedError, match=tells("teacher 'mute':", "text encoder")):
-        embed_labels(MUTE, ["wall"])
+    refused(lambda: embed_labels(MUTE, ["wall"]), "teacher 'mute':", "text encoder", error=NotImplementedError)
     with pytest.raises(NotImplementedError, match=tells("teacher 'lambda':", "text encoder")):
         make_label_set(lambda image: image, ["wall"])  # a mere function of pictures is a teacher, too, but without text
     with pytest.raises(TypeError, match=tells("teacher:", "encode_image", "encode_text", "got str")):
         make_label_set("lseg", ["wall"])
-    with pytest.raises(TypeError, match=tells("names:", "'wall'")):
-        embed_labels(TEACHER, "wall")
+    refused(lambda: embed_labels(TEACHER, "wall"), "names:", "'wall'", error=TypeError)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from kornia.models.sam import Sam, SamConfig
-from messages import tells
+from messages import refused, tells
 
 from kfgs.teachers.protocol import Teacher, identify
 from kfgs.teachers.sam import load_sam
@@ -33,14 +33,6 @@ def file(sam, tmp_path_factory):
 @pytest.fixture(scope="module")
 def teacher(file):
     return load_sam(file)
-
-
-def test_sizes_of_the_encoder_follow_from_its_weights(teacher):
-    blocks = teacher.encoder.blocks
-    assert [block.window_size for block in blocks] == [14, 0, 14]
-    assert [block.attn.num_heads for block in blocks] == [2, 2, 2]
-    assert not teacher.encoder.training
-    assert not any(tensor.is_meta for tensor in teacher.encoder.state_dict().values())
 
 
 def test_map_of_a_wide_picture_loses_the_rows_of_the_padding(teacher, sam):
@@ -81,18 +73,13 @@ def test_mobile_sam_is_recognised(tmp_path):
 def test_other_checkpoints_are_named(sam, tmp_path):
     path = tmp_path / "other.pth"
     torch.save({"visual.proj": torch.zeros(2)}, path)
-    with pytest.raises(ValueError, match=tells("other.pth:", "Segment Anything", "got none")):
-        load_sam(path)
+    refused(lambda: load_sam(path), "other.pth:", "Segment Anything", "got none")
     torch.save({"image_encoder.trunk.pos_embed": torch.zeros(2)}, path)
-    with pytest.raises(ValueError, match=tells("other.pth:", "'patch_embed.proj.weight'")):
-        load_sam(path)
+    refused(lambda: load_sam(path), "other.pth:", "'patch_embed.proj.weight'")
     state = {**sam.state_dict(), "image_encoder.neck.0.weight": torch.zeros(256, 17, 1, 1)}
     torch.save(state, path)
-    with pytest.raises(ValueError, match=tells("other.pth:", "neck.0.weight", "[256, 17, 1, 1]", "[256, 16")):
-        load_sam(path)
+    refused(lambda: load_sam(path), "other.pth:", "neck.0.weight", "[256, 17, 1, 1]", "[256, 16")
     del state["image_encoder.neck.0.weight"]
     torch.save({**state, "image_encoder.more": torch.zeros(1)}, path)
-    with pytest.raises(ValueError, match=tells("other.pth:", "Missing", "neck.0.weight", "more")):
-        load_sam(path)
-    with pytest.raises(FileNotFoundError, match=tells("none.pth:", "no such file")):
-        load_sam(tmp_path / "none.pth")
+    refused(lambda: load_sam(path), "other.pth:", "Missing", "neck.0.weight", "more")
+    refused(lambda: load_sam(tmp_path / "none.pth"), "none.pth:", "no such file", error=FileNotFoundError)

@@ -1,5 +1,3 @@
-import base64
-
 import cases_web
 import numpy as np
 import pytest
@@ -15,12 +13,6 @@ from kfgs.viewer.picking import gaussian_at
 
 pytestmark = needs_chromium
 ENOUGH = 40  # dB
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with cases_web.software_chromium() as opened:
-        yield opened
 
 
 @pytest.fixture(scope="module")
@@ -97,6 +89,10 @@ def test_labels_within_lambda(viewer, state):
         assert psnr(viewer.picture(camera, mode="labels", **{"lambda": distance}), truth) > ENOUGH
         wrong = viewer.picture(camera, mode="labels", **{"lambda": 0.1 if distance > 0.1 else 1})
         assert psnr(wrong, truth) < ENOUGH
+    for kind, mode in (("labels", "labels"), ("rgb", "color")):
+        state.set_show(kind)
+        truth = drawn(state, camera, "semantic", state.colors("semantic"))
+        assert psnr(viewer.picture(camera, "semantic", mode=mode), truth) > ENOUGH
 
 
 def test_scores_of_the_labels_and_of_a_question(viewer, state):
@@ -112,31 +108,6 @@ def test_scores_of_the_labels_and_of_a_question(viewer, state):
     truth = drawn(state, camera, colors=state_colors(state, "score"))
     assert psnr(viewer.picture(camera, **look | {"low": low, "high": high, "question": 1}), truth) > ENOUGH
     state.ask(None)
-
-
-def test_the_semantic_side(viewer, state):
-    camera = state.cameras[5]
-    state.set_show("labels")
-    truth = drawn(state, camera, "semantic", state.colors("semantic"))
-    assert psnr(viewer.picture(camera, "semantic", mode="labels"), truth) > ENOUGH
-    state.set_show("rgb")
-    truth = drawn(state, camera, "semantic", state.colors("semantic"))
-    assert psnr(viewer.picture(camera, "semantic", mode="color"), truth) > ENOUGH
-
-
-INFLATED = """async (text) => {
-  const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
-  const data = new Uint8Array(await kfgs.inflate(bytes, packed.header));
-  const wanted = new Uint8Array(packed.data);
-  return data.length === wanted.length && data.every((value, k) => value === wanted[k]);
-}"""
-
-
-def test_compressed_data_come_back(viewer, state):
-    packed = pack_scene(state)
-    text = base64.b64encode(packed.compressed()).decode()
-    assert len(text) < len(packed.data)
-    assert viewer.run(INFLATED, text)
 
 
 def test_what_is_not_selected_dims(viewer, state):
@@ -157,10 +128,6 @@ def test_what_is_not_selected_dims(viewer, state):
     changed = np.abs(outlined - dimmed).max(axis=2) > 0.1
     assert 0 < changed.mean() < 0.5
     state.ask(None)
-
-
-def every(n, third):
-    return list(range(0, n, third))
 
 
 @pytest.mark.parametrize("side", ["color", "semantic"])
@@ -193,26 +160,3 @@ def test_a_polygon(viewer, state):
     mask = numbers(viewer.run(within, [lasso, drawn.astype(int).tolist()]), np.uint8) > 0
     assert inside.sum() > 5
     assert (mask != inside).sum() <= 1  # the pack's rounding at the border
-
-
-SPLIT = """async (camera) => {
-  renderer.setLook({mode: "labels", question: null, dim: false});
-  const one = {x: 0, y: 0, width: canvas.width, height: canvas.height};
-  const middle = canvas.width / 2;
-  renderer.setSide("color");
-  renderer.draw({...one, clip: {...one, width: middle}});
-  renderer.setSide("semantic");
-  renderer.draw({...one, clip: {...one, x: middle, width: middle}});
-  await renderer.settled();
-  return base64(shown());
-}"""
-
-
-def test_two_clouds_beside_each_other(viewer, state):
-    camera = state.cameras[0]
-    color = viewer.picture(camera, mode="labels", **{"lambda": 0.2})
-    semantic = viewer.picture(camera, "semantic", mode="labels")
-    split = numbers(viewer.run(SPLIT), np.uint8).reshape(camera.height, camera.width, 4)[..., :3] / 255
-    half = camera.width // 2
-    assert np.array_equal(split[:, :half], color[:, :half])
-    assert np.array_equal(split[:, half:], semantic[:, half:])

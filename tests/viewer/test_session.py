@@ -6,7 +6,7 @@ import cases_explorer
 import numpy as np
 import pytest
 import torch
-from messages import tells
+from messages import refused
 
 from kfgs.formats import read_splats
 from kfgs.labels import EditList, Selection, connected_parts
@@ -48,14 +48,6 @@ def test_an_answer_is_that_of_the_state(session):
     assert (scores > answer["gamma"]).equal(asked.selection.mask)
 
 
-def test_what_surrounds_a_gaussian(session):
-    state = session.state
-    answer, _ = session.call("describe", {"side": "semantic", "index": 5})
-    sights = views_seeing(state.cloud("semantic"), 5, state.cameras)
-    assert answer["views"] == [{"index": s.index, "name": s.name, "weight": s.weight} for s in sights]
-    assert sights
-
-
 def test_connected_parts_of_a_selection(session):
     mask = torch.arange(60) % 2 == 0
     answer, attached = session.call("parts", {"side": "color"}, bits_of(mask))
@@ -81,19 +73,18 @@ def test_a_selection_by_hand_is_written(session):
     assert details["lambda"] == 0.5
 
 
-def test_edits_are_written_and_can_be_replayed(session):
-    edits = [
-        {"op": "recolor", "where": index(0, 1), "rgb": [1, 0, 0], "mode": "tint"},
-        {"op": "opacity", "where": index(1, 2), "factor": 0.5},
-        {"op": "remove", "where": index(3, 4)},
-    ]
+def test_what_surrounds_a_gaussian_and_edits_that_can_be_replayed(session):
+    state = session.state
+    answer, _ = session.call("describe", {"side": "semantic", "index": 5})
+    sights = views_seeing(state.cloud("semantic"), 5, state.cameras)
+    assert answer["views"] == [{"index": s.index, "name": s.name, "weight": s.weight} for s in sights] != []
+    edits = [{"op": "opacity", "where": index(1, 2), "factor": 0.5}, {"op": "remove", "where": index(3, 4)}]
     session.call("save_edits", {"edits": {"color": edits, "semantic": []}})
-    folder = session.out / "edited_001"
-    made, before = read_splats(folder / "color.ply"), session.state.cloud("color")
+    made, before = read_splats(session.out / "edited_001" / "color.ply"), state.cloud("color")
     assert len(made) == len(before) - 2
     torch.testing.assert_close(made.opacities[2], 0.5 * before.opacities[2])
-    assert [edit.op for edit in EditList.load(folder / "color.json")] == ["recolor", "opacity", "remove"]
-    assert not (folder / "semantic.ply").exists()
+    assert [edit.op for edit in EditList.load(session.out / "edited_001" / "color.json")] == ["opacity", "remove"]
+    assert not (session.out / "edited_001" / "semantic.ply").exists()
 
 
 def test_copies_are_saved_and_split_as_they_are_in_the_viewer(session):
@@ -137,7 +128,6 @@ def test_what_is_like_a_selection(session):
     [
         ("ask", {}, b"", ["args", "words"]),
         ("ask", {"words": 3}, b"", ["words"]),
-        ("ask", {"words": "sky"}, b"", ["sky"]),
         ("describe", {"side": "left", "index": 1}, b"", ["side"]),
         ("describe", {"side": "color", "index": 10**9}, b"", ["index"]),
         ("save_selection", {"sides": ["color"]}, b"\0", ["attached"]),
@@ -145,12 +135,7 @@ def test_what_is_like_a_selection(session):
         ("save_edits", {"edits": {"color": [{"op": "remove", "where": index(10**9)}]}}, b"", ["indices"]),
         ("save_edits", {"edits": {"color": [{"op": "recolor", "where": index(1), "rgb": [300, 0, 0]}]}}, b"", ["rgb"]),
         ("save_edits", {"edits": {"color": [{"op": "insert", "source": "/etc/passwd"}]}}, b"", ["op"]),
-        (
-            "save_edits",
-            {"edits": {"color": [{"op": "remove", "where": {"kind": "class", "name": "chair"}}]}},
-            b"",
-            ["where"],
-        ),
+        ("save_edits", {"edits": {"color": [{"op": "remove", "where": "chair"}]}}, b"", ["where"]),
         ("save_edits", {"edits": {"left": []}}, b"", ["side"]),
         ("save_edits", {"edits": {}}, b"", ["edits"]),
         ("save_selection", {"sides": 5}, b"", ["args", "5"]),
@@ -160,6 +145,5 @@ def test_what_is_like_a_selection(session):
     ],
 )
 def test_wrong_calls(session, name, args, attached, words):
-    with pytest.raises((ValueError, TypeError), match=tells(*words)):
-        session.call(name, args, attached)
+    refused(lambda: session.call(name, args, attached), *words, error=(ValueError, TypeError))
     assert not session.out.exists()

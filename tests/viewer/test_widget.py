@@ -2,13 +2,13 @@
 
 import base64
 import io
-import subprocess
 import sys
 
 import cases_explorer
 import numpy as np
 import pytest
 import torch
+from messages import refused
 from PIL import Image
 
 pytest.importorskip("anywidget")
@@ -65,7 +65,7 @@ def test_calls_are_answered_with_their_number(tmp_path):
     assert "name" in wrong["answer"]["error"]
 
 
-def test_explore_in_a_notebook_gives_a_viewer():
+def test_explore_in_a_notebook_gives_a_viewer(monkeypatch):
     state = exploration()
     viewer = explore(
         cases_explorer.field("fused"), state.cloud("color"), classes=cases_explorer.classes(), where="notebook"
@@ -78,6 +78,8 @@ def test_explore_in_a_notebook_gives_a_viewer():
     bundle = viewer._repr_mimebundle_()
     assert "application/vnd.jupyter.widget-view+json" in (bundle[0] if isinstance(bundle, tuple) else bundle)
     viewer.close()
+    monkeypatch.setitem(sys.modules, "anywidget", None)
+    refused(lambda: Viewer(state).widget, "kfgs[notebook]", error=ImportError)
 
 
 @pytest.mark.parametrize("show", ["rgb", "labels"])
@@ -91,13 +93,3 @@ def test_a_picture_stands_in_where_widgets_cannot_run(show):
         cloud = cloud.replace(features=torch.from_numpy(state.colors("color")) / 255, sh=None)
     truth = rasterize(cloud, state.cameras[0], background=torch.ones(3)).map.clamp(0, 1)
     assert np.abs(picture / 255 - truth.numpy()).mean() < 0.03
-
-
-def test_without_anywidget_the_install_line_is_told():
-    code = (
-        "import sys; sys.modules['anywidget'] = None\n"
-        "from kfgs.viewer.viewer import require_widget\n"
-        "try: require_widget()\nexcept ImportError as error: print(error)"
-    )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert "kfgs[notebook]" in said

@@ -1,7 +1,6 @@
 import numpy as np
-import pytest
 import torch
-from messages import tells
+from messages import refused
 
 from kfgs.viz import FeatureColors
 
@@ -36,13 +35,6 @@ def test_range_is_the_first_to_ninety_ninth_percentile():
         assert 0.005 <= (rgb[:, channel] == 255).mean() <= 0.02
 
 
-def test_refitting_after_a_shuffle_gives_the_same_colours():
-    features, _ = cloud_of_features()
-    shuffled = features[torch.randperm(500, generator=torch.Generator().manual_seed(1))]
-    a, b = FeatureColors.fit(features)(features), FeatureColors.fit(shuffled)(features)
-    assert np.abs(a.astype(int) - b.astype(int)).max() <= 1
-
-
 def test_missing_axes_stay_in_the_middle():
     rgb = FeatureColors.fit(torch.linspace(0, 1, 50)[:, None])(torch.linspace(0, 1, 50)[:, None])
     assert rgb[0, 0] == 0
@@ -54,12 +46,9 @@ def test_missing_axes_stay_in_the_middle():
 
 def test_wrong_features_are_named():
     colors = FeatureColors.fit(torch.randn(10, 4, generator=torch.Generator().manual_seed(0)))
-    with pytest.raises(ValueError, match=tells("features:", "[..., D]", "D = 4", "got (2, 2, 5)")):
-        colors(torch.ones(2, 2, 5))
-    with pytest.raises(ValueError, match=tells("features:", "got (3, 2)")):
-        FeatureColors.fit(torch.full((3, 2), torch.nan))
-    with pytest.raises(ValueError, match=tells("features:", "got (0, 3)")):
-        FeatureColors.fit(torch.empty(0, 3))
+    refused(lambda: colors(torch.ones(2, 2, 5)), "features:", "[..., D]", "D = 4", "got (2, 2, 5)")
+    refused(lambda: FeatureColors.fit(torch.full((3, 2), torch.nan)), "features:", "got (3, 2)")
+    refused(lambda: FeatureColors.fit(torch.empty(0, 3)), "features:", "got (0, 3)")
 
 
 def test_what_learnt_nothing_has_no_say():

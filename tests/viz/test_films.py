@@ -6,87 +6,50 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from messages import tells
+from cases_clouds import balls
+from cases_viz import C0
+from messages import refused, tells
 from PIL import Image
 
 from kfgs.cameras import Camera
-from kfgs.gaussians import Gaussians
-from kfgs.splat import rasterize
 from kfgs.viz import palette, save_animation, show_cloud
 from kfgs.viz.films import OUTLINE, show_selection
-
-C0 = 0.28209479177387814
-
-
-def some_camera(height=12, width=20):
-    K = torch.tensor([[30.0, 0, width / 2], [0, 30, height / 2], [0, 0, 1]])
-    return Camera(torch.eye(4), K, width, height)
-
-
-def wall(label=3, z=2.0):
-    """One nearly opaque Gaussian, far larger than the picture: alpha is 0.99, the clamp, all over it."""
-    return Gaussians(
-        means=torch.tensor([[0.0, 0, z]]),
-        quats=torch.tensor([[1.0, 0, 0, 0]]),
-        scales=torch.full((1, 3), 40.0),
-        opacities=torch.tensor([0.9999]),
-        features=torch.tensor([[1.0, 2, 3, 4]]),
-        sh=torch.tensor([[[0.5, -0.5, 0.2]]]),
-        labels=torch.tensor([label]),
-    )
-
-
-def test_a_cloud_is_shown_in_its_label_colours_over_the_background():
-    for background, paper in (("white", (255, 255, 255)), ((0.0, 0.5, 1.0), (0, 127.5, 255))):
-        seen = show_cloud(wall(), background=background)(some_camera())
-        assert (seen.shape, seen.dtype) == ((12, 20, 3), np.uint8)
-        expected = 0.99 * palette(np.array(3)).astype(float) + 0.01 * np.array(paper)
-        assert np.abs(seen - expected).max() <= 1
-
-
-def test_rgb_is_what_the_rasteriser_draws():
-    seen = show_cloud(wall(), color_by="rgb", background="black")(some_camera())
-    drawn = rasterize(wall().replace(features=None), some_camera()).map.clamp(0, 1).numpy() * 255
-    assert np.abs(seen - drawn).max() <= 0.51
-    expected = 0.99 * 255 * (0.5 + C0 * np.array([0.5, -0.5, 0.2]))
-    assert np.abs(seen - expected).max() <= 1
-
-
-def test_without_labels_a_cloud_is_shown_in_rgb_and_a_camera_of_any_precision_will_do():
-    double = Camera(torch.eye(4).double(), some_camera().K.double(), 20, 12)
-    plain = wall().replace(labels=None)
-    np.testing.assert_array_equal(show_cloud(plain)(double), show_cloud(wall(), color_by="rgb")(some_camera()))
-
-
-CAMERA = Camera(torch.eye(4), torch.tensor([[20.0, 0, 20], [0, 20, 10], [0, 0, 1]]), 40, 20)
-
-
-def two(labels=(1, 2)):
-    """Two opaque balls, left and right."""
-    means = torch.tensor([[-1.0, 0, 2], [1, 0, 2]])
-    quats, scales = torch.tensor([[1.0, 0, 0, 0]] * 2), torch.full((2, 3), 0.3)
-    return Gaussians(means, quats, scales, torch.full((2,), 0.99), labels=torch.tensor(labels))
-
-
-def gray(camera):
-    return np.full((camera.height, camera.width, 3), 100, np.uint8)
-
-
-def test_a_selection_keeps_its_colours_and_the_rest_fades():
-    picture = show_selection(two(), torch.tensor([True, False]), gray)(CAMERA)
-    assert picture[10, 10].tolist() == [100] * 3
-    assert (picture[10, 30] > 180).all()
-    assert (picture == OUTLINE).all(-1).sum() > 8
-    alone = show_selection(two(), torch.tensor([True, False]))(CAMERA)
-    assert alone[10, 10].max() < 100
-    assert (alone[10, 30] == 255).all()
-    with pytest.raises(ValueError, match=tells("mask", "(3,)")):
-        show_selection(two(), torch.ones(3, dtype=torch.bool))
 
 
 def cameras(count=3, height=8, width=12):
     K = torch.tensor([[10.0, 0, width / 2], [0, 10, height / 2], [0, 0, 1]])
     return [Camera(torch.eye(4), K, width, height, name=str(i)) for i in range(count)]
+
+
+def wall():
+    """A nearly opaque Gaussian, far larger than the picture: alpha is 0.99, the clamp, all over it."""
+    one = balls([[0.0, 0, 2]], [3], sh=torch.tensor([[[0.5, -0.5, 0.2]]]))
+    return one.replace(scales=torch.full((1, 3), 40.0), opacities=torch.tensor([0.9999]))
+
+
+@pytest.mark.parametrize(("background", "paper"), [("white", (255, 255, 255)), ((0.0, 0.5, 1.0), (0, 127.5, 255))])
+def test_a_cloud_is_shown_in_its_label_colours_or_in_rgb_over_the_background(background, paper):
+    (camera,), plain = cameras(1), wall().replace(labels=None)
+    seen = show_cloud(wall(), background=background)(camera)
+    assert (seen.shape, seen.dtype) == ((8, 12, 3), np.uint8)
+    assert np.abs(seen - 0.99 * palette(np.array(3)).astype(float) - 0.01 * np.array(paper)).max() <= 1
+    rgb = 0.99 * 255 * (0.5 + C0 * np.array([0.5, -0.5, 0.2])) + 0.01 * np.array(paper)
+    for show in (show_cloud(plain, background=background), show_cloud(wall(), color_by="rgb", background=background)):
+        assert np.abs(show(camera.to(torch.float64)) - rgb).max() <= 1  # a camera of any precision
+
+
+def test_a_selection_keeps_its_colours_and_the_rest_fades():
+    camera = Camera(torch.eye(4), torch.tensor([[20.0, 0, 20], [0, 20, 10], [0, 0, 1]]), 40, 20)
+    two = balls([[-1.0, 0, 2], [1, 0, 2]], [1, 2], scales=torch.full((2, 3), 0.3), opacities=torch.full((2,), 0.99))
+    gray = lambda camera: np.full((*camera.size, 3), 100, np.uint8)  # noqa: E731
+    picture = show_selection(two, torch.tensor([True, False]), gray)(camera)
+    assert picture[10, 10].tolist() == [100] * 3
+    assert (picture[10, 30] > 180).all()
+    assert (picture == OUTLINE).all(-1).sum() > 8
+    alone = show_selection(two, torch.tensor([True, False]))(camera)
+    assert alone[10, 10].max() < 100
+    assert (alone[10, 30] == 255).all()
+    refused(lambda: show_selection(two, torch.ones(3, dtype=torch.bool)), "mask", "(3,)")
 
 
 def shade(camera):
@@ -120,9 +83,7 @@ NAMES = ["a", "b", "c", "chair"]
 
 
 def test_a_legend_reaches_the_file(tmp_path):
-    cloud = Gaussians(
-        torch.tensor([[0.0, 0, 2]]), torch.eye(4)[:1], torch.ones(1, 3), torch.ones(1) / 2, labels=torch.tensor([3])
-    )
+    cloud = wall().replace(opacities=torch.tensor([0.5]))
     path = save_animation(tmp_path / "a.gif", {"field": cloud}, cameras(2, 30, 100), names=NAMES, listed=cloud.labels)
     frames, _ = frames_of(path)
     assert all((frame[-20:] == palette(np.array(3), NAMES)).all(-1).sum() > 20 for frame in frames)
@@ -193,31 +154,13 @@ def test_video_without_ffmpeg_says_what_to_install_before_anything_is_drawn(tmp_
         save_animation(tmp_path / "a.mp4", never, cameras())
 
 
-@pytest.mark.parametrize(
-    ("name", "fps", "message"),
-    [("a.avi", 10, ("path:", ".gif", ".mp4", "got 'a.avi'")), ("a.gif", 60, ("fps:", "[0.01, 50]", "got 60")),
-     ("a.gif", 0, ("fps:", "got 0"))],
-)  # fmt: skip
-def test_what_makes_no_film_is_refused(tmp_path, name, fps, message):
-    with pytest.raises(ValueError, match=tells(*message)):
-        save_animation(tmp_path / name, shade, cameras(), fps=fps)
+def test_what_makes_no_film_is_refused(tmp_path):
+    refused(lambda: save_animation(tmp_path / "a.avi", shade, cameras()), "path:", ".gif", ".mp4", "got 'a.avi'")
+    refused(lambda: save_animation(tmp_path / "a.gif", shade, cameras(), fps=60), "fps:", "[0.01, 50]", "got 60")
+    refused(lambda: save_animation(tmp_path / "a.gif", shade, []), "shows, cameras:", "got none")
+    sizes = [*cameras(1), *cameras(1, 4, 4)]
+    refused(lambda: save_animation(tmp_path / "a.gif", shade, sizes), "cameras:", "(4, 4)", "(8, 12)")
+    refused(lambda: show_cloud(wall(), color_by="score"), "color_by:", "'label', 'rgb', 'feature'", "got 'score'")
+    refused(lambda: show_cloud(wall(), background="paper"), "background:", "got 'paper'")
+    refused(lambda: show_cloud(wall()[:0]), "gaussians:", "got none")
     assert not list(tmp_path.iterdir())
-
-
-def test_cameras_must_be_some_and_of_one_size(tmp_path):
-    with pytest.raises(ValueError, match=tells("shows, cameras:", "got none")):
-        save_animation(tmp_path / "a.gif", shade, [])
-    with pytest.raises(ValueError, match=tells("cameras:", "(4, 4)", "(8, 12)")):
-        save_animation(tmp_path / "a.gif", shade, [*cameras(1), *cameras(1, 4, 4)])
-
-
-def test_what_is_missing_is_named():
-    for field, color_by in (("labels", "label"), ("sh", "rgb"), ("features", "feature")):
-        with pytest.raises(ValueError, match=tells(f"gaussians.{field}:", "got None")):
-            show_cloud(wall().replace(**{field: None}), color_by=color_by)
-    with pytest.raises(ValueError, match=tells("color_by:", "'label', 'rgb', 'feature'", "got 'score'")):
-        show_cloud(wall(), color_by="score")
-    with pytest.raises(ValueError, match=tells("background:", "got 'paper'")):
-        show_cloud(wall(), background="paper")
-    with pytest.raises(ValueError, match=tells("gaussians:", "got none")):
-        show_cloud(wall().select(torch.zeros(1, dtype=torch.bool)))

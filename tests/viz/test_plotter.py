@@ -9,7 +9,7 @@ from messages import tells
 
 from kfgs.cameras import Camera
 from kfgs.viz import add_cloud, draw_view, look_through, make_plotter, plotter
-from kfgs.viz.plotter import camera_of, trouble
+from kfgs.viz.plotter import trouble
 
 
 @pytest.fixture
@@ -51,31 +51,6 @@ def test_without_opengl_a_plotter_says_what_to_install(bare):
         with pytest.raises(RuntimeError, match=tells("OpenGL", "status -11", "crashed", "apt-get install libegl1")):
             make()
     assert len(runs) == 1  # asked once
-
-
-def test_camera_of_projects_as_vtk_does_whatever_turned_the_view():
-    from vtkmodules.vtkRenderingCore import vtkCoordinate
-
-    with some_plotter():
-        window = make_plotter(90, 260, shape=(1, 2), off_screen=True)
-    try:
-        window.subplot(0, 1)
-        window.camera_position = [(3, -4, 2), (0.2, 0.1, -0.3), (0.1, 0.2, 1)]
-        window.camera.azimuth, window.camera.elevation, window.camera.roll = 33, -21, 77
-        window.camera.SetWindowCenter(0.2, -0.3)
-        window.camera.view_angle = 41
-        camera = camera_of(window, (0, 1))
-        assert camera.size == (90, 130)
-        points = np.random.default_rng(0).uniform(-0.8, 0.8, (20, 3))
-        seen = camera.K.numpy() @ (camera.viewmat[:3, :3].numpy() @ points.T + camera.viewmat[:3, 3:].numpy())
-        place = vtkCoordinate()
-        place.SetCoordinateSystemToWorld()
-        for point, (x, y) in zip(points, (seen[:2] / seen[2]).T, strict=True):
-            place.SetValue(*point)
-            expected = place.GetComputedDoubleDisplayValue(window.renderers[1])
-            assert (x + 130, 90 - y) == pytest.approx(expected, abs=1.01)  # VTK numbers pixels, and rounds down
-    finally:
-        window.close()
 
 
 def test_draw_view_is_a_plotter_that_looks_through_the_camera_and_is_closed():

@@ -1,7 +1,6 @@
 """LSeg from a checkpoint to features and unit rows, against a whole that shares no code with it: transformers and loops."""
 
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from oracles_lseg import network, prompt_embeddings
 from oracles_windows import evaluate, resize
 
 import kfgs
-from kfgs.teachers.lseg import LSeg, LSegConfig, load_lseg
+from kfgs.teachers.lseg import LSegConfig, load_lseg
 
 TINY = LSegConfig(
     width=32, depth=5, heads=4, window=64, position_grid=3, hooks=(0, 1, 3, 4), neck=(8, 12, 16, 20), fusion=12, dim=10,
@@ -24,13 +23,8 @@ CLOSE = 1e-5  # of the largest value: the acceptance is 1e-4
 
 # Labels of ADE20K as LSeg is asked for them, and what people type beside them.
 LABELS = [
-    "wall", "building", "sky", "floor", "tree", "ceiling", "road", "bed ", "windowpane", "grass", "cabinet", "sidewalk",
-    "person", "earth", "door", "table", "mountain", "plant", "curtain", "chair", "car", "water", "painting", "sofa",
-    "shelf", "house", "sea", "mirror", "rug", "field", "armchair", "seat", "fence", "desk", "rock", "wardrobe", "lamp",
-    "bathtub", "railing", "cushion", "base", "box", "column", "signboard", "chest of drawers", "counter", "sand", "sink",
-    "skyscraper", "fireplace", "refrigerator", "grandstand", "path", "stairs", "runway", "case", "pool table", "pillow",
-    "screen door", "stairway", "river", "bridge", "bookcase", "blind", "coffee table", "crt screen", "traffic light",
-    "other", "Door-Stuff", "wall-concrete", "the red chair by the window", "a photo of a café table, 50's style", "",
+    "wall", "building", "bed ", "windowpane", "armchair", "chest of drawers", "crt screen", "other", "Door-Stuff",
+    "wall-concrete", "the red chair by the window", "a photo of a café table, 50's style", "",
 ]  # fmt: skip
 
 
@@ -72,41 +66,15 @@ def assert_close(found, expected):
     assert difference < CLOSE
 
 
-@pytest.mark.parametrize(
-    ("size", "expected_size"),
-    [((150, 113), (64, 48)), ((72, 128), (36, 64)), ((41, 29), (41, 29))],
-    ids=["portrait", "landscape", "small"],
-)
-def test_features_at_four_scales_with_flips_are_those_of_transformers(state, checkpoint, size, expected_size):
+@pytest.mark.parametrize("fast", [False, True])
+@pytest.mark.parametrize(("size", "map_size"), [((150, 113), (64, 48)), ((72, 128), (36, 64)), ((41, 29), (41, 29))])
+def test_features_at_four_scales_with_flips_and_fast_ones_are_those_of_transformers(
+    state, checkpoint, size, map_size, fast
+):
     image = picture(*size)
-    found = load_lseg(checkpoint, config=TINY).encode_image(torch.from_numpy(image))
-    assert tuple(found.shape) == (10, *expected_size)
-    assert_close(found, whole(state, image, (0.75, 1.0, 1.25, 1.75), flip=True))
-
-
-@pytest.mark.parametrize("size", [(150, 113), (72, 128), (41, 29), (64, 64)])
-def test_fast_features_are_one_window_of_transformers(state, checkpoint, size):
-    image = picture(*size)
-    found = load_lseg(checkpoint, config=TINY, fast=True).encode_image(torch.from_numpy(image))
-    assert_close(found, whole(state, image, (480 / 520,), flip=False))
-
-
-def test_the_comparison_would_tell_wrong_wholes(state, checkpoint):
-    """What is nearly right is far outside of the tolerance: another weight, no flip, one scale less, colours swapped."""
-    image = picture(41, 29)
-    teacher = load_lseg(checkpoint, config=TINY)
-    found = teacher.encode_image(torch.from_numpy(image)).double().numpy()
-    mended = load_lseg(checkpoint, config=TINY)
-    mended.network.fusion[0].out.bias.data += 1e-3
-    wrong = [
-        LSeg(mended.network),
-        LSeg(teacher.network, replace(teacher.options, flip=False)),
-        LSeg(teacher.network, replace(teacher.options, scales=(0.75, 1.0, 1.25))),
-    ]
-    others = [other.encode_image(torch.from_numpy(image)) for other in wrong]
-    others.append(teacher.encode_image(torch.from_numpy(image[::-1].copy())))
-    for other in others:
-        assert np.abs(other.double().numpy() - found).max() / np.abs(found).max() > 10 * CLOSE
+    found = load_lseg(checkpoint, config=TINY, fast=fast).encode_image(torch.from_numpy(image))
+    assert tuple(found.shape) == (10, *map_size)
+    assert_close(found, whole(state, image, (480 / 520,) if fast else (0.75, 1.0, 1.25, 1.75), flip=not fast))
 
 
 def test_text_is_that_of_transformers_from_the_letters_on(state, checkpoint):

@@ -36,16 +36,7 @@ def oracle(image: Tensor, head, window: int, scales, flip: bool) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(found))
 
 
-SIZES = {
-    "the window": (64, 64),
-    "landscape": (48, 64),
-    "portrait": (70, 40),
-    "narrow": (9, 120),
-    "narrow portrait": (90, 5),
-    "small": (7, 10),
-    "bigger": (101, 150),
-    "one pixel": (1, 1),
-}
+SIZES = {"the window": (64, 64), "portrait": (70, 40), "narrow": (9, 120), "bigger": (101, 150), "one pixel": (1, 1)}
 
 
 @pytest.mark.parametrize("size", SIZES.values(), ids=SIZES)
@@ -57,31 +48,6 @@ def test_equals_the_evaluation_step_by_step(size: tuple[int, int]) -> None:
     assert (found - expected).abs().max() < 1e-10 * expected.abs().max()
 
 
-@pytest.mark.parametrize(
-    ("size", "scales", "flip"), [((360, 480), (1.25,), False), ((480, 480), (1.0,), False), ((150, 480), (1.75,), True)]
-)
-def test_equals_it_at_the_released_size_in_single_precision(size, scales, flip: bool) -> None:
-    """A smooth picture: torch resizes with positions in float32, off by 3e-5 of a pixel, which noise would enlarge."""
-    noise = picture(size[0] // 10, size[1] // 10, dtype=torch.float32)
-    image = functional.interpolate(noise[None], size=size, mode="bicubic", align_corners=True)[0].clamp(-1, 1)
-    head = network(480, 2)
-    found = multi_scale_features(image, head, window=480, scales=scales, flip=flip)
-    expected = oracle(image, head, 480, scales, flip)
-    assert found.dtype == torch.float32
-    assert (found - expected).abs().max() < 1e-5 * expected.abs().max()
-
-
-def test_flips_make_the_features_of_a_mirrored_picture_the_mirrored_features() -> None:
-    """Where one window holds the whole width, so that padding and overlaps are the same on both sides."""
-    image, head = picture(64, 64), network(64, 3)
-    (scale,) = (480 / 520,)
-    found = multi_scale_features(image.flip(-1), head, window=64, scales=(scale,), flip=True)
-    straight = multi_scale_features(image, head, window=64, scales=(scale,), flip=True)
-    torch.testing.assert_close(found, straight.flip(-1), rtol=0, atol=1e-12)
-    unflipped = multi_scale_features(image, head, window=64, scales=(scale,), flip=False)
-    assert (unflipped - straight).abs().max() > 0.1
-
-
 def test_sizes_windows_and_forwards_of_the_released_script() -> None:
     """360 x 480: 1 + 2 + 4 + 6 = 13 windows, and their mirrors, 26 runs of the network."""
     assert [scaled_size(360, 480, s, 480) for s in PAPER] == [(293, 390), (390, 520), (488, 650), (683, 910)]
@@ -90,19 +56,3 @@ def test_sizes_windows_and_forwards_of_the_released_script() -> None:
     assert [window_starts(n, 480) for n in (390, 480, 481, 800, 801, 910)] == [
         [0], [0], [0, 320], [0, 320], [0, 320, 640], [0, 320, 640],
     ]  # fmt: skip
-
-
-def test_windows_are_filled_up_with_black_not_moved() -> None:
-    """650 pixels of a wide picture: the second window begins at 320 and ends in black."""
-    seen = []
-
-    def head(x: Tensor) -> Tensor:
-        seen.append(x[0])
-        return x.new_zeros(1, 1, 240, 240)
-
-    multi_scale_features(torch.ones(3, 360, 480), head, window=480, scales=(1.25,), flip=False)
-    assert len(seen) == 4
-    expected = -torch.ones(480, 480)
-    expected[: 488 - 320, : 650 - 320] = 1.0
-    for channel in seen[3]:  # rows from 320, columns from 320
-        torch.testing.assert_close(channel, expected)

@@ -219,9 +219,7 @@ def round_off(count: int, peak: Any, like: Any) -> Any:
 @njit(**INLINE)
 def differentiate_square(
     rows: Rows,
-    span: tuple[
-        int, int, int
-    ],  # where the square's list begins, where the forward pass was done, where its trace begins
+    span: tuple[int, int, int],  # where the list begins, where the forward pass was done, where its trace begins
     square: Square,
     passes: Passes,
     planes: Any,  # BEHIND, SHARE and GRADS

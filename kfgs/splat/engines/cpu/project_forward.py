@@ -160,9 +160,7 @@ def project_band(
     lens: Lens,
     gaussians: tuple[Any, Any, Any, Any],  # means [3 N], quats [4 N], scales [3 N], opacities [N]
     reach: Any,  # [N], 2 ln(opacity / ALPHA_MIN)
-    out: tuple[
-        Any, ...
-    ],  # means2d [2 N], conics [3 N], depths [N], opacities [N], extents [2 N], index [N] int64, written
+    out: tuple[Any, ...],  # means2d [2 N], conics [3 N], depths, opacities, extents [2 N], index int64 [N], written
     counts: Any,  # [B] int64, written: how many are visible
 ) -> None:
     """Project one of `bands` equal shares of the N Gaussians; write the visible ones from the share's beginning on."""

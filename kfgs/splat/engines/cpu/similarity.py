@@ -26,6 +26,7 @@ from .simd import (
     load_many,
     load_part,
     select,
+    spread,
     spread_many,
     store,
     store_many,
@@ -50,8 +51,12 @@ def similarity(
     counted: Tensor | None,  # [H - 10, W - 10] bool, which windows count, at least one; None = all
     window: Tensor,  # [11] weights of the window along an axis; symmetric, sum 1
     constants: tuple[float, float],  # (K1 peak)^2 and (K2 peak)^2, which keep flat windows finite
+    mix: tuple[float, float] = (1.0, 0.0),
 ) -> tuple[Tensor, Tensor]:  # [], [H, W, D]
-    """Mean SSIM over the (counted) windows inside the picture, and its gradient in `picture`."""
+    """Mean SSIM over the (counted) windows inside the picture, and a gradient in `picture`.
+
+    The gradient is that of mix[0] times the SSIM plus mix[1] times the mean absolute difference.
+    """
     height, width, channels = picture.shape
     rows, across = height - WINDOW + 1, (width - WINDOW + 1) * channels
     weights, padded = window.numpy(), -(-across // LANES) * LANES
@@ -65,16 +70,16 @@ def similarity(
     sums = np.empty(bands)
     shared = bands, weights, (height, width * channels, channels), (flat(picture), flat(target)), slopes.numpy()
     run_bands(compare_band, bands, *shared, (kind(constants[0]), kind(constants[1])), mask.ravel(), sums)
-    run_bands(spread_band, bands, *shared, kind(1 / count), flat(out))
+    run_bands(spread_band, bands, *shared, (kind(mix[0] / count), kind(mix[1] / out.numel())), flat(out))
     return picture.new_tensor(sums.sum() / count), out
 
 
 @njit(**INLINE)
-def _blur(like: Any, planes: Any, at: int, room: int, step: int, window: Any) -> Any:
-    """The window's weighted sums of numbers `step` apart, for LANES places of each plane of `room` numbers."""
-    total = zero_many(like, planes)
-    for k in range(WINDOW):
-        total = add_outer(total, spread_many(ONE, window, k, 1), load_many(like, planes, at + k * step, room))
+def _along(values: Any, j: int, step: int, window: Any) -> Any:
+    """The window's weighted sums, of numbers `step` apart, that begin at LANES places from j on."""
+    total = load(values, j + 5 * step) * window[5]
+    for k in range(5):
+        total = fma(load(values, j + k * step) + load(values, j + (10 - k) * step), window[k], total)
     return total
 
 
@@ -100,14 +105,18 @@ def compare_band(
     total = 0.0
     for i in range(rows * band // bands, rows * (band + 1) // bands):
         for j in range(0, length, LANES):
-            inside, down = lanes_below(window, length - j), zero_many(FOUR, window)
+            inside, (s_a, s_b, s_square, s_ab) = lanes_below(window, length - j), zero_many(FOUR, window)
             for k in range(WINDOW):
                 at = (i + k) * length + j
                 a, b = load_part(picture, at, inside), load_part(target, at, inside)
-                down = add_outer(down, spread_many(ONE, window, k, 1), (a, b, fma(a, a, b * b), a * b))
-            store_many(blurred, j, room, down)
+                near, far = a * window[k], b * window[k]
+                s_a, s_b, s_ab = s_a + near, s_b + far, fma(near, b, s_ab)
+                s_square = fma(far, b, fma(near, a, s_square))
+            store_many(blurred, j, room, (s_a, s_b, s_square, s_ab))
         for j in range(0, padded, LANES):
-            m_a, m_b, m_square, m_ab = _blur(FOUR, blurred, j, room, channels, window)
+            m_a, m_b = _along(blurred, j, channels, window), _along(blurred, room + j, channels, window)
+            m_square = _along(blurred, 2 * room + j, channels, window)
+            m_ab = _along(blurred, 3 * room + j, channels, window)
             # SSIM = (2 m_a m_b + c1) (2 cov + c2) / ((m_a^2 + m_b^2 + c1) (var_a + var_b + c2))
             both, squares = m_a * m_b, fma(m_a, m_a, m_b * m_b)
             light, structure = both * 2 + constants[0], (m_ab - both) * 2 + constants[1]
@@ -134,10 +143,10 @@ def spread_band(
     shape: tuple[int, int, int],  # rows, numbers in a row (W D), D
     pictures: Any,  # two [H W D]
     slopes: Any,  # [3 * (H - 10) * padded]
-    factor: Any,  # of the slopes
+    factors: tuple[Any, Any],  # of the slopes, and of the sign of the difference
     out: Any,  # [H W D], written
 ) -> None:
-    """Carry the windows' slopes back to a share of the picture's rows."""
+    """Carry the windows' slopes back to a share of the picture's rows, and add those of the absolute difference."""
     picture, target = pictures
     height, length, channels = shape
     rows, first = height - WINDOW + 1, (WINDOW - 1) * channels
@@ -154,7 +163,8 @@ def spread_band(
             store_many(blurred, first + j, room, up)
         for j in range(0, length, LANES):
             inside, at = lanes_below(window, length - j), i * length + j
-            by_a, by_square, by_ab = _blur(THREE, blurred, j, room, channels, window)
-            slope = fma(load_part(picture, at, inside) * 2, by_square, by_a)
-            slope = fma(load_part(target, at, inside), by_ab, slope)
-            store_part(out, at, inside, slope * factor)
+            a, b = load_part(picture, at, inside), load_part(target, at, inside)
+            slope = fma(a * 2, _along(blurred, room + j, channels, window), _along(blurred, j, channels, window))
+            slope = fma(b, _along(blurred, 2 * room + j, channels, window), slope) * factors[0]
+            apart = spread(window, factors[1])
+            store_part(out, at, inside, slope + select(a > b, apart, select(a < b, apart * -1, 0)))

@@ -28,9 +28,7 @@ def find_pairs(
     band: int,
     bands: int,
     order: Any,  # [M] int32, rows by depth
-    splats: tuple[
-        Any, Any, Any, Any
-    ],  # means2d [2 M], conics [3 M], extents [2 M] and reach [M], 2 ln(opacity / ALPHA_MIN)
+    splats: tuple[Any, ...],  # means2d [2 M], conics [3 M], extents [2 M] and reach [M], 2 ln(opacity / ALPHA_MIN)
     eps: float,  # of the dtype
     picture: tuple[int, int, int],  # width, height and tile size, pixels
     counts: Any,  # [T] int32 of zeros, written: how many Gaussians of this share touch each tile

@@ -171,9 +171,7 @@ def composite_square(
 @njit(**INLINE)
 def differentiate_square(
     rows: Rows,
-    span: tuple[
-        int, int, int
-    ],  # where the square's list begins, where the forward pass was done, where its trace begins
+    span: tuple[int, int, int],  # where the list begins, where the forward pass was done, where its trace begins
     square: Square,
     source: Source,
     grads: Any,  # [PIXELS, padded D] the loss's gradient in the maps, in the order of blocks, 0 outside of the image
