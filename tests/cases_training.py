@@ -1,8 +1,11 @@
-"""Options of a training with changes in any of its parts, by one list of keywords."""
+"""Small trainings: options with changes in any of their parts, cameras, and whether two clouds are equal."""
 
 from dataclasses import fields, replace
 
-from kfgs.fields import Densify, Rates, Training
+import torch
+
+from kfgs import Camera
+from kfgs.fields import Densify, GaussianParams, Rates, Training
 
 DENSIFY = {field.name for field in fields(Densify)}
 RATES = {field.name for field in fields(Rates)}
@@ -15,3 +18,18 @@ def changed(training: Training, **changes) -> Training:
     if densify:
         changes["densify"] = replace(training.densify, **densify)
     return replace(training, rates=replace(training.rates, **rates), **changes)
+
+
+def look_at_origin(angle: float) -> Camera:
+    """A camera of 24 x 32 pixels on a circle of radius 4 around the y axis, looking at the origin."""
+    c, s = torch.cos(torch.tensor(angle)), torch.sin(torch.tensor(angle))
+    viewmat = torch.eye(4)
+    viewmat[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    viewmat[2, 3] = 4.0
+    return Camera(viewmat, torch.tensor([[30.0, 0, 16.3], [0, 31.0, 11.6], [0, 0, 1]]), 32, 24, name=f"view {angle}")
+
+
+def same(a: GaussianParams, b: GaussianParams) -> bool:
+    """Whether all raw tensors are equal."""
+    first, second = a.to_tensors(), b.to_tensors()
+    return list(first) == list(second) and all(torch.equal(first[name], second[name]) for name in first)

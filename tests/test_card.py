@@ -102,7 +102,7 @@ def test_lines_stay_short_and_cards_are_tables():
     camera = Camera.look_at((0, -3, 0), (0, 0, 0), width=30, height=20)
     rendering = rasterize(cloud, camera, engine="reference")
     nearest = Nearest(torch.rand(900), torch.rand(900))
-    report = CodebookReport([{"a": 1.0}] * 99, torch.rand(9), 1, 1, 1, None)
+    report = CodebookReport([{"a": 1.0}] * 99, torch.rand(9), 1, 1)
     things = [book, autoencoder, field, rendering, rendering.projected, cloud, LinearLatents(torch.eye(9)), nearest]
     for thing in (*things, report):
         assert len(repr(thing)) < 200
@@ -110,7 +110,7 @@ def test_lines_stay_short_and_cards_are_tables():
         assert "\n" not in repr(thing)
     assert repr(autoencoder) == "Autoencoder(512 channels to 9 latents and back, widths [512, 64, 9, 64, 512])"
     for card, facts in (
-        (field._repr_html_(), ("&lt;lseg&gt;", "decouple+ADC+SC", " for 512 of the teacher")),
+        (field._repr_html_(), ("&lt;lseg&gt;", "decouple+ADC+SC", " for 512)")),
         (book._repr_html_(), (">300<", "[300, 512] float32")),
         (rendering._repr_html_(), ("30 x 20", "9")),
     ):

@@ -104,7 +104,7 @@ def _parts(place: Path, add: Add) -> None:
     add("codebook", place, "codebook.safetensors")
     add("autoencoder", place, "autoencoder.safetensors")
     add("index maps", place, "maps.npz")
-    state = {"identity": {"config": "x"}, "a": torch.ones(3, 2), "step": 4, "history": [1.0, 2.0]}
+    state = {"identity": "x", "a": torch.ones(3, 2), "step": 4, "history": [1.0, 2.0]}
     write_checkpoint(place / "checkpoint.pt", state)
     add("training", place, "checkpoint.pt")
     run = place / "run/stages/uplift-0123"

@@ -116,7 +116,7 @@ def _index_maps(path: Path) -> None:
 def _training(path: Path) -> None:
     from kfgs.fields.checkpoint import read_checkpoint
 
-    read_checkpoint(path, {"config": "x"})
+    read_checkpoint(path, "x")
 
 
 def _description(path: Path) -> None:

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import io
-import pickle
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from .._arrays import reading
 from .._files import atomic_path
 
-DAMAGED = (pickle.UnpicklingError, zipfile.BadZipFile, RuntimeError, LookupError, TypeError, ValueError, EOFError)
+AGAIN = "delete it to start again, or give another path"
 
 
 def digest_tensors(*tensors: Tensor) -> str:
@@ -36,18 +35,12 @@ def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
         temporary.write_bytes(buffer.getbuffer())
 
 
-def read_checkpoint(path: Path, identity: dict[str, str]) -> dict[str, Any]:
+def read_checkpoint(path: Path, identity: str) -> dict[str, Any]:
     """Read the file; a ValueError if it is damaged, or belongs to a fit with other inputs."""
-    advice = "delete it to start again, or give another path"
-    try:
-        with path.open("rb") as file:
-            state = torch.load(file, map_location="cpu", weights_only=True)
-        known = dict(state["identity"])
-    except DAMAGED as error:
-        raise ValueError(f"{path}: expected a checkpoint of kfgs, got another or a damaged file; {advice}") from error
-    differing = sorted(name for name in identity | known if identity.get(name) != known.get(name))
-    if differing:
-        raise ValueError(
-            f"checkpoint: expected one of this very fit at {path}, got one with other {', '.join(differing)}; {advice}"
-        )
-    return dict(state)
+    with reading(path, "a checkpoint of kfgs", AGAIN), path.open("rb") as file:
+        state = dict(torch.load(file, map_location="cpu", weights_only=True))
+        known = state["identity"]
+    if known != identity:
+        got = f"one with other Gaussians, views, options, loss or seed; {AGAIN}"
+        raise ValueError(f"checkpoint: expected one of this very fit at {path}, got {got}")
+    return state

@@ -41,10 +41,12 @@ class Decoder(Protocol):
     @property
     def latent(self) -> int:
         """Channels of a latent, d."""
+        return self.dim
 
     @property
     def parameters(self) -> int:
         """Numbers that decoding and labelling need, as Table 1 counts them."""
+        return 0
 
     def decode(self, latents: Tensor) -> Tensor:  # [..., d] -> [..., D]
         """Features in the teacher's space."""
@@ -55,7 +57,7 @@ class Decoder(Protocol):
 
     def votes(self, latents: Tensor, rows: Tensor) -> Votes | None:  # [N, d], [C, D] of length 1
         """What each Gaussian adds to the score of each class at a pixel; None if only `label_pixels` can tell."""
-        return None
+        return similarity_votes(latents, rows)
 
     def label_pixels(
         self,
@@ -66,7 +68,10 @@ class Decoder(Protocol):
     ) -> Ranks:
         """The most similar classes of each pixel, the best first, and their cosines; -1 and 0 where nothing is known."""
         cosines = torch.cat([self.cosines(part, rows) for part in pixels.reshape(-1, self.latent).split(CHUNK)])
-        return _best(pixels, cosines, top, covered)
+        scores, labels = cosines.sort(dim=1, descending=True, stable=True)  # ties go to the lowest class
+        empty = ((row_norms(pixels) <= EPS) | ~covered)[..., None]
+        labels, scores = (best[:, :top].reshape(*pixels.shape[:-1], top) for best in (labels, scores))
+        return labels.masked_fill(empty, -1), scores.masked_fill(empty, 0)
 
     def to_tensors(self) -> dict[str, Tensor]:
         """What `make_decoder` reads."""
@@ -86,22 +91,14 @@ class Identity(Decoder):
     channels: int
     paper: bool = False
     name = "just decouple"
-    parameters = 0
 
     @property
     def dim(self) -> int:
         return self.channels
 
-    @property
-    def latent(self) -> int:
-        return self.channels
-
     def cosines(self, latents: Tensor, rows: Tensor) -> Tensor:
         check_directions("gaussians.features", latents)
         return torch.cat([unit_rows(part) @ rows.T for part in latents.split(CHUNK)])
-
-    def votes(self, latents: Tensor, rows: Tensor) -> Votes | None:
-        return similarity_votes(latents, rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +126,40 @@ class Linear(LinearLatents, Decoder):
         return {"linear.basis": self.basis}
 
 
+class _Quantised(Decoder):
+    """A Gaussian has the cosines of its nearest codeword."""
+
+    codebook: Codebook
+
+    @property
+    def dim(self) -> int:
+        return self.codebook.dim
+
+    @property
+    def parameters(self) -> int:
+        return self.codebook.codewords.numel()
+
+    def cosines(self, latents: Tensor, rows: Tensor) -> Tensor:
+        per_codeword = self.codebook.unit.to(rows) @ rows.T  # [K, M]
+        index = torch.cat([self.codebook.quantize(self.decode(part)) for part in latents.split(CHUNK)])
+        return per_codeword[index] * latents.any(dim=1)[:, None]
+
+    def codewords(self, pixels: Tensor, covered: Tensor) -> Tensor:  # [..., d], [...] bool -> [...] int64
+        """The codeword of each rendered latent, -1 where nothing is known."""
+        return pixel_codewords(pixels, self.codebook, covered=covered)
+
+    def label_pixels(self, pixels: Tensor, rows: Tensor, top: int, covered: Tensor) -> Ranks:
+        unit, index = self.codebook.unit, self.codewords(pixels, covered)
+        scores, labels = (unit @ rows.T.to(unit)).sort(dim=1, descending=True, stable=True)  # [K, C]
+        empty = (index < 0)[..., None]
+        return labels[:, :top][index].masked_fill_(empty, -1), scores[:, :top][index].masked_fill_(empty, 0)
+
+    def to_tensors(self) -> dict[str, Tensor]:
+        return {"codebook.codewords": self.codebook.codewords}
+
+
 @dataclass(frozen=True, eq=False)
-class Codewords(Decoder):
+class Codewords(_Quantised):
     """Latents are features near codewords of S (Sec. 3.3.1). A Gaussian has the cosines of its nearest codeword.
 
     A pixel takes the class most similar to its rendered feature; with `paper`, that of the nearest codeword.
@@ -140,36 +169,17 @@ class Codewords(Decoder):
     paper: bool = False
     name = "decouple+ADC"
 
-    @property
-    def dim(self) -> int:
-        return self.codebook.dim
-
-    @property
-    def latent(self) -> int:
-        return self.codebook.dim
-
-    @property
-    def parameters(self) -> int:
-        return self.codebook.codewords.numel()
-
-    def cosines(self, latents: Tensor, rows: Tensor) -> Tensor:
-        return _quantised_cosines(self, latents, rows)
-
     def votes(self, latents: Tensor, rows: Tensor) -> Votes | None:
         return None if self.paper else similarity_votes(latents, rows)
 
     def label_pixels(self, pixels: Tensor, rows: Tensor, top: int, covered: Tensor) -> Ranks:
-        if not self.paper:
-            return _best(pixels, unit_rows(pixels).flatten(0, -2) @ rows.T, top, covered)
-        index = pixel_codewords(pixels, self.codebook, covered=covered)
-        return _look_up(index, self.codebook, rows, top)
-
-    def to_tensors(self) -> dict[str, Tensor]:
-        return {"codebook.codewords": self.codebook.codewords}
+        if self.paper:
+            return super().label_pixels(pixels, rows, top, covered)
+        return Identity(self.dim).label_pixels(pixels, rows, top, covered)
 
 
 @dataclass(frozen=True, eq=False)
-class Autoencoded(Decoder):
+class Autoencoded(_Quantised):
     """Latents are codewords compressed by the autoencoder (Sec. 3.3.2). A Gaussian has the cosines of its nearest codeword.
 
     A pixel takes the codeword with the latent nearest to the rendered one, which is 900 times cheaper than decoding; with
@@ -181,9 +191,12 @@ class Autoencoded(Decoder):
     paper: bool = False
     name = "decouple+ADC+SC"
 
-    @property
-    def dim(self) -> int:
-        return self.codebook.dim
+    def __post_init__(self) -> None:
+        if self.autoencoder.dim != self.codebook.dim:
+            raise ValueError(
+                f"autoencoder: expected {self.codebook.dim} decoded channels (from codebook), got {self.autoencoder.dim}; "
+                "pass the autoencoder that was fitted to this codebook"
+            )
 
     @property
     def latent(self) -> int:
@@ -193,22 +206,14 @@ class Autoencoded(Decoder):
     def parameters(self) -> int:
         return self.autoencoder.decoder_parameters + self.codebook.codewords.numel()
 
-    def __post_init__(self) -> None:
-        if self.autoencoder.dim != self.codebook.dim:
-            raise ValueError(
-                f"autoencoder: expected {self.codebook.dim} decoded channels (from codebook), got {self.autoencoder.dim}; "
-                "pass the autoencoder that was fitted to this codebook"
-            )
-
     def decode(self, latents: Tensor) -> Tensor:
         return self.autoencoder.decode(latents)
 
-    def cosines(self, latents: Tensor, rows: Tensor) -> Tensor:
-        return _quantised_cosines(self, latents, rows)
+    def votes(self, latents: Tensor, rows: Tensor) -> Votes | None:
+        return None
 
-    def label_pixels(self, pixels: Tensor, rows: Tensor, top: int, covered: Tensor) -> Ranks:
-        index = pixel_codewords(pixels, self.codebook, self.autoencoder, exact=self.paper, covered=covered)
-        return _look_up(index, self.codebook, rows, top)
+    def codewords(self, pixels: Tensor, covered: Tensor) -> Tensor:
+        return pixel_codewords(pixels, self.codebook, self.autoencoder, exact=self.paper, covered=covered)
 
     def to_tensors(self) -> dict[str, Tensor]:
         weights = {f"autoencoder.{name}": value for name, value in self.autoencoder.state_dict().items()}
@@ -224,25 +229,3 @@ def make_decoder(tensors: Mapping[str, Tensor], channels: int) -> Decoder:
     codebook, prefix = Codebook(tensors["codebook.codewords"]), "autoencoder."
     weights = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
     return Autoencoded(codebook, Autoencoder.from_state_dict(weights)) if weights else Codewords(codebook)
-
-
-def _quantised_cosines(decoder: Codewords | Autoencoded, latents: Tensor, rows: Tensor) -> Tensor:  # [N, M]
-    """The cosines of each latent's nearest codeword; 0 for an all-zero latent."""
-    per_codeword = decoder.codebook.unit.to(rows) @ rows.T  # [K, M]
-    index = torch.cat([decoder.codebook.quantize(decoder.decode(part)) for part in latents.split(CHUNK)])
-    return per_codeword[index] * latents.any(dim=1)[:, None]
-
-
-def _best(pixels: Tensor, cosines: Tensor, top: int, covered: Tensor) -> Ranks:
-    """The `top` largest of the cosines [n, C] of pixels [..., d]; ties go to the lowest class."""
-    scores, labels = cosines.sort(dim=1, descending=True, stable=True)
-    empty, shape = ((row_norms(pixels) <= EPS) | ~covered)[..., None], (*pixels.shape[:-1], top)
-    return labels[:, :top].reshape(shape).masked_fill(empty, -1), scores[:, :top].reshape(shape).masked_fill(empty, 0)
-
-
-def _look_up(index: Tensor, codebook: Codebook, rows: Tensor, top: int) -> Ranks:
-    """The best classes of each pixel's codeword, given its index, -1 for none."""
-    similarity = codebook.unit @ rows.T.to(codebook.unit)  # [K, C]
-    scores, labels = similarity.sort(dim=1, descending=True, stable=True)
-    empty = (index < 0)[..., None]
-    return labels[:, :top][index].masked_fill_(empty, -1), scores[:, :top][index].masked_fill_(empty, 0)

@@ -75,7 +75,7 @@ def densify(
         options: thresholds.
         extent: size of the scene, world units.
         prune_large: in 3DGS true only after the first reset of opacities.
-        generator: draws the children's positions (on its own device).
+        generator: draws the children's positions.
 
     Note:
         3DGS intends to prune Gaussians larger than 20 pixels on screen, but sets their radii to zero before the test, so
@@ -97,20 +97,14 @@ def densify(
     grown = values.map(lambda value: value[source])
     if len(parents):
         first = len(kept) + len(cloned)
-        drawn, means = values.map(lambda value: value[parents]), values.means[parents]
-        noise = torch.randn(means.shape, dtype=means.dtype, device=generator.device, generator=generator).to(
-            means.device
-        )
-        rotation = quaternion_to_rotation_matrix(drawn.quats)  # wxyz, normalises
-        grown.means[first:] = means + (rotation @ (noise * drawn.log_scales.exp())[:, :, None])[:, :, 0]
+        means = values.means[parents]
+        rotation = quaternion_to_rotation_matrix(values.quats[parents])  # wxyz, normalises
+        noise = torch.randn(means.shape, dtype=means.dtype, device=generator.device, generator=generator)
+        away = noise.to(means.device) * values.log_scales[parents].exp()
+        grown.means[first:] = means + (rotation @ away[:, :, None])[:, :, 0]
         grown.log_scales[first:] -= math.log(SPLIT_SHRINK)
 
     stays = grown.logit_opacities.sigmoid() >= options.prune_opacity
     if prune_large:
         stays &= grown.log_scales.exp().amax(dim=1) <= options.prune_extent * extent
     return Densified(grown.map(lambda value: value[stays]), source[stays], fresh[stays])
-
-
-def lowered_opacities(logit_opacities: Tensor, opacity: float) -> Tensor:  # [N] -> [N]
-    """The opacity reset of 3DGS: logits lowered to at most that of `opacity`."""
-    return logit_opacities.detach().clamp(max=math.log(opacity / (1 - opacity)))

@@ -141,17 +141,16 @@ def read_examples(path: str | Path) -> dict[str, list[Example]]:
             entry = (masks["annotations"] if isinstance(masks, dict) else masks)[entry["index"]]
         return Mask(view, decode_rle(entry["segmentation"]))
 
-    if not isinstance(content, dict) or not all(isinstance(shown, list) for shown in content.values()):
-        raise ValueError(
-            f'{path}: expected an object of lists of examples by class name, {{"chair": [...]}}; correct it'
-        )
-    examples: dict[str, list[Example]] = {name: [] for name in content}
-    for name, i, entry in ((name, i, entry) for name, shown in content.items() for i, entry in enumerate(shown)):
-        try:
-            examples[name].append(read(entry))
-        except (TypeError, LookupError, ValueError, OverflowError, RuntimeError) as error:
-            why = f"{type(error).__name__}: {error}" if isinstance(error, LookupError) else str(error)
-            raise ValueError(
-                f"{path}: {name!r}[{i}]: expected an example, got {entry!r:.60} ({why}); see kfgs features --help"
-            ) from error
+    examples: dict[str, list[Example]] = {}
+    where = ""
+    try:
+        for name, shown in content.items():
+            examples[name] = []
+            for i, entry in enumerate(shown):
+                where = f"{name!r}[{i}]: "
+                examples[name].append(read(entry))
+    except (AttributeError, TypeError, LookupError, ValueError, OverflowError, RuntimeError) as error:
+        why = f"{type(error).__name__}: {error}" if isinstance(error, LookupError) else str(error)
+        expected = 'an example, in an object of lists by class name, {"chair": [...]}'
+        raise ValueError(f"{path}: {where}expected {expected}, got others ({why}); see kfgs features --help") from error
     return examples

@@ -15,14 +15,12 @@ from torch import Tensor
 from .._rows import EPS, row_norms, unit_rows
 from ..cameras import Camera
 from ..gaussians import Gaussians
-from ..labels.classify import nearest_codeword
 from ..quant.linear import fit_linear_latents
 from ..splat import average_views, rasterize
 from .decoders import Autoencoded, Codewords, Linear
 from .semantic_field import Seen, SemanticField
 
 KEEP, MOST = 0.999, 64  # share of the codewords' variation to keep, with at most this many latents
-CHUNK = 8192  # pixels quantised at once
 PIXELS = 80_000  # most pixels of a view that are rendered
 
 
@@ -39,25 +37,18 @@ def fuse_views(field: SemanticField, cameras: Sequence[Camera]) -> SemanticField
         return replace(field, cameras=tuple(cameras))
     with torch.no_grad():
         if isinstance(decoder, Codewords | Autoencoded):
-            latents = fit_linear_latents(decoder.codebook.unit, keep=KEEP, maximum=MOST)
-            table = latents.encode(decoder.codebook.unit).to(gaussians.means)
+            rows, weights = decoder.codebook.unit, None
         else:
-            latents = fit_linear_latents(unit_rows(field.features), gaussians.opacities, keep=KEEP, maximum=MOST)
-        centres = None
-        if isinstance(decoder, Autoencoded):
-            centres = decoder.autoencoder.encode(decoder.codebook.codewords).to(gaussians.means)
-
-        def encode(pixels: Tensor) -> Tensor:  # [n, d] -> [n, e]
-            if isinstance(decoder, Codewords):
-                return table[decoder.codebook.quantize(pixels)]
-            return latents.encode(unit_rows(pixels)) if centres is None else table[nearest_codeword(pixels, centres)]
+            rows, weights = unit_rows(field.features), gaussians.opacities
+        latents = fit_linear_latents(rows, weights, keep=KEEP, maximum=MOST)
+        table = torch.nn.functional.pad(latents.encode(rows), (0, 0, 0, 1)).to(gaussians.means)  # nothing known: zeros
 
         def show(camera: Camera) -> tuple[Camera, Tensor]:  # [H, W, e]
             rendering = rasterize(gaussians, camera)
-            pixels = rendering.map.flatten(0, 1)
-            rows = torch.cat([encode(part) for part in pixels.split(CHUNK)])
-            something = rendering.alpha > 0 if centres is not None else row_norms(pixels).view(camera.size) > EPS
-            return camera, rows.view(*camera.size, -1) * something[..., None]
+            pixels = rendering.map
+            if isinstance(decoder, Codewords | Autoencoded):
+                return camera, table[decoder.codewords(pixels, rendering.alpha > 0)]
+            return camera, latents.encode(unit_rows(pixels)) * (row_norms(pixels) > EPS)[..., None]
 
         small = []
         for camera in cameras:

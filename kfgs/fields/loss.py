@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -54,8 +54,6 @@ class ColorLoss:
 
     ssim_weight: float = 0.2
     """Lambda of 3DGS, in [0, 1]; 0 = L1 only."""
-    engine: str = field(default="auto", repr=False)
-    """Whose SSIM is used, as `Training.engine`. Engines that have none use kornia's."""
 
     def __post_init__(self) -> None:
         check_range("ssim_weight", self.ssim_weight, 0, 1)
@@ -67,15 +65,15 @@ class ColorLoss:
         if self.ssim_weight == 0 or min(target.shape[:2]) < SSIM_WINDOW:
             return l1_loss(rendered, alpha, target)
         picture = _resized(rendered, target)
-        compiled = _compiled(picture, target, self.engine)
+        compiled = _compiled(picture, target)
         if compiled is not None and not bool(target.sum().isnan()):  # no unknown pixel: one walk for both slopes
             mix = -self.ssim_weight, 1 - self.ssim_weight
             return self.ssim_weight + _Similarity.apply(picture, target, None, mix, compiled)
-        dissimilar = 1 - mean_similarity(picture, target, self.engine)
+        dissimilar = 1 - mean_similarity(picture, target)
         return (1 - self.ssim_weight) * l1_loss(picture, alpha, target) + self.ssim_weight * dissimilar
 
 
-def mean_similarity(picture: Tensor, target: Tensor, engine: str = "auto") -> Tensor:  # [H, W, D] x 2 -> []
+def mean_similarity(picture: Tensor, target: Tensor) -> Tensor:  # [H, W, D] x 2 -> []
     """Mean SSIM over the windows without a NaN (Gaussian, 11x11, sigma 1.5); 1 if there is none. Differentiable in `picture`.
 
     The engine's if it has one (1.2 ms instead of kornia's 37 at 240x320, two threads), else kornia's.
@@ -87,7 +85,7 @@ def mean_similarity(picture: Tensor, target: Tensor, engine: str = "auto") -> Te
         counted = torch.nn.functional.max_pool2d(holes, SSIM_WINDOW, stride=1)[0, 0] == 0  # [H - 10, W - 10]
         if not bool(counted.any()):
             return picture.new_ones(())
-    if (compiled := _compiled(picture, target, engine)) is not None:
+    if (compiled := _compiled(picture, target)) is not None:
         return _Similarity.apply(picture, target, counted, (1.0, 0.0), compiled)  # type: ignore[no-any-return]
     similarity = from_bchw(ssim(to_bchw(picture), to_bchw(target), SSIM_WINDOW, eps=0.0, padding="valid"))
     return similarity.mean() if counted is None else similarity[counted].mean()
@@ -98,9 +96,9 @@ def _resized(rendered: Tensor, target: Tensor) -> Tensor:  # [H, W, D], [h, w, D
     return resize_map(rendered, (target.shape[0], target.shape[1]))
 
 
-def _compiled(picture: Tensor, target: Tensor, engine: str) -> Callable[..., Any] | None:
+def _compiled(picture: Tensor, target: Tensor) -> Callable[..., Any] | None:
     """The engine's SSIM; None if kornia's must be used, as for a gradient in the target."""
-    return compiled_similarity(picture, target) if engine in ("auto", "numba") and not target.requires_grad else None
+    return None if target.requires_grad else compiled_similarity(picture, target)
 
 
 def _known(target: Tensor) -> Tensor:  # [H, W, D] -> [H, W] bool

@@ -65,6 +65,7 @@ def merge_gaussians(
     """
     check_shapes(("gaussians.means", gaussians.means, "N 3"), ("weights", weights, "N"))
     check_whole("maximum", maximum, 1)
+    check_whole("clusters", clusters, 1)
     check_range("faint", faint, 0, 1, closed=(True, False))
     if gaussians.features is None:
         raise ValueError("gaussians: expected features [N, d], got None; uplift some first")
@@ -73,8 +74,10 @@ def merge_gaussians(
         raise ValueError(
             "weights: expected Gaussians that some view shows, got none; do cameras and Gaussians share one frame?"
         )
-    if len(rows) > maximum:
-        rows = rows[_above(weights[rows], faint)]
+    if len(rows) > maximum:  # all but the smallest weights, which sum to at most this share of all
+        order = rows[weights[rows].argsort(stable=True)]
+        below = weights[order].double().cumsum(0) <= faint * weights.double().sum()
+        rows = order[~below].sort().values
     kept, worth = gaussians.select(rows), weights[rows]
     assert kept.features is not None
     source = torch.full_like(weights, -1, dtype=torch.int64)
@@ -87,32 +90,21 @@ def merge_gaussians(
     return Merged(_match_moments(kept, worth, group, count), _sum(worth, group, count), source)
 
 
-def _above(weights: Tensor, faint: float) -> Tensor:  # [n] -> [n] bool
-    """All but the smallest weights, which sum to at most the share `faint` of all; at least one is left."""
-    order = weights.argsort(stable=True)
-    below = weights[order].double().cumsum(0) <= faint * weights.double().sum()
-    kept = torch.ones_like(below)
-    kept[order] = ~below
-    return kept
-
-
 def _smallest_voxels(means: Tensor, kinds: Tensor, worth: Tensor, maximum: int) -> tuple[Tensor, int]:  # [n] int64, M
     """The groups of the finest grid that leaves at most `maximum` of them."""
     low, span = means.amin(0), float((means.amax(0) - means.amin(0)).max())
     fine, coarse = 0.0, 1.001 * span + torch.finfo(means.dtype).tiny
-    best = _groups(means, low, coarse, kinds, worth)
-    while best[1] > maximum:  # a single cube has more kinds than `maximum`: merge kinds too
-        kinds = kinds // 2
-        best = _groups(means, low, coarse, kinds, worth)
+    while (best := _groups(means, low, coarse, kinds, worth))[1] > maximum:
+        kinds = kinds // 2  # a single cube has more kinds than `maximum`: merge kinds too
     for _ in range(TRIES):
         middle = (fine + coarse) / 2
-        found = _groups(means, low, middle, kinds, worth)
-        if found[1] > maximum:
+        groups = _groups(means, low, middle, kinds, worth)
+        if groups[1] > maximum:
             fine = middle
-            continue
-        coarse, best = middle, found
-        if found[1] > 0.99 * maximum:
+        elif (best := groups)[1] > 0.99 * maximum:
             break
+        else:
+            coarse = middle
     return best
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -20,34 +21,25 @@ class FieldOptimizer:
     stays; new ones start at 0 (as in 3DGS).
     """
 
-    def __init__(self, params: GaussianParams, training: Training, *, extent: float) -> None:
-        """Copy `params` and prepare Adam; the learning rate of the means is in units of `extent`."""
-        self.params = params.map(_leaf)
-        self._training, self._extent, rates = training, extent, training.rates
-        self._rates = {
-            "means": rates.means * extent,
-            "quats": rates.quats,
-            "log_scales": rates.scales,
-            "logit_opacities": rates.opacities,
-            "features": rates.features,
-            "sh0": rates.sh0,
-            "sh_rest": rates.sh_rest,
-        }
-        tensors = self.params.to_tensors().items()
-        groups = [{"params": [value], "lr": self._rates[name], "name": name} for name, value in tensors]
-        self._adam = torch.optim.Adam(groups, eps=rates.adam_eps, fused=True)
-        self._groups = {group["name"]: group for group in self._adam.param_groups}
+    def __init__(self, params: GaussianParams, training: Training) -> None:
+        """Copy `params` and prepare Adam; the extent of `training` is known."""
+        self.params, self._training = params.map(_leaf), training
+        groups = [{"params": [value], "name": name} for name, value in self.params.to_tensors().items()]
+        self._adam = torch.optim.Adam(groups, eps=training.rates.adam_eps, fused=True)
 
-    def means_lr(self, step: int) -> float:
-        """Learning rate of the means: from `rates.means` to `means_final` times the extent, exponentially in the step."""
+    def rate(self, name: str, step: int) -> float:
+        """Learning rate of a parameter. That of the means falls from the first step on, and is in units of the extent."""
         rates, t = self._training.rates, step / self._training.steps
-        return rates.means ** (1 - t) * rates.means_final**t * self._extent
+        if name == "means":
+            assert self._training.extent is not None
+            return rates.means ** (1 - t) * rates.means_final**t * self._training.extent
+        own: float = getattr(rates, name.removeprefix("log_").removeprefix("logit_"))
+        return own * rates.final ** max(0.0, 2 * t - 1)
 
     def step_(self, step: int) -> None:
         """Apply the gradients of step number `step`, then forget them."""
-        factor = self._training.rates.final ** max(0.0, 2 * step / self._training.steps - 1)
-        for name, group in self._groups.items():
-            group["lr"] = self.means_lr(step) if name == "means" else self._rates[name] * factor
+        for group in self._adam.param_groups:
+            group["lr"] = self.rate(group["name"], step)
         self._adam.step()
         self._adam.zero_grad(set_to_none=True)
 
@@ -59,20 +51,18 @@ class FieldOptimizer:
     ) -> None:
         """Train `params` from now on: row i takes the moments of old row `source[i]`, or zeros where `fresh[i]`."""
         self.params = params.map(_leaf)
-        for name, value in self.params.to_tensors().items():
-            state = self._adam.state.pop(self._groups[name]["params"][0], {})
-            for moment in _MOMENTS:
-                if moment in state:
+        for group, value in zip(self._adam.param_groups, self.params.to_tensors().values(), strict=True):
+            if state := self._adam.state.pop(group["params"][0], None):
+                for moment in _MOMENTS:
                     state[moment] = state[moment][source]
                     state[moment][fresh] = 0
-            self._groups[name]["params"] = [value]
-            if state:
                 self._adam.state[value] = state
+            group["params"] = [value]
 
-    def set_opacities_(self, logit_opacities: Tensor) -> None:  # [N]
-        """Exchange the opacities and forget their moments, which belong to the old values."""
+    def lower_opacities_(self, opacity: float) -> None:
+        """The opacity reset of 3DGS: to at most `opacity`. Their moments, which belong to the old values, are forgotten."""
         leaf = self.params.logit_opacities
-        leaf.data.copy_(logit_opacities)
+        leaf.data.clamp_(max=math.log(opacity / (1 - opacity)))
         for moment in _MOMENTS:
             if moment in self._adam.state.get(leaf, {}):
                 self._adam.state[leaf][moment].zero_()
@@ -83,9 +73,7 @@ class FieldOptimizer:
 
     def load_state_(self, state: dict[str, Any]) -> None:
         """Continue from the result of `state`, for these `params`."""
-        copied = {i: {name: value.clone() for name, value in part.items()} for i, part in state.items()}
-        self._adam.load_state_dict(self._adam.state_dict() | {"state": copied})
-        self._groups = {group["name"]: group for group in self._adam.param_groups}  # Adam makes new ones
+        self._adam.load_state_dict(self._adam.state_dict() | {"state": state})
 
 
 def _leaf(value: Tensor) -> Tensor:

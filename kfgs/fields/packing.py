@@ -8,21 +8,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import torch
 import zstandard
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from .._arrays import most_unpacked
+from .._arrays import Array, most_unpacked
 from .._check import check_choice, check_range
 from ..formats.encodings import morton_cells, morton_codes
 from ..formats.values import unit_quats
 
-Array = NDArray[Any]
 Entry = dict[str, Any]
 LEVEL = 19  # of zstd: the best compression that takes only seconds
 LARGEST = 1 << 22  # most steps from zero: they stay exact in float32
@@ -71,13 +69,6 @@ PRECISIONS = {"fine": FINE, "small": SMALL, "tiny": TINY}
 Precision = Literal["fine", "small", "tiny"] | Rounding
 
 
-class _Place(NamedTuple):
-    """Where the Gaussians are on the grid of the means; what is predicted from neighbours needs it."""
-
-    cells: Array  # [N, 3] int64
-    before: Array  # [N] int64: the row that each one is predicted from; N for none
-
-
 def pack(
     tensors: dict[str, Tensor], precision: Precision
 ) -> tuple[dict[str, Tensor], dict[str, Entry], dict[str, float]]:
@@ -103,16 +94,22 @@ def pack(
     origin = means.min(0) if len(means) else np.zeros(3)
     cells = np.round((means - origin) / step).astype(np.int64)
     order = np.argsort(morton_codes(cells.astype(np.uint64)), kind="stable")
+    cells = cells[order]
     quats = unit_quats(torch.from_numpy(arrays["gaussians.quats"])).numpy()
     arrays["gaussians.quats"], arrays["gaussians.scales"] = _nearest_turn(quats, scales)
-    place = _Place(cells[order], _find_before(cells[order]))
-    streams, entries, fused = dict[str, Tensor](), dict[str, Entry](), "linear.basis" in tensors
-    errors: dict[str, float] = {}
+    fused, before = "linear.basis" in tensors, _find_before(cells)
+    streams, entries, errors = dict[str, Tensor](), dict[str, Entry](), dict[str, float]()
     for name, value in tensors.items():
-        per_gaussian = name.startswith(PER_GAUSSIAN)
-        array = arrays.get(name)
-        array = array[order] if array is not None and per_gaussian else array
-        entry, plain = _encode(name, value[order] if per_gaussian else value, array, chosen, place, step, origin, fused)
+        rows = order if name.startswith(PER_GAUSSIAN) else slice(None)
+        array = arrays[name][rows] if name in arrays else None
+        if array is None or not array.size:
+            entry, plain = _exact(value[rows])
+        elif name == "gaussians.means":
+            codes = morton_codes(cells.astype(np.uint64))
+            entry = {"coding": "curve", "step": step, "origin": origin.tolist(), "error": step / 2}
+            entry, plain = _planes(entry, np.diff(codes, prepend=np.uint64(0)).astype(np.int64)[:, None])
+        else:
+            entry, plain = _encode(name, array, chosen, step, before, fused) or _exact(value[rows])
         packed = zstandard.ZstdCompressor(level=LEVEL).compress(plain)
         shorter = len(packed) < len(plain)
         streams[name] = torch.from_numpy(np.frombuffer(packed if shorter else plain, np.uint8).copy())
@@ -126,10 +123,10 @@ def unpack(streams: dict[str, Tensor], entries: dict[str, Entry]) -> dict[str, T
     if set(entries) != set(streams):
         raise ValueError(f"expected a description of {sorted(streams)}, got {sorted(entries)!r:.200}")
     plain = {name: _plain_bytes(streams[name].numpy().tobytes(), entry) for name, entry in entries.items()}
-    tensors: dict[str, Tensor] = {}
-    place = None
-    for name in sorted(entries, key=lambda name: entries[name]["coding"] != "curve"):  # others may need the means
-        tensors[name], place = _decode(entries[name], tuple(entries[name]["shape"]), plain[name], place)
+    means, before = entries["gaussians.means"], None
+    if means["coding"] == "curve":
+        before = _find_before(_cells(plain["gaussians.means"], means))
+    tensors = {name: _decode(entry, plain[name], before) for name, entry in entries.items()}
     if entries["gaussians.opacities"]["coding"] != "exact":
         tensors["gaussians.opacities"].clamp_(EDGE, 1 - EDGE)
     scales = entries["gaussians.scales"]
@@ -139,23 +136,10 @@ def unpack(streams: dict[str, Tensor], entries: dict[str, Entry]) -> dict[str, T
 
 
 def _encode(
-    name: str,
-    value: Tensor,
-    array: Array | None,
-    chosen: Rounding,
-    place: _Place,
-    step: float,
-    origin: Array,
-    fused: bool,
-) -> tuple[Entry, bytes]:
-    """One tensor, whose float64 values are `array` if it has real numbers."""
-    if array is None or not array.size:
-        return _exact(value)
+    name: str, array: Array, chosen: Rounding, step: float, before: Array, fused: bool
+) -> tuple[Entry, bytes] | None:
+    """One tensor of real numbers, for Gaussians in the order of the curve; None if it stays exact."""
     match name.split("."):
-        case ["gaussians", "means"]:
-            codes = morton_codes(place.cells.astype(np.uint64))
-            entry = {"coding": "curve", "step": step, "origin": origin.tolist(), "error": step / 2}
-            return _planes(entry, np.diff(codes, prepend=np.uint64(0)).astype(np.int64)[:, None])
         case ["gaussians", "quats"]:
             turn = math.radians(chosen.degrees) / TURN
             return _planes({"coding": "turns", "step": turn, "error": chosen.degrees}, np.round(array[:, 1:] / turn))
@@ -167,16 +151,16 @@ def _encode(
             size = 2 * chosen.opacities
             return _planes({"coding": "steps", "step": size, "error": size / 2}, np.round(array[:, None] / size))
         case ["gaussians", "features"]:
-            return _near(array, chosen.latents if fused else chosen.latents / 2, place)
+            return _near(array, chosen.latents if fused else chosen.latents / 2, before)
         case ["fused", "latents"]:
-            return _near(array, chosen.latents, place)
-        case ["linear" | "fused", "basis"] if math.prod(value.shape) * value.shape[1] <= QR_MOST:
+            return _near(array, chosen.latents, before)
+        case ["linear" | "fused", "basis"] if array.size * array.shape[1] <= QR_MOST:
             return _rows(array, chosen.decoder, "basis")
         case ["codebook", "codewords"] | ["classes", _]:
             return _rows(array, chosen.decoder)
         case ["autoencoder", _, _, "weight"]:
             return _rows(array, chosen.decoder / 4)
-    return _exact(value)
+    return None
 
 
 def _exact(value: Tensor) -> tuple[Entry, bytes]:
@@ -201,7 +185,7 @@ def _logs(values: Array, share: float, least: float) -> tuple[Entry, bytes]:  # 
     return _planes({"coding": "logs", "step": step, "least": least, "error": share}, whole)
 
 
-def _near(values: Array, share: float, place: _Place) -> tuple[Entry, bytes]:  # [N, d]
+def _near(values: Array, share: float, before: Array) -> tuple[Entry, bytes]:  # [N, d]
     """Multiples of a step, as differences to the row before. No row becomes zero that was not."""
     lengths = np.linalg.norm(values, axis=1)
     known = lengths > 0
@@ -212,7 +196,7 @@ def _near(values: Array, share: float, place: _Place) -> tuple[Entry, bytes]:  #
     largest = np.abs(values[lost]).argmax(1)
     whole[lost, largest] = np.sign(values[lost, largest])
     entry = {"coding": "near", "step": step, "error": step if len(lost) else step / 2}
-    return _planes(entry, whole - np.concatenate([whole, np.zeros_like(whole[:1])])[place.before])
+    return _planes(entry, whole - np.concatenate([whole, np.zeros_like(whole[:1])])[before])
 
 
 def _rows(values: Array, share: float, coding: str = "rows") -> tuple[Entry, bytes]:  # [K, D]
@@ -235,14 +219,14 @@ def _plain_bytes(stream: bytes, entry: Entry) -> bytes:
     return zstandard.ZstdDecompressor().decompress(stream, max_output_size=size)
 
 
-def _decode(entry: Entry, shape: tuple[int, ...], plain: bytes, place: _Place | None) -> tuple[Tensor, _Place | None]:
-    """The tensor of an entry and its plain bytes; and the place, if these are the means."""
-    coding = entry["coding"]
+def _decode(entry: Entry, plain: bytes, before: Array | None) -> Tensor:
+    """The tensor of an entry and its plain bytes."""
+    coding, shape = entry["coding"], tuple(entry["shape"])
     if coding == "exact":
         dtype = getattr(torch, entry["dtype"])
         planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
         whole = torch.from_numpy(np.array(planes.T, order="C")).reshape(-1)
-        return (whole.view(dtype) if len(whole) else torch.zeros(0, dtype=dtype)).reshape(shape), place
+        return (whole.view(dtype) if len(whole) else torch.zeros(0, dtype=dtype)).reshape(shape)
     rows, columns = shape[0], math.prod(shape[1:])
     if coding in ("rows", "basis"):
         rows, columns = (columns, rows) if coding == "basis" else (rows, columns)
@@ -252,25 +236,28 @@ def _decode(entry: Entry, shape: tuple[int, ...], plain: bytes, place: _Place | 
             Q, R = np.linalg.qr(values.T)
             values = Q * np.sign(np.diagonal(R))
     elif coding == "curve":
-        codes = np.cumsum(_whole(plain, entry, rows, 1)[:, 0].astype(np.uint64), dtype=np.uint64)
-        cells = morton_cells(codes).astype(np.int64)
-        place = _Place(cells, _find_before(cells))
-        values = np.array(entry["origin"], np.float64) + cells * float(entry["step"])
+        values = np.array(entry["origin"], np.float64) + _cells(plain, entry) * float(entry["step"])
     elif coding == "turns":
         small = _whole(plain, entry, rows, 3) * float(entry["step"])
         squares = np.square(small).sum(1, keepdims=True)
         small = small / np.sqrt(np.maximum(squares, 1))
         values = np.concatenate([np.sqrt(np.maximum(0, 1 - squares)), small], axis=1)
     elif coding == "near":
-        if place is None or len(place.before) != rows:
+        if before is None or len(before) != rows:
             raise ValueError(f"expected as many latents as there are means, got {rows}")
-        values = _sum_up(_whole(plain, entry, rows, columns), place.before) * np.float32(entry["step"])
+        values = _sum_up(_whole(plain, entry, rows, columns), before) * np.float32(entry["step"])
     elif coding in ("steps", "logs"):
         steps = _whole(plain, entry, rows, columns) * float(entry["step"])
         values = steps if coding == "steps" else np.expm1(np.clip(steps, 0, 700)) * float(entry["least"])
     else:
         raise ValueError(f"coding: expected one of kfgs, got {coding!r:.40}")
-    return torch.from_numpy(np.ascontiguousarray(values.reshape(shape), dtype=np.float32)), place
+    return torch.from_numpy(np.ascontiguousarray(values.reshape(shape), dtype=np.float32))
+
+
+def _cells(plain: bytes, entry: Entry) -> Array:  # [N, 3] int64
+    """Where the Gaussians are on the grid of the means."""
+    steps = _whole(plain, entry, entry["shape"][0], 1)[:, 0].astype(np.uint64)
+    return morton_cells(np.cumsum(steps, dtype=np.uint64)).astype(np.int64)
 
 
 def _whole(plain: bytes, entry: Entry, rows: int, columns: int) -> Array:  # [rows, columns] integers

@@ -119,19 +119,19 @@ class GaussianParams:
             raise ValueError(
                 "gaussians: expected features [N, D] or sh [N, K, 3], got neither; give them some with replace()"
             )
-        scales, opacities = gaussians.scales.detach(), gaussians.opacities.detach()
-        sh = None if gaussians.features is not None else gaussians.sh
+        cloud = gaussians.detach()
+        sh = None if cloud.features is not None else cloud.sh
         return cls(
-            means=gaussians.means.detach().clone(),
-            quats=gaussians.quats.detach().clone(),
-            log_scales=scales.clamp_min(torch.finfo(scales.dtype).tiny).log(),
-            logit_opacities=torch.logit(opacities, eps=torch.finfo(opacities.dtype).eps),
-            features=None if gaussians.features is None else gaussians.features.detach().clone(),
-            sh0=None if sh is None else sh[:, 0].detach().clone(),
-            sh_rest=sh[:, 1:].detach().clone() if sh is not None and sh.shape[1] > 1 else None,
-            origin=gaussians.origin,
-            antialiased=gaussians.antialiased,
-        )
+            means=cloud.means,
+            quats=cloud.quats,
+            log_scales=cloud.scales.clamp_min(torch.finfo(cloud.scales.dtype).tiny).log(),
+            logit_opacities=torch.logit(cloud.opacities, eps=torch.finfo(cloud.opacities.dtype).eps),
+            features=cloud.features,
+            sh0=None if sh is None else sh[:, 0],
+            sh_rest=sh[:, 1:] if sh is not None and sh.shape[1] > 1 else None,
+            origin=cloud.origin,
+            antialiased=cloud.antialiased,
+        ).map(torch.clone)
 
     @classmethod
     def from_points(
@@ -165,22 +165,23 @@ class GaussianParams:
             >>> GaussianParams.from_points(cube, 9).activated().scales[0]
             tensor([1., 1., 1.])
         """
-        if (channels is None) == (colors is None):
-            got = "neither" if channels is None else "both"
-            raise ValueError(f"channels, colors: expected one of them, got {got}; a field has features or colours")
         points = as_tensor("points", points, floating=True).detach()
         if colors is not None:
             colors = as_tensor("colors", colors).to(points.device)
             colors = colors.double() / 255 if colors.dtype == torch.uint8 else colors
+            if not bool(((colors >= 0) & (colors <= 1)).all()):
+                raise ValueError("colors: expected uint8, or numbers in [0, 1], got others; divide by 255")
         check_shapes(("points", points, "P 3"), ("colors", colors, "P 3"))
         check_whole("channels", 1 if channels is None else channels, 1)
         check_whole("sh_degree", sh_degree, 0, 3)
         check_range("initial_opacity", initial_opacity, 0, 1, closed=(False, False))
         if not bool(torch.isfinite(points).all()):
             raise ValueError("points: expected finite numbers, got others; drop those rows first")
-        if colors is not None and not bool(((colors >= 0) & (colors <= 1)).all()):
-            raise ValueError("colors: expected uint8, or numbers in [0, 1], got others; divide by 255")
-        kept = _inliers(points).nonzero()[:, 0]
+        kept = torch.arange(len(points), device=points.device)
+        if len(points):
+            distance = (points - points.median(dim=0).values).norm(dim=1)
+            radius = float(np.quantile(distance.cpu().double().numpy(), 0.95))  # torch.quantile stops at 16M elements
+            kept = kept[distance <= OUTLIER_RANGE * radius] if radius > 0 else kept
         if max_points is not None and len(kept) > max_points:
             check_whole("max_points", max_points, 2)
             generator = generator or torch.Generator().manual_seed(0)
@@ -196,15 +197,6 @@ class GaussianParams:
             sh0=None if colors is None else rgb_to_sh0(colors[kept].to(points)),
             sh_rest=points.new_zeros(n, (sh_degree + 1) ** 2 - 1, 3) if colors is not None and sh_degree else None,
         )
-
-
-def _inliers(points: Tensor) -> Tensor:  # [P, 3] -> [P] bool
-    """The points within `OUTLIER_RANGE` times the 0.95 quantile of the distances from the median."""
-    if len(points) == 0:
-        return torch.zeros(0, dtype=torch.bool, device=points.device)
-    distance = (points - points.median(dim=0).values).norm(dim=1)
-    radius = float(np.quantile(distance.cpu().double().numpy(), 0.95))  # torch.quantile stops at 16M elements
-    return distance <= OUTLIER_RANGE * radius if radius > 0 else torch.ones_like(distance, dtype=torch.bool)
 
 
 def point_spacing(points: Tensor) -> Tensor:  # [P, 3] -> [P] world units

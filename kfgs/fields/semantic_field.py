@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import torch
@@ -23,22 +23,11 @@ from ..metrics import MIB, semantic_storage_bytes
 from ..splat import Ranked, Rendering, rasterize
 from .decoders import Decoder
 from .packing import Precision
-from .store import load_field, save_field
+from .store import Seen, load_field, save_field
 from .votes import Votes, rank_votes
 
 _VOTES: WeakKeyDictionary[Any, tuple[Any, Tensor, Votes]] = WeakKeyDictionary()
 """Votes depend on the text alone, so the last ones of each field are kept, with the text they answer."""
-
-
-class Seen(NamedTuple):
-    """How well the training views show each Gaussian."""
-
-    pixels: Tensor  # [N] number of pixels that it fills, in all training views
-    agreement: Tensor  # [N] in [0, 1]: length of the mean of the unit features at its pixels
-
-    def to(self, *args: Any, **kwargs: Any) -> Seen:
-        """Both on another device or in another dtype, as `torch.Tensor.to`."""
-        return Seen(*(value.to(*args, **kwargs) for value in self))
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,23 +104,21 @@ class SemanticField:
 
     def _facts(self) -> dict[str, Any]:
         teacher, rounded = self.info.get("teacher"), self.info.get("rounded", ())
+        plain = {name: value for name, value in self.info.items() if not isinstance(value, list | dict)}
         return {
             "size as Table 1 counts it": f"{self.storage() / MIB:.2f} MiB",
             "teacher": teacher.get("name") if isinstance(teacher, dict) else None,
             "training views": len(self.cameras),
             "classes": None if self.classes is None else f"{len(self.classes)}, with their text table",
             "rounded": ", ".join(str(entry["precision"]) for entry in rounded) or None,
-        }
+        } | plain
 
     def _repr_html_(self) -> str:
-        channels = f"{self.features.shape[1]} for {self.dim} of the teacher"
-        counts = {"method": self.decoder.name, "Gaussians": len(self), "channels": channels}
-        return html_card("SemanticField", counts | self._facts())
+        return html_card(repr(self), self._facts())
 
     def summary(self) -> str:
         """A few lines of text: counts, channels, size, origin."""
-        plain = {name: value for name, value in self.info.items() if not isinstance(value, list | dict)}
-        facts = {name: value for name, value in (self._facts() | plain).items() if value is not None}
+        facts = {name: value for name, value in self._facts().items() if value is not None}
         return "\n".join([repr(self), *(f"  {name}: {value}" for name, value in facts.items())])
 
     def to(self, *args: Any, **kwargs: Any) -> SemanticField:
@@ -218,13 +205,12 @@ class SemanticField:
             negatives = "none"
         source = self._source
         classes = self.classes if classes is None else classes
-        question = make_question(target, classes, negatives, source.decoder.dim, self.info)
-        latents, rows = source.features, question.rows
+        rows, latents = make_question(target, classes, negatives, self.dim, self.info), source.features
         named = isinstance(target, str) and isinstance(negatives, str)  # the rows of a label set are checked
         unit = unit_rows(rows) if named else unit_embeddings(rows, "embedding, negatives")
         with torch.no_grad():
             cosines = source.decoder.cosines(latents, unit.to(latents))
-        against = None if question.negatives is None else cosines[:, 1:]
+        against = cosines[:, 1:] if len(rows) > 1 else None
         return select_by_similarity(cosines[:, 0], against, threshold, latents.any(dim=1), score)
 
     def segment(self, camera: Camera, classes: Classes | None = None) -> Tensor:  # [H, W] int64
@@ -272,9 +258,7 @@ class SemanticField:
             FileNotFoundError: if there is nothing.
             ValueError: if it is not a field, or damaged.
         """
-        parts, seen, fused = load_field(path)
-        seen = None if seen is None else Seen(*seen)
-        return cls(**parts, seen=seen, fused=None if fused is None else cls(**fused, seen=seen))
+        return load_field(path, cls)  # type: ignore[no-any-return]
 
     def _rows(self, classes: Classes | None) -> Tensor:  # [C, D]
         if isinstance(classes, str):

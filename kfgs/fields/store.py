@@ -8,9 +8,9 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import zstandard
@@ -32,6 +32,17 @@ SUFFIX, NAME = ".kfgs", "field.kfgs"
 KIND, VERSION = "semantic field", "1"
 ABOUT, WORDS = "description", 8 << 20  # the tensor with the JSON, and its most bytes
 WHAT, AGAIN = "a field of kfgs", "copy it again, or fit the field again"
+
+
+class Seen(NamedTuple):
+    """How well the training views show each Gaussian."""
+
+    pixels: Tensor  # [N] number of pixels that it fills, in all training views
+    agreement: Tensor  # [N] in [0, 1]: length of the mean of the unit features at its pixels
+
+    def to(self, *args: Any, **kwargs: Any) -> Seen:
+        """Both on another device or in another dtype, as `torch.Tensor.to`."""
+        return Seen(*(value.to(*args, **kwargs) for value in self))
 
 
 def find_field(path: str | Path) -> Path | None:
@@ -74,8 +85,8 @@ def save_field(path: str | Path, parts: Mapping[str, Any], precision: Precision 
         save_tensors(temporary, tensors, {"kfgs": KIND, "version": VERSION})
 
 
-def load_field(path: str | Path) -> tuple[dict[str, Any], Any, dict[str, Any] | None]:
-    """The parts of a field, by name; what the views show of its Gaussians, or None; and the parts of its fused field, or None."""
+def load_field(path: str | Path, kind: Callable[..., Any]) -> Any:
+    """A field from its file; `kind` makes one of its parts, by name."""
     path = _field_file(path)
     with reading(path, WHAT, AGAIN), safe_open(path, framework="pt") as file:
         about = _description(file)
@@ -84,7 +95,7 @@ def load_field(path: str | Path) -> tuple[dict[str, Any], Any, dict[str, Any] | 
             raise ValueError("its content is not what was saved")
         if "packed" in about:
             tensors = unpack(tensors, about["packed"])
-        return _from_tensors(path, tensors, about)
+        return _from_tensors(path, tensors, about, kind)
 
 
 def read_description(path: str | Path) -> dict[str, Any]:
@@ -165,11 +176,9 @@ def _to_tensors(path: Path, parts: Mapping[str, Any]) -> tuple[dict[str, Tensor]
     return {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}, about
 
 
-def _from_tensors(
-    path: Path, tensors: dict[str, Tensor], about: dict[str, Any]
-) -> tuple[dict[str, Any], Any, dict[str, Any] | None]:
-    """The parts of a field, which `SemanticField` checks."""
-    origin, classes = as_origin(about.get("origin", ORIGIN)), None
+def _from_tensors(path: Path, tensors: dict[str, Tensor], about: dict[str, Any], kind: Callable[..., Any]) -> Any:
+    """The field, which checks its parts."""
+    origin, classes, seen, fused = as_origin(about.get("origin", ORIGIN)), None, None, None
     cloud: dict[str, Any] = {name: tensors[f"gaussians.{name}"] for name in CLOUD if f"gaussians.{name}" in tensors}
     for name, value in cloud.items():
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
@@ -188,15 +197,10 @@ def _from_tensors(
             raise ValueError(f"a camera has {width:,} x {height:,} pixels; a picture has at most {PIXELS:,}")
         pose = tensors["cameras.viewmats"][i], tensors["cameras.Ks"][i]
         cameras.append(Camera(*pose, width, height, name, near=near, origin=origin))
-    parts = {
-        "gaussians": gaussians,
-        "decoder": make_decoder(tensors, tensors["gaussians.features"].shape[1]),
-        "cameras": tuple(cameras),
-        "classes": classes,
-        "info": info,
-    }
-    seen = (tensors["seen.pixels"], tensors["seen.agreement"]) if "seen.pixels" in tensors else None
-    if "fused.latents" not in tensors:
-        return parts, seen, None
-    fused = gaussians.replace(features=tensors["fused.latents"])
-    return parts, seen, {"gaussians": fused, "decoder": Linear(tensors["fused.basis"])}
+    if "seen.pixels" in tensors:
+        seen = Seen(tensors["seen.pixels"], tensors["seen.agreement"])
+    if "fused.latents" in tensors:
+        latents = gaussians.replace(features=tensors["fused.latents"])
+        fused = kind(latents, Linear(tensors["fused.basis"]), seen=seen)
+    decoder = make_decoder(tensors, tensors["gaussians.features"].shape[1])
+    return kind(gaussians, decoder, tuple(cameras), classes, info, seen, fused)

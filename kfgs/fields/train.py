@@ -21,11 +21,11 @@ from ..cameras import Camera
 from ..cameras.bounds import camera_extent
 from ..splat import rasterize
 from .checkpoint import digest_tensors, read_checkpoint, write_checkpoint
-from .densify import GradientStatistics, densify, lowered_opacities
+from .densify import GradientStatistics, densify
 from .loss import ColorLoss, Loss, l1_loss
 from .optimizer import FieldOptimizer
 from .params import GaussianParams
-from .training import Training, check_extent
+from .training import Densify, Training, check_extent
 from .working_maps import shrink_camera, shrink_map
 
 
@@ -80,21 +80,18 @@ def fit_field(
         FileNotFoundError: if something else deletes the checkpoint's folder meanwhile; noticed at the next checkpoint.
     """
     training, progress = training or Training(), as_progress(progress)
-    generator = generator or torch.Generator().manual_seed(0)
     if not isinstance(params, GaussianParams) or not len(params):
         got = "no Gaussian" if isinstance(params, GaussianParams) else type(params).__name__
         raise TypeError(f"params: expected GaussianParams, got {got}; GaussianParams.from_points makes them")
     if not cameras or len(cameras) != len(targets):
-        raise ValueError(
-            f"targets: expected one map per camera ({len(cameras)}, at least one), got {len(targets)}; pass the views that "
-            "have maps"
-        )
+        got = f"{len(targets)}; pass the views that have maps"
+        raise ValueError(f"targets: expected one map per camera ({len(cameras)}, at least one), got {got}")
     if params.origin == ORIGIN:
         params = replace(params, origin=cameras[0].origin)
     cameras = [camera.with_origin(params.origin) for camera in cameras]
     if training.extent is None:
         training = replace(training, extent=float(check_extent(camera_extent(cameras, params.means))))
-    trainer = Trainer(params, cameras, targets, training, loss, generator)
+    trainer = Trainer(params, cameras, targets, training, loss, generator or torch.Generator().manual_seed(0))
     path = as_path(checkpoint) if checkpoint is not None else None
     if path is not None:
         identity = trainer.identity()
@@ -130,12 +127,11 @@ class Trainer:
         generator: torch.Generator,
     ) -> None:
         """Prepare step 1; the arguments are those of `fit_field`, checked, and the extent is known."""
-        assert training.extent is not None
         self._cameras, self._targets, self._loss = cameras, targets, loss
-        self._training, self._extent, self._generator = training, training.extent, generator
+        self._training, self._generator = training, generator
         self._render_cameras: dict[tuple[int, bool], Camera] = {}
         self._sh_start = params.used_sh_degree()  # of the start, so a resumed fit has the same
-        self.optimizer = FieldOptimizer(params, training, extent=self._extent)
+        self.optimizer = FieldOptimizer(params, training)
         self.statistics = GradientStatistics.zeros(params)
         self.history: list[dict[str, Any]] = []
         self.step = 0
@@ -146,14 +142,14 @@ class Trainer:
         """One step of the optimisation; returns the new row of the history, if there is one."""
         started = time.perf_counter()
         self.step += 1
-        densify = self._training.densify
-        self._learn_()
-        if densify is not None and self.step < densify.stop:
-            if self.step > densify.start and self.step % densify.every == 0:
-                self._densify_()
-            if densify.reset_every and self.step % densify.reset_every == 0:
-                logits = self.optimizer.params.logit_opacities
-                self.optimizer.set_opacities_(lowered_opacities(logits, densify.reset_opacity))
+        options = self._training.densify
+        growing = options is not None and self.step < options.stop
+        self._learn_(growing)
+        if options is not None and growing:
+            if self.step > options.start and self.step % options.every == 0:
+                self._densify_(options)
+            if options.reset_every and self.step % options.reset_every == 0:
+                self.optimizer.lower_opacities_(options.reset_opacity)
         self._seconds += time.perf_counter() - started
         if self.step % self._training.report_every and self.step != self._training.steps:
             return None
@@ -164,8 +160,8 @@ class Trainer:
         self._losses = 0.0
         return row
 
-    def _learn_(self) -> None:
-        """Follow the gradients of the next view; keep those of the places in the picture, which densifying needs."""
+    def _learn_(self, growing: bool) -> None:
+        """Follow the gradients of the next view; while `growing`, keep those of the places in the picture."""
         if not self._queue:
             device = self._generator.device
             self._queue = torch.randperm(len(self._cameras), generator=self._generator, device=device).tolist()
@@ -188,20 +184,18 @@ class Trainer:
         self._losses += value
         if loss.requires_grad:  # not so when the view shows no Gaussian
             loss.backward()
-            if means2d.grad is not None and training.densify and self.step < training.densify.stop:
+            if growing and means2d.grad is not None:
                 self.statistics.add_(rendering.projected.index, means2d.grad, camera.size)
         self.optimizer.step_(self.step)
 
-    def _densify_(self) -> None:
-        options = self._training.densify
-        assert options is not None
-        gradient, prune_large = self.statistics.mean(), 0 < options.reset_every < self.step
+    def _densify_(self, options: Densify) -> None:
+        assert self._training.extent is not None
         grown = densify(
             self.optimizer.params,
-            gradient,
+            self.statistics.mean(),
             options,
-            extent=self._extent,
-            prune_large=prune_large,
+            extent=self._training.extent,
+            prune_large=0 < options.reset_every < self.step,
             generator=self._generator,
         )
         if len(grown.params) == 0:
@@ -242,20 +236,15 @@ class Trainer:
             self._render_cameras[view, half] = shrink_camera(camera, 2) if half else camera
         return self._render_cameras[view, half]
 
-    def identity(self) -> dict[str, str]:
-        """A digest of each input of the fit, before its first step. Of the targets, only their number and the first map count."""
-        params, cameras, targets = self.optimizer.params, self._cameras, self._targets
-        views = [tensor for camera in cameras for tensor in (camera.viewmat, camera.K)]
-        facts = [(camera.size, camera.near) for camera in cameras]
-        options = {name: value for name, value in asdict(self._training).items() if name != "checkpoint_every"}
-        return {
-            "params": digest_tensors(*params.to_tensors().values()) + digest_value([params.origin, params.antialiased]),
-            "cameras": digest_tensors(*views) + digest_value(facts),
-            "targets": digest_tensors(as_tensor("targets[0]", targets[0], floating=True)) + str(len(targets)),
-            "training": digest_value(options),
-            "generator": digest_tensors(self._generator.get_state()),
-            "loss": getattr(self._loss, "__qualname__", None) or repr(self._loss),
-        }
+    def identity(self) -> str:
+        """A digest of the inputs of the fit, before its first step. Of the targets, only their number and the first map count."""
+        params, options = self.optimizer.params, asdict(replace(self._training, checkpoint_every=1))
+        views = [tensor for camera in self._cameras for tensor in (camera.viewmat, camera.K)]
+        first = as_tensor("targets[0]", self._targets[0], floating=True)
+        tensors = digest_tensors(*params.to_tensors().values(), *views, first, self._generator.get_state())
+        loss = getattr(self._loss, "__qualname__", None) or repr(self._loss)
+        sizes = [len(self._targets), *((camera.size, camera.near) for camera in self._cameras)]
+        return digest_value([tensors, params.origin, params.antialiased, sizes, options, loss])
 
     def state(self) -> dict[str, Any]:
         """Everything that `restore_` needs: tensors, numbers, lists and dictionaries."""
@@ -271,8 +260,7 @@ class Trainer:
         """Continue from a `state`; also restores that of the fit's generator."""
         now = self.optimizer.params
         tensors: dict[str, Any] = {name: value.to(now.means) for name, value in state["params"].items()}
-        params = replace(now, **tensors)
-        self.optimizer = FieldOptimizer(params, self._training, extent=self._extent)
+        self.optimizer = FieldOptimizer(replace(now, **tensors), self._training)
         self.optimizer.load_state_(state["adam"])
         self.statistics = GradientStatistics(*(value.to(now.means) for value in state["statistics"].values()))
         self._generator.set_state(state["generator"])

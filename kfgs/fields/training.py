@@ -61,13 +61,11 @@ class Densify:
     """The most Gaussians; those with the strongest gradients grow first. None = no limit."""
 
     def __post_init__(self) -> None:
-        for name in ("start", "stop", "reset_every"):
-            check_whole(name, getattr(self, name), 0)
-        check_whole("every", self.every, 1)
-        if self.maximum is not None:
-            check_whole("maximum", self.maximum, 1)
-        for name in ("gradient", "percent_dense"):
-            check_range(name, getattr(self, name), 0, closed=(True, False))
+        for name, least in {"start": 0, "stop": 0, "reset_every": 0, "every": 1}.items():
+            check_whole(name, getattr(self, name), least)
+        check_whole("maximum", 1 if self.maximum is None else self.maximum, 1)
+        check_range("gradient", self.gradient, 0)
+        check_range("percent_dense", self.percent_dense, 0)
         check_range("prune_extent", self.prune_extent, 0, closed=(False, False))
         check_range("prune_opacity", self.prune_opacity, 0, 1, closed=(True, False))
         check_range("reset_opacity", self.reset_opacity, 0, 1, closed=(False, False))
@@ -102,22 +100,15 @@ class Training:
     """Steps between checkpoints, when `fit_field` is given a file for them."""
 
     def __post_init__(self) -> None:
-        for name in ("steps", "report_every", "checkpoint_every"):
-            check_whole(name, getattr(self, name), 1)
-        for name in ("half_until", "sh_degree_every"):
-            check_whole(name, getattr(self, name), 0)
+        least = {"steps": 1, "report_every": 1, "checkpoint_every": 1, "half_until": 0, "sh_degree_every": 0}
+        for name, low in least.items():
+            check_whole(name, getattr(self, name), low)
         for name in ("extent", "render_scale"):
-            if getattr(self, name) is not None:
-                check_range(name, getattr(self, name), 0, closed=(False, False))
+            check_range(name, 1.0 if getattr(self, name) is None else getattr(self, name), 0, closed=(False, False))
         if self.half_until and self.render_scale is not None:
             raise ValueError(
                 f"half_until: expected 0 with render_scale = {self.render_scale}, got {self.half_until}; use one of the two"
             )
-
-    @staticmethod
-    def paper() -> Training:
-        """The published values, which are the defaults."""
-        return Training()
 
     @staticmethod
     def cpu() -> Training:
@@ -140,14 +131,12 @@ class Training:
     def with_steps(self, steps: int) -> Training:
         """The same schedule stretched or compressed to another number of steps; `densify.every` stays."""
         ratio = steps / self.steps
-        changes: dict[str, Any] = {
-            name: round(getattr(self, name) * ratio) for name in ("half_until", "sh_degree_every")
-        }
-        if self.densify is not None:
-            names = ("start", "stop", "reset_every")
-            scaled: dict[str, Any] = {name: round(getattr(self.densify, name) * ratio) for name in names}
-            changes["densify"] = replace(self.densify, **scaled)
-        return replace(self, steps=steps, **changes)
+
+        def stretched(options: Any, *names: str) -> Any:
+            return options and replace(options, **{name: round(getattr(options, name) * ratio) for name in names})
+
+        densify = stretched(self.densify, "start", "stop", "reset_every")
+        return replace(stretched(self, "half_until", "sh_degree_every"), steps=steps, densify=densify)
 
     def with_maximum(self, count: int | None) -> Training:
         """The same with at most `count` Gaussians; None changes nothing."""

@@ -7,6 +7,7 @@ reconstruction technique (SIRT, Gilbert 1972) remove that: render, compare with 
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +31,7 @@ from ..quant.sampling import FeatureMaps
 from ..splat import accumulate_pixels, bin_tiles, composite, project
 from ..splat.views import divide_sums, sum_pixels
 from .decoders import Linear
-from .merge import FAINT, merge_gaussians
+from .merge import merge_gaussians
 from .semantic_field import Seen, SemanticField
 from .working_maps import WorkingMaps, shrink_map, working_directions
 
@@ -54,16 +55,12 @@ class UpliftConfig:
     pixels: int = 80_000
     """Most pixels of a working view. Views are rendered at the largest whole multiple of the map's size within it; larger maps
     are shrunk by a whole factor."""
-    faint: float = FAINT
-    """Before merging, the faintest Gaussians, which together fill this share of all pixels, are dropped (`merge_gaussians`)."""
 
     def __post_init__(self) -> None:
         check_whole("max_gaussians", 1 if self.max_gaussians is None else self.max_gaussians, 1)
         check_range("keep", self.keep, 0, 1, closed=(False, True))
-        check_range("faint", self.faint, 0, 1, closed=(True, False))
-        check_whole("max_latents", self.max_latents, 1)
-        check_whole("corrections", self.corrections, 0)
-        check_whole("pixels", self.pixels, 64)
+        for name, least in {"max_latents": 1, "corrections": 0, "pixels": 64}.items():
+            check_whole(name, getattr(self, name), least)
 
     @staticmethod
     def field(**changes: Any) -> UpliftConfig:
@@ -122,34 +119,33 @@ def uplift_maps(
     check_splats(cloud)
     cloud = cloud.to(torch.promote_types(cloud.means.dtype, torch.float32))
     passes = 1 + config.corrections + (config.max_gaussians is not None and config.corrections > 0)
-    with torch.no_grad(), tqdm(total=count * passes, desc="uplift", unit="view", disable=not progress) as bar:
+    bar = tqdm(total=count * passes, desc="uplift", unit="view", disable=not progress)
+    with torch.no_grad(), bar, tempfile.TemporaryDirectory(prefix="kfgs_") as temporary:
         directions = (working_directions(maps) if latents is None else latents.basis).to(cloud.means)
-        with WorkingMaps(cameras, maps, directions, config.pixels, scratch) as views:
-            sums, shown = average(cloud, views, bar)
-            if not bool((shown > 0).any()):
-                raise ValueError(
-                    "cameras: expected views that show the Gaussians, got none that does; do both share one frame?"
-                )
-            filled = float(shown.sum()) / sum(camera.width * camera.height for camera in cameras)
-            means = per_weight(sums.sum(0))
-            agreement = row_norms(means).clamp_max(1)
-            if latents is None:
-                weights = cap(shown, shown[shown > 0])
-                fitted = fit_linear_latents(
-                    unit_rows(means), weights, keep=config.keep, maximum=config.max_latents
-                ).basis
-                views.basis = fitted
-                sums = torch.cat([sums[..., :-1] @ fitted, sums[..., -1:]], dim=-1)
-                latents = LinearLatents((directions.double() @ fitted.double()).to(directions))
-            for _ in range(config.corrections):
+        views = WorkingMaps(cameras, maps, directions, config.pixels, scratch or Path(temporary))
+        sums, shown = average(cloud, views, bar)
+        if not bool((shown > 0).any()):
+            raise ValueError(
+                "cameras: expected views that show the Gaussians, got none that does; do both share one frame?"
+            )
+        filled = float(shown.sum()) / sum(camera.width * camera.height for camera in cameras)
+        means = per_weight(sums.sum(0))
+        agreement = row_norms(means).clamp_max(1)
+        if latents is None:
+            weights, keep = cap(shown, shown[shown > 0]), config.keep
+            fitted = fit_linear_latents(unit_rows(means), weights, keep=keep, maximum=config.max_latents).basis
+            views.basis = fitted
+            sums = torch.cat([sums[..., :-1] @ fitted, sums[..., -1:]], dim=-1)
+            latents = LinearLatents((directions.double() @ fitted.double()).to(directions))
+        for _ in range(config.corrections):
+            sums = correct(cloud, sums, views, bar)
+        if config.max_gaussians is not None:
+            cloud = cloud.replace(features=per_weight(sums.sum(0)))
+            merged = merge_gaussians(cloud, shown, config.max_gaussians, generator=generator)
+            agreement = divide_sums(merged.pool(agreement * shown), merged.weights)
+            cloud, shown, sums = merged.gaussians, merged.weights, torch.stack([merged.pool(half) for half in sums])
+            if config.corrections:
                 sums = correct(cloud, sums, views, bar)
-            if config.max_gaussians is not None:
-                cloud = cloud.replace(features=per_weight(sums.sum(0)))
-                merged = merge_gaussians(cloud, shown, config.max_gaussians, faint=config.faint, generator=generator)
-                agreement = divide_sums(merged.pool(agreement * shown), merged.weights)
-                cloud, shown, sums = merged.gaussians, merged.weights, torch.stack([merged.pool(half) for half in sums])
-                if config.corrections:
-                    sums = correct(cloud, sums, views, bar)
     note = f"the Gaussians fill {filled:.0%} of the views; are they in the cameras' frame?"
     info = {"note": note} if filled < SPARSE else {}
     fused = cloud.replace(features=per_weight(sums.sum(0)))
@@ -158,7 +154,8 @@ def uplift_maps(
 
 def average(cloud: Gaussians, views: WorkingMaps, bar: Any) -> tuple[Tensor, Tensor]:  # [2, N, d' + 1], [N]
     """Sums of features and weights, over the even and the odd views, and the number of pixels that each Gaussian fills."""
-    sums, shown = cloud.means.new_zeros(2, len(cloud), views.channels + 1), torch.zeros_like(cloud.opacities)
+    channels, shown = views.directions.shape[1], torch.zeros_like(cloud.opacities)
+    sums = cloud.means.new_zeros(2, len(cloud), channels + 1)
     for i in range(len(views)):
         view, half = views[i], sums[i % 2]
         index, total, _ = sum_pixels(cloud, view.camera, _known(view.map, view.camera.size))

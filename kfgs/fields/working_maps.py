@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -58,28 +57,15 @@ class WorkingMaps:
         maps: FeatureMaps,
         directions: Tensor,  # [D, d']
         pixels: int,
-        scratch: Path | None,
+        folder: Path,
     ) -> None:
-        self._cameras, self._maps, self._directions, self._pixels = cameras, maps, directions, pixels
-        self._temporary = tempfile.TemporaryDirectory(prefix="kfgs_") if scratch is None else None
-        self._folder = Path(scratch if self._temporary is None else self._temporary.name)  # type: ignore[arg-type]
+        self._cameras, self._maps, self._pixels, self._folder = cameras, maps, pixels, folder
+        self.directions = directions
         self.basis: Tensor | None = None
         """[d', d]: from now on return maps in these directions, given in the working directions."""
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._temporary is not None:
-            self._temporary.cleanup()
-
     def __len__(self) -> int:
         return len(self._cameras)
-
-    @property
-    def channels(self) -> int:
-        """Number of current directions."""
-        return int((self._directions if self.basis is None else self.basis).shape[1])
 
     def __getitem__(self, i: int) -> WorkingView:
         file = self._folder / f"{i}.npz"
@@ -89,17 +75,13 @@ class WorkingMaps:
                 # not rounded, so that a run that continues gives the same bits
                 np.savez(opened, rows=made.cpu().numpy(), shape=np.asarray(size))
         with np.load(file) as arrays:
-            rows, shape = torch.from_numpy(arrays["rows"]).to(self._directions), torch.from_numpy(arrays["shape"])
+            rows, shape = torch.from_numpy(arrays["rows"]).to(self.directions), torch.from_numpy(arrays["shape"])
         (h, w, _), camera = rows.shape, self._cameras[i]
         factor = max(1, min(camera.height // h, camera.width // w, int((self._pixels / (h * w)) ** 0.5)))
         features = rows if self.basis is None else rows @ self.basis
-        # (width, height) of the whole picture in working pixels: not whole if some at the right or bottom were left over
-        span = (
-            shape.double().flip(0)
-            / self._shrinkage(*shape.tolist())
-            * factor
-            / torch.tensor([camera.width, camera.height])
-        )
+        # the whole picture in working pixels: not a whole number if some at the right or bottom were left over
+        whole = factor * shape.double().flip(0) / self._shrinkage(*shape.tolist())
+        span = whole / torch.tensor([camera.width, camera.height])
         K = camera.K.to(features) * torch.cat([span, torch.ones(1)]).to(features)[:, None]
         working = replace(camera.to(features), K=K, width=w * factor, height=h * factor)
         return WorkingView(working, features, factor, 1 / float(span.prod()))
@@ -108,12 +90,12 @@ class WorkingMaps:
         """Read a map as unit features in the working directions, and shrink it to its working size."""
         parts, masks = [], []
         for block in read_blocks(self._maps, i):  # [r, w, D]
-            check_shapes((f"maps[{i}]", block, ("h", "w", len(self._directions))))
-            features = block.to(self._directions)
+            check_shapes((f"maps[{i}]", block, ("h", "w", len(self.directions))))
+            features = block.to(self.directions)
             lengths = row_norms(features)
             check_directions(f"maps[{i}]", features, lengths, ENCODE)
             masks.append((lengths > EPS)[..., None])
-            parts.append((features @ self._directions) / lengths.clamp_min(EPS)[..., None] * masks[-1])
+            parts.append((features @ self.directions) / lengths.clamp_min(EPS)[..., None] * masks[-1])
         rows, known = torch.cat(parts), torch.cat(masks)
         height, width = rows.shape[:2]
         if (shrink := self._shrinkage(height, width)) > 1:

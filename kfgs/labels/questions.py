@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -17,18 +17,6 @@ SAME = 1 - 1e-4  # cosine of one text embedded twice: half precision stays well 
 AGAIN = "embed the words with the teacher whose features this field was fitted to"
 Negatives = Literal["auto", "classes", "canonical", "none"]
 Classes = LabelSet | Tensor  # classes with names, or embeddings [C, D] alone
-
-
-class Question(NamedTuple):
-    """A target and its negatives, the rows it is compared with."""
-
-    row: Tensor  # [D]
-    negatives: Tensor | None  # [M, D]
-
-    @property
-    def rows(self) -> Tensor:  # [1 + M, D]
-        """The target, then its negatives."""
-        return torch.cat([self.row[None], *([] if self.negatives is None else [self.negatives.to(self.row)])])
 
 
 def class_rows(classes: Classes, dim: int, info: dict[str, Any]) -> Tensor:  # [C, D]
@@ -48,7 +36,7 @@ def class_rows(classes: Classes, dim: int, info: dict[str, Any]) -> Tensor:  # [
     if "examples" in classes.info:
         what, again = "examples", "make them again: `kfgs features FIELD --examples FILE`"
     got = f"{what} of another teacher" + ("" if difference is None else f" ({difference})")
-    if classes.dim != dim:
+    if classes.embeddings.shape[1] != dim:
         got = f"{tuple(classes.embeddings.shape)}: {got}"
         raise ValueError(f"classes: expected embeddings [C, {dim}] (from the field), got {got}? If so, {again}")
     if difference is not None:
@@ -62,8 +50,8 @@ def make_question(
     negatives: Negatives | Tensor,
     dim: int,
     info: dict[str, Any],
-) -> Question:
-    """The rows of a target and its negatives.
+) -> Tensor:  # [1 + M, D]
+    """The rows of a target and of its negatives, the target first.
 
     With negatives "auto", a class (given by name or by its embedding) is compared with the other classes, or with the
     canonical words if it is the only class. Any other target is compared with the canonical words, or with nothing if there
@@ -84,20 +72,22 @@ def make_question(
     if not isinstance(negatives, str):
         against = as_tensor("negatives", negatives, floating=True)
         check_rows("negatives", against, ("M",), dim)
-        return Question(row, against)
+        return torch.cat([row[None], against.to(row)])
     check_choice("negatives", negatives, ("auto", "classes", "canonical", "none"))
-    others = row.new_zeros(0, dim) if rows is None else rows[_unlike(rows, row)]
-    canonical = None if table is None else _canonical(table, words, row)
-    if negatives == "auto":
-        is_class = isinstance(target, str) or (rows is not None and len(others) < len(rows))
-        negatives = "classes" if is_class and len(others) else "none" if canonical is None else "canonical"
-    if negatives == "classes" and len(others) == 0:
+    against = nobody = row.new_zeros(0, dim)
+    if negatives in ("auto", "classes") and rows is not None:
+        against = rows[_unlike(rows, row)]
+        if negatives == "auto" and not isinstance(target, str) and len(against) == len(rows):
+            against = nobody  # the target is no class
+    if negatives == "classes" and len(against) == 0:
         raise ValueError(f"negatives: expected other classes than {words!r}, got none; use 'canonical' or 'none'")
-    if negatives == "canonical" and canonical is None:
+    if negatives in ("auto", "canonical") and len(against) == 0 and table is not None:
+        against = _canonical(table, words, row)
+    if negatives == "canonical" and len(against) == 0:
         raise ValueError(
             "negatives: expected canonical words in the table, got none; `kfgs features --words` makes some"
         )
-    return Question(row, {"classes": others, "canonical": canonical, "none": None}[negatives])
+    return torch.cat([row[None], against.to(row)])
 
 
 def check_rows(name: str, rows: Tensor, axes: Sequence[str], dim: int) -> None:
@@ -108,13 +98,13 @@ def check_rows(name: str, rows: Tensor, axes: Sequence[str], dim: int) -> None:
     check_shapes((name, rows, (*axes, dim)))
 
 
-def _canonical(classes: LabelSet, words: str, row: Tensor) -> Tensor | None:  # [M, D]
+def _canonical(classes: LabelSet, words: str, row: Tensor) -> Tensor:  # [M, D]
     """The canonical negatives without the target, which is recognised by its words or its embedding."""
     if classes.negatives is None:
-        return None
+        return row.new_zeros(0, len(row))
     other_words = torch.tensor([word.casefold() != words.casefold() for word in classes.negative_names])
     kept = _unlike(classes.negatives, row) & other_words.to(classes.negatives.device)
-    return classes.negatives[kept] if bool(kept.any()) else None
+    return classes.negatives[kept]
 
 
 def _unlike(rows: Tensor, row: Tensor) -> Tensor:  # [M, D], [D] -> [M] bool

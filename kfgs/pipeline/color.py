@@ -170,7 +170,7 @@ def color_stage(
             cameras,
             TrainingPictures(scene, views, cameras),
             with_extent(config.training, scene),
-            loss=ColorLoss(config.ssim_weight, config.training.engine),
+            loss=ColorLoss(config.ssim_weight),
             generator=generator,
             progress=progress,
             checkpoint=checkpoint,

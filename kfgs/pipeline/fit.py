@@ -254,9 +254,6 @@ def _learn(
         made = learn(generator=stage_generator(job.seed, name), progress=job.progress)
         made.save(folder / f"{name}.safetensors")
         assert made.report is not None
-        note = getattr(made.report, "note", None)
-        if note is not None:
-            job.run.say(f"note: {note}")
         write_json(folder / "history.json", made.report.history)
 
     return job.run.stage(name, inputs | {"config": asdict(options), "seed": job.seed}, make)

@@ -59,7 +59,7 @@ class Paper:
         options: dict[str, Any] = {
             "codebook": PaperCodebook(),
             "autoencoder": AutoencoderConfig.paper(),
-            "training": Training.paper(),
+            "training": Training(),
         }
         return Paper(**(options | changes))
 

@@ -2,8 +2,7 @@
 
 from .autoencoder import Autoencoder, AutoencoderConfig, fit_autoencoder
 from .codebook import Codebook
-from .fit_codebook import fit_codebook
-from .grow import GrownCodebook
+from .grow import GrownCodebook, fit_codebook
 from .linear import LinearLatents
 from .maps import LatentMaps, quantize_maps
 from .paper import PaperCodebook

@@ -27,6 +27,7 @@ BLENDED = 4  # codewords per blend: pixels at borders and noisy Gaussians mix a 
 LAST_RATE = 0.02  # of the learning rate, at the last step
 NORM_EPS = 1e-5  # added to the variance in batch normalisation, torch's default
 SMALLEST = 1e-6  # range of the latents of one codeword with one channel
+RECORDED = 100  # steps between two records of the history
 
 
 @dataclass(frozen=True)
@@ -53,15 +54,11 @@ class AutoencoderConfig:
     """Blends of codewords per step: their blended latents are trained to decode to the blended features; 0 as in the paper."""
     weight_decay: float = 5e-6
     """L2 penalty in Adam's gradient (script)."""
-    record_every: int = 100
-    """Steps between two records of the history."""
 
     def __post_init__(self) -> None:
-        for name in ("latent", "steps", "record_every"):
-            check_whole(name, getattr(self, name), 1)
-        for name in ("encoder", "decoder"):
-            for i, width in enumerate(getattr(self, name)):
-                check_whole(f"{name}[{i}]", width, 1)
+        widths = {f"{name}[{i}]": n for name in ("encoder", "decoder") for i, n in enumerate(getattr(self, name))}
+        for name, value in {"latent": self.latent, "steps": self.steps, **widths}.items():
+            check_whole(name, value, 1)
         check_whole("blends", self.blends, 0)
         check_range("learning_rate", self.learning_rate, 0, closed=(False, True))
         check_range("weight_decay", self.weight_decay, 0)
@@ -77,14 +74,12 @@ class AutoencoderReport:
     """How an autoencoder was fitted, and how well it keeps the codebook apart."""
 
     history: list[dict[str, Any]] = field(repr=False)
-    """Every `record_every` steps: step (from 1), loss (Eq. 10, mean over codewords and blends)."""
+    """Every 100 steps: step (from 1), loss (Eq. 10, mean over codewords and blends)."""
     recovered: float
     """Share of codewords whose decoded latent is quantised to that codeword again; below 1, some classes are lost
     whatever the field does: fit longer, or with more latent channels."""
     loss: float
     """Eq. 10 of the finished autoencoder, mean over codewords."""
-    min_latent_distance: float
-    """Smallest Euclidean distance between two codewords' latents (infinite for one codeword)."""
 
     __repr__ = short_repr
 
@@ -148,10 +143,6 @@ class Autoencoder(nn.Module, Stored):
         """The features of latents (Psi in Sec. 3.4), as unit rows. Differentiable."""
         return _by_chunk("latents", latents, self.latent, lambda rows: unit_rows(mlp(self.decoder, rows)))
 
-    def forward(self, features: Tensor) -> Tensor:  # [..., D] -> [..., D]
-        """Psi(E(f))."""
-        return self.decode(self.encode(features))
-
     def to(self, *args: Any, **kwargs: Any) -> Autoencoder:
         """A copy, moved or converted, as all objects of kfgs have it; `torch.nn.Module.to` would change this one."""
         return nn.Module.to(deepcopy(self), *args, **kwargs)
@@ -211,7 +202,7 @@ def fit_autoencoder(
     progress = as_progress(progress)
     with quick_on_a_cpu():
         for step in tqdm(range(1, config.steps + 1), desc="autoencoder", disable=progress is not True):
-            latents = unit_latents(_normalised_mlp(made.encoder, norms, target))
+            latents = _normalised_latents(made, norms, target)
             low, high = latents.detach().amin(), latents.detach().amax()
             rows, wanted = (latents - low) / (high - low).clamp_min(SMALLEST), target
             if config.blends:
@@ -224,22 +215,20 @@ def fit_autoencoder(
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             optimizer.step()
-            if step % config.record_every == 0 or step == config.steps:
+            if step % RECORDED == 0 or step == config.steps:
                 history.append({"step": step, "loss": float(loss.detach())})
                 if callable(progress):
                     progress(dict(history[-1]))
     made.requires_grad_(False)
     with torch.no_grad():
-        _freeze(made, norms, target)
-        latents = made.encode(codebook.codewords)
-        decoded, own = made.decode(latents), torch.arange(codebook.size, device=latents.device)
-        apart = torch.cdist(latents, latents, compute_mode="donot_use_mm_for_euclid_dist").fill_diagonal_(torch.inf)
-        made.report = AutoencoderReport(
-            history,
-            recovered=float((codebook.quantize(decoded) == own).double().mean()),
-            loss=float(row_norms(decoded - codebook.unit).mean()),
-            min_latent_distance=float(apart.min()),
-        )
+        latents = _normalised_latents(made, norms, target, freeze=True)
+        least = float(latents.min())
+        ends = [least, max(float(latents.max()), least + SMALLEST)]
+        made.range = torch.tensor(ends, dtype=torch.float64, device=target.device)
+        decoded = made.decode(made.encode(codebook.codewords))
+        recovered = codebook.quantize(decoded) == torch.arange(codebook.size, device=decoded.device)
+        loss = row_norms(decoded - codebook.unit).mean()
+        made.report = AutoencoderReport(history, float(recovered.double().mean()), float(loss))
     return made
 
 
@@ -279,32 +268,22 @@ def _blends(count: int, K: int, generator: torch.Generator, like: Tensor) -> Ten
     return like.new_zeros(count, K).scatter_add_(1, which, share)
 
 
-def _statistics(rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation that batch normalisation divides by (the variance is the biased one)."""
-    return rows.mean(dim=0), (rows.var(dim=0, correction=0) + NORM_EPS).sqrt()
+def _normalised_latents(
+    made: Autoencoder, norms: list[tuple[Tensor, Tensor]], rows: Tensor, *, freeze: bool = False
+) -> Tensor:  # [K, D] -> [K, d]
+    """Unit latents with batch normalisation before each ReLU; written out because torch's refuses a single row.
 
-
-def _normalised_mlp(layers: nn.ModuleList, norms: list[tuple[Tensor, Tensor]], rows: Tensor) -> Tensor:
-    """`mlp` with batch normalisation before each ReLU; written out because torch's refuses a single row."""
-    for layer, (scale, shift) in zip(layers[:-1], norms, strict=True):
-        rows = layer(rows)
-        mean, deviation = _statistics(rows)
-        rows = torch.relu((rows - mean) / deviation * scale + shift)
-    return layers[-1](rows)  # type: ignore[no-any-return]
-
-
-def _freeze(made: Autoencoder, norms: list[tuple[Tensor, Tensor]], target: Tensor) -> None:
-    """Fold batch normalisation, with its statistics over the codebook, into the encoder, and fix the latents' range."""
-    rows = target
+    With `freeze`, its statistics over these rows become part of the linear layers.
+    """
     for layer, (scale, shift) in zip(made.encoder[:-1], norms, strict=True):
-        mean, deviation = _statistics(layer(rows))
-        gain = scale / deviation
-        layer.weight.copy_(gain[:, None] * layer.weight)
-        layer.bias.copy_(gain * (layer.bias - mean) + shift)
-        rows = layer(rows).relu()
-    latents = unit_latents(mlp(made.encoder, target))
-    low = float(latents.min())
-    made.range = torch.tensor([low, max(float(latents.max()), low + SMALLEST)], dtype=torch.float64).to(target.device)
+        sums = layer(rows)
+        mean, deviation = sums.mean(dim=0), (sums.var(dim=0, correction=0) + NORM_EPS).sqrt()
+        if freeze:
+            gain = scale / deviation
+            layer.weight.mul_(gain[:, None])
+            layer.bias.sub_(mean).mul_(gain).add_(shift)
+        rows = torch.relu(layer(rows) if freeze else (sums - mean) / deviation * scale + shift)
+    return unit_latents(made.encoder[-1](rows))
 
 
 def mlp(layers: Iterable[nn.Module], rows: Tensor) -> Tensor:  # [n, in] -> [n, out]
@@ -321,7 +300,7 @@ def unit_latents(latents: Tensor) -> Tensor:  # [n, d]
 
 def _by_chunk(name: str, x: Tensor, width: int, function: Callable[[Tensor], Tensor]) -> Tensor:
     x = as_tensor(name, x, floating=True)
-    if x.ndim < 1 or x.shape[-1] != width:
+    if x.shape[-1:] != (width,):
         raise ValueError(f"{name}: expected [..., {width}], got {tuple(x.shape)}; pass what belongs to the same scene")
     rows = torch.cat([function(part) for part in x.reshape(-1, width).split(CHUNK)])  # one empty part of no rows
     return rows.reshape(*x.shape[:-1], rows.shape[1])

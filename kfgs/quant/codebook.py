@@ -32,17 +32,14 @@ class CodebookReport:
     """How a codebook was fitted, and how well it represents the sampled features."""
 
     history: list[dict[str, Any]] = field(repr=False)
-    """Per round of growth (`PaperCodebook`: per epoch): epoch (from 0), size, added, pruned, and coverage and
-    mean_similarity before the round's growth; with `PaperCodebook` also loss (Eq. 6, mean over images)."""
+    """Per round of growth (`PaperCodebook`: per epoch): round or epoch (from 0), size, added, pruned, and coverage and
+    mean_similarity before its growth; with `PaperCodebook` also loss (Eq. 6, mean over images)."""
     usage: Tensor  # [K] int64
     """Sampled features of each codeword; unused codewords are kept, as in the paper."""
     coverage: float
-    """Share of the sampled features whose similarity to their codeword is at least `alpha`."""
+    """Share of the sampled features that are similar to their codeword by at least alpha: `PaperCodebook.expand_below`, or
+    what nine in ten features of a `GrownCodebook` reach."""
     mean_similarity: float
-    alpha: float
-    """`expand_below`, or the similarity that a share `coverage` of the features has reached."""
-    note: str | None
-    """One line of advice if the book is full or covers too little; None if all is well."""
 
     __repr__ = short_repr
 
@@ -76,13 +73,10 @@ class Codebook(Stored):
         facts = {"codewords": self.size, "channels": self.dim, "numbers": short_value(self.codewords)}
         return html_card("Codebook", facts)
 
-    def __len__(self) -> int:
-        return int(self.codewords.shape[0])
-
     @property
     def size(self) -> int:
-        """The number of codewords, K; `len` is the same."""
-        return len(self)
+        """The number of codewords, K."""
+        return int(self.codewords.shape[0])
 
     @property
     def dim(self) -> int:
@@ -114,7 +108,7 @@ class Codebook(Stored):
 
     def _checked(self, features: Tensor) -> Tensor:
         features = as_tensor("features", features)
-        if features.ndim < 1 or features.shape[-1] != self.dim:
+        if features.shape[-1:] != (self.dim,):
             raise ValueError(
                 f"features: expected [..., D] with D = {self.dim} (from codewords), got {tuple(features.shape)}; "
                 "pass features of the teacher that the codebook was fitted to"
@@ -154,24 +148,8 @@ def share_above(similarity: Tensor, alpha: float) -> float:
     return float((similarity >= alpha).double().mean())
 
 
-def with_report(
-    codewords: Tensor,  # [K, D]
-    history: list[dict[str, Any]],
-    nearest: Nearest,  # of the sampled features [n]
-    alpha: float,
-    *,
-    asked: bool,
-    full: bool,
-    enough: float,
-) -> Codebook:
-    """A codebook with its report. `asked`: alpha is an option; `enough`: the share of features that should reach it."""
-    size, coverage, note = len(codewords), share_above(nearest.similarity, alpha), None
-    reached = f"{100 * coverage:.0f} % of the features are {alpha:.2f} similar to their codeword"
-    if full and not (asked and coverage >= enough):
-        note = f"the codebook is full ({size} codewords): {reached}; raise maximum for finer codewords"
-        note += ", or lower expand_below" if asked else ""
-    elif asked and coverage < enough:
-        note = f"{size} codewords, low coverage: {reached}; lower expand_below"
-    usage = torch.bincount(nearest.codeword, minlength=size).cpu()
-    mean = float(nearest.similarity.mean(dtype=torch.float64))
-    return Codebook(codewords, CodebookReport(history, usage, coverage, mean, alpha, note))
+def with_report(codewords: Tensor, history: list[dict[str, Any]], nearest: Nearest, alpha: float) -> Codebook:
+    """A codebook with its report, from the `nearest` codewords of the sampled features [n]."""
+    usage, similarity = torch.bincount(nearest.codeword, minlength=len(codewords)).cpu(), nearest.similarity
+    mean = float(similarity.mean(dtype=torch.float64))
+    return Codebook(codewords, CodebookReport(history, usage, share_above(similarity, alpha), mean))

@@ -1,25 +1,26 @@
-"""kfgs's codebook: split the cell whose features are represented worst, and run k-means on the sphere after each split."""
+"""Fit the codebook of a scene (Sec. 3.3.1). kfgs's grows on a sample: the cell represented worst splits, then k-means runs."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from .._check import check_range, check_whole
-from .._progress import Progress
-from .._rows import unit_rows
+from .._check import check_range, check_shapes, check_whole
+from .._progress import Progress, as_progress
+from .._rows import ENCODE, EPS, check_directions, row_norms, unit_rows
 from .codebook import Codebook, Nearest, share_above, with_report
 from .kmeans import Cells, refine
-from .paper import prune
-from .sampling import SAMPLES, all_zero
+from .paper import PaperCodebook, prune
+from .sampling import SAMPLES, FeatureMaps, all_zero, read_grid
 
 POOL = 32_768  # features that codewords grow on: 67 MB of 512 channels in float32, 365 of each of 90 maps
 CODEWORD_RMS = 0.5  # of a codeword's channels: in mode adc the field learns them at absolute rates made for [0, 1]
+COVERAGE = 0.9  # share of the features that reach the similarity alpha, which the history counts by
 LEAST_GAIN = 0.05  # of a cell's cosine distance; isotropic noise in n dimensions gains about 2 / (pi n) from a split
 LEAST_SHARE = 1 / 16  # of the mean cell's features, at maximum size: fewer are outliers, not content
 ROUNDS = 2  # of k-means after each growth: cells only need to be good enough to be ranked
@@ -37,24 +38,12 @@ class GrownCodebook:
 
     maximum: int = 255
     """The most codewords (K_max). 255 and holes still fit one byte per pixel; 1,024 won 1.7 points of `adc` on room_0."""
-    expand_below: float | None = None
-    """The similarity that features should reach (alpha, Eq. 8). None grows as long as a split pays and reports the
-    similarity that a share `coverage` of the features has reached."""
-    coverage: float = 0.9
-    """Share of the features of a cell that must reach alpha; a cell below that is split."""
     prune_above: float = 0.99
     """The later of two codewords is dropped when their similarity is above this (beta, Eq. 9)."""
-    samples: int = SAMPLES
-    """The most features sampled per map; at most `POOL` of all maps together."""
 
     def __post_init__(self) -> None:
         check_whole("maximum", self.maximum, 1)
-        check_whole("samples", self.samples, 1)
-        if self.expand_below is not None:
-            check_range("expand_below", self.expand_below, -1, 1)
-        # Otherwise a new codeword is pruned at once, and joins again.
-        check_range("prune_above", self.prune_above, -1 if self.expand_below is None else self.expand_below, 1)
-        check_range("coverage", self.coverage, 0, 1, closed=(False, True))
+        check_range("prune_above", self.prune_above, -1, 1)
 
     def fit(
         self,
@@ -68,18 +57,14 @@ class GrownCodebook:
         pool = torch.cat([unit_rows(read(i)) for i in bar])
         if len(pool) == 0:
             raise all_zero(maps)
-        grown = grow(pool, self.maximum, alpha=self.expand_below, coverage=self.coverage, generator=generator)
-        cells = grown.cells
+        cells, rounds = grow(pool, self.maximum, generator)
         stays = prune(cells.centres, threshold=self.prune_above)
-        pruned = len(cells.centres) - len(stays)
-        if pruned:
+        if pruned := len(cells.centres) - len(stays):
             cells = refine(pool, cells.centres[stays], ROUNDS)
-        alpha = self.expand_below
-        if alpha is None:
-            alpha = float(cells.similarity.sort().values[int((1 - self.coverage) * (len(pool) - 1))])
+        alpha = float(cells.similarity.sort().values[int((1 - COVERAGE) * (len(pool) - 1))])
         history: list[dict[str, Any]] = []
-        for epoch, (size, added, similarity) in enumerate(grown.rounds):
-            record: dict[str, Any] = {"epoch": epoch, "size": size, "added": added, "pruned": 0}
+        for number, (size, added, similarity) in enumerate(rounds):
+            record: dict[str, Any] = {"round": number, "size": size, "added": added, "pruned": 0}
             record |= {"coverage": share_above(similarity, alpha), "mean_similarity": float(similarity.mean())}
             history.append(record)
         history[-1] |= {"size": len(cells.centres), "pruned": pruned}
@@ -87,33 +72,66 @@ class GrownCodebook:
             for record in history:
                 progress(dict(record))
         codewords = cells.centres * (CODEWORD_RMS * cells.centres.shape[1] ** 0.5)
-        nearest, asked = Nearest(cells.index, cells.similarity), self.expand_below is not None
-        return with_report(codewords, history, nearest, alpha, asked=asked, full=grown.full, enough=self.coverage)
+        return with_report(codewords, history, Nearest(cells.index, cells.similarity), alpha)
 
 
-class Grown(NamedTuple):
-    """The result of `grow`."""
+def fit_codebook(
+    maps: FeatureMaps,  # each [h, w, D]
+    options: GrownCodebook | PaperCodebook | None = None,
+    *,
+    generator: torch.Generator | None = None,
+    progress: Progress = False,
+) -> Codebook:
+    """Fit a codebook to the feature maps of a scene: K features that stand for all others.
 
-    cells: Cells
-    rounds: list[tuple[int, int, Tensor]]  # size after, codewords added, and the features' similarities [n] before
-    full: bool  # whether a split that pays was left out because the book was full
+    Args:
+        maps: one map per image, read one at a time. Sizes may differ, D may not. All-zero features are left out; half
+            precision is computed in float32.
+        options: `GrownCodebook` (also if None), kfgs's own, reads each map once; `PaperCodebook` (Eq. 5-9) once per epoch.
+        generator: draws the first directions of splits, or the order of the images; None: seed 0. On a CPU the same state
+            gives the same bits.
+        progress: True shows a bar; a function is called with each record as it is written to the history.
+
+    Returns:
+        The codebook; its `report` has the history, and how well it represents the sampled features.
+
+    Raises:
+        ValueError: if there is no map, a map has another shape or is not finite, or every feature is zero.
+    """
+    options, count = options or GrownCodebook(), len(maps)
+    if count == 0:
+        raise ValueError("maps: expected at least one feature map, got none; encode the training images first")
+    samples = options.samples if isinstance(options, PaperCodebook) else min(SAMPLES, -(-POOL // count))
+    channels: list[int] = []
+
+    def read(i: int) -> Tensor:  # [n, D] nonzero, in at least single precision
+        features = read_grid(maps, i, samples)
+        channels.append(features.shape[-1])
+        check_shapes((f"maps[{i}]", features, ("n", channels[0])))
+        # row by row, whatever memory they come in: sums over another layout differ in their last bits
+        features = features.to(torch.promote_types(features.dtype, torch.float32)).contiguous()
+        norms = row_norms(features)
+        check_directions(f"maps[{i}]", features, norms, ENCODE)
+        return features if bool((norms > EPS).all()) else features[norms > EPS]
+
+    generator = generator or torch.Generator().manual_seed(0)
+    return options.fit(read, count, generator, as_progress(progress))
 
 
 def grow(
     unit: Tensor,  # [n, D] unit rows
     maximum: int,
-    *,
-    alpha: float | None = None,
-    coverage: float = 0.9,
     generator: torch.Generator,
-) -> Grown:
+) -> tuple[Cells, list[tuple[int, int, Tensor]]]:
     """Start with one codeword and split cells, the least similar first, until no split pays or `maximum` is reached.
 
     A cell is split in two across its widest direction. It qualifies by its *mean* similarity, not by its number of
     features, so rare content gets codewords as readily as a wall; by at least 2 `LEAST_SHARE` n / `maximum` features,
     so that a few outliers never lead; and by a split that lowers its cosine distance by `LEAST_GAIN`, which noise
-    without structure does not allow. With `alpha`, only cells split in which less than `coverage` of the features are
-    that similar (Eq. 8 for cells instead of single features). At most half of the cells split in one round.
+    without structure does not allow. At most half of the cells split in one round.
+
+    Returns:
+        The cells; and of each round the size after it, the codewords added, and the features' similarities [n] before.
     """
     least = max(2.0, LEAST_SHARE * len(unit) / maximum)
     cells = refine(unit, unit_rows(unit.sum(dim=0, keepdim=True)), 0)
@@ -121,15 +139,12 @@ def grow(
     while True:
         K = len(cells.centres)
         halves, gain = _halves(unit, cells, least, generator)
-        mean = _mean(cells.similarity, cells.index, K)
-        pays = gain >= LEAST_GAIN
-        if alpha is not None:
-            pays &= _mean((cells.similarity >= alpha).to(mean), cells.index, K) < coverage
+        pays, mean = gain >= LEAST_GAIN, _mean(cells.similarity, cells.index, K)
         room = min(maximum - K, max(1, K // 2))
         chosen = mean.masked_fill(~pays, torch.inf).argsort(stable=True)[: min(room, int(pays.sum()))]
         rounds.append((K + len(chosen), len(chosen), cells.similarity))
         if len(chosen) == 0:
-            return Grown(refine(unit, cells.centres, LAST_ROUNDS), rounds, bool(pays.any()))
+            return refine(unit, cells.centres, LAST_ROUNDS), rounds
         centres = cells.centres.clone()
         centres[chosen] = halves[0, chosen]
         cells = refine(unit, torch.cat([centres, halves[1, chosen]]), ROUNDS)
@@ -155,7 +170,7 @@ def _halves(unit: Tensor, cells: Cells, least: float, generator: torch.Generator
         pull = torch.zeros_like(centres[:, 0]).index_add_(0, index, inside * across)
         direction = unit_rows(_sums(learn, index, K, across) - pull[:, None] * centres)
     across = along(direction)
-    square, cube = ((_mean(across**power, index, K)) for power in (2, 3))
+    square, cube = (_mean(across**power, index, K) for power in (2, 3))
     # In the middle, or, for a small group far out on one side, half way to it: its share of square and cube is the same
     # but for one factor, its distance.
     middles = torch.zeros_like(square), 0.5 * cube / square.clamp_min(1e-12)

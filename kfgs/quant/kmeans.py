@@ -7,7 +7,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .._check import check_shapes, check_whole
 from .._rows import EPS, row_norms, unit_rows
 
 CHUNK = 16_384  # features compared with the centres at a time
@@ -33,12 +32,8 @@ def spherical_kmeans(
 
     The first centres are drawn in proportion to the weights, capped at their 0.99 quantile, so that one huge weight does not
     draw all of them. An all-zero feature goes to group 0 and moves no centre. With fewer features than `clusters`, K is smaller.
-
-    Raises:
-        ValueError: if shapes disagree, or every weighted feature is zero.
+    A ValueError if every weighted feature is zero.
     """
-    check_shapes(("features", features, "n D"), ("weights", weights, "n"))
-    check_whole("clusters", clusters, 1)
     rows, counted = unit_rows(features), (weights > 0) & (row_norms(features) > EPS)
     candidates = int(counted.sum())
     if candidates == 0:

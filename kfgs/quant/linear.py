@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .._card import short_repr
-from .._check import as_tensor, check_range, check_shapes, check_whole
+from .._check import check_shapes
 from .._rows import unit_rows
 from .store import Stored
 
@@ -78,29 +78,19 @@ def fit_linear_latents(
     """The fewest latents that keep a stated share of the features' variation about their mean direction.
 
     Args:
-        features: longer rows have more weight; normalise rows for equal weights.
+        features: longer rows have more weight; normalise rows for equal weights. A ValueError if nothing is known of any.
         weights: of the rows; 1 if None.
         keep: share in (0, 1] of the energy beyond the first direction that the other latents must hold.
         maximum: the most latents; None: D.
-
-    Raises:
-        ValueError: if shapes disagree, an option is out of range, a number is not finite, or there is nothing but zeros.
     """
-    features = as_tensor("features", features, floating=True)
-    sizes = check_shapes(("features", features, "n D"), ("weights", weights, "n"))
-    maximum = sizes["D"] if maximum is None else maximum
-    check_range("keep", keep, 0, 1, closed=(False, True))
-    check_whole("maximum", maximum, 1)
     rows = features.double()
     moment = rows.T @ (rows if weights is None else rows * weights.double()[:, None])
-    if not bool(torch.isfinite(moment).all()):
-        raise ValueError("features, weights: expected finite numbers, got NaN or infinity; encode those images again")
+    if not bool(torch.isfinite(moment).all()) or not bool(moment.any()):
+        raise ValueError("features: expected finite rows, not all of them zero, got others; check the teacher")
     values, vectors = principal_directions(moment)
     values = values * (values > NOISE * values[0])
-    if not float(values[0]) > 0:
-        raise ValueError(f"features: expected a nonzero row, got {sizes['n']} all-zero rows; check the teacher")
     beyond = values[1:].cumsum(0)  # what the first 1, 2, ... further directions hold
     further = 0
     if len(beyond) and float(beyond[-1]) > 0:
         further = int((beyond < keep * beyond[-1]).sum()) + 1  # the first that hold enough
-    return LinearLatents(vectors[:, : min(maximum, 1 + further)].to(features))
+    return LinearLatents(vectors[:, : min(maximum or len(vectors), 1 + further)].to(features))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
-from .._check import as_tensor, check_shapes
+from .._check import as_tensor, check_shapes, check_whole
 from .._progress import as_bar
 from .._rows import ENCODE, EPS, check_directions
 from .codebook import Codebook, compare
@@ -30,17 +30,14 @@ class IndexMaps(Stored, Sequence[NDArray[Any]]):
 
     def __init__(self, maps: Sequence[NDArray[Any]], size: int) -> None:
         """Whole numbers in [0, size], one array per image; `size` is the number of codewords, K."""
-        if not 1 <= size <= 65_535:
-            raise ValueError(f"size: expected 1 to 65535 codewords (two bytes a pixel), got {size}; lower K_max")
-        self.size, self._maps = size, list[NDArray[Any]]()
+        check_whole("size", size, 1, 65_535)
         for i, indices in enumerate(maps):
             check_shapes((f"maps[{i}]", indices, "h w"))
-            if indices.size and not (indices.min() >= 0 and indices.max() <= size):
-                raise ValueError(
-                    f"maps[{i}]: expected numbers from 0 to {size} (size, a hole), got {indices.min()} to "
-                    f"{indices.max()}; quantise it with the codebook of that size"
-                )
-            self._maps.append(np.ascontiguousarray(indices, dtype=np.uint8 if size <= 255 else np.uint16))
+            if indices.size and not 0 <= indices.min() <= indices.max() <= size:
+                got = f"{indices.min()} to {indices.max()}; quantise it with the codebook of that size"
+                raise ValueError(f"maps[{i}]: expected numbers from 0 to {size} (size, a hole), got {got}")
+        dtype = np.uint8 if size <= 255 else np.uint16
+        self.size, self._maps = size, [np.ascontiguousarray(indices, dtype=dtype) for indices in maps]
 
     def __len__(self) -> int:
         return len(self._maps)
@@ -49,7 +46,7 @@ class IndexMaps(Stored, Sequence[NDArray[Any]]):
         return self._maps[i]
 
     def __repr__(self) -> str:
-        return f"IndexMaps({len(self)} maps, {self.size} codewords, {self.nbytes} bytes)"
+        return f"IndexMaps({len(self)} maps, {self.size} codewords)"
 
     @property
     def nbytes(self) -> int:

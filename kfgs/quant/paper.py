@@ -19,7 +19,6 @@ from .sampling import SAMPLES, all_zero
 BETAS = (0.9, 0.999)  # Adam's usual decay rates; the paper names none
 ADAM_EPS = 1e-9  # the released script's
 BLOCK = 2048  # rows of a similarity matrix in memory at a time
-ENOUGH = 0.9  # share of covered features below which a full book is worth a note
 
 
 @dataclass(frozen=True)
@@ -98,11 +97,8 @@ class PaperCodebook:
             if callable(progress):
                 progress(dict(history[-1]))
         codebook = Codebook(book.rows)
-        index, last = zip(*(codebook.nearest(read(i)) for i in range(maps)), strict=True)
-        nearest, full = Nearest(torch.cat(index), torch.cat(last)), codebook.size >= self.maximum
-        return with_report(
-            codebook.codewords, history, nearest, self.expand_below, asked=True, full=full, enough=ENOUGH
-        )
+        nearest = map(torch.cat, zip(*(codebook.nearest(read(i)) for i in range(maps)), strict=True))
+        return with_report(codebook.codewords, history, Nearest(*nearest), self.expand_below)
 
 
 def farthest_points(features: Tensor, count: int) -> Tensor:  # [n, D] -> [min(count, nonzero rows)] int64
@@ -116,23 +112,18 @@ def farthest_points(features: Tensor, count: int) -> Tensor:  # [n, D] -> [min(c
     unit = unit_rows(features[rows])
     if len(rows) < 2:
         return rows
-    picked = torch.tensor(_least_similar_pair(unit)[:count], device=rows.device)
-    largest = (unit @ unit[picked].T).amax(dim=1)
-    largest[picked] = torch.inf  # never twice
-    return rows[torch.cat([picked, expand(unit, largest, threshold=torch.inf, room=count - len(picked))])]
-
-
-def _least_similar_pair(unit: Tensor) -> tuple[int, int]:  # [n, D], n >= 2
-    """Rows i < j of the smallest inner product: the upper triangle, one block of rows at a time."""
     least, pair = float("inf"), (0, 1)
-    for start in range(0, len(unit) - 1, BLOCK):
+    for start in range(0, len(unit) - 1, BLOCK):  # the upper triangle, one block of rows at a time
         similarity = unit[start : start + BLOCK] @ unit[start:].T  # [b, n - start], starts on the diagonal
         square = similarity[:, : len(similarity)]
         square.masked_fill_(torch.ones_like(square, dtype=torch.bool).tril(), torch.inf)
         row, column = divmod(int(similarity.argmin()), similarity.shape[1])
         if float(similarity[row, column]) < least:
             least, pair = float(similarity[row, column]), (start + row, start + column)
-    return pair
+    picked = torch.tensor(pair[:count], device=rows.device)
+    largest = (unit @ unit[picked].T).amax(dim=1)
+    largest[picked] = torch.inf  # never twice
+    return rows[torch.cat([picked, expand(unit, largest, threshold=torch.inf, room=count - len(picked))])]
 
 
 class EvolvingCodebook:
@@ -144,8 +135,13 @@ class EvolvingCodebook:
 
     def __init__(self, codewords: Tensor, options: PaperCodebook, joins: int) -> None:  # [K, D]
         self.options, self.joins = options, joins
-        self.rows, self.first, self.second, self.steps = _fresh(codewords)
-        self.gradient, self.gathered = torch.zeros_like(codewords), 0  # since the last step
+        self.state = _fresh(codewords)
+        self.gathered = 0  # gradients since the last step
+
+    @property
+    def rows(self) -> Tensor:  # [K, D]
+        """The codewords."""
+        return self.state["rows"]
 
     def learn_from(self, features: Tensor) -> tuple[float, Tensor]:  # [n, D] of one image
         """Quantise, expand, and gather the gradient; the loss, and each feature's similarity to the codewords before [n]."""
@@ -156,36 +152,32 @@ class EvolvingCodebook:
         if len(joining):
             newest = Codebook(joining).nearest(features)
             index = torch.where(newest.similarity > similarity, newest.codeword + size, index)
-            old = self.rows, self.first, self.second, self.steps
-            self.rows, self.first, self.second, self.steps = map(torch.cat, zip(old, _fresh(joining), strict=True))
-            self.gradient = torch.cat([self.gradient, torch.zeros_like(joining)])
+            self.state = {name: torch.cat([self.state[name], value]) for name, value in _fresh(joining).items()}
         loss, gradient = class_balanced_loss(features, self.rows, index)
-        self.gradient, self.gathered = self.gradient + gradient, self.gathered + 1
+        self.state["gradient"] = self.state["gradient"] + gradient
+        self.gathered += 1
         return float(loss), similarity
 
     def step(self) -> int:
         """An Adam step with the mean of the gathered gradients, then pruning; the number of dropped codewords."""
         if self.gathered == 0:  # every feature was zero
             return 0
-        size, gradient = len(self.rows), self.gradient / self.gathered
-        decay1, decay2 = BETAS
-        self.steps = self.steps + 1
-        self.first = self.first.lerp(gradient, 1 - decay1)
-        self.second = decay2 * self.second + (1 - decay2) * gradient.square()
-        bias1, bias2 = ((1 - decay**self.steps).to(gradient.dtype) for decay in BETAS)
-        denominator = (self.second / bias2).sqrt() + ADAM_EPS
-        self.rows = self.rows - self.options.learning_rate * (self.first / bias1) / denominator
-        stays = prune(self.rows, threshold=self.options.prune_above)
-        old = self.rows, self.first, self.second, self.steps
-        self.rows, self.first, self.second, self.steps = (part[stays] for part in old)
-        self.gradient, self.gathered = torch.zeros_like(self.rows), 0
-        return size - len(stays)
+        state, (decay1, decay2) = self.state, BETAS
+        gradient, steps = state["gradient"] / self.gathered, state["steps"] + 1
+        first, second = state["first"].lerp(gradient, 1 - decay1), decay2 * state["second"]
+        second = second + (1 - decay2) * gradient.square()
+        bias1, bias2 = ((1 - decay**steps).to(gradient.dtype) for decay in BETAS)
+        rows = self.rows - self.options.learning_rate * (first / bias1) / ((second / bias2).sqrt() + ADAM_EPS)
+        stays = prune(rows, threshold=self.options.prune_above)
+        moved = _fresh(rows) | {"first": first, "second": second, "steps": steps}
+        self.state, self.gathered = {name: value[stays] for name, value in moved.items()}, 0
+        return len(rows) - len(stays)
 
 
-def _fresh(rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Rows, two zero moments, and zero steps in float64: 1 - 0.999 ** t cancels in float32."""
-    steps = torch.zeros(len(rows), 1, dtype=torch.float64, device=rows.device)
-    return rows.clone(), torch.zeros_like(rows), torch.zeros_like(rows), steps
+def _fresh(rows: Tensor) -> dict[str, Tensor]:
+    """Codewords without a step: zero moments and gradient, and steps in float64, because 1 - 0.999 ** t cancels in float32."""
+    zeros = {name: torch.zeros_like(rows) for name in ("first", "second", "gradient")}
+    return {"rows": rows, "steps": torch.zeros(len(rows), 1, dtype=torch.float64, device=rows.device), **zeros}
 
 
 def expand(features: Tensor, similarity: Tensor, *, threshold: float, room: int) -> Tensor:  # [n, D], [n] -> [m] int64

@@ -81,8 +81,8 @@ class FieldMeaning:
         if words not in self._answers:
             target = words if known else self._phrase(words)
             selection = self.field.query(target, self._classes)
-            question = make_question(target, self._classes, "auto", self.field.dim, {})
-            self._answers[words] = _asked(words, selection, self.field.known, question.negatives is not None, known)
+            rows = make_question(target, self._classes, "auto", self.field.dim, {})
+            self._answers[words] = _asked(words, selection, self.field.known, len(rows) > 1, known)
         return self._answers[words]
 
     def similar(self, mask: Tensor) -> Asked:  # [N] bool

@@ -28,7 +28,7 @@ Row = Mapping[str, Any]  # of a recorded history: numbers by name
 # Okabe and Ito's darker colours, which are readable as lines
 LINES = np.array([[0, 114, 178], [213, 94, 0], [0, 158, 115], [204, 121, 167], [86, 180, 233], [230, 159, 0]]) / 255
 INK, REST = (0.08, 0.08, 0.08), (0.75, 0.75, 0.75)
-STEPS = ("step", "iteration", "epoch")  # keys for the x axis
+STEPS = ("step", "iteration", "epoch", "round")  # keys for the x axis
 COUNTS = {"size", "added", "pruned", "count", "gaussians"}  # whole numbers, drawn from zero
 BINS, STEEP = 80, 5.0  # counts are logarithmic if the highest bin of the rest is this many times that of the selected
 
@@ -39,8 +39,8 @@ def plot_history(history: Sequence[Row] | Mapping[str, Sequence[Row]], path: str
     Numbers that are always 0 are left out, and so are `seconds`, a nearly straight line.
 
     Args:
-        history: rows with `step` (or `iteration`, or `epoch`) and numbers: `FieldFit.history`, `Codebook.report.history`; or
-            several histories by name, which get a line each.
+        history: rows with `step` (or `iteration`, `epoch`, `round`) and numbers: `FieldFit.history`,
+            `Codebook.report.history`; or several histories by name, which get a line each.
         path: the file.
 
     Raises:

@@ -1,12 +1,11 @@
 import math
 from dataclasses import replace
 
-import pytest
 import torch
 
 from kfgs.fields import Densify, GaussianParams
 from kfgs.fields import densify as densifying
-from kfgs.fields.densify import GradientStatistics, lowered_opacities
+from kfgs.fields.densify import GradientStatistics
 
 CONFIG = Densify()
 EXTENT = 10.0  # cloned up to scale 0.1, pruned beyond scale 1
@@ -80,16 +79,6 @@ def test_children_are_drawn_from_their_parent():
     torch.testing.assert_close(grown.params.means.T.cov(), expected, atol=0.025, rtol=0)
 
 
-def test_split_is_seeded():
-    start, hot = params([0.5]), torch.tensor([HOT])
-
-    def means(seed):
-        return densify(start, hot, CONFIG, extent=EXTENT, seed=seed).params.means
-
-    assert torch.equal(means(1), means(1))
-    assert not torch.equal(means(1), means(2))
-
-
 def test_faint_ones_are_dropped():
     start = params([0.05, 0.05, 0.05], [0.004, 0.006, 0.5])
     grown = densify(start, torch.full((3,), COLD), CONFIG, extent=EXTENT)
@@ -122,10 +111,3 @@ def test_statistics_are_means_of_ndc_gradients_over_views_that_saw_it():
     statistics.add_(torch.tensor([2]), torch.tensor([[0.0, 1.0]]), (100, 300))
     # 0: 100 * |(3e-3, 4e-3)| = 0.5; 1: never seen; 2: (1 * 100 + 1 * 50) / 2, width and height not mixed up
     torch.testing.assert_close(statistics.mean(), torch.tensor([0.5, 0.0, 75.0]))
-
-
-@pytest.mark.parametrize("opacity", [0.01, 0.2])
-def test_reset_lowers_but_never_raises(opacity):
-    logits = torch.logit(torch.tensor([0.001, 0.1, 0.9]))
-    lowered = lowered_opacities(logits, opacity).sigmoid()
-    torch.testing.assert_close(lowered, torch.tensor([0.001, min(0.1, opacity), opacity]))

@@ -8,7 +8,6 @@ import torch
 from cases_quant import made_autoencoder
 from cases_splat import a_camera, gaussians_before
 
-from kfgs import Camera, Gaussians
 from kfgs.fields import Autoencoded, Codewords, Identity, SemanticField, fuse_views
 from kfgs.quant import Codebook
 
@@ -106,20 +105,6 @@ def test_what_learnt_nothing_answers_nothing(mode):
     features = torch.cat([torch.zeros(9, DIM), codebook().unit[:1]])  # the last, far away, has some
     found = fuse(cloud.replace(features=features), mode, views())
     assert (found.features == 0).all()
-
-
-def test_one_gaussian_answers_with_what_its_pixels_show():
-    K = torch.tensor([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
-    ball = Gaussians(
-        torch.tensor([[0.0, 0, 2]]),
-        torch.eye(4)[:1],
-        torch.full((1, 3), 0.2),
-        torch.tensor([0.9]),
-        codebook().unit[1:2] * 3,
-    )
-    found = fuse(ball, "adc", [Camera(torch.eye(4), K, 8, 8)])
-    torch.testing.assert_close(found.decode(found.features), codebook().unit[1:2])
-    torch.testing.assert_close(found.seen.agreement, torch.ones(1))
 
 
 def test_large_views_are_rendered_small_and_counted_in_their_own_pixels(monkeypatch):

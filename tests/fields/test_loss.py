@@ -24,17 +24,6 @@ def path(request, monkeypatch):
     return request.param
 
 
-@pytest.mark.parametrize(("engine", "compiled"), [("numba", True), ("auto", True), ("reference", False)])
-def test_the_similarity_is_that_of_the_engine(engine, compiled, monkeypatch):
-    cpu = pytest.importorskip("kfgs.splat.engines.cpu.similarity")
-    calls, own = [], cpu.similarity
-    monkeypatch.setattr(cpu, "similarity", lambda *arguments: calls.append(1) or own(*arguments))
-    a, b = pictures()
-    measured = float(ColorLoss(1.0, engine)(a, a[..., 0], b))
-    assert bool(calls) == compiled
-    assert measured == pytest.approx(1 - ssim_windows(a, b).mean(), abs=1e-12)
-
-
 def test_similarity_is_the_mean_over_windows(path):
     a, b = pictures()
     assert float(mean_similarity(a, b)) == pytest.approx(ssim_windows(a, b).mean(), abs=1e-12)
@@ -73,20 +62,6 @@ def test_gradient_of_the_similarity_is_that_of_finite_differences(path):
     assert torch.autograd.gradcheck(lambda x: mean_similarity(x, b), a.clone().requires_grad_())
     b[0, 0] = torch.nan
     assert torch.autograd.gradcheck(lambda x: mean_similarity(x, b), a.clone().requires_grad_())
-
-
-def test_compiled_and_kornias_gradients_agree_in_float32(monkeypatch):
-    pytest.importorskip("numba")
-    gradients = []
-    for compiled in (True, False):
-        if not compiled:
-            monkeypatch.setattr(loss, "compiled_similarity", lambda *tensors: None)
-        a, b = pictures(90, 75, torch.float32)
-        value = mean_similarity(a.requires_grad_(), b)
-        value.backward()
-        gradients.append((float(value.detach()), a.grad))
-    assert gradients[0][0] == pytest.approx(gradients[1][0], abs=1e-6)
-    torch.testing.assert_close(gradients[0][1], gradients[1][1], rtol=2e-4, atol=2e-8)
 
 
 def test_nothing_known_is_no_loss(path):

@@ -5,7 +5,7 @@ import torch
 from kfgs.fields import GaussianParams, Rates, Training
 from kfgs.fields.optimizer import FieldOptimizer
 
-CONFIG = Training(steps=100)
+CONFIG = Training(steps=100, extent=4.0)
 RATES = {"quats": 0.001, "log_scales": 0.005, "logit_opacities": 0.05, "features": 0.005}
 
 
@@ -43,7 +43,7 @@ def adam_by_hand(start, gradients, rates, eps):
 
 def test_every_group_follows_adam_at_its_rate():
     start = params()
-    optimizer = FieldOptimizer(start, CONFIG, extent=4.0)
+    optimizer = FieldOptimizer(start, CONFIG)
     for step in range(1, 8):
         give_gradients(optimizer, step)
         optimizer.step_(step)
@@ -58,7 +58,7 @@ def test_every_group_follows_adam_at_its_rate():
 def test_moments_follow_their_gaussians():
     """Reordering and dropping Gaussians changes nothing for those that stay."""
     source = torch.tensor([4, 0, 2])
-    plain, moved = (FieldOptimizer(params(), CONFIG, extent=1.0) for _ in range(2))
+    plain, moved = (FieldOptimizer(params(), CONFIG) for _ in range(2))
     for optimizer in (plain, moved):
         for step in (1, 2, 3):
             give_gradients(optimizer, step)
@@ -74,7 +74,7 @@ def test_moments_follow_their_gaussians():
 
 
 def test_new_gaussians_start_without_moments():
-    optimizer = FieldOptimizer(params(), CONFIG, extent=1.0)
+    optimizer = FieldOptimizer(params(), CONFIG)
     give_gradients(optimizer, 1)
     optimizer.step_(1)
     before = {name: value.clone() for name, value in state_tensors(optimizer).items()}
@@ -86,21 +86,23 @@ def test_new_gaussians_start_without_moments():
     assert torch.equal(after["features.exp_avg_sq"][2], torch.zeros(6, dtype=torch.float64))
 
 
-def test_setting_opacities_forgets_only_their_moments():
-    optimizer = FieldOptimizer(params(), CONFIG, extent=1.0)
+def test_a_reset_lowers_opacities_and_forgets_only_their_moments():
+    optimizer = FieldOptimizer(params(), CONFIG)
     give_gradients(optimizer, 1)
     optimizer.step_(1)
-    optimizer.set_opacities_(torch.full((5,), -4.0, dtype=torch.float64))
+    before = optimizer.params.logit_opacities.detach().sigmoid()
+    optimizer.lower_opacities_(0.4)
     state = state_tensors(optimizer)
-    assert (optimizer.params.logit_opacities == -4).all()
+    assert 0 < int((before > 0.4).sum()) < 5
+    torch.testing.assert_close(optimizer.params.logit_opacities.detach().sigmoid(), before.clamp_max(0.4))
     assert not state["logit_opacities.exp_avg"].any()
     assert not state["logit_opacities.exp_avg_sq"].any()
     assert state["means.exp_avg"].all()
 
 
 def test_rates_fall_in_the_second_half_to_their_final_share():
-    config = Training(steps=100, rates=Rates(final=0.1))
-    optimizer = FieldOptimizer(params(), config, extent=1.0)
+    config = Training(steps=100, extent=1.0, rates=Rates(final=0.1))
+    optimizer = FieldOptimizer(params(), config)
     found = {}
     for step in (1, 50, 75, 100):
         optimizer.step_(step)

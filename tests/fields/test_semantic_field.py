@@ -132,14 +132,6 @@ def test_views_of_a_fused_field_blend_votes():
     assert (found == expected)[clear].all()
 
 
-def test_pixels_of_what_knows_nothing_have_no_class():
-    made = field("fused")
-    features = made.features.clone()
-    features[1] = 0
-    labels = replace(made, gaussians=made.gaussians.replace(features=features)).segment(camera(), embeddings())
-    assert labels[8, CENTRES].tolist() == [0, -1, 2, 2]
-
-
 def test_a_class_that_is_second_everywhere_wins_no_pixel():
     """The front ball votes 0.52 for class 0 and 0.48 for class 2, the one behind it the same for classes 1 and 2. Class 2 has
     the most votes in the sum."""
@@ -153,13 +145,6 @@ def test_a_class_that_is_second_everywhere_wins_no_pixel():
     labels = SemanticField(one, Linear(torch.eye(3))).segment(camera(), torch.eye(3))
     assert labels[8, 20] == 0
     assert not (labels == 2).any()
-
-
-def test_a_fused_field_that_knows_nothing_labels_no_pixel():
-    made = field("fused")
-    blank = replace(made, gaussians=made.gaussians.replace(features=torch.zeros(4, 4)))
-    assert (blank.segment(camera(), embeddings()) == -1).all()
-    assert blank.classify(embeddings()).labels.tolist() == [-1] * 4
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -218,14 +203,6 @@ def test_a_query_of_fused_answers(mode):
         fuse_views(made, [])
 
 
-def test_a_fused_field_has_its_answers_and_remembers_the_views():
-    made = field("fused")
-    fused = fuse_views(made, [camera()])
-    assert fused.fused is None
-    assert len(fused.cameras) == 1
-    assert torch.equal(fused.cosines(embeddings()), made.cosines(embeddings()))
-
-
 @pytest.mark.parametrize("mode", MODES)
 def test_query_with_negatives(mode):
     made = field(mode)
@@ -236,34 +213,6 @@ def test_query_with_negatives(mode):
         assert torch.equal(asked.query(embeddings()[2], embeddings()).scores, against.scores)  # the other classes
     with pytest.raises(ValueError, match=tells("negatives:", "[M, 16]", "got (2, 5)")):
         made.query(embeddings()[0], negatives=torch.ones(2, 5))
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_query_by_any_score(mode):
-    """Each ball lies at a codeword, so its cosines with the three classes are 1, 0 or sqrt(1/2), and scores follow."""
-    made, root = field(mode), 0.5**0.5
-    against = {"negatives": embeddings()[:2]}
-    cosine = made.query(embeddings()[2], threshold=0.5, score="cosine", **against)
-    torch.testing.assert_close(cosine.scores, torch.tensor([0, 0, root, root]))
-    relevant = made.query(embeddings()[2], score="relevancy", **against)
-    torch.testing.assert_close(relevant.scores[2:], torch.sigmoid(torch.tensor([10 * root] * 2)))
-    by_views = fuse_views(made, [camera()]).query(embeddings()[2], **against)
-    assert by_views.mask.tolist() == [False, False, True, True]
-    with pytest.raises(ValueError, match=tells("negatives:", "relevancy", "got none")):
-        made.query(embeddings()[2], score="relevancy")
-
-
-def test_text_of_another_size_is_guessed_to_be_another_teachers():
-    for ask in (
-        lambda: field().query(torch.ones(7)),
-        lambda: field().classify(torch.ones(2, 7)),
-        lambda: field().segment(camera(), torch.ones(2, 7)),
-        lambda: field().query(torch.ones(16), negatives=torch.ones(2, 7)),
-    ):
-        with pytest.raises(ValueError, match=tells("16], got (", "7", "teacher")):
-            ask()
-    with pytest.raises(ValueError, match=tells("embedding:", "[16]", "got (1, 16)")):
-        field().query(torch.ones(1, 16))
 
 
 @pytest.mark.parametrize("mode", MODES)

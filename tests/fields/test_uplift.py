@@ -1,6 +1,4 @@
-import tempfile
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import oracles_uplift
@@ -13,18 +11,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from kfgs import Camera, Gaussians
 from kfgs._rows import unit_rows
 from kfgs.cameras import resize_map
-from kfgs.fields import (
-    GaussianParams,
-    Rates,
-    Training,
-    UpliftConfig,
-    fit_field,
-    uplift,
-    uplift_maps,
-    working_maps,
-)
+from kfgs.fields import GaussianParams, Rates, Training, UpliftConfig, fit_field, uplift, uplift_maps, working_maps
 from kfgs.fields.working_maps import shrink_map
-from kfgs.quant.kmeans import cap
 from kfgs.splat import average_views, rasterize
 
 PLAIN = UpliftConfig(corrections=0, keep=1.0)  # the average alone, and as many latents as channels
@@ -103,14 +91,6 @@ def test_without_corrections_it_is_the_average_of_unit_features():
     torch.testing.assert_close(found.seen.agreement, length, atol=1e-5, rtol=0)
 
 
-def test_latents_are_a_projection_of_the_same_average():
-    views, gaussians, maps = cameras(), cloud(), random_maps(cameras(), channels=9)
-    whole = decoded(uplift_maps(gaussians, views, maps, PLAIN))
-    few = uplift_maps(gaussians, views, maps, replace(PLAIN, max_latents=3))
-    assert few.decoder.latent == 3
-    torch.testing.assert_close(few.gaussians.features, few.decoder.encode(whole), atol=1e-5, rtol=0)
-
-
 def test_reliability_is_the_spearman_brown_share_among_neighbours():
     one, other = torch.tensor([[1.0, 0.0], [2.0, 0.0], [0.0, 0.0]]), torch.tensor([[0.6, 0.8], [2.0, 0.0], [0.0, 0.0]])
     alone = uplift.reliability(one, other, torch.tensor([[0], [1], [2]]))
@@ -133,11 +113,6 @@ def test_latents_are_chosen_by_directions_and_pixels():
     found = uplift_maps(gaussians, ahead(2, size=24), maps, replace(PLAIN, max_latents=2))
     expected = torch.tensor([[1.0, 0, 0, 0], [0, 0.6, 0, 0], [0, 0, 0, 0]])
     torch.testing.assert_close(decoded(found), expected, atol=1e-5, rtol=0)
-
-
-def test_one_huge_weight_is_held_among_those_that_count():
-    weights = torch.cat([torch.zeros(900), torch.ones(199), torch.tensor([1e6])])
-    assert torch.equal(cap(weights, weights[weights > 0]), weights.clamp_max(1))
 
 
 # Laws
@@ -193,14 +168,6 @@ def test_what_no_view_shows_knows_nothing(corrections):
     assert (found.seen.agreement > 0).tolist() == [True, False, False, True]
 
 
-def test_disagreement_of_views_is_seen():
-    """Half of the pixels say x and half say y: the mean (1/2, 1/2) has length sqrt(1/2)."""
-    x, y = torch.tensor([1.0, 0.0]).expand(8, 8, 2), torch.tensor([0.0, 1.0]).expand(8, 8, 2)
-    found = uplift_maps(balls([[0.0, 0.0, 2.0]]), ahead(2), [x, y], PLAIN)
-    torch.testing.assert_close(found.seen.agreement, torch.tensor([0.5**0.5]))
-    torch.testing.assert_close(decoded(found), torch.tensor([[0.5, 0.5]]))
-
-
 def test_weights_of_an_antialiased_cloud_are_those_that_are_drawn():
     tiny = balls([[0.0, 0, 2], [0.2, 0.1, 2]], scale=0.03).replace(antialiased=True)  # 0.12 pixels wide
     fused = uplift_maps(tiny, ahead(2), random_maps(ahead(2)), PLAIN)
@@ -209,16 +176,6 @@ def test_weights_of_an_antialiased_cloud_are_those_that_are_drawn():
     assert fused.seen.pixels.tolist() == pytest.approx([2 * float(one.alpha.sum()) for one in drawn], rel=0.02)
     plain = uplift_maps(tiny.replace(antialiased=False), ahead(2), random_maps(ahead(2)), PLAIN)
     assert (plain.seen.pixels > 5 * fused.seen.pixels).all()
-
-
-def test_the_cloud_keeps_its_shape_and_loses_colours():
-    gaussians = cloud()
-    carried = gaussians.replace(sh=torch.zeros(12, 1, 3).double(), features=torch.ones(12, 2).double())
-    found = uplift_maps(carried, cameras(), random_maps(cameras())).gaussians
-    for name in ("means", "quats", "scales", "opacities"):
-        assert torch.equal(getattr(found, name), getattr(gaussians, name))
-    assert found.sh is None
-    assert found.features.shape[0] == 12
 
 
 # Corrections
@@ -285,20 +242,6 @@ def test_large_maps_are_shrunk_to_the_working_size():
     config = UpliftConfig(corrections=1, keep=1.0, pixels=130)
     one, other = (uplift_maps(gaussians, views, maps, config) for maps in (small, large))
     torch.testing.assert_close(decoded(one), decoded(other), atol=2e-3, rtol=0)  # half precision
-    torch.testing.assert_close(one.seen.pixels, other.seen.pixels)
-
-
-def test_a_shrunk_pixel_is_the_mean_of_the_known_ones_if_these_are_most():
-    views, gaussians = cameras(width=24, height=20), cloud()
-    small = [unit_rows(m) for m in random_maps(views, size=(10, 12))]
-    large = [m.repeat_interleave(2, dim=0).repeat_interleave(2, dim=1) for m in small]
-    for one, whole in zip(small, large, strict=True):
-        whole[0::4, 0::4] = 0  # one of four is unknown: the others stand for it
-        whole[2::4, 2::4], whole[3::4, 3::4] = 0, 0  # two of four: a hole
-        one[1::2, 1::2] = 0
-    config = replace(PLAIN, pixels=130)
-    one, other = (uplift_maps(gaussians, views, maps, config) for maps in (small, large))
-    torch.testing.assert_close(decoded(one), decoded(other), atol=1e-5, rtol=0)
     torch.testing.assert_close(one.seen.pixels, other.seen.pixels)
 
 
@@ -380,13 +323,11 @@ def test_merging_leaves_at_most_what_was_asked_for():
     views, gaussians = cameras(), cloud(200)
     maps = random_maps(views, channels=8)
     kept = uplift_maps(gaussians, views, maps, UpliftConfig(corrections=0))
-    found = uplift_maps(gaussians, views, maps, UpliftConfig(max_gaussians=40, faint=0.0))
+    found = uplift_maps(gaussians, views, maps, UpliftConfig(max_gaussians=40))
     assert 20 < len(found.gaussians) <= 40
-    assert found.seen.pixels.shape == found.seen.agreement.shape == (len(found.gaussians),)
-    fill = kept.seen.pixels > 0
-    torch.testing.assert_close(found.seen.pixels.sum(), kept.seen.pixels[fill].sum())
-    mean = (kept.seen.agreement * kept.seen.pixels)[fill].sum() / kept.seen.pixels[fill].sum()
-    torch.testing.assert_close((found.seen.agreement * found.seen.pixels).sum() / found.seen.pixels.sum(), mean)
+    assert 0.94 < float(found.seen.pixels.sum() / kept.seen.pixels.sum()) < 1  # the faintest are dropped
+    means = [float((f.seen.agreement * f.seen.pixels).sum() / f.seen.pixels.sum()) for f in (found, kept)]
+    assert means[0] == pytest.approx(means[1], abs=0.02)
 
 
 def test_merged_features_are_means_by_pixels():
@@ -400,24 +341,6 @@ def test_merged_features_are_means_by_pixels():
 
 
 # The files of the maps
-
-
-@pytest.fixture
-def folders(monkeypatch):
-    """The temporary folders that were made."""
-    made, make = [], tempfile.TemporaryDirectory
-
-    def record(*args, **kwargs):
-        made.append(make(*args, **kwargs))
-        return made[-1]
-
-    monkeypatch.setattr(tempfile, "TemporaryDirectory", record)
-    return made
-
-
-def test_the_temporary_folder_is_gone_afterwards(folders):
-    uplift_maps(cloud(), cameras(), random_maps(cameras()))
-    assert [Path(folder.name).exists() for folder in folders] == [False]
 
 
 def test_a_killed_uplift_reads_no_map_twice_and_gives_the_same_bits(tmp_path, monkeypatch):
@@ -465,35 +388,6 @@ def test_gaussians_that_fill_little_of_the_views_are_pointed_out():
     one = small.select(torch.arange(1)).replace(scales=torch.full((1, 3), 0.01))
     found = uplift_maps(one, cameras(), random_maps(cameras()))
     assert "of the views; are they in the cameras' frame?" in found.info["note"]
-
-
-class InBlocks:
-    """Maps that are read a few rows at a time, and never whole."""
-
-    def __init__(self, maps):
-        self.maps = maps
-
-    def __len__(self):
-        return len(self.maps)
-
-    def __getitem__(self, i):
-        raise AssertionError("a whole map was read")
-
-    def grid(self, i, step, samples):
-        return self.maps[i].reshape(-1, self.maps[i].shape[-1])
-
-    def blocks(self, i):
-        return iter(self.maps[i].split(3))
-
-
-def test_maps_that_are_read_in_blocks_give_the_same():
-    maps = random_maps(cameras())
-    maps[1][2:4] = 0  # unknown
-    whole, parts = (uplift_maps(cloud(), cameras(), given, PLAIN) for given in (maps, InBlocks(maps)))
-    torch.testing.assert_close(parts.gaussians.features, whole.gaussians.features)
-    maps[2][9, 0, 1] = torch.nan
-    with pytest.raises(ValueError, match=tells("maps[2]:", "got NaN")):
-        uplift_maps(cloud(), cameras(), InBlocks(maps), PLAIN)
 
 
 # Wrong input

@@ -48,18 +48,14 @@ def test_the_shrunken_camera_sees_the_shrunken_picture():
 
 
 @pytest.mark.parametrize(("height", "width"), [(107, 107), (90, 120), (48, 64)])
-def test_the_working_camera_has_the_pixels_of_the_shrunken_map(height, width):
+def test_the_working_camera_has_the_pixels_of_the_shrunken_map(height, width, tmp_path):
     """107 pixels are shrunk by 12 to 8 blocks, of which 11 pixels are left over: 107 // 8 is 13."""
     K = torch.tensor([[100.0, 0, width / 2], [0, 100.0, height / 2], [0, 0, 1]])
     camera = Camera(torch.eye(4), K, width, height)
     shrink = next(k for k in range(1, 200) if (height // k) * (width // k) <= 64)
-    with WorkingMaps([camera], [torch.rand(height, width, 3) + 0.1], torch.eye(3), 64, None) as views:
-        for view in (views[0], views[0]):  # made, and read from its file
-            assert view.map.shape[:2] == (height // shrink, width // shrink)
-            torch.testing.assert_close(
-                view.camera.K,
-                torch.diag(torch.tensor([1 / shrink, 1 / shrink, 1.0]))
-                @ K
-                * torch.tensor([[view.factor], [view.factor], [1.0]]),
-            )
-            assert view.scale == pytest.approx((shrink / view.factor) ** 2)
+    views = WorkingMaps([camera], [torch.rand(height, width, 3) + 0.1], torch.eye(3), 64, tmp_path)
+    for view in (views[0], views[0]):  # made, and read from its file
+        assert view.map.shape[:2] == (height // shrink, width // shrink)
+        resized = torch.tensor([view.factor / shrink, view.factor / shrink, 1.0])
+        torch.testing.assert_close(view.camera.K, K * resized[:, None])
+        assert view.scale == pytest.approx((shrink / view.factor) ** 2)

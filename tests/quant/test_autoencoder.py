@@ -60,7 +60,6 @@ def test_save_then_load_is_the_same(tmp_path):
         assert (again.dim, again.latent, again.decoder_parameters) == (6, 3, (3 * 4 + 4) + (4 * 6 + 6))
     assert found.to(torch.float32).encode(features.float()).dtype == torch.float32
     assert found.encode(features).dtype == torch.float64  # `to` gives a copy
-    torch.testing.assert_close(found(features), found.decode(found.encode(features)))
 
 
 def test_bad_input(tmp_path):

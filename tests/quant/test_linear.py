@@ -89,12 +89,6 @@ def test_a_weight_is_a_repetition():
 
 
 def test_wrong_input_to_the_fit_is_named():
-    with pytest.raises(ValueError, match=tells("features:", "zero", "got 3")):
-        fit_linear_latents(torch.zeros(3, 4))
-    with pytest.raises(ValueError, match=tells("features, weights:", "got NaN")):
-        fit_linear_latents(torch.full((3, 4), torch.nan))
-    with pytest.raises(ValueError, match=tells("weights:", "[n]", "n = 3", "got (2,)")):
-        fit_linear_latents(torch.ones(3, 4), torch.ones(2))
-    for name, value in (("keep", 0.0), ("keep", 1.1), ("maximum", 0)):
-        with pytest.raises(ValueError, match=tells(f"{name}:", f"got {value}")):
-            fit_linear_latents(torch.ones(3, 4), **{name: value})
+    for features in (torch.zeros(3, 4), torch.full((3, 4), torch.nan)):
+        with pytest.raises(ValueError, match=tells("features:", "finite", "not all of them zero")):
+            fit_linear_latents(features)
