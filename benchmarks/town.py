@@ -69,7 +69,7 @@ def main() -> None:
     began = time.perf_counter()
     took = _apart(_fit_in_blocks, town, folder, args.blocks, config)
     took["seconds"] = time.perf_counter() - began
-    blocks = [Block.from_json(block) for block in read_json(folder / "blocks.json")["blocks"]]
+    blocks = [Block(**block) for block in read_json(folder / "blocks.json")["blocks"]]
     _print(f"{args.blocks} blocks", join_blocks(folder), scene, town, blocks, took)
     _print("whole", SemanticField.load(args.out / f"run{args.seed}" / "field.kfgs"), scene, town, blocks, whole)
 

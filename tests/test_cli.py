@@ -10,7 +10,7 @@ from small_room import fit_run, make_room
 
 from kfgs import scenes
 from kfgs.cli import main
-from kfgs.formats.ply import read_comments, read_ply, write_ply
+from kfgs.formats.ply import read_header, read_ply, write_ply
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def test_attach_carries_classes_to_points_and_keeps_their_columns(run, room, tmp
     np.testing.assert_array_equal(columns["mass"], np.arange(len(surface)))
     assert (columns["class_id"] >= 0).mean() > 0.8
     assert set(columns["red"].tolist()) == {200}
-    assert "SplatRenderMode: mip" in read_comments(out)
+    assert "SplatRenderMode: mip" in read_header(out).comments
     names = json.loads((tmp_path / "labelled.ply.classes.json").read_text())
     assert names["class_id"]["1"] == "floor"
     assert names["distance"] > 0

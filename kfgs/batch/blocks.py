@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +28,10 @@ from ..pipeline import Uplift, fit
 from ..pipeline.maps import maps_of_views
 from ..quant import LinearLatents
 from ..scenes import FeatureFolder, Scene, SceneError, load_scene
-from ..scenes.blocks import Block, partition, write_parts
-from ..scenes.colmap_model import read_whole_model
+from ..scenes.blocks import Block, partition, write_part
+from ..scenes.colmap_model import read_model
+from ..scenes.load import find_model
 from ..scenes.masks import picture_folder
-from ..scenes.sub_models import find_model
 from .run import run_tasks
 
 BLOCKS, BLOCK, CORE, FACTS, LATENTS, SPLAT = (
@@ -101,18 +101,19 @@ def _cut(source: Path, out: Path, count: int, splat: str | Path | None, latents:
     if model is None:
         raise SceneError(f"scene: expected a folder with a COLMAP model, got {source}; make one with `kfgs sfm`")
     maps = maps_of_views(whole, whole.views("train"), FeatureFolder(source / "features").of(whole, "train"))
-    blocks, training = partition(read_whole_model(model), count), set(whole.views("train"))
+    content, training = read_model(model), set(whole.views("train"))
+    blocks = partition(content, count)
     unseen = next((block.name for block in blocks if not training & _views_of(whole, block)), None)
     if unseen is not None:
         raise SceneError(f"{unseen}: expected training views that see it, got none; ask for fewer blocks than {count}")
     todo = [block for block in blocks if not (out / block.name / BLOCK).is_file()]
     cloud = read_splats(splat) if todo and splat is not None else None
     facts = {
-        "format": "kfgs.blocks/2",
+        "format": "kfgs.blocks/3",
         "scene": os.path.relpath(real_path(source), real_path(out)),
         "splat": None if splat is None else digest_file(splat_file_of(splat)),
         "latents": latents,
-        "blocks": [block.to_json() for block in blocks],
+        "blocks": [asdict(block) for block in blocks],
     }
     if not (out / BLOCKS).is_file():
         write_json(out / BLOCKS, facts)  # first, so that another cut is refused even if this one is killed
@@ -120,9 +121,8 @@ def _cut(source: Path, out: Path, count: int, splat: str | Path | None, latents:
         raise ValueError(f"out: expected a new folder, or one with these blocks, got {out} with others; choose another")
     if not (out / LATENTS).is_file():
         uplift.sample_latents(maps, count=latents).save(out / LATENTS)
-    if todo:
-        write_parts(model, {out / block.name / "sparse/0": block.views for block in todo})
     for block in todo:
+        write_part(out / block.name / "sparse/0", content, block.views)
         _write_block(out / block.name, block, whole, cloud)
     return [block.name for block in blocks]
 
@@ -141,12 +141,12 @@ def _write_block(folder: Path, block: Block, whole: Scene, cloud: Gaussians | No
     if cloud is not None:
         means, radii = _places(cloud), REACH * as_array(cloud.scales).max(1)
         write_splats(cloud.select(torch.from_numpy(block.needs(means, radii))), folder / SPLAT)
-    write_json(folder / BLOCK, block.to_json())  # last: the folder is complete
+    write_json(folder / BLOCK, asdict(block))  # last: the folder is complete
 
 
 def _fit_block(folder: Path, method: Uplift) -> dict[str, Any]:
     """Fit the field of one block, and keep its core; the facts about it, as `core.json` has them."""
-    block, scene = Block.from_json(read_json(folder / BLOCK)), load_scene(folder)
+    block, scene = Block(**read_json(folder / BLOCK)), load_scene(folder)
     splat = read_splats(folder / SPLAT) if (folder / SPLAT).is_file() else None
     facts: dict[str, Any] = {"gaussians": 0, "box": None, "seconds": 0.0, "options": digest_value(method.options())}
     (folder / FACTS).unlink(missing_ok=True)  # a fit that is killed leaves a block that is not fitted

@@ -3,9 +3,8 @@
 from .bounds import robust_bounds
 from .camera import Camera, Distortion
 from .distortion import undistort
-from .kornia_camera import from_kornia, to_kornia
 from .paths import Orbit, estimate_up, orbit_cameras, path_cameras
-from .projection import project_points
+from .projection import from_kornia, project_points, to_kornia
 from .resample import resize_map
 from .similarity import Similarity, fit_similarity
 

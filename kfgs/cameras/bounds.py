@@ -16,7 +16,6 @@ from .camera import Camera
 class Bounds(NamedTuple):
     """The box of most points of a cloud, in world units."""
 
-    center: Tensor  # [3] median
     low: Tensor  # [3] lower corner
     high: Tensor  # [3] upper corner
     inside: Tensor  # [P] bool, which points lie in the box
@@ -43,7 +42,7 @@ def robust_bounds(points: Tensor, *, coverage: float = 0.98, margin: float = 0.1
     pad = (high - low) * margin
     low, high = low - pad, high + pad
     inside = ((points.detach() >= low) & (points.detach() <= high)).all(-1)
-    return Bounds(ordered[last // 2], low, high, inside)
+    return Bounds(low, high, inside)
 
 
 def camera_extent(cameras: Sequence[Camera], points: Tensor) -> float:  # [P, 3]

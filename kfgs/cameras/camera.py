@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -71,9 +70,9 @@ class Camera:
         check_shapes(("viewmat", self.viewmat, "4 4"), ("K", self.K, "3 3"))
         object.__setattr__(self, "origin", as_origin(self.origin))
         for name, size in (("width", self.width), ("height", self.height)):
-            whole = isinstance(size, numbers.Real) and math.isfinite(size) and size >= 1 and int(size) == size
-            if isinstance(size, bool) or not whole:
-                raise ValueError(f"{name}: expected a positive whole number of pixels, got {size!r}; pass an integer")
+            check_range(name, size, 1)
+            if size % 1:
+                raise ValueError(f"{name}: expected a whole number of pixels, got {size!r}; pass an integer")
             object.__setattr__(self, name, int(size))
         if torch.compiler.is_compiling():  # a traced matrix has no values yet
             return
@@ -224,13 +223,12 @@ def unit_vector(name: str, vector: Tensor | Sequence[float]) -> Tensor:  # [3] f
 
 def view_named(cameras: Sequence[Camera], view: str | Camera, where: str) -> Camera:
     """The one camera of a name, with or without its ending; a camera is itself. Errors begin with `where`."""
-    if isinstance(view, Camera):
-        return view
-    names = Names((camera.name for camera in cameras), bare=True)
-    found = [camera for camera in cameras if camera.name == names.find(view)]
-    if len(found) != 1:
-        some = ", ".join(camera.name for camera in cameras[:3]) or "none"
+    named = {camera.name: camera for camera in cameras}
+    names = Names(named, bare=True)
+    found = view if isinstance(view, Camera) else named.get(names.find(view) or "")
+    if found is None:
+        some = ", ".join(list(named)[:3]) or "none"
         raise ValueError(
-            f"{where}: expected the name of a training view ({some}, ...), got {view!r}; {names.advice(view)}"
+            f"{where}: expected the name of a training view ({some}, ...), got {view!r}; {names.advice(str(view))}"
         )
-    return found[0]
+    return found

@@ -24,10 +24,6 @@ STANDING = 1e-6  # of the coordinates: cameras on one tripod differ by the round
 LEVEL = 0.05  # if the pictures' x axes spread less than this in their second direction, they do not determine "up"
 
 
-class TooFewViewsError(ValueError):
-    """There are no two different views to go through."""
-
-
 def path_cameras(
     cameras: Sequence[Camera], frames: int = 150, *, every: int = 1, size: tuple[int, int] | None = None
 ) -> list[Camera]:
@@ -48,7 +44,7 @@ def path_cameras(
         linearly between the keys.
 
     Raises:
-        TooFewViewsError: if there are fewer than two different views.
+        ValueError: if there are fewer than two different views.
     """
     from scipy.interpolate import CubicSpline  # takes a third of a second, which every command would wait
 
@@ -62,7 +58,7 @@ def path_cameras(
         moved = _steps(*_poses(keys)) > SAME
         keys = [keys[0], *(key for key, new in zip(keys[1:], moved, strict=True) if new)]
     if len(keys) < 2:
-        raise TooFewViewsError(
+        raise ValueError(
             f"cameras: expected at least two different views, got {len(keys)} (of {len(cameras)}, every {every}); pass the "
             "cameras of the scene in the order of the path"
         )
@@ -77,13 +73,11 @@ def path_cameras(
     lenses = np.stack([as_array(key.K).astype(np.float64).reshape(9) for key in keys], axis=1)  # [9, k]
     Ks = np.stack([np.interp(moments, times, row) for row in lenses], axis=1).reshape(-1, 3, 3)
     near, origin = min(camera.near for camera in cameras), cameras[0].origin
-    path = []
-    for number in range(frames):
-        viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = R[number], t[number]
-        lens = torch.from_numpy(Ks[number]), width, height
-        path.append(Camera(torch.from_numpy(viewmat), *lens, f"path_{number:04d}", near=near, origin=origin))
-    return path
+    viewmats = np.tile(np.eye(4), (frames, 1, 1))
+    viewmats[:, :3, :3], viewmats[:, :3, 3] = R, t
+    pairs = zip(torch.from_numpy(viewmats), torch.from_numpy(Ks), strict=True)
+    names = (f"path_{number:04d}" for number in range(frames))
+    return [Camera(*pair, width, height, next(names), near=near, origin=origin) for pair in pairs]
 
 
 def _poses(keys: Sequence[Camera]) -> tuple[Array, Rotation]:  # [k, 3], k rotations from world to camera

@@ -1,4 +1,4 @@
-"""Convert points between the world, the frame of the camera and its pixels.
+"""Convert points between the world, the frame of the camera and its pixels; and cameras to kornia's and back.
 
 **Convention** (COLMAP's): x right, y down, z forward; the centre of the first pixel is (0.5, 0.5). The camera's matrices
 follow the dtype and device of the points.
@@ -6,14 +6,17 @@ follow the dtype and device of the points.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import reduce
+
 import torch
-from kornia.geometry.camera import dx_project_points_z1
+from kornia.geometry.camera import PinholeCamera, dx_project_points_z1
 from kornia.geometry.conversions import convert_points_from_homogeneous
 from kornia.geometry.depth import depth_to_3d_v2
 from torch import Tensor
 
 from .._check import as_tensor, check_range, check_shapes
-from .camera import Camera
+from .camera import Camera, at_one_origin
 from .distortion import fold_radius, plane_to_pixel
 
 
@@ -108,3 +111,56 @@ def refuse_distortion(camera: Camera) -> None:
             f"camera: expected a pinhole camera, got {camera.distortion.model} distortion (camera {camera.name!r}); "
             "undistort its images first (kfgs.cameras.undistort) and use the camera that returns"
         )
+
+
+def to_kornia(cameras: Sequence[Camera]) -> PinholeCamera:
+    """Stack cameras into one kornia `PinholeCamera` of batch B = len(cameras).
+
+    **Convention**: both libraries map world to camera with x right, y down, z forward, and both project by K (R X + t):
+    K decides where pixel centres are. kfgs's K puts the centre of the first pixel at (0.5, 0.5), so `project` gives the
+    pixels of `project_points`. Functions of kornia that make their own pixel grid (`create_meshgrid`, `DepthWarper`,
+    `remap`) put that centre at (0, 0): subtract 0.5 from cx and cy for them.
+
+    Returns:
+        `intrinsics` and `extrinsics` [B, 4, 4] in the widest dtype, `height` and `width` [B] int64, counted from the origin
+        of the first camera. Names, `near` and that origin are lost. `project` does not test for front and border.
+
+    Raises:
+        ValueError: if there is no camera, or one has distortion.
+
+    Example:
+        >>> camera = Camera(torch.eye(4), torch.tensor([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]), 64, 48)
+        >>> to_kornia([camera]).project(torch.tensor([[[0.2, 0.1, 2.0]]]))
+        tensor([[[42., 29.]]])
+    """
+    if not len(cameras):
+        raise ValueError("cameras: expected at least one Camera, got none; select a view that the scene has")
+    cameras = at_one_origin(cameras)
+    for camera in cameras:
+        refuse_distortion(camera)
+    dtype = reduce(torch.promote_types, (matrix.dtype for camera in cameras for matrix in (camera.K, camera.viewmat)))
+    extrinsics = torch.stack([camera.viewmat.to(dtype) for camera in cameras])
+    intrinsics = torch.eye(4, dtype=dtype, device=extrinsics.device).repeat(len(cameras), 1, 1)
+    intrinsics[:, :3, :3] = torch.stack([camera.K.to(dtype) for camera in cameras])
+    sizes = torch.tensor([camera.size for camera in cameras], device=extrinsics.device)
+    return PinholeCamera(intrinsics, extrinsics, height=sizes[:, 0], width=sizes[:, 1])
+
+
+def from_kornia(pinhole: PinholeCamera, names: Sequence[str] = ()) -> list[Camera]:
+    """The cameras of a kornia batch, one by one: the inverse of `to_kornia`.
+
+    Of `intrinsics` only the upper left 3 x 3 is read, as kornia does; it is taken as it is. kornia's documentation puts pixel
+    centres on integers: add 0.5 to cx and cy of such a K. One from COLMAP has them on halves, inside kornia's cameras too.
+
+    Args:
+        pinhole: B cameras.
+        names: B names, or none.
+    """
+    count = pinhole.batch_size
+    for name in ("intrinsics", "extrinsics"):
+        check_shapes((f"pinhole.{name}", getattr(pinhole, name), (count, 4, 4)))
+    if names and len(names) != count:
+        raise ValueError(f"names: expected {count} (one per camera), got {len(names)}; give one for each")
+    viewmats, Ks = pinhole.extrinsics.clone(), pinhole.camera_matrix.clone()  # kornia's scale_ changes them in place
+    rows = zip(viewmats, Ks, pinhole.width.tolist(), pinhole.height.tolist(), names or [""] * count, strict=True)
+    return [Camera(*row) for row in rows]

@@ -85,11 +85,6 @@ class Similarity:
         """The inverse: x = R^T (x' - t) / s."""
         return Similarity(1 / self.scale, self.rotation.T, -(self.rotation.T @ self.translation) / self.scale)
 
-    def __matmul__(self, first: Similarity) -> Similarity:
-        """This similarity after another one: `(a @ b).apply(x)` is `a.apply(b.apply(x))`."""
-        translation = self.scale * (self.rotation @ first.translation) + self.translation
-        return Similarity(self.scale * first.scale, self.rotation @ first.rotation, translation)
-
     def between_worlds(self, src: Origin, dst: Origin) -> Similarity:
         """The same motion in the world, of a similarity of coordinates that are counted from an origin on each side."""
         source, target = (torch.tensor(origin, dtype=torch.float64) for origin in (src, dst))

@@ -74,7 +74,7 @@ def open_field(name: str, path: Path) -> Any:
 def open_splats(name: str, path: Path, *, labelled: bool = False, named: bool = False) -> Any:
     """Read a splat file. A ValueError if it has no classes and `labelled` asks for them, or no names and `named` does."""
     from ..formats import read_splats
-    from ..formats.sidecar import names_path
+    from ..formats.sidecar import NAMES, beside
 
     if is_field(path):
         raise ValueError(f"{name}: expected a splat file, got {path}, a semantic field; pass what `kfgs color` writes")
@@ -85,7 +85,7 @@ def open_splats(name: str, path: Path, *, labelled: bool = False, named: bool = 
         )
     if named and not splats.names:
         raise ValueError(
-            f"{name}: expected the names of its classes in {names_path(path)}, got no such file; copy it from where the "
+            f"{name}: expected the names of its classes in {beside(path, NAMES)}, got no such file; copy it from where the "
             "splat was, or run `kfgs attach` again"
         )
     return splats

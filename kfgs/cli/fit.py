@@ -54,8 +54,8 @@ def sfm(
 ) -> None:
     """Find the cameras of photographs or of a video (structure from motion, pycolmap).
 
-    Of a video, the sharpest frames are written to OUT/images first. HEIC photographs are written there as JPEG. Nothing is found
-    where a photograph is black in its mask, masks/NAME.png in the folder or next to it, or transparent.
+    Of a video, the sharpest frames are written to OUT/images first. Nothing is found where a
+    photograph is black in its mask, masks/NAME.png in the folder or next to it, or transparent.
 
     Examples:
         kfgs sfm photos/ --out scene/
@@ -75,8 +75,8 @@ def sfm(
     from ..scenes import SfmConfig, list_images, run_sfm
     from ..scenes.load import is_scene
     from ..scenes.masks import folder_masks
-    from ..scenes.pictures import is_video
     from ..scenes.sfm import link_images
+    from ..scenes.video import VIDEO_SUFFIXES, extract_frames, is_video
 
     config = SfmConfig(
         matching=matching or ("sequential" if is_video(images) else "exhaustive"),
@@ -88,7 +88,13 @@ def sfm(
             f"images: expected photographs without poses, got {images} with some; `kfgs fit` and `kfgs color` take it as it is "
             "(and find its points, if it has none), or give --ignore-poses to estimate new ones"
         )
-    images = _plain_pictures(images, out, fps)
+    if is_video(images):
+        frames = extract_frames(images, out / "images", fps=fps or 2.0, progress=True)
+        say(f"{images}: the {len(frames)} sharpest frames are in {out / 'images'}")
+        images = out / "images"
+    elif images.is_file():
+        kinds = ", ".join(VIDEO_SUFFIXES)
+        raise ValueError(f"images: expected a folder, or a video ({kinds}), got {images}; convert it to .mp4")
     for note in folder_masks(list_images(images), images)[1]:
         say(f"note: {note}")
     say(str(run_sfm(images, out, config=config, replace=replace, progress=True)))
@@ -98,27 +104,6 @@ def sfm(
     elif real_path(out / "images") != real_path(images):
         say(f"note: other commands read the pictures of these names in {out / 'images'}; --images {images} names these")
     wrote([out / "sparse" / "0", *([out / "images"] if linked else [])])
-
-
-def _plain_pictures(images: Path, out: Path, fps: float | None) -> Path:
-    """A folder of pictures that pycolmap reads: of a video its frames, of HEIC photographs JPEG files, both in OUT/images."""
-    from ..scenes.pictures import VIDEO_SUFFIXES, convert_heic, extract_frames, has_heic, is_video
-
-    if is_video(images):
-        frames = extract_frames(images, out / "images", fps=fps or 2.0, progress=True)
-        say(f"{images}: the {len(frames)} sharpest frames are in {out / 'images'}")
-    elif has_heic(images):
-        pictures = convert_heic(images, out / "images", progress=True)
-        masks = next((place / "masks" for place in (images, images.parent) if (place / "masks").is_dir()), None)
-        if masks is not None and not os.path.lexists(out / "masks"):
-            (out / "masks").symlink_to(real_path(masks), target_is_directory=True)
-        say(f"{images}: HEIC photographs are JPEG files in {out / 'images'}, {len(pictures)} pictures in all")
-    elif images.is_file():
-        kinds = ", ".join(VIDEO_SUFFIXES)
-        raise ValueError(f"images: expected a folder, or a video ({kinds}), got {images}; convert it to .mp4")
-    else:
-        return images
-    return out / "images"
 
 
 def fit(

@@ -70,7 +70,9 @@ def attach(
     loaded = open_field("field", field)
     label_set = classes.load_classes(loaded)
     plain = cloud.is_file() and not is_field(cloud) and find_format(cloud).NAME == "ply"
-    if plain and "scale_0" not in ply.vertex_columns(cloud):  # points
+    if plain and "scale_0" not in {
+        row.name for table in ply.read_header(cloud).elements[:1] for row in table.properties
+    }:  # points
         moved, paths = label_cloud(loaded.label(label_set), cloud, out, distance=distance)
         say(str(moved))
         say("\n".join(count_lines(moved.labels, label_set.names)))

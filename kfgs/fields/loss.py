@@ -110,13 +110,13 @@ class _Absolute(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, picture: Tensor, target: Tensor) -> Tensor:
-        difference, count = picture - target, max(1, target.numel())
+        difference, share, more = picture - target, 1 / max(1, target.numel()), 1.0
         if bool((total := difference.abs().sum()).isnan()):
-            known = _known(target)
-            difference[~known] = 0
-            total, count = difference.abs().sum(), max(1, int(known.sum())) * target.shape[2]
-        ctx.save_for_backward(difference.sign_().mul_(1 / count))
-        return total / count
+            difference[~(known := _known(target))] = 0
+            total, more = difference.abs().sum(), known.numel() / max(1, int(known.sum()))
+        slope = difference.sign_().mul_(share)
+        ctx.save_for_backward(slope if more == 1 else slope.mul_(more))
+        return total * (share * more)
 
     @staticmethod
     @once_differentiable

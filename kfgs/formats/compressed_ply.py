@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ..gaussians import Gaussians
 from .encodings import pack_smallest_three, unpack_smallest_three
-from .ply import Columns, read_comments, read_ply_elements, write_ply_elements
+from .ply import Columns, read_header, read_ply_elements, write_ply_elements
 from .render_mode import comments_of_mode, mode_from_comments, with_mode
 from .values import SH_C0, describe_coarse, describe_cut, positive_scales, up_to_degree_3
 
@@ -77,7 +77,7 @@ def read(path: Path) -> Gaussians:
         opacities=torch.from_numpy(rgba[:, 3].copy()),
         sh=up_to_degree_3(path, torch.from_numpy(sh)),
     )
-    return with_mode(path, gaussians, mode_from_comments(read_comments(path)))
+    return with_mode(path, gaussians, mode_from_comments(read_header(path).comments))
 
 
 def write(path: Path, g: Gaussians) -> list[str]:

@@ -41,11 +41,6 @@ class _Section(NamedTuple):
     degree: int
 
 
-def matches(head: bytes) -> bool:
-    """Never: the content has no mark, so the name decides."""
-    return False
-
-
 def read(path: Path) -> Gaussians:
     """Read a .ksplat file of compression level 0, 1 or 2 and harmonics of degree 0 to 2."""
     data = path.read_bytes()

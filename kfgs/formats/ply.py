@@ -39,17 +39,17 @@ class _Property(NamedTuple):
 
 
 class _Element(NamedTuple):
-    """A table declared in the header."""
-
     name: str
     rows: int
     properties: list[_Property]
 
 
-class _Header(NamedTuple):
+class Header(NamedTuple):
+    """What a PLY file declares."""
+
     order: str  # of bytes, "<" or ">"; "" for text
     elements: list[_Element]
-    comments: list[str]
+    comments: list[str]  # programs write their name and options there
 
     def vertex(self) -> _Element:
         """The first element, which has to be a vertex table."""
@@ -73,22 +73,10 @@ def read_ply_elements(path: str | Path) -> dict[str, Columns]:
         return {element.name: _read_rows(file, element, header.order) for element in header.elements}
 
 
-def vertex_columns(path: str | Path) -> list[str]:
-    """Names of the columns of the vertex table, which is not read."""
+def read_header(path: str | Path) -> Header:
+    """The header of a PLY file alone."""
     with _opened(path) as (_, header):
-        return [prop.name for prop in header.vertex().properties]
-
-
-def other_elements(path: str | Path) -> list[str]:
-    """Names of the non-empty elements after the vertices, for instance the faces of a mesh; `read_ply` skips them."""
-    with _opened(path) as (_, header):
-        return [element.name for element in header.elements[1:] if element.rows]
-
-
-def read_comments(path: str | Path) -> list[str]:
-    """The comments of a PLY file's header, in order; programs write their name and options there."""
-    with _opened(path) as (_, header):
-        return header.comments
+        return header
 
 
 def write_ply(path: str | Path, columns: Columns, *, comments: tuple[str, ...] = ()) -> None:
@@ -140,13 +128,13 @@ def points_from_columns(path: str | Path, columns: Columns) -> Tensor:  # [N, 3]
 
 
 @contextmanager
-def _opened(path: str | Path) -> Iterator[tuple[BinaryIO, _Header]]:
+def _opened(path: str | Path) -> Iterator[tuple[BinaryIO, Header]]:
     """A file that stands behind its header; whatever fails names it."""
     with reading(path, "a PLY file", "write it again"), as_path(path).open("rb") as file:
         yield file, _read_header(file)
 
 
-def _read_header(file: BinaryIO) -> _Header:
+def _read_header(file: BinaryIO) -> Header:
     head = file.read(_HEADER_BYTES)
     end = head.find(b"\nend_header") + 1
     newline = head.find(b"\n", end)
@@ -179,7 +167,7 @@ def _read_header(file: BinaryIO) -> _Header:
                 elements[-1].properties.append(_Property(line, "", ""))
     if layout not in _ORDERS:
         raise ValueError(f"its layout is {layout!r:.40}, not binary or ascii")
-    return _Header(_ORDERS[layout], elements, comments)
+    return Header(_ORDERS[layout], elements, comments)
 
 
 def _read_rows(file: BinaryIO, element: _Element, order: str) -> Columns:

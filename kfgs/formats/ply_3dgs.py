@@ -18,7 +18,7 @@ from torch import Tensor
 from .._check import ORIGIN
 from .._origin import to_world
 from ..gaussians import Gaussians
-from .ply import Columns, points_from_columns, read_comments, read_ply, stack_columns, write_ply
+from .ply import Columns, points_from_columns, read_header, read_ply, stack_columns, write_ply
 from .render_mode import comments_of_mode, mode_from_comments, with_mode
 from .values import EXACT, SCORE, SH_C0, positive_scales, up_to_degree_3, whole_labels
 
@@ -45,7 +45,7 @@ def read(path: Path) -> Gaussians:
     known = {"x", "y", "z", "opacity", "class_id", SCORE, FILTER, *NORMALS}
     known |= set(RGB) if gaussians.sh is not None and "f_dc_0" not in columns else set()
     extra = {name: values for name, values in columns.items() if name not in known and not name.startswith(OURS)}
-    mode = mode_from_comments(read_comments(path))
+    mode = mode_from_comments(read_header(path).comments)
     surfels, antialiased = mode.surfels or "scale_2" not in columns, mode.antialiased or FILTER in columns
     return with_mode(path, gaussians.replace(extra=extra), mode._replace(surfels=surfels, antialiased=antialiased))
 

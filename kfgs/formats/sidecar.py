@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,29 +15,21 @@ from .._files import as_path, atomic_path, digest_file, read_json, real_path, wr
 from ..gaussians import Gaussians
 from .values import SCORE
 
+NAMES, LABELS, ORIGINS = ".classes.json", ".labels.npz", ".origin.json"
+"""What follows the name of a splat file: its classes; `class_id` and `score` of a format that cannot hold them; and where the
+(0, 0, 0) of a file that holds float32 only lies in the world."""
 _NPZ_HEADERS = 1 << 16  # bytes of headers in an .npz file of three arrays
 
 
-def names_path(path: str | Path) -> Path:
-    """`scene.ply` -> `scene.ply.classes.json`: the names of the classes of this one splat file."""
-    return as_path(path).with_name(as_path(path).name + ".classes.json")
-
-
-def labels_path(path: str | Path) -> Path:
-    """`scene.splat` -> `scene.splat.labels.npz`: `class_id` and `score` of a format that cannot hold them."""
-    return as_path(path).with_name(as_path(path).name + ".labels.npz")
-
-
-def origin_path(path: str | Path) -> Path:
-    """`scene.splat` -> `scene.splat.origin.json`: where the (0, 0, 0) of a file that holds float32 only lies in the world."""
-    return as_path(path).with_name(as_path(path).name + ".origin.json")
+def beside(path: str | Path, ending: str) -> Path:
+    """`scene.ply` -> `scene.ply.classes.json`."""
+    return as_path(path).with_name(as_path(path).name + ending)
 
 
 def write_names(path: str | Path, classes: tuple[str, ...], **facts: Any) -> Path:
     """Write the class names of a splat file next to it, with details about how its labels were made."""
-    target = names_path(path)
-    write_json(target, {"class_id": dict(enumerate(classes)), "none": -1, **facts})
-    return target
+    write_json(beside(path, NAMES), {"class_id": dict(enumerate(classes)), "none": -1, **facts})
+    return beside(path, NAMES)
 
 
 def write_sidecar(path: Path, gaussians: Gaussians, facts: Mapping[str, Any], holds: frozenset[str]) -> list[Path]:
@@ -50,15 +42,15 @@ def write_sidecar(path: Path, gaussians: Gaussians, facts: Mapping[str, Any], ho
         arrays = {"class_id": labels.to(torch.int32).cpu().numpy(), "of": np.array(digest_file(path))}
         if gaussians.scores is not None:
             arrays[SCORE] = gaussians.scores.detach().to("cpu", torch.float32).numpy()
-        with atomic_path(labels_path(path)) as temporary, temporary.open("wb") as file:
+        with atomic_path(beside(path, LABELS)) as temporary, temporary.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
-        written.append(labels_path(path))
+        written.append(beside(path, LABELS))
     if gaussians.origin != ORIGIN and "origin" not in holds:
-        write_json(origin_path(path), {"origin": gaussians.origin, "of": digest_file(path)})
-        written.append(origin_path(path))
+        write_json(beside(path, ORIGINS), {"origin": gaussians.origin, "of": digest_file(path)})
+        written.append(beside(path, ORIGINS))
     if labels is not None and gaussians.names:
         written.append(write_names(path, gaussians.names, **facts))
-    for older in {labels_path(path), origin_path(path), names_path(path)} - set(written):
+    for older in {beside(path, ending) for ending in (NAMES, LABELS, ORIGINS)} - set(written):
         older.unlink(missing_ok=True)
     return written
 
@@ -69,12 +61,21 @@ def read_sidecar(path: Path, gaussians: Gaussians) -> Gaussians:
     If `path` is a link, files next to the link come first, then those next to the file that it leads to. A FileError if one
     is damaged, or belongs to another version of the splat file.
     """
-    labels, origin, names = (_next_to(path, name) for name in (labels_path, origin_path, names_path))
-    digest = None
+    labels, origin, names = (
+        next((file for place in (path, real_path(path)) if (file := beside(place, ending)).is_file()), None)
+        for ending in (LABELS, ORIGINS, NAMES)
+    )
     if labels is not None or origin is not None:
-        digest = digest_file(path / "meta.json" if path.is_dir() else path)
+        digest, n = digest_file(path / "meta.json" if path.is_dir() else path), len(gaussians)
     if gaussians.labels is None and labels is not None:
-        gaussians = _with_labels(labels, path, gaussians, digest)
+        what = f"labels of the {n} Gaussians of {path.name}"
+        with reading(labels, what, "delete it"):
+            arrays = read_arrays(labels, what, "delete it", most=16 * n + _NPZ_HEADERS)  # before it is unpacked
+            classes = arrays["class_id"]
+            _check_version(labels, path, str(arrays["of"]), digest)
+            if classes.dtype.kind not in "iu" or (classes < -1).any():
+                raise ValueError(f"class_id: {classes.dtype}, not whole numbers of -1 or more")
+            gaussians = gaussians.replace(labels=classes.astype(np.int64), scores=arrays.get(SCORE))
     if origin is not None:
         with reading(origin, "an origin of three numbers", "delete it"):
             content = read_json(origin)
@@ -85,11 +86,7 @@ def read_sidecar(path: Path, gaussians: Gaussians) -> Gaussians:
     return gaussians
 
 
-def _next_to(path: Path, name: Callable[[Path], Path]) -> Path | None:
-    return next((file for place in (path, real_path(path)) if (file := name(place)).is_file()), None)
-
-
-def _check_version(file: Path, path: Path, of: object, digest: str | None) -> None:
+def _check_version(file: Path, path: Path, of: object, digest: str) -> None:
     if of != digest:
         raise FileError(
             f"{file}: expected a file of this version of {path.name}, got one of another version; delete it, or write both again"
@@ -104,16 +101,3 @@ def read_names(path: Path) -> tuple[str, ...]:
         if not all(isinstance(name, str) for name in names):
             raise ValueError(f"got {names!r:.80}")
         return names
-
-
-def _with_labels(file: Path, path: Path, gaussians: Gaussians, digest: str | None) -> Gaussians:
-    """The labels and scores of a file that `write_sidecar` wrote; its size is checked before it is unpacked."""
-    n = len(gaussians)
-    what = f"labels of the {n} Gaussians of {path.name}"
-    with reading(file, what, "delete it"):
-        arrays = read_arrays(file, what, "delete it", most=16 * n + _NPZ_HEADERS)
-        labels, scores = arrays["class_id"], arrays.get(SCORE)
-        _check_version(file, path, str(arrays["of"]), digest)
-        if labels.dtype.kind not in "iu" or (labels < -1).any():
-            raise ValueError(f"class_id: {labels.dtype}, not whole numbers of -1 or more")
-        return gaussians.replace(labels=labels.astype(np.int64), scores=scores)

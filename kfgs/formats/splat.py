@@ -23,11 +23,6 @@ HOLDS: frozenset[str] = frozenset()
 RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 
 
-def matches(head: bytes) -> bool:
-    """Never: the content has no mark, so the name decides."""
-    return False
-
-
 def read(path: Path) -> Gaussians:
     """Read a .splat file: colours of degree 0, opacities as stored (0 and 1 included)."""
     size = path.stat().st_size

@@ -4,7 +4,7 @@ A format is one module of this package, and a line in `MODULES`. It has
 
 - `NAME`, `SUFFIXES`: its name, and the endings of its files;
 - `MAGIC`, if all files begin with the same bytes: then the ending of a name alone never chooses this format;
-- `matches(head)`: whether a file that begins with these bytes (up to 64 KiB) has this format;
+- `matches(head)`, unless the name alone decides: whether a file that begins with these bytes (up to 64 KiB) has this format;
 - `read(path) -> Gaussians`: whatever it raises becomes an error that names the file; other programs' broken Gaussians stay;
 - `write(path, gaussians) -> list[str]`: write the file, whole or not at all, and describe what it rounds or cuts off. The cloud
   has been checked, is in float64 on the CPU, and has colours (but for PLY). Formats that are only read have no `write`;
@@ -28,15 +28,16 @@ from torch import Tensor
 
 from .._arrays import reading
 from .._card import short_repr
+from .._check import ORIGIN
 from .._files import as_path
 from .._notes import is_strict
-from .._origin import describe_origin
+from .._origin import choose_origin, describe_origin, to_local
 from ..gaussians import Gaussians, check_gaussians
 from .encodings import morton_order
 from .ply_3dgs import plain_cloud
-from .sidecar import names_path, read_sidecar, write_sidecar
+from .sidecar import NAMES, beside, read_sidecar, write_sidecar
 from .sog_files import META
-from .values import check_splats, describe_loss, leave_out_broken, near_zero
+from .values import check_splats, describe_loss, leave_out_broken
 
 MODULES = (  # tried in this order: compressed PLY before PLY, because both end in .ply
     "compressed_ply",
@@ -88,9 +89,9 @@ def find_format(path: str | Path) -> ModuleType:
                 head = file.read(_HEAD_BYTES).removeprefix(BOM_UTF8)
         except OSError as error:  # Python names no file if reading fails
             raise type(error)(f"{path}: expected a splat file that can be read ({error.strerror})") from error
+        marked = [module for module in known.values() if hasattr(module, "matches") and module.matches(head)]
         named = [module for module in known.values() if path.name.lower().endswith(module.SUFFIXES)]
-        unmarked = [module for module in named if not hasattr(module, "MAGIC")]
-        candidates = [module for module in known.values() if module.matches(head)] or unmarked
+        candidates = marked or [module for module in named if not hasattr(module, "MAGIC")]
         if candidates:
             return candidates[0]
     elif (path / META).is_file():
@@ -134,9 +135,12 @@ def read_rows(path: str | Path, *, strict: bool = False) -> tuple[Gaussians, Ten
         if low < -1 or (names and high >= len(names)):
             raise ValueError(
                 f"{path}: expected labels from -1 to {len(names) - 1} (the named classes), got {low} to {high}; correct the "
-                f"labels, or the names in {names_path(path).name}"
+                f"labels, or the names in {beside(path, NAMES).name}"
             )
-    return near_zero(gaussians), kept
+    if gaussians.origin != ORIGIN:  # the file has its own
+        return gaussians.replace(means=gaussians.means.float()), kept
+    origin = choose_origin(gaussians.means)
+    return gaussians.replace(means=to_local(gaussians.means, origin), origin=origin), kept
 
 
 def write_splats(
@@ -200,15 +204,10 @@ def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
     return files
 
 
-def newest_splat(folder: Path) -> Path | None:
-    """The splat of the highest step in the output folder of a training program; None if this is no such folder."""
-    steps = (numbered_files(folder, pattern) for pattern in PATTERNS)
-    return next((files[max(files)] for files in steps if files), None)
-
-
 def splat_file_of(path: str | Path) -> Path:
     """The path itself; of the output folder of a training program, its newest splat; of SOG's `meta.json`, its folder."""
     path = as_path(path)
     if path.name == META and path.is_file():
         return path.parent
-    return newest_splat(path) or path if path.is_dir() else path
+    steps = (numbered_files(path, pattern) for pattern in PATTERNS)
+    return next((files[max(files)] for files in steps if files), path)

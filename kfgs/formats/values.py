@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .._arrays import most_unpacked
-from .._check import ORIGIN, as_origin
+from .._check import as_origin
 from .._notes import tell
-from .._origin import choose_origin, to_local
 from ..gaussians import Gaussians
 
 SCORE = "score"  # the column with `Gaussians.scores`
@@ -132,14 +131,6 @@ def whole_labels(values: NDArray[Any]) -> Tensor:  # [N] -> [N] int64
             f"class_id: {values[row]} at Gaussian {row} is not a whole number; name a column of scores 'score'"
         )
     return torch.from_numpy(np.where(unknown, _UNKNOWN, values.astype(np.int64)))
-
-
-def near_zero(g: Gaussians) -> Gaussians:
-    """A cloud as read, with its means in float32, counted from an origin if they are far from zero."""
-    if g.origin != ORIGIN:  # the file has its own
-        return g.replace(means=g.means.float())
-    origin = choose_origin(g.means)
-    return g.replace(means=to_local(g.means, origin), origin=origin)
 
 
 def flip_axes(g: Gaussians, axes: tuple[int, int, int]) -> Gaussians:

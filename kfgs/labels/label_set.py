@@ -64,6 +64,8 @@ class LabelSet:
 
     def index(self, name: str) -> int:
         """The label of a class; for an unknown name, a ValueError lists similar names."""
+        if name in self.names:
+            return self.names.index(name)
         return class_indices(name, self.names, "add its embedding to the classes")[0]
 
     def knows(self, name: str) -> bool:

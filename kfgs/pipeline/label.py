@@ -14,7 +14,7 @@ from .._files import as_path
 from .._origin import recounted
 from ..cameras import Camera
 from ..formats import write_splats
-from ..formats.ply import other_elements, points_from_columns, read_comments, read_ply, write_ply
+from ..formats.ply import points_from_columns, read_header, read_ply, write_ply
 from ..formats.ply_3dgs import label_column
 from ..formats.sidecar import write_names
 from ..gaussians import Gaussians
@@ -50,8 +50,8 @@ def label_cloud(
     """
     assert gaussians.labels is not None
     cloud, out = as_path(cloud), check_suffix(out, ".ply", name="out")
-    columns, others = read_ply(cloud), other_elements(cloud)
-    if others:
+    columns, header = read_ply(cloud), read_header(cloud)
+    if others := [element.name for element in header.elements[1:] if element.rows]:  # for instance the faces of a mesh
         raise ValueError(
             f"{cloud}: expected nothing but points, got {', '.join(others)} too, which labelling would lose; save the "
             "vertices as a point cloud"
@@ -62,7 +62,7 @@ def label_cloud(
     if not {"red", "green", "blue"} & set(columns):
         rgb = palette(moved.labels, gaussians.names)
         added |= {name: np.ascontiguousarray(rgb[:, i]) for i, name in enumerate(("red", "green", "blue"))}
-    write_ply(out, columns | added, comments=("labels carried by kfgs", *read_comments(cloud)))
+    write_ply(out, columns | added, comments=("labels carried by kfgs", *header.comments))
     names = write_names(out, gaussians.names, **{"distance": moved.distance, "distance from": moved.how})
     return moved, [out, names]
 

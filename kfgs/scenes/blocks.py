@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import copy
-import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,16 +10,16 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from .._check import check_whole
-from .._files import as_path, atomic_folder
+from .._files import atomic_folder
 from ..cameras.bounds import robust_bounds
 from .colmap_model import ColmapModel
-from .files import SceneError
-from .pycolmap_import import quiet_pycolmap, scene_errors, without_rigs
+from .files import MAX_NUMBER, SceneError
 
 Array = NDArray[np.float64]
-Box = tuple[tuple[float, ...], tuple[float, ...]]  # low and high corner, world units
+Box = list[list[float]]  # low and high corner, world units
 MARGIN = 0.05  # of the reach's size, added on each side: Gaussians are larger than their centres
 SHARE = 0.01  # an image belongs to a block if at least this share of the points that it sees lie in the core
 
@@ -36,10 +34,10 @@ class Block:
 
     name: str
     core: Box
-    """Infinite at the border of the scene. low <= x < high lies inside."""
+    """Up to `MAX_NUMBER` at the border of the scene. low <= x < high lies inside."""
     reach: Box
     """The box around the core's points and the cameras that see them, with a margin."""
-    views: tuple[str, ...]
+    views: list[str]
     """Names of the images that see the core."""
 
     def holds(self, means: NDArray[Any]) -> NDArray[np.bool_]:  # [N, 3] -> [N]
@@ -51,19 +49,6 @@ class Block:
         low, high = np.array(self.reach)
         near = ((means + radii[:, None] >= low) & (means - radii[:, None] <= high)).all(1)
         return np.asarray(near | self.holds(means))
-
-    def to_json(self) -> dict[str, Any]:
-        """As JSON; an infinite coordinate is null."""
-        core = [[value if math.isfinite(value) else None for value in corner] for corner in self.core]
-        return {"name": self.name, "core": core, "reach": list(map(list, self.reach)), "views": list(self.views)}
-
-    @staticmethod
-    def from_json(value: dict[str, Any]) -> Block:
-        """The inverse of `to_json`."""
-        low, high = value["core"]
-        core = tuple(-math.inf if x is None else x for x in low), tuple(math.inf if x is None else x for x in high)
-        reach = tuple(value["reach"][0]), tuple(value["reach"][1])
-        return Block(value["name"], core, reach, tuple(value["views"]))
 
 
 def partition(model: ColmapModel, count: int) -> list[Block]:
@@ -85,44 +70,36 @@ def partition(model: ColmapModel, count: int) -> list[Block]:
         )
     centers = np.array([-image.pose[:3, :3].T @ image.pose[:3, 3] for image in images if image.pose is not None])
     blocks = []
-    for number, core in enumerate(_cut(model.points[inside], np.array([[-np.inf] * 3, [np.inf] * 3]), count)):
+    for number, core in enumerate(_cut(model.points[inside], np.array([[-MAX_NUMBER] * 3, [MAX_NUMBER] * 3]), count)):
         name, own = f"block{number:0{max(2, len(str(count - 1)))}d}", _within(model.points, core)
         shares = np.array([own[rows].mean() if len(rows) else 0.0 for rows in seen])
         chosen = np.flatnonzero((shares >= SHARE) & (shares > 0))
         if len(chosen) == 0:
             raise SceneError(f"{name}: expected images that see this part of the scene, got none; ask for fewer blocks")
         near = np.concatenate([model.points[own & inside], centers[chosen]])
-        low, high = near.min(0), near.max(0)
-        pad = MARGIN * (high - low)
-        reach = tuple((low - pad).tolist()), tuple((high + pad).tolist())
-        views = tuple(images[i].name for i in chosen)
-        blocks.append(Block(name, (tuple(core[0].tolist()), tuple(core[1].tolist())), reach, views))
+        pad = MARGIN * np.ptp(near, axis=0)
+        reach = [(near.min(0) - pad).tolist(), (near.max(0) + pad).tolist()]
+        blocks.append(Block(name, core.tolist(), reach, [images[i].name for i in chosen]))
     return blocks
 
 
-def write_parts(model: str | Path, parts: Mapping[Path, Iterable[str]]) -> None:
-    """Write COLMAP models with some of the images of another, and the points that at least two of them see.
-
-    `parts` has the folder of each new model, with the names of its images. The model, which `read_whole_model` accepts, is read
-    once, as that of a city has gigabytes; then memory holds it, and a copy from which one part is made.
-    """
-    model = as_path(model)
-    with (
-        without_rigs(model) as safe,
-        quiet_pycolmap() as pycolmap,
-        scene_errors(f"{model}: expected a model that pycolmap can read", "write it again with COLMAP"),
-    ):
-        whole = pycolmap.Reconstruction(str(safe))
-        frames = {image.name: image.frame_id for image in whole.images.values()}
-        for folder, names in parts.items():
-            missing = set(names) - frames.keys()
-            if missing:
-                raise SceneError(f"parts: expected images of {model}, got {min(missing)!r}; correct the name")
-            part = copy.deepcopy(whole)
-            for frame in set(frames.values()) - {frames[name] for name in names}:
-                part.deregister_frame(frame)
-            with atomic_folder(folder) as place:
-                part.write(str(place))
+def write_part(folder: Path, model: ColmapModel, names: Sequence[str]) -> None:
+    """Write a COLMAP model with some of the images of another, and the points that at least two of them see; no 2-D points."""
+    images = {key: image for key, image in model.images.items() if image.name in set(names)}
+    seen, counts = np.unique(np.concatenate([np.unique(i.observed) for i in images.values()]), return_counts=True)
+    kept = np.isin(model.point_ids, seen[counts > 1])
+    cameras, lines = {i.camera_id: model.cameras[i.camera_id] for i in images.values()}, list[str]()
+    for key, image in images.items():
+        assert image.pose is not None  # of an image that sees a block
+        x, y, z, w = Rotation.from_matrix(image.pose[:3, :3]).as_quat().tolist()
+        numbers = " ".join(map(repr, (w, x, y, z, *image.pose[:3, 3].tolist())))
+        lines.append(f"{key} {numbers} {image.camera_id} {image.name}\n\n")
+    with atomic_folder(folder) as place:
+        (place / "images.txt").write_text("".join(lines), encoding="utf-8")
+        heads = [(f"{key} {c.model} {c.width} {c.height}", c.params) for key, c in cameras.items()]
+        (place / "cameras.txt").write_text("".join(f"{head} {' '.join(map(repr, params))}\n" for head, params in heads))
+        rows = np.column_stack([model.point_ids[kept], model.points[kept], model.colors[kept]])
+        np.savetxt(place / "points3D.txt", rows, "%d %.17g %.17g %.17g %d %d %d 0")
 
 
 def _within(points: NDArray[Any], core: Array) -> NDArray[np.bool_]:

@@ -6,15 +6,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from .._files import Names
-from .._notes import Repair
-from ..cameras.camera import Camera, Distortion, DistortionModel
-from .colmap_files import CAMERA_MODELS
-from .colmap_model import ColmapImage, ColmapModel, read_model
+from ..cameras.camera import Distortion, DistortionModel
+from .colmap_model import CAMERA_MODELS, ColmapModel, read_model
 from .files import SceneError, find_pictures, list_images, natural_key, some
-from .posed import NO_POINTS, NOTHING, as_large_as_pictures, assemble_scene
+from .posed import Matrix, PosedPicture, inverse_pose, scene_of_poses
 from .scene import Scene
 
 # COLMAP's model: (our lens, its number of coefficients). COLMAP's own order after the intrinsics is ours in each case:
@@ -29,7 +28,7 @@ LENSES: dict[str, tuple[DistortionModel | None, int]] = {
 PANORAMA = "cut perspective views out of the panoramas, and give these with their poses"  # no undistorter flattens them
 
 
-def convert_intrinsics(model: str, params: Sequence[float]) -> tuple[torch.Tensor, Distortion | None]:
+def convert_intrinsics(model: str, params: Sequence[float]) -> tuple[Matrix, Distortion | None]:
     """K [3, 3] float64 and the lens of a COLMAP camera; a perspective lens with all coefficients zero is a pinhole."""
     if model not in LENSES:
         advice = "undistort the images first (`colmap image_undistorter`)"
@@ -39,7 +38,7 @@ def convert_intrinsics(model: str, params: Sequence[float]) -> tuple[torch.Tenso
         )
     kind, length = LENSES[model]
     fx, fy, cx, cy, *lens = [params[0], *params] if CAMERA_MODELS[model].startswith("f ") else params
-    K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
     if kind is None or (kind == "brown_conrady" and not any(lens)):
         return K, None
     return K, Distortion(kind, tuple(float(k) for k in lens) + (0.0,) * (length - len(lens)))
@@ -50,62 +49,50 @@ def load_colmap(path: Path, images: Path) -> Scene:
     if not images.is_dir():
         raise FileNotFoundError(f"{images}: no such folder; expected the images of {path} there")
     model = read_model(path)
-    views, notes = _posed(model)
-    files, there = find_pictures(images, [view.name for view in views]), list_images(images)
-    names = {name: file.relative_to(images).as_posix() for name, file in files.items()}
-    found = [replace(view, name=names[view.name]) for view in views if view.name in names]
-    missing = [view.name for view in views if view.name not in names]
-    if not found:
-        raise SceneError(
-            f"{images}: expected the images of {path}, none of its {len(views)} posed images ({some(missing, 3)}) "
-            f"is there; give the right image folder ({Names(there).advice(missing[0]) if missing else notes[0]})"
-        )
-    found.sort(key=lambda view: natural_key(view.name))
-    paths = [images / view.name for view in found]
-    cameras, resized = as_large_as_pictures(_cameras(path, model, found), paths, images)
-    notes += resized
-    other = [f"{name} is {file}" for name, file in names.items() if name != file]
-    if other:
-        notes.append(f"{len(other)} images of {images} were found by a name that is spelled otherwise: {some(other)}")
-    known = {view.name for view in (*found, *model.images.values())}
-    extra = [name for name in there if name not in known]
-    if missing:
-        near = f" ({Names(extra).advice(missing[0])})" if extra else ""
-        notes.append(f"{len(missing)} of {len(views)} posed images have no file in {images}: {some(missing)}{near}")
-    if extra:
-        notes.append(f"{len(extra)} image files in {images} have no pose in the model: {some(extra)}")
-    if len(model.points) == 0:
-        notes.append(NO_POINTS)
-    return assemble_scene(cameras, paths, torch.from_numpy(model.points), torch.from_numpy(model.colors), notes)
+    views, there = _views(path, model), list_images(images)
+    names = [view.name for view in views if view.pose is not None]
+    files = find_pictures(images, names)
+    missing = [name for name in names if name not in files]
+    if not files:
+        lost = f"none of its {len(names)} posed images ({some(missing, 3)}) is there"
+        near = Names(there).advice(missing[0]) if missing else f"{len(views)} images have no pose or no usable lens"
+        raise SceneError(f"{images}: expected the images of {path}, {lost}; give the right image folder ({near})")
+    given = {name: file.relative_to(images).as_posix() for name, file in files.items()}
+    extra = sorted(set(there) - set(given.values()) - {view.name for view in views}, key=natural_key)
+    other = [f"{name} is {file}" for name, file in given.items() if name != file]
+    near = f" ({Names(extra).advice(missing[0])})" if missing and extra else ""
+    told = {
+        f"{len(other)} images of {images} were found by a name that is spelled otherwise: {some(other)}": other,
+        f"{len(missing)} of {len(names)} posed images have no file in {images}: {some(missing)}{near}": missing,
+        f"{len(extra)} image files in {images} have no pose in the model: {some(extra)}": extra,
+    }
+    chosen = [view for view in views if view.name in files or view.pose is None]
+    for view in chosen:
+        view.name = given.get(view.name, view.name)
+        view.path = images / view.name
+    points = (torch.from_numpy(model.points), torch.from_numpy(model.colors)) if len(model.points) else None
+    notes = [*model.notes, *(note for note, lost_names in told.items() if lost_names)]
+    return scene_of_poses(path, chosen, points, notes, images)
 
 
 def colmap_cameras(path: Path) -> Scene:
     """The views of a model's images with a pose, whose image files need not be there, without points."""
     model = read_model(path)
-    views, notes = _posed(model)
-    cameras = _cameras(path, model, [replace(view, name=view.name.replace("\\", "/")) for view in views])
-    if not cameras:
-        raise SceneError(f"{path}: expected cameras with poses, got none; run COLMAP again (`kfgs sfm`)")
-    return assemble_scene(cameras, [Path(camera.name) for camera in cameras], *NOTHING, notes)
+    views = [replace(view, name=view.name.replace("\\", "/")) for view in _views(path, model)]
+    return scene_of_poses(path, views, notes=model.notes, pictures=False)
 
 
-def _posed(model: ColmapModel) -> tuple[list[ColmapImage], list[str]]:
-    """The images with a pose and a lens, in natural order of names, and notes about the others and all that is broken."""
-    views = sorted(model.images.values(), key=lambda image: natural_key(image.name))
-    lost = [image.name for image in views if image.pose is None]
-    notes = [Repair(f"{len(lost)} images of the model have no pose and were left out: {some(lost)}")] if lost else []
-    whole = [image for image in views if image.pose is not None and model.cameras[image.camera_id].usable]
-    return whole, [*notes, *model.notes]
-
-
-def _cameras(path: Path, model: ColmapModel, images: list[ColmapImage]) -> list[Camera]:
-    cameras = []
-    for image in images:
-        lens = model.cameras[image.camera_id]
-        try:
-            K, distortion = convert_intrinsics(lens.model, lens.params)
-            pose = torch.from_numpy(image.pose)
-            cameras.append(Camera(pose, K.float(), lens.width, lens.height, image.name, distortion))
-        except ValueError as error:
-            raise SceneError(f"{path}, image {image.name}, camera {image.camera_id}: {error}") from error
-    return cameras
+def _views(path: Path, model: ColmapModel) -> list[PosedPicture]:
+    """The images of a model in natural order of their names."""
+    views = []
+    for image in sorted(model.images.values(), key=lambda image: natural_key(image.name)):
+        lens, where = model.cameras[image.camera_id], f"{path}, image {image.name}, camera {image.camera_id}"
+        view = PosedPicture(image.name, Path(image.name), None, where, size=(lens.width, lens.height))
+        if image.pose is not None:
+            try:
+                view.K, view.distortion = convert_intrinsics(lens.model, lens.params)
+            except ValueError as error:
+                raise SceneError(f"{where}: {error}") from error
+            view.pose = inverse_pose(image.pose)
+        views.append(view)
+    return views

@@ -1,29 +1,58 @@
-"""Read a COLMAP model: refuse what is damaged, leave out numbers that are not finite.
+"""Read a COLMAP model, binary or text: what is damaged is refused, numbers that are not finite are left out.
 
 pycolmap 4.2.1 is not safe with files of strangers: it loads a truncated cameras.bin with wrong intrinsics, a corrupt points3D.bin
-takes all memory, and names in text files are cut at blanks. So models are read here. `rigs` and `frames` (COLMAP 3.12) are not
-needed: the images file has every pose.
+takes all memory, and names in text files are cut at blanks. So models are read here. `rigs` and `frames` (COLMAP 3.12) and the
+tracks of points are not needed: the images file has every pose, and the point that each 2-D point sees.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import mmap
+import re
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from .._files import as_path
+from .._files import as_path, text_encoding
 from .._notes import Repair
-from .colmap_files import CAMERA_MODELS, BinaryTable, CameraRow, ImageRow, Ints, TextTable, require
 from .files import MAX_NUMBER, MAX_SIDE, SceneError, is_inside, some
-from .posed import Matrix, is_rotation, mending_notes
+from .posed import Matrix
 
 FILES = ("cameras", "images", "points3D")
+# The models in the order of COLMAP's ids, with their parameters. Those that begin with f are focal lengths.
+CAMERA_MODELS: dict[str, str] = {
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "FOV": "fx fy cx cy omega",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k",
+    "RADIAL_FISHEYE": "f cx cy k1 k2",
+    "THIN_PRISM_FISHEYE": "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1",
+    "RAD_TAN_THIN_PRISM_FISHEYE": "fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3",
+    "SIMPLE_DIVISION": "f cx cy k",
+    "DIVISION": "fx fy cx cy k",
+    "SIMPLE_FISHEYE": "f cx cy",
+    "FISHEYE": "fx fy cx cy",
+    "EUCM": "fx fy cx cy alpha beta",
+    "EQUIRECTANGULAR": "w h",
+}
 QUATERNION_SLACK = 0.1  # text files are rounded; a norm farther from 1 means a wrong byte
-STRANGE = 0.5  # share of the 2-D points of tracks that see another point: two models, not a damaged one
+LEAST_BYTES = 73  # of an image without 2-D points, with a name of one letter
+_BROKEN = re.compile(r"[+-]?(nan\(\w*\)|1\.#\w+)", re.IGNORECASE)  # numbers that are none, as Windows writes them
+
+Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -35,11 +64,10 @@ class ColmapCamera:
     height: int
     params: tuple[float, ...]
 
-    @property
-    def usable(self) -> bool:
-        """Whether the parameters are plausible numbers, and focal lengths above 0."""
-        focal = [v for name, v in zip(CAMERA_MODELS[self.model].split(), self.params, strict=True) if name[0] == "f"]
-        return all(abs(value) < MAX_NUMBER for value in self.params) and all(f > 0 for f in focal)
+    def __post_init__(self) -> None:
+        size, count = (self.width, self.height), len(CAMERA_MODELS[self.model].split())
+        if not (0 < min(size) <= max(size) <= MAX_SIDE and len(self.params) == count):
+            raise ValueError(f"{len(self.params)} parameters, not {count}, of {self.model}, of {size} pixels")
 
 
 @dataclass(frozen=True)
@@ -49,7 +77,7 @@ class ColmapImage:
     name: str
     camera_id: int
     pose: Matrix | None
-    """[4, 4] world to camera; None if the file has no plausible one."""
+    """[4, 4] world to camera; None if it or the camera has numbers that are not finite or plausible."""
     observed: Ints = field(repr=False)
     """[n] the id of the 3-D point that each 2-D point sees, -1 = none."""
 
@@ -71,139 +99,183 @@ def has_model(path: str | Path) -> bool:
     return any((as_path(path) / f"{name}.{suffix}").is_file() for name in FILES[:2] for suffix in ("bin", "txt"))
 
 
-def model_suffix(folder: Path) -> str | None:
-    """`bin` or `txt`, whichever all three files have; None if neither."""
-    return next((s for s in ("bin", "txt") if all((folder / f"{name}.{s}").is_file() for name in FILES)), None)
+def count_images(model: Path) -> int:
+    """The number of images in a model, without reading them; 0 if it is damaged."""
+    file, lines = model / "images.bin", _lines(model / "images.txt")
+    with suppress(OSError, ValueError):
+        if file.is_file():
+            with file.open("rb") as head:
+                count = int.from_bytes(head.read(8), "little")
+            return count if count * LEAST_BYTES <= file.stat().st_size else 0
+        return sum(next(lines, "") != "" for _ in filter(_is_record, lines))
+    return 0
 
 
 def read_model(path: str | Path) -> ColmapModel:
-    """Read a COLMAP model, binary or, if there is none, text.
+    """Read a COLMAP model, binary or, if there is none, text. A SceneError for one that is damaged names the file.
 
-    What does not fit together is refused. Poses without finite numbers and a unit quaternion become None; points that are not
-    finite, and entries of tracks that lead to no 2-D point (of deleted images), are left out and noted.
+    Poses without finite numbers and a nearly unit quaternion become None; points that are not finite are left out and noted.
     """
     folder = as_path(path)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder; expected a COLMAP model there")
-    suffix = model_suffix(folder)
-    if suffix is None:
+    whole = [s for s in ("bin", "txt") if all((folder / f"{name}.{s}").is_file() for name in FILES)]
+    if not whole:
         present = sorted(file.name for file in folder.iterdir() if file.stem in FILES)
         raise SceneError(
             f"{folder}: expected a COLMAP model (cameras, images and points3D, all as .bin or all as .txt), got "
             f"{', '.join(present) or 'none of these files'}; copy the missing files or run COLMAP (`kfgs sfm`)"
         )
-    files = [folder / f"{name}.{suffix}" for name in FILES]
-    table, scales = BinaryTable if suffix == "bin" else TextTable, dict[str, float]()
-    cameras = _cameras(table(files[0]).cameras())
-    images = _images(table(files[1]).images(), cameras, scales)
-    rows = sorted(table(files[2]).points(), key=lambda row: row[0])
-    ids = np.array([row[0] for row in rows], np.int64)
-    points = np.array([row[1] for row in rows], np.float64).reshape(-1, 3)
-    colors = np.array([row[2] for row in rows], np.uint8).reshape(-1, 3)
-    twice = ids[1:][ids[1:] == ids[:-1]]
-    require(len(twice) == 0, str(files[2]), "each point id once", f"{twice[:1]} again")
-    notes = _check_tracks(str(files[2]), ids, [row[3] for row in rows], images) + mending_notes([], scales)
-    good = (np.abs(points) < MAX_NUMBER).all(1)  # NaN fails
-    if not good.all():
-        lost = some(list(map(str, ids[~good])))
-        notes.append(f"{(~good).sum()} of {len(ids)} points have no finite place and were left out (ids {lost})")
-    lensless = [image.name for image in images.values() if not cameras[image.camera_id].usable]
-    if lensless:
-        lens = "a camera without a focal length above 0 and finite parameters"
-        notes.append(f"{len(lensless)} images have {lens}: {some(lensless)}")
-    return ColmapModel(cameras, images, ids[good], points[good], colors[good], tuple(map(Repair, notes)))
+    cameras, images, points = (_read_table(folder / f"{name}.{whole[0]}", name) for name in FILES)
+    for key, image in images.items():
+        if image.camera_id not in cameras:
+            raise SceneError(
+                f"{folder}: expected cameras for all images, got none for image {key} (camera {image.camera_id}); copy the "
+                "cameras and images files of one model"
+            )
+        if not _is_usable(cameras[image.camera_id]):
+            images[key] = ColmapImage(image.name, image.camera_id, None, image.observed)
+    ids = np.array(sorted(points), np.int64)
+    places = np.array([points[i][0] for i in ids.tolist()], np.float64).reshape(-1, 3)
+    colors = np.array([points[i][1] for i in ids.tolist()], np.uint8).reshape(-1, 3)
+    good = (np.abs(places) < MAX_NUMBER).all(1)  # NaN fails
+    lost = some(list(map(str, ids[~good])))
+    note = f"{(~good).sum()} of {len(ids)} points have no finite place and were left out (ids {lost})"
+    return ColmapModel(cameras, images, ids[good], places[good], colors[good], (Repair(note),) if lost else ())
 
 
-def read_whole_model(path: str | Path) -> ColmapModel:
-    """Read a model of which pycolmap needs all: nothing may be left out."""
-    model = read_model(path)
-    advice = "write a whole binary model with COLMAP, or estimate one: `kfgs sfm PHOTOS --out OUT`"
-    require(not model.notes, str(path), "a model with nothing broken, for pycolmap", "; ".join(model.notes), advice)
-    blank = next((image.name for image in model.images.values() if len(image.name.split()) > 1), "")
-    expected = "names without blanks, at which COLMAP cuts those of text files"
-    require(model_suffix(as_path(path)) == "bin" or not blank, str(path), expected, repr(blank), advice)
-    return model
+def _read_table(file: Path, name: str) -> dict[int, Any]:
+    """The records of a file by their ids."""
+    table = dict[int, Any]()
+    try:
+        for key, value in READERS[name + file.suffix](file):
+            if key in table:
+                raise ValueError(f"id {key} again")
+            table[key] = value
+    except (ValueError, KeyError, OverflowError, struct.error) as error:
+        raise SceneError(
+            f"{file}: expected a COLMAP model, but record {len(table) + 1} is truncated or damaged ({error}); copy the model "
+            "again from its source, or write it again with COLMAP"
+        ) from error
+    return table
 
 
-def _cameras(rows: Iterator[CameraRow]) -> dict[int, ColmapCamera]:
-    cameras: dict[int, ColmapCamera] = {}
-    for where, camera_id, model, width, height, params in rows:
-        require(model in CAMERA_MODELS, where, f"a MODEL of {', '.join(CAMERA_MODELS)}", repr(model))
-        count = len(CAMERA_MODELS[model].split())
-        expected = f"the parameters {CAMERA_MODELS[model]} of {model}"
-        require(len(params) == count, where, expected, f"{len(params)}")
-        good = 0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE
-        require(good, where, f"an image of 1 to {MAX_SIDE} pixels a side", f"{width} x {height}")
-        require(camera_id not in cameras, where, "an id that no other has", f"{camera_id} again")
-        cameras[camera_id] = ColmapCamera(model, width, height, params)
-    return cameras
+class _Binary:
+    """A file of little-endian records without padding. It is mapped: only the parts that are used take memory."""
+
+    def __init__(self, file: Path) -> None:
+        with file.open("rb") as opened:
+            self.data, self.at = mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ), 0
+
+    def records(self) -> Iterator[_Binary]:
+        """This, at the beginning of each record; the file must end after the last."""
+        for _ in range(*self.take("Q")):
+            yield self
+        if self.at != len(self.data):
+            raise ValueError(f"{len(self.data) - self.at} bytes follow the last")
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        values = struct.unpack_from("<" + layout, self.data, self.at)
+        self.at += struct.calcsize("<" + layout)
+        return values
+
+    def take_name(self) -> str:
+        end = self.data.find(b"\0", self.at)
+        if end < 0:
+            raise ValueError("its name does not end")
+        start, self.at = self.at, end + 1
+        return self.data[start:end].decode("utf-8")
+
+    def take_array(self, dtype: np.dtype[Any]) -> NDArray[Any]:
+        (count,) = self.take("Q")
+        values = np.frombuffer(self.data, dtype, count, self.at)  # refuses more than there is
+        self.at += values.nbytes
+        return values
 
 
-def _images(
-    rows: Iterator[ImageRow], cameras: dict[int, ColmapCamera], scales: dict[str, float]
-) -> dict[int, ColmapImage]:
-    images: dict[int, ColmapImage] = {}
-    names: dict[str, int] = {}
-    for where, image_id, numbers, camera_id, name, observed in rows:
-        rename = "rename the image in the model (no absolute path, no '..', no control characters)"
-        expected = "an image's file name inside the image folder"
-        require(name.isprintable() and is_inside(name), where, expected, repr(name), rename)
-        known = f"a camera of the model ({', '.join(map(str, sorted(cameras)[:8])) or 'it has none'})"
-        require(camera_id in cameras, where, f"image {image_id}: {known}", f"camera {camera_id}")
-        expected = f"image {image_id}: a name that no other image has"
-        require(name not in names, where, expected, f"{name!r} again (as image {names.get(name)})")
-        require(image_id not in images, where, "an id that no other has", f"{image_id} again")
-        pose = _pose(numbers, f"image {image_id}", scales)
-        images[image_id], names[name] = ColmapImage(name, camera_id, pose, observed), image_id
-    return images
+def _binary_cameras(file: Path) -> Iterator[tuple[int, ColmapCamera]]:
+    models = dict(enumerate(CAMERA_MODELS))
+    for record in _Binary(file).records():
+        key, number, width, height = record.take("IiQQ")
+        params = record.take(f"{len(CAMERA_MODELS[models[number]].split())}d")
+        yield key, ColmapCamera(models[number], width, height, params)
 
 
-def _pose(numbers: tuple[float, ...], key: str, scales: dict[str, float]) -> Matrix | None:  # [4, 4]
-    """A pose from qw qx qy qz tx ty tz; None if they are not finite, or the first four not a unit quaternion.
+def _binary_images(file: Path) -> Iterator[tuple[int, ColmapImage]]:
+    points = np.dtype([("xy", "<f8", 2), ("id", "<i8")])
+    for record in _Binary(file).records():
+        key, *pose, camera_id = record.take("I7dI")
+        name = record.take_name()
+        yield key, _image(name, camera_id, pose, record.take_array(points)["id"].astype(np.int64))
 
-    As in pycolmap, the quaternion is not normalised, unless the result is not a rotation for `Camera`; then `scales` receives
-    its length.
-    """
+
+def _binary_points(file: Path) -> Iterator[tuple[int, tuple[Any, ...]]]:
+    track = np.dtype(("<u4", 2))
+    for record in _Binary(file).records():
+        key, x, y, z, *color, _ = record.take("q3d3Bd")
+        record.take_array(track)
+        yield key, ((x, y, z), color)
+
+
+def _lines(file: Path) -> Iterator[str]:
+    with file.open(encoding=text_encoding(file)) as lines:
+        yield from lines
+
+
+def _is_record(line: str) -> bool:
+    return bool(line.strip()) and not line.lstrip().startswith("#")
+
+
+def _number(word: str) -> float:
+    return math.nan if _BROKEN.fullmatch(word) else float(word)
+
+
+def _text_cameras(file: Path) -> Iterator[tuple[int, ColmapCamera]]:
+    for line in filter(_is_record, _lines(file)):
+        key, model, width, height, *params = line.split()
+        yield int(key), ColmapCamera(model, int(width), int(height), tuple(map(_number, params)))
+
+
+def _text_images(file: Path) -> Iterator[tuple[int, ColmapImage]]:
+    """Two lines each, of which the second may be empty."""
+    lines = _lines(file)
+    for line in filter(_is_record, lines):
+        key, *pose, camera_id, name = line.strip().split(maxsplit=9)  # a name may hold blanks
+        points = next(lines, "no line of 2-D points").split()
+        if len(points) % 3 or len(pose) != 7:
+            raise ValueError(f"{points[:4]} are not 2-D points as X Y POINT3D_ID, or there are {len(pose)} numbers")
+        yield int(key), _image(name, int(camera_id), list(map(_number, pose)), np.array(points[2::3], np.int64))
+
+
+def _text_points(file: Path) -> Iterator[tuple[int, tuple[Any, ...]]]:
+    for line in filter(_is_record, _lines(file)):
+        key, x, y, z, r, g, b, _ = line.split(maxsplit=8)[:8]
+        color = int(r), int(g), int(b)
+        if not 0 <= min(color) <= max(color) <= 255:
+            raise ValueError(f"colour {color}")
+        yield int(key), ((_number(x), _number(y), _number(z)), color)
+
+
+READERS: dict[str, Callable[[Path], Iterator[tuple[int, Any]]]] = {
+    "cameras.bin": _binary_cameras, "images.bin": _binary_images, "points3D.bin": _binary_points,
+    "cameras.txt": _text_cameras, "images.txt": _text_images, "points3D.txt": _text_points,
+}  # fmt: skip
+
+
+def _is_usable(camera: ColmapCamera) -> bool:
+    """Whether the parameters are plausible numbers, and focal lengths above 0."""
+    named = zip(CAMERA_MODELS[camera.model].split(), camera.params, strict=True)
+    return all(abs(value) < MAX_NUMBER and (value > 0 or name[0] != "f") for name, value in named)
+
+
+def _image(name: str, camera_id: int, numbers: list[float], observed: Ints) -> ColmapImage:
+    """An image with its pose from qw qx qy qz tx ty tz."""
+    if not (name.isprintable() and is_inside(name)):
+        raise ValueError(f"{name!r} is not a file inside the image folder: rename the image in the model")
     norm = math.hypot(*numbers[:4])
     if not abs(norm - 1) < QUATERNION_SLACK or not all(abs(number) < MAX_NUMBER for number in numbers):
-        return None
-    w, x, y, z, *translation = numbers
-    x2, y2, z2 = 2 * x, 2 * y, 2 * z
+        return ColmapImage(name, camera_id, None, observed)
+    w, x, y, z, *place = numbers
     pose = np.eye(4)
-    pose[:3, :3] = [
-        [1 - (y2 * y + z2 * z), y2 * x - z2 * w, z2 * x + y2 * w],
-        [y2 * x + z2 * w, 1 - (x2 * x + z2 * z), z2 * y - x2 * w],
-        [z2 * x - y2 * w, z2 * y + x2 * w, 1 - (x2 * x + y2 * y)],
-    ]
-    pose[:3, 3] = translation
-    if is_rotation(pose[:3, :3]):
-        return pose
-    scales[key] = norm
-    return _pose((*(number / norm for number in numbers[:4]), *translation), key, {})
-
-
-def _check_tracks(where: str, ids: Ints, tracks: list[Ints], images: dict[int, ColmapImage]) -> list[str]:
-    """A note if 2-D points that tracks name are not there, or do not name the point of the track.
-
-    kfgs does not use the tracks. But images and points of which most do not fit together come from two different models.
-    """
-    owner = np.repeat(ids, list(map(len, tracks)))
-    image_ids, numbers = np.concatenate([np.zeros((0, 2), np.int64), *tracks]).T
-    known = sorted(images)
-    sizes = np.array([len(images[i].observed) for i in known], np.int64)
-    seen = np.concatenate([np.zeros(0, np.int64), *(images[i].observed for i in known)])
-    place, there = np.searchsorted(known, image_ids), np.isin(image_ids, known)
-    there[there] = numbers[there] < sizes[place[there]]
-    good = there.copy()
-    good[there] = seen[(np.cumsum(sizes) - sizes)[place[there]] + numbers[there]] == owner[there]
-    if good.all():
-        return []
-    strange, lost = there & ~good, sorted(set(image_ids.tolist()) - set(images))
-    wrong = int(np.flatnonzero(strange if strange.any() else ~good)[0])
-    example = f"point {owner[wrong]} names 2-D point {numbers[wrong]} of image {image_ids[wrong]}"
-    got = f"{strange.sum()} that see other points ({example})"
-    fits = strange.sum() <= STRANGE * there.sum()
-    require(fits, where, "tracks over 2-D points that see them", got, "copy the images and points files of one model")
-    gone = f"; images {some(list(map(str, lost)))} are not in the model" if lost else ""
-    count = f"{(~good).sum()} of {len(good)} entries of tracks"
-    return [f"{count} lead to no 2-D point that sees the point and were left out ({example}{gone})"]
+    pose[:3, :3], pose[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), place
+    return ColmapImage(name, camera_id, pose, observed)

@@ -15,7 +15,7 @@ from ..cameras.camera import Camera
 from ..cameras.projection import unproject_depth
 from .files import SceneError, is_file, open_picture, read_alpha, read_image
 from .masks import folder_masks, picture_folder, read_mask
-from .posed import Matrix, PosedPicture
+from .posed import Matrix, PosedPicture, mend_pose
 
 MILLIMETRE = 1e-3  # metres: the step of most depth pictures
 DEPTH_VIEWS = 25  # depth pictures that are read: enough to see a room from all sides, a second to decode
@@ -36,40 +36,37 @@ def read_depth(path: Path) -> NDArray[Any]:  # [H, W]
 
 def points_from_depth(
     views: Sequence[PosedPicture],
-    depths: Sequence[Path],
     unit: float = MILLIMETRE,
     K: Matrix | None = None,  # [3, 3]
 ) -> tuple[Tensor, Tensor] | None:  # [P, 3] float64, [P, 3] uint8
     """About `DEPTH_POINTS` points of surfaces with their colours, from `DEPTH_VIEWS` evenly chosen depth pictures.
 
-    Pixels that are masked or transparent in the colour picture give none. Views without a pose and missing depth pictures are
-    left out.
+    Pixels that are masked or transparent in the colour picture give none. Views without a pose, with a lens, or without a depth
+    picture are left out.
 
     Args:
         views: the pictures.
-        depths: their depth pictures.
         unit: world units per step of the depth pictures.
-        K: intrinsics of the depth pictures. None takes those of each view (`lens`), resized: pictures and depth then show
-            the same. A colour is that of the same place in the colour picture.
+        K: intrinsics of the depth pictures. None takes those of each view, resized: pictures and depth then show the same. A
+            colour is that of the same place in the colour picture.
 
     Returns:
         The points, or None if there is no depth.
     """
-    pairs = [(v, d) for v, d in zip(views, depths, strict=True) if np.isfinite(v.pose).all() and is_file(d)]
+    usable = [v for v in views if v.depth is not None and is_file(v.depth) and v.distortion is None]
+    pairs = [(view, pose) for view in usable if (pose := mend_pose(view.pose)[0]) is not None]
     if not pairs:
         return None
     chosen = [pairs[i] for i in np.unique(np.linspace(0, len(pairs) - 1, DEPTH_VIEWS).round().astype(int))]
     names = [view.name for view, _ in chosen]
     masks = folder_masks(names, picture_folder(names[0], chosen[0][0].path))[0] or [None] * len(chosen)
     points, colors = [], []
-    for (view, file), folder_mask in zip(chosen, masks, strict=True):
-        depth, image = read_depth(file).astype(np.float64) * unit, read_image(view.path).numpy()
+    for (view, pose), folder_mask in zip(chosen, masks, strict=True):
+        assert view.depth is not None
+        depth, image = read_depth(view.depth).astype(np.float64) * unit, read_image(view.path).numpy()
         height, width = depth.shape
         step = max(int(np.sqrt(height * width * len(chosen) / DEPTH_POINTS)), 1)
-        own = K
-        if own is None:
-            assert view.lens is not None
-            own = np.diag([width / view.lens[1][0], height / view.lens[1][1], 1.0]) @ view.lens[0]
+        own = np.diag([width / view.size[0], height / view.size[1], 1.0]) @ view.K if K is None else K
         y, x = (axis.reshape(-1) for axis in np.mgrid[step // 2 : height : step, step // 2 : width : step])
         rows, columns = y * image.shape[0] // height, x * image.shape[1] // width  # in the colour picture
         mask, alpha, known = view.mask or folder_mask, read_alpha(view.path), depth[y, x] > 0
@@ -79,7 +76,7 @@ def points_from_depth(
             known &= (alpha > 0.5).numpy()[rows, columns]
         camera = Camera(torch.eye(4), torch.from_numpy(own), width, height)
         local = unproject_depth(camera, torch.from_numpy(depth)).numpy()[y[known], x[known]]
-        points.append(local @ view.pose[:3, :3].T + view.pose[:3, 3])
+        points.append(local @ pose[:3, :3].T + pose[:3, 3])
         colors.append(image[rows[known], columns[known]])
     shades = torch.from_numpy((np.concatenate(colors) * 255).round().astype(np.uint8))
     return torch.from_numpy(np.concatenate(points)), shades

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from .._check import one_line
+from .._check import as_tensor, check_shapes, one_line
 from .._files import as_path, digest_file, locked, read_json, write_json
 from .feature_files import ENDINGS, OWN, save_feature_map
 from .files import is_inside, read_image
@@ -39,9 +39,10 @@ class Manifest:
     pictures: dict[str, str] = field(default_factory=dict)
     """The SHA-256 of each picture, by the stem of its map."""
 
-    def save(self, folder: Path) -> None:
-        """Write `features.json`."""
-        write_json(folder / MANIFEST, {"format": FORMAT, **asdict(self)})
+
+def _write_manifest(folder: Path, manifest: Manifest) -> Manifest:
+    write_json(folder / MANIFEST, {"format": FORMAT, **asdict(manifest)})
+    return manifest
 
 
 def read_manifest(folder: str | Path) -> Manifest | None:
@@ -109,43 +110,40 @@ def extract_features(
             for stem in filter(is_inside, manifest.pictures):
                 (folder / f"{stem}{OWN}").unlink(missing_ok=True)
             manifest = Manifest(identity)
-        manifest.save(folder)
+        _write_manifest(folder, manifest)
         channels: int | None = None
         for stem, path in tqdm(pictures.items(), desc="features", unit="image", disable=not progress):
             digest, file = digest_file(path), folder / f"{stem}{OWN}"
             if file.is_file() and manifest.pictures.get(stem) == digest:
                 continue
             with torch.inference_mode():
-                features = encode(read_image(path).permute(2, 0, 1).contiguous())
-                half = _half(features, f"teacher {identity['name']!r}", path)
-            if half.shape[2] != (channels or half.shape[2]):
-                raise ValueError(
-                    f"teacher {identity['name']!r}: expected {channels} channels for {path} as before, got {half.shape[2]}; use "
-                    "one teacher with the same options for all pictures"
-                )
-            channels = int(half.shape[2])
-            save_feature_map(folder, stem, half)
-            manifest = replace(manifest, pictures={**manifest.pictures, stem: digest})
-            manifest.save(folder)
+                answer = encode(read_image(path).permute(2, 0, 1).contiguous())
+            try:
+                features = as_tensor("features", answer, floating=True)
+                check_shapes(("features", features, "D h w" if channels is None else (channels, "h", "w")))
+                save_feature_map(folder, stem, features.permute(1, 2, 0))
+            except (ValueError, TypeError) as error:
+                raise type(error)(f"teacher {identity['name']!r}, for {path}: {error}") from error
+            channels = int(features.shape[0])
+            manifest = _write_manifest(folder, replace(manifest, pictures={**manifest.pictures, stem: digest}))
     return manifest
 
 
 def _as_encoder(teacher: Any) -> tuple[Callable[[Tensor], Tensor], dict[str, Any]]:
     """The function from a picture to features, and what is known about the teacher as JSON."""
-    encode = getattr(teacher, "encode_image", teacher)
+    encode, version = getattr(teacher, "encode_image", teacher), str(getattr(teacher, "version", ""))
     if inspect.isclass(teacher) or not callable(encode):
         raise TypeError(
             f"teacher: expected an object with encode_image, or a function from [3, H, W] to [D, h, w], got {teacher!r:.80}; "
             "load_teacher(name) loads one"
         )
     name = getattr(teacher, "name", None) or getattr(teacher, "__name__", type(teacher).__name__)
-    version = getattr(teacher, "version", "")
-    identity = getattr(teacher, "identity", None) or ({"version": str(version)} if version else {})
+    identity = getattr(teacher, "identity", None) or ({"version": version} if version else {})
     try:
         return encode, json.loads(json.dumps({"name": name, **identity}, allow_nan=False))  # tuples become lists
     except (TypeError, ValueError) as error:
         raise TypeError(
-            f"teacher.identity: expected plain values that JSON can hold, got {identity!r} ({error}); leave out the rest"
+            f"teacher.identity: expected plain values that JSON can hold, got {identity!r} ({error})"
         ) from error
 
 
@@ -167,27 +165,3 @@ def _check_folder(folder: Path, identity: dict[str, Any], stems: list[str], over
             f"({one_line(json.dumps(there), 200)}); use another folder, or pass overwrite=True to give up its "
             f"{len(manifest.pictures)} maps"
         )
-
-
-def _half(features: Any, teacher: str, picture: Path) -> Tensor:  # [D, h, w] -> [h, w, D] float16
-    """A teacher's answer as it is stored: channels last, rounded to half precision, on the CPU."""
-    if not isinstance(features, Tensor) or features.layout != torch.strided:
-        raise TypeError(f"{teacher}: expected a dense tensor [D, h, w], got a {type(features).__name__}")
-    if features.ndim != 3 or 0 in features.shape or not features.is_floating_point():
-        raise ValueError(
-            f"{teacher}: expected floats [D, h, w] for one picture, got {features.dtype} {tuple(features.shape)}; leave out "
-            "the batch axis"
-        )
-    half = features.permute(1, 2, 0).to(torch.float16).cpu().contiguous()
-    if not bool(torch.isfinite(half).all()):
-        raise ValueError(
-            f"{teacher}: expected finite features below 65504 (they are stored as float16) for {picture}, got values from "
-            f"{float(features.min()):g} to {float(features.max()):g}; check its weights, or scale the rows"
-        )
-    empty = ~half.any(-1)
-    if bool(empty.any()) and bool(features[:, empty.to(features.device)].any()):
-        raise ValueError(
-            f"{teacher}: expected features above 6e-8 (they are stored as float16) for {picture}, got some that become "
-            "all-zero, which means unknown; scale them, or bring the rows to unit length"
-        )
-    return half

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .._arrays import FileError, read_array, read_safetensors
+from .._arrays import read_array, read_safetensors, reading
 from .._check import as_tensor, check_shapes
 from .._files import as_path, atomic_path
 from ..cameras.resample import fits_aspect
@@ -39,13 +39,18 @@ def open_map(
     picture; if both fit, [h, w, D]. If nothing is known, a first axis of twice the others' size is D. `size` is that
     of the view's picture; `own` says that kfgs wrote the map.
     """
-    try:
-        values = _load(file)
-    except FileError:
-        raise
-    except Exception as error:  # a damaged pickle raises almost anything: struct.error, KeyError, EOFError, ...
-        reason = str(error).split(". ")[0].strip()[:120]
-        raise ValueError(f"{file}: expected a feature map, but it cannot be read ({reason}); {AGAIN}") from error
+    if file.name.endswith(OWN):
+        values: Any = read_array(file, "a feature map", AGAIN)
+    else:
+        with reading(file, "a feature map", AGAIN):
+            if file.name.endswith(SAFETENSORS):
+                (values,) = read_safetensors(file)[0].values()
+            else:
+                values = torch.load(file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file))
+            if isinstance(values, Tensor) and values.layout == torch.strided:
+                if values.untyped_storage().nbytes() < values.numel() * values.element_size():
+                    raise ValueError("its values repeat")  # a few bytes on disk that would fill the memory
+                values = values.detach()  # saved by a training run, it may ask for gradients
     if not isinstance(values, np.ndarray) and not (isinstance(values, Tensor) and values.layout == torch.strided):
         kind = type(values).__name__
         raise TypeError(f"{file}: expected one dense tensor of features, got a {kind}; save the tensor alone")
@@ -67,20 +72,6 @@ def open_map(
     if not turned:
         return values
     return values.permute(1, 2, 0) if isinstance(values, Tensor) else values.transpose(1, 2, 0)
-
-
-def _load(file: Path) -> Any:
-    if file.name.endswith(OWN):
-        return read_array(file, "a feature map", AGAIN)
-    if file.name.endswith(SAFETENSORS):
-        (tensor,) = read_safetensors(file, "a feature map", AGAIN)[0].values()
-        return tensor
-    values = torch.load(file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file))
-    if not isinstance(values, Tensor) or values.layout != torch.strided:
-        return values
-    if values.untyped_storage().nbytes() < values.numel() * values.element_size():
-        raise ValueError("its values repeat")  # a few bytes on disk that would fill the memory
-    return values.detach()  # saved by a training run, it may ask for gradients
 
 
 def read_rows(
@@ -110,15 +101,18 @@ def save_feature_map(path: str | Path, stem: str, features: Tensor) -> Path:  # 
     """Write one view's map as kfgs stores it: `<stem>.npy`, float16 [h, w, D]; the file appears whole or not at all.
 
     Raises:
-        ValueError: if `features` is not [h, w, D], or not finite in float16 (largest value 65504).
+        ValueError: if `features` is not [h, w, D], not finite in float16 (largest value 65504), or becomes all-zero there in
+            some cells but not before (below 6e-8).
     """
     features = as_tensor("features", features, floating=True)
     check_shapes(("features", features, "h w D"))
     half = features.detach().to(torch.float16).cpu().contiguous()
-    if count_bad(half):
+    empty = ~half.any(-1)
+    if 0 in half.shape or count_bad(half) or bool(features[empty.to(features.device)].any()):
+        low, high = (float(end) for end in features.aminmax()) if features.numel() else (0.0, 0.0)
         raise ValueError(
-            f"features: expected finite values below 65504 (they are stored as float16), got others for {stem!r}; "
-            "normalise the rows"
+            f"features: expected finite values below 65504 and, where they are not all zero, above 6e-8 (they are stored as "
+            f"float16), got {tuple(half.shape)} from {low:g} to {high:g} for {stem!r}; bring the rows to unit length"
         )
     target = as_path(path) / f"{stem}{OWN}"
     with atomic_path(target) as temporary, temporary.open("wb") as file:

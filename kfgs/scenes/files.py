@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import re
 import warnings
@@ -20,7 +19,6 @@ from .._check import one_line
 from .._files import Names, as_path, folded_name, read_json
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
-HEIC_SUFFIXES = (".heic", ".heif")  # photographs by phones: Pillow reads them with pillow-heif only, and pycolmap never
 MASKS = "masks"  # the folder of the masks of photos, as in COLMAP, brush and LichtFeld
 ORIENTATION = 0x0112  # EXIF's tag
 PIXELS, SMALL, COLORS, PACKED = 1 << 27, 1 << 24, 9 << 20, 200
@@ -128,7 +126,7 @@ def has_alpha(path: Path) -> bool:
     try:
         with open_picture(path) as picture:
             return _may_be_clear(picture)
-    except (OSError, ImportError, SceneError):
+    except (OSError, SceneError):
         return False
 
 
@@ -151,19 +149,12 @@ def open_picture(
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our limits come next
-            if path.suffix.lower() in HEIC_SUFFIXES:
-                importlib.import_module("pillow_heif").register_heif_opener()
             picture = Image.open(path)
         with picture:
             width, height = picture.size
             if width * height > min(PIXELS, max(small, PACKED * path.stat().st_size)):
                 raise ValueError(f"{width}x{height} pixels in {path.stat().st_size} bytes are too many to be one")
             yield picture
-    except ImportError as error:
-        advice = "pip install pillow-heif (or save them as JPEG)"
-        raise ImportError(
-            f"{path}: expected pillow-heif to read HEIC photographs, but it is not installed; run: {advice}"
-        ) from error
     except Exception as error:  # hostile bytes raise almost anything, memory may be short
         why = one_line(error, 160) or type(error).__name__
         raise SceneError(f"{path}: expected {expected}, but it cannot be decoded ({why}); {advice}") from error

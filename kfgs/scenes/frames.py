@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Any, NamedTuple
 
@@ -57,8 +57,8 @@ class Alignment:
     """Cameras that fit."""
     count: int
     """Cameras that were compared."""
-    details: dict[str, Any] = field(default_factory=dict)
-    """More numbers as JSON, for instance the worst cameras by name."""
+    left_out: tuple[str, ...]
+    """Names of the cameras that do not fit."""
 
     def __repr__(self) -> str:
         return f"Alignment({self.summary})"
@@ -73,9 +73,9 @@ class Alignment:
 
     def to_json(self) -> dict[str, Any]:
         """The similarity's matrix and every number, as plain lists and floats."""
-        matrix, scale = self.similarity.matrix().tolist(), float(self.similarity.scale)
         facts = {"rms": self.rms, "rms of extent": self.rms / self.size, "inliers": self.inliers, "count": self.count}
-        return {"matrix": matrix, "scale": scale, **facts, **self.details}
+        motion = {"matrix": self.similarity.matrix().tolist(), "scale": self.similarity.scale}
+        return {**motion, **facts, "left out": list(self.left_out)}
 
 
 def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
@@ -116,14 +116,10 @@ def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
             f"cameras: expected at least half of the {len(pairs)} common cameras to fit one similarity, got "
             f"{int(good.sum())}; check that the names mean the same pictures in both, or pass the similarity"
         )
-    errors, angles = _errors(similarity, A, B, turns)
-    details = {
-        "worst cameras": {names[i]: float(errors[i]) for i in np.argsort(-errors)[:5]},
-        "left out": [name for name, ok in zip(names, good, strict=True) if not ok],
-        "median angle": float(np.median(angles[good])),
-    }
+    errors = _errors(similarity, A, B, turns)[0]
+    lost = tuple(name for name, ok in zip(names, good, strict=True) if not ok)
     rms = float(np.sqrt((errors[good] ** 2).mean()))
-    return Alignment(similarity.between_worlds(*origins), rms, size, int(good.sum()), len(pairs), details)
+    return Alignment(similarity.between_worlds(*origins), rms, size, int(good.sum()), len(pairs), lost)
 
 
 def _common_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> list[tuple[Camera, Camera]]:

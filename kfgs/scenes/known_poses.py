@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
-from tqdm import tqdm
+from torch import Tensor
 
 from .._files import real_path
 from ..cameras.camera import Camera
 from .files import SceneError
-from .pycolmap_import import quiet_pycolmap, scene_errors
 from .scene import Scene, check_is_scene
-from .sfm import SfmConfig, SfmRun
+from .sfm import SfmConfig, SfmRun, sfm_run
 
 MOST_VIEWS = 200  # that `find_points` looks at, evenly chosen: about 100,000 points of a room in some minutes
 NEIGHBOURS = 20  # views that each view is compared with: twice what COLMAP takes of a video
@@ -49,44 +48,44 @@ def find_points(scene: Scene, *, config: SfmConfig | None = None, progress: bool
     for path in seen.image_paths:
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such file; expected a picture of the scene there")
+    what = "scene: expected pictures that fit their poses"
     advice = "check the pictures, or estimate the poses again (`kfgs sfm --ignore-poses`)"
-    with (
-        tempfile.TemporaryDirectory(prefix="kfgs-points-") as scratch,
-        quiet_pycolmap() as pycolmap,
-        scene_errors("scene: expected pictures that fit their poses", advice),
-        tqdm(disable=not progress, unit="image") as bar,
-    ):
-        folder, photos = Path(scratch) / "images", {}
-        folder.mkdir()
+    with tempfile.TemporaryDirectory(prefix="kfgs-points-") as scratch:
+        folder, photos = Path(scratch), {}
         for i, path in enumerate(seen.image_paths):
             name = f"{i:06d}{path.suffix.lower()}"  # pycolmap cuts names at blanks in a list of pairs
             (folder / name).symlink_to(real_path(path))
             photos[name] = (path, None if seen.masks is None else seen.masks[i])
-        names, known = list(photos), _reconstruction(pycolmap, seen, list(photos))
-        run = SfmRun(pycolmap, folder, Path(scratch), config or SfmConfig(), bar, photos)
-        with pycolmap.Database.open(run.database) as database:
-            for kind in ("camera", "rig", "frame", "image"):
-                for value in getattr(known, f"{kind}s").values():
-                    getattr(database, f"write_{kind}")(value, **{f"use_{kind}_id": True})
-        run.extract(known=True)
-        run.match_pairs([(names[a], names[b]) for a, b in neighbours(seen.cameras)])
-        (run.scratch / "points").mkdir()
-        pycolmap.triangulate_points(known, run.database, str(folder), str(run.scratch / "points"), True, run.options())
-        with pycolmap.Database.open(run.database) as database:
-            matches = sum(len(pair.inlier_matches) for pair in database.read_two_view_geometries()[1])
-        lengths = [len(point.track.elements) for point in known.points3D.values()]
-        agree = sum(n * (n - 1) // 2 for n in lengths)
-        if len(lengths) < FEWEST or agree < AGREEING * matches:
-            raise SceneError(
-                f"scene: expected pictures that fit their poses, got {matches} matches between them of which {agree} agree "
-                f"with the poses ({len(lengths)} points); do the poses belong to these pictures, and is their axis convention "
-                "right? Else estimate them again (`kfgs sfm --ignore-poses`)"
-            )
-        known.extract_colors_for_all_images(str(folder))
-        points = [known.points3D[i] for i in sorted(known.points3D)]
-    places = torch.from_numpy(np.array([point.xyz for point in points])).float()
-    colors = torch.from_numpy(np.array([point.color for point in points], np.uint8))
+        with sfm_run(folder, photos, config or SfmConfig(), what, advice, progress) as run:
+            places, colors = _triangulate(run, seen)
     return replace(scene, points=places, colors=colors)
+
+
+def _triangulate(run: SfmRun, seen: Scene) -> tuple[Tensor, Tensor]:  # [P, 3] float32, [P, 3] uint8
+    pycolmap, names = run.pycolmap, list(run.photos)
+    known = _reconstruction(pycolmap, seen, names)
+    with pycolmap.Database.open(run.database) as database:
+        for kind in ("camera", "rig", "frame", "image"):
+            for value in getattr(known, f"{kind}s").values():
+                getattr(database, f"write_{kind}")(value, **{f"use_{kind}_id": True})
+    run.extract(known=True)
+    run.match([(names[a], names[b]) for a, b in neighbours(seen.cameras)])
+    (run.scratch / "points").mkdir()
+    pycolmap.triangulate_points(known, run.database, str(run.images), str(run.scratch / "points"), True, run.options())
+    with pycolmap.Database.open(run.database) as database:
+        matches = sum(len(pair.inlier_matches) for pair in database.read_two_view_geometries()[1])
+    lengths = [len(point.track.elements) for point in known.points3D.values()]
+    agree = sum(n * (n - 1) // 2 for n in lengths)
+    if len(lengths) < FEWEST or agree < AGREEING * matches:
+        raise SceneError(
+            f"scene: expected pictures that fit their poses, got {matches} matches between them of which {agree} agree "
+            f"with the poses ({len(lengths)} points); do the poses belong to these pictures, and is their axis convention "
+            "right? Else estimate them again (`kfgs sfm --ignore-poses`)"
+        )
+    known.extract_colors_for_all_images(str(run.images))
+    points = [known.points3D[i] for i in sorted(known.points3D)]
+    places = torch.from_numpy(np.array([point.xyz for point in points])).float()
+    return places, torch.from_numpy(np.array([point.color for point in points], np.uint8))
 
 
 def neighbours(cameras: list[Camera]) -> list[tuple[int, int]]:
@@ -102,33 +101,20 @@ def neighbours(cameras: list[Camera]) -> list[tuple[int, int]]:
 
 
 def _reconstruction(pycolmap: Any, scene: Scene, names: list[str]) -> Any:
-    """The views as pycolmap has them: one camera for each lens."""
-    known, numbers = pycolmap.Reconstruction(), dict[tuple[Any, ...], int]()
+    """The views as pycolmap has them, each with its own camera."""
+    known = pycolmap.Reconstruction()
     for i, (lens, name) in enumerate(zip(scene.lenses or scene.cameras, names, strict=True), 1):
-        model, params = _lens(lens)
-        key = (model, *params, lens.width, lens.height)
-        if key not in numbers:
-            numbers[key] = len(numbers) + 1
-            camera = pycolmap.Camera(
-                model=model, width=lens.width, height=lens.height, params=params, camera_id=numbers[key],
-                has_prior_focal_length=True,
-            )  # fmt: skip
-            known.add_camera_with_trivial_rig(camera)
+        bent = [] if lens.distortion is None else [*lens.distortion.coefficients]
+        model = {0: "PINHOLE", 4: "OPENCV"}.get(len(bent), "FULL_OPENCV")
+        if lens.distortion is not None and lens.distortion.model == "kannala_brandt":
+            model = "OPENCV_FISHEYE"
+        bent += [0.0] * (8 - len(bent) if model == "FULL_OPENCV" else 0)
+        params = [float(lens.K[j]) for j in ((0, 0), (1, 1), (0, 2), (1, 2))] + bent
+        camera = pycolmap.Camera(model=model, width=lens.width, height=lens.height, params=params, camera_id=i)
+        camera.has_prior_focal_length = True
+        known.add_camera_with_trivial_rig(camera)
         view = lens.viewmat.double().numpy()
         U, _, Vh = np.linalg.svd(view[:3, :3])  # float32 is not orthonormal enough
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(U @ Vh), view[:3, 3])
-        known.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=numbers[key], image_id=i), pose)
+        known.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=i, image_id=i), pose)
     return known
-
-
-def _lens(camera: Camera) -> tuple[str, list[float]]:
-    """COLMAP's name and parameters of a lens."""
-    intrinsics = [float(camera.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
-    if camera.distortion is None:
-        return "PINHOLE", intrinsics
-    lens = list(camera.distortion.coefficients)
-    if camera.distortion.model == "kannala_brandt":
-        return "OPENCV_FISHEYE", intrinsics + lens
-    if len(lens) == 4:
-        return "OPENCV", intrinsics + lens
-    return "FULL_OPENCV", intrinsics + lens + [0.0] * (8 - len(lens))

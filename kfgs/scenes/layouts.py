@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,23 +34,20 @@ def load_nice_slam(folder: Path) -> Scene:
             f"{places[1]}: no such file; expected the camera of the Replica scenes there or in {folder}: "
             '{"camera": {"w": 1200, "h": 680, "fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "scale": 6553.5}}'
         )
-    top = read_scene_json(path, AGAIN)
-    camera: Any = top.get("camera") if isinstance(top, dict) else None
-    values: list[Any] = [
-        camera.get(name) if isinstance(camera, dict) else None for name in ("w", "h", "fx", "fy", "cx", "cy", "scale")
-    ]
-    numbers: list[Any] = [n if type(n) in (int, float) and abs(n) < MAX_NUMBER else -1 for n in values]
-    width, height, fx, fy, cx, cy, scale = numbers
-    if min(width, height, fx, fy, scale) <= 0 or max(width, height) > MAX_SIDE or width % 1 or height % 1:
-        raise SceneError(
-            f"{path}: expected w, h, fx, fy, cx, cy and the scale of the depth pictures as positive numbers, got "
-            f"{values!r:.200}; {AGAIN}"
-        )
-    K = np.array([[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1]], np.float64)
+    top, names = read_scene_json(path, AGAIN), ("w", "h", "fx", "fy", "scale", "cx", "cy")
+    try:
+        values = [float(top["camera"][name]) for name in names]
+        width, height, fx, fy, scale, cx, cy = values
+        if not (min(values[:5]) > 0 and max(width, height) <= MAX_SIDE and max(map(abs, values)) < MAX_NUMBER):
+            raise ValueError(f"{values}")
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        expected = f"a 'camera' with {', '.join(names)} (the scale of the depth pictures) as positive numbers"
+        raise SceneError(f"{path}: expected {expected}, got something else ({error!r:.200}); {AGAIN}") from error
     views, notes = _numbered(folder / "results", r"frame(\d+)\.(?:jpg|jpeg|png)", folder / "traj.txt")
-    depths = [view.path.with_name(Path(view.name).stem.replace("frame", "depth") + ".png") for view in views]
-    points = points_from_depth(views, depths, 1 / scale, K)
-    return scene_of_poses(folder, views, (K, (int(width), int(height))), points, notes)
+    for view in views:
+        view.K, view.size = np.array([[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1]]), (int(width), int(height))
+        view.depth = view.path.with_name(Path(view.name).stem.replace("frame", "depth") + ".png")
+    return scene_of_poses(folder, views, points_from_depth(views, 1 / scale), notes)
 
 
 def load_semantic_nerf(folder: Path) -> Scene:
@@ -59,15 +56,14 @@ def load_semantic_nerf(folder: Path) -> Scene:
     No file has the intrinsics: the field of view is 90 degrees across, the principal point is the middle of the picture.
     """
     views, notes = _numbered(folder / "rgb", r"rgb_(\d+)\.(?:png|jpg)", folder / "traj_w_c.txt")
-    for i, view in enumerate(views):
-        width, height = picture_size(view.path)
-        K = np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]])
-        views[i] = view._replace(lens=(K, (width, height)))
-    depths = [folder / "depth" / (Path(view.name).stem.replace("rgb", "depth") + ".png") for view in views]
+    for view in views:
+        width, height = view.size = picture_size(view.path)
+        view.K = np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]])
+        view.depth = folder / "depth" / (Path(view.name).stem.replace("rgb", "depth") + ".png")
     notes.append(
         "no file has the intrinsics of Semantic-NeRF's renders: 90 degrees across and a centred principal point assumed"
     )
-    return scene_of_poses(folder, views, None, points_from_depth(views, depths), notes)
+    return scene_of_poses(folder, views, points_from_depth(views), notes)
 
 
 def _numbered(folder: Path, pattern: str, poses: Path) -> tuple[list[PosedPicture], list[str]]:
@@ -110,19 +106,19 @@ def load_scannet(folder: Path) -> Scene:
             f"{folder / 'pose'}: expected N.txt for the pictures N.jpg of {folder / 'color'} ({some(names, 3) or 'none'}), "
             "got none that fits; export the scene again with ScanNet's SensReader"
         )
-    views = [
-        PosedPicture(name, folder / "color" / name, _square(files[name]), str(files[name]))
-        for name in names
-        if name not in lost
-    ]
-    file = folder / "intrinsic" / "intrinsic_color.txt"
+    file, views = folder / "intrinsic" / "intrinsic_color.txt", list[PosedPicture]()
     K = _square(file)[:3, :3]
-    size, largest = max((picture_size(view.path), view.path) for view in views)  # others may be smaller copies
+    size, largest = max((picture_size(folder / "color" / name), name) for name in names)  # others may be smaller copies
     if not (0 < K[0, 2] < size[0] and 0 < K[1, 2] < size[1]):
         raise SceneError(
             f"{file}: expected a principal point inside {largest} ({size[0]}x{size[1]} pixels), got ({K[0, 2]:g}, "
             f"{K[1, 2]:g}); give pictures of the size that was exported"
         )
+    for name in names:
+        if name not in lost:
+            view = PosedPicture(name, folder / "color" / name, _square(files[name]), str(files[name]), K, size)
+            view.depth = folder / "depth" / f"{file_stem(name)}.png"
+            views.append(view)
     notes = [f"{len(lost)} pictures have no file in pose/ and were left out: {some(lost)}"] if lost else []
     points = None
     mesh, depth = min(folder.glob(f"*{MESH}"), default=None), folder / "intrinsic" / "intrinsic_depth.txt"
@@ -133,9 +129,8 @@ def load_scannet(folder: Path) -> Scene:
             raise SceneError(f"{error}; copy the mesh again, or remove it to take points from the depth") from error
         points, notes = (places, colors), notes + told
     elif depth.is_file():
-        depths = [folder / "depth" / f"{file_stem(view.name)}.png" for view in views]
-        points = points_from_depth(views, depths, K=_square(depth)[:3, :3])
-    return scene_of_poses(folder, views, (K, size), points, notes)
+        points = points_from_depth(views, K=_square(depth)[:3, :3])
+    return scene_of_poses(folder, views, points, notes)
 
 
 def _square(path: Path) -> Matrix:  # [4, 4]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -14,16 +12,18 @@ from .._files import as_path, real_path
 from .._notes import tell_repairs
 from ..cameras.camera import Camera
 from .colmap import colmap_cameras, load_colmap
+from .colmap_model import count_images, has_model
 from .files import SceneError, natural_key, picture_size, some
 from .layouts import LAYOUTS, find_layout
 from .masks import check_mask, folder_masks, picture_folder
 from .scene import Scene
-from .splits import RULES, choose_split, make_split, read_lists, read_split
-from .sub_models import above, choice_note, find_model
+from .splits import RULES, choose_split, make_split, read_split
 from .transforms import load_transforms
 
+PLACES = ("sparse", "colmap/sparse", "dense/sparse", "distorted/sparse", "colmap_ground_truth", ".")
+"""Folders of models, asked in this order; a model may also lie in their subfolders `N`, `N/models/M` and `models/M`."""
 _TRANSFORMS = ("transforms.json", "transforms_train.json")
-SplitChoice = Literal["auto", "file", "df3dgs", "feature3dgs", "holdout8", "all"]
+SplitChoice = Literal["auto", "df3dgs", "feature3dgs", "holdout8", "all"]
 
 
 def load_scene(
@@ -40,8 +40,8 @@ def load_scene(
         images: the image folder, also by its name in the scene folder; cameras are resized to its pictures. None: `images/`
             next to the model or above it, else the first of `images_2`, `images_4`, ..., else the scene folder.
         split: `"auto"`: split.json, else lists of names (`test.txt`, `train_list.txt`, ...), else the split of the
-            transforms.json, else `"df3dgs"` for the videos of Replica, `"holdout8"` from 8 images, below 8 `"all"`; `"file"`:
-            split.json; or a rule of `make_split`.
+            transforms.json, else `"df3dgs"` for the videos of Replica, `"holdout8"` from 8 images, below 8 `"all"`; or a rule
+            of `make_split`.
         strict: refuse a scene of which something broken was left out or mended; else the notes say it.
 
     Returns:
@@ -49,20 +49,19 @@ def load_scene(
         (`Scene.with_near`). Its `notes` list missing files and assumptions.
 
     Raises:
-        FileNotFoundError: if there is no such folder, no image folder, or (`split="file"`) no split.json.
+        FileNotFoundError: if there is no such folder, or no image folder.
         SceneError: if there is no scene, or it cannot be used.
         ValueError: if `split` is unknown.
     """
     path = as_path(path)
-    check_choice("split", split, ("auto", "file", *RULES))
+    check_choice("split", split, ("auto", *RULES))
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such folder; expected a scene there")
     root, model = _root(path), find_model(path)
     if images is not None and not as_path(images).is_dir() and (root / images).is_dir():
         images = root / images
-    with _naming(root):
-        scene = replace(_load_views(path, model, None if images is None else as_path(images)), folder=root)
-        scene = _with_masks(scene, root)
+    scene = replace(_load_views(path, model, None if images is None else as_path(images)), folder=root)
+    scene = _with_masks(scene, root)
     tell_repairs(str(path), scene.notes, strict, SceneError)
     return _with_split(scene, path, root, model, split)
 
@@ -77,25 +76,13 @@ def load_cameras(path: str | Path) -> list[Camera]:
     model = find_model(path)
     if model is None and not (path.exists() and _is_transforms(path)):
         return load_scene(path).undistorted().cameras
-    with _naming(path):
-        scene = load_transforms(path, pictures=False) if model is None else colmap_cameras(model)
+    scene = load_transforms(path, pictures=False) if model is None else colmap_cameras(model)
     tell_repairs(str(path), scene.notes, False, SceneError)
     return scene.undistorted().cameras
 
 
 def _root(path: Path) -> Path:
     return path if path.is_dir() else path.parent
-
-
-@contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Errors of cameras that do not fit together name the scene."""
-    try:
-        yield
-    except SceneError as error:
-        if str(path) in str(error):
-            raise
-        raise SceneError(f"{path}: {error}") from error
 
 
 def _with_masks(scene: Scene, root: Path) -> Scene:
@@ -112,8 +99,14 @@ def _with_masks(scene: Scene, root: Path) -> Scene:
 
 def _load_views(path: Path, model: Path | None, images: Path | None) -> Scene:
     if model is not None:
-        scene = load_colmap(model, images or find_images(path, model))
-        return replace(scene, notes=(*scene.notes, *choice_note(path, model)))
+        scene = load_colmap(model, images or _find_images(path, model))
+        counts = {other: f"{other.relative_to(path)} with {count_images(other)} images" for other in _models_of(path)}
+        used, others = counts.pop(model), some(list(counts.values()))
+        if not counts:
+            return scene
+        advice = f"to use another, give its folder as the scene, as in {next(iter(counts))}"
+        note = f"{used} is used, the largest of several models; there is {others} too: {advice}"
+        return replace(scene, notes=(*scene.notes, note))
     if _is_transforms(path):
         return load_transforms(path, images)
     layout = find_layout(path)
@@ -150,9 +143,9 @@ def _advice(path: Path) -> str:
     return f"estimate the cameras first: `kfgs sfm {shlex.quote(str(path))} --out scene/`, or run_sfm"
 
 
-def find_images(root: Path, model: Path) -> Path:
+def _find_images(root: Path, model: Path) -> Path:
     """The folder with the pictures of a scene's model; see `load_scene`."""
-    folders = above(model)
+    folders = _above(model)
     dense = [folder for folder in folders if folder.name in ("dense", "distorted")]  # pictures of their own
     places = list(dict.fromkeys((*dense, root, *folders)))
     full = [folder / "images" for folder in places]
@@ -168,25 +161,51 @@ def find_images(root: Path, model: Path) -> Path:
 
 def _with_split(scene: Scene, path: Path, root: Path, model: Path | None, split: SplitChoice) -> Scene:
     names = [camera.name for camera in scene.cameras]
-    homes = [root] if model is None else list(dict.fromkeys((model, root, *above(model)[: 4 if model == path else 0])))
-    file = next((home / "split.json" for home in homes if (home / "split.json").is_file()), root / "split.json")
-    chosen = None
-    if split == "file" or (split == "auto" and file.is_file()):
-        chosen = read_split(file, names)
-    elif split == "auto":
-        chosen = next((lists for home in homes if (lists := read_lists(home, names)) is not None), None)
-    if chosen is not None:
-        return replace(scene, splits=chosen[0], notes=(*scene.notes, *chosen[1]))
-    if split == "auto" and (scene.splits.get("test") or len(scene.splits["train"]) < len(scene)):  # of its own lists
-        return scene
-    rule = split
+    homes = [root] if model is None else list(dict.fromkeys((model, root, *_above(model)[: 4 if model == path else 0])))
     if split == "auto":
-        layout = None if model is not None else find_layout(root)
-        rule = choose_split(len(scene), layout is not None and layout.video)
-    splits = make_split(len(scene), rule)  # type: ignore[arg-type]  # "file" was read above
+        chosen = next((lists for home in homes if (lists := read_split(home, names)) is not None), None)
+        if chosen is not None:
+            return replace(scene, splits=chosen[0], notes=(*scene.notes, *chosen[1]))
+        if scene.splits.get("test") or len(scene.splits["train"]) < len(scene):  # of its own lists
+            return scene
+    layout = None if model is not None else find_layout(root)
+    rule = choose_split(len(scene), layout is not None and layout.video) if split == "auto" else split
+    splits = make_split(len(scene), rule)
     note = f"split {rule}: {len(splits['train'])} of {len(scene)} views train, {len(splits['test'])} test"
     if not splits["train"]:
         raise SceneError(
             f'{root}: expected at least 6 views for the split {rule!r}, got {len(scene)}; use split="all" or "holdout8"'
         )
     return replace(scene, splits=splits, notes=(*scene.notes, note))
+
+
+def _models_of(path: Path) -> list[Path]:
+    """The models of the first of `PLACES` that has some; in a subfolder without a number only if there is no other."""
+    for folder in (path / place for place in PLACES) if path.is_dir() else ():
+        inner = [] if folder == path else [below for below in _folders(folder) if below.name != "models"]
+        numbered = [below for below in inner if below.name.isdecimal()]
+        hloc = [model for below in (folder, *numbered) for model in _folders(below / "models")]
+        for places in ([*numbered, *hloc, folder], inner):
+            if models := [place for place in places if has_model(place)]:
+                return models
+    return []
+
+
+def find_model(path: Path) -> Path | None:
+    """The COLMAP model that `load_scene` reads in a scene folder, the one with most images; None if there is none."""
+    return max(_models_of(path), key=count_images, default=None)  # the first of equal ones
+
+
+def _above(model: Path) -> list[Path]:
+    """The folders above a model that may be its scene, nearest first: two, or all up to the one that holds `PLACES`."""
+    parents = list(real_path(model).parents)[:6]
+    names = [folder.name for folder in parents]
+    if "sparse" not in names:
+        return parents[:2]
+    count = names.index("sparse") + 2
+    return parents[: count + (names[count - 1 : count] in (["colmap"], ["dense"], ["distorted"]))]
+
+
+def _folders(folder: Path) -> list[Path]:
+    inner = [below for below in folder.iterdir() if below.is_dir()] if folder.is_dir() else []
+    return sorted(inner, key=lambda below: natural_key(below.name))

@@ -71,8 +71,7 @@ def folder_masks(
     if not files:
         return None, []
     known = Names(files)
-    heic = [f"{file_stem(name)}.heic" for name in names]  # photos are converted from HEIC
-    chosen = [a or b for a, b in zip(known.find_each(names), known.find_each(heic), strict=True)]
+    chosen = known.find_each(names)
     masks = [None if file is None else folder / file for file in chosen]
     taken = set(chosen) - {None}
     extra = [file for file in files if file not in taken]

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,7 +14,7 @@ from torch import Tensor
 from .._files import read_text
 from .._notes import Repair
 from .._origin import choose_origin, describe_origin, to_local
-from ..cameras.camera import ROTATION_TOLERANCE, Camera
+from ..cameras.camera import ROTATION_TOLERANCE, Camera, Distortion
 from ..cameras.resample import fits_aspect
 from ..formats.ply import points_from_columns, read_ply
 from .files import MAX_NUMBER, SceneError, natural_key, picture_size, some
@@ -25,37 +24,34 @@ NO_POINTS = "no points: `kfgs fit` and `kfgs color` triangulate some from the po
 SKEW = 0.02  # largest difference of a rotation's singular values, relative: rotations that are rounded to two digits
 
 Matrix = NDArray[np.float64]
-Lens = tuple[Matrix, tuple[int, int]]  # K [3, 3] and (width, height)
-NOTHING = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)  # points and colours of a scene without any
 
 
-class PosedPicture(NamedTuple):
+@dataclass
+class PosedPicture:
     """A picture, and where it was taken from."""
 
     name: str  # of the view, with suffix
     path: Path
-    pose: Matrix  # [4, 4] camera to world, x right, y down, z forward
+    pose: Matrix | None  # [4, 4] camera to world, x right, y down, z forward; None: unknown
     origin: str  # the file, and the line, that the pose is from; for messages
-    lens: Lens | None = None  # its own; None: that of the scene
+    K: Matrix = field(default_factory=lambda: np.eye(3))
+    size: tuple[int, int] = (1, 1)  # width, height
+    distortion: Distortion | None = None
     mask: Path | None = None  # that the scene's file names; None: that of a folder `masks`
+    depth: Path | None = None  # whole numbers, which show the same as the picture
 
 
-def is_rotation(R: Matrix) -> bool:  # [3, 3]
-    """Whether `Camera` accepts a matrix, but for its handedness."""
-    return bool(np.abs(R @ R.T - np.eye(3)).max() <= ROTATION_TOLERANCE)
-
-
-def mend_pose(pose: Matrix) -> tuple[Matrix | None, float | None]:  # [4, 4]
+def mend_pose(pose: Matrix | None) -> tuple[Matrix | None, float | None]:  # [4, 4]
     """A pose whose rotation has a scale or is rounded, with the nearest rotation (by SVD). The translation stays.
 
     Returns:
         The pose, or None if it has numbers that are not finite or plausible, or no rotation at all; and the scale that was
         removed, or None if it is unchanged. A matrix that is far from a rotation stays as it is, and `Camera` refuses it.
     """
-    if not np.isfinite(pose).all() or np.abs(pose).max() > MAX_NUMBER:
+    if pose is None or not (np.abs(pose) <= MAX_NUMBER).all():  # NaN fails
         return None, None
     R = pose[:3, :3]
-    if is_rotation(R):
+    if np.abs(R @ R.T - np.eye(3)).max() <= ROTATION_TOLERANCE:  # `Camera` accepts it
         return pose, None
     U, sizes, Vt = np.linalg.svd(R)
     if sizes[2] <= 1e-9 * sizes[0] or sizes[0] == 0:
@@ -67,25 +63,11 @@ def mend_pose(pose: Matrix) -> tuple[Matrix | None, float | None]:  # [4, 4]
     return mended, float(sizes.mean())
 
 
-def mending_notes(lost: list[str], scaled: dict[str, float]) -> list[str]:
-    """Notes about views that were left out, and about those whose pose was mended, with the scale of each."""
-    notes = []
-    if lost:
-        notes.append(f"{len(lost)} views have no pose or lens of finite numbers and were left out: {some(lost)}")
-    if scaled:
-        low, high = f"{min(scaled.values()):.6g}", f"{max(scaled.values()):.6g}"
-        sizes = low if low == high else f"{low} to {high}"
-        notes.append(
-            f"{len(scaled)} poses have a scale ({sizes}) or a rounded rotation, which was removed: {some(list(scaled))}"
-        )
-    return [Repair(note) for note in notes]
-
-
-def as_large_as_pictures(
+def _as_large_as_pictures(
     cameras: Sequence[Camera], paths: Sequence[Path], folder: Path | None = None
 ) -> tuple[list[Camera], list[str]]:
     """Each camera in the size of its own picture, which may be a resized copy (`images_4`), and a note if some are."""
-    fitting, factors = [], Counter[str]()
+    fitting = []
     for camera, path in zip(cameras, paths, strict=True):
         width, height = picture_size(path)
         if not fits_aspect((height, width), camera.size):
@@ -93,29 +75,31 @@ def as_large_as_pictures(
                 f"{path}: expected a picture in the shape of {camera.width}x{camera.height} pixels, as its camera says, got "
                 f"{width}x{height}; replace it by the picture that the camera was made for, or by a copy at another size"
             )
-        if (height, width) == camera.size:
-            fitting.append(camera)
-        else:
-            small = camera.width / width
-            factors[f"{small:.3g} times smaller" if small >= 1 else f"{1 / small:.3g} times larger"] += 1
-            fitting.append(camera.resized(height, width))
-    if not factors:
+        fitting.append(camera if (height, width) == camera.size else camera.resized(height, width))
+    other = [i for i, camera in enumerate(cameras) if camera is not fitting[i]]
+    if not other:
         return fitting, []
     where = folder.name if folder is not None and paths[0].is_relative_to(folder) else "images"
-    count = "" if factors.total() == len(paths) else f"{factors.total()} of {len(paths)} "
-    sizes = some([factor for factor, _ in factors.most_common()], 3)
-    return fitting, [f"{where}: {count}pictures are {sizes} than the model says; cameras were resized to them"]
+    small = f"{paths[other[0]].name} is {cameras[other[0]].width / fitting[other[0]].width:.3g} times smaller"
+    count = f"{len(other)} of {len(paths)} pictures have other sizes than the model says"
+    return fitting, [f"{where}: {count} ({small}); cameras were resized to them"]
 
 
 def scene_of_poses(
-    folder: Path,
+    path: Path,
     views: Sequence[PosedPicture],
-    lens: Lens | None = None,  # None: each view has its own
     points: tuple[Tensor, Tensor] | None = None,  # [P, 3] of the world, [P, 3] uint8
     notes: Sequence[str] = (),
+    images: Path | None = None,
+    *,
+    pictures: bool = True,
 ) -> Scene:
-    """A scene of pictures with poses; views without a pose (not finite) are left out and noted."""
-    cameras, paths, lost, scaled = list[Camera](), list[Path](), list[str](), dict[str, float]()
+    """A scene of pictures with poses, all in the `train` split; views without a pose (not finite) are left out and noted.
+
+    Cameras get the size of their pictures, whose files need not be there without `pictures`. `images` is a folder that the user
+    gave, for a note.
+    """
+    cameras, kept, lost, scaled = list[Camera](), list[PosedPicture](), list[str](), dict[str, float]()
     for view in sorted(views, key=lambda view: natural_key(view.name)):
         pose, scale = mend_pose(view.pose)
         if pose is None:
@@ -126,38 +110,47 @@ def scene_of_poses(
         try:
             if not np.allclose(pose[3], [0, 0, 0, 1], rtol=0, atol=1e-6):
                 raise ValueError(f"pose: expected 0 0 0 1 as its last row, got {pose[3].tolist()}")
-            K, size = view.lens or lens or (np.eye(3), (1, 1))
-            cameras.append(Camera(inverse_pose(pose), torch.from_numpy(K).float(), *size, view.name))
+            viewmat, K = torch.from_numpy(inverse_pose(pose)), torch.from_numpy(view.K).float()
+            cameras.append(Camera(viewmat, K, *view.size, view.name, view.distortion))
         except ValueError as error:
             raise SceneError(f"{view.origin}: {error}; correct this pose") from error
-        paths.append(view.path)
+        kept.append(view)
     if not cameras:
         raise SceneError(
-            f"{folder}: expected poses of finite numbers, none of {len(views)} is; estimate them (`kfgs sfm`)"
+            f"{path}: expected poses and lenses of finite numbers, got none in {len(views)} ({some(lost, 3)}); estimate them "
+            "(`kfgs sfm`)"
         )
-    cameras, resized = as_large_as_pictures(cameras, paths)
-    told = [*notes, *resized, *mending_notes(lost, scaled), *([NO_POINTS] if points is None else [])]
-    return assemble_scene(cameras, paths, *(points or NOTHING), told)
-
-
-def inverse_pose(pose: Matrix) -> Tensor:  # [4, 4] camera to world -> [4, 4] world to camera
-    """The inverse of a rigid motion. `Camera` refuses what is not a rotation."""
-    viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
-    return torch.from_numpy(viewmat)
-
-
-def assemble_scene(
-    cameras: list[Camera], paths: list[Path], points: Tensor, colors: Tensor, notes: Sequence[str]
-) -> Scene:
-    """A scene of cameras and points [P, 3] in float64 of the world, with float32 from one origin, and a note if that is far.
-
-    Every view is in the `train` split.
-    """
-    origin = choose_origin(torch.stack([camera.center for camera in cameras]), points)
+    paths, masks, resized = [view.path for view in kept], [view.mask for view in kept], list[str]()
+    if pictures:
+        cameras, resized = _as_large_as_pictures(cameras, paths, images)
+    told = [*notes, *resized, *([NO_POINTS] if points is None else [])]
+    if lost:
+        told.append(Repair(f"{len(lost)} views have no pose or lens of finite numbers and were left out: {some(lost)}"))
+    if scaled:
+        low, high = f"{min(scaled.values()):.6g}", f"{max(scaled.values()):.6g}"
+        sizes, names = low if low == high else f"{low} to {high}", some(list(scaled))
+        told.append(
+            Repair(f"{len(scaled)} poses have a scale ({sizes}) or a rounded rotation, which was removed: {names}")
+        )
+    places, colors = points or (torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))
+    origin = choose_origin(torch.stack([camera.center for camera in cameras]), places)
     local = [camera.with_origin(origin).to(torch.float32) for camera in cameras]
-    far, splits = describe_origin(origin, "cameras and points"), {"train": list(range(len(cameras))), "test": []}
-    return Scene(local, paths, to_local(points, origin), colors, splits, (*notes, *far)).with_near()
+    told, splits = (
+        [*told, *describe_origin(origin, "cameras and points")],
+        {"train": list(range(len(local))), "test": []},
+    )
+    try:
+        scene = Scene(local, paths, to_local(places, origin), colors, splits, tuple(told))
+    except SceneError as error:  # names that do not differ
+        raise SceneError(f"{path}: {error}") from error
+    return replace(scene.with_near(), masks=masks if any(masks) else None)
+
+
+def inverse_pose(pose: Matrix) -> Matrix:  # [4, 4] -> [4, 4]
+    """The inverse of a rigid motion. `Camera` refuses what is not a rotation."""
+    inverse = np.eye(4)
+    inverse[:3, :3], inverse[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
+    return inverse
 
 
 def read_numbers(path: Path, expected: str) -> Matrix:  # [rows, columns]

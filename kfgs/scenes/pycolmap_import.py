@@ -7,17 +7,13 @@ the first PNG that Pillow writes corrupts the heap and aborts the process. So th
 from __future__ import annotations
 
 import signal
-import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import PIL.Image  # noqa: F401  # see above: the order matters
 
-from .._files import real_path
-from .colmap_model import FILES, model_suffix
 from .files import SceneError
 
 # Exceptions of pycolmap for unusable input (a failed CHECK is a ValueError, a missing id an IndexError).
@@ -40,37 +36,17 @@ def import_pycolmap() -> Any:
 
 
 @contextmanager
-def quiet_pycolmap() -> Iterator[Any]:
-    """Pycolmap without its log: failures come as exceptions. The log level is restored afterwards."""
+def quiet_pycolmap(what: str = "pycolmap: expected input that it can use", advice: str = "check it") -> Iterator[Any]:
+    """Pycolmap without its log. Its failures become a SceneError that begins with `what` and ends with `advice`."""
     pycolmap = import_pycolmap()
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = 3  # fatal
     try:
         yield pycolmap
-    finally:
-        pycolmap.logging.minloglevel = before
-
-
-@contextmanager
-def scene_errors(what: str, advice: str) -> Iterator[None]:
-    """Turn pycolmap's exceptions into a SceneError that begins with `what` and ends with `advice`."""
-    try:
-        yield
     except SceneError:
         raise
     except FAILURES as error:
         lines = str(error).strip().splitlines()
         raise SceneError(f"{what} ({type(error).__name__}: {lines[0] if lines else 'no text'}); {advice}") from error
-
-
-@contextmanager
-def without_rigs(model: Path) -> Iterator[Path]:
-    """A folder with links to the cameras, images and points of a model, which `read_whole_model` has checked.
-
-    Rigs and frames are left out: the images file has every pose, and pycolmap never returns from random bytes in frames.bin.
-    """
-    with tempfile.TemporaryDirectory(prefix="kfgs-model-") as scratch:
-        for name in FILES:
-            file = real_path(model / f"{name}.{model_suffix(model)}")
-            (Path(scratch) / file.name).symlink_to(file)
-        yield Path(scratch)
+    finally:
+        pycolmap.logging.minloglevel = before

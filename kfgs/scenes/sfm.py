@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import tempfile
 from collections import Counter
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -19,8 +19,7 @@ from .colmap import LENSES
 from .colmap_model import has_model
 from .files import SceneError, list_images, picture_size, some
 from .masks import folder_masks, write_colmap_masks
-from .pictures import heic_names
-from .pycolmap_import import quiet_pycolmap, scene_errors
+from .pycolmap_import import quiet_pycolmap
 
 OVERLAP = 10  # next images that one of a video is compared with, and as many at distances 1, 2, 4, ... (as COLMAP)
 SMALL = 400
@@ -115,26 +114,26 @@ def run_sfm(
             f"out: expected a scene folder without a model, got one in {model}; name another folder, or pass replace=True "
             "(--replace) to give up that model"
         )
-    heic, names = heic_names(images), list_images(images)
+    names, heic = list_images(images), list_images(images, (".heic", ".heif"))
     if heic:
         raise SceneError(
-            f"{images}: expected pictures that pycolmap reads, got HEIC photographs ({some(heic, 3)}); make JPEG files of them: "
-            "`kfgs sfm` does, and kfgs.scenes.pictures.convert_heic(images, out)"
+            f"{images}: expected pictures that pycolmap reads, got HEIC photographs ({some(heic, 3)}); save them as JPEG, with "
+            "their EXIF: `magick mogrify -format jpg *.heic`, in the app of the phone, or in its settings before the next photo"
         )
     if len(names) < 3:
         raise SceneError(f"{images}: expected at least 3 images (PNG, JPEG, TIFF, WebP), got {len(names)}; add views")
-    advice = "check the images and the free disk space"
-    with (
-        tempfile.TemporaryDirectory(prefix="kfgs-sfm-") as scratch,
-        quiet_pycolmap() as pycolmap,
-        scene_errors(f"{images}: expected images that pycolmap can register", advice),
-        tqdm(disable=not progress, unit="image") as bar,
-    ):
-        masks = folder_masks(names, images)[0] or [None] * len(names)
-        photos = {name: (images / name, mask) for name, mask in zip(names, masks, strict=True)}
-        run = SfmRun(pycolmap, images, Path(scratch), config, bar, photos)
+    pairs = None if config.matching == "exhaustive" else sequential_pairs(names)
+    if pairs is not None and any(len(name.split()) > 1 for name in names):  # pycolmap cuts them in a list of pairs
+        raise SceneError(
+            f"{images}: expected names without blanks for sequential matching, got {some(names, 3)}; rename the images "
+            "or use matching='exhaustive' (--matching exhaustive)"
+        )
+    masks = folder_masks(names, images)[0] or [None] * len(names)
+    photos = {name: (images / name, mask) for name, mask in zip(names, masks, strict=True)}
+    what, advice = f"{images}: expected images that pycolmap can register", "check the images and the free disk space"
+    with sfm_run(images, photos, config, what, advice, progress) as run:
         run.extract()
-        run.match_all()
+        run.match(pairs)
         models = sorted(run.map(), key=lambda model: -model.num_reg_images())
         sizes = [model.num_reg_images() for model in models]
         if not sizes or sizes[0] < config.min_registered * len(names):
@@ -144,6 +143,19 @@ def run_sfm(
         placed = {image.name for image in models[0].images.values() if image.has_pose}
         error, missing = float(models[0].compute_mean_reprojection_error()), [n for n in names if n not in placed]
         return SfmReport(len(placed), len(names), len(models[0].points3D), error, tuple(missing))
+
+
+@contextmanager
+def sfm_run(
+    images: Path, photos: dict[str, tuple[Path, Path | None]], config: SfmConfig, what: str, advice: str, progress: bool
+) -> Iterator[SfmRun]:
+    """A run over the images of a folder in a scratch folder; errors of pycolmap begin with `what` and end with `advice`."""
+    with (
+        tempfile.TemporaryDirectory(prefix="kfgs-sfm-") as scratch,
+        quiet_pycolmap(what, advice) as pycolmap,
+        tqdm(disable=not progress, unit="image") as bar,
+    ):
+        yield SfmRun(pycolmap, images, Path(scratch), config, bar, photos)
 
 
 def link_images(images: str | Path, out: str | Path) -> bool:
@@ -207,33 +219,20 @@ class SfmRun:
                 f"{some([name for name in names if name not in ids], 3)}: save them again as PNG or JPEG"
             )
 
-    def match_all(self) -> None:
-        """Compare the pairs of images that the config says."""
-        names = list(self.photos)
-        if self.config.matching == "exhaustive":
-            self._match(self.pycolmap.match_exhaustive, {}, len(names) * (len(names) - 1) // 2)
-            return
-        if any(character.isspace() for name in names for character in name):  # pycolmap cuts them in a list of pairs
-            raise SceneError(
-                f"{self.images}: expected names without blanks for sequential matching, got {some(names, 3)}; rename the images "
-                "or use matching='exhaustive' (--matching exhaustive)"
-            )
-        self.match_pairs(sequential_pairs(names))
-
-    def match_pairs(self, pairs: list[tuple[str, str]]) -> None:
-        """Compare given pairs of images; no name may have a blank."""
-        listed = self.scratch / "pairs.txt"
-        listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
-        options = self.pycolmap.ImportedPairingOptions(match_list_path=str(listed))
-        self._match(self.pycolmap.match_image_pairs, {"pairing_options": options}, len(pairs))
-
-    def _match(self, match: Callable[..., None], pairing: dict[str, Any], total: int) -> None:
+    def match(self, pairs: Sequence[tuple[str, str]] | None = None) -> None:
+        """Compare pairs of images, whose names may have no blank; None: each with each."""
+        colmap, count, pairing = self.pycolmap, len(self.photos), dict[str, Any]()
+        if pairs is not None:
+            listed = self.scratch / "pairs.txt"
+            listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
+            pairing["pairing_options"] = colmap.ImportedPairingOptions(match_list_path=str(listed))
+        total = count * (count - 1) // 2 if pairs is None else len(pairs)
         self.bar.set_description("matching")
         self.bar.reset(total=total)
         self.bar.set_postfix_str("no count until all are done")  # pycolmap reports no progress meanwhile
-        match(
+        (colmap.match_exhaustive if pairs is None else colmap.match_image_pairs)(
             self.database, matching_options={"num_threads": self.config.num_threads}, **pairing,
-            verification_options={"ransac": {"random_seed": self.config.seed}}, device=self.pycolmap.Device.cpu,
+            verification_options={"ransac": {"random_seed": self.config.seed}}, device=colmap.Device.cpu,
         )  # fmt: skip
         self.bar.set_postfix_str("")
         self.bar.update(total)

@@ -41,43 +41,34 @@ def choose_split(count: int, video: bool = False) -> SplitRule:
     return "holdout8" if count >= 8 else "all"
 
 
-def read_split(path: Path, names: Sequence[str]) -> Split:
-    """Read a split.json: `{"train": [names], "test": [names]}`; more splits are allowed. Without test, `val` is tested."""
-    return split_by_lists(str(path), _read_lists(path, "repair the file or remove it"), names)
+def read_split(folder: Path, names: Sequence[str]) -> Split | None:
+    """The split that lists of views in a folder give; None if there is none.
 
-
-def read_lists(folder: Path, names: Sequence[str]) -> Split | None:
-    """Read the lists of views in a folder, as other programs write them; None if there is none.
-
-    They are `train.txt`, `val.txt` and `test.txt`, also as `train_list.txt`: a name per line (3DGS and Occam's LGS put a
-    `test.txt` next to the model); or ScanNet++'s `train_test_lists.json`.
+    They are in `split.json`, {"train": [names], "test": [names], ...}; else in `train.txt`, `val.txt` and `test.txt`, also as
+    `train_list.txt`, a name per line (3DGS and Occam's LGS put a `test.txt` next to the model); else in ScanNet++'s
+    `train_test_lists.json`.
     """
-    lists: dict[str, list[str]] = {}
-    files = []
-    for split in ("train", "val", "test"):
-        both = (folder / f"{split}.txt", folder / f"{split}_list.txt")
-        for file in [file for file in both if file.is_file()][:1]:
-            try:
-                lines = read_text(file, "a list of names of views").split("\n")
-            except ValueError as error:
-                raise SceneError(str(error)) from error
-            lists[split] = [line.strip() for line in lines if line.strip()]
-            files.append(file.name)
-    if not lists and (folder / SCANNETPP).is_file():
-        lists, files = _read_lists(folder / SCANNETPP, "correct it or remove it"), [SCANNETPP]
-    return split_by_lists(str(folder / ", ".join(files)), lists, names) if any(lists.values()) else None
-
-
-def _read_lists(path: Path, advice: str) -> dict[str, list[str]]:
-    """The lists of names in a JSON file; what is not a list is passed over."""
-    value = read_scene_json(path, advice)
+    places = [(split, folder / f"{split}{end}") for end in ("_list.txt", ".txt") for split in ("train", "val", "test")]
+    texts = {split: file for split, file in places if file.is_file()}
+    tables = [folder / name for name in ("split.json", SCANNETPP) if (folder / name).is_file()]
+    if texts and tables[:1] != [folder / "split.json"]:
+        try:
+            lines = {split: read_text(file, "a list of names of views").split("\n") for split, file in texts.items()}
+        except ValueError as error:
+            raise SceneError(str(error)) from error
+        lists = {split: [line.strip() for line in text if line.strip()] for split, text in lines.items()}
+        where = folder / ", ".join(file.name for file in texts.values())
+        return split_by_lists(str(where), lists, names) if any(lists.values()) else None
+    if not tables:
+        return None
+    value = read_scene_json(tables[0], "repair the file or remove it")
     lists = {name: words for name, words in value.items() if isinstance(words, list)} if isinstance(value, dict) else {}
     if "train" not in lists or not all(isinstance(word, str) and word for words in lists.values() for word in words):
         expected = '{"train": [names], "test": [names]}'
         raise SceneError(
-            f"{path}: expected {expected}, got {str(value)[:80]}; stems are enough, and there must be a 'train'"
+            f"{tables[0]}: expected {expected}, got {str(value)[:80]}; stems are enough, and there must be a 'train'"
         )
-    return lists
+    return split_by_lists(str(tables[0]), lists, names)
 
 
 def split_by_lists(where: str, lists: Mapping[str, Sequence[str]], names: Sequence[str]) -> Split:

@@ -6,26 +6,22 @@ import os
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import torch
 from torch import Tensor
 
 from .._files import Names, file_stem
-from ..cameras.camera import Camera
 from .depth import MILLIMETRE, points_from_depth
 from .files import (
     IMAGE_SUFFIXES,
     SceneError,
-    find_pictures,
     is_file,
     list_images,
-    natural_key,
     picture_size,
     read_scene_json,
     some,
 )  # fmt: skip
-from .posed import NO_POINTS, NOTHING, PosedPicture, as_large_as_pictures, assemble_scene, mending_notes, read_points
+from .posed import PosedPicture, read_points, scene_of_poses
 from .scene import Scene
 from .splits import split_by_lists
 from .transforms_frame import Frame
@@ -33,29 +29,19 @@ from .transforms_frame import Frame
 _UNNAMED_POINTS = "points3d.ply"  # 3DGS and OpenGaussian write it
 
 
-class _View(NamedTuple):
-    camera: Camera
-    path: Path
-    split: str
-    mask: Path | None
-    depth: Path | None
-
-
 @dataclass
 class _Reader:
-    """The views of one scene, and what was noticed about them."""
+    """Finds the files of one scene's frames, and remembers what was noticed about them."""
 
     root: Path
     images: Path | None
-    views: list[_View] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
     unmasked: list[str] = field(default_factory=list)
-    broken: list[str] = field(default_factory=list)
-    scaled: dict[str, float] = field(default_factory=dict)
     respelled: list[str] = field(default_factory=list)
 
-    def read(self, split: str, path: Path, top: dict[str, Any], pictures: bool) -> None:
-        """Add the views of a file; without `pictures` also those of frames that have no image file or no name."""
+    def read(self, path: Path, top: dict[str, Any], pictures: bool) -> list[PosedPicture]:
+        """The views of a file; without `pictures` also those of frames that have no image file or no name."""
+        views = []
         for i, values in enumerate(top["frames"]):
             if not isinstance(values, dict):
                 expected = "an object with a 'transform_matrix'"
@@ -76,17 +62,16 @@ class _Reader:
             if file is None:
                 file = self.root / listed.replace("\\", "/")
                 file = file if file.suffix.lower() in IMAGE_SUFFIXES else file.with_name(f"{file.name}.png")
-            name = self.name(file)
-            camera, scale = (None, None) if frame.broken else frame.camera(name)
-            mask = self.find_mask(frame.values.get("mask_path"))
+            view = PosedPicture(self.name(file), file, None, f"{path}, frame {i} ({self.name(file)})")
+            if not frame.broken:
+                view.pose, (view.K, view.size), view.distortion = frame.pose(), frame.lens(), frame.distortion()
+            mask = frame.values.get("mask_path")
+            view.mask = self.inside(mask)
+            self.unmasked += [f"{mask!r:.200}"] if mask is not None and view.mask is None else []
             depth = self.inside(frame.values.get("depth_file_path", frame.values.get("depth_path")))
-            if scale is not None:
-                self.scaled[name] = scale
-            if camera is None:
-                self.broken.append(name)
-            else:
-                depth = depth if depth is not None and depth.suffix.lower() == ".png" else None
-                self.views.append(_View(camera, file, split, mask, depth))
+            view.depth = depth if depth is not None and depth.suffix.lower() == ".png" else None
+            views.append(view)
+        return views
 
     @cached_property
     def known(self) -> Names:
@@ -112,16 +97,6 @@ class _Reader:
             self.respelled.append(f"{listed} is {near}")
         return self.root / near
 
-    def find_mask(self, listed: Any) -> Path | None:
-        """The mask of a frame; one that is missing is noted."""
-        if listed is None:
-            return None
-        place = self.root / str(listed).replace("\\", "/").replace("\0", "")
-        mask = find_pictures(place.parent, [place.name]).get(place.name)
-        if mask is None:
-            self.unmasked.append(f"{listed!r:.200}")
-        return mask
-
     def inside(self, listed: Any) -> Path | None:
         """A file that is listed, unless it lies outside of the scene folder."""
         if not isinstance(listed, str):
@@ -136,18 +111,18 @@ class _Reader:
                 return _normal(file).relative_to(_normal(folder)).as_posix()
         return file.name
 
-    def notes(self) -> list[str]:
+    def notes(self, views: list[PosedPicture]) -> list[str]:
         """What was noticed, for people."""
-        masks, frames = sum(view.mask is not None for view in self.views), len(self.missing) + len(self.views)
+        masks, frames = sum(view.mask is not None for view in views), len(self.missing) + len(views)
         pairs = [
             (self.missing, f"{len(self.missing)} of {frames} frames have no image file: {some(self.missing)}"),
-            (masks, f"masks: {masks} of {len(self.views)} frames have a mask_path; black is ignored"),
+            (masks, f"masks: {masks} of {len(views)} frames have a mask_path; black is ignored"),
             (self.unmasked, f"{len(self.unmasked)} files of mask_path are missing, and those frames have no mask: "
              f"{some(self.unmasked)}"),
             (self.respelled, f"{len(self.respelled)} images were found by a name that is spelled otherwise: "
              f"{some(self.respelled)}"),
         ]  # fmt: skip
-        return [*mending_notes(self.broken, self.scaled), *(note for some_are, note in pairs if some_are)]
+        return [note for some_are, note in pairs if some_are]
 
 
 def load_transforms(path: Path, images: Path | None = None, *, pictures: bool = True) -> Scene:
@@ -169,26 +144,25 @@ def load_transforms(path: Path, images: Path | None = None, *, pictures: bool = 
             number, `0007.png`.
     """
     files = _files(path)
-    first = next(iter(files.values()))
-    tops, reader = {split: _read_top(file) for split, file in files.items()}, _Reader(first.parent, images)
-    for split, file in files.items():
-        reader.read(split, file, tops[split], pictures)
-    if not reader.views:
-        lost = [*reader.missing, *reader.broken]
+    first, tops = next(iter(files.values())), {split: _read_top(file) for split, file in files.items()}
+    reader, top = _Reader(first.parent, images), tops[next(iter(files))]
+    parts = {split: reader.read(file, tops[split], pictures) for split, file in files.items()}
+    views = [view for part in parts.values() for view in part]
+    if not views:
         raise SceneError(
-            f"{path}: expected frames with image files and poses, none of {len(lost)} has both ({some(lost, 3)}); "
-            f"copy the images next to the file or pass their folder; {'; '.join(reader.notes())}"
+            f"{path}: expected frames with image files, none of {len(reader.missing)} has one ({some(reader.missing, 3)}); copy "
+            "the images next to the file or pass their folder"
         )
-    views = sorted(reader.views, key=lambda view: natural_key(view.camera.name))
-    cameras, paths = [view.camera for view in views], [view.path for view in views]
     if not pictures:
-        return assemble_scene(cameras, paths, *NOTHING, reader.notes())
-    points, colors, told = _points(reader, first, tops[next(iter(files))], views)
-    cameras, resized = as_large_as_pictures(cameras, paths, images)
-    splits, held = _splits(path, views, tops[next(iter(files))])
-    scene = assemble_scene(cameras, paths, points, colors, [*reader.notes(), *told, *resized, *held])
-    masks = [view.mask for view in views]
-    return replace(scene, splits=splits, masks=masks if any(masks) else None)
+        return scene_of_poses(path, views, notes=reader.notes(views), pictures=False)
+    points, told = _points(reader, first, top, views)
+    scene = scene_of_poses(path, views, points, [*reader.notes(views), *told], images)
+    names = [camera.name for camera in scene.cameras]
+    lists = {name: top.get(f"{name}_filenames") for name in ("train", "val", "test")}
+    if "all" not in files:
+        lists = {split: [view.name for view in part if view.name in names] for split, part in parts.items()}
+    splits, held = _splits(path, names, lists)
+    return replace(scene, splits=splits, notes=(*scene.notes, *held))
 
 
 def _files(path: Path) -> dict[str, Path]:
@@ -215,7 +189,9 @@ def _normal(path: Path) -> Path:
     return Path(os.path.abspath(path))
 
 
-def _points(reader: _Reader, path: Path, top: dict[str, Any], views: list[_View]) -> tuple[Tensor, Tensor, list[str]]:
+def _points(
+    reader: _Reader, path: Path, top: dict[str, Any], views: list[PosedPicture]
+) -> tuple[tuple[Tensor, Tensor] | None, list[str]]:
     """Points and colours in the frame of the poses, and notes."""
     listed, notes = top.get("ply_file_path"), list[str]()
     if listed is None and is_file(reader.root / _UNNAMED_POINTS):
@@ -232,33 +208,23 @@ def _points(reader: _Reader, path: Path, top: dict[str, Any], views: list[_View]
             raise SceneError(f"{error}; {advice}") from error
         notes += told
         if len(points):
-            return points, colors, notes
+            return (points, colors), notes
     unit = Frame(path, "top level", top).number("integer_depth_scale", MILLIMETRE)  # world units per step
     if not unit > 0:
         raise SceneError(f"{path}: integer_depth_scale: expected a number above 0, got {unit:g}; correct it")
-    posed, depths = [], []
-    for camera, picture, _, mask, depth in views:
-        if depth is not None and camera.distortion is None:
-            lens = camera.K.double().numpy(), (camera.width, camera.height)
-            pose = torch.linalg.inv(camera.viewmat.double()).numpy()
-            posed.append(PosedPicture(camera.name, picture, pose, str(depth), lens, mask))
-            depths.append(depth)
-    from_depth = points_from_depth(posed, depths, unit)
-    if from_depth is not None:
-        return *from_depth, [f"points from the depth pictures of {len(posed)} views"]
-    lost = f"no points: ply_file_path {listed!r:.200} is not a file inside {reader.root}"
-    return *NOTHING, [*notes, NO_POINTS if listed is None or notes else lost]
+    lifted = points_from_depth(views, unit)
+    if lifted is not None:
+        notes = [f"points from the depth pictures of {sum(view.depth is not None for view in views)} views"]
+    elif listed is not None and not notes:
+        notes = [f"ply_file_path {listed!r:.200} is not a file inside {reader.root}"]
+    return lifted, notes
 
 
-def _splits(path: Path, views: list[_View], top: dict[str, Any]) -> tuple[dict[str, list[int]], list[str]]:
+def _splits(path: Path, names: list[str], lists: dict[str, Any]) -> tuple[dict[str, list[int]], list[str]]:
     """The splits that the files give; if there are none, all views in train. And notes."""
-    names = [view.camera.name for view in views]
-    lists = {name: top.get(f"{name}_filenames") for name in ("train", "val", "test")}
-    if views[0].split != "all":
-        lists = {name: [view.camera.name for view in views if view.split == name] for name in lists}
     given = {k: [word for word in v if isinstance(word, str)] for k, v in lists.items() if isinstance(v, list) and v}
     if not given:
-        return {"train": list(range(len(views))), "test": []}, []
+        return {"train": list(range(len(names))), "test": []}, []
     known, every = Names(names, bare=True), given.get("train", [])
     held = {known.find(word) for name in ("val", "test") for word in given.get(name, ())}
     own = [word for word in every if known.find(word) not in held]

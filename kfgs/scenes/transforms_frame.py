@@ -15,12 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from ..cameras.camera import Camera, Distortion
+from ..cameras.camera import Distortion
 from .colmap import PANORAMA
 from .files import MAX_NUMBER, MAX_SIDE, SceneError
-from .posed import Matrix, inverse_pose, mend_pose
+from .posed import Matrix
 
 _LENSES = {  # the coefficients that each camera_model has
     **dict.fromkeys(("PINHOLE", "SIMPLE_PINHOLE"), ()),
@@ -62,8 +61,8 @@ class Frame:
         numbers += [number for row in rows if isinstance(row, list) for number in row] if isinstance(rows, list) else []
         return rows is None or any(isinstance(n, float) and not abs(n) < MAX_NUMBER for n in numbers)
 
-    def camera(self, name: str) -> tuple[Camera | None, float | None]:
-        """The camera with its lens (None if its pose is no rotation), and the scale that was removed from the pose, if any."""
+    def lens(self) -> tuple[Matrix, tuple[int, int]]:
+        """K [3, 3], and (width, height) in pixels."""
         width, height = self.number("w"), self.number("h")
         if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE and width % 1 == 0 and height % 1 == 0):
             raise self.fail("", f"w and h of 1 to {MAX_SIDE} whole pixels", (width, height), "correct the size")
@@ -72,14 +71,7 @@ class Frame:
             expected = "'fl_x' or 'camera_angle_x'"
             raise self.fail("", expected, sorted(self.values), "add one at the top or in each frame")
         cx, cy = self.number("cx", width / 2), self.number("cy", height / 2)
-        K = torch.tensor([[fx, 0, cx], [0, fx if fy is None else fy, cy], [0, 0, 1]], dtype=torch.float32)
-        (pose, scale), lens = mend_pose(self.pose()), self.distortion()
-        if pose is None:
-            return None, None
-        try:
-            return Camera(inverse_pose(pose), K, int(width), int(height), name, lens), scale
-        except ValueError as error:
-            raise SceneError(f"{self.path}, {self.where} ({name}): {error}") from error
+        return np.array([[fx, 0, cx], [0, fx if fy is None else fy, cy], [0, 0, 1]]), (int(width), int(height))
 
     def focal_length(self, axis: str, side: float) -> float | None:
         """The focal length in pixels along x or y, also from the angle of view; None if the frame has neither."""

@@ -15,7 +15,6 @@ def test_outliers_do_not_move_the_box() -> None:
     bounds = robust_bounds(torch.cat([cloud, far]))
     assert bounds.inside[:1000].float().mean() > 0.99
     assert not bounds.inside[1000:].any()
-    torch.testing.assert_close(bounds.center, torch.tensor([2.0, 1.0, 0.5]), rtol=0, atol=0.15)
     torch.testing.assert_close(bounds.high - bounds.low, torch.tensor([4.0, 2.0, 1.0]) * 1.2, rtol=0.05, atol=0)
 
 
@@ -24,7 +23,6 @@ def test_full_coverage_is_the_plain_box() -> None:
     bounds = robust_bounds(points, coverage=1.0, margin=0.0)
     assert bounds.low.tolist() == [0, -1, 2]
     assert bounds.high.tolist() == [4, 1, 5]
-    assert bounds.center.tolist() == [1, 0, 2]
     assert bounds.inside.all()
     assert repr(bounds).endswith("inside=[3] bool)")
 

@@ -65,7 +65,7 @@ def test_the_near_plane_stays_with_the_camera():
         ({"height": 3.5}, ValueError, ("height:", "got 3.5")),
         ({"width": float("nan")}, ValueError, ("width:", "got nan")),
         ({"height": float("inf")}, ValueError, ("height:", "got inf")),
-        ({"width": "64"}, ValueError, ("width:", "got '64'")),
+        ({"width": "64"}, TypeError, ("width:", "got '64'")),
         ({"K": changed(K, 0, 0, float("nan"))}, ValueError, ("viewmat, K:", "'a.png'", "got NaN")),
         ({"viewmat": changed(torch.eye(4), 0, 3, float("inf"))}, ValueError, ("viewmat, K:", "got NaN")),
         ({"K": changed(K, 0, 1, 0.1)}, ValueError, ("K:", "skew")),

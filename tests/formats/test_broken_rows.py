@@ -16,7 +16,7 @@ from kfgs import Gaussians
 from kfgs.cli import main
 from kfgs.formats import read_splats, write_splats
 from kfgs.formats.ply import read_ply, read_ply_elements, write_ply, write_ply_elements
-from kfgs.formats.sidecar import labels_path
+from kfgs.formats.sidecar import LABELS, beside
 from kfgs.formats.table import read_rows
 
 N, BAD = 600, (7, 8, 400)
@@ -84,10 +84,10 @@ def _splat(path):
     rows = np.fromfile(path, "<f4").reshape(N, 8)
     rows[BAD[0], 0], rows[BAD[1], 4], rows[BAD[2], 3] = np.nan, np.inf, -1  # a position, a scale, a negative scale
     rows.tofile(path)
-    labels = dict(np.load(labels_path(path)))
+    labels = dict(np.load(beside(path, LABELS)))
     from kfgs._files import digest_file
 
-    np.savez(labels_path(path), **labels | {"of": np.array(digest_file(path))})
+    np.savez(beside(path, LABELS), **labels | {"of": np.array(digest_file(path))})
 
 
 def _gltf(path):

@@ -8,7 +8,7 @@ import torch
 
 from kfgs import Gaussians
 from kfgs.formats import read_splats, write_splats
-from kfgs.formats.ply import read_comments, write_ply
+from kfgs.formats.ply import read_header, write_ply
 
 C0 = 0.28209479177387814
 
@@ -98,7 +98,7 @@ def test_names_and_comments_that_are_not_ascii(tmp_path, coding):
             (tmp_path / "b.ply").read_bytes().replace("Büro".encode(), "Büro".encode("latin-1"))
         )
     (tmp_path / "b.ply").write_bytes(mark + (tmp_path / "b.ply").read_bytes())
-    assert read_comments(tmp_path / "b.ply") == ["Büro"]
+    assert read_header(tmp_path / "b.ply").comments == ["Büro"]
     splats = read_splats(tmp_path / "b.ply")
     assert list(splats.extra) == ["größe"]
     assert write_splats(splats, tmp_path / "c.ply").lost == ()

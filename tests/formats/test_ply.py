@@ -6,9 +6,8 @@ from messages import tells
 from kfgs import Gaussians
 from kfgs.formats import read_splats, write_splats
 from kfgs.formats.ply import (
-    other_elements,
     points_from_columns,
-    read_comments,
+    read_header,
     read_ply,
     read_ply_elements,
     write_ply,
@@ -146,7 +145,7 @@ def test_a_mesh_is_read_and_its_faces_are_told(tmp_path, layout):
     text = "".join(f"{x:g} {y:g} {z:g}\n" for x, y, z in points) + "3 0 1 2\n"
     (tmp_path / "a.ply").write_bytes(head.encode() + (text.encode() if layout == "ascii" else points.tobytes() + face))
     np.testing.assert_array_equal(points_from_columns("", read_ply(tmp_path / "a.ply")).numpy(), points)
-    assert other_elements(tmp_path / "a.ply") == ["face"]
+    assert [element.name for element in read_header(tmp_path / "a.ply").elements if element.rows] == ["vertex", "face"]
 
 
 TABLES = {
@@ -168,7 +167,7 @@ def _assert_same(back, tables):
 def test_several_elements_survive_the_file(tmp_path):
     write_ply_elements(tmp_path / "a.ply", TABLES, comments=("first", "and second"))
     _assert_same(read_ply_elements(tmp_path / "a.ply"), TABLES)
-    assert read_comments(tmp_path / "a.ply") == ["first", "and second"]
+    assert read_header(tmp_path / "a.ply").comments == ["first", "and second"]
     with pytest.raises(ValueError, match=tells("a.ply:", "'vertex'", "['chunk'")):
         read_ply(tmp_path / "a.ply")
     (tmp_path / "short.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:-1])

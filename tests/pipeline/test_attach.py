@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from kfgs.cameras import Camera
 from kfgs.cameras.similarity import Similarity
 from kfgs.fields import Identity, SemanticField
-from kfgs.formats.sidecar import names_path
+from kfgs.formats.sidecar import NAMES, beside
 from kfgs.formats.table import read_splats, write_splats
 from kfgs.gaussians import Gaussians
 from kfgs.labels import LabelSet
@@ -161,7 +161,7 @@ def test_the_facts_survive_a_file(tmp_path):
     back = read_splats(tmp_path / "a.ply")
     assert torch.equal(back.labels, attached.labels)
     assert back.names == CLASSES.names
-    written = json.loads(names_path(tmp_path / "a.ply").read_text())
+    written = json.loads(beside(tmp_path / "a.ply", NAMES).read_text())
     assert written["labelled by"] == "votes of 6 segmented views"
 
 

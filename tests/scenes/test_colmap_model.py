@@ -1,7 +1,6 @@
 import random
 import shutil
 import struct
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -18,35 +17,24 @@ from colmap_models import (
 from messages import tells
 
 from kfgs.scenes import SceneError
-from kfgs.scenes.colmap_files import CAMERA_MODELS
-from kfgs.scenes.colmap_model import ColmapModel, read_model, read_whole_model
-from kfgs.scenes.pycolmap_import import without_rigs
+from kfgs.scenes.colmap_model import CAMERA_MODELS, ColmapModel, read_model
 
 LAYOUTS = [(text, rigs) for text in (False, True) for rigs in (False, True)]
 
 
 def _read_alike(folder: Path) -> ColmapModel:
-    """Read a model with kfgs and with pycolmap; cameras, poses and points must be the same to the last bit."""
-    ours = read_whole_model(folder)
-    with without_rigs(folder) as safe:
-        theirs = read_with_pycolmap(safe)
-    assert set(ours.cameras) == set(theirs.cameras)
-    for i, camera in theirs.cameras.items():
-        expected = (camera.model_name, camera.width, camera.height, tuple(camera.params))
-        assert (
-            ours.cameras[i].model,
-            ours.cameras[i].width,
-            ours.cameras[i].height,
-            ours.cameras[i].params,
-        ) == expected
+    """Read a model with kfgs and with pycolmap; cameras, poses and points must be the same."""
+    ours, theirs = read_model(folder), read_with_pycolmap(folder)
+    assert {i: (c.model, c.width, c.height, c.params) for i, c in ours.cameras.items()} == {
+        i: (c.model_name, c.width, c.height, tuple(c.params)) for i, c in theirs.cameras.items()
+    }
     assert {i: (image.name, image.camera_id) for i, image in ours.images.items()} == {
         i: (image.name, image.camera_id) for i, image in theirs.images.items()
     }
     for i, image in theirs.images.items():
-        pose = ours.images[i].pose
-        assert pose is not None
-        np.testing.assert_allclose(pose[:3], image.cam_from_world().matrix(), rtol=0, atol=1e-14)
-        assert pose[3].tolist() == [0, 0, 0, 1]
+        np.testing.assert_allclose(
+            ours.images[i].pose[:3], image.cam_from_world().matrix(), rtol=0, atol=1e-6
+        )  # pycolmap does not normalise
         seen = [point.point3D_id if point.has_point3D() else -1 for point in image.points2D]
         assert ours.images[i].observed.tolist() == seen
     assert ours.point_ids.tolist() == sorted(theirs.points3D)
@@ -126,18 +114,13 @@ def test_every_truncation_of_every_binary_file_is_refused(tmp_path: Path) -> Non
         whole = file.read_bytes()
         for length in range(len(whole)):
             file.write_bytes(whole[:length])
-            with pytest.raises(SceneError, match=tells(file.name)):
+            with pytest.raises(SceneError, match=tells(file.name, "truncated or damaged", "copy the model")):
                 read_model(folder)
         file.write_bytes(whole + b"\0")
-        with pytest.raises(SceneError, match=tells("end", "got 1")):
+        with pytest.raises(SceneError, match=tells("1 bytes follow")):
             read_model(folder)
         file.write_bytes(whole)
     read_model(folder)
-
-
-def _shape(model: ColmapModel) -> tuple[int, ...]:
-    sizes = sorted(len(image.observed) for image in model.images.values())
-    return len(model.cameras), len(model.images), len(model.points), *sizes
 
 
 def _mutate(data: bytes, rng: random.Random) -> bytes:
@@ -158,28 +141,22 @@ def _mutate(data: bytes, rng: random.Random) -> bytes:
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_corrupt_models_are_refused_or_load_with_equal_shapes(tmp_path: Path, text: bool) -> None:
+def test_corrupt_models_are_refused_or_read_whole(tmp_path: Path, text: bool) -> None:
     folder = write_model(tmp_path / "m", ["a.png", "b.png"], text=text, rigs=False)
-    expected = _shape(_read_alike(folder))
     files = {file: file.read_bytes() for file in sorted(folder.iterdir())}
-    rng, outcome = random.Random(7), Counter[str]()
-    for trial in range(300):
+    rng, refused = random.Random(7), 0
+    for _ in range(300):
         file = rng.choice(list(files))
         file.write_bytes(_mutate(files[file], rng))
         try:
-            lost = any(image.pose is None for image in read_whole_model(folder).images.values())
-            with without_rigs(folder) as safe:  # `write_parts` hands it to pycolmap, which must not hang
-                read_with_pycolmap(safe)
-            found = _shape(read_model(folder) if lost else _read_alike(folder))
+            model = read_model(folder)
         except SceneError:
-            outcome["refused"] += 1
-        else:
-            # a digit or letter lost from a text file can leave a shorter, still consistent model
-            assert text or found == expected, f"trial {trial}, {file.name}: {found}"
-            outcome["loaded"] += 1
+            refused += 1
+        else:  # numbers may change within their bounds: no check can know better
+            assert text or (len(model.cameras), len(model.images), len(model.points) >= 4) == (1, 2, True)
+            assert np.isfinite(model.points).all()
         file.write_bytes(files[file])
-    assert outcome["refused"] > 100
-    assert outcome["loaded"] > 10  # numbers may change within their bounds: no check can know better
+    assert 100 < refused < 290
 
 
 def test_a_huge_count_is_refused_before_anything_is_allocated(tmp_path: Path) -> None:
@@ -189,42 +166,27 @@ def test_a_huge_count_is_refused_before_anything_is_allocated(tmp_path: Path) ->
         whole = file.read_bytes()
         for count in (2**40, 2**64 - 1):
             file.write_bytes(struct.pack("<Q", count) + whole[8:])
-            with pytest.raises(SceneError, match=tells(f"{name}.bin:", f"got {count}")):
+            with pytest.raises(SceneError, match=tells(f"{name}.bin:")):
                 read_model(folder)
         file.write_bytes(whole)
 
 
-def test_the_message_names_file_place_and_cure(tmp_path: Path) -> None:
-    folder = write_model(tmp_path / "m", ["a.png"])
-    file = folder / "cameras.bin"
-    file.write_bytes(file.read_bytes()[:-5])
-    parts = ("cameras.bin, camera 0", "32 bytes at byte 32", "got 27", "truncated", "copy the model")
-    with pytest.raises(SceneError, match=tells(*parts)):
-        read_model(folder)
-
-
 BAD_TABLES = [
-    ({"cameras": CAMERAS.replace("PINHOLE", "BANANA")}, ["cameras.txt, line 1", "MODEL", "RADIAL", "'BANANA'"]),
-    ({"cameras": CAMERAS.replace("31 25", "31")}, ["line 1", "fx fy cx cy", "got 3"]),
-    ({"cameras": CAMERAS.replace("31 25", "31 25 9")}, ["line 1", "fx fy cx cy", "got 5"]),
-    ({"cameras": CAMERAS.replace("50 55", "half 55")}, ["line 1", "PARAMS", "'half'"]),
-    ({"cameras": CAMERAS.replace("64 48", "0 48")}, ["1 to 100000 pixels", "0 x 48"]),
-    ({"cameras": CAMERAS.replace("64 48", "-64 48")}, ["1 to 100000 pixels", "-64 x 48"]),
-    ({"cameras": CAMERAS + CAMERAS}, ["line 2", "an id that no other has", "1 again"]),
-    ({"cameras": CAMERAS.replace("1 P", "2 P")}, ["image 1", "a camera of the model (2)", "got camera 1"]),
-    ({"images": IMAGES.replace("1 2 3 1 b", "1 x 3 1 b")}, ["line 3", "TY", "'x'"]),
+    ({"cameras": CAMERAS.replace("PINHOLE", "BANANA")}, ["cameras.txt", "record 1", "'BANANA'"]),
+    ({"cameras": CAMERAS.replace("31 25", "31")}, ["cameras.txt", "3 parameters, not 4"]),
+    ({"cameras": CAMERAS.replace("50 55", "half 55")}, ["'half'"]),
+    ({"cameras": CAMERAS.replace("64 48", "0 48")}, ["(0, 48) pixels"]),
+    ({"cameras": CAMERAS + CAMERAS}, ["record 2", "id 1 again"]),
+    ({"cameras": CAMERAS.replace("1 P", "2 P")}, ["expected cameras for all images", "image 1 (camera 1)"]),
+    ({"images": IMAGES.replace("1 2 3 1 b", "1 x 3 1 b")}, ["images.txt", "record 2", "'x'"]),
     ({"images": IMAGES.replace("b.png", "../b.png")}, ["inside the image folder", "'../b.png'", "rename"]),
     ({"images": IMAGES.replace("b.png", "/etc/b.png")}, ["inside the image folder", "'/etc/b.png'", "rename"]),
-    ({"images": IMAGES.replace("b.png", "a.png")}, ["image 2", "name", "'a.png' again", "as image 1"]),
-    ({"images": IMAGES.replace("2 0.6", "1 0.6")}, ["line 3", "an id that no other has", "1 again"]),
-    ({"images": IMAGES.removesuffix("5 6 7\n")}, ["line 3", "a line of 2-D points", "the end of the file"]),
-    ({"images": IMAGES.replace("5 6 7", "5 6")}, ["line 4", "2-D points as X Y POINT3D_ID", "2 words"]),
-    ({"images": IMAGES.replace("5 6 7", "5 6 7.5")}, ["line 4", "2-D points as X Y POINT3D_ID", "'7.5'"]),
-    ({"images": IMAGES.replace("2 7 3", "2 8 3").replace("5 6 7", "5 6 8")}, ["2 that see other points", "one model"]),
-    ({"points3D": POINTS + POINTS}, ["points3D.txt", "each point id once", "7"]),
-    ({"points3D": POINTS.replace("10 20 30", "10 256 30")}, ["points3D.txt, line 1", "R G B", "256"]),
-    ({"points3D": POINTS.replace("1 0 2 0", "1 0 2")}, ["points3D.txt, line 1", "TRACK"]),
-    ({"points3D": POINTS.replace("1 0 2 0", "1 0 -2 0")}, ["points3D.txt, line 1", "-2"]),
+    ({"images": IMAGES.replace("2 0.6", "1 0.6")}, ["record 2", "id 1 again"]),
+    ({"images": IMAGES.removesuffix("5 6 7\n")}, ["record 2", "no", "2-D points"]),
+    ({"images": IMAGES.replace("5 6 7", "5 6")}, ["record 2", "2-D points as X Y POINT3D_ID"]),
+    ({"images": IMAGES.replace("5 6 7", "5 6 7.5")}, ["record 2", "'7.5'"]),
+    ({"points3D": POINTS + POINTS}, ["points3D.txt", "id 7 again"]),
+    ({"points3D": POINTS.replace("10 20 30", "10 256 30")}, ["points3D.txt", "record 1", "256"]),
 ]
 
 
@@ -234,45 +196,11 @@ def test_bad_tables_are_refused(tmp_path: Path, tables: dict[str, str], parts: l
         read_model(write_text_model(tmp_path, **tables))
 
 
-BROKEN_TABLES = [
-    (
-        {"cameras": CAMERAS.replace("50 55", "nan 55")},
-        "2 images have a camera without a focal length above 0",
-        "a.png, b.png",
-    ),
-    (
-        {"cameras": CAMERAS.replace("50 55", "1e400 55")},
-        "2 images have a camera without a focal length",
-        "a.png, b.png",
-    ),
-    ({"cameras": CAMERAS.replace("50 55", "-50 55")}, "2 images have a camera without a focal length", "a.png, b.png"),
-    (
-        {"images": IMAGES.replace("5 6 7", "")},
-        "1 of 2 entries of tracks lead to no 2-D point",
-        "2-D point 0 of image 2",
-    ),
-    (
-        {"images": IMAGES.replace("5 6 7", "5 6 8")},
-        "1 of 2 entries of tracks lead to no 2-D point",
-        "2-D point 0 of image 2",
-    ),
-    ({"points3D": POINTS.replace("1 0 2 0", "9 0 2 0")}, "1 of 2 entries of tracks", "images 9 are not in the model"),
-    ({"points3D": POINTS.replace("1 0 2 0", "1 99 2 0")}, "1 of 2 entries of tracks", "2-D point 99 of image 1"),
-    ({"points3D": POINTS.replace("1 2 3", "1 2 1e30")}, "1 of 1 points have no finite place", "ids 7"),
-    ({"points3D": POINTS.replace("1 2 3", "1 -nan(ind) 3")}, "1 of 1 points have no finite place", "ids 7"),
-]
-
-
-@pytest.mark.parametrize(("tables", "count", "place"), BROKEN_TABLES)
-def test_broken_numbers_are_noted_and_kept_from_pycolmap(
-    tmp_path: Path, tables: dict[str, str], count: str, place: str
-) -> None:
-    folder = write_text_model(tmp_path, **tables)
-    (note,) = read_model(folder).notes
-    assert note.startswith(count)
-    assert place in note
-    with pytest.raises(SceneError, match=tells("nothing broken", count, "kfgs sfm PHOTOS --out OUT")):
-        read_whole_model(folder)
+@pytest.mark.parametrize("place", ["1 2 1e30", "1 -nan(ind) 3"])
+def test_points_without_a_finite_place_are_left_out_and_noted(tmp_path: Path, place: str) -> None:
+    model = read_model(write_text_model(tmp_path, points3D=POINTS.replace("1 2 3", place)))
+    assert model.notes == ("1 of 1 points have no finite place and were left out (ids 7)",)
+    assert len(model.points) == 0
 
 
 @pytest.mark.parametrize("numbers", ["0 0 0 0 1 2 3", "nan 0.8 0 0 1 2 3", "6 8 0 0 1 2 3", "0.6 0.8 0 0 inf 2 3"])
@@ -283,11 +211,15 @@ def test_an_image_whose_pose_is_broken_has_none(tmp_path: Path, numbers: str) ->
     assert poses["a.png"] is not None
 
 
+@pytest.mark.parametrize("focal", ["nan", "1e400", "-50"])
+def test_the_images_of_a_broken_camera_have_no_pose(tmp_path: Path, focal: str) -> None:
+    model = read_model(write_text_model(tmp_path, cameras=CAMERAS.replace("50 55", f"{focal} 55")))
+    assert [image.pose for image in model.images.values()] == [None, None]
+
+
 def test_names_may_hold_blanks_which_colmap_cuts_in_text_files(tmp_path: Path) -> None:
     folder = write_text_model(tmp_path / "m", images=IMAGES.replace("b.png", " my  shot (1).png"))
     assert [image.name for image in read_model(folder).images.values()] == ["a.png", "my  shot (1).png"]
-    with pytest.raises(SceneError, match=tells("without blanks", "'my  shot (1).png'", "kfgs sfm PHOTOS --out OUT")):
-        read_whole_model(folder)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
@@ -307,7 +239,7 @@ def test_honest_variants_pass(tmp_path: Path) -> None:
     ]
     for i, tables in enumerate(variants):
         folder = write_text_model(tmp_path / str(i), **tables)
-        assert len(_read_alike(folder).images) in (1, 2)
+        assert len(read_model(folder).images) in (1, 2)
 
 
 def test_bad_binary_values_are_refused(tmp_path: Path) -> None:
@@ -316,13 +248,13 @@ def test_bad_binary_values_are_refused(tmp_path: Path) -> None:
         data = bytearray((folder / name).read_bytes())
         struct.pack_into(layout, data, offset, value)
         (folder / name).write_bytes(data)
-        with pytest.raises(SceneError, match=tells(name, *parts)):
+        with pytest.raises(SceneError, match=tells(*parts)):
             read_model(folder)
 
-    refused("cameras.bin", 12, "<i", 99, "camera 0", "a camera model in 0..17", "got 99")
-    refused("cameras.bin", 16, "<Q", 0, "an image of 1 to 100000", "0 x 48")
-    refused("images.bin", 8 + 4 + 56, "<I", 77, "image 1", "a camera of the model (1)", "camera 77")
-    refused("images.bin", 8 + 64, "<B", 0xFF, "UTF-8")
+    refused("cameras.bin", 12, "<i", 99, "record 1", "99")
+    refused("cameras.bin", 16, "<Q", 0, "(0, 48) pixels")
+    refused("images.bin", 8 + 4 + 56, "<I", 77, "cameras for all images", "camera 77")
+    refused("images.bin", 8 + 64, "<B", 0xFF, "utf-8")
 
 
 def test_missing_folder_and_files_are_named(tmp_path: Path) -> None:

@@ -118,7 +118,7 @@ def test_poses_that_do_not_fit_are_refused(posed: Scene) -> None:
 
 def test_each_lens_reaches_pycolmap(posed: Scene) -> None:
     from kfgs.cameras.distortion import plane_to_pixel
-    from kfgs.scenes.known_poses import _lens
+    from kfgs.scenes.known_poses import _reconstruction
 
     pycolmap = import_pycolmap()
     rays = np.array([[0.1, -0.2, 1.0], [-0.3, 0.15, 1.0]])
@@ -128,8 +128,10 @@ def test_each_lens_reaches_pycolmap(posed: Scene) -> None:
                                 ("kannala_brandt", (0.1, -0.02, 0.01, 0.005))):  # fmt: skip
         lens = None if model is None else Distortion(model, coefficients)
         K = torch.tensor([[50.0, 0, 31], [0, 55, 25], [0, 0, 1]])
-        name, params = _lens(Camera(torch.eye(4), K, 64, 48, "a.png", lens))
-        theirs = pycolmap.Camera(model=name, width=64, height=48, params=params).img_from_cam(rays)
+        scene = Scene(
+            [Camera(torch.eye(4), K, 64, 48, "a.png", lens)], [Path("a.png")], torch.zeros(0, 3), torch.zeros(0, 3)
+        )
+        theirs = _reconstruction(pycolmap, scene, ["a.png"]).cameras[1].img_from_cam(rays)
         ours = plane_to_pixel(torch.from_numpy(rays[:, :2]), K.double(), lens)
         np.testing.assert_allclose(np.asarray(theirs), ours.numpy(), atol=1e-6)
 

@@ -7,7 +7,7 @@ import pytest
 from messages import tells
 
 from kfgs.scenes import SceneError
-from kfgs.scenes.pycolmap_import import scene_errors
+from kfgs.scenes.pycolmap_import import quiet_pycolmap
 
 PROGRAM = """
 import os, signal, sys
@@ -42,11 +42,11 @@ def test_a_process_that_is_asked_to_end_says_nothing(ended):
     assert ended.stderr == ""  # pycolmap's log library would print a stack
 
 
-def test_pycolmap_failures_become_scene_errors(tmp_path: Path) -> None:
+def test_pycolmap_failures_become_quiet_pycolmap(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match=tells("x:", "a model", "(IndexError: unordered_map::at)", "do this")):  # noqa: SIM117
-        with scene_errors("x: expected a model", "do this"):
+        with quiet_pycolmap("x: expected a model", "do this"):
             raise IndexError("unordered_map::at")
-    with pytest.raises(SceneError, match=tells("MemoryError: no text")), scene_errors("x", "y"):
+    with pytest.raises(SceneError, match=tells("MemoryError: no text")), quiet_pycolmap("x", "y"):
         raise MemoryError
-    with pytest.raises(KeyboardInterrupt), scene_errors("x", "y"):
+    with pytest.raises(KeyboardInterrupt), quiet_pycolmap("x", "y"):
         raise KeyboardInterrupt

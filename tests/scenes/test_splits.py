@@ -6,7 +6,7 @@ from messages import tells
 
 from kfgs.scenes import SceneError
 from kfgs.scenes.files import natural_key
-from kfgs.scenes.splits import choose_split, make_split, read_lists, read_split
+from kfgs.scenes.splits import choose_split, make_split, read_split
 
 
 def test_the_papers_split_takes_every_10th_from_the_1st_and_6th() -> None:
@@ -54,8 +54,8 @@ def _write(path: Path, value: object) -> Path:
 
 
 def test_a_split_file_lists_stems(tmp_path: Path) -> None:
-    file = _write(tmp_path / "split.json", {"train": ["c", "a.png"], "test": ["b", "cc"], "hard": ["a"]})
-    splits, notes = read_split(file, ["a.png", "b.png", "c.png"])
+    _write(tmp_path / "split.json", {"train": ["c", "a.png"], "test": ["b", "cc"], "hard": ["a"]})
+    splits, notes = read_split(tmp_path, ["a.png", "b.png", "c.png"])
     assert splits == {"train": [0, 2], "test": [1], "hard": [0]}
     assert [note.partition(" in ")[0] for note in notes] == ["1 names"]
     assert notes[0].endswith("not in the scene: cc (did you mean 'c.png'?)")
@@ -75,12 +75,12 @@ def test_a_split_file_lists_stems(tmp_path: Path) -> None:
 )
 def test_wrong_split_files_are_refused(tmp_path: Path, value: object, message: str) -> None:
     with pytest.raises(SceneError, match=tells(*message)):
-        read_split(_write(tmp_path / "split.json", value), ["a", "b"])
+        read_split(_write(tmp_path / "split.json", value).parent, ["a", "b"])
 
 
 def test_the_shipped_split(shared_data: Path) -> None:
     names = sorted((p.stem for p in (shared_data / "room_0/images").iterdir()), key=natural_key)
-    splits, notes = read_split(shared_data / "room_0/split.json", names)
+    splits, notes = read_split(shared_data / "room_0", names)
     assert (len(splits["train"]), len(splits["test"]), notes) == (90, 90, [])
     assert [names[i] for i in splits["train"][:2] + splits["test"][:2]] == ["rgb_5", "rgb_15", "rgb_0", "rgb_10"]
 
@@ -100,23 +100,23 @@ def test_lists_of_views_are_obeyed(tmp_path: Path, files: dict[str, str], train:
     for name, text in files.items():
         (tmp_path / name).write_text(text, encoding="utf-8")
     names = ["a.png", "b.png", "c.png", "d.png"]
-    read = read_split(tmp_path / "split.json", names) if "split.json" in files else read_lists(tmp_path, names)
+    read = read_split(tmp_path, names)
     assert read is not None
     assert (read[0]["train"], read[0]["test"], read[1]) == (train, test, [])
 
 
 def test_unknown_names_of_a_list_are_told_and_lists_without_a_view_refused(tmp_path: Path) -> None:
     names = ["a.png", "b.png"]
-    assert read_lists(tmp_path, names) is None
+    assert read_split(tmp_path, names) is None
     (tmp_path / "test.txt").write_text("b.png\nframe_b.png\n")
-    splits, notes = read_lists(tmp_path, names) or ({}, [])
+    splits, notes = read_split(tmp_path, names) or ({}, [])
     assert splits == {"train": [0], "test": [1]}
     assert "1 names" in notes[0]
     assert notes[0].endswith("test.txt are not in the scene: frame_b.png (did you mean 'b.png'?)")
     for text in ("frame_1.png", "a.png\nb.png"):
         (tmp_path / "test.txt").write_text(text)
         with pytest.raises(SceneError, match=tells("test.txt", "2 pictures", text[:5], "correct the names")):
-            read_lists(tmp_path, names)
+            read_split(tmp_path, names)
     (tmp_path / "test.txt").write_bytes(b"K\xfcche.png")
     with pytest.raises(SceneError, match="save it as UTF-8"):
-        read_lists(tmp_path, names)
+        read_split(tmp_path, names)

@@ -204,11 +204,7 @@ def _frame(**changes: Any) -> list[dict[str, Any]]:
 BAD = [
     ([], {}, ("'frames'", "transforms.json")),
     ([3], {}, ("frame 0:", "'transform_matrix'", "got 3")),
-    (
-        _frame(transform_matrix=None),
-        {},
-        ("none of 1 has both", "1 views have no pose or lens of finite numbers", "a.png"),
-    ),
+    (_frame(transform_matrix=None), {}, ("poses and lenses of finite numbers", "none in 1 (a.png)")),
     (_frame(transform_matrix=[[1, 2], [3]]), {}, ("transform_matrix:", "expected 4", "got [[")),
     (_frame(transform_matrix=[[1.0, 2.0]]), {}, ("transform_matrix:", "expected 4", "got [[1.0, 2.0]]")),
     (_frame(transform_matrix=[["a"] * 4] * 4), {}, ("transform_matrix:", "expected 4", "got [[")),
@@ -221,7 +217,7 @@ BAD = [
     (_frame(fl_x="wide"), {}, ("fl_x:", "got 'wide'")),
     (_frame(fl_x=True), {}, ("fl_x:", "got True")),
     (_frame(fl_x=-5), {}, ("(a.png):", "K[0, 0] (fx):", "got -5.0")),
-    (_frame(cx=1e300), {}, ("none of 1 has both", "no pose or lens of finite numbers", "a.png")),
+    (_frame(cx=1e300), {}, ("poses and lenses of finite numbers", "none in 1 (a.png)")),
     (_frame(), {"fl_x": None}, ("'fl_x'", "'camera_angle_x'")),
     (_frame(), {"fl_x": None, "camera_angle_x": 4.0}, ("camera_angle_x:", "(0, pi)", "got 4.0")),
     (_frame(), {"w": 64.5}, ("w and h", "1 to 100000", "got (64.")),

@@ -1,21 +1,18 @@
-"""Pictures that structure from motion takes from a video or from HEIC photographs."""
+"""Pictures that structure from motion takes from a video."""
 
-import importlib.util
-import os
 import sys
 from pathlib import Path
 
 import imageio_ffmpeg
 import numpy as np
 import pytest
-import torch
 from cases_sfm import downsized
 from messages import tells
 from PIL import Image, ImageFilter
 
 from kfgs.cli import main
-from kfgs.scenes import SceneError, SfmConfig, load_scene, read_image, run_sfm
-from kfgs.scenes.pictures import SOURCE, convert_heic, extract_frames, has_heic, is_video, sharpness
+from kfgs.scenes import SceneError, load_scene, run_sfm
+from kfgs.scenes.video import SOURCE, extract_frames, is_video, sharpness
 
 # imageio-ffmpeg leaves the pipes of a finished ffmpeg to the garbage collector, which warns.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
@@ -129,64 +126,7 @@ def test_sfm_of_a_video(shared_data: Path, tmp_path: Path, capsys: pytest.Captur
         assert message in capsys.readouterr().err
 
 
-def test_heic_without_its_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_heic_photographs_are_refused_with_a_cure(tmp_path: Path) -> None:
     (tmp_path / "a.HEIC").write_bytes(b"\0\0\0\x18ftypheic")
-    assert has_heic(tmp_path)
-    monkeypatch.setitem(__import__("sys").modules, "pillow_heif", None)
-    with pytest.raises(ImportError, match=tells("a.HEIC", "pip install pillow-heif", "JPEG")):
-        read_image(tmp_path / "a.HEIC")
-    with pytest.raises(ImportError, match=tells("pillow-heif")):
-        convert_heic(tmp_path, tmp_path / "out")
-    with pytest.raises(SceneError, match=tells("HEIC", "convert_heic")):
-        run_sfm(tmp_path, tmp_path / "scene", config=SfmConfig(num_threads=1))
-
-
-@pytest.mark.skipif(importlib.util.find_spec("pillow_heif") is None, reason="pillow-heif is not installed")
-def test_heic_photographs_become_jpeg(tmp_path: Path) -> None:
-    import pillow_heif
-
-    photos = tmp_path / "photos"
-    (photos / "more").mkdir(parents=True)
-    made = pillow_heif.from_pillow(texture(0))
-    made.save(photos / "IMG_1.HEIC", quality=95)
-    made.save(photos / "more/IMG_2.heic", quality=95)
-    made.save(photos / "IMG_3.heic", quality=95)
-    texture(3).save(photos / "IMG_3.jpg")  # the phone's own copy: not converted again
-    read = read_image(photos / "IMG_1.HEIC")
-    assert float((read * 255 - torch.from_numpy(np.array(texture(0)))).abs().mean()) < 12
-    files = convert_heic(photos, tmp_path / "out")
-    assert sorted(file.relative_to(tmp_path / "out").as_posix() for file in files) == [
-        "IMG_1.jpg",
-        "IMG_3.jpg",
-        "more/IMG_2.jpg",
-    ]
-    assert os.path.samefile(tmp_path / "out/IMG_3.jpg", photos / "IMG_3.jpg")
-    assert float((read_image(tmp_path / "out/IMG_1.jpg") - read).abs().mean()) < 0.05
-    assert convert_heic(photos, tmp_path / "out") == files
-
-
-@pytest.mark.skipif(importlib.util.find_spec("pillow_heif") is None, reason="pillow-heif is not installed")
-def test_no_heic_photograph_is_lost_or_mistaken_for_another(tmp_path: Path) -> None:
-    import pillow_heif
-
-    photos = tmp_path / "photos"
-    (photos / ".trash").mkdir(parents=True)
-    texture(0).save(photos / "a.png")
-    pillow_heif.from_pillow(texture(1)).save(photos / ".trash/old.heic")
-    assert not has_heic(photos)  # hidden, as everywhere
-    for name in ("b.HEIC", "b.heif"):
-        pillow_heif.from_pillow(texture(2)).save(photos / name)
-    with pytest.raises(SceneError, match=tells("b.HEIC", "b.heif", "rename")):
-        convert_heic(photos, tmp_path / "out")
-    (photos / "b.heif").unlink()
-    cut = texture(3).convert("RGBA")
-    cut.putalpha(texture(4).convert("L"))  # an object that the phone cut out
-    pillow_heif.from_pillow(cut).save(photos / "cut.heic")
-    assert [file.name for file in convert_heic(photos, tmp_path / "out")] == ["a.png", "b.jpg", "cut.png"]
-    with Image.open(tmp_path / "out/cut.png") as picture:
-        assert picture.mode == "RGBA"
-    data = bytearray((photos / "b.HEIC").read_bytes())
-    data[-1] ^= 1
-    (photos / "b.HEIC").write_bytes(data)  # another photograph of the same size
-    with pytest.raises(FileExistsError, match=tells("out", "new or empty")):
-        convert_heic(photos, tmp_path / "out")
+    with pytest.raises(SceneError, match=tells("HEIC", "a.HEIC", "save them as JPEG")):
+        run_sfm(tmp_path, tmp_path / "out")
