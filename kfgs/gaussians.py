@@ -51,6 +51,7 @@ class Gaussians:
     extra: Mapping[str, Array] = field(default_factory=dict)  # other columns of a file by name, one value per Gaussian
     origin: tuple[float, float, float] = ORIGIN  # where (0, 0, 0) lies in the world: add it to `means` in float64
     antialiased: bool = False  # trained with Mip-Splatting's filter: drawn with opacity compensation
+    gaussians = property(lambda self: self, doc="The cloud itself, so that `read_splats(...).gaussians` works.")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "origin", as_origin(self.origin))
@@ -95,8 +96,7 @@ class Gaussians:
         raise TypeError("gaussians: expected an array, got Gaussians, which hold several; use to_numpy()")
 
     def _tensors(self) -> dict[str, Tensor]:
-        values = {name: getattr(self, name) for name in TENSORS}
-        return {name: value for name, value in values.items() if value is not None}
+        return {name: value for name in TENSORS if (value := getattr(self, name)) is not None}
 
     def replace(self, **changes: Any) -> Gaussians:
         """A copy with some parts exchanged."""
@@ -202,5 +202,5 @@ def as_rows(name: str, which: Any, count: int) -> Tensor:  # [count] bool, or [n
 def check_gaussians(value: object, name: str = "gaussians") -> None:
     """Raise a TypeError unless `value` is a cloud of Gaussians; the message says where it is, if `value` holds one."""
     if not isinstance(value, Gaussians):
-        hint = "its .gaussians" if hasattr(value, "gaussians") else "Gaussians"
-        raise TypeError(f"{name}: expected Gaussians, got {type(value).__name__}; pass {hint}")
+        hint = f"pass {'its .gaussians' if hasattr(value, 'gaussians') else 'Gaussians'}"
+        raise TypeError(f"{name}: expected Gaussians, got {type(value).__name__}; {hint}")

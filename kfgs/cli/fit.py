@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .._files import real_path, write_json
-from .options import Flag, Given, Matching, Positional, SceneFolder, Views
+from .options import Flag, Given, Matching, Positional, SceneFolder, Teacher, Views
 from .output import say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -116,6 +116,7 @@ def fit(
     steps: Given[int] = None,
     max_gaussians: Given[int] = None,
     views: Views,
+    teacher: Teacher,
 ) -> None:
     """Make a semantic field of a scene and its teacher's feature maps.
 
@@ -127,6 +128,7 @@ def fit(
     Examples:
         kfgs fit scene/ --out run/ --splat my.ply
         kfgs fit scene/ --out run/ --features maps/
+        kfgs fit scene/ --out run/ --teacher mine:colors    # makes the maps, in OUT/features
         kfgs fit scene/ --out run/ --splat my.ply --max-gaussians 0    # keeps every Gaussian of the splat
         kfgs fit scene/ --out run/ --method paper
 
@@ -148,12 +150,13 @@ def fit(
     as_taken = views.load(scene)
     loaded, split = as_taken.undistorted(), views.split
     folder = features or (scene if scene.is_dir() else scene.parent) / "features"
-    if not folder.is_dir():
+    network = teacher.load()
+    if network is None and not folder.is_dir():
         raise ValueError(
             f"features: expected a folder of feature maps, got {folder}, which is none; name another, or make them with "
             "`kfgs features`"
         )
-    maps = FeatureFolder(folder).of(as_taken, split)
+    maps = network or FeatureFolder(folder).of(as_taken, split)
     field = fit_field(loaded, maps, made_by, folder=out, split=split, report=say, progress=True)
     command = f"cd {shlex.quote(os.getcwd())}\n{shlex.join(['kfgs', *sys.argv[1:]])}"
     report = write_run_report(out, field, loaded, made_by, split=split, command=command)

@@ -159,10 +159,7 @@ ENGINE = TritonEngine()
 
 
 def launch_options(kernel: str, channels: int, tile_size: int) -> dict[str, Any]:
-    """The sizes a kernel of `LAUNCHES` is compiled for, and its warps.
-
-    Several programs share a tile of more pixels than the table has.
-    """
+    """The sizes a kernel of `LAUNCHES` is compiled for, and its warps; several programs share a larger tile."""
     launch = LAUNCHES[kernel][channels > SMALLEST]
     pixels = min(launch.pixels, max(SMALLEST, triton.next_power_of_2(tile_size**2)))
     return {

@@ -179,6 +179,15 @@ def slope_of_point(viewmat, K, size, tangent, z, g0, g1, g2, g_mean, AXIS: tl.co
     return g_tangent / z, -(j * (g_j - at * g_jz) + g_tangent * tangent) / z
 
 
+@triton.jit
+def slope_of_quat(w, x, y, z, g0, g1, g2, g3, g4, g5, g6, g7, g8):
+    """The slopes in a quaternion, given those in its rotation matrix: sums and differences across the diagonal."""
+    g_w = 2.0 * (x * (g7 - g5) + y * (g2 - g6) + z * (g3 - g1))
+    g_x = 2.0 * (w * (g7 - g5) + y * (g3 + g1) + z * (g2 + g6) - 2.0 * x * (g4 + g8))
+    g_y = 2.0 * (w * (g2 - g6) + x * (g3 + g1) + z * (g7 + g5) - 2.0 * y * (g0 + g8))
+    return g_w, g_x, g_y, 2.0 * (w * (g3 - g1) + x * (g2 + g6) + y * (g7 + g5) - 2.0 * z * (g0 + g4))
+
+
 @triton.jit(do_not_specialize=NUMBERS)
 def differentiate_projection_kernel(
     means, quats, scales, viewmat, K, kept, ends,
@@ -218,15 +227,12 @@ def differentiate_projection_kernel(
     store_3(out_scales, row, inside, gu0 * a0 + gv0 * b0, gu1 * a1 + gv1 * b1, gu2 * a2 + gv2 * b2)
     gu0, gu1, gu2, gv0, gv1, gv2 = gu0 * sx, gu1 * sy, gu2 * sz, gv0 * sx, gv1 * sy, gv2 * sz
 
-    # of the rotation, R_ik: p_i gu_k + q_i gv_k; then of the quaternion, by sums and differences across the diagonal
+    # of the rotation, R_ik: p_i gu_k + q_i gv_k
     g0, g4, g8 = p0 * gu0 + q0 * gv0, p1 * gu1 + q1 * gv1, p2 * gu2 + q2 * gv2
     g1, g3 = p0 * gu1 + q0 * gv1, p1 * gu0 + q1 * gv0
     g2, g6 = p0 * gu2 + q0 * gv2, p2 * gu0 + q2 * gv0
     g5, g7 = p1 * gu2 + q1 * gv2, p2 * gu1 + q2 * gv1
-    g_w = 2.0 * (x * (g7 - g5) + y * (g2 - g6) + qz * (g3 - g1))
-    g_x = 2.0 * (w * (g7 - g5) + y * (g3 + g1) + qz * (g2 + g6) - 2.0 * x * (g4 + g8))
-    g_y = 2.0 * (w * (g2 - g6) + x * (g3 + g1) + qz * (g7 + g5) - 2.0 * y * (g0 + g8))
-    g_z = 2.0 * (w * (g3 - g1) + x * (g2 + g6) + y * (g7 + g5) - 2.0 * qz * (g0 + g4))
+    g_w, g_x, g_y, g_z = slope_of_quat(w, x, y, qz, g0, g1, g2, g3, g4, g5, g6, g7, g8)
     # A quaternion of unit norm cannot grow; one that is divided by the floor can.
     radial = tl.where(norm >= QUAT_FLOOR, g_w * w + g_x * x + g_y * y + g_z * qz, 0.0)
     norm = tl.maximum(norm, QUAT_FLOOR)
