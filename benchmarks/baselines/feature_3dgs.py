@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-
-from kfgs.cameras import resize_map
+from torch.nn.functional import interpolate
 
 from .common import FLOAT, Clock, Fitted, KeptMaps, Task, is_shown, seeded
 from .methods import LinearDecoder, RenderedMethod
@@ -65,7 +64,8 @@ class Features(torch.nn.Module):
     def loss(self, rendered: Tensor, target: Tensor, step: int) -> Tensor:  # [H, W, d], [h, w, D] -> []
         """The mean over all pixels and channels of |conv(resize(rendered)) - teacher|."""
         height, width, _ = target.shape
-        small = resize_map(rendered, (height, width), align_corners=True)
+        planes = rendered.permute(2, 0, 1)[None]
+        small = interpolate(planes, (height, width), mode="bilinear", align_corners=True)[0].permute(1, 2, 0)
         found = small if self.convolution is None else self.convolution(small)
         return (found - target).abs().mean()
 

@@ -175,17 +175,17 @@ class Trainer:
         if means2d.requires_grad:
             means2d.retain_grad()
         loss = self._loss(rendering.map, rendering.alpha, target)
-        value = float(loss.detach())
+        if loss.requires_grad:  # not so when the view shows no Gaussian
+            loss.backward()
+            if growing and means2d.grad is not None:
+                self.statistics.add_(rendering.projected.index, means2d.grad, camera.size)
+        value = float(loss.detach())  # waits for a GPU, which has its work by now
         if not math.isfinite(value):
             raise FloatingPointError(
                 f"loss: expected a finite number at step {self.step}, got {value} (view {camera.name!r}); "
                 "check the targets for infinities, or lower the learning rates"
             )
         self._losses += value
-        if loss.requires_grad:  # not so when the view shows no Gaussian
-            loss.backward()
-            if growing and means2d.grad is not None:
-                self.statistics.add_(rendering.projected.index, means2d.grad, camera.size)
         self.optimizer.step_(self.step)
 
     def _densify_(self, options: Densify) -> None:

@@ -22,7 +22,9 @@ def test_query(fused, room, recorded):
         recorded["gamma of the cosine"], abs=0.03
     )  # 0.870 on an Intel, 0.893 on an AMD
     parts = kfgs.connected_parts(fused.gaussians, selection, distance=0.15)
-    assert 5 <= len(parts) <= recorded["chairs"]  # the room has five; on an Intel two backrests lie apart, on an AMD none
+    assert (
+        5 <= len(parts) <= recorded["chairs"]
+    )  # the room has five; on an Intel two backrests lie apart, on an AMD none
     inside = fused.gaussians.means[parts[0].indices]
     low, high = parts[0].extent
     assert ((inside >= low - 1e-4) & (inside <= high + 1e-4)).all()
