@@ -102,8 +102,7 @@ def extract_features(
             raise ValueError(f"scene: expected names inside the folder, got {stem!r}; rename the picture")
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such file; expected the picture of view {stem!r}")
-    # A folder that is refused stays as it is, without a lock file.
-    _check_folder(folder, identity, list(pictures), overwrite)
+    _check_folder(folder, identity, list(pictures), overwrite)  # before the lock: a refused folder stays as it is
     with locked(folder, LOCK):
         manifest = read_manifest(folder) or Manifest(identity)
         if manifest.teacher != identity:
@@ -120,6 +119,8 @@ def extract_features(
                 answer = encode(read_image(path).permute(2, 0, 1).contiguous())
             try:
                 features = as_tensor("features", answer, floating=True)
+                if features.layout != torch.strided:
+                    raise TypeError(f"features: expected a dense tensor, got {features.layout}; call its to_dense()")
                 check_shapes(("features", features, "D h w" if channels is None else (channels, "h", "w")))
                 save_feature_map(folder, stem, features.permute(1, 2, 0))
             except (ValueError, TypeError) as error:
@@ -131,7 +132,7 @@ def extract_features(
 
 def _as_encoder(teacher: Any) -> tuple[Callable[[Tensor], Tensor], dict[str, Any]]:
     """The function from a picture to features, and what is known about the teacher as JSON."""
-    encode, version = getattr(teacher, "encode_image", teacher), str(getattr(teacher, "version", ""))
+    encode, version = getattr(teacher, "encode_image", teacher), str(getattr(teacher, "version", None) or "")
     if inspect.isclass(teacher) or not callable(encode):
         raise TypeError(
             f"teacher: expected an object with encode_image, or a function from [3, H, W] to [D, h, w], got {teacher!r:.80}; "
@@ -142,9 +143,7 @@ def _as_encoder(teacher: Any) -> tuple[Callable[[Tensor], Tensor], dict[str, Any
     try:
         return encode, json.loads(json.dumps({"name": name, **identity}, allow_nan=False))  # tuples become lists
     except (TypeError, ValueError) as error:
-        raise TypeError(
-            f"teacher.identity: expected plain values that JSON can hold, got {identity!r} ({error})"
-        ) from error
+        raise TypeError(f"teacher.identity: expected values that JSON can hold, got {identity!r} ({error})") from error
 
 
 def _check_folder(folder: Path, identity: dict[str, Any], stems: list[str], overwrite: bool) -> None:

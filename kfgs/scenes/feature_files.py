@@ -112,7 +112,8 @@ def save_feature_map(path: str | Path, stem: str, features: Tensor) -> Path:  # 
         low, high = (float(end) for end in features.aminmax()) if features.numel() else (0.0, 0.0)
         raise ValueError(
             f"features: expected finite values below 65504 and, where they are not all zero, above 6e-8 (they are stored as "
-            f"float16), got {tuple(half.shape)} from {low:g} to {high:g} for {stem!r}; bring the rows to unit length"
+            f"float16), got {tuple(half.shape)} from {low:g} to {high:g} for {stem!r}; "
+            + ("bring the rows to unit length" if math.isfinite(low + high) else "check the weights of its network")
         )
     target = as_path(path) / f"{stem}{OWN}"
     with atomic_path(target) as temporary, temporary.open("wb") as file:

@@ -181,7 +181,8 @@ class _Broken(Counting):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda f: f.index_fill(0, torch.tensor([1]), torch.nan), ("finite", "b.png")),
+        (lambda f: f.index_fill(0, torch.tensor([1]), torch.nan), ("finite", "b.png", "check the weights")),
+        (lambda f: f.to_sparse(), ("features: expected a dense tensor", "sparse_coo", "b.png")),
         (lambda f: f * 0 + 70_000, ("65504", "float16", "b.png", "70000", "unit length")),
         (lambda f: f.index_fill(1, torch.tensor([2]), 1e-9), ("6e-8", "float16", "b.png", "unit length")),
         (lambda f: f[:3], ("expected [5, h, w]", "b.png", "got (3, 3, 4)")),
@@ -193,6 +194,13 @@ def test_what_a_teacher_may_not_return_is_named_and_the_maps_before_stay(change,
     with pytest.raises((ValueError, TypeError), match=tells("counting", *message)):
         extract_features(_Broken(change), scene, tmp_path / "maps", "all")
     assert list(contents(tmp_path / "maps")) == ["a.npy"]
+
+
+@pytest.mark.parametrize(("version", "known"), [(None, {}), ("", {}), (2, {"version": "2"})])
+def test_a_teacher_without_a_version_is_known_by_its_name_alone(version, known, scene, tmp_path):
+    teacher = Counting()
+    teacher.identity, teacher.version = None, version
+    assert extract_features(teacher, scene, tmp_path / "maps").teacher == {"name": "counting", **known}
 
 
 def test_features_that_are_all_zero_stay_so_and_small_ones_are_kept(scene, tmp_path):
