@@ -1,16 +1,12 @@
-"""One scene of a batch from its photos to its scores: the steps of the task that a worker runs.
-
-Each step calls the function that does it for a single scene, and these find what an earlier call has finished.
-"""
+"""One scene of a batch from its photos to its scores: steps, each of which finds what an earlier call has finished."""
 
 from __future__ import annotations
 
-import glob
+import os
 import shutil
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -72,8 +68,7 @@ def make_scene(
 ) -> dict[str, Any]:
     """Make the field of a scene or a folder of photos in the folder `run`, segment its test views and score them.
 
-    `step` is a context for each step of the work, `say` receives notes. Returns `gaussians`, `latents`, and `miou` (None
-    without true labels).
+    `step` is a context for each step, `say` receives notes. Returns `gaussians`, `latents`, `miou` (None without true labels).
     """
     maps = source / "features"
     with step("cameras"):
@@ -83,8 +78,7 @@ def make_scene(
     if options.teacher is not None:
         maps = run / "features"
         with step("features"):
-            given = tuple(options.teacher_options.items())
-            extract_features(_teacher(options.teacher, options.weights, given), scene, maps)
+            extract_features(_teacher(options.teacher, options), scene, maps)
     elif not maps.is_dir():
         raise SceneError(f"{source}: expected feature maps in features/, got none; name a teacher (--teacher)")
     with step("fit"):
@@ -97,11 +91,9 @@ def make_scene(
         return value
     with step("segment"):
         scene, shown = scene.undistorted(), "test" if scene.splits.get("test") else "train"
-        known = scored_labels(source, classes, say)
+        known, drawn = scored_labels(source, classes, say), options.pictures
         truth = {} if known is None else true_labels(scene, known, shown)
-        labels = segment_scene(
-            made, scene, classes, run / "segmented", split=shown, pictures=options.pictures, truth=truth
-        )
+        labels = segment_scene(made, scene, classes, run / "segmented", split=shown, pictures=drawn, truth=truth)
         if truth:
             report = score_scene(labels, truth, classes)
             write_json(run / "scores.json", {"scene": run.name, **report.to_json()})
@@ -131,14 +123,22 @@ def _load(source: Path, posed: Path, config: SfmConfig, say: Callable[[str], Non
 
 
 def stamps(folder: Path, skip: str | None = None) -> list[list[Any]]:
-    """[name, size, time] of each file below a folder, those of links to folders included; `skip` is a part to leave out."""
-    names = sorted(glob.glob("**", root_dir=folder, recursive=True, include_hidden=True))
-    files = [(name, folder / name) for name in names if skip is None or Path(name).parts[:1] != (skip,)]
-    return [[name, file.stat().st_size, file.stat().st_mtime_ns] for name, file in files if file.is_file()]
+    """[name, size, time] of each file below a folder but in `skip`. Links are followed, but not back to a folder seen before."""
+    files, seen = list[Path](), {os.path.realpath(folder / (skip or "."))}
+    for here, folders, names in os.walk(folder, followlinks=True):
+        seen.add(os.path.realpath(here))
+        folders[:] = [name for name in sorted(folders) if os.path.realpath(os.path.join(here, name)) not in seen]
+        files += [file for file in (Path(here, name) for name in sorted(names)) if file.is_file()]
+    return [[file.relative_to(folder).as_posix(), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
 
 
-@lru_cache(maxsize=1)
-def _teacher(name: str, weights: str | None, options: tuple[tuple[str, Any], ...]) -> Teacher:
+_loaded: dict[str, Teacher] = {}
+
+
+def _teacher(name: str, options: BatchOptions) -> Teacher:
     """The teacher of this worker process, loaded once."""
-    teacher = load_teacher(name, weights, **dict(options))
-    return teacher.to(training_device()) if hasattr(teacher, "to") else teacher
+    if (key := repr((name, options.weights, options.teacher_options))) not in _loaded:
+        _loaded.clear()
+        teacher = load_teacher(name, options.weights, **options.teacher_options)
+        _loaded[key] = teacher.to(training_device()) if hasattr(teacher, "to") else teacher
+    return _loaded[key]

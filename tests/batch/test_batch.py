@@ -18,6 +18,7 @@ from small_batch import OPTIONS, make_rooms, one_process, results
 from kfgs._files import read_json
 from kfgs.batch import BatchOptions, open_client, run_batch
 from kfgs.batch.run import describe_batch
+from kfgs.batch.scene_task import _teacher, stamps
 from kfgs.cli import main
 from kfgs.scenes import SceneError, load_scene
 from kfgs.scenes.sfm import SfmReport
@@ -110,6 +111,28 @@ def test_a_failed_scene_is_tried_again_and_others_are_not_touched(rooms, tmp_pat
     gone = run_batch({"room": room}, tmp_path / "gone", dataclasses.replace(OPTIONS, discard_features=True))[0]
     assert gone.failure is None
     assert not list((tmp_path / "gone/room/features").glob("*.npy"))
+
+
+def test_a_teacher_is_loaded_once_whatever_its_options(tmp_path):
+    options = dataclasses.replace(OPTIONS, teacher_options={"deadly": [1.0]})
+    first = _teacher(options.teacher, options)
+    assert _teacher(options.teacher, dataclasses.replace(options)) is first
+    assert _teacher(options.teacher, OPTIONS) is not first
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links")
+def test_links_are_followed_but_not_in_circles(tmp_path):
+    for name in ("scene/images/a.png", "scene/features/a.npy", "elsewhere/b.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"123")
+    for name, target in (("self", "."), ("up", ".."), ("images/more", "../../elsewhere"), ("images/top", "..")):
+        (tmp_path / "scene" / name).symlink_to(target)
+    (tmp_path / "elsewhere/back").symlink_to("../scene")
+    assert next(name for name, *_ in stamps(tmp_path / "scene/images")) == "a.png"
+    found = stamps(tmp_path / "scene", "features")
+    assert found == sorted(found)
+    assert {Path(name).name: size for name, size, _ in found} == {"a.png": 3, "b.png": 3}
+    assert len(found) == 2
 
 
 def test_photos_get_their_cameras_first(rooms, tmp_path, monkeypatch):
