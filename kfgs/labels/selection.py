@@ -148,6 +148,8 @@ class OfClass(Where):
         if self.part is not None:
             parts = component_numbers(gaussians.means, mask, self.distance)
             count = len(parts[mask].unique())
+            if count == 0:
+                raise ValueError(f"part: expected a class of some Gaussians, got {self.name}, which none has")
             if self.part >= count:
                 raise ValueError(
                     f"part: expected 1 to {count}, got {self.name}/{self.part + 1}; `kfgs select` lists them"

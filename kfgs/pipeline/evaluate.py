@@ -106,8 +106,11 @@ def evaluate(
     Raises:
         FileNotFoundError: if the result is missing.
         ValueError: if something does not fit, such as texts without embeddings.
-        TypeError: if a protocol of Gaussians is asked about a teacher.
+        TypeError: if a protocol of Gaussians is asked about a teacher, or `question` is no Question.
     """
+    if not isinstance(question, Question):
+        got = type(question).__name__
+        raise TypeError(f"question: expected a Question, got {got}; call open_question(scene, protocol)")
     scorer, rule = question.protocol, getattr(question.protocol, "own_labels", None)
     if labels is not None and rule is None:
         raise ValueError(f"labels: expected none with {scorer.name}, which takes no class per pixel, got {labels!r}")

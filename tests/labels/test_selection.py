@@ -44,7 +44,7 @@ def test_a_part_of_a_class_is_the_largest_or_the_next():
     g = cloud(6).replace(means=means, labels=torch.tensor([1, 1, 1, 1, 1, 0]))
     assert ask(OfClass(1, 0, 0.5), g) == [True, True, True, False, False, False]
     assert ask(OfClass("chair", part=1, distance=0.5), g) == [False, False, False, True, True, False]
-    for rule, got in ((OfClass("chair", 2, 0.5), "1 to 2, got chair/3"), (OfClass(9, 0, 0.5), "1 to 0, got 9/1")):
+    for rule, got in ((OfClass("chair", 2, 0.5), "1 to 2, got chair/3"), (OfClass(9, 0), ".* got 9, which none has")):
         with pytest.raises(ValueError, match=f"part: expected {got}"):
             rule.select(g)
     assert ask(OfIndex([2, 0, 2]), g) == [True, False, True, False, False, False]

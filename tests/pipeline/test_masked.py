@@ -14,7 +14,7 @@ from small_room import ROOM, stages
 from kfgs import Camera, FeatureFolder, Uplift, fit, load_scene, rasterize
 from kfgs.evaluation import LabelTruth, score_views
 from kfgs.fields import UpliftConfig
-from kfgs.pipeline import open_question
+from kfgs.pipeline import evaluate, open_question
 from kfgs.pipeline.color import ColorConfig, TrainingPictures, fit_color
 from kfgs.scenes import Scene
 from kfgs.toy.room_folder import make_toy_room
@@ -117,6 +117,8 @@ def test_a_changed_mask_makes_the_stages_again(crowded, tmp_path):
 def test_masked_and_transparent_pixels_are_void_in_scores(crowded):
     scene = with_masks(crowded)
     i = scene.views("train")[0]
+    with pytest.raises(TypeError, match=r"question: expected a Question, got str; call open_question\("):
+        evaluate("field", str(crowded))
     question = open_question(crowded, split="train")
     assert isinstance(question.truth, LabelTruth)
     labels = question.truth.maps[scene.stem(i)]
