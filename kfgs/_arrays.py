@@ -43,7 +43,7 @@ def read_array(path: str | Path, expected: str = "an .npy file of numbers", advi
         FileError: if it is not a `.npy` file of numbers, is damaged or cut short, or states more values than it has.
     """
     with reading(path, expected, advice):
-        return _numbers(np.load(as_path(path), mmap_mode="r", allow_pickle=False))
+        return _numbers(np.lib.format.open_memmap(as_path(path), mode="r"))
 
 
 def read_arrays(

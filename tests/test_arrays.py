@@ -6,6 +6,7 @@ import struct
 import subprocess
 import sys
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -94,6 +95,16 @@ def test_arrays_are_read_as_numpy_wrote_them(tmp_path, values):
     assert found.dtype == values.dtype
     assert np.array_equal(found, values)
     assert isinstance(found, np.memmap)
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="Linux lists open files")
+def test_an_archive_with_the_name_of_an_array_is_refused_and_closed(tmp_path):
+    np.savez(tmp_path / "a.npz", a=np.arange(4))
+    file = (tmp_path / "a.npz").rename(tmp_path / "a.npy")
+    with pytest.raises(FileError, match=tells(file, "cannot be read")) as caught:
+        read_array(file)
+    assert caught.value.__cause__ is not None  # its frames are alive, and so would be an open file
+    assert file not in [link.readlink() for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
 
 
 def test_missing_files_are_named(tmp_path):

@@ -157,7 +157,7 @@ class TeacherMethod:
     Args:
         maps: a `FeatureFolder`, or maps [h, w, D] by the stem of their picture. An all-zero feature means "unknown".
         name: for tables.
-        align_corners: how maps are resized, see `resize_map`; True is Feature 3DGS's way.
+        align_corners: False resizes maps as `resize_map` does; True puts corner pixels on each other, as Feature 3DGS does.
     """
 
     levels = 1

@@ -1,11 +1,14 @@
 import math
+import re
+from pathlib import Path
 
 import oracles_quant as oracle
 import pytest
 import torch
 from messages import tells
 
-from kfgs.quant import PaperCodebook, fit_codebook, grow, sample_grid
+import kfgs
+from kfgs.quant import GrownCodebook, PaperCodebook, fit_codebook, grow, sample_grid
 
 
 class Lazy:
@@ -133,6 +136,17 @@ def test_paper_has_the_papers_values():
     config = PaperCodebook()
     assert (config.initial, config.maximum, config.expand_below, config.prune_above) == (8, 100, 0.9, 0.99)
     assert (config.epochs, config.learning_rate, config.step_every) == (28, 8e-4, 8)
+
+
+def test_the_table_of_concepts_has_the_fields_and_their_values():
+    page = Path(kfgs.__file__).parents[1] / "docs/concepts.md"
+    if not page.is_file():
+        pytest.skip("an installed kfgs has no pages")
+    rows = re.findall(r"^\| `(\w+)` \|.* \| (.+) \| (.+) \|$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    assert len(rows) == 3
+    for name, *told in rows:
+        for config, value in zip((GrownCodebook(), PaperCodebook()), told, strict=True):
+            assert value.partition(":")[0] == str(getattr(config, name, "none"))
 
 
 def test_bad_maps():
