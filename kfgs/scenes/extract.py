@@ -131,7 +131,7 @@ def extract_features(
 
 def _as_encoder(teacher: Any) -> tuple[Callable[[Tensor], Tensor], dict[str, Any]]:
     """The function from a picture to features, and what is known about the teacher as JSON."""
-    encode, version = getattr(teacher, "encode_image", teacher), str(getattr(teacher, "version", ""))
+    encode, version = getattr(teacher, "encode_image", teacher), str(getattr(teacher, "version", None) or "")
     if inspect.isclass(teacher) or not callable(encode):
         raise TypeError(
             f"teacher: expected an object with encode_image, or a function from [3, H, W] to [D, h, w], got {teacher!r:.80}; "
