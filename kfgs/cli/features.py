@@ -102,7 +102,7 @@ def _make_maps(network: Any, scene: Any, target: Path, split: str) -> None:
         return
     if not target.is_dir():
         raise ValueError(f"teacher: expected a teacher, or maps in {target} to check, got neither; pass --teacher")
-    problems, count = FeatureFolder(target).of(scene, split).check(), len(scene.views(split))
+    problems, count = FeatureFolder(target).check(scene, split), len(scene.views(split))
     say(f"{target}: {count - len(problems)} of {count} views have a map that fits")
     for name, text in problems.items():
         say(f"{name}: {text}")

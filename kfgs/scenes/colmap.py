@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,9 +49,9 @@ def load_colmap(path: Path, images: Path) -> Scene:
     if not images.is_dir():
         raise FileNotFoundError(f"{images}: no such folder; expected the images of {path} there")
     model = read_model(path)
-    views, there = _views(path, model), list_images(images)
-    names = [view.name for view in views if view.pose is not None]
+    names = sorted((image.name for image in model.images.values() if image.pose is not None), key=natural_key)
     files = find_pictures(images, names)
+    views, there = _views(path, model, files), list_images(images)
     missing = [name for name in names if name not in files]
     if not files:
         lost = f"none of its {len(names)} posed images ({some(missing, 3)}) is there"
@@ -66,13 +66,12 @@ def load_colmap(path: Path, images: Path) -> Scene:
         f"{len(missing)} of {len(names)} posed images have no file in {images}: {some(missing)}{near}": missing,
         f"{len(extra)} image files in {images} have no pose in the model: {some(extra)}": extra,
     }
-    chosen = [view for view in views if view.name in files or view.pose is None]
-    for view in chosen:
+    for view in views:
         view.name = given.get(view.name, view.name)
         view.path = images / view.name
     points = (torch.from_numpy(model.points), torch.from_numpy(model.colors)) if len(model.points) else None
     notes = [*model.notes, *(note for note, lost_names in told.items() if lost_names)]
-    return scene_of_poses(path, chosen, points, notes, images)
+    return scene_of_poses(path, views, points, notes, images)
 
 
 def colmap_cameras(path: Path) -> Scene:
@@ -82,10 +81,12 @@ def colmap_cameras(path: Path) -> Scene:
     return scene_of_poses(path, views, notes=model.notes, pictures=False)
 
 
-def _views(path: Path, model: ColmapModel) -> list[PosedPicture]:
-    """The images of a model in natural order of their names."""
+def _views(path: Path, model: ColmapModel, files: Container[str] | None = None) -> list[PosedPicture]:
+    """The images of a model in natural order of their names; those with a pose that are not in `files` are left out."""
     views = []
     for image in sorted(model.images.values(), key=lambda image: natural_key(image.name)):
+        if image.pose is not None and files is not None and image.name not in files:
+            continue
         lens, where = model.cameras[image.camera_id], f"{path}, image {image.name}, camera {image.camera_id}"
         view = PosedPicture(image.name, Path(image.name), None, where, size=(lens.width, lens.height))
         if image.pose is not None:

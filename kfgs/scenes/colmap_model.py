@@ -1,8 +1,8 @@
 """Read a COLMAP model, binary or text: what is damaged is refused, numbers that are not finite are left out.
 
 pycolmap 4.2.1 is not safe with files of strangers: it loads a truncated cameras.bin with wrong intrinsics, a corrupt points3D.bin
-takes all memory, and names in text files are cut at blanks. So models are read here. `rigs` and `frames` (COLMAP 3.12) and the
-tracks of points are not needed: the images file has every pose, and the point that each 2-D point sees.
+takes all memory, and names in text files are cut at blanks. So models are read here. `rigs` and `frames` (COLMAP 3.12) are not
+needed: the images file has every pose, and the point that each 2-D point sees. Tracks tell whether the files are of one model.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from .._files import as_path, text_encoding
 from .._notes import Repair
+from ..cameras.camera import ROTATION_TOLERANCE
 from .files import MAX_NUMBER, MAX_SIDE, SceneError, is_inside, some
 from .posed import Matrix
 
@@ -49,6 +50,7 @@ CAMERA_MODELS: dict[str, str] = {
     "EQUIRECTANGULAR": "w h",
 }
 QUATERNION_SLACK = 0.1  # text files are rounded; a norm farther from 1 means a wrong byte
+STRANGE = 0.5  # share of the 2-D points of tracks that see another point: two models, not a damaged one
 LEAST_BYTES = 73  # of an image without 2-D points, with a name of one letter
 _BROKEN = re.compile(r"[+-]?(nan\(\w*\)|1\.#\w+)", re.IGNORECASE)  # numbers that are none, as Windows writes them
 
@@ -80,6 +82,8 @@ class ColmapImage:
     """[4, 4] world to camera; None if it or the camera has numbers that are not finite or plausible."""
     observed: Ints = field(repr=False)
     """[n] the id of the 3-D point that each 2-D point sees, -1 = none."""
+    norm: float = 1.0
+    """The length of the file's quaternion."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -114,7 +118,8 @@ def count_images(model: Path) -> int:
 def read_model(path: str | Path) -> ColmapModel:
     """Read a COLMAP model, binary or, if there is none, text. A SceneError for one that is damaged names the file.
 
-    Poses without finite numbers and a nearly unit quaternion become None; points that are not finite are left out and noted.
+    Poses without finite numbers and a nearly unit quaternion become None; points that are not finite, and entries of tracks that
+    lead to no 2-D point (of deleted images), are left out and noted.
     """
     folder = as_path(path)
     if not folder.is_dir():
@@ -138,10 +143,45 @@ def read_model(path: str | Path) -> ColmapModel:
     ids = np.array(sorted(points), np.int64)
     places = np.array([points[i][0] for i in ids.tolist()], np.float64).reshape(-1, 3)
     colors = np.array([points[i][1] for i in ids.tolist()], np.uint8).reshape(-1, 3)
+    notes = _check_tracks(folder / f"{FILES[2]}.{whole[0]}", ids, [points[i][2] for i in ids.tolist()], images)
+    scaled = {image.name: image.norm for image in images.values() if abs(image.norm**2 - 1) > ROTATION_TOLERANCE}
+    if scaled:
+        low, high = min(scaled.values()), max(scaled.values())
+        notes.append(f"{len(scaled)} quaternions have a length of {low:.6g} to {high:.6g}, not 1: {some(list(scaled))}")
     good = (np.abs(places) < MAX_NUMBER).all(1)  # NaN fails
     lost = some(list(map(str, ids[~good])))
-    note = f"{(~good).sum()} of {len(ids)} points have no finite place and were left out (ids {lost})"
-    return ColmapModel(cameras, images, ids[good], places[good], colors[good], (Repair(note),) if lost else ())
+    if lost:
+        notes.append(f"{(~good).sum()} of {len(ids)} points have no finite place and were left out (ids {lost})")
+    return ColmapModel(cameras, images, ids[good], places[good], colors[good], tuple(map(Repair, notes)))
+
+
+def _check_tracks(file: Path, ids: Ints, tracks: list[Ints], images: dict[int, ColmapImage]) -> list[str]:
+    """A note if 2-D points that tracks name are not there, or do not name the point of the track.
+
+    kfgs does not use the tracks. But images and points of which most do not fit together come from two different models.
+    """
+    owner = np.repeat(ids, list(map(len, tracks)))
+    image_ids, numbers = np.concatenate([np.zeros((0, 2), np.int64), *tracks]).T
+    known = sorted(images)
+    sizes = np.array([len(images[i].observed) for i in known], np.int64)
+    seen = np.concatenate([np.zeros(0, np.int64), *(images[i].observed for i in known)])
+    place, there = np.searchsorted(known, image_ids), np.isin(image_ids, known)
+    there[there] = numbers[there] < sizes[place[there]]
+    good = there.copy()
+    good[there] = seen[(np.cumsum(sizes) - sizes)[place[there]] + numbers[there]] == owner[there]
+    if good.all():
+        return []
+    strange, lost = there & ~good, sorted(set(image_ids.tolist()) - set(images))
+    wrong = int(np.flatnonzero(strange if strange.any() else ~good)[0])
+    example = f"point {owner[wrong]} names 2-D point {numbers[wrong]} of image {image_ids[wrong]}"
+    if strange.sum() > STRANGE * there.sum():
+        raise SceneError(
+            f"{file}: expected tracks over 2-D points that see them, got {strange.sum()} that see other points ({example}); "
+            "copy the images and points files of one model"
+        )
+    gone = f"; images {some(list(map(str, lost)))} are not in the model" if lost else ""
+    count = f"{(~good).sum()} of {len(good)} entries of tracks"
+    return [f"{count} lead to no 2-D point that sees the point and were left out ({example}{gone})"]
 
 
 def _read_table(file: Path, name: str) -> dict[int, Any]:
@@ -213,8 +253,7 @@ def _binary_points(file: Path) -> Iterator[tuple[int, tuple[Any, ...]]]:
     track = np.dtype(("<u4", 2))
     for record in _Binary(file).records():
         key, x, y, z, *color, _ = record.take("q3d3Bd")
-        record.take_array(track)
-        yield key, ((x, y, z), color)
+        yield key, ((x, y, z), color, record.take_array(track).astype(np.int64))
 
 
 def _lines(file: Path) -> Iterator[str]:
@@ -249,11 +288,12 @@ def _text_images(file: Path) -> Iterator[tuple[int, ColmapImage]]:
 
 def _text_points(file: Path) -> Iterator[tuple[int, tuple[Any, ...]]]:
     for line in filter(_is_record, _lines(file)):
-        key, x, y, z, r, g, b, _ = line.split(maxsplit=8)[:8]
+        key, x, y, z, r, g, b, _, *track = line.split()
         color = int(r), int(g), int(b)
-        if not 0 <= min(color) <= max(color) <= 255:
-            raise ValueError(f"colour {color}")
-        yield int(key), ((_number(x), _number(y), _number(z)), color)
+        pairs = np.array(track, np.int64).reshape(-1, 2)
+        if not 0 <= min(color) <= max(color) <= 255 or (pairs < 0).any():
+            raise ValueError(f"colour {color}, track {track[:6]}")
+        yield int(np.int64(int(key))), ((_number(x), _number(y), _number(z)), color, pairs)
 
 
 READERS: dict[str, Callable[[Path], Iterator[tuple[int, Any]]]] = {
@@ -278,4 +318,4 @@ def _image(name: str, camera_id: int, numbers: list[float], observed: Ints) -> C
     w, x, y, z, *place = numbers
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), place
-    return ColmapImage(name, camera_id, pose, observed)
+    return ColmapImage(name, camera_id, pose, observed, norm)

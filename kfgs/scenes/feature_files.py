@@ -36,7 +36,8 @@ def open_map(
     """Map a file into memory without reading its values.
 
     Feature 3DGS writes [D, h, w], kfgs [h, w, D]. In other files a known number of channels decides, then the aspect of the
-    picture; if both fit, [h, w, D]. If nothing is known, a first axis of twice the others' size is D. `size` is that
+    picture; if both fit, [h, w, D]. If nothing is known, a first axis of twice the others' size is D,
+    except in .npy. `size` is that
     of the view's picture; `own` says that kfgs wrote the map.
     """
     if file.name.endswith(OWN):
@@ -66,7 +67,7 @@ def open_map(
     elif channels in (first, last) and first != last:
         turned = first == channels
     elif size is None:
-        turned = channels is None and first >= 2 * max(middle, last)
+        turned = channels is None and not file.name.endswith(OWN) and first >= 2 * max(middle, last)
     else:
         turned = not fits_aspect((first, middle), size) and fits_aspect((middle, last), size)
     if not turned:

@@ -108,14 +108,18 @@ class FeatureFolder(Sequence[Tensor]):
                     files.append((rank, stem, file))
         return {stem: file for _, stem, file in sorted(files, key=lambda entry: -entry[0])}
 
+    def _find(self, stems: Sequence[str]) -> dict[str, Path]:
+        """The map of each view that has one."""
+        names = Names(self._listed, bare=True).find_each(stems)
+        return {stem: self._listed[name] for stem, name in zip(stems, names, strict=True) if name is not None}
+
     @cached_property
     def files(self) -> list[Path]:
         """The file of each view's map."""
-        names = Names(self._listed, bare=True).find_each(self.stems)
-        files = [self._listed[name] for name in names if name is not None]
-        missing = [stem for stem, name in zip(self.stems, names, strict=True) if name is None]
+        files = self._find(self.stems)
+        missing = [stem for stem in self.stems if stem not in files]
         if not missing:
-            return files
+            return [files[stem] for stem in self.stems]
         text = f"expected a feature map for each of {len(self)} views, {len(missing)} missing: {some(missing)}"
         others = sorted(set(self._listed) - set(self.stems))
         if not files and others and self.identity is None:
@@ -168,18 +172,24 @@ class FeatureFolder(Sequence[Tensor]):
         size = self.sizes[i] if self.sizes else None
         return open_map(self.files[i], self.channels, size, own=self.identity is not None)
 
-    def check(self, *, values: bool = True) -> dict[str, str]:
-        """Check the map of every view; says why a map cannot be used, by its file.
+    def check(self, scene: Scene | None = None, split: Split = "train", *, values: bool = True) -> dict[str, str]:
+        """Check the map of every view; says why a map cannot be used, by its file (if there is none, by the view).
 
-        It cannot be read or is not a map of floats; it has other channels than most; it looks transposed; it has NaN or infinite
-        values, or only zeros. `values=False` checks only shape and type, in milliseconds.
+        There is none; it cannot be read or is not a map of floats; it has other channels than most; it looks transposed; it has
+        NaN or infinite values, or only zeros. `scene` and `split` say whose views (None: those of this folder); `values=False`
+        checks only shape and type, in milliseconds.
         """
-        problems, turned = dict[str, str](), dict[str, str]()
-        shapes: dict[str, tuple[int, ...]] = {}
-        for i, file in enumerate(self.files):
-            name, size = file.relative_to(self.path).as_posix(), self.sizes[i] if self.sizes else None
+        sizes = dict(zip(self.stems, self.sizes or [None] * len(self), strict=True))
+        if scene is not None:
+            chosen = select_views(scene, split)
+            sizes = {chosen.stem(i): camera.size for i, camera in enumerate(chosen.cameras)}
+        files = self._find(list(sizes))
+        problems = {stem: "expected its map, got none" for stem in sizes if stem not in files}
+        shapes, turned = dict[str, tuple[int, ...]](), dict[str, str]()
+        for stem, file in files.items():
+            name, size = file.relative_to(self.path).as_posix(), sizes[stem]
             try:
-                stored = self._open(i)
+                stored = open_map(file, self.channels, size, own=self.identity is not None)
             except (ValueError, TypeError) as error:
                 problems[name] = str(error).removeprefix(f"{file}: ")
                 continue

@@ -36,9 +36,11 @@ def load_nice_slam(folder: Path) -> Scene:
         )
     top, names = read_scene_json(path, AGAIN), ("w", "h", "fx", "fy", "scale", "cx", "cy")
     try:
-        values = [float(top["camera"][name]) for name in names]
+        values = [top["camera"][name] for name in names]
         width, height, fx, fy, scale, cx, cy = values
-        if not (min(values[:5]) > 0 and max(width, height) <= MAX_SIDE and max(map(abs, values)) < MAX_NUMBER):
+        numbers = all(type(value) in (int, float) and abs(value) < MAX_NUMBER for value in values)  # NaN fails
+        whole = numbers and width % 1 == height % 1 == 0
+        if not (whole and min(values[:5]) > 0 and max(width, height) <= MAX_SIDE):
             raise ValueError(f"{values}")
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         expected = f"a 'camera' with {', '.join(names)} (the scale of the depth pictures) as positive numbers"

@@ -163,6 +163,7 @@ def _with_split(scene: Scene, path: Path, root: Path, model: Path | None, split:
     names = [camera.name for camera in scene.cameras]
     homes = [root] if model is None else list(dict.fromkeys((model, root, *_above(model)[: 4 if model == path else 0])))
     if split == "auto":
+        homes.sort(key=lambda home: not (home / "split.json").is_file())  # before any lists
         chosen = next((lists for home in homes if (lists := read_split(home, names)) is not None), None)
         if chosen is not None:
             return replace(scene, splits=chosen[0], notes=(*scene.notes, *chosen[1]))

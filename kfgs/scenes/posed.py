@@ -80,9 +80,10 @@ def _as_large_as_pictures(
     if not other:
         return fitting, []
     where = folder.name if folder is not None and paths[0].is_relative_to(folder) else "images"
-    small = f"{paths[other[0]].name} is {cameras[other[0]].width / fitting[other[0]].width:.3g} times smaller"
+    ratio = cameras[other[0]].width / fitting[other[0]].width
+    how = f"{ratio:.3g} times smaller" if ratio > 1 else f"{1 / ratio:.3g} times larger"
     count = f"{len(other)} of {len(paths)} pictures have other sizes than the model says"
-    return fitting, [f"{where}: {count} ({small}); cameras were resized to them"]
+    return fitting, [f"{where}: {count} ({paths[other[0]].name} is {how}); cameras were resized to them"]
 
 
 def scene_of_poses(

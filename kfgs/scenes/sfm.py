@@ -14,7 +14,7 @@ from typing import Any, Literal
 from tqdm import tqdm
 
 from .._check import check_choice, check_range
-from .._files import as_path, atomic_folder, check_output, real_path
+from .._files import as_path, atomic_folder, check_output, file_stem, real_path
 from .colmap import LENSES
 from .colmap_model import has_model
 from .files import SceneError, list_images, picture_size, some
@@ -115,6 +115,8 @@ def run_sfm(
             "(--replace) to give up that model"
         )
     names, heic = list_images(images), list_images(images, (".heic", ".heif"))
+    stems = {file_stem(name) for name in names}
+    heic = [name for name in heic if file_stem(name) not in stems]  # others are converted already
     if heic:
         raise SceneError(
             f"{images}: expected pictures that pycolmap reads, got HEIC photographs ({some(heic, 3)}); save them as JPEG, with "

@@ -15,6 +15,7 @@ from .depth import MILLIMETRE, points_from_depth
 from .files import (
     IMAGE_SUFFIXES,
     SceneError,
+    find_pictures,
     is_file,
     list_images,
     picture_size,
@@ -65,9 +66,7 @@ class _Reader:
             view = PosedPicture(self.name(file), file, None, f"{path}, frame {i} ({self.name(file)})")
             if not frame.broken:
                 view.pose, (view.K, view.size), view.distortion = frame.pose(), frame.lens(), frame.distortion()
-            mask = frame.values.get("mask_path")
-            view.mask = self.inside(mask)
-            self.unmasked += [f"{mask!r:.200}"] if mask is not None and view.mask is None else []
+            view.mask = self.find_mask(frame.values.get("mask_path"))
             depth = self.inside(frame.values.get("depth_file_path", frame.values.get("depth_path")))
             view.depth = depth if depth is not None and depth.suffix.lower() == ".png" else None
             views.append(view)
@@ -96,6 +95,16 @@ class _Reader:
         if name not in (near, file_stem(near)):
             self.respelled.append(f"{listed} is {near}")
         return self.root / near
+
+    def find_mask(self, listed: Any) -> Path | None:
+        """The mask of a frame; one that is missing is noted."""
+        if listed is None:
+            return None
+        place = self.root / str(listed).replace("\\", "/").replace("\0", "")
+        mask = find_pictures(place.parent, [place.name]).get(place.name)
+        if mask is None:
+            self.unmasked.append(f"{listed!r:.200}")
+        return mask
 
     def inside(self, listed: Any) -> Path | None:
         """A file that is listed, unless it lies outside of the scene folder."""

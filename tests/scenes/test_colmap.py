@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from colmap_models import (
+    CAMERAS,
     IMAGES,
     pycolmap,
     read_with_pycolmap,
@@ -104,6 +105,16 @@ def test_missing_files_and_unposed_files_are_noted(tmp_path: Path) -> None:
     assert "extra.png" in scene.notes[1]
 
 
+def test_a_lens_of_a_picture_that_is_not_there_may_be_any(tmp_path: Path) -> None:
+    cameras = CAMERAS + "2 FOV 64 48 50 55 31 25 0.1\n"
+    folder = write_text_model(tmp_path / "m", cameras=cameras, images=IMAGES.replace("1 2 3 1 b", "1 2 3 2 b"))
+    write_picture(tmp_path / "images/a.png")
+    assert "1 of 2 posed images have no file" in load_colmap(folder, tmp_path / "images").notes[0]
+    write_picture(tmp_path / "images/b.png")
+    with pytest.raises(SceneError, match=tells("b.png", "FOV")):
+        load_colmap(folder, tmp_path / "images")
+
+
 def test_the_wrong_image_folder_is_an_error(tmp_path: Path) -> None:
     model, _ = _scene_folder(tmp_path, ["a.png"])
     (tmp_path / "other").mkdir()
@@ -119,6 +130,7 @@ def test_a_quaternion_that_is_not_of_length_1_is_normalised(tmp_path: Path) -> N
     scene = load_colmap(model, tmp_path / "images")
     turned = torch.tensor([[1, 0, 0, 1], [0, -0.28, -0.96, 2], [0, 0.96, -0.28, 3], [0, 0, 0, 1]])  # cos = 2 * 0.36 - 1
     torch.testing.assert_close(scene.cameras[0].viewmat, turned)
+    assert "1 quaternions have a length of 1.001 to 1.001, not 1: a.png" in scene.notes
 
 
 def test_a_name_too_long_for_the_disk_is_a_missing_file(tmp_path: Path) -> None:

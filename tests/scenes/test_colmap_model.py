@@ -16,6 +16,7 @@ from colmap_models import (
 )
 from messages import tells
 
+from kfgs._notes import Repair
 from kfgs.scenes import SceneError
 from kfgs.scenes.colmap_model import CAMERA_MODELS, ColmapModel, read_model
 
@@ -185,6 +186,9 @@ BAD_TABLES = [
     ({"images": IMAGES.removesuffix("5 6 7\n")}, ["record 2", "no", "2-D points"]),
     ({"images": IMAGES.replace("5 6 7", "5 6")}, ["record 2", "2-D points as X Y POINT3D_ID"]),
     ({"images": IMAGES.replace("5 6 7", "5 6 7.5")}, ["record 2", "'7.5'"]),
+    ({"points3D": "1" * 20 + POINTS[1:]}, ["points3D.txt", "record 1"]),
+    ({"points3D": POINTS.replace("1 0 2 0", "1 0 2")}, ["points3D.txt", "record 1"]),
+    ({"points3D": POINTS.replace("1 0 2 0", "1 0 -2 0")}, ["points3D.txt", "-2"]),
     ({"points3D": POINTS + POINTS}, ["points3D.txt", "id 7 again"]),
     ({"points3D": POINTS.replace("10 20 30", "10 256 30")}, ["points3D.txt", "record 1", "256"]),
 ]
@@ -194,6 +198,28 @@ BAD_TABLES = [
 def test_bad_tables_are_refused(tmp_path: Path, tables: dict[str, str], parts: list[str]) -> None:
     with pytest.raises(SceneError, match=tells(*parts)):
         read_model(write_text_model(tmp_path, **tables))
+
+
+BROKEN_TRACKS = [
+    ({"images": IMAGES.replace("5 6 7", "")}, "2-D point 0 of image 2"),
+    ({"images": IMAGES.replace("5 6 7", "5 6 8")}, "2-D point 0 of image 2"),
+    ({"points3D": POINTS.replace("1 0 2 0", "9 0 2 0")}, "images 9 are not in the model"),
+    ({"points3D": POINTS.replace("1 0 2 0", "1 99 2 0")}, "2-D point 99 of image 1"),
+]
+
+
+@pytest.mark.parametrize(("tables", "place"), BROKEN_TRACKS)
+def test_tracks_that_lead_nowhere_are_noted(tmp_path: Path, tables: dict[str, str], place: str) -> None:
+    (note,) = read_model(write_text_model(tmp_path, **tables)).notes
+    assert isinstance(note, Repair)
+    assert note.startswith("1 of 2 entries of tracks lead to no 2-D point")
+    assert place in note
+
+
+def test_images_and_points_of_two_models_are_refused(tmp_path: Path) -> None:
+    other = IMAGES.replace("2 7 3", "2 8 3").replace("5 6 7", "5 6 8")
+    with pytest.raises(SceneError, match=tells("points3D.txt", "2 that see other points", "files of one model")):
+        read_model(write_text_model(tmp_path, images=other))
 
 
 @pytest.mark.parametrize("place", ["1 2 1e30", "1 -nan(ind) 3"])

@@ -1,6 +1,7 @@
 """Scenes in the layouts of data sets, written here as those data sets have them."""
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -107,6 +108,10 @@ def test_replica_that_is_not_whole(tmp_path: Path) -> None:
     (tmp_path / "cam_params.json").write_text(json.dumps({"camera": CAMERA | {"fx": "fifty"}}))
     with pytest.raises(SceneError, match=tells("cam_params.json", "fx", "copy it again")):
         load_scene(folder)
+    for wrong in ({"scale": math.nan}, {"fx": math.nan}, {"cx": math.nan}, {"w": 64.7}, {"h": "48"}, {"fy": True}):
+        (tmp_path / "cam_params.json").write_text(json.dumps({"camera": CAMERA | wrong}))
+        with pytest.raises(SceneError, match=tells("cam_params.json", *wrong, "copy it again")):
+            load_scene(folder)
     (tmp_path / "cam_params.json").unlink()
     with pytest.raises(FileNotFoundError, match=tells("cam_params.json", '"scale": 6553.5')):
         load_scene(folder)
@@ -224,6 +229,8 @@ def test_every_picture_has_its_own_size(tmp_path: Path) -> None:
             f"1 of {len(scene)} pictures have other sizes" in note and "2 times smaller" in note for note in scene.notes
         )
         assert noted == (folder != "nerf")  # whose file says no size
+    write_picture(tmp_path / last[0], 96, 128)
+    assert any("b.png is 2 times larger" in note for note in load_scene(tmp_path / "colmap").notes)
     write_picture(tmp_path / last[1], 64, 48)  # turned
     with pytest.raises(SceneError, match=tells("frame000002.jpg", "64x48", "got 48x64")):
         load_scene(tmp_path / "replica/room0")

@@ -111,6 +111,13 @@ def test_another_teachers_maps_are_neither_mixed_nor_lost(other, scene, tmp_path
     assert contents(folder)["a.npy"] != whole["a.npy"]
 
 
+@pytest.mark.parametrize(("version", "more"), [(None, {}), (2, {"version": "2"})])
+def test_a_teacher_is_known_by_its_version_if_it_has_one(version, more, scene, tmp_path):
+    teacher = Counting()
+    teacher.identity, teacher.version = None, version
+    assert extract_features(teacher, scene, tmp_path / "maps").teacher == {"name": "counting"} | more
+
+
 def test_maps_of_other_programs_are_left_alone(scene, tmp_path):
     folder = tmp_path / "maps"
     folder.mkdir()

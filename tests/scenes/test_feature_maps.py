@@ -232,7 +232,9 @@ def test_sizes_of_pictures_or_channels_tell_the_order_of_the_axes(tmp_path):
     assert torch.equal(maps[0], want)
     assert torch.equal(maps[1:][0], want)
     assert torch.equal(FeatureFolder(tmp_path, ["a"], channels=20)[0], want)
-    assert torch.equal(FeatureFolder(tmp_path, ["a"])[0], want)  # 20 channels of 6 x 8: nothing else is likely
+    assert FeatureFolder(tmp_path, ["a"]).shape == (20, 6, 8)  # .npy is [h, w, D] if nothing is known
+    save_file({"map": want.permute(2, 0, 1).contiguous()}, tmp_path / "c.safetensors")
+    assert torch.equal(FeatureFolder(tmp_path, ["c"])[0], want)  # 20 channels of 6 x 8: nothing else is likely
 
 
 @pytest.mark.parametrize("kind", FILES)

@@ -153,7 +153,10 @@ def test_deleted_images_and_broken_poses_are_left_out_and_strict_refuses_them(tm
     torch.testing.assert_close(scene.cameras[1].viewmat, before.cameras[1].viewmat)
     told = " ".join(scene.notes)
     assert "1 views have no pose or lens of finite numbers and were left out: c.png" in told
-    with pytest.raises(SceneError, match=tells(tmp_path, "nothing broken (strict)", "c.png", "without --strict")):
+    assert "5 of 20 entries of tracks lead to no 2-D point" in told
+    with pytest.raises(
+        SceneError, match=tells(tmp_path, "nothing broken (strict)", "images 4 are not", "without --strict")
+    ):
         load_scene(tmp_path, strict=True)
 
 
@@ -187,6 +190,8 @@ def test_the_split_file_wins(tmp_path: Path) -> None:
     assert scene.splits == {"train": [2, 10], "test": [0]}
     assert any("1 names in" in note and "rgb_99" in note for note in scene.notes)
     assert load_scene(tmp_path, split="holdout8").splits["test"] == [0, 8, 16]
+    (tmp_path / "sparse/0/test.txt").write_text("rgb_1\n")
+    assert load_scene(tmp_path).splits["test"] == [0]
 
 
 def test_what_cannot_be_loaded_is_named(tmp_path: Path) -> None:

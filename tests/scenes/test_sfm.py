@@ -92,6 +92,16 @@ def test_folders_without_enough_images(tmp_path: Path) -> None:
         run_sfm(tmp_path, tmp_path / "out")
 
 
+def test_photographs_of_a_phone_count_until_a_jpeg_is_next_to_them(tmp_path: Path) -> None:
+    for name in ("a.HEIC", "b.heic", "b.jpg"):
+        (tmp_path / name).touch()
+    with pytest.raises(SceneError, match=tells("HEIC", "(a.HEIC)", "mogrify")):
+        run_sfm(tmp_path, tmp_path / "out")
+    (tmp_path / "a.jpg").touch()
+    with pytest.raises(SceneError, match=tells("3 images", "got 2")):
+        run_sfm(tmp_path, tmp_path / "out")
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [

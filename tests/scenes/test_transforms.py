@@ -197,6 +197,16 @@ def test_splits_and_masks_of_nerfstudio(tmp_path: Path) -> None:
     assert "3 files of mask_path are missing, and those frames have no mask: 'm.png', 'm.png', 'm.png'" in scene.notes
 
 
+@pytest.mark.parametrize("listed", ["masks/A0.PNG", "masks/a0.jpg", "../masks/a0.png"])
+def test_masks_are_found_by_the_rule_of_names(tmp_path: Path, listed: str) -> None:
+    write_picture(tmp_path / "scene/images/0.png")
+    mask = tmp_path / ("masks" if listed.startswith("..") else "scene/masks") / "a0.png"
+    write_picture(mask)
+    frame = {"file_path": "images/0.png", "transform_matrix": LOOK_X, "mask_path": listed}
+    (found,) = load_transforms(_write(tmp_path / "scene", [frame])).masks
+    assert found.samefile(mask)
+
+
 def _frame(**changes: Any) -> list[dict[str, Any]]:
     return [{"file_path": "images/a.png", "transform_matrix": LOOK_X, **changes}]
 
