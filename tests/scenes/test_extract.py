@@ -203,13 +203,6 @@ def test_what_a_teacher_may_not_return_is_named_and_the_maps_before_stay(change,
     assert list(contents(tmp_path / "maps")) == ["a.npy"]
 
 
-@pytest.mark.parametrize(("version", "known"), [(None, {}), ("", {}), (2, {"version": "2"})])
-def test_a_teacher_without_a_version_is_known_by_its_name_alone(version, known, scene, tmp_path):
-    teacher = Counting()
-    teacher.identity, teacher.version = None, version
-    assert extract_features(teacher, scene, tmp_path / "maps").teacher == {"name": "counting", **known}
-
-
 def test_features_that_are_all_zero_stay_so_and_small_ones_are_kept(scene, tmp_path):
     teacher = _Broken(lambda f: f.index_fill(2, torch.tensor([1]), 0) * 1e-6)
     extract_features(teacher, scene, tmp_path / "maps", "all")
