@@ -101,10 +101,9 @@ class TritonEngine(CompiledEngine):
         trace = trace.view(2, height, width)
         stops, lights = trace[0], trace[1].view(torch.float32)
         M = len(means2d) if of_splats else 0
-        room = (
-            -(-M // 4) * 4
-        )  # each part starts at a multiple of 16 bytes; for other starts the kernel is compiled anew
-        parts = means2d.new_zeros(6 * room).split((2 * room, 3 * room, room))  # one kernel fills them
+        # One kernel clears all three. Each starts at a multiple of 16 bytes: for other starts the kernel is compiled again.
+        room = -(-M // 4) * 4
+        parts = means2d.new_zeros(6 * room).split((2 * room, 3 * room, room))
         shapes = [(M, *value.shape[1:]) for value in splats[:3]]
         results = [part[: math.prod(shape)].view(shape) for part, shape in zip(parts, shapes, strict=True)]
         results.append(torch.zeros_like(features) if of_features else features.new_empty(0))
