@@ -53,13 +53,10 @@ def bin(
 def depth_order(depths: Tensor) -> np.ndarray:  # [M] -> [M] int32
     """The rows by depth; equal depths by row. NaN comes last, as torch sorts.
 
-    A float32's bits (of a number that is not negative they are in the numbers' order) and its row are one uint64, which
-    numpy sorts by vector instructions: a third of the time of a stable sort of the rows.
+    The bits of numbers that are not negative are in the numbers' order, and torch sorts whole numbers by their digits:
+    fifty times as fast as it sorts floating point numbers.
     """
-    values = depths.detach().numpy()
-    if values.dtype != np.float32 or bool((values < 0).any()):
-        return torch.sort(depths.detach(), stable=True).indices.numpy().astype(np.int32)
-    keys = np.abs(values).view(np.uint32).astype(np.uint64) << np.uint64(32)  # -0 is 0
-    keys |= np.arange(len(values), dtype=np.uint64)
-    keys.sort()
-    return keys.astype(np.uint32).view(np.int32)  # the lower half
+    values = depths.detach()
+    if not bool((values < 0).any()):
+        values = values.abs().view(torch.int32 if values.dtype == torch.float32 else torch.int64)  # -0 is 0
+    return torch.sort(values, stable=True).indices.numpy().astype(np.int32)
