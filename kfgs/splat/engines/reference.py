@@ -78,10 +78,10 @@ class _Composite(torch.autograd.Function):
         for batch in _batches(tiles):
             for tile, rows, present in _front_to_back(tiles, batch, stopped):
                 chunk = _Chunk(tile, rows, present, transmittance[tile], stopped[tile])
-                seen, transmittance[tile], stopped[tile] = _composite_chunk(
-                    chunk, tiles, chunk.transmittance, *(value[rows] for value in splats)
+                weights, transmittance[tile], stopped[tile] = _weigh_chunk(
+                    chunk, tiles, chunk.transmittance, *(value[rows] for value in splats[:3])
                 )
-                sums[tile] += seen
+                sums[tile] += weights @ features[rows]
                 if any(ctx.needs_input_grad):
                     ctx.chunks.append(chunk)
         return sums, transmittance
@@ -96,28 +96,14 @@ class _Composite(torch.autograd.Function):
             inputs = [chunk.transmittance, *(value[chunk.rows] for value in splats)]
             with torch.enable_grad():
                 inputs = [value.detach().requires_grad_() for value in inputs]
-                seen, transmittance, _ = _composite_chunk(chunk, ctx.tiles, *inputs)
-            given, *local = torch.autograd.grad(
-                (seen, transmittance), inputs, (grad_sums[chunk.tiles], grad_transmittance[chunk.tiles])
-            )
+                weights, transmittance, _ = _weigh_chunk(chunk, ctx.tiles, *inputs[:4])
+                outputs = weights @ inputs[4], transmittance
+            upstream = grad_sums[chunk.tiles], grad_transmittance[chunk.tiles]
+            given, *local = torch.autograd.grad(outputs, inputs, upstream)
             grad_transmittance[chunk.tiles] = given
             for total, part in zip(grads, local, strict=True):
                 total.index_add_(0, chunk.rows.flatten(), part.flatten(0, 1))
         return (*grads, None)
-
-
-def _composite_chunk(
-    chunk: _Chunk,
-    tiles: Tiles,
-    transmittance: Tensor,  # [B, P] at the start
-    means2d: Tensor,  # [B, C, 2]
-    conics: Tensor,  # [B, C, 3]
-    opacities: Tensor,  # [B, C]
-    features: Tensor,  # [B, C, D]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Composite C Gaussians at every pixel of B tiles: sums [B, P, D], transmittance [B, P], stopped [B, P] after them."""
-    weights, left, stopped = _weigh_chunk(chunk, tiles, transmittance, means2d, conics, opacities)
-    return weights @ features, left, stopped
 
 
 def _weigh_chunk(
@@ -128,7 +114,7 @@ def _weigh_chunk(
     conics: Tensor,  # [B, C, 3]
     opacities: Tensor,  # [B, C]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Weights [B, P, C] of C Gaussians at every pixel of B tiles, transmittance [B, P], stopped [B, P] after them."""
+    """Weights [B, P, C] of C Gaussians at every pixel of B tiles; transmittance [B, P], stopped [B, P] after them."""
     alphas = _alphas(_pixel_centers(chunk.tiles, tiles, means2d.dtype), means2d, conics, opacities)  # [B, P, C]
     alphas = torch.where((alphas >= ALPHA_MIN) & chunk.present[:, None], alphas, 0)
     start = transmittance[..., None]

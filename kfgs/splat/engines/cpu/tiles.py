@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .threads import find_reach, run_bands
-from .tiles_kernels import find_pairs, list_rows
+from .tiles_kernels import find_pairs, list_rows, sort_keys
 
 _SHARE = 8192
 """Gaussians of a band: few, so that all threads end together, but many compared with the tiles' counters."""
@@ -53,10 +53,9 @@ def bin(
 def depth_order(depths: Tensor) -> np.ndarray:  # [M] -> [M] int32
     """The rows by depth; equal depths by row. NaN comes last, as torch sorts.
 
-    The bits of numbers that are not negative are in the numbers' order, and torch sorts whole numbers by their digits:
-    fifty times as fast as it sorts floating point numbers.
+    The bits of float32 numbers that are not negative are in the numbers' order: they are sorted digit by digit.
     """
     values = depths.detach()
-    if not bool((values < 0).any()):
-        values = values.abs().view(torch.int32 if values.dtype == torch.float32 else torch.int64)  # -0 is 0
+    if values.dtype == torch.float32 and not bool((values < 0).any()):
+        return sort_keys(values.abs().numpy().view(np.uint32))  # -0 is 0
     return torch.sort(values, stable=True).indices.numpy().astype(np.int32)
