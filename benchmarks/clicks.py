@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw
 
 from kfgs import SemanticField, label_set_from_examples, load_scene
 from kfgs.fields import Clicks
-from kfgs.fields.notes import recall_scene
+from kfgs.fields.store import recall_scene
 
 SIZE = (480, 270)  # height, width of the numbers below
 VIEW, THING = "0027", "fox"

@@ -13,7 +13,7 @@ from small_room import make_room
 import kfgs
 from kfgs import FeatureFolder, SemanticField, Uplift, fit, load_label_set, load_scene, read_splats, write_splats
 from kfgs.fields import UpliftConfig, fuse_views
-from kfgs.fields.notes import scene_classes
+from kfgs.fields.store import scene_classes
 
 SHORT = UpliftConfig.field(max_gaussians=2_000)
 ROOT = Path(kfgs.__file__).parents[1]

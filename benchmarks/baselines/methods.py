@@ -12,7 +12,7 @@ from torch import Tensor
 from kfgs._rows import unit_rows
 from kfgs.cameras import Camera
 from kfgs.evaluation import Method, View, label_view
-from kfgs.fields.votes import divide_votes, rank_votes
+from kfgs.fields.decoders import divide_votes, rank_votes
 from kfgs.gaussians import Gaussians
 from kfgs.splat import Rendering, rasterize
 

@@ -14,13 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from .._card import error_line
 from .._check import as_array
 from .._files import Names, as_path, check_output, digest_file, digest_value, locked, read_json, real_path, write_json
 from .._origin import to_world
-from ..fields import SemanticField, fused, notes, uplift
+from ..fields import SemanticField, fused, store, working_maps
 from ..formats import read_splats, write_splats
 from ..formats.table import splat_file_of
 from ..gaussians import Gaussians
@@ -120,7 +119,7 @@ def _cut(source: Path, out: Path, count: int, splat: str | Path | None, latents:
     elif read_json(out / BLOCKS) != facts:
         raise ValueError(f"out: expected a new folder, or one with these blocks, got {out} with others; choose another")
     if not (out / LATENTS).is_file():
-        uplift.sample_latents(maps, count=latents).save(out / LATENTS)
+        working_maps.sample_latents(maps, latents, most=256).save(out / LATENTS)
     for block in todo:
         write_part(out / block.name / "sparse/0", content, block.views)
         _write_block(out / block.name, block, whole, cloud)
@@ -140,7 +139,7 @@ def _write_block(folder: Path, block: Block, whole: Scene, cloud: Gaussians | No
         (folder / name).symlink_to(os.path.relpath(real_path(target), real_path(folder)), target.is_dir())
     if cloud is not None:
         means, radii = _places(cloud), REACH * as_array(cloud.scales).max(1)
-        write_splats(cloud.select(torch.from_numpy(block.needs(means, radii))), folder / SPLAT)
+        write_splats(cloud.select(block.needs(means, radii)), folder / SPLAT)
     write_json(folder / BLOCK, asdict(block))  # last: the folder is complete
 
 
@@ -154,9 +153,9 @@ def _fit_block(folder: Path, method: Uplift) -> dict[str, Any]:
         maps = FeatureFolder(folder / "features").of(scene)
         method = replace(method, splat=splat, latents=LinearLatents.load(folder.parent / LATENTS))
         made = fit(scene.undistorted(), maps, method, folder=folder / RUN)
-        own = torch.from_numpy(block.holds(_places(made.gaussians)))
+        own = block.holds(_places(made.gaussians))
         facts |= {"gaussians": int(own.sum()), "seconds": round(sum(made.info["seconds"].values()), 1)}
-        if bool(own.any()):
+        if own.any():
             core = made.select(own)
             means, radii = _places(core.gaussians), REACH * as_array(core.gaussians.scales).max(1)[:, None]
             facts["box"] = [(means - radii).min(0).tolist(), (means + radii).max(0).tolist()]
@@ -196,12 +195,12 @@ def join_blocks(
             part = SemanticField.load(root / name / CORE)
             means = _places(part.gaussians)
             inside = ((means >= box[0]) & (means <= box[1])).all(1)
-            parts += [part.select(torch.from_numpy(inside))] if inside.any() else []
+            parts += [part.select(inside)] if inside.any() else []
     if not parts:
         where = {name: corners.round(3).tolist() for name, corners in boxes.items()}
         raise ValueError(f"low, high: expected a box with Gaussians, got none in it; all of them lie in {where}")
     field, scene = fused.join_fields(parts), real_path(root / described["scene"])
-    return replace(field, info=field.info | {"scene": str(scene)}, classes=notes.scene_classes(scene, field.dim))
+    return replace(field, info=field.info | {"scene": str(scene)}, classes=store.scene_classes(scene, field.dim))
 
 
 def _places(gaussians: Gaussians) -> Any:  # [N, 3]

@@ -13,7 +13,7 @@ from typing import Any
 from .._check import check_whole
 from .._files import as_path, read_json, write_json
 from .._notes import is_strict
-from ..fields.notes import scene_classes
+from ..fields.store import scene_classes
 from ..labels import load_label_set
 from ..pipeline import Paper, Uplift, fit, score_scene, segment_scene, true_labels
 from ..pipeline.segment import scored_labels

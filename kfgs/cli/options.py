@@ -89,7 +89,7 @@ class Classes:
 
     def of(self, field: Any) -> Classes:
         """The same with the scene that a field remembers, if none is given."""
-        from ..fields.notes import recall_scene
+        from ..fields.store import recall_scene
 
         return self if self.scene is not None else replace(self, scene=recall_scene(field.info))
 
@@ -107,7 +107,7 @@ class Classes:
         scene's table, in their order. A table that is named by --text is used whole.
         """
         from .._files import read_json
-        from ..fields.notes import CLASSES
+        from ..fields.store import SCENE_FILES
         from ..labels import load_label_set
 
         folder = self.scene if self.scene is None or self.scene.is_dir() else self.scene.parent
@@ -119,7 +119,7 @@ class Classes:
                 say(f"note: label numbers follow the class list of {self.text}, which differs from {listed}")
             return label_set
         if folder is not None:
-            for files in ([folder / name for name in names] for names in CLASSES):
+            for files in ([folder / name for name in names] for names in SCENE_FILES):
                 if all(file.is_file() for file in files):
                     return load_label_set(*files)
         if field is None or field.classes is None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,15 +16,15 @@ _MOMENTS = ("exp_avg", "exp_avg_sq")
 class FieldOptimizer:
     """torch's fused Adam with one learning rate per kind of parameter, and moments that stay with their Gaussians.
 
-    `params` holds the leaf tensors that are being trained. Growing or pruning keeps the moments of every Gaussian that
-    stays; new ones start at 0 (as in 3DGS).
+    `params` holds the leaf tensors that are being trained, `adam` their moments. Growing or pruning keeps the moments of
+    every Gaussian that stays; new ones start at 0 (as in 3DGS).
     """
 
     def __init__(self, params: GaussianParams, training: Training) -> None:
         """Copy `params` and prepare Adam; the extent of `training` is known."""
         self.params, self._training = params.map(_leaf), training
         groups = [{"params": [value], "name": name} for name, value in self.params.to_tensors().items()]
-        self._adam = torch.optim.Adam(groups, eps=training.rates.adam_eps, fused=True)
+        self.adam = torch.optim.Adam(groups, eps=training.rates.adam_eps, fused=True)
 
     def rate(self, name: str, step: int) -> float:
         """Learning rate of a parameter. That of the means falls from the first step on, and is in units of the extent."""
@@ -38,10 +37,10 @@ class FieldOptimizer:
 
     def step_(self, step: int) -> None:
         """Apply the gradients of step number `step`, then forget them."""
-        for group in self._adam.param_groups:
+        for group in self.adam.param_groups:
             group["lr"] = self.rate(group["name"], step)
-        self._adam.step()
-        self._adam.zero_grad(set_to_none=True)
+        self.adam.step()
+        self.adam.zero_grad(set_to_none=True)
 
     def replace_(
         self,
@@ -51,12 +50,12 @@ class FieldOptimizer:
     ) -> None:
         """Train `params` from now on: row i takes the moments of old row `source[i]`, or zeros where `fresh[i]`."""
         self.params = params.map(_leaf)
-        for group, value in zip(self._adam.param_groups, self.params.to_tensors().values(), strict=True):
-            if state := self._adam.state.pop(group["params"][0], None):
+        for group, value in zip(self.adam.param_groups, self.params.to_tensors().values(), strict=True):
+            if state := self.adam.state.pop(group["params"][0], None):
                 for moment in _MOMENTS:
                     state[moment] = state[moment][source]
                     state[moment][fresh] = 0
-                self._adam.state[value] = state
+                self.adam.state[value] = state
             group["params"] = [value]
 
     def lower_opacities_(self, opacity: float) -> None:
@@ -64,16 +63,8 @@ class FieldOptimizer:
         leaf = self.params.logit_opacities
         leaf.data.clamp_(max=math.log(opacity / (1 - opacity)))
         for moment in _MOMENTS:
-            if moment in self._adam.state.get(leaf, {}):
-                self._adam.state[leaf][moment].zero_()
-
-    def state(self) -> dict[str, Any]:
-        """Moments and step counts of Adam; empty before the first step."""
-        return dict(self._adam.state_dict()["state"])
-
-    def load_state_(self, state: dict[str, Any]) -> None:
-        """Continue from the result of `state`, for these `params`."""
-        self._adam.load_state_dict(self._adam.state_dict() | {"state": state})
+            if moment in self.adam.state.get(leaf, {}):
+                self.adam.state[leaf][moment].zero_()
 
 
 def _leaf(value: Tensor) -> Tensor:

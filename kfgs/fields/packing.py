@@ -123,9 +123,8 @@ def unpack(streams: dict[str, Tensor], entries: dict[str, Entry]) -> dict[str, T
     if set(entries) != set(streams):
         raise ValueError(f"expected a description of {sorted(streams)}, got {sorted(entries)!r:.200}")
     plain = {name: _plain_bytes(streams[name].numpy().tobytes(), entry) for name, entry in entries.items()}
-    means, before = entries["gaussians.means"], None
-    if means["coding"] == "curve":
-        before = _find_before(_cells(plain["gaussians.means"], means))
+    means = entries["gaussians.means"]
+    before = _find_before(_cells(plain["gaussians.means"], means)) if means["coding"] == "curve" else None
     tensors = {name: _decode(entry, plain[name], before) for name, entry in entries.items()}
     if entries["gaussians.opacities"]["coding"] != "exact":
         tensors["gaussians.opacities"].clamp_(EDGE, 1 - EDGE)
@@ -300,9 +299,6 @@ def _nearest_turn(quats: Array, scales: Array) -> tuple[Array, Array]:  # [N, 4]
     if not len(quats):
         return quats, scales
     group = Rotation.create_group("O")
-    turns = np.roll(group.as_quat(), 1, axis=1)  # [24, 4] wxyz
-    axes = np.abs(group.as_matrix()).argmax(axis=1)  # [24, 3]: the old axis that becomes axis 0, 1 and 2
-    best = np.abs(quats @ (turns * [1, -1, -1, -1]).T).argmax(1)  # the largest w of q C
-    both = Rotation.from_quat(np.roll(quats, -1, axis=1)) * Rotation.from_quat(np.roll(turns[best], -1, axis=1))
-    turned = np.roll(both.as_quat(), 1, axis=1)
-    return turned * np.where(turned[:, :1] < 0, -1, 1), np.take_along_axis(scales, axes[best], axis=1)
+    nearest, _, best = Rotation.from_quat(np.roll(quats, -1, axis=1)).reduce(right=group, return_indices=True)
+    axes = np.abs(group.as_matrix()).argmax(axis=1)[best]  # [N, 3]: the old axis that becomes axis 0, 1 and 2
+    return np.roll(nearest.as_quat(canonical=True), 1, axis=1), np.take_along_axis(scales, axes, axis=1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import isqrt
 from typing import Any
@@ -84,12 +84,6 @@ class GaussianParams:
         values = {name: getattr(self, name) for name in _NAMES}
         return {name: value for name, value in values.items() if value is not None}
 
-    @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> GaussianParams:
-        """The inverse of `to_tensors`; other names are ignored."""
-        known: dict[str, Any] = {name: tensors[name] for name in _NAMES if name in tensors}
-        return cls(**known)
-
     def map(self, function: Callable[[Tensor], Tensor]) -> GaussianParams:
         """Apply one function to every raw tensor."""
         mapped: dict[str, Any] = {name: function(value) for name, value in self.to_tensors().items()}
@@ -142,8 +136,6 @@ class GaussianParams:
         colors: Tensor | None = None,  # [P, 3] in [0, 1], or uint8
         sh_degree: int = 3,
         initial_opacity: float = 0.1,
-        max_points: int | None = None,
-        generator: torch.Generator | None = None,
     ) -> GaussianParams:
         """Put one round Gaussian on each point, with the distance of its three nearest neighbours as its width (3DGS).
 
@@ -157,8 +149,6 @@ class GaussianParams:
             colors: of the points, usually `Scene.colors`; None starts a field of features.
             sh_degree: highest degree of the spherical harmonics of a colour field, 0 to 3.
             initial_opacity: in (0, 1).
-            max_points: keep a random subset of at most this many (after outliers are dropped).
-            generator: draws the subset; None draws the same one each time.
 
         Example:
             >>> cube = torch.tensor([[x, y, z] for x in (0., 1.) for y in (0., 1.) for z in (0., 1.)])
@@ -177,24 +167,19 @@ class GaussianParams:
         check_range("initial_opacity", initial_opacity, 0, 1, closed=(False, False))
         if not bool(torch.isfinite(points).all()):
             raise ValueError("points: expected finite numbers, got others; drop those rows first")
-        kept = torch.arange(len(points), device=points.device)
         if len(points):
             distance = (points - points.median(dim=0).values).norm(dim=1)
             radius = float(np.quantile(distance.cpu().double().numpy(), 0.95))  # torch.quantile stops at 16M elements
-            kept = kept[distance <= OUTLIER_RANGE * radius] if radius > 0 else kept
-        if max_points is not None and len(kept) > max_points:
-            check_whole("max_points", max_points, 2)
-            generator = generator or torch.Generator().manual_seed(0)
-            order = torch.randperm(len(kept), generator=generator, device=generator.device)
-            kept = kept[order[:max_points].sort().values.to(points.device)]
-        points, n = points[kept], len(kept)
+            kept = distance <= (OUTLIER_RANGE * radius or math.inf)
+            points, colors = points[kept], None if colors is None else colors[kept]
+        n = len(points)
         return cls(
             means=points.clone(),
             quats=points.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
             log_scales=point_spacing(points).log()[:, None].repeat(1, 3),
             logit_opacities=points.new_full((n,), math.log(initial_opacity / (1 - initial_opacity))),
             features=None if channels is None else points.new_zeros(n, channels),
-            sh0=None if colors is None else rgb_to_sh0(colors[kept].to(points)),
+            sh0=None if colors is None else rgb_to_sh0(colors.to(points)),
             sh_rest=points.new_zeros(n, (sh_degree + 1) ** 2 - 1, 3) if colors is not None and sh_degree else None,
         )
 

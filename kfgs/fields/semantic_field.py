@@ -17,14 +17,13 @@ from ..cameras import Camera
 from ..gaussians import Gaussians, as_rows
 from ..labels import LabelSet, Selection
 from ..labels.classify import Classification
-from ..labels.questions import Classes, Negatives, check_rows, class_rows, make_question
+from ..labels.label_set import Classes, Negatives, check_rows, class_rows, make_question
 from ..labels.scores import Score, select_by_similarity
 from ..metrics import MIB, semantic_storage_bytes
 from ..splat import Ranked, Rendering, rasterize
-from .decoders import Decoder
+from .decoders import Decoder, Votes, rank_votes
 from .packing import Precision
 from .store import Seen, load_field, save_field
-from .votes import Votes, rank_votes
 
 _VOTES: WeakKeyDictionary[Any, tuple[Any, Tensor, Votes]] = WeakKeyDictionary()
 """Votes depend on the text alone, so the last ones of each field are kept, with the text they answer."""
@@ -127,11 +126,12 @@ class SemanticField:
         moved = {name: part.to(*args, **kwargs) for name, part in parts.items() if part is not None}
         return replace(self, **moved, cameras=tuple(camera.to(*args, **kwargs) for camera in self.cameras))
 
-    def select(self, which: Tensor) -> SemanticField:  # [N] bool or [n] int64
-        """A field of some of its Gaussians, with all that is known about them."""
-        seen = None if self.seen is None else Seen(*(values[which] for values in self.seen))
-        fused = None if self.fused is None else self.fused.select(which)
-        return replace(self, gaussians=self.gaussians.select(which), seen=seen, fused=fused)
+    def select(self, which: Any) -> SemanticField:
+        """A field of some of its Gaussians, with all that is known about them. Rows and errors: see `Gaussians.select`."""
+        rows = as_rows("which", which, len(self)).to(self.features.device)
+        seen = None if self.seen is None else Seen(*(values[rows] for values in self.seen))
+        fused = None if self.fused is None else self.fused.select(rows)
+        return replace(self, gaussians=self.gaussians.select(rows), seen=seen, fused=fused)
 
     # Maps
 
@@ -204,8 +204,9 @@ class SemanticField:
         if score == "cosine" and isinstance(negatives, str) and negatives == "auto":
             negatives = "none"
         source = self._source
-        classes = self.classes if classes is None else classes
-        rows, latents = make_question(target, classes, negatives, self.dim, self.info), source.features
+        latents, classes = source.gaussians.features, self.classes if classes is None else classes
+        assert latents is not None
+        rows = make_question(target, classes, negatives, self.decoder.dim, self.info)
         named = isinstance(target, str) and isinstance(negatives, str)  # the rows of a label set are checked
         unit = unit_rows(rows) if named else unit_embeddings(rows, "embedding, negatives")
         with torch.no_grad():
@@ -215,17 +216,32 @@ class SemanticField:
 
     def segment(self, camera: Camera, classes: Classes | None = None) -> Tensor:  # [H, W] int64
         """The class of each pixel from a viewpoint, -1 for empty pixels; the rule is that of the decoder."""
-        return self._rank(camera, classes, 1, early=True).labels[..., 0]
+        return self.rank(camera, classes, early=True).labels[..., 0]
 
-    def rank(self, camera: Camera, classes: Classes | None = None, *, top: int = 1) -> Ranked:
+    def rank(self, camera: Camera, classes: Classes | None = None, *, top: int = 1, early: bool = False) -> Ranked:
         """The `top` best classes of each pixel by the rule of `segment`, and their scores.
+
+        Args:
+            camera: the viewpoint.
+            classes: as for `classify`.
+            top: how many, from 1 to the number of classes.
+            early: for labels alone, in less time; scores and opacities are then as far as they were needed.
 
         Returns:
             Labels and scores [H, W, top], the best first; -1 and 0 where there is no class. And the opacity [H, W]. Scores are
             blended votes, from 0 to 1; of a field with codewords, cosines of the pixel's codeword with the classes; where
             features are compared, numbers that only compare the classes of one pixel.
         """
-        return self._rank(camera, classes, top, early=False)
+        rows = self._rows(classes)
+        check_whole("top", top, 1, len(rows))
+        with torch.no_grad():
+            votes = self._votes(rows)
+            if votes is not None:
+                return rank_votes(self.gaussians, camera, votes, top, early=early)
+            rendering = self.render(camera)
+            unit = unit_embeddings(rows).to(self.features)
+            labels = self.decoder.label_pixels(rendering.map, unit, top, rendering.alpha > 0)
+            return Ranked(*labels, rendering.alpha)
 
     # Size and files
 
@@ -261,27 +277,10 @@ class SemanticField:
         return load_field(path, cls)  # type: ignore[no-any-return]
 
     def _rows(self, classes: Classes | None) -> Tensor:  # [C, D]
-        if isinstance(classes, str):
-            raise TypeError(
-                f"classes: expected a LabelSet or embeddings [C, D], got the name {classes!r}; query({classes!r}) finds the "
-                "Gaussians of one class"
-            )
         classes = self.classes if classes is None else classes
         if classes is None:
             raise ValueError("classes: expected a label set, got none, and the field holds none; pass the classes")
         return class_rows(classes, self.dim, self.info)
-
-    def _rank(self, camera: Camera, classes: Classes | None, top: int, *, early: bool) -> Ranked:
-        rows = self._rows(classes)
-        check_whole("top", top, 1, len(rows))
-        with torch.no_grad():
-            votes = self._votes(rows)
-            if votes is not None:
-                return rank_votes(self.gaussians, camera, votes, top, early=early)
-            rendering = self.render(camera)
-            unit = unit_embeddings(rows).to(self.features)
-            labels = self.decoder.label_pixels(rendering.map, unit, top, rendering.alpha > 0)
-            return Ranked(*labels, rendering.alpha)
 
     def _votes(self, rows: Tensor) -> Votes | None:
         """What the Gaussians say about some classes; that for the last text is kept."""

@@ -17,13 +17,13 @@ import zstandard
 from safetensors import safe_open
 from torch import Tensor
 
-from .._arrays import reading, save_tensors
+from .._arrays import read_safetensors, reading, save_tensors
 from .._check import ORIGIN, as_origin
 from .._files import as_path, atomic_path, parse_json, real_path
 from ..cameras import Camera
 from ..gaussians import TENSORS as CLOUD
 from ..gaussians import Gaussians
-from ..labels import LabelSet
+from ..labels import LabelSet, load_label_set
 from ..scenes.files import PIXELS
 from .decoders import Linear, make_decoder
 from .packing import Precision, pack, unpack
@@ -32,6 +32,8 @@ SUFFIX, NAME = ".kfgs", "field.kfgs"
 KIND, VERSION = "semantic field", "1"
 ABOUT, WORDS = "description", 8 << 20  # the tensor with the JSON, and its most bytes
 WHAT, AGAIN = "a field of kfgs", "copy it again, or fit the field again"
+SCENE_FILES = ("classes.json", "text.npy"), ("classes.json", "text.safetensors"), ("text.safetensors",)
+"""Files of a scene folder that make a label set; the first group of which all exist is used."""
 
 
 class Seen(NamedTuple):
@@ -88,9 +90,8 @@ def save_field(path: str | Path, parts: Mapping[str, Any], precision: Precision 
 def load_field(path: str | Path, kind: Callable[..., Any]) -> Any:
     """A field from its file; `kind` makes one of its parts, by name."""
     path = _field_file(path)
-    with reading(path, WHAT, AGAIN), safe_open(path, framework="pt") as file:
-        about = _description(file)
-        tensors = {name: file.get_tensor(name) for name in file.keys() if name != ABOUT}  # noqa: SIM118 (no mapping)
+    tensors, about = _read(path)
+    with reading(path, WHAT, AGAIN):
         if _digest(tensors, about) != about["sha256"]:
             raise ValueError("its content is not what was saved")
         if "packed" in about:
@@ -100,16 +101,35 @@ def load_field(path: str | Path, kind: Callable[..., Any]) -> Any:
 
 def read_description(path: str | Path) -> dict[str, Any]:
     """The JSON of a field: `gaussians`, `cameras`, `info`, `sha256`, and `packed` of a packed one. No number is read."""
-    path = _field_file(path)
-    with reading(path, WHAT, AGAIN), safe_open(path, framework="pt") as file:
-        return _description(file)
+    return _read(_field_file(path))[1]
 
 
 def stream_sizes(path: Path) -> dict[str, int]:
     """The bytes of each tensor in a field's file, largest first."""
-    with safe_open(path, framework="pt") as file:
-        sizes = {name: file.get_tensor(name).nbytes for name in file.keys()}  # noqa: SIM118 (no mapping)
+    sizes = {name: value.nbytes for name, value in read_safetensors(path)[0].items()}
     return dict(sorted(sizes.items(), key=lambda entry: -entry[1]))
+
+
+def scene_classes(scene: Path, channels: int | None = None) -> LabelSet | None:
+    """The label set in a scene folder; None if there is none, it cannot be read, or it has other channels than the features."""
+    files = next((names for names in SCENE_FILES if all((scene / name).is_file() for name in names)), None)
+    if files is None:
+        return None
+    try:
+        classes = load_label_set(*(scene / name for name in files))
+    except (ValueError, OSError):  # said when classes are asked for; a long fit does not fail at its end
+        return None
+    return classes if channels in (None, classes.embeddings.shape[1]) else None
+
+
+def recall_scene(info: Mapping[str, Any]) -> Path:
+    """The scene folder in a field's notes; a ValueError if there is no note, a FileNotFoundError if no folder."""
+    if not isinstance(info.get("scene"), str):
+        raise ValueError("scene: expected a field that remembers its scene, got one that does not; pass the scene")
+    path = Path(info["scene"])
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path}: no such folder, where this field's scene was; pass the scene")
+    return path
 
 
 def _field_file(path: str | Path) -> Path:
@@ -117,16 +137,14 @@ def _field_file(path: str | Path) -> Path:
     return path / NAME if path.is_dir() else path
 
 
-def _description(file: Any) -> dict[str, Any]:
-    metadata = file.metadata() or {}
-    if metadata.get("kfgs") != KIND:
-        raise ValueError(f"it holds {metadata.get('kfgs', 'other tensors')!s:.40}")
-    if metadata.get("version") != VERSION:
-        raise ValueError(f"version {metadata.get('version')!s:.40}: use the kfgs that wrote it")
-    packed = file.get_tensor(ABOUT).numpy().tobytes()
-    if zstandard.get_frame_parameters(packed).content_size > WORDS:
-        raise ValueError("its description is too long")
-    return dict(parse_json(zstandard.ZstdDecompressor().decompress(packed, max_output_size=WORDS)))
+def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """The tensors of a field's file, and its description."""
+    tensors, _ = read_safetensors(path, WHAT, AGAIN, kfgs=(KIND, VERSION))
+    with reading(path, WHAT, AGAIN):
+        packed = tensors.pop(ABOUT).numpy().tobytes()
+        if zstandard.get_frame_parameters(packed).content_size > WORDS:
+            raise ValueError("its description is too long")
+        return tensors, dict(parse_json(zstandard.ZstdDecompressor().decompress(packed, max_output_size=WORDS)))
 
 
 def _digest(tensors: Mapping[str, Tensor], about: Mapping[str, Any]) -> str:

@@ -250,7 +250,7 @@ class Trainer:
         """Everything that `restore_` needs: tensors, numbers, lists and dictionaries."""
         return {
             "params": {name: value.detach() for name, value in self.optimizer.params.to_tensors().items()},
-            "adam": self.optimizer.state(),
+            "adam": self.optimizer.adam.state_dict()["state"],
             "statistics": self.statistics._asdict(),
             "generator": self._generator.get_state(),
             "progress": [self.step, self._queue, self.history, self._losses, self._seconds],
@@ -261,7 +261,7 @@ class Trainer:
         now = self.optimizer.params
         tensors: dict[str, Any] = {name: value.to(now.means) for name, value in state["params"].items()}
         self.optimizer = FieldOptimizer(replace(now, **tensors), self._training)
-        self.optimizer.load_state_(state["adam"])
+        self.optimizer.adam.load_state_dict(self.optimizer.adam.state_dict() | {"state": state["adam"]})
         self.statistics = GradientStatistics(*(value.to(now.means) for value in state["statistics"].values()))
         self._generator.set_state(state["generator"])
         self.step, self._queue, self.history, self._losses, self._seconds = state["progress"]

@@ -33,7 +33,7 @@ from ..splat.views import divide_sums, sum_pixels
 from .decoders import Linear
 from .merge import merge_gaussians
 from .semantic_field import Seen, SemanticField
-from .working_maps import WorkingMaps, shrink_map, working_directions
+from .working_maps import WorkingMaps, sample_latents, shrink_map
 
 SPARSE = 0.3  # share of the views' pixels: a splat of the scene fills nearly all of them
 NEIGHBOURS = 17  # a Gaussian and its 16 nearest, whose corrections are judged together
@@ -121,7 +121,7 @@ def uplift_maps(
     passes = 1 + config.corrections + (config.max_gaussians is not None and config.corrections > 0)
     bar = tqdm(total=count * passes, desc="uplift", unit="view", disable=not progress)
     with torch.no_grad(), bar, tempfile.TemporaryDirectory(prefix="kfgs_") as temporary:
-        directions = (working_directions(maps) if latents is None else latents.basis).to(cloud.means)
+        directions = (sample_latents(maps) if latents is None else latents).basis.to(cloud.means)
         views = WorkingMaps(cameras, maps, directions, config.pixels, scratch or Path(temporary))
         sums, shown = average(cloud, views, bar)
         if not bool((shown > 0).any()):
@@ -212,14 +212,3 @@ def _known(signal: Tensor, size: tuple[int, int]) -> Tensor:  # [h, w, c] -> [H,
     """A map in a camera's size, 0 where it is unknown, and which pixels are known as its last channel."""
     known = ~signal[..., :1].isnan()
     return resize_map(torch.cat([torch.where(known, signal, 0), known.to(signal)], dim=-1), size).contiguous()
-
-
-def sample_latents(maps: FeatureMaps, *, count: int = 32, views: int = 256) -> LinearLatents:
-    """Latents for several fields of one teacher: the main directions of features that are sampled from their maps.
-
-    Args:
-        maps: of all scenes together, or of all parts of a scene.
-        count: of the latents; fewer if features have fewer channels.
-        views: most maps that are read, evenly chosen.
-    """
-    return LinearLatents(working_directions(maps, count, views))

@@ -16,7 +16,7 @@ from .._files import atomic_path
 from .._rows import ENCODE, EPS, check_directions, row_norms, unit_rows
 from ..cameras import Camera
 from ..cameras.resample import from_bchw, to_bchw
-from ..quant.linear import principal_directions
+from ..quant.linear import LinearLatents, principal_directions
 from ..quant.sampling import FeatureMaps, all_zero, read_blocks, read_grid
 
 WORKING = 64
@@ -111,8 +111,11 @@ class WorkingMaps:
         return shrink
 
 
-def working_directions(maps: FeatureMaps, count: int = WORKING, most: int = LOOKED_AT[0]) -> Tensor:  # [D, d']
-    """The main `count` directions of unit features, from samples of at most `most` evenly spread maps."""
+def sample_latents(maps: FeatureMaps, count: int = WORKING, most: int = LOOKED_AT[0]) -> LinearLatents:
+    """The main `count` directions of unit features, from samples of at most `most` evenly spread maps.
+
+    With the latents of maps from several scenes, or from all parts of one, the fields of these agree.
+    """
     moment: Tensor | None = None
     for i in sorted({round(i) for i in np.linspace(0, len(maps) - 1, min(most, len(maps)))}):
         rows = read_grid(maps, i, LOOKED_AT[1]).float()
@@ -122,4 +125,4 @@ def working_directions(maps: FeatureMaps, count: int = WORKING, most: int = LOOK
         moment = rows.T @ rows if moment is None else moment + rows.T @ rows
     if moment is None or not bool(moment.any()):
         raise all_zero(len(maps))
-    return principal_directions(moment)[1][:, :count].float()
+    return LinearLatents(principal_directions(moment)[1][:, :count].float())

@@ -1,12 +1,13 @@
-"""The classes of a scene and their text embeddings, in memory and in a file."""
+"""The classes of a scene and their text embeddings, in memory and in files; and what a query compares with what."""
 
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -14,11 +15,15 @@ from torch import Tensor
 
 from .._arrays import read_array, read_safetensors, reading, save_tensors
 from .._card import cut
-from .._check import as_tensor, check_shapes, class_indices
+from .._check import as_tensor, check_choice, check_shapes, class_indices
 from .._files import as_path, atomic_path, parse_json, read_json
+from .._rows import unit_rows
 
 KIND, VERSION = "label set", "1"  # of the metadata's "kfgs" and "version"
 SUFFIX = ".safetensors"
+SAME = 1 - 1e-4  # cosine of one text embedded twice: half precision stays well above, other words below
+AGAIN = "embed the words with the teacher whose features this field was fitted to"
+Negatives = Literal["auto", "classes", "canonical", "none"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +102,9 @@ class LabelSet:
             save_tensors(temporary, tensors, texts)
 
 
+Classes = LabelSet | Tensor  # classes with names, or embeddings [C, D] alone
+
+
 def load_label_set(classes: str | Path, embeddings: str | Path | None = None) -> LabelSet:
     """Read classes and their embeddings from one table, or from two files: names and rows.
 
@@ -138,6 +146,108 @@ def teacher_mismatch(one: dict[str, Any], other: dict[str, Any]) -> str | None:
             if mine is not None and its is not None and mine != its:
                 return f"{key} {its!r:.40} instead of {mine!r:.40}"
     return None
+
+
+def class_rows(classes: Classes, dim: int, info: dict[str, Any]) -> Tensor:  # [C, D]
+    """The embeddings of a label set, or rows as they are, checked against a field's D and `info`.
+
+    Warns if another teacher embedded them; raises a TypeError if it is neither, a ValueError for other channels.
+    """
+    if not isinstance(classes, LabelSet):
+        try:
+            rows = as_tensor("embeddings", classes, floating=True)
+        except TypeError as error:
+            got = (
+                f"the name {classes!r}; query(name) finds one class"
+                if isinstance(classes, str)
+                else type(classes).__name__
+            )
+            got = f"{got}; load_label_set reads one, make_label_set makes one"
+            raise TypeError(f"classes: expected a LabelSet or embeddings [C, {dim}], got {got}") from error
+        check_rows("embeddings", rows, ("C",), dim)
+        return rows
+    difference, what, again = teacher_mismatch(info, classes.info), "text", AGAIN
+    if "examples" in classes.info:
+        what, again = "examples", "make them again: `kfgs features FIELD --examples FILE`"
+    got = f"{what} of another teacher" + ("" if difference is None else f" ({difference})")
+    if classes.embeddings.shape[1] != dim:
+        got = f"{tuple(classes.embeddings.shape)}: {got}"
+        raise ValueError(f"classes: expected embeddings [C, {dim}] (from the field), got {got}? If so, {again}")
+    if difference is not None:
+        warnings.warn(f"classes: expected those of the field's teacher, got {got}; {again}", stacklevel=4)
+    return classes.embeddings
+
+
+def make_question(
+    target: str | Tensor,
+    classes: Classes | None,
+    negatives: Negatives | Tensor,
+    dim: int,
+    info: dict[str, Any],
+) -> Tensor:  # [1 + M, D]
+    """The rows of a target and of its negatives, the target first.
+
+    With negatives "auto", a class (given by name or by its embedding) is compared with the other classes, or with the
+    canonical words if it is the only class. Any other target is compared with the canonical words, or with nothing if there
+    are none: not with the classes, because "chair" would exclude much of "office chair".
+    """
+    rows = None if classes is None else class_rows(classes, dim, info)
+    table = classes if isinstance(classes, LabelSet) else None
+    if isinstance(target, str):
+        if table is None:
+            got = f"{type(classes).__name__}; pass one, or an embedding"
+            raise ValueError(f"classes: expected a LabelSet to look {target!r} up in, got {got}")
+        index = table.index(target)
+        row, words = table.embeddings[index], table.names[index]
+    else:
+        row, words = as_tensor("embedding", target, floating=True), "embedding"
+        check_rows("embedding", row, (), dim)
+        row = row if rows is None else row.to(rows)
+    if not isinstance(negatives, str):
+        against = as_tensor("negatives", negatives, floating=True)
+        check_rows("negatives", against, ("M",), dim)
+        return torch.cat([row[None], against.to(row)])
+    rows = row.new_zeros(0, dim) if rows is None else rows
+    if negatives == "auto":
+        against = rows[_unlike(rows, row)]
+        if len(against) == 0 or (len(against) == len(rows) and not isinstance(target, str)):  # no others, or no class
+            against = _canonical(table, words, row)
+    elif negatives == "classes":
+        against = rows[_unlike(rows, row)]
+        if len(against) == 0:
+            raise ValueError(f"negatives: expected other classes than {words!r}, got none; use 'canonical' or 'none'")
+    elif negatives == "canonical":
+        against = _canonical(table, words, row)
+        if len(against) == 0:
+            raise ValueError(
+                "negatives: expected canonical words in the table, got none; `kfgs features --words` makes some"
+            )
+    else:
+        check_choice("negatives", negatives, get_args(Negatives))
+        against = rows[:0]
+    return torch.cat([row[None], against.to(row)])
+
+
+def check_rows(name: str, rows: Tensor, axes: Sequence[str], dim: int) -> None:
+    """Raise a ValueError unless rows have this shape. If only D differs, it asks whether the text is of another teacher."""
+    if rows.ndim == len(axes) + 1 and rows.shape[-1] != dim:
+        expected, got = ", ".join((*axes, str(dim))), tuple(rows.shape)
+        raise ValueError(f"{name}: expected [{expected}], got {got}: text of another teacher? If so, {AGAIN}")
+    check_shapes((name, rows, (*axes, dim)))
+
+
+def _canonical(classes: LabelSet | None, words: str, row: Tensor) -> Tensor:  # [M, D]
+    """The canonical negatives without the target, which is recognised by its words or its embedding."""
+    if classes is None or classes.negatives is None:
+        return row.new_zeros(0, len(row))
+    other_words = torch.tensor([word.casefold() != words.casefold() for word in classes.negative_names])
+    kept = _unlike(classes.negatives, row) & other_words.to(classes.negatives.device)
+    return classes.negatives[kept]
+
+
+def _unlike(rows: Tensor, row: Tensor) -> Tensor:  # [M, D], [D] -> [M] bool
+    """Which rows are embeddings of other words."""
+    return unit_rows(rows) @ unit_rows(row[None]).to(rows)[0] <= SAME
 
 
 def _as_list(names: Sequence[str]) -> tuple[str, ...]:

@@ -160,7 +160,7 @@ def color_stage(
 
     def train(checkpoint: Path) -> FieldFit:
         generator, degree = stage_generator(seed, "color"), config.sh_degree
-        start = GaussianParams.from_points(scene.points, colors=scene.colors, sh_degree=degree, generator=generator)
+        start = GaussianParams.from_points(scene.points, colors=scene.colors, sh_degree=degree)
         cameras = [scene.cameras[i] for i in views]
         if config.picture_scale != 1:
             sizes = [[max(1, round(n * config.picture_scale)) for n in camera.size] for camera in cameras]

@@ -24,8 +24,7 @@ from ..cameras import Camera
 from ..fields import Autoencoded, Codewords, GaussianParams, Identity, SemanticField, fit_field, fuse_views, uplift_maps
 from ..fields.checkpoint import digest_tensors
 from ..fields.decoders import Decoder
-from ..fields.notes import scene_classes
-from ..fields.store import NAME, check_place
+from ..fields.store import NAME, check_place, scene_classes
 from ..fields.train import FieldFit
 from ..formats import read_splats, write_splats
 from ..formats.table import splat_file_of
@@ -266,7 +265,7 @@ def _train(job: _Job, method: Paper, targets: Sequence[Tensor], inputs: dict[str
 
     def train(checkpoint: Path) -> FieldFit:
         generator = stage_generator(job.seed, "field")
-        start = GaussianParams.from_points(job.scene.points, int(targets[0].shape[-1]), generator=generator)
+        start = GaussianParams.from_points(job.scene.points, int(targets[0].shape[-1]))
         start = start.map(lambda value: value.to(training_device()))
         progress = job.progress
         return fit_field(

@@ -28,7 +28,7 @@ class Uplift:
     """How to train Gaussians if there is no splat; `ColorConfig()` is the published schedule. If `fit_color` trained for longer
     in the same run folder, its Gaussians are used instead."""
     latents: LinearLatents | None = None
-    """Latents of other fields (`fields.sample_latents`), which this one shall share; None: its own."""
+    """Latents of other fields (`fields.working_maps.sample_latents`), which this one shall share; None: its own."""
 
     def options(self) -> dict[str, Any]:
         """The options as JSON, without the Gaussians and latents."""

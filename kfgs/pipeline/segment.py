@@ -23,7 +23,7 @@ from ..evaluation.segmentation import SegmentationReport, check_truth
 from ..evaluation.views import labels_of_view
 from ..fields import SemanticField
 from ..labels import LabelSet, classify
-from ..labels.questions import class_rows
+from ..labels.label_set import class_rows
 from ..scenes import Scene, list_images
 from ..viz import FeatureColors, overlay_labels, palette
 from ..viz.linked import evenly

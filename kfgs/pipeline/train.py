@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from .._arrays import read_safetensors, save_tensors
-from .._check import ORIGIN, as_origin
+from .._check import as_origin
 from .._files import write_json
 from .._progress import Progress
 from ..cameras.projection import project_points
@@ -121,5 +121,5 @@ def field_stage(
 def stage_params(stage: Stage) -> GaussianParams:
     """The parameters that a finished stage of `field_stage` has."""
     tensors = read_safetensors(stage.folder / "params.safetensors")[0]
-    origin = as_origin(tensors["origin"].tolist()) if "origin" in tensors else ORIGIN
-    return replace(GaussianParams.from_tensors(tensors), origin=origin)
+    origin = tensors.pop("origin", torch.zeros(3))
+    return GaussianParams(**tensors, origin=as_origin(origin.tolist()))

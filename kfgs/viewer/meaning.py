@@ -14,7 +14,7 @@ from ..cameras import Camera
 from ..fields import Linear, SemanticField, fuse_views
 from ..gaussians import Gaussians
 from ..labels import LabelSet, OfClass, Selection
-from ..labels.questions import class_rows, make_question
+from ..labels.label_set import class_rows, make_question
 from ..labels.selection import class_name
 
 UNIT = (0.0, 1.0)

@@ -14,7 +14,7 @@ from kfgs._files import read_json, write_json
 from kfgs.batch import fit_blocks, join_blocks
 from kfgs.cli import main
 from kfgs.fields import SemanticField, UpliftConfig, uplift_maps
-from kfgs.fields.notes import recall_scene
+from kfgs.fields.store import recall_scene
 from kfgs.formats import read_splats, write_splats
 from kfgs.gaussians import Gaussians
 from kfgs.pipeline import Uplift

@@ -14,9 +14,9 @@ from cases_packed import LOSSY, METHODS, assert_same, assert_same_notes, assert_
 from messages import tells
 
 from kfgs.fields import SemanticField
-from kfgs.fields.notes import recall_scene, scene_classes
 from kfgs.fields.packing import SMALL
 from kfgs.fields.semantic_field import Seen
+from kfgs.fields.store import recall_scene, scene_classes
 from kfgs.labels import LabelSet
 
 

@@ -7,8 +7,7 @@ from messages import refused, tells
 
 from kfgs import Camera
 from kfgs.fields import Identity, SemanticField
-from kfgs.labels import LabelSet
-from kfgs.labels.questions import class_rows, make_question
+from kfgs.labels.label_set import LabelSet, class_rows, make_question
 
 NAMES = ("chair", "table", "lamp")
 ROWS = torch.eye(3, 6)
