@@ -28,7 +28,7 @@ from kfgs.evaluation.label_pictures import load_label_map
 from kfgs.fields import UpliftConfig, uplift_maps
 from kfgs.pipeline import score_scene, score_teacher, true_labels
 from kfgs.pipeline.maps import maps_of_views
-from kfgs.splat import vote_labels
+from kfgs.splat import average_views, vote_labels
 
 
 class Room:
@@ -83,8 +83,9 @@ def open_vocabulary(room: Room, field: SemanticField, words: Path) -> dict[str, 
     own = field.own_features(torch.arange(len(field)))
     cosine = torch.nn.functional.cosine_similarity(own, exact, dim=1)
     same = (own @ rows.T).argmax(1) == (exact @ rows.T).argmax(1)
-    assert field.seen is not None
-    weights = field.seen.pixels / field.seen.pixels.sum()
+    ones = ((camera, torch.ones(*camera.size, 1)) for camera in field.cameras)
+    weights = average_views(field.gaussians, ones).weights
+    weights /= weights.sum()
     return {"cosine": float((cosine * weights).sum()), f"best of {len(rows)} words": float((same * weights).sum())}
 
 

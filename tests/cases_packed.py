@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from kfgs import Camera, Gaussians
 from kfgs.fields import Autoencoded, Codewords, Identity, Linear, SemanticField
-from kfgs.fields.semantic_field import Seen
 from kfgs.labels import LabelSet
 from kfgs.quant import Codebook, LinearLatents
 
@@ -49,10 +48,9 @@ def field(method="fused", n=300, seed=0, **changes):
     if method == "fused":
         decoder = Linear(_basis(d, g).basis)
     gaussians = Gaussians(**cloud | changes)
-    seen = Seen(torch.rand(n, generator=g) * 5000, torch.rand(n, generator=g))
     if method != "fused":
         latents = torch.randn(n, 6, generator=g) * torch.rand(n, 1, generator=g)
-        fused = SemanticField(gaussians.replace(features=latents), Linear(_basis(6, g).basis), seen=seen)
+        fused = SemanticField(gaussians.replace(features=latents), Linear(_basis(6, g).basis))
     pose = torch.eye(4)
     pose[:3, :3] = torch.from_numpy(Rotation.from_euler("xyz", [0.1, 0.5, 1.0]).as_matrix()).float()
     K = torch.tensor([[40.0, 0, 20], [0, 41, 8], [0, 0, 1]])
@@ -62,7 +60,7 @@ def field(method="fused", n=300, seed=0, **changes):
     )  # fmt: skip
     cameras = Camera(pose, K, 40, 16, "first"), Camera(torch.eye(4), K, 39, 16, "Zweite", near=0.01)
     info = {"method": method, "nested": {"a": [1, None]}}
-    return SemanticField(gaussians, decoder, cameras, words, info, seen, fused)
+    return SemanticField(gaussians, decoder, cameras, words, info, fused)
 
 
 def assert_same(one, other):
@@ -77,7 +75,6 @@ def assert_same(one, other):
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)
     assert (one.fused is None) == (other.fused is None)
     assert one.fused is None or torch.equal(one.fused.features, other.fused.features)
-    assert all(torch.equal(a, b) for a, b in zip(one.seen, other.seen, strict=True))
     assert_same_notes(one, other)
     assert torch.equal(one.classes.embeddings, other.classes.embeddings)
     assert one.info == other.info
@@ -110,9 +107,6 @@ def assert_within(made, back):
             close(made.fused.features[order], back.fused.features, errors["fused.latents"])
         close(before.features, after.features, errors["gaussians.features"])
     assert torch.equal(made.known[order], back.known)
-    pixels, agreement = (value[order] for value in made.seen)
-    assert ((pixels - back.seen.pixels).abs() <= (errors["seen.pixels"] + EPS) * (pixels + 1)).all()
-    close(agreement, back.seen.agreement, errors["seen.agreement"])
     for ours, theirs, name in _decoders(made, back):
         rms = ours.double().square().mean(1, keepdim=True).sqrt()
         assert ((ours - theirs).abs() <= (errors[name] + EPS) * rms).all(), name

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import mse_loss
 
-from kfgs._rows import unit_rows
+from kfgs._rows import row_norms, unit_rows
 from kfgs.cameras import Camera
 from kfgs.fields import GaussianParams, Training, UpliftConfig, fit_field, uplift_maps
 from kfgs.gaussians import Gaussians
@@ -182,9 +182,8 @@ def fit(task: Task, config: CF3Config) -> Fitted:
     cameras = [within(camera, config.pixels) for camera in task.cameras]
     with clock.stage("lift"):
         found = uplift_maps(task.frozen, task.cameras, task.maps, options, generator=task.generator())
-        assert found.seen is not None
-        seen = found.seen.pixels > 0
-        agreement = found.seen.agreement.where(seen, 2.0)
+        seen = found.known
+        agreement = row_norms(found.features).where(seen, 2.0)  # the length of a mean of unit features
         dropped = agreement.argsort()[: int(VARIANCE_SHARE * int(seen.sum()))]
         seen[dropped] = False
         lifted = found.gaussians.select(seen)

@@ -11,7 +11,6 @@ import torch
 from kfgs.cameras import Camera
 from kfgs.fields import Autoencoded, Codewords, Linear, SemanticField
 from kfgs.fields.checkpoint import write_checkpoint
-from kfgs.fields.semantic_field import Seen
 from kfgs.formats import write_splats
 from kfgs.gaussians import Gaussians
 from kfgs.labels import (
@@ -59,8 +58,7 @@ def tiny_field(method: str = "fused", n: int = 16) -> SemanticField:
         fused = SemanticField(gaussians.replace(features=random(n, 3)), linear)
     words = LabelSet(("wall", "chair"), random(2, DIM), random(1, DIM), ("object",), {"teacher": {"name": "toy"}})
     camera = Camera(torch.eye(4), torch.tensor([[40.0, 0, 20], [0, 41, 8], [0, 0, 1]]), 40, 16, "first")
-    seen = Seen(torch.rand(n, generator=g) * 50, torch.rand(n, generator=g))
-    return SemanticField(gaussians, decoder, (camera,), words, {"seconds": 1.5}, seen, fused)
+    return SemanticField(gaussians, decoder, (camera,), words, {"seconds": 1.5}, fused)
 
 
 def make(folder: Path, add: Add) -> None:

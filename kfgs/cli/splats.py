@@ -21,8 +21,7 @@ UNITS = {  # of the error of a tensor; those of all others are shares
     "gaussians.means": "world units a coordinate",
     "gaussians.quats": "degrees",
     "gaussians.scales": "of a scale, and as much of twice the error of a coordinate",
-    "seen.pixels": "of a count, and as much of a pixel",
-    **dict.fromkeys(("gaussians.opacities", "gaussians.features", "fused.latents", "seen.agreement"), ""),
+    **dict.fromkeys(("gaussians.opacities", "gaussians.features", "fused.latents"), ""),
 }
 
 

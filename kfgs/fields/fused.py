@@ -18,7 +18,7 @@ from ..gaussians import Gaussians
 from ..quant.linear import fit_linear_latents
 from ..splat import average_views, rasterize
 from .decoders import Autoencoded, Codewords, Linear
-from .semantic_field import Seen, SemanticField
+from .semantic_field import SemanticField
 
 KEEP, MOST = 0.999, 64  # share of the codewords' variation to keep, with at most this many latents
 PIXELS = 80_000  # most pixels of a view that are rendered
@@ -54,11 +54,9 @@ def fuse_views(field: SemanticField, cameras: Sequence[Camera]) -> SemanticField
         for camera in cameras:
             factor = min(1.0, (PIXELS / (camera.width * camera.height)) ** 0.5)
             small.append(camera.resized(max(1, round(camera.height * factor)), max(1, round(camera.width * factor))))
-        mean = average_views(gaussians, map(show, small))
-        scale = sum(a.width * a.height for a in cameras) / max(1, sum(b.width * b.height for b in small))
-        seen = Seen(mean.weights * scale, row_norms(mean.values).clamp_max(1))
-    fused = SemanticField(gaussians.replace(features=mean.values), Linear(latents.basis), seen=seen)
-    return replace(field, cameras=tuple(cameras), seen=seen, fused=fused)
+        means = average_views(gaussians, map(show, small)).values
+    fused = SemanticField(gaussians.replace(features=means), Linear(latents.basis))
+    return replace(field, cameras=tuple(cameras), fused=fused)
 
 
 def join_fields(fields: Sequence[SemanticField]) -> SemanticField:
@@ -73,7 +71,6 @@ def join_fields(fields: Sequence[SemanticField]) -> SemanticField:
     return replace(
         first,
         gaussians=Gaussians.cat([part.gaussians.with_origin(first.gaussians.origin) for part in fields]),
-        seen=Seen(*(torch.cat(values) for values in zip(*(part.seen for part in fields if part.seen), strict=True))),
         cameras=tuple(cameras.values()),
         info=first.info | {"views": views},
     )

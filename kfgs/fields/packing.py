@@ -34,7 +34,7 @@ TURN = 2.1
 least 0.85 after `_nearest_turn`, by 0.61 times as much: the quaternion by 1.02 steps, the rotation by twice that."""
 QR_MOST = 1 << 31
 """Most rows x columns^2 of a basis that is rounded: its QR decomposition takes a second."""
-PER_GAUSSIAN = ("gaussians.", "fused.latents", "seen.")
+PER_GAUSSIAN = ("gaussians.", "fused.latents")
 
 
 @dataclass(frozen=True)
@@ -48,23 +48,21 @@ class Rounding:
     degrees: float
     """Angle between a rotation and its stored one. Axes may change their order: the ellipsoid is the same."""
     opacities: float
-    """Of an opacity, and of the agreement of the training views."""
+    """Of an opacity."""
     latents: float
     """Root mean square error of a fused latent, as a share of the median length. Trained latents get half of it."""
     decoder: float
     """Root mean square error of a row of basis, codebook or text table, as a share of the row. Weights of an
     autoencoder get a quarter: their errors add up from layer to layer."""
-    pixels: float
-    """Share of a count of pixels (`SemanticField.seen`), plus as much of one pixel."""
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
             check_range(name, value, 0, 30 if name == "degrees" else 1, closed=(False, True))
 
 
-FINE = Rounding(1 / 128, 0.02, 0.5, 1 / 512, 0.02, 0.004, 0.05)
-SMALL = Rounding(1 / 24, 0.08, 3.0, 1 / 40, 0.07, 0.02, 0.25)
-TINY = Rounding(1 / 8, 0.15, 8.0, 1 / 30, 0.2, 0.04, 0.5)
+FINE = Rounding(1 / 128, 0.02, 0.5, 1 / 512, 0.02, 0.004)
+SMALL = Rounding(1 / 24, 0.08, 3.0, 1 / 40, 0.07, 0.02)
+TINY = Rounding(1 / 8, 0.15, 8.0, 1 / 30, 0.2, 0.04)
 PRECISIONS = {"fine": FINE, "small": SMALL, "tiny": TINY}
 Precision = Literal["fine", "small", "tiny"] | Rounding
 
@@ -144,9 +142,7 @@ def _encode(
             return _planes({"coding": "turns", "step": turn, "error": chosen.degrees}, np.round(array[:, 1:] / turn))
         case ["gaussians", "scales"]:
             return _logs(array, chosen.scales, step)
-        case ["seen", "pixels"]:
-            return _logs(array, chosen.pixels, 1.0)
-        case ["gaussians", "opacities"] | ["seen", "agreement"]:
+        case ["gaussians", "opacities"]:
             size = 2 * chosen.opacities
             return _planes({"coding": "steps", "step": size, "error": size / 2}, np.round(array[:, None] / size))
         case ["gaussians", "features"]:

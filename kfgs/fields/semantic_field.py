@@ -23,7 +23,7 @@ from ..metrics import MIB, semantic_storage_bytes
 from ..splat import Ranked, Rendering, rasterize
 from .decoders import Decoder, Votes, rank_votes
 from .packing import Precision
-from .store import Seen, load_field, save_field
+from .store import load_field, save_field
 
 _VOTES: WeakKeyDictionary[Any, tuple[Any, Tensor, Votes]] = WeakKeyDictionary()
 """Votes depend on the text alone, so the last ones of each field are kept, with the text they answer."""
@@ -51,19 +51,13 @@ class SemanticField:
     """The classes of its scene with their text table."""
     info: dict[str, Any] = field(default_factory=dict)
     """The origin of the field, as JSON."""
-    seen: Seen | None = None
-    """How well the training views show each Gaussian: `pixels` that it fills, and their `agreement` in [0, 1]."""
     fused: SemanticField | None = None
     """The fused features of a trained field (`fuse_views`), with a `Linear` decoder."""
 
     def __post_init__(self) -> None:
         if self.gaussians.features is None:
             raise ValueError("gaussians: expected features [N, d], got None; fit them with fit_field")
-        check_shapes(
-            ("gaussians.features", self.gaussians.features, ("N", self.decoder.latent)),
-            ("seen.pixels", self.seen and self.seen.pixels, "N"),
-            ("seen.agreement", self.seen and self.seen.agreement, "N"),
-        )
+        check_shapes(("gaussians.features", self.gaussians.features, ("N", self.decoder.latent)))
         if self.fused is not None and (len(self.fused) != len(self) or self.fused.dim != self.dim):
             raise ValueError(f"fused: expected a field of the same Gaussians and teacher, got {self.fused!r}")
 
@@ -122,16 +116,15 @@ class SemanticField:
 
     def to(self, *args: Any, **kwargs: Any) -> SemanticField:
         """The field on another device or in another dtype, as `torch.Tensor.to`; cameras that you pass must be there, too."""
-        parts = {name: getattr(self, name) for name in ("gaussians", "decoder", "seen", "fused")}
+        parts = {name: getattr(self, name) for name in ("gaussians", "decoder", "fused")}
         moved = {name: part.to(*args, **kwargs) for name, part in parts.items() if part is not None}
         return replace(self, **moved, cameras=tuple(camera.to(*args, **kwargs) for camera in self.cameras))
 
     def select(self, which: Any) -> SemanticField:
         """A field of some of its Gaussians, with all that is known about them. Rows and errors: see `Gaussians.select`."""
-        rows = as_rows("which", which, len(self)).to(self.features.device)
-        seen = None if self.seen is None else Seen(*(values[rows] for values in self.seen))
+        rows = as_rows("which", which, len(self))
         fused = None if self.fused is None else self.fused.select(rows)
-        return replace(self, gaussians=self.gaussians.select(rows), seen=seen, fused=fused)
+        return replace(self, gaussians=self.gaussians.select(rows), fused=fused)
 
     # Maps
 

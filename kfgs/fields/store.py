@@ -10,7 +10,7 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 import zstandard
@@ -34,17 +34,6 @@ ABOUT, WORDS = "description", 8 << 20  # the tensor with the JSON, and its most 
 WHAT, AGAIN = "a field of kfgs", "copy it again, or fit the field again"
 SCENE_FILES = ("classes.json", "text.npy"), ("classes.json", "text.safetensors"), ("text.safetensors",)
 """Files of a scene folder that make a label set; the first group of which all exist is used."""
-
-
-class Seen(NamedTuple):
-    """How well the training views show each Gaussian."""
-
-    pixels: Tensor  # [N] number of pixels that it fills, in all training views
-    agreement: Tensor  # [N] in [0, 1]: length of the mean of the unit features at its pixels
-
-    def to(self, *args: Any, **kwargs: Any) -> Seen:
-        """Both on another device or in another dtype, as `torch.Tensor.to`."""
-        return Seen(*(value.to(*args, **kwargs) for value in self))
 
 
 def find_field(path: str | Path) -> Path | None:
@@ -172,8 +161,6 @@ def _to_tensors(path: Path, parts: Mapping[str, Any]) -> tuple[dict[str, Tensor]
     tensors |= parts["decoder"].to_tensors()
     if parts["fused"] is not None:
         tensors |= {"fused.latents": parts["fused"].features, "fused.basis": parts["fused"].decoder.basis}
-    if parts["seen"] is not None:
-        tensors |= {f"seen.{name}": value for name, value in parts["seen"]._asdict().items()}
     if cameras:
         cameras = [camera.with_origin(gaussians.origin) for camera in cameras]
         tensors["cameras.viewmats"] = torch.stack([camera.viewmat for camera in cameras])
@@ -196,7 +183,7 @@ def _to_tensors(path: Path, parts: Mapping[str, Any]) -> tuple[dict[str, Tensor]
 
 def _from_tensors(path: Path, tensors: dict[str, Tensor], about: dict[str, Any], kind: Callable[..., Any]) -> Any:
     """The field, which checks its parts."""
-    origin, classes, seen, fused = as_origin(about.get("origin", ORIGIN)), None, None, None
+    origin, classes, fused = as_origin(about.get("origin", ORIGIN)), None, None
     cloud: dict[str, Any] = {name: tensors[f"gaussians.{name}"] for name in CLOUD if f"gaussians.{name}" in tensors}
     for name, value in cloud.items():
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
@@ -215,10 +202,7 @@ def _from_tensors(path: Path, tensors: dict[str, Tensor], about: dict[str, Any],
             raise ValueError(f"a camera has {width:,} x {height:,} pixels; a picture has at most {PIXELS:,}")
         pose = tensors["cameras.viewmats"][i], tensors["cameras.Ks"][i]
         cameras.append(Camera(*pose, width, height, name, near=near, origin=origin))
-    if "seen.pixels" in tensors:
-        seen = Seen(tensors["seen.pixels"], tensors["seen.agreement"])
     if "fused.latents" in tensors:
-        latents = gaussians.replace(features=tensors["fused.latents"])
-        fused = kind(latents, Linear(tensors["fused.basis"]), seen=seen)
+        fused = kind(gaussians.replace(features=tensors["fused.latents"]), Linear(tensors["fused.basis"]))
     decoder = make_decoder(tensors, tensors["gaussians.features"].shape[1])
-    return kind(gaussians, decoder, tuple(cameras), classes, info, seen, fused)
+    return kind(gaussians, decoder, tuple(cameras), classes, info, fused)

@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from .._check import check_range, check_whole
 from .._progress import as_bar
-from .._rows import row_norms, unit_rows
+from .._rows import unit_rows
 from ..cameras import Camera, resize_map
 from ..formats.values import check_splats
 from ..gaussians import Gaussians
@@ -32,7 +32,7 @@ from ..splat import accumulate_pixels, bin_tiles, composite, project
 from ..splat.views import divide_sums, sum_pixels
 from .decoders import Linear
 from .merge import merge_gaussians
-from .semantic_field import Seen, SemanticField
+from .semantic_field import SemanticField
 from .working_maps import WorkingMaps, sample_latents, shrink_map
 
 SPARSE = 0.3  # share of the views' pixels: a splat of the scene fills nearly all of them
@@ -97,8 +97,8 @@ def uplift_maps(
         progress: show a bar.
 
     Returns:
-        A field with a `Linear` decoder. Latents are all-zero where no view shows the Gaussian. `seen.agreement` of merged
-        Gaussians is the mean over their members. `info["note"]` warns if the Gaussians fill little of the views.
+        A field with a `Linear` decoder. Latents are all-zero where no view shows the Gaussian. `info["note"]` warns if the
+        Gaussians fill little of the views.
 
     Raises:
         ValueError: if counts or shapes disagree, `write_splats` would refuse the Gaussians, a map is not finite, no map has
@@ -129,11 +129,9 @@ def uplift_maps(
                 "cameras: expected views that show the Gaussians, got none that does; do both share one frame?"
             )
         filled = float(shown.sum()) / sum(camera.width * camera.height for camera in cameras)
-        means = per_weight(sums.sum(0))
-        agreement = row_norms(means).clamp_max(1)
         if latents is None:
-            weights, keep = cap(shown, shown[shown > 0]), config.keep
-            fitted = fit_linear_latents(unit_rows(means), weights, keep=keep, maximum=config.max_latents).basis
+            rows, weights = unit_rows(per_weight(sums.sum(0))), cap(shown, shown[shown > 0])
+            fitted = fit_linear_latents(rows, weights, keep=config.keep, maximum=config.max_latents).basis
             views.basis = fitted
             sums = torch.cat([sums[..., :-1] @ fitted, sums[..., -1:]], dim=-1)
             latents = LinearLatents((directions.double() @ fitted.double()).to(directions))
@@ -142,14 +140,13 @@ def uplift_maps(
         if config.max_gaussians is not None:
             cloud = cloud.replace(features=per_weight(sums.sum(0)))
             merged = merge_gaussians(cloud, shown, config.max_gaussians, generator=generator)
-            agreement = divide_sums(merged.pool(agreement * shown), merged.weights)
-            cloud, shown, sums = merged.gaussians, merged.weights, torch.stack([merged.pool(half) for half in sums])
+            cloud, sums = merged.gaussians, torch.stack([merged.pool(half) for half in sums])
             if config.corrections:
                 sums = correct(cloud, sums, views, bar)
     note = f"the Gaussians fill {filled:.0%} of the views; are they in the cameras' frame?"
     info = {"note": note} if filled < SPARSE else {}
     fused = cloud.replace(features=per_weight(sums.sum(0)))
-    return SemanticField(fused, Linear(latents.basis), tuple(cameras), info=info, seen=Seen(shown, agreement))
+    return SemanticField(fused, Linear(latents.basis), tuple(cameras), info=info)
 
 
 def average(cloud: Gaussians, views: WorkingMaps, bar: Any) -> tuple[Tensor, Tensor]:  # [2, N, d' + 1], [N]

@@ -81,11 +81,8 @@ def test_answers_are_those_of_the_slow_oracle(mode):
     expected, pixels = oracles_answers.fused(blend_weights(cloud, views()), cloud.features.double().numpy(), shown)
     found = fuse(cloud, mode, views())
     features = found.decode(found.features)
-    np.testing.assert_allclose(found.seen.pixels.numpy(), pixels, atol=1e-4)
     # KEEP drops what is below 0.001 of the variation between features: at most sqrt(0.001) of each.
     np.testing.assert_allclose(features.numpy(), expected, atol=2e-5 if book is not None else 0.03)
-    length = np.sqrt((expected**2).sum(axis=1))
-    np.testing.assert_allclose(found.seen.agreement.numpy(), length, atol=2e-5 if book is not None else 2e-3)
     assert (pixels[:8] > 0.5).sum() >= 6
     assert (pixels[8:] == 0).all()
 
@@ -94,7 +91,6 @@ def test_answers_are_those_of_the_slow_oracle(mode):
 def test_what_no_view_shows_answers_nothing(mode):
     found = fuse(trained(mode), mode, views())
     assert (found.features[-2:] == 0).all()
-    assert found.seen.pixels[-2:].tolist() == found.seen.agreement[-2:].tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("mode", ["decouple", "adc"])
@@ -107,9 +103,7 @@ def test_what_learnt_nothing_answers_nothing(mode):
     assert (found.features == 0).all()
 
 
-def test_large_views_are_rendered_small_and_counted_in_their_own_pixels(monkeypatch):
+def test_large_views_are_rendered_small(monkeypatch):
     cloud, large = trained("adc"), [view.resized(40, 52) for view in views()]
     monkeypatch.setattr("kfgs.fields.fused.PIXELS", 130)
-    small, found = fuse(cloud, "adc", views()), fuse(cloud, "adc", large)
-    torch.testing.assert_close(found.features, small.features)
-    torch.testing.assert_close(found.seen.pixels, 16 * small.seen.pixels)
+    torch.testing.assert_close(fuse(cloud, "adc", large).features, fuse(cloud, "adc", views()).features)

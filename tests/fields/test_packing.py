@@ -15,7 +15,6 @@ from messages import tells
 
 from kfgs.fields import SemanticField
 from kfgs.fields.packing import SMALL
-from kfgs.fields.semantic_field import Seen
 from kfgs.fields.store import recall_scene, scene_classes
 from kfgs.labels import LabelSet
 
@@ -70,7 +69,6 @@ def degenerate():
     yield "rotations between two names", field(n=n, quats=torch.eye(4)[torch.arange(n) % 4] + torch.eye(4)[0])
     yield "known to nothing", field(n=n, features=torch.zeros(n, 5))
     yield "short latents", field(n=n, features=torch.randn(n, 5) * torch.logspace(-12, 0, n)[:, None])
-    yield "nothing seen", replace(field(n=n), seen=Seen(torch.zeros(n), torch.zeros(n)))
 
 
 @pytest.mark.parametrize("precision", ["fine", "tiny"])
@@ -197,7 +195,7 @@ HOSTILE = {
     "an origin out of reach": entry("gaussians.means", origin=[1e300, 0, 0]),
     "means that need the means": entry("gaussians.means", coding="near"),
     "a missing tensor": lambda about: about["packed"].pop("gaussians.means"),
-    "a tensor too many": lambda about: about["packed"].update(extra=about["packed"]["seen.pixels"]),
+    "a tensor too many": lambda about: about["packed"].update(extra=about["packed"]["gaussians.scales"]),
     "no tensors": lambda about: about.update(packed=[]),
     "cameras without names": lambda about: about.update(cameras=[[1, 2]]),
     "cameras of no size": lambda about: about.update(cameras=[["a", 0, 3, 0.2], ["b", 3, 3, 0.2]]),

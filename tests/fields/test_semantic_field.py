@@ -11,7 +11,6 @@ from messages import tells
 
 from kfgs import Camera, Gaussians
 from kfgs.fields import Autoencoded, Codewords, Identity, Linear, SemanticField, fuse_views
-from kfgs.fields.semantic_field import Seen
 from kfgs.metrics import MIB
 from kfgs.quant import Autoencoder, Codebook, LinearLatents
 
@@ -255,8 +254,6 @@ def test_parts_must_belong_together():
         SemanticField(field("adc").gaussians, decoder("fused"))
     with pytest.raises(ValueError, match=tells("fused:", "the same Gaussians")):
         SemanticField(field("adc").gaussians, decoder("adc"), fused=field("fused", n=5))
-    with pytest.raises(ValueError, match=tells("seen.agreement:", "[N]", "N = 4", "got (3,)")):
-        replace(field(), seen=Seen(torch.ones(4), torch.ones(3)))
 
 
 def test_some_gaussians_of_a_field():
@@ -264,7 +261,6 @@ def test_some_gaussians_of_a_field():
     part = whole.select(torch.tensor([3, 1]))
     assert torch.equal(part.features, whole.features[[3, 1]])
     assert torch.equal(part.fused.features, whole.fused.features[[3, 1]])
-    assert torch.equal(part.seen.pixels, whole.seen.pixels[[3, 1]])
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -280,9 +276,7 @@ def test_wrong_embeddings(mode):
 
 @pytest.mark.parametrize("mode", MODES)
 def test_another_dtype_gives_the_same_answers(mode):
-    count = 8
-    seen = Seen(torch.ones(count), torch.ones(count))
-    one = replace(field(mode, count), cameras=(a_camera(),), seen=seen if mode == "fused" else None)
+    one = replace(field(mode, n=8), cameras=(a_camera(),))
     other = one.to(torch.float64)
     assert {other.gaussians.means.dtype, other.features.dtype, other.cameras[0].K.dtype} == {torch.float64}
     assert one.gaussians.means.dtype == torch.float32  # the field itself stays
