@@ -8,7 +8,7 @@ import torch
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from torch import Tensor
 
-from .._check import check_range, check_shapes, check_whole
+from .._check import check_shapes, check_whole
 from ..gaussians import Gaussians
 from ..quant.kmeans import spherical_kmeans
 from ..splat import covariance_3d
@@ -42,16 +42,14 @@ def merge_gaussians(
     weights: Tensor,  # [N] >= 0
     maximum: int,
     *,
-    faint: float = FAINT,
-    clusters: int = CLUSTERS,
     generator: torch.Generator | None = None,
 ) -> Merged:
     """Prune and merge Gaussians with features until at most `maximum` are left. Classes are not used.
 
-    If there are more, the faintest Gaussians are dropped, which together have the share `faint` of all weight. These are
-    many, because a splat has many Gaussians that are hardly visible; their features are noise. The others are merged if
-    they lie in one cube of a grid and their features are in one of `clusters` groups (spherical k-means). The cubes are as
-    small as possible with at most `maximum` Gaussians left. A merged Gaussian has the weighted mean, covariance (of the
+    If there are more, the faintest Gaussians are dropped, which together have a twentieth of all weight. These are many,
+    because a splat has many Gaussians that are hardly visible; their features are noise. The others are merged if they lie
+    in one cube of a grid and their features are in one of 64 groups (spherical k-means). The cubes are as small as possible
+    with at most `maximum` Gaussians left. A merged Gaussian has the weighted mean, covariance (of the
     mixture: within plus between its members) and mean feature of its members. Its opacity keeps the area that they covered:
     the sum of o_i A_i divided by its A, where A is the product of the two larger standard deviations.
 
@@ -59,14 +57,10 @@ def merge_gaussians(
         gaussians: N Gaussians with features.
         weights: of the Gaussians, usually the pixels that each fills in the training views. Those without are dropped.
         maximum: most Gaussians of the result.
-        faint: share of all weight that is dropped, in [0, 1).
-        clusters: groups of features.
         generator: draws the first centres of k-means; None: seed 0.
     """
     check_shapes(("gaussians.means", gaussians.means, "N 3"), ("weights", weights, "N"))
     check_whole("maximum", maximum, 1)
-    check_whole("clusters", clusters, 1)
-    check_range("faint", faint, 0, 1, closed=(True, False))
     if gaussians.features is None:
         raise ValueError("gaussians: expected features [N, d], got None; uplift some first")
     rows = (weights > 0).nonzero()[:, 0]
@@ -76,7 +70,7 @@ def merge_gaussians(
         )
     if len(rows) > maximum:  # all but the smallest weights, which sum to at most this share of all
         order = rows[weights[rows].argsort(stable=True)]
-        below = weights[order].double().cumsum(0) <= faint * weights.double().sum()
+        below = weights[order].double().cumsum(0) <= FAINT * weights.double().sum()
         rows = order[~below].sort().values
     kept, worth = gaussians.select(rows), weights[rows]
     assert kept.features is not None
@@ -84,7 +78,7 @@ def merge_gaussians(
     if len(rows) <= maximum:
         source[rows] = torch.arange(len(rows), device=rows.device)
         return Merged(kept.replace(labels=None, sh=None), worth, source)
-    kinds = spherical_kmeans(kept.features, worth, clusters, generator=generator).index
+    kinds = spherical_kmeans(kept.features, worth, CLUSTERS, generator=generator).index
     group, count = _smallest_voxels(kept.means, kinds, worth, maximum)
     source[rows] = group
     return Merged(_match_moments(kept, worth, group, count), _sum(worth, group, count), source)

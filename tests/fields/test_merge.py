@@ -7,14 +7,20 @@ import torch
 from messages import tells
 
 from kfgs.cameras import Camera
-from kfgs.fields import merge_gaussians as merge_any
+from kfgs.fields import merge, merge_gaussians
 from kfgs.gaussians import Gaussians
 from kfgs.splat import covariance_3d, rasterize
 
 
-def merge_gaussians(*args, **options):
-    """Without dropping the faintest, so that each Gaussian can be followed."""
-    return merge_any(*args, faint=0.0, **options)
+@pytest.fixture(autouse=True)
+def nothing_is_faint(monkeypatch):
+    """So that each Gaussian can be followed."""
+    monkeypatch.setattr(merge, "FAINT", 0.0)
+
+
+@pytest.fixture
+def one_kind(monkeypatch):
+    monkeypatch.setattr(merge, "CLUSTERS", 1)
 
 
 def random_cloud(n=300, channels=5, kinds=4, seed=0):
@@ -47,11 +53,11 @@ def covariances(cloud):
     return covariance_3d(cloud.quats, cloud.scales)
 
 
-def test_two_equal_balls_become_their_mixture():
+def test_two_equal_balls_become_their_mixture(one_kind):
     """Two balls of deviation s at -a and +a along x: variances s^2 + a^2, s^2, s^2. The opacity keeps 2 o s^2 = o' s A."""
     a, s, o = 0.05, 0.1, 0.3
     cloud = balls([[1 - a, 2, 3], [1 + a, 2, 3]], [[1, 0], [0.8, 0.6]], s, o)
-    merged = merge_gaussians(cloud, torch.tensor([2.0, 2.0]), 1, clusters=1)
+    merged = merge_gaussians(cloud, torch.tensor([2.0, 2.0]), 1)
     assert merged.source.tolist() == [0, 0]
     assert merged.weights.tolist() == [4.0]
     found = merged.gaussians
@@ -63,10 +69,10 @@ def test_two_equal_balls_become_their_mixture():
     assert torch.linalg.vector_norm(found.quats).item() == pytest.approx(1, abs=1e-5)
 
 
-def test_merged_balls_smaller_than_a_pixel_are_antialiased_and_cover_as_much():
+def test_merged_balls_smaller_than_a_pixel_are_antialiased_and_cover_as_much(one_kind):
     """The opacity that keeps o A keeps the light on the screen, too: compensated, a Gaussian covers 2 pi o sqrt(det S)."""
     cloud = balls([[0.0, 0, 4], [0.002, 0, 4], [0, 0.003, 4]], [[1.0, 0]] * 3, 0.005, 0.5).replace(antialiased=True)
-    merged = merge_gaussians(cloud, torch.ones(3), 1, clusters=1).gaussians
+    merged = merge_gaussians(cloud, torch.ones(3), 1).gaussians
     camera = Camera(torch.eye(4), torch.tensor([[60.0, 0, 8.2], [0, 60, 7.9], [0, 0, 1]]), 16, 16)  # 0.08 pixels wide
     before = sum(
         float(rasterize(one, camera, engine="reference").alpha.sum()) for one in (cloud[0], cloud[1], cloud[2])
@@ -107,14 +113,13 @@ def test_what_is_few_enough_stays_as_it_is():
     assert merged.gaussians.labels is None
 
 
-def test_the_faintest_are_dropped_as_far_as_their_share_goes():
-    """Weights 1 to 10 add up to 55: a tenth of it holds 1 and 2, but not 3 as well."""
+@pytest.mark.parametrize(("share", "maximum", "dropped"), [(0.1, 9, [1, 4]), (0.0, 9, []), (0.9, 10, [])])
+def test_the_faintest_are_dropped_as_far_as_their_share_goes(monkeypatch, share, maximum, dropped):
+    """Weights 1 to 10 add up to 55: a tenth of it holds 1 and 2, but not 3 as well. Of 10, none is too many."""
+    monkeypatch.setattr(merge, "FAINT", share)
     cloud, _ = random_cloud(10)
-    weights = torch.tensor([4.0, 2, 10, 6, 1, 8, 3, 9, 7, 5])
-    assert (merge_any(cloud, weights, 9, faint=0.1).source < 0).nonzero()[:, 0].tolist() == [1, 4]
-    assert (merge_any(cloud, weights, 9, faint=0.0).source >= 0).all()
-    assert (merge_any(cloud, weights, 10, faint=0.9).source >= 0).all()  # none is too many
-    assert len(merge_any(cloud, torch.ones(10), 9, faint=0.99).gaussians) >= 1
+    source = merge_gaussians(cloud, torch.tensor([4.0, 2, 10, 6, 1, 8, 3, 9, 7, 5]), maximum).source
+    assert (source < 0).nonzero()[:, 0].tolist() == dropped
 
 
 @pytest.mark.parametrize("maximum", [1, 2, 7, 50, 150, 299])
@@ -131,37 +136,22 @@ def test_at_most_maximum_are_left_and_no_weight_is_lost(maximum):
     assert (sums > 0).all()
 
 
-def all_in_one_place(n, g):
-    return torch.full((n, 3), 7.0)
+PLACES = {
+    "all in one place": lambda n, g: torch.full((n, 3), 7.0),
+    "in five places": lambda n, g: torch.randn(5, 3, generator=g)[torch.arange(n) % 5],
+    "on a line": lambda n, g: torch.linspace(0, 1, n)[:, None] * torch.tensor([1.0, 0, 0]),
+    "with outliers": lambda n, g: torch.cat([torch.tensor([[1e6] * 3, [-1e6] * 3]), torch.rand(n - 2, 3, generator=g)]),
+    "far from the origin": lambda n, g: 1e4 + torch.rand(n, 3, generator=g),
+}
 
 
-def in_five_places(n, g):
-    return torch.randn(5, 3, generator=g)[torch.arange(n) % 5]
-
-
-def on_a_line(n, g):
-    return torch.linspace(0, 1, n)[:, None] * torch.tensor([1.0, 0, 0])
-
-
-def with_far_outliers(n, g):
-    means = torch.rand(n, 3, generator=g)
-    means[0], means[1] = 1e6, -1e6
-    return means
-
-
-def far_from_the_origin(n, g):
-    return 1e4 + torch.rand(n, 3, generator=g)
-
-
-@pytest.mark.parametrize(
-    "places", [all_in_one_place, in_five_places, on_a_line, with_far_outliers, far_from_the_origin]
-)
+@pytest.mark.parametrize("places", PLACES)
 @pytest.mark.parametrize("maximum", [1, 3, 40])
 def test_difficult_clouds_stay_below_the_maximum_as_well(places, maximum):
     """Each Gaussian has a feature of its own, so that there are 64 kinds in one place."""
     n, g = 200, torch.Generator().manual_seed(0)
     cloud, _ = random_cloud(n)
-    cloud = cloud.replace(means=places(n, g), features=torch.randn(n, 30, generator=g))
+    cloud = cloud.replace(means=PLACES[places](n, g), features=torch.randn(n, 30, generator=g))
     merged = merge_gaussians(cloud, torch.ones(n), maximum)
     assert 1 <= len(merged.gaussians) <= maximum
     for name in ("means", "quats", "scales", "opacities", "features"):
@@ -206,12 +196,12 @@ def test_a_fragment_joins_the_heaviest_kind_of_its_cube(light, groups):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_order_of_gaussians_does_not_matter(seed):
+def test_the_order_of_gaussians_does_not_matter(one_kind, seed):
     """With one kind of feature; the first centres of k-means are drawn by position."""
     cloud, weights = random_cloud(seed=seed)
     order = torch.randperm(len(cloud), generator=torch.Generator().manual_seed(seed))
-    one = merge_gaussians(cloud, weights, 60, clusters=1)
-    other = merge_gaussians(cloud.select(order), weights[order], 60, clusters=1)
+    one = merge_gaussians(cloud, weights, 60)
+    other = merge_gaussians(cloud.select(order), weights[order], 60)
     assert torch.equal(other.source, one.source[order])
     torch.testing.assert_close(other.weights, one.weights)
     for name in ("means", "opacities", "features"):
@@ -230,7 +220,3 @@ def test_wrong_input_is_named():
     for maximum in (0, 2.0):
         with pytest.raises(ValueError, match=tells("maximum:", f"got {maximum}")):
             merge_gaussians(cloud, weights, maximum)
-    with pytest.raises(ValueError, match=tells("clusters:", "got 0")):
-        merge_gaussians(cloud, weights, 5, clusters=0)
-    with pytest.raises(ValueError, match=tells("faint:", "got 1.0")):
-        merge_any(cloud, weights, 5, faint=1.0)

@@ -11,7 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from kfgs import Camera, Gaussians
 from kfgs._rows import unit_rows
 from kfgs.cameras import resize_map
-from kfgs.fields import GaussianParams, Rates, Training, UpliftConfig, fit_field, uplift, uplift_maps, working_maps
+from kfgs.fields import UpliftConfig, uplift, uplift_maps, working_maps
 from kfgs.fields.working_maps import shrink_map
 from kfgs.splat import average_views, rasterize
 
@@ -85,15 +85,6 @@ def test_without_corrections_it_is_the_average_of_unit_features():
     average = average_views(gaussians, resized)
     found = uplift_maps(gaussians, views, maps, PLAIN)
     torch.testing.assert_close(decoded(found), average.values, atol=1e-5, rtol=0)
-
-
-def test_reliability_is_the_spearman_brown_share_among_neighbours():
-    one, other = torch.tensor([[1.0, 0.0], [2.0, 0.0], [0.0, 0.0]]), torch.tensor([[0.6, 0.8], [2.0, 0.0], [0.0, 0.0]])
-    alone = uplift.reliability(one, other, torch.tensor([[0], [1], [2]]))
-    torch.testing.assert_close(alone, torch.tensor([2 * 0.6 / 1.6, 1.0, 0.0]))
-    r = (0.6 + 4) / (1 + 4)
-    together = uplift.reliability(one, other, torch.tensor([[0, 1], [1, 0], [2, 0]]))
-    torch.testing.assert_close(together, torch.tensor([2 * r / (1 + r), 2 * r / (1 + r), 2 * 0.6 / 1.6]))
 
 
 def test_latents_are_chosen_by_directions_and_pixels():
@@ -328,17 +319,6 @@ def test_a_killed_uplift_reads_no_map_twice_and_gives_the_same_bits(tmp_path, mo
     whole = uplift_maps(cloud(), cameras(), Maps())
     assert torch.equal(resumed.gaussians.features, whole.gaussians.features)
     assert torch.equal(resumed.decoder.basis, whole.decoder.basis)
-
-
-def test_an_uplifted_cloud_is_a_start_for_training():
-    views = cameras()
-    maps = [torch.nn.functional.normalize(one, dim=-1) for one in random_maps(views)]
-    found = uplift_maps(cloud(), views, maps)
-    targets = [found.decoder.encode(one) for one in maps]
-    config = Training(steps=30, extent=1.0, densify=None, rates=Rates(features=0.02), report_every=10)
-    trained = fit_field(GaussianParams.from_gaussians(found.gaussians), views, targets, config)
-    assert trained.history[-1]["loss"] < trained.history[0]["loss"]
-    assert trained.params.channels == found.decoder.latent
 
 
 def test_gaussians_that_fill_little_of_the_views_are_pointed_out():
