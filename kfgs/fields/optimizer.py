@@ -1,16 +1,20 @@
-"""Adam for the raw values of a cloud; the number of Gaussians may change during training."""
+"""Adam for the raw values of a cloud, and the density control of 3DGS, which changes the number of Gaussians in training."""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
+from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
 
 from .params import GaussianParams
-from .training import Training
+from .training import Densify, Training
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")
+SPLIT_CHILDREN = 2
+SPLIT_SHRINK = 1.6  # 0.8 times the number of children (3DGS)
 
 
 class FieldOptimizer:
@@ -69,3 +73,97 @@ class FieldOptimizer:
 
 def _leaf(value: Tensor) -> Tensor:
     return value.detach().clone().requires_grad_(True)
+
+
+class GradientStatistics(NamedTuple):
+    """Running sum of screen-space gradient norms per Gaussian, and its number of views."""
+
+    total: Tensor  # [N]
+    views: Tensor  # [N], number of views that saw it
+
+    @staticmethod
+    def zeros(params: GaussianParams) -> GradientStatistics:
+        """Statistics of no view."""
+        return GradientStatistics(*(params.means.new_zeros(len(params)) for _ in range(2)))
+
+    def add_(
+        self,
+        index: Tensor,  # [M] int64, each Gaussian at most once
+        gradient: Tensor,  # [M, 2] of the loss by means2d, in pixels
+        size: tuple[int, int],  # (height, width)
+    ) -> None:
+        """Add one view. NDC spans 2 over the picture, so a gradient in NDC is half the size times one in pixels."""
+        height, width = size
+        norm = torch.hypot(gradient[:, 0] * (width / 2), gradient[:, 1] * (height / 2))
+        self.total[index] += norm
+        self.views[index] += 1
+
+    def mean(self) -> Tensor:  # [N]
+        """Mean norm over the views that saw the Gaussian; 0 if none did."""
+        return self.total / self.views.clamp(min=1)
+
+
+class Densified(NamedTuple):
+    """The new cloud, and the source of each of its rows."""
+
+    params: GaussianParams
+    source: Tensor  # [N'] int64: row of the old cloud
+    fresh: Tensor  # [N'] bool: a new Gaussian
+
+
+def densify(
+    params: GaussianParams,
+    gradient: Tensor,  # [N] mean norm, NDC units
+    options: Densify,
+    *,
+    extent: float,
+    prune_large: bool,
+    generator: torch.Generator,
+) -> Densified:
+    """One round of adaptive density control.
+
+    A Gaussian with a gradient of at least `options.gradient` is cloned (an exact copy is added) if its largest scale
+    is at most `percent_dense * extent`; otherwise two Gaussians of 1/1.6 its scales, drawn from its distribution, replace
+    it. Then Gaussians below `prune_opacity`, and with `prune_large` those larger than `prune_extent * extent`, are dropped.
+    Order of the result: old ones, clones, children. With a `maximum` the strongest gradients grow first (ties in order
+    of index).
+
+    Args:
+        params: the cloud; not changed.
+        gradient: `GradientStatistics.mean()`.
+        options: thresholds.
+        extent: size of the scene, world units.
+        prune_large: in 3DGS true only after the first reset of opacities.
+        generator: draws the children's positions.
+
+    Note:
+        3DGS intends to prune Gaussians larger than 20 pixels on screen, but sets their radii to zero before the test, so
+        it never does. Neither does this function.
+    """
+    values = params.map(torch.Tensor.detach)
+    scales = values.log_scales.exp().amax(dim=1)
+    growing = gradient >= options.gradient
+    if options.maximum is not None and len(params) + int(growing.sum()) > options.maximum:  # each adds one Gaussian
+        strongest = torch.where(growing, gradient, -torch.inf).argsort(descending=True, stable=True)
+        growing[strongest[max(0, options.maximum - len(params)) :]] = False
+    large = scales > options.percent_dense * extent
+    kept = (~(growing & large)).nonzero()[:, 0]
+    cloned = (growing & ~large).nonzero()[:, 0]
+    parents = (growing & large).nonzero()[:, 0].repeat_interleave(SPLIT_CHILDREN)
+
+    source = torch.cat([kept, cloned, parents])
+    fresh = torch.arange(len(source), device=source.device) >= len(kept)
+    grown = values.map(lambda value: value[source])
+    if len(parents):
+        first = len(kept) + len(cloned)
+        means = values.means[parents]
+        rotation = quaternion_to_rotation_matrix(values.quats[parents])  # wxyz, normalises
+        noise = torch.randn(means.shape, dtype=means.dtype, device=generator.device, generator=generator)
+        away = noise.to(means.device) * values.log_scales[parents].exp()
+        grown.means[first:] = means + (rotation @ away[:, :, None])[:, :, 0]
+        grown.log_scales[first:] -= math.log(SPLIT_SHRINK)
+
+    stays = grown.logit_opacities.sigmoid() >= options.prune_opacity
+    if prune_large:
+        stays &= grown.log_scales.exp().amax(dim=1) <= options.prune_extent * extent
+    return Densified(grown.map(lambda value: value[stays]), source[stays], fresh[stays])

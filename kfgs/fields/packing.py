@@ -140,8 +140,10 @@ def _encode(
         case ["gaussians", "quats"]:
             turn = math.radians(chosen.degrees) / TURN
             return _planes({"coding": "turns", "step": turn, "error": chosen.degrees}, np.round(array[:, 1:] / turn))
-        case ["gaussians", "scales"]:
-            return _logs(array, chosen.scales, step)
+        case ["gaussians", "scales"]:  # steps of log(1 + x / least): each x within a share of x + least
+            size = 2 * math.log1p(chosen.scales)
+            entry = {"coding": "logs", "step": size, "least": step, "error": chosen.scales}
+            return _planes(entry, np.round(np.log1p(array / step) / size))
         case ["gaussians", "opacities"]:
             size = 2 * chosen.opacities
             return _planes({"coding": "steps", "step": size, "error": size / 2}, np.round(array[:, None] / size))
@@ -171,13 +173,6 @@ def _planes(entry: Entry, whole: Array) -> tuple[Entry, bytes]:  # [n, c] whole 
     width = next(size for size in (1, 2, 4, 8) if reach < 1 << (8 * size - 1))
     columns = np.ascontiguousarray(whole.T).astype(f"<i{width}").view(np.uint8).reshape(whole.shape[1], -1, width)
     return {**entry, "width": width}, columns.transpose(0, 2, 1).tobytes()
-
-
-def _logs(values: Array, share: float, least: float) -> tuple[Entry, bytes]:  # [N] or [N, 3], >= 0
-    """Steps of log(1 + x / least): each x within a share of x + least."""
-    step = 2 * math.log1p(share)
-    whole = np.round(np.log1p(values.reshape(len(values), -1) / least) / step)
-    return _planes({"coding": "logs", "step": step, "least": least, "error": share}, whole)
 
 
 def _near(values: Array, share: float, before: Array) -> tuple[Entry, bytes]:  # [N, d]

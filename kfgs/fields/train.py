@@ -21,9 +21,8 @@ from ..cameras import Camera
 from ..cameras.bounds import camera_extent
 from ..splat import rasterize
 from .checkpoint import digest_tensors, read_checkpoint, write_checkpoint
-from .densify import GradientStatistics, densify
 from .loss import ColorLoss, Loss, l1_loss
-from .optimizer import FieldOptimizer
+from .optimizer import FieldOptimizer, GradientStatistics, densify
 from .params import GaussianParams
 from .training import Densify, Training, check_extent
 from .working_maps import shrink_camera, shrink_map

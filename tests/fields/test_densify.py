@@ -3,9 +3,8 @@ from dataclasses import replace
 
 import torch
 
-from kfgs.fields import Densify, GaussianParams
-from kfgs.fields import densify as densifying
-from kfgs.fields.densify import GradientStatistics
+from kfgs.fields import Densify, GaussianParams, optimizer
+from kfgs.fields.optimizer import GradientStatistics
 
 CONFIG = Densify()
 EXTENT = 10.0  # cloned up to scale 0.1, pruned beyond scale 1
@@ -27,7 +26,7 @@ def params(scales, opacities=None):
 
 def densify(params, gradient, options=CONFIG, *, extent=EXTENT, prune_large=False, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    return densifying.densify(params, gradient, options, extent=extent, prune_large=prune_large, generator=generator)
+    return optimizer.densify(params, gradient, options, extent=extent, prune_large=prune_large, generator=generator)
 
 
 def rows(params, index):
