@@ -28,11 +28,10 @@ class Merged(NamedTuple):
     """The merged cloud, and the members of its Gaussians."""
 
     gaussians: Gaussians  # M, with features
-    weights: Tensor  # [M] sums of their members' weights
     source: Tensor  # [N] int64, the merged Gaussian of each old one; -1 = dropped
 
     def pool(self, values: Tensor) -> Tensor:  # [N, ...] -> [M, ...]
-        """Sums over the members of each merged Gaussian."""
+        """Sums over the members of each merged Gaussian, for instance of their weights."""
         kept = self.source >= 0
         return _sum(values[kept], self.source[kept], len(self.gaussians))
 
@@ -77,11 +76,11 @@ def merge_gaussians(
     source = torch.full_like(weights, -1, dtype=torch.int64)
     if len(rows) <= maximum:
         source[rows] = torch.arange(len(rows), device=rows.device)
-        return Merged(kept.replace(labels=None, sh=None), worth, source)
+        return Merged(kept.replace(labels=None, sh=None), source)
     kinds = spherical_kmeans(kept.features, worth, CLUSTERS, generator=generator).index
     group, count = _smallest_voxels(kept.means, kinds, worth, maximum)
     source[rows] = group
-    return Merged(_match_moments(kept, worth, group, count), _sum(worth, group, count), source)
+    return Merged(_match_moments(kept, worth, group, count), source)
 
 
 def _smallest_voxels(means: Tensor, kinds: Tensor, worth: Tensor, maximum: int) -> tuple[Tensor, int]:  # [n] int64, M

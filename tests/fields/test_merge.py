@@ -59,7 +59,7 @@ def test_two_equal_balls_become_their_mixture(one_kind):
     cloud = balls([[1 - a, 2, 3], [1 + a, 2, 3]], [[1, 0], [0.8, 0.6]], s, o)
     merged = merge_gaussians(cloud, torch.tensor([2.0, 2.0]), 1)
     assert merged.source.tolist() == [0, 0]
-    assert merged.weights.tolist() == [4.0]
+    assert merged.pool(torch.tensor([2.0, 2.0])).tolist() == [4.0]
     found = merged.gaussians
     torch.testing.assert_close(found.means, torch.tensor([[1.0, 2.0, 3.0]]))
     torch.testing.assert_close(covariances(found)[0], torch.diag(torch.tensor([s * s + a * a, s * s, s * s])))
@@ -98,7 +98,6 @@ def test_every_group_is_the_mixture_of_its_members(seed):
         np.testing.assert_allclose(spreads[k], spread, atol=2e-6)
         np.testing.assert_allclose(merged.gaussians.features[k].numpy(), feature, atol=2e-6)
         assert merged.gaussians.opacities[k].item() == pytest.approx(opacity, rel=2e-5)
-        assert merged.weights[k].item() == pytest.approx(sum(parts[5][i] for i in members), rel=1e-5)
 
 
 def test_what_is_few_enough_stays_as_it_is():
@@ -106,7 +105,7 @@ def test_what_is_few_enough_stays_as_it_is():
     cloud = cloud.replace(sh=torch.zeros(20, 1, 3), labels=torch.zeros(20, dtype=torch.int64))
     merged = merge_gaussians(cloud, weights, 20)
     assert merged.source.tolist() == list(range(20))
-    assert torch.equal(merged.weights, weights)
+    assert torch.equal(merged.pool(weights), weights)
     for name in ("means", "quats", "scales", "opacities", "features"):
         assert torch.equal(getattr(merged.gaussians, name), getattr(cloud, name))
     assert merged.gaussians.sh is None  # its colours and labels were of another cloud
@@ -128,12 +127,10 @@ def test_at_most_maximum_are_left_and_no_weight_is_lost(maximum):
     weights[::10] = 0.1
     merged = merge_gaussians(cloud, weights, maximum)
     assert 1 <= len(merged.gaussians) <= maximum
-    kept = weights > 0
-    assert torch.equal(merged.source >= 0, kept)
-    torch.testing.assert_close(merged.weights.sum(), weights[kept].sum())
-    sums = torch.zeros(len(merged.gaussians)).index_add_(0, merged.source[kept], weights[kept])
-    torch.testing.assert_close(merged.weights, sums)  # `source` is a map onto 0 ... M - 1
-    assert (sums > 0).all()
+    assert torch.equal(merged.source >= 0, weights > 0)
+    sums = merged.pool(weights)
+    torch.testing.assert_close(sums.sum(), weights.sum())
+    assert (sums > 0).all()  # `source` is a map onto 0 ... M - 1
 
 
 PLACES = {
@@ -203,7 +200,6 @@ def test_the_order_of_gaussians_does_not_matter(one_kind, seed):
     one = merge_gaussians(cloud, weights, 60)
     other = merge_gaussians(cloud.select(order), weights[order], 60)
     assert torch.equal(other.source, one.source[order])
-    torch.testing.assert_close(other.weights, one.weights)
     for name in ("means", "opacities", "features"):
         torch.testing.assert_close(getattr(other.gaussians, name), getattr(one.gaussians, name))
     torch.testing.assert_close(covariances(other.gaussians), covariances(one.gaussians), atol=1e-6, rtol=1e-4)
