@@ -1,10 +1,10 @@
-"""Small trainings: options with changes in any of their parts, cameras, and whether two clouds are equal."""
+"""Small trainings: options with changes in any of their parts, Gaussians, cameras, and whether two clouds are equal."""
 
 from dataclasses import fields, replace
 
 import torch
 
-from kfgs import Camera
+from kfgs import Camera, Gaussians, rasterize
 from kfgs.fields import Densify, GaussianParams, Rates, Training
 
 DENSIFY = {field.name for field in fields(Densify)}
@@ -18,6 +18,43 @@ def changed(training: Training, **changes) -> Training:
     if densify:
         changes["densify"] = replace(training.densify, **densify)
     return replace(training, rates=replace(training.rates, **rates), **changes)
+
+
+SHORT = changed(
+    Training(),
+    steps=60,
+    extent=2.0,
+    scales_rate=0.01,
+    means_rate=1e-3,
+    means_final_rate=1e-4,
+    start=5,
+    stop=45,
+    every=10,
+    gradient=5e-4,
+    report_every=10,
+    checkpoint_every=20,
+)
+
+
+def blobs(n=12, seed=0, *, colors=False) -> Gaussians:
+    """Gaussians around the origin with 3 features, or with colours of degree 1."""
+    g = torch.Generator().manual_seed(seed)
+    shape = {
+        "means": torch.rand(n, 3, generator=g) * 2 - 1,
+        "quats": torch.randn(n, 4, generator=g),
+        "scales": torch.rand(n, 3, generator=g) * 0.25 + 0.1,
+        "opacities": torch.rand(n, generator=g) * 0.6 + 0.3,
+    }
+    if colors:
+        return Gaussians(**shape, sh=torch.randn(n, 4, 3, generator=g) * 0.4)
+    return Gaussians(**shape, features=torch.rand(n, 3, generator=g))
+
+
+def scene(views=5, truth=None):
+    """Cameras around the origin and what they see of some Gaussians."""
+    cameras = [look_at_origin(0.5 * i) for i in range(views)]
+    truth = blobs() if truth is None else truth
+    return cameras, [rasterize(truth, camera).map.clamp(0, 1) for camera in cameras]
 
 
 def look_at_origin(angle: float) -> Camera:

@@ -2,50 +2,21 @@
 
 import pytest
 import torch
-from cases_training import changed, look_at_origin, same
+from cases_training import SHORT as BASE
+from cases_training import blobs, changed, look_at_origin, same
+from cases_training import scene as scene_of
 from messages import tells
 
 from kfgs import Gaussians, rasterize
-from kfgs.fields import ColorLoss, GaussianParams, Training, fit_field
+from kfgs.fields import ColorLoss, GaussianParams, fit_field
 
-SHORT = changed(
-    Training(),
-    steps=60,
-    extent=2.0,
-    sh0_rate=0.05,
-    sh_rest_rate=0.01,
-    sh_degree_every=20,
-    half_until=25,
-    scales_rate=0.01,
-    means_rate=1e-3,
-    means_final_rate=1e-4,
-    start=5,
-    stop=45,
-    every=10,
-    gradient=5e-4,
-    reset_every=30,
-    report_every=10,
-    checkpoint_every=20,
-)
-
-
+SHORT = changed(BASE, sh0_rate=0.05, sh_rest_rate=0.01, sh_degree_every=20, half_until=25, reset_every=30)
+BLOBS = blobs(14, colors=True)
 DEGREES = (slice(0, 3), slice(3, 8), slice(8, 15))  # of sh_rest
 
 
-def blobs(n=14, seed=0):
-    g = torch.Generator().manual_seed(seed)
-    return Gaussians(
-        means=torch.rand(n, 3, generator=g) * 2 - 1,
-        quats=torch.randn(n, 4, generator=g),
-        scales=torch.rand(n, 3, generator=g) * 0.25 + 0.1,
-        opacities=torch.rand(n, generator=g) * 0.6 + 0.3,
-        sh=torch.randn(n, 4, 3, generator=g) * 0.4,
-    )
-
-
 def scene(views=5):
-    cameras = [look_at_origin(0.5 * i) for i in range(views)]
-    return cameras, [rasterize(blobs(), camera).map.clamp(0, 1) for camera in cameras]
+    return scene_of(views, BLOBS)
 
 
 def start(n=60, sh_degree=2):
@@ -73,7 +44,7 @@ def test_colours_that_change_with_the_view_are_recovered():
 
     def error(params):
         gaussians, camera = params.activated(), look_at_origin(0.75)
-        return float((rasterize(gaussians, camera).map - rasterize(blobs(), camera).map.clamp(0, 1)).abs().mean())
+        return float((rasterize(gaussians, camera).map - rasterize(BLOBS, camera).map.clamp(0, 1)).abs().mean())
 
     fits = [fit_field(start(sh_degree=degree), cameras, targets, config, loss=ColorLoss()).params for degree in (0, 2)]
     level = sum(float(target.mean()) for target in targets) / len(targets)
@@ -100,7 +71,7 @@ def shiny(n=14, degree=3, filled=3):
     """A splat of harmonics up to a degree, of which those above `filled` are 0."""
     sh = torch.zeros(n, (degree + 1) ** 2, 3)
     sh[:, : (filled + 1) ** 2] = torch.randn(n, (filled + 1) ** 2, 3, generator=torch.Generator().manual_seed(5)) * 0.3
-    return GaussianParams.from_gaussians(blobs(n).replace(sh=sh))
+    return GaussianParams.from_gaussians(blobs(n, colors=True).replace(sh=sh))
 
 
 def test_a_perfect_splat_stays_perfect():

@@ -3,48 +3,17 @@ from dataclasses import replace
 
 import pytest
 import torch
-from cases_training import changed, look_at_origin, same
+from cases_training import SHORT as BASE
+from cases_training import blobs, changed, look_at_origin, same, scene
 from messages import tells
 
-from kfgs import Gaussians, rasterize
+from kfgs import rasterize
 from kfgs.cameras import Distortion, resize_map
-from kfgs.fields import GaussianParams, Training, fit_field
+from kfgs.fields import GaussianParams, fit_field
 from kfgs.fields.loss import l1_loss
 
 CHANNELS = 3
-SHORT = changed(
-    Training(),
-    steps=60,
-    extent=2.0,
-    features_rate=0.05,
-    scales_rate=0.01,
-    means_rate=1e-3,
-    means_final_rate=1e-4,
-    start=5,
-    stop=45,
-    every=10,
-    gradient=5e-4,
-    reset_every=25,
-    report_every=10,
-    checkpoint_every=20,
-)
-
-
-def blobs(n=12, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    return Gaussians(
-        means=torch.rand(n, 3, generator=generator) * 2 - 1,
-        quats=torch.randn(n, 4, generator=generator),
-        scales=torch.rand(n, 3, generator=generator) * 0.25 + 0.1,
-        opacities=torch.rand(n, generator=generator) * 0.6 + 0.3,
-        features=torch.rand(n, CHANNELS, generator=generator),
-    )
-
-
-def scene(views=5):
-    cameras = [look_at_origin(0.5 * i) for i in range(views)]
-    targets = [rasterize(blobs(), camera).map for camera in cameras]
-    return cameras, targets
+SHORT = changed(BASE, features_rate=0.05, reset_every=25)
 
 
 def start(n=60, channels=CHANNELS):
