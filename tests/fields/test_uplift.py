@@ -331,35 +331,25 @@ def test_gaussians_that_fill_little_of_the_views_are_pointed_out():
 
 # Wrong input
 
-
-@pytest.mark.parametrize("value", [torch.nan, torch.inf])
-def test_a_map_that_is_not_finite_is_named(value):
-    maps = random_maps(cameras())
-    maps[3][0, 0, 0] = value
-    with pytest.raises(ValueError, match=tells("maps[3]:", "got NaN")):
-        uplift_maps(cloud(), cameras(), maps)
+FOUR = random_maps(cameras())
 
 
-def test_wrong_counts_and_shapes_are_named():
-    maps = random_maps(cameras())
-    with pytest.raises(ValueError, match=tells("maps:", "got 3")):
-        uplift_maps(cloud(), cameras(), maps[:3])
-    with pytest.raises(ValueError, match=tells("maps:", "got 0")):
-        uplift_maps(cloud(), [], [])
-    with pytest.raises(ValueError, match=tells("gaussians:", "got none")):
-        uplift_maps(cloud().select(torch.zeros(12, dtype=torch.bool)), cameras(), maps)
-    with pytest.raises(ValueError, match=tells("maps[1]:", "5]", "7)")):
-        uplift_maps(cloud(), cameras(), [maps[0], torch.ones(10, 13, 7), *maps[2:]])
-    with pytest.raises(ValueError, match=tells("maps[0]:", "[h, w, D]", "got (4, 5)")):
-        uplift_maps(cloud(), cameras(), [torch.ones(4, 5)] * 4)
-
-
-def test_maps_that_say_nothing_and_views_that_show_nothing_are_named():
-    with pytest.raises(ValueError, match=tells("maps:", "zero", "got 4")):
-        uplift_maps(cloud(), cameras(), [torch.zeros(5, 6, 3)] * 4)
-    with pytest.raises(ValueError, match=tells("maps:", "longer than 1e-08", "got 4")):
-        uplift_maps(cloud(), cameras(), [torch.full((5, 6, 3), 1e-37)] * 4)
-    with pytest.raises(ValueError, match=tells("maps[0]:", "squares", "float32", "got 1e+37", "divide")):
-        uplift_maps(cloud(), cameras(), [torch.full((5, 6, 3), 1e37)] * 4)
-    with pytest.raises(ValueError, match=tells("cameras:", "show", "got none")):
-        uplift_maps(balls([[0.0, 0.0, -2.0]]), ahead(), [torch.ones(8, 8, 2)])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"maps": FOUR[:3]}, ("maps:", "got 3")),
+        ({"cameras": [], "maps": []}, ("maps:", "got 0")),
+        ({"gaussians": cloud().select(slice(0, 0))}, ("gaussians:", "got none")),
+        ({"maps": [FOUR[0], torch.ones(10, 13, 7), *FOUR[2:]]}, ("maps[1]:", "5]", "7)")),
+        ({"maps": [torch.ones(4, 5)] * 4}, ("maps[0]:", "[h, w, D]", "got (4, 5)")),
+        ({"maps": [*FOUR[:3], FOUR[3].masked_fill(FOUR[3] == FOUR[3][0, 0, 0], torch.nan)]}, ("maps[3]:", "got NaN")),
+        ({"maps": [*FOUR[:3], FOUR[3].masked_fill(FOUR[3] == FOUR[3][0, 0, 0], torch.inf)]}, ("maps[3]:", "got NaN")),
+        ({"maps": [torch.zeros(5, 6, 3)] * 4}, ("maps:", "zero", "got 4")),
+        ({"maps": [torch.full((5, 6, 3), 1e-37)] * 4}, ("maps:", "longer than 1e-08", "got 4")),
+        ({"maps": [torch.full((5, 6, 3), 1e37)] * 4}, ("maps[0]:", "squares", "float32", "got 1e+37", "divide")),
+        ({"gaussians": balls([[0.0, 0.0, -2.0]])}, ("cameras:", "show", "got none")),
+    ],
+)
+def test_wrong_input_is_named(change, message):
+    with pytest.raises(ValueError, match=tells(*message)):
+        uplift_maps(**({"gaussians": cloud(), "cameras": cameras(), "maps": FOUR} | change))
