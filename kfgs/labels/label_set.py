@@ -158,7 +158,7 @@ def class_rows(classes: Classes, dim: int, info: dict[str, Any]) -> Tensor:  # [
             rows = as_tensor("embeddings", classes, floating=True)
         except TypeError as error:
             got = (
-                f"the name {classes!r}; query(name) finds one class"
+                f"the name {classes!r}, for which there is query"
                 if isinstance(classes, str)
                 else type(classes).__name__
             )
