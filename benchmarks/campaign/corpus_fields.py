@@ -10,7 +10,7 @@ import torch
 
 from kfgs.cameras import Camera
 from kfgs.fields import Autoencoded, Codewords, Linear, SemanticField
-from kfgs.fields.checkpoint import write_checkpoint
+from kfgs.fields.train import write_checkpoint
 from kfgs.formats import write_splats
 from kfgs.gaussians import Gaussians
 from kfgs.labels import (

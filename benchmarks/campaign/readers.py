@@ -114,7 +114,7 @@ def _index_maps(path: Path) -> None:
 
 
 def _training(path: Path) -> None:
-    from kfgs.fields.checkpoint import read_checkpoint
+    from kfgs.fields.train import read_checkpoint
 
     read_checkpoint(path, "x")
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import math
 import time
 from collections.abc import Sequence
@@ -13,19 +15,21 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from .._arrays import reading
 from .._card import short_repr
 from .._check import ORIGIN, as_tensor
-from .._files import as_path, digest_value
+from .._files import as_path, atomic_path, digest_value
 from .._progress import Progress, as_progress
 from ..cameras import Camera
 from ..cameras.bounds import camera_extent
 from ..splat import rasterize
-from .checkpoint import digest_tensors, read_checkpoint, write_checkpoint
 from .loss import ColorLoss, Loss, l1_loss
 from .optimizer import FieldOptimizer, GradientStatistics, densify
 from .params import GaussianParams
 from .training import Densify, Training, check_extent
 from .working_maps import shrink_camera, shrink_map
+
+AGAIN = "delete it to start again, or give another path"  # what to do about a checkpoint that does not fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,3 +268,33 @@ class Trainer:
         self.statistics = GradientStatistics(*(value.to(now.means) for value in state["statistics"].values()))
         self._generator.set_state(state["generator"])
         self.step, self._queue, self.history, self._losses, self._seconds = state["progress"]
+
+
+def digest_tensors(*tensors: Tensor) -> str:
+    """SHA-256 over shapes, dtypes and values, in hexadecimal."""
+    digest = hashlib.sha256()
+    for tensor in tensors:
+        digest.update(f"{tuple(tensor.shape)}{tensor.dtype}".encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
+    """Write the file; it is whole or absent. Its folder was made at the start and is not made again."""
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path.parent}: expected this folder to stay while Gaussians are trained; start again")
+    buffer = io.BytesIO()  # torch.save reports a full disk as a bug of its own, with a traceback
+    torch.save(state, buffer)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(buffer.getbuffer())
+
+
+def read_checkpoint(path: Path, identity: str) -> dict[str, Any]:
+    """Read the file; a ValueError if it is damaged, or belongs to a fit with other inputs."""
+    with reading(path, "a checkpoint of kfgs", AGAIN), path.open("rb") as file:
+        state = dict(torch.load(file, map_location="cpu", weights_only=True))
+        known = state["identity"]
+    if known != identity:
+        got = f"one with other Gaussians, views, options, loss or seed; {AGAIN}"
+        raise ValueError(f"checkpoint: expected one of this very fit at {path}, got {got}")
+    return state

@@ -16,8 +16,7 @@ from .._files import check_output, locked
 from .._progress import Progress, as_progress
 from ..cameras import Camera, resize_map
 from ..fields import ColorLoss, Densify, GaussianParams, Rates, Training, fit_field
-from ..fields.checkpoint import digest_tensors
-from ..fields.train import FieldFit
+from ..fields.train import FieldFit, digest_tensors
 from ..formats import write_splats
 from ..gaussians import Gaussians
 from ..scenes import Scene

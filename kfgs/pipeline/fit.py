@@ -22,10 +22,9 @@ from .._files import check_output, folded_name, locked, real_path, write_json
 from .._progress import Progress, as_progress
 from ..cameras import Camera
 from ..fields import Autoencoded, Codewords, GaussianParams, Identity, SemanticField, fit_field, fuse_views, uplift_maps
-from ..fields.checkpoint import digest_tensors
 from ..fields.decoders import Decoder
 from ..fields.store import NAME, check_place, scene_classes
-from ..fields.train import FieldFit
+from ..fields.train import FieldFit, digest_tensors
 from ..formats import read_splats, write_splats
 from ..formats.table import splat_file_of
 from ..gaussians import Gaussians

@@ -14,7 +14,7 @@ from .._check import as_tensor
 from .._files import digest_value
 from .._rows import EPS, row_norms
 from ..cameras import undistort
-from ..fields.checkpoint import digest_tensors
+from ..fields.train import digest_tensors
 from ..quant.sampling import FeatureMaps
 from ..scenes import Scene
 from ..scenes.files import has_alpha

@@ -21,7 +21,7 @@ from .._arrays import reading
 from .._files import atomic_folder, digest_file, digest_value, read_json, real_path, write_json
 from .._origin import Origin
 from ..cameras import Camera
-from ..fields.checkpoint import digest_tensors
+from ..fields.train import digest_tensors
 from ..gaussians import Gaussians
 from ..scenes import Scene
 
