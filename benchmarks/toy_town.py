@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from kfgs._check import check_whole
 from kfgs._files import as_path, atomic_folder, check_output, read_json, write_json
-from kfgs.scenes.pycolmap_import import quiet_pycolmap
+from kfgs.scenes.colmap import quiet_pycolmap
 from kfgs.toy.geometry import Array
 from kfgs.toy.room_folder import ToyConfig, make_toy_room
 

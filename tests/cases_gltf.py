@@ -11,7 +11,7 @@ from kfgs.formats import write_splats
 KHR = "KHR_gaussian_splatting"
 
 
-def random_cloud(n: int = 7, degree: int = 3, seed: int = 3) -> Gaussians:
+def random_cloud(n: int = 7, degree: int = 3, seed: int = 3, **changes) -> Gaussians:
     """Random Gaussians of unit quaternions."""
     g = torch.Generator().manual_seed(seed)
     return Gaussians(
@@ -20,7 +20,7 @@ def random_cloud(n: int = 7, degree: int = 3, seed: int = 3) -> Gaussians:
         scales=torch.rand(n, 3, generator=g) + 0.1,
         opacities=torch.rand(n, generator=g) * 0.9 + 0.05,
         sh=torch.randn(n, (degree + 1) ** 2, 3, generator=g),
-    )
+    ).replace(**changes)
 
 
 def json_of_glb(path) -> dict:

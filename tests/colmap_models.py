@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from kornia.io import write_image
 
-from kfgs.scenes.pycolmap_import import import_pycolmap, quiet_pycolmap
+from kfgs.scenes.colmap import import_pycolmap, quiet_pycolmap
 
 pycolmap = import_pycolmap()
 

@@ -53,7 +53,7 @@ import os, signal
 from kfgs import cli
 def probe() -> None:
     "Load pycolmap, and be asked to end."
-    from kfgs.scenes.pycolmap_import import import_pycolmap
+    from kfgs.scenes.colmap import import_pycolmap
     import_pycolmap()
     os.kill(os.getpid(), signal.SIGTERM)
     print("went on")

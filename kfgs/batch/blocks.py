@@ -29,8 +29,8 @@ from ..quant import LinearLatents
 from ..scenes import FeatureFolder, Scene, SceneError, load_scene
 from ..scenes.blocks import Block, partition, write_part
 from ..scenes.colmap_model import read_model
+from ..scenes.files import picture_folder
 from ..scenes.load import find_model
-from ..scenes.masks import picture_folder
 from .run import run_tasks
 
 BLOCKS, BLOCK, CORE, FACTS, LATENTS, SPLAT = (

@@ -53,6 +53,7 @@ def features(
         examples: A .json file of examples, or COCO's annotations, instead of words.
         fast: One pass over each picture instead of the exact evaluation at several scales (lseg).
     """
+    from ..scenes.load import scene_root
     from ..teachers.prompts import make_label_set
 
     if examples is not None:
@@ -62,7 +63,7 @@ def features(
         return
     if source is None and words is None:
         raise ValueError("source, words: expected a scene, or words to embed, got neither; see `kfgs features --help`")
-    folder = None if source is None else source if source.is_dir() else source.parent
+    folder = None if source is None else scene_root(source)
     table = None if words is None else _table(out if folder is None else folder / TABLE)
     if table is not None and teacher.teacher is None:
         raise ValueError("words: expected --teacher with it, whose text encoder embeds them, got none; pass --teacher")

@@ -10,8 +10,6 @@ from .._files import check_output, real_path
 
 # Heavy imports happen inside the functions, so that `kfgs --help` answers at once.
 
-PICTURES = ("images", "images_2", "images_4", "images_8", "color", "results", "rgb", "train", "val", "test")
-SCENE_PARTS = ("features", "sparse", "labels", "labels_scored", "masks", "depth", "pose", *PICTURES)
 OUTPUTS = ("out", "target")  # parameters that name what a command writes
 
 
@@ -21,7 +19,7 @@ def check_outputs(given: Mapping[str, Any], made: str | None = None) -> None:
     `given` are its arguments by parameter; it may write to the part `made`.
     """
     from ..fields.store import find_field
-    from ..scenes.load import is_scene
+    from ..scenes.load import SCENE_PARTS, is_scene, scene_root
 
     read = [value for name, value in given.items() if isinstance(value, Path) and name not in OUTPUTS]
     for name, target in ((name, given[name]) for name in OUTPUTS if given.get(name) is not None):
@@ -30,8 +28,7 @@ def check_outputs(given: Mapping[str, Any], made: str | None = None) -> None:
                 raise ValueError(f"{name}: expected another place than {file}, which is read; give another name")
         place = real_path(target)
         for scene in (path for path in (*read, *place.parents) if is_scene(path)):
-            root = scene if scene.is_dir() else scene.parent
-            for part in (root / part for part in SCENE_PARTS if part != made):
+            for part in (scene_root(scene) / part for part in SCENE_PARTS if part != made):
                 if real_path(part) in (place, *place.parents):
                     raise ValueError(
                         f"{name}: expected a place apart from {part}, a part of a scene, got {target}; give another"

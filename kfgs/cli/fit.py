@@ -73,8 +73,8 @@ def sfm(
         replace: Replace a model that is in OUT/sparse/0 already; without it that is an error.
     """
     from ..scenes import SfmConfig, list_images, run_sfm
+    from ..scenes.files import folder_masks
     from ..scenes.load import is_scene
-    from ..scenes.masks import folder_masks
     from ..scenes.sfm import link_images
     from ..scenes.video import VIDEO_SUFFIXES, extract_frames, is_video
 
@@ -145,11 +145,12 @@ def fit(
     from ..pipeline import fit as fit_field
     from ..pipeline.run_report import write_run_report
     from ..scenes import FeatureFolder
+    from ..scenes.load import scene_root
 
     made_by = _method(method, splat, steps, max_gaussians)
     as_taken = views.load(scene)
     loaded, split = as_taken.undistorted(), views.split
-    folder = features or (scene if scene.is_dir() else scene.parent) / "features"
+    folder = features or scene_root(scene) / "features"
     network = teacher.load()
     if network is None and not folder.is_dir():
         raise ValueError(

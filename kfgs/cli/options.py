@@ -109,8 +109,9 @@ class Classes:
         from .._files import read_json
         from ..fields.store import SCENE_FILES
         from ..labels import load_label_set
+        from ..scenes.load import scene_root
 
-        folder = self.scene if self.scene is None or self.scene.is_dir() else self.scene.parent
+        folder = None if self.scene is None else scene_root(self.scene)
         if self.text is not None:
             beside = self.text.with_name("classes.json")
             label_set = load_label_set(beside, self.text) if self.text.suffix == ".npy" else load_label_set(self.text)

@@ -56,9 +56,7 @@ def read(path: Path) -> Gaussians:
     document = Document(path)
     unknown = [name for name in document.root.get("extensionsRequired", []) if name not in _UNDERSTOOD]
     if unknown:
-        raise ValueError(
-            f"it needs {', '.join(map(str, unknown))}; write it again with {EXTENSION} alone, uncompressed"
-        )
+        raise ValueError(f"it needs {', '.join(map(str, unknown))}; write it with {EXTENSION} alone, uncompressed")
     parts: list[Gaussians] = []
     for mesh, matrix in document.placed_meshes():
         for primitive in document.root["meshes"][mesh]["primitives"]:
@@ -117,9 +115,7 @@ def _read_primitive(path: Path, document: Document, primitive: dict[str, Any]) -
     kernel, mode = extension.get("kernel", _WRITTEN["kernel"]), primitive.get("mode", 4)
     if kernel != _WRITTEN["kernel"] or extension.get("extensions") or mode != _POINTS:
         got = ", ".join(extension.get("extensions", ())) or f"kernel {kernel!r}, mode {mode!r}"
-        raise ValueError(
-            f"expected points with the kernel {_WRITTEN['kernel']!r} and no further extension, got {got:.60}"
-        )
+        raise ValueError(f"expected points, kernel {_WRITTEN['kernel']!r} and no further extension, got {got:.60}")
     for key in ("colorSpace", "projection"):
         if extension.get(key, _WRITTEN[key]) != _WRITTEN[key]:
             said = f"the file says {key} {extension[key]!r:.80}"

@@ -58,9 +58,8 @@ class Document:
         buffer, start, length = self._buffer(view["buffer"]), view.get("byteOffset", 0), view["byteLength"]
         step = view.get("byteStride", 0) or width * dtype.itemsize
         if not 0 <= start <= start + length <= len(buffer) or step < width * dtype.itemsize:
-            raise ValueError(
-                f"bufferViews[{accessor['bufferView']}] has bytes {start} to {start + length} in steps of {step}"
-            )
+            place = f"bufferViews[{accessor['bufferView']}]"
+            raise ValueError(f"{place} has bytes {start} to {start + length} in steps of {step}")
         content, offset = buffer[start : start + length], accessor.get("byteOffset", 0)
         values: NDArray[Any] = np.ndarray((rows, width), dtype, content, offset, (step, dtype.itemsize))
         if not accessor.get("normalized") or dtype.kind == "f":
@@ -86,9 +85,7 @@ class Document:
             return base64.b64decode(text, validate=True)
         file = real_path(self._folder / unquote(uri))
         if urlsplit(uri).scheme or not file.is_relative_to(self._folder) or not file.is_file():
-            raise ValueError(
-                f"the uri {uri!r:.60} is not a file in its folder; copy it there, or pack the scene as .glb"
-            )
+            raise ValueError(f"the uri {uri!r:.60} is not a file in its folder; copy it there, or write .glb")
         with file.open("rb") as handle:
             content = handle.read(min(length, file.stat().st_size))
         self.fetched += len(content)
@@ -191,14 +188,12 @@ class BufferWriter:
                 temporary.write_text(json.dumps(root, allow_nan=False), encoding="utf-8")
             return
         text = json.dumps(root, allow_nan=False, separators=(",", ":")).encode("utf-8")
-        chunks = [
-            (_JSON, text + b" " * (-len(text) % 4)),
-            (_BIN, bytes(self._binary) + b"\0" * (-len(self._binary) % 4)),
-        ]
-        length = _HEAD.size + sum(_CHUNK.size + len(content) for _, content in chunks)
+        text += b" " * (-len(text) % 4)
+        binary = bytes(self._binary) + b"\0" * (-len(self._binary) % 4)
+        length = _HEAD.size + 2 * _CHUNK.size + len(text) + len(binary)
         if length >= 1 << 32:
             raise ValueError(f"path: expected a .glb below 4 GiB, got {length} bytes; split the cloud, or write .ply")
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             file.write(_HEAD.pack(MAGIC, 2, length))
-            for kind, content in chunks:
+            for kind, content in ((_JSON, text), (_BIN, binary)):
                 file.write(_CHUNK.pack(len(content), kind) + content)

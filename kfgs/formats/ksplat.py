@@ -79,7 +79,7 @@ def _read_section(
     end = rows_at + s.capacity * record.itemsize
     if end > len(data):
         raise ValueError(
-            f"a section has room for {s.capacity} Gaussians up to byte {end} of {len(data)}: it is truncated"
+            f"a section has room for {s.capacity} Gaussians, to byte {end} of {len(data)}: it is truncated"
         )
     rows = np.frombuffer(data, record, s.size, rows_at)
     means = rows["means"].astype(np.float32)

@@ -21,7 +21,8 @@ from torch import Tensor
 from .._arrays import reading
 from .._files import as_path, atomic_path
 
-Columns = dict[str, NDArray[Any]]
+Column = NDArray[Any]  # [N]
+Columns = dict[str, Column]
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
@@ -51,12 +52,6 @@ class Header(NamedTuple):
     elements: list[_Element]
     comments: list[str]  # programs write their name and options there
 
-    def vertex(self) -> _Element:
-        """The first element, which has to be a vertex table."""
-        if not self.elements or self.elements[0].name != "vertex":
-            raise ValueError(f"its first element is not 'vertex', it has {[element.name for element in self.elements]}")
-        return self.elements[0]
-
 
 def read_ply(path: str | Path) -> Columns:
     """Read the vertex table of a PLY file as columns of N values each.
@@ -64,7 +59,9 @@ def read_ply(path: str | Path) -> Columns:
     A FileError if it is not a PLY file with scalar vertex properties, or is shorter than its header says.
     """
     with _opened(path) as (file, header):
-        return _read_rows(file, header.vertex(), header.order)
+        if not header.elements or header.elements[0].name != "vertex":
+            raise ValueError(f"its first element is not 'vertex', it has {[e.name for e in header.elements]}")
+        return _read_rows(file, header.elements[0], header.order)
 
 
 def read_ply_elements(path: str | Path) -> dict[str, Columns]:
@@ -95,17 +92,14 @@ def write_ply_elements(path: str | Path, elements: dict[str, Columns], *, commen
         codes = {name: values.dtype.str[1:] for name, values in columns.items()}
         odd = {name: code for name, code in codes.items() if name.split() != [name] or code not in _NAMES}
         if odd:
-            raise ValueError(
-                f"columns: expected names without blanks and the types {sorted(_NAMES)}, got {odd!r:.80}; rename or convert them"
-            )
+            expected = f"names without blanks and the types {sorted(_NAMES)}"
+            raise ValueError(f"columns: expected {expected}, got {odd!r:.80}; rename or convert them")
         rows = np.empty(next(iter(lengths.values())), dtype=[(name, "<" + code) for name, code in codes.items()])
         for name, values in columns.items():
             rows[name] = values
         tables.append(rows)
-        header += [
-            f"element {element} {len(rows)}",
-            *(f"property {_NAMES[code]} {name}" for name, code in codes.items()),
-        ]
+        header.append(f"element {element} {len(rows)}")
+        header += [f"property {_NAMES[code]} {name}" for name, code in codes.items()]
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join([*header, "end_header\n"]).encode())
         for rows in tables:
@@ -158,9 +152,8 @@ def _read_header(file: BinaryIO) -> Header:
                 elements.append(_Element(name, int(rows), []))
             case ["property", "list", count, kind, name] if elements:
                 length = _TYPES.get(count, "f")
-                elements[-1].properties.append(
-                    _Property(name, "" if length[0] == "f" else _TYPES.get(kind, ""), length)
-                )
+                code = "" if length[0] == "f" else _TYPES.get(kind, "")
+                elements[-1].properties.append(_Property(name, code, length))
             case ["property", kind, name] if elements:
                 elements[-1].properties.append(_Property(name, _TYPES.get(kind, ""), ""))
             case ["property", *_] if elements:
@@ -175,9 +168,7 @@ def _read_rows(file: BinaryIO, element: _Element, order: str) -> Columns:
     names = [prop.name for prop in element.properties]
     odd = [prop.name for prop in element.properties if prop.length or not prop.code]
     if odd or not names or len(set(names)) != len(names):
-        raise ValueError(
-            f"expected {element.name!r} with scalar properties of different names, got {(odd or names)!r:.80}"
-        )
+        raise ValueError(f"expected {element.name!r} with scalars of different names, got {(odd or names)!r:.80}")
     left = os.fstat(file.fileno()).st_size - file.tell()
     dtype = np.dtype([(prop.name, order + prop.code) for prop in element.properties])
     least = dtype.itemsize if order else 2 * len(names)  # a digit and a separator each, at the very least

@@ -8,17 +8,15 @@ kfgs adds `class_id` and `score`; every other column is kept.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from .._check import ORIGIN
 from .._origin import to_world
 from ..gaussians import Gaussians
-from .ply import Columns, points_from_columns, read_header, read_ply, stack_columns, write_ply
+from .ply import Column, Columns, points_from_columns, read_header, read_ply, stack_columns, write_ply
 from .render_mode import comments_of_mode, mode_from_comments, with_mode
 from .values import EXACT, SCORE, SH_C0, positive_scales, up_to_degree_3, whole_labels
 
@@ -150,7 +148,7 @@ def columns_from_gaussians(gaussians: Gaussians) -> Columns:
     return columns
 
 
-def label_column(labels: Tensor) -> NDArray[Any]:  # [N] -> [N]
+def label_column(labels: Tensor) -> Column:  # [N] -> [N]
     """The column `class_id`, as `float` like all others: some importers know no `int`, and misread the whole file.
 
     It is `int` if a label is too large for `float` to hold exactly.

@@ -88,9 +88,8 @@ def read_sidecar(path: Path, gaussians: Gaussians) -> Gaussians:
 
 def _check_version(file: Path, path: Path, of: object, digest: str) -> None:
     if of != digest:
-        raise FileError(
-            f"{file}: expected a file of this version of {path.name}, got one of another version; delete it, or write both again"
-        )
+        got = "one of another version; delete it, or write both again"
+        raise FileError(f"{file}: expected a file of this version of {path.name}, got {got}")
 
 
 def read_names(path: Path) -> tuple[str, ...]:

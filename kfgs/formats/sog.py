@@ -59,18 +59,15 @@ def read(path: Path) -> Gaussians:
         sh = np.concatenate([meta.tables["sh0"][rgba[:, :3]][:, None], _read_rest(files, meta)], 1)
     if (turns[:, 3] < _LARGEST_FIRST).any():
         row = int((turns[:, 3] < _LARGEST_FIRST).argmax())
-        raise ValueError(
-            f"the rotation of Gaussian {row} has alpha {turns[row, 3]}, not 252 to 255: an image with loss?"
-        )
+        raise ValueError(f"the rotation of Gaussian {row} has alpha {turns[row, 3]}, not 252 to 255: is it lossy?")
+    largest = turns[:, 3].astype(np.int64) - _LARGEST_FIRST
     logs = meta.bounds[0] + (meta.bounds[1] - meta.bounds[0]) * ((low + 256 * high) / _LEVELS)
     with np.errstate(over="ignore", invalid="ignore"):  # left out
         means = np.sign(logs) * np.expm1(np.abs(logs))
         linear = np.exp(meta.tables["scales"][scales[:, :3]])
     gaussians = Gaussians(
         means=torch.from_numpy(means),
-        quats=unpack_smallest_three(
-            turns[:, 3].astype(np.int64) - _LARGEST_FIRST, turns[:, :3].astype(np.float32), 255
-        ),
+        quats=unpack_smallest_three(largest, turns[:, :3].astype(np.float32), 255),
         scales=positive_scales(linear),
         opacities=torch.from_numpy(rgba[:, 3].astype(np.float32) / 255),
         sh=up_to_degree_3(path, torch.from_numpy(sh)),
@@ -80,9 +77,8 @@ def read(path: Path) -> Gaussians:
 
 def write(path: Path, g: Gaussians) -> list[str]:
     """Write version 2 in the given order, as a zip file without compression (its images have it) and without dates."""
-    files = _encode(g)
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
-        for name, data in files.items():
+        for name, data in _encode(g).items():
             archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)
     return describe_coarse(g, position_errors(g.means.numpy()), ".sog")
 

@@ -70,6 +70,9 @@ class _Header(NamedTuple):
         return {name: size * self.size for name, size in each.items()}
 
 
+_Streams = tuple[_Header, dict[str, NDArray[np.uint8]], dict[int, bytes]]  # header, plain streams, extension records
+
+
 def matches(head: bytes) -> bool:
     """NGSP at the beginning, or at the beginning of a gzip stream."""
     if head[:2] != _GZIP:
@@ -82,7 +85,11 @@ def matches(head: bytes) -> bool:
 
 def read(path: Path) -> Gaussians:
     """Read an SPZ file of version 1 to 4, gzipped or plain, into the axes of the 3DGS PLY."""
-    header, streams, records = _read_streams(path.read_bytes())
+    data = path.read_bytes()
+    if data[:2] == _GZIP:
+        header, streams, records = _read_plain(_inflate(data))
+    else:
+        header, streams, records = (_read_plain if _read_header(data).version < 4 else _read_packed)(data)
 
     def floats(name: str) -> Tensor:
         return torch.from_numpy(streams[name].astype(np.float32))
@@ -147,16 +154,6 @@ def choose_fractional_bits(means: Tensor) -> int:  # means: [N, 3]
     if reach == 0.0:
         return _COMMON_BITS
     return min(max(_COMMON_BITS, _STEPS - floor(log2(reach))), 20, floor(log2(_MAX_FIXED / reach)))
-
-
-_Streams = tuple[_Header, dict[str, NDArray[np.uint8]], dict[int, bytes]]  # header, plain streams, extension records
-
-
-def _read_streams(data: bytes) -> _Streams:
-    """The content of a file. Sizes that it cannot hold are refused before unpacking."""
-    if data[:2] == _GZIP:
-        return _read_plain(_inflate(data))
-    return (_read_plain if _read_header(data).version < 4 else _read_packed)(data)
 
 
 def _read_header(data: bytes | bytearray) -> _Header:

@@ -39,16 +39,8 @@ from .sidecar import NAMES, beside, read_sidecar, write_sidecar
 from .sog_files import META
 from .values import check_splats, describe_loss, leave_out_broken
 
-MODULES = (  # tried in this order: compressed PLY before PLY, because both end in .ply
-    "compressed_ply",
-    "ply_3dgs",
-    "spz",
-    "checkpoint",  # before sog, which takes every zip file
-    "sog",
-    "gltf",
-    "ksplat",
-    "splat",
-)
+MODULES = ("compressed_ply", "ply_3dgs", "spz", "checkpoint", "sog", "gltf", "ksplat", "splat")
+"""Tried in this order: compressed PLY before PLY, because both end in .ply, and checkpoints before SOG, which takes every zip."""
 _HEAD_BYTES = 1 << 16
 _PLAIN = frozenset({"harmonics", "antialiased"})  # what a plain PLY holds
 PATTERNS = (  # of the output folders of training programs: Inria's 3DGS, gsplat, nerfstudio; * is the step
@@ -166,14 +158,11 @@ def write_splats(
     """
     check_gaussians(gaussians)
     path = as_path(path)
-    endings = {
-        ending: module for module in formats().values() if hasattr(module, "write") for ending in module.SUFFIXES
-    }
-    module = next((module for ending, module in endings.items() if path.name.lower().endswith(ending)), None)
+    writers = [module for module in formats().values() if hasattr(module, "write")]
+    module = next((module for module in writers if path.name.lower().endswith(module.SUFFIXES)), None)
     if module is None:
-        raise ValueError(
-            f"path: expected a name that ends in one of {', '.join(endings)}, got {path.name!r}; rename it"
-        )
+        endings = ", ".join(ending for module in writers for ending in module.SUFFIXES)
+        raise ValueError(f"path: expected a name that ends in one of {endings}, got {path.name!r}; rename it")
     if plain and module.NAME != "ply":
         raise ValueError(f"plain: expected it for a file that ends in .ply, got {path}; leave it out")
     what, holds = ("a plain PLY", _PLAIN) if plain else (module.SUFFIXES[0], module.HOLDS)
@@ -195,10 +184,9 @@ def write_splats(
 
 def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
     """The files of a pattern with one `*`, by the whole number in its place."""
-    before, after = pattern.split("*")
-    files = {}
+    shape, files = re.escape(pattern).replace(r"\*", r"(\d{1,18})"), dict[int, Path]()
     for file in folder.glob(pattern) if folder.is_dir() else ():
-        match = re.fullmatch(re.escape(before) + r"(\d{1,18})" + re.escape(after), file.relative_to(folder).as_posix())
+        match = re.fullmatch(shape, file.relative_to(folder).as_posix())
         if match and file.is_file():
             files[int(match[1])] = file
     return files

@@ -106,9 +106,8 @@ def positive_scales(scales: NDArray[np.float32]) -> Tensor:  # [N, 3] float32
     """Linear scales as read, zeros raised to 1e-10. Negative ones become NaN; if most are, it is another format (ValueError)."""
     negative = (scales < 0).any(1)
     if 2 * negative.sum() > len(scales):
-        raise ValueError(
-            f"scales of 0 or more, got {scales[int(negative.argmax())].tolist()} and others: is it another format?"
-        )
+        first = scales[int(negative.argmax())].tolist()
+        raise ValueError(f"scales of 0 or more, got {first} and others: is it another format?")
     usable = np.where(scales < 0, np.float32("nan"), scales)
     return torch.from_numpy(np.where(scales == 0, np.float32(_TINY_SCALE), usable))
 
@@ -127,9 +126,7 @@ def whole_labels(values: NDArray[Any]) -> Tensor:  # [N] -> [N] int64
     whole = (values == np.trunc(values)) & (np.abs(values.astype(np.float64)) < 2**53)
     if not whole.all():
         row = int((~whole).argmax())
-        raise ValueError(
-            f"class_id: {values[row]} at Gaussian {row} is not a whole number; name a column of scores 'score'"
-        )
+        raise ValueError(f"class_id: {values[row]} at Gaussian {row} is not a whole number; name scores 'score'")
     return torch.from_numpy(np.where(unknown, _UNKNOWN, values.astype(np.int64)))
 
 

@@ -1,7 +1,6 @@
 """Scenes: posed images, points and feature maps, read from files of other programs, or estimated."""
 
-from .extract import extract_features
-from .feature_files import save_feature_map
+from .extract import extract_features, save_feature_map
 from .feature_maps import FeatureFolder
 from .files import SceneError, list_images, read_image
 from .frames import align_by_cameras, frames_agree

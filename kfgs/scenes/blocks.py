@@ -60,14 +60,10 @@ def partition(model: ColmapModel, count: int) -> list[Block]:
     ids, images = model.point_ids, [image for image in model.images.values() if image.pose is not None]
     seen = [np.searchsorted(ids, image.observed[np.isin(image.observed, ids)]) for image in images]
     if not any(len(rows) for rows in seen):
-        raise SceneError(
-            "model: expected images that say which points they see, got none; make it with COLMAP (`kfgs sfm`)"
-        )
+        raise SceneError("model: expected images that say which points they see, got none; make it with `kfgs sfm`")
     inside = robust_bounds(torch.from_numpy(model.points)).inside.numpy()
     if inside.sum() < count:
-        raise SceneError(
-            f"count: expected at most as many blocks as points ({len(model.points)}), got {count}; ask for fewer"
-        )
+        raise SceneError(f"count: expected at most a block per point ({len(model.points)}), got {count}; ask for fewer")
     centers = np.array([-image.pose[:3, :3].T @ image.pose[:3, 3] for image in images if image.pose is not None])
     blocks = []
     for number, core in enumerate(_cut(model.points[inside], np.array([[-MAX_NUMBER] * 3, [MAX_NUMBER] * 3]), count)):
@@ -88,16 +84,16 @@ def write_part(folder: Path, model: ColmapModel, names: Sequence[str]) -> None:
     images = {key: image for key, image in model.images.items() if image.name in set(names)}
     seen, counts = np.unique(np.concatenate([np.unique(i.observed) for i in images.values()]), return_counts=True)
     kept = np.isin(model.point_ids, seen[counts > 1])
-    cameras, lines = {i.camera_id: model.cameras[i.camera_id] for i in images.values()}, list[str]()
+    cameras, views = {i.camera_id: model.cameras[i.camera_id] for i in images.values()}, list[str]()
     for key, image in images.items():
         assert image.pose is not None  # of an image that sees a block
         x, y, z, w = Rotation.from_matrix(image.pose[:3, :3]).as_quat().tolist()
         numbers = " ".join(map(repr, (w, x, y, z, *image.pose[:3, 3].tolist())))
-        lines.append(f"{key} {numbers} {image.camera_id} {image.name}\n\n")
+        views.append(f"{key} {numbers} {image.camera_id} {image.name}\n\n")
+    lenses = [f"{k} {c.model} {c.width} {c.height} {' '.join(map(repr, c.params))}\n" for k, c in cameras.items()]
     with atomic_folder(folder) as place:
-        (place / "images.txt").write_text("".join(lines), encoding="utf-8")
-        heads = [(f"{key} {c.model} {c.width} {c.height}", c.params) for key, c in cameras.items()]
-        (place / "cameras.txt").write_text("".join(f"{head} {' '.join(map(repr, params))}\n" for head, params in heads))
+        (place / "images.txt").write_text("".join(views), encoding="utf-8")
+        (place / "cameras.txt").write_text("".join(lenses))
         rows = np.column_stack([model.point_ids[kept], model.points[kept], model.colors[kept]])
         np.savetxt(place / "points3D.txt", rows, "%d %.17g %.17g %.17g %d %d %d 0")
 
@@ -117,7 +113,5 @@ def _cut(points: Array, box: Array, count: int) -> list[Array]:  # [P, 3], [2, 3
     lower[1, axis] = upper[0, axis] = (order[at - 1] + order[at]) / 2
     below = points[:, axis] < lower[1, axis]
     if not 0 < below.sum() < len(points):
-        raise SceneError(
-            f"count: expected points at different places, got too many at one for {count} blocks; ask for fewer blocks"
-        )
+        raise SceneError(f"count: expected points at different places, too many are at one; ask for fewer than {count}")
     return [*_cut(points[below], lower, first), *_cut(points[~below], upper, count - first)]

@@ -1,10 +1,18 @@
-"""Make a scene from a COLMAP model and its images."""
+"""Make a scene from a COLMAP model and its images; and pycolmap, imported late, without its log.
+
+Pillow's C module must be loaded **before** pycolmap. In the other order (pycolmap 4.2.1, Pillow 13.0.0, Linux wheels)
+the first PNG that Pillow writes corrupts the heap and aborts the process. `files`, which is imported here, loads Pillow.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+import signal
+import threading
+from collections.abc import Container, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,7 +20,7 @@ import torch
 from .._files import Names
 from ..cameras.camera import Distortion, DistortionModel
 from .colmap_model import CAMERA_MODELS, ColmapModel, read_model
-from .files import SceneError, find_pictures, list_images, natural_key, some
+from .files import SceneError, find_pictures, list_images, natural_key, scene_error, some
 from .posed import Matrix, PosedPicture, inverse_pose, scene_of_poses
 from .scene import Scene
 
@@ -25,17 +33,16 @@ LENSES: dict[str, tuple[DistortionModel | None, int]] = {
     **dict.fromkeys(("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), ("kannala_brandt", 4)),
     **dict.fromkeys(("SIMPLE_FISHEYE", "FISHEYE"), ("kannala_brandt", 4)),
 }
+# Exceptions of pycolmap for unusable input (a failed CHECK is a ValueError, a missing id an IndexError).
+FAILURES = (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OSError)
 PANORAMA = "cut perspective views out of the panoramas, and give these with their poses"  # no undistorter flattens them
 
 
 def convert_intrinsics(model: str, params: Sequence[float]) -> tuple[Matrix, Distortion | None]:
     """K [3, 3] float64 and the lens of a COLMAP camera; a perspective lens with all coefficients zero is a pinhole."""
     if model not in LENSES:
-        advice = "undistort the images first (`colmap image_undistorter`)"
-        raise SceneError(
-            f"camera: expected one of the COLMAP models {', '.join(LENSES)}, got {model}; "
-            f"{PANORAMA if model == 'EQUIRECTANGULAR' else advice}"
-        )
+        advice = PANORAMA if model == "EQUIRECTANGULAR" else "undistort the images first (`colmap image_undistorter`)"
+        raise SceneError(f"camera: expected one of the COLMAP models {', '.join(LENSES)}, got {model}; {advice}")
     kind, length = LENSES[model]
     fx, fy, cx, cy, *lens = [params[0], *params] if CAMERA_MODELS[model].startswith("f ") else params
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
@@ -44,11 +51,17 @@ def convert_intrinsics(model: str, params: Sequence[float]) -> tuple[Matrix, Dis
     return K, Distortion(kind, tuple(float(k) for k in lens) + (0.0,) * (length - len(lens)))
 
 
-def load_colmap(path: Path, images: Path) -> Scene:
-    """Read a COLMAP model and pair it with its image files in a folder, to whose sizes the cameras are resized."""
-    if not images.is_dir():
+def load_colmap(path: Path, images: Path | None) -> Scene:
+    """Read a COLMAP model and pair it with its image files in a folder, to whose sizes the cameras are resized.
+
+    Without a folder, the views alone, of all images with a pose, and no points.
+    """
+    if images is not None and not images.is_dir():
         raise FileNotFoundError(f"{images}: no such folder; expected the images of {path} there")
     model = read_model(path)
+    if images is None:
+        views = [replace(view, name=view.name.replace("\\", "/")) for view in _views(path, model)]
+        return scene_of_poses(path, views, notes=model.notes, pictures=False)
     names = sorted((image.name for image in model.images.values() if image.pose is not None), key=natural_key)
     files = find_pictures(images, names)
     views, there = _views(path, model, files), list_images(images)
@@ -74,13 +87,6 @@ def load_colmap(path: Path, images: Path) -> Scene:
     return scene_of_poses(path, views, points, notes, images)
 
 
-def colmap_cameras(path: Path) -> Scene:
-    """The views of a model's images with a pose, whose image files need not be there, without points."""
-    model = read_model(path)
-    views = [replace(view, name=view.name.replace("\\", "/")) for view in _views(path, model)]
-    return scene_of_poses(path, views, notes=model.notes, pictures=False)
-
-
 def _views(path: Path, model: ColmapModel, files: Container[str] | None = None) -> list[PosedPicture]:
     """The images of a model in natural order of their names; those with a pose that are not in `files` are left out."""
     views = []
@@ -90,10 +96,38 @@ def _views(path: Path, model: ColmapModel, files: Container[str] | None = None) 
         lens, where = model.cameras[image.camera_id], f"{path}, image {image.name}, camera {image.camera_id}"
         view = PosedPicture(image.name, Path(image.name), None, where, size=(lens.width, lens.height))
         if image.pose is not None:
-            try:
+            with scene_error(f"{where}: "):
                 view.K, view.distortion = convert_intrinsics(lens.model, lens.params)
-            except ValueError as error:
-                raise SceneError(f"{where}: {error}") from error
             view.pose = inverse_pose(image.pose)
         views.append(view)
     return views
+
+
+def import_pycolmap() -> Any:
+    """The module, loaded at the first call. Raises an ImportError if it is not installed, with the install line."""
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        import pycolmap
+    except ImportError as error:
+        advice = f"run `pip install 'pycolmap>=4.0'` ({error})"
+        raise ImportError(f"pycolmap: needed to estimate cameras, but it cannot be imported; {advice}") from error
+    if before is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, before)  # pycolmap's log library would print a stack
+    return pycolmap
+
+
+@contextmanager
+def quiet_pycolmap(what: str = "pycolmap: expected input that it can use", advice: str = "check it") -> Iterator[Any]:
+    """Pycolmap without its log. Its failures become a SceneError that begins with `what` and ends with `advice`."""
+    pycolmap = import_pycolmap()
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = 3  # fatal
+    try:
+        yield pycolmap
+    except SceneError:
+        raise
+    except FAILURES as error:
+        lines = str(error).strip().splitlines()
+        raise SceneError(f"{what} ({type(error).__name__}: {lines[0] if lines else 'no text'}); {advice}") from error
+    finally:
+        pycolmap.logging.minloglevel = before

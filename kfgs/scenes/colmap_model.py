@@ -13,7 +13,8 @@ import re
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from fileinput import FileInput
 from pathlib import Path
 from typing import Any
 
@@ -30,25 +31,15 @@ from .posed import Matrix
 FILES = ("cameras", "images", "points3D")
 # The models in the order of COLMAP's ids, with their parameters. Those that begin with f are focal lengths.
 CAMERA_MODELS: dict[str, str] = {
-    "SIMPLE_PINHOLE": "f cx cy",
-    "PINHOLE": "fx fy cx cy",
-    "SIMPLE_RADIAL": "f cx cy k",
-    "RADIAL": "f cx cy k1 k2",
-    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
-    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
-    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
-    "FOV": "fx fy cx cy omega",
-    "SIMPLE_RADIAL_FISHEYE": "f cx cy k",
-    "RADIAL_FISHEYE": "f cx cy k1 k2",
+    "SIMPLE_PINHOLE": "f cx cy", "PINHOLE": "fx fy cx cy", "SIMPLE_RADIAL": "f cx cy k", "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2", "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "FOV": "fx fy cx cy omega",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k", "RADIAL_FISHEYE": "f cx cy k1 k2",
     "THIN_PRISM_FISHEYE": "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1",
     "RAD_TAN_THIN_PRISM_FISHEYE": "fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3",
-    "SIMPLE_DIVISION": "f cx cy k",
-    "DIVISION": "fx fy cx cy k",
-    "SIMPLE_FISHEYE": "f cx cy",
-    "FISHEYE": "fx fy cx cy",
-    "EUCM": "fx fy cx cy alpha beta",
-    "EQUIRECTANGULAR": "w h",
-}
+    "SIMPLE_DIVISION": "f cx cy k", "DIVISION": "fx fy cx cy k", "SIMPLE_FISHEYE": "f cx cy", "FISHEYE": "fx fy cx cy",
+    "EUCM": "fx fy cx cy alpha beta", "EQUIRECTANGULAR": "w h",
+}  # fmt: skip
 QUATERNION_SLACK = 0.1  # text files are rounded; a norm farther from 1 means a wrong byte
 STRANGE = 0.5  # share of the 2-D points of tracks that see another point: two models, not a damaged one
 LEAST_BYTES = 73  # of an image without 2-D points, with a name of one letter
@@ -70,6 +61,12 @@ class ColmapCamera:
         size, count = (self.width, self.height), len(CAMERA_MODELS[self.model].split())
         if not (0 < min(size) <= max(size) <= MAX_SIDE and len(self.params) == count):
             raise ValueError(f"{len(self.params)} parameters, not {count}, of {self.model}, of {size} pixels")
+
+    @property
+    def usable(self) -> bool:
+        """Whether the parameters are plausible numbers, and focal lengths above 0."""
+        named = zip(CAMERA_MODELS[self.model].split(), self.params, strict=True)
+        return all(abs(value) < MAX_NUMBER and (value > 0 or name[0] != "f") for name, value in named)
 
 
 @dataclass(frozen=True)
@@ -105,12 +102,13 @@ def has_model(path: str | Path) -> bool:
 
 def count_images(model: Path) -> int:
     """The number of images in a model, without reading them; 0 if it is damaged."""
-    file, lines = model / "images.bin", _lines(model / "images.txt")
+    file = model / "images.bin"
     with suppress(OSError, ValueError):
         if file.is_file():
             with file.open("rb") as head:
                 count = int.from_bytes(head.read(8), "little")
             return count if count * LEAST_BYTES <= file.stat().st_size else 0
+        lines = _lines(model / "images.txt")
         return sum(next(lines, "") != "" for _ in filter(_is_record, lines))
     return 0
 
@@ -126,31 +124,28 @@ def read_model(path: str | Path) -> ColmapModel:
         raise FileNotFoundError(f"{folder}: no such folder; expected a COLMAP model there")
     whole = [s for s in ("bin", "txt") if all((folder / f"{name}.{s}").is_file() for name in FILES)]
     if not whole:
-        present = sorted(file.name for file in folder.iterdir() if file.stem in FILES)
-        raise SceneError(
-            f"{folder}: expected a COLMAP model (cameras, images and points3D, all as .bin or all as .txt), got "
-            f"{', '.join(present) or 'none of these files'}; copy the missing files or run COLMAP (`kfgs sfm`)"
-        )
+        got = ", ".join(sorted(file.name for file in folder.iterdir() if file.stem in FILES)) or "none of these files"
+        expected = "a COLMAP model (cameras, images and points3D, all as .bin or all as .txt)"
+        raise SceneError(f"{folder}: expected {expected}, got {got}; copy the missing files or run COLMAP (`kfgs sfm`)")
     cameras, images, points = (_read_table(folder / f"{name}.{whole[0]}", name) for name in FILES)
     for key, image in images.items():
         if image.camera_id not in cameras:
-            raise SceneError(
-                f"{folder}: expected cameras for all images, got none for image {key} (camera {image.camera_id}); copy the "
-                "cameras and images files of one model"
-            )
-        if not _is_usable(cameras[image.camera_id]):
-            images[key] = ColmapImage(image.name, image.camera_id, None, image.observed)
+            got = f"none for image {key} (camera {image.camera_id}); copy the cameras and images files of one model"
+            raise SceneError(f"{folder}: expected cameras for all images, got {got}")
+        if not cameras[image.camera_id].usable:
+            images[key] = replace(image, pose=None)
     ids = np.array(sorted(points), np.int64)
-    places = np.array([points[i][0] for i in ids.tolist()], np.float64).reshape(-1, 3)
-    colors = np.array([points[i][1] for i in ids.tolist()], np.uint8).reshape(-1, 3)
-    notes = _check_tracks(folder / f"{FILES[2]}.{whole[0]}", ids, [points[i][2] for i in ids.tolist()], images)
+    rows = [points[i] for i in ids.tolist()]
+    places = np.array([place for place, _, _ in rows], np.float64).reshape(-1, 3)
+    colors = np.array([color for _, color, _ in rows], np.uint8).reshape(-1, 3)
+    notes = _check_tracks(folder / f"{FILES[2]}.{whole[0]}", ids, [track for *_, track in rows], images)
     scaled = {image.name: image.norm for image in images.values() if abs(image.norm**2 - 1) > ROTATION_TOLERANCE}
     if scaled:
-        low, high = min(scaled.values()), max(scaled.values())
-        notes.append(f"{len(scaled)} quaternions have a length of {low:.6g} to {high:.6g}, not 1: {some(list(scaled))}")
+        ends = f"{min(scaled.values()):.6g} to {max(scaled.values()):.6g}"
+        notes.append(f"{len(scaled)} quaternions have a length of {ends}, not 1: {some(list(scaled))}")
     good = (np.abs(places) < MAX_NUMBER).all(1)  # NaN fails
-    lost = some(list(map(str, ids[~good])))
-    if lost:
+    if not good.all():
+        lost = some(list(map(str, ids[~good])))
         notes.append(f"{(~good).sum()} of {len(ids)} points have no finite place and were left out (ids {lost})")
     return ColmapModel(cameras, images, ids[good], places[good], colors[good], tuple(map(Repair, notes)))
 
@@ -162,23 +157,20 @@ def _check_tracks(file: Path, ids: Ints, tracks: list[Ints], images: dict[int, C
     """
     owner = np.repeat(ids, list(map(len, tracks)))
     image_ids, numbers = np.concatenate([np.zeros((0, 2), np.int64), *tracks]).T
-    known = sorted(images)
-    sizes = np.array([len(images[i].observed) for i in known], np.int64)
-    seen = np.concatenate([np.zeros(0, np.int64), *(images[i].observed for i in known)])
+    known, observed = sorted(images), [images[i].observed for i in sorted(images)]
+    sizes = np.array(list(map(len, observed)), np.int64)
     place, there = np.searchsorted(known, image_ids), np.isin(image_ids, known)
     there[there] = numbers[there] < sizes[place[there]]
-    good = there.copy()
-    good[there] = seen[(np.cumsum(sizes) - sizes)[place[there]] + numbers[there]] == owner[there]
+    good, starts = there.copy(), np.cumsum(sizes) - sizes
+    good[there] = np.concatenate([ids[:0], *observed])[starts[place[there]] + numbers[there]] == owner[there]
     if good.all():
         return []
     strange, lost = there & ~good, sorted(set(image_ids.tolist()) - set(images))
     wrong = int(np.flatnonzero(strange if strange.any() else ~good)[0])
     example = f"point {owner[wrong]} names 2-D point {numbers[wrong]} of image {image_ids[wrong]}"
     if strange.sum() > STRANGE * there.sum():
-        raise SceneError(
-            f"{file}: expected tracks over 2-D points that see them, got {strange.sum()} that see other points ({example}); "
-            "copy the images and points files of one model"
-        )
+        got = f"{strange.sum()} that see other points ({example}); copy the images and points files of one model"
+        raise SceneError(f"{file}: expected tracks over 2-D points that see them, got {got}")
     gone = f"; images {some(list(map(str, lost)))} are not in the model" if lost else ""
     count = f"{(~good).sum()} of {len(good)} entries of tracks"
     return [f"{count} lead to no 2-D point that sees the point and were left out ({example}{gone})"]
@@ -186,17 +178,17 @@ def _check_tracks(file: Path, ids: Ints, tracks: list[Ints], images: dict[int, C
 
 def _read_table(file: Path, name: str) -> dict[int, Any]:
     """The records of a file by their ids."""
-    table = dict[int, Any]()
+    table, lines = dict[int, Any](), _lines(file)
     try:
-        for key, value in READERS[name + file.suffix](file):
+        for key, value in READERS[name + file.suffix](file if file.suffix == ".bin" else lines):
             if key in table:
                 raise ValueError(f"id {key} again")
             table[key] = value
     except (ValueError, KeyError, OverflowError, struct.error) as error:
-        raise SceneError(
-            f"{file}: expected a COLMAP model, but record {len(table) + 1} is truncated or damaged ({error}); copy the model "
-            "again from its source, or write it again with COLMAP"
-        ) from error
+        place = f"record {len(table) + 1}" if file.suffix == ".bin" else f"line {lines.lineno()}"
+        advice = "copy the model again from its source, or write it again with COLMAP"
+        text = f"expected a COLMAP model, but {place} is truncated or damaged ({error})"
+        raise SceneError(f"{file}: {text}; {advice}") from error
     return table
 
 
@@ -256,9 +248,8 @@ def _binary_points(file: Path) -> Iterator[tuple[int, tuple[Any, ...]]]:
         yield key, ((x, y, z), color, record.take_array(track).astype(np.int64))
 
 
-def _lines(file: Path) -> Iterator[str]:
-    with file.open(encoding=text_encoding(file)) as lines:
-        yield from lines
+def _lines(file: Path) -> FileInput[str]:
+    return FileInput(file, encoding=text_encoding(file))
 
 
 def _is_record(line: str) -> bool:
@@ -269,25 +260,25 @@ def _number(word: str) -> float:
     return math.nan if _BROKEN.fullmatch(word) else float(word)
 
 
-def _text_cameras(file: Path) -> Iterator[tuple[int, ColmapCamera]]:
-    for line in filter(_is_record, _lines(file)):
+def _text_cameras(lines: FileInput[str]) -> Iterator[tuple[int, ColmapCamera]]:
+    for line in filter(_is_record, lines):
         key, model, width, height, *params = line.split()
         yield int(key), ColmapCamera(model, int(width), int(height), tuple(map(_number, params)))
 
 
-def _text_images(file: Path) -> Iterator[tuple[int, ColmapImage]]:
+def _text_images(lines: FileInput[str]) -> Iterator[tuple[int, ColmapImage]]:
     """Two lines each, of which the second may be empty."""
-    lines = _lines(file)
     for line in filter(_is_record, lines):
-        key, *pose, camera_id, name = line.strip().split(maxsplit=9)  # a name may hold blanks
+        key, *words, camera_id, name = line.strip().split(maxsplit=9)  # a name may hold blanks
+        pose = list(map(_number, words))
         points = next(lines, "no line of 2-D points").split()
         if len(points) % 3 or len(pose) != 7:
             raise ValueError(f"{points[:4]} are not 2-D points as X Y POINT3D_ID, or there are {len(pose)} numbers")
-        yield int(key), _image(name, int(camera_id), list(map(_number, pose)), np.array(points[2::3], np.int64))
+        yield int(key), _image(name, int(camera_id), pose, np.array(points[2::3], np.int64))
 
 
-def _text_points(file: Path) -> Iterator[tuple[int, tuple[Any, ...]]]:
-    for line in filter(_is_record, _lines(file)):
+def _text_points(lines: FileInput[str]) -> Iterator[tuple[int, tuple[Any, ...]]]:
+    for line in filter(_is_record, lines):
         key, x, y, z, r, g, b, _, *track = line.split()
         color = int(r), int(g), int(b)
         pairs = np.array(track, np.int64).reshape(-1, 2)
@@ -296,16 +287,10 @@ def _text_points(file: Path) -> Iterator[tuple[int, tuple[Any, ...]]]:
         yield int(np.int64(int(key))), ((_number(x), _number(y), _number(z)), color, pairs)
 
 
-READERS: dict[str, Callable[[Path], Iterator[tuple[int, Any]]]] = {
+READERS: dict[str, Callable[[Any], Iterator[tuple[int, Any]]]] = {
     "cameras.bin": _binary_cameras, "images.bin": _binary_images, "points3D.bin": _binary_points,
     "cameras.txt": _text_cameras, "images.txt": _text_images, "points3D.txt": _text_points,
 }  # fmt: skip
-
-
-def _is_usable(camera: ColmapCamera) -> bool:
-    """Whether the parameters are plausible numbers, and focal lengths above 0."""
-    named = zip(CAMERA_MODELS[camera.model].split(), camera.params, strict=True)
-    return all(abs(value) < MAX_NUMBER and (value > 0 or name[0] != "f") for name, value in named)
 
 
 def _image(name: str, camera_id: int, numbers: list[float], observed: Ints) -> ColmapImage:

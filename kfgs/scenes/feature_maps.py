@@ -3,23 +3,33 @@
 from __future__ import annotations
 
 import os
+import zipfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from .._arrays import read_array, read_safetensors, reading
 from .._files import Names, as_path
 from .._rows import EPS, row_norms
 from ..cameras.resample import fits_aspect
 from ..quant.sampling import grid_slices
-from .extract import Split, read_manifest, select_views
-from .feature_files import AGAIN, ENDINGS, Size, StoredMap, count_bad, open_map, read_rows
+from .extract import ENDINGS, FEATURE_3DGS, OWN, SAFETENSORS, Split, count_bad, read_manifest, select_views
 from .files import IMAGE_SUFFIXES, some
 from .scene import Scene
+
+StoredMap = Tensor | NDArray[Any]
+"""A map [h, w, D], mapped into memory: values are read when they are used."""
+Size = tuple[int, int]
+"""(H, W) of a picture."""
+AGAIN = "encode it again, or leave the photo out (split.json)"
+ROW_BLOCK = 32  # rows of a map converted at a time: 30 MB in single precision at 480 x 512 channels
 
 
 class FeatureFolder(Sequence[Tensor]):
@@ -74,8 +84,9 @@ class FeatureFolder(Sequence[Tensor]):
         if not self.stems or len(set(self.stems)) < len(self.stems):
             got = some(self.stems) or "none"
             raise ValueError(f"stems (in {self.path}): expected at least one view, each once, got {got}; correct them")
-        self.channels, self.sizes = channels, None if sizes is None else list(sizes)
-        if self.sizes is not None and len(self.sizes) != len(self):
+        self.channels = channels
+        self.sizes = [None] * len(self.stems) if sizes is None else list(sizes)
+        if len(self.sizes) != len(self):
             raise ValueError(f"sizes: expected {len(self)} (one per view), got {len(self.sizes)}; give one for each")
         if stems is not None:
             _ = self.files  # views without a map are an error here, not hours later
@@ -120,35 +131,31 @@ class FeatureFolder(Sequence[Tensor]):
         missing = [stem for stem in self.stems if stem not in files]
         if not missing:
             return [files[stem] for stem in self.stems]
-        text = f"expected a feature map for each of {len(self)} views, {len(missing)} missing: {some(missing)}"
         others = sorted(set(self._listed) - set(self.stems))
+        split = "" if self.identity is None else f" --split all --out {self.path}"
+        advice = f"make them with `kfgs features SCENE{split}`, or leave these views out"
         if not files and others and self.identity is None:
             advice = f"rename the maps there ({len(others)}: {some(others, 3)}) to the names of the pictures"
-        else:
-            split = "" if self.identity is None else f" --split all --out {self.path}"
-            advice = f"make them with `kfgs features SCENE{split}`, or leave these views out"
+        text = f"expected a feature map for each of {len(self)} views, {len(missing)} missing: {some(missing)}"
         raise FileNotFoundError(f"{self.path}: {text}; {advice}")
 
     @cached_property
     def shape(self) -> tuple[int, int, int]:
         """(h, w, D) of the first map; opens its file, without reading its values."""
-        h, w, D = map(int, self._open(0).shape)
+        h, w, D = map(int, self._open(self.files[0], self.sizes[0]).shape)
         if self.channels is not None and self.channels != D:
-            raise ValueError(
-                f"{self.files[0]}: expected {self.channels} channels, got {D} in a map of {h} x {w}; "
-                "use maps and embeddings of the same encoder"
-            )
+            got = f"{D} in a map of {h} x {w}; use maps and embeddings of the same encoder"
+            raise ValueError(f"{self.files[0]}: expected {self.channels} channels, got {got}")
         return h, w, D
 
     def __getitem__(self, index: int | slice) -> Any:  # [h, w, D]; of a slice, a FeatureFolder
         if isinstance(index, slice):
-            sizes = None if self.sizes is None else self.sizes[index]
-            return FeatureFolder(self.path, self.stems[index], channels=self.channels, sizes=sizes)
+            return FeatureFolder(self.path, self.stems[index], channels=self.channels, sizes=self.sizes[index])
         return torch.cat(list(self.blocks(index)))
 
     def grid(self, i: int, step: tuple[int, int] | None, samples: int) -> Tensor:  # [n, D] float32
         """`quant.sample_grid(maps[i], step, samples=samples)`, reading no more of the file than these pixels."""
-        stored = self._open(i)
+        stored = self._open(self.files[i], self.sizes[i])
         rows, columns = grid_slices(int(stored.shape[0]), int(stored.shape[1]), step, samples=samples)
         return torch.cat(list(self.blocks(i, rows, columns))).flatten(0, 1)
 
@@ -156,21 +163,55 @@ class FeatureFolder(Sequence[Tensor]):
         self, i: int, rows: slice = slice(None), columns: slice = slice(None)
     ) -> Iterator[Tensor]:  # each [at most 32, w, D] float32
         """A map, or some of its rows and columns, a few rows at a time, which takes less memory than `maps[i]`."""
-        stored = self._open(i)
+        stored = self._open(self.files[i], self.sizes[i])
         if stored.shape[2] != self.shape[2]:
-            raise ValueError(
-                f"{self.files[i]}: expected {self.shape[2]} channels as in {self.files[0].name}, got {stored.shape[2]}; {AGAIN}"
-            )
+            expected = f"{self.shape[2]} channels as in {self.files[0].name}"
+            raise ValueError(f"{self.files[i]}: expected {expected}, got {stored.shape[2]}; {AGAIN}")
         for block in read_rows(stored, rows, columns):
             if bad := count_bad(block):
-                raise ValueError(
-                    f"{self.files[i]}: expected finite features, got {bad} NaN or infinite values; {AGAIN}"
-                )
+                raise ValueError(f"{self.files[i]}: expected finite features, got {bad} NaN or infinite; {AGAIN}")
             yield block
 
-    def _open(self, i: int) -> StoredMap:  # [h, w, D]
-        size = self.sizes[i] if self.sizes else None
-        return open_map(self.files[i], self.channels, size, own=self.identity is not None)
+    def _open(self, file: Path, size: Size | None) -> StoredMap:  # [h, w, D]
+        """Map a file into memory without reading its values.
+
+        Feature 3DGS writes [D, h, w], kfgs [h, w, D]. In other files a known number of channels decides, then the aspect of
+        the picture (`size`); if both fit, [h, w, D]. If nothing is known, a first axis of twice the others' size is D (not in
+        .npy).
+        """
+        if file.name.endswith(OWN):
+            values: Any = read_array(file, "a feature map", AGAIN)
+        else:
+            with reading(file, "a feature map", AGAIN):
+                if file.name.endswith(SAFETENSORS):
+                    (values,) = read_safetensors(file)[0].values()
+                else:
+                    values = torch.load(file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file))
+                if isinstance(values, Tensor) and values.layout == torch.strided:
+                    if values.untyped_storage().nbytes() < values.numel() * values.element_size():
+                        raise ValueError("its values repeat")  # a few bytes on disk that would fill the memory
+                    values = values.detach()  # saved by a training run, it may ask for gradients
+        if not isinstance(values, np.ndarray) and not (isinstance(values, Tensor) and values.layout == torch.strided):
+            kind = type(values).__name__
+            raise TypeError(f"{file}: expected one dense tensor of features, got a {kind}; save the tensor alone")
+        if not (values.is_floating_point() if isinstance(values, Tensor) else values.dtype.kind == "f"):
+            raise ValueError(f"{file}: expected floating-point features, got {values.dtype}; {AGAIN}")
+        if values.ndim != 3 or 0 in values.shape:
+            raise ValueError(f"{file}: expected a map [h, w, D], got {tuple(values.shape)}; save one view per file")
+        first, middle, last = map(int, values.shape)
+        if file.name.endswith(FEATURE_3DGS):
+            turned = True
+        elif self.identity is not None and file.name.endswith(OWN):
+            turned = False
+        elif self.channels in (first, last) and first != last:
+            turned = first == self.channels
+        elif size is None:
+            turned = self.channels is None and not file.name.endswith(OWN) and first >= 2 * max(middle, last)
+        else:
+            turned = not fits_aspect((first, middle), size) and fits_aspect((middle, last), size)
+        if not turned:
+            return values
+        return values.permute(1, 2, 0) if isinstance(values, Tensor) else values.transpose(1, 2, 0)
 
     def check(self, scene: Scene | None = None, split: Split = "train", *, values: bool = True) -> dict[str, str]:
         """Check the map of every view; says why a map cannot be used, by its file (if there is none, by the view).
@@ -179,17 +220,16 @@ class FeatureFolder(Sequence[Tensor]):
         NaN or infinite values, or only zeros. `scene` and `split` say whose views (None: those of this folder); `values=False`
         checks only shape and type, in milliseconds.
         """
-        sizes = dict(zip(self.stems, self.sizes or [None] * len(self), strict=True))
+        sizes = dict(zip(self.stems, self.sizes, strict=True))
         if scene is not None:
             chosen = select_views(scene, split)
             sizes = {chosen.stem(i): camera.size for i, camera in enumerate(chosen.cameras)}
-        files = self._find(list(sizes))
+        files, shapes, turned = self._find(list(sizes)), dict[str, tuple[int, ...]](), dict[str, str]()
         problems = {stem: "expected its map, got none" for stem in sizes if stem not in files}
-        shapes, turned = dict[str, tuple[int, ...]](), dict[str, str]()
         for stem, file in files.items():
             name, size = file.relative_to(self.path).as_posix(), sizes[stem]
             try:
-                stored = open_map(file, self.channels, size, own=self.identity is not None)
+                stored = self._open(file, size)
             except (ValueError, TypeError) as error:
                 problems[name] = str(error).removeprefix(f"{file}: ")
                 continue
@@ -215,3 +255,20 @@ class FeatureFolder(Sequence[Tensor]):
         for name, text in problems.items():
             more = f" ({len(problems) - 1} more do not fit; `kfgs features SCENE --out {self.path}` names them)"
             raise ValueError(f"{self.path / name}: {text}; {AGAIN}{more if len(problems) > 1 else ''}")
+
+
+def read_rows(
+    stored: StoredMap,  # [h, w, D]
+    rows: slice = slice(None),
+    columns: slice = slice(None),
+) -> Iterator[Tensor]:  # each [at most ROW_BLOCK, columns, D] float32
+    """Copy some rows and columns of a map in single precision, a few rows at a time; only these are read from disk."""
+    chosen = range(int(stored.shape[0]))[rows]
+    for start in range(0, len(chosen), ROW_BLOCK):
+        part = chosen[start : start + ROW_BLOCK]
+        block = stored[part.start : part.stop : part.step, columns]
+        if isinstance(block, Tensor):
+            yield block.float() if block.dtype != torch.float32 else block.clone()
+        else:
+            with np.errstate(over="ignore"):  # a value beyond single precision becomes infinite
+                yield torch.from_numpy(np.array(block, np.float32, order="C"))

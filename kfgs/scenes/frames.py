@@ -66,10 +66,9 @@ class Alignment:
     @property
     def summary(self) -> str:
         """One sentence: the scale, how many fit and how closely."""
-        return (
-            f"cameras of the same names: scale {self.similarity.scale:.6g}, {self.inliers} of {self.count} fit, rms "
-            f"{self.rms:.3g} ({self.rms / self.size:.2%} of the extent {self.size:.3g})"
-        )
+        near = f"rms {self.rms:.3g} ({self.rms / self.size:.2%} of the extent {self.size:.3g})"
+        fits = f"{self.inliers} of {self.count} fit"
+        return f"cameras of the same names: scale {self.similarity.scale:.6g}, {fits}, {near}"
 
     def to_json(self) -> dict[str, Any]:
         """The similarity's matrix and every number, as plain lists and floats."""
@@ -99,10 +98,8 @@ def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
     turns = S.transpose(0, 2, 1) @ R  # [V, 3, 3] source world to destination world
     sizes, least = _extents(B), max(2, MIN_INLIERS * len(A))
     if min(sizes[0] / max(1.0, np.abs(B).max()), _extents(A)[0] / max(1.0, np.abs(A).max())) < 1e-9:
-        raise SceneError(
-            f"cameras: expected common cameras at different places, got {len(pairs)} at one ({some(names)}), from which "
-            "no scale follows; give more views, or pass the similarity"
-        )
+        got = f"{len(pairs)} at one ({some(names)}), from which no scale follows"
+        raise SceneError(f"cameras: expected common ones at other places, got {got}; give more, or pass the similarity")
     similarity, good, size = None, np.zeros(len(A), dtype=bool), sizes[0]
     for trial in sizes:
         start = _start(A, B, turns, MAX_ERROR * trial) if good.sum() < least else None
@@ -112,13 +109,11 @@ def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
             if spread > TRIPOD * trial and fits.sum() > good.sum():  # at one place any scale fits
                 similarity, good, size = fit, fits, trial
     if similarity is None or good.sum() < least:
-        raise SceneError(
-            f"cameras: expected at least half of the {len(pairs)} common cameras to fit one similarity, got "
-            f"{int(good.sum())}; check that the names mean the same pictures in both, or pass the similarity"
-        )
-    errors = _errors(similarity, A, B, turns)[0]
+        expected = f"at least half of the {len(pairs)} common cameras to fit one similarity, got {int(good.sum())}"
+        advice = "check that the names mean the same pictures in both, or pass the similarity"
+        raise SceneError(f"cameras: expected {expected}; {advice}")
     lost = tuple(name for name, ok in zip(names, good, strict=True) if not ok)
-    rms = float(np.sqrt((errors[good] ** 2).mean()))
+    rms = float(np.sqrt((_errors(similarity, A, B, turns)[0][good] ** 2).mean()))
     return Alignment(similarity.between_worlds(*origins), rms, size, int(good.sum()), len(pairs), lost)
 
 
@@ -130,11 +125,10 @@ def _common_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> list[tuple[
             break
     pairs = [(camera, there[name]) for name, camera in here.items() if name in there]
     if len(pairs) < 2:
-        raise SceneError(
-            f"cameras: expected at least two names that both have, got {len(pairs)} (source: "
-            f"{some([c.name for c in src], 3)}; destination: {some([c.name for c in dst], 3)}); give both the names of "
-            "their pictures, or pass the similarity"
-        )
+        names = (some([camera.name for camera in side], 3) for side in (src, dst))
+        got = f"{len(pairs)} (source, destination: {'; '.join(names)})"
+        advice = "give both the names of their pictures, or pass the similarity"
+        raise SceneError(f"cameras: expected at least two names that both have, got {got}; {advice}")
     return pairs
 
 
@@ -144,18 +138,16 @@ def _start(A: Array, B: Array, turns: Array, reach: float) -> Similarity | None:
     row = near[int(near.sum(1).argmax())]
     R = Rotation.from_matrix(turns[row]).mean().as_matrix()
     turned, there = A[row] @ R.T, B[row]  # [n, 3]
-    i, j = np.triu_indices(len(turned), 1)
-    chosen = np.random.default_rng(0).permutation(len(i))[:PAIRS]
-    i, j = i[chosen], j[chosen]
+    pairs = np.stack(np.triu_indices(len(turned), 1))
+    i, j = pairs[:, np.random.default_rng(0).permutation(pairs.shape[1])[:PAIRS]]
     base, other = turned[j] - turned[i], there[j] - there[i]
     scales = (base * other).sum(1) / np.maximum((base**2).sum(1), 1e-300)
     best, most = None, 0
-    for scale, first in zip(scales, i, strict=True):
-        if scale > 0:
-            shift = there[first] - scale * turned[first]
-            fits = int((np.linalg.norm(scale * turned + shift - there, axis=1) < reach).sum())
-            if fits > most:
-                best, most = Similarity(float(scale), torch.from_numpy(R), torch.from_numpy(shift)), fits
+    for scale, first in zip(scales[scales > 0], i[scales > 0], strict=True):
+        shift = there[first] - scale * turned[first]
+        fits = int((np.linalg.norm(scale * turned + shift - there, axis=1) < reach).sum())
+        if fits > most:
+            best, most = Similarity(float(scale), torch.from_numpy(R), torch.from_numpy(shift)), fits
     return best
 
 
@@ -207,7 +199,6 @@ class FrameCheck(NamedTuple):
     agree: bool
     summary: str  # one sentence with the numbers
     near: tuple[float, float]  # share of src's points near dst, and of dst's near src
-    reach: tuple[float, float]  # the distances that count as near dst, and near src, world units
     drift: float  # how far the best fit nearby moves the surface of src, along its normals, world units
 
 
@@ -240,7 +231,7 @@ def frames_agree(
         f"{to_dst:.3g} and {to_src:.3g} of the other cloud (spacings {spacings[0]:.3g} and {spacings[1]:.3g}, size "
         f"{size:.3g}), and the best fit nearby moves their surface by {drift:.3g}"
     )
-    return FrameCheck(agree, summary, near, (to_dst, to_src), drift)
+    return FrameCheck(agree, summary, near, drift)
 
 
 def _nearest(tree: cKDTree, places: Array, k: int = 1) -> tuple[Array, Array]:
@@ -278,9 +269,8 @@ def _drift(a: Array, b: Array) -> float:
         squares, counts = np.concatenate([d**2, (e * s) ** 2]), np.repeat([len(d), len(e)], [len(d), len(e)])
         w = ((reach**2 / (reach**2 + squares)) ** 2 / counts)[:, None]
         center = P.mean(0)
-        rows = np.concatenate(
-            [np.cross(P - center, normals), normals, ((P - center) * normals).sum(1)[:, None]], axis=1
-        )
+        arms = P - center
+        rows = np.concatenate([np.cross(arms, normals), normals, (arms * normals).sum(1)[:, None]], axis=1)
         system = (rows * w).T @ rows  # [7, 7]: turn, shift, scale
         damping = 1e-4 * np.diag(np.maximum(np.diag(system), 1e-12 * np.trace(system)))
         x = np.linalg.solve(system + damping, (rows * w).T @ ((Q - P) * normals).sum(1))
@@ -300,9 +290,8 @@ def _with_normals(points: Array) -> tuple[Array, Array, cKDTree]:
         _, inverse, counts = np.unique(key, return_inverse=True, return_counts=True)
         if len(counts) > 0.8 * FITTED:
             sums = [np.bincount(inverse, points[:, k]) for k in range(3)]
-            thinned = (np.stack(sums, axis=1) / counts[:, None])[
-                np.random.default_rng(0).permutation(len(counts))[:FITTED]
-            ]
+            chosen = np.random.default_rng(0).permutation(len(counts))[:FITTED]
+            thinned = (np.stack(sums, axis=1) / counts[:, None])[chosen]
             break
         cell /= 1.1
     tree = cKDTree(thinned)

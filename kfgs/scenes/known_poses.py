@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
-from torch import Tensor
 
 from .._files import real_path
 from ..cameras.camera import Camera
@@ -57,11 +56,15 @@ def find_points(scene: Scene, *, config: SfmConfig | None = None, progress: bool
             (folder / name).symlink_to(real_path(path))
             photos[name] = (path, None if seen.masks is None else seen.masks[i])
         with sfm_run(folder, photos, config or SfmConfig(), what, advice, progress) as run:
-            places, colors = _triangulate(run, seen)
-    return replace(scene, points=places, colors=colors)
+            known = _triangulate(run, seen)
+            known.extract_colors_for_all_images(scratch)
+            points = [known.points3D[i] for i in sorted(known.points3D)]
+    places = torch.from_numpy(np.array([point.xyz for point in points])).float()
+    return replace(scene, points=places, colors=torch.from_numpy(np.array([p.color for p in points], np.uint8)))
 
 
-def _triangulate(run: SfmRun, seen: Scene) -> tuple[Tensor, Tensor]:  # [P, 3] float32, [P, 3] uint8
+def _triangulate(run: SfmRun, seen: Scene) -> Any:
+    """The views as pycolmap has them, with points that enough matches agree on."""
     pycolmap, names = run.pycolmap, list(run.photos)
     known = _reconstruction(pycolmap, seen, names)
     with pycolmap.Database.open(run.database) as database:
@@ -77,15 +80,11 @@ def _triangulate(run: SfmRun, seen: Scene) -> tuple[Tensor, Tensor]:  # [P, 3] f
     lengths = [len(point.track.elements) for point in known.points3D.values()]
     agree = sum(n * (n - 1) // 2 for n in lengths)
     if len(lengths) < FEWEST or agree < AGREEING * matches:
-        raise SceneError(
-            f"scene: expected pictures that fit their poses, got {matches} matches between them of which {agree} agree "
-            f"with the poses ({len(lengths)} points); do the poses belong to these pictures, and is their axis convention "
-            "right? Else estimate them again (`kfgs sfm --ignore-poses`)"
-        )
-    known.extract_colors_for_all_images(str(run.images))
-    points = [known.points3D[i] for i in sorted(known.points3D)]
-    places = torch.from_numpy(np.array([point.xyz for point in points])).float()
-    return places, torch.from_numpy(np.array([point.color for point in points], np.uint8))
+        got = f"{matches} matches of which {agree} agree with the poses ({len(lengths)} points)"
+        ask = "do the poses belong to these pictures, and is their axis convention right"
+        advice = f"{ask}? Else estimate them again (`kfgs sfm --ignore-poses`)"
+        raise SceneError(f"scene: expected pictures that fit their poses, got {got}; {advice}")
+    return known
 
 
 def neighbours(cameras: list[Camera]) -> list[tuple[int, int]]:
@@ -109,7 +108,7 @@ def _reconstruction(pycolmap: Any, scene: Scene, names: list[str]) -> Any:
         if lens.distortion is not None and lens.distortion.model == "kannala_brandt":
             model = "OPENCV_FISHEYE"
         bent += [0.0] * (8 - len(bent) if model == "FULL_OPENCV" else 0)
-        params = [float(lens.K[j]) for j in ((0, 0), (1, 1), (0, 2), (1, 2))] + bent
+        params = [*lens.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), *bent]
         camera = pycolmap.Camera(model=model, width=lens.width, height=lens.height, params=params, camera_id=i)
         camera.has_prior_focal_length = True
         known.add_camera_with_trivial_rig(camera)

@@ -12,14 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .._files import file_stem, real_path
-from .depth import points_from_depth
-from .files import MAX_NUMBER, MAX_SIDE, SceneError, list_images, picture_size, read_scene_json, some
-from .posed import Matrix, PosedPicture, read_numbers, read_points, scene_of_poses
+from .._files import file_stem, read_json, real_path
+from .files import MAX_NUMBER, MAX_SIDE, SceneError, list_images, picture_size, scene_error, some
+from .posed import PosedPicture, points_from_depth, read_numbers, read_points, scene_of_poses
 from .scene import Scene
 
 AGAIN = "copy it again from the data set"
-MESH = "_vh_clean_2.ply"  # of ScanNet
+SQUARE, MESH = "4 rows of 4 numbers", "_vh_clean_2.ply"  # of ScanNet
 
 
 def load_nice_slam(folder: Path) -> Scene:
@@ -34,10 +33,11 @@ def load_nice_slam(folder: Path) -> Scene:
             f"{places[1]}: no such file; expected the camera of the Replica scenes there or in {folder}: "
             '{"camera": {"w": 1200, "h": 680, "fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "scale": 6553.5}}'
         )
-    top, names = read_scene_json(path, AGAIN), ("w", "h", "fx", "fy", "scale", "cx", "cy")
+    names = ("w", "h", "fx", "fy", "scale", "cx", "cy")
+    with scene_error(after=f"; {AGAIN}"):
+        top = read_json(path)
     try:
-        values = [top["camera"][name] for name in names]
-        width, height, fx, fy, scale, cx, cy = values
+        width, height, fx, fy, scale, cx, cy = values = [top["camera"][name] for name in names]
         numbers = all(type(value) in (int, float) and abs(value) < MAX_NUMBER for value in values)  # NaN fails
         whole = numbers and width % 1 == height % 1 == 0
         if not (whole and min(values[:5]) > 0 and max(width, height) <= MAX_SIDE):
@@ -63,29 +63,22 @@ def load_semantic_nerf(folder: Path) -> Scene:
         view.K = np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]])
         view.depth = folder / "depth" / (Path(view.name).stem.replace("rgb", "depth") + ".png")
     notes.append(
-        "no file has the intrinsics of Semantic-NeRF's renders: 90 degrees across and a centred principal point assumed"
+        "no file has the intrinsics: 90 degrees across and a centred principal point, as Semantic-NeRF renders"
     )
     return scene_of_poses(folder, views, points_from_depth(views), notes)
 
 
 def _numbered(folder: Path, pattern: str, poses: Path) -> tuple[list[PosedPicture], list[str]]:
     """The pictures of a folder whose number says which line of a file is their pose, and a note about other lines."""
-    expected = "lines of 16 numbers, one camera-to-world matrix per picture"
-    rows = read_numbers(poses, expected)
-    if rows.shape[1] != 16:
-        raise SceneError(f"{poses}: expected {expected}, got lines of {rows.shape[1]}; {AGAIN}")
+    rows = read_numbers(poses, "lines of 16 numbers, one camera-to-world matrix per picture", 16)
     matches = [match for name in list_images(folder) if (match := re.fullmatch(pattern, name, re.IGNORECASE))]
     if not matches:
         example = pattern.replace(r"(\d+)", "NUMBER").split("\\")[0]
-        raise SceneError(
-            f"{folder}: expected pictures named {example}..., got none; copy the pictures of {poses} there"
-        )
+        raise SceneError(f"{folder}: expected pictures named {example}..., got none; copy those of {poses} there")
     numbers = [int(match[1]) for match in matches]
     if max(numbers) >= len(rows):
-        raise SceneError(
-            f"{poses}: expected a line for each picture of {folder}, got {len(rows)} lines for numbers up to "
-            f"{max(numbers)} (the first line is for number 0); copy the whole folder again"
-        )
+        got = f"{len(rows)} lines for numbers up to {max(numbers)} (the first line is for number 0)"
+        raise SceneError(f"{poses}: expected a line per picture of {folder}, got {got}; copy the whole folder again")
     views = [
         PosedPicture(match[0], folder / match[0], rows[number].reshape(4, 4), f"{poses}, line {number + 1}")
         for match, number in zip(matches, numbers, strict=True)
@@ -104,42 +97,30 @@ def load_scannet(folder: Path) -> Scene:
     files = {name: folder / "pose" / f"{file_stem(name)}.txt" for name in names}
     lost = [name for name in names if not files[name].is_file()]
     if len(lost) == len(names):
-        raise SceneError(
-            f"{folder / 'pose'}: expected N.txt for the pictures N.jpg of {folder / 'color'} ({some(names, 3) or 'none'}), "
-            "got none that fits; export the scene again with ScanNet's SensReader"
-        )
+        expected = f"N.txt for the pictures N.jpg of {folder / 'color'} ({some(names, 3) or 'none'})"
+        advice = "export the scene again with ScanNet's SensReader"
+        raise SceneError(f"{folder / 'pose'}: expected {expected}, got none that fits; {advice}")
     file, views = folder / "intrinsic" / "intrinsic_color.txt", list[PosedPicture]()
-    K = _square(file)[:3, :3]
+    K = read_numbers(file, SQUARE, 4, 4)[:3, :3]
     size, largest = max((picture_size(folder / "color" / name), name) for name in names)  # others may be smaller copies
     if not (0 < K[0, 2] < size[0] and 0 < K[1, 2] < size[1]):
-        raise SceneError(
-            f"{file}: expected a principal point inside {largest} ({size[0]}x{size[1]} pixels), got ({K[0, 2]:g}, "
-            f"{K[1, 2]:g}); give pictures of the size that was exported"
-        )
+        got = f"({K[0, 2]:g}, {K[1, 2]:g}); give pictures of the size that was exported"
+        raise SceneError(f"{file}: expected a principal point inside {largest} ({size[0]}x{size[1]} pixels), got {got}")
     for name in names:
         if name not in lost:
-            view = PosedPicture(name, folder / "color" / name, _square(files[name]), str(files[name]), K, size)
+            pose = read_numbers(files[name], SQUARE, 4, 4)
+            view = PosedPicture(name, folder / "color" / name, pose, str(files[name]), K, size)
             view.depth = folder / "depth" / f"{file_stem(name)}.png"
             views.append(view)
     notes = [f"{len(lost)} pictures have no file in pose/ and were left out: {some(lost)}"] if lost else []
     points = None
     mesh, depth = min(folder.glob(f"*{MESH}"), default=None), folder / "intrinsic" / "intrinsic_depth.txt"
     if mesh is not None:
-        try:
-            places, colors, told = read_points(mesh)
-        except SceneError as error:
-            raise SceneError(f"{error}; copy the mesh again, or remove it to take points from the depth") from error
+        places, colors, told = read_points(mesh, "copy the mesh again, or remove it to take points from the depth")
         points, notes = (places, colors), notes + told
     elif depth.is_file():
-        points = points_from_depth(views, K=_square(depth)[:3, :3])
+        points = points_from_depth(views, K=read_numbers(depth, SQUARE, 4, 4)[:3, :3])
     return scene_of_poses(folder, views, points, notes)
-
-
-def _square(path: Path) -> Matrix:  # [4, 4]
-    matrix = read_numbers(path, "4 rows of 4 numbers")
-    if matrix.shape != (4, 4):
-        raise SceneError(f"{path}: expected 4 rows of 4 numbers, got {matrix.shape}; export the scene again")
-    return matrix
 
 
 class Layout(NamedTuple):
@@ -159,5 +140,5 @@ LAYOUTS = (
 
 
 def find_layout(folder: Path) -> Layout | None:
-    """The layout of a folder; None if it has none."""
+    """The layout of a folder, if it has one."""
     return next((layout for layout in LAYOUTS if all((folder / file).exists() for file in layout.files)), None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -11,18 +12,19 @@ from .._check import check_choice
 from .._files import as_path, real_path
 from .._notes import tell_repairs
 from ..cameras.camera import Camera
-from .colmap import colmap_cameras, load_colmap
+from .colmap import load_colmap
 from .colmap_model import count_images, has_model
-from .files import SceneError, natural_key, picture_size, some
+from .files import SceneError, check_mask, folder_masks, natural_key, picture_folder, picture_size, some
 from .layouts import LAYOUTS, find_layout
-from .masks import check_mask, folder_masks, picture_folder
 from .scene import Scene
 from .splits import RULES, choose_split, make_split, read_split
 from .transforms import load_transforms
 
 PLACES = ("sparse", "colmap/sparse", "dense/sparse", "distorted/sparse", "colmap_ground_truth", ".")
 """Folders of models, asked in this order; a model may also lie in their subfolders `N`, `N/models/M` and `models/M`."""
-_TRANSFORMS = ("transforms.json", "transforms_train.json")
+PICTURES = ("images", "images_2", "images_4", "images_8", "color", "results", "rgb", "train", "val", "test")
+SCENE_PARTS = ("features", "sparse", "labels", "labels_scored", "masks", "depth", "pose", *PICTURES)
+"""Folders of a scene that hold what it is read from."""
 SplitChoice = Literal["auto", "df3dgs", "feature3dgs", "holdout8", "all"]
 
 
@@ -57,7 +59,7 @@ def load_scene(
     check_choice("split", split, ("auto", *RULES))
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such folder; expected a scene there")
-    root, model = _root(path), find_model(path)
+    root, model = scene_root(path), find_model(path)
     if images is not None and not as_path(images).is_dir() and (root / images).is_dir():
         images = root / images
     scene = replace(_load_views(path, model, None if images is None else as_path(images)), folder=root)
@@ -76,12 +78,13 @@ def load_cameras(path: str | Path) -> list[Camera]:
     model = find_model(path)
     if model is None and not (path.exists() and _is_transforms(path)):
         return load_scene(path).undistorted().cameras
-    scene = load_transforms(path, pictures=False) if model is None else colmap_cameras(model)
+    scene = load_transforms(path, pictures=False) if model is None else load_colmap(model, None)
     tell_repairs(str(path), scene.notes, False, SceneError)
     return scene.undistorted().cameras
 
 
-def _root(path: Path) -> Path:
+def scene_root(path: Path) -> Path:
+    """The folder of a scene that is given by a folder or a .json file."""
     return path if path.is_dir() else path.parent
 
 
@@ -112,18 +115,14 @@ def _load_views(path: Path, model: Path | None, images: Path | None) -> Scene:
     layout = find_layout(path)
     if layout is not None:
         return layout.read(path)
-    parts = [(file, layout) for layout in LAYOUTS for file in layout.files if (path / file).exists()]
-    half = "".join(
-        f" (there is {file}, but not all of {row.name}: {' and '.join(row.files)})" for file, row in parts[:1]
-    )
-    raise SceneError(
-        f"{path}: expected a COLMAP model, a transforms.json or the layout of a data set (docs/datasets.md), found "
-        f"none{half}; {_advice(path)}"
-    )
+    there = [(file, layout) for layout in LAYOUTS for file in layout.files if (path / file).exists()][:1]
+    half = "".join(f" (there is {file}, but not all of {row.name}: {' and '.join(row.files)})" for file, row in there)
+    expected = "a COLMAP model, a transforms.json or the layout of a data set (docs/datasets.md)"
+    raise SceneError(f"{path}: expected {expected}, found none{half}; {_advice(path)}")
 
 
 def _is_transforms(path: Path) -> bool:
-    return path.suffix == ".json" or any((path / name).is_file() for name in _TRANSFORMS)
+    return path.suffix == ".json" or any((path / f"transforms{end}.json").is_file() for end in ("", "_train"))
 
 
 def is_scene(path: str | Path) -> bool:
@@ -134,8 +133,7 @@ def is_scene(path: str | Path) -> bool:
 
 
 def _advice(path: Path) -> str:
-    folders = [folder for folder in path.iterdir() if folder.is_dir()] if path.is_dir() else []
-    inside = [f.name for f in sorted(folders, key=lambda f: natural_key(f.name))[:100] if is_scene(f)]
+    inside = [folder.name for folder in _folders(path)[:100] if is_scene(folder)]
     if inside:
         return f"it holds scenes ({some(inside)}): give one of them, as in {path / inside[0]}"
     if is_scene(real_path(path).parent):
@@ -149,12 +147,7 @@ def _find_images(root: Path, model: Path) -> Path:
     dense = [folder for folder in folders if folder.name in ("dense", "distorted")]  # pictures of their own
     places = list(dict.fromkeys((*dense, root, *folders)))
     full = [folder / "images" for folder in places]
-    small = [
-        inner
-        for folder in places
-        for inner in sorted(folder.glob("images_*"), key=lambda inner: natural_key(inner.name))
-        if inner.name[7:].isdecimal()
-    ]
+    small = [inner for folder in places for inner in _folders(folder) if re.fullmatch(r"images_\d+", inner.name)]
     undistorted = [folder / "input" for folder in dense]
     return next((folder for folder in (*full, *small, *undistorted) if folder.is_dir()), root)
 
@@ -174,9 +167,7 @@ def _with_split(scene: Scene, path: Path, root: Path, model: Path | None, split:
     splits = make_split(len(scene), rule)
     note = f"split {rule}: {len(splits['train'])} of {len(scene)} views train, {len(splits['test'])} test"
     if not splits["train"]:
-        raise SceneError(
-            f'{root}: expected at least 6 views for the split {rule!r}, got {len(scene)}; use split="all" or "holdout8"'
-        )
+        raise SceneError(f'{root}: expected at least 6 views for {rule!r}, got {len(scene)}; use "all" or "holdout8"')
     return replace(scene, splits=splits, notes=(*scene.notes, note))
 
 

@@ -1,10 +1,11 @@
-"""From cameras with one pose per picture to a scene: what all readers share, and poses as programs write them."""
+"""From cameras with one pose per picture to a scene, what all readers share: poses as programs write them, and points."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,12 +16,17 @@ from .._files import read_text
 from .._notes import Repair
 from .._origin import choose_origin, describe_origin, to_local
 from ..cameras.camera import ROTATION_TOLERANCE, Camera, Distortion
+from ..cameras.projection import unproject_depth
 from ..cameras.resample import fits_aspect
 from ..formats.ply import points_from_columns, read_ply
+from . import files
 from .files import MAX_NUMBER, SceneError, natural_key, picture_size, some
 from .scene import Scene
 
 NO_POINTS = "no points: `kfgs fit` and `kfgs color` triangulate some from the poses before they train"
+MILLIMETRE = 1e-3  # metres: the step of most depth pictures
+DEPTH_VIEWS = 25  # depth pictures that are read: enough to see a room from all sides, a second to decode
+DEPTH_POINTS = 100_000  # points from all of them: what structure from motion gives for a room, and more
 SKEW = 0.02  # largest difference of a rotation's singular values, relative: rotations that are rounded to two digits
 
 Matrix = NDArray[np.float64]
@@ -44,9 +50,8 @@ class PosedPicture:
 def mend_pose(pose: Matrix | None) -> tuple[Matrix | None, float | None]:  # [4, 4]
     """A pose whose rotation has a scale or is rounded, with the nearest rotation (by SVD). The translation stays.
 
-    Returns:
-        The pose, or None if it has numbers that are not finite or plausible, or no rotation at all; and the scale that was
-        removed, or None if it is unchanged. A matrix that is far from a rotation stays as it is, and `Camera` refuses it.
+    It becomes None if it has numbers that are not finite or plausible, or no rotation at all; what is far from a rotation
+    stays, and `Camera` refuses it. The second value is the scale that was removed, None if the pose is unchanged.
     """
     if pose is None or not (np.abs(pose) <= MAX_NUMBER).all():  # NaN fails
         return None, None
@@ -71,19 +76,18 @@ def _as_large_as_pictures(
     for camera, path in zip(cameras, paths, strict=True):
         width, height = picture_size(path)
         if not fits_aspect((height, width), camera.size):
-            raise SceneError(
-                f"{path}: expected a picture in the shape of {camera.width}x{camera.height} pixels, as its camera says, got "
-                f"{width}x{height}; replace it by the picture that the camera was made for, or by a copy at another size"
-            )
+            expected = f"a picture in the shape of {camera.width}x{camera.height} pixels, as its camera says"
+            advice = "replace it by the picture that the camera was made for, or by a copy at another size"
+            raise SceneError(f"{path}: expected {expected}, got {width}x{height}; {advice}")
         fitting.append(camera if (height, width) == camera.size else camera.resized(height, width))
     other = [i for i, camera in enumerate(cameras) if camera is not fitting[i]]
     if not other:
         return fitting, []
     where = folder.name if folder is not None and paths[0].is_relative_to(folder) else "images"
     ratio = cameras[other[0]].width / fitting[other[0]].width
-    how = f"{ratio:.3g} times smaller" if ratio > 1 else f"{1 / ratio:.3g} times larger"
+    how = f"{paths[other[0]].name} is {max(ratio, 1 / ratio):.3g} times {'smaller' if ratio > 1 else 'larger'}"
     count = f"{len(other)} of {len(paths)} pictures have other sizes than the model says"
-    return fitting, [f"{where}: {count} ({paths[other[0]].name} is {how}); cameras were resized to them"]
+    return fitting, [f"{where}: {count} ({how}); cameras were resized to them"]
 
 
 def scene_of_poses(
@@ -108,42 +112,34 @@ def scene_of_poses(
             continue
         if scale is not None:
             scaled[view.name] = scale
-        try:
+        with files.scene_error(f"{view.origin}: ", "; correct this pose"):
             if not np.allclose(pose[3], [0, 0, 0, 1], rtol=0, atol=1e-6):
-                raise ValueError(f"pose: expected 0 0 0 1 as its last row, got {pose[3].tolist()}")
+                row = "0 0 0 1 as its last row (if that is its last column, transpose it)"
+                raise ValueError(f"pose: expected {row}, got {pose[3].tolist()}")
             viewmat, K = torch.from_numpy(inverse_pose(pose)), torch.from_numpy(view.K).float()
             cameras.append(Camera(viewmat, K, *view.size, view.name, view.distortion))
-        except ValueError as error:
-            raise SceneError(f"{view.origin}: {error}; correct this pose") from error
         kept.append(view)
     if not cameras:
-        raise SceneError(
-            f"{path}: expected poses and lenses of finite numbers, got none in {len(views)} ({some(lost, 3)}); estimate them "
-            "(`kfgs sfm`)"
-        )
-    paths, masks, resized = [view.path for view in kept], [view.mask for view in kept], list[str]()
+        got = f"none in {len(views)} ({some(lost, 3)}); estimate them (`kfgs sfm`)"
+        raise SceneError(f"{path}: expected poses and lenses of finite numbers, got {got}")
+    paths, masks, told = [view.path for view in kept], [view.mask for view in kept], list(notes)
     if pictures:
         cameras, resized = _as_large_as_pictures(cameras, paths, images)
-    told = [*notes, *resized, *([NO_POINTS] if points is None else [])]
+        told += resized
+    told += [NO_POINTS] if points is None else []
     if lost:
         told.append(Repair(f"{len(lost)} views have no pose or lens of finite numbers and were left out: {some(lost)}"))
     if scaled:
         low, high = f"{min(scaled.values()):.6g}", f"{max(scaled.values()):.6g}"
-        sizes, names = low if low == high else f"{low} to {high}", some(list(scaled))
-        told.append(
-            Repair(f"{len(scaled)} poses have a scale ({sizes}) or a rounded rotation, which was removed: {names}")
-        )
+        sizes = f"({low if low == high else f'{low} to {high}'}) or a rounded rotation"
+        told.append(Repair(f"{len(scaled)} poses have a scale {sizes}, which was removed: {some(list(scaled))}"))
     places, colors = points or (torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))
     origin = choose_origin(torch.stack([camera.center for camera in cameras]), places)
     local = [camera.with_origin(origin).to(torch.float32) for camera in cameras]
-    told, splits = (
-        [*told, *describe_origin(origin, "cameras and points")],
-        {"train": list(range(len(local))), "test": []},
-    )
-    try:
+    told += describe_origin(origin, "cameras and points")
+    splits = {"train": list(range(len(local))), "test": []}
+    with files.scene_error(f"{path}: "):  # names that do not differ
         scene = Scene(local, paths, to_local(places, origin), colors, splits, tuple(told))
-    except SceneError as error:  # names that do not differ
-        raise SceneError(f"{path}: {error}") from error
     return replace(scene.with_near(), masks=masks if any(masks) else None)
 
 
@@ -154,25 +150,21 @@ def inverse_pose(pose: Matrix) -> Matrix:  # [4, 4] -> [4, 4]
     return inverse
 
 
-def read_numbers(path: Path, expected: str) -> Matrix:  # [rows, columns]
-    """The numbers of a text file, row by row."""
-    try:
+def read_numbers(path: Path, expected: str, columns: int, rows: int | None = None) -> Matrix:  # [rows, columns]
+    """The numbers of a text file, row by row; `rows` None: at least one."""
+    with files.scene_error(f"{path}: expected {expected}, got something else (", "); copy or export it again"):
         lines = read_text(path, expected).splitlines()
-        rows = [[float(word) for word in line.replace(",", " ").split()] for line in lines if line.strip()]
-        if not rows or len({len(row) for row in rows}) != 1:
-            raise ValueError(f"{len(rows)} rows of {sorted({len(row) for row in rows})} numbers")
-    except ValueError as error:
-        raise SceneError(f"{path}: expected {expected}, got something else ({error}); correct it") from error
-    return np.array(rows, dtype=np.float64)
+        numbers = [[float(word) for word in line.replace(",", " ").split()] for line in lines if line.strip()]
+        if {len(row) for row in numbers} != {columns} or rows not in (None, len(numbers)):
+            raise ValueError(f"{len(numbers)} rows of {sorted({len(row) for row in numbers})} numbers")
+    return np.array(numbers, dtype=np.float64)
 
 
-def read_points(path: Path) -> tuple[Tensor, Tensor, list[str]]:  # [P, 3] float64, [P, 3] uint8
+def read_points(path: Path, advice: str) -> tuple[Tensor, Tensor, list[str]]:  # [P, 3] float64, [P, 3] uint8
     """The vertices of a PLY and their colours, grey if it has none; and a note if some are left out as they are not finite."""
-    try:
+    with files.scene_error(after=f"; {advice}"):
         columns = read_ply(path)
         points = points_from_columns(path, columns)
-    except ValueError as error:
-        raise SceneError(str(error)) from error
     colors = torch.full((len(points), 3), 128, dtype=torch.uint8)
     for i, name in enumerate(("red", "green", "blue")):
         if name in columns and columns[name].dtype.kind in "iu":
@@ -180,3 +172,53 @@ def read_points(path: Path) -> tuple[Tensor, Tensor, list[str]]:  # [P, 3] float
     good = torch.isfinite(points).all(1)
     note = f"{int((~good).sum())} of {len(points)} points of {path.name} are not finite and were left out"
     return points[good], colors[good], [] if good.all() else [Repair(note)]
+
+
+def read_depth(path: Path) -> NDArray[Any]:  # [H, W]
+    """The whole numbers of a depth PNG; 0 is unknown."""
+    with files.open_picture(path, "a depth PNG", "copy it again") as picture:
+        depth, mode = np.asarray(picture), picture.mode
+    if depth.ndim != 2 or mode == "P":
+        got = "colours of a palette" if mode == "P" else str(depth.shape)
+        raise SceneError(f"{path}: expected a depth PNG of one channel, got {got}; is this a picture for people?")
+    return depth
+
+
+def points_from_depth(
+    views: Sequence[PosedPicture],
+    unit: float = MILLIMETRE,
+    K: Matrix | None = None,  # [3, 3]
+) -> tuple[Tensor, Tensor] | None:  # [P, 3] float64, [P, 3] uint8
+    """About `DEPTH_POINTS` points of surfaces with their colours, from `DEPTH_VIEWS` evenly chosen depth pictures.
+
+    Pixels that are masked or transparent in the colour picture give none. Views without a pose, with a lens, or without a depth
+    picture are left out; None if that are all. `unit` is world units per step. `K` are the intrinsics of the depth pictures;
+    None takes those of each view, resized: picture and depth then show the same. A colour is that of the same place there.
+    """
+    usable = [v for v in views if v.depth is not None and files.is_file(v.depth) and v.distortion is None]
+    pairs = [(view, pose) for view in usable if (pose := mend_pose(view.pose)[0]) is not None]
+    if not pairs:
+        return None
+    chosen = [pairs[i] for i in np.unique(np.linspace(0, len(pairs) - 1, DEPTH_VIEWS).round().astype(int))]
+    names = [view.name for view, _ in chosen]
+    masks = files.folder_masks(names, files.picture_folder(names[0], chosen[0][0].path))[0] or [None] * len(chosen)
+    points, colors = [], []
+    for (view, pose), folder_mask in zip(chosen, masks, strict=True):
+        assert view.depth is not None
+        depth, image = read_depth(view.depth).astype(np.float64) * unit, files.read_image(view.path).numpy()
+        height, width = depth.shape
+        step = max(int(np.sqrt(height * width * len(chosen) / DEPTH_POINTS)), 1)
+        own = np.diag([width / view.size[0], height / view.size[1], 1.0]) @ view.K if K is None else K
+        y, x = (axis.reshape(-1) for axis in np.mgrid[step // 2 : height : step, step // 2 : width : step])
+        rows, columns = y * image.shape[0] // height, x * image.shape[1] // width  # in the colour picture
+        mask, alpha, known = view.mask or folder_mask, files.read_alpha(view.path), depth[y, x] > 0
+        if mask is not None:
+            known &= files.read_mask(mask, image.shape[:2]).numpy()[rows, columns]
+        if alpha is not None:
+            known &= (alpha > 0.5).numpy()[rows, columns]
+        camera = Camera(torch.eye(4), torch.from_numpy(own), width, height)
+        local = unproject_depth(camera, torch.from_numpy(depth)).numpy()[y[known], x[known]]
+        points.append(local @ pose[:3, :3].T + pose[:3, 3])
+        colors.append(image[rows[known], columns[known]])
+    shades = torch.from_numpy((np.concatenate(colors) * 255).round().astype(np.uint8))
+    return torch.from_numpy(np.concatenate(points)), shades

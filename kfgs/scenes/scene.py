@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from operator import index
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,8 +18,7 @@ from .._files import Names, file_stem
 from ..cameras.bounds import camera_extent
 from ..cameras.camera import NEAR, Camera
 from ..cameras.distortion import undistort
-from .files import SceneError, read_alpha, read_image, some
-from .masks import read_mask, shrink_mask
+from .files import SceneError, read_alpha, read_image, read_mask, shrink_mask, some
 
 # Of the extent: 3DGS's near plane of 0.2 suits cameras 2 m apart; in smaller scenes it must be smaller.
 NEAR_SHARE = 0.1
@@ -62,16 +62,13 @@ class Scene:
                 raise ValueError(f"{name}: expected {views} (one per camera), got {len(values)}; give one for each")
         twice = [stem for stem, n in Counter(file_stem(camera.name) for camera in self.cameras).items() if n > 1]
         if twice:
-            raise SceneError(
-                f"cameras: expected names that differ before the suffix (features and labels are found by them), "
-                f"got {twice[0]!r} twice; move one of the two images away, or rename it here and in the file of the poses"
-            )
+            advice = "move one of the two images away, or rename it here and in the file of the poses"
+            expected = "names that differ before the suffix (features and labels are found by them)"
+            raise SceneError(f"cameras: expected {expected}, got {twice[0]!r} twice; {advice}")
         for name, indices in self.splits.items():
             wrong = [i for i in indices if not 0 <= i < views]
             if wrong:
-                raise ValueError(
-                    f"splits[{name!r}]: expected numbers in [0, {views}), got {wrong[0]}; correct the split"
-                )
+                raise ValueError(f"splits[{name!r}]: expected numbers in [0, {views}), got {wrong[0]}; correct it")
         origins = {camera.origin for camera in [*self.cameras, *(self.lenses or [])]}
         if len(origins) > 1:
             raise ValueError(f"cameras: expected one origin, got {sorted(origins)[:2]}; use camera.with_origin()")
@@ -121,10 +118,8 @@ class Scene:
         lens = (self.lenses or self.cameras)[i]
         image = read_image(self.image_paths[i], "black")
         if image.shape[:2] != lens.size:
-            raise SceneError(
-                f"{self.image_paths[i]}: expected {lens.width}x{lens.height} pixels as its camera says, got "
-                f"{image.shape[1]}x{image.shape[0]}; replace it by a copy of that size"
-            )
+            expected = f"{lens.width}x{lens.height} pixels as its camera says, got {image.shape[1]}x{image.shape[0]}"
+            raise SceneError(f"{self.image_paths[i]}: expected {expected}; replace it by a copy of that size")
         return image if self.lenses is None else undistort(image, lens)[0]
 
     def mask(self, i: int) -> Tensor:  # [H, W] bool
@@ -195,10 +190,8 @@ class Scene:
         """
         if isinstance(which, str):
             if which not in self.splits:
-                raise ValueError(
-                    f"which: expected one of the splits {sorted(self.splits)}, got {which!r}; pass a list to select views "
-                    "by name"
-                )
+                expected = f"one of the splits {sorted(self.splits)}"
+                raise ValueError(f"which: expected {expected}, got {which!r}; pass a list to select views by name")
             which = self.splits[which]
         place = {camera.name: i for i, camera in enumerate(self.cameras)}
         names, indices = Names(place, bare=True), list[int]()
@@ -206,21 +199,15 @@ class Scene:
             i = place.get(names.find(view) or "", -1) if isinstance(view, str) else index(view)  # also torch's integers
             if not 0 <= i < len(self):
                 advice = names.advice(view) if isinstance(view, str) else f"names are like {self.cameras[0].name!r}"
-                raise ValueError(
-                    f"which: expected names or indices of the scene's {len(self)} views, got {view!r}; {advice}"
-                )
+                raise ValueError(f"which: expected names or indices of the {len(self)} views, got {view!r}; {advice}")
             indices.append(i)
         position = {view: n for n, view in enumerate(indices)}
         if len(position) != len(indices):
             raise ValueError("which: expected each view once, got one twice; remove the repetition")
-        return replace(
-            self,
-            cameras=[self.cameras[i] for i in indices],
-            image_paths=[self.image_paths[i] for i in indices],
-            lenses=None if self.lenses is None else [self.lenses[i] for i in indices],
-            masks=None if self.masks is None else [self.masks[i] for i in indices],
-            splits={name: sorted(position[i] for i in views if i in position) for name, views in self.splits.items()},
-        )
+        lists = {name: getattr(self, name) for name in ("cameras", "image_paths", "lenses", "masks")}
+        chosen: Any = {name: values and [values[i] for i in indices] for name, values in lists.items()}
+        splits = {name: sorted(position[i] for i in views if i in position) for name, views in self.splits.items()}
+        return replace(self, splits=splits, **chosen)
 
 
 def check_is_scene(scene: object) -> None:

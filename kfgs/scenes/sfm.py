@@ -15,11 +15,9 @@ from tqdm import tqdm
 
 from .._check import check_choice, check_range
 from .._files import as_path, atomic_folder, check_output, file_stem, real_path
-from .colmap import LENSES
+from .colmap import LENSES, quiet_pycolmap
 from .colmap_model import has_model
-from .files import SceneError, list_images, picture_size, some
-from .masks import folder_masks, write_colmap_masks
-from .pycolmap_import import quiet_pycolmap
+from .files import SceneError, folder_masks, list_images, picture_size, some, write_colmap_masks
 
 OVERLAP = 10  # next images that one of a video is compared with, and as many at distances 1, 2, 4, ... (as COLMAP)
 SMALL = 400
@@ -70,11 +68,9 @@ class SfmReport:
     """Images without a pose."""
 
     def __str__(self) -> str:
+        placed = f"{self.registered} of {self.total} images registered, {self.points} points"
         lost = f"; without a pose: {some(list(self.missing))}" if self.missing else ""
-        return (
-            f"{self.registered} of {self.total} images registered, {self.points} points, mean reprojection error "
-            f"{self.mean_reprojection_error:.2f} px{lost}"
-        )
+        return f"{placed}, mean reprojection error {self.mean_reprojection_error:.2f} px{lost}"
 
 
 def run_sfm(
@@ -110,13 +106,11 @@ def run_sfm(
         raise FileNotFoundError(f"{images}: no such folder; expected the images there")
     model = check_output("out", out, "a folder") / "sparse" / "0"
     if has_model(model) and not replace:
-        raise FileExistsError(
-            f"out: expected a scene folder without a model, got one in {model}; name another folder, or pass replace=True "
-            "(--replace) to give up that model"
-        )
-    names, heic = list_images(images), list_images(images, (".heic", ".heif"))
-    stems = {file_stem(name) for name in names}
-    heic = [name for name in heic if file_stem(name) not in stems]  # others are converted already
+        advice = "name another folder, or pass replace=True (--replace) to give up that model"
+        raise FileExistsError(f"out: expected a scene folder without a model, got one in {model}; {advice}")
+    names = list_images(images)
+    stems = {file_stem(name) for name in names}  # of converted ones, too
+    heic = [name for name in list_images(images, (".heic", ".heif")) if file_stem(name) not in stems]
     if heic:
         raise SceneError(
             f"{images}: expected pictures that pycolmap reads, got HEIC photographs ({some(heic, 3)}); save them as JPEG, with "
@@ -126,10 +120,8 @@ def run_sfm(
         raise SceneError(f"{images}: expected at least 3 images (PNG, JPEG, TIFF, WebP), got {len(names)}; add views")
     pairs = None if config.matching == "exhaustive" else sequential_pairs(names)
     if pairs is not None and any(len(name.split()) > 1 for name in names):  # pycolmap cuts them in a list of pairs
-        raise SceneError(
-            f"{images}: expected names without blanks for sequential matching, got {some(names, 3)}; rename the images "
-            "or use matching='exhaustive' (--matching exhaustive)"
-        )
+        advice = "rename the images or use matching='exhaustive' (--matching exhaustive)"
+        raise SceneError(f"{images}: expected names without blanks for a sequence, got {some(names, 3)}; {advice}")
     masks = folder_masks(names, images)[0] or [None] * len(names)
     photos = {name: (images / name, mask) for name, mask in zip(names, masks, strict=True)}
     what, advice = f"{images}: expected images that pycolmap can register", "check the images and the free disk space"
@@ -143,8 +135,9 @@ def run_sfm(
         with atomic_folder(model) as folder:
             models[0].write(str(folder))
         placed = {image.name for image in models[0].images.values() if image.has_pose}
-        error, missing = float(models[0].compute_mean_reprojection_error()), [n for n in names if n not in placed]
-        return SfmReport(len(placed), len(names), len(models[0].points3D), error, tuple(missing))
+        missing = tuple(name for name in names if name not in placed)
+        error = float(models[0].compute_mean_reprojection_error())
+        return SfmReport(len(placed), len(names), len(models[0].points3D), error, missing)
 
 
 @contextmanager
@@ -181,10 +174,8 @@ class SfmRun:
     photos: dict[str, tuple[Path, Path | None]]
     """The file and the mask of each image by its name."""
 
-    @property
-    def database(self) -> str:
-        """Where features and matches are kept."""
-        return str(self.scratch / "database.db")
+    def __post_init__(self) -> None:
+        self.database = str(self.scratch / "database.db")  # of features and matches
 
     def extract(self, known: bool = False) -> None:
         """Compute features of a few images at a time, so that the bar moves and Ctrl-C works.
@@ -241,8 +232,8 @@ class SfmRun:
 
     def options(self) -> Any:
         """Of the mapping, with its seeds."""
-        seed = self.config.seed
-        options = self.pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=self.config.num_threads)
+        seed, threads = self.config.seed, self.config.num_threads
+        options = self.pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=threads)
         options.mapper.random_seed = options.triangulation.random_seed = seed
         return options
 
@@ -270,18 +261,17 @@ def _too_few(images: Path, sizes: list[int], names: list[str], config: SfmConfig
     if len(sizes) > 1:
         got = f"a scene split into {len(sizes)} unconnected models of {', '.join(map(str, sizes))} images"
     width, height = max((_size(images / name) for name in names), key=max)
-    advice = ["take overlapping photos between the parts"]
-    if 0 < max(width, height) < SMALL:
-        small = f"these are small ({width}x{height} pixels)"
-        advice.insert(0, f"use the original photos, or enlarge them to twice their size: {small}")
-    if config.matching == "sequential":
-        advice.append("use matching='exhaustive' (--matching exhaustive)")
-    if config.single_camera:
-        advice.append("give single_camera=False (--no-single-camera) if several cameras took them, or zoom differs")
+    small = f"these are small ({width}x{height} pixels)"
+    advice = {
+        f"use the original photos, or enlarge them to twice their size: {small}": 0 < max(width, height) < SMALL,
+        "take overlapping photos between the parts": True,
+        "use matching='exhaustive' (--matching exhaustive)": config.matching == "sequential",
+        "give single_camera=False (--no-single-camera) if several cameras took them, or zoom differs": config.single_camera,
+        "lower min_registered (--min-registered)": True,
+    }
     return (
         f"expected at least {config.min_registered * len(names):.0f} of {len(names)} images registered in one model "
-        f"(min_registered = {config.min_registered:g}), got {got}; {', or '.join(advice)}, or lower min_registered "
-        "(--min-registered)"
+        f"(min_registered = {config.min_registered:g}), got {got}; {', or '.join(words for words in advice if advice[words])}"
     )
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Literal
 
 from .._check import check_choice
-from .._files import Names, file_stem, read_text
-from .files import SceneError, read_scene_json, some
+from .._files import Names, file_stem, read_json, read_text
+from .files import SceneError, scene_error, some
 
 SplitRule = Literal["df3dgs", "feature3dgs", "holdout8", "all"]
 RULES: tuple[SplitRule, ...] = ("df3dgs", "feature3dgs", "holdout8", "all")
@@ -52,22 +52,19 @@ def read_split(folder: Path, names: Sequence[str]) -> Split | None:
     texts = {split: file for split, file in places if file.is_file()}
     tables = [folder / name for name in ("split.json", SCANNETPP) if (folder / name).is_file()]
     if texts and tables[:1] != [folder / "split.json"]:
-        try:
+        with scene_error():
             lines = {split: read_text(file, "a list of names of views").split("\n") for split, file in texts.items()}
-        except ValueError as error:
-            raise SceneError(str(error)) from error
         lists = {split: [line.strip() for line in text if line.strip()] for split, text in lines.items()}
         where = folder / ", ".join(file.name for file in texts.values())
         return split_by_lists(str(where), lists, names) if any(lists.values()) else None
     if not tables:
         return None
-    value = read_scene_json(tables[0], "repair the file or remove it")
+    with scene_error(after="; repair the file or remove it"):
+        value = read_json(tables[0])
     lists = {name: words for name, words in value.items() if isinstance(words, list)} if isinstance(value, dict) else {}
     if "train" not in lists or not all(isinstance(word, str) and word for words in lists.values() for word in words):
-        expected = '{"train": [names], "test": [names]}'
-        raise SceneError(
-            f"{tables[0]}: expected {expected}, got {str(value)[:80]}; stems are enough, and there must be a 'train'"
-        )
+        expected = '{"train": [names], "test": [names]} (stems are enough)'
+        raise SceneError(f"{tables[0]}: expected {expected}, got {str(value)[:80]}; there must be a 'train'")
     return split_by_lists(str(tables[0]), lists, names)
 
 
@@ -86,18 +83,13 @@ def split_by_lists(where: str, lists: Mapping[str, Sequence[str]], names: Sequen
     unknown = [name for name in wanted if known.find(name) is None]
     if not splits["train"] or not listed:
         got = f"none of {len(wanted)} listed is there" if unknown else "all of them for the test"
-        raise SceneError(
-            f"{where}: expected training views among the scene's {len(names)} pictures ({some(list(names), 3)}), got {got} "
-            f"({some(unknown or wanted, 3)}); correct the names"
-        )
+        expected = f"training views among the scene's {len(names)} pictures ({some(list(names), 3)})"
+        raise SceneError(f"{where}: expected {expected}, got {got} ({some(unknown or wanted, 3)}); correct the names")
     both = sorted(set(splits["train"]) & {*splits["test"], *splits.get("val", ())})
     if both:
-        raise SceneError(
-            f"{where}: expected train and test without a common view, {file_stem(names[both[0]])} and {len(both) - 1} more are "
-            "in both; scores on training views mean nothing: remove them from one"
-        )
-    if not unknown:
-        return splits, []
-    return splits, [
-        f"{len(unknown)} names in {where} are not in the scene: {some(unknown)} ({known.advice(unknown[0])})"
-    ]
+        got = f"{file_stem(names[both[0]])} and {len(both) - 1} more are in both"
+        advice = "scores on training views mean nothing: remove them from one"
+        raise SceneError(f"{where}: expected train and test without a common view, {got}; {advice}")
+    advice = known.advice(unknown[0]) if unknown else ""
+    notes = [f"{len(unknown)} names in {where} are not in the scene: {some(unknown)} ({advice})"]
+    return splits, notes if unknown else []

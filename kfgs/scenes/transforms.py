@@ -1,33 +1,133 @@
-"""Read scenes from transforms.json (nerfstudio, instant-ngp, Blender). `transforms_frame` has the conventions."""
+"""Read scenes from transforms.json (nerfstudio, instant-ngp, Blender).
+
+**Convention**: `transform_matrix` is camera to world with OpenGL axes (x right, y up, z backward). kfgs wants world to
+camera with y down and z forward, so the y and z columns change sign and the pose is inverted. World coordinates are those of
+the file: `applied_transform`, which was applied to poses and points, is not undone.
+`cx, cy` are read as in COLMAP (the centre of the first pixel is (0.5, 0.5)), because the converters of nerfstudio and
+instant-ngp copy COLMAP's numbers and both programs sample pixels at +0.5.
+"""
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 
-from .._files import Names, file_stem
-from .depth import MILLIMETRE, points_from_depth
-from .files import (
-    IMAGE_SUFFIXES,
-    SceneError,
-    find_pictures,
-    is_file,
-    list_images,
-    picture_size,
-    read_scene_json,
-    some,
-)  # fmt: skip
-from .posed import PosedPicture, read_points, scene_of_poses
+from .._files import Names, file_stem, read_json
+from ..cameras.camera import Distortion
+from . import files
+from .colmap import PANORAMA
+from .files import IMAGE_SUFFIXES, MAX_NUMBER, MAX_SIDE, SceneError, is_file, list_images, some
+from .posed import MILLIMETRE, Matrix, PosedPicture, points_from_depth, read_points, scene_of_poses
 from .scene import Scene
 from .splits import split_by_lists
-from .transforms_frame import Frame
 
+_LENSES = {  # the coefficients that each camera_model has
+    **dict.fromkeys(("PINHOLE", "SIMPLE_PINHOLE"), ()),
+    **dict.fromkeys(("OPENCV_FISHEYE", "FISHEYE"), ("k1", "k2", "k3", "k4")),
+    **dict.fromkeys(("PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), ("k1", "k2", "p1", "p2", "k3")),
+    "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+}
+_COEFFICIENTS = _LENSES["FULL_OPENCV"]
+_NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", *_COEFFICIENTS)
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL axes to COLMAP's
 _UNNAMED_POINTS = "points3d.ply"  # 3DGS and OpenGaussian write it
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The values of one frame; if the frame lacks one, that at the top of the file."""
+
+    path: Path
+    where: str
+    values: dict[str, Any]
+
+    def fail(self, where: str, expected: str, got: object, advice: str) -> SceneError:
+        """An error that names the file, the frame and the place in it."""
+        place = f"{self.where}, {where}" if where else self.where
+        return SceneError(f"{self.path}, {place}: expected {expected}, got {got!r:.200}; {advice}")
+
+    def number(self, name: str, default: float | None = None) -> float:
+        """A finite number of the frame; a SceneError if it is something else, or missing without a default."""
+        value = self.values.get(name, default)
+        if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) < MAX_NUMBER:
+            raise self.fail(name, "a finite number", value, "add it at the top or in each frame")
+        return float(value)
+
+    @property
+    def broken(self) -> bool:
+        """Whether its pose is missing, or a number of it or of the lens is NaN, infinite or implausible."""
+        rows = self.values.get("transform_matrix")
+        numbers = [self.values.get(name) for name in _NUMBERS]
+        numbers += [number for row in rows if isinstance(row, list) for number in row] if isinstance(rows, list) else []
+        return rows is None or any(isinstance(n, float) and not abs(n) < MAX_NUMBER for n in numbers)
+
+    def lens(self) -> tuple[Matrix, tuple[int, int]]:
+        """K [3, 3], and (width, height) in pixels."""
+        width, height = self.number("w"), self.number("h")
+        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE and width % 1 == 0 and height % 1 == 0):
+            raise self.fail("", f"w and h of 1 to {MAX_SIDE} whole pixels", (width, height), "correct the size")
+        fx, fy = self.focal_length("x", width), self.focal_length("y", height)
+        if fx is None:
+            raise self.fail(
+                "", "'fl_x' or 'camera_angle_x'", sorted(self.values), "add one at the top, or to all frames"
+            )
+        cx, cy = self.number("cx", width / 2), self.number("cy", height / 2)
+        return np.array([[fx, 0, cx], [0, fx if fy is None else fy, cy], [0, 0, 1]]), (int(width), int(height))
+
+    def focal_length(self, axis: str, side: float) -> float | None:
+        """The focal length in pixels along x or y, also from the angle of view; None if the frame has neither."""
+        if f"fl_{axis}" in self.values:
+            return self.number(f"fl_{axis}")
+        name = f"camera_angle_{axis}"
+        if name not in self.values:
+            return None
+        angle = self.number(name)
+        if not 0 < angle < math.pi:
+            raise self.fail(name, "an angle in (0, pi) radians", angle, "correct it")
+        return side / 2 / math.tan(angle / 2)
+
+    def distortion(self) -> Distortion | None:
+        """The lens; a perspective lens whose coefficients are all zero is None.
+
+        The k4 of nerfstudio's perspective camera is the fourth radial term; OpenCV's k4 is the first of the denominator. So
+        k4 is accepted only with FULL_OPENCV, where it can only mean OpenCV's.
+        """
+        model = "OPENCV_FISHEYE" if self.values.get("is_fisheye") is True else self.values.get("camera_model", "OPENCV")
+        if model not in _LENSES:
+            advice = PANORAMA if model == "EQUIRECTANGULAR" else "undistort the images first"
+            raise self.fail("camera_model", f"one of {', '.join(_LENSES)}", model, advice)
+        values, known = {name: self.number(name, 0.0) for name in _COEFFICIENTS}, _LENSES[model]
+        other = {name: value for name, value in values.items() if value and name not in known}
+        if other:
+            advice = 'correct camera_model ("FULL_OPENCV" for OpenCV\'s k4 k5 k6), or undistort the images first'
+            raise self.fail("", f"only {' '.join(known) or 'zeros'} with camera_model {model}", other, advice)
+        coefficients = tuple(values[name] for name in known)
+        if "FISHEYE" in model:
+            return Distortion("kannala_brandt", coefficients)
+        if not any(coefficients):
+            return None
+        used = next(n for n in (4, 5, 8) if not any(coefficients[n:]))  # as few as kornia and OpenCV need
+        return Distortion("brown_conrady", coefficients[:used])
+
+    def pose(self) -> Matrix:  # [4, 4] float64
+        """Camera to world, x right, y down, z forward."""
+        rows = self.values.get("transform_matrix")
+        try:
+            pose = np.array(rows, dtype=np.float64)
+            if pose.shape == (3, 4):
+                pose = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]])
+            if pose.shape != (4, 4):
+                raise ValueError(f"shape {pose.shape}")
+        except (TypeError, ValueError, OverflowError) as error:
+            advice = "correct it, or take the frame out"
+            raise self.fail("transform_matrix", "4 rows of 4 numbers", rows, advice) from error
+        return pose @ FLIP
 
 
 @dataclass
@@ -39,14 +139,14 @@ class _Reader:
     missing: list[str] = field(default_factory=list)
     unmasked: list[str] = field(default_factory=list)
     respelled: list[str] = field(default_factory=list)
+    names: dict[tuple[Path, bool], Names] = field(default_factory=dict)
 
     def read(self, path: Path, top: dict[str, Any], pictures: bool) -> list[PosedPicture]:
         """The views of a file; without `pictures` also those of frames that have no image file or no name."""
         views = []
         for i, values in enumerate(top["frames"]):
             if not isinstance(values, dict):
-                expected = "an object with a 'transform_matrix'"
-                raise Frame(path, f"frame {i}", {}).fail("", expected, values, "take it out of the file")
+                raise Frame(path, f"frame {i}", {}).fail("", "an object with a 'transform_matrix'", values, "drop it")
             frame = Frame(path, f"frame {i}", {**top, **values})
             listed = frame.values.get("file_path") or ("" if pictures else f"{i:04d}")
             named = isinstance(listed, str) and bool(listed)
@@ -59,7 +159,7 @@ class _Reader:
                 continue
             if file is not None and not {"w", "h"} <= set(frame.values):
                 # Blender; a smaller copy in `images` is not what the file is about
-                frame.values["w"], frame.values["h"] = picture_size(self.find_image(listed, None) or file)
+                frame.values["w"], frame.values["h"] = files.picture_size(self.find_image(listed, None) or file)
             if file is None:
                 file = self.root / listed.replace("\\", "/")
                 file = file if file.suffix.lower() in IMAGE_SUFFIXES else file.with_name(f"{file.name}.png")
@@ -72,24 +172,22 @@ class _Reader:
             views.append(view)
         return views
 
-    @cached_property
-    def known(self) -> Names:
-        """The images in the scene folder, for names that are not there as they are written."""
-        return Names(list_images(self.root), bare=True)
-
-    @cached_property
-    def given(self) -> Names:
-        """The images in the folder that the user gave."""
-        return Names([] if self.images is None else list_images(self.images), bare=True)
+    def by_name(self, folder: Path, name: str, *, below: bool = True) -> str | None:
+        """The picture in a folder, or below it, that a name means."""
+        if (folder, below) not in self.names:
+            here = list_images(folder) if below else next(os.walk(folder), ("", [], []))[2]
+            pictures = [file for file in here if file.lower().endswith(IMAGE_SUFFIXES)]
+            self.names[folder, below] = Names(pictures, bare=below)
+        return self.names[folder, below].find(name)
 
     def find_image(self, listed: str, images: Path | None) -> Path | None:
         """The file of a frame: in the folder that the user gave, else as listed, else by `Names`. Only image files count."""
         name = listed.replace("\\", "/").removeprefix("./")
-        if images is not None and (near := self.given.find(name)) is not None:
+        if images is not None and (near := self.by_name(images, name)) is not None:
             return images / near
         if Path(name).suffix.lower() in IMAGE_SUFFIXES and is_file(self.root / name):
             return self.root / name
-        near = self.known.find(name)
+        near = self.by_name(self.root, name)
         if near is None:
             return None
         if name not in (near, file_stem(near)):
@@ -101,10 +199,12 @@ class _Reader:
         if listed is None:
             return None
         place = self.root / str(listed).replace("\\", "/").replace("\0", "")
-        mask = find_pictures(place.parent, [place.name]).get(place.name)
-        if mask is None:
+        if is_file(place):
+            return place
+        near = self.by_name(place.parent, place.name, below=False)
+        if near is None:
             self.unmasked.append(f"{listed!r:.200}")
-        return mask
+        return None if near is None else place.parent / near
 
     def inside(self, listed: Any) -> Path | None:
         """A file that is listed, unless it lies outside of the scene folder."""
@@ -115,23 +215,21 @@ class _Reader:
 
     def name(self, file: Path) -> str:
         """File name relative to `images/` of the scene, or else to the scene folder; for other files, the bare name."""
-        for folder in (self.images, self.root / "images", self.root):
-            if folder is not None and _normal(file).is_relative_to(_normal(folder)):
-                return _normal(file).relative_to(_normal(folder)).as_posix()
+        for folder in map(_normal, filter(None, (self.images, self.root / "images", self.root))):
+            if _normal(file).is_relative_to(folder):
+                return _normal(file).relative_to(folder).as_posix()
         return file.name
 
     def notes(self, views: list[PosedPicture]) -> list[str]:
         """What was noticed, for people."""
-        masks, frames = sum(view.mask is not None for view in views), len(self.missing) + len(views)
-        pairs = [
-            (self.missing, f"{len(self.missing)} of {frames} frames have no image file: {some(self.missing)}"),
-            (masks, f"masks: {masks} of {len(views)} frames have a mask_path; black is ignored"),
-            (self.unmasked, f"{len(self.unmasked)} files of mask_path are missing, and those frames have no mask: "
-             f"{some(self.unmasked)}"),
-            (self.respelled, f"{len(self.respelled)} images were found by a name that is spelled otherwise: "
-             f"{some(self.respelled)}"),
-        ]  # fmt: skip
-        return [note for some_are, note in pairs if some_are]
+        masked = [view.name for view in views if view.mask is not None]
+        told = {
+            f"of {len(self.missing) + len(views)} frames have no image file: {some(self.missing)}": self.missing,
+            f"of {len(views)} frames have a mask_path; black is ignored": masked,
+            f"files of mask_path are missing, and those frames have no mask: {some(self.unmasked)}": self.unmasked,
+            f"images were found by a name that is spelled otherwise: {some(self.respelled)}": self.respelled,
+        }
+        return [f"{'masks: ' * (names is masked)}{len(names)} {note}" for note, names in told.items() if names]
 
 
 def load_transforms(path: Path, images: Path | None = None, *, pictures: bool = True) -> Scene:
@@ -146,50 +244,45 @@ def load_transforms(path: Path, images: Path | None = None, *, pictures: bool = 
     (millimetres, or `integer_depth_scale`) if no lens is distorted. What is black in a `mask_path` is ignored. Splits come from
     the file's lists (`train_filenames`, ...) or from Blender's files; else all views train.
 
-    Args:
-        path: the file, or a folder with `transforms.json` or `transforms_train.json`.
-        images: where to look for image files before the scene folder. Other sizes than the file says resize the cameras.
-        pictures: False reads cameras alone, also of frames without an image file; a frame without `file_path` is named by its
-            number, `0007.png`.
+    Image files are looked for in `images` before the scene folder; other sizes than the file says resize the cameras. Without
+    `pictures` only cameras are read, also of frames without an image file; one without `file_path` is called `0007.png`.
     """
-    files = _files(path)
-    first, tops = next(iter(files.values())), {split: _read_top(file) for split, file in files.items()}
-    reader, top = _Reader(first.parent, images), tops[next(iter(files))]
-    parts = {split: reader.read(file, tops[split], pictures) for split, file in files.items()}
+    sources = _sources(path)
+    first, tops = next(iter(sources.values())), {split: _read_top(file) for split, file in sources.items()}
+    reader, top = _Reader(first.parent, images), tops[next(iter(sources))]
+    parts = {split: reader.read(file, tops[split], pictures) for split, file in sources.items()}
     views = [view for part in parts.values() for view in part]
     if not views:
-        raise SceneError(
-            f"{path}: expected frames with image files, none of {len(reader.missing)} has one ({some(reader.missing, 3)}); copy "
-            "the images next to the file or pass their folder"
-        )
+        got = f"none of {len(reader.missing)} has one ({some(reader.missing, 3)})"
+        advice = "copy the images next to the file or pass their folder"
+        raise SceneError(f"{path}: expected frames with image files, {got}; {advice}")
     if not pictures:
         return scene_of_poses(path, views, notes=reader.notes(views), pictures=False)
     points, told = _points(reader, first, top, views)
     scene = scene_of_poses(path, views, points, [*reader.notes(views), *told], images)
     names = [camera.name for camera in scene.cameras]
     lists = {name: top.get(f"{name}_filenames") for name in ("train", "val", "test")}
-    if "all" not in files:
+    if "all" not in sources:
         lists = {split: [view.name for view in part if view.name in names] for split, part in parts.items()}
-    splits, held = _splits(path, names, lists)
-    return replace(scene, splits=splits, notes=(*scene.notes, *held))
+    splits, told = _splits(path, names, lists)
+    return replace(scene, splits=splits, notes=(*scene.notes, *told))
 
 
-def _files(path: Path) -> dict[str, Path]:
+def _sources(path: Path) -> dict[str, Path]:
     """The files to read, by split; `all` if the file itself has splits or none."""
     if not path.is_dir() or (path / "transforms.json").is_file():
         return {"all": path / "transforms.json" if path.is_dir() else path}
-    files = {name: path / f"transforms_{name}.json" for name in ("train", "test", "val")}
-    files = {name: file for name, file in files.items() if file.is_file()}
-    if "test" in files:  # then nobody needs those for validation
-        files.pop("val", None)
-    return files
+    parts = {name: path / f"transforms_{name}.json" for name in ("train", "test", "val")}
+    needed = {name: file for name, file in parts.items() if file.is_file()}
+    return {name: file for name, file in needed.items() if name != "val" or "test" not in needed}
 
 
 def _read_top(path: Path) -> dict[str, Any]:
-    top = read_scene_json(path, "correct it there")
+    with files.scene_error(after="; correct it there"):
+        top = read_json(path)
     if not isinstance(top, dict) or not isinstance(top.get("frames"), list) or not top["frames"]:
-        place = Frame(path, "top level", {})
-        raise place.fail("", "an object with a list of 'frames'", top, "is this a transforms.json?")
+        expected = "an object with a list of 'frames'"
+        raise Frame(path, "top level", {}).fail("", expected, top, "is this a transforms.json?")
     return top
 
 
@@ -202,19 +295,14 @@ def _points(
     reader: _Reader, path: Path, top: dict[str, Any], views: list[PosedPicture]
 ) -> tuple[tuple[Tensor, Tensor] | None, list[str]]:
     """Points and colours in the frame of the poses, and notes."""
-    listed, notes = top.get("ply_file_path"), list[str]()
+    notes, listed = list[str](), top.get("ply_file_path")
     if listed is None and is_file(reader.root / _UNNAMED_POINTS):
         listed = _UNNAMED_POINTS
-        notes.append(
-            f"points of {listed}, which no file names: 3DGS and OpenGaussian write it; random for Blender scenes"
-        )
+        notes = [f"points of {listed}, which no file names: 3DGS and OpenGaussian write it; random for Blender scenes"]
     file = reader.inside(listed)
     if file is not None:
-        try:
-            points, colors, told = read_points(file)
-        except SceneError as error:
-            advice = f"write the points of {path} again, or remove ply_file_path or the file"
-            raise SceneError(f"{error}; {advice}") from error
+        advice = f"write the points of {path} again, or remove ply_file_path or the file"
+        points, colors, told = read_points(file, advice)
         notes += told
         if len(points):
             return (points, colors), notes

@@ -55,10 +55,8 @@ def extract_frames(video: str | Path, out: str | Path, *, fps: float = 2.0, prog
     check_output("out", out, "a folder")
     held = sorted(file.name for file in out.iterdir()) if out.exists() else []
     if held and (SOURCE not in held or read_json(out / SOURCE) != source):
-        raise FileExistsError(
-            f"{out}: expected a new or empty folder for the pictures, got one with {some(held, 3)}; name another scene folder "
-            "(--out)"
-        )
+        got = f"one with {some(held, 3)}; name another scene folder (--out)"
+        raise FileExistsError(f"{out}: expected a new or empty folder for the pictures, got {got}")
     if not held:
         with atomic_folder(out) as folder:
             for count, frame in enumerate(_sharpest(video, fps, progress), 1):
@@ -78,9 +76,10 @@ def sharpness(frame: Frame) -> float:
 def _sharpest(video: Path, fps: float, progress: bool) -> Iterator[Frame]:
     """The sharpest frame of each interval, one after the other; two frames are in memory."""
     frames = enumerate(tqdm(_decode(video), disable=not progress, unit="frame", desc="frames"))
-    some = ((i / rate, frame) for i, (frame, rate) in frames if i % max(1, round(rate / fps / CANDIDATES)) == 0)
-    for _, group in groupby(some, lambda pair: math.floor(pair[0] * fps)):
-        yield max((frame for _, frame in group), key=sharpness)
+    timed = ((i / rate, rate, frame) for i, (frame, rate) in frames)
+    for _, group in groupby(timed, lambda part: math.floor(part[0] * fps)):
+        some = (frame for n, (_, rate, frame) in enumerate(group) if n % max(1, round(rate / fps / CANDIDATES)) == 0)
+        yield max(some, key=sharpness)
 
 
 def _decode(video: Path) -> Iterator[tuple[Frame, float]]:
@@ -88,9 +87,7 @@ def _decode(video: Path) -> Iterator[tuple[Frame, float]]:
     try:
         ffmpeg = importlib.import_module("imageio_ffmpeg")
     except ImportError as error:
-        raise ImportError(
-            "video: expected imageio-ffmpeg to decode it, but it is not installed; run: pip install imageio-ffmpeg"
-        ) from error
+        raise ImportError("video: expected imageio-ffmpeg to decode it; run: pip install imageio-ffmpeg") from error
     safe = ["-protocol_whitelist", "file"]  # a playlist that is named .mp4 could make ffmpeg fetch pages: files only
     try:
         with closing(ffmpeg.read_frames(str(real_path(video)), pix_fmt="rgb24", input_params=safe)) as frames:
@@ -101,6 +98,5 @@ def _decode(video: Path) -> Iterator[tuple[Frame, float]]:
             for data in frames:
                 yield np.frombuffer(data, np.uint8).reshape(height, width, 3), rate
     except (OSError, RuntimeError, ValueError, KeyError, IndexError, StopIteration) as error:
-        raise SceneError(
-            f"{video}: expected a video that ffmpeg can decode, got an error ({one_line(error, 160)}); convert it to MP4 (H.264)"
-        ) from error
+        got = f"an error ({one_line(error, 160)}); convert it to MP4 (H.264)"
+        raise SceneError(f"{video}: expected a video that ffmpeg can decode, got {got}") from error

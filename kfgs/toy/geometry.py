@@ -103,9 +103,8 @@ def _window(solid: Solid, camera: Camera) -> tuple[slice, slice]:
     xy, z = project(camera, signs * np.array(solid.half) @ solid.rotation().T + np.array(solid.center))
     if z.min() < NEAR:
         return slice(0, camera.height), slice(0, camera.width)
-    (x0, y0), (x1, y1) = (
-        np.clip(ends, 0, [camera.width, camera.height]).astype(int) for ends in (xy.min(0) - 1, xy.max(0) + 2)
-    )
+    ends = np.stack([xy.min(0) - 1, xy.max(0) + 2])
+    (x0, y0), (x1, y1) = np.clip(ends, 0, [camera.width, camera.height]).astype(int)
     return slice(y0, y1), slice(x0, x1)
 
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch.nn.functional import grid_sample
 
 Array = NDArray[np.float64]
 Color = tuple[float, float, float]
@@ -28,10 +29,8 @@ class Noise:
 
     def layer(self, points: Array, wavelength: float) -> Array:  # [N, 3] -> [N]
         """One octave: lattice points `wavelength` / 2 metres apart."""
-        grid = torch.from_numpy((points * (4.0 / (wavelength * (LATTICE - 1)))).astype(np.float32))
-        out = torch.nn.functional.grid_sample(
-            self.volume, grid[None, None, None], mode="bilinear", padding_mode="reflection", align_corners=True
-        )
+        grid = torch.from_numpy((points * (4.0 / (wavelength * (LATTICE - 1)))).astype(np.float32))[None, None, None]
+        out = grid_sample(self.volume, grid, mode="bilinear", padding_mode="reflection", align_corners=True)
         return out.flatten().double().numpy()
 
     def fractal(

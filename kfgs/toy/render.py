@@ -76,9 +76,8 @@ def surface_color(
         solid, p, n = solids[i], points[rows], outward[rows]
         axis = np.argmax(np.abs(n @ solid.rotation()), axis=-1)
         is_round = solid.shape == "ellipsoid"
-        own = evaluate(
-            solid.texture, noise, solid.to_local(p), axis, np.array(solid.half), footprint[rows], is_round=is_round
-        )
+        local, half = solid.to_local(p), np.array(solid.half)
+        own = evaluate(solid.texture, noise, local, axis, half, footprint[rows], is_round=is_round)
         bright = light(p, n, lit[rows, :-1], lit[rows, -1]) + solid.texture.glow
         color[rows] = np.square(np.clip(own, 0.0, 1.0)) * bright  # light multiplies linear values, about squares
     return np.sqrt(-np.expm1(-_EXPOSURE * color))  # bright places turn white slowly, as on film

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from .._check import check_size, check_whole
 from .._files import as_path, atomic_folder, check_output, read_json, write_json
 from ..cameras.camera import Camera
-from ..scenes.pycolmap_import import import_pycolmap
+from ..scenes.colmap import import_pycolmap
 from .geometry import Array, Solid, normals, project, sample_surface, visible
 from .patterns import Noise
 from .render import light_reaches, render, surface_color, walk_cameras
@@ -63,7 +63,7 @@ class ToyConfig:
             object.__setattr__(self, name, tuple(getattr(self, name)))
         if any(f > s for f, s in zip(self.feature_size, self.size, strict=True)):
             raise ValueError(
-                f"feature_size: expected at most size = {self.size}, got {self.feature_size}; make the images larger"
+                f"feature_size: expected at most size = {self.size}, got {self.feature_size}; enlarge size"
             )
 
 
@@ -125,9 +125,10 @@ def make_toy_room(
             rng = np.random.default_rng([config.seed, 4, zlib.crc32(stem.encode())])  # errors follow from seed and name
             features = teacher_features(view.labels, view.image, embeddings, config.feature_size, rng)
             torch.save(torch.from_numpy(features), folder / "features" / f"{stem}_fmap_CxHxW.pt")
+        held = {stem for stem, test in zip(stems, testing, strict=True) if test}
         split = {
-            "train": [stem for stem, test in zip(stems, testing, strict=True) if not test],
-            "test": [stem for stem, test in zip(stems, testing, strict=True) if test],
+            "train": [stem for stem in stems if stem not in held],
+            "test": [stem for stem in stems if stem in held],
         }
         write_json(folder / "split.json", split)
         write_json(folder / "classes.json", list(CLASSES))
@@ -201,13 +202,10 @@ def _write_model(
 ) -> None:
     """Write `cameras.bin`, `images.bin` and `points3D.bin` (one shared PINHOLE camera) into `folder` through pycolmap."""
     pycolmap = import_pycolmap()
-    first = cameras[0]
-    K = first.K.double().numpy()
-    model = pycolmap.Reconstruction()
-    params = [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])]
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(model="PINHOLE", width=first.width, height=first.height, params=params, camera_id=1)
-    )
+    model, (height, width) = pycolmap.Reconstruction(), cameras[0].size
+    params = cameras[0].K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()  # fx, fy, cx, cy
+    lens = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params, camera_id=1)
+    model.add_camera_with_trivial_rig(lens)
     tracks = [pycolmap.Track() for _ in points]
     residuals = np.linalg.norm(pixel_noise, axis=-1)
     for number, camera in enumerate(cameras):

@@ -1,5 +1,7 @@
 import pytest
 import torch
+from cases_gltf import random_cloud
+from scipy.spatial.transform import Rotation
 
 from kfgs import Gaussians
 from kfgs.cameras import Similarity
@@ -7,20 +9,9 @@ from kfgs.formats.values import flip_axes
 from kfgs.splat import evaluate_sh, transform_gaussians
 
 
-def _cloud(n: int = 20) -> Gaussians:
-    g = torch.Generator().manual_seed(3)
-    return Gaussians(
-        means=torch.randn(n, 3, generator=g),
-        quats=torch.randn(n, 4, generator=g),
-        scales=torch.rand(n, 3, generator=g) + 0.1,
-        opacities=torch.rand(n, generator=g),
-        sh=torch.randn(n, 16, 3, generator=g),
-    )
-
-
 @pytest.mark.parametrize("axes", [(1, -1, -1), (-1, 1, 1), (1, 1, -1), (-1, -1, -1)])
 def test_turned_axes_show_the_same_colours(axes):
-    cloud = _cloud()
+    cloud = random_cloud(20)
     directions = torch.nn.functional.normalize(cloud.means.roll(1, 0), dim=1)
     turned = flip_axes(cloud, axes)
     assert torch.equal(turned.means, cloud.means * torch.tensor(axes))
@@ -33,7 +24,7 @@ def test_turned_axes_show_the_same_colours(axes):
 
 @pytest.mark.parametrize("axes", [(1, -1, -1), (-1, 1, -1), (-1, -1, 1)])
 def test_two_axes_turned_are_half_a_turn(axes):
-    cloud = _cloud()
+    cloud = random_cloud(20)
     expected = transform_gaussians(cloud, Similarity(1.0, torch.diag(torch.tensor(axes)).double(), torch.zeros(3)))
     turned = flip_axes(cloud, axes)
     torch.testing.assert_close(turned.means, expected.means)
@@ -44,16 +35,10 @@ def test_two_axes_turned_are_half_a_turn(axes):
 
 
 def test_no_zero_becomes_negative():
-    cloud = _cloud().replace(means=torch.zeros(20, 3))
+    cloud = random_cloud(20).replace(means=torch.zeros(20, 3))
     assert not torch.signbit(flip_axes(cloud, (1, -1, -1)).means).any()
 
 
 def _covariances(g: Gaussians) -> torch.Tensor:  # [N, 3, 3]
-    w, x, y, z = torch.nn.functional.normalize(g.quats, dim=1).unbind(1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    R = torch.stack([torch.stack(row, 1) for row in rows], 1)
+    R = torch.from_numpy(Rotation.from_quat(g.quats[:, [1, 2, 3, 0]].numpy()).as_matrix()).float()
     return R @ torch.diag_embed(g.scales**2) @ R.transpose(1, 2)

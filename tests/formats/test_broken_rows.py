@@ -7,7 +7,7 @@ import zipfile
 import numpy as np
 import pytest
 import torch
-from cases_gltf import json_of_glb
+from cases_gltf import json_of_glb, random_cloud
 from cases_ksplat import ksplat_file, ksplat_section
 from messages import tells
 from oracles_spz import legacy_payload
@@ -24,16 +24,8 @@ KEPT = [row for row in range(N) if row not in BAD]
 
 
 def _cloud(degree: int = 1) -> Gaussians:
-    g = torch.Generator().manual_seed(4)
-    cloud = Gaussians(
-        means=torch.randn(N, 3, generator=g),
-        quats=torch.nn.functional.normalize(torch.randn(N, 4, generator=g), dim=1),
-        scales=torch.rand(N, 3, generator=g) + 0.1,
-        opacities=torch.rand(N, generator=g) * 0.9 + 0.05,
-        sh=torch.randn(N, (degree + 1) ** 2, 3, generator=g) * 0.3,
-        labels=torch.arange(N) % 3 - 1,
-    )
-    return cloud.replace(scores=np.arange(N, dtype=np.float32), names=("rug", "sofa"))
+    scores, names = np.arange(N, dtype=np.float32), ("rug", "sofa")
+    return random_cloud(N, degree, 4, labels=torch.arange(N) % 3 - 1, scores=scores, names=names)
 
 
 def _ply(path, column, value):
@@ -54,14 +46,9 @@ def _same(splats, expected, notes):
 
 @pytest.mark.parametrize(
     ("column", "value", "what"),
-    [
-        ("x", np.nan, "means"),
-        ("scale_1", np.inf, "scales"),
-        ("rot_2", -np.inf, "quats"),
-        ("f_rest_7", np.nan, "sh"),
-        ("opacity", np.nan, "opacities"),
-    ],
-)
+    [("x", np.nan, "means"), ("scale_1", np.inf, "scales"), ("rot_2", -np.inf, "quats"), ("f_rest_7", np.nan, "sh"),
+     ("opacity", np.nan, "opacities")],
+)  # fmt: skip
 def test_in_a_ply(tmp_path, notes, column, value, what):
     path = _ply(tmp_path / "a.ply", column, value)
     splats = read_splats(path)
@@ -95,9 +82,8 @@ def _gltf(path):
     root, data = json_of_glb(path), bytearray(path.read_bytes())
     attributes = root["meshes"][0]["primitives"][0]["attributes"]
     start = data.index(b"BIN\0") + 4
-    for row, (name, width) in zip(
-        BAD, (("POSITION", 3), ("KHR_gaussian_splatting:OPACITY", 1), ("_CLASS_ID", 1)), strict=True
-    ):
+    bent = ("POSITION", 3), ("KHR_gaussian_splatting:OPACITY", 1), ("_CLASS_ID", 1)
+    for row, (name, width) in zip(BAD, bent, strict=True):
         at = start + root["bufferViews"][attributes[name]]["byteOffset"] + 4 * width * row
         data[at : at + 4] = np.float32(np.nan).tobytes()
     at = start + root["bufferViews"][attributes["KHR_gaussian_splatting:ROTATION"]]["byteOffset"] + 16 * BAD[2]
@@ -140,17 +126,10 @@ def test_in_spz_ksplat_and_a_checkpoint(tmp_path):
     row = {"position": (1.0, 2, 3), "alpha": 51, "color": (0, 128, 255), "scale": (160, 128, 96), "rotation": (0, 0, 0)}
     rows = [row, row | {"position": (float("inf"), 0, 0)}, row]
     (tmp_path / "a.spz").write_bytes(gzip.compress(legacy_payload(rows, version=1)))
-    half = (
-        ksplat_file(1, [ksplat_section(1, [0, 1, 2], 0, 3, [])], 3)[:-18] + b"\0\x7c"
-    )  # the last rotation's first half
-    (tmp_path / "a.ksplat").write_bytes(half + ksplat_file(1, [ksplat_section(1, [0, 1, 2], 0, 3, [])], 3)[-16:])
-    values = {
-        "means": torch.zeros(3, 3),
-        "scales": torch.zeros(3, 3),
-        "quats": torch.ones(3, 4),
-        "opacities": torch.zeros(3),
-    }
-    values["means"][1, 2] = torch.nan
+    whole = ksplat_file(1, [ksplat_section(1, [0, 1, 2], 0, 3, [])], 3)
+    (tmp_path / "a.ksplat").write_bytes(whole[:-18] + b"\0\x7c" + whole[-16:])  # the last rotation's first half
+    values = {"means": torch.zeros(3, 3), "scales": torch.zeros(3, 3), "quats": torch.ones(3, 4)}
+    values["opacities"], values["means"][1, 2] = torch.zeros(3), torch.nan
     torch.save({"splats": values | {"sh0": torch.zeros(3, 1, 3)}}, tmp_path / "a.pt")
     for name, left_out in (("a.spz", [1]), ("a.ksplat", [2]), ("a.pt", [1])):
         splats, kept = read_rows(tmp_path / name)
@@ -160,17 +139,8 @@ def test_in_spz_ksplat_and_a_checkpoint(tmp_path):
 
 @pytest.mark.parametrize("name", ["a.ply", "a.splat", "a.pt"])
 def test_rows_of_zeros_are_left_out(tmp_path, notes, name):
-    columns = [
-        "x",
-        "y",
-        "z",
-        "f_dc_0",
-        "f_dc_1",
-        "f_dc_2",
-        "opacity",
-        *(f"scale_{i}" for i in range(3)),
-        *(f"rot_{i}" for i in range(4)),
-    ]
+    columns = [*"xyz", *(f"f_dc_{i}" for i in range(3)), "opacity"]
+    columns += [*(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     values = {column: np.zeros(1000, np.float32) for column in columns}
     for i, column in enumerate(columns):
         values[column][0] = i / 8 + 0.125
@@ -180,13 +150,8 @@ def test_rows_of_zeros_are_left_out(tmp_path, notes, name):
         (tmp_path / name).write_bytes(np.float32([1, 2, 3, 1, 1, 1]).tobytes() + b"\x90" * 8 + bytes(32 * 999))
     else:
         tensor = torch.from_numpy(np.stack([values[column] for column in columns], 1))
-        splats = {
-            "means": tensor[:, :3],
-            "sh0": tensor[:, None, 3:6],
-            "opacities": tensor[:, 6],
-            "scales": tensor[:, 7:10],
-        }
-        splats |= {"quats": tensor[:, 10:]}
+        splats = {"means": tensor[:, :3], "sh0": tensor[:, None, 3:6], "opacities": tensor[:, 6]}
+        splats |= {"scales": tensor[:, 7:10], "quats": tensor[:, 10:]}
         torch.save({"splats": {key: value.contiguous() for key, value in splats.items()}}, tmp_path / name)
     splats = read_splats(tmp_path / name)
     assert len(splats) == 1

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from messages import tells
+from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from kfgs.cli import main
@@ -93,8 +94,7 @@ def write_frame(run: Path) -> None:
 
 def test_gsplat_values_are_activated(tmp_path: Path) -> None:
     raw = raw_values()
-    file = read_splats(write_gsplat(tmp_path / "ckpt_29999_rank0.pt", raw))
-    cloud = file
+    cloud = read_splats(write_gsplat(tmp_path / "ckpt_29999_rank0.pt", raw))
     assert torch.equal(cloud.means, raw["means"])
     for row in range(N):
         for axis in range(3):
@@ -103,7 +103,7 @@ def test_gsplat_values_are_activated(tmp_path: Path) -> None:
     torch.testing.assert_close(cloud.quats / cloud.quats.norm(dim=1, keepdim=True),
                                raw["quats"] / raw["quats"].norm(dim=1, keepdim=True))  # fmt: skip
     assert torch.equal(cloud.sh, torch.cat([raw["dc"], raw["rest"]], 1))
-    write_splats(file, tmp_path / "same.ply")
+    write_splats(cloud, tmp_path / "same.ply")
     torch.testing.assert_close(read_splats(tmp_path / "same.ply").scales, cloud.scales)
 
 
@@ -125,8 +125,7 @@ def test_nerfstudio_lies_in_the_frame_of_the_data(tmp_path: Path) -> None:
     raw = raw_values()
     path = write_nerfstudio(tmp_path / "nerfstudio_models/step-000029999.ckpt", raw)
     write_frame(tmp_path)
-    file = read_splats(tmp_path)
-    cloud = file
+    cloud = read_splats(tmp_path)
     forward = SCALE * (cloud.means.double().numpy() @ R.T + SHIFT)  # what nerfstudio does to the data
     np.testing.assert_allclose(forward, raw["means"].numpy(), atol=1e-5)
     torch.testing.assert_close(cloud.scales * SCALE, raw["scales"].exp())
@@ -144,14 +143,7 @@ def test_nerfstudio_lies_in_the_frame_of_the_data(tmp_path: Path) -> None:
 
 
 def _covariance(quat: Tensor, scales: Tensor) -> np.ndarray:
-    w, x, y, z = (quat / quat.norm()).double().tolist()
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    turn = Rotation.from_quat(quat[[1, 2, 3, 0]].numpy()).as_matrix()
     return turn @ np.diag(scales.double().numpy() ** 2) @ turn.T
 
 

@@ -42,9 +42,8 @@ def test_where_there_are_both_harmonics_count_and_the_others_are_kept(tmp_path):
     splats = read_splats(tmp_path / "a.ply")
     np.testing.assert_array_equal(splats.sh[:, 0, 1], columns["f_dc_1"])
     assert sorted(splats.extra) == ["blue", "green", "red"]
-    write_ply(
-        tmp_path / "b.ply", {name: values for name, values in columns.items() if name != "green" and name[:2] != "f_"}
-    )
+    rest = {name: values for name, values in columns.items() if name != "green" and name[:2] != "f_"}
+    write_ply(tmp_path / "b.ply", rest)
     assert sorted(read_splats(tmp_path / "b.ply").extra) == ["blue", "red"]  # no colour
 
 
@@ -63,23 +62,16 @@ def test_degree_4_is_read_up_to_degree_3_and_noted(tmp_path, notes):
     write_splats(splats, tmp_path / "a.gltf")
     root = json.loads((tmp_path / "a.gltf").read_text())
     attributes = root["meshes"][0]["primitives"][0]["attributes"]
-    for i in range(9):
-        attributes[f"KHR_gaussian_splatting:SH_DEGREE_4_COEF_{i}"] = attributes[
-            "KHR_gaussian_splatting:SH_DEGREE_0_COEF_0"
-        ]
+    name = "KHR_gaussian_splatting:SH_DEGREE_{}_COEF_{}"
+    attributes |= {name.format(4, i): attributes[name.format(0, 0)] for i in range(9)}
     (tmp_path / "b.gltf").write_text(json.dumps(root))
     back = read_splats(tmp_path / "b.gltf")
     assert notes[-1] == "b.gltf: " + NOTE
     assert torch.equal(back.sh, read_splats(tmp_path / "a.gltf").sh)
 
     g = splats
-    values = {
-        "means": g.means,
-        "scales": g.scales.log(),
-        "quats": g.quats,
-        "opacities": g.opacities.logit(),
-        "sh0": g.sh[:, :1],
-    }
+    values = {"means": g.means, "scales": g.scales.log(), "quats": g.quats, "opacities": g.opacities.logit()}
+    values["sh0"] = g.sh[:, :1]
     torch.save({"splats": values | {"shN": torch.cat([g.sh[:, 1:], torch.ones(50, 9, 3)], 1)}}, tmp_path / "a.pt")
     back = read_splats(tmp_path / "a.pt")
     assert notes[-1] == "a.pt: " + NOTE
@@ -89,15 +81,10 @@ def test_degree_4_is_read_up_to_degree_3_and_noted(tmp_path, notes):
 @pytest.mark.parametrize("coding", ["utf-8", "latin-1", "utf-8-sig"])
 def test_names_and_comments_that_are_not_ascii(tmp_path, coding):
     write_ply(tmp_path / "a.ply", _columns() | {"größe": np.arange(50, dtype="f4")}, comments=("Büro",))
-    (tmp_path / "b.ply").write_bytes(
-        (tmp_path / "a.ply").read_bytes().replace("größe".encode(), "größe".encode(coding.replace("-sig", "")))
-    )
-    mark = b"\xef\xbb\xbf" if coding == "utf-8-sig" else b""
-    if coding == "latin-1":
-        (tmp_path / "b.ply").write_bytes(
-            (tmp_path / "b.ply").read_bytes().replace("Büro".encode(), "Büro".encode("latin-1"))
-        )
-    (tmp_path / "b.ply").write_bytes(mark + (tmp_path / "b.ply").read_bytes())
+    content = (tmp_path / "a.ply").read_bytes()
+    for word in ("größe", "Büro"):
+        content = content.replace(word.encode(), word.encode(coding.replace("-sig", "")))
+    (tmp_path / "b.ply").write_bytes((b"\xef\xbb\xbf" if coding == "utf-8-sig" else b"") + content)
     assert read_header(tmp_path / "b.ply").comments == ["Büro"]
     splats = read_splats(tmp_path / "b.ply")
     assert list(splats.extra) == ["größe"]
@@ -109,9 +96,7 @@ def test_names_and_comments_that_are_not_ascii(tmp_path, coding):
 def test_names_that_a_ply_cannot_have_are_dropped_in_words(tmp_path):
     write_ply(tmp_path / "a.ply", _columns() | {"mine": np.arange(50, dtype="f4")})
     splats = read_splats(tmp_path / "a.ply")
-    splats = splats.replace(
-        extra={"my column": splats.extra["mine"], "x": splats.extra["mine"], "ok": splats.extra["mine"]}
-    )
+    splats = splats.replace(extra=dict.fromkeys(("my column", "x", "ok"), splats.extra["mine"]))
     assert write_splats(splats, tmp_path / "b.ply").lost == ("the columns my column, x: .ply has no place for them",)
     back = read_splats(tmp_path / "b.ply")
     assert list(back.extra) == ["ok"]

@@ -86,17 +86,13 @@ def test_quantised_gltf_is_read_to_half_a_step(tmp_path, bits):
         stride = -(-values[0].nbytes // 4) * 4  # attributes lie at multiples of four bytes
         padded = b"".join(row.tobytes().ljust(stride, b"\0") for row in values)
         views.append(pygltflib.BufferView(buffer=0, byteOffset=len(blob), byteLength=len(padded), byteStride=stride))
-        accessors.append(
-            pygltflib.Accessor(bufferView=i, componentType=component, normalized=normalized, count=N, type=kind)
-        )
+        about = {"componentType": component, "normalized": normalized, "count": N, "type": kind}
+        accessors.append(pygltflib.Accessor(bufferView=i, **about))
         blob += padded
-    accessors[0].min, accessors[0].max = (
-        data["POSITION"][3].min(0).tolist(),
-        data["POSITION"][3].max(0).tolist(),
-    )
-    primitive = pygltflib.Primitive(
-        mode=0, extensions={extension: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}}
-    )
+    places = data["POSITION"][3]
+    accessors[0].min, accessors[0].max = places.min(0).tolist(), places.max(0).tolist()
+    shown = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    primitive = pygltflib.Primitive(mode=0, extensions={extension: shown})
     for i, name in enumerate(data):
         setattr(primitive.attributes, name, i)
     document = pygltflib.GLTF2(

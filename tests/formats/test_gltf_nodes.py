@@ -36,12 +36,8 @@ def test_a_node_moves_resizes_and_turns(tmp_path):
 def test_a_turned_node_looks_the_same_from_a_moved_camera(tmp_path, degree):
     cloud = random_cloud(30, degree)
     R = Rotation.from_euler("xyz", [25, -65, 110], degrees=True).as_matrix()
-    node = {
-        "mesh": 0,
-        "translation": [1, 2, 3],
-        "scale": [1.5] * 3,
-        "rotation": Rotation.from_matrix(R).as_quat().tolist(),
-    }
+    turn = Rotation.from_matrix(R).as_quat().tolist()
+    node = {"mesh": 0, "translation": [1, 2, 3], "scale": [1.5] * 3, "rotation": turn}
     moved = read_splats(bent_gltf(tmp_path, cloud, **{"nodes": [node]}))
     S = np.diag([1.0, -1.0, -1.0])  # glTF's axes against ours
     motion = Similarity(1.5, torch.from_numpy(S @ R @ S), torch.tensor([1.0, -2.0, -3.0]))

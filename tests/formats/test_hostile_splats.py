@@ -13,9 +13,9 @@ import zipfile
 import numpy as np
 import pytest
 import torch
+from cases_gltf import random_cloud
 from oracles_spz import legacy_payload
 
-from kfgs import Gaussians
 from kfgs.formats import read_splats, write_splats
 from kfgs.formats.table import formats
 
@@ -24,19 +24,6 @@ MOST_SECONDS = 5.0
 FLIPS, CUTS = 120, 60
 FORMATS = [name for name, module in formats().items() if hasattr(module, "write")]
 KINDS = [*FORMATS, "gltf-text", "ascii", "spz-2", "ksplat"]
-
-
-def _cloud(n: int = 40) -> Gaussians:
-    g = torch.Generator().manual_seed(2)
-    cloud = Gaussians(
-        means=torch.randn(n, 3, generator=g),
-        quats=torch.randn(n, 4, generator=g),
-        scales=torch.rand(n, 3, generator=g) + 0.1,
-        opacities=torch.rand(n, generator=g) * 0.9 + 0.05,
-        sh=torch.randn(n, 4, 3, generator=g) * 0.3,
-        labels=torch.arange(n) % 3,
-    )
-    return cloud.replace(names=("a", "b", "c"))
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +44,7 @@ def sound(tmp_path_factory, request):
             row = {"position": (256, -512, 768), "alpha": 51, "color": (0, 128, 255), "scale": (160, 128, 96)}
             return ".spz", gzip.compress(legacy_payload([row | {"rotation": (191, 64, 200)}] * 40, version=2))
         suffix = ".gltf" if kind == "gltf-text" else formats()[kind].SUFFIXES[0]
-        write_splats(_cloud(), folder / f"a{suffix}")
+        write_splats(random_cloud(40, 1, labels=torch.arange(40) % 3, names=("a", "b", "c")), folder / f"a{suffix}")
         return suffix, (folder / f"a{suffix}").read_bytes()
 
     return make
@@ -165,10 +152,8 @@ def test_any_value_in_the_json_of_gltf(tmp_path, sound):
     suffix, content = sound("gltf-text")
     root = json.loads(content)
     root["extensionsRequired"] = ["KHR_gaussian_splatting"]
-    root["nodes"] = [
-        {"children": [1], "scale": [2, 2, 2]},
-        {"mesh": 0, "rotation": [0, 0, 1, 0], "translation": [1, 2, 3]},
-    ]
+    placed = {"mesh": 0, "rotation": [0, 0, 1, 0], "translation": [1, 2, 3]}
+    root["nodes"] = [{"children": [1], "scale": [2, 2, 2]}, placed]
     root["bufferViews"][0]["byteStride"] = 12
     root["accessors"][0]["normalized"] = False
     outcomes = [_read(tmp_path / f"bad{suffix}", json.dumps(bent).encode()) for bent in _documents(root)]

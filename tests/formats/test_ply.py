@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from cases_gltf import random_cloud
 from messages import tells
 
 from kfgs import Gaussians
@@ -17,16 +18,8 @@ from kfgs.formats.ply_3dgs import columns_from_gaussians, gaussians_from_columns
 
 
 def _cloud(n: int = 7, degree: int = 3) -> Gaussians:
-    g = torch.Generator().manual_seed(3)
-    return Gaussians(
-        means=torch.randn(n, 3, generator=g),
-        quats=torch.randn(n, 4, generator=g),
-        scales=torch.rand(n, 3, generator=g) + 0.1,
-        opacities=torch.rand(n, generator=g) * 0.9 + 0.05,
-        features=torch.randn(n, 9, generator=g),
-        sh=torch.randn(n, (degree + 1) ** 2, 3, generator=g),
-        labels=torch.arange(n) - 1,
-    )
+    features = torch.randn(n, 9, generator=torch.Generator().manual_seed(1))
+    return random_cloud(n, degree, features=features, labels=torch.arange(n) - 1)
 
 
 def test_gaussians_survive_the_file(tmp_path):

@@ -9,20 +9,11 @@ from kfgs import Gaussians
 from kfgs.cameras import Camera
 from kfgs.fields import uplift_maps
 from kfgs.formats import read_splats, write_splats
-from kfgs.formats.ply import write_ply
-from kfgs.formats.ply_3dgs import columns_from_gaussians
-from kfgs.splat.covariance import covariance_3d
 
 
 def cloud(n=5, **changes):
-    values = {
-        "means": torch.rand(n, 3),
-        "quats": torch.ones(n, 4),
-        "scales": torch.full((n, 3), 0.1),
-        "opacities": torch.full((n,), 0.5),
-        "sh": torch.zeros(n, 4, 3),
-    }
-    return Gaussians(**values | changes)
+    values = {"means": torch.rand(n, 3), "quats": torch.ones(n, 4), "scales": torch.full((n, 3), 0.1)}
+    return Gaussians(**values | {"opacities": torch.full((n,), 0.5), "sh": torch.zeros(n, 4, 3)} | changes)
 
 
 WRONG = {
@@ -54,19 +45,6 @@ def test_writers_and_fusing_refuse_the_same_values(name, tmp_path):
     camera = Camera.look_at((0, -4, 0), (0, 0, 0), width=32, height=24)
     with pytest.raises(ValueError, match=tells(*parts)):
         uplift_maps(cloud(**changes), [camera], [torch.rand(6, 8, 4)])
-
-
-def test_a_rotation_of_length_0_in_a_file_is_read_as_none(tmp_path):
-    """As the rasteriser reads it."""
-    columns = columns_from_gaussians(cloud())
-    for i in range(4):
-        columns[f"rot_{i}"][2] = 0
-    write_ply(tmp_path / "a.ply", columns)
-    quats = read_splats(tmp_path / "a.ply").quats
-    assert quats.tolist() == [[1, 1, 1, 1]] * 2 + [[1, 0, 0, 0]] + [[1, 1, 1, 1]] * 2
-    assert covariance_3d(quats, torch.ones(5, 3)).equal(
-        covariance_3d(quats * (quats.norm(dim=1) > 1)[:, None], torch.ones(5, 3))
-    )
 
 
 def test_maps_without_features_are_named_not_the_frame():

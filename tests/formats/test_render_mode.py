@@ -8,6 +8,7 @@ import numpy as np
 import oracles_splat as oracle
 import pytest
 import torch
+from cases_gltf import random_cloud
 
 from kfgs import Gaussians
 from kfgs.cameras import Camera
@@ -22,16 +23,8 @@ HOLD_ANTIALIASED = ("compressed_ply", "ply", "spz", "sog")
 
 
 def _splats(antialiased: bool = False) -> Gaussians:
-    g = torch.Generator().manual_seed(2)
-    cloud = Gaussians(
-        means=torch.randn(5, 3, generator=g),
-        quats=torch.randn(5, 4, generator=g),
-        scales=torch.rand(5, 3, generator=g) + 0.1,
-        opacities=torch.rand(5, generator=g),
-        sh=torch.randn(5, 1, 3, generator=g) * 0.3,
-        antialiased=antialiased,
-    )
-    return cloud
+    cloud = random_cloud(5, 0, antialiased=antialiased)
+    return cloud.replace(sh=0.3 * cloud.sh)
 
 
 def _through(folder, to, splats):
@@ -41,36 +34,26 @@ def _through(folder, to, splats):
     return suffix, written.lost, read_splats(written.paths[0])
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("to", WRITABLE)
-def test_antialiased_is_kept_or_named(tmp_path, to):
-    suffix, lost, back = _through(tmp_path, to, _splats(antialiased=True))
-    kept = to in HOLD_ANTIALIASED
-    assert back.antialiased is kept
+def test_antialiased_is_kept_or_named_and_a_plain_cloud_stays_plain(tmp_path, notes, to, antialiased):
+    suffix, lost, back = _through(tmp_path, to, _splats(antialiased))
+    kept = to in HOLD_ANTIALIASED or not antialiased
+    assert back.antialiased is (antialiased and kept)
     assert lost == (() if kept else (f"antialiased rendering: {suffix} has no place for it",))
-
-
-@pytest.mark.parametrize("to", WRITABLE)
-def test_a_plain_cloud_stays_plain(tmp_path, notes, to):
-    _, lost, back = _through(tmp_path, to, _splats())
-    assert (lost, back.antialiased, notes) == ((), False, [])
+    assert notes == []
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply"])
 def test_comments_are_those_that_others_look_for(tmp_path, suffix):
-    for mode, comments in (
-        ({"antialiased": True}, ["SplatRenderMode: mip", "antialiased 1"]),
-        ({}, []),
-    ):
-        write_splats(_splats(**mode), tmp_path / f"a{suffix}")
+    for antialiased, comments in ((True, ["SplatRenderMode: mip", "antialiased 1"]), (False, [])):
+        write_splats(_splats(antialiased), tmp_path / f"a{suffix}")
         assert read_header(tmp_path / f"a{suffix}").comments == ["written by kfgs", *comments]
 
 
 def test_meta_has_the_keys_that_others_look_for(tmp_path):
-    for mode, keys in (
-        ({"antialiased": True}, {"antialias": True, "model": "antialiased"}),
-        ({}, {}),
-    ):
-        write_splats(_splats(**mode), tmp_path / "a.sog")
+    for antialiased, keys in ((True, {"antialias": True, "model": "antialiased"}), (False, {})):
+        write_splats(_splats(antialiased), tmp_path / "a.sog")
         with zipfile.ZipFile(tmp_path / "a.sog") as archive:
             meta = json.loads(archive.read("meta.json"))
         assert {key: meta[key] for key in ("antialias", "model") if key in meta} == keys

@@ -4,6 +4,7 @@ import zipfile
 import numpy as np
 import pytest
 import torch
+from cases_gltf import random_cloud
 from messages import tells
 
 from kfgs import Gaussians
@@ -14,16 +15,7 @@ CLASSES = ("wall", "Stuhl ä", "plant")
 
 
 def _splats(n: int = 6) -> Gaussians:
-    g = torch.Generator().manual_seed(1)
-    cloud = Gaussians(
-        means=torch.randn(n, 3, generator=g),
-        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
-        scales=torch.ones(n, 3),
-        opacities=torch.full((n,), 0.5),
-        sh=torch.randn(n, 1, 3, generator=g),
-        labels=torch.arange(n) % 4 - 1,
-    )
-    return cloud.replace(scores=np.linspace(0, 1, n), names=CLASSES)
+    return random_cloud(n, 0, labels=torch.arange(n) % 4 - 1, scores=np.linspace(0, 1, n), names=CLASSES)
 
 
 @pytest.fixture

@@ -4,15 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from colmap_models import (
-    CAMERAS,
-    IMAGES,
-    pycolmap,
-    read_with_pycolmap,
-    write_model,
-    write_picture,
-    write_text_model,
-)
+from colmap_models import CAMERAS, IMAGES, pycolmap, read_with_pycolmap, write_model, write_picture, write_text_model
 from messages import tells
 
 from kfgs._notes import hear

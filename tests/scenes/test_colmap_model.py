@@ -5,15 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from colmap_models import (
-    CAMERAS,
-    IMAGES,
-    POINTS,
-    pycolmap,
-    read_with_pycolmap,
-    write_model,
-    write_text_model,
-)
+from colmap_models import CAMERAS, IMAGES, POINTS, pycolmap, read_with_pycolmap, write_model, write_text_model
 from messages import tells
 
 from kfgs._notes import Repair
@@ -26,16 +18,12 @@ LAYOUTS = [(text, rigs) for text in (False, True) for rigs in (False, True)]
 def _read_alike(folder: Path) -> ColmapModel:
     """Read a model with kfgs and with pycolmap; cameras, poses and points must be the same."""
     ours, theirs = read_model(folder), read_with_pycolmap(folder)
-    assert {i: (c.model, c.width, c.height, c.params) for i, c in ours.cameras.items()} == {
-        i: (c.model_name, c.width, c.height, tuple(c.params)) for i, c in theirs.cameras.items()
-    }
-    assert {i: (image.name, image.camera_id) for i, image in ours.images.items()} == {
-        i: (image.name, image.camera_id) for i, image in theirs.images.items()
-    }
-    for i, image in theirs.images.items():
-        np.testing.assert_allclose(
-            ours.images[i].pose[:3], image.cam_from_world().matrix(), rtol=0, atol=1e-6
-        )  # pycolmap does not normalise
+    lenses = {i: (c.model_name, c.width, c.height, tuple(c.params)) for i, c in theirs.cameras.items()}
+    assert {i: (c.model, c.width, c.height, c.params) for i, c in ours.cameras.items()} == lenses
+    names = [{i: (image.name, image.camera_id) for i, image in m.images.items()} for m in (ours, theirs)]
+    assert names[0] == names[1]
+    for i, image in theirs.images.items():  # pycolmap does not normalise
+        np.testing.assert_allclose(ours.images[i].pose[:3], image.cam_from_world().matrix(), rtol=0, atol=1e-6)
         seen = [point.point3D_id if point.has_point3D() else -1 for point in image.points2D]
         assert ours.images[i].observed.tolist() == seen
     assert ours.point_ids.tolist() == sorted(theirs.points3D)
@@ -173,24 +161,24 @@ def test_a_huge_count_is_refused_before_anything_is_allocated(tmp_path: Path) ->
 
 
 BAD_TABLES = [
-    ({"cameras": CAMERAS.replace("PINHOLE", "BANANA")}, ["cameras.txt", "record 1", "'BANANA'"]),
+    ({"cameras": CAMERAS.replace("PINHOLE", "BANANA")}, ["cameras.txt", "line 1 ", "'BANANA'"]),
     ({"cameras": CAMERAS.replace("31 25", "31")}, ["cameras.txt", "3 parameters, not 4"]),
     ({"cameras": CAMERAS.replace("50 55", "half 55")}, ["'half'"]),
     ({"cameras": CAMERAS.replace("64 48", "0 48")}, ["(0, 48) pixels"]),
-    ({"cameras": CAMERAS + CAMERAS}, ["record 2", "id 1 again"]),
+    ({"cameras": "# a comment\n" + CAMERAS + CAMERAS}, ["line 3 ", "id 1 again"]),
     ({"cameras": CAMERAS.replace("1 P", "2 P")}, ["expected cameras for all images", "image 1 (camera 1)"]),
-    ({"images": IMAGES.replace("1 2 3 1 b", "1 x 3 1 b")}, ["images.txt", "record 2", "'x'"]),
+    ({"images": IMAGES.replace("1 2 3 1 b", "1 x 3 1 b")}, ["images.txt", "line 3 ", "'x'"]),
     ({"images": IMAGES.replace("b.png", "../b.png")}, ["inside the image folder", "'../b.png'", "rename"]),
     ({"images": IMAGES.replace("b.png", "/etc/b.png")}, ["inside the image folder", "'/etc/b.png'", "rename"]),
-    ({"images": IMAGES.replace("2 0.6", "1 0.6")}, ["record 2", "id 1 again"]),
-    ({"images": IMAGES.removesuffix("5 6 7\n")}, ["record 2", "no", "2-D points"]),
-    ({"images": IMAGES.replace("5 6 7", "5 6")}, ["record 2", "2-D points as X Y POINT3D_ID"]),
-    ({"images": IMAGES.replace("5 6 7", "5 6 7.5")}, ["record 2", "'7.5'"]),
-    ({"points3D": "1" * 20 + POINTS[1:]}, ["points3D.txt", "record 1"]),
-    ({"points3D": POINTS.replace("1 0 2 0", "1 0 2")}, ["points3D.txt", "record 1"]),
+    ({"images": IMAGES.replace("2 0.6", "1 0.6")}, ["line 4 ", "id 1 again"]),
+    ({"images": IMAGES.removesuffix("5 6 7\n")}, ["line 3 ", "no", "2-D points"]),
+    ({"images": IMAGES.replace("5 6 7", "5 6")}, ["line 4 ", "2-D points as X Y POINT3D_ID"]),
+    ({"images": IMAGES.replace("5 6 7", "5 6 7.5")}, ["line 4 ", "'7.5'"]),
+    ({"points3D": "1" * 20 + POINTS[1:]}, ["points3D.txt", "line 1 "]),
+    ({"points3D": POINTS.replace("1 0 2 0", "1 0 2")}, ["points3D.txt", "line 1 "]),
     ({"points3D": POINTS.replace("1 0 2 0", "1 0 -2 0")}, ["points3D.txt", "-2"]),
     ({"points3D": POINTS + POINTS}, ["points3D.txt", "id 7 again"]),
-    ({"points3D": POINTS.replace("10 20 30", "10 256 30")}, ["points3D.txt", "record 1", "256"]),
+    ({"points3D": POINTS.replace("10 20 30", "10 256 30")}, ["points3D.txt", "line 1 ", "256"]),
 ]
 
 

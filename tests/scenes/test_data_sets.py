@@ -93,7 +93,7 @@ def test_replica_that_is_not_whole(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match=tells("traj.txt", "2 lines", "numbers up to 2", "copy the whole folder")):
         load_scene(folder)
     (folder / "traj.txt").write_text("1 2 3\n")
-    with pytest.raises(SceneError, match=tells("traj.txt", "16 numbers", "lines of 3")):
+    with pytest.raises(SceneError, match=tells("traj.txt", "16 numbers", "1 rows of [3]")):
         load_scene(folder)
     (folder / "traj.txt").write_text("1 2 3\n1 2\n")
     with pytest.raises(SceneError, match=tells("traj.txt", "2 rows of [2, 3] numbers")):
@@ -169,7 +169,7 @@ def test_scannet(tmp_path: Path) -> None:
 def test_scannet_that_is_not_whole(tmp_path: Path) -> None:
     folder = _scannet(tmp_path)
     (folder / "pose/0.txt").write_text("1 2 3\n")
-    with pytest.raises(SceneError, match=tells("0.txt", "4 rows of 4 numbers", "(1, 3)")):
+    with pytest.raises(SceneError, match=tells("0.txt", "4 rows of 4 numbers", "1 rows of [3]")):
         load_scene(folder)
     (folder / "pose/0.txt").write_text("one two")
     with pytest.raises(SceneError, match=tells("0.txt", "4 rows of 4 numbers", "'one'")):

@@ -46,14 +46,8 @@ def paint(path: Path, seed: int, size: tuple[int, int] = (6, 8)) -> None:
 def scene_of(paths: dict[str, Path]) -> Scene:
     """Views of 8 x 6 pixels by their stems."""
     cameras = [Camera(torch.eye(4), torch.eye(3), 8, 6, name=f"{stem}.png") for stem in paths]
-    nothing = torch.zeros(0, 3)
-    return Scene(
-        cameras,
-        list(paths.values()),
-        nothing,
-        nothing.byte(),
-        {"train": [0, 2], "test": [1]} if len(paths) == 3 else {},
-    )
+    nothing, splits = torch.zeros(0, 3), {"train": [0, 2], "test": [1]} if len(paths) == 3 else {}
+    return Scene(cameras, list(paths.values()), nothing, nothing.byte(), splits)
 
 
 @pytest.fixture

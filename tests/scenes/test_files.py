@@ -11,8 +11,8 @@ from messages import tells
 from PIL import Image
 
 from kfgs.scenes import SceneError, read_image
-from kfgs.scenes.depth import read_depth
 from kfgs.scenes.files import picture_size
+from kfgs.scenes.posed import read_depth
 
 RNG = np.random.default_rng(0)
 COLORS = RNG.integers(0, 256, (5, 7, 3), dtype=np.uint8)
@@ -105,13 +105,8 @@ def test_a_small_file_of_many_pixels_is_refused_before_memory_is_asked_for(tmp_p
 
 
 def test_what_a_decoder_raises_is_named(tmp_path, monkeypatch):
-    for content in (
-        b"",
-        b"\xff\xd8\xff\xe0" + bytes(100),
-        png(7, 5, b"\0" * 3),
-        b"II*\0" + bytes(60),
-        b"RIFF\0\0\0\0WEBPVP8 ",
-    ):
+    jpeg, tiff, webp = b"\xff\xd8\xff\xe0" + bytes(100), b"II*\0" + bytes(60), b"RIFF\0\0\0\0WEBPVP8 "
+    for content in (b"", jpeg, png(7, 5, b"\0" * 3), tiff, webp):
         (tmp_path / "a.png").write_bytes(content)
         with pytest.raises(SceneError, match=tells("a.png", "PNG, JPEG, TIFF or WebP", "cannot be decoded", "replace")):
             read_image(tmp_path / "a.png")
@@ -127,30 +122,6 @@ def test_what_a_decoder_raises_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(Image.Image, "convert", short)
     with pytest.raises(SceneError, match=tells("a.png", "MemoryError")):
         read_image(tmp_path / "a.png")
-
-
-SHORT = """
-import os, resource, sys
-from kfgs.scenes import SceneError, read_image
-read_image(sys.argv[2])  # a small one: loads all that is needed
-with open("/proc/self/statm") as about:
-    now = int(about.read().split()[0]) * resource.getpagesize()
-codes = []
-for more in map(int, sys.argv[3:]):
-    child = os.fork()
-    if child == 0:
-        code = 70
-        try:
-            resource.setrlimit(resource.RLIMIT_AS, (now + (more << 20),) * 2)
-            read_image(sys.argv[1])
-            code = 0
-        except SceneError as error:
-            code = 3 if sys.argv[1] in str(error) and "cannot be decoded" in str(error) else 4
-        finally:
-            os._exit(code)
-    codes.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
-print(codes)
-"""
 
 
 def test_depth_of_a_palette_is_refused_as_its_numbers_are_colours(tmp_path):

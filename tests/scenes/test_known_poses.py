@@ -16,8 +16,8 @@ from kfgs.cameras import Camera, Distortion
 from kfgs.cli import main
 from kfgs.formats.ply import write_ply
 from kfgs.scenes import Scene, SceneError, SfmConfig, find_points, load_scene
+from kfgs.scenes.colmap import import_pycolmap
 from kfgs.scenes.known_poses import neighbours
-from kfgs.scenes.pycolmap_import import import_pycolmap
 
 FEW = SfmConfig(max_features=1500, num_threads=1)
 
@@ -36,15 +36,8 @@ def posed(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Scene:
         small = camera.resized(height, width)
         pose = np.linalg.inv(small.viewmat.double().numpy()) @ np.diag([1.0, -1, -1, 1])
         fx, fy, cx, cy = (float(small.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        lens = {
-            "fl_x": fx,
-            "fl_y": fy,
-            "cx": cx,
-            "cy": cy,
-            "k1": small.distortion.coefficients[0],
-            "w": width,
-            "h": height,
-        }
+        lens = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "k1": small.distortion.coefficients[0]}
+        lens |= {"w": width, "h": height}
         frames.append({"file_path": f"images/{file.name}", "transform_matrix": pose.tolist(), **lens})
     (folder / "transforms.json").write_text(json.dumps({"frames": frames}))
     return load_scene(folder, split="all")
@@ -128,9 +121,8 @@ def test_each_lens_reaches_pycolmap(posed: Scene) -> None:
                                 ("kannala_brandt", (0.1, -0.02, 0.01, 0.005))):  # fmt: skip
         lens = None if model is None else Distortion(model, coefficients)
         K = torch.tensor([[50.0, 0, 31], [0, 55, 25], [0, 0, 1]])
-        scene = Scene(
-            [Camera(torch.eye(4), K, 64, 48, "a.png", lens)], [Path("a.png")], torch.zeros(0, 3), torch.zeros(0, 3)
-        )
+        camera = Camera(torch.eye(4), K, 64, 48, "a.png", lens)
+        scene = Scene([camera], [Path("a.png")], torch.zeros(0, 3), torch.zeros(0, 3))
         theirs = _reconstruction(pycolmap, scene, ["a.png"]).cameras[1].img_from_cam(rays)
         ours = plane_to_pixel(torch.from_numpy(rays[:, :2]), K.double(), lens)
         np.testing.assert_allclose(np.asarray(theirs), ours.numpy(), atol=1e-6)

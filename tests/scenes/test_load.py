@@ -73,9 +73,7 @@ def test_of_several_models_the_largest_is_used(
         return
     assert f"{chosen} with {models[chosen]} images is used" in notes[0]
     assert f"{other} with {models[other]} images" in notes[0]
-    advised = load_scene(
-        notes[0].rpartition("as in ")[2]
-    )  # the advice works, and the lists of the scene hold there, too
+    advised = load_scene(notes[0].rpartition("as in ")[2])  # it works, and the lists of the scene hold there, too
     assert advised.folder == tmp_path / other
     assert [c.name for c in advised.cameras] == names[-models[other] :]
     assert advised.image_paths[0].parent == tmp_path / "images"
@@ -119,9 +117,8 @@ def test_a_file_is_never_two_views_and_the_nearest_name_is_told(tmp_path: Path) 
     _pictures(tmp_path / "images", ["a.jpg", "frame1.png"])
     scene = load_scene(tmp_path)
     assert [c.name for c in scene.cameras] == ["a.jpg"]
-    assert any(
-        "2 of 3 posed images have no file" in n and n.endswith("(did you mean 'frame1.png'?)") for n in scene.notes
-    )
+    (note,) = (note for note in scene.notes if "2 of 3 posed images have no file" in note)
+    assert note.endswith("(did you mean 'frame1.png'?)")
     (tmp_path / "images/a.jpg").rename(tmp_path / "images/a.JPG")
     write_picture(tmp_path / "images/a.png")
     with pytest.raises(SceneError, match=tells("'a' twice", "move one of the two images away")):
@@ -129,9 +126,8 @@ def test_a_file_is_never_two_views_and_the_nearest_name_is_told(tmp_path: Path) 
     (tmp_path / "images/a.JPG").unlink()
     assert [c.name for c in load_scene(tmp_path).cameras] == ["a.png"]
     (tmp_path / "images/a.png").unlink()
-    with pytest.raises(
-        SceneError, match=tells("none of its 3 posed images", "image folder", "did you mean 'frame1.png'?")
-    ):
+    words = "none of its 3 posed images", "image folder", "did you mean 'frame1.png'?"
+    with pytest.raises(SceneError, match=tells(*words)):
         load_scene(tmp_path)
 
 
@@ -154,9 +150,8 @@ def test_deleted_images_and_broken_poses_are_left_out_and_strict_refuses_them(tm
     told = " ".join(scene.notes)
     assert "1 views have no pose or lens of finite numbers and were left out: c.png" in told
     assert "5 of 20 entries of tracks lead to no 2-D point" in told
-    with pytest.raises(
-        SceneError, match=tells(tmp_path, "nothing broken (strict)", "images 4 are not", "without --strict")
-    ):
+    words = tmp_path, "nothing broken (strict)", "images 4 are not", "without --strict"
+    with pytest.raises(SceneError, match=tells(*words)):
         load_scene(tmp_path, strict=True)
 
 
@@ -227,10 +222,8 @@ def test_the_real_scenes(shared_data: Path) -> None:
     assert [c.name for c in load_scene(shared_data / "fox/transforms.json").cameras] == [c.name for c in fox.cameras]
 
 
-def _same(some: list[Any], others: list[Any]) -> bool:
-    return [(c.name, c.size, c.near, c.distortion, c.viewmat.tolist(), c.K.tolist()) for c in some] == [
-        (c.name, c.size, c.near, c.distortion, c.viewmat.tolist(), c.K.tolist()) for c in others
-    ]
+def _facts(cameras: list[Any]) -> list[Any]:
+    return [(c.name, c.size, c.near, c.distortion, c.viewmat.tolist(), c.K.tolist()) for c in cameras]
 
 
 def test_cameras_of_a_model_without_its_pictures_are_those_with_them(tmp_path: Path) -> None:
@@ -241,7 +234,7 @@ def test_cameras_of_a_model_without_its_pictures_are_those_with_them(tmp_path: P
     shutil.rmtree(tmp_path / "images")
     assert [camera.name for camera in expected] == ["a.png", "b_9.png", "b_10.png"]
     for path in (tmp_path, tmp_path / "sparse/0"):
-        assert _same(load_cameras(path), expected)
+        assert _facts(load_cameras(path)) == _facts(expected)
 
 
 POSES = [[[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 2 * x], [0, 0, 0, 1]] for x in range(3)]
@@ -268,7 +261,7 @@ def test_cameras_of_a_transforms_json_without_its_pictures_are_those_with_them(t
         shutil.rmtree(tmp_path / name)
     assert [camera.name for camera in expected] == ["a.png", "b.png", "train/r_0.5.png"]
     for path in (tmp_path, file):
-        assert _same(load_cameras(path), expected)
+        assert _facts(load_cameras(path)) == _facts(expected)
 
 
 def test_cameras_need_no_names_and_keep_their_order(tmp_path: Path) -> None:

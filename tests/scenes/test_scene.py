@@ -95,9 +95,7 @@ def test_extent_is_of_the_training_cameras(tmp_path: Path) -> None:
     scene = _scene(tmp_path)  # training cameras at x = 0 and 2
     assert scene.extent == pytest.approx(1.1)
     assert replace(scene, splits={}).extent == pytest.approx(1.1 * 4)  # mean 3, farthest 7
-    assert scene.select("test").extent == pytest.approx(
-        ((7**2 + 9) ** 0.5), rel=1e-6
-    )  # one camera: lower median distance
+    assert scene.select("test").extent == pytest.approx((7**2 + 9) ** 0.5, rel=1e-6)  # one: lower median distance
     alone = replace(scene.select("test"), points=torch.zeros(0, 3), colors=torch.zeros(0, 3, dtype=torch.uint8))
     assert alone.extent == 1.0
     with pytest.raises(ValueError, match=tells("cameras:", "extent", "got none")):

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from kfgs.cli import main
 from kfgs.scenes import SceneError, SfmConfig, load_scene, run_sfm
-from kfgs.scenes.pycolmap_import import import_pycolmap
+from kfgs.scenes.colmap import import_pycolmap
 from kfgs.scenes.sfm import SfmReport, SfmRun, sequential_pairs
 
 
@@ -29,10 +29,8 @@ def test_sfm_finds_the_true_poses(shared_data: Path, tmp_path: Path, capfd: pyte
     shown = capfd.readouterr().err
     assert all(stage in shown for stage in ("features", "matching", "mapping", "no count until all are done", "8/8"))
 
-    found, truth = (
-        load_scene(tmp_path, split="all"),
-        load_scene(shared_data / "lund_door", split="all").select(range(8)),
-    )
+    found = load_scene(tmp_path, split="all")
+    truth = load_scene(shared_data / "lund_door", split="all").select(range(8))
     assert [found.stem(i) for i in range(8)] == [truth.stem(i) for i in range(8)]
     ours = torch.stack([c.center for c in found.cameras]).double().numpy()
     theirs = torch.stack([c.center for c in truth.cameras]).double().numpy()
@@ -53,12 +51,8 @@ def test_images_that_share_nothing_are_refused(tmp_path: Path) -> None:
     images.mkdir()
     for i in range(3):
         write_image(str(images / f"{i}.png"), torch.randint(0, 255, (3, 60, 80), generator=g, dtype=torch.uint8))
-    with pytest.raises(
-        SceneError,
-        match=tells(
-            "images:", "3 of 3", "min_registered = 0.9", "got 0", "original photos", "enlarge", "(80x60 pixels)"
-        ),
-    ):
+    words = "images:", "3 of 3", "min_registered = 0.9", "got 0", "original photos", "enlarge", "(80x60 pixels)"
+    with pytest.raises(SceneError, match=tells(*words)):
         run_sfm(images, tmp_path / "out", config=SfmConfig(num_threads=1))
     assert not (tmp_path / "out").exists()
 
@@ -155,10 +149,8 @@ def test_nothing_is_found_where_a_photo_is_masked_or_transparent(tmp_path: Path)
 
 def test_one_camera_for_the_photos_of_each_size(tmp_path: Path) -> None:
     """COLMAP alone leaves out what is not as large as the first photo."""
-    pycolmap, sizes = (
-        import_pycolmap(),
-        {"a.png": (96, 128), "b.png": (128, 96), "c.png": (96, 128), "d.png": (128, 96)},
-    )
+    pycolmap = import_pycolmap()
+    sizes = {"a.png": (96, 128), "b.png": (128, 96), "c.png": (96, 128), "d.png": (128, 96)}
     for name, size in sizes.items():
         noise = torch.randint(0, 255, (3, *size), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
         write_image(str(tmp_path / name), noise)

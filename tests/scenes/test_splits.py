@@ -24,15 +24,9 @@ def test_holdout8_and_all() -> None:
 
 @pytest.mark.parametrize(
     ("count", "video", "rule"),
-    [
-        (0, False, "all"),
-        (7, True, "all"),
-        (8, False, "holdout8"),
-        (500, False, "holdout8"),
-        (199, True, "holdout8"),
-        (200, True, "df3dgs"),
-    ],
-)
+    [(0, False, "all"), (7, True, "all"), (8, False, "holdout8"), (500, False, "holdout8"), (199, True, "holdout8"),
+     (200, True, "df3dgs")],
+)  # fmt: skip
 def test_the_rule_without_a_split_file(count: int, video: bool, rule: str) -> None:
     assert choose_split(count, video) == rule
 

@@ -17,15 +17,8 @@ from kfgs.toy.render import walk_cameras
 from kfgs.toy.room import CLASSES, ROOM
 from kfgs.toy.room_folder import ToyConfig, make_toy_room
 
-SMALL = ToyConfig(
-    train_views=4,
-    test_views=2,
-    size=(72, 96),
-    feature_size=(18, 24),
-    feature_dim=32,
-    surface_points=1500,
-    sparse_points=300,
-)
+SIZES = {"size": (72, 96), "feature_size": (18, 24), "feature_dim": 32, "surface_points": 1500, "sparse_points": 300}
+SMALL = ToyConfig(train_views=4, test_views=2, **SIZES)
 TINY = replace(SMALL, train_views=2, test_views=1, size=(24, 32), feature_size=(12, 16), feature_dim=16)
 
 

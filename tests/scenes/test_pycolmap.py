@@ -7,13 +7,13 @@ import pytest
 from messages import tells
 
 from kfgs.scenes import SceneError
-from kfgs.scenes.pycolmap_import import quiet_pycolmap
+from kfgs.scenes.colmap import quiet_pycolmap
 
 PROGRAM = """
 import os, signal, sys
 import kfgs.scenes
 assert "pycolmap" not in sys.modules, "kfgs.scenes must not load pycolmap before it is needed"
-from kfgs.scenes.pycolmap_import import import_pycolmap
+from kfgs.scenes.colmap import import_pycolmap
 import_pycolmap()
 import numpy as np
 from PIL import Image
