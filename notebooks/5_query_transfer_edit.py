@@ -33,7 +33,6 @@ import kfgs
 from kfgs import viz
 from kfgs.cameras import Orbit, estimate_up, orbit_cameras
 from kfgs.labels import InBox, OfClass, nearest_labels
-from kfgs.pipeline import views_of_change
 
 scene = kfgs.load_scene(folder).undistorted()
 classes = kfgs.load_label_set(names, text)
@@ -171,7 +170,7 @@ edits = kfgs.EditList().then(kfgs.Remove(OfClass(thing))).then(kfgs.Recolor(OfCl
 edited = edits.apply(labelled)
 print(f"{len(labelled)} Gaussians, {len(edited)} after {[edit.op for edit in edits]}")
 unseen = [scene.cameras[i] for i in scene.views("test")]
-views = [unseen[i] for i in views_of_change(labelled, edited, unseen)]
+views = [unseen[i] for i in viz.views_of_change(labelled, edited, unseen)]
 rows = [[viz.show_cloud(cloud, **picture)(view) for cloud in (labelled, edited)] for view in views]
 Image.fromarray(viz.picture_grid(rows, ("before", f"no {thing}, {painted} in red"), width=320))
 

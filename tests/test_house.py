@@ -17,7 +17,7 @@ AIM = {  # lines of Python with docstrings (DESIGN, section 2); "base": the file
     "splat/engines": 5_300, "quant": 1_100, "cameras": 950, "base": 1_200,
 }  # fmt: skip
 NOT_YET = {  # what is above its aim: a change may lower these numbers, and never raises them
-    "cli": 1_944, "pipeline": 2_070, "fields": 2_800, "toy": 1_126, "scenes": 3_328,
+    "fields": 2_800, "toy": 1_126, "scenes": 3_328,
     "quant": 1_348, "cameras": 1_025, "base": 1_362,
 }  # fmt: skip
 SCRIPTS = 4_000  # lines of the viewer's JavaScript

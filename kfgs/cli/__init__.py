@@ -2,7 +2,8 @@
 
 Every command names the files it wrote, shows progress on long work, and ends with 0 (done), 1 (bad input, with one
 message that says what to do), 2 (wrong usage), 130 (interrupted; demo, features, fit, color and batch
-continue where they stopped) or 141 (its output was closed).
+continue where they stopped) or 141 (its output was closed). Heavy imports happen inside the commands, or by names of `kfgs`,
+which are imported when first used, so that `kfgs --help` answers at once.
 """
 
 from __future__ import annotations
@@ -22,19 +23,16 @@ from typing import Any, get_type_hints
 
 import tyro
 
+import kfgs
+
 from .._card import error_line, short_of_memory
 from .._interrupts import interruptible
-from .batch import batch
-from .evaluate import evaluate
+from .ask import select, view
+from .draw import evaluate, render, segment
 from .features import features
-from .files import check_outputs
-from .fit import color, demo, fit, sfm
-from .output import notes_as_lines, say
-from .render import render
-from .segment import segment
-from .select import select
+from .files import check_outputs, notes_as_lines, say
+from .fit import batch, color, demo, fit, sfm
 from .splats import attach, convert, edit
-from .view import view
 
 GROUPS: dict[str, tuple[Any, ...]] = {
     "Start here": (demo,),
@@ -106,9 +104,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _answer(name: str) -> None:
     """Say what was asked for without a command: the overview, the version, or which command was probably meant."""
     if name == "--version":
-        from .. import __version__
-
-        say(f"kfgs {__version__}")
+        say(f"kfgs {kfgs.__version__}")
     elif name in ("-h", "--help"):
         say(_overview())
     else:

@@ -6,12 +6,11 @@ import os
 from pathlib import Path
 from typing import Any
 
-from .._files import check_output
-from .files import open_field
-from .options import Classes, Flag, Given, Name, Positional, Teacher, Views
-from .output import say, wrote
+import kfgs
 
-# Heavy imports happen inside the functions, so that `kfgs --help` answers at once.
+from .._files import check_output, read_json, read_text
+from .files import open_field, say, wrote
+from .options import Classes, Flag, Given, Name, Positional, Teacher, Views
 
 TABLE = "text.safetensors"
 
@@ -54,7 +53,6 @@ def features(
         fast: One pass over each picture instead of the exact evaluation at several scales (lseg).
     """
     from ..scenes.load import scene_root
-    from ..teachers.prompts import make_label_set
 
     if examples is not None:
         if source is None:
@@ -74,7 +72,7 @@ def features(
     scene = None if source is None else views.load(source)
     network = teacher.load(**({"fast": True} if fast else {}))
     if table is not None:
-        made = make_label_set(network, listed)
+        made = kfgs.make_label_set(network, listed)
         made.save(table)
         templates = ", ".join(map(repr, made.info["templates"]))
         say(f"{len(made)} classes, {made.dim} channels each, by {made.info['teacher']['name']}, as {templates}")
@@ -90,20 +88,15 @@ def features(
 
 def _make_maps(network: Any, scene: Any, target: Path, split: str) -> None:
     """Make the maps of a teacher; without one, check those that are there."""
-    from ..scenes import FeatureFolder, extract_features
+    from ..pipeline.describe import describe
 
     if network is not None:
-        extract_features(network, scene, target, split, progress=True)
-        maps = FeatureFolder(target).of(scene, split)
-        identity = maps.identity or {}
-        weights = {"weights": str(identity["weights"])[:12]} if identity.get("weights") else {}
-        words = [f"{name} {value}" for name, value in (weights | (identity.get("options") or {})).items()]
-        teacher = ", ".join([str(identity.get("name", "unknown")), *words])
-        say(f"{len(maps)} maps of {' x '.join(map(str, maps.shape))} by {teacher}")
+        kfgs.extract_features(network, scene, target, split, progress=True)
+        say(describe(target))
         return
     if not target.is_dir():
         raise ValueError(f"teacher: expected a teacher, or maps in {target} to check, got neither; pass --teacher")
-    problems, count = FeatureFolder(target).check(scene, split), len(scene.views(split))
+    problems, count = kfgs.FeatureFolder(target).check(scene, split), len(scene.views(split))
     say(f"{target}: {count - len(problems)} of {count} views have a map that fits")
     for name, text in problems.items():
         say(f"{name}: {text}")
@@ -127,9 +120,8 @@ def _learn_examples(out: Path, field: Any, path: Path) -> None:
     """Write a table of examples and, if the photographs of their views are at hand, a picture of what was shown."""
     from torch import Tensor
 
-    from .._files import read_json
     from ..evaluation.coco import load_coco_examples
-    from ..fields.examples import label_set_from_examples, read_examples
+    from ..fields.examples import read_examples
     from ..viz import draw_examples
     from ..viz.films import show_photos
     from ..viz.pictures import save_picture
@@ -137,7 +129,7 @@ def _learn_examples(out: Path, field: Any, path: Path) -> None:
     content = read_json(path)
     coco = isinstance(content, dict) and {"images", "annotations", "categories"} <= set(content)
     examples = load_coco_examples(path) if coco else read_examples(path)
-    made = label_set_from_examples(field, examples)
+    made = kfgs.label_set_from_examples(field, examples)
     made.save(out)
     written, scene = [out], Classes().photos_of(field)
     if scene is not None and any(not isinstance(example, Tensor) for shown in examples.values() for example in shown):
@@ -152,8 +144,6 @@ def read_words(words: str) -> list[str]:
 
     Text with neither ending is words, even if a folder has the same name; a file with another ending is an error.
     """
-    from .._files import read_json, read_text
-
     kind = Path(words).suffix.lower()
     listed: Any = words.split(",")
     if kind == ".json":

@@ -1,16 +1,22 @@
-"""Open what commands read, and check what they write before the work begins."""
+"""What commands read, write and print: inputs are opened, outputs checked before the work begins, warnings become notes."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
+
+import kfgs
 
 from .._files import check_output, real_path
-
-# Heavy imports happen inside the functions, so that `kfgs --help` answers at once.
+from .._notes import Wait, hear
 
 OUTPUTS = ("out", "target")  # parameters that name what a command writes
+LINE, END = 2000, 600
+"""Most characters of a printed line, and how many of them are from its end, where an error says what to do."""
 
 
 def check_outputs(given: Mapping[str, Any], made: str | None = None) -> None:
@@ -56,7 +62,6 @@ def is_field(path: Path) -> bool:
 
 def open_field(name: str, path: Path) -> Any:
     """Load a semantic field, of a run folder its `field.kfgs`. Raises a ValueError if the path is not a field."""
-    from ..fields import SemanticField
     from ..fields.store import find_field
 
     field = find_field(path)
@@ -65,17 +70,16 @@ def open_field(name: str, path: Path) -> Any:
         raise ValueError(
             f"{name}: expected a field (RUN/field.kfgs, or RUN), got {path}, {what}; make one with `kfgs fit`"
         )
-    return SemanticField.load(field)
+    return kfgs.SemanticField.load(field)
 
 
 def open_splats(name: str, path: Path, *, labelled: bool = False, named: bool = False) -> Any:
     """Read a splat file. A ValueError if it has no classes and `labelled` asks for them, or no names and `named` does."""
-    from ..formats import read_splats
     from ..formats.sidecar import NAMES, beside
 
     if is_field(path):
         raise ValueError(f"{name}: expected a splat file, got {path}, a semantic field; pass what `kfgs color` writes")
-    splats = read_splats(path)
+    splats = kfgs.read_splats(path)
     if (labelled or named) and splats.labels is None:
         raise ValueError(
             f"{name}: expected a splat with classes, got {path} without; run `kfgs attach FIELD {path} --out labelled.ply`"
@@ -86,3 +90,57 @@ def open_splats(name: str, path: Path, *, labelled: bool = False, named: bool = 
             "splat was, or run `kfgs attach` again"
         )
     return splats
+
+
+def say(text: str, file: TextIO | None = None) -> None:
+    r"""Print a line at once, to standard output or a file.
+
+    Names from foreign files may hold anything: what is not printable is shown as Python writes it (`\x1b`), and the middle
+    of a very long line is left out.
+    """
+    try:
+        print("\n".join(map(_shown, text.split("\n"))), file=file or sys.stdout, flush=True)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, "standard output") from error
+
+
+def _shown(line: str) -> str:
+    left = len(line) - LINE
+    if left > 0:
+        line = f"{line[: LINE - END]} ... ({left} characters left out) ... {line[-END:]}"
+    return "".join(
+        character if character.isprintable() or character == "\t" else ascii(character)[1:-1] for character in line
+    )
+
+
+def wrote(paths: Sequence[Path]) -> None:
+    """Name the files that a command wrote."""
+    say("wrote:")
+    for path in paths:
+        say(f"  {path}" + (f"  ({sum(1 for p in path.iterdir())} files)" if path.is_dir() else ""))
+
+
+def say_lost(written: Any) -> None:
+    """Report what the format of a splat file (`Written`) could not store, and whether it reordered the Gaussians."""
+    for words in written.lost:
+        say(f"note: {words}")
+    if written.order is not None:
+        say("note: neighbours now lie side by side (Morton order), so indices into the old file do not fit the new one")
+
+
+@contextmanager
+def notes_as_lines(spoken: Callable[[str], str], *, strict: bool) -> Iterator[None]:
+    """Print warnings, in the words of `spoken`, and notes of readers and engines, as lines.
+
+    With `strict`, readers refuse what they would leave out.
+    """
+
+    def note(message: Warning | str, *_: Any, **__: Any) -> None:
+        say(f"note: {spoken(str(message))}", sys.stderr if isinstance(message, Wait) else None)
+
+    with warnings.catch_warnings(), hear(note, strict=strict):
+        warnings.filterwarnings("always", message="classes: ")
+        warnings.showwarning = note
+        yield

@@ -1,21 +1,25 @@
-"""Commands that make fields and what they need: demo, sfm, fit, color."""
+"""Commands that make fields and what they need: demo, sfm, fit, color; and batch, for many scenes."""
 
 from __future__ import annotations
 
 import os
 import shlex
 import sys
-from dataclasses import replace
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+import tyro
+
+import kfgs
 
 from .._files import real_path, write_json
-from .options import Flag, Given, Matching, Positional, SceneFolder, Teacher, Views
-from .output import say, wrote
-
-# Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
+from .files import say, wrote
+from .options import Flag, Given, Positional, SceneFolder, Teacher, Views
 
 PICTURES = 4  # held-out views that `kfgs color` draws
+Workers = Annotated[str | None, tyro.conf.arg(metavar="NUMBER|ADDRESS", help_behavior_hint="")]
 Method = Literal["uplift", "paper", "paper-full", "adc", "decouple"]
 
 
@@ -33,10 +37,8 @@ def demo(out: Path = Path("kfgs_demo")) -> None:
         out: Folder for the scene, the run and its results; running again continues where it stopped.
     """
     from ..pipeline import demo as run_demo
-    from ..toy.room_folder import ToyConfig
 
-    room = ToyConfig(train_views=36, test_views=9)
-    wrote(run_demo.run(out, room=room, report=say, progress=True))
+    wrote(run_demo.run(out, room=kfgs.ToyConfig(train_views=36, test_views=9), report=say, progress=True))
     look = ["view", str(out / "run" / "field.kfgs"), "--scene", str(out / "scene"), "--color", str(out / "color.ply")]
     say(f'6. Look. Type "chair" there, select, edit: kfgs {shlex.join(look)}')
 
@@ -45,8 +47,8 @@ def sfm(
     images: Positional[Path],
     out: Path,
     *,
-    fps: Given[float] = None,
-    matching: Given[Matching] = None,
+    fps: float = 2.0,
+    matching: Given[Literal["exhaustive", "sequential"]] = None,
     no_single_camera: Flag = False,
     min_registered: float = 0.9,
     ignore_poses: Flag = False,
@@ -65,14 +67,14 @@ def sfm(
     Args:
         images: Folder of photographs, or a video.
         out: Scene folder to make; OUT/sparse/0 receives the COLMAP model.
-        fps: Frames of each second of a video that are used, 2 when not given: the sharpest of each half second.
+        fps: Frames of each second of a video that are used; of 2, the sharpest of each half second.
         matching: sequential for the frames of a video, exhaustive for everything else; by default so.
         no_single_camera: The photographs were taken with several cameras, or with changes of zoom.
         min_registered: Share of the images that must be placed; fewer is an error.
         ignore_poses: Estimate poses also if the folder has some.
         replace: Replace a model that is in OUT/sparse/0 already; without it that is an error.
     """
-    from ..scenes import SfmConfig, list_images, run_sfm
+    from ..scenes import SfmConfig, list_images
     from ..scenes.files import folder_masks
     from ..scenes.load import is_scene
     from ..scenes.sfm import link_images
@@ -89,21 +91,36 @@ def sfm(
             "(and find its points, if it has none), or give --ignore-poses to estimate new ones"
         )
     if is_video(images):
-        frames = extract_frames(images, out / "images", fps=fps or 2.0, progress=True)
-        say(f"{images}: the {len(frames)} sharpest frames are in {out / 'images'}")
+        count = len(extract_frames(images, out / "images", fps=fps, progress=True))
+        say(f"{images}: the {count} sharpest frames are in {out / 'images'}")
         images = out / "images"
     elif images.is_file():
-        kinds = ", ".join(VIDEO_SUFFIXES)
-        raise ValueError(f"images: expected a folder, or a video ({kinds}), got {images}; convert it to .mp4")
+        videos = f"a video ({', '.join(VIDEO_SUFFIXES)})"
+        raise ValueError(f"images: expected a folder, or {videos}, got {images}; convert it to .mp4")
     for note in folder_masks(list_images(images), images)[1]:
         say(f"note: {note}")
-    say(str(run_sfm(images, out, config=config, replace=replace, progress=True)))
+    say(str(kfgs.run_sfm(images, out, config=config, replace=replace, progress=True)))
     linked = link_images(images, out)
     if linked:
         say(f"{out / 'images'} is a link to {real_path(images)}: keep the photos there")
     elif real_path(out / "images") != real_path(images):
         say(f"note: other commands read the pictures of these names in {out / 'images'}; --images {images} names these")
     wrote([out / "sparse" / "0", *([out / "images"] if linked else [])])
+
+
+@dataclass(frozen=True)
+class Amount:
+    """How long training takes, and how large the result is."""
+
+    steps: Given[int] = None
+    """Training steps; those of the method or preset when not given."""
+    max_gaussians: Given[int] = None
+    """At most this many Gaussians, 0: no limit, all of the splat; that of the method or preset when not given."""
+
+    def of(self, options: Any) -> Any:
+        """The options of a training with these numbers."""
+        training = options.training if self.steps is None else options.training.with_steps(self.steps)
+        return replace(options, training=training.with_maximum(self.max_gaussians or None))
 
 
 def fit(
@@ -113,8 +130,7 @@ def fit(
     features: Given[Path] = None,
     splat: Given[Path] = None,
     method: Method = "uplift",
-    steps: Given[int] = None,
-    max_gaussians: Given[int] = None,
+    amount: Amount,
     views: Views,
     teacher: Teacher,
 ) -> None:
@@ -139,15 +155,11 @@ def fit(
         method: uplift: average the features in 3-D, then compress. paper: compress each map, then train Gaussians on it
             (DF-3DGS) in minutes on two cores; paper-full: with the published 30,000 steps; adc: without the autoencoder;
             decouple: on the raw features.
-        steps: Training steps; those of the method when not given.
-        max_gaussians: At most this many Gaussians in the result, 0: all of the splat; the method's when not given.
     """
-    from ..pipeline import fit as fit_field
     from ..pipeline.run_report import write_run_report
-    from ..scenes import FeatureFolder
     from ..scenes.load import scene_root
 
-    made_by = _method(method, splat, steps, max_gaussians)
+    made_by = _method(method, splat, amount)
     as_taken = views.load(scene)
     loaded, split = as_taken.undistorted(), views.split
     folder = features or scene_root(scene) / "features"
@@ -157,34 +169,27 @@ def fit(
             f"features: expected a folder of feature maps, got {folder}, which is none; name another, or make them with "
             "`kfgs features`"
         )
-    maps = network or FeatureFolder(folder).of(as_taken, split)
-    field = fit_field(loaded, maps, made_by, folder=out, split=split, report=say, progress=True)
+    maps = network or kfgs.FeatureFolder(folder).of(as_taken, split)
+    field = kfgs.fit(loaded, maps, made_by, folder=out, split=split, report=say, progress=True)
     command = f"cd {shlex.quote(os.getcwd())}\n{shlex.join(['kfgs', *sys.argv[1:]])}"
     report = write_run_report(out, field, loaded, made_by, split=split, command=command)
     say(field.summary())
     wrote([out / "field.kfgs", *report])
 
 
-def _method(method: Method, splat: Path | None, steps: int | None, most: int | None) -> Any:
-    """The options of `pipeline.fit` for a method's name and the given numbers."""
-    from ..fields import UpliftConfig
-    from ..pipeline import Paper, Uplift
-
+def _method(method: Method, splat: Path | None, amount: Amount) -> Any:
+    """The options of `kfgs.fit` for a method's name and the given numbers."""
     if method == "uplift":
-        made_by = Uplift(splat) if most is None else Uplift(splat, UpliftConfig(max_gaussians=most or None))
-        return replace(made_by, color=_trained(made_by.color, steps))
+        made_by = kfgs.Uplift(splat)
+        if amount.max_gaussians is not None:
+            made_by = replace(made_by, uplift=replace(made_by.uplift, max_gaussians=amount.max_gaussians or None))
+        return replace(made_by, color=Amount(amount.steps).of(made_by.color))
     if splat is not None:
         raise ValueError(f"splat: expected none with --method {method}, which trains its own Gaussians, got {splat}")
-    paper = _trained(Paper.paper() if method == "paper-full" else Paper(), steps, most)
+    paper = amount.of(kfgs.Paper.paper() if method == "paper-full" else kfgs.Paper())
     if method == "decouple":
         return replace(paper, codebook=None, autoencoder=None)
     return replace(paper, autoencoder=None) if method == "adc" else paper
-
-
-def _trained(options: Any, steps: int | None, most: int | None = None) -> Any:
-    """The options of `fit` or `fit_color` with another number of training steps and Gaussians."""
-    training = options.training if steps is None else options.training.with_steps(steps)
-    return replace(options, training=training.with_maximum(most or None))
 
 
 def color(
@@ -192,8 +197,7 @@ def color(
     out: Path,
     *,
     preset: Literal["quick", "cpu", "paper"] = "cpu",
-    steps: Given[int] = None,
-    max_gaussians: Given[int] = None,
+    amount: Amount,
     views: Views,
 ) -> None:
     """Train a colour splat (3-D Gaussian Splatting) on a scene, and score it on the views held out.
@@ -206,22 +210,19 @@ def color(
         out: Run folder; OUT/color.ply receives the splat. Running again continues where it stopped.
         preset: quick (a minute, for small scenes), cpu (minutes on two cores) or paper (30,000 steps, full size, degree 3:
             for a GPU).
-        steps: Training steps; the preset's when not given.
-        max_gaussians: At most this many Gaussians; the preset's when not given.
     """
-    from ..evaluation.color import score_views
-    from ..pipeline.color import ColorConfig, fit_color
-    from ..pipeline.compare import draw_photos
+    from ..viz.compare import draw_photos
     from ..viz.linked import evenly
 
-    config = {"quick": ColorConfig.quick, "cpu": ColorConfig.cpu, "paper": ColorConfig}[preset]()
+    presets = {"quick": kfgs.ColorConfig.quick, "cpu": kfgs.ColorConfig.cpu, "paper": kfgs.ColorConfig}
+    config = amount.of(presets[preset]())
     loaded, split = views.load(scene).undistorted(), views.split
-    gaussians = fit_color(loaded, out, _trained(config, steps, max_gaussians), split=split, report=say, progress=True)
+    gaussians = kfgs.fit_color(loaded, out, config, split=split, report=say, progress=True)
     say(repr(gaussians))
     written = [out / "color.ply"]
     held_out = loaded.splits.get("test", [])
     if held_out and not set(held_out) & set(loaded.views(split)):
-        scores = score_views(gaussians, loaded, "test")
+        scores = kfgs.score_views(gaussians, loaded, "test")
         write_json(out / "scores.json", {"color": scores.to_json()})
         say(str(scores))
         shown = [held_out[k] for k in evenly(len(held_out), PICTURES)]
@@ -229,3 +230,72 @@ def color(
     else:
         say("note: no views are held out (split 'test', not trained on): nothing to score against")
     wrote(written)
+
+
+def batch(
+    scenes: Positional[Path],
+    out: Path,
+    *,
+    text: Given[Path] = None,
+    workers: Workers = None,
+    blocks: Given[int] = None,
+    splat: Given[Path] = None,
+    teacher: Teacher,
+) -> None:
+    """Take many scenes through sfm, features, fit, segment and evaluate; or, with --blocks, one scene that is too large.
+
+    SCENES is a text file with a scene in each line: a folder with a COLMAP model or a transforms.json, or a folder of photos
+    whose cameras are found first. `name = scene` gives a run another name than its folder. Running again repeats nothing
+    that is finished, and tries failed scenes again. Without --teacher each scene has its maps in features/; all workers must
+    be able to read --weights. With --blocks, SCENES is the folder of one scene with a COLMAP model
+    and feature maps: it is cut into blocks, and their fields are joined. --workers needs pip install 'kfgs[batch]'.
+
+    Examples:
+        kfgs batch scenes.txt --out runs/ --teacher lseg --weights demo_e200.ckpt --workers 2
+        kfgs batch scenes.txt --out /shared/runs --workers slurm:gpu:16
+        kfgs batch town/ --out city/ --blocks 16 --splat town.ply
+
+    Args:
+        scenes: The list of scenes (relative folders begin at that of the list), or with --blocks the scene.
+        out: Folder of the runs: OUT/NAME receives field, segmented views, scores.json, state.json and log.txt. Of blocks:
+            OUT/field.kfgs is the joined field.
+        text: Text table of `kfgs features --words` for all scenes; each scene's classes.json and text.* when not given.
+        workers: Processes on this machine, or a Dask scheduler (tcp://HOST:8786), or slurm:PARTITION:NUMBER. One scene after
+            the other in this process when not given.
+        blocks: Cut the scene SCENES into this many blocks. With fewer than about 300 views in each, a block fits into the
+            memory of most machines.
+        splat: With --blocks: Gaussians of the whole scene, a splat file; without it each block trains its own.
+    """
+    from ..batch import BatchOptions, fit_blocks, join_blocks, open_client, read_scenes, run_batch
+    from ..teachers.load import check_teacher_name
+
+    clients = nullcontext() if workers is None else open_client(workers)
+    if blocks is not None:
+        if (teacher, text) != (Teacher(), None):
+            raise ValueError(
+                "blocks: expected a scene with features/, got --teacher, --weights or --text; leave these out"
+            )
+        with clients as client:
+            fit_blocks(scenes, out, blocks, splat=splat, client=client, report=say)
+        field = join_blocks(out)
+        field.save(out / "field.kfgs")
+        say(field.summary())
+        wrote([out / "field.kfgs"])
+        return
+    entries = read_scenes(scenes)
+    teacher.check()
+    if teacher.teacher is not None:
+        check_teacher_name(teacher.teacher)
+    local = int(workers) if workers is not None and workers.isdecimal() else 0
+    threads = max(1, (os.cpu_count() or 1) // local) if local else 1
+    options = BatchOptions(**vars(teacher), text=None if text is None else str(text), threads=threads)
+    with clients as client:
+        results = run_batch(entries, out, options, client=client, report=say)
+    failed = [result.name for result in results if result.failure is not None]
+    say(f"{len(results) - len(failed)} of {len(results)} scenes are finished; kfgs convert {out} has a line for each")
+    if failed:
+        some = ", ".join(failed[:3]) + (", ..." if len(failed) > 3 else "")
+        raise ValueError(
+            f"scenes: expected all {len(results)} to succeed, but {len(failed)} failed ({some}); see log.txt in their folders "
+            f"of {out}, correct the cause, and give the same command again"
+        )

@@ -10,10 +10,11 @@ from typing import Annotated, Any, Literal, TypeVar
 import tyro
 from tyro.conf import Positional as Positional
 
-from .._notes import Repair
-from .output import say
+import kfgs
 
-# Heavy imports happen inside the functions, so that `kfgs --help` answers at once.
+from .._files import read_json
+from .._notes import Repair
+from .files import say
 
 T = TypeVar("T")
 Given = Annotated[T | None, tyro.conf.arg(help_behavior_hint="")]  # None if the option is not given
@@ -21,10 +22,6 @@ Flag = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
 Word = Annotated[str, tyro.conf.arg(metavar="NAME")]
 Name = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")]
 Several = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="TEXT")]
-By = Literal["views", "distance"]
-LabelRule = Literal["own", "nearest"]  # of `kfgs evaluate`: who says the class of a pixel
-Matching = Literal["exhaustive", "sequential"]  # of `kfgs sfm`: which pairs of pictures are compared
-Precision = Literal["lossless", "fine", "small", "tiny"]  # `fields.precision`, without its imports
 Walk = Literal["orbit", "cameras"] | Path  # paths of cameras
 SceneFolder = Annotated[
     Path, Positional, tyro.conf.arg(help="Folder with images and a COLMAP model or transforms.json.")
@@ -42,9 +39,7 @@ class Views:
 
     def load(self, scene: Path) -> Any:
         """Load a scene as its pictures were taken, and print its notes."""
-        from ..scenes import load_scene
-
-        loaded = load_scene(scene, images=self.images)
+        loaded = kfgs.load_scene(scene, images=self.images)
         for note in loaded.notes:
             if self.split == "all" and "all" not in loaded.splits and note.startswith("split "):
                 note = f"split all: all {len(loaded)} views"
@@ -65,16 +60,17 @@ class Teacher:
     def load(self, **options: Any) -> Any:
         """Load the teacher, on the GPU if there is one; None if none is named."""
         from ..pipeline.train import training_device
-        from ..teachers.load import load_teacher
 
+        self.check()
         if self.teacher is None:
-            if self.weights is not None:
-                raise ValueError(
-                    f"weights: expected --teacher with it, whose weights they are, got {self.weights} alone"
-                )
             return None
-        teacher = load_teacher(self.teacher, self.weights, **options)
+        teacher = kfgs.load_teacher(self.teacher, self.weights, **options)
         return teacher.to(training_device()) if hasattr(teacher, "to") else teacher
+
+    def check(self) -> None:
+        """Raise a ValueError if weights are given without their teacher."""
+        if self.teacher is None and self.weights is not None:
+            raise ValueError(f"weights: expected --teacher with it, whose weights they are, got {self.weights} alone")
 
 
 @dataclass(frozen=True)
@@ -96,9 +92,7 @@ class Classes:
     @cached_property
     def loaded(self) -> Any:
         """The scene without distortion of its lens; None if none is given."""
-        from ..scenes import load_scene
-
-        return None if self.scene is None else load_scene(self.scene).undistorted()
+        return None if self.scene is None else kfgs.load_scene(self.scene).undistorted()
 
     def load_classes(self, field: Any | None = None) -> Any:
         """The label set that is named by --text, else that of the scene, else that of the field.
@@ -106,15 +100,14 @@ class Classes:
         If the scene has a `classes.json`, whose indices its label pictures hold, only these classes are taken from the
         scene's table, in their order. A table that is named by --text is used whole.
         """
-        from .._files import read_json
         from ..fields.store import SCENE_FILES
-        from ..labels import load_label_set
         from ..scenes.load import scene_root
 
         folder = None if self.scene is None else scene_root(self.scene)
         if self.text is not None:
             beside = self.text.with_name("classes.json")
-            label_set = load_label_set(beside, self.text) if self.text.suffix == ".npy" else load_label_set(self.text)
+            files = [beside, self.text] if self.text.suffix == ".npy" else [self.text]
+            label_set = kfgs.load_label_set(*files)
             listed = None if folder is None else folder / "classes.json"
             if listed is not None and listed.is_file() and tuple(read_json(listed)) != label_set.names:
                 say(f"note: label numbers follow the class list of {self.text}, which differs from {listed}")
@@ -122,7 +115,7 @@ class Classes:
         if folder is not None:
             for files in ([folder / name for name in names] for names in SCENE_FILES):
                 if all(file.is_file() for file in files):
-                    return load_label_set(*files)
+                    return kfgs.load_label_set(*files)
         if field is None or field.classes is None:
             raise ValueError(
                 "text: expected a table of words, got none; make one with `kfgs features --words chair,table --teacher NAME`, or "

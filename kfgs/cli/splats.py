@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import re
-from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from .._files import check_output
+import kfgs
+
+from .._files import atomic_folder, check_output
 from .edit_syntax import Edits, parse_edits
-from .files import check_target, is_field, open_field, open_splats
-from .options import By, Classes, Flag, Given, Positional, Precision
-from .output import say, say_lost, wrote
+from .files import check_target, is_field, open_field, open_splats, say, say_lost, wrote
+from .options import Classes, Flag, Given, Positional
 
-# Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
-
-TITLES = ("before", "after")
 PICTURES = 2  # views that `kfgs edit` shows
 UNITS = {  # of the error of a tensor; those of all others are shares
     "gaussians.means": "world units a coordinate",
@@ -30,7 +27,7 @@ def attach(
     cloud: Positional[Path],
     out: Path,
     *,
-    by: Given[By] = None,
+    by: Given[Literal["views", "distance"]] = None,
     distance: Given[float] = None,
     splat_scene: Given[Path] = None,
     same_frame: Flag = False,
@@ -59,22 +56,16 @@ def attach(
         same_frame: Do not compare the frames; they are the same.
     """
     from ..cameras.similarity import Similarity
-    from ..formats import find_format, ply, write_splats
-    from ..pipeline.attach import attach as attach_field
+    from ..pipeline.attach import is_cloud, label_cloud
     from ..pipeline.describe import count_lines
-    from ..pipeline.label import label_cloud
-    from ..scenes import SceneError, load_scene
+    from ..scenes import SceneError
 
     check_target("out", out)
     loaded = open_field("field", field)
     label_set = classes.load_classes(loaded)
-    plain = cloud.is_file() and not is_field(cloud) and find_format(cloud).NAME == "ply"
-    if plain and "scale_0" not in {
-        row.name for table in ply.read_header(cloud).elements[:1] for row in table.properties
-    }:  # points
+    if not is_field(cloud) and is_cloud(cloud):
         moved, paths = label_cloud(loaded.label(label_set), cloud, out, distance=distance)
-        say(str(moved))
-        say("\n".join(count_lines(moved.labels, label_set.names)))
+        say("\n".join([str(moved), *count_lines(moved.labels, label_set.names)]))
         wrote(paths)
         return
     splats = open_splats("cloud", cloud)
@@ -83,18 +74,16 @@ def attach(
         cameras = [scene.cameras[i] for i in scene.views("train")]
     frame: Any = Similarity.identity() if same_frame else None
     if splat_scene is not None:
-        frame = load_scene(splat_scene).undistorted().cameras
+        frame = kfgs.load_scene(splat_scene).undistorted().cameras
     try:
-        attached = attach_field(loaded, splats, label_set, cameras=cameras, frame=frame, distance=distance, by=by)
+        attached = kfgs.attach(loaded, splats, label_set, cameras=cameras, frame=frame, distance=distance, by=by)
     except SceneError as error:
         raise SceneError(
             f"cloud: no frame found in which field and splat agree: {error} (--splat-scene gives the splat's cameras, "
             "--same-frame says that there is nothing to find)"
         ) from error
-    written = write_splats(attached.gaussians, out, facts=attached.facts)
-    for note in attached.notes:
-        say(note)
-    say("\n".join(count_lines(attached.labels, label_set.names)))
+    written = kfgs.write_splats(attached.gaussians, out, facts=attached.facts)
+    say("\n".join([*attached.notes, *count_lines(attached.labels, label_set.names)]))
     say_lost(written)
     wrote(written.paths)
 
@@ -124,29 +113,30 @@ def edit(
         replay: Saved edits; they come first.
         scene: Scene folder in the same frame, for pictures of the views in which most changes.
     """
-    from ..formats import write_splats
-    from ..labels import EditList
-    from ..pipeline.compare import views_of_change, write_comparison
-    from ..scenes import load_scene
+    from ..viz.compare import views_of_change, write_comparison
 
     check_target("out", out)
     saved = check_output("out", out.with_name(f"{out.name}.edits.json"), "a file")
-    replayed = EditList() if replay is None else EditList.load(replay, anywhere=True)  # the user's own file
+    replayed = kfgs.EditList() if replay is None else kfgs.EditList.load(replay, anywhere=True)  # the user's own file
     by_class = any(rule.kind == "class" for change in replayed for rule in getattr(change, "where", ()))
     before = open_splats("splats", splats, named=replay is None or by_class)
-    states = list(accumulate(replayed, _apply, initial=before))
+    states = [before]
+    for change in replayed:
+        states.append(change.apply(states[-1]))
     asked = parse_edits(edits, states[-1].names)
     if not asked and not len(replayed):
         raise ValueError("edits: expected at least one, got none; give --remove, --recolor, --move or another")
     if scene is not None and before.sh is None:
         raise ValueError(f"scene: expected a splat with colours to show in it, got {before!r}; leave --scene out")
-    cameras = [] if scene is None else load_scene(scene).undistorted().cameras
-    *states, after = [*states[:-1], *accumulate(asked, _apply, initial=states[-1])]
+    cameras = [] if scene is None else kfgs.load_scene(scene).undistorted().cameras
+    for change in asked:
+        states.append(change.apply(states[-1]))
+    *states, after = states
     shown = [cameras[i] for i in views_of_change(before, after, cameras, PICTURES, between=states[1:])]
-    written = write_splats(after, out)
-    paths = [*written.paths, EditList((*replayed, *asked)).save(saved)]
+    written = kfgs.write_splats(after, out)
+    paths = [*written.paths, kfgs.EditList((*replayed, *asked)).save(saved)]
     if shown:
-        paths.append(write_comparison(out.with_name(f"{out.name}.png"), before, after, shown, titles=TITLES))
+        paths.append(write_comparison(out.with_name(f"{out.name}.png"), before, after, shown))
     say(f"{len(before)} Gaussians before, {len(after)} after {len(states)} edit(s)")
     if len(after) == 0:
         say("note: nothing is left")
@@ -158,15 +148,11 @@ def edit(
     wrote(paths)
 
 
-def _apply(cloud: Any, edit: Any) -> Any:
-    return edit.apply(cloud)
-
-
 def convert(
     source: Positional[Path],
     target: Positional[Given[Path]] = None,
     *,
-    precision: Precision = "small",
+    precision: Literal["lossless", "fine", "small", "tiny"] = "small",
     plain: Flag = False,
     by_class: Flag = False,
 ) -> None:
@@ -195,9 +181,8 @@ def convert(
         by_class: TARGET is a folder that receives one plain .ply for each class, 05_chair.ply for class 5.
     """
     from ..batch.run import describe_batch
-    from ..formats import write_splats
+    from ..pipeline.attach import save_labelled
     from ..pipeline.describe import describe
-    from ..pipeline.label import save_labelled
 
     if target is None:
         say(describe_batch(source) or describe(source))
@@ -213,14 +198,14 @@ def convert(
         check_target("target", target)
         splats = open_splats("source", source)
         shown = repr(splats)
-        written = write_splats(splats, target, plain=plain)
+        written = kfgs.write_splats(splats, target, plain=plain)
         say(shown)
         say_lost(written)
         say(f"{_bytes_of(source) / 2**10:,.1f} KiB -> {_bytes_of(target) / 2**10:,.1f} KiB")
         wrote(written.paths)
 
 
-def _pack(source: Path, target: Path, precision: Precision) -> None:
+def _pack(source: Path, target: Path, precision: Any) -> None:
     """Write a field again; say the error of each part, read back from the file."""
     from ..fields.store import check_place, read_description, stream_sizes
 
@@ -242,9 +227,6 @@ def _pack(source: Path, target: Path, precision: Precision) -> None:
 
 def _convert_by_class(source: Path, folder: Path) -> None:
     """One plain PLY for each class of a splat. The class is in the name of its file, so there is nothing next to it."""
-    from .._files import atomic_folder
-    from ..formats import write_splats
-
     check_output("target", folder, "a folder")
     splats = open_splats("source", source, labelled=True)
     if len(splats) == 0:
@@ -257,7 +239,7 @@ def _convert_by_class(source: Path, folder: Path) -> None:
         raise ValueError(f"target: expected another folder than that of {source}, which is read; give another name")
     with atomic_folder(folder) as new:
         for name, part in parts.items():
-            written = write_splats(part.replace(labels=None, scores=None), new / name, plain=True)
+            written = kfgs.write_splats(part.replace(labels=None, scores=None), new / name, plain=True)
     for name, part in parts.items():
         say(f"{name}: {len(part)} Gaussians")
     say_lost(written)

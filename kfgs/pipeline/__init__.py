@@ -2,7 +2,6 @@
 
 from .attach import attach
 from .color import ColorConfig, fit_color
-from .compare import views_of_change
 from .evaluate import evaluate, open_question
 from .fit import fit
 from .methods import Paper, Uplift
@@ -22,5 +21,4 @@ __all__ = [
     "segment_cameras",
     "segment_scene",
     "true_labels",
-    "views_of_change",
 ]

@@ -1,4 +1,4 @@
-"""Give any splat the classes of a semantic field: check or find the common frame, and carry the classes over."""
+"""Give a splat, or a cloud of points, the classes of a semantic field: find the common frame, and carry the classes over."""
 
 from __future__ import annotations
 
@@ -7,20 +7,28 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from .._check import check_choice, check_range
+from .._check import ORIGIN, check_choice, check_range
+from .._files import as_path
 from .._origin import recounted
 from ..cameras import Camera
 from ..cameras.similarity import Similarity
 from ..fields import SemanticField, fuse_views
-from ..formats import read_splats
+from ..formats import find_format, read_splats, write_splats
+from ..formats.ply import points_from_columns, read_header, read_ply, write_ply
+from ..formats.ply_3dgs import label_column
+from ..formats.sidecar import write_names
 from ..gaussians import Gaussians
 from ..labels import LabelSet, Transfer, nearest_labels
 from ..scenes import SceneError, align_by_cameras, frames_agree
 from ..scenes.frames import Alignment
 from ..splat import transform_gaussians, vote_labels
+from ..splat.sh import rgb_to_sh0
+from ..viz import palette
+from ..viz.pictures import check_suffix
 
 By = Literal["distance", "views"]
 NEARNESS = "1 - distance / lambda"  # the meaning of a score
@@ -120,8 +128,8 @@ def attach(
         votes = vote_labels(splats, views, len(semantic.names), min_share=0.0)
         hidden = votes.labels < 0
         transfer = _carry(splats.replace(labels=votes.labels), splats.select(hidden), distance)
-        labels, scores = votes.labels.clone(), votes.shares.clone()
-        labels[hidden], scores[hidden] = transfer.labels, transfer.scores.to(scores)
+        labels = votes.labels.masked_scatter(hidden, transfer.labels)
+        scores = votes.shares.masked_scatter(hidden, transfer.scores.to(votes.shares))
         how = {
             "labelled by": f"votes of {len(cameras)} segmented views",
             "score": f"share of the votes; where no view shows a Gaussian, {NEARNESS}, to those that have a class",
@@ -138,15 +146,13 @@ def attach(
         "similarity": similarity.matrix().tolist(),
         "counts": {"none": counts[0], **dict(zip(semantic.names, counts[1:], strict=True))},
     }
-    carried = f"by distance (lambda {transfer.distance:.3g})"
-    ways = [f"{transfer.labelled:,} got a class {carried}"]
-    if by == "views":
-        ways = [f"{len(splats) - len(transfer.labels):,} got a class by the views"]
-        ways += [f"{transfer.labelled:,} that no view shows {carried}"] if transfer.labelled else []
-    ways.append(f"{transfer.orphaned:,} got none")
-    notes = frame_note, f"{how['labelled by']}: of {len(splats):,} Gaussians {', '.join(ways)}"
+    ways = [f"{how['shown']:,} got a class by the views"] if by == "views" else []
+    if transfer.labelled or not ways:
+        who = "that no view shows" if ways else "got a class"
+        ways.append(f"{transfer.labelled:,} {who} by distance (lambda {transfer.distance:.3g})")
+    note = f"{how['labelled by']}: of {len(splats):,} Gaussians {', '.join(ways)}, {transfer.orphaned:,} got none"
     labelled = splats.replace(labels=labels, scores=scores.float(), names=semantic.names)
-    return Attached(labelled, transfer, similarity, alignment, notes, facts)
+    return Attached(labelled, transfer, similarity, alignment, (frame_note, note), facts)
 
 
 def _common_frame(
@@ -177,3 +183,49 @@ def _carry(source: Gaussians, target: Gaussians, distance: float | None) -> Tran
     assert source.labels is not None
     means = recounted(target.means, target.origin, source.origin)
     return nearest_labels(source.means, source.labels, means, distance)
+
+
+def is_cloud(path: Path) -> bool:
+    """Whether a path is a PLY of points, which have no size."""
+    if not path.is_file() or find_format(path).NAME != "ply":
+        return False
+    return "scale_0" not in {row.name for table in read_header(path).elements[:1] for row in table.properties}
+
+
+def save_labelled(path: str | Path, gaussians: Gaussians, *, rule: str) -> list[Path]:
+    """Write labelled Gaussians as a splat in the colours of their classes, with `class_id` and `score`.
+
+    `rule` says how they were found, in the JSON file with the class names that is written next to it.
+    """
+    assert gaussians.labels is not None
+    colors = torch.from_numpy(palette(gaussians.labels, gaussians.names)).to(gaussians.means) / 255
+    painted = gaussians.replace(features=None, sh=rgb_to_sh0(colors)[:, None])
+    return list(write_splats(painted, path, facts={"labelled by": rule}).paths)
+
+
+def label_cloud(
+    gaussians: Gaussians, cloud: str | Path, out: str | Path, *, distance: float | None = None
+) -> tuple[Transfer, list[Path]]:
+    """Carry labels to the points or Gaussians of a PLY file by distance (Sec. 3.4), keeping all their other columns.
+
+    Label colours are added if the cloud has no colours; `class_id` is replaced. A JSON file with the class names is written
+    next to `out`. `distance` is lambda, in world units; None: from the clouds' spacing. A ValueError if the file has no x, y,
+    z, or holds more than points (faces would be lost).
+    """
+    assert gaussians.labels is not None
+    cloud, out = as_path(cloud), check_suffix(out, ".ply", name="out")
+    columns, header = read_ply(cloud), read_header(cloud)
+    if others := [element.name for element in header.elements[1:] if element.rows]:  # for instance the faces of a mesh
+        raise ValueError(
+            f"{cloud}: expected nothing but points, got {', '.join(others)} too, which labelling would lose; save the "
+            "vertices as a point cloud"
+        )
+    local = recounted(points_from_columns(cloud, columns), ORIGIN, gaussians.origin)
+    moved = nearest_labels(gaussians.means, gaussians.labels, local, distance)
+    added = {"class_id": label_column(moved.labels)}
+    if not {"red", "green", "blue"} & set(columns):
+        rgb = palette(moved.labels, gaussians.names)
+        added |= {name: np.ascontiguousarray(rgb[:, i]) for i, name in enumerate(("red", "green", "blue"))}
+    write_ply(out, columns | added, comments=("labels carried by kfgs", *header.comments))
+    names = write_names(out, gaussians.names, **{"distance": moved.distance, "distance from": moved.how})
+    return moved, [out, names]

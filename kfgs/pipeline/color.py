@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,12 @@ from .._files import check_output, locked
 from .._progress import Progress, as_progress
 from ..cameras import Camera, resize_map
 from ..fields import ColorLoss, Densify, GaussianParams, Rates, Training, fit_field
-from ..fields.train import FieldFit, digest_tensors
+from ..fields.train import digest_tensors
 from ..formats import write_splats
 from ..gaussians import Gaussians
 from ..scenes import Scene
-from .stages import LOCK, Run, digest_pictures, digest_scene, stage_generator
-from .train import field_stage, stage_params, training_device, training_views, with_extent, with_points
+from .stages import LOCK, Run, digest_pictures, digest_scene
+from .train import field_stage, stage_gaussians, training_views, with_extent, with_points
 
 
 @dataclass(frozen=True)
@@ -88,15 +89,13 @@ class TrainingPictures(Sequence[Tensor]):
 
     def __init__(self, scene: Scene, views: Sequence[int], cameras: Sequence[Camera]) -> None:
         self._scene, self._views, self._sizes = scene, list(views), [camera.size for camera in cameras]
-        self._kept: dict[int, tuple[Tensor, Tensor | None]] = {}
+        self._kept = cache(self._read)
 
     def __len__(self) -> int:
         return len(self._views)
 
     def __getitem__(self, i: int) -> Tensor:  # type: ignore[override]  # [h, w, 3 or 4], one picture at a time
-        if i not in self._kept:
-            self._kept[i] = self._read(i)
-        bytes_, known = self._kept[i]
+        bytes_, known = self._kept(i)
         picture = bytes_.float() / 255
         return picture if known is None else picture.masked_fill(~known[..., None], torch.nan)
 
@@ -142,46 +141,36 @@ def fit_color(
         ValueError: if a camera has distortion, the scene's points are out of sight, the split has no views, or another
             process works in `folder`.
     """
-    config, progress = config or ColorConfig(), as_progress(progress)
+    config = config or ColorConfig()
     views = training_views(scene, split)
-    run = Run(check_output("folder", folder, "a folder"), report)
+    run = Run(check_output("folder", folder, "a folder"), report, seed, as_progress(progress))
     with locked(run.folder, LOCK):
-        scene = with_points(run, scene, views, seed, progress)
-        gaussians = color_stage(run, scene, views, config, seed, progress)
+        gaussians = color_stage(run, with_points(run, scene, views), views, config)
         write_splats(gaussians, run.folder / "color.ply")
     return gaussians
 
 
-def color_stage(
-    run: Run, scene: Scene, views: Sequence[int], config: ColorConfig, seed: int, progress: Progress
-) -> Gaussians:
+def color_stage(run: Run, scene: Scene, views: Sequence[int], config: ColorConfig) -> Gaussians:
     """The Gaussians of a colour field, as a stage of a run."""
-
-    def train(checkpoint: Path) -> FieldFit:
-        generator, degree = stage_generator(seed, "color"), config.sh_degree
-        start = GaussianParams.from_points(scene.points, colors=scene.colors, sh_degree=degree)
-        cameras = [scene.cameras[i] for i in views]
-        if config.picture_scale != 1:
-            sizes = [[max(1, round(n * config.picture_scale)) for n in camera.size] for camera in cameras]
-            cameras = [camera.resized(*size) for camera, size in zip(cameras, sizes, strict=True)]
-        return fit_field(
-            start.map(lambda value: value.to(training_device())),
-            cameras,
-            TrainingPictures(scene, views, cameras),
-            with_extent(config.training, scene),
-            loss=ColorLoss(config.ssim_weight),
-            generator=generator,
-            progress=progress,
-            checkpoint=checkpoint,
-        )
-
-    return field_stage(run, "color", _inputs(run, scene, views, config, seed), train)[0].activated().detach()
+    cameras = [scene.cameras[i] for i in views]
+    if config.picture_scale != 1:
+        sizes = [[max(1, round(n * config.picture_scale)) for n in camera.size] for camera in cameras]
+        cameras = [camera.resized(*size) for camera, size in zip(cameras, sizes, strict=True)]
+    start = partial(GaussianParams.from_points, scene.points, colors=scene.colors, sh_degree=config.sh_degree)
+    train = partial(
+        fit_field,
+        cameras=cameras,
+        targets=TrainingPictures(scene, views, cameras),
+        training=with_extent(config.training, scene),
+        loss=ColorLoss(config.ssim_weight),
+    )
+    return stage_gaussians(field_stage(run, "color", _inputs(run, scene, views, config), start, train))
 
 
 def find_color(run: Run, scene: Scene, views: Sequence[int], config: ColorConfig) -> tuple[Gaussians, int] | None:
     """Gaussians and steps of the longest colour stage of this scene in the run, if it has more steps than `config`."""
     free: dict[str, None] = {"config": None, "seed": None}
-    wanted = json.loads(json.dumps(_inputs(run, scene, views, config, 0) | free))
+    wanted = json.loads(json.dumps(_inputs(run, scene, views, config) | free))
     fitting = {
         int(stage.inputs["config"]["training"]["steps"]): stage
         for stage in run.finished("color")
@@ -191,10 +180,10 @@ def find_color(run: Run, scene: Scene, views: Sequence[int], config: ColorConfig
     if steps <= config.training.steps:
         return None
     run.say(f"geometry: the colours of {steps:,} steps that are in {run.folder}")
-    return stage_params(fitting[steps]).activated().detach(), steps
+    return stage_gaussians(fitting[steps]), steps
 
 
-def _inputs(run: Run, scene: Scene, views: Sequence[int], config: ColorConfig, seed: int) -> dict[str, Any]:
+def _inputs(run: Run, scene: Scene, views: Sequence[int], config: ColorConfig) -> dict[str, Any]:
     """What decides the colour stage."""
     training = asdict(with_extent(config.training, scene))
     extent = training.pop("extent")
@@ -203,6 +192,6 @@ def _inputs(run: Run, scene: Scene, views: Sequence[int], config: ColorConfig, s
         "scene": digest_scene(scene, views),
         "colors": digest_tensors(scene.colors),
         "extent": extent,
-        "seed": seed,
+        "seed": run.seed,
         "config": asdict(config) | {"training": training},
     }

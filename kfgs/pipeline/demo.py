@@ -6,10 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from .._check import ORIGIN
 from .._files import check_output, write_json
-from .._origin import recounted
-from ..evaluation import find_points, score_views
+from ..evaluation import Report, find_points, score_views
 from ..evaluation.surface import score_surface
 from ..fields import SemanticField
 from ..fields.store import NAME
@@ -17,20 +15,17 @@ from ..formats import write_splats
 from ..formats.ply import write_ply
 from ..gaussians import Gaussians
 from ..labels import EditList, OfClass, Recolor, Remove, connected_parts
-from ..labels.color import parse_color
 from ..scenes import FeatureFolder, Scene, load_scene
 from ..toy.room_folder import ToyConfig, make_toy_room
-from .attach import attach
+from ..viz.compare import views_of_change, write_comparison
+from .attach import attach, label_cloud, save_labelled
 from .color import ColorConfig, fit_color
-from .compare import views_of_change, write_comparison
 from .fit import fit
-from .label import label_cloud, save_labelled
 from .methods import Uplift
 from .run_report import write_run_report
 from .segment import score_scene, score_teacher, segment_scene, true_labels
 
 REMOVED, PAINTED, PAINT = "chair", "plant", "#c04040"  # the edits of the paper's Figures 5 and 4
-TITLES = ("before", "after")
 
 
 def run(
@@ -85,13 +80,7 @@ def run(
     say(f"the 2-D network alone, on the same views: {teacher.miou}")
     gaussians = field.label(classes)
     written = save_labelled(out / "gaussians.ply", gaussians, rule="fused features; score = cosine")
-    assert gaussians.labels is not None
-    known = find_points(folder)  # the room's true surface; protocol `kfgs-surface/1`
-    points = known.points.float()
-    local = recounted(points, ORIGIN, gaussians.origin)
-    surface = score_surface(gaussians.means, gaussians.labels, local, known.labels)
-    write_ply(out / "surface.ply", {name: points[:, i].contiguous().numpy() for i, name in enumerate("xyz")})
-    label_cloud(gaussians, out / "surface.ply", out / "surface.ply")
+    surface = _label_surface(folder, gaussians, out / "surface.ply")
     say(f"surface points: {surface}")
     say(
         f'5. Edits. The classes are carried over to the splat with the colours, and then "{REMOVED}" is a name for Gaussians: '
@@ -105,6 +94,15 @@ def run(
     return [out / "run" / NAME, *segmented, *written, out / "surface.ply", *pages, *edited, out / "scores.json"]
 
 
+def _label_surface(room: Path, gaussians: Gaussians, cloud: Path) -> Report:
+    """Write points of the room's true surface with the labels carried to them, and score these (`kfgs-surface/1`)."""
+    known = find_points(room)
+    write_ply(cloud, {name: known.points[:, i].float().numpy() for i, name in enumerate("xyz")})
+    label_cloud(gaussians, cloud, cloud)
+    assert gaussians.labels is not None
+    return score_surface(gaussians.means, gaussians.labels, known.points.float(), known.labels)
+
+
 def _edit_colors(
     out: Path, scene: Scene, field: SemanticField, colors: Gaussians, say: Callable[[str], None]
 ) -> list[Path]:
@@ -113,12 +111,9 @@ def _edit_colors(
     written = write_splats(before, out / "color.ply").paths
     for part in connected_parts(before, OfClass(REMOVED).select(before), field.cameras):
         say(f"  {REMOVED}: {part!r}")
-    for name, edit in {
-        "removed": Remove(OfClass(REMOVED)),
-        "recolored": Recolor(OfClass(PAINTED), parse_color(PAINT)),
-    }.items():
+    for name, edit in {"removed": Remove(REMOVED), "recolored": Recolor(PAINTED, PAINT)}.items():
         after, file = edit.apply(before), out / f"{name}.ply"
         written += [*write_splats(after, file).paths, EditList((edit,)).save(out / f"{name}.ply.edits.json")]
         views = [scene.cameras[i] for i in views_of_change(before, after, scene.cameras)]
-        written.append(write_comparison(out / f"{name}.png", before, after, views, titles=TITLES))
+        written.append(write_comparison(out / f"{name}.png", before, after, views))
     return written

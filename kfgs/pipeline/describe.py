@@ -20,6 +20,7 @@ from ..formats.ply import read_ply
 from ..formats.table import splat_file_of
 from ..scenes import FeatureFolder, load_scene
 from ..scenes.load import is_scene
+from .attach import is_cloud
 from .stages import Run
 
 
@@ -37,11 +38,10 @@ def describe(path: str | Path) -> str:
     if field is not None:
         return f"{SemanticField.load(field).summary()}\n  one file of {field.stat().st_size / 2**20:.2f} MiB"
     if path.is_file() or (splat_file_of(path) != path and not is_scene(path)):
-        if find_format(path).NAME == "ply":
-            columns = read_ply(splat_file_of(path))
-            if "scale_0" not in columns:
-                count = len(next(iter(columns.values())))
-                return f"{path}: PLY with {count} vertices; columns {', '.join(columns)}"
+        if is_cloud(splat_file_of(path)):
+            vertices = read_ply(splat_file_of(path))
+            count = len(next(iter(vertices.values())))
+            return f"{path}: PLY with {count} vertices; columns {', '.join(vertices)}"
         splats = read_splats(path)
         lines = [f"{path}: {splats!r}"]
         if len(splats):

@@ -9,7 +9,8 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,11 +21,10 @@ from torch import Tensor
 
 from .._files import check_output, folded_name, locked, real_path, write_json
 from .._progress import Progress, as_progress
-from ..cameras import Camera
 from ..fields import Autoencoded, Codewords, GaussianParams, Identity, SemanticField, fit_field, fuse_views, uplift_maps
 from ..fields.decoders import Decoder
 from ..fields.store import NAME, check_place, scene_classes
-from ..fields.train import FieldFit, digest_tensors
+from ..fields.train import digest_tensors
 from ..formats import read_splats, write_splats
 from ..formats.table import splat_file_of
 from ..gaussians import Gaussians
@@ -36,8 +36,8 @@ from ..scenes.scene import as_taken
 from .color import color_stage, find_color
 from .maps import KnownFeatures, as_maps, describe_maps, map_shape, maps_of_views
 from .methods import Paper, Uplift
-from .stages import LOCK, Run, Stage, digest_cameras, digest_scene, digest_shape, stage_generator
-from .train import field_stage, training_device, training_views, with_extent, with_points
+from .stages import LOCK, Run, Stage, digest_cameras, digest_scene, digest_shape
+from .train import field_stage, stage_gaussians, training_views, with_extent, with_points
 
 REPORT = ("report.html", "preview.png", "codebook.png", "field.png")  # what `write_run_report` writes
 
@@ -85,18 +85,18 @@ def fit(
     if kept is not None:
         check_place(kept / NAME)
     with nullcontext(kept) if kept is not None else TemporaryDirectory(prefix="kfgs-") as place:
-        run = Run(Path(place), report)
+        run = Run(Path(place), report, seed, progress)
         maps = _open_maps(maps, scene, split, run.folder / "features", progress is True)
         with locked(run.folder, LOCK):
             if isinstance(method, Paper) or method.splat is None:  # else nothing is trained
-                scene = with_points(run, scene, views, seed, progress)
+                scene = with_points(run, scene, views)
             seen = maps_of_views(scene, views, maps)
-            job = _Job(run, scene, views, seen, describe_maps(run, seen), seed, progress)
-            field, about = _uplift(job, method) if isinstance(method, Uplift) else _paper(job, method)
+            make = _uplift if isinstance(method, Uplift) else _paper
+            field, about = make(run, scene, views, seen, method)  # type: ignore[arg-type]
             info = {
                 **about,
                 "seed": seed,
-                "views": [camera.name for camera in job.cameras],
+                "views": [scene.cameras[i].name for i in views],
                 "teacher_map": list(map_shape(seen)),
                 "seconds": {stage.name: round(stage.seconds, 3) for stage in run.stages},
                 "stages": [stage.folder.name for stage in run.stages],
@@ -113,25 +113,6 @@ def fit(
                     (kept / name).unlink(missing_ok=True)
                 field.save(kept / NAME)
     return field
-
-
-@dataclass(frozen=True)
-class _Job:
-    """The values that all stages of a fit need."""
-
-    run: Run
-    scene: Scene
-    views: list[int]
-    maps: FeatureMaps
-    features: dict[str, Any]
-    """What decides the maps, as JSON."""
-    seed: int
-    progress: Progress
-
-    @property
-    def cameras(self) -> list[Camera]:
-        """The cameras of the views."""
-        return [self.scene.cameras[i] for i in self.views]
 
 
 def _open_maps(maps: Any, scene: Scene, split: str, folder: Path, progress: bool) -> FeatureMaps:
@@ -156,119 +137,105 @@ def _open_maps(maps: Any, scene: Scene, split: str, folder: Path, progress: bool
 # Uplift: fuse first, compress after.
 
 
-def _uplift(job: _Job, method: Uplift) -> tuple[SemanticField, dict[str, Any]]:
+def _uplift(
+    run: Run, scene: Scene, views: list[int], maps: FeatureMaps, method: Uplift
+) -> tuple[SemanticField, dict[str, Any]]:
     """The maps' features on the Gaussians of a splat, merged and compressed; and facts about the geometry."""
-    geometry, origin = _geometry(job, method)
-    cameras, options = digest_cameras(job.cameras), method.uplift
+    cameras, options = [scene.cameras[i] for i in views], method.uplift
     latents = None if method.latents is None else digest_tensors(method.latents.basis)
-    seen = {"features": job.features, "cameras": cameras, "latents": latents}
-    inputs = seen | {"geometry": digest_shape(geometry), "config": asdict(options), "seed": job.seed}
-    scratch = job.run.scratch("uplift", seen | {"pixels": options.pixels})
+    seen = {"features": describe_maps(run, maps), "cameras": digest_cameras(cameras), "latents": latents}
+    geometry, origin = _geometry(run, scene, views, method)
+    inputs = seen | {"geometry": digest_shape(geometry), "config": asdict(options), "seed": run.seed}
+    scratch = run.scratch("uplift", seen | {"pixels": options.pixels})
 
     def make(folder: Path) -> None:
         field = uplift_maps(
             geometry.to("cpu"),
-            job.cameras,
-            job.maps,
+            cameras,
+            maps,
             options,
             latents=method.latents,
-            generator=stage_generator(job.seed, "uplift"),
+            generator=run.generator("uplift"),
             scratch=scratch,
-            progress=job.progress is True,
+            progress=run.progress is True,
         )
-        job.run.say(
+        run.say(
             f"{field.dim} channels as {field.decoder.latent} latents; {len(field)} of {len(geometry)} Gaussians left"
         )
         if "note" in field.info:
-            job.run.say(f"note: {field.info['note']}")
+            run.say(f"note: {field.info['note']}")
         field.save(folder / NAME)
 
-    stage = job.run.stage("uplift", inputs, make)
+    stage = run.stage("uplift", inputs, make)
     shutil.rmtree(scratch, ignore_errors=True)
     return SemanticField.load(stage.folder), {"method": "uplift", **origin}
 
 
-def _geometry(job: _Job, method: Uplift) -> tuple[Gaussians, dict[str, Any]]:
+def _geometry(run: Run, scene: Scene, views: list[int], method: Uplift) -> tuple[Gaussians, dict[str, Any]]:
     """The Gaussians to fuse onto, and where they are from."""
     splat = method.splat
     if isinstance(splat, Gaussians):
         return splat, {"geometry": "given"}
     if splat is not None:
         return read_splats(splat), {"geometry": str(splat_file_of(splat))}
-    longer = find_color(job.run, job.scene, job.views, method.color)
-    if longer is not None:
-        gaussians, steps = longer
-    else:
-        options = method.color, job.seed, job.progress
-        gaussians, steps = color_stage(job.run, job.scene, job.views, *options), method.color.training.steps
-        if not (job.run.folder / "color.ply").exists():
-            write_splats(gaussians, job.run.folder / "color.ply")
+    longer = find_color(run, scene, views, method.color)
+    gaussians, steps = longer or (color_stage(run, scene, views, method.color), method.color.training.steps)
+    if longer is None and not (run.folder / "color.ply").exists():
+        write_splats(gaussians, run.folder / "color.ply")
     return gaussians, {"geometry": "trained on the pictures", "steps": {"color": steps}}
 
 
 # Paper: compress each map, then train Gaussians on the compressed maps (Figure 2).
 
 
-def _paper(job: _Job, method: Paper) -> tuple[SemanticField, dict[str, Any]]:
+def _paper(
+    run: Run, scene: Scene, views: list[int], maps: FeatureMaps, method: Paper
+) -> tuple[SemanticField, dict[str, Any]]:
     """Codebook, index maps, autoencoder, Gaussians trained on the latent maps, and what the views show of each Gaussian."""
-    run, maps, bars = job.run, job.maps, job.progress is True
     targets: Sequence[Tensor] = KnownFeatures(maps)
     decoder: Decoder = Identity(map_shape(maps)[-1])
-    inputs: dict[str, Any] = {"features": job.features}
+    features = {"features": describe_maps(run, maps)}
+    inputs: dict[str, Any] = dict(features)
     if method.codebook is not None:  # Adaptive Data Compression, Sec. 3.3.1: the codebook S
-        options = method.codebook
-        book = _learn(job, "codebook", inputs, options, lambda **given: fit_codebook(maps, options, **given))
+        book = _learn(run, "codebook", features, method.codebook, partial(fit_codebook, maps))
         codebook = Codebook.load(book.folder / "codebook.safetensors")
-        indexed = run.stage(  # quantisation, Eq. 5: the index map M of every view
-            "index_maps",
-            {"features": job.features, "codebook": book.key},
-            lambda folder: quantize_maps(maps, codebook, progress=bars).save(folder / "index_maps.safetensors"),
-        )
+
+        def quantize(folder: Path) -> None:  # Eq. 5: the index map M of every view
+            quantize_maps(maps, codebook, progress=run.progress is True).save(folder / "index_maps.safetensors")
+
+        indexed = run.stage("index_maps", features | {"codebook": book.key}, quantize)
         inputs, latents, decoder = {"index_maps": indexed.key}, codebook.codewords, Codewords(codebook)
         if method.autoencoder is not None:  # Semantic Compression, Sec. 3.3.2: encoder E and decoder Psi
-            layers, learnt = method.autoencoder, {"codebook": book.key}
-            coder = _learn(
-                job, "autoencoder", learnt, layers, lambda **given: fit_autoencoder(codebook, layers, **given)
-            )
+            learn = partial(fit_autoencoder, codebook)
+            coder = _learn(run, "autoencoder", {"codebook": book.key}, method.autoencoder, learn)
             autoencoder = Autoencoder.load(coder.folder / "autoencoder.safetensors")
             inputs["autoencoder"], decoder = coder.key, Autoencoded(codebook, autoencoder)
             with torch.no_grad():
                 latents = autoencoder.encode(codebook.codewords)
         targets = LatentMaps(IndexMaps.load(indexed.folder / "index_maps.safetensors"), latents)
-    params, trained = _train(job, method, targets, inputs)
-    field = SemanticField(params.activated().detach(), decoder)
-    answers = run.stage(
-        "answers", {"field": trained.key}, lambda folder: fuse_views(field, job.cameras).save(folder / NAME)
+    # the decoupled field, Sec. 3.2: Gaussians whose rendered latents follow the targets (Eq. 4)
+    cameras, training = [scene.cameras[i] for i in views], with_extent(method.training, scene)
+    inputs |= {"scene": digest_scene(scene, views), "config": asdict(training), "seed": run.seed}
+    start = partial(GaussianParams.from_points, scene.points, decoder.latent)
+    trained = field_stage(
+        run, "field", inputs, start, partial(fit_field, cameras=cameras, targets=targets, training=training)
     )
-    return SemanticField.load(answers.folder), {"method": "paper", "steps": {"field": method.training.steps}}
+    field = SemanticField(stage_gaussians(trained), decoder)
+    answers = run.stage(
+        "answers", {"field": trained.key}, lambda folder: fuse_views(field, cameras).save(folder / NAME)
+    )
+    return SemanticField.load(answers.folder), {"method": "paper", "steps": {"field": training.steps}}
 
 
 def _learn(
-    job: _Job, name: str, inputs: dict[str, Any], options: Any, learn: Callable[..., Codebook | Autoencoder]
+    run: Run, name: str, inputs: dict[str, Any], options: Any, learn: Callable[..., Codebook | Autoencoder]
 ) -> Stage:
     """The stage of a codebook or an autoencoder: its file, named like the stage, and its history."""
 
     def make(folder: Path) -> None:
-        made = learn(generator=stage_generator(job.seed, name), progress=job.progress)
+        made = learn(options, generator=run.generator(name), progress=run.progress)
         made.save(folder / f"{name}.safetensors")
         assert made.report is not None
         write_json(folder / "history.json", made.report.history)
 
-    return job.run.stage(name, inputs | {"config": asdict(options), "seed": job.seed}, make)
-
-
-def _train(job: _Job, method: Paper, targets: Sequence[Tensor], inputs: dict[str, Any]) -> tuple[GaussianParams, Stage]:
-    """The decoupled field, Sec. 3.2: Gaussians whose rendered latents follow the targets (Eq. 4)."""
-    options = with_extent(method.training, job.scene)
-    inputs |= {"scene": digest_scene(job.scene, job.views), "config": asdict(options), "seed": job.seed}
-
-    def train(checkpoint: Path) -> FieldFit:
-        generator = stage_generator(job.seed, "field")
-        start = GaussianParams.from_points(job.scene.points, int(targets[0].shape[-1]))
-        start = start.map(lambda value: value.to(training_device()))
-        progress = job.progress
-        return fit_field(
-            start, job.cameras, targets, options, generator=generator, progress=progress, checkpoint=checkpoint
-        )
-
-    return field_stage(job.run, "field", inputs, train)
+    return run.stage(name, inputs | {"config": asdict(options), "seed": run.seed}, make)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ class ViewMaps:
 
     def __init__(self, maps: FeatureMaps, views: Scene) -> None:
         self.maps, self._taken, self._straighten = maps, as_taken(views), views.lenses is not None
-        self._kept: dict[tuple[int, tuple[int, int]], Tensor | None] = {}
+        self._counted = cache(self._taken.counted)  # maps are read several times
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -55,12 +56,6 @@ class ViewMaps:
             return features
         straight, _, inside = undistort(features, self._taken.cameras[i].resized(*size))
         return straight * inside[..., None]
-
-    def _counted(self, i: int, size: tuple[int, int]) -> Tensor | None:  # [h, w] bool
-        """The pixels that are neither masked nor transparent; kept, because maps are read several times."""
-        if (i, size) not in self._kept:
-            self._kept[i, size] = self._taken.counted(i, size)
-        return self._kept[i, size]
 
 
 class KnownFeatures(Sequence[Tensor]):

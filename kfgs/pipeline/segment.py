@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ from ..fields import SemanticField
 from ..labels import LabelSet, classify
 from ..labels.label_set import class_rows
 from ..scenes import Scene, list_images
+from ..scenes.files import is_inside
 from ..viz import FeatureColors, overlay_labels, palette
 from ..viz.linked import evenly
 from ..viz.palette import UNLABELLED
@@ -65,7 +66,7 @@ def segment_scene(
     for stem, known in truth.items():
         check_truth(known, len(classes), f"truth[{stem!r}]")
     views = scene.views(split)
-    labels = _segment(field, {scene.stem(i): scene.cameras[i] for i in views}, classes, as_path(out), progress)
+    labels = segment_cameras(field, [scene.cameras[i] for i in views], classes, out, progress=progress)
     colors = FeatureColors.fit(field.features) if pictures else None
     for k in evenly(len(views), pictures).tolist():
         stem, photo = scene.stem(views[k]), scene.image(views[k])
@@ -102,20 +103,12 @@ def segment_cameras(
         The label map [H, W] of each camera by its name, without a suffix such as .png.
     """
     names = [file_stem(camera.name or "") for camera in cameras]
-    outside = any(name.startswith("/") or ".." in PurePosixPath(name).parts for name in names)
-    if "" in names or len(set(names)) != len(names) or outside:
+    if len(set(names)) != len(names) or not all(map(is_inside, names)):
         raise ValueError(
             f"cameras: expected a name of its own for each, as pictures in a folder can have, got {names!r:.120}; name them "
             "with replace()"
         )
-    return _segment(field, dict(zip(names, cameras, strict=True)), classes, as_path(out), progress)
-
-
-def _segment(
-    field: SemanticField, cameras: Mapping[str, Camera], classes: LabelSet, out: Path, progress: bool
-) -> dict[str, Tensor]:
-    """Segment each camera, and write both label pictures under its name."""
-    check_output("out", out, "a folder")
+    out = check_output("out", out, "a folder")
     if len(classes) > VOID:
         raise ValueError(
             f"classes: expected at most {VOID} (label pictures hold a byte per pixel, {VOID} = none), got {len(classes)}; "
@@ -125,7 +118,8 @@ def _segment(
     unused = np.zeros((VOID - len(classes), 3), np.uint8)
     colors = np.vstack([palette(np.arange(len(classes)), classes.names), unused, [UNLABELLED]]).astype(np.uint8)
     labels = {}
-    for name, camera in tqdm(cameras.items(), desc="segment", unit="view", disable=not progress):
+    pairs = zip(names, cameras, strict=True)
+    for name, camera in tqdm(pairs, desc="segment", total=len(names), unit="view", disable=not progress):
         labels[name] = field.segment(camera, classes)
         save_label_map(out / "predicted" / f"{name}.png", labels[name])
         save_label_map(out / "colored" / f"{name}.png", labels[name], colors)

@@ -20,6 +20,7 @@ from torch import Tensor
 from .._arrays import reading
 from .._files import atomic_folder, digest_file, digest_value, read_json, real_path, write_json
 from .._origin import Origin
+from .._progress import Progress
 from ..cameras import Camera
 from ..fields.train import digest_tensors
 from ..gaussians import Gaussians
@@ -60,6 +61,8 @@ class Run:
 
     folder: Path
     report: Callable[[str], None] | None = None
+    seed: int = 0
+    progress: Progress = False
     stages: list[Stage] = field(default_factory=list)
 
     def stage(self, name: str, inputs: dict[str, Any], make: Callable[[Path], float | None]) -> Stage:
@@ -112,6 +115,11 @@ class Run:
             write_json(file, known)
         return result
 
+    def generator(self, name: str) -> torch.Generator:
+        """A separate generator for each stage, so that reusing a stage does not change later ones."""
+        digest = hashlib.sha256(f"{name}:{self.seed}".encode()).digest()
+        return torch.Generator().manual_seed(int.from_bytes(digest[:7], "little"))
+
     def say(self, text: str) -> None:
         """Report a line, if anyone listens."""
         if self.report is not None:
@@ -123,12 +131,6 @@ def read_stage(folder: Path) -> Stage:
     about = read_json(folder / STAGE_FILE)
     with reading(folder / STAGE_FILE, "the description of a stage", "delete its folder, and it will be made again"):
         return Stage(str(about["name"]), folder, float(about["seconds"]), dict(about["inputs"]))
-
-
-def stage_generator(seed: int, purpose: str) -> torch.Generator:
-    """A separate generator for each stage, so that reusing a stage does not change later ones."""
-    digest = hashlib.sha256(f"{purpose}:{seed}".encode()).digest()
-    return torch.Generator().manual_seed(int.from_bytes(digest[:7], "little"))
 
 
 def digest_shape(gaussians: Gaussians) -> str:

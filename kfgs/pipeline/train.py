@@ -13,11 +13,11 @@ import torch
 from .._arrays import read_safetensors, save_tensors
 from .._check import as_origin
 from .._files import write_json
-from .._progress import Progress
 from ..cameras.projection import project_points
 from ..fields import GaussianParams, Training
 from ..fields.train import FieldFit
 from ..fields.training import check_extent
+from ..gaussians import Gaussians
 from ..scenes import Scene, SceneError, SfmConfig, find_points
 from ..scenes.scene import check_is_scene
 from ..splat import available_engines
@@ -62,7 +62,7 @@ def check_scene(scene: Scene, views: Sequence[int], few: int = FEW_POINTS) -> No
         )
 
 
-def with_points(run: Run, scene: Scene, views: Sequence[int], seed: int, progress: Progress) -> Scene:
+def with_points(run: Run, scene: Scene, views: Sequence[int]) -> Scene:
     """The scene, with points if it had fewer than `FEW_POINTS`: triangulated from the known poses of some of its views.
 
     If `find_points` finds no more than there are, these stay. A SceneError if there are none, and pictures and poses do not
@@ -71,7 +71,11 @@ def with_points(run: Run, scene: Scene, views: Sequence[int], seed: int, progres
     if len(scene.points) >= FEW_POINTS:
         return scene
     seen, everything = scene.select(views), range(len(views))
-    inputs = {"pictures": digest_pictures(run, seen, everything), "scene": digest_scene(seen, everything), "seed": seed}
+    inputs = {
+        "pictures": digest_pictures(run, seen, everything),
+        "scene": digest_scene(seen, everything),
+        "seed": run.seed,
+    }
 
     def make(folder: Path) -> None:
         run.say(
@@ -80,7 +84,7 @@ def with_points(run: Run, scene: Scene, views: Sequence[int], seed: int, progres
         )
         made = scene
         try:
-            made = find_points(seen, config=SfmConfig(seed=seed), progress=progress is True)
+            made = find_points(seen, config=SfmConfig(seed=run.seed), progress=run.progress is True)
         except (SceneError, ImportError) as error:
             if len(scene.points) == 0:
                 raise
@@ -100,14 +104,14 @@ def with_extent(options: Training, scene: Scene) -> Training:
 
 
 def field_stage(
-    run: Run, name: str, inputs: dict[str, Any], train: Callable[[Path], FieldFit]
-) -> tuple[GaussianParams, Stage]:
-    """Train a field as a stage of a run; `train` gets the file for its checkpoint, from which it resumes after a kill."""
+    run: Run, name: str, inputs: dict[str, Any], start: Callable[[], GaussianParams], train: Callable[..., FieldFit]
+) -> Stage:
+    """Train a field as a stage of a run: `train`, a part of `fit_field`, from `start()`; after a kill it resumes."""
     checkpoint = run.scratch(name, inputs)
 
     def make(folder: Path) -> float:
-        started = time.perf_counter()
-        fit = train(checkpoint)
+        started, params = time.perf_counter(), start().map(lambda value: value.to(training_device()))
+        fit = train(params, generator=run.generator(name), progress=run.progress, checkpoint=checkpoint)
         origin = dict(zip(("origin",), origin_tensors(fit.params.origin), strict=False))
         save_tensors(folder / "params.safetensors", fit.params.to_tensors() | origin)
         write_json(folder / "history.json", fit.history)
@@ -115,11 +119,11 @@ def field_stage(
 
     stage = run.stage(name, inputs, make)
     checkpoint.unlink(missing_ok=True)
-    return stage_params(stage), stage
+    return stage
 
 
-def stage_params(stage: Stage) -> GaussianParams:
-    """The parameters that a finished stage of `field_stage` has."""
+def stage_gaussians(stage: Stage) -> Gaussians:
+    """The Gaussians that a finished stage of `field_stage` has."""
     tensors = read_safetensors(stage.folder / "params.safetensors")[0]
     origin = tensors.pop("origin", torch.zeros(3))
-    return GaussianParams(**tensors, origin=as_origin(origin.tolist()))
+    return GaussianParams(**tensors, origin=as_origin(origin.tolist())).activated().detach()

@@ -3,6 +3,7 @@
 from .boxes import add_boxes
 from .clouds import add_cloud, to_pyvista
 from .colors import FeatureColors
+from .compare import views_of_change
 from .examples import draw_examples
 from .films import save_animation, show_cloud
 from .frusta import add_cameras
@@ -34,4 +35,5 @@ __all__ = [
     "save_animation",
     "show_cloud",
     "to_pyvista",
+    "views_of_change",
 ]

@@ -20,16 +20,18 @@ from .._check import check_choice, check_range, check_shapes
 from .._files import atomic_path
 from ..cameras import Camera
 from ..gaussians import Gaussians, check_gaussians
+from ..labels import Part
 from ..labels.color import parse_color
 from ..scenes import Scene
 from ..splat import rasterize
 from .colors import Array, CloudColor, FeatureColors, cloud_colors, color_by_default
-from .pictures import as_bytes, check_suffix, legend_strip, picture_grid, resize_photo
+from .pictures import as_bytes, check_suffix, legend_strip, picture_grid, picture_sheet, resize_photo, save_picture
 
 Show = Callable[[Camera], Any]
 SUFFIXES = (".gif", ".mp4")
 OUTLINE = (213, 94, 0)  # vermilion of Okabe and Ito
 FADED = 0.7  # share of white in what is not selected
+MOST, WIDTH = 12, 360  # parts in a sheet, and pixels of the picture of each
 
 
 def show_cloud(
@@ -86,6 +88,25 @@ def show_selection(gaussians: Gaussians, mask: Tensor, under: Show | None = None
         return np.rint(picture).astype(np.uint8)
 
     return show
+
+
+def write_parts(
+    path: Path, gaussians: Gaussians, parts: Sequence[Part], cameras: Sequence[Camera], under: Show | None, name: str
+) -> None:
+    """Draw the largest parts, each in its best view with an outline, while the rest fades; nothing if no view shows one.
+
+    `parts` are from `connected_parts`, with these cameras. They are titled name/1, name/2.
+    """
+    drawn: dict[str, Array] = {}
+    for number, part in enumerate(parts[:MOST], start=1):
+        if part.best_view is not None:
+            camera = cameras[part.best_view.index]
+            camera = camera.resized(max(1, round(WIDTH * camera.height / camera.width)), WIDTH)
+            mask = torch.zeros(len(gaussians), dtype=torch.bool).index_fill_(0, part.indices.cpu(), True)
+            title = f"{name}/{number}" + (f" in {camera.name}" if camera.name else "")
+            drawn[title] = show_selection(gaussians, mask, under)(camera)
+    if drawn:
+        save_picture(path, picture_sheet([*drawn.values()], [*drawn], 3))
 
 
 def show_photos(scene: Scene) -> Show:

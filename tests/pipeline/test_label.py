@@ -9,7 +9,8 @@ from kfgs.formats import read_splats
 from kfgs.formats.ply import read_ply, write_ply
 from kfgs.gaussians import Gaussians
 from kfgs.labels import Selection, connected_parts
-from kfgs.pipeline.label import WIDTH, label_cloud, save_labelled, write_parts
+from kfgs.pipeline.attach import label_cloud, save_labelled
+from kfgs.viz.films import WIDTH, write_parts
 
 K = torch.tensor([[40.0, 0, 40], [0, 40, 30], [0, 0, 1]])
 

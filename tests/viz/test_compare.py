@@ -8,11 +8,7 @@ from PIL import Image
 
 from kfgs.cameras import Camera
 from kfgs.gaussians import Gaussians
-from kfgs.pipeline.compare import (
-    render_color,
-    views_of_change,
-    write_comparison,
-)
+from kfgs.viz.compare import render_color, views_of_change, write_comparison
 
 
 def ball(*places, color=(1.0, 0.0, 0.0), scale=0.3):
@@ -88,7 +84,7 @@ def test_an_edit_that_is_undone_gets_no_view():
 
 def test_the_comparison_holds_both_renderings(tmp_path):
     before, after = ball(AHEAD), ball(AHEAD, color=(0.0, 1.0, 0.0))
-    path = write_comparison(tmp_path / "new" / "a.png", before, after, [camera(0)], titles=("x", "y"))
+    path = write_comparison(tmp_path / "new" / "a.png", before, after, [camera(0)])
     picture = np.asarray(Image.open(path))
     assert path == tmp_path / "new" / "a.png"
     left, right = ((render_color(cloud, camera(0)) * 255).round().numpy() for cloud in (before, after))

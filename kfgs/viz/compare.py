@@ -9,12 +9,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from .._files import as_path
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..scenes import Scene
 from ..splat import rasterize
-from ..viz.pictures import picture_grid, save_picture
+from .pictures import picture_grid, save_picture
 
 PREVIEW = 96  # pixels: width of the renderings that choose the viewpoints
 VISIBLE = 8 / 255  # a pixel has changed if a channel changed by more than this
@@ -66,13 +65,11 @@ def _ranked(shares: Sequence[float]) -> list[int]:
     return [i for i in order if shares[i] > 0]
 
 
-def write_comparison(
-    path: str | Path, before: Gaussians, after: Gaussians, cameras: Sequence[Camera], *, titles: tuple[str, str]
-) -> Path:
+def write_comparison(path: Path, before: Gaussians, after: Gaussians, cameras: Sequence[Camera]) -> Path:
     """Draw the scene before and after from each viewpoint, one row each, into one PNG file."""
     rows = [[render_color(cloud, camera) for cloud in (before, after)] for camera in cameras]
-    save_picture(path, picture_grid(rows, titles))
-    return as_path(path)
+    save_picture(path, picture_grid(rows, ("before", "after")))
+    return path
 
 
 def draw_photos(gaussians: Gaussians, scene: Scene, views: Sequence[int], folder: Path) -> list[Path]:

@@ -1,4 +1,4 @@
-"""The command select: the Gaussians of a class or phrase."""
+"""The commands select and view: ask a field or a labelled splat, in the terminal or in the viewer."""
 
 from __future__ import annotations
 
@@ -6,14 +6,16 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from .._files import atomic_folder, check_output
-from .files import is_field, open_field, open_splats
+import kfgs
+
+from .._files import atomic_folder, check_output, real_path, write_json
+from .files import is_field, open_field, open_splats, say, wrote
 from .options import Classes, Given, Positional, Teacher
-from .output import say, wrote
 
-# Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
+Where = Literal["browser", "html", "window", "picture"]
+FEW = 0.05  # of a colour cloud within lambda, under which the frames probably differ
 
 
 def select(
@@ -46,7 +48,7 @@ def select(
         distance: Gaussians at most this far apart are one part, in world units; by default from the spacing of the scene.
     """
     from .._check import check_range
-    from ..labels import OfClass, Selection, connected_parts
+    from ..labels import Selection
     from ..labels.components import component_distance
 
     if out is not None:
@@ -67,7 +69,7 @@ def select(
         scene = classes.photos_of(field) if out is not None else None
     else:
         scene, cloud = classes.loaded, open_splats("source", source, named=True)
-        cameras, selection = None if scene is None else scene.cameras, OfClass(query).select(cloud)
+        cameras, selection = None if scene is None else scene.cameras, kfgs.OfClass(query).select(cloud)
         if cloud.scores is not None:
             mask = selection.mask if threshold is None else selection.mask & (cloud.scores > threshold)
             selection = Selection(mask, cloud.scores, threshold, selection.how)
@@ -77,7 +79,7 @@ def select(
         raise ValueError(f"query: expected Gaussians to save, got none of {query!r}; lower the threshold or drop --out")
     if distance is None and len(selection):
         distance = component_distance(cloud.means, selection.mask)
-    parts = connected_parts(cloud, selection, cameras, distance=distance)
+    parts = kfgs.connected_parts(cloud, selection, cameras, distance=distance)
     if out is not None:  # before anything is printed, whose reader may have ended
         facts = {"query": query, "threshold": selection.threshold, "how": selection.how, "count": len(selection)}
         written = _save(out, facts | {"parts": parts}, cloud, selection, cameras, scene)
@@ -96,18 +98,13 @@ def select(
 
 def _save(folder: Path, facts: dict[str, Any], cloud: Any, selection: Any, cameras: Any, scene: Any) -> list[str]:
     """Write a selection as numbers (JSON), as Gaussians (PLY), and as a picture of its parts over photographs."""
-    from .._files import write_json
-    from ..formats import write_splats
-    from ..pipeline.label import write_parts
-    from ..viz import show_cloud
-    from ..viz.films import show_photos
+    from ..viz.films import show_cloud, show_photos, write_parts
 
     under = None if cloud.sh is None else show_cloud(cloud, color_by="rgb")
-    under = under if scene is None else show_photos(scene)
-    parts = facts["parts"]
+    under, parts = under if scene is None else show_photos(scene), facts["parts"]
     with atomic_folder(folder) as new:
         write_json(new / "selection.json", facts | {"parts": [part.to_json() for part in parts]})
-        write_splats(cloud.select(selection.mask), new / "selection.ply")
+        kfgs.write_splats(cloud.select(selection.mask), new / "selection.ply")
         write_parts(new / "parts.png", cloud, parts, cameras or (), under, facts["query"])
         written = sorted(path.name for path in new.iterdir())
     for name in {"parts.png", "selection.ply.classes.json"} - set(written):
@@ -122,7 +119,6 @@ def words_of(classes: Classes, teacher: Teacher, field: Any) -> tuple[Any, Calla
     compared, are then its own. It may be asked without a table of words, too.
     """
     from ..labels.label_set import teacher_mismatch
-    from ..teachers.prompts import make_label_set
 
     network = teacher.load()
     if network is None:
@@ -130,7 +126,7 @@ def words_of(classes: Classes, teacher: Teacher, field: Any) -> tuple[Any, Calla
     known = classes.text is not None or classes.scene is not None or field.classes is not None
     label_set = classes.load_classes(field) if known else None
     templates = None if label_set is None else label_set.info.get("templates")
-    asked = make_label_set(network, ["thing"], templates=templates)
+    asked = kfgs.make_label_set(network, ["thing"], templates=templates)
     label_set = label_set or asked
     difference = teacher_mismatch(asked.info, label_set.info)
     if difference is not None:
@@ -144,6 +140,109 @@ def words_of(classes: Classes, teacher: Teacher, field: Any) -> tuple[Any, Calla
 
     @cache
     def embed(phrase: str) -> Any:
-        return make_label_set(network, [phrase], templates=templates, negatives=None).embeddings[0]
+        return kfgs.make_label_set(network, [phrase], templates=templates, negatives=None).embeddings[0]
 
     return label_set, embed
+
+
+def view(
+    source: Positional[Path],
+    *,
+    color: Given[Path] = None,
+    ask: Given[str] = None,
+    where: Where = "browser",
+    out: Path = Path("kfgs_view"),
+    teacher: Teacher,
+    classes: Classes,
+) -> None:
+    """Explore a field: type "chair", change gamma and lambda, click a Gaussian, save the selection.
+
+    It opens a page in the browser, which only this machine can open. A selection in the semantic cloud lights up in the colour
+    cloud. Gamma is the score that a Gaussian must exceed; lambda is the distance within which the colour cloud
+    lights up too.
+
+    Examples:
+        kfgs view run/
+        kfgs view run/ --where html    # one file to share
+        kfgs view labelled.ply --ask chair --where picture --out pictures/
+        kfgs view run/ --teacher lseg --weights demo_e200.ckpt    # any text
+
+    Args:
+        source: A run folder of `kfgs fit` or its field, asked by text; or a splat with classes (`kfgs attach`), asked by class.
+        color: Colour splat in the same frame, any splat file. Of a field, by default: RUN/color.ply, or the splat it was made on.
+        ask: A first question.
+        where: browser; html (writes OUT/view.html, one file that any browser opens without kfgs, and ends); window (pyvista:
+            two clouds side by side); or picture (writes OUT/view.png and ends). The first two show small photos of the
+            scene, too.
+        out: Folder for saved pictures and selections.
+    """
+    from ..fields.store import NAME
+    from ..viewer import Exploration, Explorer, Viewer
+    from ..viz.plotter import has_display, require
+
+    if where in ("html", "picture") or out.exists():  # the others write only when asked
+        check_output("out", out, "a folder")
+    if where == "window" and not has_display():
+        raise ValueError("where: expected a display for a window, got none; use browser or picture")
+    if where in ("window", "picture"):
+        try:
+            require()
+        except RuntimeError as error:  # nothing draws here
+            raise ValueError(str(error)) from error
+    say("reading")
+    meaning, cameras = open_meaning(source, classes, teacher)
+    colors = open_colors(source, color, meaning)
+    state = Exploration(meaning, None if colors is meaning.gaussians else colors, cameras=cameras)
+    about = state.details().get("color")
+    if about and (near := about["total"] - about["none"]) < FEW * about["total"]:
+        few = f"only {near:,} of {about['total']:,} colour Gaussians lie within lambda of the field"
+        say(f"note: {few}; another frame? `kfgs attach` checks and aligns")
+    state.ask(ask)
+    say("\n".join(state.lines()))
+    if where in ("window", "picture"):
+        with Explorer(state, out=out, off_screen=where == "picture") as explorer:
+            explorer.set_show("labels")
+            if where == "window":
+                explorer.show()
+            else:
+                explorer.screenshot(out / "view.png")
+                wrote([out / "view.png"])
+        return
+    state.set_show(state.first_show)
+    path = real_path(source)  # the title tells one page from another: the run of RUN/field.kfgs, else the file
+    title = path.parent.name if path.name == NAME else path.stem
+    viewer = Viewer(state, title=title, scene=classes.photos_of(getattr(meaning, "field", None)), out=out)
+    if where == "html":
+        out.mkdir(parents=True, exist_ok=True)
+        wrote([viewer.save_html(out / "view.html")])
+    else:
+        viewer.serve(report=say)
+
+
+def open_colors(source: Path, color: Path | None, meaning: Any) -> Any:
+    """The colour cloud: the given one, the source's own, or that of the run; None if there is none."""
+    from ..fields.store import find_field, read_description
+
+    if color is not None:
+        return open_splats("color", color)
+    if meaning.gaussians.sh is not None:
+        return meaning.gaussians
+    if (field := find_field(source)) is not None:
+        geometry = read_description(field).get("info", {}).get("geometry")
+        for place in (field.parent / "color.ply", Path(str(geometry))):
+            if place.is_file() and not is_field(place):
+                say(f"colours: {place}")
+                return open_splats("color", place)
+    return None
+
+
+def open_meaning(source: Path, classes: Classes, teacher: Teacher) -> tuple[Any, list[Any]]:
+    """The answers to questions, and the cameras of the scene (those that a field was trained on)."""
+    from ..viewer import FieldMeaning, SplatMeaning
+
+    cameras = [] if classes.loaded is None else classes.loaded.cameras
+    if is_field(source) or not source.exists():
+        field = open_field("source", source)
+        label_set, embed = words_of(classes, teacher, field)
+        return FieldMeaning(field, label_set, embed=embed), list(field.cameras) or cameras
+    return SplatMeaning(open_splats("source", source, labelled=True)), cameras
