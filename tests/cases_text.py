@@ -1,7 +1,11 @@
 """A teacher of made-up text for tests: words that share letters lie near each other."""
 
 import torch
+from cases_color import surface
 
+from kfgs import SemanticField, load_scene, make_label_set
+from kfgs._files import read_json
+from kfgs.fields import Identity
 from kfgs.teachers import CallableTeacher
 
 DIM = 16
@@ -24,3 +28,14 @@ def pixels(image):
 TEACHER = CallableTeacher(pixels, letters, name="letters")
 TEACHER.identity = {"name": "letters", "weights": "abc"}
 MUTE = CallableTeacher(pixels, name="mute")
+
+
+def save_letters(room, folder):
+    """A field of the room's surface, each Gaussian with the teacher's text of its class, and the table of the classes."""
+    cloud, truth = surface(room)
+    table, scene = make_label_set(TEACHER, read_json(room / "classes.json")), load_scene(room)
+    info = {"views": [scene.cameras[i].name for i in scene.views("train")], "teacher": TEACHER.identity}
+    field = SemanticField(cloud.replace(features=table.embeddings[truth]), Identity(table.dim), info=info)
+    field.save(folder / "field.kfgs")
+    table.save(folder / "table.safetensors")
+    return folder / "field.kfgs", folder / "table.safetensors"

@@ -98,6 +98,22 @@ def as_many_threads_as_before():
 
 
 @pytest.fixture(scope="session")
+def room(tmp_path_factory) -> Path:
+    """The small toy room on disk. No test changes it."""
+    from small_room import make_room
+
+    return make_room(tmp_path_factory.mktemp("desk") / "scene")
+
+
+@pytest.fixture(scope="session")
+def desk(room) -> Path:
+    """The folder of the room, with what `small_room.make_desk` puts there. No test changes it."""
+    from small_room import make_desk
+
+    return make_desk(room.parent)
+
+
+@pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder of real scenes beside the project; the test is skipped where it is missing."""
     if not SHARED.is_dir():

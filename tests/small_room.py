@@ -1,13 +1,13 @@
 """A toy room small enough to fit in seconds, shared by the tests of pipeline and command line."""
 
 import dataclasses
+import shutil
 from pathlib import Path
 
-from cases_color import make_splat
+from cases_color import make_field, make_splat
 from cases_training import changed
 
-from kfgs import FeatureFolder, Paper, Uplift, fit, load_scene
-from kfgs.cli import main
+from kfgs import FeatureFolder, Paper, Uplift, attach, fit, load_scene, write_splats
 from kfgs.fields import Training, UpliftConfig
 from kfgs.quant import AutoencoderConfig, PaperCodebook
 from kfgs.toy.room_folder import ToyConfig, make_toy_room
@@ -37,17 +37,25 @@ PAPER = Paper.paper(
     training=FIELD,
 )
 
+SMALL = UpliftConfig.field(max_gaussians=1_500)
+
 
 def make_room(folder: Path) -> Path:
     return make_toy_room(folder, ROOM)
 
 
 def make_desk(folder: Path) -> Path:
-    """A folder as a user has it after `kfgs fit`: scene/, run/field.kfgs, and a splat of another program, my.ply."""
-    make_splat(make_room(folder / "scene"), folder / "my.ply")
+    """What a user has: scene/, run/ (`kfgs fit`, and color.ply), my.ply of another program, labelled.ply (`kfgs attach`).
+
+    And true/field.kfgs, a field without classes of its own whose features are those of the true classes.
+    """
+    splat = make_splat(make_room(folder / "scene"), folder / "my.ply")
     scene = load_scene(folder / "scene")
     maps = FeatureFolder(folder / "scene" / "features", [scene.stem(i) for i in scene.views("train")])
-    fit(scene, maps, Uplift(folder / "my.ply", UpliftConfig.field(max_gaussians=2_000)), folder=folder / "run")
+    field = fit(scene, maps, Uplift(splat, UpliftConfig.field(max_gaussians=2_000)), folder=folder / "run")
+    write_splats(attach(field, splat).gaussians, folder / "labelled.ply")
+    shutil.copyfile(splat, folder / "run" / "color.ply")
+    make_field(folder / "scene", folder / "true" / "field.kfgs")
     return folder
 
 
@@ -59,10 +67,3 @@ def stages(lines: list[str]) -> dict[str, str]:
     """The stages that a fit reported, and whether each was "found" or "done"."""
     words = ((line.partition(": ")[0], line.partition(": ")[2]) for line in lines)
     return {name: rest.split()[0] for name, rest in words if rest.startswith(("found in", "done in"))}
-
-
-def fit_run(room: Path, out: Path) -> Path:
-    """A fitted run, made through the command line, without an autoencoder for speed."""
-    arguments = ["fit", str(room), "--features", str(room / "features"), "--out", str(out)]
-    assert main([*arguments, "--method", "adc", "--steps", "60", "--max-gaussians", "2000"]) == 0
-    return out

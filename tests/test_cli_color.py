@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from cases_color import SH0, make_field, make_splat, surface
+from cases_color import SH0, surface
 from PIL import Image
-from small_room import make_room
 
 import kfgs.pipeline.color as color_module
 from kfgs.cli import main
 from kfgs.fields import SemanticField, fuse_views
 from kfgs.formats import read_splats
 from kfgs.formats.ply import read_ply
-from kfgs.labels import load_label_set
+from kfgs.labels import connected_parts, load_label_set
+from kfgs.labels.components import component_distance
 from kfgs.pipeline.color import TrainingPictures
 from kfgs.scenes import load_scene
 from kfgs.splat import rasterize
@@ -26,23 +26,18 @@ COLOR = ["--steps", "30", "--max-gaussians", "2000"]
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory):
-    return make_room(tmp_path_factory.mktemp("cli") / "scene")
-
-
-@pytest.fixture(scope="module")
 def truth(room):
     return surface(room)[1]
 
 
 @pytest.fixture(scope="module")
-def field(room, tmp_path_factory):
-    return make_field(room, tmp_path_factory.mktemp("run") / "run" / "field.kfgs")
+def field(desk):
+    return desk / "true" / "field.kfgs"
 
 
 @pytest.fixture(scope="module")
-def splat(room, tmp_path_factory):
-    return make_splat(room, tmp_path_factory.mktemp("splat") / "room.ply")
+def splat(desk):
+    return desk / "my.ply"
 
 
 @pytest.fixture(scope="module")
@@ -80,8 +75,8 @@ def test_color_scores_the_views_held_out(colored, room):
 def test_color_interrupted_goes_on_to_the_same_field(colored, room, tmp_path, monkeypatch, capsys):
     fit, look, looks = color_module.fit_field, TrainingPictures.__getitem__, []
 
-    def often(start, cameras, photos, config, **options):
-        return fit(start, cameras, photos, dataclasses.replace(config, checkpoint_every=10), **options)
+    def often(start, *, training, **options):
+        return fit(start, training=dataclasses.replace(training, checkpoint_every=10), **options)
 
     def stopping(photos, i):
         looks.append(i)
@@ -219,3 +214,23 @@ def test_all_photographs_can_be_used_and_none_is_left_to_score(room, splat, tmp_
     assert "nothing to score against" in printed
     assert re.findall("^note: split .*", printed, re.MULTILINE) in ([], [f"note: split all: all {len(every)} views"])
     assert not (tmp_path / "color" / "scores.json").exists()
+
+
+def test_parts_that_are_not_listed_are_counted(desk, capsys):
+    field = SemanticField.load(desk / "run")
+    selection = field.query("chair")
+    listed, distance = (
+        connected_parts(field.gaussians, selection),
+        component_distance(field.gaussians.means, selection.mask),
+    )
+    assert main(["select", "chair", str(desk / "run")]) == 0
+    *parts, joined, note = capsys.readouterr().out.splitlines()[1:]
+    assert joined == f"  parts are joined within {distance:.3g}; --distance changes it"
+    assert [int(re.search(r"Part\((\d+) ", line)[1]) for line in parts] == [part.count for part in listed]
+    left = listed[0].total - len(listed)
+    assert left > 0
+    assert note == f"  {left} smaller part{'s are' if left > 1 else ' is'} not listed"
+    assert main(["select", "chair", str(desk / "run"), "--distance", "100"]) == 0
+    whole, joined = capsys.readouterr().out.splitlines()[1:]
+    assert whole.startswith(f"  Part({len(selection)} Gaussians")
+    assert joined == "  parts are joined within 100; --distance changes it"

@@ -6,7 +6,6 @@ import shutil
 
 import pytest
 from evaluated_room import save_splats
-from small_room import fit_run, make_room
 
 from kfgs import SemanticField, load_scene
 from kfgs.cli import main
@@ -18,27 +17,13 @@ from kfgs.pipeline import evaluate, open_question
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory):
-    return make_room(tmp_path_factory.mktemp("evaluate") / "scene")
-
-
-@pytest.fixture(scope="module")
-def run(room, tmp_path_factory):
-    return fit_run(room, tmp_path_factory.mktemp("run"))
+def run(desk):
+    return desk / "run"
 
 
 @pytest.fixture(scope="module")
 def splats(room, tmp_path_factory):
     return save_splats(room, tmp_path_factory.mktemp("splats"))
-
-
-@pytest.fixture(scope="module")
-def fused(room, splats, tmp_path_factory):
-    """A field whose own rule (votes) is not the nearest text."""
-    out = tmp_path_factory.mktemp("fused")
-    words = ["fit", str(room), "--splat", str(splats / "before.ply"), "--max-gaussians", "0", "--out", str(out)]
-    assert main(words) == 0
-    return out / "field.kfgs"
 
 
 @pytest.fixture(scope="module")
@@ -101,9 +86,9 @@ def test_every_protocol_end_to_end(words, shown, run, room, splats, tmp_path, ca
 
 
 def test_the_rule_for_labels_is_that_of_the_protocol_unless_asked_and_is_said(
-    fused, room, words, asked, tmp_path, capsys
+    run, room, words, asked, tmp_path, capsys
 ):
-    field = SemanticField.load(fused)
+    field = SemanticField.load(run)
     expected = {
         rule: KfgsPooled().score(FieldMethod(field, own_labels=rule == "own"), *asked, lambda _: words.embeddings)
         for rule in ("own", "nearest")
@@ -111,13 +96,13 @@ def test_the_rule_for_labels_is_that_of_the_protocol_unless_asked_and_is_said(
     assert expected["own"].scores != expected["nearest"].scores
     capsys.readouterr()
     for given, rule in (((), "own"), (("--labels", "own"), "own"), (("--labels", "nearest"), "nearest")):
-        said = scored(capsys, fused, *given, "--out", tmp_path / f"{rule}.json")
+        said = scored(capsys, run, *given, "--out", tmp_path / f"{rule}.json")
         kept = json.loads((tmp_path / f"{rule}.json").read_text())
         assert kept["scores"] == dict(expected[rule].scores)
         assert kept["options"]["labels"] == rule
         assert ("labels=nearest" in said.splitlines()[0]) == (rule == "nearest")
     question = open_question(room, "feature3dgs-teacher")
-    published, own = (evaluate(fused, question, encode=words, labels=rule) for rule in (None, "own"))
+    published, own = (evaluate(run, question, encode=words, labels=rule) for rule in (None, "own"))
     assert (published.options["labels"], published.changed) == ("nearest", ("texts",))
     assert (own.options["labels"], own.changed) == ("own", ("texts", "labels"))
     method = FieldMethod(field, own_labels=False)
@@ -139,7 +124,7 @@ def test_the_rule_for_labels_is_that_of_the_protocol_unless_asked_and_is_said(
             "{run} --protocol feature3dgs-teacher --truth /no",
             "--truth: expected a folder of the teacher's feature maps",
         ),
-        ("{run} --protocol kfgs-color", "color.ply: no such file; expected a colour splat"),
+        ("{run}/../true --scene {room} --protocol kfgs-color", "color.ply: no such file; expected a colour splat"),
         ("{run} --protocol kfgs-color --truth {room}", "--truth: expected none with kfgs-color/1"),
         ("{room}/features --scene {room} --protocol kfgs-surface", "expected one with Gaussians"),
         ("{room}/features", "--scene: expected a scene folder, got none"),

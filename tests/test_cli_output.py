@@ -5,26 +5,10 @@ import io
 import torch
 
 from kfgs.cli import main
-from kfgs.cli.output import END, LINE, say
-from kfgs.formats import write_splats
-from kfgs.gaussians import Gaussians
+from kfgs.cli.files import END, LINE, say
+from kfgs.formats import read_splats, write_splats
 
 ESCAPES = "a\x1b[31m\x07\x9b\u202eb\udc80\r"
-
-
-def splat(path, classes):
-    rng = torch.Generator().manual_seed(0)
-    n = 20
-    cloud = Gaussians(
-        torch.randn(n, 3, generator=rng),
-        torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
-        torch.full((n, 3), 0.1),
-        torch.full((n,), 0.5),
-        sh=torch.zeros(n, 1, 3),
-        labels=torch.arange(n) % 2,
-    )
-    write_splats(cloud.replace(names=classes), path)
-    return path
 
 
 def test_what_is_not_printable_is_escaped_and_letters_stay():
@@ -46,8 +30,10 @@ def test_the_middle_of_a_long_line_is_left_out():
     assert file.getvalue().endswith("\n" + "y" * LINE + "\n")
 
 
-def test_class_names_of_a_stranger_reach_the_terminal_without_control_characters(tmp_path, capsys):
-    file = splat(tmp_path / "a.ply", ("wall\x1b]0;owned\x07", "chair\x9b2J"))
+def test_class_names_of_a_stranger_reach_the_terminal_without_control_characters(desk, tmp_path, capsys):
+    cloud, file = read_splats(desk / "my.ply").select(torch.arange(20)), tmp_path / "a.ply"
+    names = ("wall\x1b]0;owned\x07", "chair\x9b2J")
+    write_splats(cloud.replace(labels=torch.arange(20) % 2, names=names), file)
     assert main(["convert", str(file)]) == 0
     assert main(["select", "sofa", str(file), "--out", str(tmp_path / "b.ply")]) == 1
     said = capsys.readouterr()

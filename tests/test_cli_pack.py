@@ -1,14 +1,11 @@
 """The command pack, and that other commands take its file wherever they take a field folder."""
 
-import re
 from dataclasses import replace
 
 import pytest
 import torch
 from cases_packed import field
-from messages import tells
 
-from kfgs._files import digest_file
 from kfgs.cli import main
 from kfgs.fields import SemanticField
 from kfgs.formats import read_splats
@@ -55,23 +52,3 @@ def test_other_commands_take_the_file(place, tmp_path, capsys):
     assert main(["convert", str(packed), str(tmp_path / "labelled.ply")]) == 0
     labels = read_splats(tmp_path / "labelled.ply").labels
     assert torch.equal(labels, SemanticField.load(packed).classify().labels)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["{tmp}", "{tmp}/o" + ENDING], ("SOURCE:", "field.kfgs", "`kfgs fit`")),
-        (["{place}/run/field.kfgs", "{tmp}/o"], ("path:", ENDING)),
-        (["{place}/room" + ENDING, "{place}/room" + ENDING], ("TARGET:", "another place")),
-        (["{place}/room" + ENDING, "{place}/run"], ("TARGET:", "a file", "a folder")),
-    ],
-)
-def test_bad_input_ends_with_one_message_and_no_files(arguments, message, place, tmp_path, capsys):
-    fill = {"tmp": str(tmp_path), "place": str(place)}
-    before = digest_file(place / "run" / "field.kfgs")
-    assert main(["convert", *(one.format(**fill) for one in arguments)]) == 1
-    said = capsys.readouterr().err
-    assert said.startswith("error: ")
-    assert re.search(tells(*(part.format(**fill) for part in message)), said)
-    assert not list(tmp_path.iterdir())
-    assert digest_file(place / "run" / "field.kfgs") == before

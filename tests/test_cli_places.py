@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 from messages import tells
-from small_room import make_desk
 
 from kfgs.cli import COMMANDS, main
 from kfgs.cli.files import OUTPUTS
@@ -31,29 +30,18 @@ LINES = {  # a command with its output {}; and one of its inputs that could be n
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory):
-    """A scene, a run and its files, as a user has them: the names of LINES."""
-    folder = make_desk(tmp_path_factory.mktemp("desk"))
-    scene, run = folder / "scene", folder / "run"
-    places = {"tmp": folder, "scene": scene, "run": run, "splat": folder / "my.ply", "list": folder / "list.txt"}
-    places |= {"packed": folder / "p.kfgs", "labelled": folder / "l.ply"}
-    places["list"].write_text(f"{scene}\n")
-    places["table"] = folder / "lseg.safetensors"
-    places["table"].write_text("weights")
+def places(desk, tmp_path_factory):
+    """A scene, a run and its files, as a user has them, at the names of LINES."""
+    folder = shutil.copytree(desk, tmp_path_factory.mktemp("places") / "desk", symlinks=True)
+    scene = folder / "scene"
+    (folder / "list.txt").write_text(f"{scene}\n")
     shutil.copytree(scene / "images", folder / "photos")
-    shutil.copyfile(places["splat"], run / "color.ply")
-    (scene / "labels").mkdir(exist_ok=True)
-    assert main(["convert", str(run / "field.kfgs"), str(places["packed"])]) == 0
-    assert main(["attach", str(run / "field.kfgs"), str(places["splat"]), "--out", str(places["labelled"])]) == 0
-    return places
+    found = {"tmp": folder, "scene": scene, "run": folder / "run", "splat": folder / "my.ply"}
+    return found | {"list": folder / "list.txt", "labelled": folder / "labelled.ply"}
 
 
 def contents(places):
     return {path: path.is_file() and path.read_bytes() for path in places["tmp"].rglob("*")}
-
-
-def with_output(line, out):
-    return line.replace("{}", out)
 
 
 def refused(line, places, capsys, *parts):
@@ -73,21 +61,21 @@ def test_every_command_that_writes_is_tried():
 
 
 @pytest.mark.parametrize("command", LINES)
-def test_no_command_writes_among_the_parts_of_a_scene(command, desk, capsys):
+def test_no_command_writes_among_the_parts_of_a_scene(command, places, capsys):
     line = LINES[command][0]
     own = {"features": "features"}.get(command)
     for place in ("images", "features", "sparse/0", "labels"):
         if place != own:
-            there = desk["scene"] / place
-            refused(with_output(line, f"{there}/new"), desk, capsys, "expected a place apart from", there)
+            there = places["scene"] / place
+            refused(line.replace("{}", f"{there}/new"), places, capsys, "expected a place apart from", there)
 
 
 @pytest.mark.parametrize("command", [name for name, (_, given) in LINES.items() if given])
-def test_no_command_replaces_what_it_reads(command, desk, tmp_path, capsys):
+def test_no_command_replaces_what_it_reads(command, places, tmp_path, capsys):
     line, given = LINES[command]
-    file = Path(given.format(**desk))
+    file = Path(given.format(**places))
     link = tmp_path / file.name
     link.symlink_to(file)
     for out in (file, link):
         words = re.sub(r"\{\}\S*", str(out), line)
-        refused(words, desk, capsys, "expected another place than", file, "give another name")
+        refused(words, places, capsys, "expected another place than", file, "give another name")

@@ -7,17 +7,11 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from small_room import make_desk
 
 from kfgs.cli import main
 from kfgs.evaluation.coco import load_coco_labels
 from kfgs.fields import SemanticField
 from kfgs.scenes import load_scene
-
-
-@pytest.fixture(scope="module")
-def desk(tmp_path_factory):
-    return make_desk(tmp_path_factory.mktemp("desk"))
 
 
 def segment(desk, out, *words):
@@ -102,32 +96,3 @@ def test_a_path_through_the_cameras_of_a_scene_without_pictures(desk, tmp_path):
         f"path_{i:04d}.png" for i in range(4)
     ]
     assert read(tmp_path / "out" / "predicted" / "path_0000.png").shape == (60, 80)
-
-
-PLACES = ("expected orbit, cameras, a transforms.json (a name that ends in .json), or a folder with a COLMAP model,",)
-
-
-@pytest.mark.parametrize(
-    ("words", "parts"),
-    [
-        (["--path", "orbit", "--frames", "0"], ("--frames:", "got 0")),
-        (["--path", "orbitt"], ("--path:", *PLACES, "got orbitt")),
-        (
-            ["--path", "{scene}/classes.json"],
-            ("{scene}/classes.json, top level:", "'frames'", "is this a transforms.json"),
-        ),
-        (["--path", "{scene}/labels"], ("--path:", *PLACES, "got {scene}/labels")),
-        (["--path", "{scene}/../run"], ("--path:", *PLACES, "got {scene}/../run; `--path cameras`")),
-        (["--path", "{scene}/../my.ply"], ("--path:", *PLACES, "my.ply")),
-        (["--path", "/dev/null"], ("--path:", *PLACES, "got /dev/null")),
-        (["--path", "{one}", "--frames", "3"], ("two different views, got 1",)),
-    ],
-)
-def test_options_that_would_have_no_effect_are_named(desk, tmp_path, words, parts, capsys):
-    cameras = load_scene(desk / "scene").cameras[:1]
-    known = {"scene": desk / "scene", "one": own_cameras(tmp_path / "in", cameras)}
-    assert segment(desk, tmp_path / "o", *(word.format(**known) for word in words)) == 1
-    error = capsys.readouterr().err
-    for part in parts:
-        assert part.format(**known) in error
-    assert not (tmp_path / "o").exists()

@@ -7,7 +7,6 @@ import sys
 import numpy as np
 import pytest
 import torch
-from small_room import make_desk
 
 from kfgs import cli
 
@@ -32,14 +31,6 @@ def test_a_reader_that_ends_is_no_error(words, tmp_path):
 def test_a_full_disk_below_the_output_is_named(tmp_path):
     code, _, error = shell(f"{KFGS} --help > /dev/full", tmp_path)
     assert (code, error) == (1, "error: [Errno 28] No space left on device: 'standard output'\n")
-
-
-@pytest.fixture(scope="module")
-def desk(tmp_path_factory):
-    folder = make_desk(tmp_path_factory.mktemp("desk"))
-    for words in ("attach {0}/run/field.kfgs {0}/my.ply --out {0}/labelled.ply",):
-        assert cli.main(words.format(folder).split()) == 0
-    return folder
 
 
 @pytest.mark.parametrize(

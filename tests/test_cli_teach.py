@@ -7,7 +7,6 @@ import pytest
 import torch
 from cases_teach import TinyLSeg, save_checkpoint
 from PIL import Image
-from small_room import make_room
 
 from kfgs.cli import main
 from kfgs.fields import SemanticField
@@ -19,8 +18,8 @@ QUICK = ["--steps", "3", "--method", "adc"]
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return make_room(tmp_path_factory.mktemp("room") / "scene")
+def scene(room):
+    return room
 
 
 @pytest.fixture(scope="module")

@@ -8,17 +8,15 @@ import numpy as np
 import pytest
 import torch
 from cases_color import surface
-from cases_text import DIM, TEACHER, letters
+from cases_text import DIM, TEACHER, letters, save_letters
 from messages import tells
 from PIL import Image
-from small_room import make_desk, make_room
 
 from kfgs.cli import features, main
 from kfgs.cli.features import read_words
 from kfgs.cli.options import Classes, Teacher, Views
-from kfgs.fields import Identity, SemanticField
+from kfgs.fields import SemanticField
 from kfgs.labels import load_label_set
-from kfgs.scenes import load_scene
 from kfgs.teachers.prompts import make_label_set
 
 LETTERS = ["--teacher", "cases_text:TEACHER"]
@@ -26,11 +24,6 @@ LETTERS = ["--teacher", "cases_text:TEACHER"]
 
 def text(names, teacher, out):
     features(words=names, views=Views(), teacher=Teacher(teacher), out=out)
-
-
-@pytest.fixture(scope="module")
-def room(tmp_path_factory):
-    return make_room(tmp_path_factory.mktemp("words") / "scene")
 
 
 @pytest.fixture(scope="module")
@@ -44,14 +37,8 @@ def truth(room):
 
 
 @pytest.fixture(scope="module")
-def field(room, truth, names, tmp_path_factory):
-    """The room's surface, each Gaussian with the text embedding of its class, as the teacher of letters gives it."""
-    cloud, folder = surface(room)[0], tmp_path_factory.mktemp("field") / "field.kfgs"
-    scene = load_scene(room)
-    info = {"views": [scene.cameras[i].name for i in scene.views("train")], "teacher": TEACHER.identity}
-    rows = make_label_set(TEACHER, names).embeddings
-    SemanticField(cloud.replace(features=rows[truth]), Identity(rows.shape[1]), info=info).save(folder)
-    return folder
+def field(room, tmp_path_factory):
+    return save_letters(room, tmp_path_factory.mktemp("letters"))[0]
 
 
 def count(truth, names, name):
@@ -194,18 +181,19 @@ def test_wrong_queries_are_named(field, names, tmp_path, capsys, arguments, mess
     assert error.count("\n") == 1
 
 
-def test_examples_are_drawn_in_the_photographs_of_the_field(tmp_path, capsys):
-    folder = make_desk(tmp_path)
+def test_examples_are_drawn_in_the_photographs_of_the_field(desk, tmp_path, capsys):
+    shutil.copytree(desk / "run", tmp_path / "run")
+    (tmp_path / "scene").symlink_to(desk / "scene")
     clicks, out = tmp_path / "clicks.json", tmp_path / "shown.safetensors"
-    view = SemanticField.load(folder / "run/field.kfgs").cameras[0].name
+    view = SemanticField.load(tmp_path / "run").cameras[0].name
     clicks.write_text(json.dumps({"chair": [{"view": view, "points": [[20, 30]]}], "wall": [{"gaussians": [3]}]}))
-    words = ["features", str(folder / "run/field.kfgs"), "--examples", str(clicks), "--out", str(out)]
+    words = ["features", str(tmp_path / "run/field.kfgs"), "--examples", str(clicks), "--out", str(out)]
     assert main(words) == 0
     picture = tmp_path / "shown.safetensors.png"
     assert f"wrote:\n  {out}\n  {picture}\n" in capsys.readouterr().out
     with Image.open(picture) as opened:
         assert opened.size[0] > 480
     picture.unlink()
-    shutil.move(folder / "scene", folder / "elsewhere")
+    (tmp_path / "scene").unlink()
     assert main(words) == 0  # without photographs there is no picture
     assert not picture.exists()

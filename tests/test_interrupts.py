@@ -27,10 +27,7 @@ def encode(picture):
 """
 
 
-def test_while_a_module_loads_the_process_ends_at_once(tmp_path):
-    from small_room import make_room
-
-    room = make_room(tmp_path / "room")
+def test_while_a_module_loads_the_process_ends_at_once(room, tmp_path):
     (tmp_path / "native.py").write_text(CPP)
     words = ["features", room, "--teacher", "native:encode", "--out", tmp_path / "maps"]
     assert run(tmp_path, *words) == (130, "interrupted\n")

@@ -1,6 +1,7 @@
 """The Python of the README and of the guide runs as it is written, on a small room; only the schedule is shortened."""
 
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +9,6 @@ import numpy as np
 import pytest
 from cases_color import make_field, make_splat
 from cases_teach import TINY, save_checkpoint
-from small_room import make_room
 
 import kfgs
 from kfgs import FeatureFolder, SemanticField, Uplift, fit, load_label_set, load_scene, read_splats, write_splats
@@ -32,11 +32,11 @@ def examples():
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory):
+def desk(room, tmp_path_factory):
     """A folder as the README's user has it: scene/, features/, my.spz."""
-    folder = tmp_path_factory.mktemp("desk")
-    room = make_room(folder / "scene")
-    (folder / "features").symlink_to(room / "features", target_is_directory=True)
+    folder = tmp_path_factory.mktemp("readme")
+    (folder / "scene").symlink_to(room)
+    (folder / "features").symlink_to(room / "features")
     make_splat(room, folder / "my.spz")
     return folder
 
@@ -67,8 +67,8 @@ def test_examples_run_one_after_the_other(examples, desk, monkeypatch):
     view.close()
 
 
-def test_the_example_of_a_teacher_runs_with_a_tiny_lseg(examples, tmp_path, monkeypatch):
-    make_room(tmp_path / "scene")
+def test_the_example_of_a_teacher_runs_with_a_tiny_lseg(examples, room, tmp_path, monkeypatch):
+    shutil.copytree(room, tmp_path / "scene", ignore=shutil.ignore_patterns("features"))
     monkeypatch.chdir(tmp_path)
     save_checkpoint(Path("demo_e200.ckpt"))
     teaching = examples[0]

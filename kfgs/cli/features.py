@@ -88,11 +88,11 @@ def features(
 
 def _make_maps(network: Any, scene: Any, target: Path, split: str) -> None:
     """Make the maps of a teacher; without one, check those that are there."""
-    from ..pipeline.describe import describe
-
     if network is not None:
         kfgs.extract_features(network, scene, target, split, progress=True)
-        say(describe(target))
+        maps = kfgs.FeatureFolder(target).of(scene, split)
+        teacher = (maps.identity or {}).get("name", "unknown")
+        say(f"{len(maps)} maps of {' x '.join(map(str, maps.shape))} by {teacher}")
         return
     if not target.is_dir():
         raise ValueError(f"teacher: expected a teacher, or maps in {target} to check, got neither; pass --teacher")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -89,13 +89,15 @@ class TrainingPictures(Sequence[Tensor]):
 
     def __init__(self, scene: Scene, views: Sequence[int], cameras: Sequence[Camera]) -> None:
         self._scene, self._views, self._sizes = scene, list(views), [camera.size for camera in cameras]
-        self._kept = cache(self._read)
+        self._kept: dict[int, tuple[Tensor, Tensor | None]] = {}
 
     def __len__(self) -> int:
         return len(self._views)
 
     def __getitem__(self, i: int) -> Tensor:  # type: ignore[override]  # [h, w, 3 or 4], one picture at a time
-        bytes_, known = self._kept(i)
+        if i not in self._kept:
+            self._kept[i] = self._read(i)
+        bytes_, known = self._kept[i]
         picture = bytes_.float() / 255
         return picture if known is None else picture.masked_fill(~known[..., None], torch.nan)
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
-from small_room import make_desk
 from test_public import PACKAGES
 
 import kfgs
@@ -48,11 +47,6 @@ def words_of(topic):
         found |= {node.id for node in nodes if isinstance(node, ast.Name)}
         found |= {node.attr for node in nodes if isinstance(node, ast.Attribute)}
     return found
-
-
-@pytest.fixture(scope="module")
-def desk(tmp_path_factory):
-    return make_desk(tmp_path_factory.mktemp("desk"))
 
 
 @cache

@@ -50,20 +50,15 @@ def a_splat(count=6_000):
     return gaussians.replace(sh=sh, extra={"warmth": np.arange(len(gaussians), dtype=np.float32)})
 
 
-def look(place, name, target=(1.6, 1.2, 0.6)):
-    """A camera at `place` that looks at `target` with z up."""
-    ahead = torch.tensor(target) - torch.tensor(place)
-    ahead = ahead / ahead.norm()
-    right = torch.linalg.cross(ahead, torch.tensor([0.0, 0.0, 1.0]))
-    right = right / right.norm()
-    viewmat = torch.eye(4)
-    viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(ahead, right), ahead])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ torch.tensor(place)
-    return Camera(viewmat, torch.tensor([[90.0, 0, 63], [0, 92, 49], [0, 0, 1]]), 128, 96, name)
-
-
 CAMERAS = [
-    look((3.2 + math.cos(a), 2.6 + math.sin(a), 2.0 + 0.4 * math.sin(3 * a)), f"view_{a:.1f}.png")
+    Camera.look_at(
+        (3.2 + math.cos(a), 2.6 + math.sin(a), 2.0 + 0.4 * math.sin(3 * a)),
+        (1.6, 1.2, 0.6),
+        width=128,
+        height=96,
+        fov_degrees=56,
+        name=f"view_{a:.1f}.png",
+    )
     for a in (0.0, 0.5, 1.0, 1.6, 2.4, -0.7)
 ]
 
@@ -75,9 +70,8 @@ def a_similarity(seed=3):
 
 
 def moved(splats, similarity):
-    gaussians = splats
-    turned = gaussians.replace(means=similarity.apply(gaussians.means), scales=gaussians.scales * similarity.scale)
-    return turned  # the Gaussians are round: no rotation to turn
+    """The Gaussians are round: there is no rotation to turn."""
+    return splats.replace(means=similarity.apply(splats.means), scales=splats.scales * similarity.scale)
 
 
 def accuracy(labels, splats):
@@ -106,8 +100,7 @@ def test_distance_in_one_frame():
 def test_views_label_what_they_show_and_their_neighbours():
     splats = a_splat()
     hidden = torch.tensor([[1.2, 1.8, 0.62], [50.0, 50.0, 50.0]])  # below the table's top; out of every view and reach
-    gaussians = Gaussians.cat([splats, splats.select(torch.tensor([0, 1])).replace(means=hidden)])
-    splats = gaussians
+    splats = Gaussians.cat([splats, splats.select(torch.tensor([0, 1])).replace(means=hidden)])
     attached = attach(a_field(), splats, CLASSES, cameras=CAMERAS, by="views")
     labelled = int((attached.labels >= 0).sum())  # by views and by distance
     assert repr(attached).startswith(f"Attached({labelled:,} of {len(splats):,} Gaussians labelled, 3 classes, lambda ")

@@ -7,12 +7,11 @@ import torch
 from cases_training import changed
 from messages import tells
 from safetensors.torch import load_file
-from small_room import make_room, stages
+from small_room import stages
 
 from kfgs.cameras import Distortion
 from kfgs.evaluation.color import score_views
 from kfgs.pipeline.color import ColorConfig, TrainingPictures, fit_color
-from kfgs.scenes import load_scene
 
 FIELD = changed(
     ColorConfig.quick().training.with_steps(120),
@@ -22,11 +21,6 @@ FIELD = changed(
     checkpoint_every=25,
 )
 CONFIG = dataclasses.replace(ColorConfig.quick(), training=FIELD)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return load_scene(make_room(tmp_path_factory.mktemp("room") / "scene"))
 
 
 @pytest.fixture(scope="module")

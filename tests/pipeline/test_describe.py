@@ -6,33 +6,23 @@ import numpy as np
 import pytest
 import torch
 from messages import tells
-from small_room import make_room
+from PIL import Image
 
 from kfgs.pipeline.describe import describe
 from kfgs.scenes import SceneError
 
 
-@pytest.fixture
-def captures(tmp_path):
-    """Two scenes, a capture that lost its poses, and photos alone."""
-    folder = tmp_path / "captures"
-    make_room(folder / "flat2")
-    shutil.copytree(folder / "flat2", folder / "flat10")
-    shutil.copytree(folder / "flat2", folder / "lost", ignore=shutil.ignore_patterns("sparse"))
-    shutil.copytree(folder / "flat2" / "images", folder / "photos")
-    return folder
-
-
-def test_a_scene_that_cannot_be_read_says_why(captures):
-    (captures / "flat2" / "sparse" / "0" / "cameras.bin").write_bytes(b"junk")
+def test_a_scene_that_cannot_be_read_says_why(room, tmp_path):
+    shutil.copytree(room / "images", tmp_path / "images")
+    shutil.copytree(room / "sparse", tmp_path / "sparse")
+    (tmp_path / "sparse" / "0" / "cameras.bin").write_bytes(b"junk")
     with pytest.raises(SceneError, match=tells("cameras.bin")):
-        describe(captures / "flat2")
+        describe(tmp_path)
 
 
-def test_maps_with_a_picture_among_them_are_maps(captures, tmp_path):
-    shutil.copy(next((captures / "photos").iterdir()), tmp_path / "preview.png")
+def test_maps_with_a_picture_among_them_are_maps(tmp_path):
+    Image.new("RGB", (9, 6)).save(tmp_path / "preview.png")
     np.save(tmp_path / "a.npy", torch.ones(6, 9, 8).numpy())
-    shutil.rmtree(captures)
     assert "1 feature maps by another program" in describe(tmp_path)
 
 

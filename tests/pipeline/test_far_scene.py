@@ -2,17 +2,16 @@
 
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pycolmap
 import pytest
 import torch
-from cases_color import make_splat
 from cases_training import changed
-from small_room import FIELD, make_room
+from small_room import FIELD
 
-from kfgs import FeatureFolder, SemanticField, Uplift, attach, load_scene, read_splats
-from kfgs import fit as fit_field
+from kfgs import FeatureFolder, SemanticField, Uplift, attach, fit, load_scene, read_splats
 from kfgs.cli import main
 from kfgs.fields import GaussianParams, UpliftConfig
 from kfgs.fields.fused import join_fields
@@ -24,27 +23,21 @@ UTM = np.array([448262.0, 5411932.0, 200.0])
 COLOR = ColorConfig(sh_degree=1, training=changed(FIELD, steps=4, start=5, stop=6))
 
 
-def fit(folder):
-    scene = load_scene(folder / "scene")
-    maps = FeatureFolder(folder / "scene" / "features", [scene.stem(i) for i in scene.views("train")])
-    fit_field(scene, maps, Uplift(folder / "my.ply", UpliftConfig.field(max_gaussians=1_500)), folder=folder / "run")
-    return SemanticField.load(folder / "run"), scene
-
-
 @pytest.fixture(scope="module")
-def rooms(tmp_path_factory):
+def rooms(desk, tmp_path_factory):
     """near/ and far/: a scene, my.ply, and a field of both; only the model and the splat of the second are moved."""
     root = tmp_path_factory.mktemp("rooms")
-    for name, offset in (("near", 0 * UTM), ("far", UTM)):
-        make_splat(make_room(root / name / "scene"), root / name / "my.ply")
-        model = root / name / "scene" / "sparse" / "0"
-        whole = pycolmap.Reconstruction(str(model))
-        whole.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), offset))
-        whole.write(str(model))
-        table = read_ply(root / name / "my.ply")
-        moved = {axis: table[axis].astype(np.float64) + offset[i] for i, axis in enumerate("xyz")}
-        write_ply(root / name / "my.ply", table | moved)
-    return {name: (root / name, *fit(root / name)) for name in ("near", "far")}
+    near, far = (shutil.copytree(desk, root / name, ignore=shutil.ignore_patterns("true")) for name in ("near", "far"))
+    model = far / "scene" / "sparse" / "0"
+    whole = pycolmap.Reconstruction(str(model))
+    whole.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), UTM))
+    whole.write(str(model))
+    table = read_ply(far / "my.ply")
+    write_ply(far / "my.ply", table | {axis: table[axis].astype(np.float64) + UTM[i] for i, axis in enumerate("xyz")})
+    scene = load_scene(far / "scene")
+    maps = FeatureFolder(far / "scene" / "features").of(scene, "train")
+    fit(scene, maps, Uplift(far / "my.ply", UpliftConfig.field(max_gaussians=2_000)), folder=far / "run")
+    return {f.name: (f, SemanticField.load(f / "run"), load_scene(f / "scene")) for f in (near, far)}
 
 
 def test_labels_are_the_same(rooms):
