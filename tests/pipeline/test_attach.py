@@ -14,11 +14,12 @@ from scipy.spatial.transform import Rotation
 from kfgs.cameras import Camera
 from kfgs.cameras.similarity import Similarity
 from kfgs.fields import Identity, SemanticField
+from kfgs.formats.ply import read_ply, write_ply
 from kfgs.formats.sidecar import NAMES, beside
 from kfgs.formats.table import read_splats, write_splats
 from kfgs.gaussians import Gaussians
 from kfgs.labels import LabelSet
-from kfgs.pipeline.attach import attach
+from kfgs.pipeline.attach import attach, label_cloud, save_labelled
 from kfgs.scenes import SceneError
 
 CLASSES = LabelSet(("wall", "box", "table"), torch.eye(4)[:3])
@@ -174,3 +175,36 @@ def test_what_cannot_be_done_is_refused():
     strangers = [replace(camera, name=f"other_{i}.png") for i, camera in enumerate(CAMERAS)]
     with pytest.raises(SceneError, match=tells("cameras:", "two names", "got 0")):
         attach(field, splats, CLASSES, cameras=CAMERAS, frame=strangers)
+
+
+def balls(*places):
+    n = len(places)
+    quats, scales = torch.tensor([[1.0, 0, 0, 0]] * n), torch.full((n, 3), 0.2)
+    return Gaussians(torch.tensor(places), quats, scales, torch.full((n,), 0.99))
+
+
+def test_labels_are_written_and_carried_to_points(tmp_path):
+    cloud = balls((0.0, 0, 0), (5.0, 0, 0)).replace(
+        features=torch.eye(2), labels=torch.tensor([1, 0]), scores=torch.tensor([0.5, 0.75]), names=("wall", "chair")
+    )
+    save_labelled(tmp_path / "a.ply", cloud, rule="by hand")
+    read = read_splats(tmp_path / "a.ply")
+    assert (read.labels.tolist(), read.scores.tolist(), read.names) == ([1, 0], [0.5, 0.75], ("wall", "chair"))
+    assert read.sh is not None  # other programs show the classes
+    points = {"x": np.array([0.1, 5.0, 100.0], np.float32), "mine": np.arange(3, dtype=np.uint8)}
+    points |= {name: np.zeros(3, np.float32) for name in "yz"}
+    write_ply(tmp_path / "points.ply", points)
+    moved, files = label_cloud(cloud, tmp_path / "points.ply", tmp_path / "labelled.ply", distance=1.0)
+    columns = read_ply(tmp_path / "labelled.ply")
+    assert columns["class_id"].tolist() == moved.labels.tolist() == [1, 0, -1]
+    assert columns["mine"].tolist() == [0, 1, 2]
+    assert {"red", "green", "blue"} <= set(columns)
+    assert [file.name for file in files] == ["labelled.ply", "labelled.ply.classes.json"]
+
+
+def test_labelled_points_are_a_ply(tmp_path):
+    cloud = balls((0.0, 0, 0)).replace(labels=torch.tensor([0]), names=("wall",))
+    points = {name: np.zeros(3, np.float32) for name in "xyz"}
+    write_ply(tmp_path / "points.ply", points)
+    with pytest.raises(ValueError, match=tells("out:", ".ply", "points.spz")):
+        label_cloud(cloud, tmp_path / "points.ply", tmp_path / "points.spz")

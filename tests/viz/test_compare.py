@@ -8,7 +8,9 @@ from PIL import Image
 
 from kfgs.cameras import Camera
 from kfgs.gaussians import Gaussians
+from kfgs.labels import Selection, connected_parts
 from kfgs.viz.compare import render_color, views_of_change, write_comparison
+from kfgs.viz.films import WIDTH, write_parts
 
 
 def ball(*places, color=(1.0, 0.0, 0.0), scale=0.3):
@@ -92,3 +94,27 @@ def test_the_comparison_holds_both_renderings(tmp_path):
     np.testing.assert_allclose(picture[bottom - 48 : bottom, 6:70], left, atol=1)
     np.testing.assert_allclose(picture[bottom - 48 : bottom, 76:140], right, atol=1)
     assert picture.shape == (bottom + 6, 146, 3)
+
+
+def test_each_part_is_drawn_in_its_own_view(tmp_path):
+    cloud = ball((0.0, 0, 2), (0.0, 0, -2), (9.0, 0, 0), scale=0.2)
+    selection = Selection.of(torch.tensor([True, True, False]), "by hand")
+    views = [camera(0, "front.png", (60, 80)), camera(180, "back.png", (60, 80))]
+    parts = connected_parts(cloud, selection, views, distance=0.5)
+    seen = []
+
+    def under(camera):
+        seen.append(camera.name)
+        return np.full((camera.height, camera.width, 3), 120, np.uint8)
+
+    write_parts(tmp_path / "a.png", cloud, parts, views, under, "ball")
+    assert sorted(seen) == ["back.png", "front.png"]
+    with Image.open(tmp_path / "a.png") as picture:
+        drawn = np.asarray(picture)
+    assert abs(drawn.shape[1] - 2 * WIDTH) < 30
+    middle = drawn.shape[0] // 2 + 10
+    for center in (WIDTH // 2, 3 * WIDTH // 2):
+        assert drawn[middle, center].tolist() == [120] * 3  # the part keeps its colour
+    assert (drawn[middle, 20] > 200).all()
+    write_parts(tmp_path / "b.png", cloud, connected_parts(cloud, selection), views, under, "ball")
+    assert not (tmp_path / "b.png").exists()
