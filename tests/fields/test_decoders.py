@@ -53,18 +53,6 @@ def voted(field, rows):
     return rasterize(field.gaussians.replace(features=votes.contiguous()), camera()).map, winners
 
 
-def test_labels_are_those_of_the_rendered_votes():
-    field = fused(unknown=160)
-    blended, winners = voted(field, texts())
-    most, index = blended.max(dim=-1)
-    expected = winners[index].masked_fill(most <= 0, -1)
-    labels = field.segment(camera(), texts())
-    assert labels.equal(expected)
-    assert len(labels.unique()) > 4
-    shown = rasterize(field.gaussians, camera()).alpha > 0
-    assert ((labels < 0) & shown).any()  # pixels that show only what nothing is known about
-
-
 @pytest.mark.parametrize("make", [fused, uncompressed])
 def test_the_paper_s_labels_are_those_of_the_decoded_pixels(make):
     field = make()

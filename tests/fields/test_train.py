@@ -229,21 +229,6 @@ def test_l1_loss_is_the_mean_over_pixels_and_channels_after_the_resize():
     assert float(loss) == pytest.approx((2.0 + 1.0) / 2)
 
 
-def test_wrong_arguments():
-    cameras, targets = scene(2)
-    with pytest.raises(ValueError, match=tells("targets:", "got 1")):
-        fit_field(start(), cameras, targets[:1], SHORT)
-    with pytest.raises(ValueError, match=tells("targets[", "[h, w, D]", "D = 5", "got (24, 32, 3)")):
-        fit_field(start(channels=5), cameras, targets, SHORT)
-    with pytest.raises(ValueError, match=tells("extent:", "got 0.0")):
-        changed(SHORT, extent=0.0)
-    with pytest.raises(TypeError, match=tells("params:", "got no Gaussian")):
-        fit_field(start().map(lambda value: value[:0]), cameras, targets, SHORT)
-    bent = replace(cameras[0], distortion=Distortion("brown_conrady", (0.1, 0.0, 0.0, 0.0)))
-    with pytest.raises(ValueError, match=tells("camera:", "got brown_conrady")):
-        fit_field(start(), [bent], targets[:1], SHORT)
-
-
 def test_unknown_pixels_count_nowhere():
     rendered = torch.rand(4, 6, 2, generator=torch.Generator().manual_seed(0), requires_grad=True)
     target = torch.rand(4, 6, 2, generator=torch.Generator().manual_seed(1))
@@ -257,22 +242,30 @@ def test_unknown_pixels_count_nowhere():
     assert float(l1_loss(rendered, torch.ones(4, 6), holes * torch.nan).detach()) == 0.0
 
 
-def test_an_infinite_target_stops_the_fit():
+def one_place(params):
+    return replace(params, means=look_at_origin(0.0).center.repeat(len(params), 1))
+
+
+BENT = replace(look_at_origin(0.0), distortion=Distortion("brown_conrady", (0.1, 0.0, 0.0, 0.0)))
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"targets": []}, ValueError, ("targets:", "got 0")),
+        ({"params": start(channels=5)}, ValueError, ("targets[", "[h, w, D]", "D = 5", "got (24, 32, 3)")),
+        ({"params": start().map(lambda value: value[:0])}, TypeError, ("params:", "got no Gaussian")),
+        ({"cameras": [BENT]}, ValueError, ("camera:", "got brown_conrady")),
+        ({"targets": [torch.full((24, 32, 3), torch.inf)]}, FloatingPointError, ("loss:", "step 1", "got inf")),
+        ({"training": changed(SHORT, prune_opacity=0.9)}, ValueError, ("training:", "got none", "step 10")),
+        (
+            {"params": one_place(start(2)), "training": changed(SHORT, extent=None)}, ValueError,
+            ("cameras", "extent of 0", "Training(extent=...)"),
+        ),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_trained_is_named(change, error, message):
     cameras, targets = scene(1)
-    with pytest.raises(FloatingPointError, match=tells("loss:", "step 1", "got inf")):
-        fit_field(start(), cameras, [targets[0] + torch.inf], SHORT)
-
-
-def test_losing_every_gaussian_says_so():
-    cameras, targets = scene(1)
-    config = changed(SHORT, prune_opacity=0.9)
-    with pytest.raises(ValueError, match=tells("training:", "got none", "step 10")):
-        fit_field(start(), cameras, targets, config)
-
-
-def test_a_scene_without_size_needs_an_extent():
-    camera = look_at_origin(0.0)
-    params = start(2).map(lambda value: value)
-    params = replace(params, means=camera.center.repeat(len(params), 1))
-    with pytest.raises(ValueError, match=tells("cameras", "extent of 0", "Training(extent=...)")):
-        fit_field(params, [camera], [torch.zeros(4, 4, CHANNELS)], changed(SHORT, extent=None))
+    fitting = {"params": start(), "cameras": cameras, "targets": targets, "training": SHORT}
+    with pytest.raises(error, match=tells(*message)):
+        fit_field(**(fitting | change))
