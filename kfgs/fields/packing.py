@@ -290,6 +290,8 @@ def _nearest_turn(quats: Array, scales: Array) -> tuple[Array, Array]:  # [N, 4]
     if not len(quats):
         return quats, scales
     group = Rotation.create_group("O")
-    nearest, _, best = Rotation.from_quat(np.roll(quats, -1, axis=1)).reduce(right=group, return_indices=True)
+    inverses = np.roll(group.inv().as_quat(), 1, axis=1)  # [24, 4] wxyz
+    best = np.abs(quats @ inverses.T).argmax(1)  # half of the time of Rotation.reduce
+    nearest = (Rotation.from_quat(np.roll(quats, -1, axis=1)) * group[best]).as_quat(canonical=True)
     axes = np.abs(group.as_matrix()).argmax(axis=1)[best]  # [N, 3]: the old axis that becomes axis 0, 1 and 2
-    return np.roll(nearest.as_quat(canonical=True), 1, axis=1), np.take_along_axis(scales, axes, axis=1)
+    return np.roll(nearest, 1, axis=1), np.take_along_axis(scales, axes, axis=1)
