@@ -44,17 +44,15 @@ def fuse_views(field: SemanticField, cameras: Sequence[Camera]) -> SemanticField
         table = torch.nn.functional.pad(latents.encode(rows), (0, 0, 0, 1)).to(gaussians.means)  # nothing known: zeros
 
         def show(camera: Camera) -> tuple[Camera, Tensor]:  # [H, W, e]
-            rendering = rasterize(gaussians, camera)
+            factor = min(1.0, (PIXELS / (camera.width * camera.height)) ** 0.5)
+            small = camera.resized(max(1, round(camera.height * factor)), max(1, round(camera.width * factor)))
+            rendering = rasterize(gaussians, small)
             pixels = rendering.map
             if isinstance(decoder, Codewords | Autoencoded):
-                return camera, table[decoder.codewords(pixels, rendering.alpha > 0)]
-            return camera, latents.encode(unit_rows(pixels)) * (row_norms(pixels) > EPS)[..., None]
+                return small, table[decoder.codewords(pixels, rendering.alpha > 0)]
+            return small, latents.encode(unit_rows(pixels)) * (row_norms(pixels) > EPS)[..., None]
 
-        small = []
-        for camera in cameras:
-            factor = min(1.0, (PIXELS / (camera.width * camera.height)) ** 0.5)
-            small.append(camera.resized(max(1, round(camera.height * factor)), max(1, round(camera.width * factor))))
-        means = average_views(gaussians, map(show, small)).values
+        means = average_views(gaussians, map(show, cameras)).values
     fused = SemanticField(gaussians.replace(features=means), Linear(latents.basis))
     return replace(field, cameras=tuple(cameras), fused=fused)
 
