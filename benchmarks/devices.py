@@ -63,7 +63,7 @@ class MapsOn:
     def __init__(self, maps: FeatureMaps, device: torch.device) -> None:
         self._maps, self._device = maps, device
         if hasattr(maps, "grid"):  # samples of a map, without reading all of it
-            self.grid = lambda i, step, samples: maps.grid(i, step, samples).to(device)
+            self.grid = lambda i, samples: maps.grid(i, samples).to(device)
 
     def __len__(self) -> int:
         return len(self._maps)

@@ -10,7 +10,7 @@ import contextlib
 import difflib
 import math
 import numbers
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,8 @@ from torch import Tensor
 PARTS = ("embeddings", "codewords", "map", "means", "gaussians")  # where our objects keep what is mostly meant
 SHOWN = 20  # class names listed in a message
 ORIGIN = (0.0, 0.0, 0.0)  # of a scene whose coordinates are counted from the world's own zero
+Progress = bool | Callable[[dict[str, Any]], None]
+"""`progress` of every function that trains: True shows a bar, a function is called with each new row of the history."""
 
 
 def as_origin(value: Any) -> tuple[float, float, float]:
@@ -175,6 +177,18 @@ def check_size(size: tuple[int, int], name: str = "size", low: int = 1) -> None:
         check_whole(f"{name} ({axis})", pixels, low)
 
 
+def as_progress(progress: Any) -> Progress:
+    """A function as it is, a truth value as a bool."""
+    return progress if callable(progress) else bool(progress)
+
+
+def as_bar(progress: Any) -> bool:
+    """`as_progress` where there is no history to call a function with (TypeError)."""
+    if callable(progress):
+        raise TypeError("progress: expected True or False, got a function; there are no rows to call it with")
+    return bool(progress)
+
+
 def one_line(text: object, length: int = 60) -> str:
     """Shorten a name from an untrusted file for a message: one line, no control characters."""
     shown = ascii(str(text))[1:-1]
@@ -200,9 +214,7 @@ def class_indices(name: str, names: Sequence[str], otherwise: str = "take one of
     if spelled is not None:
         return tuple(index for index, known in enumerate(names) if known == spelled)
     if not names:
-        raise ValueError(
-            f"class: expected class names to look {name!r} up in, got none; pass the names or use an index"
-        )
+        raise ValueError(f"class: expected class names to look {name!r} up in, got none; pass names or use an index")
     lower = {known.lower(): known for known in names}
     alike = [lower[match] for match in difflib.get_close_matches(name.lower(), lower, 3)]
     alike += [known for known in dict.fromkeys(names) if name and name.lower() in known.lower()][:3]

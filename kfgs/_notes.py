@@ -19,8 +19,7 @@ class Wait(str):
     """A note that something takes long; commands print it next to the progress bars."""
 
 
-_listeners: list[Callable[[str], None]] = []
-_strict: list[bool] = []
+_listeners: list[tuple[Callable[[str], None], bool]] = []  # whom to tell, and whether readers are strict
 _logged: set[str] = set()
 
 
@@ -34,19 +33,18 @@ def hear(say: Callable[[str], None], *, strict: bool = False) -> Iterator[None]:
             told.add(note)
             say(note)
 
-    _listeners.append(once)
-    _strict.append(strict)
+    listener = once, strict
+    _listeners.append(listener)
     try:
         yield
     finally:
-        _listeners.remove(once)
-        _strict.pop()
+        _listeners.remove(listener)
 
 
 def tell(note: str) -> None:
     """Pass a note to the command that listens; if there is none, log it."""
     if _listeners:
-        _listeners[-1](note)
+        _listeners[-1][0](note)
     elif note not in _logged:
         _logged.add(note)
         logging.getLogger("kfgs").log(logging.INFO if isinstance(note, Wait) else logging.WARNING, note)
@@ -54,7 +52,7 @@ def tell(note: str) -> None:
 
 def is_strict() -> bool:
     """Whether readers refuse a file with broken parts (`--strict`)."""
-    return any(_strict)
+    return any(strict for _, strict in _listeners)
 
 
 def tell_repairs(where: str, notes: Iterable[str], strict: bool, error: type[ValueError]) -> None:

@@ -64,7 +64,5 @@ def in_world(points: Tensor) -> Tensor:  # [N, 3] float64
 def describe_origin(origin: Origin, what: str) -> list[str]:
     """A note for people; none if coordinates are counted from zero."""
     place = ", ".join(f"{value:.15g}" for value in origin)
-    note = (
-        f"coordinates of {what} are counted from the origin ({place}): float32 has 7 digits; answers are in the world"
-    )
+    note = f"coordinates of {what} are relative to the origin ({place}): float32 has 7 digits; answers are in the world"
     return [] if origin == ORIGIN else [note]

@@ -35,9 +35,7 @@ def unit_embeddings(embeddings: Tensor, name: str = "embeddings") -> Tensor:  # 
         row = int(empty.nonzero()[0])
         length = float(embeddings[row].double().norm())
         got = f"a length of {length:.3g}" if length else "all zeros"
-        raise ValueError(
-            f"{name}: expected rows longer than {EPS:g}, got {got} in row {row}; drop or replace that class"
-        )
+        raise ValueError(f"{name}: expected rows longer than {EPS:g}, got {got} in row {row}; drop or replace it")
     return unit_rows(embeddings.detach())
 
 

@@ -78,23 +78,16 @@ def _stand_ins(path: Path) -> list[Any]:
     return [_Empty, *((_Empty if name.startswith("numpy") else type(name, (_Items,), {}), name) for name in names)]
 
 
-def plain_tensor(
-    path: Path, name: str, value: object, dtype: torch.dtype | None = torch.float32, *, finite: bool = True
-) -> Tensor:
+def plain_tensor(path: Path, name: str, value: object, dtype: torch.dtype | None = torch.float32) -> Tensor:
     """A dense tensor of a file as numbers of `dtype` (None: its own), without its graph.
 
     Raises:
-        FileError: if it is something else, repeats its values by strides, or has numbers that are not `finite`.
+        FileError: if it is something else, or repeats its values by strides.
     """
     if not isinstance(value, Tensor) or value.layout != torch.strided or value.is_quantized or value.is_meta:
         kind = "another kind" if isinstance(value, Tensor) else type(value).__name__
         raise FileError(f"{path}: expected a dense tensor for {name}, got {kind}; is this another program's file?")
     held = value.untyped_storage().nbytes() // value.element_size()
     if value.numel() > held:  # a few bytes could fill the memory
-        raise FileError(
-            f"{path}: {name} has {list(value.shape)} values, but the file has only {held}; save it contiguous"
-        )
-    values = value.detach() if dtype is None else value.detach().to(dtype)
-    if finite and not bool(torch.isfinite(values).all()):
-        raise FileError(f"{path}: expected finite numbers for {name}, got NaN or infinity; did the training diverge?")
-    return values
+        raise FileError(f"{path}: {name} has {list(value.shape)} values, the file only {held}; save it contiguous")
+    return value.detach() if dtype is None else value.detach().to(dtype)

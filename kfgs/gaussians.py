@@ -88,9 +88,6 @@ class Gaussians:
         parts += [f"columns {short_value(list(self.extra))}"] if self.extra else []
         return cut(f"Gaussians({', '.join(parts)}, {self.means.dtype}, {self.means.device})", LINE)
 
-    def __getitem__(self, which: Any) -> Gaussians:
-        return self.select(which)
-
     def __array__(self, *args: Any, **kwargs: Any) -> Array:
         """None: without it, NumPy would look into g[0][0][0]... for numbers."""
         raise TypeError("gaussians: expected an array, got Gaussians, which hold several; use to_numpy()")
@@ -123,6 +120,8 @@ class Gaussians:
         rows = index.cpu().numpy() if self.extra else None
         extra = {name: np.asarray(column)[rows] for name, column in self.extra.items()}
         return self.replace(**{name: value[index] for name, value in self._tensors().items()}, extra=extra)
+
+    __getitem__ = select
 
     def by_class(self) -> dict[int, Gaussians]:
         """One cloud for each label that occurs, ascending; -1 is the cloud without a class.

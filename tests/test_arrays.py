@@ -3,8 +3,6 @@
 import io
 import json
 import struct
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
@@ -219,13 +217,6 @@ def test_texts_and_tensors_come_back_in_the_order_given(tmp_path):
     head = path.read_bytes()
     places = [head.index(f'"{name}":'.encode()) for name in TEXTS]
     assert places == sorted(places)
-
-
-def test_two_processes_write_the_same_bytes(tmp_path):
-    code = (
-        f"import sys, torch, pathlib; from kfgs._arrays import save_tensors; "
-        f"save_tensors(pathlib.Path(sys.argv[1]), {{'a': torch.ones(3), 'b': torch.ones(3)}}, {TEXTS!r})"
-    )
-    for name in "123":
-        subprocess.run([sys.executable, "-c", code, tmp_path / name], check=True)
-    assert len({(tmp_path / name).read_bytes() for name in "123"}) == 1
+    for _ in range(9):  # safetensors alone takes another order each time
+        save_tensors(path, tensors, TEXTS)
+        assert path.read_bytes() == head

@@ -111,7 +111,6 @@ def test_lines_stay_short_and_cards_are_tables():
     assert repr(autoencoder) == "Autoencoder(512 channels to 9 latents and back, widths [512, 64, 9, 64, 512])"
     for card, facts in (
         (field._repr_html_(), ("&lt;lseg&gt;", "decouple+ADC+SC", " for 512)")),
-        (book._repr_html_(), (">300<", "[300, 512] float32")),
         (rendering._repr_html_(), ("30 x 20", "9")),
     ):
         assert card.startswith("<table>")

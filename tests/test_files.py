@@ -81,12 +81,8 @@ def test_a_folder_with_files_keeps_what_the_new_ones_do_not_replace(tmp_path):
         (new / "deep").mkdir()
         for name in ("a.txt", "deep/b.txt"):
             (new / name).write_text("new")
-    assert visible(tmp_path / "out") == {
-        "mine.txt": "mine",
-        "a.txt": "new",
-        "deep/mine.txt": "mine",
-        "deep/b.txt": "new",
-    }
+    files = {"mine.txt": "mine", "a.txt": "new", "deep/mine.txt": "mine", "deep/b.txt": "new"}
+    assert visible(tmp_path / "out") == files
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
 
 
@@ -149,12 +145,8 @@ def test_what_can_be_written_is_returned_and_nothing_is_left(tmp_path, monkeypat
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "old").mkdir()
     (tmp_path / "old.ply").touch()
-    for name, kind in (
-        ("old", "a folder"),
-        ("old.ply", "a file"),
-        ("new/deep", "a folder"),
-        ("new/deep.ply", "a file"),
-    ):
+    for name in ("old", "new/deep", "old.ply", "new/deep.ply"):
+        kind = "a file" if name.endswith(".ply") else "a folder"
         assert check_output("out", f"~/{name}", kind) == tmp_path / name
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["old", "old.ply"]
 
@@ -306,17 +298,9 @@ def test_the_exact_name_wins_over_one_that_differs_in_case() -> None:
 
 def test_names_of_views_may_lack_their_folder_where_only_one_fits() -> None:
     names = Names(["left/a.png", "right/a.png", "left/b.png"], bare=True)
-    assert [names.find(name) for name in ("b.png", "b", "a.png", "left/a")] == [
-        "left/b.png",
-        "left/b.png",
-        None,
-        "left/a.png",
-    ]
-
-
-def test_a_name_with_a_folder_is_not_that_of_another_folder() -> None:
-    names = Names(["left/a.png"], bare=True)
-    assert [names.find(name) for name in ("a.png", "images/left/a.png", "right/a.png")] == ["left/a.png"] * 2 + [None]
+    for name, meant in (("b.png", "b"), ("b", "b"), ("a.png", None), ("left/a", "a"), ("images/left/a.png", "a")):
+        assert names.find(name) == (meant and f"left/{meant}.png")
+    assert names.find("right/b.png") is None  # of another folder
 
 
 def test_what_several_find_is_only_for_one_that_is_spelled_so() -> None:

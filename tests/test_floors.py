@@ -18,7 +18,7 @@ ROOT = Path(kfgs.__file__).parent
 # From the bottom up. Places of one row never import each other; evaluation lies under pipeline, which scores with it.
 FLOORS = (
     {"_card"},
-    {"_check", "_files", "_interrupts", "_notes", "_progress", "_rows"},
+    {"_check", "_files", "_interrupts", "_notes", "_rows"},
     {"_arrays", "_origin"},
     {"_torch_files", "gaussians", "cameras"},
     {"splat", "quant", "metrics"},

@@ -107,9 +107,6 @@ def test_label_refusals():
         ConfusionMatrix(0)
 
 
-# scores
-
-
 # features
 
 

@@ -223,12 +223,12 @@ def unit_vector(name: str, vector: Tensor | Sequence[float]) -> Tensor:  # [3] f
 
 def view_named(cameras: Sequence[Camera], view: str | Camera, where: str) -> Camera:
     """The one camera of a name, with or without its ending; a camera is itself. Errors begin with `where`."""
+    if isinstance(view, Camera):
+        return view
     named = {camera.name: camera for camera in cameras}
     names = Names(named, bare=True)
-    found = view if isinstance(view, Camera) else named.get(names.find(view) or "")
-    if found is None:
-        some = ", ".join(list(named)[:3]) or "none"
-        raise ValueError(
-            f"{where}: expected the name of a training view ({some}, ...), got {view!r}; {names.advice(str(view))}"
-        )
-    return found
+    name = names.find(view)
+    if name is None:
+        some = ", ".join([*list(named)[:3], "..."])
+        raise ValueError(f"{where}: expected the name of a training view ({some}), got {view!r}; {names.advice(view)}")
+    return named[name]

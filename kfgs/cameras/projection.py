@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from functools import reduce
 
 import torch
-from kornia.geometry.camera import PinholeCamera, dx_project_points_z1
+from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import convert_points_from_homogeneous
 from kornia.geometry.depth import depth_to_3d_v2
 from torch import Tensor
@@ -37,19 +37,8 @@ def camera_to_pixel(camera: Camera, points_cam: Tensor) -> Tensor:  # points_cam
     A point behind the camera gives an ordinary-looking pixel, so mask by depth *before* calling (`project_points` does). At
     z = 0 the division is skipped: the result is finite, and means nothing.
     """
-    check_shapes(("points_cam", as_tensor("points_cam", points_cam, floating=True), "N 3"))
     plane = convert_points_from_homogeneous(points_cam)  # finite at z = 0, where project_points_z1 is not
     return plane_to_pixel(plane, camera.K.to(points_cam), camera.distortion)
-
-
-def projection_jacobian(camera: Camera, points_cam: Tensor) -> Tensor:  # points_cam: [N, 3] -> [N, 2, 3]
-    """Derivative of the pinhole projection, d(u, v) / d(x, y, z), in pixels per world unit (EWA, Zwicker 2001).
-
-    The caller masks `z > near` first.
-    """
-    check_shapes(("points_cam", points_cam, "N 3"))
-    refuse_distortion(camera)
-    return dx_project_points_z1(points_cam) * camera.K.diagonal()[:2].to(points_cam)[:, None]
 
 
 def project_points(
@@ -146,21 +135,15 @@ def to_kornia(cameras: Sequence[Camera]) -> PinholeCamera:
     return PinholeCamera(intrinsics, extrinsics, height=sizes[:, 0], width=sizes[:, 1])
 
 
-def from_kornia(pinhole: PinholeCamera, names: Sequence[str] = ()) -> list[Camera]:
+def from_kornia(pinhole: PinholeCamera) -> list[Camera]:
     """The cameras of a kornia batch, one by one: the inverse of `to_kornia`.
 
     Of `intrinsics` only the upper left 3 x 3 is read, as kornia does; it is taken as it is. kornia's documentation puts pixel
     centres on integers: add 0.5 to cx and cy of such a K. One from COLMAP has them on halves, inside kornia's cameras too.
-
-    Args:
-        pinhole: B cameras.
-        names: B names, or none.
     """
     count = pinhole.batch_size
     for name in ("intrinsics", "extrinsics"):
         check_shapes((f"pinhole.{name}", getattr(pinhole, name), (count, 4, 4)))
-    if names and len(names) != count:
-        raise ValueError(f"names: expected {count} (one per camera), got {len(names)}; give one for each")
     viewmats, Ks = pinhole.extrinsics.clone(), pinhole.camera_matrix.clone()  # kornia's scale_ changes them in place
-    rows = zip(viewmats, Ks, pinhole.width.tolist(), pinhole.height.tolist(), names or [""] * count, strict=True)
+    rows = zip(viewmats, Ks, pinhole.width.tolist(), pinhole.height.tolist(), strict=True)
     return [Camera(*row) for row in rows]

@@ -52,10 +52,7 @@ def resize_map(
     return from_bchw(resize(to_bchw(map), tuple(size), align_corners=False, antialias=antialias))
 
 
-def resize_labels(
-    labels: Tensor,  # [H, W] integer
-    size: tuple[int, int],  # (h, w)
-) -> Tensor:  # [h, w], dtype of labels
+def resize_labels(labels: Tensor, size: tuple[int, int]) -> Tensor:  # [H, W] integer -> [h, w], dtype of labels
     """Resize a label map: each new pixel takes the label at its centre; -1 stays -1.
 
     Row i of the result reads row floor((i + 0.5) H / h), in whole numbers. kornia's `resize(interpolation="nearest")` takes

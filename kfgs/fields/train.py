@@ -17,9 +17,8 @@ from tqdm.auto import tqdm
 
 from .._arrays import reading
 from .._card import short_repr
-from .._check import ORIGIN, as_tensor
+from .._check import ORIGIN, Progress, as_progress, as_tensor
 from .._files import as_path, atomic_path, digest_value
-from .._progress import Progress, as_progress
 from ..cameras import Camera
 from ..cameras.bounds import camera_extent
 from ..splat import rasterize

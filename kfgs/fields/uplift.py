@@ -19,8 +19,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from tqdm import tqdm
 
-from .._check import check_range, check_whole
-from .._progress import as_bar
+from .._check import as_bar, check_range, check_whole
 from .._rows import unit_rows
 from ..cameras import Camera, resize_map
 from ..formats.values import check_splats

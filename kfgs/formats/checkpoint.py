@@ -111,7 +111,7 @@ def _cloud(path: Path, values: dict[str, Any], dc: Tensor, rest: Tensor | None) 
     raw = {name: values[name] for name in ("means", "quats", "scales", "opacities")} | {"sh0": dc}
     raw |= {} if rest is None else {"shN": rest}
     wide = {"means": torch.float64}
-    raw = {name: plain_tensor(path, name, v, wide.get(name, torch.float32), finite=False) for name, v in raw.items()}
+    raw = {name: plain_tensor(path, name, v, wide.get(name, torch.float32)) for name, v in raw.items()}
     N = len(raw["means"])
     if raw["opacities"].numel() != N:
         shapes = ", ".join(f"{name} {list(value.shape)}" for name, value in raw.items())

@@ -17,10 +17,7 @@ SPACINGS = 1.5  # the default distance in spacings of the selection: on room_0 2
 MOST_SPACINGS = 4.0  # ... and its bound in spacings of the cloud: a few specks across a room have a spacing of metres
 
 
-def component_distance(
-    means: Tensor,  # [N, 3]
-    mask: Tensor,  # [N] bool
-) -> float:
+def component_distance(means: Tensor, mask: Tensor) -> float:  # [N, 3], [N] bool
     """The default distance of `component_numbers`, in world units: 1.5 spacings of the masked Gaussians, at most 4 of all.
 
     It keeps a thing in one piece, and things apart. No constant does: on room_0 0.08 m joins two chairs and breaks a sofa.

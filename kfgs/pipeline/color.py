@@ -12,9 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._check import check_range, check_whole
+from .._check import Progress, as_progress, check_range, check_whole
 from .._files import check_output, locked
-from .._progress import Progress, as_progress
 from ..cameras import Camera, resize_map
 from ..fields import ColorLoss, Densify, GaussianParams, Rates, Training, fit_field
 from ..fields.train import digest_tensors

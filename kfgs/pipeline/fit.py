@@ -19,8 +19,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .._check import Progress, as_progress
 from .._files import check_output, folded_name, locked, real_path, write_json
-from .._progress import Progress, as_progress
 from ..fields import Autoencoded, Codewords, GaussianParams, Identity, SemanticField, fit_field, fuse_views, uplift_maps
 from ..fields.decoders import Decoder
 from ..fields.store import NAME, check_place, scene_classes

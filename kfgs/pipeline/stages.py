@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from .._arrays import reading
+from .._check import Progress
 from .._files import atomic_folder, digest_file, digest_value, read_json, real_path, write_json
 from .._origin import Origin
-from .._progress import Progress
 from ..cameras import Camera
 from ..fields.train import digest_tensors
 from ..gaussians import Gaussians

@@ -16,8 +16,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from .._card import short_repr
-from .._check import as_tensor, check_range, check_whole
-from .._progress import Progress, as_progress
+from .._check import Progress, as_progress, as_tensor, check_range, check_whole
 from .._rows import row_norms, unit_rows
 from .codebook import Codebook
 from .store import Stored
@@ -132,12 +131,8 @@ class Autoencoder(nn.Module, Stored):
     def encode(self, features: Tensor) -> Tensor:  # [..., D] -> [..., d] in [0, 1]
         """The latents of features (E), by their directions. Codewords fill [0, 1]; another latent is clamped to it."""
         low, high = self.range.tolist()
-
-        def encode_rows(rows: Tensor) -> Tensor:  # [n, D] -> [n, d]
-            unit = unit_latents(mlp(self.encoder, unit_rows(rows)))
-            return ((unit - low) / (high - low)).clamp(0, 1)
-
-        return _by_chunk("features", features, self.dim, encode_rows)
+        unit = _by_chunk("features", features, self.dim, lambda rows: unit_latents(mlp(self.encoder, unit_rows(rows))))
+        return ((unit - low) / (high - low)).clamp(0, 1)
 
     def decode(self, latents: Tensor) -> Tensor:  # [..., d] -> [..., D]
         """The features of latents (Psi in Sec. 3.4), as unit rows. Differentiable."""
@@ -189,12 +184,16 @@ def fit_autoencoder(
     """
     generator = generator or torch.Generator().manual_seed(0)
     target = codebook.unit.detach()
+    K, D = target.shape  # codewords, channels
     with torch.device("meta"):  # nothing is drawn from the global generator
-        made = Autoencoder(
-            (codebook.dim, *config.encoder, config.latent), (config.latent, *config.decoder, codebook.dim)
-        )
+        made = Autoencoder((D, *config.encoder, config.latent), (config.latent, *config.decoder, D))
     made = made.to_empty(device=target.device).to(target.dtype)
-    _initialise(made, generator)
+    for layer in (*made.encoder, *made.decoder):  # torch.nn.Linear's distribution: uniform within 1 / sqrt(inputs)
+        outputs, inputs = layer.weight.shape
+        drawn = torch.rand(outputs, inputs + 1, generator=generator, device=generator.device, dtype=torch.float64)
+        both = (2 * drawn - 1) / inputs**0.5
+        layer.weight.data.copy_(both[:, 1:])
+        layer.bias.data.copy_(both[:, 0])
     norms = [(torch.ones_like(layer.bias), torch.zeros_like(layer.bias)) for layer in made.encoder[:-1]]
     weights = [*made.parameters(), *(tensor.requires_grad_() for norm in norms for tensor in norm)]
     optimizer = torch.optim.Adam(weights, lr=config.learning_rate, weight_decay=config.weight_decay, fused=True)
@@ -206,7 +205,7 @@ def fit_autoencoder(
             low, high = latents.detach().amin(), latents.detach().amax()
             rows, wanted = (latents - low) / (high - low).clamp_min(SMALLEST), target
             if config.blends:
-                shares = _blends(config.blends, codebook.size, generator, target)
+                shares = _blends(config.blends, K, generator, target)
                 rows, wanted = torch.cat([rows, shares @ rows]), torch.cat([target, unit_rows(shares @ target)])
             loss = row_norms(unit_rows(mlp(made.decoder, rows)) - wanted).mean()
             if config.decay:
@@ -226,7 +225,7 @@ def fit_autoencoder(
         ends = [least, max(float(latents.max()), least + SMALLEST)]
         made.range = torch.tensor(ends, dtype=torch.float64, device=target.device)
         decoded = made.decode(made.encode(codebook.codewords))
-        recovered = codebook.quantize(decoded) == torch.arange(codebook.size, device=decoded.device)
+        recovered = codebook.quantize(decoded) == torch.arange(K, device=decoded.device)
         loss = row_norms(decoded - codebook.unit).mean()
         made.report = AutoencoderReport(history, float(recovered.double().mean()), float(loss))
     return made
@@ -247,16 +246,6 @@ def quick_on_a_cpu() -> Iterator[None]:
     finally:
         torch.set_flush_denormal(flushed)
         torch.set_num_threads(threads)
-
-
-def _initialise(made: Autoencoder, generator: torch.Generator) -> None:
-    """torch.nn.Linear's initial distribution, uniform within 1 / sqrt(inputs), from our own generator."""
-    for layer in (*made.encoder, *made.decoder):
-        outputs, inputs = layer.weight.shape
-        drawn = torch.rand(outputs, inputs + 1, generator=generator, device=generator.device, dtype=torch.float64)
-        both = (2 * drawn - 1) / inputs**0.5
-        layer.weight.data.copy_(both[:, 1:])
-        layer.bias.data.copy_(both[:, 0])
 
 
 def _blends(count: int, K: int, generator: torch.Generator, like: Tensor) -> Tensor:  # [count, K], rows sum to 1

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .._card import html_card, short_repr, short_value
+from .._card import short_repr
 from .._check import as_tensor, check_shapes
 from .._rows import EPS, row_norms, unit_rows
 from .store import Stored
@@ -69,10 +69,6 @@ class Codebook(Stored):
 
     __repr__ = short_repr
 
-    def _repr_html_(self) -> str:
-        facts = {"codewords": self.size, "channels": self.dim, "numbers": short_value(self.codewords)}
-        return html_card("Codebook", facts)
-
     @property
     def size(self) -> int:
         """The number of codewords, K."""
@@ -98,13 +94,13 @@ class Codebook(Stored):
         Note:
             Ties go to the lowest index. An all-zero feature gets index 0 with similarity 0.
         """
-        index, product, length = compare(self._checked(features), self.unit)
+        index, product, length = nearest_rows(self._checked(features), self.unit)
         shortest = max(EPS, torch.finfo(product.dtype).tiny)  # as in unit_rows
         return Nearest(index, (product / length.clamp_min(shortest)).to(product.dtype))
 
     def quantize(self, features: Tensor) -> Tensor:  # [..., D] -> [...] int64
         """The index map M of Eq. 5: for each feature, t = argmax_e cos(f, f_e). Ties as in `nearest`."""
-        return compare(self._checked(features), self.unit)[0]
+        return nearest_rows(self._checked(features), self.unit)[0]
 
     def _checked(self, features: Tensor) -> Tensor:
         features = as_tensor("features", features)
@@ -116,7 +112,7 @@ class Codebook(Stored):
         return features
 
 
-def compare(
+def nearest_rows(
     features: Tensor,  # [..., D]
     unit: Tensor,  # [K, D] unit rows
 ) -> tuple[Tensor, Tensor, Tensor]:  # [...] int64, [...], [...]
@@ -129,18 +125,15 @@ def compare(
     K, D = unit.shape
     rows = features.reshape(-1, D)
     wide = torch.promote_types(torch.promote_types(features.dtype, torch.float32), unit.dtype)
-    index = torch.empty(len(rows), dtype=torch.int64, device=features.device)
-    product = torch.empty(len(rows), dtype=unit.dtype, device=features.device)
-    length = torch.empty(len(rows), dtype=wide, device=features.device)
+    parts = []
     with torch.no_grad():
         padded = torch.nn.functional.pad(unit, (0, 0, 0, -K % 16)).T  # 256 columns are quicker than 255
-        for start in range(0, len(rows), CHUNK):
-            here = slice(start, start + CHUNK)
-            part = rows[here].to(wide)
-            product[here], index[here] = (part.to(unit.dtype) @ padded)[:, :K].max(dim=-1)  # the first of equal ones
-            length[here] = row_norms(part)
-    shape = features.shape[:-1]
-    return index.view(shape), product.view(shape), length.view(shape)
+        for part in rows.split(CHUNK):
+            part = part.to(wide)
+            best = (part.to(unit.dtype) @ padded)[:, :K].max(dim=-1)  # the first of equal ones
+            parts.append((best.indices, best.values, row_norms(part)))
+    index, product, length = (torch.cat(values).view(features.shape[:-1]) for values in zip(*parts, strict=True))
+    return index, product, length
 
 
 def share_above(similarity: Tensor, alpha: float) -> float:

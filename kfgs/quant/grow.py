@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from .._check import check_range, check_shapes, check_whole
-from .._progress import Progress, as_progress
+from .._check import Progress, as_progress, check_range, check_shapes, check_whole
 from .._rows import ENCODE, EPS, check_directions, row_norms, unit_rows
 from .codebook import Codebook, Nearest, share_above, with_report
 from .kmeans import Cells, refine
@@ -19,7 +18,7 @@ from .paper import PaperCodebook, prune
 from .sampling import SAMPLES, FeatureMaps, all_zero, read_grid
 
 POOL = 32_768  # features that codewords grow on: 67 MB of 512 channels in float32, 365 of each of 90 maps
-CODEWORD_RMS = 0.5  # of a codeword's channels: in mode adc the field learns them at absolute rates made for [0, 1]
+CODEWORD_RMS = 0.5  # of a codeword's channels: without an autoencoder the field learns them, at rates made for [0, 1]
 COVERAGE = 0.9  # share of the features that reach the similarity alpha, which the history counts by
 LEAST_GAIN = 0.05  # of a cell's cosine distance; isotropic noise in n dimensions gains about 2 / (pi n) from a split
 LEAST_SHARE = 1 / 16  # of the mean cell's features, at maximum size: fewer are outliers, not content
@@ -37,7 +36,8 @@ class GrownCodebook:
     """
 
     maximum: int = 255
-    """The most codewords (K_max). 255 and holes still fit one byte per pixel; 1,024 won 1.7 points of `adc` on room_0."""
+    """The most codewords (K_max). 255 and holes still fit one byte per pixel; 1,024 won 1.7 points on
+    room_0 without an autoencoder."""
     prune_above: float = 0.99
     """The later of two codewords is dropped when their similarity is above this (beta, Eq. 9)."""
 
@@ -45,14 +45,8 @@ class GrownCodebook:
         check_whole("maximum", self.maximum, 1)
         check_range("prune_above", self.prune_above, -1, 1)
 
-    def fit(
-        self,
-        read: Callable[[int], Tensor],  # the sampled features [n, D] of a map, all-zero ones left out
-        maps: int,
-        generator: torch.Generator,
-        progress: Progress,
-    ) -> Codebook:
-        """See `fit_codebook`."""
+    def fit(self, read: Callable[[int], Tensor], maps: int, generator: torch.Generator, progress: Progress) -> Codebook:
+        """See `fit_codebook`. `read` gives the sampled features [n, D] of a map, without all-zero ones."""
         bar = tqdm(range(maps), desc="codebook", disable=progress is not True)
         pool = torch.cat([unit_rows(read(i)) for i in bar])
         if len(pool) == 0:
@@ -157,40 +151,40 @@ def _halves(unit: Tensor, cells: Cells, least: float, generator: torch.Generator
     split looks good on the features it was made for. The gain is 0 where a half holds fewer than `least` features.
     """
     centres, K = cells.centres, len(cells.centres)
-    (learn, index), (check, other) = ((unit[i::2], cells.index[i::2]) for i in (0, 1))
+    (learn, cell), (check, check_cell) = ((unit[i::2], cells.index[i::2]) for i in (0, 1))
     drawn = torch.randn(centres.shape, generator=generator, device=generator.device, dtype=torch.float64)
     direction = unit_rows(drawn.to(centres))
-    inside = (learn * centres[index]).sum(dim=1)  # u . c of the residual u - (u . c) c, which is never built whole
+    inside = (learn * centres[cell]).sum(dim=1)  # u . c of the residual u - (u . c) c, which is never built whole
 
     def along(direction: Tensor) -> Tensor:  # [n / 2] the residual's part along its cell's direction
-        return (learn * direction[index]).sum(dim=1) - inside * (centres * direction).sum(dim=1)[index]
+        return (learn * direction[cell]).sum(dim=1) - inside * (centres * direction).sum(dim=1)[cell]
 
     for _ in range(POWER_STEPS):
         across = along(direction)
-        pull = torch.zeros_like(centres[:, 0]).index_add_(0, index, inside * across)
-        direction = unit_rows(_sums(learn, index, K, across) - pull[:, None] * centres)
+        pull = torch.zeros_like(centres[:, 0]).index_add_(0, cell, inside * across)
+        direction = unit_rows(_sums(learn, cell, K, across) - pull[:, None] * centres)
     across = along(direction)
-    square, cube = (_mean(across**power, index, K) for power in (2, 3))
+    square, cube = (_mean(across**power, cell, K) for power in (2, 3))
     # In the middle, or, for a small group far out on one side, half way to it: its share of square and cube is the same
     # but for one factor, its distance.
     middles = torch.zeros_like(square), 0.5 * cube / square.clamp_min(1e-12)
-    tried = [_try(learn, index + K * (across > middle[index]), check, other, cells, least) for middle in middles]
+    tried = [_try(learn, cell + K * (across > middle[cell]), check, check_cell, cells, least) for middle in middles]
     second = tried[1][1] > tried[0][1]
     return torch.where(second[:, None], tried[1][0], tried[0][0]), torch.where(second, tried[1][1], tried[0][1])
 
 
 def _try(
-    learn: Tensor, side: Tensor, check: Tensor, other: Tensor, cells: Cells, least: float
+    learn: Tensor, side: Tensor, check: Tensor, check_cell: Tensor, cells: Cells, least: float
 ) -> tuple[Tensor, Tensor]:  # [2, K, D], [K]
-    """Halves from the features `learn`, those of cell e in half `side` = e or e + K; gain on `check` of cells `other`."""
+    """Halves from the features `learn`, those of cell e in half `side` = e or e + K; the gain is measured on `check`."""
     K = len(cells.centres)
     halves = unit_rows(_sums(learn, side, 2 * K)).view(2, K, -1)
-    to_halves = torch.stack([(check * half[other]).sum(dim=1) for half in halves])  # [2, n / 2]
+    to_halves = torch.stack([(check * half[check_cell]).sum(dim=1) for half in halves])  # [2, n / 2]
     before, after = 1 - cells.similarity[1::2], 1 - to_halves.amax(dim=0)
-    checked = other + K * to_halves.argmax(dim=0)
+    checked = check_cell + K * to_halves.argmax(dim=0)
     counts = torch.bincount(torch.cat([side, checked]), minlength=2 * K).view(2, K)
-    distance = _mean(before, other, K)
-    gain = 1 - _mean(after, other, K) / distance.clamp_min(1e-12)
+    distance = _mean(before, check_cell, K)
+    gain = 1 - _mean(after, check_cell, K) / distance.clamp_min(1e-12)
     # 1e-5 is what float32 rounding leaves of the cosine distance of equal features
     out = (counts.amin(dim=0) < least) | (distance < 1e-5) | (halves.abs().amax(dim=2) == 0).any(dim=0)
     return halves, gain.masked_fill(out, 0)

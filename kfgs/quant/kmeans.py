@@ -37,9 +37,7 @@ def spherical_kmeans(
     rows, counted = unit_rows(features), (weights > 0) & (row_norms(features) > EPS)
     candidates = int(counted.sum())
     if candidates == 0:
-        raise ValueError(
-            f"features: expected a nonzero row with a weight, got {len(features)} without; check the teacher"
-        )
+        raise ValueError(f"features: expected a weighted nonzero row, got {len(features)} without; check the teacher")
     capped = cap(weights, weights[counted].double()) * counted
     generator = generator or torch.Generator().manual_seed(0)
     first = torch.multinomial(capped.cpu().double(), min(clusters, candidates), generator=generator)

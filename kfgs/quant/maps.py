@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
-from .._check import as_tensor, check_shapes, check_whole
-from .._progress import as_bar
+from .._check import as_bar, as_tensor, check_shapes, check_whole
 from .._rows import ENCODE, EPS, check_directions
-from .codebook import Codebook, compare
+from .codebook import Codebook, nearest_rows
 from .sampling import FeatureMaps
 from .store import Stored
 
@@ -100,7 +99,7 @@ def quantize_maps(
     for i in tqdm(range(len(maps)), desc="quantise", disable=not as_bar(progress)):
         feature_map = as_tensor(f"maps[{i}]", maps[i])
         check_shapes((f"maps[{i}]", feature_map, ("h", "w", codebook.dim)))
-        index, _, length = compare(feature_map, codebook.unit)
+        index, _, length = nearest_rows(feature_map, codebook.unit)
         check_directions(f"maps[{i}]", feature_map, length, ENCODE)
         indices.append(index.masked_fill(length <= EPS, codebook.size).cpu().numpy().astype(np.uint16))
     return IndexMaps(indices, codebook.size)

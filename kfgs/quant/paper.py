@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from .._check import check_range, check_whole
-from .._progress import Progress
+from .._check import Progress, check_range, check_whole
 from .._rows import EPS, row_norms, unit_rows
 from .codebook import Codebook, Nearest, share_above, with_report
 from .sampling import SAMPLES, all_zero
@@ -62,14 +61,8 @@ class PaperCodebook:
         check_range("prune_above", self.prune_above, self.expand_below, 1)  # below it, what joins is pruned at once
         check_range("learning_rate", self.learning_rate, 0, closed=(False, True))
 
-    def fit(
-        self,
-        read: Callable[[int], Tensor],  # the sampled features [n, D] of a map, all-zero ones left out
-        maps: int,
-        generator: torch.Generator,
-        progress: Progress,
-    ) -> Codebook:
-        """See `fit_codebook`."""
+    def fit(self, read: Callable[[int], Tensor], maps: int, generator: torch.Generator, progress: Progress) -> Codebook:
+        """See `fit_codebook`. `read` gives the sampled features [n, D] of a map, without all-zero ones."""
         first = next((features for features in map(read, range(maps)) if len(features)), None)
         if first is None:
             raise all_zero(maps)

@@ -153,10 +153,10 @@ class FeatureFolder(Sequence[Tensor]):
             return FeatureFolder(self.path, self.stems[index], channels=self.channels, sizes=self.sizes[index])
         return torch.cat(list(self.blocks(index)))
 
-    def grid(self, i: int, step: tuple[int, int] | None, samples: int) -> Tensor:  # [n, D] float32
-        """`quant.sample_grid(maps[i], step, samples=samples)`, reading no more of the file than these pixels."""
+    def grid(self, i: int, samples: int) -> Tensor:  # [n, D] float32
+        """`quant.sample_grid(maps[i], samples=samples)`, reading no more of the file than these pixels."""
         stored = self._open(self.files[i], self.sizes[i])
-        rows, columns = grid_slices(int(stored.shape[0]), int(stored.shape[1]), step, samples=samples)
+        rows, columns = grid_slices(int(stored.shape[0]), int(stored.shape[1]), samples)
         return torch.cat(list(self.blocks(i, rows, columns))).flatten(0, 1)
 
     def blocks(

@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
+from kornia.geometry.camera import dx_project_points_z1
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
 
 from .._card import short_repr
 from .._check import check_range
 from ..cameras.camera import Camera
-from ..cameras.projection import camera_to_pixel, projection_jacobian, refuse_distortion, world_to_camera
+from ..cameras.projection import camera_to_pixel, refuse_distortion, world_to_camera
 from ..gaussians import Gaussians
 from .engines.contract import ALPHA_MIN, Cloud, Pinhole
 from .engines.table import choose_projecting
@@ -99,7 +100,7 @@ def _project(gaussians: Gaussians, camera: Camera, near: float, low_pass: float)
     opacities = gaussians.opacities[index]
     means2d = camera_to_pixel(camera, points)
     variances, covariances, det = _covariance_2d(
-        projection_jacobian(camera, _clamp_tangents(points, camera)) @ camera.viewmat[:3, :3],
+        _jacobian(points, camera) @ camera.viewmat[:3, :3],
         gaussians.quats[index],
         gaussians.scales[index],
         low_pass,
@@ -158,15 +159,18 @@ def _reach(opacities: Tensor) -> Tensor:
     return 2 * torch.log(opacities / ALPHA_MIN)
 
 
-def _clamp_tangents(points: Tensor, camera: Camera) -> Tensor:  # [M, 3] -> [M, 3]
-    """Move points along the image plane to where the projection may be linearised; depth stays."""
+def _jacobian(points: Tensor, camera: Camera) -> Tensor:  # [M, 3] of the camera's frame -> [M, 2, 3]
+    """Derivative of the projection, d(u, v) / d(x, y, z), in pixels per world unit (EWA, Zwicker 2001).
+
+    It is taken at the point, moved along the image plane to where the projection may be linearised.
+    """
     focal = camera.K.diagonal()[:2]
     size = torch.tensor([camera.width, camera.height], dtype=points.dtype, device=points.device)
     middle = (size / 2 - camera.K[:2, 2]) / focal
     half = FIELD_OF_VIEW_MARGIN * size / 2 / focal
     z = points[:, 2:]
     tangents = torch.clamp(points[:, :2] / z, middle - half, middle + half)
-    return torch.cat([tangents * z, z], dim=1)
+    return dx_project_points_z1(torch.cat([tangents * z, z], dim=1)) * focal[:, None]
 
 
 @torch.no_grad()
@@ -175,7 +179,7 @@ def _candidates(gaussians: Gaussians, camera: Camera, near: float, low_pass: flo
     points = world_to_camera(camera, gaussians.means)  # [N, 3]
     index = ((points[:, 2] > near) & (_reach(gaussians.opacities) > 0)).nonzero().squeeze(1)
     points = points[index]
-    J = projection_jacobian(camera, _clamp_tangents(points, camera))
+    J = _jacobian(points, camera)
     largest = gaussians.scales[index].amax(dim=1, keepdim=True)
     variances = (J * J).sum(dim=2) * largest**2 + low_pass
     extents = (_reach(gaussians.opacities[index])[:, None] * variances).sqrt()

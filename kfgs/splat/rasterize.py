@@ -147,9 +147,7 @@ def rasterize_labels(
     """
     _check_arguments(gaussians, camera)
     if gaussians.features is None:
-        raise ValueError(
-            "gaussians: expected scores of classes as features, got None; add them with gaussians.replace()"
-        )
+        raise ValueError("gaussians: expected scores of classes as features, got None; add them by gaussians.replace()")
     with torch.no_grad():
         projected = project(gaussians, camera, near=near, engine=engine)
         tiles = bin_tiles(projected, camera.width, camera.height, engine=engine)

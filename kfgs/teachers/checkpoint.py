@@ -44,7 +44,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Tensor]:
             f"{path}: expected {_EXPECTED}, got one without a state dict (names to tensors): {keys}; {SAVE}"
         )
     return {
-        name: plain_tensor(path, one_line(name), value, None, finite=False)
+        name: plain_tensor(path, one_line(name), value, None)
         for name, value in state.items()
         if isinstance(name, str) and isinstance(value, Tensor)
     }

@@ -1,13 +1,16 @@
+from dataclasses import replace
+
 import kornia.geometry
 import numpy as np
 import pycolmap
 import pytest
 import torch
+from kornia.geometry.camera import PinholeCamera
 from messages import tells
-from oracles_cameras import HEIGHT, LENSES, WIDTH, colmap_pixels, project_pinhole
+from oracles_cameras import HEIGHT, LENSES, WIDTH, colmap_camera, colmap_pixels, project_pinhole
 
-from kfgs.cameras import Camera, Distortion, project_points
-from kfgs.cameras.projection import camera_to_pixel, projection_jacobian, unproject_depth, world_to_camera
+from kfgs.cameras import Camera, Distortion, from_kornia, project_points, to_kornia
+from kfgs.cameras.projection import camera_to_pixel, unproject_depth, world_to_camera
 
 K = torch.tensor([[70.0, 0.0, 50.0], [0.0, 66.0, 30.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
 QUAT_XYZW = np.array([0.1, -0.2, 0.3, 0.9]) / np.linalg.norm([0.1, -0.2, 0.3, 0.9])
@@ -21,11 +24,8 @@ def posed(distortion=None, dtype=torch.float64):
 
 
 def lens_camera(model):
-    parameters, kind, coefficients = LENSES[model]
-    focal = parameters[:2] if len(parameters) > 5 else [parameters[0]] * 2
-    center = parameters[2:4] if len(parameters) > 5 else parameters[1:3]
-    intrinsics = torch.tensor([[focal[0], 0, center[0]], [0, focal[1], center[1]], [0, 0, 1]], dtype=torch.float64)
-    return Camera(torch.eye(4, dtype=torch.float64), intrinsics, WIDTH, HEIGHT, model, Distortion(kind, coefficients))
+    intrinsics = torch.from_numpy(colmap_camera(model).calibration_matrix())
+    return Camera(torch.eye(4).double(), intrinsics, WIDTH, HEIGHT, model, Distortion(*LENSES[model][1:]))
 
 
 def points_in_front(count=40, seed=0):
@@ -61,8 +61,6 @@ def test_lens_agrees_with_colmap(model):
     cam, _ = points_in_front()
     ours = camera_to_pixel(lens_camera(model), torch.from_numpy(cam)).numpy()
     np.testing.assert_allclose(ours, colmap_pixels(model, cam), atol=1e-9)
-    _, kind, coefficients = LENSES[model]
-    assert lens_camera(model).distortion == Distortion(kind, coefficients)
     pinhole = camera_to_pixel(Camera(torch.eye(4), lens_camera(model).K, WIDTH, HEIGHT), torch.from_numpy(cam)).numpy()
     assert np.abs(pinhole - ours).max() > 0.5  # leaving the lens out shows
 
@@ -128,12 +126,6 @@ def test_lens_does_not_fold_far_points_into_the_picture():
     assert project_points(camera, points)[2].tolist() == [True, False]
 
 
-def test_jacobian_is_the_derivative_of_the_projection():
-    cam = torch.from_numpy(points_in_front(6)[0])
-    exact = torch.autograd.functional.jacobian(lambda x: camera_to_pixel(posed(), x).sum(0), cam)  # [2, N, 3]
-    torch.testing.assert_close(projection_jacobian(posed(), cam), exact.transpose(0, 1))
-
-
 @pytest.mark.parametrize("model", [None, "FULL_OPENCV", "OPENCV_FISHEYE"])
 def test_gradcheck(model):
     lens = None if model is None else lens_camera(model).distortion
@@ -168,15 +160,49 @@ def test_refusals():
         project_points(camera, points[:, :2])
     with pytest.raises(TypeError, match=tells("points:", "got torch.int64", ".float()")):
         world_to_camera(camera, points.long())
-    with pytest.raises(TypeError, match=tells("points_cam:", "got torch.int64")):
-        camera_to_pixel(camera, points.long())
     with pytest.raises(ValueError, match=tells("near:", "got -1")):
         project_points(camera, points, near=-1)
     with pytest.raises(ValueError, match=tells("camera:", "got brown_conrady", "'posed'")):
-        projection_jacobian(bent, points)
-    with pytest.raises(ValueError, match=tells("camera:", "got brown_conrady")):
         unproject_depth(bent, torch.ones(camera.size))
     with pytest.raises(ValueError, match=tells("depth:", "[64, 96]", "got (96, 64)")):
         unproject_depth(camera, torch.ones(WIDTH, HEIGHT))
     with pytest.raises(TypeError, match=tells("depth:", "got torch.int32")):
         unproject_depth(camera, torch.ones(camera.size, dtype=torch.int32))
+
+
+# kornia's cameras
+
+OTHER = torch.eye(4).double()
+OTHER[:3] = torch.from_numpy(pycolmap.Rigid3d(pycolmap.Rotation3d([0.6, 0.0, 0.0, 0.8]), [-0.4, 0.3, 1.0]).matrix())
+CAMERAS = [posed(), Camera(OTHER, K * torch.tensor([[1.3], [1.3], [1]]), 80, HEIGHT, "b.png")]
+
+
+def test_kornia_projects_to_the_pixels_of_kfgs_and_lifts_them_again():
+    cam = torch.from_numpy(points_in_front()[0])
+    world = torch.stack([(cam - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3] for camera in CAMERAS])
+    pixels, depths, _ = (torch.stack(x) for x in zip(*map(project_points, CAMERAS, world), strict=True))
+    torch.testing.assert_close(to_kornia(CAMERAS).project(world), pixels, rtol=0, atol=1e-9)
+    torch.testing.assert_close(to_kornia(CAMERAS).unproject(pixels, depths[..., None]), world, rtol=0, atol=1e-12)
+    assert (pixels[0] - project_points(CAMERAS[1], world[0])[0]).norm(dim=1).max() > 1  # the other camera's
+
+
+def test_to_kornia_and_back():
+    for camera, again in zip(CAMERAS, from_kornia(to_kornia(CAMERAS)), strict=True):
+        assert torch.equal(again.K, camera.K)
+        assert torch.equal(again.viewmat, camera.viewmat)
+        assert again.size == camera.size
+        assert again.K.dtype == again.viewmat.dtype == torch.float64
+
+
+def test_what_kornia_cannot_hold_is_refused():
+    bent = replace(CAMERAS[1], distortion=Distortion("kannala_brandt", (0.1, 0, 0, 0)))
+    with pytest.raises(ValueError, match=tells("camera:", "got kannala_brandt", "'b.png'")):
+        to_kornia([CAMERAS[0], bent])
+    with pytest.raises(ValueError, match=tells("cameras:", "got none")):
+        to_kornia([])
+    pinhole = to_kornia(CAMERAS)
+    stacked = PinholeCamera(pinhole.intrinsics[:, None], pinhole.extrinsics[:, None], pinhole.height, pinhole.width)
+    with pytest.raises(ValueError, match=tells("pinhole.intrinsics:", "[2, 4, 4]", "got (2, 1, 4, 4)")):
+        from_kornia(stacked)
+    with pytest.raises(ValueError, match=tells("width:", "got 28.")):
+        from_kornia(to_kornia(CAMERAS[:1]).scale(torch.tensor([0.3], dtype=torch.float64)))

@@ -67,19 +67,6 @@ def test_fit_finds_what_moved_the_points(seed):
     close(fit_similarity(flat, truth.apply(flat)), truth, atol=1e-10, rtol=0)
 
 
-def test_no_nearby_similarity_fits_noisy_pairs_better():
-    """The fit is a minimum of the squares in all seven directions."""
-    points = cloud()
-    target = a_similarity(8).apply(points) + cloud(seed=3) * 0.3
-    fit = fit_similarity(points, target)
-    cost = lambda s: (s.apply(points) - target).square().sum()  # noqa: E731
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        turn = torch.from_numpy(Rotation.from_rotvec(rng.normal(size=3) * 1e-2).as_matrix())
-        nudge = Similarity(float(np.exp(rng.normal() * 1e-2)), turn, torch.from_numpy(rng.normal(size=3) * 1e-2))
-        assert cost(Similarity.from_matrix(nudge.matrix() @ fit.matrix())) > cost(fit)
-
-
 @pytest.mark.parametrize(
     ("build", "message"),
     [
@@ -87,17 +74,11 @@ def test_no_nearby_similarity_fits_noisy_pairs_better():
         (lambda: Similarity(1.0, 2 * QUARTER, torch.zeros(3)), ("rotation:", "divide")),
         (lambda: Similarity(1.0, QUARTER * torch.nan, torch.zeros(3)), ("rotation:", "rotation", "got [[nan")),
         (lambda: Similarity(1.0, MIRROR, torch.zeros(3)), ("rotation:", "reflection")),
-        (
-            lambda: Similarity(1.0, QUARTER, torch.tensor([0.0, torch.inf, 0.0])),
-            ("translation:", "got [0.0, inf, 0.0]"),
-        ),
+        (lambda: Similarity(1.0, QUARTER, torch.full((3,), torch.inf)), ("translation:", "got [inf, inf, inf]")),
         (lambda: Similarity(1.0, QUARTER, torch.zeros(4)), ("translation:", "[3]", "got (4,)")),
         (lambda: Similarity.from_matrix(torch.ones(4, 4)), ("matrix:", "0 0 0 1")),
         (lambda: Similarity.from_matrix(torch.block_diag(2 * MIRROR, torch.ones(1, 1))), ("matrix:", "determinant -8")),
-        (
-            lambda: Similarity.from_matrix(torch.diag(torch.tensor([1.0, 2.0, 3.0, 1.0]))),
-            ("matrix:", "rotation", "got [["),
-        ),
+        (lambda: Similarity.from_matrix(torch.tensor([1.0, 2, 3, 1]).diag()), ("matrix:", "rotation", "got [[")),
         (lambda: Similarity.identity().apply(torch.zeros(2, 4)), ("points:", "[N, 3]", "got (2, 4)")),
         (lambda: fit_similarity(cloud(5), cloud(6)), ("dst:", "[N, 3]", "N = 5", "got (6, 3)")),
         (lambda: fit_similarity(cloud(2), cloud(2)), ("src:", "at least 3", "got 2")),

@@ -10,9 +10,8 @@ from kfgs.cameras.distortion import undistort_labels
 
 
 def camera_of(model, dtype=torch.float64):
-    _, kind, coefficients = LENSES[model]
     K = torch.from_numpy(colmap_camera(model).calibration_matrix()).to(dtype)
-    return Camera(torch.eye(4, dtype=dtype), K, WIDTH, HEIGHT, model, Distortion(kind, coefficients))
+    return Camera(torch.eye(4, dtype=dtype), K, WIDTH, HEIGHT, model, Distortion(*LENSES[model][1:]))
 
 
 def coordinates(dtype=torch.float64):

@@ -230,7 +230,7 @@ class Maps(list):
 
 
 class Grid(Maps):
-    def grid(self, i, step, samples):
+    def grid(self, i, samples):
         return list.__getitem__(self, i).reshape(-1, 5)[:samples]
 
 

@@ -4,7 +4,7 @@ import torch
 from messages import tells
 
 from kfgs.quant import Codebook
-from kfgs.quant.codebook import compare
+from kfgs.quant.codebook import nearest_rows
 from kfgs.quant.maps import IndexMaps
 
 
@@ -95,7 +95,7 @@ def test_every_feature_gets_the_first_largest_product_whatever_the_size(size):
     features = torch.randint(-3, 4, (3_000, 8), generator=generator).half()  # many chunks
     features[0] = torch.tensor([-5.0, 0, 0, 0, 0, 0, 0, 0])
     unit = torch.cat([codewords, codewords])  # each codeword twice
-    codeword, product, length = compare(features, unit)
+    codeword, product, length = nearest_rows(features, unit)
     products = (features.double()[:, None] * unit).sum(dim=2)
     assert torch.equal(product, products.amax(dim=1))
     assert torch.equal(codeword, (products == product[:, None]).int().argmax(dim=1))

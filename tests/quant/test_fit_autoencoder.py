@@ -124,7 +124,7 @@ def test_paper_gives_the_autoencoder_it_always_gave():
 def test_blended_latents_decode_to_blended_features():
     """The default learns what the field renders; the paper's training leaves it to chance."""
     book = realistic_codebook(8, 2)
-    options = dict(encoder=(64, 32), decoder=(32, 128), steps=600, learning_rate=2e-3)
+    options = dict(encoder=(64, 32), decoder=(32, 128), steps=300, learning_rate=2e-3)
     plain, blended = (
         fit_autoencoder(book, AutoencoderConfig.paper(**options)),
         fit_autoencoder(book, AutoencoderConfig(**options)),

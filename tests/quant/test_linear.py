@@ -64,12 +64,9 @@ def test_principal_directions_of_a_known_moment():
 )
 def test_the_fewest_latents_that_keep_the_share_beyond_the_first(keep, latents):
     """Beyond the first direction lie 5 + 3 + 1.8 + 0.2 = 10: shares 0.5, 0.8, 0.98 and 1."""
-    assert fit_linear_latents(with_spectrum(1000, 5, 3, 1.8, 0.2), keep=keep).latent == latents
-
-
-def test_a_maximum_bounds_the_number():
     rows = with_spectrum(1000, 5, 3, 1.8, 0.2)
-    assert fit_linear_latents(rows, keep=1.0, maximum=3).latent == 3
+    assert fit_linear_latents(rows, keep=keep).latent == latents
+    assert fit_linear_latents(rows, keep=keep, maximum=3).latent == min(latents, 3)
 
 
 def test_latents_are_the_main_directions():

@@ -31,26 +31,12 @@ def test_expand_closed_form():
     assert chosen.tolist() == [2, 1, 4]
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_expand_against_loops(seed):
-    codewords, features = random_rows(3, 4, seed), random_rows(25, 4, seed + 10)
+@pytest.mark.parametrize("maximum", [3, 5, 9, 1000])
+def test_expand_against_loops(maximum):
+    codewords, features = random_rows(3, 4, maximum), random_rows(25, 4, maximum + 10)
     features[7] = 0
-    chosen = expand(codewords, features, threshold=0.8, maximum=9).tolist()
-    assert chosen == oracle.expand(codewords.numpy(), features.numpy(), 0.8, 9)
-
-
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("maximum", [3, 5, 8, 1000])
-def test_expand_never_passes_the_maximum_and_admits_only_below_alpha(seed, maximum):
-    book, features = random_rows(3, 5, seed), random_rows(60, 5, seed + 10)
-    chosen = expand(book, features, threshold=0.7, maximum=maximum)
-    assert book.shape[0] + chosen.numel() <= maximum
-    for i in chosen.tolist():
-        assert max(oracle.cosine(features[i].numpy(), c) for c in book.numpy()) < 0.7
-        book = torch.cat([book, features[i : i + 1]])
-    if book.shape[0] < maximum:  # then it stopped because all are represented
-        assert expand(book, features, threshold=0.7, maximum=maximum).numel() == 0
-        assert all(max(oracle.cosine(f, c) for c in book.numpy()) >= 0.7 for f in features.numpy())
+    chosen = expand(codewords, features, threshold=0.8, maximum=maximum).tolist()
+    assert chosen == oracle.expand(codewords.numpy(), features.numpy(), 0.8, maximum)
 
 
 def test_expand_tie_goes_to_lowest_row():

@@ -9,9 +9,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kfgs._arrays import FileError
 from kfgs._torch_files import plain_tensor, read_torch
 from kfgs.formats.table import numbered_files
 from kfgs.gaussians import Gaussians
+
+
+def finite_tensor(path: Path, name: str, value: object) -> Tensor:
+    """A dense tensor of a file in float32; a FileError if it is something else, or not all of its numbers are finite."""
+    values = plain_tensor(path, name, value)
+    if not bool(torch.isfinite(values).all()):
+        raise FileError(f"{path}: expected finite numbers for {name}, got NaN or infinity; did the training diverge?")
+    return values
 
 
 def read_state(path: Path, expected: str) -> dict[str, Tensor]:
@@ -28,7 +37,7 @@ def read_state(path: Path, expected: str) -> dict[str, Tensor]:
     if not isinstance(top, Mapping) or not top:
         raise ValueError(f"{path}: expected {expected}, got {type(top).__name__}; give the file with the weights")
     names = [name for name, value in top.items() if isinstance(value, Tensor)]
-    return {str(name): plain_tensor(path, str(name), top[name]) for name in names}
+    return {str(name): finite_tensor(path, str(name), top[name]) for name in names}
 
 
 def read_capture(
@@ -64,8 +73,8 @@ def read_capture(
         )
     if len(values) <= max([len(order.split()), *extra.values()]):
         raise ValueError(f"{path}: expected {expected} with {', '.join(extra)}, got {len(values)} values")
-    raw = {name: plain_tensor(path, name, values[i]) for i, name in enumerate(order.split(), 1) if name != "-"}
-    found = {name: plain_tensor(path, name, values[place]) for name, place in extra.items()}
+    raw = {name: finite_tensor(path, name, values[i]) for i, name in enumerate(order.split(), 1) if name != "-"}
+    found = {name: finite_tensor(path, name, values[place]) for name, place in extra.items()}
     return {"gaussians": _activate(path, raw), **found}
 
 

@@ -15,9 +15,10 @@ from torch import Tensor
 
 from kfgs._arrays import read_array
 from kfgs._files import as_path
-from kfgs._torch_files import plain_tensor, read_torch
+from kfgs._torch_files import read_torch
 from kfgs.formats.table import read_rows
 
+from .files import finite_tensor
 from .splatted import Level, SplattedMethod
 
 
@@ -73,7 +74,7 @@ def _read_rows(path: Path) -> Tensor:  # [N, D]
         value = read_torch(path, expected)
         if isinstance(value, Mapping) and len(value) == 1:
             value = next(iter(value.values()))
-    values = plain_tensor(path, "features", value)
+    values = finite_tensor(path, "features", value)
     if values.ndim != 2 or 0 in values.shape:
         raise ValueError(f"{path}: expected {expected}, got {list(values.shape)}; give one row per Gaussian")
     return values
