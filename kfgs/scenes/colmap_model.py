@@ -185,7 +185,7 @@ def _read_table(file: Path, name: str) -> dict[int, Any]:
                 raise ValueError(f"id {key} again")
             table[key] = value
     except (ValueError, KeyError, OverflowError, struct.error) as error:
-        place = f"record {len(table) + 1}" if file.suffix == ".bin" else f"line {lines.lineno()}"
+        place = f"record {len(table) + 1}" if file.suffix == ".bin" else f"line {lines.lineno() or 1}"
         advice = "copy the model again from its source, or write it again with COLMAP"
         text = f"expected a COLMAP model, but {place} is truncated or damaged ({error})"
         raise SceneError(f"{file}: {text}; {advice}") from error

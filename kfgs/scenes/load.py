@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -147,7 +146,8 @@ def _find_images(root: Path, model: Path) -> Path:
     dense = [folder for folder in folders if folder.name in ("dense", "distorted")]  # pictures of their own
     places = list(dict.fromkeys((*dense, root, *folders)))
     full = [folder / "images" for folder in places]
-    small = [inner for folder in places for inner in _folders(folder) if re.fullmatch(r"images_\d+", inner.name)]
+    numbered = (sorted(folder.glob("images_*"), key=lambda inner: natural_key(inner.name)) for folder in places)
+    small = [inner for folders in numbered for inner in folders if inner.name[7:].isdecimal()]
     undistorted = [folder / "input" for folder in dense]
     return next((folder for folder in (*full, *small, *undistorted) if folder.is_dir()), root)
 

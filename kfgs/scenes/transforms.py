@@ -127,7 +127,8 @@ class Frame:
         except (TypeError, ValueError, OverflowError) as error:
             advice = "correct it, or take the frame out"
             raise self.fail("transform_matrix", "4 rows of 4 numbers", rows, advice) from error
-        return pose @ FLIP
+        pose[:3] = pose[:3] @ FLIP
+        return pose
 
 
 @dataclass
