@@ -33,12 +33,9 @@ class Block:
     """
 
     name: str
-    core: Box
-    """Up to `MAX_NUMBER` at the border of the scene. low <= x < high lies inside."""
-    reach: Box
-    """The box around the core's points and the cameras that see them, with a margin."""
-    views: list[str]
-    """Names of the images that see the core."""
+    core: Box  # up to `MAX_NUMBER` at the border of the scene; low <= x < high lies inside
+    reach: Box  # the box around the core's points and the cameras that see them, with a margin
+    views: list[str]  # names of the images that see the core
 
     def holds(self, means: NDArray[Any]) -> NDArray[np.bool_]:  # [N, 3] -> [N]
         """Which points lie in the core."""

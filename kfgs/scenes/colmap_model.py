@@ -75,12 +75,9 @@ class ColmapImage:
 
     name: str
     camera_id: int
-    pose: Matrix | None
-    """[4, 4] world to camera; None if it or the camera has numbers that are not finite or plausible."""
-    observed: Ints = field(repr=False)
-    """[n] the id of the 3-D point that each 2-D point sees, -1 = none."""
-    norm: float = 1.0
-    """The length of the file's quaternion."""
+    pose: Matrix | None  # [4, 4] world to camera; None if it or the camera has numbers that are not finite or plausible
+    observed: Ints = field(repr=False)  # [n] the id of the 3-D point that each 2-D point sees, -1 = none
+    norm: float = 1.0  # the length of the file's quaternion
 
 
 @dataclass(frozen=True, repr=False)

@@ -38,10 +38,8 @@ def select_views(scene: Scene, split: Split) -> Scene:
 class Manifest:
     """Which teacher made the maps of a folder, and from which pictures (`features.json`)."""
 
-    teacher: dict[str, Any]
-    """The identity of the teacher: its name, weights and options, as JSON."""
-    pictures: dict[str, str] = field(default_factory=dict)
-    """The SHA-256 of each picture, by the stem of its map."""
+    teacher: dict[str, Any]  # its identity: name, weights and options, as JSON
+    pictures: dict[str, str] = field(default_factory=dict)  # the SHA-256 of each picture, by the stem of its map
 
     def save(self, folder: Path) -> Manifest:
         """Write it to a folder of maps; returns itself."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import zipfile
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path, PurePosixPath
+from statistics import multimode
 from typing import Any
 
 import numpy as np
@@ -106,18 +106,16 @@ class FeatureFolder(Sequence[Tensor]):
     @cached_property
     def _listed(self) -> dict[str, Path]:
         """All maps of the folder by stem; of several files with one stem, the first in the order of `ENDINGS`."""
-        files: list[tuple[int, str, Path]] = []
+        maps: list[tuple[int, str, Path]] = []
         for here, folders, names in os.walk(self.path):
             folders[:] = sorted(name for name in folders if not name.startswith("."))
-            for name in sorted(name for name in names if not name.startswith(".")):
-                rank = next((i for i, ending in enumerate(ENDINGS) if name.endswith(ending)), None)
-                if rank is not None:
-                    file = Path(here) / name
-                    stem = file.relative_to(self.path).as_posix().removesuffix(ENDINGS[rank])
-                    after = PurePosixPath(stem).suffix  # rgb_1.png.npy is the map of rgb_1, too
-                    stem = stem.removesuffix(after) if after.lower() in IMAGE_SUFFIXES else stem
-                    files.append((rank, stem, file))
-        return {stem: file for _, stem, file in sorted(files, key=lambda entry: -entry[0])}
+            for name in sorted(name for name in names if name.endswith(ENDINGS) and not name.startswith(".")):
+                file, ending = Path(here) / name, next(ending for ending in ENDINGS if name.endswith(ending))
+                stem = file.relative_to(self.path).as_posix().removesuffix(ending)
+                after = PurePosixPath(stem).suffix  # rgb_1.png.npy is the map of rgb_1, too
+                stem = stem.removesuffix(after) if after.lower() in IMAGE_SUFFIXES else stem
+                maps.append((ENDINGS.index(ending), stem, file))
+        return {stem: file for _, stem, file in sorted(maps, key=lambda entry: -entry[0])}
 
     def _find(self, stems: Sequence[str]) -> dict[str, Path]:
         """The map of each view that has one."""
@@ -241,8 +239,7 @@ class FeatureFolder(Sequence[Tensor]):
                 bad, known = map(sum, zip(*counts, strict=True))
                 if bad or not known:
                     problems[name] = f"{bad} NaN or infinite values" if bad else "every feature is all-zero"
-        most = Counter(shape[2] for shape in shapes.values()).most_common(1)
-        channels = self.channels or (most[0][0] if most else 0)
+        channels = self.channels or next(iter(multimode(shape[2] for shape in shapes.values())), 0)
         wrong = {name: shape[2] for name, shape in shapes.items() if shape[2] != channels}
         problems |= {name: f"expected {channels} channels, got {D}" for name, D in wrong.items()}
         if len({shape[:2] for shape in shapes.values()}) > 1 or (self.identity is None and len(turned) == len(shapes)):

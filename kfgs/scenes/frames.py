@@ -47,18 +47,12 @@ NEARBY, FITTED, FEWEST = 0.05, 3_000, 12  # of the size: counterparts; points of
 class Alignment:
     """A similarity that brings a source frame onto a destination frame, and how well it fits."""
 
-    similarity: Similarity
-    """x_dst = scale R x_src + t."""
-    rms: float
-    """Root mean square distance of the inliers, world units of the destination."""
-    size: float
-    """Extent of the compared cameras in the destination, world units."""
-    inliers: int
-    """Cameras that fit."""
-    count: int
-    """Cameras that were compared."""
-    left_out: tuple[str, ...]
-    """Names of the cameras that do not fit."""
+    similarity: Similarity  # x_dst = scale R x_src + t
+    rms: float  # root mean square distance of the inliers, world units of the destination
+    size: float  # extent of the compared cameras in the destination, world units
+    inliers: int  # cameras that fit
+    count: int  # cameras that were compared
+    left_out: tuple[str, ...]  # names of the cameras that do not fit
 
     def __repr__(self) -> str:
         return f"Alignment({self.summary})"

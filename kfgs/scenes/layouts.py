@@ -62,9 +62,7 @@ def load_semantic_nerf(folder: Path) -> Scene:
         width, height = view.size = picture_size(view.path)
         view.K = np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]])
         view.depth = folder / "depth" / (Path(view.name).stem.replace("rgb", "depth") + ".png")
-    notes.append(
-        "no file has the intrinsics: 90 degrees across and a centred principal point, as Semantic-NeRF renders"
-    )
+    notes.append("no file has the intrinsics: 90 degrees across, the principal point centred, as Semantic-NeRF renders")
     return scene_of_poses(folder, views, points_from_depth(views), notes)
 
 

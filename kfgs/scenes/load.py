@@ -62,7 +62,13 @@ def load_scene(
     if images is not None and not as_path(images).is_dir() and (root / images).is_dir():
         images = root / images
     scene = replace(_load_views(path, model, None if images is None else as_path(images)), folder=root)
-    scene = _with_masks(scene, root)
+    if scene.masks is None:  # its file names none
+        names = [camera.name for camera in scene.cameras]
+        masks, notes = folder_masks(names, picture_folder(names[0], scene.image_paths[0]), root)
+        scene = replace(scene, masks=masks, notes=(*scene.notes, *notes))
+    for mask, camera in zip(scene.masks or (), scene.cameras, strict=scene.masks is not None):
+        if mask is not None:
+            check_mask(mask, picture_size(mask), camera.size)
     tell_repairs(str(path), scene.notes, strict, SceneError)
     return _with_split(scene, path, root, model, split)
 
@@ -85,18 +91,6 @@ def load_cameras(path: str | Path) -> list[Camera]:
 def scene_root(path: Path) -> Path:
     """The folder of a scene that is given by a folder or a .json file."""
     return path if path.is_dir() else path.parent
-
-
-def _with_masks(scene: Scene, root: Path) -> Scene:
-    """The scene with the masks of a folder `masks`, if its file names none; a mask must have the shape of its photo."""
-    if scene.masks is None:
-        names = [camera.name for camera in scene.cameras]
-        masks, notes = folder_masks(names, picture_folder(names[0], scene.image_paths[0]), root)
-        scene = replace(scene, masks=masks, notes=(*scene.notes, *notes))
-    for mask, camera in zip(scene.masks or (), scene.cameras, strict=scene.masks is not None):
-        if mask is not None:
-            check_mask(mask, picture_size(mask), camera.size)
-    return scene
 
 
 def _load_views(path: Path, model: Path | None, images: Path | None) -> Scene:

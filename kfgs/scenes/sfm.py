@@ -56,16 +56,11 @@ class SfmConfig:
 class SfmReport:
     """The result of structure from motion."""
 
-    registered: int
-    """Images with a pose."""
-    total: int
-    """Images in the folder."""
-    points: int
-    """3-D points."""
-    mean_reprojection_error: float
-    """Mean over the points, in pixels."""
-    missing: tuple[str, ...] = ()
-    """Images without a pose."""
+    registered: int  # images with a pose
+    total: int  # images in the folder
+    points: int  # 3-D points
+    mean_reprojection_error: float  # over the points, in pixels
+    missing: tuple[str, ...] = ()  # images without a pose
 
     def __str__(self) -> str:
         placed = f"{self.registered} of {self.total} images registered, {self.points} points"
@@ -171,8 +166,7 @@ class SfmRun:
     scratch: Path
     config: SfmConfig
     bar: Any
-    photos: dict[str, tuple[Path, Path | None]]
-    """The file and the mask of each image by its name."""
+    photos: dict[str, tuple[Path, Path | None]]  # the file and the mask of each image by its name
 
     def __post_init__(self) -> None:
         self.database = str(self.scratch / "database.db")  # of features and matches

@@ -68,10 +68,13 @@ def read_split(folder: Path, names: Sequence[str]) -> Split | None:
     return split_by_lists(str(tables[0]), lists, names)
 
 
-def split_by_lists(where: str, lists: Mapping[str, Sequence[str]], names: Sequence[str]) -> Split:
+def split_by_lists(
+    where: str, lists: Mapping[str, Sequence[str]], names: Sequence[str], *, held_out_wins: bool = False
+) -> Split:
     """Splits from lists of names, with or without their folders and suffixes; `where` is the lists' place, for messages.
 
-    What no list has is in no split; without a list for training, it trains. Without test, `val` is tested too.
+    What no list has is in no split; without a list for training, it trains. Without test, `val` is tested too. A view for
+    training that is held out, too, is an error; or it does not train, unless no other does (`held_out_wins`).
     """
     known, place = Names(names, bare=True), {name: i for i, name in enumerate(names)}
     indices = {split: [place.get(known.find(name) or "") for name in listed] for split, listed in lists.items()}
@@ -85,11 +88,17 @@ def split_by_lists(where: str, lists: Mapping[str, Sequence[str]], names: Sequen
         got = f"none of {len(wanted)} listed is there" if unknown else "all of them for the test"
         expected = f"training views among the scene's {len(names)} pictures ({some(list(names), 3)})"
         raise SceneError(f"{where}: expected {expected}, got {got} ({some(unknown or wanted, 3)}); correct the names")
+    advice = known.advice(unknown[0]) if unknown else ""
+    notes = [f"{len(unknown)} names in {where} are not in the scene: {some(unknown)} ({advice})"] * (len(unknown) > 0)
     both = sorted(set(splits["train"]) & {*splits["test"], *splits.get("val", ())})
-    if both:
+    if both and not held_out_wins:
         got = f"{file_stem(names[both[0]])} and {len(both) - 1} more are in both"
         advice = "scores on training views mean nothing: remove them from one"
         raise SceneError(f"{where}: expected train and test without a common view, {got}; {advice}")
-    advice = known.advice(unknown[0]) if unknown else ""
-    notes = [f"{len(unknown)} names in {where} are not in the scene: {some(unknown)} ({advice})"]
-    return splits, notes if unknown else []
+    if both and (own := [i for i in splits["train"] if i not in both]):
+        splits["train"] = own
+        notes.append(f"{len(both)} views for training are validation or test views, too: they do not train")
+    elif both:
+        splits = {"train": both, "test": []}
+        notes.append("all training views are validation or test views, too: none is held out")
+    return splits, notes

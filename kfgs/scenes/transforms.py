@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections import defaultdict
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -137,9 +138,7 @@ class _Reader:
 
     root: Path
     images: Path | None
-    missing: list[str] = field(default_factory=list)
-    unmasked: list[str] = field(default_factory=list)
-    respelled: list[str] = field(default_factory=list)
+    told: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
     names: dict[tuple[Path, bool], Names] = field(default_factory=dict)
 
     def read(self, path: Path, top: dict[str, Any], pictures: bool) -> list[PosedPicture]:
@@ -156,7 +155,7 @@ class _Reader:
                 raise frame.fail("file_path", expected, listed, "correct it, or take the frame out")
             file = self.find_image(listed, self.images)
             if file is None and pictures:
-                self.missing.append(listed)
+                self.told["missing"].append(listed)
                 continue
             if file is not None and not {"w", "h"} <= set(frame.values):
                 # Blender; a smaller copy in `images` is not what the file is about
@@ -173,39 +172,36 @@ class _Reader:
             views.append(view)
         return views
 
-    def by_name(self, folder: Path, name: str, *, below: bool = True) -> str | None:
+    def by_name(self, folder: Path, name: str, *, below: bool = True) -> Path | None:
         """The picture in a folder, or below it, that a name means."""
         if (folder, below) not in self.names:
             here = list_images(folder) if below else next(os.walk(folder), ("", [], []))[2]
             pictures = [file for file in here if file.lower().endswith(IMAGE_SUFFIXES)]
             self.names[folder, below] = Names(pictures, bare=below)
-        return self.names[folder, below].find(name)
+        near = self.names[folder, below].find(name)
+        return None if near is None else folder / near
 
     def find_image(self, listed: str, images: Path | None) -> Path | None:
         """The file of a frame: in the folder that the user gave, else as listed, else by `Names`. Only image files count."""
         name = listed.replace("\\", "/").removeprefix("./")
-        if images is not None and (near := self.by_name(images, name)) is not None:
-            return images / near
+        if images is not None and (given := self.by_name(images, name)) is not None:
+            return given
         if Path(name).suffix.lower() in IMAGE_SUFFIXES and is_file(self.root / name):
             return self.root / name
-        near = self.by_name(self.root, name)
-        if near is None:
-            return None
-        if name not in (near, file_stem(near)):
-            self.respelled.append(f"{listed} is {near}")
-        return self.root / near
+        file = self.by_name(self.root, name)
+        if file is not None and name not in (near := file.relative_to(self.root).as_posix(), file_stem(near)):
+            self.told["respelled"].append(f"{listed} is {near}")
+        return file
 
     def find_mask(self, listed: Any) -> Path | None:
         """The mask of a frame; one that is missing is noted."""
         if listed is None:
             return None
         place = self.root / str(listed).replace("\\", "/").replace("\0", "")
-        if is_file(place):
-            return place
-        near = self.by_name(place.parent, place.name, below=False)
-        if near is None:
-            self.unmasked.append(f"{listed!r:.200}")
-        return None if near is None else place.parent / near
+        mask = place if is_file(place) else self.by_name(place.parent, place.name, below=False)
+        if mask is None:
+            self.told["unmasked"].append(f"{listed!r:.200}")
+        return mask
 
     def inside(self, listed: Any) -> Path | None:
         """A file that is listed, unless it lies outside of the scene folder."""
@@ -223,14 +219,14 @@ class _Reader:
 
     def notes(self, views: list[PosedPicture]) -> list[str]:
         """What was noticed, for people."""
-        masked = [view.name for view in views if view.mask is not None]
-        told = {
-            f"of {len(self.missing) + len(views)} frames have no image file: {some(self.missing)}": self.missing,
-            f"of {len(views)} frames have a mask_path; black is ignored": masked,
-            f"files of mask_path are missing, and those frames have no mask: {some(self.unmasked)}": self.unmasked,
-            f"images were found by a name that is spelled otherwise: {some(self.respelled)}": self.respelled,
+        masked, lost = sum(view.mask is not None for view in views), len(self.told["missing"])
+        words = {
+            "missing": f"of {lost + len(views)} frames have no image file",
+            "unmasked": "files of mask_path are missing, and those frames have no mask",
+            "respelled": "images were found by a name that is spelled otherwise",
         }
-        return [f"{'masks: ' * (names is masked)}{len(names)} {note}" for note, names in told.items() if names]
+        told = [f"{len(names)} {words[what]}: {some(names)}" for what, names in self.told.items() if names]
+        return told + [f"masks: {masked} of {len(views)} frames have a mask_path; black is ignored"] * (masked > 0)
 
 
 def load_transforms(path: Path, images: Path | None = None, *, pictures: bool = True) -> Scene:
@@ -254,7 +250,8 @@ def load_transforms(path: Path, images: Path | None = None, *, pictures: bool = 
     parts = {split: reader.read(file, tops[split], pictures) for split, file in sources.items()}
     views = [view for part in parts.values() for view in part]
     if not views:
-        got = f"none of {len(reader.missing)} has one ({some(reader.missing, 3)})"
+        missing = reader.told["missing"]
+        got = f"none of {len(missing)} has one ({some(missing, 3)})"
         advice = "copy the images next to the file or pass their folder"
         raise SceneError(f"{path}: expected frames with image files, {got}; {advice}")
     if not pictures:
@@ -265,7 +262,10 @@ def load_transforms(path: Path, images: Path | None = None, *, pictures: bool = 
     lists = {name: top.get(f"{name}_filenames") for name in ("train", "val", "test")}
     if "all" not in sources:
         lists = {split: [view.name for view in part if view.name in names] for split, part in parts.items()}
-    splits, told = _splits(path, names, lists)
+    given = {k: [word for word in v if isinstance(word, str)] for k, v in lists.items() if isinstance(v, list) and v}
+    if not given:
+        return scene
+    splits, told = split_by_lists(str(path), given, names, held_out_wins=True)
     return replace(scene, splits=splits, notes=(*scene.notes, *told))
 
 
@@ -316,22 +316,3 @@ def _points(
     elif listed is not None and not notes:
         notes = [f"ply_file_path {listed!r:.200} is not a file inside {reader.root}"]
     return lifted, notes
-
-
-def _splits(path: Path, names: list[str], lists: dict[str, Any]) -> tuple[dict[str, list[int]], list[str]]:
-    """The splits that the files give; if there are none, all views in train. And notes."""
-    given = {k: [word for word in v if isinstance(word, str)] for k, v in lists.items() if isinstance(v, list) and v}
-    if not given:
-        return {"train": list(range(len(names))), "test": []}, []
-    known, every = Names(names, bare=True), given.get("train", [])
-    held = {known.find(word) for name in ("val", "test") for word in given.get(name, ())}
-    own = [word for word in every if known.find(word) not in held]
-    notes = []
-    if every and not own:
-        given, notes = {"train": every}, ["all training views are validation or test views, too: none is held out"]
-    elif len(own) < len(every):
-        both = len(every) - len(own)
-        notes = [f"{both} views of train_filenames are validation or test views, too: they do not train"]
-        given |= {"train": own}
-    splits, told = split_by_lists(str(path), given, names)
-    return splits, [*notes, *told]

@@ -226,17 +226,6 @@ def _facts(cameras: list[Any]) -> list[Any]:
     return [(c.name, c.size, c.near, c.distortion, c.viewmat.tolist(), c.K.tolist()) for c in cameras]
 
 
-def test_cameras_of_a_model_without_its_pictures_are_those_with_them(tmp_path: Path) -> None:
-    names = ["a.png", "b_10.png", "b_9.png"]
-    write_model(tmp_path / "sparse/0", names)
-    _pictures(tmp_path / "images", names)
-    expected = load_scene(tmp_path).undistorted().cameras
-    shutil.rmtree(tmp_path / "images")
-    assert [camera.name for camera in expected] == ["a.png", "b_9.png", "b_10.png"]
-    for path in (tmp_path, tmp_path / "sparse/0"):
-        assert _facts(load_cameras(path)) == _facts(expected)
-
-
 POSES = [[[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 2 * x], [0, 0, 0, 1]] for x in range(3)]
 LENS = {"w": 16, "h": 12, "fl_x": 20.0, "k1": 0.01}
 
@@ -251,17 +240,23 @@ def _write_transforms(file: Path, names: list[Any]) -> Path:
     return file
 
 
-def test_cameras_of_a_transforms_json_without_its_pictures_are_those_with_them(tmp_path: Path) -> None:
-    names = ["images/b.png", "images/a.png", "./train/r_0.5"]
-    file = _write_transforms(tmp_path / "transforms.json", names)
-    for name in [*names[:2], "train/r_0.5.png"]:
-        write_picture(tmp_path / name, 12, 16)
-    expected = load_scene(tmp_path).undistorted().cameras
-    for name in ("images", "train"):
-        shutil.rmtree(tmp_path / name)
-    assert [camera.name for camera in expected] == ["a.png", "b.png", "train/r_0.5.png"]
-    for path in (tmp_path, file):
-        assert _facts(load_cameras(path)) == _facts(expected)
+def test_cameras_without_their_pictures_are_those_with_them(tmp_path: Path) -> None:
+    write_model(tmp_path / "a/sparse/0", ["a.png", "b_10.png", "b_9.png"])
+    _pictures(tmp_path / "a/images", ["a.png", "b_10.png", "b_9.png"])
+    (tmp_path / "b").mkdir()
+    file = _write_transforms(tmp_path / "b/transforms.json", ["images/b.png", "images/a.png", "./train/r_0.5"])
+    for name in ("images/b.png", "images/a.png", "train/r_0.5.png"):
+        write_picture(tmp_path / "b" / name, 12, 16)
+    for folder, other, names in (
+        (tmp_path / "a", tmp_path / "a/sparse/0", ["a.png", "b_9.png", "b_10.png"]),
+        (tmp_path / "b", file, ["a.png", "b.png", "train/r_0.5.png"]),
+    ):
+        expected = load_scene(folder).undistorted().cameras
+        shutil.rmtree(folder / "images")
+        shutil.rmtree(folder / "train", ignore_errors=True)
+        assert [camera.name for camera in expected] == names
+        for path in (folder, other):
+            assert _facts(load_cameras(path)) == _facts(expected)
 
 
 def test_cameras_need_no_names_and_keep_their_order(tmp_path: Path) -> None:

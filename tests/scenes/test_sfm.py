@@ -68,7 +68,7 @@ def test_a_capture_that_lost_its_poses_gets_them_in_place(
         shutil.copytree(tmp_path / "found", out / "sparse")
         return SfmReport(9, 9, 1500, 0.5)
 
-    monkeypatch.setattr("kfgs.scenes.run_sfm", found)
+    monkeypatch.setattr("kfgs.run_sfm", found)
     assert main(["sfm", str(capture / "images"), "--out", str(capture)]) == 0
     assert "note:" not in capsys.readouterr().out
     assert {path: path.read_bytes() for path in capture.rglob("*") if path.is_file()} == before

@@ -317,7 +317,9 @@ def test_wrong_lists_are_told(tmp_path: Path) -> None:
     assert note.startswith("1 names in ")
     assert note.endswith("images/1_.png (did you mean '1.png'?)")
     both = _ring(4, train_filenames=["0.png", "1.png"], test_filenames=["1.png"])
-    assert any("1 views of train_filenames" in note for note in load_transforms(_write(tmp_path, **both)).notes)
+    assert any(
+        "1 views for training are validation" in note for note in load_transforms(_write(tmp_path, **both)).notes
+    )
     every = _ring(2, train_filenames=["0.png", "1.png"], test_filenames=["0.png", "1.png"])
     scene = load_transforms(_write(tmp_path, **every))
     assert scene.splits == {"train": [0, 1], "test": []}

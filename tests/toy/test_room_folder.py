@@ -211,28 +211,3 @@ def test_a_failed_run_leaves_nothing(tmp_path, monkeypatch):
 def test_a_bad_configuration_is_refused(change, message):
     with pytest.raises(ValueError, match=tells(*message)):
         replace(SMALL, **change)
-
-
-def test_pictures_are_rich_enough_for_structure_from_motion(tmp_path):
-    """Every one of six neighbouring views of the default size registers."""
-    from skimage.io import imsave
-
-    from kfgs.toy.patterns import Noise
-    from kfgs.toy.render import render
-    from kfgs.toy.room import build_room
-
-    (tmp_path / "images").mkdir()
-    (tmp_path / "sparse").mkdir()
-    cameras, _ = walk_cameras(24, 12, (192, 256))
-    noise, solids = Noise(np.random.default_rng([0, 3])), build_room(0)
-    for camera in cameras[12:18]:
-        imsave(tmp_path / "images" / camera.name, render(solids, noise, camera).image)
-    pycolmap.logging.minloglevel = 2
-    database, images = tmp_path / "database.db", tmp_path / "images"
-    reader = {"camera_model": "PINHOLE", "camera_params": "180,183.6,131.5,93.5"}
-    pycolmap.extract_features(
-        database, images, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader, device=pycolmap.Device.cpu
-    )
-    pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
-    models = pycolmap.incremental_mapping(database, images, tmp_path / "sparse")
-    assert max(model.num_reg_images() for model in models.values()) == 6
