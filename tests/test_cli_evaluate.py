@@ -5,7 +5,6 @@ import re
 import shutil
 
 import pytest
-from evaluated_room import save_splats
 
 from kfgs import SemanticField, load_scene
 from kfgs.cli import main
@@ -19,11 +18,6 @@ from kfgs.pipeline import evaluate, open_question
 @pytest.fixture(scope="module")
 def run(desk):
     return desk / "run"
-
-
-@pytest.fixture(scope="module")
-def splats(room, tmp_path_factory):
-    return save_splats(room, tmp_path_factory.mktemp("splats"))
 
 
 @pytest.fixture(scope="module")
@@ -67,14 +61,14 @@ def test_a_run_remembers_its_scene_and_its_score_is_the_protocols(run, words, as
     [
         ("{run}/field.kfgs --scene {room}", "mIoU"),
         ("{run} --protocol kfgs-surface", "agreement"),
-        ("{splats}/before.ply --scene {room} --protocol kfgs-color", "PSNR"),
+        ("{run}/color.ply --scene {room} --protocol kfgs-color", "PSNR"),
         ("{run} --protocol feature3dgs-teacher --truth {room}/features", "mIoU"),
         ("{room}/features --scene {room}", "mIoU"),
     ],
 )
-def test_every_protocol_end_to_end(words, shown, run, room, splats, tmp_path, capsys):
+def test_every_protocol_end_to_end(words, shown, run, room, tmp_path, capsys):
     capsys.readouterr()
-    words = words.format(run=run, room=room, splats=splats).split()
+    words = words.format(run=run, room=room).split()
     if "feature3dgs-teacher" in words:  # every 8th view from index 2: the room has 9
         assert "1 of 9 views are scored" in scored(capsys, *words)
     assert shown in scored(capsys, *words, "--out", tmp_path / "s.json")
@@ -130,12 +124,12 @@ def test_the_rule_for_labels_is_that_of_the_protocol_unless_asked_and_is_said(
         ("{room}/features", "--scene: expected a scene folder, got none"),
         ("{room} --scene {room}", "expected a field or a finished run of kfgs"),
         ("nothing --scene {room}", "expected a field or a finished run of kfgs"),
-        ("{splats}/before.ply --scene {room}", "benchmarks/protocols.py"),
+        ("{run}/color.ply --scene {room}", "benchmarks/protocols.py"),
         ("{room}/features --scene {bare}", "--text: expected a table of words, got none"),
     ],
 )
-def test_mistakes_are_named(words, message, run, room, splats, tmp_path, capsys):
+def test_mistakes_are_named(words, message, run, room, tmp_path, capsys):
     bare = shutil.copytree(room, tmp_path / "bare", ignore=shutil.ignore_patterns("text.npy"))
     capsys.readouterr()
-    assert main(["evaluate", *words.format(run=run, room=room, splats=splats, bare=bare).split()]) == 1
+    assert main(["evaluate", *words.format(run=run, room=room, bare=bare).split()]) == 1
     assert re.search(message, capsys.readouterr().err)

@@ -136,10 +136,9 @@ def fit(
 ) -> None:
     """Make a semantic field of a scene and its teacher's feature maps.
 
-    The features are averaged onto Gaussians in 3-D and then compressed. The Gaussians are those of --splat, or of the
-    newest splat in the scene's folder (an output folder of 3DGS has one). Without both they are trained on the pictures
-    first; `kfgs color` with the same --out makes better ones, which are then used if it took more steps. A
-    color.ply that is there already is not replaced.
+    The features are averaged onto Gaussians in 3-D and then compressed. The Gaussians are those of --splat. Without it they
+    are trained on the pictures first; `kfgs color` with the same --out makes better ones, which are then used if it took more
+    steps. A color.ply that is there already is not replaced.
 
     Examples:
         kfgs fit scene/ --out run/ --splat my.ply
@@ -151,7 +150,7 @@ def fit(
     Args:
         out: Run folder; OUT/field.kfgs receives the field, OUT/report.html what was made. Running again continues.
         features: Folder of maps by `kfgs features` or another program; SCENE/features when not given.
-        splat: Any splat file of the scene, in its frame: the Gaussians to average onto.
+        splat: Any splat of the scene, in its frame: the Gaussians to average onto. A file, or the output folder of 3DGS.
         method: uplift: average the features in 3-D, then compress. paper: compress each map, then train Gaussians on it
             (DF-3DGS) in minutes on two cores; paper-full: with the published 30,000 steps; adc: without the autoencoder;
             decouple: on the raw features.

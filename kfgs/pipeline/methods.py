@@ -20,8 +20,7 @@ class Uplift:
     """
 
     splat: Gaussians | str | Path | None = None
-    """The Gaussians to average onto, in the scene's frame, or a splat file. None takes the scene's own splat; if the scene
-    has none, Gaussians are trained on its pictures."""
+    """The Gaussians to average onto, in the scene's frame, or a splat file; None: they are trained on the pictures."""
     uplift: UpliftConfig = field(default_factory=UpliftConfig.field)
     """How to average. `UpliftConfig()` keeps every Gaussian of the splat."""
     color: ColorConfig = field(default_factory=ColorConfig.geometry)

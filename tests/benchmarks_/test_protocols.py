@@ -6,22 +6,19 @@ import sys
 import numpy as np
 import protocols
 import pytest
-from evaluated_room import save_splats
+from cases_color import make_splat, surface
 from PIL import Image
-from small_room import make_room
 
 from kfgs import load_scene
 from kfgs.evaluation.label_pictures import load_label_map
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory):
-    return make_room(tmp_path_factory.mktemp("protocols") / "scene")
-
-
-@pytest.fixture(scope="module")
-def splats(room, tmp_path_factory):
-    return save_splats(room, tmp_path_factory.mktemp("splats"))
+def foreign(room, tmp_path_factory):
+    """A splat on the room's surface, and the text of the class of each Gaussian as its feature, as another program has them."""
+    folder, text = tmp_path_factory.mktemp("splats"), np.load(room / "text.npy")
+    np.save(folder / "features.npy", text[surface(room)[1]])
+    return f"{make_splat(room, folder / 'splat.ply')}={folder / 'features.npy'}"
 
 
 @pytest.fixture
@@ -36,8 +33,8 @@ def said(monkeypatch, capsys):
     return run
 
 
-def test_several_results_are_compared_and_drawn(room, splats, tmp_path, said):
-    foreign, teacher = f"{splats / 'before.ply'}={splats / 'features.npy'}", room / "features"
+def test_several_results_are_compared_and_drawn(room, foreign, tmp_path, said):
+    teacher = room / "features"
     table = said(foreign, teacher, "--scene", room, "--out", tmp_path, "--pictures", 2).splitlines()
     assert table[-2:] == ["(kfgs-pooled/1)", f"wrote {tmp_path}"]
     scores = json.loads((tmp_path / "scores.json").read_text())
@@ -48,7 +45,7 @@ def test_several_results_are_compared_and_drawn(room, splats, tmp_path, said):
     assert np.asarray(Image.open(pictures[0])).std() > 10
 
 
-def test_a_foreign_splat_under_other_protocols_and_masks_that_are_found(room, splats, tmp_path, said):
+def test_a_foreign_splat_under_other_protocols_and_masks_that_are_found(room, foreign, tmp_path, said):
     scene, names = load_scene(room), json.loads((room / "classes.json").read_text())
     folder = tmp_path / "segmentations"
     folder.mkdir()
@@ -58,7 +55,7 @@ def test_a_foreign_splat_under_other_protocols_and_masks_that_are_found(room, sp
         (folder / scene.stem(i)).mkdir()
         for label in np.unique(labels):
             Image.fromarray(np.uint8(labels == label) * 255).save(folder / scene.stem(i) / f"{names[label]}.png")
-    words = [f"{splats / 'before.ply'}={splats / 'features.npy'}", "--scene", room, "--protocol"]
+    words = [foreign, "--scene", room, "--protocol"]
     assert "agreement" in said(*words, "kfgs-surface")
     assert "mIoU" in said(*words, "feature3dgs-teacher", "--set", "split=null")
     long = said(*words, "3dovs-closed", "--truth", tmp_path, "--long")
