@@ -1,10 +1,10 @@
 import json
-import shutil
 
 import numpy as np
-from PIL import Image
+import torch
 
 import kfgs
+from kfgs import SemanticField, read_splats
 from kfgs.cli import main
 from kfgs.formats.ply import read_header, read_ply, write_ply
 
@@ -29,17 +29,13 @@ def test_attach_carries_classes_to_points_and_keeps_their_columns(desk, room, tm
 
 
 def test_a_scene_without_points_is_told_that_some_are_found(room, tmp_path, capsys):
-    (tmp_path / "images").mkdir()
-    frames = []
-    for number, picture in enumerate(sorted((room / "images").iterdir())[:2]):
-        shutil.copy(picture, tmp_path / "images")
-        pose = np.eye(4)
-        pose[0, 3] = number
-        frames.append({"file_path": f"images/{picture.name}", "transform_matrix": pose.tolist()})
-    lens = {"fl_x": 60.0, "fl_y": 60.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48}
-    with Image.open(picture) as opened:
-        lens |= {"w": opened.width, "h": opened.height}
-    (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+    (tmp_path / "images").symlink_to(room / "images")
+    poses = np.eye(4)[None].repeat(2, 0)
+    poses[1, 0, 3] = 1
+    names = [f"images/{picture.name}" for picture in sorted((room / "images").iterdir())[:2]]
+    frames = [{"file_path": n, "transform_matrix": E.tolist()} for n, E in zip(names, poses, strict=True)]
+    camera = {"fl_x": 60.0, "fl_y": 60.0, "cx": 40.0, "cy": 30.0, "w": 80, "h": 60, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(camera))
     assert main(["fit", str(tmp_path), "--out", str(tmp_path / "run")]) == 1
     said = capsys.readouterr()
     assert "triangulate some from the poses before they train" in said.out
@@ -57,3 +53,20 @@ def test_sfm_says_that_the_images_of_the_scene_are_a_link(tmp_path, monkeypatch,
     assert main(["sfm", str(photos), "--out", str(scene)]) == 0
     assert (scene / "images").is_symlink()
     assert f"{scene / 'images'} is a link to {photos}: keep the photos there\n" in capsys.readouterr().out
+
+
+def test_a_field_is_packed_and_the_file_is_taken_where_a_field_is(desk, tmp_path, capsys):
+    packed, labelled = tmp_path / "a.kfgs", tmp_path / "labelled.ply"
+    assert main(["convert", str(desk / "run"), str(packed), "--precision", "fine"]) == 0
+    said, field = capsys.readouterr().out, SemanticField.load(packed)
+    assert f"within {field.info['rounded'][0]['errors']['gaussians.means']:.3g} world units" in said
+    assert "within 0.5 degrees" in said
+    assert "Morton order" in said
+    assert str(packed) in said
+    assert main(["convert", str(packed)]) == 0
+    said = capsys.readouterr().out
+    assert f"{len(field)} Gaussians" in said
+    assert "rounded: fine" in said
+    assert "one file of 0.0" in said
+    assert main(["convert", str(packed), str(labelled)]) == 0
+    assert torch.equal(read_splats(labelled).labels, field.classify().labels)
