@@ -1,7 +1,10 @@
 """The help of every command, and the command lines that docs and help show: true, and in the words of the command line."""
 
+import os
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -153,3 +156,18 @@ def test_a_wrong_choice_is_told_the_words_that_can_be_given(line, choices, capsy
     said = capsys.readouterr()
     told = re.search(r"Expected one of \((.*?)\)", said.out + said.err)
     assert re.findall(r"'(.*?)'", told[1]) == choices
+
+
+@pytest.mark.parametrize("flags", [(), ("-OO",)])
+def test_help_is_there_without_docstrings(flags, capsys):
+    """PYTHONOPTIMIZE=2 and -OO leave docstrings out, which are the texts of help."""
+    words = [sys.executable, *flags, "-m", "kfgs", "--help"]
+    env = {**os.environ, "PYTHONOPTIMIZE": "" if flags else "2", "COLUMNS": "100"}
+    shown = subprocess.run(words, env=env, capture_output=True, text=True, check=True).stdout
+    assert "Find the Gaussians of a class or phrase" in shown
+
+
+@pytest.mark.parametrize("words", [["", "a.ply"], ["chair", ""]])
+def test_an_empty_text_is_told_what_to_write(words, capsys):
+    assert cli.main(["select", *words]) == 1
+    assert "write one (. is this folder), or none" in capsys.readouterr().err

@@ -55,6 +55,9 @@ STYLE = (
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; return the exit code."""
+    if arguments is None and sys.flags.optimize > 1:  # -OO: without docstrings, which help shows; -O keeps them
+        os.environ["PYTHONOPTIMIZE"] = "1"
+        os.execv(sys.executable, [sys.executable, "-m", "kfgs", *sys.argv[1:]])
     # Read when torch is first imported: waiting threads sleep instead of spinning. With other busy programs this makes 25
     # training steps a second instead of one (measured on two cores).
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -78,7 +81,7 @@ def main(arguments: list[str] | None = None) -> int:
         if command is None:
             _answer(name)
         elif any(word == "" or re.fullmatch("--[^=]+=", word) for word in given):
-            raise ValueError("arguments: expected a name, got an empty text; leave it out, or write . for this folder")
+            raise ValueError("argument: expected a text, got an empty one; write one (. is this folder), or none")
         else:
             with interruptible(), notes_as_lines(lambda note: in_options(note, names), strict=STRICT in words):
                 about = _description(command)

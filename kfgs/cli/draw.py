@@ -277,13 +277,9 @@ def evaluate(
     if out is not None:
         check_output("out", out, "a file")
     loaded = open_field("field", field) if is_field(field) else None
+    classes = classes if loaded is None else classes.of(loaded)
     if classes.scene is None:
-        if loaded is None:
-            raise ValueError(
-                f"scene: expected a scene folder, got none, and {field} is not a field with one; pass --scene"
-            )
-        classes = classes.of(loaded)
-    assert classes.scene is not None
+        raise ValueError(f"scene: expected a scene folder, got none, and {field} is not a field with one; pass --scene")
     question = open_question(classes.scene, protocol, truth=truth)
     colors = getattr(question.protocol, "of_colors", False)
     result = field if colors or loaded is None else loaded

@@ -17,9 +17,9 @@ from torch import Tensor
 from .._files import as_path, file_stem, read_json, write_json
 from ..fields.examples import Mask
 from ..labels.run_lengths import decode_rle
+from ..scenes.files import PIXELS
 from .truth import LabelTruth, ReadWhenAsked, is_void
 
-LONGEST = 2**15  # pixels: more than the side of any picture
 FARTHEST = 100_000  # pixels: a corner that lies farther away is damage
 
 
@@ -131,7 +131,7 @@ def read_coco(path: Path) -> tuple[dict[int, str], dict[str, CocoPicture]]:
     if len(set(stems.values())) != len(stems) or len(set(names.values())) != len(names) or not names or not pictures:
         raise ValueError(f"{path}: expected some images and categories, each name once; export it again")
     for number, picture in pictures.items():
-        if not all(0 < side <= LONGEST for side in picture.size):
+        if min(picture.size) <= 0 or picture.size[0] * picture.size[1] > PIXELS:
             raise ValueError(f"{path}: expected a size of image {stems[number]!r}, got {picture.size}; export it again")
     return names, {stems[number]: picture for number, picture in pictures.items()}
 

@@ -11,6 +11,8 @@ import torch
 
 from .._arrays import read_arrays
 from .._files import as_path, read_json
+from ..scenes.files import list_images
+from ..scenes.load import is_scene
 from .label_pictures import load_labels
 from .replica import load_replica_points, load_semantic_nerf_labels
 from .scannet import load_scannet_points
@@ -57,11 +59,19 @@ def read_first(path: Path, places: list[Place], what: str, as_file: Callable[[Pa
     if path.is_file():
         return as_file(path)
     for pattern, read in places:
-        if path.is_dir() and next(path.glob(pattern), None) is not None:
+        if path.is_dir() and _has(path, pattern):
             return read(path)
     tried = ", ".join(pattern for pattern, _ in places)
     problem = "found none" if path.is_dir() else "which is not a folder"
     raise FileNotFoundError(f"truth: expected {what} in {path} ({tried}), {problem}; name the folder that has them")
+
+
+def _has(folder: Path, pattern: str) -> bool:
+    """Whether a folder has files of a pattern. Of a folder of pictures those below count too, with any case of the ending."""
+    below, _, name = pattern.rpartition("/")
+    if name == "*.png" and "*" not in below and (below or not is_scene(folder)):
+        return any(file.lower().endswith(".png") for file in list_images(folder / below))
+    return next(folder.glob(pattern), None) is not None
 
 
 def _read_surface(folder: Path) -> PointTruth:

@@ -89,8 +89,7 @@ def _spacing(points: Array) -> float:
     if len(places) < 2:
         return 0.0
     k = min(NEIGHBOUR, len(places) - 1)
-    near: Array = np.asarray(cKDTree(places).query(sampled(places), k=k + 1, workers=-1)[0])
-    return float(np.quantile(near[:, k], QUANTILE))
+    return float(np.quantile(cKDTree(places).query(sampled(places), k=[k + 1], workers=-1)[0], QUANTILE))
 
 
 def _nearest_within(points: Array, queries: Array, distance: float, k: int = 1) -> tuple[Array, Array]:
@@ -102,5 +101,4 @@ def _nearest_within(points: Array, queries: Array, distance: float, k: int = 1) 
 
 def _united(n: int, a: Array, b: Array) -> Array:
     edges = coo_matrix((np.ones(len(a), dtype=bool), (a, b)), shape=(n, n))
-    labels: Array = connected_components(edges, directed=False)[1]
-    return labels
+    return np.asarray(connected_components(edges, directed=False)[1])

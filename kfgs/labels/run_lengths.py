@@ -20,7 +20,7 @@ def decode_rle(segmentation: dict[str, Any]) -> Tensor:  # [H, W] bool
     size, counts = segmentation.get("size"), segmentation.get("counts")
     try:
         height, width = size  # type: ignore[misc]
-        if max(height, width) >= 2**16 or (not isinstance(counts, str) and sum(counts) != height * width):  # type: ignore[arg-type]
+        if min(size) < 0 or height * width > 2**27 or (not isinstance(counts, str) and sum(counts) != height * width):  # type: ignore[arg-type]  # 2**27: as of a picture
             raise ValueError("another size")
         runs = segmentation if isinstance(counts, str) else coco.frPyObjects(segmentation, height, width)
         return torch.from_numpy(coco.decode(runs)).bool()

@@ -201,5 +201,5 @@ def read_object(name: str, value: Any, kinds: Mapping[str, type[T]], tag: str) -
         raise ValueError(f"{name}: expected an object whose {tag!r} is one of {', '.join(kinds)}, got {value!r:.80}")
     try:
         return kinds[kind](**{key: part for key, part in value.items() if key != tag})
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{name}: {error}") from error

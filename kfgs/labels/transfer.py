@@ -10,7 +10,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from .._check import as_tensor, check_range, check_shapes
+from .._check import as_array, as_tensor, check_range, check_shapes
+from .._notes import Repair, tell_repairs
 from .._origin import recounted
 from .._rows import check_finite
 from ..gaussians import Gaussians, check_gaussians
@@ -97,7 +98,8 @@ def nearest_labels(
     a destination between two sources reaches both. And at most 10 times the 90 % quantile of the spacings, so that floaters
     and background, which only the colour field has, take no labels across the room.
 
-    A ValueError if shapes disagree, a position is not finite, a label is below -1, or the distance is not positive.
+    A destination that is not finite gets no label, and a note is logged. A ValueError if shapes disagree, a source is not
+    finite, a label is below -1, or the distance is not positive.
     """
     src_means, dst_means = as_tensor("src_means", src_means), as_tensor("dst_means", dst_means)
     src_labels = as_tensor("src_labels", src_labels)
@@ -109,10 +111,14 @@ def nearest_labels(
     given: Array = src_labels.detach().cpu().numpy().astype(np.int64)
     if given.size and given.min() < -1:
         raise ValueError(f"src_labels: expected class indices or -1, got {given.min()}; map other codes to -1 first")
-    points, targets = positions("src_means", src_means), positions("dst_means", dst_means)
+    points, targets = positions("src_means", src_means), as_array(dst_means).astype(np.float64, copy=False)
+    known = np.isfinite(targets).all(1)
+    lost = [f"{(~known).sum():,} of {len(known):,} places are not finite: they get no label"] * (not known.all())
+    tell_repairs("dst_means", map(Repair, lost), False, ValueError)
     sources = Sources(points, given >= 0)
-    chosen, how = sources.default_distance(targets) if distance is None else (float(distance), "given")
-    distances, index = sources.nearest(targets, chosen)
+    chosen, how = sources.default_distance(targets[known]) if distance is None else (float(distance), "given")
+    distances, index = np.full(len(targets), np.inf), np.full(len(targets), -1)
+    distances[known], index[known] = sources.nearest(targets[known], chosen)
     labels = np.append(given, -1)[index]  # the last one for index -1
     carried, winners = (torch.from_numpy(values).to(dst_means.device) for values in (labels, index))
     return Transfer(carried, torch.from_numpy(distances).to(dst_means), winners, chosen, how)
@@ -124,14 +130,10 @@ class Sources:
     def __init__(self, points: Array, labelled: Array) -> None:  # [S, 3], [S] bool
         kept = np.flatnonzero(labelled)
         order = kept[np.lexsort(points[kept].T)]  # stable: equal points keep their order; half the time of np.unique
-        new = np.ones(len(order), dtype=bool)
-        new[1:] = (points[order[1:]] != points[order[:-1]]).any(axis=1)
-        self.index = np.sort(order[new])
+        new = (points[order[1:]] != points[order[:-1]]).any(axis=1)
+        self.index = np.sort(order[np.append(True, new)[: len(order)]])
         """The Gaussian of each position of the tree, ascending."""
         self.tree = cKDTree(points[self.index])
-
-    def __len__(self) -> int:
-        return len(self.index)
 
     def nearest(self, points: Array, distance: float = np.inf) -> tuple[Array, Array]:  # [N] float64, [N] int64
         """Distance and index of the nearest source **strictly** closer than `distance`; infinite and -1 if there is none.
@@ -139,12 +141,12 @@ class Sources:
         Of equally near ones it is the lowest index. scipy returns them in any order: while all are equally near, ask for more.
         """
         far, index = np.full(len(points), np.inf), np.full(len(points), -1)
-        if not (len(points) and len(self)):
+        if not (len(points) and len(self.index)):
             return far, index
         # neighbours follow each other: a tree answers twice as fast
         cell = max(float(np.ptp(points, axis=0).max()) / 64, np.finfo(np.float64).tiny)
         order: Array = np.lexsort(np.floor((points - points.min(axis=0)) / cell).T)
-        n, ours = len(self), np.append(self.index, -1)  # scipy's index of none is n
+        n, ours = len(self.index), np.append(self.index, -1)  # scipy's index of none is n
         for left in (order[i : i + CHUNK] for i in range(0, len(points), CHUNK)):
             k = 1
             while left.size:
@@ -159,14 +161,14 @@ class Sources:
 
     def default_distance(self, targets: Array) -> tuple[float, str]:
         """Lambda for these destinations (see `nearest_labels`), in world units, and one line that explains it."""
-        if len(self) == 0:
+        if len(self.index) == 0:
             return 0.0, "no labelled source"
         tiny = 1e-6 * max(1.0, float(np.abs(self.tree.maxes).max()), float(np.abs(self.tree.mins).max()))
         if len(targets) == 0:
             return tiny, "no destinations"
         reach = float(np.quantile(self.tree.query(sampled(targets), workers=-1)[0], COVERAGE))
         usual = wide = 1.01 * reach / NEAREST  # of a single source, which is to reach that far
-        if len(self) > 1:
+        if len(self.index) > 1:
             spacings = np.asarray(self.tree.query(sampled(np.asarray(self.tree.data)), k=2, workers=-1)[0])[:, 1]
             usual, wide = (float(spacing) for spacing in np.quantile(spacings, [0.5, WIDE]))
         chosen = min(max(reach, NEAREST * usual), FARTHEST * wide)
@@ -184,5 +186,4 @@ def sampled(points: Array) -> Array:
 def positions(name: str, means: Tensor) -> Array:  # [N, 3] float64
     """The means in numpy; a ValueError names the first that is not finite."""
     check_finite(name, means)
-    points: Array = means.detach().cpu().double().numpy()
-    return points
+    return as_array(means).astype(np.float64, copy=False)

@@ -136,7 +136,8 @@ def save_animation(
     Args:
         path: a name that ends in .gif or .mp4. The file appears whole or not at all.
         shows: Gaussians, a function camera -> picture (`show_cloud`), or several of these by title, shown side by side.
-        cameras: one per frame, all of one size (`kfgs.cameras.orbit_cameras`, `path_cameras`).
+        cameras: one per frame (`kfgs.cameras.orbit_cameras`, `path_cameras`); all frames have the size of the first, in which
+            those of other shapes are seen whole.
         fps: frames per second; at most 50 in a GIF, because browsers slow down films with shorter frames.
         names: class names: they decide the colours of labelled Gaussians.
         listed: the labels in a legend below every frame, with these names; None: no legend.
@@ -148,15 +149,12 @@ def save_animation(
         raise ValueError(
             "shows, cameras: expected at least one of each, got none; kfgs.cameras.orbit_cameras makes some"
         )
-    sizes = sorted({camera.size for camera in cameras})
-    if len(sizes) > 1:
-        raise ValueError(f"cameras: expected one size for all frames, got {sizes}; pass path_cameras(cameras, frames)")
     target = check_target(path, fps)
     drawn = {t: show_cloud(show, names=names) if isinstance(show, Gaussians) else show for t, show in named.items()}
 
     def frames() -> Iterator[Array]:
         for done, camera in enumerate(cameras, start=1):
-            pictures = [as_bytes(show(camera)) for show in drawn.values()]
+            pictures = [as_bytes(show(camera.letterboxed(*cameras[0].size))) for show in drawn.values()]
             frame = pictures[0] if list(drawn) == [""] else picture_grid([pictures], list(drawn))
             if names is not None and listed is not None:
                 frame = np.concatenate([frame, legend_strip(listed, names, frame.shape[1])])

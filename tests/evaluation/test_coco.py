@@ -49,7 +49,13 @@ def test_run_lengths_of_coco() -> None:
     for counts, message in (([13, -1], "counts: expected"), ("T", "Invalid RLE"), ("3 1", "Invalid RLE")):
         with pytest.raises(ValueError, match=message):
             decode_rle({"size": [3, 4], "counts": counts})
-    refused(lambda: decode_rle({"size": [10**9, 10**9], "counts": [10**18]}), "another size")
+    for size in ([10**9, 10**9], [2**15, 2**15], [-4, -4]):  # a few bytes that would fill the memory
+        refused(lambda size=size: decode_rle({"size": size, "counts": [size[0] * size[1]]}), "another size")
+
+
+def test_a_picture_of_coco_has_no_more_pixels_than_a_picture(tmp_path: Path) -> None:
+    path = _coco(tmp_path / "coco.json", images=[{"id": 3, "file_name": "a.png", "height": 2**15, "width": 2**15}])
+    refused(lambda: load_coco_labels(path), "coco.json", "expected a size of image 'a'", "(32768, 32768)")
 
 
 @pytest.mark.parametrize(

@@ -131,3 +131,7 @@ def test_points_and_labels_are_found_by_their_files(tmp_path: Path) -> None:
         Image.fromarray(np.full((2, 2), grey, np.uint8)).save(tmp_path / name / "a.png")
     assert find_labels(tmp_path).maps["a"].unique().tolist() == [1]  # the scored ones come first
     assert find_labels(tmp_path / "labels").maps["a"].unique().tolist() == [0]
+    for name in ("labels", "labels_scored"):  # as photos in subfolders, from a camera that writes .PNG
+        (tmp_path / name / "left").mkdir()
+        (tmp_path / name / "a.png").rename(tmp_path / name / "left/a.PNG")
+    assert list(find_labels(tmp_path).maps) == list(find_labels(tmp_path / "labels").maps) == ["left/a"]

@@ -126,6 +126,7 @@ def test_files_that_are_no_edits(tmp_path, content, message):
         ({"op": "remove", "where": {"kind": "no"}}, ("where:", "got {'kind': 'no'}")),
         ({"op": "opacity", "where": "a", "factor": "1"}, ("factor:", "got '1'")),
         ({"op": "opacity", "where": "a", "factor": 1e999}, ("factor:", "got inf")),
+        ({"op": "move", "where": "a", "translation": [10**400, 0, 0]}, ("int too large",)),
         ({"op": "opacity", "where": "a", "factor": 2}, ("factor:", "[0, 1]", "got 2")),
         ({"op": "recolor", "where": "a", "rgb": [1, 2, 3]}, ("rgb:", "[0, 1]", "got [1, 2, 3]")),
         ({"op": "move", "where": "a", "rotation": 90}, ("rotation:", "got 90")),

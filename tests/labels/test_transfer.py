@@ -7,6 +7,7 @@ from cases_clouds import balls
 from messages import refused
 from oracles_labels import transfer as oracle
 
+from kfgs._notes import hear
 from kfgs.labels import nearest_labels, transfer_labels
 
 
@@ -71,12 +72,22 @@ def test_without_sources_or_destinations(distance):
         (torch.ones(2, 3), torch.zeros(2), torch.ones(1, 3), 1.0, TypeError, ("src_labels:", "got torch.float32")),
         (torch.ones(2, 3), torch.tensor([0, -5]), torch.ones(1, 3), 1.0, ValueError, ("src_labels:", "got -5")),
         (torch.ones(1, 3), torch.tensor([0]), torch.ones(1, 3), 0.0, ValueError, ("distance:", "got 0.0")),
-        (torch.ones(1, 3), torch.tensor([0]), torch.full((1, 3), math.nan), 1.0, ValueError, ("dst_means:", "row 0")),
         (torch.full((1, 3), math.inf), torch.tensor([0]), torch.ones(1, 3), 1.0, ValueError, ("src_means:", "NaN")),
     ],
 )
 def test_wrong_input_is_named(src, labels, dst, distance, error, message):
     refused(lambda: nearest_labels(src, labels, dst, distance), *message, error=error)
+
+
+def test_destinations_that_are_not_finite_get_no_label_unless_strict():
+    dst, said = torch.tensor([[math.nan, 0, 0], [0.5, 0, 0], [0, 0, math.inf]]), []
+    with hear(said.append):
+        result = nearest_labels(torch.zeros(1, 3), torch.tensor([4]), dst)
+    assert (result.labels.tolist(), result.sources.tolist()) == ([-1, 4, -1], [-1, 0, -1])
+    assert result.distances.tolist() == [math.inf, 0.5, math.inf]
+    assert said == ["2 of 3 places are not finite: they get no label"]
+    with hear(said.append, strict=True):
+        refused(lambda: nearest_labels(torch.zeros(1, 3), torch.tensor([4]), dst), "dst_means:", said[0], "--strict")
 
 
 def test_a_splat_is_labelled_in_one_call():

@@ -191,13 +191,13 @@ def test_labels_are_written_and_carried_to_points(tmp_path):
     read = read_splats(tmp_path / "a.ply")
     assert (read.labels.tolist(), read.scores.tolist(), read.names) == ([1, 0], [0.5, 0.75], ("wall", "chair"))
     assert read.sh is not None  # other programs show the classes
-    points = {"x": np.array([0.1, 5.0, 100.0], np.float32), "mine": np.arange(3, dtype=np.uint8)}
-    points |= {name: np.zeros(3, np.float32) for name in "yz"}
+    points = {"x": np.array([0.1, 5.0, 100.0, np.nan], np.float32), "mine": np.arange(4, dtype=np.uint8)}
+    points |= {name: np.zeros(4, np.float32) for name in "yz"}
     write_ply(tmp_path / "points.ply", points)
     moved, files = label_cloud(cloud, tmp_path / "points.ply", tmp_path / "labelled.ply", distance=1.0)
     columns = read_ply(tmp_path / "labelled.ply")
-    assert columns["class_id"].tolist() == moved.labels.tolist() == [1, 0, -1]
-    assert columns["mine"].tolist() == [0, 1, 2]
+    assert columns["class_id"].tolist() == moved.labels.tolist() == [1, 0, -1, -1]
+    assert columns["mine"].tolist() == [0, 1, 2, 3]
     assert {"red", "green", "blue"} <= set(columns)
     assert [file.name for file in files] == ["labelled.ply", "labelled.ply.classes.json"]
 

@@ -158,9 +158,14 @@ def test_what_makes_no_film_is_refused(tmp_path):
     refused(lambda: save_animation(tmp_path / "a.avi", shade, cameras()), "path:", ".gif", ".mp4", "got 'a.avi'")
     refused(lambda: save_animation(tmp_path / "a.gif", shade, cameras(), fps=60), "fps:", "[0.01, 50]", "got 60")
     refused(lambda: save_animation(tmp_path / "a.gif", shade, []), "shows, cameras:", "got none")
-    sizes = [*cameras(1), *cameras(1, 4, 4)]
-    refused(lambda: save_animation(tmp_path / "a.gif", shade, sizes), "cameras:", "(4, 4)", "(8, 12)")
     refused(lambda: show_cloud(wall(), color_by="score"), "color_by:", "'label', 'rgb', 'feature'", "got 'score'")
     refused(lambda: show_cloud(wall(), background="paper"), "background:", "got 'paper'")
     refused(lambda: show_cloud(wall()[:0]), "gaussians:", "got none")
     assert not list(tmp_path.iterdir())
+
+
+def test_all_frames_have_the_size_of_the_first(tmp_path):
+    seen = []
+    watched = lambda camera: seen.append(camera.size) or shade(camera)  # noqa: E731
+    save_animation(tmp_path / "a.gif", watched, [*cameras(1), *cameras(1, 4, 4)])
+    assert seen == [(8, 12)] * 2
