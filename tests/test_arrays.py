@@ -129,10 +129,10 @@ def test_archives_are_read_as_numpy_wrote_them(tmp_path):
 
 def test_an_archive_unpacks_to_no_more_than_allowed(tmp_path):
     zeros = io.BytesIO()
-    np.save(zeros, np.zeros(200_000_000, np.uint8))
+    np.save(zeros, np.zeros(90_000_000, np.uint8))
     file = zipped(tmp_path, {"a.npy": zeros.getvalue()})
     assert file.stat().st_size < 1_000_000
-    with pytest.raises(FileError, match=tells(file, "unpack to 200000128 bytes")):
+    with pytest.raises(FileError, match=tells(file, "unpack to 90000128 bytes")):
         read_arrays(file)
     with pytest.raises(FileError, match=tells(file, "at most 1000")):
         read_arrays(file, most=1000)
@@ -143,7 +143,7 @@ def test_a_damaged_archive_is_one_error(tmp_path):
     rng = np.random.default_rng(0)
     file = tmp_path / "b.npz"
     refused = 0
-    for _ in range(300):
+    for _ in range(150):
         damaged = bytearray(whole)
         for place in rng.integers(len(whole), size=3):
             damaged[place] = rng.integers(256)
@@ -152,7 +152,7 @@ def test_a_damaged_archive_is_one_error(tmp_path):
             read_arrays(file)
         except FileError:
             refused += 1
-    assert refused > 200
+    assert refused > 100
 
 
 def safetensors(header: object, data: bytes = b"") -> bytes:

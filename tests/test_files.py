@@ -127,7 +127,7 @@ def test_errors_of_writing_name_the_output(tmp_path, monkeypatch):
 
 def test_two_writers_of_one_file_both_succeed(tmp_path):
     code = (
-        "import sys; from kfgs._files import write_json\nfor i in range(200): write_json('a', [int(sys.argv[1])] * 100)"
+        "import sys; from kfgs._files import write_json\nfor i in range(80): write_json('a', [int(sys.argv[1])] * 100)"
     )
     writers = [subprocess.Popen([sys.executable, "-c", code, str(i)], cwd=tmp_path) for i in range(2)]
     values = set()

@@ -83,11 +83,11 @@ def project(
         camera = camera.to(gaussians.means)
     values = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
     to_camera = torch.is_grad_enabled() and (camera.viewmat.requires_grad or camera.K.requires_grad)
-    projecting = choose_projecting(engine, *values)
-    if projecting and not to_camera:
+    compiled = choose_projecting(engine, *values)
+    if compiled and not to_camera:
         cloud = Cloud(*(value.contiguous() for value in values))
         pinhole = Pinhole(camera.viewmat, camera.K, camera.width, camera.height, near, low_pass)
-        projected = Projected(*projecting.project(cloud, pinhole))
+        projected = Projected(*compiled.project(cloud, pinhole))
     else:
         projected = _project(gaussians, camera, near, low_pass)
     return _compensate(projected, camera, low_pass) if gaussians.antialiased else projected

@@ -178,6 +178,6 @@ def _seen(gaussians: Gaussians, camera: Camera, projected: Projected, engine: st
         return gaussians.features, projected.index
     assert gaussians.sh is not None
     center = camera.with_origin(gaussians.origin).center.to(gaussians.means)
-    projecting = None if center.requires_grad else choose_projecting(engine, gaussians.sh, gaussians.means)
+    compiled = None if center.requires_grad else choose_projecting(engine, gaussians.sh, gaussians.means)
     tensors = gaussians.sh.contiguous(), gaussians.means.contiguous(), center.contiguous(), projected.index
-    return (projecting or Engine()).shade(*tensors), None
+    return (compiled or Engine()).shade(*tensors), None

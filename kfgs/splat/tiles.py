@@ -49,11 +49,9 @@ def bin_tiles(
     if tile_size is None:
         tile_size = choose(engine, projected.means2d.device.type, projected.means2d.dtype).tile_size
     check_sizes(width, height, tile_size)
-    projecting = choose_projecting(engine, *projected[:5])
-    if projecting:
-        rows, offsets = projecting.bin(
-            *(value.contiguous() for value in projected[:5]), size=(width, height, tile_size)
-        )
+    compiled = choose_projecting(engine, *projected[:5])
+    if compiled:
+        rows, offsets = compiled.bin(*(value.contiguous() for value in projected[:5]), size=(width, height, tile_size))
     else:
         rows, offsets = _bin(projected, width, height, tile_size)
     return Tiles(rows, offsets, width, height, tile_size)
