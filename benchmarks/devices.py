@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kfgs.quant.sampling import FeatureMaps
+from kfgs.quant.maps import FeatureMaps
 
 CPU = torch.device("cpu")
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kfgs.cameras import Camera
 from kfgs.gaussians import Gaussians
-from kfgs.quant.sampling import FeatureMaps
+from kfgs.quant.maps import FeatureMaps
 from kfgs.splat.views import sum_pixels
 
 from .methods import RenderedMethod

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from kfgs.cameras import Camera
 from kfgs.gaussians import Gaussians
-from kfgs.quant.sampling import FeatureMaps
+from kfgs.quant.maps import FeatureMaps
 from kfgs.splat import rasterize
 
 from .common import within

@@ -26,7 +26,7 @@ from ..formats.values import check_splats
 from ..gaussians import Gaussians
 from ..quant.kmeans import cap
 from ..quant.linear import LinearLatents, fit_linear_latents
-from ..quant.sampling import FeatureMaps
+from ..quant.maps import FeatureMaps
 from ..splat import accumulate_pixels, bin_tiles, composite, project
 from ..splat.views import divide_sums, sum_pixels
 from .decoders import Linear

@@ -17,7 +17,7 @@ from .._rows import ENCODE, EPS, check_directions, row_norms, unit_rows
 from ..cameras import Camera
 from ..cameras.resample import from_bchw, to_bchw
 from ..quant.linear import LinearLatents, principal_directions
-from ..quant.sampling import FeatureMaps, all_zero, read_blocks, read_grid
+from ..quant.maps import FeatureMaps, all_zero, read_blocks, read_grid
 
 WORKING = 64
 """Number of working directions. For room_0's maps they keep 98.8 % of the energy; the rest is noise of single pixels. The

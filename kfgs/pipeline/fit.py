@@ -29,8 +29,7 @@ from ..formats import read_splats, write_splats
 from ..formats.table import splat_file_of
 from ..gaussians import Gaussians
 from ..quant import Autoencoder, Codebook, LatentMaps, fit_autoencoder, fit_codebook, quantize_maps
-from ..quant.maps import IndexMaps
-from ..quant.sampling import FeatureMaps
+from ..quant.maps import FeatureMaps, IndexMaps
 from ..scenes import FeatureFolder, Scene, extract_features
 from ..scenes.scene import as_taken
 from .color import color_stage, find_color

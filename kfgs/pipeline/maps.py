@@ -16,7 +16,7 @@ from .._files import digest_value
 from .._rows import EPS, row_norms
 from ..cameras import undistort
 from ..fields.train import digest_tensors
-from ..quant.sampling import FeatureMaps
+from ..quant.maps import FeatureMaps
 from ..scenes import Scene
 from ..scenes.files import has_alpha
 from ..scenes.scene import as_taken

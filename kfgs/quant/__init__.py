@@ -4,9 +4,8 @@ from .autoencoder import Autoencoder, AutoencoderConfig, fit_autoencoder
 from .codebook import Codebook
 from .grow import GrownCodebook, fit_codebook
 from .linear import LinearLatents
-from .maps import LatentMaps, quantize_maps
+from .maps import LatentMaps, quantize_maps, sample_grid
 from .paper import PaperCodebook
-from .sampling import sample_grid
 
 __all__ = [
     "Autoencoder",

@@ -14,8 +14,8 @@ from .._check import Progress, as_progress, check_range, check_shapes, check_who
 from .._rows import ENCODE, EPS, check_directions, row_norms, unit_rows
 from .codebook import Codebook, Nearest, share_above, with_report
 from .kmeans import Cells, refine
+from .maps import SAMPLES, FeatureMaps, all_zero, read_grid
 from .paper import PaperCodebook, prune
-from .sampling import SAMPLES, FeatureMaps, all_zero, read_grid
 
 POOL = 32_768  # features that codewords grow on: 67 MB of 512 channels in float32, 365 of each of 90 maps
 CODEWORD_RMS = 0.5  # of a codeword's channels: without an autoencoder the field learns them, at rates made for [0, 1]

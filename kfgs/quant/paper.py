@@ -13,7 +13,7 @@ from tqdm import tqdm
 from .._check import Progress, check_range, check_whole
 from .._rows import EPS, row_norms, unit_rows
 from .codebook import Codebook, Nearest, share_above, with_report
-from .sampling import SAMPLES, all_zero
+from .maps import SAMPLES, all_zero
 
 BETAS = (0.9, 0.999)  # Adam's usual decay rates; the paper names none
 ADAM_EPS = 1e-9  # the released script's

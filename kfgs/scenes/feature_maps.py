@@ -19,7 +19,7 @@ from .._arrays import read_array, read_safetensors, reading
 from .._files import Names, as_path
 from .._rows import EPS, row_norms
 from ..cameras.resample import fits_aspect
-from ..quant.sampling import grid_slices
+from ..quant.maps import grid_slices
 from .extract import ENDINGS, FEATURE_3DGS, OWN, SAFETENSORS, Split, count_bad, read_manifest, select_views
 from .files import IMAGE_SUFFIXES, some
 from .scene import Scene

@@ -3,8 +3,8 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.quant import Codebook, LatentMaps, quantize_maps
-from kfgs.quant.maps import IndexMaps
+from kfgs.quant import Codebook, LatentMaps, quantize_maps, sample_grid
+from kfgs.quant.maps import IndexMaps, grid_slices
 
 
 class Lazy:
@@ -61,6 +61,10 @@ def test_latent_maps_look_up_rows():
 
 
 def test_bad_input():
+    with pytest.raises(ValueError, match=tells("feature_map:", "[h, w, D]", "got (3, 2)")):
+        sample_grid(torch.zeros(3, 2))
+    with pytest.raises(ValueError, match=tells("samples:", "[1, inf)", "got 0")):
+        sample_grid(torch.zeros(3, 3, 1), samples=0)
     with pytest.raises(ValueError, match=tells("maps[0]:", "got 0 to 4")):
         IndexMaps([np.array([[0, 4]])], 3)
     with pytest.raises(ValueError, match=tells("maps[1]:", "got -1 to 0")):
@@ -98,3 +102,27 @@ def test_maps_that_are_not_finite_are_refused(value):
     maps = [torch.ones(1, 2, 2), torch.tensor([[[1.0, 2.0], [value, 0.0]]])]
     with pytest.raises(ValueError, match=tells("maps[1]:", "got NaN")):
         quantize_maps(maps, Codebook(torch.eye(2)))
+
+
+def test_grid_of_the_paper_is_rows_1_2_columns_1_3():
+    feature_map = torch.arange(360 * 480, dtype=torch.float32).reshape(360, 480, 1)
+    samples = sample_grid(feature_map)
+    assert samples.shape == (28_800, 1)
+    assert torch.equal(samples, feature_map[1::2, 1::3].reshape(-1, 1))
+
+
+@pytest.mark.parametrize(
+    ("size", "samples", "step"),
+    [
+        ((90, 120), 28_800, (1, 1)),
+        ((360, 480), 100_000, (1, 2)),
+        ((360, 480), 43_200, (2, 2)),
+        ((1, 10), 3, (2, 3)),
+        ((1, 10), 2, (3, 4)),
+    ],
+)
+def test_step_is_the_finest_within_the_limit(size, samples, step):
+    slices = grid_slices(*size, samples)
+    assert tuple(part.step for part in slices) == step
+    assert [part.start for part in slices] == [min(n // 2, length - 1) for n, length in zip(step, size, strict=True)]
+    assert 1 <= len(sample_grid(torch.zeros(*size, 1), samples=samples)) <= samples

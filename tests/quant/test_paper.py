@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from kfgs.quant import Codebook, PaperCodebook, paper
-from kfgs.quant.paper import EvolvingCodebook, class_balanced_loss
+from kfgs.quant.paper import EvolvingCodebook, class_balanced_loss, farthest_points
 
 
 def expand(codewords, features, *, threshold=0.9, maximum=100):
@@ -115,3 +115,22 @@ def test_gradient_against_autograd(seed):
     classes = index.unique()
     torch.stack([distance[index == tau].mean() for tau in classes]).mean().backward()
     torch.testing.assert_close(class_balanced_loss(features, codewords, index)[1], leaf.grad)
+
+
+def test_farthest_points_closed_form():
+    angles = torch.tensor([0.0, 10.0, 170.0, 90.0, 20.0]).deg2rad()
+    points = torch.stack([angles.cos(), angles.sin()], dim=1) * torch.tensor([[1.0], [9.0], [2.0], [0.1], [5.0]])
+    # 0 and 170 degrees are the least similar pair; then 90 (80 away from both sides), then 20.
+    assert farthest_points(points, 4).tolist() == [0, 2, 3, 4]
+
+
+@pytest.mark.parametrize("block", [1, 5, 64])
+def test_farthest_points_against_loops(block, monkeypatch):
+    monkeypatch.setattr(paper, "BLOCK", block)
+    features = torch.randn(17, 4, generator=torch.Generator().manual_seed(block), dtype=torch.float64)
+    assert farthest_points(features, 6).tolist() == oracle.farthest_points(features.numpy(), 6)
+
+
+def test_first_pair_tie_goes_to_lowest_rows_and_equal_rows_are_picked_once_each():
+    axes = torch.eye(3)[[0, 1, 2, 0]]  # all pairs but (0, 3) are equally dissimilar
+    assert farthest_points(axes, 4).tolist() == [0, 1, 2, 3]
