@@ -56,11 +56,6 @@ def to_world(points: Tensor, origin: Origin) -> Tensor:  # [..., 3]
     return recounted(points, origin, ORIGIN)
 
 
-def in_world(points: Tensor) -> Tensor:  # [N, 3] float64
-    """Places that stay in the world: in float32, or as they are if that would lose something."""
-    return points.float() if choose_origin(points) == ORIGIN else points
-
-
 def describe_origin(origin: Origin, what: str) -> list[str]:
     """A note for people; none if coordinates are counted from zero."""
     place = ", ".join(f"{value:.15g}" for value in origin)

@@ -13,10 +13,9 @@ from torch import Tensor
 
 from .._arrays import reading
 from .._files import as_path, read_json, real_path
-from .._origin import in_world
 from ..scenes.files import natural_key, some
 from .label_pictures import Ids, read_ids, relabel
-from .truth import LabelTruth, PointTruth, ReadWhenAsked
+from .truth import LabelTruth, PointTruth, ReadWhenAsked, in_world
 
 INFO = "info_semantic.json"
 ADVICE = "give semantic_class/, not vis_*"

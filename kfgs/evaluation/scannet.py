@@ -10,10 +10,9 @@ import numpy as np
 import torch
 
 from .._files import as_path
-from .._origin import in_world
 from ..formats.ply import points_from_columns, read_ply
 from ..scenes.files import some
-from .truth import PointTruth
+from .truth import PointTruth, in_world
 
 LABELS = "_vh_clean_2.labels.ply"
 

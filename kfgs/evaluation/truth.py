@@ -10,7 +10,8 @@ from typing import TypeVar
 from torch import Tensor
 
 from .._card import short_repr
-from .._check import check_shapes
+from .._check import ORIGIN, check_shapes
+from .._origin import choose_origin
 
 T = TypeVar("T")
 VOID_NAMES = ("void", "unlabeled", "unlabelled", "unknown", "ignore")
@@ -27,6 +28,11 @@ class LabelTruth:
     """Labels [H, W] int64, -1 = void, by the picture's stem; or a label picture that `load_label_map` reads."""
 
     __repr__ = short_repr
+
+
+def in_world(points: Tensor) -> Tensor:  # [N, 3] float64
+    """Places that stay in the world: in float32, or as they are if that would lose something."""
+    return points.float() if choose_origin(points) == ORIGIN else points
 
 
 @dataclass(frozen=True, eq=False)

@@ -126,7 +126,7 @@ class EvolvingCodebook:
     would start with a jump of about three learning rates. For rows that are there from the start the two agree.
     """
 
-    def __init__(self, codewords: Tensor, options: PaperCodebook, joins: int) -> None:  # [K, D]
+    def __init__(self, codewords: Tensor, options: PaperCodebook, joins: int) -> None:  # [K, D], the most per image
         self.options, self.joins = options, joins
         self.state = _fresh(codewords)
         self.gathered = 0  # gradients since the last step

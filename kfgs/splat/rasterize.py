@@ -173,7 +173,7 @@ def _check_arguments(gaussians: Gaussians, camera: Camera) -> None:
 
 
 def _seen(gaussians: Gaussians, camera: Camera, projected: Projected, engine: str) -> tuple[Tensor, Tensor | None]:
-    """What the Gaussians show to the camera, and which row each visible one shows (None: one row each)."""
+    """Rows of what the Gaussians show to the camera, and the row of each visible one (None: they are its rows already)."""
     if gaussians.features is not None:
         return gaussians.features, projected.index
     assert gaussians.sh is not None

@@ -16,8 +16,7 @@ from torch import Tensor
 from kfgs._arrays import read_array
 from kfgs._check import check_choice
 from kfgs._files import as_path
-from kfgs._origin import in_world
-from kfgs.evaluation.truth import PointTruth
+from kfgs.evaluation.truth import PointTruth, in_world
 
 from ..class_lists import load_classes
 
