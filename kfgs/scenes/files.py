@@ -196,8 +196,8 @@ def check_mask(path: Path, given: tuple[int, int], size: tuple[int, int]) -> Non
     """Raise a SceneError unless a mask of (width, height) pixels has the shape of a photo of (height, width) pixels."""
     (width, height), (rows, columns) = given, size
     if abs(width * rows - height * columns) > max(width + rows, height + columns):
-        shape = f"the shape of its photo ({columns}x{rows} pixels), got {width}x{height}"
-        raise SceneError(f"{path}: expected a mask in {shape}; make it of this photo, or take it away")
+        expected = f"expected a mask in the shape of its photo ({columns}x{rows} pixels), got {width}x{height}"
+        raise SceneError(f"{path}: {expected}; make it of this photo, or take it away")
 
 
 def shrink_mask(mask: Tensor, size: tuple[int, int]) -> Tensor:  # [H, W] bool -> [h, w] bool

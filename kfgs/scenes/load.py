@@ -110,8 +110,8 @@ def _load_views(path: Path, model: Path | None, images: Path | None) -> Scene:
         return layout.read(path)
     there = [(file, layout) for layout in LAYOUTS for file in layout.files if (path / file).exists()][:1]
     half = "".join(f" (there is {file}, but not all of {row.name}: {' and '.join(row.files)})" for file, row in there)
-    expected = "a COLMAP model, a transforms.json or the layout of a data set (docs/datasets.md)"
-    raise SceneError(f"{path}: expected {expected}, found none{half}; {_advice(path)}")
+    what = "expected a COLMAP model, a transforms.json or the layout of a data set (docs/datasets.md), found none"
+    raise SceneError(f"{path}: {what}{half}; {_advice(path)}")
 
 
 def _is_transforms(path: Path) -> bool:
