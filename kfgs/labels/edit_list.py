@@ -15,6 +15,7 @@ from torch import Tensor
 from .._card import cut
 from .._check import as_tensor
 from .._files import as_path, read_json, real_path, write_json
+from .._notes import tell
 from ..cameras.similarity import Similarity
 from ..formats.table import read_splats
 from ..gaussians import Gaussians
@@ -154,6 +155,8 @@ def join(first: Gaussians, second: Gaussians) -> Gaussians:
     if (first.sh is None) != (second.sh is None):
         which = "the scene" if first.sh is None else "what is inserted"
         raise ValueError(f"sh: expected colours in both clouds, got none in {which}; choose one with colours")
+    if second.antialiased != first.antialiased:
+        tell(f"what is inserted has antialiased={second.antialiased}; it is drawn as the scene: {first.antialiased}")
     labels, names = _in_classes_of(first, second)
     second = second.replace(labels=labels, names=names, antialiased=first.antialiased)
     degrees = max(0 if cloud.sh is None else cloud.sh.shape[1] for cloud in (first, second))

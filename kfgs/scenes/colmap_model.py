@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import mmap
-import re
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -26,7 +25,7 @@ from .._files import as_path, text_encoding
 from .._notes import Repair
 from ..cameras.camera import ROTATION_TOLERANCE
 from .files import MAX_NUMBER, MAX_SIDE, SceneError, is_inside, some
-from .posed import Matrix
+from .posed import Matrix, to_number
 
 FILES = ("cameras", "images", "points3D")
 # The models in the order of COLMAP's ids, with their parameters. Those that begin with f are focal lengths.
@@ -43,7 +42,6 @@ CAMERA_MODELS: dict[str, str] = {
 QUATERNION_SLACK = 0.1  # text files are rounded; a norm farther from 1 means a wrong byte
 STRANGE = 0.5  # share of the 2-D points of tracks that see another point: two models, not a damaged one
 LEAST_BYTES = 73  # of an image without 2-D points, with a name of one letter
-_BROKEN = re.compile(r"[+-]?(nan\(\w*\)|1\.#\w+)", re.IGNORECASE)  # numbers that are none, as Windows writes them
 
 Ints = NDArray[np.int64]
 
@@ -253,21 +251,17 @@ def _is_record(line: str) -> bool:
     return bool(line.strip()) and not line.lstrip().startswith("#")
 
 
-def _number(word: str) -> float:
-    return math.nan if _BROKEN.fullmatch(word) else float(word)
-
-
 def _text_cameras(lines: FileInput[str]) -> Iterator[tuple[int, ColmapCamera]]:
     for line in filter(_is_record, lines):
         key, model, width, height, *params = line.split()
-        yield int(key), ColmapCamera(model, int(width), int(height), tuple(map(_number, params)))
+        yield int(key), ColmapCamera(model, int(width), int(height), tuple(map(to_number, params)))
 
 
 def _text_images(lines: FileInput[str]) -> Iterator[tuple[int, ColmapImage]]:
     """Two lines each, of which the second may be empty."""
     for line in filter(_is_record, lines):
         key, *words, camera_id, name = line.strip().split(maxsplit=9)  # a name may hold blanks
-        pose = list(map(_number, words))
+        pose = list(map(to_number, words))
         points = next(lines, "no line of 2-D points").split()
         if len(points) % 3 or len(pose) != 7:
             raise ValueError(f"{points[:4]} are not 2-D points as X Y POINT3D_ID, or there are {len(pose)} numbers")
@@ -281,7 +275,7 @@ def _text_points(lines: FileInput[str]) -> Iterator[tuple[int, tuple[Any, ...]]]
         pairs = np.array(track, np.int64).reshape(-1, 2)
         if not 0 <= min(color) <= max(color) <= 255 or (pairs < 0).any():
             raise ValueError(f"colour {color}, track {track[:6]}")
-        yield int(np.int64(int(key))), ((_number(x), _number(y), _number(z)), color, pairs)
+        yield int(np.int64(int(key))), ((to_number(x), to_number(y), to_number(z)), color, pairs)
 
 
 READERS: dict[str, Callable[[Any], Iterator[tuple[int, Any]]]] = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -150,11 +151,16 @@ def inverse_pose(pose: Matrix) -> Matrix:  # [4, 4] -> [4, 4]
     return inverse
 
 
+def to_number(word: str) -> float:
+    """A number of a text file; NaN for what Windows writes for NaN and infinity: `-nan(ind)`, `1.#QNAN`."""
+    return math.nan if ".#" in word or "nan(" in word.lower() else float(word)
+
+
 def read_numbers(path: Path, expected: str, columns: int, rows: int | None = None) -> Matrix:  # [rows, columns]
     """The numbers of a text file, row by row; `rows` None: at least one."""
     with files.scene_error(f"{path}: expected {expected}, got something else (", "); copy or export it again"):
         lines = read_text(path, expected).splitlines()
-        numbers = [[float(word) for word in line.replace(",", " ").split()] for line in lines if line.strip()]
+        numbers = [[to_number(word) for word in line.replace(",", " ").split()] for line in lines if line.strip()]
         if {len(row) for row in numbers} != {columns} or rows not in (None, len(numbers)):
             raise ValueError(f"{len(numbers)} rows of {sorted({len(row) for row in numbers})} numbers")
     return np.array(numbers, dtype=np.float64)

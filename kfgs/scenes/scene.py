@@ -110,7 +110,7 @@ class Scene:
             return list(range(len(self)))
         if not self.splits.get(split):
             named = "".join(f"{name}, " for name, views in self.splits.items() if views and name != "all")
-            raise ValueError(f"split: expected one of {named}all, got {split!r}")
+            raise ValueError(f"split: expected one of {named}all, got {split!r}; list its views in split.json")
         return self.splits[split]
 
     def image(self, i: int) -> Tensor:  # [H, W, 3] in [0, 1]

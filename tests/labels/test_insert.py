@@ -4,6 +4,7 @@ import torch
 from cases_clouds import random_cloud
 from messages import refused
 
+from kfgs._notes import hear
 from kfgs.cameras import Similarity
 from kfgs.formats import write_splats
 from kfgs.labels import Insert
@@ -59,6 +60,15 @@ def test_what_one_cloud_lacks_is_filled():
     assert both.extra["heat"].tolist() == [0, 0, 3]
     assert join(splats(2), splats(1)).labels is None
     assert join(splats(2, dtype=torch.float64), splats(1)).sh.dtype == torch.float64
+
+
+def test_all_is_drawn_as_the_scene_and_a_note_says_so():
+    said = []
+    with hear(said.append):
+        both = join(random_cloud(2), random_cloud(3, antialiased=True))
+        join(random_cloud(2), random_cloud(3))
+    assert not both.antialiased
+    assert said == ["what is inserted has antialiased=True; it is drawn as the scene: False"]
 
 
 def test_what_cannot_be_joined_or_inserted_is_refused():

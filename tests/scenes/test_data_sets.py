@@ -151,7 +151,7 @@ def _scannet(folder: Path) -> Path:
 
 def test_scannet(tmp_path: Path) -> None:
     folder = _scannet(tmp_path)
-    (folder / "pose/1.txt").write_text("\n".join(["-inf -inf -inf -inf"] * 4))
+    (folder / "pose/1.txt").write_text("\n".join(["-inf nan -nan(ind) -1.#IND00"] * 4))
     write_picture(folder / "color/7.jpg")
     scene = load_scene(folder)
     _looks_along_x(scene, (50, 55, 32, 24))
