@@ -160,11 +160,8 @@ class Compared(NamedTuple):
     on_edge: int  # pixels on a threshold
 
 
-def _compare(case, dtype, engine, given=None, factors=None):
-    """Compare the engine's results with the oracle's.
-
-    For a test of the test, the engine may be `given` another case, and its results be multiplied by `factors`, by name.
-    """
+def _compare(case, dtype, engine, factors=None):
+    """Compare the engine's results with the oracle's; for a test of the test, they are multiplied by `factors`, by name."""
     scene, unit = case.scene, UNIT[dtype]
     seen = oracle.composite(scene, unit)
     cotangents = _cotangents(seen, scene, case.seed)
@@ -175,7 +172,7 @@ def _compare(case, dtype, engine, given=None, factors=None):
     grads, allowed = (v._replace(features=_spread(case, v.features)) for v in (grads, allowed))
     expected = (seen.maps, seen.alphas, *grads, sums, weights)
     allowances = (2 * largest * seen.allowance[:, None], seen.allowance, *allowed, sum_allowance, seen.allowance.sum())
-    actual = _run(given or case, dtype, engine, cotangents)
+    actual = _run(case, dtype, engine, cotangents)
     excess, plain = {}, set()
     for name, a, e, allowance in zip(RESULTS, actual, expected, allowances, strict=True):
         error = np.abs(a.double().numpy() * (factors or {}).get(name, 1) - e)
@@ -239,26 +236,6 @@ def test_float64_is_as_accurate_as_its_rounding(engine, block):
 # the test itself ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "change"),
-    [
-        ("opacities", lambda v, step: v * (1 + step)),
-        ("means2d", lambda v, step: v + 5 * step),  # pixels
-        ("conics", lambda v, step: v * (1 + step)),
-        ("features", lambda v, step: v * (1 + step)),
-        ("depths", lambda v, step: -v),
-    ],
-)
-def test_comparison_in_float32_notices_ten_times_its_bound(name, change):
-    step, noticed, needles = 10 * MAPS[torch.float32], 0, 0
-    for case in map(_case, range(30)):
-        given = case._replace(scene=case.scene._replace(**{name: change(getattr(case.scene, name), step)}))
-        found = max(_compare(case, torch.float32, COMPILED, given).excess.values()) > 1
-        noticed, needles = noticed + found, needles + (found and _has_needles(case.scene))
-    assert noticed >= 24
-    assert needles >= 8  # of 11: what is allowed where terms cancel does not cover it either
-
-
 @pytest.mark.parametrize("name", RESULTS)
 def test_comparison_in_float32_notices_each_result_alone(name):
     """Each result off by ten times its own bound, where no needle widens what is allowed."""
@@ -284,23 +261,3 @@ def test_oracle_agrees_with_the_one_written_pixel_by_pixel():
             error = np.abs(actual - truth.reshape(actual.shape))
             limit = (1e-13 + 2 * seen.allowance[:, None]) * (1 + np.abs(truth).max())
             assert (error <= limit)[smooth].all(), f"seed {case.seed}"
-
-
-def test_oracle_gradients_are_its_differences():
-    """Central differences along a random direction in each input, where no threshold is near; needles bend too much."""
-    g = np.random.default_rng(0)
-    for case in (case for case in map(_case, range(600, 650)) if not _has_needles(case.scene)):
-        scene = case.scene
-        seen = oracle.composite(scene, 2.0**-53 * 1e8)  # so wide is the band
-        cotangents = _cotangents(seen, scene, case.seed)
-        grads, _ = oracle.differentiate(scene, seen, cotangents, 2.0**-53, from_outputs=False)
-        for name, grad in zip(oracle.Gradients._fields, grads, strict=True):
-            value, step = getattr(scene, name), 1e-7
-            along = g.normal(0, 1, value.shape) * np.abs(value)
-            losses = []
-            for sign in (1, -1):
-                moved = oracle.composite(scene._replace(**{name: value + sign * step * along}), 2.0**-53)
-                losses.append((moved.maps * cotangents[0]).sum() + (moved.alphas * cotangents[1]).sum())
-            expected = (losses[0] - losses[1]) / (2 * step)
-            scale = np.abs(grad * along).sum() + np.abs(losses).max() + 1e-3
-            assert (grad * along).sum() == pytest.approx(expected, abs=1e-6 * scale), f"seed {case.seed}, {name}"

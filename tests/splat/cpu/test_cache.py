@@ -1,6 +1,6 @@
 """Kernels on disk: taken from there when nothing has changed, compiled again otherwise, and quick to call."""
 
-import json
+import importlib.util
 import os
 import subprocess
 import sys
@@ -8,11 +8,14 @@ from pathlib import Path
 from types import SimpleNamespace
 from zlib import crc32
 
+import numpy as np
 import pytest
 
-pytest.importorskip("numba")
+numba = pytest.importorskip("numba")
 
-from kfgs.splat.engines.cpu import cache as numba_cache
+from numba.core import event  # noqa: E402
+
+from kfgs.splat.engines.cpu import cache as numba_cache  # noqa: E402
 
 FILE = Path(numba_cache.__file__)
 
@@ -42,48 +45,47 @@ def decorate(cached_njit):
     return kernel
 """
 
-DRIVER = """
-import importlib.util, json, sys
-import numpy as np
 
-file, dtype = sys.argv[1:]
-spec = importlib.util.spec_from_file_location("numba_cache", file)
-numba_cache = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(numba_cache)
-import kernels
-
-
-def probe():  # a call of Python, which the profiler must see
-    pass
-
-
-kernel = kernels.decorate(numba_cache.cached_njit)
-pair, out = kernels.Pair(np.arange(3, dtype=dtype), np.ones(3, dtype)), np.zeros(3, dtype)
-kernel(pair, out)
-python_calls = []
-sys.setprofile(lambda frame, event, _: python_calls.append(frame.f_code.co_name) if event == "call" else None)
-probe()
-kernel(pair, out)
-sys.setprofile(None)
-print(json.dumps({
-    "out": out.tolist(),
-    "hits": sum(kernel.stats.cache_hits.values()),
-    "misses": sum(kernel.stats.cache_misses.values()),
-    "python calls": python_calls,
-}))
-"""
-
-
-def test_later_processes_take_the_kernel_from_the_disk_until_a_file_changes(tmp_path):
-    """Each process has the kernel of a throw-away module, and cache.py in a folder with another file.
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """Calls the kernel of a throw-away module as a new process does: with cache.py and the module as they are on disk.
 
     Only a kernel's first call goes through Python, also of one from the disk: 0.1 ms would be lost in each other call.
     """
     (tmp_path / "kernels.py").write_text(KERNELS)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(event, "register", lambda *_: None)  # once for the whole process is enough
+
+    def load(file):
+        spec = importlib.util.spec_from_file_location(file.stem, file)
+        module = importlib.util.module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, file.stem, module)
+        spec.loader.exec_module(module)
+        return module
+
+    def run(dtype="float32", file=FILE):
+        """The number of kernels that came from the disk."""
+        cache, kernels = load(file), load(tmp_path / "kernels.py")
+        kernel = kernels.decorate(cache.cached_njit)
+        pair, out = kernels.Pair(np.arange(3, dtype=dtype), np.ones(3, dtype)), np.zeros(3, dtype)
+        kernel(pair, out)
+        called = []
+        sys.setprofile(lambda frame, event, _: called.append(frame.f_code.co_name) if event == "call" else None)
+        kernel(pair, out)
+        sys.setprofile(None)
+        assert set(called) <= {"kernel"}  # numba may report the kernel
+        assert out.tolist() == [1, 3, 5]
+        hits, misses = (sum(counts.values()) for counts in (kernel.stats.cache_hits, kernel.stats.cache_misses))
+        assert hits + misses == 1
+        return hits
+
+    return run
+
+
+def test_a_kernel_is_taken_from_the_disk_until_a_file_changes(run, tmp_path):
     copy, other = tmp_path / "engine" / FILE.name, tmp_path / "engine" / "inlined.py"
     copy.parent.mkdir()
     copy.write_bytes(FILE.read_bytes())
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path)}
     for change, dtype, hits in (
         (None, "float32", 0),
         (None, "float32", 1),
@@ -94,39 +96,27 @@ def test_later_processes_take_the_kernel_from_the_disk_until_a_file_changes(tmp_
     ):
         if change:
             other.write_text(change)
-        command = [sys.executable, "-c", DRIVER, str(copy), dtype]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
-        found = json.loads(done.stdout)
-        assert (found["hits"], found["misses"], found["out"]) == (hits, 1 - hits, [1, 3, 5]), (change, dtype)
-        assert [name for name in found["python calls"] if name != "kernel"] == ["probe"]  # numba may report the kernel
+        assert run(dtype, copy) == hits, (change, dtype)
 
 
-def _drive(tmp_path, dtype="float32", first=""):
-    """Run the kernel in a process of its own; what it prints, and stderr."""
-    (tmp_path / "kernels.py").write_text(KERNELS)
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path)}
-    command = [sys.executable, "-c", first + DRIVER, str(FILE), dtype]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
-    assert found["out"] == [1, 3, 5]
-    return found["hits"], done.stderr
-
-
-def test_a_full_disk_costs_the_cache_alone(tmp_path):
-    pytest.importorskip("resource")
-    full = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))\n"
+def test_a_full_disk_costs_the_cache_alone(run, tmp_path):
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     for _ in range(2):
-        hits, said = _drive(tmp_path, first=full)
-        assert hits == 0
-        assert said.count(str(tmp_path / "cache")) == said.count("NUMBA_CACHE_DIR to another folder") == 1
-    assert [_drive(tmp_path) for _ in range(2)] == [(0, ""), (1, "")]  # with space, as the message says
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
+        try:
+            with pytest.warns(RuntimeWarning) as said:
+                assert run() == 0
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        (message,) = [str(warning.message) for warning in said]
+        assert message.startswith(str(tmp_path / "cache"))
+        assert "NUMBA_CACHE_DIR to another folder" in message
+    assert [run(), run()] == [0, 1]  # with space, as the message says
 
 
-def test_a_damaged_cache_is_made_again(tmp_path):
-    for dtype in ("float32", "float64"):
-        _drive(tmp_path, dtype)
+def test_a_damaged_cache_is_made_again(run, tmp_path):
+    run("float32"), run("float64")
     index, first, second = sorted(
         (tmp_path / "cache").rglob("*.nb?"), key=lambda file: (file.suffix != ".nbi", file.name)
     )
@@ -139,7 +129,7 @@ def test_a_damaged_cache_is_made_again(tmp_path):
         (first, other),  # the disk was full between index and kernel
     ):
         file.write_bytes(damaged)
-        assert [_drive(tmp_path) for _ in range(2)] == [(0, ""), (1, "")]
+        assert [run(), run()] == [0, 1]
 
 
 def test_sources_are_all_files_of_the_engines():
@@ -181,30 +171,6 @@ def test_no_kernel_goes_around():
     assert [path.name for path in files if "cache=True" in path.read_text()] == []
 
 
-SORT = """
-import numpy as np
-from numba import njit
-from kfgs._notes import hear
-from kfgs.splat.engines.cpu.tiles_kernels import list_rows
-
-made = {}
-exec("def double(x): return 2 * x", made)  # a function of no module
-with hear(print):
-    for kind in (np.int32, np.int64):  # two compilations, one line
-        njit(made["double"])(kind(1))
-        list_rows(*np.zeros((4, 1), kind))
-"""
-
-
-def test_the_first_process_says_that_it_compiles(tmp_path):
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    said = [
-        subprocess.run([sys.executable, "-c", SORT], env=environment, capture_output=True, text=True, check=True).stdout
-        for _ in range(2)
-    ]
-    assert said == [f"{numba_cache.COMPILING}\n", ""]
-
-
 COMMAND = """
 import sys
 import numpy as np
@@ -213,7 +179,8 @@ from kfgs import cli
 def sort():
     "Sort."
     from kfgs.splat.engines.cpu.tiles_kernels import list_rows
-    list_rows(*np.zeros((4, 1), np.int64))
+    for kind in (np.int32, np.int64):
+        list_rows(*np.zeros((4, 1), kind))
     print("sorted")
 
 cli.COMMANDS["sort"] = sort
@@ -221,11 +188,11 @@ sys.exit(cli.main(["sort"]))
 """
 
 
-def test_every_command_says_on_stderr_that_it_compiles(tmp_path):
+def test_the_first_command_says_on_stderr_that_it_compiles(tmp_path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     ran = [
         subprocess.run([sys.executable, "-c", COMMAND], env=environment, capture_output=True, text=True, check=True)
         for _ in range(2)
     ]
-    line = f"note: {numba_cache.COMPILING}\n"
+    line = f"note: {numba_cache.COMPILING}\n"  # once, for two compilations
     assert [(done.stdout, done.stderr) for done in ran] == [("sorted\n", line), ("sorted\n", "")]

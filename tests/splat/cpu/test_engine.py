@@ -214,30 +214,6 @@ def test_a_broken_gaussian_is_not_drawn_and_changes_no_gradient(broken, channels
 # against the oracle ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("tile_size", "channels", "fast"),
-    [
-        *((5, 1, False), (8, 5, False), (16, 1, True), (32, 4, True), (5, 5, True), (8, 10, True), (16, 11, True)),
-        *((32, 26, True), (5, 27, True), (8, 33, True), (16, 33, True), (32, 10, True), (16, 4, True)),
-    ],
-)
-@pytest.mark.parametrize("shared", [False, True], ids=["own features", "by index"])
-def test_gradcheck(tile_size, channels, fast, shared):
-    """With an index, Gaussians share rows of features, in no order, and some rows belong to nobody."""
-    M, N = 10, 7
-    projected, features = random_splats(M, 11, 9, seed=4, opacities=(0.2, 0.8), sigma=(1.5, 4.0), channels=channels)
-    index = torch.tensor([3, 0, 0, 5, 3, 6, 1, 0, 2, 6]) if shared else None
-    tiles = _everywhere(M, 11, 9, tile_size)
-    inputs = [projected.means2d, projected.conics, projected.opacities, features[: N if shared else M]]
-    inputs = [v.clone().requires_grad_() for v in (*inputs, torch.linspace(-1, 1, channels).double())]
-
-    def run(*inputs):
-        return composite(*inputs[:4], tiles, background=inputs[4], index=index, engine="numba")
-
-    # a Gaussian is cut off at 1/255, where central differences see a step: keep the step far smaller than the density's
-    assert torch.autograd.gradcheck(run, inputs, eps=1e-7, atol=1e-5, rtol=1e-4, fast_mode=fast)
-
-
 @pytest.mark.parametrize("channels", [3, 40])
 def test_rising_index_is_that_of_the_selected_rows(channels, many_bands):
     """Rising numbers are worked on by many bands, others by one: the result is the same."""
@@ -390,14 +366,6 @@ def test_what_was_in_memory_before_is_never_read(channels, dtype, monkeypatch, m
     monkeypatch.setattr(numba_cpu, "take_memory", poisoned)
     for a, b in zip(run(), expected, strict=True):
         assert torch.equal(a, b)
-
-
-def test_each_band_runs_once_and_gets_the_arguments(two_threads):
-    seen = []
-    run_bands(lambda band, *rest: seen.append((band, rest)), 9, "a", 2)
-    assert sorted(seen) == [(band, ("a", 2)) for band in range(9)]
-    run_bands(lambda band: seen.append(band), 0)
-    assert len(seen) == 9
 
 
 @pytest.mark.parametrize("where", [0, 3])

@@ -1,7 +1,6 @@
 """Memory that is kept for the next frame is never given out while somebody uses it."""
 
 import gc
-import pickle
 import threading
 
 import numpy as np
@@ -117,15 +116,6 @@ def test_memory_saved_for_backward_is_not_handed_out():
     assert len({take_memory(LIKE, SIZE).data_ptr() for _ in range(9)}) == 2
 
 
-def test_a_copy_does_not_hold_memory():
-    tensor = take_memory(LIKE, SIZE).fill_(3)
-    place = tensor.data_ptr()
-    copies = tensor.clone(), pickle.loads(pickle.dumps(tensor)), tensor.tolist()
-    del tensor
-    assert take_memory(LIKE, SIZE).fill_(7).data_ptr() == place
-    assert (copies[0] == 3).all()
-
-
 def test_no_more_is_kept_than_allowed(monkeypatch):
     monkeypatch.setattr(numba_memory, "MOST_KEPT", 50_000)  # two buffers of 20 kB
     tensors = [take_memory(LIKE, SIZE).fill_(i) for i in range(5)]
@@ -147,12 +137,6 @@ def test_memory_is_handed_back_on_request():
     assert numba_memory._kept.buffers == []
     take_memory(LIKE, SIZE).fill_(7)
     assert (mine == 3).all()  # what is in use stays
-
-
-def test_nothing_is_kept_where_references_are_not_counted(monkeypatch):
-    monkeypatch.setattr(numba_memory, "_COUNTS", False)
-    assert take_memory(LIKE, SIZE).shape == (SIZE,)
-    assert numba_memory._kept.buffers == []
 
 
 def test_each_thread_has_its_own():

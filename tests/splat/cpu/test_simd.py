@@ -8,29 +8,19 @@ import sys
 
 import numpy as np
 import pytest
-import torch
-from cases_splat import random_splats
 
 numba = pytest.importorskip("numba")
 
 from llvmlite import binding  # noqa: E402
 
-from kfgs.splat import bin_tiles, composite  # noqa: E402
-from kfgs.splat.engines.cpu import engine as numba_cpu  # noqa: E402
-from kfgs.splat.engines.cpu import square as numba_square  # noqa: E402
 from kfgs.splat.engines.cpu.simd import (  # noqa: E402
     LANES,
-    bits,
     exp2,
-    fetch,
     fma,
     lanes_below,
     load,
     load_part,
-    maximum,
-    minimum,
     reciprocal,
-    select,
     store,
     store_part,
 )
@@ -42,126 +32,6 @@ CANARY = -77.0
 
 def _random(dtype, *shape, seed=0):
     return np.random.default_rng(seed).standard_normal(shape).astype(dtype)
-
-
-def _whole(dtype, *shape, seed=0):
-    """Small whole numbers: their sums and products are exact in any order."""
-    return np.random.default_rng(seed).integers(-9, 10, shape).astype(dtype)
-
-
-# operators ------------------------------------------------------------------------------------------------------------
-
-
-@numba.njit
-def _arithmetic(x, y, out):
-    a, b = load(x, 0), load(y, 0)
-    store(out, 0 * LANES, a + b)
-    store(out, 1 * LANES, a - b)
-    store(out, 2 * LANES, a * b)
-    store(out, 3 * LANES, a / b)
-    store(out, 4 * LANES, a + 0.1)
-    store(out, 5 * LANES, 0.1 + a)
-    store(out, 6 * LANES, a - 3)
-    store(out, 7 * LANES, 3 - a)
-    store(out, 8 * LANES, a * fetch(y, 2))
-    store(out, 9 * LANES, fetch(y, 2) * a)
-    store(out, 10 * LANES, a / 0.1)
-    store(out, 11 * LANES, 1 / b)
-
-
-@every_dtype
-def test_arithmetic_is_that_of_numpy_to_the_bit(dtype):
-    x, y, out = _random(dtype, LANES), _random(dtype, LANES, seed=1), np.empty(12 * LANES, dtype)
-    _arithmetic(x, y, out)
-    tenth, three, one = dtype(0.1), dtype(3), dtype(1)
-    expected = [x + y, x - y, x * y, x / y, x + tenth, tenth + x, x - three, three - x]
-    expected += [x * y[2], y[2] * x, x / tenth, one / y]
-    np.testing.assert_array_equal(out.reshape(12, LANES), expected)
-
-
-@numba.njit
-def _choices(x, y, out, masks):
-    a, b = load(x, 0), load(y, 0)
-    store(out, 0 * LANES, minimum(a, b))
-    store(out, 1 * LANES, maximum(a, b))
-    store(out, 2 * LANES, minimum(a, 0.1))
-    store(out, 3 * LANES, minimum(0.1, a))
-    store(out, 4 * LANES, maximum(a, 0))
-    store(out, 5 * LANES, maximum(0, a))
-    store(out, 6 * LANES, select(a < b, a, b))
-    store(out, 7 * LANES, select(a < b, 0.1, b))
-    store(out, 8 * LANES, select(a < b, a, 2))
-    for i, mask in enumerate(
-        (a < b, a <= b, a > b, a >= b, a < 0, a > 0, a <= 0, a > 0, a >= 0, (a < b) & (a > 0), (a < b) | (a > 0))
-    ):
-        masks[i] = bits(mask)
-
-
-def _as_bits(mask):
-    return sum(1 << i for i, holds in enumerate(mask) if holds)
-
-
-@every_dtype
-def test_comparisons_and_choices(dtype):
-    x, y = _whole(dtype, LANES), _whole(dtype, LANES, seed=1)
-    x[:3], y[:3] = (4, 0, -0.0), (4, 0, 0)  # equal ones
-    out, masks = np.empty(9 * LANES, dtype), np.zeros(11, np.uint32)
-    _choices(x, y, out, masks)
-    tenth = dtype(0.1)
-    expected = [np.minimum(x, y), np.maximum(x, y), np.minimum(x, tenth), np.minimum(x, tenth)]
-    expected += [np.maximum(x, 0), np.maximum(x, 0)]
-    expected += [np.where(x < y, x, y), np.where(x < y, tenth, y), np.where(x < y, x, 2)]
-    np.testing.assert_array_equal(out.reshape(9, LANES), expected)
-    truths = [x < y, x <= y, x > y, x >= y, x < 0, x > 0, x <= 0, x > 0, x >= 0, (x < y) & (x > 0), (x < y) | (x > 0)]
-    assert masks.tolist() == [_as_bits(truth) for truth in truths]
-
-
-@every_dtype
-def test_nan_compares_false_and_gives_the_second_argument(dtype):
-    nan = dtype("nan")
-    x, y = np.full(LANES, nan), _whole(dtype, LANES)
-    out, masks = np.empty(9 * LANES, dtype), np.zeros(11, np.uint32)
-    _choices(x, y, out, masks)
-    tenth = np.full(LANES, dtype(0.1))
-    expected = [y, y, tenth, x, 0 * tenth, x, y, y, np.full(LANES, 2)]
-    np.testing.assert_array_equal(out.reshape(9, LANES), expected)
-    assert not masks.any()
-    _choices(y, x, out, masks)
-    np.testing.assert_array_equal(out.reshape(9, LANES)[:2], [x, x])
-    assert not masks[:4].any()
-
-
-@numba.njit
-def _fused(x, y, z, out):
-    a, b, c = load(x, 0), load(y, 0), load(z, 0)
-    store(out, 0 * LANES, fma(a, b, c))
-    store(out, 1 * LANES, fma(a, 3, c))
-    store(out, 2 * LANES, fma(3, a, -1.5))
-
-
-@every_dtype
-def test_fma(dtype):
-    x, y, z = (_random(dtype, LANES, seed=seed) for seed in range(3))
-    eps = np.finfo(dtype).eps
-    x[0], y[0], z[0] = 1 + eps, 1 - eps, -1  # the product is 1 - eps^2, which rounds to 1
-    out = np.empty(3 * LANES, dtype)
-    _fused(x, y, z, out)
-    exact = [x.astype(np.longdouble) * y + z, x.astype(np.longdouble) * 3 + z, x.astype(np.longdouble) * 3 - 1.5]
-    size = np.abs(x * y) + np.abs(z) + np.abs(3 * x) + 1.5
-    assert (np.abs(out.reshape(3, LANES) - np.array(exact)) <= eps * size).all()
-    assert out[0] in (-(eps**2), 0)
-    if binding.get_host_cpu_features().get("fma"):
-        assert out[0] == -(eps**2), "the processor rounds once, the code does not"
-
-
-def test_vectors_of_two_types_do_not_mix():
-    single, double = np.ones(LANES, np.float32), np.ones(LANES)
-    for function in (
-        lambda x, y: store(x, 0, load(x, 0) + load(y, 0)),
-        lambda x, y: store(x, 0, minimum(load(x, 0), load(y, 0))),
-    ):
-        with pytest.raises(numba.core.errors.TypingError):
-            numba.njit(function)(single, double)
 
 
 # memory ---------------------------------------------------------------------------------------------------------------
@@ -288,17 +158,3 @@ def test_a_vector_is_a_register():
     assert _count_wide(_polynomial, registers) >= 2
     (assembly,) = _polynomial.inspect_asm().values()
     assert not re.search(r"\bvfmadd\d+ss\b", assembly), "some numbers are computed one by one"
-
-
-@pytest.mark.parametrize("name", ["composite_band", "differentiate_band"])
-def test_compositing_is_as_wide(name, monkeypatch):
-    """Compiled anew, because no assembly is kept on disk."""
-    registers = _registers()
-    kernel = numba.njit(**numba_square.OPTIONS)(getattr(numba_cpu, name).py_func)
-    monkeypatch.setattr(numba_cpu, name, kernel)
-    projected, features = random_splats(20, 16, 16, seed=0, dtype=torch.float32)
-    inputs = projected.means2d, projected.conics, projected.opacities, features.requires_grad_()
-    maps, _ = composite(*inputs, bin_tiles(projected, 16, 16), engine="numba")
-    maps.sum().backward()
-    assert features.grad.abs().min() > 0
-    assert _count_wide(kernel, registers) >= 10
