@@ -1,6 +1,5 @@
 """A small field, classes and views to ask, and clouds whose positions tie, for the tests of the explorer."""
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -22,7 +21,6 @@ from kfgs.viewer.state import Exploration
 DIM, WORDS = 16, 12
 NAMES = ("wall", "chair", "table", "office chair")
 MODES = ("decouple", "adc", "adc+sc", "fused")
-TRAINED = MODES[:3]
 LINE = [[float(i), 0, 5] for i in range(4)]
 
 
@@ -83,16 +81,6 @@ def field(mode="adc+sc", n=80, seed=0):
         return SemanticField(gaussians, Identity(DIM))
     trained = Autoencoded(codebook(), autoencoder()) if mode == "adc+sc" else Codewords(codebook())
     return SemanticField(gaussians, trained)
-
-
-def stored(folder, mode="fused", **changes):
-    """A field on disk that remembers its classes."""
-    scene = folder / "scene"
-    scene.mkdir()
-    classes().save(scene / "text.safetensors")
-    made = replace(field(mode), info={"scene": str(scene)}, classes=classes(), **changes)
-    made.save(folder / "field.kfgs")
-    return SemanticField.load(folder / "field.kfgs")
 
 
 def classes(count=4, negatives=True):

@@ -101,15 +101,3 @@ def gaussians_before(
         opacities=uniform(*opacities, N),
         features=torch.randn(N, channels, generator=g, dtype=torch.float64).to(dtype),
     )
-
-
-def assert_close_but_for_thresholds(actual: Tensor, expected: Tensor, *, tolerance: float, band: float) -> None:
-    """Equal within `tolerance`, except at 0.5 % of the pixels at most, where a threshold fell the other way (`band`).
-
-    An alpha on the edge of 1/255 may be taken by one side and skipped by the other, because they round differently.
-    """
-    error = (actual.double() - expected.double()).abs()
-    error = error.reshape(error.shape[0] * error.shape[1], -1).amax(dim=1)
-    assert error.max() <= band, f"largest error {error.max():.3g}"
-    off = int((error > tolerance).sum())
-    assert off <= 0.005 * len(error), f"{off} of {len(error)} pixels differ by more than {tolerance:g}"

@@ -13,8 +13,6 @@ pycolmap = import_pycolmap()
 CAMERAS = "1 PINHOLE 64 48 50 55 31 25\n"
 IMAGES = "1 1 0 0 0 0 0 0 1 a.png\n1 2 7 3 4 -1\n2 0.6 0.8 0 0 1 2 3 1 b.png\n5 6 7\n"
 POINTS = "7 1 2 3 10 20 30 0.5 1 0 2 0\n"
-RIGS = "1 1 CAMERA 1\n"
-FRAMES = "1 1 1 0 0 0 0 0 0 1 CAMERA 1 1\n2 1 0.6 0.8 0 0 1 2 3 1 CAMERA 1 2\n"
 
 
 def write_text_model(folder: Path, **tables: str) -> Path:

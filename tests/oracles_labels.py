@@ -30,36 +30,3 @@ def transfer(src, labels, dst, distance):
         out_sources.append(best[1])
         out_labels.append(-1 if best[1] < 0 else int(labels[best[1]]))
     return np.array(out_labels), np.array(out_sources), np.array(out_distances)
-
-
-def vote(src, labels, dst, distance, neighbours, weigh, limit=np.inf):
-    """The label with the most weight among the nearest sources in range, and its share; one destination at a time.
-
-    `weigh(i, j)` gives destination j's weight for source i and how far i counts as being away from j; sources from
-    `limit` on are left out. Of tied labels the one with the least far source wins.
-    """
-    out_labels, out_shares, out_sources = [], [], []
-    for j, point in enumerate(np.asarray(dst, dtype=np.float64)):
-        ranked = []
-        for i, source in enumerate(np.asarray(src, dtype=np.float64)):
-            d = float(np.sqrt(((point - source) ** 2).sum()))
-            if labels[i] >= 0 and d < distance:
-                ranked.append((d, i))
-        totals, closest = {}, {}
-        for _, i in sorted(ranked)[:neighbours]:
-            weight, far = weigh(i, j)
-            if far >= limit:
-                continue
-            label = int(labels[i])
-            totals[label] = totals.get(label, 0.0) + weight
-            closest[label] = min(closest.get(label, (np.inf, -1)), (far, i))
-        if not totals:
-            out_labels.append(-1)
-            out_shares.append(0.0)
-            out_sources.append(-1)
-            continue
-        winner = min(totals, key=lambda label: (-totals[label], closest[label]))
-        out_labels.append(winner)
-        out_shares.append(totals[winner] / sum(totals.values()))
-        out_sources.append(closest[winner][1])
-    return np.array(out_labels), np.array(out_shares), np.array(out_sources)

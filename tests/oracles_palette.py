@@ -1,9 +1,8 @@
-"""How the palette's table was made and is measured: colours that differ for three kinds of eyes."""
+"""How the palette's table is measured: colours that differ for three kinds of eyes."""
 
 import numpy as np
 from skimage.color import rgb2lab
 
-GREY, BLACK, WHITE = [128, 128, 128], [0, 0, 0], [255, 255, 255]
 # Found by a random search: one colour at a time was replaced by the best of 120 others, for the smallest CIEDE2000 distance
 _FIRST = """
 f1ea0b 8000d7 6c3200 9be5ff ed6a31 0088ff eee1e4 ff22c1 573852 c2a2ff
@@ -36,17 +35,3 @@ def seen(rgb8):
 def worst_distance(a, b):
     """Smallest of the three eyes' CIE76 distances between colours a [N, 3] and b [M, 3] -> [N, M]."""
     return np.linalg.norm(seen(a)[:, :, None] - seen(b)[:, None, :], axis=-1).min(axis=0)
-
-
-def make_palette(size=256, step=15):
-    levels = np.arange(0, 256, step)
-    candidates = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1).reshape(-1, 3)
-    lightness = seen(candidates)[0, :, 0]
-    candidates = candidates[(lightness > 25) & (lightness < 92)]  # seen on white and on black
-    chosen = [[int(code[i : i + 2], 16) for i in (0, 2, 4)] for code in FIRST]
-    nearest = worst_distance(candidates, np.array([*chosen, GREY, BLACK, WHITE])).min(axis=1)
-    while len(chosen) < size:
-        best = int(nearest.argmax())
-        chosen.append(candidates[best].tolist())
-        nearest = np.minimum(nearest, worst_distance(candidates, candidates[best : best + 1])[:, 0])
-    return np.array(chosen, dtype=np.uint8)

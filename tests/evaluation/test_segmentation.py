@@ -30,18 +30,6 @@ def test_pooled_scores_by_hand(tmp_path):
     assert report.to_json()["protocol"] == PROTOCOL
 
 
-def test_pooling_is_not_a_mean_over_images(tmp_path):
-    truth = {"a": _save(tmp_path / "a.png", [[0] * 4]), "b": _save(tmp_path / "b.png", [[0, 1, 1, 1]])}
-    predictions = {"a": torch.zeros(1, 4, dtype=torch.int64), "b": torch.tensor([[1, 1, 1, 1]])}
-    report = evaluate_segmentation(predictions.__getitem__, truth, ["x", "y"])
-    assert report.miou.value == pytest.approx((4 / 5 + 3 / 4) / 2)
-    large = {stem: _save(path, np.repeat(np.array(Image.open(path)), 3, 1)) for stem, path in truth.items()}
-    again = evaluate_segmentation(predictions.__getitem__, large, ["x", "y"])  # small predictions are enlarged
-    assert again.miou.value == report.miou.value
-    per_image = (1.0 + (0 + 3 / 4) / 2) / 2
-    assert abs(report.miou.value - per_image) > 0.05
-
-
 def test_bad_input_is_named(tmp_path):
     refused(lambda: evaluate_segmentation(lambda stem: torch.zeros(1, 1), {}, ["x"]), "truth:", "got none")
     path = _save(tmp_path / "a.png", [[0, 7]])

@@ -73,17 +73,6 @@ def test_negatives_are_the_classes_the_canonical_words_or_none():
         assert found.scores[5] == 0  # never learnt
 
 
-def test_by_default_a_class_is_told_from_the_others_and_a_phrase_from_the_canonical_words():
-    asked, told = field(), field().query("chair", CLASSES, negatives="classes")
-    for target in ("Chair", FIVE[1]):
-        assert torch.equal(asked.query(target, CLASSES).scores, told.scores)
-    phrase = torch.tensor([0.0, 1, 0, 0.5, 0])
-    canonical = asked.query(phrase, CLASSES, negatives="canonical")
-    assert torch.equal(asked.query(phrase, CLASSES).scores, canonical.scores)
-    cosine = asked.query("chair", CLASSES, 0.9, score="cosine")  # to which negatives are nothing
-    assert cosine.scores.tolist() == [0, 1, 0, 0, 0, 0]
-
-
 def test_names_and_embeddings_of_classes_give_the_same_labels():
     by_name, by_row = field().classify(CLASSES), field().classify(FIVE[:3])
     assert by_name.labels.tolist() == by_row.labels.tolist() == [0, 1, 2, 0, 0, -1]  # rows 3 and 4 are like no class

@@ -1,8 +1,11 @@
+import math
+
 import pytest
 import torch
-from lseg_layout import TINY, random_state
+from lseg_layout import TINY, layout, random_state
 from messages import refused, tells
 
+from kfgs.teachers.lseg import LSegConfig
 from kfgs.teachers.lseg.keys import network_from_state, text_from_state
 
 HEAD = "net.scratch.head1.weight"
@@ -13,6 +16,15 @@ QKV = "net.pretrained.model.blocks.2.attn.qkv.weight"
 @pytest.fixture
 def state():
     return random_state(TINY, torch.Generator().manual_seed(7))
+
+
+def test_layout_of_these_tests_has_the_released_tensors_and_parameters():
+    shapes = layout(LSegConfig())
+    assert len(shapes) == 730
+    assert round(sum(math.prod(shape) for shape in shapes.values()) / 1e6, 1) == 495.1
+    visual = [math.prod(shape) for name, shape in shapes.items() if ".visual." in name]
+    assert round(sum(visual) / 1e6, 1) == 87.8
+    assert LSegConfig().hooks == (5, 11, 17, 23)
 
 
 def test_single_precision_is_shared_and_half_is_cast(state, tmp_path):
