@@ -156,38 +156,6 @@ def test_a_click_picks_what_is_under_it(page, state):
     assert np.hypot(*(np.array(place_of(page, "color", found)) - (x, y))) < 30
 
 
-def test_lasso_selects_remove_removes_and_undo_brings_back(page, state):
-    page.keyboard.press("3")
-    box = page.locator(".stage").bounding_box()
-    corners = [(0.15, 0.2), (0.5, 0.2), (0.5, 0.75), (0.15, 0.75)]
-    path = [(box["x"] + x * box["width"], box["y"] + y * box["height"]) for x, y in corners]
-    places = np.array([place_of(page, "color", i) for i in range(450)])
-    page.mouse.move(*path[0])
-    page.mouse.down()
-    for place in path[1:]:
-        page.mouse.move(*place, steps=4)
-    page.mouse.up()
-    (left, top), (right, bottom) = path[0], path[2]
-    inside = (places > (left, top)).all(1) & (places < (right, bottom)).all(1)
-    edge = (np.abs(places - (left, top)).min(1) < 1) | (np.abs(places - (right, bottom)).min(1) < 1)
-    selected = mask(page, "color")
-    assert 0 < selected.sum() < 450
-    np.testing.assert_array_equal(selected[~edge], inside[~edge])
-    page.keyboard.press("Delete")
-    labels = state.labels("color")[~selected]
-    counts = page.evaluate("viewer.model.counts('color')")
-    assert counts["classes"] == [int((labels == k).sum()) for k in range(3)]
-    assert (counts["total"], counts["removed"], counts["selected"]) == (450 - selected.sum(), selected.sum(), 0)
-    page.keyboard.press("Control+z")
-    assert page.evaluate("viewer.model.counts('color').total") == 450
-    np.testing.assert_array_equal(mask(page, "color"), selected)
-    page.keyboard.press("Control+z")
-    assert not mask(page, "color").any()
-    page.keyboard.press("Control+Shift+Z")
-    page.keyboard.press("Control+Shift+Z")
-    assert page.evaluate("viewer.model.counts('color').removed") == selected.sum()
-
-
 def test_edits_are_those_of_python(page, state, tmp_path):
     """What a person does becomes an EditList, whose result has the Gaussians that the page shows."""
     ask(page, "table")

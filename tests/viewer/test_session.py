@@ -1,7 +1,5 @@
 """What the viewer asks of Python: the same answers as the explorer's state, and files that hold what was selected."""
 
-import json
-
 import cases_explorer
 import numpy as np
 import pytest
@@ -57,20 +55,6 @@ def test_connected_parts_of_a_selection(session):
     for number, part in enumerate(expected):
         assert (numbers == number).nonzero()[:, 0].equal(part.indices)
     assert (numbers[~mask] == -1).all()
-
-
-def test_a_selection_by_hand_is_written(session):
-    masks = {side: torch.arange(len(session.state.cloud(side))) % 3 == 0 for side in session.state.sides}
-    attached = b"".join(map(bits_of, masks.values()))
-    args = {"words": None, "gamma": None, "lambda": 0.5, "sides": list(masks)}
-    answer, _ = session.call("save_selection", args, attached)
-    folder = session.out / "selection_001"
-    assert {path.rsplit("/", 1)[1] for path in answer["paths"]} == {path.name for path in folder.iterdir()}
-    details = json.loads((folder / "selection.json").read_text())
-    for side, mask in masks.items():
-        assert details[side]["selected"] == int(mask.sum())
-        assert len(read_splats(folder / f"selection_{side}.ply")) == int(mask.sum())
-    assert details["lambda"] == 0.5
 
 
 def test_what_surrounds_a_gaussian_and_edits_that_can_be_replayed(session):

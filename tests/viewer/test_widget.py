@@ -26,14 +26,6 @@ def exploration():
     return Exploration(meaning, color, cameras=cases_explorer.cameras(), distance=0.4)
 
 
-def answers(widget, *messages):
-    sent = []
-    widget.send = lambda *found: sent.append(found)
-    for message in messages:
-        widget._handle_custom_msg(message, [b""])
-    return sent
-
-
 def still_of(state):
     bundle = Viewer(state).widget._repr_mimebundle_()
     file = base64.b64decode((bundle[0] if isinstance(bundle, tuple) else bundle)["image/jpeg"])
@@ -49,20 +41,6 @@ def test_the_scene_is_sent_once(tmp_path):
     assert widget.header["start"]["words"] == "chair"
     assert widget.data == packed.compressed()
     assert (widget.question, widget.header["phrases"]) == ("chair", False)
-
-
-def test_calls_are_answered_with_their_number(tmp_path):
-    widget = Viewer(exploration(), out=tmp_path).widget
-    (first, scores), (second, _) = answers(
-        widget, {"id": 7, "name": "ask", "args": {"words": "chair"}}, {"id": 8, "name": "ask", "args": {"words": "sky"}}
-    )
-    assert first["id"] == 7
-    asked = exploration().meaning.ask("chair")
-    assert np.array_equal(np.frombuffer(scores[0], "<f4") > 0.5, asked.selection.mask.numpy())
-    assert second["id"] == 8
-    assert "sky" in second["answer"]["error"]
-    ((wrong, _),) = answers(widget, {"id": 9})
-    assert "name" in wrong["answer"]["error"]
 
 
 def test_explore_in_a_notebook_gives_a_viewer(monkeypatch):
