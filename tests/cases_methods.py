@@ -5,7 +5,6 @@ import torch
 
 from kfgs import Camera, Gaussians
 from kfgs.evaluation import View
-from kfgs.evaluation.method import best_labels
 
 
 class Numbers:
@@ -35,13 +34,6 @@ class Numbers:
 
     def gaussian_cosines(self, text):
         return torch.stack([torch.as_tensor(self.own[name]) for name in self._asked(text)], dim=-1)
-
-
-class Labels(Numbers):
-    """The same with a rule of its own: the best text of the last level."""
-
-    def labels(self, view, text):
-        return best_labels(self.cosines(view, text)[-1])
 
 
 def camera(height, width):
