@@ -4,16 +4,16 @@ import importlib.util
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 from zlib import crc32
 
 import numpy as np
 import pytest
+from forked import forks, in_fork
 
 numba = pytest.importorskip("numba")
-
-from numba.core import event  # noqa: E402
 
 from kfgs.splat.engines.cpu import cache as numba_cache  # noqa: E402
 
@@ -46,42 +46,53 @@ def decorate(cached_njit):
 """
 
 
+def load(file):
+    spec = importlib.util.spec_from_file_location(file.stem, file)
+    sys.modules[file.stem] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def call(folder, dtype, file, full):
+    """Call the kernel twice; how many came from the disk, which functions of Python the second call ran, and warnings."""
+    numba.config.CACHE_DIR = str(folder / "cache")
+    kernels = load(folder / "kernels.py")
+    kernel = kernels.decorate(load(file).cached_njit)
+    pair, out = kernels.Pair(np.arange(3, dtype=dtype), np.ones(3, dtype)), np.zeros(3, dtype)
+    if full:
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        kernel(pair, out)
+    python_calls = []
+    sys.setprofile(lambda frame, event, _: python_calls.append(frame.f_code.co_name) if event == "call" else None)
+    kernel(pair, out)
+    sys.setprofile(None)
+    assert out.tolist() == [1, 3, 5]
+    hits, misses = (sum(counts.values()) for counts in (kernel.stats.cache_hits, kernel.stats.cache_misses))
+    assert hits + misses == 1
+    return hits, python_calls, [str(warning.message) for warning in said]
+
+
 @pytest.fixture
-def run(tmp_path, monkeypatch):
-    """Calls the kernel of a throw-away module as a new process does: with cache.py and the module as they are on disk.
+def run(tmp_path):
+    """Calls the kernel of a throw-away module in a new process: the number of kernels from the disk, and warnings.
 
     Only a kernel's first call goes through Python, also of one from the disk: 0.1 ms would be lost in each other call.
     """
     (tmp_path / "kernels.py").write_text(KERNELS)
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(event, "register", lambda *_: None)  # once for the whole process is enough
 
-    def load(file):
-        spec = importlib.util.spec_from_file_location(file.stem, file)
-        module = importlib.util.module_from_spec(spec)
-        monkeypatch.setitem(sys.modules, file.stem, module)
-        spec.loader.exec_module(module)
-        return module
-
-    def run(dtype="float32", file=FILE):
-        """The number of kernels that came from the disk."""
-        cache, kernels = load(file), load(tmp_path / "kernels.py")
-        kernel = kernels.decorate(cache.cached_njit)
-        pair, out = kernels.Pair(np.arange(3, dtype=dtype), np.ones(3, dtype)), np.zeros(3, dtype)
-        kernel(pair, out)
-        called = []
-        sys.setprofile(lambda frame, event, _: called.append(frame.f_code.co_name) if event == "call" else None)
-        kernel(pair, out)
-        sys.setprofile(None)
-        assert set(called) <= {"kernel"}  # numba may report the kernel
-        assert out.tolist() == [1, 3, 5]
-        hits, misses = (sum(counts.values()) for counts in (kernel.stats.cache_hits, kernel.stats.cache_misses))
-        assert hits + misses == 1
-        return hits
+    def run(dtype="float32", file=FILE, full=False):
+        hits, python_calls, said = in_fork(lambda: call(tmp_path, dtype, file, full))
+        assert set(python_calls) <= {"kernel"}  # numba may report the kernel
+        return hits, said
 
     return run
 
 
+@forks
 def test_a_kernel_is_taken_from_the_disk_until_a_file_changes(run, tmp_path):
     copy, other = tmp_path / "engine" / FILE.name, tmp_path / "engine" / "inlined.py"
     copy.parent.mkdir()
@@ -96,27 +107,23 @@ def test_a_kernel_is_taken_from_the_disk_until_a_file_changes(run, tmp_path):
     ):
         if change:
             other.write_text(change)
-        assert run(dtype, copy) == hits, (change, dtype)
+        assert run(dtype, copy) == (hits, []), (change, dtype)
 
 
+@forks
 def test_a_full_disk_costs_the_cache_alone(run, tmp_path):
-    resource = pytest.importorskip("resource")
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     for _ in range(2):
-        resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
-        try:
-            with pytest.warns(RuntimeWarning) as said:
-                assert run() == 0
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-        (message,) = [str(warning.message) for warning in said]
-        assert message.startswith(str(tmp_path / "cache"))
-        assert "NUMBA_CACHE_DIR to another folder" in message
-    assert [run(), run()] == [0, 1]  # with space, as the message says
+        hits, (said,) = run(full=True)
+        assert hits == 0
+        assert said.startswith(str(tmp_path / "cache"))
+        assert "NUMBA_CACHE_DIR to another folder" in said
+    assert [run(), run()] == [(0, []), (1, [])]  # with space, as the message says
 
 
+@forks
 def test_a_damaged_cache_is_made_again(run, tmp_path):
-    run("float32"), run("float64")
+    for dtype in ("float32", "float64"):
+        run(dtype)
     index, first, second = sorted(
         (tmp_path / "cache").rglob("*.nb?"), key=lambda file: (file.suffix != ".nbi", file.name)
     )
@@ -129,7 +136,7 @@ def test_a_damaged_cache_is_made_again(run, tmp_path):
         (first, other),  # the disk was full between index and kernel
     ):
         file.write_bytes(damaged)
-        assert [run(), run()] == [0, 1]
+        assert [run(), run()] == [(0, []), (1, [])]
 
 
 def test_sources_are_all_files_of_the_engines():

@@ -1,9 +1,6 @@
 """The numba engine beyond the contract that `test_engines.py` asks of every engine: its blocks, runs and threads."""
 
 import json
-import multiprocessing
-import os
-import signal
 import subprocess
 import sys
 import time
@@ -15,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from cases_splat import random_splats, splats_from
+from forked import forks, in_fork
 from torch.utils.data import DataLoader
 
 numba = pytest.importorskip("numba")
@@ -43,8 +41,6 @@ from kfgs.splat.engines.cpu.threads import run_bands  # noqa: E402
 DTYPES = [torch.float32, torch.float64]
 every_dtype = pytest.mark.parametrize("dtype", DTYPES)
 """On both sides of: a few channels, one pass, two passes, registers at all."""
-
-forks = pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="this system does not fork")
 
 
 def _needles(M, width, height, dtype, seed=3):
@@ -383,29 +379,6 @@ def test_error_of_a_band_reaches_the_caller(where, two_threads):
 # processes ------------------------------------------------------------------------------------------------------------
 
 
-def _in_fork(work, seconds=300):
-    """What `work` returns in a forked child, as JSON; the child is ended if it hangs."""
-    read, write = os.pipe()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # from Python 3.12 on: a fork of a process with threads
-        child = os.fork()
-    if child == 0:
-        try:
-            os.write(write, json.dumps(work()).encode())
-        finally:
-            os._exit(0)
-    os.close(write)
-    deadline = time.monotonic() + seconds
-    while os.waitpid(child, os.WNOHANG) == (0, 0):
-        if time.monotonic() > deadline:
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            pytest.fail(f"the forked child hangs for more than {seconds} s")
-        time.sleep(0.01)
-    with os.fdopen(read, "rb") as pipe:
-        return json.loads(pipe.read())
-
-
 def _splats(seed=0):
     return random_splats(700, 150, 110, seed=seed, channels=9, dtype=torch.float32)
 
@@ -432,7 +405,7 @@ def test_a_forked_child_does_all_that_its_parent_does(two_threads):
         same = [torch.allclose(*pair, rtol=1e-4) for pair in zip(compute(), truth, strict=True)]
         return [*same, torch.equal(_frame(), expected)]
 
-    assert _in_fork(work) == [True] * 5
+    assert in_fork(work) == [True] * 5
     assert torch.equal(_frame(), expected)
 
 
