@@ -69,7 +69,7 @@ def pytest_unconfigure():
     gc.unfreeze()
 
 
-COMPILING = ("tests/splat/cpu/", "tests/splat/test_engine", "tests/splat/test_ops", "tests/splat/test_splat_project")
+COMPILING = ("tests/splat/cpu/", "tests/splat/test_engine", "tests/splat/test_ops", "tests/splat/test_ranks")
 
 
 @pytest.hookimpl(optionalhook=True)
