@@ -37,8 +37,8 @@ class Case(NamedTuple):
 
     channels: int = 3
     tile_size: int = 16
-    count: int = 40  # Gaussians
-    size: tuple[int, int] = (24, 18)  # width, height: the tiles of 16 at two sides are cut off
+    count: int = 20  # Gaussians
+    size: tuple[int, int] = (18, 13)  # width, height: the tiles of 16 are cut off
     rows_of_features: int | None = None  # index into that many rows, the last of which none shows
     opacities: tuple[float, ...] = (0.05, 0.95)  # range of random ones, or the stack's
     sigma: tuple[float, float] = (0.7, 6.0)
@@ -54,9 +54,9 @@ CASES = {
     "130 channels": Case(130),
     "indexed": Case(9, rows_of_features=20, manners=True),
     "indexed, more rows than Gaussians": Case(40, rows_of_features=90),
-    "tiles of 5": Case(tile_size=5, size=(18, 13)),
+    "tiles of 5": Case(tile_size=5),
     "tiles of 12": Case(tile_size=12),
-    "tiles of 32, wide": Case(70, tile_size=32, size=(40, 24), count=25),
+    "tiles of 32, wide": Case(70, tile_size=32, size=(34, 20), count=12),
     "rows int64, offsets int32": Case(integers=(torch.int64, torch.int32)),
     "many that stop": Case(count=150, size=(12, 9), opacities=(0.3, 0.6), sigma=(3.0, 30.0)),
     "clamped": Case(opacities=(0.999,), stack=True),
@@ -66,7 +66,7 @@ CASES = {
     "ties": Case(70, opacities=(0.5, 0.5, 0.5), stack=True),
     "skipped": Case(opacities=(0.999 / 255, 0.5, 0.999 / 255), stack=True),
     "opacity 0": Case(opacities=(0.0, 0.5), stack=True),
-    "empty tiles": Case(count=3, size=(100, 40), sigma=(0.7, 2.0)),
+    "empty tiles": Case(count=3, size=(60, 13), sigma=(0.7, 2.0)),
     "no Gaussians, indexed": Case(count=0, rows_of_features=4, manners=True),
 }
 
