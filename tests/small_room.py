@@ -1,10 +1,7 @@
 """A toy room small enough to fit in seconds, shared by the tests of pipeline and command line."""
 
-import atexit
 import dataclasses
 import shutil
-import tempfile
-from functools import cache
 from pathlib import Path
 
 from cases_color import make_field, make_splat
@@ -43,25 +40,8 @@ PAPER = Paper.paper(
 SMALL = UpliftConfig.field(max_gaussians=1_500)
 
 
-@cache
-def _made(make) -> Path:
-    """What a function makes in a folder, once in this process; the others are copies of it."""
-    folder = Path(tempfile.mkdtemp())
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    make(folder)
-    return folder
-
-
-def _copy(make, folder: Path) -> Path:
-    return Path(shutil.copytree(_made(make), folder, dirs_exist_ok=True))
-
-
 def make_room(folder: Path) -> Path:
-    return _copy(_new_room, folder)
-
-
-def _new_room(folder: Path) -> None:
-    make_toy_room(folder, ROOM)
+    return make_toy_room(folder, ROOM)
 
 
 def make_desk(folder: Path) -> Path:
@@ -69,10 +49,6 @@ def make_desk(folder: Path) -> Path:
 
     And true/field.kfgs, a field without classes of its own whose features are those of the true classes.
     """
-    return _copy(_new_desk, folder)
-
-
-def _new_desk(folder: Path) -> None:
     splat = make_splat(make_room(folder / "scene"), folder / "my.ply")
     scene = load_scene(folder / "scene")
     maps = FeatureFolder(folder / "scene" / "features", [scene.stem(i) for i in scene.views("train")])
@@ -80,6 +56,7 @@ def _new_desk(folder: Path) -> None:
     write_splats(attach(field, splat).gaussians, folder / "labelled.ply")
     shutil.copyfile(splat, folder / "run" / "color.ply")
     make_field(folder / "scene", folder / "true" / "field.kfgs")
+    return folder
 
 
 def paper(**changes):

@@ -11,7 +11,6 @@ import real_teacher
 import torch
 from messages import refused, tells
 from PIL import Image
-from small_room import make_room
 
 pytest.importorskip("transformers", reason='the backbone needs `pip install "kfgs[hf]"`')
 from tiny_transformers import write_teacher
@@ -26,11 +25,6 @@ ROOT = Path(real_teacher.__file__).parents[1]
 @pytest.fixture(scope="session")
 def backbone(tmp_path_factory):
     return write_teacher(tmp_path_factory.mktemp("dinov2"), "dinov2")
-
-
-@pytest.fixture(scope="session")
-def room(tmp_path_factory):
-    return make_room(tmp_path_factory.mktemp("room"))
 
 
 def run(monkeypatch, *arguments):

@@ -10,7 +10,6 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from small_room import make_room
 
 from kfgs.fields import GaussianParams
 from kfgs.formats import write_splats
@@ -47,8 +46,8 @@ def rows_of(said):
     return [line.split(" | ") for line in said.splitlines() if line.startswith("| ")][1:]
 
 
-def test_color_field_fits_scores_and_draws(tmp_path, monkeypatch, capsys):
-    words = [make_room(tmp_path / "room"), tmp_path / "out", "--preset", "quick", "--steps", 20, "--pictures", 2]
+def test_color_field_fits_scores_and_draws(room, tmp_path, monkeypatch, capsys):
+    words = [room, tmp_path / "out", "--preset", "quick", "--steps", 20, "--pictures", 2]
     start(monkeypatch, "color_field", *words).main()
     facts = json.loads((tmp_path / "out" / "scores.json").read_text())
     assert (facts["steps"], facts["preset"], len(facts["scores"]["views"])) == (20, "quick", 3)
@@ -105,16 +104,15 @@ def test_transfer_prints_every_row(monkeypatch, capsys):
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the highest memory is read from /proc")
-def test_streaming_measures_each_stage(tmp_path, monkeypatch, capsys):
+def test_streaming_measures_each_stage(room, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    scene, table = make_room(tmp_path / "scene"), tmp_path / "table.json"
-    read = load_scene(scene)
+    read, table = load_scene(room), tmp_path / "table.json"
     write_splats(
         GaussianParams.from_points(read.points, colors=read.colors, sh_degree=0).activated(), tmp_path / "splat.ply"
     )
     words = ["--images", 11, "--size", 12, 16, "--channels", 7, "--epochs", 2, "--json", table]
     words += ["--splat", tmp_path / "splat.ply", "--folder", tmp_path / "kept"]
-    streaming = start(monkeypatch, "streaming", scene, *words)
+    streaming = start(monkeypatch, "streaming", room, *words)
     apart = streaming.run_apart  # a process costs seconds of imports
 
     def run(args, stage):

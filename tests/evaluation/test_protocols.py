@@ -2,7 +2,6 @@ import cases_methods as cases
 import numpy as np
 import pytest
 import torch
-from small_room import make_room
 
 from kfgs.evaluation import LabelTruth, TeacherMethod, View, get_protocol, score_views
 from kfgs.evaluation.protocols import KfgsColor, KfgsPooled, KfgsSurface
@@ -38,11 +37,6 @@ def test_pooled_is_evaluate_segmentation():
     assert "one confusion matrix over all views" in report.text
     with pytest.raises(ValueError, match="got none for y; pass views with these stems"):
         KfgsPooled().score(method, truth, views[:1] + views[2:], method.encode)
-
-
-@pytest.fixture(scope="module")
-def room(tmp_path_factory):
-    return make_room(tmp_path_factory.mktemp("own") / "room")
 
 
 def test_the_teacher_scores_as_the_demo_says(room):

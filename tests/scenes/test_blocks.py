@@ -6,16 +6,10 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 from messages import tells
-from small_room import make_room
 
 from kfgs.scenes import SceneError, load_scene
 from kfgs.scenes.blocks import Block, partition, write_part
 from kfgs.scenes.colmap_model import read_model
-
-
-@pytest.fixture(scope="module")
-def room(tmp_path_factory):
-    return make_room(tmp_path_factory.mktemp("blocks") / "room")
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7])

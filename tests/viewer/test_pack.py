@@ -9,16 +9,9 @@ from cases_explorer import classes as few_classes
 from cases_explorer import cloud, field, grid, line
 from cases_web import room_state
 from messages import refused
-from small_room import make_room
 
 from kfgs.viewer import Exploration, FieldMeaning, SplatMeaning, pack
 from kfgs.viewer.pack import pack_scene, rounded_far
-
-
-@pytest.fixture(scope="module")
-def room(tmp_path_factory):
-    state = room_state(make_room(tmp_path_factory.mktemp("room") / "room"))
-    return state, pack_scene(state)
 
 
 def buffer(packed, name):
@@ -28,7 +21,8 @@ def buffer(packed, name):
 
 
 def test_labels_and_distances_are_exact(room):
-    state, packed = room
+    state = room_state(room)
+    packed = pack_scene(state)
     labels, source, far = (buffer(packed, name) for name in ("semantic/labels", "color/source", "color/far"))
     assert labels.tolist() == state.labels("semantic").tolist()
     assert all(entry["offset"] % 16 == 0 for entry in packed.header["buffers"].values())

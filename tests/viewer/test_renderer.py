@@ -3,7 +3,6 @@ import numpy as np
 import pytest
 import torch
 from cases_web import PAPER, needs_chromium, numbers, psnr
-from small_room import make_room
 
 from kfgs.cameras import Camera
 from kfgs.splat import rasterize
@@ -16,8 +15,8 @@ ENOUGH = 40  # dB
 
 
 @pytest.fixture(scope="module")
-def state(tmp_path_factory):
-    return cases_web.room_state(make_room(tmp_path_factory.mktemp("room") / "room"))
+def state(room):
+    return cases_web.room_state(room)
 
 
 @pytest.fixture(scope="module")
