@@ -9,7 +9,7 @@ from torch import Tensor
 
 from .._card import short_repr
 from .._check import as_tensor, check_shapes
-from .._rows import EPS, check_directions, row_norms, unit_embeddings, unit_rows
+from .._rows import EPS, check_directions, largest, row_norms, unit_embeddings, unit_rows
 from ..quant.codebook import Codebook
 
 if TYPE_CHECKING:
@@ -49,9 +49,9 @@ def classify(
     classes = unit_embeddings(embeddings).T.to(features)
     check_directions("features", features)
     with torch.no_grad():
-        best = [(unit_rows(rows) @ classes).max(dim=-1) for rows in features.split(CHUNK)]
+        best = [largest(unit_rows(rows) @ classes) for rows in features.split(CHUNK)]
         nothing = row_norms(features) <= EPS
-    labels, scores = torch.cat([part.indices for part in best]), torch.cat([part.values for part in best])
+    scores, labels = (torch.cat(parts) for parts in zip(*best, strict=True))
     return Classification(labels.masked_fill(nothing, -1), scores.masked_fill(nothing, 0))
 
 
@@ -93,8 +93,8 @@ def nearest_codeword(
     latents: Tensor,  # [N, d]
     centres: Tensor,  # [K, d]
 ) -> Tensor:  # [N] int64
-    """The codeword whose latent is nearest, argmin_k |x - c_k|^2 = argmin_k |c_k|^2 - 2 x.c_k; ties go to the lowest."""
-    return torch.addmm((centres * centres).sum(dim=-1), latents, centres.T, alpha=-2).argmin(dim=-1)
+    """The codeword whose latent is nearest, argmin_k |x - c_k|^2 = argmax_k 2 x.c_k - |c_k|^2; ties go to the lowest."""
+    return largest(torch.addmm(-(centres * centres).sum(dim=-1), latents, centres.T, alpha=2))[1]
 
 
 def _score_layers(
@@ -120,6 +120,6 @@ def _decide(layers: tuple[tuple[Tensor, Tensor], ...], rows: Tensor) -> tuple[Te
     """The largest output (linear layers, ReLU between) and how clearly: (largest - second) / largest, 0 if not positive."""
     for k, (weight, bias) in enumerate(layers):
         rows = torch.addmm(bias, rows.relu_() if k else rows, weight.T)
-    best, winners = rows.max(dim=1)
+    best, winners = largest(rows)
     second = rows.scatter_(1, winners[:, None], -torch.inf).amax(dim=1)
     return winners, torch.where(best > 0, (best - second) / best, 0)

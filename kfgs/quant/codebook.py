@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .._card import short_repr
 from .._check import as_tensor, check_shapes
-from .._rows import EPS, row_norms, unit_rows
+from .._rows import EPS, largest, row_norms, unit_rows
 from .store import Stored
 
 CHUNK = 1024  # features at a time: 2 MB of 512 channels stay in a core's cache, a third faster than 65,536 (measured)
@@ -130,9 +130,8 @@ def nearest_rows(
         padded = torch.nn.functional.pad(unit, (0, 0, 0, -K % 16)).T  # 256 columns are quicker than 255
         for part in rows.split(CHUNK):
             part = part.to(wide)
-            best = (part.to(unit.dtype) @ padded)[:, :K].max(dim=-1)  # the first of equal ones
-            parts.append((best.indices, best.values, row_norms(part)))
-    index, product, length = (torch.cat(values).view(features.shape[:-1]) for values in zip(*parts, strict=True))
+            parts.append((*largest((part.to(unit.dtype) @ padded)[:, :K]), row_norms(part)))
+    product, index, length = (torch.cat(values).view(features.shape[:-1]) for values in zip(*parts, strict=True))
     return index, product, length
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .._rows import EPS, row_norms, unit_rows
+from .._rows import EPS, largest, row_norms, unit_rows
 
 CHUNK = 16_384  # features compared with the centres at a time
 
@@ -63,5 +63,6 @@ def refine(unit: Tensor, centres: Tensor, rounds: int, *, weights: Tensor | None
 
 def nearest_cells(unit: Tensor, centres: Tensor) -> Cells:
     """Eq. 5 for unit rows. Ties go to the lowest index."""
-    best = [(part @ centres.T).max(dim=1) for part in unit.split(CHUNK)]
-    return Cells(centres, torch.cat([b.indices for b in best]), torch.cat([b.values for b in best]))
+    best = [largest(part @ centres.T) for part in unit.split(CHUNK)]
+    similarity, index = (torch.cat(parts) for parts in zip(*best, strict=True))
+    return Cells(centres, index, similarity)
