@@ -7,8 +7,8 @@ SCENE holds classes.json, text.npy and label pictures; MAPS a teacher map for ev
 teacher is to be scored). Without --splat the geometry is trained from the pictures, its time counted. --words are text embeddings
 of the teacher's space [C, D] with which open vocabulary is checked; --uplift adds rows that keep every Gaussian of the splat.
 
---device is where the geometry is trained and where the rows of --uplift fuse. The default method itself fuses on the CPU, and all
-fields are scored there. Name a new OUT for another device: finished stages are kept.
+--device is where the rows of --uplift fuse. `kfgs.fit` takes a GPU if there is one (CUDA_VISIBLE_DEVICES= hides it), and all
+fields are scored on the CPU. Name a new OUT for another device: finished stages are kept.
 """
 
 from __future__ import annotations
@@ -145,8 +145,7 @@ def main() -> None:
                 f"mIoU {miou:.2f}, accuracy {accuracy:.2f}, queries {room.queries(field):.3f}"
             )
     for seed in args.seeds:
-        place = {"folder": args.out / str(seed), "seed": seed, "device": args.device}
-        field = fit(room.scene, room.maps, Uplift(args.splat), **place, report=print)
+        field = fit(room.scene, room.maps, Uplift(args.splat), folder=args.out / str(seed), seed=seed, report=print)
         small = args.out / f"{seed}.kfgs"
         field.save(small, "small")
         packed = SemanticField.load(small)

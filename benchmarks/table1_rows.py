@@ -244,8 +244,7 @@ def make_kfgs(row: Row, room: Room, request: dict[str, Any], folder: Path) -> Ma
     if isinstance(method, Uplift):
         method = replace(method, splat=request["splat"])
     shutil.rmtree(folder / "run", ignore_errors=True)  # stages of a killed run would count too few seconds
-    place = {"folder": folder / "run", "seed": request["seed"], "device": request["device"]}
-    field = fit(room.scene, room.maps, method, **place, report=print)
+    field = fit(room.scene, room.maps, method, folder=folder / "run", seed=request["seed"], report=print)
     facts = {
         "dim": str(field.decoder.latent), "gaussians": len(field), "storage": field.storage(),
         "disk": (folder / "run" / "field.kfgs").stat().st_size, "stages": field.info["seconds"],

@@ -4,8 +4,8 @@
         [--device cuda]
 
 All rows share the codebook and the index maps, which are made once and counted in each. A row that is finished is read back.
---quick: 800 steps (512 channels: 350), and every third test view is scored. --device is where the fields are trained and where
-frames per second are measured; the other stages run on the CPU. Name a new OUT for another device: finished stages are kept.
+--quick: 800 steps (512 channels: 350), and every third test view is scored. --device is where frames per second are measured;
+`kfgs.fit` takes a GPU if there is one. Name a new OUT for another device: finished stages are kept.
 """
 
 from __future__ import annotations
@@ -46,8 +46,7 @@ def config_of(dim: int, args: argparse.Namespace) -> Paper:
 def run(dim: int, room: Room, args: argparse.Namespace) -> dict[str, Any]:
     """One row, fitted and scored, or read back."""
     method = config_of(dim, args)
-    place = {"folder": args.out / "run", "seed": args.seed, "device": args.device}
-    field = fit(room.scene, room.maps, method, **place, report=print)
+    field = fit(room.scene, room.maps, method, folder=args.out / "run", seed=args.seed, report=print)
     asked = {
         "stages": field.info["stages"],
         "views": [view.stem for view in room.views],
