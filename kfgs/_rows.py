@@ -26,11 +26,10 @@ def row_norms(x: Tensor) -> Tensor:  # [..., D] -> [...]
 
 def largest(rows: Tensor) -> tuple[Tensor, Tensor]:  # [N, K] -> [N], [N] int64
     """The largest number of each row, and the first place where it stands; without gradient."""
-    rows = rows.detach()
     if rows.device.type != "cpu" or rows.dtype not in (torch.float32, torch.float64):
-        return torch.max(rows, dim=1)
-    places = torch.from_numpy(rows.numpy().argmax(axis=1))  # ten times as fast as torch's own search
-    return rows.gather(1, places[:, None])[:, 0], places
+        return torch.max(rows.detach(), dim=1)
+    places = torch.from_numpy(rows.detach().numpy().argmax(axis=1))  # ten times as fast as torch's own search
+    return rows.detach().gather(1, places[:, None])[:, 0], places
 
 
 def unit_embeddings(embeddings: Tensor, name: str = "embeddings") -> Tensor:  # [C, D] -> [C, D]
