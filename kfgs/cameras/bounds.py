@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from .._card import short_repr
-from .._check import check_range, check_shapes
+from .._check import as_tensor, check_range, check_shapes
 from .camera import Camera
 
 
@@ -30,7 +30,7 @@ def robust_bounds(points: Tensor, *, coverage: float = 0.98, margin: float = 0.1
     SfM clouds have points far behind every wall (in Replica's room_0, a room of about 8 m, one is 139 m away), so the
     minimum and maximum are useless. A ValueError if there are no points.
     """
-    check_shapes(("points", points, "P 3"))
+    check_shapes(("points", points := as_tensor("points", points), "P 3"))
     check_range("coverage", coverage, 0, 1, closed=(False, True))
     check_range("margin", margin, 0)
     if len(points) == 0:

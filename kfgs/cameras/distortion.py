@@ -13,7 +13,7 @@ from kornia.geometry.camera import distort_points_affine, distort_points_kannala
 from kornia.geometry.conversions import normalize_points_with_intrinsics
 from torch import Tensor
 
-from .._check import check_shapes
+from .._check import as_tensor, check_shapes
 from .camera import Camera, Distortion
 from .resample import from_bchw, to_bchw
 
@@ -87,7 +87,7 @@ def undistort(image: Tensor, camera: Camera) -> tuple[Tensor, Camera, Tensor]:  
         border of the picture, or beyond the `fold_radius` of the lens model, are not recorded. Within half a pixel of the
         border the outermost pixel is repeated.
     """
-    check_shapes(("image", image, f"{camera.height} {camera.width} C"))
+    check_shapes(("image", image := as_tensor("image", image), f"{camera.height} {camera.width} C"))
     if not image.is_floating_point():
         raise TypeError(f"image: expected floating point, got {image.dtype}; convert it with .float() / 255")
     if camera.distortion is None:

@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
-from .._check import ORIGIN, as_array, as_origin, check_range, check_size, check_whole
+from .._check import ORIGIN, as_array, as_origin, as_tensor, check_range, check_size, check_whole
 from .._rows import check_finite
 from .bounds import robust_bounds
 from .camera import UP, Camera, at_one_origin, unit_vector
@@ -53,7 +53,7 @@ def path_cameras(
     if size is not None:
         check_size(size)
     cameras = at_one_origin(cameras)
-    keys = [*cameras[::every], *([cameras[-1]] if (len(cameras) - 1) % every else [])]
+    keys = [*cameras[::every], *([cameras[-1]] if cameras and (len(cameras) - 1) % every else [])]
     if len(keys) > 1:
         moved = _steps(*_poses(keys)) > SAME
         keys = [keys[0], *(key for key, new in zip(keys[1:], moved, strict=True) if new)]
@@ -166,7 +166,7 @@ def orbit_cameras(
         origin: that the points are counted from, `gaussians.origin`.
     """
     orbit = orbit or Orbit()
-    cloud = points.detach().double().cpu()
+    cloud = as_tensor("points", points).detach().double().cpu()
     check_finite("points", cloud)
     bounds = robust_bounds(cloud, coverage=0.96, margin=0.0)
     center, radius = (bounds.low + bounds.high) / 2, float((bounds.high - bounds.low).norm()) / 2

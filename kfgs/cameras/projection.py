@@ -26,7 +26,7 @@ def world_to_camera(camera: Camera, points: Tensor) -> Tensor:  # points: [N, 3]
     Written out because kornia's `transform_points` divides by a homogeneous coordinate that is always 1 here, and takes
     twice as long.
     """
-    check_shapes(("points", as_tensor("points", points, floating=True), "N 3"))
+    check_shapes(("points", points := as_tensor("points", points, floating=True), "N 3"))
     viewmat = camera.viewmat.to(points)
     return points @ viewmat[:3, :3].T + viewmat[:3, 3]
 
@@ -76,7 +76,7 @@ def project_points(
     inside = (pixels >= 0).all(dim=1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
     if camera.distortion is not None:
         inside &= seen[:, :2].norm(dim=1) < fold_radius(camera.distortion) * seen[:, 2]
-    xy = points.new_zeros(len(points), 2).index_put((front,), pixels)
+    xy = points_cam.new_zeros(len(points), 2).index_put((front,), pixels)
     visible = torch.zeros_like(depth, dtype=torch.bool).index_put((front,), inside)
     return xy, depth, visible
 
@@ -86,7 +86,7 @@ def unproject_depth(camera: Camera, depth: Tensor) -> Tensor:  # depth: [H, W] -
 
     A pixel of depth 0 (often "unknown") gives the centre of the camera: mask it.
     """
-    check_shapes(("depth", as_tensor("depth", depth, floating=True), (camera.height, camera.width)))
+    check_shapes(("depth", depth := as_tensor("depth", depth, floating=True), (camera.height, camera.width)))
     refuse_distortion(camera)
     K = camera.intrinsics_at_integer_centers.to(depth)  # kornia's pixel grid counts from 0, not from 0.5
     viewmat = camera.viewmat.to(depth)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from .._check import ORIGIN, check_range, check_shapes
+from .._check import ORIGIN, as_tensor, check_range, check_shapes
 from .._origin import FAR_UNITS, Origin
 from .camera import Camera, exact_rotation
 
@@ -35,16 +35,16 @@ class Similarity:
 
     def __post_init__(self) -> None:
         check_range("scale", self.scale, 0, closed=(False, False))
-        check_shapes(("rotation", self.rotation, "3 3"), ("translation", self.translation, "3"))
-        if not torch.isfinite(self.translation).all():
-            raise ValueError(f"translation: expected finite numbers, got {self.translation.tolist()}; check the fit")
+        rotation, shift = as_tensor("rotation", self.rotation), as_tensor("translation", self.translation)
+        check_shapes(("rotation", rotation, "3 3"), ("translation", shift, "3"))
+        if not torch.isfinite(shift).all():
+            raise ValueError(f"translation: expected finite numbers, got {shift.tolist()}; check the fit")
         object.__setattr__(self, "scale", float(self.scale))
-        object.__setattr__(self, "rotation", exact_rotation("rotation", self.rotation))
-        object.__setattr__(self, "translation", self.translation.detach().double().cpu().clone())
+        object.__setattr__(self, "rotation", exact_rotation("rotation", rotation))
+        object.__setattr__(self, "translation", shift.detach().double().cpu().clone())
 
     def __repr__(self) -> str:
-        cosine = (float(self.rotation.trace()) - 1) / 2
-        degrees = math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
+        degrees = math.degrees(math.acos(max(-1.0, min(1.0, (float(self.rotation.trace()) - 1) / 2))))
         x, y, z = self.translation.tolist()
         return f"Similarity(scale {self.scale:.6g}, rotation by {degrees:.4g} degrees, translation ({x:.4g}, {y:.4g}, {z:.4g}))"
 
@@ -56,8 +56,8 @@ class Similarity:
     @staticmethod
     def from_matrix(matrix: Tensor) -> Similarity:  # [4, 4]
         """Read scale, rotation and translation from [[s R, t], [0, 1]]; a ValueError if it shears, mirrors or is projective."""
+        matrix = as_tensor("matrix", matrix).detach().double().cpu()
         check_shapes(("matrix", matrix, "4 4"))
-        matrix = matrix.detach().double().cpu()
         if not (matrix[3] - matrix.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().max() <= LAST_ROW_TOLERANCE:  # NaN fails
             raise ValueError(f"matrix: expected the last row 0 0 0 1, got {matrix[3].tolist()}; pass points as columns")
         determinant = float(torch.linalg.det(matrix[:3, :3]))
@@ -77,7 +77,7 @@ class Similarity:
 
     def apply(self, points: Tensor) -> Tensor:  # [N, 3] -> [N, 3]
         """Move points; computed in float64, returned in their dtype and on their device."""
-        check_shapes(("points", points, "N 3"))
+        check_shapes(("points", points := as_tensor("points", points), "N 3"))
         R, t = self.rotation.to(points.device), self.translation.to(points.device)
         return (self.scale * (points.double() @ R.T) + t).to(points.dtype)
 
@@ -119,8 +119,8 @@ def fit_similarity(src: Tensor, dst: Tensor) -> Similarity:  # [N, 3], [N, 3]
     """
     from skimage.transform import SimilarityTransform  # slow to import, and seldom needed
 
-    check_shapes(("src", src, "N 3"), ("dst", dst, "N 3"))
-    points = [values.detach().double().cpu() for values in (src, dst)]
+    points = [as_tensor(name, values).detach().double().cpu() for name, values in (("src", src), ("dst", dst))]
+    check_shapes(("src", points[0], "N 3"), ("dst", points[1], "N 3"))
     for name, values in zip(("src", "dst"), points, strict=True):
         if len(values) < 3 or not torch.isfinite(values).all():
             raise ValueError(f"{name}: expected at least 3 finite points, got {len(values)}; add pairs, leave NaN out")

@@ -6,7 +6,17 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.cameras import Camera, Distortion, project_points, undistort
+from kfgs.cameras import (
+    Camera,
+    Distortion,
+    Orbit,
+    Similarity,
+    fit_similarity,
+    orbit_cameras,
+    project_points,
+    robust_bounds,
+    undistort,
+)
 from kfgs.cameras.camera import view_named
 
 K = torch.tensor([[70.0, 0.0, 50.0], [0.0, 66.0, 30.5], [0.0, 0.0, 1.0]])
@@ -134,6 +144,21 @@ def test_matrices_may_be_arrays_or_lists():
         Camera(np.eye(4, dtype=np.int64), np.eye(3), 4, 4)
     with pytest.raises(TypeError, match=tells("K", "str")):
         Camera(np.eye(4), "pinhole", 4, 4)
+
+
+def test_points_and_pictures_may_be_arrays():
+    camera = Camera(np.eye(4), K.double(), 96, 64)
+    points = torch.tensor([[0.1, 0.2, 3.0], [-0.3, 0.1, 2.0], [0.5, 0.0, 4.0]], dtype=torch.float64)
+    turn = Similarity.from_matrix(np.eye(4)[[1, 2, 0, 3]])
+    for function in (
+        lambda points: project_points(camera, points),
+        robust_bounds,
+        lambda points: [view.viewmat for view in orbit_cameras(points, Orbit(frames=2))],
+        lambda points: [turn.apply(points), fit_similarity(points, turn.apply(points)).matrix()],
+        lambda points: [Similarity(2.0, np.eye(3), points[0]).matrix()],
+        lambda points: [undistort(points[None], replace(camera, width=3, height=1))[0]],
+    ):
+        assert all(map(torch.equal, function(points.numpy()), function(points)))
 
 
 def test_an_unknown_name_does_not_mean_the_view_without_a_name():

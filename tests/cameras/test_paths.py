@@ -72,7 +72,7 @@ def test_a_portrait_among_landscapes_is_not_stretched():
 @pytest.mark.parametrize(
     ("keys", "options", "message"),
     [
-        ([], {}, ("cameras:", "got 0")),
+        ([], {"every": 2}, ("cameras:", "got 0")),
         ([camera((0, 0, 0))] * 3, {}, ("cameras:", "got 1")),
         ([camera((0, 0, 0)), camera((1, 0, 0))], {"frames": 1}, ("frames:", "got 1")),
         ([camera((0, 0, 0)), camera((1, 0, 0))], {"every": 0}, ("every:", "got 0")),
