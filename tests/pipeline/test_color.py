@@ -5,7 +5,6 @@ import dataclasses
 import pytest
 import torch
 from cases_training import changed
-from messages import tells
 from safetensors.torch import load_file
 from small_room import stages
 
@@ -113,13 +112,3 @@ def test_few_points_are_used_where_pictures_give_none(scene, tmp_path):
     assert any("the few points of the scene are used: scene: expected pictures that fit" in line for line in said)
     (stage,) = (tmp_path / "stages").glob("points-*/points.safetensors")
     assert torch.equal(load_file(stage)["points"], few.points)
-
-
-def test_bad_input_is_refused_before_any_work(scene, tmp_path):
-    lens = Distortion("brown_conrady", (0.3, 0.0, 0.0, 0.0))
-    bent = dataclasses.replace(scene, cameras=[dataclasses.replace(c, distortion=lens) for c in scene.cameras])
-    with pytest.raises(ValueError, match=tells("scene:", "distortion", "scene.undistorted()")):
-        fit_color(bent, tmp_path, CONFIG)
-    with pytest.raises(ValueError, match=tells("split:", "train, test", "got 'val'")):
-        fit_color(scene, tmp_path, CONFIG, split="val")
-    assert list(tmp_path.iterdir()) == []

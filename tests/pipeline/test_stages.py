@@ -3,33 +3,17 @@ import pytest
 from kfgs.pipeline.stages import Run
 
 
-def _maker(calls: list[str], name: str):
-    def make(folder):
-        calls.append(name)
-        (folder / "value").write_text(name)
-        return 0.0
+def test_a_finished_stage_is_found_again_by_its_name_and_inputs(tmp_path):
+    lines = []
 
-    return make
+    def made(text, inputs):
+        return Run(tmp_path, lines.append).stage("a", inputs, lambda folder: (folder / "value").write_text(text))
 
-
-def test_a_finished_stage_is_found_again_by_another_process(tmp_path):
-    calls: list[str] = []
-    first = Run(tmp_path).stage("a", {"x": 1}, _maker(calls, "one"))
-    again = Run(tmp_path).stage("a", {"x": 1}, _maker(calls, "two"))
-    assert calls == ["one"]
-    assert again.key == first.key
-    assert again.seconds == first.seconds
-    assert (again.folder / "value").read_text() == "one"
-
-
-def test_other_inputs_make_another_stage_and_keep_the_first(tmp_path):
-    calls: list[str] = []
-    run = Run(tmp_path)
-    one = run.stage("a", {"x": 1}, _maker(calls, "one"))
-    two = run.stage("a", {"x": 2}, _maker(calls, "two"))
-    assert calls == ["one", "two"]
-    assert one.key != two.key
-    assert (one.folder / "value").read_text() == "one"
+    first, other, again = made("one", {"x": 1}), made("two", {"x": 2}), made("three", {"x": 1})
+    assert again == first
+    assert other.key != first.key
+    assert [(stage.folder / "value").read_text() for stage in (first, other)] == ["one", "two"]
+    assert [line.split(" in ")[0] for line in lines] == ["a: working", "a: done"] * 2 + ["a: found"]
 
 
 def test_a_killed_stage_leaves_nothing_and_is_made_again(tmp_path):
@@ -41,16 +25,8 @@ def test_a_killed_stage_leaves_nothing_and_is_made_again(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         run.stage("a", {}, dies)
     assert list((tmp_path / "stages").iterdir()) == []
-    calls: list[str] = []
-    stage = run.stage("a", {}, _maker(calls, "whole"))
+    stage = run.stage("a", {}, lambda folder: (folder / "value").write_text("whole"))
     assert sorted(path.name for path in stage.folder.iterdir()) == ["stage.json", "value"]
-
-
-def test_reports_say_what_was_made_and_what_was_found(tmp_path):
-    lines: list[str] = []
-    Run(tmp_path, lines.append).stage("a", {}, lambda folder: None)
-    Run(tmp_path, lines.append).stage("a", {}, lambda folder: None)
-    assert [line.split(" in ")[0] for line in lines] == ["a: working", "a: done", "a: found"]
 
 
 @pytest.mark.parametrize("text", ["[]", "{}", "{", "", "null", "[1]"])
