@@ -12,9 +12,10 @@ from torch import Tensor
 from kfgs._rows import unit_rows
 from kfgs.cameras import Camera
 from kfgs.evaluation import Method, View, label_view
-from kfgs.fields.decoders import divide_votes, rank_votes
+from kfgs.fields.decoders import divide_votes
 from kfgs.gaussians import Gaussians
 from kfgs.splat import Rendering, rasterize
+from kfgs.splat.rasterize import rank_votes
 
 CHUNK = 16_384  # pixels decoded at once
 

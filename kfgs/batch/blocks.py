@@ -19,7 +19,7 @@ from .._card import error_line
 from .._check import as_array
 from .._files import Names, as_path, check_output, digest_file, digest_value, locked, read_json, real_path, write_json
 from .._origin import to_world
-from ..fields import SemanticField, fused, store, working_maps
+from ..fields import SemanticField, store, uplift, working_maps
 from ..formats import read_splats, write_splats
 from ..formats.table import splat_file_of
 from ..gaussians import Gaussians
@@ -199,7 +199,7 @@ def join_blocks(
     if not parts:
         where = {name: corners.round(3).tolist() for name, corners in boxes.items()}
         raise ValueError(f"low, high: expected a box with Gaussians, got none in it; all of them lie in {where}")
-    field, scene = fused.join_fields(parts), real_path(root / described["scene"])
+    field, scene = uplift.join_fields(parts), real_path(root / described["scene"])
     return replace(field, info=field.info | {"scene": str(scene)}, classes=store.scene_classes(scene, field.dim))
 
 

@@ -2,14 +2,13 @@
 
 from .decoders import Autoencoded, Codewords, Identity, Linear
 from .examples import Box, Clicks, Mask, label_set_from_examples
-from .fused import fuse_views
 from .loss import ColorLoss
 from .merge import merge_gaussians
 from .params import GaussianParams
 from .semantic_field import SemanticField
 from .train import fit_field
 from .training import Densify, Rates, Training
-from .uplift import UpliftConfig, uplift_maps
+from .uplift import UpliftConfig, fuse_views, uplift_maps
 
 __all__ = [
     "Autoencoded",

@@ -11,31 +11,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import torch
 from torch import Tensor
 
 from .._card import short_repr
 from .._rows import EPS, check_directions, row_norms, unit_rows
-from ..cameras import Camera
-from ..gaussians import Gaussians
 from ..labels.classify import pixel_codewords
 from ..labels.scores import LOGIT_SCALE
 from ..quant import Autoencoder, Codebook, LinearLatents
-from ..splat import Ranked, rasterize_labels
+from ..splat.rasterize import Votes
 
 CHUNK = 8192  # latents decoded at once: the decoder's widest layer then holds 32 MB
 LEAST_SHARE = 1e-30
 """A smaller share of a vote counts as none: blended, it would be a denormal number, with which a CPU takes ten times as long."""
 Ranks = tuple[Tensor, Tensor]  # [..., top] int64, [..., top]: the best classes and their scores; -1 and 0 for none
-
-
-class Votes(NamedTuple):
-    """What the Gaussians say about some classes."""
-
-    classes: Tensor  # [W] int64, which
-    shares: Tensor  # [N, W], positive; 0 of a Gaussian about which nothing is known
 
 
 class Decoder(Protocol):
@@ -263,23 +254,3 @@ def similarity_votes(features: Tensor, rows: Tensor) -> Votes:  # [N, d], [C, d]
     """
     shares = features @ rows.T + 2 * row_norms(features)[:, None]
     return Votes(torch.arange(len(rows), device=shares.device), shares)
-
-
-def rank_votes(gaussians: Gaussians, camera: Camera, votes: Votes, top: int = 1, *, early: bool = False) -> Ranked:
-    """The classes with most votes at each pixel; votes are blended like colours. Beyond the classes voted for: -1, 0.
-
-    `early` is that of `rasterize_labels`.
-    """
-    if not len(votes.classes):  # nothing is known about any Gaussian: no votes for one class, and the opacity
-        votes = Votes(votes.classes.new_zeros(1), votes.shares.new_zeros(len(votes.shares), 1))
-    count = min(top, len(votes.classes))
-    with torch.no_grad():
-        shown = gaussians.replace(features=votes.shares, sh=None)
-        labels, scores, alphas = rasterize_labels(shown, camera, top=count, early=early)
-        if len(votes.classes) <= int(votes.classes[-1]):  # else they are all classes, in order
-            labels = votes.classes[labels]
-        labels.masked_fill_(scores <= 0, -1)
-    if count < top:
-        labels = torch.nn.functional.pad(labels, (0, top - count), value=-1)
-        scores = torch.nn.functional.pad(scores, (0, top - count))
-    return Ranked(labels, scores, alphas)

@@ -21,7 +21,8 @@ from ..labels.label_set import Classes, Negatives, check_rows, class_rows, make_
 from ..labels.scores import Score, select_by_similarity
 from ..metrics import MIB, semantic_storage_bytes
 from ..splat import Ranked, Rendering, rasterize
-from .decoders import Decoder, Votes, rank_votes
+from ..splat.rasterize import Votes, rank_votes
+from .decoders import Decoder
 from .packing import Precision
 from .store import load_field, save_field
 

@@ -1,15 +1,18 @@
-"""Carry features of 2-D maps to Gaussians without training: average in 3-D, correct, then compress.
+"""Carry features of 2-D maps, or what views show of a trained field, to Gaussians: average in 3-D, correct, then compress.
 
 Each Gaussian takes the mean of the pixels that show it, weighted by its rendering weight w = T alpha. Every rendered pixel
 is a blend of Gaussians, so near a border the mean contains some of the neighbours. A few passes of the simultaneous iterative
 reconstruction technique (SIRT, Gilbert 1972) remove that: render, compare with the maps, carry the difference back.
+
+Training constrains only blends of Gaussians, so the latent of a single one may decode to something that no view shows. The mean
+over its pixels (`fuse_views`), computed once when a field is finished, does not have this problem.
 """
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,22 +23,24 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._check import as_bar, check_range, check_whole
-from .._rows import unit_rows
+from .._rows import EPS, row_norms, unit_rows
 from ..cameras import Camera, resize_map
 from ..formats.values import check_splats
 from ..gaussians import Gaussians
 from ..quant.kmeans import cap
 from ..quant.linear import LinearLatents, fit_linear_latents
 from ..quant.maps import FeatureMaps
-from ..splat import accumulate_pixels, bin_tiles, composite, project
+from ..splat import accumulate_pixels, average_views, bin_tiles, composite, project, rasterize
 from ..splat.views import divide_sums, sum_pixels
-from .decoders import Linear
+from .decoders import Autoencoded, Codewords, Linear
 from .merge import merge_gaussians
 from .semantic_field import SemanticField
 from .working_maps import WorkingMaps, sample_latents, shrink_map
 
 SPARSE = 0.3  # share of the views' pixels: a splat of the scene fills nearly all of them
 NEIGHBOURS = 17  # a Gaussian and its 16 nearest, whose corrections are judged together
+KEEP, MOST = 0.999, 64  # share of the codewords' variation to keep, with at most this many latents
+PIXELS = 80_000  # most pixels of a view that are rendered
 
 
 @dataclass(frozen=True)
@@ -208,3 +213,50 @@ def _known(signal: Tensor, size: tuple[int, int]) -> Tensor:  # [h, w, c] -> [H,
     """A map in a camera's size, 0 where it is unknown, and which pixels are known as its last channel."""
     known = ~signal[..., :1].isnan()
     return resize_map(torch.cat([torch.where(known, signal, 0), known.to(signal)], dim=-1), size).contiguous()
+
+
+def fuse_views(field: SemanticField, cameras: Sequence[Camera]) -> SemanticField:
+    """Render a trained field from its training cameras, quantise the pixels, and average them onto the Gaussians they show.
+
+    The result is the field with these `cameras` and the averages as `fused`. A field with a `Linear` decoder is fused
+    already, and gets the cameras alone. Without a codebook, rendered features are averaged without quantising.
+    """
+    if not cameras:
+        raise ValueError("cameras: expected at least one, got none; pass those that the field was trained with")
+    decoder, gaussians = field.decoder, field.gaussians
+    if isinstance(decoder, Linear):
+        return replace(field, cameras=tuple(cameras))
+    with torch.no_grad():
+        if isinstance(decoder, Codewords | Autoencoded):
+            rows, weights = decoder.codebook.unit, None
+        else:
+            rows, weights = unit_rows(field.features), gaussians.opacities
+        latents = fit_linear_latents(rows, weights, keep=KEEP, maximum=MOST)
+        table = torch.nn.functional.pad(latents.encode(rows), (0, 0, 0, 1)).to(gaussians.means)  # nothing known: zeros
+
+        def show(camera: Camera) -> tuple[Camera, Tensor]:  # [H, W, e]
+            factor = min(1.0, (PIXELS / (camera.width * camera.height)) ** 0.5)
+            small = camera.resized(max(1, round(camera.height * factor)), max(1, round(camera.width * factor)))
+            rendering = rasterize(gaussians, small)
+            pixels = rendering.map
+            if isinstance(decoder, Codewords | Autoencoded):
+                return small, table[decoder.codewords(pixels, rendering.alpha > 0)]
+            return small, latents.encode(unit_rows(pixels)) * (row_norms(pixels) > EPS)[..., None]
+
+        means = average_views(gaussians, map(show, cameras)).values
+    fused = SemanticField(gaussians.replace(features=means), Linear(latents.basis))
+    return replace(field, cameras=tuple(cameras), fused=fused)
+
+
+def join_fields(fields: Sequence[SemanticField]) -> SemanticField:
+    """Fused fields with the same linear latents (`sample_latents`) as one; views that several fields have are kept once."""
+    first, bases = fields[0], [part.decoder.to_tensors()["linear.basis"] for part in fields]
+    assert all(torch.equal(basis, bases[0]) for basis in bases), "fields with the latents of others"
+    cameras = {camera.name: camera for part in fields for camera in part.cameras}
+    views = list(dict.fromkeys(name for part in fields for name in part.info.get("views", ())))
+    return replace(
+        first,
+        gaussians=Gaussians.cat([part.gaussians.with_origin(first.gaussians.origin) for part in fields]),
+        cameras=tuple(cameras.values()),
+        info=first.info | {"views": views},
+    )

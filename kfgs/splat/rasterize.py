@@ -157,6 +157,33 @@ def rasterize_labels(
         )
 
 
+class Votes(NamedTuple):
+    """What the Gaussians say about some classes."""
+
+    classes: Tensor  # [W] int64, which
+    shares: Tensor  # [N, W], positive; 0 of a Gaussian about which nothing is known
+
+
+def rank_votes(gaussians: Gaussians, camera: Camera, votes: Votes, top: int = 1, *, early: bool = False) -> Ranked:
+    """The classes with most votes at each pixel; votes are blended like colours. Beyond the classes voted for: -1, 0.
+
+    `early` is that of `rasterize_labels`.
+    """
+    if not len(votes.classes):  # nothing is known about any Gaussian: no votes for one class, and the opacity
+        votes = Votes(votes.classes.new_zeros(1), votes.shares.new_zeros(len(votes.shares), 1))
+    count = min(top, len(votes.classes))
+    with torch.no_grad():
+        shown = gaussians.replace(features=votes.shares, sh=None)
+        labels, scores, alphas = rasterize_labels(shown, camera, top=count, early=early)
+        if len(votes.classes) <= int(votes.classes[-1]):  # else they are all classes, in order
+            labels = votes.classes[labels]
+        labels.masked_fill_(scores <= 0, -1)
+    if count < top:
+        labels = torch.nn.functional.pad(labels, (0, top - count), value=-1)
+        scores = torch.nn.functional.pad(scores, (0, top - count))
+    return Ranked(labels, scores, alphas)
+
+
 def _check_arguments(gaussians: Gaussians, camera: Camera) -> None:
     check_gaussians(gaussians)
     if not isinstance(camera, Camera):

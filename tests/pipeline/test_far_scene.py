@@ -14,7 +14,7 @@ from small_room import FIELD
 from kfgs import FeatureFolder, SemanticField, Uplift, attach, fit, load_scene, read_splats
 from kfgs.cli import main
 from kfgs.fields import GaussianParams, UpliftConfig
-from kfgs.fields.fused import join_fields
+from kfgs.fields.uplift import join_fields
 from kfgs.formats import write_splats
 from kfgs.formats.ply import read_ply, write_ply
 from kfgs.pipeline.color import ColorConfig, fit_color
