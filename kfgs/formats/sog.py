@@ -59,7 +59,7 @@ def read(path: Path) -> Gaussians:
         sh = np.concatenate([meta.tables["sh0"][rgba[:, :3]][:, None], _read_rest(files, meta)], 1)
     if (turns[:, 3] < _LARGEST_FIRST).any():
         row = int((turns[:, 3] < _LARGEST_FIRST).argmax())
-        raise ValueError(f"the rotation of Gaussian {row} has alpha {turns[row, 3]}, not 252 to 255: is it lossy?")
+        raise ValueError(f"the rotation of Gaussian {row} has alpha {turns[row, 3]}, not 252 to 255: a lossy image?")
     largest = turns[:, 3].astype(np.int64) - _LARGEST_FIRST
     logs = meta.bounds[0] + (meta.bounds[1] - meta.bounds[0]) * ((low + 256 * high) / _LEVELS)
     with np.errstate(over="ignore", invalid="ignore"):  # left out

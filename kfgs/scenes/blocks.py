@@ -39,7 +39,8 @@ class Block:
 
     def holds(self, means: NDArray[Any]) -> NDArray[np.bool_]:  # [N, 3] -> [N]
         """Which points lie in the core."""
-        return _within(means, np.array(self.core))
+        low, high = np.array(self.core)
+        return np.asarray(((means >= low) & (means < high)).all(1))
 
     def needs(self, means: NDArray[Any], radii: NDArray[Any]) -> NDArray[np.bool_]:  # [N, 3], [N] -> [N]
         """Which balls lie in the core or touch the reach."""
@@ -64,7 +65,8 @@ def partition(model: ColmapModel, count: int) -> list[Block]:
     centers = np.array([-image.pose[:3, :3].T @ image.pose[:3, 3] for image in images if image.pose is not None])
     blocks = []
     for number, core in enumerate(_cut(model.points[inside], np.array([[-MAX_NUMBER] * 3, [MAX_NUMBER] * 3]), count)):
-        name, own = f"block{number:0{max(2, len(str(count - 1)))}d}", _within(model.points, core)
+        name, low, high = f"block{number:0{max(2, len(str(count - 1)))}d}", *core
+        own = ((model.points >= low) & (model.points < high)).all(1)
         shares = np.array([own[rows].mean() if len(rows) else 0.0 for rows in seen])
         chosen = np.flatnonzero((shares >= SHARE) & (shares > 0))
         if len(chosen) == 0:
@@ -93,10 +95,6 @@ def write_part(folder: Path, model: ColmapModel, names: Sequence[str]) -> None:
         (place / "cameras.txt").write_text("".join(lenses))
         rows = np.column_stack([model.point_ids[kept], model.points[kept], model.colors[kept]])
         np.savetxt(place / "points3D.txt", rows, "%d %.17g %.17g %.17g %d %d %d 0")
-
-
-def _within(points: NDArray[Any], core: Array) -> NDArray[np.bool_]:
-    return np.asarray(((points >= core[0]) & (points < core[1])).all(1))
 
 
 def _cut(points: Array, box: Array, count: int) -> list[Array]:  # [P, 3], [2, 3] -> count x [2, 3]

@@ -93,7 +93,8 @@ def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
     sizes, least = _extents(B), max(2, MIN_INLIERS * len(A))
     if min(sizes[0] / max(1.0, np.abs(B).max()), _extents(A)[0] / max(1.0, np.abs(A).max())) < 1e-9:
         got = f"{len(pairs)} at one ({some(names)}), from which no scale follows"
-        raise SceneError(f"cameras: expected common ones at other places, got {got}; give more, or pass the similarity")
+        advice = "give more views, or pass the similarity"
+        raise SceneError(f"cameras: expected common cameras at different places, got {got}; {advice}")
     similarity, good, size = None, np.zeros(len(A), dtype=bool), sizes[0]
     for trial in sizes:
         start = _start(A, B, turns, MAX_ERROR * trial) if good.sum() < least else None

@@ -161,7 +161,8 @@ def _with_split(scene: Scene, path: Path, root: Path, model: Path | None, split:
     splits = make_split(len(scene), rule)
     note = f"split {rule}: {len(splits['train'])} of {len(scene)} views train, {len(splits['test'])} test"
     if not splits["train"]:
-        raise SceneError(f'{root}: expected at least 6 views for {rule!r}, got {len(scene)}; use "all" or "holdout8"')
+        needed = f"at least 6 views for the split {rule!r}, got {len(scene)}"
+        raise SceneError(f'{root}: expected {needed}; use split="all" or "holdout8"')
     return replace(scene, splits=splits, notes=(*scene.notes, note))
 
 

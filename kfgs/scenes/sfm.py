@@ -115,8 +115,8 @@ def run_sfm(
         raise SceneError(f"{images}: expected at least 3 images (PNG, JPEG, TIFF, WebP), got {len(names)}; add views")
     pairs = None if config.matching == "exhaustive" else sequential_pairs(names)
     if pairs is not None and any(len(name.split()) > 1 for name in names):  # pycolmap cuts them in a list of pairs
-        advice = "rename the images or use matching='exhaustive' (--matching exhaustive)"
-        raise SceneError(f"{images}: expected names without blanks for a sequence, got {some(names, 3)}; {advice}")
+        got = f"{some(names, 3)}; rename the images or use matching='exhaustive' (--matching exhaustive)"
+        raise SceneError(f"{images}: expected names without blanks for sequential matching, got {got}")
     masks = folder_masks(names, images)[0] or [None] * len(names)
     photos = {name: (images / name, mask) for name, mask in zip(names, masks, strict=True)}
     what, advice = f"{images}: expected images that pycolmap can register", "check the images and the free disk space"

@@ -6,8 +6,9 @@ import importlib
 import math
 from collections.abc import Iterator
 from contextlib import closing
-from itertools import groupby
+from itertools import groupby, islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -58,9 +59,13 @@ def extract_frames(video: str | Path, out: str | Path, *, fps: float = 2.0, prog
         got = f"one with {some(held, 3)}; name another scene folder (--out)"
         raise FileExistsError(f"{out}: expected a new or empty folder for the pictures, got {got}")
     if not held:
+        frames = _decode(video)
+        rate, numbered = next(frames), enumerate(tqdm(frames, disable=not progress, unit="frame", desc="frames"))
+        step = max(1, round(rate / fps / CANDIDATES))
         with atomic_folder(out) as folder:
-            for count, frame in enumerate(_sharpest(video, fps, progress), 1):
-                Image.fromarray(frame).save(folder / f"frame_{count:05d}.jpg", quality=QUALITY, subsampling=0)
+            for count, (_, part) in enumerate(groupby(numbered, lambda pair: math.floor(pair[0] / rate * fps)), 1):
+                sharpest = max((frame for _, frame in islice(part, 0, None, step)), key=sharpness)  # two are in memory
+                Image.fromarray(sharpest).save(folder / f"frame_{count:05d}.jpg", quality=QUALITY, subsampling=0)
             if not any(folder.iterdir()):
                 raise SceneError(f"{video}: expected a video with frames, got none; does it play?")
             write_json(folder / SOURCE, source)
@@ -73,17 +78,8 @@ def sharpness(frame: Frame) -> float:
     return float(laplacian(grey[None, None], kernel_size=3, normalized=False).var())
 
 
-def _sharpest(video: Path, fps: float, progress: bool) -> Iterator[Frame]:
-    """The sharpest frame of each interval, one after the other; two frames are in memory."""
-    frames = enumerate(tqdm(_decode(video), disable=not progress, unit="frame", desc="frames"))
-    timed = ((i / rate, rate, frame) for i, (frame, rate) in frames)
-    for _, group in groupby(timed, lambda part: math.floor(part[0] * fps)):
-        some = (frame for n, (_, rate, frame) in enumerate(group) if n % max(1, round(rate / fps / CANDIDATES)) == 0)
-        yield max(some, key=sharpness)
-
-
-def _decode(video: Path) -> Iterator[tuple[Frame, float]]:
-    """Each frame of a video, and the frames per second."""
+def _decode(video: Path) -> Iterator[Any]:
+    """The frames per second of a video, and then each of them."""
     try:
         ffmpeg = importlib.import_module("imageio_ffmpeg")
     except ImportError as error:
@@ -95,8 +91,9 @@ def _decode(video: Path) -> Iterator[tuple[Frame, float]]:
             (width, height), rate = about["size"], float(about["fps"])
             if not (0 < width * height <= PIXELS and 0 < rate < 10_000):
                 raise ValueError(f"{width}x{height} pixels, {rate:g} frames per second")
+            yield rate
             for data in frames:
-                yield np.frombuffer(data, np.uint8).reshape(height, width, 3), rate
+                yield np.frombuffer(data, np.uint8).reshape(height, width, 3)
     except (OSError, RuntimeError, ValueError, KeyError, IndexError, StopIteration) as error:
         got = f"an error ({one_line(error, 160)}); convert it to MP4 (H.264)"
         raise SceneError(f"{video}: expected a video that ffmpeg can decode, got {got}") from error

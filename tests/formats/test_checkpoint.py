@@ -169,21 +169,17 @@ def test_colours_without_harmonics_are_logits_of_nerfstudio(tmp_path: Path) -> N
 
 def test_what_cannot_be_read_is_said(tmp_path: Path) -> None:
     path, raw = tmp_path / "a.pt", raw_values()
-    torch.save({"weights": torch.ones(2)}, path)
-    with pytest.raises(ValueError, match=tells("a.pt", "gsplat", "splatfacto", "one with weights")):
-        read_splats(path)
-    torch.save({"splats": {"means": raw["means"], "features": raw["means"], "colors": raw["means"]}}, path)
-    with pytest.raises(ValueError, match=tells("a.pt", "app_opt", "--save_ply")):
-        read_splats(path)
-    write_gsplat(path, raw | {"opacities": raw["opacities"][:3]})
-    with pytest.raises(ValueError, match=tells("a.pt", "7 Gaussians", "opacities [3]")):
-        read_splats(path)
-    write_gsplat(path, raw | {"scales": raw["scales"] + 200})
-    with pytest.raises(ValueError, match=tells("a.pt", "7 of 7", "infinity", "scales")):
-        read_splats(path)
-    torch.save({"pipeline": {"_model.field.weight": torch.ones(2)}}, path)
-    with pytest.raises(ValueError, match=tells("a.pt", "gauss_params.means", "another method")):
-        read_splats(path)
+    colours = {"means": raw["means"], "features": raw["means"], "colors": raw["means"]}
+    for content, words in (
+        ({"weights": torch.ones(2)}, ("gsplat", "splatfacto", "one with weights")),
+        ({"splats": colours}, ("app_opt", "--save_ply")),
+        ({"pipeline": {"_model.field.weight": torch.ones(2)}}, ("gauss_params.means", "another method")),
+        (raw | {"opacities": raw["opacities"][:3]}, ("7 Gaussians", "opacities [3]")),
+        (raw | {"scales": raw["scales"] + 200}, ("7 of 7", "infinity", "scales")),
+    ):
+        write_gsplat(path, content) if "means" in content else torch.save(content, path)
+        with pytest.raises(ValueError, match=tells("a.pt", *words)):
+            read_splats(path)
     path.write_bytes(write_gsplat(tmp_path / "b.pt", raw).read_bytes()[:-200])
     with pytest.raises(ValueError, match=tells("a.pt", "cannot be read")):
         read_splats(path)

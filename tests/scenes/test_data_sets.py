@@ -236,22 +236,6 @@ def test_every_picture_has_its_own_size(tmp_path: Path) -> None:
         load_scene(tmp_path / "replica/room0")
 
 
-def test_feature_3dgs_and_lists_of_test_views(tmp_path: Path) -> None:
-    names = [f"rgb_{i}.png" for i in range(12)]
-    write_model(tmp_path / "sparse/0", names)
-    for name in names:
-        write_picture(tmp_path / "images" / name)
-    assert load_scene(tmp_path, split="feature3dgs").splits["test"] == [2, 10]
-    (tmp_path / "sparse/0/test.txt").write_text("rgb_3.png\nrgb_7\n\n")
-    scene = load_scene(tmp_path)
-    assert scene.splits["test"] == [3, 7]
-    assert len(scene.splits["train"]) == 10
-    (tmp_path / "sparse/0/test.txt").write_text("frame_1.png\n")
-    with pytest.raises(SceneError, match=tells("test.txt", "12 pictures", "frame_1.png")):
-        load_scene(tmp_path)
-    assert load_scene(tmp_path, split="holdout8").splits["test"] == [0, 8]
-
-
 def test_scannet_as_opengaussian_has_it(tmp_path: Path) -> None:
     opengl = (POSE @ np.diag([1.0, -1, -1, 1])).tolist()
     lens = {"w": 64, "h": 48, "fl_x": 50, "fl_y": 55, "cx": 32, "cy": 24}

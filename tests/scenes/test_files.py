@@ -110,8 +110,9 @@ def test_what_a_decoder_raises_is_named(tmp_path, monkeypatch):
         (tmp_path / "a.png").write_bytes(content)
         with pytest.raises(SceneError, match=tells("a.png", "PNG, JPEG, TIFF or WebP", "cannot be decoded", "replace")):
             read_image(tmp_path / "a.png")
-    with pytest.raises(FileNotFoundError, match=tells("none.png", "no such file")):
-        read_image(tmp_path / "none.png")
+    for path in (tmp_path / "none.png", tmp_path):
+        with pytest.raises(FileNotFoundError, match=tells(path, "no such file")):
+            read_image(path)
     buffer = io.BytesIO()
     Image.fromarray(COLORS).save(buffer, "PNG")
     (tmp_path / "a.png").write_bytes(buffer.getvalue())

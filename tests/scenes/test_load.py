@@ -185,8 +185,11 @@ def test_the_split_file_wins(tmp_path: Path) -> None:
     assert scene.splits == {"train": [2, 10], "test": [0]}
     assert any("1 names in" in note and "rgb_99" in note for note in scene.notes)
     assert load_scene(tmp_path, split="holdout8").splits["test"] == [0, 8, 16]
+    assert load_scene(tmp_path, split="feature3dgs").splits["test"] == [2, 10, 18]
     (tmp_path / "sparse/0/test.txt").write_text("rgb_1\n")
     assert load_scene(tmp_path).splits["test"] == [0]
+    (tmp_path / "split.json").unlink()
+    assert load_scene(tmp_path).splits["test"] == [1]  # 3DGS and Occam's LGS put it next to the model
 
 
 def test_what_cannot_be_loaded_is_named(tmp_path: Path) -> None:

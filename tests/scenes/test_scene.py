@@ -9,7 +9,7 @@ from messages import tells
 
 from kfgs.cameras import Camera, Distortion
 from kfgs.cameras.distortion import undistort
-from kfgs.scenes import Scene, SceneError, read_image
+from kfgs.scenes import Scene, SceneError
 
 K = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
 LENS = Distortion("brown_conrady", (0.3, 0.0, 0.0, 0.0))  # pincushion: the picture does not fill the pinhole's
@@ -29,34 +29,11 @@ def _scene(tmp_path: Path, distortion: Distortion | None = None, positions: tupl
     return Scene(cameras, paths, points, colors, {"train": [0, 1], "test": [2]})
 
 
-def test_images_are_rgb_between_0_and_1(tmp_path: Path) -> None:
-    image = _scene(tmp_path).image(1)
-    assert image.shape == (48, 64, 3)
-    assert image.dtype == torch.float32
-    torch.testing.assert_close(image[10, 20], torch.tensor([60.0, 40.0, 9.0]) / 255)
-
-
 def test_a_picture_of_another_size_is_an_error(tmp_path: Path) -> None:
     scene = _scene(tmp_path)
     write_picture(scene.image_paths[1], 24, 32)
     with pytest.raises(SceneError, match=tells("rgb_5.png:", "64x48", "got 32x24")):
         scene.image(1)
-
-
-def test_broken_and_missing_pictures_are_named(tmp_path: Path) -> None:
-    scene = _scene(tmp_path)
-    scene.image_paths[0].write_bytes(b"not an image")
-    with pytest.raises(SceneError, match=tells("rgb_0.png:", "WebP")):
-        scene.image(0)
-    whole = scene.image_paths[1].read_bytes()
-    scene.image_paths[1].write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(SceneError, match=tells("rgb_5.png:", "PNG", "decoded")):
-        scene.image(1)
-    scene.image_paths[2].unlink()
-    with pytest.raises(FileNotFoundError, match=tells("rgb_10.png:", "no such file")):
-        scene.image(2)
-    with pytest.raises(FileNotFoundError, match=tells("no such file")):
-        read_image(tmp_path)
 
 
 def test_undistorted_scenes_undistort_lazily(tmp_path: Path) -> None:

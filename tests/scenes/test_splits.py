@@ -31,11 +31,6 @@ def test_the_rule_without_a_split_file(count: int, video: bool, rule: str) -> No
     assert choose_split(count, video) == rule
 
 
-def test_an_unknown_rule_is_refused() -> None:
-    with pytest.raises(ValueError, match=tells("split:", "'df3dgs', 'feature3dgs', 'holdout8', 'all'", "got 'llff'")):
-        make_split(10, "llff")  # type: ignore[arg-type]
-
-
 def test_numbers_sort_as_numbers() -> None:
     names = ["rgb_10", "rgb_5", "rgb_100", "a", "rgb_05b", "10", "9"]
     assert sorted(names, key=natural_key) == ["9", "10", "a", "rgb_05b", "rgb_5", "rgb_10", "rgb_100"]
@@ -70,13 +65,6 @@ def test_a_split_file_lists_stems(tmp_path: Path) -> None:
 def test_wrong_split_files_are_refused(tmp_path: Path, value: object, message: str) -> None:
     with pytest.raises(SceneError, match=tells(*message)):
         read_split(_write(tmp_path / "split.json", value).parent, ["a", "b"])
-
-
-def test_the_shipped_split(shared_data: Path) -> None:
-    names = sorted((p.stem for p in (shared_data / "room_0/images").iterdir()), key=natural_key)
-    splits, notes = read_split(shared_data / "room_0", names)
-    assert (len(splits["train"]), len(splits["test"]), notes) == (90, 90, [])
-    assert [names[i] for i in splits["train"][:2] + splits["test"][:2]] == ["rgb_5", "rgb_15", "rgb_0", "rgb_10"]
 
 
 @pytest.mark.parametrize(
