@@ -69,27 +69,27 @@ class TritonEngine(CompiledEngine):
     def forward(self, splats: Splats, tiles: Tiles) -> Composited:
         """Composite as the contract says.
 
-        The trace, [2 * H * W], is how many Gaussians of its tile's list each pixel passed before it stopped, and the
-        bits of its final transmittance, of which 1 - alpha would keep few digits behind what is opaque.
+        The trace is how many Gaussians of its tile's list each pixel passed before it stopped, and the bits of its final
+        transmittance, of which 1 - alpha would keep few digits behind what is opaque; `_room(H * W)` numbers each.
         """
         means2d, conics, opacities, features, background, index = splats
         rows, offsets, width, height, tile_size = tiles
         D = features.shape[1]
         maps, alphas = features.new_empty(height, width, D), features.new_empty(height, width)
-        trace = torch.empty(2, height, width, dtype=torch.int32, device=features.device)
-        stops, lights = trace[0], trace[1].view(torch.float32)
+        trace = torch.empty(2 * _room(height * width), dtype=torch.int32, device=features.device)
+        stops, lights = trace.chunk(2)
         if len(rows) == 0:
             stops.zero_()
-            lights.fill_(1.0)
-            return Composited(maps.copy_(background.expand_as(maps)), alphas.zero_(), trace.view(-1))
+            lights.view(torch.float32).fill_(1.0)
+            return Composited(maps.copy_(background.expand_as(maps)), alphas.zero_(), trace)
         options = launch_options("composite", D, tile_size)
         grid = _programs(options, tiles), -(-D // options["BLOCK"])
         with on_device(means2d):
             composite_kernel[grid](
                 means2d, conics, opacities, features, background, index, rows, offsets,
-                maps, alphas, stops, lights, width, height, tiles.grid[1], D, **options,
+                maps, alphas, stops, lights.view(torch.float32), width, height, tiles.grid[1], D, **options,
             )  # fmt: skip
-        return Composited(maps, alphas, trace.view(-1))
+        return Composited(maps, alphas, trace)
 
     def backward(
         self, grads: tuple[Tensor, Tensor], wanted: list[bool], splats: Splats, tiles: Tiles, result: Composited
@@ -98,12 +98,10 @@ class TritonEngine(CompiledEngine):
         means2d, conics, opacities, features, _, index = splats
         rows, offsets, width, height, tile_size = tiles
         of_splats, of_features = any(wanted[:3]), bool(wanted[3])
-        trace = trace.view(2, height, width)
-        stops, lights = trace[0], trace[1].view(torch.float32)
+        stops, lights = trace.chunk(2)
         M = len(means2d) if of_splats else 0
-        # One kernel clears all three. Each starts at a multiple of 16 bytes: for other starts the kernel is compiled again.
-        room = -(-M // 4) * 4
-        parts = means2d.new_zeros(6 * room).split((2 * room, 3 * room, room))
+        room = _room(M)
+        parts = means2d.new_zeros(6 * room).split((2 * room, 3 * room, room))  # one kernel clears all three
         shapes = [(M, *value.shape[1:]) for value in splats[:3]]
         results = [part[: math.prod(shape)].view(shape) for part, shape in zip(parts, shapes, strict=True)]
         results.append(torch.zeros_like(features) if of_features else features.new_empty(0))
@@ -116,7 +114,8 @@ class TritonEngine(CompiledEngine):
                     grad_maps, grad_alphas, *results,
                     width, height, tiles.grid[1], D, **options, OF_SPLATS=of_splats, OF_FEATURES=of_features,
                 )  # fmt: skip
-        of_background = torch.einsum("hwd,hw->d", grad_maps, lights) if wanted[4] else None
+        light = lights.view(torch.float32)[: height * width].view(height, width)
+        of_background = torch.einsum("hwd,hw->d", grad_maps, light) if wanted[4] else None
         return [grad if want else None for grad, want in zip((*results, of_background), wanted, strict=True)]
 
     def accumulate(
@@ -176,3 +175,8 @@ def launch_options(kernel: str, channels: int, tile_size: int) -> dict[str, Any]
 
 def _programs(options: dict[str, Any], tiles: Tiles) -> int:
     return tiles.grid[0] * tiles.grid[1] * options["PARTS"]
+
+
+def _room(count: int) -> int:
+    """Numbers for an array of `count` and what follows it at a multiple of 16 bytes: elsewhere Triton compiles again."""
+    return -(-count // 4) * 4

@@ -94,6 +94,13 @@ def load_block(base, line, lines, channel, channels):
 
 
 @triton.jit
+def add_block(base, line, lines, channel, channels, part):
+    """Add a part [lines, BLOCK] to what `load_block` reads."""
+    there = lines[:, None] & (channel < channels)[None, :]
+    tl.atomic_add(base + line[:, None] * channels + channel[None, :], part, mask=there, sem="relaxed")
+
+
+@triton.jit
 def sum_pixels(weight, values, CHUNK: tl.constexpr, PIXELS: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr):
     """The product weight [CHUNK, PIXELS] · values [PIXELS, BLOCK], in slices of a warp's pixels that are added up.
 
@@ -174,8 +181,7 @@ def accumulate_kernel(
         alpha, _, _, _ = find_alphas(x, y, mean_x, mean_y, a, b, c, opacity)
         weight, light, stop = weigh(alpha, position, light, stop, count)
         part = sum_pixels(weight, values, CHUNK, PIXELS, BLOCK, PRECISION)
-        there = listed[:, None] & (channel < channels)[None, :]
-        tl.atomic_add(sums + row[:, None] * channels + channel[None, :], part, mask=there, sem="relaxed")
+        add_block(sums, row, listed, channel, channels, part)
         if tl.program_id(1) == 0:
             tl.atomic_add(weights + row, tl.sum(weight, 1), mask=listed, sem="relaxed")
         first += CHUNK

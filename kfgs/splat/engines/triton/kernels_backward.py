@@ -17,6 +17,7 @@ import triton.language as tl
 from .kernels import (
     MOST,
     SIZES,
+    add_block,
     find_alphas,
     find_features,
     find_list,
@@ -114,9 +115,7 @@ def differentiate_kernel(
                     part = tl.dot(weight, grad, input_precision=PRECISION)
                 else:
                     part = sum_pixels(weight, grad, CHUNK, PIXELS, BLOCK, PRECISION)
-                there = listed[:, None] & (channel < channels)[None, :]
-                into = grad_features + shown_row[:, None] * channels + channel[None, :]
-                tl.atomic_add(into, part, mask=there, sem="relaxed")
+                add_block(grad_features, shown_row, listed, channel, channels, part)
         if OF_SPLATS:
             own = weight * slope
             rest = behind[None, :] - tl.cumsum(own, 0)

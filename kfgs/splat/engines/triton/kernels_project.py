@@ -61,15 +61,11 @@ def cross(a, b, c, x, y, z):
 
 
 @triton.jit
-def turn(viewmat, x, y, z, AXIS: tl.constexpr):
-    """Row AXIS of the camera's rotation times a vector."""
-    return dot(tl.load(viewmat + 4 * AXIS), tl.load(viewmat + 4 * AXIS + 1), tl.load(viewmat + 4 * AXIS + 2), x, y, z)
-
-
-@triton.jit
-def turn_back(viewmat, x, y, z, AXIS: tl.constexpr):
-    """Column AXIS of the camera's rotation times a vector."""
-    return dot(tl.load(viewmat + AXIS), tl.load(viewmat + 4 + AXIS), tl.load(viewmat + 8 + AXIS), x, y, z)
+def turn(viewmat, x, y, z, AXIS: tl.constexpr, BACK: tl.constexpr = False):
+    """Row AXIS of the camera's rotation times a vector; with BACK, column AXIS."""
+    STEP: tl.constexpr = 4 if BACK else 1
+    first = viewmat + (4 // STEP) * AXIS
+    return dot(tl.load(first), tl.load(first + STEP), tl.load(first + 2 * STEP), x, y, z)
 
 
 @triton.jit
@@ -104,13 +100,14 @@ def limit(K, size, tangent, AXIS: tl.constexpr):
 
 
 @triton.jit
-def linearize(viewmat, K, size, tangent, z, AXIS: tl.constexpr):
-    """Row AXIS of J W: J's entries are focal / z, and minus that times the tangent within its limits."""
+def linearize(viewmat, K, size, tangent, z, R0, R1, R2, R3, R4, R5, R6, R7, R8, AXIS: tl.constexpr):
+    """Row AXIS of J W, and of J W R: J's entries are focal / z, and minus that times the tangent within its limits."""
     focal, at = limit(K, size, tangent, AXIS)
     j = focal / z
     t0 = j * tl.load(viewmat + 4 * AXIS) - j * at * tl.load(viewmat + 8)
     t1 = j * tl.load(viewmat + 4 * AXIS + 1) - j * at * tl.load(viewmat + 9)
-    return t0, t1, j * tl.load(viewmat + 4 * AXIS + 2) - j * at * tl.load(viewmat + 10)
+    t2 = j * tl.load(viewmat + 4 * AXIS + 2) - j * at * tl.load(viewmat + 10)
+    return t0, t1, t2, dot(t0, t1, t2, R0, R3, R6), dot(t0, t1, t2, R1, R4, R7), dot(t0, t1, t2, R2, R5, R8)
 
 
 @triton.jit
@@ -134,10 +131,9 @@ def project_kernel(
     _, _, _, _, norm, R0, R1, R2, R3, R4, R5, R6, R7, R8 = load_axes(quats, row, there)
     sx, sy, sz = load_3(scales, row, there)
     opacity = load(opacities, row, there)
-    p0, p1, p2 = linearize(viewmat, K, width, tan_x, z, 0)
-    q0, q1, q2 = linearize(viewmat, K, height, tan_y, z, 1)
-    u0, u1, u2 = dot(p0, p1, p2, R0, R3, R6) * sx, dot(p0, p1, p2, R1, R4, R7) * sy, dot(p0, p1, p2, R2, R5, R8) * sz
-    v0, v1, v2 = dot(q0, q1, q2, R0, R3, R6) * sx, dot(q0, q1, q2, R1, R4, R7) * sy, dot(q0, q1, q2, R2, R5, R8) * sz
+    p0, p1, p2, a0, a1, a2 = linearize(viewmat, K, width, tan_x, z, R0, R1, R2, R3, R4, R5, R6, R7, R8, 0)
+    q0, q1, q2, b0, b1, b2 = linearize(viewmat, K, height, tan_y, z, R0, R1, R2, R3, R4, R5, R6, R7, R8, 1)
+    u0, u1, u2, v0, v1, v2 = a0 * sx, a1 * sy, a2 * sz, b0 * sx, b1 * sy, b2 * sz
     var_x, var_y = dot(u0, u1, u2, u0, u1, u2) + low_pass, dot(v0, v1, v2, v0, v1, v2) + low_pass
     mean_x = tl.load(K) * tan_x + tl.load(K + 2)
     mean_y = tl.load(K + 4) * tan_y + tl.load(K + 5)
@@ -157,8 +153,8 @@ def project_kernel(
         there &= tl.load(kept + row, mask=there, other=0) > 0
         at = tl.load(ends + row, mask=there, other=1).to(tl.int64) - 1
         # |u|^2 |v|^2 - (u.v)^2 = |u x v|^2 (Lagrange): the difference cancels for needles, the cross product does not.
-        a0, a1, a2 = cross(u0, u1, u2, v0, v1, v2)
-        det = dot(a0, a1, a2, a0, a1, a2) + low_pass * (var_x + var_y - low_pass)
+        n0, n1, n2 = cross(u0, u1, u2, v0, v1, v2)
+        det = dot(n0, n1, n2, n0, n1, n2) + low_pass * (var_x + var_y - low_pass)
         tl.store(means2d + 2 * at, mean_x, mask=there)
         tl.store(means2d + 2 * at + 1, mean_y, mask=there)
         store_3(conics, at, there, var_y / det, -dot(u0, u1, u2, v0, v1, v2) / det, var_x / det)
@@ -180,8 +176,12 @@ def slope_of_point(viewmat, K, size, tangent, z, g0, g1, g2, g_mean, AXIS: tl.co
 
 
 @triton.jit
-def slope_of_quat(w, x, y, z, g0, g1, g2, g3, g4, g5, g6, g7, g8):
-    """The slopes in a quaternion, given those in its rotation matrix: sums and differences across the diagonal."""
+def slope_of_quat(w, x, y, z, p0, p1, p2, q0, q1, q2, gu0, gu1, gu2, gv0, gv1, gv2):
+    """The slopes in a quaternion: sums and differences across the diagonal of those in its matrix, p_i gu_k + q_i gv_k."""
+    g0, g4, g8 = p0 * gu0 + q0 * gv0, p1 * gu1 + q1 * gv1, p2 * gu2 + q2 * gv2
+    g1, g3 = p0 * gu1 + q0 * gv1, p1 * gu0 + q1 * gv0
+    g2, g6 = p0 * gu2 + q0 * gv2, p2 * gu0 + q2 * gv0
+    g5, g7 = p1 * gu2 + q1 * gv2, p2 * gu1 + q2 * gv1
     g_w = 2.0 * (x * (g7 - g5) + y * (g2 - g6) + z * (g3 - g1))
     g_x = 2.0 * (w * (g7 - g5) + y * (g3 + g1) + z * (g2 + g6) - 2.0 * x * (g4 + g8))
     g_y = 2.0 * (w * (g2 - g6) + x * (g3 + g1) + z * (g7 + g5) - 2.0 * y * (g0 + g8))
@@ -204,10 +204,8 @@ def differentiate_projection_kernel(
     tan_x, tan_y, z = tl.where(there, tan_x, 0.0), tl.where(there, tan_y, 0.0), tl.where(there, z, 1.0)
     w, x, y, qz, norm, R0, R1, R2, R3, R4, R5, R6, R7, R8 = load_axes(quats, row, there)
     sx, sy, sz = load_3(scales, row, there)
-    p0, p1, p2 = linearize(viewmat, K, width, tan_x, z, 0)
-    q0, q1, q2 = linearize(viewmat, K, height, tan_y, z, 1)
-    a0, a1, a2 = dot(p0, p1, p2, R0, R3, R6), dot(p0, p1, p2, R1, R4, R7), dot(p0, p1, p2, R2, R5, R8)
-    b0, b1, b2 = dot(q0, q1, q2, R0, R3, R6), dot(q0, q1, q2, R1, R4, R7), dot(q0, q1, q2, R2, R5, R8)
+    p0, p1, p2, a0, a1, a2 = linearize(viewmat, K, width, tan_x, z, R0, R1, R2, R3, R4, R5, R6, R7, R8, 0)
+    q0, q1, q2, b0, b1, b2 = linearize(viewmat, K, height, tan_y, z, R0, R1, R2, R3, R4, R5, R6, R7, R8, 1)
     u0, u1, u2, v0, v1, v2 = a0 * sx, a1 * sy, a2 * sz, b0 * sx, b1 * sy, b2 * sz
 
     # of the conic (|v|^2 + l, -u.v, |u|^2 + l) / D, D = |u x v|^2 + l (|u|^2 + |v|^2) + l^2; dD/du = 2 v x (u x v) + 2 l u
@@ -227,12 +225,8 @@ def differentiate_projection_kernel(
     store_3(out_scales, row, inside, gu0 * a0 + gv0 * b0, gu1 * a1 + gv1 * b1, gu2 * a2 + gv2 * b2)
     gu0, gu1, gu2, gv0, gv1, gv2 = gu0 * sx, gu1 * sy, gu2 * sz, gv0 * sx, gv1 * sy, gv2 * sz
 
-    # of the rotation, R_ik: p_i gu_k + q_i gv_k
-    g0, g4, g8 = p0 * gu0 + q0 * gv0, p1 * gu1 + q1 * gv1, p2 * gu2 + q2 * gv2
-    g1, g3 = p0 * gu1 + q0 * gv1, p1 * gu0 + q1 * gv0
-    g2, g6 = p0 * gu2 + q0 * gv2, p2 * gu0 + q2 * gv0
-    g5, g7 = p1 * gu2 + q1 * gv2, p2 * gu1 + q2 * gv1
-    g_w, g_x, g_y, g_z = slope_of_quat(w, x, y, qz, g0, g1, g2, g3, g4, g5, g6, g7, g8)
+    # of the rotation
+    g_w, g_x, g_y, g_z = slope_of_quat(w, x, y, qz, p0, p1, p2, q0, q1, q2, gu0, gu1, gu2, gv0, gv1, gv2)
     # A quaternion of unit norm cannot grow; one that is divided by the floor can.
     radial = tl.where(norm >= QUAT_FLOOR, g_w * w + g_x * x + g_y * y + g_z * qz, 0.0)
     norm = tl.maximum(norm, QUAT_FLOOR)
@@ -250,8 +244,8 @@ def differentiate_projection_kernel(
     cam_z = z_of_x + z_of_y + load(grad_depths, at, there)
     store_3(
         out_means, row, inside,
-        turn_back(viewmat, cam_x, cam_y, cam_z, 0),
-        turn_back(viewmat, cam_x, cam_y, cam_z, 1),
-        turn_back(viewmat, cam_x, cam_y, cam_z, 2),
+        turn(viewmat, cam_x, cam_y, cam_z, 0, BACK=True),
+        turn(viewmat, cam_x, cam_y, cam_z, 1, BACK=True),
+        turn(viewmat, cam_x, cam_y, cam_z, 2, BACK=True),
     )  # fmt: skip
     tl.store(out_opacities + row, load(grad_opacities, at, there), mask=inside)
