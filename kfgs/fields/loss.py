@@ -7,22 +7,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from kornia.filters import get_gaussian_kernel1d
-from kornia.metrics import ssim
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from .._check import check_range, check_shapes
 from ..cameras import resize_map
-from ..cameras.resample import from_bchw, to_bchw
 from ..splat.engines.table import compiled_similarity
+from ..splat.similarity import SSIM_CONSTANTS, SSIM_WINDOW, similar_windows, window_weights
 
 Loss = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(rendered map [H, W, D], its alpha [H, W], target [h, w, D]) -> a scalar."""
-
-SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
-SSIM_CONSTANTS = 0.01**2, 0.03**2
-"""(K1 peak)^2 and (K2 peak)^2 of SSIM, for colours in [0, 1]."""
 
 
 def l1_loss(
@@ -69,25 +63,24 @@ class ColorLoss:
         if compiled is not None and not bool(target.sum().isnan()):  # no unknown pixel: one walk for both slopes
             mix = -self.ssim_weight, 1 - self.ssim_weight
             return self.ssim_weight + _Similarity.apply(picture, target, None, mix, compiled)
-        dissimilar = 1 - mean_similarity(picture, target)
-        return (1 - self.ssim_weight) * l1_loss(picture, alpha, target) + self.ssim_weight * dissimilar
+        absolute, dissimilar = l1_loss(picture, alpha, target), 1 - mean_similarity(picture, target)
+        return (1 - self.ssim_weight) * absolute + self.ssim_weight * dissimilar
 
 
 def mean_similarity(picture: Tensor, target: Tensor) -> Tensor:  # [H, W, D] x 2 -> []
     """Mean SSIM over the windows without a NaN (Gaussian, 11x11, sigma 1.5); 1 if there is none. Differentiable in `picture`.
 
-    The engine's if it has one (1.2 ms instead of kornia's 37 at 240x320, two threads), else kornia's.
+    The engine's if it has one (1.2 ms instead of kornia's 37 at 240x320, two threads), else by kornia's filters.
     """
     known, counted = _known(target), None
     if not bool(known.all()):
         picture, target = (torch.where(known[..., None], value, 0) for value in (picture, target))
-        holes = to_bchw((~known).to(picture)[..., None])
-        counted = torch.nn.functional.max_pool2d(holes, SSIM_WINDOW, stride=1)[0, 0] == 0  # [H - 10, W - 10]
+        counted = torch.nn.functional.max_pool2d((~known).to(picture)[None], SSIM_WINDOW, stride=1)[0] == 0
         if not bool(counted.any()):
             return picture.new_ones(())
     if (compiled := _compiled(picture, target)) is not None:
         return _Similarity.apply(picture, target, counted, (1.0, 0.0), compiled)  # type: ignore[no-any-return]
-    similarity = from_bchw(ssim(to_bchw(picture), to_bchw(target), SSIM_WINDOW, eps=0.0, padding="valid"))
+    similarity = similar_windows(picture, target)
     return similarity.mean() if counted is None else similarity[counted].mean()
 
 
@@ -97,7 +90,7 @@ def _resized(rendered: Tensor, target: Tensor) -> Tensor:  # [H, W, D], [h, w, D
 
 
 def _compiled(picture: Tensor, target: Tensor) -> Callable[..., Any] | None:
-    """The engine's SSIM; None if kornia's must be used, as for a gradient in the target."""
+    """The engine's SSIM; None if kornia's filters must do, as for a gradient in the target."""
     return None if target.requires_grad else compiled_similarity(picture, target)
 
 
@@ -130,8 +123,8 @@ class _Similarity(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, picture: Tensor, target: Tensor, counted: Any, mix: Any, compiled: Any) -> Tensor:
-        window = get_gaussian_kernel1d(SSIM_WINDOW, SSIM_SIGMA, dtype=torch.float64)[0].to(picture.dtype)
-        similar, slope = compiled(picture.contiguous(), target.contiguous(), counted, window, SSIM_CONSTANTS, mix)
+        pictures, window = (picture.contiguous(), target.contiguous()), window_weights(picture.dtype)
+        similar, slope = compiled(*pictures, counted, window, SSIM_CONSTANTS, mix)
         ctx.save_for_backward(slope)
         return mix[0] * similar + mix[1] * (picture - target).abs().mean() if mix[1] else mix[0] * similar
 

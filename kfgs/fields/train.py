@@ -64,7 +64,8 @@ def fit_field(
         params: the start; not changed. They decide dtype and device of the fit. Without an origin they are counted from that
             of the cameras, as the points of a scene are.
         cameras: C posed cameras without distortion.
-        targets: one map per camera, of any size, NaN where nothing is known; read one at a time, so they may live on disk.
+        targets: one map per camera, of any size, NaN where nothing is known; read one at a time, so they may live on disk;
+            a GPU keeps those that it has read, as long as half of its memory is free.
         training: the paper's values when not given. If its `extent` is None, that of the cameras takes its place:
             1.1 times their largest distance from their mean.
         loss: compares a rendered map, its alpha and the target. For colours, `ColorLoss`.
@@ -132,6 +133,7 @@ class Trainer:
         self._cameras, self._targets, self._loss = cameras, targets, loss
         self._training, self._generator = training, generator
         self._render_cameras: dict[tuple[int, bool], Camera] = {}
+        self._on_gpu: dict[int, Tensor] = {}  # targets that stay there, as long as half of its memory is free
         self._sh_start = params.used_sh_degree()  # of the start, so a resumed fit has the same
         self.optimizer = FieldOptimizer(params, training)
         self.statistics = GradientStatistics.zeros(params)
@@ -210,7 +212,8 @@ class Trainer:
 
     def _target(self, view: int) -> tuple[Tensor, bool]:  # [h, w, D]
         """The map of a view, and whether it was halved."""
-        target, size = as_tensor(f"targets[{view}]", self._targets[view], floating=True), self._cameras[view].size
+        given = self._on_gpu[view] if view in self._on_gpu else self._targets[view]
+        target, size = as_tensor(f"targets[{view}]", given, floating=True), self._cameras[view].size
         channels = self.optimizer.params.channels
         clear = isinstance(self._loss, ColorLoss) and target.shape[2:] == (channels + 1,)
         if target.ndim != 3 or (target.shape[2] != channels and not clear):
@@ -219,14 +222,17 @@ class Trainer:
                 "start from GaussianParams.from_points(points, D)"
             )
         target = target.to(self.optimizer.params.means)
-        if self.step > self._training.half_until or min(size) < 2:
-            return target, False
-        if tuple(target.shape[:2]) != size:
+        if target.is_cuda and view not in self._on_gpu:
+            free, memory = torch.cuda.mem_get_info(target.device)
+            if free > memory / 2:
+                self._on_gpu[view] = target
+        half = self.step <= self._training.half_until and min(size) >= 2
+        if half and tuple(target.shape[:2]) != size:
             raise ValueError(
                 f"targets[{view}]: expected {size} pixels as the camera has (half_until asks for it), got "
                 f"{tuple(target.shape[:2])}; resize the camera, or leave half_until at 0"
             )
-        return shrink_map(target, 2), True
+        return shrink_map(target, 2) if half else target, half
 
     def _camera(self, view: int, target: Tensor, half: bool) -> Camera:
         """The camera to render with; cached, because checking a new camera takes longer than using it."""

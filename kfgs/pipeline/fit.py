@@ -36,7 +36,7 @@ from .color import color_stage, find_color
 from .maps import KnownFeatures, as_maps, describe_maps, map_shape, maps_of_views
 from .methods import Paper, Uplift
 from .stages import LOCK, Run, Stage, digest_cameras, digest_scene, digest_shape
-from .train import field_stage, stage_gaussians, training_views, with_extent, with_points
+from .train import field_stage, stage_gaussians, training_device, training_views, with_extent, with_points
 
 REPORT = ("report.html", "preview.png", "codebook.png", "field.png")  # what `write_run_report` writes
 
@@ -205,7 +205,7 @@ def _paper(
         indexed = run.stage("index_maps", features | {"codebook": book.key}, quantize)
         inputs, latents, decoder = {"index_maps": indexed.key}, codebook.codewords, Codewords(codebook)
         if method.autoencoder is not None:  # Semantic Compression, Sec. 3.3.2: encoder E and decoder Psi
-            learn = partial(fit_autoencoder, codebook)
+            learn = partial(fit_autoencoder, codebook.to(training_device()))
             coder = _learn(run, "autoencoder", {"codebook": book.key}, method.autoencoder, learn)
             autoencoder = Autoencoder.load(coder.folder / "autoencoder.safetensors")
             inputs["autoencoder"], decoder = coder.key, Autoencoded(codebook, autoencoder)
