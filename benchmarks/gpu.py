@@ -129,7 +129,7 @@ def do_main_job(folder: Path, out: Path, device: str, methods: Iterable[str], sa
         there, camera = field.to(device), field.cameras[0]
         same = there.segment(camera.to(device)).cpu() == field.segment(camera)
         facts["labels equal on the CPU"] = round(float(same.float().mean()), 5)
-        save(name, facts | {"score": str(score_scene(labels, truth, field.classes))})
+        save(name, facts | {"score": str(score_scene(labels, truth, field.classes).miou)})
 
 
 def make_features(folder: Path) -> Path:
