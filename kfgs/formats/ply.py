@@ -7,6 +7,7 @@ UTF-8 or Latin-1 in practice.
 from __future__ import annotations
 
 import os
+import re
 from codecs import BOM_UTF8
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,6 +31,7 @@ _TYPES = {
 }  # fmt: skip
 _NAMES = {code: name for name, code in _TYPES.items() if not name[-1].isdigit()}
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
+NAN = re.compile(r"[+-]?(nan\(\w*\)|1\.#\w+)", re.IGNORECASE)  # as texts of Windows have NaN and infinity
 _HEADER_BYTES = 1 << 20  # no real header is longer
 
 
@@ -94,11 +96,8 @@ def write_ply_elements(path: str | Path, elements: dict[str, Columns], *, commen
         if odd:
             expected = f"names without blanks and the types {sorted(_NAMES)}"
             raise ValueError(f"columns: expected {expected}, got {odd!r:.80}; rename or convert them")
-        rows = np.empty(next(iter(lengths.values())), dtype=[(name, "<" + code) for name, code in codes.items()])
-        for name, values in columns.items():
-            rows[name] = values
-        tables.append(rows)
-        header.append(f"element {element} {len(rows)}")
+        tables.append(np.rec.fromarrays([*columns.values()], [(n, "<" + code) for n, code in codes.items()]))
+        header.append(f"element {element} {len(tables[-1])}")
         header += [f"property {_NAMES[code]} {name}" for name, code in codes.items()]
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join([*header, "end_header\n"]).encode())
@@ -179,7 +178,8 @@ def _read_rows(file: BinaryIO, element: _Element, order: str) -> Columns:
         return {prop.name: np.ascontiguousarray(rows[prop.name].astype(prop.code)) for prop in element.properties}
     table = np.zeros((0, len(names)))
     if element.rows:
-        table = np.loadtxt(file, dtype=np.float64, max_rows=element.rows, ndmin=2)
+        lines = (NAN.sub("nan", line) if "#" in line or "(" in line else line for line in map(bytes.decode, file))
+        table = np.loadtxt(lines, dtype=np.float64, comments=None, max_rows=element.rows, ndmin=2)
     if table.shape != (element.rows, len(names)):
         raise ValueError(f"expected {element.rows} rows of {len(names)} numbers, got {list(table.shape)}")
     return {prop.name: table[:, i].astype(prop.code) for i, prop in enumerate(element.properties)}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,7 +18,7 @@ from .._origin import choose_origin, describe_origin, to_local
 from ..cameras.camera import ROTATION_TOLERANCE, Camera, Distortion
 from ..cameras.projection import unproject_depth
 from ..cameras.resample import fits_aspect
-from ..formats.ply import points_from_columns, read_ply
+from ..formats.ply import NAN, points_from_columns, read_ply
 from . import files
 from .files import MAX_NUMBER, SceneError, natural_key, picture_size, some
 from .scene import Scene
@@ -153,7 +152,7 @@ def inverse_pose(pose: Matrix) -> Matrix:  # [4, 4] -> [4, 4]
 
 def to_number(word: str) -> float:
     """A number of a text file; NaN for what Windows writes for NaN and infinity: `-nan(ind)`, `1.#QNAN`."""
-    return math.nan if ".#" in word or "nan(" in word.lower() else float(word)
+    return float(NAN.sub("nan", word))
 
 
 def read_numbers(path: Path, expected: str, columns: int, rows: int | None = None) -> Matrix:  # [rows, columns]
