@@ -21,8 +21,7 @@ def window_weights(dtype: torch.dtype) -> Tensor:  # [11], on the CPU
 def similar_windows(picture: Tensor, target: Tensor) -> Tensor:  # [H, W, D] x 2 -> [H - 10, W - 10, D]
     """SSIM of every window that lies in the picture, differentiable: `kornia.metrics.ssim` up to rounding.
 
-    The five moments are filtered at once: 150 instead of 230 kernels in a step of training on a GPU, which the launches
-    hold up.
+    The five moments are filtered at once: a third fewer kernels in a step of training, whose launches keep a GPU waiting.
     """
     x, y = to_bchw(picture), to_bchw(target)
     weights = window_weights(picture.dtype).to(picture.device)[None]
