@@ -81,6 +81,7 @@ ERRORS = [
     ("render {run} --out {o}.gif --show labels,colour", ("--show:", "'colour'", "query=TEXT")),
     ("render {run} --out {o}.gif --show query=unicorn", ("unicorn",)),
     ("render {run} --out {o}.gif --frames 1", ("--frames:",)),
+    ("render {run} --out {o}.gif --width 0", ("--width:", "got 0")),
     ("render {run} --out {o}.gif --path {tmp}/x.json", ("--path:", "got {tmp}/x.json")),
     ("render {splat} --out {o}.gif", ("SOURCE:", "expected a splat with classes")),
     ("view {run} --out {o} --where window", ("--where: expected a display for a window, got none",)),

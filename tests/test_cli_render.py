@@ -52,9 +52,9 @@ def test_cameras_of_your_own_are_the_frames(run, tmp_path):
     assert main([*words, str(tmp_path / "a.gif")]) == 0
     scene, made = load_scene(run.parent / "scene"), frames(tmp_path / "a.gif")
     assert len(made) == len(scene)
-    assert main([*words, str(tmp_path / "b.gif"), "--frames", "4"]) == 0
+    assert main([*words, str(tmp_path / "b.gif"), "--frames", "4", "--width", "40"]) == 0
     assert len(frames(tmp_path / "b.gif")) == 4
-    assert frames(tmp_path / "b.gif")[0].shape[1] == made[0].shape[1]
+    assert frames(tmp_path / "b.gif")[0].shape[1] == made[0].shape[1] - (scene.cameras[0].width - 40)
     poses = [np.linalg.inv(camera.viewmat.numpy()) @ np.diag([1, -1, -1, 1]) for camera in scene.cameras[:2]]
     views = [{"transform_matrix": pose.tolist(), "h": h} for pose, h in zip(poses, (30, 60), strict=True)]
     listed = {"w": 40, "fl_x": 30, "frames": views}

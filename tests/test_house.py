@@ -21,7 +21,7 @@ NOT_YET = {  # what is above its aim: a change may lower these numbers, and neve
     "quant": 1_291, "cameras": 1_002, "base": 1_342,
 }  # fmt: skip
 SCRIPTS = 4_000  # lines of the viewer's JavaScript
-PUBLIC, TOP, COMMAND, OPTIONS = 170, 40, 14, 108  # names, of kfgs itself, commands, options; limits: 170, 40, 14, 110
+PUBLIC, TOP, COMMAND, OPTIONS = 170, 40, 14, 109  # names, of kfgs itself, commands, options; limits: 170, 40, 14, 110
 PACKAGES = [folder for folder in AIM if "/" not in folder and folder not in ("cli", "base")]
 
 

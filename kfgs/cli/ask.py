@@ -158,8 +158,7 @@ def view(
     """Explore a field: type "chair", change gamma and lambda, click a Gaussian, save the selection.
 
     It opens a page in the browser, which only this machine can open. A selection in the semantic cloud lights up in the colour
-    cloud. Gamma is the score that a Gaussian must exceed; lambda is the distance within which the colour cloud
-    lights up too.
+    cloud. Gamma is the score that a Gaussian must exceed; lambda the distance within which the colour cloud lights up.
 
     Examples:
         kfgs view run/

@@ -34,6 +34,7 @@ def render(
     show: Given[str] = None,
     color: Given[Path] = None,
     frames: Given[int] = None,
+    width: Given[int] = None,
     classes: Classes,
 ) -> None:
     """Make a film of a field or a labelled splat: an orbit, or a flight along its cameras or your own.
@@ -48,13 +49,13 @@ def render(
         source: A run folder, a field (RUN/field.kfgs), or a splat with classes.
         out: The film, .gif or .mp4 (which needs imageio-ffmpeg).
         path: orbit goes around the scene and looks in from above: what is in front is cut away, and a class "ceiling" is left
-            out. cameras flies along the scene's cameras. A file or folder
-            (transforms.json, COLMAP model, scene; without pictures, too) gives cameras of your own: exactly these, in the order
-            of their names; or with --frames a smooth path through them.
+            out. cameras flies along the scene's cameras. A file or folder (transforms.json, COLMAP model, scene; without
+            pictures, too) gives cameras of your own: exactly these, in the order of their names; or with --frames a smooth path.
         show: What stands side by side, with commas between: photo (the colours), labels, features, query=TEXT. By default
             photo,labels, or labels if there are no colours.
         color: Colour splat in the same frame; by default that of the run, or that which the field was made on.
         frames: Number of pictures; by default 72, or one for each camera of your own.
+        width: Of a picture, pixels; by default 480, or that of your own cameras.
     """
     from tqdm import tqdm
 
@@ -74,6 +75,8 @@ def render(
     words = [word.strip() for word in (show or ("labels" if colors is None else "photo,labels")).split(",")]
     shows = {TITLES.get(word, word.removeprefix("query=")): _show(word, meaning, semantic, colors) for word in words}
     walk = walk_of(semantic if colors is None else colors, cameras)
+    if width is not None:
+        walk = [camera.resized(max(1, round(width * camera.height / camera.width)), width) for camera in walk]
     names, listed = (meaning.names, semantic.labels.unique()) if "labels" in words else (None, None)
     with tqdm(total=len(walk), desc="render", unit="frame") as bar:
         save_animation(out, shows, walk, fps=FPS, names=names, listed=listed, progress=lambda *_: bar.update())
