@@ -20,7 +20,6 @@ from kfgs.viewer.state import Exploration
 
 DIM, WORDS = 16, 12
 NAMES = ("wall", "chair", "table", "office chair")
-MODES = ("decouple", "adc", "adc+sc", "fused")
 LINE = [[float(i), 0, 5] for i in range(4)]
 
 

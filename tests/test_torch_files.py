@@ -1,14 +1,12 @@
 """Files of torch.save by strangers: nothing in them runs, settings with unknown classes are read, other files are named."""
 
-import argparse
 import os
 import pickle
 import sys
 import zipfile
-from collections import OrderedDict, defaultdict
+from collections import OrderedDict
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from messages import tells
@@ -48,24 +46,6 @@ def test_an_attack_runs_nothing_and_imports_nothing(tmp_path, attack, container)
     assert not {
         name for name in set(sys.modules) - modules if name.partition(".")[0] not in ("torch", "numpy", "encodings")
     }
-
-
-class Callback:
-    """Stands for a class that Lightning's files name."""
-
-
-def test_the_settings_in_a_file_of_lightning_do_not_matter(tmp_path):
-    whole = {
-        "callbacks": {Callback: {"best_model_score": torch.tensor(0.5), "best_model_path": Path("a/b.ckpt")}},
-        "optimizer_states": [{"state": {0: {"step": np.float64(3), "exp_avg": torch.ones(4)}}}],
-        "hyper_parameters": argparse.Namespace(backbone="clip_vitl16_384", seen={1, (2, 3)}),
-        "more": defaultdict(list, a=[1]),
-        "state_dict": {"a": torch.ones(2)},
-    }
-    torch.save(whole, tmp_path / "a.ckpt")
-    found = read_torch(tmp_path / "a.ckpt", "weights")
-    assert found["state_dict"]["a"].tolist() == [1, 1]
-    assert found["more"] == {"a": [1]}
 
 
 KINDS = {

@@ -1,4 +1,4 @@
-"""Every CPU engine against float64 brute force, over a thousand random scenes with near-degenerate Gaussians.
+"""Every CPU engine against float64 brute force, over hundreds of random scenes with near-degenerate Gaussians.
 
 What is compared, with u the rounding unit of the engine's dtype:
 
@@ -31,7 +31,7 @@ MAPS = {torch.float32: 1e-5, torch.float64: 1e-10}
 GRADIENTS = {torch.float32: 1e-4, torch.float64: 1e-8}
 UNIT = {torch.float32: 2.0**-24, torch.float64: 2.0**-53}
 BLOCK = 50  # scenes in one test
-BLOCKS = {"numba": 20, "reference": 3}  # 1,000 scenes of the engine that people get; float64 takes a tenth
+BLOCKS = {"numba": 10, "reference": 2}  # 500 scenes of the engine that people get; float64 takes a tenth
 RESULTS = ("maps", "alphas", *oracle.Gradients._fields, "sums", "weights")
 CHANNELS = (1, 3, 9, 10, 11, 16, 27, 40)
 KINDS = ("ordinary", "needle", "huge", "tiny", "opaque", "faint", "outside")
