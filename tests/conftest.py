@@ -69,20 +69,36 @@ def pytest_unconfigure():
     gc.unfreeze()
 
 
-COMPILING = ("tests/splat/cpu/", "tests/splat/test_engine", "tests/splat/test_ops", "tests/splat/test_ranks")
+SHARING = {  # files whose tests share what takes long to make: one worker runs them, and they begin first
+    "kernels": ("tests/splat/cpu/", "tests/splat/test_engine", "tests/splat/test_ranks"),  # compiled once
+    "interpreted": ("tests/splat/test_triton",),
+    "stories": ("tests/stories/",),  # fields that are fitted once
+    "pipeline": ("tests/pipeline/",),
+}
+
+
+def scope_of(nodeid):
+    return next((scope for scope, files in SHARING.items() if nodeid.startswith(files)), None)
+
+
+def pytest_collection_modifyitems(items):
+    """What takes longest begins first, or one worker would be left with it in the end."""
+    order = [*SHARING, None]
+    items.sort(key=lambda item: order.index(scope_of(item.nodeid)))
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """With `--dist loadfile`, what compiles the most kernels is one worker's: two at a time would compile each twice."""
+    """With `--dist loadfile`, files that share much are one worker's: two would make it twice."""
     if config.getvalue("dist") != "loadfile":
         return None
     from xdist.scheduler import LoadFileScheduling
 
     class ByFile(LoadFileScheduling):
         def _split_scope(self, nodeid):
-            return "kernels" if nodeid.startswith(COMPILING) else super()._split_scope(nodeid)
+            return scope_of(nodeid) or super()._split_scope(nodeid)
 
+    config.option.loadscopereorder = False
     return ByFile(config, log)
 
 
