@@ -113,17 +113,13 @@ def test_missing_package_names_the_line_to_install_it(folder, monkeypatch):
     refused(lambda: load_transformers_teacher("clip", folder), "transformers:", "kfgs[hf]", error=ImportError)
 
 
-@pytest.mark.parametrize(
-    "error", ["RuntimeError('operator is\\nnot there')", "OSError('libcudart.so')", "ImportError('cycle')"]
-)
-def test_package_that_does_not_import_is_named(folder, tmp_path, monkeypatch, error):
+def test_package_that_does_not_import_is_named(folder, tmp_path, monkeypatch):
     (tmp_path / "site" / "transformers").mkdir(parents=True)
-    (tmp_path / "site" / "transformers" / "__init__.py").write_text(f"raise {error}\n")
+    (tmp_path / "site" / "transformers" / "__init__.py").write_text("raise RuntimeError('operator is\\nnot there')\n")
     for name in [name for name in sys.modules if name.partition(".")[0] == "transformers"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.syspath_prepend(str(tmp_path / "site"))
-    kind = error.partition("(")[0]
-    with pytest.raises(ImportError, match=tells("transformers:", "import", f"({kind}: ", "--upgrade")) as got:
+    with pytest.raises(ImportError, match=tells("transformers:", "import", "(RuntimeError: ", "--upgrade")) as got:
         load_transformers_teacher("clip", folder)
     assert one_line(got)
 
