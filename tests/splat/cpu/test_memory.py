@@ -59,19 +59,6 @@ def test_memory_is_handed_out_again_once_it_is_free():
     assert len(numba_memory._kept.buffers) == 2
 
 
-class _Saves(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, x):
-        mine = take_memory(x, SIZE).fill_(2)
-        ctx.save_for_backward(mine)
-        return x * 2
-
-    @staticmethod
-    def backward(ctx, grad):
-        (mine,) = ctx.saved_tensors
-        return grad * mine[0]
-
-
 HOLDERS = {
     "itself": lambda t: t,
     "a view": lambda t: t.view(50, 100)[3:5],
@@ -103,17 +90,6 @@ def test_memory_in_use_is_not_handed_out(held):
     del holder
     gc.collect(1)  # what the test made is young
     assert take_memory(LIKE, SIZE).data_ptr() == place
-
-
-def test_memory_saved_for_backward_is_not_handed_out():
-    x = torch.ones(3, requires_grad=True)
-    y = _Saves.apply(x)
-    for _ in range(3):
-        take_memory(LIKE, SIZE).fill_(7)
-    (grad,) = torch.autograd.grad(y.sum(), x)
-    assert grad.tolist() == [2, 2, 2]
-    del y  # the graph held the one, and the loop filled another again and again
-    assert len({take_memory(LIKE, SIZE).data_ptr() for _ in range(9)}) == 2
 
 
 def test_no_more_is_kept_than_allowed(monkeypatch):
@@ -155,17 +131,6 @@ def test_each_thread_has_its_own():
     assert found[1] == 1
     assert take_memory(LIKE, SIZE).data_ptr() == place
     assert len(numba_memory._kept.buffers) == 1
-
-
-def test_memory_outlives_the_thread_that_took_it():
-    found = []
-    thread = threading.Thread(target=lambda: found.append(take_memory(LIKE, SIZE).fill_(5)))
-    thread.start()
-    thread.join()
-    gc.collect(1)  # what the test made is young
-    others = [take_memory(LIKE, SIZE).fill_(7) for _ in range(3)]
-    assert (found[0] == 5).all()
-    assert found[0].data_ptr() not in [other.data_ptr() for other in others]
 
 
 def _frame(seed, channels=3, grad=False):
