@@ -120,7 +120,7 @@ class Amount:
     def of(self, options: Any) -> Any:
         """The options of a training with these numbers."""
         training = options.training if self.steps is None else options.training.with_steps(self.steps)
-        return replace(options, training=training.with_maximum(self.max_gaussians or None))
+        return replace(options, training=training.with_maximum(self.max_gaussians))
 
 
 def fit(

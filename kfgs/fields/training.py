@@ -139,10 +139,10 @@ class Training:
         return replace(stretched(self, "half_until", "sh_degree_every"), steps=steps, densify=densify)
 
     def with_maximum(self, count: int | None) -> Training:
-        """The same with at most `count` Gaussians; None changes nothing."""
+        """The same with at most `count` Gaussians; 0 is no limit, None changes nothing."""
         if count is None or self.densify is None:
             return self
-        return replace(self, densify=replace(self.densify, maximum=count))
+        return replace(self, densify=replace(self.densify, maximum=count or None))
 
 
 def check_extent(extent: float) -> float:

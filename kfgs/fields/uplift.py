@@ -251,7 +251,8 @@ def fuse_views(field: SemanticField, cameras: Sequence[Camera]) -> SemanticField
 def join_fields(fields: Sequence[SemanticField]) -> SemanticField:
     """Fused fields with the same linear latents (`sample_latents`) as one; views that several fields have are kept once."""
     first, bases = fields[0], [part.decoder.to_tensors()["linear.basis"] for part in fields]
-    assert all(torch.equal(basis, bases[0]) for basis in bases), "fields with the latents of others"
+    if not all(torch.equal(basis, bases[0]) for basis in bases):
+        raise ValueError("fields: expected some with the same latents, got others; fit with one `sample_latents`")
     cameras = {camera.name: camera for part in fields for camera in part.cameras}
     views = list(dict.fromkeys(name for part in fields for name in part.info.get("views", ())))
     return replace(

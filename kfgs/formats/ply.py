@@ -179,7 +179,7 @@ def _read_rows(file: BinaryIO, element: _Element, order: str) -> Columns:
     table = np.zeros((0, len(names)))
     if element.rows:
         lines = (NAN.sub("nan", line) if "#" in line or "(" in line else line for line in map(bytes.decode, file))
-        table = np.loadtxt(lines, dtype=np.float64, comments=None, max_rows=element.rows, ndmin=2)
+        table = np.loadtxt(lines, dtype=np.float64, max_rows=element.rows, ndmin=2)
     if table.shape != (element.rows, len(names)):
         raise ValueError(f"expected {element.rows} rows of {len(names)} numbers, got {list(table.shape)}")
     return {prop.name: table[:, i].astype(prop.code) for i, prop in enumerate(element.properties)}

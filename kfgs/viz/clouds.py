@@ -16,7 +16,6 @@ from torch import Tensor
 
 from .._check import as_array, check_choice, check_range
 from .._origin import to_world
-from ..cameras.bounds import robust_bounds
 from ..cameras.camera import NEAR
 from ..gaussians import Gaussians
 from .colors import Array, CloudColors, ColorBy, FeatureColors, cloud_colors, seen_from
@@ -30,7 +29,7 @@ Style = Literal["points", "gaussians", "ellipsoids"]
 FAINT = 0.5  # Gaussians up to this opacity get no ellipsoid: its surface would hide what is behind
 FACES = ((5_000, 2), (20_000, 1))  # up to 5,000 ellipsoids have 320 faces each, up to 20,000 have 80; more have 20
 MOST = 100_000  # ellipsoids, with 2 million faces: 1.2 s a frame in software
-MARGIN = 0.05  # room around the box that a first view shows, of its size
+OUTER, MARGIN = 0.01, 0.05  # share of the points beyond each side of the box that a first view shows; room around it
 
 
 def add_cloud(
@@ -137,9 +136,11 @@ def recolor_cloud(
 
 def middle_box(points: Array) -> Array:  # [N, 3] -> [6]: x from, x to, y from, ...
     """The box around the middle 98 % of the points in each axis, with a margin; never larger than the box around all."""
-    box = robust_bounds(torch.from_numpy(points.astype(np.float64)), margin=MARGIN)
-    low, high = np.maximum(box.low.numpy(), points.min(0)), np.minimum(box.high.numpy(), points.max(0))
-    return np.stack([low, high], axis=1).reshape(-1)
+    last, cut = len(points) - 1, int(OUTER * len(points))
+    ends = [0, cut, last - cut, last]  # a partition takes a fraction of the time of a sort; NaN comes last
+    least, low, high, most = np.partition(points.T.astype(np.float64), ends).T[ends]
+    margin = MARGIN * (high - low)
+    return np.stack([np.maximum(low - margin, least), np.minimum(high + margin, most)], axis=1).reshape(-1)
 
 
 def _frame_middle(renderer: Any) -> None:

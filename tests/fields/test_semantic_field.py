@@ -11,6 +11,7 @@ from messages import tells
 
 from kfgs import Camera, Gaussians
 from kfgs.fields import Autoencoded, Codewords, Identity, Linear, SemanticField, fuse_views
+from kfgs.fields.uplift import join_fields
 from kfgs.metrics import MIB
 from kfgs.quant import Autoencoder, Codebook, LinearLatents
 
@@ -285,3 +286,10 @@ def test_another_dtype_gives_the_same_answers(mode):
         assert b.classify(embeddings()).labels.equal(a.classify(embeddings()).labels)
         assert b.segment(camera.to(torch.float64), embeddings()).equal(a.segment(camera, embeddings()))
     assert other.to(torch.float32).features.equal(one.features)
+
+
+def test_fields_with_other_latents_are_not_joined():
+    cloud = gaussians_before(a_camera(8, 8), 2, seed=0).replace(features=torch.ones(2, 3), sh=None)
+    fields = [SemanticField(cloud, Linear(basis)) for basis in (torch.eye(3), torch.eye(3).flip(0))]
+    with pytest.raises(ValueError, match=tells("fields:", "same latents", "sample_latents")):
+        join_fields(fields)

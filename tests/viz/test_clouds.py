@@ -10,7 +10,7 @@ from messages import refused, tells
 from kfgs.cameras.camera import Distortion
 from kfgs.splat.covariance import covariance_3d
 from kfgs.viz import FeatureColors, add_cloud, look_through, palette, show_cloud, to_pyvista
-from kfgs.viz.clouds import recolor_cloud
+from kfgs.viz.clouds import middle_box, recolor_cloud
 
 C0 = 0.28209479177387814
 
@@ -146,6 +146,16 @@ def with_floaters(count=3):
     means, opacities = gaussians.means.clone(), gaussians.opacities.clone()
     means[:count], opacities[:count] = torch.tensor([-1000.0, -400, -700]), 0.9
     return gaussians.replace(means=means, opacities=opacities)
+
+
+def test_the_middle_box_leaves_one_in_a_hundred_out_on_each_side():
+    points = np.random.default_rng(0).permuted(np.tile(np.arange(200.0), (3, 1)), axis=1).T
+    points[points == 199] = 1e6
+    np.testing.assert_allclose(
+        middle_box(points.astype(np.float32)), [0, 197 + 0.05 * 195] * 3
+    )  # 2 to 197, but no less than 0
+    points[points == 1e6] = np.nan
+    assert middle_box(points)[::2].tolist() == [0, 0, 0]
 
 
 @pytest.mark.parametrize("style", STYLES)
