@@ -167,6 +167,14 @@ def test_help_is_there_without_docstrings(flags, capsys):
     assert "Find the Gaussians of a class or phrase" in shown
 
 
+def test_a_folder_called_kfgs_does_not_hide_the_command(tmp_path):
+    (tmp_path / "kfgs").mkdir()
+    (tmp_path / "kfgs" / "__init__.py").touch()
+    words = [sys.executable, "-P", "-c", "import sys, kfgs.__main__ as m; sys.exit(m.run())", "--version"]
+    env = {**os.environ, "PYTHONOPTIMIZE": "2"}
+    assert subprocess.run(words, env=env, cwd=tmp_path, capture_output=True, check=True).stdout.startswith(b"kfgs ")
+
+
 @pytest.mark.parametrize("words", [["", "a.ply"], ["chair", ""]])
 def test_an_empty_text_is_told_what_to_write(words, capsys):
     assert cli.main(["select", *words]) == 1

@@ -56,7 +56,7 @@ STYLE = (
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; return the exit code."""
     if arguments is None and sys.flags.optimize > 1:  # -OO: without docstrings, which help shows; -O keeps them
-        os.environ["PYTHONOPTIMIZE"] = "1"
+        os.environ |= {"PYTHONOPTIMIZE": "1", "PYTHONSAFEPATH": "" if sys.path[0] == os.getcwd() else "1"}  # no -m
         os.execv(sys.executable, [sys.executable, "-m", "kfgs", *sys.argv[1:]])
     # Read when torch is first imported: waiting threads sleep instead of spinning. With other busy programs this makes 25
     # training steps a second instead of one (measured on two cores).
