@@ -81,7 +81,7 @@ def main(arguments: list[str] | None = None) -> int:
         if command is None:
             _answer(name)
         elif any(word == "" or re.fullmatch("--[^=]+=", word) for word in given):
-            raise ValueError("argument: expected a text, got an empty one; write one (. is this folder), or none")
+            raise ValueError("argument: expected a text, got an empty one; leave it out, or write . for this folder")
         else:
             with interruptible(), notes_as_lines(lambda note: in_options(note, names), strict=STRICT in words):
                 about = _description(command)
