@@ -173,9 +173,3 @@ def test_a_folder_called_kfgs_does_not_hide_the_command(tmp_path):
     words = [sys.executable, "-P", "-c", "import sys, kfgs.__main__ as m; sys.exit(m.run())", "--version"]
     env = {**os.environ, "PYTHONOPTIMIZE": "2"}
     assert subprocess.run(words, env=env, cwd=tmp_path, capture_output=True, check=True).stdout.startswith(b"kfgs ")
-
-
-@pytest.mark.parametrize("words", [["", "a.ply"], ["chair", ""]])
-def test_an_empty_text_is_told_what_to_write(words, capsys):
-    assert cli.main(["select", *words]) == 1
-    assert "write one (. is this folder), or none" in capsys.readouterr().err
