@@ -15,7 +15,7 @@ from kfgs import read_splats
 from kfgs.gaussians import Gaussians
 from kfgs.labels import EditList, InBox, OfClass, Recolor, Remove, connected_parts
 from kfgs.scenes import Scene, load_scene
-from kfgs.viz.compare import render_color
+from kfgs.splat.rasterize import render_color
 from kfgs.viz.pictures import picture_grid
 
 AROUND_CHAIR = 0.05  # metres around a chair's box: a cushion leans over its edge

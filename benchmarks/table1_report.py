@@ -17,7 +17,7 @@ from kfgs.labels import load_label_set
 from kfgs.metrics import MIB
 from kfgs.scenes import load_scene
 from kfgs.viz import overlay_labels
-from kfgs.viz.pictures import legend_strip, picture_sheet, save_picture
+from kfgs.viz.pictures import draw_legend, picture_sheet, save_picture
 from kfgs.viz.plots import INK, LINES, finish, new_figure
 
 COLUMNS = 5  # of the picture of labels
@@ -151,7 +151,7 @@ def draw_labels(out: Path, folder: Path, truth: str, results: list[dict[str, Any
     titles = [f"photo {stem}", *maps]
     sheet = picture_sheet(pictures, titles, COLUMNS, width=320)
     present = np.concatenate([labels.numpy().ravel() for labels in maps.values()])
-    save_picture(out / "labels.png", np.concatenate([sheet, legend_strip(present, names, sheet.shape[1])]))
+    save_picture(out / "labels.png", np.concatenate([sheet, draw_legend(present, names, width=sheet.shape[1])]))
 
 
 def plot_quality_storage(

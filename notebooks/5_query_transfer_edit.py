@@ -120,28 +120,15 @@ plotter.close()
 Image.fromarray(picture)
 
 # %% [markdown]
-# Who gave a label to whom? From above and without walls, with the colour cloud moved aside: each line joins a colour Gaussian
-# to the semantic one that gave it its class, in the colour of the class. 300 of the lines are drawn.
+# Who gave a label to whom? `show_transfer` lifts the colour cloud over the semantic one, without walls and ceiling. Each line
+# joins a colour Gaussian to the semantic one that gave it its class, in the colour of the class. Red has no label, and yellow
+# is disputed: another class is nearly as near. In a window, a slider moves $\lambda$, and the key P names a Gaussian.
 
 # %%
-kept = torch.isin(carried.labels, hidden, invert=True)
-above = Orbit(frames=1, size=(420, 960), elevation_degrees=40, start_degrees=30, zoom=1.6)
-right = orbit_cameras(inside.means, above, up=up)[0].viewmat[0, :3].to(inside.means)  # in this picture
-across = inside.means @ right
-aside = (1.1 * (across.max() - across.min()) * right).tolist()
-apart = colors.replace(means=colors.means + torch.tensor(aside).to(colors.means)).select(kept)
-only = replace(carried, labels=torch.where(kept, carried.labels, -1))
-
-
-def draw_transfer(plotter):
-    viz.add_cloud(plotter, inside, style="gaussians")
-    viz.add_cloud(plotter, apart, color_by="rgb", style="gaussians")
-    viz.add_transfer(plotter, semantic, colors, only, shift=aside, sample=300)
-    viz.add_legend(plotter, inside.labels, classes.names)
-
-
-both = torch.cat([inside.means, apart.means])
-Image.fromarray(viz.draw_view(orbit_cameras(both, above, up=up)[0], draw_transfer))
+plotter = viz.show_transfer(field, colors, off_screen=True)
+picture = plotter.screenshot(return_img=True)
+plotter.close()
+Image.fromarray(picture)
 
 # %% [markdown]
 # If $\lambda$ is too small, Gaussians stay without a label (grey). The last picture shows another way, `attach(by="views")`:

@@ -45,6 +45,16 @@ semantic = field.label(classes)
 print(f"{len(semantic):,} semantic Gaussians, {len(color):,} of colour")
 
 # %% [markdown]
+# ## Two clouds and their labels, in one line
+#
+# Below are the classes, above the colours, and lines show who gave a label to whom (notebook 5). It is a pyvista plotter:
+# `.show()` in a cell turns it, and the slider moves $\lambda$ (`pip install "pyvista[jupyter]"` makes it live in Jupyter).
+
+# %%
+both = viz.show_transfer(field, color, off_screen=True)
+Image.fromarray(both.screenshot(return_img=True))  # or: viz.show_transfer(field, color).show()
+
+# %% [markdown]
 # ## A plotter, a cloud, a picture
 #
 # `make_plotter` is `pv.Plotter`, made safe for machines without a display. `look_through` puts the view where one of the

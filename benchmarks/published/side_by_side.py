@@ -18,7 +18,7 @@ from kfgs.evaluation.texts import Encode, encode_unit
 from kfgs.pipeline.evaluate import Question
 from kfgs.splat import rasterize
 from kfgs.viz import overlay_labels
-from kfgs.viz.pictures import legend_strip, picture_grid, resize_photo, save_picture
+from kfgs.viz.pictures import draw_legend, picture_grid, resize_photo, save_picture
 
 from .mask_truth import MaskTruth
 
@@ -81,7 +81,7 @@ def write_pictures(
             picture_grid(above, [f"photo {view.stem}", "truth", *answers], width=WIDTH),
             picture_grid(below, ["", "", *wrong], width=WIDTH),
         ]
-        sheets += [legend_strip(labels, names, sheets[0].shape[1])] if names else []
+        sheets += [draw_legend(labels, names, width=sheets[0].shape[1])] if names else []
         written.append(folder / f"{view.stem}.png")
         save_picture(written[-1], np.concatenate(sheets))
     return written

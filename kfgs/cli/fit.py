@@ -210,7 +210,7 @@ def color(
         preset: quick (a minute, for small scenes), cpu (minutes on two cores) or paper (30,000 steps, full size, degree 3:
             for a GPU).
     """
-    from ..viz.compare import draw_photos
+    from ..pipeline.run_report import draw_photos
     from ..viz.linked import evenly
 
     presets = {"quick": kfgs.ColorConfig.quick, "cpu": kfgs.ColorConfig.cpu, "paper": kfgs.ColorConfig}

@@ -12,7 +12,7 @@ from torch import Tensor
 from ..gaussians import Gaussians
 from ..metrics import Score, psnr, ssim
 from ..scenes import Scene
-from ..splat import rasterize
+from ..splat.rasterize import render_color
 from .report import plain
 
 COLOR_PROTOCOL = (
@@ -79,11 +79,10 @@ def score_views(
         raise ValueError(
             "gaussians: expected colours sh [N, K, 3], got None; pass a colour field, as fit_color makes it"
         )
-    colors = gaussians.replace(features=None)
     scores = []
     for i in scene.views(split):
-        taken, known = scene.image(i).to(colors.means), scene.mask(i).to(colors.means.device)
-        rendered = rasterize(colors, scene.cameras[i]).map.clamp(0, 1)
+        taken, known = scene.image(i).to(gaussians.means), scene.mask(i).to(gaussians.means.device)
+        rendered = render_color(gaussians, scene.cameras[i])
         if show is not None:
             show(scene.stem(i), rendered, taken)
         if not bool(known.any()):  # masked as a whole

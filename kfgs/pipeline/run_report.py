@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -12,7 +13,9 @@ import torch
 from .._files import as_path, atomic_path, read_json
 from ..fields import SemanticField
 from ..fields.store import NAME
+from ..gaussians import Gaussians
 from ..scenes import Scene
+from ..splat.rasterize import render_color
 from ..viz import FeatureColors, overlay_labels, plot_history
 from ..viz.pictures import as_bytes, picture_grid, resize_photo, save_picture
 from .methods import Paper, Uplift
@@ -44,6 +47,15 @@ def write_preview(path: Path, field: SemanticField, scene: Scene, split: str) ->
         titles = ("photograph", "features as colours", "labels")[: len(rows[0])]
         save_picture(path, picture_grid(rows, titles, width=WIDTH))
     return bool(rows)
+
+
+def draw_photos(gaussians: Gaussians, scene: Scene, views: Sequence[int], folder: Path) -> list[Path]:
+    """Draw views of a colour field next to their photographs, into `folder/<stem>.png`; the files."""
+    written = [folder / f"{scene.stem(i)}.png" for i in views]
+    for i, path in zip(views, written, strict=True):
+        pair = [scene.image(i), render_color(gaussians, scene.cameras[i])]
+        save_picture(path, picture_grid([pair], ("photograph", "colour field")))
+    return written
 
 
 def write_run_report(

@@ -29,7 +29,7 @@ from ..scenes.files import is_inside
 from ..viz import FeatureColors, overlay_labels, palette
 from ..viz.linked import evenly
 from ..viz.palette import UNLABELLED
-from ..viz.pictures import Array, legend_strip, picture_grid, save_picture
+from ..viz.pictures import Array, draw_legend, picture_grid, save_picture
 
 WIDTH = 480  # pixels of a picture in a sheet
 
@@ -81,7 +81,7 @@ def segment_scene(
             panels["features as colours"] = colors(field.render(scene.cameras[views[k]]).map)
         sheet = picture_grid([list(panels.values())], list(panels), width=WIDTH)
         present = torch.cat([value.unique() for value in drawn.values()])
-        legend = legend_strip(present, classes.names, sheet.shape[1])
+        legend = draw_legend(present, classes.names, width=sheet.shape[1])
         save_picture(as_path(out) / "sheets" / f"{stem}.png", np.concatenate([sheet, legend]))
     return labels
 

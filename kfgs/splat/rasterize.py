@@ -208,3 +208,9 @@ def _seen(gaussians: Gaussians, camera: Camera, projected: Projected, engine: st
     compiled = None if center.requires_grad else choose_projecting(engine, gaussians.sh, gaussians.means)
     tensors = gaussians.sh.contiguous(), gaussians.means.contiguous(), center.contiguous(), projected.index
     return (compiled or Engine()).shade(*tensors), None
+
+
+def render_color(gaussians: Gaussians, camera: Camera) -> Tensor:  # [H, W, 3] in [0, 1]
+    """Draw a colour field on black, without gradients."""
+    with torch.no_grad():
+        return rasterize(gaussians.replace(features=None), camera).map.clamp(0, 1)

@@ -19,8 +19,8 @@ from .._origin import to_world
 from ..cameras import Camera
 from ..cameras.camera import NEAR
 from ..viz.clouds import add_cloud, recolor_cloud
-from ..viz.colors import Array
-from ..viz.legends import add_legend, add_scalar_bar, add_title, letters
+from ..viz.colors import COLORMAP, Array
+from ..viz.legends import add_legend, add_title, letters
 from ..viz.linked import look_over, upwards
 from ..viz.pictures import save_picture
 from ..viz.plotter import camera_of, has_display, look_through, make_plotter
@@ -125,7 +125,7 @@ class Explorer:
         """Look through a posed camera: its whole picture, at its aspect ratio; None: at everything but floaters."""
         self.plotter.subplot(0, 0)
         if camera is None:
-            look_over(self.plotter, self.state.cloud("semantic"), upwards(self.state.cameras))
+            look_over(self.plotter, upwards(self.state.cameras))
             return
         width, height = self.plotter.window_size
         width //= len(self.state.sides)
@@ -204,7 +204,13 @@ class Explorer:
             if state.show == "labels" and column == 0:
                 self._notes.append(add_legend(plotter, state.labels(side), state.meaning.names))
             if state.show == "score" and column == len(state.sides) - 1:
-                add_scalar_bar(plotter, state.clim)
+                scale = self._actors[column].mapper  # whose colours are given: its own table would not be used
+                scale.lookup_table.apply_cmap(COLORMAP)
+                scale.scalar_range = state.clim
+                plotter.add_scalar_bar(
+                    "score", mapper=scale, vertical=True, n_labels=5, fmt="%.3g", color=letters(plotter), title_font_size=14,
+                    label_font_size=14, position_x=0.88, position_y=0.05, width=0.08, height=0.5, render=False,
+                )  # fmt: skip
             if self._picked is not None and self._picked.side == side:
                 place = as_array(state.cloud(side).means[self._picked.index])[None]
                 options = {"always_visible": True, "point_size": 10, "point_color": "red", "reset_camera": False}

@@ -8,11 +8,12 @@ from .examples import draw_examples
 from .films import save_animation, show_cloud
 from .frusta import add_cameras
 from .legends import add_legend
-from .linked import add_transfer, linked_clouds
+from .linked import linked_clouds
 from .palette import palette
 from .pictures import overlay_labels, picture_grid
 from .plots import plot_history, plot_iou, plot_scores
 from .plotter import draw_view, look_through, make_plotter
+from .transfer import show_transfer
 
 __all__ = [
     "FeatureColors",
@@ -20,7 +21,6 @@ __all__ = [
     "add_cameras",
     "add_cloud",
     "add_legend",
-    "add_transfer",
     "draw_examples",
     "draw_view",
     "linked_clouds",
@@ -34,6 +34,7 @@ __all__ = [
     "plot_scores",
     "save_animation",
     "show_cloud",
+    "show_transfer",
     "to_pyvista",
     "views_of_change",
 ]

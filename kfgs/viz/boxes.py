@@ -10,7 +10,6 @@ import torch
 
 from .._origin import choose_origin
 from ..labels import OrientedBox
-from .colors import Array
 from .legends import letters
 from .palette import palette
 from .plotter import draw_mesh, origin_of
@@ -62,18 +61,13 @@ def add_boxes(
     mesh.cell_data["label"] = classes[mesh.cell_data["box"]]
     mesh.cell_data["rgb"] = palette(classes)[mesh.cell_data["box"]]
     if names:
-        _write_names(plotter, places, names, np.asarray(up, dtype=np.float64))
+        axis = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+        centers, heights = places.mean(axis=1), places @ axis
+        tops = centers + np.outer(heights.max(axis=1) - heights.mean(axis=1), axis)
+        actor = plotter.add_point_labels(
+            tops, list(names), shape="rounded_rect", shape_color=plotter.renderer.background_color, shape_opacity=0.6,
+            margin=2, show_points=False, always_visible=True, font_size=LETTERS, text_color=letters(plotter), bold=True,
+            pickable=False, reset_camera=False,
+        )  # fmt: skip
+        actor.GetMapper().SetPlaceAllLabels(True)  # otherwise VTK leaves out names that overlap
     return draw_mesh(plotter, mesh, scalars="rgb", rgb=True, line_width=line_width, lighting=False)
-
-
-def _write_names(plotter: pv.Plotter, corners: Array, names: Sequence[str], up: Array) -> None:
-    """Write a name over each box. All names are drawn, even if they overlap."""
-    height = (corners @ up).max(axis=1) / (up @ up)
-    centers = corners.mean(axis=1)
-    tops = centers + np.outer(height - centers @ up / (up @ up), up)
-    actor = plotter.add_point_labels(
-        tops, list(names), shape="rounded_rect", shape_color=plotter.renderer.background_color, shape_opacity=0.6, margin=2,
-        show_points=False, always_visible=True, font_size=LETTERS, text_color=letters(plotter), bold=True, pickable=False,
-        reset_camera=False,
-    )  # fmt: skip
-    actor.GetMapper().SetPlaceAllLabels(True)  # otherwise VTK leaves out names that overlap

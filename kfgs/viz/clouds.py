@@ -6,7 +6,6 @@ arrays on the actor's mesh (`actor.mapper.dataset["label"]`). pyvista is importe
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
@@ -18,7 +17,7 @@ from .._check import as_array, check_choice, check_range
 from .._origin import to_world
 from ..cameras.camera import NEAR
 from ..gaussians import Gaussians
-from .colors import Array, CloudColors, ColorBy, FeatureColors, cloud_colors, seen_from
+from .colors import Array, CloudColors, ColorBy, FeatureColors, cloud_colors
 from .gaussian_actor import as_gaussians
 from .plotter import draw_mesh, placed
 
@@ -78,13 +77,15 @@ def add_cloud(
         raise ValueError("gaussians: expected at least one Gaussian to draw, got none; widen the selection")
     by_view = isinstance(color_by, str) and color_by == "view"
     if by_view and style != "gaussians":
-        raise ValueError(
-            f"color_by: expected 'rgb' for style {style!r}, got 'view'; only 'gaussians' follow the camera"
-        )
+        raise ValueError(f"color_by: expected 'rgb' for {style!r}, got 'view'; only 'gaussians' follow the camera")
     colors = cloud_colors(gaussians, color_by, feature_colors, clim)
     mesh = _ellipsoids(gaussians) if style == "ellipsoids" else _points(gaussians)
     _fill(mesh, gaussians, colors)
-    mesh.field_data["box"] = middle_box(np.asarray(mesh.points))
+    last, cut = mesh.n_points - 1, int(OUTER * mesh.n_points)
+    ends = [0, cut, last - cut, last]  # a partition takes a fraction of the time of a sort; NaN comes last
+    least, low, high, most = np.partition(np.asarray(mesh.points, np.float64).T, ends).T[ends]
+    box = np.maximum(low - MARGIN * (high - low), least), np.minimum(high + MARGIN * (high - low), most)
+    mesh.field_data["box"] = np.stack(box, axis=1).reshape(-1)  # x from, x to, y from, ...
     _frame_middle(plotter.renderer)
     shared: dict[str, Any] = {"scalars": "rgb", "rgb": True}
     if style == "points":
@@ -94,16 +95,11 @@ def add_cloud(
         actor.prop.interpolation = "Phong"
         return actor
     _add_shapes(mesh, gaussians)
-    follow = partial(seen_from, gaussians) if by_view else None
-    return as_gaussians(plotter, mesh, near=near, antialiased=gaussians.antialiased, colors_from=follow)
+    followed = gaussians.detach() if by_view else None
+    return as_gaussians(plotter, mesh, near=near, antialiased=gaussians.antialiased, followed=followed)
 
 
-def to_pyvista(
-    gaussians: Gaussians,
-    color_by: ColorBy | Tensor | Array | None = None,
-    *,
-    feature_colors: FeatureColors | None = None,
-) -> pv.PolyData:
+def to_pyvista(gaussians: Gaussians, color_by: ColorBy | Tensor | Array | None = None) -> pv.PolyData:
     """Convert a cloud to a pyvista point cloud: one point per Gaussian, values as named arrays.
 
     Points are in the world: in float64 if the cloud has an origin. The arrays are `index`, `rgb` (uint8), `opacity`,
@@ -111,7 +107,7 @@ def to_pyvista(
     `to_pyvista(cloud).plot(scalars="rgb", rgb=True)` shows it. Arguments as in `add_cloud`.
     For trimesh: `trimesh.PointCloud(points.points, colors=points["rgb"])`.
     """
-    colors = cloud_colors(gaussians, color_by, feature_colors)
+    colors = cloud_colors(gaussians, color_by)
     mesh = _points(gaussians)
     if any(gaussians.origin):
         mesh.points = as_array(to_world(gaussians.means, gaussians.origin))
@@ -134,31 +130,20 @@ def recolor_cloud(
     mesh.point_data["rgb"] = colors[index]
 
 
-def middle_box(points: Array) -> Array:  # [N, 3] -> [6]: x from, x to, y from, ...
-    """The box around the middle 98 % of the points in each axis, with a margin; never larger than the box around all."""
-    last, cut = len(points) - 1, int(OUTER * len(points))
-    ends = [0, cut, last - cut, last]  # a partition takes a fraction of the time of a sort; NaN comes last
-    least, low, high, most = np.partition(points.T.astype(np.float64), ends).T[ends]
-    margin = MARGIN * (high - low)
-    return np.stack([np.maximum(low - margin, least), np.minimum(high + margin, most)], axis=1).reshape(-1)
-
-
 def _frame_middle(renderer: Any) -> None:
     """When a view is reset to show everything, show the middle boxes of clouds (field data `box`) instead of their bounds.
 
     VTK calls the observer only then, not when a caller gives a box. Clipping planes keep everything.
     """
 
-    def box_of(actor: Any) -> Array | None:  # None for an actor that has no place in the world
-        mesh = getattr(getattr(actor, "mapper", None), "dataset", None)
-        if mesh is not None and "box" in mesh.field_data and actor.GetMatrix().IsIdentity():
-            return np.asarray(mesh.field_data["box"])
-        bounds = actor.GetBounds()
-        return None if bounds is None or bounds[0] > bounds[1] else np.asarray(bounds)
-
     def reset(*_: Any) -> None:
-        shown = [actor for actor in renderer.actors.values() if actor.GetVisibility() and actor.GetUseBounds()]
-        boxes = [box for box in map(box_of, shown) if box is not None]
+        boxes = []
+        for actor in renderer.actors.values():
+            mesh: Any = getattr(getattr(actor, "mapper", None), "dataset", None)
+            bounds = actor.GetBounds()
+            if actor.GetVisibility() and actor.GetUseBounds() and bounds is not None and bounds[0] <= bounds[1]:
+                has_box = mesh is not None and "box" in mesh.field_data and actor.GetMatrix().IsIdentity()
+                boxes.append(mesh.field_data["box"] if has_box else bounds)
         if boxes:
             sides = np.array(boxes).reshape(-1, 3, 2)
             renderer.ResetCamera(*np.stack([sides[..., 0].min(axis=0), sides[..., 1].max(axis=0)], axis=1).reshape(-1))

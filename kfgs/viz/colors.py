@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -12,11 +12,10 @@ from torch import Tensor
 from .._card import short_repr
 from .._check import as_array, as_tensor, check_choice, check_range, check_shapes
 from ..gaussians import Gaussians, check_gaussians
-from ..splat.sh import evaluate_sh, sh0_to_rgb
+from ..splat.sh import sh0_to_rgb
 from .palette import UNLABELLED, palette
-from .pictures import as_bytes
+from .pictures import Array, as_bytes
 
-Array = np.ndarray[Any, Any]
 CloudColor = Literal["label", "rgb", "feature", "opacity"]
 ColorBy = CloudColor | Literal["view"]
 COLORMAP = "cividis"  # brightness rises evenly; looks the same to colour-blind eyes
@@ -88,9 +87,6 @@ class CloudColors(NamedTuple):
     values: Array | None  # [N] the values shown, if each Gaussian has one
     clim: tuple[float, float] | None  # the values of the darkest and the brightest colour; None: not a scale
 
-    def __repr__(self) -> str:
-        return short_repr(self)
-
 
 def cloud_colors(
     gaussians: Gaussians,
@@ -104,7 +100,19 @@ def cloud_colors(
         color_by = color_by_default(gaussians)
     if isinstance(color_by, str):
         check_choice("color_by", color_by, ("view", *get_args(CloudColor)))
-        return _named(gaussians, color_by, feature_colors, clim)
+        source = {"label": "labels", "rgb": "sh", "view": "sh", "feature": "features", "opacity": "opacities"}[color_by]
+        values = getattr(gaussians, source)
+        if values is None:
+            raise ValueError(
+                f"gaussians.{source}: expected them, to colour by {color_by}, got None; choose another color_by"
+            )
+        if color_by == "label":
+            return CloudColors(palette(values, names_of(gaussians)), "label", as_array(values).astype(np.int64), None)
+        if color_by in ("rgb", "view"):
+            return CloudColors(as_bytes(sh0_to_rgb(values[:, 0].detach())), "rgb", None, None)
+        if color_by == "feature":
+            return CloudColors((feature_colors or FeatureColors.fit(values))(values), "feature", None, None)
+        return _scale("opacity", as_array(values), clim or (0.0, 1.0))
     values = as_array(color_by, "color_by")
     if values.ndim == 2:
         check_shapes(("gaussians", gaussians.opacities, "N"), ("color_by", values, "N 3"))
@@ -113,9 +121,7 @@ def cloud_colors(
     if np.issubdtype(values.dtype, np.floating):
         return _scale("score", values, clim)
     if not np.issubdtype(values.dtype, np.integer):
-        raise TypeError(
-            f"color_by: expected labels (integers) or scores (floats), got {values.dtype}; convert it first"
-        )
+        raise TypeError(f"color_by: expected labels (integers) or scores (floats), got {values.dtype}; convert it")
     return CloudColors(palette(values), "label", values.astype(np.int64), None)
 
 
@@ -133,32 +139,6 @@ def names_of(gaussians: Gaussians) -> tuple[str, ...] | None:
     labels = gaussians.labels
     highest = -1 if labels is None or len(labels) == 0 else int(labels.max())
     return gaussians.names if len(gaussians.names) > highest else None
-
-
-def seen_from(gaussians: Gaussians, center: Array) -> Array:  # center: [3] -> [N, 3] uint8
-    """The colours of `sh` as a camera at `center` sees them."""
-    assert gaussians.sh is not None
-    place = torch.as_tensor(center, dtype=gaussians.means.dtype, device=gaussians.means.device)
-    with torch.no_grad():
-        return as_bytes(evaluate_sh(gaussians.sh, gaussians.means - place))
-
-
-def _named(
-    gaussians: Gaussians, color_by: ColorBy, feature_colors: FeatureColors | None, clim: tuple[float, float] | None
-) -> CloudColors:
-    source = {"label": "labels", "rgb": "sh", "view": "sh", "feature": "features", "opacity": "opacities"}[color_by]
-    values = getattr(gaussians, source)
-    if values is None:
-        raise ValueError(
-            f"gaussians.{source}: expected them, to colour by {color_by}, got None; choose another color_by"
-        )
-    if color_by == "label":
-        return CloudColors(palette(values, names_of(gaussians)), "label", as_array(values).astype(np.int64), None)
-    if color_by in ("rgb", "view"):
-        return CloudColors(as_bytes(sh0_to_rgb(values[:, 0].detach())), "rgb", None, None)
-    if color_by == "feature":
-        return CloudColors((feature_colors or FeatureColors.fit(values))(values), "feature", None, None)
-    return _scale("opacity", as_array(values), clim or (0.0, 1.0))
 
 
 def _scale(name: str, values: Array, clim: tuple[float, float] | None) -> CloudColors:

@@ -6,13 +6,11 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from ..cameras import Camera
 from ..gaussians import Gaussians
-from ..scenes import Scene
-from ..splat import rasterize
+from ..splat.rasterize import render_color
 from .pictures import picture_grid, save_picture
 
 PREVIEW = 96  # pixels: width of the renderings that choose the viewpoints
@@ -20,12 +18,6 @@ VISIBLE = 8 / 255  # a pixel has changed if a channel changed by more than this
 MOST = 0.5  # if more of a picture changed, its camera is inside the change: such views come last
 SHOWN = 0.5  # a view shows an edit if it shows this share of what the best view shows
 APART = 30.0  # degrees between the viewing directions of chosen viewpoints, if enough viewpoints are that far apart
-
-
-def render_color(gaussians: Gaussians, camera: Camera) -> Tensor:  # [H, W, 3] in [0, 1]
-    """Render a colour field on black."""
-    with torch.no_grad():
-        return rasterize(gaussians.replace(features=None), camera).map.clamp(0, 1)
 
 
 def views_of_change(
@@ -70,12 +62,3 @@ def write_comparison(path: Path, before: Gaussians, after: Gaussians, cameras: S
     rows = [[render_color(cloud, camera) for cloud in (before, after)] for camera in cameras]
     save_picture(path, picture_grid(rows, ("before", "after")))
     return path
-
-
-def draw_photos(gaussians: Gaussians, scene: Scene, views: Sequence[int], folder: Path) -> list[Path]:
-    """Draw views of a colour field next to their photographs, into `folder/<stem>.png`; the files."""
-    written = [folder / f"{scene.stem(i)}.png" for i in views]
-    for i, path in zip(views, written, strict=True):
-        pair = [scene.image(i), render_color(gaussians, scene.cameras[i])]
-        save_picture(path, picture_grid([pair], ("photograph", "colour field")))
-    return written

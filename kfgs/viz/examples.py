@@ -14,7 +14,7 @@ from .._check import as_array, check_shapes, check_whole
 from ..cameras import Camera
 from ..cameras.camera import view_named
 from .palette import palette
-from .pictures import LEGEND_INK, LEGEND_PAPER, Array, as_bytes, legend_strip, picture_sheet
+from .pictures import LEGEND_INK, LEGEND_PAPER, Array, as_bytes, draw_legend, picture_sheet
 
 COLUMNS = 3
 MOST = 48  # views in one picture: of a data set with thousands, nobody looks at all
@@ -58,7 +58,7 @@ def draw_examples(
     views = list(shown.values())[:MOST]
     pictures = [_marked(camera, photo(camera), marks, width) for camera, marks in views]
     sheet = picture_sheet(pictures, [camera.name for camera, _ in views], COLUMNS)
-    return np.concatenate([sheet, legend_strip(np.arange(len(examples)), list(examples), sheet.shape[1])])
+    return np.concatenate([sheet, draw_legend(np.arange(len(examples)), list(examples), width=sheet.shape[1])])
 
 
 def _marked(camera: Camera, photo: Tensor | Array, marks: list[tuple[Any, Color]], width: int) -> Array:

@@ -25,10 +25,9 @@ from ..labels.color import parse_color
 from ..scenes import Scene
 from ..splat import rasterize
 from .colors import Array, CloudColor, FeatureColors, cloud_colors, color_by_default
-from .pictures import as_bytes, check_suffix, legend_strip, picture_grid, picture_sheet, resize_photo, save_picture
+from .pictures import as_bytes, check_suffix, draw_legend, picture_grid, picture_sheet, resize_photo, save_picture
 
 Show = Callable[[Camera], Any]
-SUFFIXES = (".gif", ".mp4")
 OUTLINE = (213, 94, 0)  # vermilion of Okabe and Ito
 FADED = 0.7  # share of white in what is not selected
 MOST, WIDTH = 12, 360  # parts in a sheet, and pixels of the picture of each
@@ -47,7 +46,6 @@ def show_cloud(
     Labels and features become one colour per Gaussian, and the colours are composited (Eq. 3 with three channels), so they
     blend at borders. `rgb` is the colour of the harmonics, which depends on the direction. `background` is a colour by name
     or three numbers in [0, 1]; with class `names`, labels have their colours in `palette`; other arguments as in `add_cloud`.
-
     """
     check_gaussians(gaussians)
     color_by = color_by or color_by_default(gaussians)
@@ -142,7 +140,6 @@ def save_animation(
         names: class names: they decide the colours of labelled Gaussians.
         listed: the labels in a legend below every frame, with these names; None: no legend.
         progress: called after each frame with (done, all).
-
     """
     named = shows if isinstance(shows, Mapping) else {"": shows}
     if not named or not cameras:
@@ -157,7 +154,7 @@ def save_animation(
             pictures = [as_bytes(show(camera.letterboxed(*cameras[0].size))) for show in drawn.values()]
             frame = pictures[0] if list(drawn) == [""] else picture_grid([pictures], list(drawn))
             if names is not None and listed is not None:
-                frame = np.concatenate([frame, legend_strip(listed, names, frame.shape[1])])
+                frame = np.concatenate([frame, draw_legend(listed, names, width=frame.shape[1])])
             yield frame
             if progress is not None:
                 progress(done, len(cameras))
@@ -169,7 +166,7 @@ def save_animation(
 
 def check_target(path: str | Path, fps: float, name: str = "path") -> Path:
     """Check the target before the first frame is drawn."""
-    target = check_suffix(path, *SUFFIXES, name=name)
+    target = check_suffix(path, ".gif", ".mp4", name=name)
     suffix = target.suffix.lower()
     check_range("fps", fps, 0.01, 50 if suffix == ".gif" else 240)  # a GIF counts to 655 seconds
     if suffix == ".mp4":
@@ -191,12 +188,11 @@ def _write_gif(path: Path, frames: Iterator[Array], fps: float) -> None:
 def _write_mp4(path: Path, frames: Iterator[Array], fps: float) -> None:
     writer = None
     for frame in frames:
-        height, width = ((edge + 1) // 2 * 2 for edge in frame.shape[:2])  # H.264 needs even sizes: a white edge
-        paper = np.full((height, width, 3), 255, np.uint8)
-        paper[: frame.shape[0], : frame.shape[1]] = frame
+        height, width = frame.shape[:2]
+        paper = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), constant_values=255)  # H.264 needs even sizes
         if writer is None:
             options = {"fps": fps, "codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-            writer = _ffmpeg().write_frames(str(path), (width, height), **options)
+            writer = _ffmpeg().write_frames(str(path), paper.shape[1::-1], **options)
             writer.send(None)
         writer.send(paper)
     assert writer is not None
@@ -207,7 +203,7 @@ def _ffmpeg() -> Any:
     try:
         return importlib.import_module("imageio_ffmpeg")
     except ImportError as error:
+        install = "pip install imageio-ffmpeg (or write a .gif, which needs nothing)"
         raise ImportError(
-            "path: expected imageio-ffmpeg to write .mp4, but it is not installed; run: pip install imageio-ffmpeg "
-            "(or write a .gif, which needs nothing)"
+            f"path: expected imageio-ffmpeg to write .mp4, but it is not installed; run: {install}"
         ) from error

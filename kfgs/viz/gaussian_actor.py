@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from ..cameras.camera import NEAR
+from ..gaussians import Gaussians
 from ..splat.engines.contract import ALPHA_MAX, ALPHA_MIN
 from ..splat.project import FIELD_OF_VIEW_MARGIN
+from ..splat.sh import evaluate_sh
+from .pictures import as_bytes
 from .plotter import draw_mesh
 
 if TYPE_CHECKING:
     import pyvista as pv
 
-Array = np.ndarray[Any, Any]
 LOW_PASS = 0.3  # pixels squared, added to each projected covariance as 3DGS does
 BOUND = 3.0  # standard deviations at which VTK stops drawing; 3.3, where ALPHA_MIN stops, agrees no better
 
@@ -50,7 +52,7 @@ def as_gaussians(
     *,
     near: float = NEAR,
     antialiased: bool = False,
-    colors_from: Callable[[Array], Array] | None = None,
+    followed: Gaussians | None = None,
 ) -> pv.Actor:
     """Draw a cloud with `index`, `rgb`, `scale`, `quat` (w, x, y, z; unit) and `opacity` as Gaussians.
 
@@ -63,7 +65,7 @@ def as_gaussians(
         cloud: its arrays may change later; a frame only changes their order.
         near: depth up to which nothing is drawn, world units (`Camera.near`).
         antialiased: what the low-pass filter widens becomes fainter (`Gaussians.antialiased`).
-        colors_from: a function from the camera's position [3] to `rgb` in the order of `index`; None: fixed colours.
+        followed: Gaussians whose `sh` gives `rgb` as the camera sees it, in the order of `index`; None: fixed colours.
     """
     actor = draw_mesh(plotter, cloud, style="points_gaussian", scalars="rgb", rgb=True, emissive=False, lighting=False)
     mapper = actor.mapper
@@ -82,17 +84,15 @@ def as_gaussians(
         )
     actor.GetShaderProperty().AddFragmentShaderReplacement(DENSITY, False, FRAGMENT, False)
     plotter.renderer.SetUseOIT(False)  # VTK would average translucency instead of drawing back to front
-    plotter.renderer.AddObserver("StartEvent", _Frame(plotter.renderer, actor, cloud, colors_from).start)
+    plotter.renderer.AddObserver("StartEvent", _Frame(plotter.renderer, actor, cloud, followed).start)
     return actor
 
 
 class _Frame:
     """Prepares each frame: low-pass filter for the window's size, order and colours for the camera."""
 
-    def __init__(
-        self, renderer: Any, actor: pv.Actor, cloud: pv.PolyData, colors_from: Callable[[Array], Array] | None
-    ) -> None:
-        self.renderer, self.actor, self.cloud, self.colors_from = renderer, actor, cloud, colors_from
+    def __init__(self, renderer: Any, actor: pv.Actor, cloud: pv.PolyData, followed: Gaussians | None) -> None:
+        self.renderer, self.actor, self.cloud, self.followed = renderer, actor, cloud, followed
         self.points = np.array(cloud.points)
         self.order = np.arange(len(self.points))  # the Gaussian in each row of the cloud
         self.forward: tuple[float, ...] | None = None
@@ -105,19 +105,18 @@ class _Frame:
         # VTK wants the covariance in normalised device coordinates, where the picture is 2 x 2
         self.actor.mapper.SetLowpassMatrix(LOW_PASS * (2 / width) ** 2, 0.0, LOW_PASS * (2 / height) ** 2)
         camera = self.renderer.GetActiveCamera()
-        self._sort(camera.GetDirectionOfProjection())
-        if self.colors_from is not None and camera.GetPosition() != self.center:
-            self.center = camera.GetPosition()
-            self.cloud.point_data["rgb"] = self.colors_from(np.asarray(self.center))[self.order]
-
-    def _sort(self, forward: tuple[float, ...]) -> None:
-        if self.forward == forward:  # the order depends on the direction, not on the camera's position
-            return
-        self.forward = forward
-        order = np.argsort(-(self.points @ np.asarray(forward)), kind="stable")
-        row = np.empty_like(self.order)
-        row[self.order] = np.arange(len(row))  # the row of each Gaussian now
-        self.cloud.points = self.points[order]
-        for name in self.cloud.point_data:
-            self.cloud.point_data[name] = np.asarray(self.cloud.point_data[name])[row[order]]
-        self.order = order
+        forward = camera.GetDirectionOfProjection()
+        if forward != self.forward:  # the order depends on the direction, not on the camera's position
+            self.forward = forward
+            order = np.argsort(-(self.points @ np.asarray(forward)), kind="stable")
+            row = np.empty_like(self.order)
+            row[self.order] = np.arange(len(row))  # the row of each Gaussian now
+            self.cloud.points = self.points[order]
+            for name in self.cloud.point_data:
+                self.cloud.point_data[name] = np.asarray(self.cloud.point_data[name])[row[order]]
+            self.order = order
+        if self.followed is not None and camera.GetPosition() != self.center:
+            self.center, means, sh = camera.GetPosition(), self.followed.means, self.followed.sh
+            assert sh is not None
+            seen = evaluate_sh(sh, means - torch.tensor(self.center).to(means))
+            self.cloud.point_data["rgb"] = as_bytes(seen)[self.order]

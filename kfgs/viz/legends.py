@@ -1,4 +1,4 @@
-"""Titles and legends in a 3-D picture: class names with colours, or a bar of scores."""
+"""Titles and legends in a 3-D picture: class names with colours."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from torch import Tensor
 
-from .._check import as_array, check_range
-from .colors import COLORMAP, Array
-from .pictures import LEGEND_INK, draw_legend
+from .._check import as_array
+from .pictures import LEGEND_INK, Array, draw_legend
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -46,7 +45,7 @@ def add_legend(
     _, bottom, _, top = plotter.renderer.GetViewport()
     room = round((top - bottom) * plotter.window_size[1])
     for size in range(max(LETTERS, round(room / 55)), SMALLEST - 1, -1):
-        picture = draw_legend(present, names, size, height=room - 2 * MARGIN if size == SMALLEST else None)
+        picture = draw_legend(present, names, size=size, height=room - 2 * MARGIN if size == SMALLEST else None)
         if len(picture) <= room - 2 * MARGIN:
             break
     height, width, _ = picture.shape
@@ -61,32 +60,6 @@ def add_legend(
     actor.SetPosition(MARGIN, MARGIN)
     plotter.add_actor(actor, reset_camera=False, pickable=False, render=False)
     return actor
-
-
-def add_scalar_bar(plotter: pv.Plotter, cloud: pv.Actor | tuple[float, float], title: str = "score") -> Any:
-    """Draw a colour bar with numbers at the right of the active subplot.
-
-    `cloud` is the actor from `add_cloud`, coloured by scores or opacity, or the numbers of the darkest and the brightest
-    colour. Each bar of a plotter needs a title of its own.
-
-    Raises:
-        ValueError: if the cloud is not coloured by numbers, or two numbers do not ascend.
-    """
-    import pyvista as pv
-
-    clim = cloud if isinstance(cloud, tuple | list) else cloud.mapper.dataset.field_data.get("clim")
-    if clim is None:
-        raise ValueError(
-            "cloud: expected one coloured by scores or opacity, got one without a scale; use add_legend for labels"
-        )
-    low, high = (float(end) for end in clim)
-    check_range("cloud (its brightest)", high, low, closed=(False, False))
-    mapper = pv.DataSetMapper()
-    mapper.lookup_table = pv.LookupTable(COLORMAP, scalar_range=(low, high))
-    return plotter.add_scalar_bar(
-        title, mapper=mapper, vertical=True, n_labels=5, fmt="%.3g", color=letters(plotter), title_font_size=LETTERS,
-        label_font_size=LETTERS, position_x=0.88, position_y=0.05, width=0.08, height=0.5, render=False,
-    )  # fmt: skip
 
 
 def add_title(plotter: pv.Plotter, title: str) -> pv.CornerAnnotation:

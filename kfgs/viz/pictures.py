@@ -54,34 +54,23 @@ def overlay_labels(
     picture = as_bytes(blended)
     if names is None or not legend:
         return picture
-    return np.concatenate([picture, legend_strip(classes, names, picture.shape[1])], axis=0)
-
-
-def legend_strip(
-    labels: Tensor | Array,  # any shape, int
-    names: Sequence[str],
-    width: int,
-) -> Array:  # [h, width, 3] uint8
-    """A legend of the classes present, from left to right, wrapped at `width` pixels.
-
-    Raises:
-        ValueError: if a label has no name.
-    """
-    return draw_legend(labels, names, int(np.clip(width / 40, 10, 22)), width=width)
+    return np.concatenate([picture, draw_legend(classes, names, width=picture.shape[1])], axis=0)
 
 
 def draw_legend(
     labels: Tensor | Array,  # any shape, int
     names: Sequence[str],
-    size: int,
     *,
+    size: int | None = None,
     width: int | None = None,
     height: int | None = None,
 ) -> Array:  # [h, w, 3] uint8
-    """A legend of the classes present, with letters of `size` pixels.
+    """A legend of the classes present, with letters of `size` pixels; a ValueError if a label has no name.
 
-    With a width, entries go from left to right and wrap. Without, there is one per line, in columns of at most `height`.
+    With a width, entries go from left to right and wrap, and the size follows from it. Without, there is one entry per line,
+    in columns of at most `height`.
     """
+    size = int(np.clip((width or 0) / 40, 10, 22)) if size is None else size
     present = [int(label) for label in np.unique(as_array(labels, "labels"))]
     swatches = palette(np.array(present), names)
     font = ImageFont.load_default(size=size)
@@ -113,18 +102,9 @@ def save_picture(
     path: str | Path,
     picture: Tensor | Array,  # [H, W], [H, W, 3] or [H, W, 4]; uint8, or floats in [0, 1]
 ) -> None:
-    """Write a PNG file, whole or not at all. Floats are clipped to [0, 1].
-
-    Raises:
-        ValueError: if the name does not end in .png, or the array is not a picture.
-    """
-    target, values = check_suffix(path, ".png"), as_array(picture, "picture")
-    if values.dtype != np.uint8 and not np.issubdtype(values.dtype, np.floating):
-        raise ValueError(f"picture: expected uint8 or floats, got {values.dtype}; colour labels with palette()")
-    if values.ndim not in (2, 3) or (values.ndim == 3 and values.shape[2] not in (3, 4)) or 0 in values.shape:
-        raise ValueError(f"picture: expected [H, W], [H, W, 3] or [H, W, 4], got {values.shape}; move channels last")
-    with atomic_path(target) as temporary:
-        Image.fromarray(np.ascontiguousarray(as_bytes(values))).save(temporary, format="PNG")
+    """Write a PNG file, whole or not at all. Floats are clipped to [0, 1]; a ValueError if the name does not end in .png."""
+    with atomic_path(check_suffix(path, ".png")) as temporary:
+        Image.fromarray(np.ascontiguousarray(as_bytes(picture))).save(temporary, format="PNG")
 
 
 def picture_grid(
@@ -159,7 +139,10 @@ def picture_grid(
     pictures = [[as_bytes(picture) for picture in row] for row in rows]
     if width is not None:
         check_whole("width", width, 1)
-        pictures = [_resize_alike(row, width) for row in pictures]
+        for row in pictures:
+            size = int(width), max(1, round(row[0].shape[0] * int(width) / row[0].shape[1]))  # Pillow's order
+            # a box filter takes the mean of the pixels covered; when enlarging, the pixel itself
+            row[:] = [np.asarray(Image.fromarray(np.ascontiguousarray(p)).resize(size, Resampling.BOX)) for p in row]
     heights = [max(picture.shape[0] for picture in row) for row in pictures]
     width = max(picture.shape[1] for row in pictures for picture in row)
     letters = max(12, width // 28)  # pixels
@@ -176,7 +159,11 @@ def picture_grid(
     for j, title in enumerate(titles):
         draw.text((GAP + j * (width + GAP) + width / 2, head / 2), title, fill=LEGEND_INK, font=font, anchor="mm")
     drawn = np.asarray(canvas)
-    return np.concatenate([drawn, legend_strip(np.arange(len(names)), names, drawn.shape[1])]) if len(names) else drawn
+    return (
+        np.concatenate([drawn, draw_legend(np.arange(len(names)), names, width=drawn.shape[1])])
+        if len(names)
+        else drawn
+    )
 
 
 def picture_sheet(pictures: Sequence[Array], titles: Sequence[str], columns: int, *, width: int | None = None) -> Array:
@@ -207,11 +194,3 @@ def as_bytes(picture: Tensor | Array) -> Array:
     if values.dtype == np.uint8:
         return values
     return np.asarray(np.round(np.clip(np.nan_to_num(values, nan=0.0), 0, 1) * 255), dtype=np.uint8)
-
-
-def _resize_alike(pictures: list[Array], width: int) -> list[Array]:
-    """All pictures of a row `width` pixels wide and in the proportions of the first."""
-    high, wide = pictures[0].shape[:2]
-    size = int(width), max(1, round(high * int(width) / wide))  # Pillow's order
-    # a box filter takes the mean of the pixels covered; when enlarging, the pixel itself
-    return [np.asarray(Image.fromarray(np.ascontiguousarray(p)).resize(size, Resampling.BOX)) for p in pictures]

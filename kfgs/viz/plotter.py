@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
-from math import atan, degrees, radians, tan
+from math import atan, degrees
 from typing import TYPE_CHECKING, Any, TypeVar
 from weakref import WeakKeyDictionary
 
@@ -179,17 +179,13 @@ def draw_view(
 def camera_of(plotter: pv.Plotter, subplot: tuple[int, int] = (0, 0), *, near: float = NEAR) -> Camera:
     """The posed camera (float64) of a subplot's current view, with the subplot's size: the inverse of `look_through`."""
     renderer = plotter.renderers[plotter.renderers.loc_to_index(subplot)]
-    view = renderer.GetActiveCamera()
-    width, height = renderer.GetSize()
-    matrix = view.GetViewTransformMatrix()
-    E = np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])
+    view, (width, height) = renderer.GetActiveCamera(), renderer.GetSize()
+    seen, drawn = view.GetViewTransformMatrix(), view.GetProjectionTransformMatrix(width / height, -1.0, 1.0)
+    E, P = (np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)]) for matrix in (seen, drawn))
     E[1:3] *= -1  # VTK's y points up and z backward
-    aspect = view.GetExplicitAspectRatio() if view.GetUseExplicitAspectRatio() else width / height
-    fy = height / 2 / tan(radians(view.GetViewAngle()) / 2)
-    fx = width / aspect * fy / height
-    x, y = view.GetWindowCenter()
-    K = [[fx, 0.0, (1 - x) * width / 2], [0.0, fy, (1 + y) * height / 2], [0.0, 0.0, 1.0]]
-    lens = torch.tensor(K, dtype=torch.float64), width, height
+    K = np.array([[P[0, 0], 0, 1 - P[0, 2]], [0, P[1, 1], 1 + P[1, 2]], [0, 0, 1]])
+    K[:2] *= np.array([[width / 2], [height / 2]])
+    lens = torch.from_numpy(K), width, height
     return Camera(torch.from_numpy(E), *lens, near=near, origin=origin_of(plotter, ORIGIN))
 
 

@@ -10,7 +10,7 @@ from messages import refused, tells
 from kfgs.cameras.camera import Distortion
 from kfgs.splat.covariance import covariance_3d
 from kfgs.viz import FeatureColors, add_cloud, look_through, palette, show_cloud, to_pyvista
-from kfgs.viz.clouds import middle_box, recolor_cloud
+from kfgs.viz.clouds import recolor_cloud
 
 C0 = 0.28209479177387814
 
@@ -118,7 +118,7 @@ def test_what_there_is_decides_the_colours_when_nothing_is_asked_for():
     colored = labelled.replace(labels=None)
     assert np.array_equal(to_pyvista(colored)["rgb"], to_pyvista(colored, "rgb")["rgb"])
     fitted = FeatureColors.fit(with_features.features)
-    expected = to_pyvista(with_features, "feature", feature_colors=fitted)["rgb"]
+    expected = to_pyvista(with_features, fitted(with_features.features))["rgb"]
     assert np.array_equal(to_pyvista(with_features)["rgb"], expected)
     assert np.array_equal(to_pyvista(plain)["rgb"], to_pyvista(plain, "opacity")["rgb"])
 
@@ -148,14 +148,12 @@ def with_floaters(count=3):
     return gaussians.replace(means=means, opacities=opacities)
 
 
-def test_the_middle_box_leaves_one_in_a_hundred_out_on_each_side():
+def test_the_middle_box_leaves_one_in_a_hundred_out_on_each_side(plotter):
     points = np.random.default_rng(0).permuted(np.tile(np.arange(200.0), (3, 1)), axis=1).T
     points[points == 199] = 1e6
-    np.testing.assert_allclose(
-        middle_box(points.astype(np.float32)), [0, 197 + 0.05 * 195] * 3
-    )  # 2 to 197, but no less than 0
-    points[points == 1e6] = np.nan
-    assert middle_box(points)[::2].tolist() == [0, 0, 0]
+    cloud = some_gaussians(200).replace(means=torch.from_numpy(points).float())
+    box = data(add_cloud(plotter, cloud)).field_data["box"]
+    np.testing.assert_allclose(box, [0, 197 + 0.05 * 195] * 3)  # 2 to 197, but no less than 0
 
 
 @pytest.mark.parametrize("style", STYLES)

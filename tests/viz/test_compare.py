@@ -9,7 +9,8 @@ from PIL import Image
 from kfgs.cameras import Camera
 from kfgs.gaussians import Gaussians
 from kfgs.labels import Selection, connected_parts
-from kfgs.viz.compare import render_color, views_of_change, write_comparison
+from kfgs.splat.rasterize import render_color
+from kfgs.viz.compare import views_of_change, write_comparison
 from kfgs.viz.films import WIDTH, write_parts
 
 

@@ -8,7 +8,7 @@ from messages import refused
 
 from kfgs.fields import Box, Clicks, Mask
 from kfgs.viz import draw_examples, palette
-from kfgs.viz.pictures import GAP, legend_strip
+from kfgs.viz.pictures import GAP, draw_legend
 
 WIDTH = 320
 NAMES = ["chair", "wall", "plant"]
@@ -37,7 +37,7 @@ def test_points_boxes_and_masks_lie_where_they_were_shown_in_the_colours_of_thei
         "plant": [Mask(ONE, mask)],
     }
     picture = draw_examples([ONE, TWO], examples, grey, width=WIDTH)
-    strip = legend_strip(np.arange(3), NAMES, picture.shape[1])
+    strip = draw_legend(np.arange(3), NAMES, width=picture.shape[1])
     assert picture.shape == (HEAD + 240 + GAP + len(strip), WIDTH + 2 * GAP, 3)
     assert (picture[-len(strip) :] == strip).all()
     assert places(picture, COLORS[0]).mean(axis=0) == pytest.approx([61, 41], abs=0.6)

@@ -15,6 +15,12 @@ def plotter():
         yield plotter
 
 
+def turned(camera, times):
+    moved = camera.viewmat.clone()
+    moved[:3, 3] += times * moved[:3, 0]
+    return Camera(moved, camera.K, camera.width, camera.height)
+
+
 def test_frusta_open_like_their_cameras(plotter):
     camera = some_camera()
     mesh = data(add_cameras(plotter, [camera, camera], size=0.5))
@@ -30,10 +36,7 @@ def test_frusta_open_like_their_cameras(plotter):
 
 
 def test_size_of_frusta_follows_the_cameras(plotter):
-    camera = some_camera()
-    moved = camera.viewmat.clone()
-    moved[:3, 3] += 10 * moved[:3, 0]
-    far = Camera(moved, camera.K, 160, 120)
+    camera, far = some_camera(), turned(some_camera(), 10)
     extent = (far.center - camera.center).abs().max()
     mesh = data(add_cameras(plotter, [camera, far]))
     ends = np.array(mesh.points).reshape(20, 2, 3)
@@ -41,12 +44,6 @@ def test_size_of_frusta_follows_the_cameras(plotter):
     np.testing.assert_allclose((ends[0, 1] - ends[0, 0]) @ forward, 0.05 * extent, rtol=1e-5)
     refused(lambda: add_cameras(plotter, []), "cameras:", "got none")
     refused(lambda: add_cameras(plotter, [camera], size=0.0), "size:", "got 0.0")
-
-
-def turned(camera, times):
-    moved = camera.viewmat.clone()
-    moved[:3, 3] += times * moved[:3, 0]
-    return Camera(moved, camera.K, camera.width, camera.height)
 
 
 def test_thinning_is_even_and_keeps_both_ends(plotter):

@@ -1,11 +1,10 @@
 import numpy as np
 import pytest
 import torch
-from cases_viz import some_gaussians, some_plotter
+from cases_viz import some_plotter
 from messages import refused
 
-from kfgs.viz import add_cloud, add_legend, palette
-from kfgs.viz.legends import add_scalar_bar
+from kfgs.viz import add_legend, palette
 from kfgs.viz.pictures import draw_legend
 
 NAMES = [f"class {i}" for i in range(18)]
@@ -32,27 +31,8 @@ def test_legend_can_be_removed_and_needs_names_and_labels(plotter):
 
 
 def test_column_of_bounded_height_continues_in_the_next_column():
-    plain, wrapped = draw_legend(np.arange(5), NAMES, 10), draw_legend(np.arange(5), NAMES, 10, height=60)
+    plain, wrapped = draw_legend(np.arange(5), NAMES, size=10), draw_legend(np.arange(5), NAMES, size=10, height=60)
     assert wrapped.shape[0] <= 60 < plain.shape[0]
     assert 2 * plain.shape[1] - 10 <= wrapped.shape[1] <= 2 * plain.shape[1]
     assert all(colors_in(wrapped, range(5)))
-    np.testing.assert_array_equal(draw_legend(np.arange(5), NAMES, 10, height=len(plain)), plain)
-
-
-def test_scalar_bar_has_the_scale_of_its_cloud_at_the_right():
-    with some_plotter() as plotter:
-        plotter.window_size = [400, 300]
-        cloud = add_cloud(plotter, some_gaussians(), color_by="opacity")
-        cloud.SetVisibility(False)
-        bar = add_scalar_bar(plotter, cloud, "opacity")
-        assert bar.GetLookupTable().scalar_range == (0, 1)
-        picture = plotter.screenshot(return_img=True)
-        assert picture[:, 340:].any(axis=2).mean() > 0.1
-        assert not picture[:, :330].any()
-        assert [253, 231, 55] in picture[:, 340:].reshape(-1, 3).tolist()  # cividis at its brightest
-
-
-def test_a_cloud_without_a_scale_has_no_bar(plotter):
-    assert add_scalar_bar(plotter, (0.0, 0.5), "given").GetLookupTable().scalar_range == (0, 0.5)
-    refused(lambda: add_scalar_bar(plotter, add_cloud(plotter, some_gaussians())), "cloud:", "coloured")
-    refused(lambda: add_scalar_bar(plotter, [1, 0]), "(1, inf)", "got 0")
+    np.testing.assert_array_equal(draw_legend(np.arange(5), NAMES, size=10, height=len(plain)), plain)

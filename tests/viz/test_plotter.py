@@ -7,7 +7,6 @@ import pytest
 from cases_viz import some_camera, some_gaussians, some_plotter
 from messages import tells
 
-from kfgs.cameras import Camera
 from kfgs.viz import add_cloud, draw_view, look_through, make_plotter, plotter
 from kfgs.viz.plotter import trouble
 
@@ -75,17 +74,3 @@ def test_draw_view_is_a_plotter_that_looks_through_the_camera_and_is_closed():
     with pytest.raises(KeyError):
         draw_view(camera, fail)
     assert [window.render_window for window in used] == [None, None]
-
-
-def test_far_from_zero_everything_is_counted_from_one_origin():
-    cloud, camera = some_gaussians(), some_camera()
-    away = (448262.0, 5411932.0, 200.0)
-    with some_plotter() as window:
-        add_cloud(window, cloud)
-        look_through(window, camera)
-        near = window.screenshot(return_img=True)
-    moved = Camera(camera.viewmat, camera.K, camera.width, camera.height, origin=away)
-    with some_plotter() as window:
-        add_cloud(window, cloud.replace(origin=away))
-        look_through(window, moved)
-        np.testing.assert_array_equal(window.screenshot(return_img=True), near)
