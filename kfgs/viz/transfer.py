@@ -65,9 +65,6 @@ def show_transfer(
 
     Raises:
         ValueError: if a cloud is empty, has no labels or no colours, or the distance is not positive.
-
-    Example:
-        >>> show_transfer(SemanticField.load("run/field.kfgs"), read_splats("run/color.ply")).show()  # doctest: +SKIP
     """
     semantic = field.label() if hasattr(field, "label") else field
     views: Sequence[Camera] = cameras or getattr(field, "cameras", None) or ()
