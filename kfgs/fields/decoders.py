@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from .._card import short_repr
-from .._rows import EPS, check_directions, row_norms, unit_rows
+from .._rows import EPS, check_directions, largest, row_norms, unit_rows
 from ..labels.classify import pixel_codewords
 from ..labels.scores import LOGIT_SCALE
 from ..quant import Autoencoder, Codebook, LinearLatents
@@ -242,7 +242,7 @@ def divide_votes(cosines: Tensor, known: Tensor) -> Votes:  # [N, C], [N] bool
 
     A class that no Gaussian prefers gets no vote: it would win pixels where it is second everywhere.
     """
-    classes = cosines.argmax(dim=1)[known].unique()
+    classes = largest(cosines)[1][known].unique()
     shares = torch.softmax(LOGIT_SCALE * cosines[:, classes], dim=1) * known[:, None]
     return Votes(classes, torch.nn.functional.threshold(shares, LEAST_SHARE, 0))
 

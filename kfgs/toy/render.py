@@ -30,7 +30,7 @@ class View(NamedTuple):
 def walk_cameras(train_views: int, test_views: int, size: tuple[int, int]) -> tuple[list[Camera], list[bool]]:
     """Cameras in the order of the walk, named `view_000.png` and so on, and which of them are for testing.
 
-    Training cameras divide the walk evenly; each test camera stands half-way between two of them. The walk goes around
+    Training cameras divide the walk evenly; each test camera stands between two of them, in the middle. The walk goes around
     the room twice, first high and looking up, then low and looking down, so that most surfaces are seen often. Pictures are
     71 degrees wide; fx != fy, and the principal point is off the centre, so that code that assumes otherwise fails visibly.
     """

@@ -41,7 +41,7 @@ class ToyConfig:
     train_views: int = 48
     """Training cameras, evenly spaced on two rounds through the room."""
     test_views: int = 12
-    """Test cameras, each half-way between two training cameras; at most `train_views`."""
+    """Test cameras, each in the middle between two training cameras; at most `train_views`."""
     size: tuple[int, int] = (192, 256)
     """(height, width) of the images, pixels."""
     feature_size: tuple[int, int] = (72, 96)

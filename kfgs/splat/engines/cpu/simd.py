@@ -240,7 +240,7 @@ def store(context: Any, builder: Any, kinds: Any, array: Any, index: Any, value:
 
 @_operation(_of_array)
 def load_part(context: Any, builder: Any, kinds: Any, array: Any, index: Any, mask: Any) -> Any:
-    """array[index + i] in the lanes i of the mask, which alone are read; 0 in the others."""
+    """array[index + i] in the lanes i of the mask; 0 in the others, where nothing is read."""
     zero, size = _number(kinds[0].dtype, 0.0), ir.Constant(_I32, kinds[0].dtype.bitwidth // 8)
     place = builder.bitcast(_pointer(context, builder, kinds[0], array, index), zero.type.as_pointer())
     return _call(builder, f"llvm.masked.load.{_suffix(kinds[0].dtype)}.p0", zero.type, place, size, mask, zero)

@@ -58,7 +58,7 @@ MEAN_X, MEAN_Y, SQUARE, LEAN, REST, LOG_OPACITY, FEATURES = range(7)
 """Columns of a packed row: with u = dx + LEAN dy, log2(opacity density) = LOG_OPACITY - SQUARE u^2 - REST dy^2."""
 
 X, Y, LIGHT, FINAL = 0, PIXELS, 2 * PIXELS, 3 * PIXELS
-"""Planes of a square's state: pixel centres; the transmittance, which goes on falling after a pixel has stopped; and the
+"""Planes of a square's state: pixel centres; the transmittance, which falls also after a pixel has stopped; and the
 transmittance with which the pixel stopped."""
 STATE = 4 * PIXELS
 

@@ -26,7 +26,7 @@ INTERPRETED = not isinstance(composite_kernel, triton.JITFunction)
 """Whether triton interprets the kernels. They then run in numpy, on the CPU."""
 
 PRECISION = "tf32x3"
-"""How matrix products of many channels round: tensor cores multiply numbers of 11 bits (tf32), which alone would be wrong
+"""Rounding of matrix products of many channels: tensor cores multiply numbers of 11 bits (tf32), which alone would be wrong
 by 5e-4. Three products of high and low parts have float32's accuracy, still on the tensor cores. Up to `SMALLEST` channels
 plain float32 is faster, and the interpreter has no other."""
 
