@@ -62,7 +62,7 @@ class Camera:
     name: str = ""
     distortion: Distortion | None = None
     near: float = NEAR  # > 0, world units: the smallest depth that is drawn
-    origin: tuple[float, float, float] = ORIGIN  # the world's place of the (0, 0, 0) that viewmat maps from; float64
+    origin: tuple[float, float, float] = ORIGIN  # where the (0, 0, 0) that viewmat maps from lies in the world
 
     def __post_init__(self) -> None:
         for name in ("viewmat", "K"):  # integers would truncate the points

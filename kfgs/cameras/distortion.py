@@ -71,7 +71,7 @@ def _first_positive_root(coefficients: np.ndarray) -> float:
     return float(min(real[real > 0], default=math.inf))
 
 
-def undistort(image: Tensor, camera: Camera) -> tuple[Tensor, Camera, Tensor]:  # [H, W, C] -> same, _, [H, W] bool
+def undistort(image: Tensor, camera: Camera) -> tuple[Tensor, Camera, Tensor]:  # image: [H, W, C]; also the mask [H, W]
     """Undistort a picture or a feature map; K, pose and size stay.
 
     Each pixel of the result looks up, bilinearly, where its ray fell in the distorted picture. kornia's `undistort_image` does

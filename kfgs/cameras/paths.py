@@ -19,7 +19,7 @@ from .camera import UP, Camera, at_one_origin, unit_vector
 from .resample import fits_aspect
 
 Array = np.ndarray[Any, Any]
-SAME = 1e-9  # successive views closer than this, in position and direction, are one
+SAME = 1e-9  # successive views closer than this, in position and direction, are the same view
 STANDING = 1e-6  # of the coordinates: cameras on one tripod differ by the rounding of float32
 LEVEL = 0.05  # if the pictures' x axes spread less than this in their second direction, they do not determine "up"
 
@@ -55,7 +55,7 @@ def path_cameras(
     cameras = at_one_origin(cameras)
     keys = [*cameras[::every], *([cameras[-1]] if cameras and (len(cameras) - 1) % every else [])]
     if len(keys) > 1:
-        moved = _steps(*_poses(keys)) > SAME
+        moved = _durations(*_poses(keys)) > SAME
         keys = [keys[0], *(key for key, new in zip(keys[1:], moved, strict=True) if new)]
     if len(keys) < 2:
         raise ValueError(
@@ -65,13 +65,13 @@ def path_cameras(
     first, (height, width) = cameras[0].size, size or cameras[0].size
     keys = [key if fits_aspect(key.size, first) else key.letterboxed(*first) for key in keys]
     keys = [key.resized(height, width) for key in keys]
-    places, turns = _poses(keys)
-    times = np.concatenate([[0.0], np.cumsum(_steps(places, turns))])
-    moments = np.linspace(0, times[-1], frames)
-    R = RotationSpline(times, turns)(moments).as_matrix()  # [frames, 3, 3] world to camera
-    t = -np.einsum("nij,nj->ni", R, CubicSpline(times, places)(moments))  # t = -R c
-    lenses = np.stack([as_array(key.K).astype(np.float64).reshape(9) for key in keys], axis=1)  # [9, k]
-    Ks = np.stack([np.interp(moments, times, row) for row in lenses], axis=1).reshape(-1, 3, 3)
+    centers, rotations = _poses(keys)
+    key_times = np.concatenate([[0.0], np.cumsum(_durations(centers, rotations))])
+    times = np.linspace(0, key_times[-1], frames)
+    R = RotationSpline(key_times, rotations)(times).as_matrix()  # [frames, 3, 3] world to camera
+    t = -np.einsum("nij,nj->ni", R, CubicSpline(key_times, centers)(times))  # t = -R c
+    key_Ks = np.stack([as_array(key.K).astype(np.float64).reshape(9) for key in keys], axis=1)  # [9, k]
+    Ks = np.stack([np.interp(times, key_times, row) for row in key_Ks], axis=1).reshape(-1, 3, 3)
     near, origin = min(camera.near for camera in cameras), cameras[0].origin
     viewmats = np.tile(np.eye(4), (frames, 1, 1))
     viewmats[:, :3, :3], viewmats[:, :3, 3] = R, t
@@ -86,13 +86,13 @@ def _poses(keys: Sequence[Camera]) -> tuple[Array, Rotation]:  # [k, 3], k rotat
     return -np.einsum("nji,nj->ni", R, t), Rotation.from_matrix(R)  # c = -R^T t
 
 
-def _steps(places: Array, turns: Rotation) -> Array:  # [k - 1]
+def _durations(centers: Array, rotations: Rotation) -> Array:  # [k - 1]
     """Time from each key to the next: hypot(distance / extent, angle / pi)."""
-    extent = float(np.linalg.norm(np.ptp(places, axis=0)))
-    if extent <= STANDING * np.abs(places).max():
+    extent = float(np.linalg.norm(np.ptp(centers, axis=0)))
+    if extent <= STANDING * np.abs(centers).max():
         extent = 1.0
-    angles = (turns[1:] * turns[:-1].inv()).magnitude()
-    return np.hypot(np.linalg.norm(np.diff(places, axis=0), axis=1) / extent, angles / np.pi)
+    angles = (rotations[1:] * rotations[:-1].inv()).magnitude()
+    return np.hypot(np.linalg.norm(np.diff(centers, axis=0), axis=1) / extent, angles / np.pi)
 
 
 @dataclass(frozen=True)
@@ -128,23 +128,23 @@ def estimate_up(cameras: Sequence[Camera]) -> Tensor:  # [3] float64, unit
 
     People hold cameras level: the x axes of the pictures are horizontal in whatever direction they look. So up is the
     direction that is most nearly perpendicular to all of them (least eigenvector of sum x x^T), on the side of the upper
-    edges. If all cameras look in one direction, up is the mean of the pictures' y axes. A ValueError if there are no cameras,
-    or their upper edges cancel.
+    edges. If all cameras look in one direction, up is the mean direction from the lower to the upper edges. A ValueError if there
+    are no cameras, or their upper edges cancel.
     """
     if not cameras:
         raise ValueError("cameras: expected at least one camera, got none; give up as a vector instead")
     R = torch.stack([camera.viewmat[:3, :3].detach().double().cpu() for camera in cameras])
-    right, mean = R[:, 0], -R[:, 1].mean(0)
-    if float(mean.norm()) < LEVEL:
+    right, mean_up = R[:, 0], -R[:, 1].mean(0)
+    if float(mean_up.norm()) < LEVEL:
         raise ValueError(
             f"cameras: expected pictures that are held upright, got {len(cameras)} whose upper edges cancel; give up as a "
             "vector instead"
         )
     values, vectors = torch.linalg.eigh(right.T @ right / len(right))
     if float(values[1]) < LEVEL:
-        return mean / mean.norm()
+        return mean_up / mean_up.norm()
     up = vectors[:, 0]
-    return up * torch.sign(up @ mean)
+    return up * torch.sign(up @ mean_up)
 
 
 def orbit_cameras(

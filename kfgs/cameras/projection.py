@@ -138,8 +138,8 @@ def to_kornia(cameras: Sequence[Camera]) -> PinholeCamera:
 def from_kornia(pinhole: PinholeCamera) -> list[Camera]:
     """The cameras of a kornia batch, one by one: the inverse of `to_kornia`.
 
-    Of `intrinsics` only the upper left 3 x 3 is read, as kornia does; it is taken as it is. kornia's documentation puts pixel
-    centres on integers: add 0.5 to cx and cy of such a K. One from COLMAP has them on halves, inside kornia's cameras too.
+    Of `intrinsics` only the upper left 3 x 3 is read, as kornia does, and it is not changed. kornia's documentation puts pixel
+    centres on integers: add 0.5 to cx and cy of such a K first. A K from COLMAP has them on halves already.
     """
     count = pinhole.batch_size
     for name in ("intrinsics", "extrinsics"):

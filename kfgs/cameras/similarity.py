@@ -86,7 +86,7 @@ class Similarity:
         return Similarity(1 / self.scale, self.rotation.T, -(self.rotation.T @ self.translation) / self.scale)
 
     def between_worlds(self, src: Origin, dst: Origin) -> Similarity:
-        """The same motion in the world, of a similarity of coordinates that are counted from an origin on each side."""
+        """The same motion for world coordinates, if this one takes points counted from `src` to points counted from `dst`."""
         source, target = (torch.tensor(origin, dtype=torch.float64) for origin in (src, dst))
         return replace(self, translation=self.translation + target - self.scale * (self.rotation @ source))
 
@@ -104,7 +104,7 @@ class Similarity:
         return replace(camera, viewmat=moved.to(camera.viewmat), near=self.scale * camera.near, origin=origin)
 
     def between_origins(self, origin: Origin) -> tuple[Similarity, Origin]:
-        """The same motion of coordinates counted from an origin, and the origin that the moved ones are counted from."""
+        """The same motion for points counted from an origin, if this one is for the world; and the origin of the moved points."""
         x, y, z = (self.scale * (self.rotation @ torch.tensor(origin, dtype=torch.float64)) + self.translation).tolist()
         if origin == ORIGIN and max(abs(x), abs(y), abs(z)) <= FAR_UNITS:
             return self, ORIGIN
