@@ -12,8 +12,8 @@ from torch.autograd.function import once_differentiable
 
 from .._check import check_range, check_shapes
 from ..cameras import resize_map
-from ..splat.engines.table import compiled_similarity
-from ..splat.similarity import SSIM_CONSTANTS, SSIM_WINDOW, similar_windows, window_weights
+from ..splat.engines.table import compiled_ssim
+from ..splat.ssim import SSIM_CONSTANTS, SSIM_WINDOW, ssim_windows, window_weights
 
 Loss = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(rendered map [H, W, D], its alpha [H, W], target [h, w, D]) -> a scalar."""
@@ -80,7 +80,7 @@ def mean_similarity(picture: Tensor, target: Tensor) -> Tensor:  # [H, W, D] x 2
             return picture.new_ones(())
     if (compiled := _compiled(picture, target)) is not None:
         return _Similarity.apply(picture, target, counted, (1.0, 0.0), compiled)  # type: ignore[no-any-return]
-    similarity = similar_windows(picture, target)
+    similarity = ssim_windows(picture, target)
     return similarity.mean() if counted is None else similarity[counted].mean()
 
 
@@ -91,7 +91,7 @@ def _resized(rendered: Tensor, target: Tensor) -> Tensor:  # [H, W, D], [h, w, D
 
 def _compiled(picture: Tensor, target: Tensor) -> Callable[..., Any] | None:
     """The engine's SSIM; None if kornia's filters must do, as for a gradient in the target."""
-    return None if target.requires_grad else compiled_similarity(picture, target)
+    return None if target.requires_grad else compiled_ssim(picture, target)
 
 
 def _known(target: Tensor) -> Tensor:  # [H, W, D] -> [H, W] bool

@@ -20,7 +20,7 @@ def path(request, monkeypatch):
     if request.param == "compiled":
         pytest.importorskip("numba")
     else:
-        monkeypatch.setattr(loss, "compiled_similarity", lambda *tensors: None)
+        monkeypatch.setattr(loss, "compiled_ssim", lambda *tensors: None)
     return request.param
 
 

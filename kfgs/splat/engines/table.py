@@ -127,12 +127,12 @@ def choose_projecting(engine: str, *tensors: Tensor) -> Engine | None:
     return chosen if chosen.projects and len({(value.device, value.dtype) for value in tensors}) == 1 else None
 
 
-def compiled_similarity(*tensors: Tensor) -> Callable[..., tuple[Tensor, Tensor]] | None:
-    """Numba's SSIM with its gradient, `cpu.similarity`. None: kornia must compare these tensors."""
+def compiled_ssim(*tensors: Tensor) -> Callable[..., tuple[Tensor, Tensor]] | None:
+    """Numba's SSIM with its gradient (`cpu.ssim`), if numba is installed. None: kornia must compare these tensors."""
     kinds = {(value.device.type, value.dtype) for value in tensors}
     device, dtype = kinds.pop()
-    if kinds or device != "cpu" or not choose("auto", device, dtype).projects:
+    if kinds or device != "cpu" or not choose("auto", device, dtype).projects:  # on a CPU only numba's engine projects
         return None
-    from .cpu.similarity import similarity
+    from .cpu.ssim import mean_ssim
 
-    return similarity
+    return mean_ssim

@@ -1,6 +1,6 @@
 """SSIM of training, compiled: its mean over the windows of a picture, and the gradient in one walk there and back.
 
-Not part of an engine: `kfgs.splat.engines.table.compiled_similarity` gives it to who trains on a CPU.
+Not part of an engine: `kfgs.splat.engines.table.compiled_ssim` gives it to who trains on a CPU.
 
 Channels stay side by side, so a vector holds neighbouring numbers. Each row of windows is blurred downwards, then along; the
 gradient takes the same two steps back. A blurred row stays in cache. No two shares of rows write the same memory.
@@ -45,7 +45,7 @@ _BAND = 32  # rows of a share
 
 
 @torch.no_grad()
-def similarity(
+def mean_ssim(
     picture: Tensor,  # [H, W, D] contiguous, float32 or float64 on the CPU, at least 11 pixels on each side
     target: Tensor,  # [H, W, D] likewise
     counted: Tensor | None,  # [H - 10, W - 10] bool, which windows count, at least one; None = all

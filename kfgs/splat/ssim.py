@@ -1,4 +1,4 @@
-"""SSIM of pictures (Wang 2004) by torch and kornia, on any device; `engines.cpu.similarity` is compiled for the CPU."""
+"""SSIM of pictures (Wang 2004) by torch and kornia, on any device; `engines.cpu.ssim` is compiled for the CPU."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def window_weights(dtype: torch.dtype) -> Tensor:  # [11], on the CPU
     return get_gaussian_kernel1d(SSIM_WINDOW, SSIM_SIGMA, dtype=torch.float64)[0].to(dtype)
 
 
-def similar_windows(picture: Tensor, target: Tensor) -> Tensor:  # [H, W, D] x 2 -> [H - 10, W - 10, D]
+def ssim_windows(picture: Tensor, target: Tensor) -> Tensor:  # [H, W, D] x 2 -> [H - 10, W - 10, D]
     """SSIM of every window that lies in the picture, differentiable: `kornia.metrics.ssim` up to rounding.
 
     The five moments are filtered at once: a third fewer kernels in a step of training, whose launches keep a GPU waiting.

@@ -7,7 +7,7 @@ from oracles_color import ssim_windows
 
 pytest.importorskip("numba")
 
-from kfgs.splat.engines.cpu.similarity import similarity
+from kfgs.splat.engines.cpu.ssim import mean_ssim
 
 CONSTANTS = 0.01**2, 0.03**2
 
@@ -29,7 +29,7 @@ def pictures(height, width, channels=3, dtype=torch.float64):
 )
 def test_value_at_awkward_sizes(height, width, channels):
     a, b = pictures(height, width, channels)
-    value, slope = similarity(a, b, None, window(a.dtype), CONSTANTS)
+    value, slope = mean_ssim(a, b, None, window(a.dtype), CONSTANTS)
     assert float(value) == pytest.approx(ssim_windows(a, b).mean(), abs=1e-12)
     assert slope.shape == a.shape
     for i, j in (
@@ -40,18 +40,18 @@ def test_value_at_awkward_sizes(height, width, channels):
         moved = [a.clone() for _ in range(2)]
         moved[0][i, j, 0] -= 1e-5
         moved[1][i, j, 0] += 1e-5
-        low, high = (float(similarity(x, b, None, window(a.dtype), CONSTANTS)[0]) for x in moved)
+        low, high = (float(mean_ssim(x, b, None, window(a.dtype), CONSTANTS)[0]) for x in moved)
         assert float(slope[i, j, 0]) == pytest.approx((high - low) / 2e-5, rel=1e-4, abs=1e-9)
 
 
 def test_only_counted_windows_count():
     a, b = pictures(40, 33)
     counted = torch.rand(30, 23, generator=torch.Generator().manual_seed(5)) < 0.3
-    value, slope = similarity(a, b, counted, window(a.dtype), CONSTANTS)
+    value, slope = mean_ssim(a, b, counted, window(a.dtype), CONSTANTS)
     assert float(value) == pytest.approx(ssim_windows(a, b)[counted.numpy()].mean(), abs=1e-12)
     one = torch.zeros_like(counted)
     one[4, 7] = True
-    _, slope = similarity(a, b, one, window(a.dtype), CONSTANTS)
+    _, slope = mean_ssim(a, b, one, window(a.dtype), CONSTANTS)
     touched = (slope != 0).any(dim=2).nonzero()
     np.testing.assert_array_equal(touched.amin(dim=0), [4, 7])
     np.testing.assert_array_equal(touched.amax(dim=0), [14, 17])
@@ -64,7 +64,7 @@ def test_bits_do_not_depend_on_the_number_of_threads():
         found = []
         for count in (1, 2, 4):
             torch.set_num_threads(count)
-            found.append(similarity(a, b, None, window(a.dtype), CONSTANTS))
+            found.append(mean_ssim(a, b, None, window(a.dtype), CONSTANTS))
     finally:
         torch.set_num_threads(threads)
     for value, slope in found[1:]:
@@ -74,6 +74,6 @@ def test_bits_do_not_depend_on_the_number_of_threads():
 
 def test_flat_pictures_are_finite():
     black = torch.zeros(20, 20, 3)
-    value, slope = similarity(black, black, None, window(black.dtype), CONSTANTS)
+    value, slope = mean_ssim(black, black, None, window(black.dtype), CONSTANTS)
     assert float(value) == pytest.approx(1.0)
     assert not slope.any()
