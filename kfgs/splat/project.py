@@ -18,7 +18,7 @@ from .engines.contract import ALPHA_MIN, Cloud, Pinhole
 from .engines.table import choose_projecting
 
 FIELD_OF_VIEW_MARGIN = 1.3
-"""Limit of the linearisation, in half fields of view (3DGS). Beyond it, the linear footprint of a Gaussian beside the
+"""Limit of the linearisation, in half fields of view (3DGS). Beyond it, the linear footprint of a Gaussian next to the
 camera grows without bound and would cover the picture."""
 
 
@@ -106,7 +106,7 @@ def _project(gaussians: Gaussians, camera: Camera, near: float, low_pass: float)
         low_pass,
     )
     with torch.no_grad():
-        extents = (_reach(opacities)[:, None] * variances).sqrt()
+        extents = (squared_reach(opacities)[:, None] * variances).sqrt()
         keep = _touches_pixel(means2d, extents, camera).nonzero().squeeze(1)
     variance_x, variance_y = variances.unbind(1)
     conics = torch.stack([variance_y, -covariances, variance_x], dim=1) / det[:, None]
@@ -124,8 +124,8 @@ def _compensate(projected: Projected, camera: Camera, low_pass: float) -> Projec
     a, b, c = (low_pass * conics).unbind(1)
     squared = (1 - a) * (1 - c) - b * b
     with torch.no_grad():
-        reach = _reach(opacities * squared.clamp(min=0).sqrt())  # negative: faint, and NaN as an extent
-        extents = extents * (reach / _reach(opacities)).sqrt()[:, None]
+        reduced = squared_reach(opacities * squared.clamp(min=0).sqrt())  # negative: faint, and NaN as an extent
+        extents = extents * (reduced / squared_reach(opacities)).sqrt()[:, None]
         keep = _touches_pixel(means2d, extents, camera).nonzero().squeeze(1)
     # The culled are left out before the root, whose slope at 0 is infinite.
     opacities = opacities[keep] * squared[keep].sqrt()
@@ -138,23 +138,23 @@ def pixel_box(
     width: int,
     height: int,
 ) -> tuple[Tensor, Tensor]:
-    """The pixels whose centres lie within `extents` of the means: first and one past the last (column, row), [M, 2] each.
+    """The pixels whose centres lie within `extents` of the means: first (column, row) and end, one past the last, [M, 2] each.
 
-    Values are whole but of the input's dtype, clamped to the image; an empty box has last <= first, a NaN stays NaN.
+    Values are whole but of the input's dtype, clamped to the image; an empty box has end <= first, a NaN stays NaN.
     """
     size = torch.tensor([width, height], dtype=means2d.dtype, device=means2d.device)
     rounding = 4 * torch.finfo(means2d.dtype).eps * (means2d.abs() + extents)  # never lose a pixel to it
     first = torch.ceil(means2d - extents - 0.5 - rounding).clamp(min=0)
-    last = torch.floor(means2d + extents - 0.5 + rounding) + 1
-    return first, torch.minimum(last, size)
+    end = torch.floor(means2d + extents - 0.5 + rounding) + 1
+    return first, torch.minimum(end, size)
 
 
 def _touches_pixel(means2d: Tensor, extents: Tensor, camera: Camera) -> Tensor:  # [M] bool
-    first, last = pixel_box(means2d, extents, camera.width, camera.height)
-    return (last > first).all(dim=1)
+    first, end = pixel_box(means2d, extents, camera.width, camera.height)
+    return (end > first).all(dim=1)
 
 
-def _reach(opacities: Tensor) -> Tensor:
+def squared_reach(opacities: Tensor) -> Tensor:  # [M] -> [M]
     """Largest value of d^T C d at which opacity * exp(-0.5 d^T C d) >= ALPHA_MIN; negative for an opacity below it."""
     return 2 * torch.log(opacities / ALPHA_MIN)
 
@@ -177,12 +177,12 @@ def _jacobian(points: Tensor, camera: Camera) -> Tensor:  # [M, 3] of the camera
 def _candidates(gaussians: Gaussians, camera: Camera, near: float, low_pass: float) -> Tensor:  # [m] int64
     """Cull, without looking at rotations: the footprint is bounded by that of a ball around the Gaussian."""
     points = world_to_camera(camera, gaussians.means)  # [N, 3]
-    index = ((points[:, 2] > near) & (_reach(gaussians.opacities) > 0)).nonzero().squeeze(1)
+    index = ((points[:, 2] > near) & (squared_reach(gaussians.opacities) > 0)).nonzero().squeeze(1)
     points = points[index]
     J = _jacobian(points, camera)
     largest = gaussians.scales[index].amax(dim=1, keepdim=True)
     variances = (J * J).sum(dim=2) * largest**2 + low_pass
-    extents = (_reach(gaussians.opacities[index])[:, None] * variances).sqrt()
+    extents = (squared_reach(gaussians.opacities[index])[:, None] * variances).sqrt()
     extents = extents * (1 + 1e-3)  # a bound stays one after rounding
     keep = _touches_pixel(camera_to_pixel(camera, points), extents, camera)
     # Where a number overflows or is NaN, gradients would be NaN. The determinant is at most the variances' product.

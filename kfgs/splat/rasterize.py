@@ -94,9 +94,9 @@ def rasterize(
         raise ValueError("gaussians: expected features or sh to render, got neither; add them with gaussians.replace()")
     projected = project(gaussians, camera, near=near, engine=engine)
     tiles = bin_tiles(projected, camera.width, camera.height, engine=engine)
-    splats = projected.means2d, projected.conics, projected.opacities
-    features, index = _seen(gaussians, camera, projected, engine)
-    maps, alphas = composite(*splats, features, tiles, background=background, index=index, engine=engine)
+    footprints = projected.means2d, projected.conics, projected.opacities
+    features, index = _shown(gaussians, camera, projected, engine)
+    maps, alphas = composite(*footprints, features, tiles, background=background, index=index, engine=engine)
     return Rendering(maps, alphas, projected)
 
 
@@ -151,31 +151,31 @@ def rasterize_labels(
     with torch.no_grad():
         projected = project(gaussians, camera, near=near, engine=engine)
         tiles = bin_tiles(projected, camera.width, camera.height, engine=engine)
-        splats = projected.means2d, projected.conics, projected.opacities
+        footprints = projected.means2d, projected.conics, projected.opacities
         return rank_channels(
-            *splats, gaussians.features, tiles, top=top, early=early, index=projected.index, engine=engine
+            *footprints, gaussians.features, tiles, top=top, early=early, index=projected.index, engine=engine
         )
 
 
 class Votes(NamedTuple):
-    """What the Gaussians say about some classes."""
+    """What each Gaussian adds to the score of a class at a pixel that shows it, for the W classes that get anything."""
 
-    classes: Tensor  # [W] int64, which
-    shares: Tensor  # [N, W], positive; 0 of a Gaussian about which nothing is known
+    classes: Tensor  # [W] int64, which of all classes, ascending
+    shares: Tensor  # [N, W] positive: shares of one vote, or any scores; 0 for a Gaussian about which nothing is known
 
 
 def rank_votes(gaussians: Gaussians, camera: Camera, votes: Votes, top: int = 1, *, early: bool = False) -> Ranked:
-    """The classes with most votes at each pixel; votes are blended like colours. Beyond the classes voted for: -1, 0.
+    """The `top` classes with most votes at each pixel; votes are blended like colours. With fewer classes, the rest is -1 and 0.
 
     `early` is that of `rasterize_labels`.
     """
-    if not len(votes.classes):  # nothing is known about any Gaussian: no votes for one class, and the opacity
+    if not len(votes.classes):  # nothing is known about any Gaussian: an empty vote, so that the opacity is drawn
         votes = Votes(votes.classes.new_zeros(1), votes.shares.new_zeros(len(votes.shares), 1))
     count = min(top, len(votes.classes))
     with torch.no_grad():
         shown = gaussians.replace(features=votes.shares, sh=None)
         labels, scores, alphas = rasterize_labels(shown, camera, top=count, early=early)
-        if len(votes.classes) <= int(votes.classes[-1]):  # else they are all classes, in order
+        if int(votes.classes[-1]) != len(votes.classes) - 1:  # else each column has the number of its class
             labels = votes.classes[labels]
         labels.masked_fill_(scores <= 0, -1)
     if count < top:
@@ -199,8 +199,8 @@ def _check_arguments(gaussians: Gaussians, camera: Camera) -> None:
             )
 
 
-def _seen(gaussians: Gaussians, camera: Camera, projected: Projected, engine: str) -> tuple[Tensor, Tensor | None]:
-    """Rows of what the Gaussians show to the camera, and the row of each visible one (None: they are its rows already)."""
+def _shown(gaussians: Gaussians, camera: Camera, projected: Projected, engine: str) -> tuple[Tensor, Tensor | None]:
+    """What the visible Gaussians show: rows of features, and the row of each; or a colour for each, and None."""
     if gaussians.features is not None:
         return gaussians.features, projected.index
     assert gaussians.sh is not None

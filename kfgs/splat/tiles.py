@@ -7,9 +7,9 @@ from torch import Tensor
 
 from .._check import check_shapes
 from .engines import check_sizes
-from .engines.contract import ALPHA_MIN, Tiles
+from .engines.contract import Tiles
 from .engines.table import choose, choose_projecting
-from .project import Projected, pixel_box
+from .project import Projected, pixel_box, squared_reach
 
 __all__ = ["Tiles", "bin_tiles"]
 
@@ -62,20 +62,20 @@ def _bin(projected: Projected, width: int, height: int, tile_size: int) -> tuple
     columns, count = -(-width // tile_size), -(-width // tile_size) * -(-height // tile_size)
     order = torch.sort(projected.depths, stable=True).indices
     means2d, extents = projected.means2d[order], projected.extents[order]
-    first, last = pixel_box(means2d, extents, width, height)
-    filled = (last > first).all(dim=1)
-    first = torch.where(filled[:, None], first, 0).to(torch.int32) // tile_size
-    last = torch.where(filled[:, None], last - 1, -1).to(torch.int32) // tile_size + 1  # empty box: 0 tiles
+    first, end = pixel_box(means2d, extents, width, height)
+    filled = (end > first).all(dim=1)
+    first_tile = torch.where(filled[:, None], first, 0).to(torch.int32) // tile_size
+    end_tile = torch.where(filled[:, None], end - 1, -1).to(torch.int32) // tile_size + 1  # empty box: 0 tiles
 
-    spans = last - first  # [M, 2] tiles along x and y
+    spans = end_tile - first_tile  # [M, 2] tiles along x and y
     hits = spans[:, 0] * spans[:, 1]
     near_to_far = torch.arange(len(order), dtype=torch.int32, device=order.device)
     which = torch.repeat_interleave(near_to_far, hits)  # [P'] candidates, front to back
     begin = torch.cumsum(hits, 0) - hits  # int64: candidates of huge Gaussians may be more than an int32 counts
     step = (torch.arange(len(which), device=order.device) - begin[which]).to(torch.int32)
     down = step // spans[which, 0]
-    tile_y = first[which, 1] + down
-    tile_x = first[which, 0] + step - down * spans[which, 0]
+    tile_y = first_tile[which, 1] + down
+    tile_x = first_tile[which, 0] + step - down * spans[which, 0]
 
     rows = order.to(torch.int32)[which]
     touched = _touches_tile(projected, rows, tile_x * tile_size, tile_y * tile_size, tile_size)
@@ -108,7 +108,7 @@ def _touches_tile(
         a * near_x * near_x + 2 * b * near_x * along_y + c * along_y * along_y,
         a * along_x * along_x + 2 * b * along_x * near_y + c * near_y * near_y,
     )
-    reach = 2 * torch.log(projected.opacities / ALPHA_MIN)[rows]
+    reach = squared_reach(projected.opacities)[rows]
     # An engine rounds the same three terms at each pixel; they are largest, and cancel worst, in the far corner.
     far_x, far_y = torch.maximum(-left, right), torch.maximum(-top, bottom)
     terms = a * far_x * far_x + 2 * b.abs() * far_x * far_y + c * far_y * far_y

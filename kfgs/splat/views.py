@@ -41,7 +41,7 @@ class ViewVotes(NamedTuple):
 
     labels: Tensor  # [N] int64, -1 = no view shows this Gaussian, or the views do not agree on it
     shares: Tensor  # [N] the winner's share of the votes, 0 if there were none
-    weights: Tensor  # [N] votes cast: the number of pixels, in all views, that the Gaussian fills
+    weights: Tensor  # [N] votes cast: the number of pixels with a label, in all views, that the Gaussian fills
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -54,11 +54,11 @@ def sum_pixels(
     *,
     engine: str = "auto",
 ) -> tuple[Tensor, Tensor, Tensor]:  # [M] int64, [M, C], [M]
-    """Indices of the Gaussians that one view shows, with the weighted sum of the signal and the sum of weights of each."""
+    """The Gaussians that a view shows, and for each the weighted sum of the signal and the sum of the weights."""
     projected = project(gaussians, camera, engine=engine)
     tiles = bin_tiles(projected, camera.width, camera.height, engine=engine)
-    shape = projected.means2d, projected.conics, projected.opacities
-    return projected.index, *accumulate_pixels(*shape, signal, tiles, engine=engine)
+    footprints = projected.means2d, projected.conics, projected.opacities
+    return projected.index, *accumulate_pixels(*footprints, signal, tiles, engine=engine)
 
 
 def average_views(

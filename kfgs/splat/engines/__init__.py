@@ -106,7 +106,7 @@ def accumulate_pixels(
     Raises:
         ValueError: as `composite`, and if `pixels` is not as large as the image of `tiles`.
     """
-    splats, tiles = _check_splats(means2d, conics, opacities, means2d, tiles, None, None)
+    splats, tiles = _check_splats(means2d, conics, opacities, means2d, tiles, None, None)  # any features will do
     check_shapes(("pixels", pixels, (tiles.height, tiles.width, "D")))
     _check_alike("pixels", pixels, means2d)
     chosen = choose(engine, means2d.device.type, means2d.dtype)
@@ -122,7 +122,7 @@ def _check_splats(
     background: Tensor | None,
     index: Tensor | None,
 ) -> tuple[Splats, Tiles]:
-    """The same as an engine takes it: contiguous, and with numbers that do not lead a kernel into foreign memory."""
+    """Check the arguments of a call and make an engine's of them: contiguous, and no index beyond its tensor's memory."""
     check_sizes(*tiles[2:], prefix="tiles.")
     rows, columns = tiles.grid
     check_shapes(

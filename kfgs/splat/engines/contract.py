@@ -50,7 +50,7 @@ class Cloud(NamedTuple):
 
 
 class Pinhole(NamedTuple):
-    """The camera and the options of `project`."""
+    """What `project` takes of the camera, and its options."""
 
     viewmat: Tensor  # [4, 4] world to camera
     K: Tensor  # [3, 3] without skew
@@ -129,7 +129,7 @@ class Engine:
     tile_size = 16
     """Side of the tiles that it composites fastest, pixels."""
     projects = False
-    """Whether it also has `project`, `shade` and `bin`. For the others kornia and torch do these."""
+    """Whether it also has `project`, `shade` and `bin`. If not, `kfgs.splat` does these by kornia and torch."""
 
     def composite(self, splats: Splats, tiles: Tiles) -> tuple[Tensor, Tensor]:  # maps [H, W, D], alphas [H, W]
         """Composite as this file says, differentiable."""

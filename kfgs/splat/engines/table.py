@@ -47,7 +47,7 @@ def available_engines(device: str | None = None) -> list[str]:
 
 def _serves(name: str, device: str) -> bool:
     try:
-        return device in load(name).devices and _ENGINES[name].device in (device, None)  # see viz/plotter.py
+        return device in load(name).devices and _ENGINES[name].device in (device, None)  # import first (viz/plotter.py)
     except ImportError:  # installed, but broken on this machine
         return False
 
