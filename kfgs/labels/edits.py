@@ -24,8 +24,8 @@ from .selection import (
     KINDS,
     OfClass,
     OfIndex,
+    Rule,
     Selection,
-    Where,
     class_name,
     plain_fields,
     read_object,
@@ -55,7 +55,7 @@ class Edit(ABC):
 class OnSelection(Edit):
     """An edit of the Gaussians that rules select."""
 
-    where: str | Selection | Where | Sequence[str | Selection | Where]
+    where: str | Selection | Rule | Sequence[str | Selection | Rule]
     """A class name, a selection or a rule (`OfClass`, `InBox`, `InSphere`, `OfIndex`); or several: what any of them selects."""
 
     def __post_init__(self) -> None:
@@ -67,7 +67,7 @@ class OnSelection(Edit):
 
     def apply(self, gaussians: Gaussians) -> Gaussians:
         """See `Edit.apply`."""
-        rules: tuple[Where, ...] = self.where  # type: ignore[assignment]  # since __post_init__
+        rules: tuple[Rule, ...] = self.where  # type: ignore[assignment]  # since __post_init__
         mask = torch.stack([rule.select(gaussians).mask for rule in rules]).any(dim=0)
         if not bool(mask.any()):
             got = f"none from {', '.join(map(repr, rules)):.120}; {_present(gaussians)}"
@@ -79,14 +79,14 @@ class OnSelection(Edit):
         """The edited cloud."""
 
 
-def _rule(where: Any) -> Where:
+def _rule(where: Any) -> Rule:
     if isinstance(where, str):
         return OfClass(where)
     if isinstance(where, Selection):
         return OfIndex(tuple(where.indices.tolist()))
     if isinstance(where, dict):
         return read_object("where", where, KINDS, "kind")
-    if not isinstance(where, Where):
+    if not isinstance(where, Rule):
         raise TypeError(f"where: expected a class name, a Selection or a rule like OfClass, got {where!r:.80}")
     return where
 

@@ -17,7 +17,7 @@ from ..cameras import Camera
 from ..gaussians import Gaussians, check_gaussians
 from ..splat.views import sum_pixels
 from .components import component_numbers
-from .scores import Selection
+from .selection import Selection
 
 LONGEST = 160  # longer side in pixels of the views compared; on room_0 shares change by at most 0.3 % of the picture
 SPECK = 0.05  # parts smaller than this share of the largest are left out

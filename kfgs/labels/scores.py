@@ -1,8 +1,7 @@
-"""Selections of Gaussians; from cosines to one (Sec. 3.4): scores, and gamma, the threshold that a selected Gaussian exceeds."""
+"""From cosines to a selection (Sec. 3.4): relevancy, and gamma, the threshold that the score of a selected Gaussian exceeds."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
@@ -10,9 +9,9 @@ import torch
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
-from .._card import cut
-from .._check import as_tensor, check_choice, check_range, check_shapes
+from .._check import check_choice, check_range, check_shapes
 from .._rows import check_finite
+from .selection import Selection
 from .transfer import Array
 
 TEMPERATURE = 10.0  # factor of the cosines in LERF (Kerr 2023)
@@ -29,84 +28,6 @@ SHARES = ((0.5, CLEAR), (0.75, 0.7))
 """A gap with more than half of the scene above it usually separates two parts of the background. If there is no other, up
 to three quarters may lie above it (the walls of a room), if it is 5 times sparser than the modes next to it."""
 TOP, WAY = 0.999, 0.7  # if no gap is clear: 70 % of the way from the median to the 99.9 % quantile
-
-
-@dataclass(frozen=True, eq=False)
-class Selection:
-    """Some of N Gaussians, with a score for every one of them; `gaussians[selection]` are the Gaussians, `len` their number.
-
-    `a & b`, `a | b`, `a - b` and `~a` combine selections of the same Gaussians. Scores follow Zadeh's rules: `&` takes the
-    smaller, `|` the larger, `~a` has 1 - score; `a - b` is `a & ~b`.
-
-    Example:
-        >>> a, b = Selection.of(torch.tensor([True, True, False])), Selection.of(torch.tensor([True, False, False]))
-        >>> (a - b).indices.tolist()
-        [1]
-    """
-
-    mask: Tensor  # [N] bool
-    scores: Tensor  # [N] how well each fits: a cosine or a relevancy; 1 and 0 if a place or a label decides
-    threshold: float | None = None
-    """Gamma of Sec. 3.4, the score that a selected Gaussian exceeds; None if there was no threshold, or several."""
-    how: str = ""
-    """How the threshold was found, or which selections were combined."""
-
-    @classmethod
-    def of(cls, mask: Tensor | Array, how: str = "given") -> Selection:  # mask: [N] bool
-        """A selection from a mask alone: scores are 1 inside, 0 outside."""
-        mask = as_tensor("mask", mask)
-        return cls(mask, mask.to(torch.get_default_dtype()), None, how)
-
-    def __post_init__(self) -> None:
-        for name in ("mask", "scores"):
-            if not isinstance(getattr(self, name), Tensor):
-                object.__setattr__(self, name, as_tensor(name, getattr(self, name)))
-        if self.mask.ndim != 1 or self.scores.shape != self.mask.shape:
-            got = f"{tuple(self.mask.shape)} and {tuple(self.scores.shape)}"
-            raise ValueError(f"mask, scores: expected [N] with the same N, got {got}; pass one score per Gaussian")
-        if self.mask.dtype != torch.bool:
-            raise TypeError(f"mask: expected a boolean mask, got {self.mask.dtype}; compare first, as in labels == 3")
-        check_finite("scores", self.scores)
-
-    def __len__(self) -> int:
-        return int(self.mask.sum())
-
-    def __repr__(self) -> str:
-        return f"Selection({len(self)} of {len(self.mask)} Gaussians: {cut(self.summary, 140)})"
-
-    @property
-    def indices(self) -> Tensor:  # [n] int64
-        """The selected Gaussians, ascending."""
-        return self.mask.nonzero()[:, 0]
-
-    @property
-    def summary(self) -> str:
-        """How it was made and its threshold, in words."""
-        return self.how if self.threshold is None else f"score > {self.threshold:.4g} ({self.how})"
-
-    def __and__(self, other: Selection) -> Selection:
-        scores = torch.minimum(*self._both_scores(other))
-        return Selection(self.mask & other.mask, scores, None, f"({self.summary}) and ({other.summary})")
-
-    def __or__(self, other: Selection) -> Selection:
-        scores = torch.maximum(*self._both_scores(other))
-        return Selection(self.mask | other.mask, scores, None, f"({self.summary}) or ({other.summary})")
-
-    def __invert__(self) -> Selection:
-        return Selection(~self.mask, 1 - self.scores, None, f"not ({self.summary})")
-
-    def __sub__(self, other: Selection) -> Selection:
-        return self & ~other
-
-    def _both_scores(self, other: Selection) -> tuple[Tensor, Tensor]:
-        """Both scores in one dtype, after a check that both select among the same Gaussians."""
-        if not isinstance(other, Selection):
-            raise TypeError(f"other: expected a Selection, got {type(other).__name__}; make one by Selection.of(mask)")
-        if len(self.mask) != len(other.mask):
-            own, its = len(self.mask), len(other.mask)
-            raise ValueError(f"other: expected a selection among the same {own} Gaussians, got one among {its}")
-        dtype = torch.promote_types(self.scores.dtype, other.scores.dtype)
-        return self.scores.to(dtype), other.scores.to(self.scores.device, dtype)
 
 
 def relevancy(

@@ -1,6 +1,7 @@
-"""Rules that select Gaussians by class, index, box or sphere.
+"""Selections of Gaussians, and rules that make them: by class, index, box or sphere.
 
-A rule works on any cloud: `OfClass("chair").select(gaussians)` is a `Selection`. Edits hold rules, and JSON can.
+A `Selection` holds for one cloud. A rule works on any: `OfClass("chair").select(gaussians)` is a `Selection`. Edits hold rules,
+and JSON can.
 """
 
 from __future__ import annotations
@@ -15,19 +16,97 @@ from typing import Any, ClassVar, TypeVar
 import torch
 from torch import Tensor
 
-from .._card import say_coordinate
-from .._check import check_range, check_whole, class_indices
+from .._card import cut, say_coordinate
+from .._check import as_tensor, check_range, check_whole, class_indices
 from .._origin import to_world
+from .._rows import check_finite
 from ..cameras.similarity import Similarity
 from ..gaussians import Gaussians
 from .components import component_numbers
-from .scores import Selection
-from .transfer import positions
+from .transfer import Array, positions
 
 T = TypeVar("T")
 
 
-class Where(ABC):
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """Some of N Gaussians, with a score for every one of them; `gaussians[selection]` are the Gaussians, `len` their number.
+
+    `a & b`, `a | b`, `a - b` and `~a` combine selections of the same Gaussians. Scores follow Zadeh's rules: `&` takes the
+    smaller, `|` the larger, `~a` has 1 - score; `a - b` is `a & ~b`.
+
+    Example:
+        >>> a, b = Selection.of(torch.tensor([True, True, False])), Selection.of(torch.tensor([True, False, False]))
+        >>> (a - b).indices.tolist()
+        [1]
+    """
+
+    mask: Tensor  # [N] bool
+    scores: Tensor  # [N] how well each fits: a cosine or a relevancy; 1 and 0 if a place or a label decides
+    threshold: float | None = None
+    """Gamma of Sec. 3.4, the score that a selected Gaussian exceeds; None if there was no threshold, or several."""
+    how: str = ""
+    """How the threshold was found, or which selections were combined."""
+
+    @classmethod
+    def of(cls, mask: Tensor | Array, how: str = "given") -> Selection:  # mask: [N] bool
+        """A selection from a mask alone: scores are 1 inside, 0 outside."""
+        mask = as_tensor("mask", mask)
+        return cls(mask, mask.to(torch.get_default_dtype()), None, how)
+
+    def __post_init__(self) -> None:
+        for name in ("mask", "scores"):
+            if not isinstance(getattr(self, name), Tensor):
+                object.__setattr__(self, name, as_tensor(name, getattr(self, name)))
+        if self.mask.ndim != 1 or self.scores.shape != self.mask.shape:
+            got = f"{tuple(self.mask.shape)} and {tuple(self.scores.shape)}"
+            raise ValueError(f"mask, scores: expected [N] with the same N, got {got}; pass one score per Gaussian")
+        if self.mask.dtype != torch.bool:
+            raise TypeError(f"mask: expected a boolean mask, got {self.mask.dtype}; compare first, as in labels == 3")
+        check_finite("scores", self.scores)
+
+    def __len__(self) -> int:
+        return int(self.mask.sum())
+
+    def __repr__(self) -> str:
+        return f"Selection({len(self)} of {len(self.mask)} Gaussians: {cut(self.summary, 140)})"
+
+    @property
+    def indices(self) -> Tensor:  # [n] int64
+        """The selected Gaussians, ascending."""
+        return self.mask.nonzero()[:, 0]
+
+    @property
+    def summary(self) -> str:
+        """How it was made and its threshold, in words."""
+        return self.how if self.threshold is None else f"score > {self.threshold:.4g} ({self.how})"
+
+    def __and__(self, other: Selection) -> Selection:
+        scores = torch.minimum(*self._both_scores(other))
+        return Selection(self.mask & other.mask, scores, None, f"({self.summary}) and ({other.summary})")
+
+    def __or__(self, other: Selection) -> Selection:
+        scores = torch.maximum(*self._both_scores(other))
+        return Selection(self.mask | other.mask, scores, None, f"({self.summary}) or ({other.summary})")
+
+    def __invert__(self) -> Selection:
+        return Selection(~self.mask, 1 - self.scores, None, f"not ({self.summary})")
+
+    def __sub__(self, other: Selection) -> Selection:
+        return self & ~other
+
+    def _both_scores(self, other: Selection) -> tuple[Tensor, Tensor]:
+        """Both scores in one dtype, after a check that both select among the same Gaussians."""
+        if not isinstance(other, Selection):
+            raise TypeError(f"other: expected a Selection, got {type(other).__name__}; make one by Selection.of(mask)")
+        if len(self.mask) != len(other.mask):
+            own, its = len(self.mask), len(other.mask)
+            raise ValueError(f"other: expected a selection among the same {own} Gaussians, got one among {its}")
+        dtype = torch.promote_types(self.scores.dtype, other.scores.dtype)
+        return self.scores.to(dtype), other.scores.to(self.scores.device, dtype)
+
+
+class Rule(ABC):
     """A rule that selects some Gaussians of a cloud. Rules are plain data: equal ones compare equal."""
 
     kind: ClassVar[str]
@@ -46,7 +125,7 @@ class Where(ABC):
 
 
 @dataclass(frozen=True)
-class OfClass(Where):
+class OfClass(Rule):
     """The Gaussians labelled with one class, or one connected part of them."""
 
     kind: ClassVar[str] = "class"
@@ -85,7 +164,7 @@ class OfClass(Where):
 
 
 @dataclass(frozen=True)
-class InBox(Where):
+class InBox(Rule):
     """The Gaussians whose centres lie in a box along the world's axes, faces included."""
 
     kind: ClassVar[str] = "box"
@@ -107,7 +186,7 @@ class InBox(Where):
 
 
 @dataclass(frozen=True)
-class InSphere(Where):
+class InSphere(Rule):
     """The Gaussians whose centres are at most `radius` from `center`, world units."""
 
     kind: ClassVar[str] = "sphere"
@@ -126,7 +205,7 @@ class InSphere(Where):
 
 
 @dataclass(frozen=True)
-class OfIndex(Where):
+class OfIndex(Rule):
     """The Gaussians with these indices **in the cloud it is applied to**; an earlier edit may have renumbered them."""
 
     kind: ClassVar[str] = "index"
@@ -155,7 +234,7 @@ def class_name(names: Sequence[str], index: int) -> str:
     return names[index] if index < len(names) else f"class {index}"
 
 
-KINDS: dict[str, type[Where]] = {kind.kind: kind for kind in (OfClass, InBox, InSphere, OfIndex)}
+KINDS: dict[str, type[Rule]] = {kind.kind: kind for kind in (OfClass, InBox, InSphere, OfIndex)}
 
 
 def _points(gaussians: Gaussians) -> Tensor:  # [N, 3] float64, in the world
@@ -187,7 +266,7 @@ def plain_fields(value: Any) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     if isinstance(value, tuple):
         return [_plain(part) for part in value]
-    if isinstance(value, Where):
+    if isinstance(value, Rule):
         return value.to_json()
     if isinstance(value, Similarity):
         return value.matrix().tolist()
