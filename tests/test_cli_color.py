@@ -16,7 +16,7 @@ from kfgs.fields import SemanticField, fuse_views
 from kfgs.formats import read_splats
 from kfgs.formats.ply import read_ply
 from kfgs.labels import connected_parts, load_label_set
-from kfgs.labels.components import component_distance
+from kfgs.labels.components import part_distance
 from kfgs.scenes import load_scene
 from kfgs.splat import rasterize
 
@@ -206,7 +206,7 @@ def test_parts_that_are_not_listed_are_counted(desk, capsys):
     selection = field.query("chair")
     listed, distance = (
         connected_parts(field.gaussians, selection),
-        component_distance(field.gaussians.means, selection.mask),
+        part_distance(field.gaussians.means, selection.mask),
     )
     assert main(["select", "chair", str(desk / "run")]) == 0
     *parts, joined, note = capsys.readouterr().out.splitlines()[1:]

@@ -49,7 +49,7 @@ def select(
     """
     from .._check import check_range
     from ..labels import Selection
-    from ..labels.components import component_distance
+    from ..labels.components import part_distance
 
     if out is not None:
         check_output("out", out, "a folder")
@@ -78,7 +78,7 @@ def select(
         say(headline)
         raise ValueError(f"query: expected Gaussians to save, got none of {query!r}; lower the threshold or drop --out")
     if distance is None and len(selection):
-        distance = component_distance(cloud.means, selection.mask)
+        distance = part_distance(cloud.means, selection.mask)
     parts = kfgs.connected_parts(cloud, selection, cameras, distance=distance)
     if out is not None:  # before anything is printed, whose reader may have ended
         facts = {"query": query, "threshold": selection.threshold, "how": selection.how, "count": len(selection)}

@@ -17,8 +17,8 @@ SPACINGS = 1.5  # the default distance in spacings of the selection: on room_0 2
 MOST_SPACINGS = 4.0  # ... and its bound in spacings of the cloud: a few specks across a room have a spacing of metres
 
 
-def component_distance(means: Tensor, mask: Tensor) -> float:  # [N, 3], [N] bool
-    """The default distance of `component_numbers`, in world units: 1.5 spacings of the masked Gaussians, at most 4 of all.
+def part_distance(means: Tensor, mask: Tensor) -> float:  # [N, 3], [N] bool
+    """The default distance of `number_parts`, in world units: 1.5 spacings of the masked Gaussians, at most 4 of all.
 
     It keeps a thing in one piece, and things apart. No constant does: on room_0 0.08 m joins two chairs and breaks a sofa.
     """
@@ -27,7 +27,7 @@ def component_distance(means: Tensor, mask: Tensor) -> float:  # [N, 3], [N] boo
     return min(SPACINGS * own, MOST_SPACINGS * whole) or 1.0  # all at one position: any distance joins them
 
 
-def component_numbers(
+def number_parts(
     means: Tensor,  # [N, 3]
     mask: Tensor,  # [N] bool
     distance: float | None = None,
@@ -38,7 +38,7 @@ def component_numbers(
     equally large parts the one with the lowest index comes first. 600,000 Gaussians take about 5 seconds on one core.
     """
     points = positions("means", means)[mask.cpu().numpy()]
-    parts = radius_components(points, distance or component_distance(means, mask))
+    parts = radius_components(points, distance or part_distance(means, mask))
     numbers = torch.full(mask.shape, -1, device=mask.device)
     numbers[mask] = torch.from_numpy(parts).to(mask.device)
     return numbers

@@ -16,7 +16,7 @@ from .._rows import check_finite
 from ..cameras import Camera
 from ..gaussians import Gaussians, check_gaussians
 from ..splat.views import sum_pixels
-from .components import component_numbers
+from .components import number_parts
 from .selection import Selection
 
 LONGEST = 160  # longer side in pixels of the views compared; on room_0 shares change by at most 0.3 % of the picture
@@ -144,7 +144,7 @@ def connected_parts(
     check_whole("most", most, 1)
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
-    numbers = component_numbers(gaussians.means, selection.mask, distance)
+    numbers = number_parts(gaussians.means, selection.mask, distance)
     sizes = torch.bincount(numbers[selection.mask])
     if len(sizes) == 0:
         return []

@@ -22,7 +22,7 @@ from .._origin import to_world
 from .._rows import check_finite
 from ..cameras.similarity import Similarity
 from ..gaussians import Gaussians
-from .components import component_numbers
+from .components import number_parts
 from .transfer import Array, positions
 
 T = TypeVar("T")
@@ -151,7 +151,7 @@ class OfClass(Rule):
         indices = class_indices(self.name, gaussians.names) if isinstance(self.name, str) else (self.name,)
         mask, how = torch.isin(labels, torch.tensor(indices, device=labels.device)), f"label {self.name}"
         if self.part is not None:
-            parts = component_numbers(gaussians.means, mask, self.distance)
+            parts = number_parts(gaussians.means, mask, self.distance)
             count = len(parts[mask].unique())
             if count == 0:
                 raise ValueError(f"part: expected a class of some Gaussians, got {self.name}, which none has")

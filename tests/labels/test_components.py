@@ -6,7 +6,7 @@ import pytest
 import torch
 from oracles_selection import components as oracle
 
-from kfgs.labels.components import component_distance, component_numbers, radius_components
+from kfgs.labels.components import number_parts, part_distance, radius_components
 
 
 def clumps(n, heaps, spread, seed):
@@ -48,19 +48,19 @@ def test_default_distance_follows_the_selection():
     dense, sparse = grid([0.0, 0, 0], n=20, step=0.1), grid([100.0, 0, 0], n=20, step=0.3)
     means = torch.cat([dense, sparse])
     first = torch.arange(800) < 400
-    step = component_distance(means, first)
+    step = part_distance(means, first)
     assert step == pytest.approx(1.5 * 0.1 * math.sqrt(2), rel=1e-4)
-    assert component_distance(means, ~first) == pytest.approx(3 * step, rel=1e-4)
-    assert component_distance(means * 7, first) == pytest.approx(7 * step, rel=1e-4)
+    assert part_distance(means, ~first) == pytest.approx(3 * step, rel=1e-4)
+    assert part_distance(means * 7, first) == pytest.approx(7 * step, rel=1e-4)
     specks = torch.zeros(800, dtype=torch.bool)
     specks[[0, 399, 799]] = True
-    assert component_distance(means, specks) <= 4 * 0.3 * math.sqrt(2) + 1e-6  # not the hundred between the sheets
-    assert component_numbers(torch.ones(3, 3), torch.ones(3, dtype=torch.bool)).tolist() == [0, 0, 0]
+    assert part_distance(means, specks) <= 4 * 0.3 * math.sqrt(2) + 1e-6  # not the hundred between the sheets
+    assert number_parts(torch.ones(3, 3), torch.ones(3, dtype=torch.bool)).tolist() == [0, 0, 0]
 
 
 @pytest.mark.parametrize(("gap", "parts"), [(0.2, [800]), (0.22, [400, 400])])
 def test_default_distance_parts_things_that_stand_close(gap, parts):
     """1.5 spacings of 0.141 are 0.212; twice the spacing joined the two chairs of room_0."""
     means = torch.cat([grid([0.0, 0, 0], n=20, step=0.1), grid([1.9 + gap, 0, 0], n=20, step=0.1)])
-    numbers = component_numbers(means, torch.ones(800, dtype=torch.bool))
+    numbers = number_parts(means, torch.ones(800, dtype=torch.bool))
     assert numbers.bincount().tolist() == parts
