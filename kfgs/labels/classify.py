@@ -1,4 +1,4 @@
-"""Classify features, and quantise rendered latents to codewords (Sec. 3.4)."""
+"""From features to classes by max-similarity, and from rendered latents to codewords (both Sec. 3.4)."""
 
 from __future__ import annotations
 
@@ -65,28 +65,26 @@ def pixel_codewords(
 ) -> Tensor:  # [...] int64
     """The codeword of each rendered latent: decode it (Psi), and quantise it by cosine to the codebook (Eq. 5).
 
-    Not `exact`, it is the codeword with the nearest **latent** (Euclidean): this saves the decoder's 0.83 M multiply-adds per
+    If not `exact`, it is the codeword with the nearest **latent** (Euclidean): this saves the decoder's 0.83 M multiply-adds per
     pixel, and gives the same class for 98.9 % of the pixels that mix two latents (72 codewords). Without an autoencoder the
     map holds features, which are quantised. -1 where the feature is all-zero, or the pixel is not `covered`.
     """
     rows = latents.detach().reshape(-1, latents.shape[-1])
-    out = torch.full((len(rows),), -1, dtype=torch.int64, device=rows.device)
-    which = torch.arange(len(rows), device=rows.device) if covered is None else covered.reshape(-1).nonzero()[:, 0]
+    codewords = torch.full((len(rows),), -1, dtype=torch.int64, device=rows.device)
+    shown = torch.arange(len(rows), device=rows.device) if covered is None else covered.reshape(-1).nonzero()[:, 0]
     with torch.no_grad():
-        centres = None
-        if autoencoder is not None and not exact:
-            centres = autoencoder.encode(codebook.codewords).to(rows)
-        layers = None if autoencoder is None or not exact else _score_layers(rows, codebook, autoencoder)
-        for part in which.split(PIXELS):
-            if layers is not None:
-                out[part], leads = _decide(layers, rows[part])
-                part = part[~(leads > LEAD)]
+        layers = _score_layers(rows, codebook, autoencoder) if autoencoder is not None and exact else None
+        centres = autoencoder.encode(codebook.codewords).to(rows) if autoencoder is not None and not exact else None
+        for pixels in shown.split(PIXELS):
+            if layers is not None:  # quick; where two codewords are too close to call, decode and quantise below
+                codewords[pixels], leads = _best_and_lead(layers, rows[pixels])
+                pixels = pixels[~(leads > LEAD)]
             if centres is not None:
-                out[part] = nearest_codeword(rows[part], centres)
+                codewords[pixels] = nearest_codeword(rows[pixels], centres)
             else:
-                features = rows[part] if autoencoder is None else autoencoder.decode(rows[part])
-                out[part] = codebook.quantize(features).masked_fill(row_norms(features) <= EPS, -1)
-    return out.reshape(latents.shape[:-1])
+                features = rows[pixels] if autoencoder is None else autoencoder.decode(rows[pixels])
+                codewords[pixels] = codebook.quantize(features).masked_fill(row_norms(features) <= EPS, -1)
+    return codewords.reshape(latents.shape[:-1])
 
 
 def nearest_codeword(
@@ -116,8 +114,8 @@ def _score_layers(
     return *decoder[:-1], (unit @ weight, unit @ bias)
 
 
-def _decide(layers: tuple[tuple[Tensor, Tensor], ...], rows: Tensor) -> tuple[Tensor, Tensor]:  # [n] int64, [n]
-    """The largest output (linear layers, ReLU between) and how clearly: (largest - second) / largest, 0 if not positive."""
+def _best_and_lead(layers: tuple[tuple[Tensor, Tensor], ...], rows: Tensor) -> tuple[Tensor, Tensor]:  # [n] int64, [n]
+    """Which output of the layers (ReLU between) is largest, and its lead: (largest - second) / largest, 0 if not positive."""
     for k, (weight, bias) in enumerate(layers):
         rows = torch.addmm(bias, rows.relu_() if k else rows, weight.T)
     best, winners = largest(rows)

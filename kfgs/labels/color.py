@@ -101,7 +101,7 @@ def shades(
     straight = (1 - gain * bend) / (1 - bend) if float(gain) > 1 else gain
     to_white = (1 - peak) / (1 - knee) if float(1 - knee) > 1e-6 else torch.ones_like(peak)  # greys stay grey
 
-    def replace(luminance: Tensor) -> tuple[Tensor, Tensor]:
+    def shade(luminance: Tensor) -> tuple[Tensor, Tensor]:
         tone = gain * luminance.clamp(max=bend) + straight * (luminance - bend).clamp(min=0)
         rate = torch.where(luminance > bend, straight, gain)
         above = (tone > knee)[:, None]
@@ -109,4 +109,4 @@ def shades(
         colors = torch.where(above, peak + to_white * (tone - knee)[:, None], slopes * tone[:, None])
         return colors, slopes * rate[:, None]
 
-    return replace
+    return shade

@@ -54,12 +54,12 @@ class Insert(Edit):
         return join(gaussians, part)
 
     def seen_from(self, folder: Path) -> Insert:
-        """The same edit with its path relative to the folder if it lies in it, else in full."""
+        """The edit as a list in the folder keeps it: with a path relative to the folder if the file lies in it, else in full."""
         path, folder = real_path(self.source), real_path(folder)
         return replace(self, source=path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path))
 
     def placed_in(self, folder: Path, name: str, *, anywhere: bool) -> Insert:
-        """The same edit of a list saved in a folder: its file lies there or below (links are followed), unless `anywhere`."""
+        """The edit of a list in the folder, to apply. Its file must lie there or below (links followed), unless `anywhere`."""
         path = folder / self.source
         if not anywhere and not Path(os.path.realpath(path)).is_relative_to(real_path(folder)):
             got = f"{str(self.source)!r:.200}; copy it there, or load with anywhere=True if you trust these edits"

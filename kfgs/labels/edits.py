@@ -229,10 +229,10 @@ class Duplicate(_Motion):
 
 
 def transformed(gaussians: Gaussians, similarity: Similarity, origin: Origin) -> Gaussians:
-    """`transform_gaussians`, counted from an origin; a ValueError if numbers leave the range in which their type is of use.
+    """`transform_gaussians`, counted from an origin; a ValueError if the dtype cannot hold the result.
 
-    Fourth powers (determinants of 2-D covariances) stay finite, scales above 0; positions are rounded by less than a tenth of
-    the size of what moves, unless they were before.
+    Fourth powers (determinants of 2-D covariances) must be finite and scales above 0. The rounding of positions must be less
+    than a tenth of the size of what moves, or no worse than before.
     """
     moved = transform_gaussians(gaussians, similarity).with_origin(origin)
     if len(moved) == 0:

@@ -1,4 +1,4 @@
-"""The classes of a scene and their text embeddings, in memory and in files; and what a query compares with what."""
+"""The classes of a scene and their text embeddings, in memory and in files; and the rows that a query compares."""
 
 from __future__ import annotations
 
@@ -134,12 +134,12 @@ def load_label_set(classes: str | Path, embeddings: str | Path | None = None) ->
         return LabelSet(tuple(names), torch.from_numpy(rows.astype(np.float32)))
 
 
-def teacher_mismatch(one: dict[str, Any], other: dict[str, Any]) -> str | None:
+def teacher_mismatch(info: dict[str, Any], other: dict[str, Any]) -> str | None:
     """How the teacher of another field's or label set's `info` differs, in words; None if no difference is known.
 
     Encoders have unrelated spaces: no word of 61 that CLIP ViT-B/16 and ViT-B/32 both embedded was nearest to itself.
     """
-    ours, theirs = one.get("teacher"), other.get("teacher")
+    ours, theirs = info.get("teacher"), other.get("teacher")
     if isinstance(ours, dict) and isinstance(theirs, dict):
         for key in ("name", "weights"):
             mine, its = ours.get(key), theirs.get(key)
@@ -210,7 +210,8 @@ def make_question(
     rows = row.new_zeros(0, dim) if rows is None else rows
     if negatives == "auto":
         against = rows[_unlike(rows, row)]
-        if len(against) == 0 or (len(against) == len(rows) and not isinstance(target, str)):  # no others, or no class
+        is_class = isinstance(target, str) or len(against) < len(rows)
+        if len(against) == 0 or not is_class:
             against = _canonical(table, words, row)
     elif negatives == "classes":
         against = rows[_unlike(rows, row)]

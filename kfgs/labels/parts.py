@@ -89,7 +89,7 @@ class Part:
     extent: tuple[Tensor, Tensor]  # lowest and highest corner [3] along the world's axes
     best_view: BestView | None  # None without cameras, or if no camera shows any of it
     how: str  # how it was selected
-    total: int = 1  # how many connected parts the selection has, with those that are left out
+    total: int = 1  # how many connected parts the selection has, including those that are left out
 
     @property
     def count(self) -> int:

@@ -60,13 +60,13 @@ def select_by_similarity(
     similarity: Tensor,  # [N]
     negatives: Tensor | None = None,  # [N, M]
     threshold: float | None = None,
-    valid: Tensor | None = None,  # [N] bool
+    known: Tensor | None = None,  # [N] bool
     score: Score | None = None,
 ) -> Selection:
     """Select the Gaussians with a score above gamma, from cosines with a query and its negatives (`SemanticField.query`).
 
     Without a `threshold`, gamma is 0.5 for a relevancy: more similar to the query than to any negative. For a cosine,
-    `similarity_threshold` finds it in the scores. Gaussians that are not `valid` have score 0 and no influence on gamma. On
+    `similarity_threshold` finds it in the scores. Gaussians that are not `known` have score 0 and no influence on gamma. On
     room_0 (mean IoU over 18 classes with the data set's labels): cosine 0.88, relevancy 0.90.
     """
     score = score or ("cosine" if negatives is None else "relevancy")
@@ -83,7 +83,7 @@ def select_by_similarity(
         check_choice("score", score, get_args(Score))
     if threshold is not None:
         check_range("threshold", threshold, -1 if score == "cosine" else 0, 1)
-    known = torch.ones_like(similarity, dtype=torch.bool) if valid is None else valid
+    known = torch.ones_like(similarity, dtype=torch.bool) if known is None else known
     scores = scores.masked_fill(~known, 0)
     if gamma is None:
         gamma, how = similarity_threshold(scores[known])

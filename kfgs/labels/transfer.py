@@ -113,8 +113,9 @@ def nearest_labels(
         raise ValueError(f"src_labels: expected class indices or -1, got {given.min()}; map other codes to -1 first")
     points, targets = positions("src_means", src_means), as_array(dst_means).astype(np.float64, copy=False)
     known = np.isfinite(targets).all(1)
-    lost = [f"{(~known).sum():,} of {len(known):,} places are not finite: they get no label"] * (not known.all())
-    tell_repairs("dst_means", map(Repair, lost), False, ValueError)
+    if not known.all():
+        lost = Repair(f"{(~known).sum():,} of {len(known):,} places are not finite: they get no label")
+        tell_repairs("dst_means", [lost], False, ValueError)
     sources = Sources(points, given >= 0)
     chosen, how = sources.default_distance(targets[known]) if distance is None else (float(distance), "given")
     distances, index = np.full(len(targets), np.inf), np.full(len(targets), -1)
@@ -140,13 +141,13 @@ class Sources:
 
         Of equally near ones it is the lowest index. scipy returns them in any order: while all are equally near, ask for more.
         """
-        far, index = np.full(len(points), np.inf), np.full(len(points), -1)
+        distances, index = np.full(len(points), np.inf), np.full(len(points), -1)
         if not (len(points) and len(self.index)):
-            return far, index
+            return distances, index
         # neighbours follow each other: a tree answers twice as fast
         cell = max(float(np.ptp(points, axis=0).max()) / 64, np.finfo(np.float64).tiny)
         order: Array = np.lexsort(np.floor((points - points.min(axis=0)) / cell).T)
-        n, ours = len(self.index), np.append(self.index, -1)  # scipy's index of none is n
+        n, gaussian = len(self.index), np.append(self.index, -1)  # scipy's index of none is n
         for left in (order[i : i + CHUNK] for i in range(0, len(points), CHUNK)):
             k = 1
             while left.size:
@@ -155,9 +156,9 @@ class Sources:
                 near, which = np.reshape(near, (len(left), k)), np.reshape(which, (len(left), k))
                 near[near >= distance] = np.inf  # scipy compares squares, which rounds otherwise
                 tied = (near == near[:, :1]) & np.isfinite(near)
-                far[left], index[left] = near[:, 0], ours[np.where(tied, which, n).min(axis=1)]
+                distances[left], index[left] = near[:, 0], gaussian[np.where(tied, which, n).min(axis=1)]
                 left = left[tied.all(axis=1) & (k < n)]
-        return far, index
+        return distances, index
 
     def default_distance(self, targets: Array) -> tuple[float, str]:
         """Lambda for these destinations (see `nearest_labels`), in world units, and one line that explains it."""
@@ -167,7 +168,7 @@ class Sources:
         if len(targets) == 0:
             return tiny, "no destinations"
         reach = float(np.quantile(self.tree.query(sampled(targets), workers=-1)[0], COVERAGE))
-        usual = wide = 1.01 * reach / NEAREST  # of a single source, which is to reach that far
+        usual = wide = 1.01 * reach / NEAREST  # a single source has no spacing: lambda becomes 1.01 times the reach
         if len(self.index) > 1:
             spacings = np.asarray(self.tree.query(sampled(np.asarray(self.tree.data)), k=2, workers=-1)[0])[:, 1]
             usual, wide = (float(spacing) for spacing in np.quantile(spacings, [0.5, WIDE]))

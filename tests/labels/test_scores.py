@@ -29,8 +29,8 @@ def test_relevancy_is_the_least_pairwise_softmax():
 
 def test_what_knows_nothing_is_not_selected_and_shapes_no_gamma():
     similarity = torch.tensor([0.2] * 30 + [0.8] * 10 + [0.99] * 10)
-    valid = torch.tensor([True] * 40 + [False] * 10)
-    result = select_by_similarity(similarity, valid=valid)
+    known = torch.tensor([True] * 40 + [False] * 10)
+    result = select_by_similarity(similarity, known=known)
     assert result.mask.tolist() == [False] * 30 + [True] * 10 + [False] * 10
     assert 0.4 < result.threshold < 0.6
     assert not result.scores[40:].any()
