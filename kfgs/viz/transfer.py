@@ -76,14 +76,14 @@ def show_transfer(
         raise ValueError(f"splat: expected Gaussians with colours, got {splat!r}; `read_splats` reads a colour cloud")
     semantic, splat = semantic.to("cpu"), splat.to("cpu").with_origin(semantic.origin)
     up = np.asarray(upwards(views))
-    shown = [np.flatnonzero(whole | ~enclosing(cloud, views, up)) for cloud in (semantic, splat)]
+    rows = [np.flatnonzero(whole | ~enclosing(cloud, views, up)) for cloud in (semantic, splat)]
     plotter = make_plotter(height, height, off_screen=off_screen)
     try:
-        picture = _Picture(plotter, (semantic, splat), shown, distance, up)
-        picture.show(picture.distance)
-        ends, bar = (0.0, REACH * picture.distance), {"pointa": (0.62, 0.08), "pointb": (0.97, 0.08), "fmt": "%.3g"}
-        plotter.add_slider_widget(picture.show, ends, value=picture.distance, color=letters(plotter), **bar)
-        plotter.enable_point_picking(picture.tell, use_picker=True, tolerance=0.005, show_message=False)
+        picture = _Picture(plotter, (semantic, splat), rows, distance, up)
+        picture.draw(picture.distance)
+        span, bar = (0.0, REACH * picture.distance), {"pointa": (0.62, 0.08), "pointb": (0.97, 0.08), "fmt": "%.3g"}
+        plotter.add_slider_widget(picture.draw, span, value=picture.distance, color=letters(plotter), **bar)
+        plotter.enable_point_picking(picture.name_picked, use_picker=True, tolerance=0.005, show_message=False)
         look_over(plotter, up.tolist())
     except BaseException:
         plotter.close()
@@ -92,97 +92,97 @@ def show_transfer(
 
 
 class _Picture:
-    """Both clouds in a plotter, who gives each colour Gaussian its label, and what changes with lambda."""
+    """Draws both clouds once, and with every move of the slider what depends on lambda: colours, lines and counts."""
 
     def __init__(
-        self, plotter: pv.Plotter, clouds: Sequence[Gaussians], shown: list[Array], distance: float | None, up: Array
+        self, plotter: pv.Plotter, clouds: Sequence[Gaussians], rows: list[Array], distance: float | None, up: Array
     ) -> None:
         semantic, splat = clouds
-        self.plotter, self.lines, (self.low, self.high) = plotter, {"counts": "", "picked": ""}, shown
+        self.plotter, self.text = plotter, {"counts": "", "picked": ""}
+        self.semantic_rows, self.color_rows = rows  # which Gaussians of each cloud are drawn
         self.classes = classes = as_array(semantic.labels)
-        self.starts, targets = (as_array(cloud.means).astype(np.float64) for cloud in clouds)
-        self.distance = nearest_labels(self.starts, classes, targets, distance).distance
-        carried = nearest_labels(self.starts, classes, targets, REACH * self.distance)
-        self.labels, self.distances, self.sources = map(as_array, (carried.labels, carried.distances, carried.sources))
+        self.sources, targets = (as_array(cloud.means).astype(np.float64) for cloud in clouds)
+        self.distance = nearest_labels(self.sources, classes, targets, distance).distance
+        carried = nearest_labels(self.sources, classes, targets, REACH * self.distance)  # the slider's end
+        self.labels, self.distances, self.givers = map(as_array, (carried.labels, carried.distances, carried.sources))
         known = np.flatnonzero(classes >= 0)
         nearest = range(1, min(NEIGHBOURS, len(known)) + 1)
-        far, rows = cKDTree(self.starts[known]).query(targets, [*nearest], workers=-1)
-        others = classes[known][rows] != self.labels[:, None]
+        far, neighbours = cKDTree(self.sources[known]).query(targets, [*nearest], workers=-1)
+        others = classes[known][neighbours] != self.labels[:, None]
         self.disputed = (others & (far < NEARLY * self.distances[:, None])).any(axis=1)
 
         names = names_of(semantic)
-        self.words = [*(names or (f"class {i}" for i in range(classes.max() + 1))), "no class"]
-        self.below, self.above = cloud_colors(semantic, "label").rgb, cloud_colors(splat, "rgb").rgb
-        width = np.ptp(np.quantile(self.starts[self.low], (0.02, 0.98), axis=0), axis=0).max()
-        self.ends = targets + LIFT * width * up
-        lifted = splat.replace(means=torch.from_numpy(self.ends).to(splat.means))
+        self.names = [*(names or (f"class {i}" for i in range(classes.max() + 1))), "no class"]
+        self.class_colors, self.own_colors = cloud_colors(semantic, "label").rgb, cloud_colors(splat, "rgb").rgb
+        width = np.ptp(np.quantile(self.sources[self.semantic_rows], (0.02, 0.98), axis=0), axis=0).max()
+        self.lifted = targets + LIFT * width * up
+        above = splat.replace(means=torch.from_numpy(self.lifted).to(splat.means))
         # joined, because VTK does not mix two clouds, without what only one of them has
-        parts = [cloud.select(rows) for cloud, rows in zip((semantic, lifted), shown, strict=True)]
+        parts = [cloud.select(some) for cloud, some in zip((semantic, above), rows, strict=True)]
         shapes = [Gaussians(part.means, part.quats, part.scales, part.opacities, origin=part.origin) for part in parts]
         self.cloud = add_cloud(plotter, Gaussians.cat(shapes), color_by="opacity", style="gaussians")
         if names:
-            add_legend(plotter, classes[self.low], names)
+            add_legend(plotter, classes[self.semantic_rows], names)
 
-    def show(self, distance: float) -> None:
+    def draw(self, distance: float) -> None:
         """Draw colours and lines for a lambda."""
         import pyvista as pv
 
         near = self.distances < distance
         unsure = near & self.disputed
-        colors = np.select([~near[:, None], unsure[:, None]], [ORPHANED, DISPUTED], self.above)
-        recolor_cloud(self.cloud, np.concatenate([self.below[self.low], colors[self.high]]))
+        colors = np.select([~near[:, None], unsure[:, None]], [ORPHANED, DISPUTED], self.own_colors)
+        recolor_cloud(self.cloud, np.concatenate([self.class_colors[self.semantic_rows], colors[self.color_rows]]))
         self.plotter.remove_actor("transfer")
-        drawn = self.high[near[self.high]]
+        drawn = self.color_rows[near[self.color_rows]]
         if len(drawn):
             drawn = drawn[evenly(len(drawn), LINES)]
-            sources = self.sources[drawn]
-            ends = np.stack([self.ends[drawn], self.starts[sources]], axis=1)
+            givers = self.givers[drawn]
+            ends = np.stack([self.lifted[drawn], self.sources[givers]], axis=1)
             mesh = pv.line_segments_from_points(ends.reshape(-1, 3).astype(np.float32))
-            mesh.cell_data.update({"rgb": self.below[sources], "label": self.labels[drawn], "source": sources})
+            mesh.cell_data.update({"rgb": self.class_colors[givers], "label": self.labels[drawn], "source": givers})
             mesh.cell_data.update({"destination": drawn, "distance": self.distances[drawn]})
             draw_mesh(self.plotter, mesh, scalars="rgb", rgb=True, name="transfer", lighting=False, pickable=False)
         counts = f"{(~near).sum():,} without a label (red), {unsure.sum():,} disputed (yellow)"
         self._write("counts", f"lambda {distance:.3g}: {len(near):,} Gaussians, {counts}")
 
-    def tell(self, _: Any, picker: Any) -> None:
-        """Name the Gaussian that was picked."""
+    def name_picked(self, _: Any, picker: Any) -> None:
+        """Write which Gaussian was picked, its class, and who gave it."""
         if picker.GetPointId() < 0:
             return
         row = int(self.cloud.mapper.dataset["index"][picker.GetPointId()])
-        if row < len(self.low):
-            i = self.low[row]
-            self._write("picked", f"semantic Gaussian {i}: {self.words[self.classes[i]]}")
+        if row < len(self.semantic_rows):
+            i = self.semantic_rows[row]
+            self._write("picked", f"semantic Gaussian {i}: {self.names[self.classes[i]]}")
         else:
-            i = self.high[row - len(self.low)]
-            source = f"from semantic Gaussian {self.sources[i]}, {self.distances[i]:.3g} away"
-            self._write("picked", f"colour Gaussian {i}: {self.words[self.labels[i]]} {source}")
+            i = self.color_rows[row - len(self.semantic_rows)]
+            giver = f"from semantic Gaussian {self.givers[i]}, {self.distances[i]:.3g} away"
+            self._write("picked", f"colour Gaussian {i}: {self.names[self.labels[i]]} {giver}")
 
     def _write(self, name: str, line: str) -> None:
-        self.lines[name] = line
-        text, ink = "\n".join(self.lines.values()), letters(self.plotter)
+        self.text[name] = line
+        text, ink = "\n".join(self.text.values()), letters(self.plotter)
         self.plotter.add_text(text, position="upper_left", font_size=9, color=ink, name="transfer text")
 
 
 def enclosing(gaussians: Gaussians, cameras: Sequence[Camera], up: Array) -> Array:  # [N] bool
     """Which Gaussians enclose the cameras: the walls, the ceiling and what is beyond them; none if walls are on one side only.
 
-    Over the middle of the cameras nothing is as high as the ceiling, and at their height little is as far out as the walls.
-    So the ceiling is at a median of heights, and the wall of each sector at a median of distances. Where a camera is farther
-    out, there is no wall.
+    In the middle, what is higher than all cameras is mostly ceiling; at their height, most is wall. So the ceiling is at a
+    median of heights, and the wall of each sector at a median of distances, unless a camera is farther out.
     """
     if not cameras:
         return np.zeros(len(gaussians), dtype=bool)
     centers = np.stack([as_array(camera.with_origin(gaussians.origin).center) for camera in cameras]).astype(np.float64)
     middle, axes = np.median(centers, axis=0), np.vstack([np.linalg.svd(up[None])[2][1:], up])  # two level axes, and up
     x, y, z = axes @ (as_array(gaussians.means) - middle).T
-    u, v, w = axes @ (centers - middle).T
-    out, farthest = np.hypot(x, y), np.hypot(u, v)
-    thick, over = THICK * np.median(out), z[(z > w.max()) & (out < np.median(out))]
-    ceiling = np.median(over) if over.size else np.inf
+    u, v, w = axes @ (centers - middle).T  # of the cameras
+    out, camera_out = np.hypot(x, y), np.hypot(u, v)
+    thick, overhead = THICK * np.median(out), z[(z > w.max()) & (out < np.median(out))]
+    ceiling = np.median(overhead) if overhead.size else np.inf
     sector, seat = (((np.arctan2(b, a) / np.pi + 1) / 2 * SECTORS).astype(int) % SECTORS for a, b in ((x, y), (u, v)))
     at_eye_level, walls = (z > 0) & (z < ceiling - thick), np.full(SECTORS, np.inf)
     for k in range(SECTORS):
         distances = out[at_eye_level & (sector == k)]
-        if distances.size and np.median(distances) > farthest[seat == k].max(initial=0.0):
+        if distances.size and np.median(distances) > camera_out[seat == k].max(initial=0.0):  # seat: a camera's sector
             walls[k] = np.median(distances) - thick
     return ((out > walls[sector]) | (z > ceiling - thick)) & (np.isfinite(walls).mean() >= AROUND)
