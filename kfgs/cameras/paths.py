@@ -5,20 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import cos, hypot, pi, radians, sin, tan
-from typing import Any
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
+from .._arrays import Array
 from .._check import ORIGIN, as_array, as_origin, as_tensor, check_range, check_size, check_whole
 from .._rows import check_finite
 from .bounds import robust_bounds
 from .camera import UP, Camera, at_one_origin, unit_vector
 from .resample import fits_aspect
 
-Array = np.ndarray[Any, Any]
 SAME = 1e-9  # successive views closer than this, in position and direction, are the same view
 STANDING = 1e-6  # of the coordinates: cameras on one tripod differ by the rounding of float32
 LEVEL = 0.05  # if the pictures' x axes spread less than this in their second direction, they do not determine "up"

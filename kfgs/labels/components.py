@@ -9,7 +9,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from .transfer import Array, positions, sampled
+from .._arrays import Array
+from .transfer import positions, sampled
 
 NEIGHBOURS = 8  # nearest neighbours of each point that are joined first
 NEIGHBOUR, QUANTILE = 4, 0.9  # a cloud's spacing: 90 % have their fourth neighbour within it

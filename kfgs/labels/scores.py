@@ -9,10 +9,10 @@ import torch
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
+from .._arrays import Array
 from .._check import check_choice, check_range, check_shapes
 from .._rows import check_finite
 from .selection import Selection
-from .transfer import Array
 
 TEMPERATURE = 10.0  # factor of the cosines in LERF (Kerr 2023)
 CANONICAL = ("object", "things", "stuff", "texture")  # LERF's negatives for a scene without known classes

@@ -16,6 +16,7 @@ from typing import Any, ClassVar, TypeVar
 import torch
 from torch import Tensor
 
+from .._arrays import Array
 from .._card import cut, say_coordinate
 from .._check import as_tensor, check_range, check_whole, class_indices
 from .._origin import to_world
@@ -23,7 +24,7 @@ from .._rows import check_finite
 from ..cameras.similarity import Similarity
 from ..gaussians import Gaussians
 from .components import number_parts
-from .transfer import Array, positions
+from .transfer import positions
 
 T = TypeVar("T")
 

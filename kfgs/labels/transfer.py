@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from .._arrays import Array
 from .._check import as_array, as_tensor, check_range, check_shapes
 from .._notes import Repair, tell_repairs
 from .._origin import recounted
@@ -21,8 +21,6 @@ SAMPLE = 20_000  # Gaussians measured for lambda or a spacing
 COVERAGE = 0.995  # lambda reaches this share of the destinations ...
 NEAREST = 2.0  # ... but is at least this many median spacings of the sources ...
 FARTHEST, WIDE = 10.0, 0.9  # ... and at most 10 times this quantile of the spacings
-
-Array = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True, eq=False)
