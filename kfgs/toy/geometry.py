@@ -5,19 +5,31 @@ Everything is numpy float64 in world units (metres). The solids are the furnitur
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
-from .patterns import Texture
+from ..cameras.projection import project_points
 
 Array = NDArray[np.float64]
 NEAR = 0.02  # metres: hits closer than this to a ray's origin are ignored
+
+
+@dataclass(frozen=True)
+class Texture:
+    """The material of one object: its pattern, two or more colours (RGB in [0, 1]), its size in metres, its seed."""
+
+    kind: str  # a name of PATTERNS
+    colors: tuple[tuple[float, float, float], ...]
+    scale: float = 0.2
+    seed: int = 0
+    contrast: float = 0.1  # of the fine noise on top, relative to the colour
+    glow: float = 0.0  # light that it gives off by itself: a lamp's shade
 
 
 @dataclass(frozen=True)
@@ -67,89 +79,72 @@ def intersect(solid: Solid, origin: Array, directions: Array) -> Array:  # [3], 
     return np.where((enter <= leave) & (enter > NEAR), enter, np.inf)
 
 
-def normals(solid: Solid, points: Array) -> Array:  # [N, 3] -> [N, 3]
-    """Outward unit normals at points on the surface; on an edge of a box, the normal of one face."""
-    local = solid.to_local(points)
-    half = np.array(solid.half)
-    if solid.shape == "ellipsoid":
-        n = local / half**2
-        n /= np.linalg.norm(n, axis=-1, keepdims=True)
-    else:
-        face = np.arange(3) == np.argmax(np.abs(local) - half, axis=-1)[:, None]
-        n = np.where(face, np.sign(local), 0.0)
-    return n @ solid.rotation().T
+class Places(NamedTuple):
+    """Places on the surfaces of solids."""
+
+    points: Array  # [N, 3] world
+    normals: Array  # [N, 3] unit length, outward
+    which: NDArray[np.int64]  # [N] the solid of each
+
+    def take(self, rows: NDArray[np.int64]) -> Places:
+        """Some of the places."""
+        return Places(self.points[rows], self.normals[rows], self.which[rows])
 
 
-def pixel_rays(camera: Camera) -> tuple[Array, Array]:  # [3], [H, W, 3]
-    """Camera centre and one world direction per pixel centre, scaled so that the ray parameter is z-depth."""
-    K, E = camera.K.double().numpy(), camera.viewmat.double().numpy()
+def places_on(solids: Sequence[Solid], points: Array, which: NDArray[np.int64]) -> Places:  # [N, 3], [N]
+    """Points on the surfaces of the given solids with their normals; on an edge of a box, the normal of one face."""
+    outward = np.zeros_like(points)
+    for i in np.unique(which):
+        rows, solid, half = which == i, solids[i], np.array(solids[i].half)
+        local = solid.to_local(points[rows])
+        if solid.shape == "ellipsoid":
+            n = local / half**2
+            n /= np.linalg.norm(n, axis=-1, keepdims=True)
+        else:
+            face = np.arange(3) == np.argmax(np.abs(local) - half, axis=-1)[:, None]
+            n = np.where(face, np.sign(local), 0.0)
+        outward[rows] = n @ solid.rotation().T
+    return Places(points, outward, which)
+
+
+def in_cone(solid: Solid, origin: Array, ways: Array, margin: float = 0.0) -> NDArray[np.bool_]:  # [N, 3] -> [N]
+    """Which unit vectors from `origin` may touch the ball around a solid, made larger by `margin`; all from inside it."""
+    to_center = np.array(solid.center) - origin
+    outside = float(to_center @ to_center) - (float(np.linalg.norm(solid.half)) + margin) ** 2
+    return ways @ to_center > np.sqrt(outside) - 1e-9 if outside > 0 else np.ones(len(ways), bool)
+
+
+def first_hit(solids: Sequence[Solid], origin: Array, directions: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Where each ray [N, 3] first enters a solid, and which: `intersect`'s parameter and the index (infinity and -1)."""
+    ways = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    nearest, which = np.full(len(ways), np.inf), np.full(len(ways), -1)
+    for i, solid in enumerate(solids):
+        rows = np.flatnonzero(in_cone(solid, origin, ways))
+        t = intersect(solid, origin, directions[rows])
+        nearer = t < nearest[rows]
+        nearest[rows[nearer]], which[rows[nearer]] = t[nearer], i
+    return nearest, which
+
+
+def cast(solids: Sequence[Solid], camera: Camera) -> tuple[Array, Places]:  # [H, W], H * W places
+    """What a camera sees at its pixels' centres in a closed room: the z-depths, and the places row by row."""
+    origin, K, E = camera.center.numpy(), camera.K.numpy(), camera.viewmat.numpy()
     u = (np.arange(camera.width) + 0.5 - K[0, 2]) / K[0, 0]
     v = (np.arange(camera.height) + 0.5 - K[1, 2]) / K[1, 1]
-    rays = np.stack([*np.meshgrid(u, v), np.ones(camera.size)], axis=-1)
-    return -E[:3, :3].T @ E[:3, 3], rays @ E[:3, :3]
+    rays = (np.stack([*np.meshgrid(u, v), np.ones(camera.size)], axis=-1) @ E[:3, :3]).reshape(-1, 3)  # 1 long along z
+    depth, which = first_hit(solids, origin, rays)
+    assert np.isfinite(depth).all(), "the room is closed"
+    return depth.reshape(camera.size), places_on(solids, origin + rays * depth[:, None], which)
 
 
-def project(camera: Camera, points: Array) -> tuple[Array, Array]:  # [N, 3] -> [N, 2], [N]
-    """Pixels and z-depths of world points; pixels of points behind the camera are meaningless."""
-    K, E = camera.K.double().numpy(), camera.viewmat.double().numpy()
-    cam = points @ E[:3, :3].T + E[:3, 3]
-    z = np.where(np.abs(cam[:, 2:]) < 1e-9, 1e-9, cam[:, 2:])
-    return cam[:, :2] / z * np.array([K[0, 0], K[1, 1]]) + K[:2, 2], cam[:, 2]
-
-
-def _window(solid: Solid, camera: Camera) -> tuple[slice, slice]:
-    """The rows and columns that the solid can touch; the whole image if it reaches behind the camera."""
-    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    xy, z = project(camera, signs * np.array(solid.half) @ solid.rotation().T + np.array(solid.center))
-    if z.min() < NEAR:
-        return slice(0, camera.height), slice(0, camera.width)
-    ends = np.stack([xy.min(0) - 1, xy.max(0) + 2])
-    (x0, y0), (x1, y1) = np.clip(ends, 0, [camera.width, camera.height]).astype(int)
-    return slice(y0, y1), slice(x0, x1)
-
-
-def cast(solids: Sequence[Solid], camera: Camera) -> tuple[Array, NDArray[np.int64]]:  # [H, W], [H, W]
-    """The z-depth and the index of the nearest solid at each pixel's centre (infinity and -1 where there is none)."""
-    origin, rays = pixel_rays(camera)
-    depth = np.full(camera.size, np.inf)
-    index = np.full(camera.size, -1, np.int64)
-    for i, solid in enumerate(solids):
-        window = _window(solid, camera)
-        t = intersect(solid, origin, rays[window])
-        nearer = t < depth[window]
-        depth[window][nearer] = t[nearer]
-        index[window][nearer] = i
-    return depth, index
-
-
-def occluded(solids: Sequence[Solid], origin: Array, targets: Array) -> NDArray[np.bool_]:  # [N]
-    """Whether a solid cuts the segment from `origin` to each target before its end (the last 0.1 mm do not count)."""
-    ways = targets - origin
-    lengths = np.maximum(np.linalg.norm(ways, axis=-1), 1e-3)
-    ways /= lengths[:, None]
-    to_centers = np.array([solid.center for solid in solids]) - origin
-    distances = np.linalg.norm(to_centers, axis=-1)
-    sines = np.minimum([np.linalg.norm(s.half) for s in solids] / np.maximum(distances, 1e-9), 1.0)
-    # the cone around each solid's bounding sphere; the whole space if the origin lies inside the sphere
-    in_cone = ways @ to_centers.T >= np.where(sines < 1.0, np.sqrt(1.0 - sines**2), -1.0) * distances - 1e-9
-    hidden = np.zeros(len(targets), bool)
-    for i, solid in enumerate(solids):
-        rows = np.flatnonzero(in_cone[:, i] & ~hidden)
-        hidden[rows] = intersect(solid, origin, ways[rows]) < lengths[rows] - 1e-4
-    return hidden
-
-
-def visible(
-    solids: Sequence[Solid], camera: Camera, points: Array, outward: Array
-) -> NDArray[np.bool_]:  # [N, 3], [N, 3] -> [N]
-    """Which surface points (with their normals) a camera sees: inside the image, facing it, nothing in between."""
-    xy, z = project(camera, points)
-    E = camera.viewmat.double().numpy()
-    origin = -E[:3, :3].T @ E[:3, 3]
-    inside = (z > NEAR) & (xy >= 0).all(-1) & (xy < [camera.width, camera.height]).all(-1)
-    rows = np.flatnonzero(inside & (((origin - points) * outward).sum(-1) > 0))
-    seen = np.zeros(len(points), bool)
-    seen[rows] = ~occluded(solids, origin, points[rows])
+def visible(solids: Sequence[Solid], camera: Camera, places: Places) -> NDArray[np.bool_]:  # [N]
+    """Which places a camera sees: inside the image, facing it, and no solid cuts the way to them, but for its last 0.1 mm."""
+    origin = camera.center.numpy()
+    seen = project_points(camera, torch.from_numpy(places.points), near=NEAR)[2].numpy()
+    seen &= ((origin - places.points) * places.normals).sum(-1) > 0
+    ways = places.points[seen] - origin
+    lengths = np.linalg.norm(ways, axis=-1)
+    seen[seen] = first_hit(solids, origin, ways / lengths[:, None])[0] >= lengths - 1e-4
     return seen
 
 

@@ -9,9 +9,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .geometry import Array, Solid
+from .geometry import Array, Places, Solid, in_cone
 from .room import ROOM
 
 
@@ -39,8 +38,7 @@ GLOWS = (  # the two lamps of the room; they cast no shadows
 SKY, GROUND = (0.30, 0.305, 0.315), (0.34, 0.32, 0.29)  # what comes from everywhere: from above, and from the floor
 NEAR = 0.22  # metres: how far a piece of furniture takes light from its surroundings
 CORNER = 0.45  # metres: the same for walls, floor and ceiling
-SHELL = ("wall", "floor", "ceiling")
-FLAT = (*SHELL, "rug", "picture", "door")  # too thin, or too large, to cast a shadow that is seen
+FLAT = ("wall", "floor", "ceiling", "rug", "picture", "door")  # too thin, or too large, to cast a shadow that is seen
 
 
 def _to_surface(solid: Solid, local: Array) -> tuple[Array, Array]:  # [N, 3] -> [N], [N, 3]
@@ -57,10 +55,9 @@ def _to_surface(solid: Solid, local: Array) -> tuple[Array, Array]:  # [N, 3] ->
     return np.maximum(size - 1.0, 0.0) * size / np.maximum(steep, 1e-6), -slope / np.maximum(steep, 1e-6)[:, None]
 
 
-def openness(
-    solids: Sequence[Solid], points: Array, outward: Array, which: NDArray[np.int64]
-) -> Array:  # [N, 3], [N, 3], [N] -> [N] in [0, 1]
+def openness(solids: Sequence[Solid], places: Places) -> Array:  # [N] in [0, 1]
     """The share of the surroundings' light that reaches each place: less in corners, below and beside furniture."""
+    points, outward, which = places
     left = np.ones(len(points))
     for axis, (low, high) in enumerate(((-ROOM[0] / 2, ROOM[0] / 2), (-ROOM[1] / 2, ROOM[1] / 2), (0.0, ROOM[2]))):
         for side, distance in ((-1.0, points[:, axis] - low), (1.0, high - points[:, axis])):
@@ -99,25 +96,21 @@ def _clearance(solid: Solid, origin: Array, ways: Array) -> tuple[Array, Array]:
     return ((np.abs(o + at[:, None] * d) - half) * aside).max(-1), at
 
 
-def lamps_seen(
-    solids: Sequence[Solid], points: Array, outward: Array, which: NDArray[np.int64]
-) -> Array:  # [N, 3], [N, 3], [N] -> [N, L]
-    """The share of each lamp that each place sees, in [0, 1]; no solid shades itself, and what faces away is not asked."""
+def lamps_seen(solids: Sequence[Solid], places: Places) -> Array:  # [N, L] in [0, 1]
+    """The share of each lamp that each place sees; no solid shades itself, and what faces away is not asked."""
+    points, outward, which = places
     seen = np.ones((len(points), len(LAMPS)))
     for k, lamp in enumerate(LAMPS):
         ways = np.array(lamp.place) - points
         lengths = np.sqrt(_dot(ways, ways))
         facing = np.flatnonzero(_dot(ways, outward) > -0.25 * lengths)
-        rays = ways[facing] / lengths[facing, None]
+        rays = -ways[facing] / lengths[facing, None]
         for i, solid in enumerate(solids):
             if solid.label in FLAT:
                 continue
-            to_center = np.array(solid.center) - lamp.place
             # A shadow's edge is as wide as the lamp times the blocker's share of the way, at most its share of the height.
             top = (solid.center[2] + solid.half[2]) / lamp.place[2]
-            reach = float(np.linalg.norm(solid.half)) + lamp.radius * top
-            near = -(rays @ to_center) > np.sqrt(max(float(to_center @ to_center) - reach**2, 0.0))
-            rows = facing[near]
+            rows = facing[in_cone(solid, np.array(lamp.place), rays, lamp.radius * top)]
             rows = rows[(which[rows] != i) & (seen[rows, k] > 0.01)]
             clear, at = _clearance(solid, points[rows], ways[rows])
             soft = np.maximum(lamp.radius * at, 0.012)  # half the width of the shadow's edge
@@ -126,15 +119,21 @@ def lamps_seen(
     return seen
 
 
-def light(points: Array, outward: Array, seen: Array, opened: Array) -> Array:  # [N, 3] linear RGB
+def light_reaches(solids: Sequence[Solid], places: Places) -> Array:  # [N, L + 1]
+    """The share of each lamp that each place sees, and how open its surroundings are."""
+    return np.column_stack([lamps_seen(solids, places), openness(solids, places)])
+
+
+def light(places: Places, reaches: Array) -> Array:  # [N, L + 1] -> [N, 3] linear RGB
     """The light on matte places: of the lamps as far as they are seen, and of the surroundings as far as they are open."""
-    up = 0.5 + 0.5 * outward[:, 2:]
+    opened = reaches[:, -1]
+    up = 0.5 + 0.5 * places.normals[:, 2:]
     total = (np.array(GROUND) + (np.array(SKY) - np.array(GROUND)) * up) * opened[:, None]
     for k, lamp in enumerate((*LAMPS, *GLOWS)):
-        ways = np.array(lamp.place) - points
+        ways = np.array(lamp.place) - places.points
         lengths = np.sqrt(_dot(ways, ways))
-        cosine = _dot(ways, outward) / np.maximum(lengths, 1e-6)
+        cosine = _dot(ways, places.normals) / np.maximum(lengths, 1e-6)
         strength = np.maximum((cosine + 0.25) / 1.25, 0.0) / (1.0 + (lengths / lamp.reach) ** 2)
-        share = seen[:, k] if k < len(LAMPS) else 0.4 + 0.6 * opened
+        share = reaches[:, k] if k < len(LAMPS) else 0.4 + 0.6 * opened
         total += (strength * share)[:, None] * np.array(lamp.color)
     return total

@@ -7,7 +7,6 @@ the object, so all views agree on it. Detail finer than a pixel fades out instea
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,8 +14,8 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.functional import grid_sample
 
-Array = NDArray[np.float64]
-Color = tuple[float, float, float]
+from .geometry import Array, Places, Solid, Texture
+
 LATTICE = 48  # random values along each edge of the noise volume, mirrored beyond it
 
 
@@ -27,22 +26,19 @@ class Noise:
         values = rng.uniform(-1.0, 1.0, (1, 1, LATTICE, LATTICE, LATTICE))
         self.volume = torch.from_numpy(values.astype(np.float32))
 
-    def layer(self, points: Array, wavelength: float) -> Array:  # [N, 3] -> [N]
-        """One octave: lattice points `wavelength` / 2 metres apart."""
-        grid = torch.from_numpy((points * (4.0 / (wavelength * (LATTICE - 1)))).astype(np.float32))[None, None, None]
-        out = grid_sample(self.volume, grid, mode="bilinear", padding_mode="reflection", align_corners=True)
-        return out.flatten().double().numpy()
+    def fractal(self, points: Array, wavelength: float, footprint: Array, octaves: int, gain: float = 0.7) -> Array:
+        """The noise at points [N, 3], in octaves from `wavelength` (metres) down.
 
-    def fractal(
-        self, points: Array, wavelength: float, footprint: Array, octaves: int = 6, gain: float = 0.7
-    ) -> Array:  # [N, 3], [N] -> [N]
-        """Octaves from `wavelength` down; those near the size of a pixel (`footprint`, metres) are faded."""
-        total = np.zeros(len(points))
-        weight = 1.0
+        An octave has a lattice point every half wavelength; one near the size of a pixel (`footprint` [N], metres) is faded.
+        """
+        total, weight = np.zeros(len(points)), 1.0
         for octave in range(octaves):
             fade = np.clip((wavelength / footprint - 1.0) / 2.0, 0.0, 1.0)
             if weight * fade.max(initial=0.0) > 0:
-                total += weight * fade * self.layer(points + 0.37 * octave, wavelength)
+                at = (points + 0.37 * octave) * (4.0 / (wavelength * (LATTICE - 1)))
+                grid = torch.from_numpy(at.astype(np.float32))[None, None, None]
+                out = grid_sample(self.volume, grid, mode="bilinear", padding_mode="reflection", align_corners=True)
+                total += weight * fade * out.flatten().double().numpy()
             weight, wavelength = weight * gain, wavelength / 2.13  # not 2: the mirrored periods must not line up
         return total
 
@@ -56,24 +52,12 @@ def hashed(cells: NDArray[np.int64], seed: int) -> Array:  # [N, n] -> [N] in [0
     return (mixed >> np.uint64(11)).astype(np.float64) / 2.0**53
 
 
-@dataclass(frozen=True)
-class Texture:
-    """The material of one object: its pattern, two or more colours (RGB in [0, 1]), its size in metres, its seed."""
-
-    kind: str  # a name of PATTERNS
-    colors: tuple[Color, ...]
-    scale: float = 0.2
-    seed: int = 0
-    contrast: float = 0.1  # of the fine noise on top, relative to the colour
-    glow: float = 0.0  # light that it gives off by itself: a lamp's shade
-
-
 class Spots(NamedTuple):
     """Places on the surface of one object."""
 
-    local: Array  # [N, 3] metres, in the object's axes
     plane: Array  # [N, 2] metres on the face, from its centre; on an upright face, the second is the height
     edge: Array  # [N, 2] half sizes of the face
+    inset: Array  # [N] metres from the face's nearest edge
     axis: NDArray[np.int64]  # [N] the face's normal axis
     grain: Array  # [N] fine noise
     footprint: Array  # [N] metres a pixel covers
@@ -97,8 +81,7 @@ def _mix(below: Array, above: Array | tuple[float, ...], share: Array) -> Array:
 
 
 def _plaster(texture: Texture, noise: Noise, spots: Spots) -> Array:
-    cloud = noise.fractal(spots.place, 0.9, spots.footprint, octaves=2)
-    return _ramp(texture.colors[:2], 0.5 + 0.4 * cloud)
+    return _ramp(texture.colors[:2], 0.5 + 0.4 * noise.fractal(spots.place, 0.9, spots.footprint, octaves=2))
 
 
 def _sprigs(texture: Texture, noise: Noise, spots: Spots) -> Array:
@@ -127,10 +110,6 @@ def _threads(texture: Texture, noise: Noise, spots: Spots, wavelength: float) ->
     return total
 
 
-def _weave(texture: Texture, noise: Noise, spots: Spots) -> Array:
-    return _ramp(texture.colors, 0.5 + 0.3 * _threads(texture, noise, spots, texture.scale))
-
-
 def _stripes(texture: Texture, noise: Noise, spots: Spots) -> Array:
     """Woven stripes of unequal widths, in the colours' order."""
     at = spots.plane[:, 0] / texture.scale
@@ -147,10 +126,6 @@ def _fibre_tone(texture: Texture, noise: Noise, spots: Spots) -> Array:  # [N] i
     wave = noise.fractal(spots.fibres, 0.5, spots.footprint, octaves=2)
     rings = np.sin(2 * np.pi * ((spots.fibres @ np.ones(3)) / texture.scale + 1.6 * wave))
     return 0.5 + 0.22 * rings + 0.3 * spots.grain
-
-
-def _wood(texture: Texture, noise: Noise, spots: Spots) -> Array:
-    return _ramp(texture.colors, _fibre_tone(texture, noise, spots))
 
 
 def _planks(texture: Texture, noise: Noise, spots: Spots) -> Array:
@@ -170,10 +145,9 @@ def _planks(texture: Texture, noise: Noise, spots: Spots) -> Array:
 def _panel(texture: Texture, noise: Noise, spots: Spots) -> Array:
     """A door or a drawer's front: a frame around a sunken panel, and a knob of the last colour."""
     color = _ramp(texture.colors[:-1], _fibre_tone(texture, noise, spots))
-    inset = (spots.edge - np.abs(spots.plane)).min(-1)  # metres from the nearest edge of the face
     broad = spots.edge.min(-1) > 0.15  # the narrow sides have no panel
-    color = color * (1.0 - broad * 0.4 * _cover(inset - texture.scale, 0.006, spots.footprint))[:, None]
-    color = color * (1.0 + broad * 0.2 * _cover(inset - texture.scale - 0.012, 0.006, spots.footprint))[:, None]
+    color = color * (1.0 - broad * 0.4 * _cover(spots.inset - texture.scale, 0.006, spots.footprint))[:, None]
+    color = color * (1.0 + broad * 0.2 * _cover(spots.inset - texture.scale - 0.012, 0.006, spots.footprint))[:, None]
     knob = np.hypot(spots.plane[:, 0] - 0.82 * spots.edge[:, 0], spots.plane[:, 1]) - 0.012
     return _mix(color, texture.colors[-1], broad * np.clip(0.5 - knob / spots.footprint, 0.0, 1.0))
 
@@ -181,10 +155,8 @@ def _panel(texture: Texture, noise: Noise, spots: Spots) -> Array:
 def _books(texture: Texture, noise: Noise, spots: Spots) -> Array:
     """A bookcase: wood, and on the front a shelf of books whose spines have the later colours."""
     color = _ramp(texture.colors[:2], _fibre_tone(texture, noise, spots))
-    inset = (spots.edge - np.abs(spots.plane)).min(-1)
-    front = (spots.axis == 0) * np.clip((inset - 0.025) / spots.footprint + 0.5, 0.0, 1.0)
-    u, v = spots.plane.T
-    s = texture.scale
+    front = (spots.axis == 0) * np.clip((spots.inset - 0.025) / spots.footprint + 0.5, 0.0, 1.0)
+    s, (u, v) = texture.scale, spots.plane.T
     at = u / s + 0.3 * np.sin(2.1 * u / s) + 31.0  # spines of unequal width
     book = np.floor(at).astype(np.int64)[:, None]
     tone, height = hashed(book, texture.seed), hashed(book, texture.seed + 1)
@@ -205,49 +177,38 @@ def _rug(texture: Texture, noise: Noise, spots: Spots) -> Array:
     u, v = (spots.plane + 0.006 * pile[:, None]).T
     s = texture.scale
     color = _ramp(texture.colors[:2], 0.5 + 0.35 * _threads(texture, noise, spots, 0.06))
-    one, two = u / s + 0.62 * v / s, u / s - 0.62 * v / s
-    cell = np.stack([np.floor(one).astype(np.int64), np.floor(two).astype(np.int64)], -1)
-    lines = np.maximum(*(_cover((k - np.round(k)) * s * 0.85, 0.011, spots.footprint) for k in (one, two)))
-    heart = np.abs(one - cell[:, 0] - 0.5) + np.abs(two - cell[:, 1] - 0.5)
+    grid = np.stack([u / s + 0.62 * v / s, u / s - 0.62 * v / s], -1)
+    cell = np.floor(grid).astype(np.int64)
+    lines = _cover((grid - np.round(grid)) * s * 0.85, 0.011, spots.footprint[:, None]).max(-1)
+    heart = np.abs(grid - cell - 0.5).sum(-1)
     filled = hashed(cell, texture.seed) < 0.55
     color = _mix(color, texture.colors[3], filled * np.clip((0.22 - heart) * s / spots.footprint + 0.5, 0.0, 1.0))
     color = _mix(color, texture.colors[2], 0.85 * lines)
-    inset = (spots.edge - np.abs(spots.plane)).min(-1)
-    color = _mix(color, texture.colors[0], np.clip((0.15 - inset) / spots.footprint + 0.5, 0.0, 1.0))
+    color = _mix(color, texture.colors[0], np.clip((0.15 - spots.inset) / spots.footprint + 0.5, 0.0, 1.0))
     for middle, reach, which in ((0.15, 0.012, 2), (0.085, 0.028, 3), (0.03, 0.008, 2)):
-        color = _mix(color, texture.colors[which], _cover(inset - middle, reach, spots.footprint))
+        color = _mix(color, texture.colors[which], _cover(spots.inset - middle, reach, spots.footprint))
     return color * (1.0 + 0.07 * pile)[:, None]
 
 
 def _leaves(texture: Texture, noise: Noise, spots: Spots) -> Array:
     """Foliage: each place belongs to the nearest of scattered leaves, bright in its middle and dark at its rim."""
     at = spots.place / texture.scale * (1.0, 1.0, 0.6)
-    cell = np.floor(at).astype(np.int64)
-    nearest, second = np.full(len(at), 9.0), np.full(len(at), 9.0)
-    tone = np.zeros(len(at))
-    for step in np.ndindex(3, 3, 3):
-        other = cell + np.array(step) - 1
-        middle = other + np.stack([hashed(other, texture.seed + k) for k in range(3)], -1)
-        away = middle - at
-        distance = np.sqrt(np.einsum("ij,ij->i", away, away))
-        closer = distance < nearest
-        second = np.where(closer, nearest, np.minimum(second, distance))
-        tone = np.where(closer, hashed(other, texture.seed + 3), tone)
-        nearest = np.minimum(nearest, distance)
+    steps = np.array(list(np.ndindex(3, 3, 3)))[:, None] - 1
+    cells = (np.floor(at).astype(np.int64) + steps).reshape(-1, 3)  # [27 N, 3]
+    middles = cells + np.stack([hashed(cells, texture.seed + k) for k in range(3)], -1)
+    away = middles.reshape(27, -1, 3) - at
+    distances = np.sqrt(np.einsum("kij,kij->ki", away, away))
+    nearest, second = np.sort(distances, axis=0)[:2]
+    tone = hashed(cells, texture.seed + 3).reshape(27, -1)[distances.argmin(0), np.arange(len(at))]
     body = np.clip((second - nearest) / 0.45, 0.0, 1.0)
     return _ramp(texture.colors, body * (0.45 + 0.55 * tone))
 
 
-def _framed(inside: Callable[[Texture, Noise, Spots], Array]) -> Callable[[Texture, Noise, Spots], Array]:
+def _framed(texture: Texture, spots: Spots, picture: Array) -> Array:
     """A picture within a white mount and a frame of the first colour."""
-
-    def draw(texture: Texture, noise: Noise, spots: Spots) -> Array:
-        inset = (spots.edge - np.abs(spots.plane)).min(-1)
-        color = _mix(inside(texture, noise, spots), (0.90, 0.89, 0.85), _cover(inset, 0.085, spots.footprint))
-        frame = np.array(texture.colors[0]) * (1.0 + 0.25 * spots.grain)[:, None]
-        return color + (frame - color) * _cover(inset, 0.028, spots.footprint)[:, None]
-
-    return draw
+    color = _mix(picture, (0.90, 0.89, 0.85), _cover(spots.inset, 0.085, spots.footprint))
+    frame = np.array(texture.colors[0]) * (1.0 + 0.25 * spots.grain)[:, None]
+    return color + (frame - color) * _cover(spots.inset, 0.028, spots.footprint)[:, None]
 
 
 def _hills(texture: Texture, noise: Noise, spots: Spots) -> Array:
@@ -263,7 +224,7 @@ def _hills(texture: Texture, noise: Noise, spots: Spots) -> Array:
         share = np.clip((ridge - v) / spots.footprint + 0.5, 0.0, 1.0)
         haze = 0.35 * np.clip((ridge - v) / (0.5 * h), 0.0, 1.0)
         color = _mix(color, _mix(np.broadcast_to(np.array(tone), color.shape), (0.93, 0.92, 0.88), haze), share)
-    return color
+    return _framed(texture, spots, color)
 
 
 def _shapes(texture: Texture, noise: Noise, spots: Spots) -> Array:
@@ -281,38 +242,31 @@ def _shapes(texture: Texture, noise: Noise, spots: Spots) -> Array:
         elif k % 3 == 2:
             inside *= v > y * h
         color = _mix(color, tone, inside)
-    return color
+    return _framed(texture, spots, color)
 
 
 PATTERNS: dict[str, Callable[[Texture, Noise, Spots], Array]] = {
-    "plaster": _plaster, "sprigs": _sprigs, "weave": _weave, "stripes": _stripes, "planks": _planks, "wood": _wood,
-    "panel": _panel, "books": _books, "rug": _rug, "leaves": _leaves, "hills": _framed(_hills), "shapes": _framed(_shapes),
+    "plaster": _plaster, "sprigs": _sprigs, "stripes": _stripes, "planks": _planks, "panel": _panel, "books": _books,
+    "rug": _rug, "leaves": _leaves, "hills": _hills, "shapes": _shapes,
+    "weave": lambda skin, noise, spots: _ramp(skin.colors, 0.5 + 0.3 * _threads(skin, noise, spots, skin.scale)),
+    "wood": lambda skin, noise, spots: _ramp(skin.colors, _fibre_tone(skin, noise, spots)),
 }  # fmt: skip
 
 
-def evaluate(
-    texture: Texture,
-    noise: Noise,
-    local: Array,  # [N, 3] metres, in the object's axes
-    axis: NDArray[np.int64],  # [N] the face's normal axis
-    half: Array,  # [3] half edges or radii of the object
-    footprint: Array,  # [N] metres a pixel covers there
-    *,
-    is_round: bool = False,
-) -> Array:  # [N, 3] RGB, not clipped
-    """The unlit colour of an object's points."""
-    if is_round and half[1] < 0.6 * half[0]:  # a cushion, seen from its front
-        plane, edge = local[:, [0, 2]], np.broadcast_to(half[[0, 2]], (len(local), 2))
-    elif is_round:  # a lamp's shade: around it, and up
-        around = np.arctan2(local[:, 1], local[:, 0]) * half[0]
-        plane, edge = np.stack([around, local[:, 2]], -1), np.broadcast_to(half[[0, 2]], (len(local), 2))
-    else:
-        order = np.array([[1, 2], [0, 2], [0, 1]])[axis]
-        plane, edge = np.take_along_axis(local, order, axis=1), half[order]
+def evaluate(solid: Solid, noise: Noise, places: Places, footprint: Array) -> Array:  # [N] -> [N, 3] RGB, not clipped
+    """The unlit colour of places on an object, where a pixel covers `footprint` metres."""
+    texture, half, local = solid.texture, np.array(solid.half), solid.to_local(places.points)
+    axis = np.argmax(np.abs(places.normals @ solid.rotation()), axis=-1)
+    across = np.array([[1, 2], [0, 2], [0, 1]])[axis]
+    plane, edge = np.take_along_axis(local, across, axis=1), half[across]
+    if solid.shape == "ellipsoid":  # a cushion, seen from its front, or a lamp's shade: around it, and up
+        around = local[:, 0] if half[1] < 0.6 * half[0] else np.arctan2(local[:, 1], local[:, 0]) * half[0]
+        plane, edge = np.stack([around, local[:, 2]], -1), np.broadcast_to(half[[0, 2]], plane.shape)
     shift = np.random.default_rng([texture.seed, 5]).uniform(-9.0, 9.0, 3)
     fibre = np.where(np.arange(3) == np.argmax(half), 0.08, 1.0)  # grain runs along the longest edge
     streaks = fibre if texture.kind in ("wood", "planks", "panel", "books") else np.ones(3)
     grain = noise.fractal(local * streaks + shift, 0.12, footprint, octaves=5, gain=0.85)
-    spots = Spots(local, plane, edge, np.asarray(axis), grain, footprint, local * fibre + shift, local + shift)
+    inset = (edge - np.abs(plane)).min(-1)
+    spots = Spots(plane, edge, inset, axis, grain, footprint, local * fibre + shift, local + shift)
     color = PATTERNS[texture.kind](texture, noise, spots)
     return color * (1.0 + texture.contrast * grain[:, None])

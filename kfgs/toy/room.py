@@ -7,8 +7,7 @@ from importlib.resources import files
 import numpy as np
 
 from .._files import parse_json
-from .geometry import Solid
-from .patterns import Texture
+from .geometry import Solid, Texture
 
 CLASSES = (
     "wall", "floor", "ceiling", "rug", "table", "chair", "sofa", "cushion", "cabinet", "plant", "lamp", "picture", "door",

@@ -1,8 +1,4 @@
-"""Write the toy room: a small scene with exact ground truth and the features of a noisy teacher.
-
-The folder has the layout of a real scene (`images`, `sparse/0`, `labels`, `classes.json`, `text.npy`, `split.json`,
-`features`), and also `depth` and `surface.npz`, which no real scene has.
-"""
+"""Write the toy room as a scene folder, with exact ground truth and the features of a noisy teacher."""
 
 from __future__ import annotations
 
@@ -11,6 +7,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,10 +17,12 @@ from tqdm import tqdm
 from .._check import check_size, check_whole
 from .._files import as_path, atomic_folder, check_output, read_json, write_json
 from ..cameras.camera import Camera
+from ..cameras.projection import camera_to_pixel, world_to_camera
 from ..scenes.colmap import import_pycolmap
-from .geometry import Array, Solid, normals, project, sample_surface, visible
+from .geometry import Array, Places, Solid, places_on, sample_surface, visible
+from .light import light_reaches
 from .patterns import Noise
-from .render import light_reaches, render, surface_color, walk_cameras
+from .render import render, surface_color, walk_cameras
 from .room import CLASSES, build_room
 from .teacher import class_embeddings, teacher_features
 
@@ -63,7 +62,7 @@ class ToyConfig:
             object.__setattr__(self, name, tuple(getattr(self, name)))
         if any(f > s for f, s in zip(self.feature_size, self.size, strict=True)):
             raise ValueError(
-                f"feature_size: expected at most size = {self.size}, got {self.feature_size}; enlarge size"
+                f"feature_size: expected at most {self.size} (size), got {self.feature_size}; enlarge size"
             )
 
 
@@ -118,74 +117,58 @@ def make_toy_room(
         embeddings = class_embeddings(config.feature_dim, config.seed if embeddings_of is None else embeddings_of)
         stems = [Path(camera.name).stem for camera in cameras]
         for stem, camera in zip(stems, tqdm(cameras, desc="toy room", disable=not progress), strict=True):
-            view = render(solids, noise, camera)
-            imsave(folder / "images" / f"{stem}.png", view.image, check_contrast=False)
-            imsave(folder / "labels" / f"{stem}.png", view.labels, check_contrast=False)
-            np.save(folder / "depth" / f"{stem}.npy", view.depth.astype(np.float32))
+            image, depth, labels = render(solids, noise, camera)
+            imsave(folder / "images" / f"{stem}.png", image, check_contrast=False)
+            imsave(folder / "labels" / f"{stem}.png", labels, check_contrast=False)
+            np.save(folder / "depth" / f"{stem}.npy", depth.astype(np.float32))
             rng = np.random.default_rng([config.seed, 4, zlib.crc32(stem.encode())])  # errors follow from seed and name
-            features = teacher_features(view.labels, view.image, embeddings, config.feature_size, rng)
+            features = teacher_features(labels, image, embeddings, config.feature_size, rng)
             torch.save(torch.from_numpy(features), folder / "features" / f"{stem}_fmap_CxHxW.pt")
-        held = {stem for stem, test in zip(stems, testing, strict=True) if test}
-        split = {
-            "train": [stem for stem in stems if stem not in held],
-            "test": [stem for stem in stems if stem in held],
-        }
-        write_json(folder / "split.json", split)
+        train, test = ([stems[i] for i in np.flatnonzero(testing == held)] for held in (False, True))
+        write_json(folder / "split.json", {"train": train, "test": test})
         write_json(folder / "classes.json", list(CLASSES))
         np.save(folder / "text.npy", embeddings)
-        _write_geometry(folder, solids, noise, cameras, np.array(testing), config)
+        _write_geometry(folder, solids, noise, cameras, testing, config)
         write_json(folder / "toy.json", about)
     return path
 
 
 def _visible_surface(
     solids: Sequence[Solid], cameras: Sequence[Camera], count: int, rng: np.random.Generator
-) -> tuple[Array, Array, NDArray[np.int64], NDArray[np.bool_]]:
-    """Draw `count` points uniformly by area where a camera sees them: points, normals, solid [P], seen by camera [P, C]."""
+) -> tuple[Places, NDArray[np.bool_]]:
+    """Draw `count` places uniformly by area where a camera sees them, and say which cameras see each, [P, C]."""
     areas = np.array([solid.area() for solid in solids])
-    found: list[tuple[Array, Array, NDArray[np.int64], NDArray[np.bool_]]] = []
+    drawn: list[list[NDArray[Any]]] = []
     have, batch = 0, count
     while have < count:
         shares = rng.multinomial(batch, areas / areas.sum())
-        which = np.repeat(np.arange(len(solids)), shares)
         points = np.concatenate([sample_surface(s, int(n), rng) for s, n in zip(solids, shares, strict=True)])
-        outward = np.concatenate([normals(s, points[which == i]) for i, s in enumerate(solids)])
-        seen = np.stack([visible(solids, camera, points, outward) for camera in cameras], axis=-1)
+        places = places_on(solids, points, np.repeat(np.arange(len(solids)), shares))
+        seen = np.stack([visible(solids, camera, places) for camera in cameras], axis=-1)
         rows = rng.permutation(np.flatnonzero(seen.any(-1)))
-        found.append((points[rows], outward[rows], which[rows], seen[rows]))
+        drawn.append([values[rows] for values in (*places, seen)])
         have += len(rows)
         batch = max(int(1.1 * (count - have) * batch / max(len(rows), 1)), count // 20)
-    points, outward, which, seen = (np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
-    return points, outward, which, seen
+    points, outward, which, seen = (np.concatenate(parts)[:count] for parts in zip(*drawn, strict=True))
+    return Places(points, outward, which), seen
 
 
 def _write_geometry(
-    folder: Path,
-    solids: Sequence[Solid],
-    noise: Noise,
-    cameras: Sequence[Camera],
-    testing: NDArray[np.bool_],  # [C]
-    config: ToyConfig,
+    folder: Path, solids: list[Solid], noise: Noise, cameras: list[Camera], tests: NDArray[np.bool_], config: ToyConfig
 ) -> None:
     """Write `surface.npz` and the sparse model: some of these points with noise, observations, and a few far outliers."""
     rng = np.random.default_rng([config.seed, 6])
-    training = [camera for camera, test in zip(cameras, testing, strict=True) if not test]
-    points, outward, which, seen = _visible_surface(solids, training, config.surface_points, rng)
+    training = [camera for camera, test in zip(cameras, tests, strict=True) if not test]
+    surface, seen = _visible_surface(solids, training, config.surface_points, rng)
     classes = np.array([CLASSES.index(solid.label) for solid in solids], np.uint8)
-    np.savez(
-        folder / "surface.npz",
-        points=points.astype(np.float32),
-        normals=outward.astype(np.float32),
-        labels=classes[which],
-        seen=seen.sum(-1).astype(np.uint16),
-    )
-    chance = np.minimum(seen.sum(-1), 8.0) + 1e-3  # SfM finds what many views share
-    rows = rng.choice(len(points), config.sparse_points, replace=False, p=chance / chance.sum())
-    near, sides, owner = points[rows], outward[rows], which[rows]
-    lit = light_reaches(solids, near, sides, owner)
-    color = surface_color(solids, noise, near, sides, owner, np.full(len(rows), 0.01), lit)
-    observed = np.stack([visible(solids, camera, near, sides) for camera in cameras], axis=-1)
-    placed = near + POINT_NOISE * rng.standard_normal(near.shape)
+    views, (points, outward) = seen.sum(-1).astype(np.uint16), (part.astype(np.float32) for part in surface[:2])
+    np.savez(folder / "surface.npz", points=points, normals=outward, labels=classes[surface.which], seen=views)
+    chance = np.minimum(views, 8.0) + 1e-3  # SfM finds what many views share
+    rows = rng.choice(len(seen), config.sparse_points, replace=False, p=chance / chance.sum())
+    places = surface.take(rows)
+    color = surface_color(solids, noise, places, np.full(len(rows), 0.01), light_reaches(solids, places))
+    observed = np.stack([visible(solids, camera, places) for camera in cameras], axis=-1)
+    placed = places.points + POINT_NOISE * rng.standard_normal(places.points.shape)
     outliers = max(1, len(rows) // 200)
     placed[:outliers] *= rng.uniform(3.0, 20.0, (outliers, 1))  # mismatches triangulate far behind the walls
     errors = PIXEL_NOISE * rng.standard_normal((*observed.shape, 2))
@@ -198,7 +181,7 @@ def _write_model(
     points: Array,  # [P, 3]
     colors: NDArray[np.uint8],  # [P, 3]
     seen: NDArray[np.bool_],  # [P, C] which camera observes which point
-    pixel_noise: Array,  # [P, C, 2] added to the observed pixels
+    errors: Array,  # [P, C, 2] added to the observed pixels
 ) -> None:
     """Write `cameras.bin`, `images.bin` and `points3D.bin` (one shared PINHOLE camera) into `folder` through pycolmap."""
     pycolmap = import_pycolmap()
@@ -206,16 +189,16 @@ def _write_model(
     params = cameras[0].K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()  # fx, fy, cx, cy
     lens = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params, camera_id=1)
     model.add_camera_with_trivial_rig(lens)
-    tracks = [pycolmap.Track() for _ in points]
-    residuals = np.linalg.norm(pixel_noise, axis=-1)
+    tracks, residuals = [pycolmap.Track() for _ in points], np.linalg.norm(errors, axis=-1)
     for number, camera in enumerate(cameras):
-        E = camera.viewmat.double().numpy()
-        image = pycolmap.Image(name=camera.name, camera_id=1, image_id=number + 1)
         rows = np.flatnonzero(seen[:, number])
-        xy = project(camera, points[rows])[0] + pixel_noise[rows, number]
+        local = world_to_camera(camera, torch.from_numpy(points[rows]))
+        xy = camera_to_pixel(camera, local).numpy() + errors[rows, number]
+        image = pycolmap.Image(name=camera.name, camera_id=1, image_id=number + 1)
         image.points2D = pycolmap.Point2DList([pycolmap.Point2D(at) for at in xy])
         for place, row in enumerate(rows):
             tracks[row].add_element(number + 1, place)
+        E = camera.viewmat.numpy()
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(E[:3, :3]), E[:3, 3]))
     for i, track in enumerate(tracks):
         point_id = model.add_point3D(points[i], track, colors[i])

@@ -47,37 +47,8 @@ def class_embeddings(feature_dim: int, seed: int) -> Floats:  # [C, D] unit rows
 
 def _field(rng: np.random.Generator, shape: tuple[int, ...], sigma: float) -> Floats:
     """Smooth Gaussian noise of about unit variance, correlated over `sigma` pixels in its last two axes."""
-    smooth = (0.0,) * (len(shape) - 2) + (sigma, sigma)
-    noise = ndimage.gaussian_filter(rng.standard_normal(shape).astype(np.float32), smooth, mode="wrap")
+    noise = ndimage.gaussian_filter(rng.standard_normal(shape).astype(np.float32), sigma, mode="wrap", axes=(-2, -1))
     return noise / max(float(noise.std()), 1e-6)
-
-
-def _resize(image: NDArray[np.floating], size: tuple[int, int]) -> Floats:  # [H, W, C] -> [h, w, C]
-    """Average over the area of each new pixel."""
-    moved = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1), dtype=np.float32))[None]
-    return torch.nn.functional.interpolate(moved, size=size, mode="area")[0].permute(1, 2, 0).numpy()
-
-
-def _evidence(
-    shares: Floats,  # [h, w, C] share of each class in each pixel
-    embeddings: Floats,  # [C, D]
-    rng: np.random.Generator,
-    pixel: float,
-) -> Floats:  # [C, h, w]
-    """Evidence for each class: its share, plus regions that drift to a related class, plus smooth confusion."""
-    h, w, C = shares.shape
-    evidence = np.ascontiguousarray(shares.transpose(2, 0, 1))
-    similarity = embeddings @ embeddings.T - 2 * np.eye(C)
-    winner = shares.argmax(-1)
-    for c in np.unique(winner):
-        regions, count = ndimage.label(winner == c)
-        for region in range(1, count + 1):
-            drifts, other = rng.random() < DRIFT, int(rng.choice(np.argsort(-similarity[c])[:3]))
-            amount, patch = rng.uniform(0.5, 1.15), _field(rng, (h, w), 5.0 * pixel)
-            if drifts:
-                evidence[other] += amount * ((regions == region) & (patch > -0.4))
-    evidence = ndimage.gaussian_filter(evidence, (0, BORDER, BORDER))
-    return evidence + CONFUSION * _field(rng, (C, h, w), 2.7 * pixel)
 
 
 def teacher_features(
@@ -90,16 +61,26 @@ def teacher_features(
     """The feature map of one view, in the axis order of Feature-3DGS; `rng` decides all errors of the view."""
     (h, w), (C, D) = size, embeddings.shape
     pixel = w / 64.0  # lengths are given for a map 64 wide
-    evidence = _evidence(_resize(np.eye(C, dtype=np.float32)[labels], size), embeddings, rng, pixel)
+    seen = np.concatenate([np.eye(C)[labels], image / 255.0], axis=-1, dtype=np.float32).transpose(2, 0, 1)
+    cells = torch.nn.functional.interpolate(torch.from_numpy(seen)[None], size=size, mode="area")[0].numpy()
+    evidence, colors = cells[:C].copy(), cells[C:]  # evidence for a class is its share of the cell
+    winner, similarity = evidence.argmax(0), embeddings @ embeddings.T - 2 * np.eye(C)
+    for c in np.unique(winner):
+        regions, count = ndimage.label(winner == c)
+        for region in range(1, count + 1):
+            drifts, other = rng.random() < DRIFT, int(rng.choice(np.argsort(-similarity[c])[:3]))
+            amount, patch = rng.uniform(0.5, 1.15), _field(rng, (h, w), 5.0 * pixel)
+            if drifts:
+                evidence[other] += amount * ((regions == region) & (patch > -0.4))
+    evidence = ndimage.gaussian_filter(evidence, (0, BORDER, BORDER)) + CONFUSION * _field(rng, (C, h, w), 2.7 * pixel)
     weights = np.exp(SHARPNESS * (evidence - evidence.max(0)))
     weights /= weights.sum(0)
 
     mean = embeddings.mean(0)
     features = 0.75 * np.tensordot(weights, _unit(embeddings - mean), axes=(0, 0)) + 0.55 * _unit(mean)  # [h, w, D]
-    colors = _resize(image / 255.0, size)
-    gray = colors.mean(-1)
+    gray = colors.mean(0)
     edges = np.hypot(ndimage.sobel(gray, 0), ndimage.sobel(gray, 1))
-    appearance = np.stack([*(colors.transpose(2, 0, 1) - 0.5), edges, ndimage.gaussian_filter(gray, 2 * pixel) - 0.5])
+    appearance = np.stack([*(colors - 0.5), edges, ndimage.gaussian_filter(gray, 2 * pixel) - 0.5])
     basis = _unit(np.random.default_rng(1234).standard_normal((len(appearance), D)))  # the same in every view
     features = features + APPEARANCE * np.tensordot(appearance, basis, axes=(0, 0))
     features = features + WHITE / np.sqrt(D) * rng.standard_normal((h, w, D), dtype=np.float32)

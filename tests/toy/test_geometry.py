@@ -1,11 +1,10 @@
 import numpy as np
 import pytest
 import torch
-from oracles_toy import first_hit
+from oracles_toy import first_hit as first_hit_by_steps
 
 from kfgs.cameras.camera import Camera
-from kfgs.toy.geometry import Solid, cast, intersect, normals, occluded, pixel_rays, sample_surface, visible
-from kfgs.toy.patterns import Texture
+from kfgs.toy.geometry import Solid, Texture, cast, first_hit, intersect, places_on, sample_surface, visible
 
 SKIN = Texture("plaster", ((0.5, 0.5, 0.5), (0.6, 0.6, 0.6)))
 
@@ -19,6 +18,12 @@ def camera(height=12, width=16) -> Camera:
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[2, 3] = 6.0  # looks along +z from z = -6
     return Camera(viewmat, K, width, height)
+
+
+def rays_of(view: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """The camera's centre and the ray through the centre of each pixel, 1 long along the optical axis."""
+    x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+    return np.array([0, 0, -6.0]), np.stack([(x - 8.7) / 15.0, (y - 5.4) / 14.0, np.ones_like(x)], -1)
 
 
 def test_ray_enters_an_ellipsoid_at_its_radius():
@@ -48,27 +53,21 @@ def test_cast_equals_stepping_along_every_ray():
         solid("ellipsoid", (0.5, 0.4, -3.5), (0.5, 0.4, 0.3), 0.2),
     ]
     view = camera()
-    depth, index = cast(solids, view)
-    origin, rays = pixel_rays(view)
+    depth, places = cast(solids, view)
+    index, (origin, rays) = places.which.reshape(view.size), rays_of(view)
     for row, column in [(r, c) for r in range(0, 12, 3) for c in range(0, 16, 2)]:
-        t, hit = first_hit(solids, origin, rays[row, column], far=10.0, step=0.02)
+        t, hit = first_hit_by_steps(solids, origin, rays[row, column], far=10.0, step=0.02)
         assert index[row, column] == hit
         assert depth[row, column] == pytest.approx(t, abs=1e-9)
     assert set(np.unique(index)) == {0, 1, 2, 3}
-
-
-def test_pixel_rays_go_through_pixel_centres():
-    view = camera()
-    origin, rays = pixel_rays(view)
-    assert np.allclose(origin, [0, 0, -6])
-    assert np.allclose(rays[2, 3], [(3.5 - 8.7) / 15.0, (2.5 - 5.4) / 14.0, 1.0])
+    assert np.allclose(places.points.reshape(12, 16, 3), origin + rays * depth[..., None])
 
 
 @pytest.mark.parametrize("shape", ["box", "ellipsoid"])
 def test_normals_are_unit_outward_and_across_the_surface(shape):
     body = solid(shape, (1.0, 2.0, 3.0), (0.5, 1.0, 2.0), 0.6)
     points = sample_surface(body, 400, np.random.default_rng(0))
-    n = normals(body, points)
+    n = places_on([body], points, np.zeros(400, int)).normals
     assert np.allclose(np.linalg.norm(n, axis=1), 1.0)
     steps = body.to_local(points + 1e-4 * n), body.to_local(points - 1e-4 * n)
     if shape == "box":
@@ -102,10 +101,11 @@ def test_points_on_an_ellipsoid_are_uniform_by_area():
     assert solid("ellipsoid", half=(2.0, 2.0, 2.0)).area() == pytest.approx(16 * np.pi)
 
 
-def test_occlusion_stops_at_the_target():
-    wall = [solid(center=(5.0, 0, 0), half=(1.0, 1.0, 1.0))]
-    targets = np.array([[3.0, 0, 0], [4.0, 0, 0], [4.1, 0, 0], [9.0, 0, 0], [9.0, 5.0, 0], [-9.0, 0, 0]])
-    assert occluded(wall, np.zeros(3), targets).tolist() == [False, False, True, True, False, False]
+def test_a_ray_may_hit_nothing_and_the_nearest_solid_wins():
+    walls = [solid(center=(9.0, 0, 0)), solid(center=(5.0, 0, 0))]
+    t, which = first_hit(walls, np.zeros(3), np.array([[2.0, 0, 0], [9.0, 5.0, 0], [-9.0, 0, 0]]))
+    assert t.tolist() == [2.0, np.inf, np.inf]
+    assert which.tolist() == [1, -1, -1]
 
 
 def test_a_camera_sees_what_its_own_rays_hit_and_nothing_else():
@@ -115,13 +115,12 @@ def test_a_camera_sees_what_its_own_rays_hit_and_nothing_else():
         solid("box", (0.0, 0.0, 3.0), (8.0, 8.0, 0.3), 0.0),
     ]
     view = camera()
-    depth, index = cast(solids, view)
-    origin, rays = pixel_rays(view)
-    for i, body in enumerate(solids):
-        points = (origin + rays * depth[..., None])[index == i]
-        n = normals(body, points)
-        assert visible(solids, view, points, n).all()
-        assert not visible(solids, view, points, -n).any()  # from behind
-    hidden = (origin + rays * intersect(solids[2], origin, rays)[..., None])[index != 2]
-    assert len(hidden) > 10
-    assert not visible(solids, view, hidden, normals(solids[2], hidden)).any()
+    _, places = cast(solids, view)
+    assert visible(solids, view, places).all()
+    assert not visible(solids, view, places._replace(normals=-places.normals)).any()  # from behind
+    origin, rays = rays_of(view)
+    behind = (origin + rays * intersect(solids[2], origin, rays)[..., None]).reshape(-1, 3)[places.which != 2]
+    assert len(behind) > 10
+    assert not visible(solids, view, places_on(solids, behind, np.full(len(behind), 2))).any()
+    before = places._replace(points=origin + 0.99 * (places.points - origin))
+    assert visible(solids, view, before).all()  # a solid hides only what lies beyond it
