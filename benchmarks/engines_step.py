@@ -12,8 +12,8 @@ from engines_runners import (
 )
 from torch import Tensor
 
-from kfgs.fields import GaussianParams
 from kfgs.fields.loss import l1_loss
+from kfgs.fields.optimizer import to_gaussians, to_raw
 from kfgs.splat import Projected, bin_tiles, project, rasterize
 
 RATE = 1e-6  # learning rate: the scene stays what it is while it is being measured
@@ -27,14 +27,14 @@ def target_of(inputs: Inputs) -> Tensor:
 
 def kfgs_step(engine: str, inputs: Inputs) -> tuple[Calls, Calls]:
     """The step, and its stages; each stage works on what the one before it left."""
-    params = GaussianParams.from_gaussians(inputs.gaussians).map(lambda value: value.requires_grad_())
-    leaves = list(params.to_tensors().values())
+    raw = {name: value.clone().requires_grad_() for name, value in to_raw(inputs.gaussians).items()}
+    leaves = list(raw.values())
     adam = torch.optim.Adam(leaves, lr=RATE, fused=True)
     target = target_of(inputs)
     width, height = inputs.case.width, inputs.case.height
 
     def step() -> None:
-        rendering = rasterize(params.activated(), inputs.camera, engine=engine)
+        rendering = rasterize(to_gaussians(raw, inputs.gaussians), inputs.camera, engine=engine)
         l1_loss(rendering.map, rendering.alpha, target).backward()
         adam.step()
         adam.zero_grad(set_to_none=True)
@@ -42,7 +42,7 @@ def kfgs_step(engine: str, inputs: Inputs) -> tuple[Calls, Calls]:
     kept: dict[str, Any] = {}
 
     def projecting() -> None:
-        kept["projected"] = project(params.activated(), inputs.camera, engine=engine)
+        kept["projected"] = project(to_gaussians(raw, inputs.gaussians), inputs.camera, engine=engine)
 
     def binning() -> None:
         projected = Projected(*(value.detach() for value in kept["projected"]))
@@ -53,7 +53,7 @@ def kfgs_step(engine: str, inputs: Inputs) -> tuple[Calls, Calls]:
         floats = [value.detach().requires_grad_() for value in projected[:2] + projected[3:4]]
         names = "means2d", "conics", "opacities"
         cut = projected._replace(**dict(zip(names, floats, strict=True)))
-        features = params.features.detach().requires_grad_()
+        features = raw["features"].detach().requires_grad_()
         kept["inputs"] = [*floats, features]
         kept["maps"], kept["alphas"] = composite_projected(cut, features, kept["tiles"], engine)
 

@@ -92,7 +92,8 @@ class Gaussians:
         """None: without it, NumPy would look into g[0][0][0]... for numbers."""
         raise TypeError("gaussians: expected an array, got Gaussians, which hold several; use to_numpy()")
 
-    def _tensors(self) -> dict[str, Tensor]:
+    def tensors(self) -> dict[str, Tensor]:
+        """The tensors that there are, by name."""
         return {name: value for name in TENSORS if (value := getattr(self, name)) is not None}
 
     def replace(self, **changes: Any) -> Gaussians:
@@ -119,7 +120,7 @@ class Gaussians:
         index = as_rows("which", which, len(self)).to(self.means.device)
         rows = index.cpu().numpy() if self.extra else None
         extra = {name: np.asarray(column)[rows] for name, column in self.extra.items()}
-        return self.replace(**{name: value[index] for name, value in self._tensors().items()}, extra=extra)
+        return self.replace(**{name: value[index] for name, value in self.tensors().items()}, extra=extra)
 
     __getitem__ = select
 
@@ -135,18 +136,18 @@ class Gaussians:
 
     def to(self, *args: Any, **kwargs: Any) -> Gaussians:
         """Move or convert the floating tensors as `Tensor.to` does; labels keep their integer type."""
-        moved = {name: value.to(*args, **kwargs) for name, value in self._tensors().items() if name != "labels"}
+        moved = {name: value.to(*args, **kwargs) for name, value in self.tensors().items() if name != "labels"}
         if self.labels is not None:
             moved["labels"] = self.labels.to(moved["means"].device)
         return self.replace(**moved)
 
     def detach(self) -> Gaussians:
         """The same values without their autograd history."""
-        return self.replace(**{name: value.detach() for name, value in self._tensors().items()})
+        return self.replace(**{name: value.detach() for name, value in self.tensors().items()})
 
     def to_numpy(self) -> dict[str, Array]:
         """The tensors that there are as NumPy arrays, by name: `means` [N, 3], ..., for trimesh, Open3D or pandas."""
-        return {name: as_array(value) for name, value in self._tensors().items()}
+        return {name: as_array(value) for name, value in self.tensors().items()}
 
     @staticmethod
     def cat(parts: Sequence[Gaussians]) -> Gaussians:
@@ -157,10 +158,10 @@ class Gaussians:
         """
         if not parts:
             raise ValueError("parts: expected at least one Gaussians, got none")
-        first, names = parts[0], list(parts[0]._tensors())
+        first, names = parts[0], list(parts[0].tensors())
         for i, part in enumerate(parts):
             for what, expected, got in (
-                ("tensors", names, list(part._tensors())),
+                ("tensors", names, list(part.tensors())),
                 ("columns", sorted(first.extra), sorted(part.extra)),
                 ("class names", first.names, part.names),
                 ("origin", first.origin, part.origin),
@@ -171,7 +172,7 @@ class Gaussians:
                     raise ValueError(
                         f"parts[{i}]: expected the {what} {expected} as in parts[0], got {got}; bring them to one with {way}"
                     )
-        tensors = {name: torch.cat([part._tensors()[name] for part in parts]) for name in names}
+        tensors = {name: torch.cat([part.tensors()[name] for part in parts]) for name in names}
         extra = {name: np.concatenate([part.extra[name] for part in parts]) for name in first.extra}
         return first.replace(**tensors, extra=extra)
 

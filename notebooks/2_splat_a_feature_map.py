@@ -134,12 +134,12 @@ Image.fromarray(viz.picture_grid(rows, width=min(scene.cameras[0].width, 320)))
 # apart, to see how well the others predict it.
 
 # %%
-from kfgs.fields import GaussianParams
+from kfgs.fields import gaussians_from_points
 from kfgs.splat import accumulate_pixels
 
 h, w, D = maps.shape
 apart = len(maps) // 4
-cloud = GaussianParams.from_points(scene.points, colors=scene.colors, sh_degree=0, initial_opacity=0.8).activated()
+cloud = gaussians_from_points(scene.points, colors=scene.colors, sh_degree=0, initial_opacity=0.8)
 cloud = cloud.replace(scales=0.8 * cloud.scales)  # a little narrower: less blur, a few holes
 sums, weights = torch.zeros(len(cloud), D), torch.zeros(len(cloud))
 for i in set(range(len(maps))) - {apart}:

@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 import torch
 
 from kfgs import Camera, Gaussians, rasterize
-from kfgs.fields import Densify, GaussianParams, Rates, Training
+from kfgs.fields import Densify, Rates, Training
 
 DENSIFY = {field.name for field in fields(Densify)}
 RATES = {field.name for field in fields(Rates)}
@@ -66,7 +66,7 @@ def look_at_origin(angle: float) -> Camera:
     return Camera(viewmat, torch.tensor([[30.0, 0, 16.3], [0, 31.0, 11.6], [0, 0, 1]]), 32, 24, name=f"view {angle}")
 
 
-def same(a: GaussianParams, b: GaussianParams) -> bool:
-    """Whether all raw tensors are equal."""
-    first, second = a.to_tensors(), b.to_tensors()
+def same(a: Gaussians, b: Gaussians) -> bool:
+    """Whether all tensors are equal."""
+    first, second = a.tensors(), b.tensors()
     return list(first) == list(second) and all(torch.equal(first[name], second[name]) for name in first)

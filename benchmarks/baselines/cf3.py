@@ -18,7 +18,7 @@ from torch.nn.functional import mse_loss
 
 from kfgs._rows import row_norms, unit_rows
 from kfgs.cameras import Camera
-from kfgs.fields import GaussianParams, Training, UpliftConfig, fit_field, uplift_maps
+from kfgs.fields import Training, UpliftConfig, fit_field, uplift_maps
 from kfgs.gaussians import Gaussians
 from kfgs.metrics import semantic_storage_bytes
 from kfgs.quant.autoencoder import quick_on_a_cpu
@@ -210,11 +210,11 @@ def fit(task: Task, config: CF3Config) -> Fitted:
             cloud = merge_pairs(cloud, total, find_pairs(cloud, config.like, allowed))
         with clock.stage("train"):
             fitted = fit_field(
-                GaussianParams.from_gaussians(cloud), cameras, targets,
+                cloud, cameras, targets,
                 Training(steps=max(1, config.steps // config.rounds), densify=None, extent=extent),
                 generator=torch.Generator().manual_seed(task.seed + turn), progress=task.progress,
             )  # fmt: skip
-            cloud = fitted.params.activated().detach()
+            cloud = fitted.gaussians
         history.append(fitted.history[-1] | {"round": turn + 1, "count": len(cloud)})
     parameters = network.decoder_parameters
     tensors = {name: getattr(cloud, name) for name in ("means", "quats", "scales", "opacities", "features")}

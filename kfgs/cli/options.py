@@ -100,7 +100,7 @@ class Classes:
         If the scene has a `classes.json`, whose indices its label pictures hold, only these classes are taken from the
         scene's table, in their order. A table that is named by --text is used whole.
         """
-        from ..fields.store import SCENE_FILES
+        from ..fields.store import find_classes
         from ..scenes.load import scene_root
 
         folder = None if self.scene is None else scene_root(self.scene)
@@ -112,10 +112,8 @@ class Classes:
             if listed is not None and listed.is_file() and tuple(read_json(listed)) != label_set.names:
                 say(f"note: label numbers follow the class list of {self.text}, which differs from {listed}")
             return label_set
-        if folder is not None:
-            for files in ([folder / name for name in names] for names in SCENE_FILES):
-                if all(file.is_file() for file in files):
-                    return kfgs.load_label_set(*files)
+        if folder is not None and (classes := find_classes(folder)) is not None:
+            return classes
         if field is None or field.classes is None:
             raise ValueError(
                 "text: expected a table of words, got none; make one with `kfgs features --words chair,table --teacher NAME`, or "

@@ -4,8 +4,8 @@ from .decoders import Autoencoded, Codewords, Identity, Linear
 from .examples import Box, Clicks, Mask, label_set_from_examples
 from .loss import ColorLoss
 from .merge import merge_gaussians
-from .params import GaussianParams
 from .semantic_field import SemanticField
+from .start import gaussians_from_points
 from .train import fit_field
 from .training import Densify, Rates, Training
 from .uplift import UpliftConfig, fuse_views, uplift_maps
@@ -17,7 +17,6 @@ __all__ = [
     "Codewords",
     "ColorLoss",
     "Densify",
-    "GaussianParams",
     "Identity",
     "Linear",
     "Mask",
@@ -27,6 +26,7 @@ __all__ = [
     "UpliftConfig",
     "fit_field",
     "fuse_views",
+    "gaussians_from_points",
     "label_set_from_examples",
     "merge_gaussians",
     "uplift_maps",

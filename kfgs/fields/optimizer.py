@@ -9,25 +9,58 @@ import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
 
-from .params import GaussianParams
+from ..gaussians import Gaussians
 from .training import Densify, Training
 
+Raw = dict[str, Tensor]
+"""What is trained, by the names of `Rates`: "means", "quats", the logarithms of "scales", the logits of "opacities", and either
+"features" or colours, "sh0" [N, 1, 3] and, above degree 0, "sh_rest" [N, K - 1, 3]: these two learn at different rates."""
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 SPLIT_CHILDREN = 2
 SPLIT_SHRINK = 1.6  # 0.8 times the number of children (3DGS)
 
 
+def to_raw(gaussians: Gaussians) -> Raw:
+    """The unbounded numbers of a cloud with features or colours; of both, features are taken.
+
+    Scales of 0 become the smallest normal number, and opacities keep eps away from 0 and 1: their logarithms and logits are
+    finite.
+    """
+    cloud, scales = gaussians.detach(), gaussians.scales.detach()
+    logits = torch.logit(cloud.opacities.double(), eps=torch.finfo(scales.dtype).eps).to(scales.dtype)
+    logs = scales.clamp_min(torch.finfo(scales.dtype).tiny).log()
+    raw = {"means": cloud.means, "quats": cloud.quats, "scales": logs, "opacities": logits}
+    if cloud.features is not None:
+        return raw | {"features": cloud.features}
+    assert cloud.sh is not None
+    return raw | {"sh0": cloud.sh[:, :1]} | ({"sh_rest": cloud.sh[:, 1:]} if cloud.sh.shape[1] > 1 else {})
+
+
+def to_gaussians(raw: Raw, like: Gaussians, sh_degree: int | None = None) -> Gaussians:
+    """The cloud with these values, differentiable. Of colours, only harmonics up to `sh_degree` (None: all).
+
+    Origin and antialiasing are those of `like`.
+    """
+    sh = raw.get("sh0")
+    if "sh_rest" in raw and sh_degree != 0:
+        sh = torch.cat(
+            [raw["sh0"], raw["sh_rest"][:, : None if sh_degree is None else (sh_degree + 1) ** 2 - 1]], dim=1
+        )
+    shape = raw["means"], raw["quats"], raw["scales"].exp(), raw["opacities"].sigmoid()
+    return Gaussians(*shape, raw.get("features"), sh, origin=like.origin, antialiased=like.antialiased)
+
+
 class FieldOptimizer:
     """torch's fused Adam with one learning rate per kind of parameter, and moments that stay with their Gaussians.
 
-    `params` holds the leaf tensors that are being trained, `adam` their moments. Growing or pruning keeps the moments of
+    `raw` holds the leaf tensors that are being trained, `adam` their moments. Growing or pruning keeps the moments of
     every Gaussian that stays; new ones start at 0 (as in 3DGS).
     """
 
-    def __init__(self, params: GaussianParams, training: Training) -> None:
-        """Copy `params` and prepare Adam; the extent of `training` is known."""
-        self.params, self._training = params.map(_leaf), training
-        groups = [{"params": [value], "name": name} for name, value in self.params.to_tensors().items()]
+    def __init__(self, raw: Raw, training: Training) -> None:
+        """Copy `raw` and prepare Adam; the extent of `training` is known."""
+        self.raw, self._training = _leaves(raw), training
+        groups = [{"params": [value], "name": name} for name, value in self.raw.items()]
         self.adam = torch.optim.Adam(groups, eps=training.rates.adam_eps, fused=True)
 
     def rate(self, name: str, step: int) -> float:
@@ -36,7 +69,7 @@ class FieldOptimizer:
         if name == "means":
             assert self._training.extent is not None
             return rates.means ** (1 - t) * rates.means_final**t * self._training.extent
-        own: float = getattr(rates, name.removeprefix("log_").removeprefix("logit_"))
+        own: float = getattr(rates, name)
         return own * rates.final ** max(0.0, 2 * t - 1)
 
     def step_(self, step: int) -> None:
@@ -48,13 +81,13 @@ class FieldOptimizer:
 
     def replace_(
         self,
-        params: GaussianParams,  # N' Gaussians
+        raw: Raw,  # of N' Gaussians
         source: Tensor,  # [N'] int64
         fresh: Tensor,  # [N'] bool
     ) -> None:
-        """Train `params` from now on: row i takes the moments of old row `source[i]`, or zeros where `fresh[i]`."""
-        self.params = params.map(_leaf)
-        for group, value in zip(self.adam.param_groups, self.params.to_tensors().values(), strict=True):
+        """Train `raw` from now on: row i takes the moments of old row `source[i]`, or zeros where `fresh[i]`."""
+        self.raw = _leaves(raw)
+        for group, value in zip(self.adam.param_groups, self.raw.values(), strict=True):
             if state := self.adam.state.pop(group["params"][0], None):
                 for moment in _MOMENTS:
                     state[moment] = state[moment][source]
@@ -64,15 +97,18 @@ class FieldOptimizer:
 
     def lower_opacities_(self, opacity: float) -> None:
         """The opacity reset of 3DGS: to at most `opacity`. Their moments, which belong to the old values, are forgotten."""
-        leaf = self.params.logit_opacities
+        leaf = self.raw["opacities"]
         leaf.data.clamp_(max=math.log(opacity / (1 - opacity)))
         for moment in _MOMENTS:
             if moment in self.adam.state.get(leaf, {}):
                 self.adam.state[leaf][moment].zero_()
 
 
-def _leaf(value: Tensor) -> Tensor:
-    return value.detach().clone().requires_grad_(True)
+def _leaves(raw: Raw) -> Raw:
+    return {
+        name: value.detach().clone(memory_format=torch.contiguous_format).requires_grad_()
+        for name, value in raw.items()
+    }
 
 
 class GradientStatistics(NamedTuple):
@@ -82,9 +118,9 @@ class GradientStatistics(NamedTuple):
     views: Tensor  # [N], number of views that saw it
 
     @staticmethod
-    def zeros(params: GaussianParams) -> GradientStatistics:
+    def zeros(means: Tensor) -> GradientStatistics:
         """Statistics of no view."""
-        return GradientStatistics(*(params.means.new_zeros(len(params)) for _ in range(2)))
+        return GradientStatistics(*(means.new_zeros(len(means)) for _ in range(2)))
 
     def add_(
         self,
@@ -106,13 +142,13 @@ class GradientStatistics(NamedTuple):
 class Densified(NamedTuple):
     """The new cloud, and the source of each of its rows."""
 
-    params: GaussianParams
+    raw: Raw
     source: Tensor  # [N'] int64: row of the old cloud
     fresh: Tensor  # [N'] bool: a new Gaussian
 
 
 def densify(
-    params: GaussianParams,
+    raw: Raw,
     gradient: Tensor,  # [N] mean norm, NDC units
     options: Densify,
     *,
@@ -129,7 +165,7 @@ def densify(
     of index).
 
     Args:
-        params: the cloud; not changed.
+        raw: the cloud; not changed.
         gradient: `GradientStatistics.mean()`.
         options: thresholds.
         extent: size of the scene, world units.
@@ -140,12 +176,12 @@ def densify(
         3DGS intends to prune Gaussians larger than 20 pixels on screen, but sets their radii to zero before the test, so
         it never does. Neither does this function.
     """
-    values = params.map(torch.Tensor.detach)
-    scales = values.log_scales.exp().amax(dim=1)
+    values = {name: value.detach() for name, value in raw.items()}
+    scales = values["scales"].exp().amax(dim=1)
     growing = gradient >= options.gradient
-    if options.maximum is not None and len(params) + int(growing.sum()) > options.maximum:  # each adds one Gaussian
+    if options.maximum is not None and len(scales) + int(growing.sum()) > options.maximum:  # each adds one Gaussian
         strongest = torch.where(growing, gradient, -torch.inf).argsort(descending=True, stable=True)
-        growing[strongest[max(0, options.maximum - len(params)) :]] = False
+        growing[strongest[max(0, options.maximum - len(scales)) :]] = False
     large = scales > options.percent_dense * extent
     kept = (~(growing & large)).nonzero()[:, 0]
     cloned = (growing & ~large).nonzero()[:, 0]
@@ -153,17 +189,17 @@ def densify(
 
     source = torch.cat([kept, cloned, parents])
     fresh = torch.arange(len(source), device=source.device) >= len(kept)
-    grown = values.map(lambda value: value[source])
+    grown = {name: value[source] for name, value in values.items()}
     if len(parents):
         first = len(kept) + len(cloned)
-        means = values.means[parents]
-        rotation = quaternion_to_rotation_matrix(values.quats[parents])  # wxyz, normalises
+        means = values["means"][parents]
+        rotation = quaternion_to_rotation_matrix(values["quats"][parents])  # wxyz, normalises
         noise = torch.randn(means.shape, dtype=means.dtype, device=generator.device, generator=generator)
-        away = noise.to(means.device) * values.log_scales[parents].exp()
-        grown.means[first:] = means + (rotation @ away[:, :, None])[:, :, 0]
-        grown.log_scales[first:] -= math.log(SPLIT_SHRINK)
+        away = noise.to(means.device) * values["scales"][parents].exp()
+        grown["means"][first:] = means + (rotation @ away[:, :, None])[:, :, 0]
+        grown["scales"][first:] -= math.log(SPLIT_SHRINK)
 
-    stays = grown.logit_opacities.sigmoid() >= options.prune_opacity
+    stays = grown["opacities"].sigmoid() >= options.prune_opacity
     if prune_large:
-        stays &= grown.log_scales.exp().amax(dim=1) <= options.prune_extent * extent
-    return Densified(grown.map(lambda value: value[stays]), source[stays], fresh[stays])
+        stays &= grown["scales"].exp().amax(dim=1) <= options.prune_extent * extent
+    return Densified({name: value[stays] for name, value in grown.items()}, source[stays], fresh[stays])

@@ -1,7 +1,6 @@
 """Round the tensors of a field to whole steps and compress them: 0.6 MB for 50,000 Gaussians.
 
-A tensor becomes an *entry* (its coding, shape and numbers, as JSON) and a stream of bytes. Means are steps along a Morton curve;
-latents are differences to the nearest of the Gaussians that come shortly before on this curve.
+A tensor becomes an *entry* (its coding, shape and numbers, as JSON) and a stream of bytes. Means are steps along a Morton curve.
 """
 
 from __future__ import annotations
@@ -27,8 +26,6 @@ LARGEST = 1 << 22  # most steps from zero: they stay exact in float32
 CELLS = (1 << 21) - 1  # most steps along an axis: three fill a Morton code
 HUGE = 1e37  # largest number that is rounded: a step away from it, float32 does not overflow yet
 EDGE = 1e-4  # unpacked opacities keep this distance from 0 and 1, as everywhere in kfgs
-WINDOW = 16
-"""Predecessors on the curve that a latent is predicted from. 32 save 1 % more and take twice the time (measured on room_0)."""
 TURN = 2.1
 """Radians of a rotation per step of its x, y and z. Half a step of each moves (x, y, z) by sqrt(3) / 2 steps and w, which is at
 least 0.85 after `_nearest_turn`, by 0.61 times as much: the quaternion by 1.02 steps, the rotation by twice that."""
@@ -95,7 +92,7 @@ def pack(
     cells = cells[order]
     quats = unit_quats(torch.from_numpy(arrays["gaussians.quats"])).numpy()
     arrays["gaussians.quats"], arrays["gaussians.scales"] = _nearest_turn(quats, scales)
-    fused, before = "linear.basis" in tensors, _find_before(cells)
+    fused = "linear.basis" in tensors
     streams, entries, errors = dict[str, Tensor](), dict[str, Entry](), dict[str, float]()
     for name, value in tensors.items():
         rows = order if name.startswith(PER_GAUSSIAN) else slice(None)
@@ -107,7 +104,7 @@ def pack(
             entry = {"coding": "curve", "step": step, "origin": origin.tolist(), "error": step / 2}
             entry, plain = _planes(entry, np.diff(codes, prepend=np.uint64(0)).astype(np.int64)[:, None])
         else:
-            entry, plain = _encode(name, array, chosen, step, before, fused) or _exact(value[rows])
+            entry, plain = _encode(name, array, chosen, step, fused) or _exact(value[rows])
         packed = zstandard.ZstdCompressor(level=LEVEL).compress(plain)
         shorter = len(packed) < len(plain)
         streams[name] = torch.from_numpy(np.frombuffer(packed if shorter else plain, np.uint8).copy())
@@ -121,9 +118,7 @@ def unpack(streams: dict[str, Tensor], entries: dict[str, Entry]) -> dict[str, T
     if set(entries) != set(streams):
         raise ValueError(f"expected a description of {sorted(streams)}, got {sorted(entries)!r:.200}")
     plain = {name: _plain_bytes(streams[name].numpy().tobytes(), entry) for name, entry in entries.items()}
-    means = entries["gaussians.means"]
-    before = _find_before(_cells(plain["gaussians.means"], means)) if means["coding"] == "curve" else None
-    tensors = {name: _decode(entry, plain[name], before) for name, entry in entries.items()}
+    tensors = {name: _decode(entry, plain[name]) for name, entry in entries.items()}
     if entries["gaussians.opacities"]["coding"] != "exact":
         tensors["gaussians.opacities"].clamp_(EDGE, 1 - EDGE)
     scales = entries["gaussians.scales"]
@@ -132,9 +127,7 @@ def unpack(streams: dict[str, Tensor], entries: dict[str, Entry]) -> dict[str, T
     return tensors
 
 
-def _encode(
-    name: str, array: Array, chosen: Rounding, step: float, before: Array, fused: bool
-) -> tuple[Entry, bytes] | None:
+def _encode(name: str, array: Array, chosen: Rounding, step: float, fused: bool) -> tuple[Entry, bytes] | None:
     """One tensor of real numbers, for Gaussians in the order of the curve; None if it stays exact."""
     match name.split("."):
         case ["gaussians", "quats"]:
@@ -148,9 +141,9 @@ def _encode(
             size = 2 * chosen.opacities
             return _planes({"coding": "steps", "step": size, "error": size / 2}, np.round(array[:, None] / size))
         case ["gaussians", "features"]:
-            return _near(array, chosen.latents if fused else chosen.latents / 2, before)
+            return _latents(array, chosen.latents if fused else chosen.latents / 2)
         case ["fused", "latents"]:
-            return _near(array, chosen.latents, before)
+            return _latents(array, chosen.latents)
         case ["linear" | "fused", "basis"] if array.size * array.shape[1] <= QR_MOST:
             return _rows(array, chosen.decoder, "basis")
         case ["codebook", "codewords"] | ["classes", _]:
@@ -175,8 +168,8 @@ def _planes(entry: Entry, whole: Array) -> tuple[Entry, bytes]:  # [n, c] whole 
     return {**entry, "width": width}, columns.transpose(0, 2, 1).tobytes()
 
 
-def _near(values: Array, share: float, before: Array) -> tuple[Entry, bytes]:  # [N, d]
-    """Multiples of a step, as differences to the row before. No row becomes zero that was not."""
+def _latents(values: Array, share: float) -> tuple[Entry, bytes]:  # [N, d]
+    """Multiples of a step. No row becomes zero that was not."""
     lengths = np.linalg.norm(values, axis=1)
     known = lengths > 0
     typical = float(np.median(lengths[known])) if known.any() else 1.0
@@ -185,8 +178,7 @@ def _near(values: Array, share: float, before: Array) -> tuple[Entry, bytes]:  #
     lost = np.flatnonzero(known & ~whole.any(1))
     largest = np.abs(values[lost]).argmax(1)
     whole[lost, largest] = np.sign(values[lost, largest])
-    entry = {"coding": "near", "step": step, "error": step if len(lost) else step / 2}
-    return _planes(entry, whole - np.concatenate([whole, np.zeros_like(whole[:1])])[before])
+    return _planes({"coding": "steps", "step": step, "error": step if len(lost) else step / 2}, whole)
 
 
 def _rows(values: Array, share: float, coding: str = "rows") -> tuple[Entry, bytes]:  # [K, D]
@@ -209,7 +201,7 @@ def _plain_bytes(stream: bytes, entry: Entry) -> bytes:
     return zstandard.ZstdDecompressor().decompress(stream, max_output_size=size)
 
 
-def _decode(entry: Entry, plain: bytes, before: Array | None) -> Tensor:
+def _decode(entry: Entry, plain: bytes) -> Tensor:
     """The tensor of an entry and its plain bytes."""
     coding, shape = entry["coding"], tuple(entry["shape"])
     if coding == "exact":
@@ -226,16 +218,13 @@ def _decode(entry: Entry, plain: bytes, before: Array | None) -> Tensor:
             Q, R = np.linalg.qr(values.T)
             values = Q * np.sign(np.diagonal(R))
     elif coding == "curve":
-        values = np.array(entry["origin"], np.float64) + _cells(plain, entry) * float(entry["step"])
+        codes = np.cumsum(_whole(plain, entry, rows, 1)[:, 0].astype(np.uint64), dtype=np.uint64)
+        values = np.array(entry["origin"], np.float64) + morton_cells(codes).astype(np.int64) * float(entry["step"])
     elif coding == "turns":
         small = _whole(plain, entry, rows, 3) * float(entry["step"])
         squares = np.square(small).sum(1, keepdims=True)
         small = small / np.sqrt(np.maximum(squares, 1))
         values = np.concatenate([np.sqrt(np.maximum(0, 1 - squares)), small], axis=1)
-    elif coding == "near":
-        if before is None or len(before) != rows:
-            raise ValueError(f"expected as many latents as there are means, got {rows}")
-        values = _sum_up(_whole(plain, entry, rows, columns), before) * np.float32(entry["step"])
     elif coding in ("steps", "logs"):
         steps = _whole(plain, entry, rows, columns) * float(entry["step"])
         values = steps if coding == "steps" else np.expm1(np.clip(steps, 0, 700)) * float(entry["least"])
@@ -244,42 +233,10 @@ def _decode(entry: Entry, plain: bytes, before: Array | None) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(values.reshape(shape), dtype=np.float32))
 
 
-def _cells(plain: bytes, entry: Entry) -> Array:  # [N, 3] int64
-    """Where the Gaussians are on the grid of the means."""
-    steps = _whole(plain, entry, entry["shape"][0], 1)[:, 0].astype(np.uint64)
-    return morton_cells(np.cumsum(steps, dtype=np.uint64)).astype(np.int64)
-
-
 def _whole(plain: bytes, entry: Entry, rows: int, columns: int) -> Array:  # [rows, columns] integers
     width = entry["width"]
     planes = np.frombuffer(plain, np.uint8).reshape(columns, width, rows).transpose(0, 2, 1)
     return np.ascontiguousarray(planes).view(f"<i{width}").reshape(columns, rows).T
-
-
-def _sum_up(steps: Array, before: Array) -> Array:  # [N, d]
-    """The sum of each row and of all rows that it is predicted from."""
-    rows = len(steps)
-    whole = np.zeros((rows + 1, steps.shape[1]), np.int32)  # the last row is before those that have none
-    whole[:rows] = steps
-    up, part = np.append(before, rows), np.empty_like(whole)
-    while (up < rows).any():  # each round adds twice as many rows before it
-        whole += np.take(whole, up, axis=0, out=part)
-        up = up[up]
-    return whole[:rows]
-
-
-def _find_before(cells: Array) -> Array:  # [N, 3] int64 -> [N]
-    """The nearest of the `WINDOW` rows before each row, N for none; of equally near ones the latest. The same everywhere."""
-    N = len(cells)
-    cells, best = np.ascontiguousarray(cells.T), np.full(N, np.iinfo(np.int64).max)
-    before = np.full(N, N)
-    for back in range(1, min(WINDOW, N - 1) + 1):
-        apart = cells[:, back:] - cells[:, :-back]
-        distance = (apart * apart).sum(0)
-        nearer = distance < best[back:]
-        best[back:][nearer] = distance[nearer]
-        before[back:][nearer] = np.flatnonzero(nearer)
-    return before
 
 
 def _nearest_turn(quats: Array, scales: Array) -> tuple[Array, Array]:  # [N, 4] of length 1, [N, 3]

@@ -99,16 +99,24 @@ def stream_sizes(path: Path) -> dict[str, int]:
     return dict(sorted(sizes.items(), key=lambda entry: -entry[1]))
 
 
+def find_classes(scene: Path) -> LabelSet | None:
+    """The label set in a scene folder; None if there is none, a ValueError or an OSError if it cannot be read."""
+    for files in ([scene / name for name in names] for names in SCENE_FILES):
+        if all(file.is_file() for file in files):
+            return load_label_set(*files)
+    return None
+
+
 def scene_classes(scene: Path, channels: int | None = None) -> LabelSet | None:
-    """The label set in a scene folder; None if there is none, it cannot be read, or it has other channels than the features."""
-    files = next((names for names in SCENE_FILES if all((scene / name).is_file() for name in names)), None)
-    if files is None:
-        return None
+    """The same for a result to hold: None, too, if it cannot be read, or has other channels than the features.
+
+    The error comes when classes are asked for; a long fit does not fail at its end.
+    """
     try:
-        classes = load_label_set(*(scene / name for name in files))
-    except (ValueError, OSError):  # said when classes are asked for; a long fit does not fail at its end
+        classes = find_classes(scene)
+    except (ValueError, OSError):
         return None
-    return classes if channels in (None, classes.embeddings.shape[1]) else None
+    return classes if classes is None or channels in (None, classes.dim) else None
 
 
 def recall_scene(info: Mapping[str, Any]) -> Path:
@@ -156,8 +164,7 @@ def _to_tensors(path: Path, parts: Mapping[str, Any]) -> tuple[dict[str, Tensor]
         info = json.loads(json.dumps(info, allow_nan=False))
     except (TypeError, ValueError) as error:
         raise ValueError(f"info: expected what JSON can hold, got {error}; use strings and finite numbers") from error
-    values = ((name, getattr(gaussians, name)) for name in CLOUD)
-    tensors = {f"gaussians.{name}": value for name, value in values if value is not None}
+    tensors = {f"gaussians.{name}": value for name, value in gaussians.tensors().items()}
     tensors |= parts["decoder"].to_tensors()
     if parts["fused"] is not None:
         tensors |= {"fused.latents": parts["fused"].features, "fused.basis": parts["fused"].decoder.basis}

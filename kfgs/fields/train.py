@@ -21,10 +21,10 @@ from .._check import ORIGIN, Progress, as_progress, as_tensor
 from .._files import as_path, atomic_path, digest_value
 from ..cameras import Camera
 from ..cameras.bounds import camera_extent
+from ..gaussians import Gaussians, check_gaussians
 from ..splat import rasterize
 from .loss import ColorLoss, Loss, l1_loss
-from .optimizer import FieldOptimizer, GradientStatistics, densify
-from .params import GaussianParams
+from .optimizer import FieldOptimizer, GradientStatistics, densify, to_gaussians, to_raw
 from .training import Densify, Training, check_extent
 from .working_maps import shrink_camera, shrink_map
 
@@ -39,14 +39,14 @@ class FieldFit:
     (training time so far, earlier runs of a resumed fit included).
     """
 
-    params: GaussianParams
+    gaussians: Gaussians
     history: list[dict[str, Any]]
 
     __repr__ = short_repr
 
 
 def fit_field(
-    params: GaussianParams,
+    gaussians: Gaussians,
     cameras: Sequence[Camera],
     targets: Sequence[Tensor],  # C maps [h, w, D]
     training: Training | None = None,
@@ -61,8 +61,8 @@ def fit_field(
     Each step uses one view, in random order; each view is used once before any is repeated.
 
     Args:
-        params: the start; not changed. They decide dtype and device of the fit. Without an origin they are counted from that
-            of the cameras, as the points of a scene are.
+        gaussians: the start, with features or colours (of both, features are trained); not changed. They decide dtype and
+            device of the fit. Without an origin they are counted from that of the cameras, as the points of a scene are.
         cameras: C posed cameras without distortion.
         targets: one map per camera, of any size, NaN where nothing is known; read one at a time, so they may live on disk;
             a GPU keeps those that it has read, as long as half of its memory is free.
@@ -83,18 +83,20 @@ def fit_field(
         FileNotFoundError: if something else deletes the checkpoint's folder meanwhile; noticed at the next checkpoint.
     """
     training, progress = training or Training(), as_progress(progress)
-    if not isinstance(params, GaussianParams) or not len(params):
-        got = "no Gaussian" if isinstance(params, GaussianParams) else type(params).__name__
-        raise TypeError(f"params: expected GaussianParams, got {got}; GaussianParams.from_points makes them")
+    check_gaussians(gaussians)
+    if not len(gaussians) or (gaussians.features is None and gaussians.sh is None):
+        raise ValueError(
+            f"gaussians: expected some with features [N, d] or sh [N, K, 3], got {gaussians!r}; gaussians_from_points makes them"
+        )
     if not cameras or len(cameras) != len(targets):
         got = f"{len(targets)}; pass the views that have maps"
         raise ValueError(f"targets: expected one map per camera ({len(cameras)}, at least one), got {got}")
-    if params.origin == ORIGIN:
-        params = replace(params, origin=cameras[0].origin)
-    cameras = [camera.with_origin(params.origin) for camera in cameras]
+    if gaussians.origin == ORIGIN:
+        gaussians = gaussians.replace(origin=cameras[0].origin)
+    cameras = [camera.with_origin(gaussians.origin) for camera in cameras]
     if training.extent is None:
-        training = replace(training, extent=float(check_extent(camera_extent(cameras, params.means))))
-    trainer = Trainer(params, cameras, targets, training, loss, generator or torch.Generator().manual_seed(0))
+        training = replace(training, extent=float(check_extent(camera_extent(cameras, gaussians.means))))
+    trainer = Trainer(gaussians, cameras, targets, training, loss, generator or torch.Generator().manual_seed(0))
     path = as_path(checkpoint) if checkpoint is not None else None
     if path is not None:
         identity = trainer.identity()
@@ -114,7 +116,7 @@ def fit_field(
             last = trainer.step == training.steps
             if path is not None and (last or trainer.step % training.checkpoint_every == 0):
                 write_checkpoint(path, trainer.state() | {"identity": identity})
-    return FieldFit(trainer.optimizer.params.map(torch.Tensor.detach), trainer.history)
+    return FieldFit(trainer.gaussians().detach(), trainer.history)
 
 
 class Trainer:
@@ -122,7 +124,7 @@ class Trainer:
 
     def __init__(
         self,
-        params: GaussianParams,
+        gaussians: Gaussians,
         cameras: Sequence[Camera],
         targets: Sequence[Tensor],
         training: Training,
@@ -134,13 +136,19 @@ class Trainer:
         self._training, self._generator = training, generator
         self._render_cameras: dict[tuple[int, bool], Camera] = {}
         self._on_gpu: dict[int, Tensor] = {}  # targets that stay there, as long as half of its memory is free
-        self._sh_start = params.used_sh_degree()  # of the start, so a resumed fit has the same
-        self.optimizer = FieldOptimizer(params, training)
-        self.statistics = GradientStatistics.zeros(params)
+        self._start = gaussians  # also of a resumed fit
+        self.optimizer = FieldOptimizer(to_raw(gaussians), training)
+        self._channels = 3 if gaussians.features is None else gaussians.features.shape[1]
+        self._sh_start = 0 if gaussians.features is not None or gaussians.sh is None else used_sh_degree(gaussians.sh)
+        self.statistics = GradientStatistics.zeros(gaussians.means)
         self.history: list[dict[str, Any]] = []
         self.step = 0
         self._queue: list[int] = []  # views still to come in this epoch, last first
         self._losses, self._seconds = 0.0, 0.0
+
+    def gaussians(self, sh_degree: int | None = None) -> Gaussians:
+        """The cloud as it is now, differentiable; of colours, only harmonics up to `sh_degree` (None: all)."""
+        return to_gaussians(self.optimizer.raw, self._start, sh_degree)
 
     def advance_(self) -> dict[str, Any] | None:
         """One step of the optimisation; returns the new row of the history, if there is one."""
@@ -158,7 +166,7 @@ class Trainer:
         if self.step % self._training.report_every and self.step != self._training.steps:
             return None
         since = self.step - (self.history[-1]["step"] if self.history else 0)
-        count = len(self.optimizer.params)
+        count = len(self.optimizer.raw["means"])
         row = {"step": self.step, "loss": self._losses / since, "count": count, "seconds": round(self._seconds, 3)}
         self.history.append(row)
         self._losses = 0.0
@@ -173,7 +181,7 @@ class Trainer:
         target, half = self._target(view)
         camera = self._camera(view, target, half)
         every = training.sh_degree_every
-        gaussians = self.optimizer.params.activated(self._sh_start + self.step // every if every else None)
+        gaussians = self.gaussians(self._sh_start + self.step // every if every else None)
         rendering = rasterize(gaussians, camera, engine=training.engine)
         means2d = rendering.projected.means2d
         if means2d.requires_grad:
@@ -195,33 +203,33 @@ class Trainer:
     def _densify_(self, options: Densify) -> None:
         assert self._training.extent is not None
         grown = densify(
-            self.optimizer.params,
+            self.optimizer.raw,
             self.statistics.mean(),
             options,
             extent=self._training.extent,
             prune_large=0 < options.reset_every < self.step,
             generator=self._generator,
         )
-        if len(grown.params) == 0:
+        if len(grown.source) == 0:
             raise ValueError(
                 f"training: expected some Gaussian to outlast pruning, got none at step {self.step}; raise prune_extent "
                 f"(now {options.prune_extent}) or lower prune_opacity ({options.prune_opacity}), or check extent"
             )
         self.optimizer.replace_(*grown)
-        self.statistics = GradientStatistics.zeros(grown.params)
+        self.statistics = GradientStatistics.zeros(grown.raw["means"])
 
     def _target(self, view: int) -> tuple[Tensor, bool]:  # [h, w, D]
         """The map of a view, and whether it was halved."""
         given = self._on_gpu[view] if view in self._on_gpu else self._targets[view]
         target, size = as_tensor(f"targets[{view}]", given, floating=True), self._cameras[view].size
-        channels = self.optimizer.params.channels
+        channels = self._channels
         clear = isinstance(self._loss, ColorLoss) and target.shape[2:] == (channels + 1,)
         if target.ndim != 3 or (target.shape[2] != channels and not clear):
             raise ValueError(
-                f"targets[{view}]: expected [h, w, D] with D = {channels} (from params), got {tuple(target.shape)}; "
-                "start from GaussianParams.from_points(points, D)"
+                f"targets[{view}]: expected [h, w, D] with D = {channels} (from gaussians), got {tuple(target.shape)}; "
+                "start from gaussians_from_points(points, D)"
             )
-        target = target.to(self.optimizer.params.means)
+        target = target.to(self._start.means)
         if target.is_cuda and view not in self._on_gpu:
             free, memory = torch.cuda.mem_get_info(target.device)
             if free > memory / 2:
@@ -237,7 +245,7 @@ class Trainer:
     def _camera(self, view: int, target: Tensor, half: bool) -> Camera:
         """The camera to render with; cached, because checking a new camera takes longer than using it."""
         if (view, half) not in self._render_cameras:
-            camera, scale = self._cameras[view].to(self.optimizer.params.means), self._training.render_scale
+            camera, scale = self._cameras[view].to(self._start.means), self._training.render_scale
             if scale is not None:
                 height, width = (max(1, round(n * scale)) for n in target.shape[:2])
                 camera = camera.resized(min(height, camera.height), min(width, camera.width))
@@ -246,18 +254,18 @@ class Trainer:
 
     def identity(self) -> str:
         """A digest of the inputs of the fit, before its first step. Of the targets, only their number and the first map count."""
-        params, options = self.optimizer.params, asdict(replace(self._training, checkpoint_every=1))
+        start, options = self._start, asdict(replace(self._training, checkpoint_every=1))
         views = [tensor for camera in self._cameras for tensor in (camera.viewmat, camera.K)]
         first = as_tensor("targets[0]", self._targets[0], floating=True)
-        tensors = digest_tensors(*params.to_tensors().values(), *views, first, self._generator.get_state())
+        tensors = digest_tensors(*self.optimizer.raw.values(), *views, first, self._generator.get_state())
         loss = getattr(self._loss, "__qualname__", None) or repr(self._loss)
         sizes = [len(self._targets), *((camera.size, camera.near) for camera in self._cameras)]
-        return digest_value([tensors, params.origin, params.antialiased, sizes, options, loss])
+        return digest_value([tensors, start.origin, start.antialiased, sizes, options, loss])
 
     def state(self) -> dict[str, Any]:
         """Everything that `restore_` needs: tensors, numbers, lists and dictionaries."""
         return {
-            "params": {name: value.detach() for name, value in self.optimizer.params.to_tensors().items()},
+            "raw": {name: value.detach() for name, value in self.optimizer.raw.items()},
             "adam": self.optimizer.adam.state_dict()["state"],
             "statistics": self.statistics._asdict(),
             "generator": self._generator.get_state(),
@@ -266,13 +274,18 @@ class Trainer:
 
     def restore_(self, state: dict[str, Any]) -> None:
         """Continue from a `state`; also restores that of the fit's generator."""
-        now = self.optimizer.params
-        tensors: dict[str, Any] = {name: value.to(now.means) for name, value in state["params"].items()}
-        self.optimizer = FieldOptimizer(replace(now, **tensors), self._training)
+        means = self._start.means
+        self.optimizer = FieldOptimizer({name: value.to(means) for name, value in state["raw"].items()}, self._training)
         self.optimizer.adam.load_state_dict(self.optimizer.adam.state_dict() | {"state": state["adam"]})
-        self.statistics = GradientStatistics(*(value.to(now.means) for value in state["statistics"].values()))
+        self.statistics = GradientStatistics(*(value.to(means) for value in state["statistics"].values()))
         self._generator.set_state(state["generator"])
         self.step, self._queue, self.history, self._losses, self._seconds = state["progress"]
+
+
+def used_sh_degree(sh: Tensor) -> int:  # [N, K, 3]
+    """Highest degree with a coefficient other than 0."""
+    filled = sh[:, 1:].ne(0).any(dim=2).any(dim=0).nonzero()  # [K - 1]
+    return math.isqrt(int(filled.max()) + 1) if len(filled) else 0
 
 
 def digest_tensors(*tensors: Tensor) -> str:

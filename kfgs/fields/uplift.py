@@ -109,7 +109,7 @@ def uplift_maps(
             features, or no view shows any Gaussian.
 
     Note:
-        To continue by training, start `fit_field` with `GaussianParams.from_gaussians(field.gaussians)` and the maps
+        To continue by training, start `fit_field` with `field.gaussians` and the maps
         `field.decoder.encode(unit features)`.
     """
     config, progress, count = config or UpliftConfig(), as_bar(progress), len(cameras)

@@ -15,7 +15,7 @@ from torch import Tensor
 from .._check import Progress, as_progress, check_range, check_whole
 from .._files import check_output, locked
 from ..cameras import Camera, resize_map
-from ..fields import ColorLoss, Densify, GaussianParams, Rates, Training, fit_field
+from ..fields import ColorLoss, Densify, Rates, Training, fit_field, gaussians_from_points
 from ..fields.train import digest_tensors
 from ..formats import write_splats
 from ..gaussians import Gaussians
@@ -157,7 +157,7 @@ def color_stage(run: Run, scene: Scene, views: Sequence[int], config: ColorConfi
     if config.picture_scale != 1:
         sizes = [[max(1, round(n * config.picture_scale)) for n in camera.size] for camera in cameras]
         cameras = [camera.resized(*size) for camera, size in zip(cameras, sizes, strict=True)]
-    start = partial(GaussianParams.from_points, scene.points, colors=scene.colors, sh_degree=config.sh_degree)
+    start = partial(gaussians_from_points, scene.points, colors=scene.colors, sh_degree=config.sh_degree)
     train = partial(
         fit_field,
         cameras=cameras,

@@ -21,7 +21,16 @@ from torch import Tensor
 
 from .._check import Progress, as_progress
 from .._files import check_output, folded_name, locked, real_path, write_json
-from ..fields import Autoencoded, Codewords, GaussianParams, Identity, SemanticField, fit_field, fuse_views, uplift_maps
+from ..fields import (
+    Autoencoded,
+    Codewords,
+    Identity,
+    SemanticField,
+    fit_field,
+    fuse_views,
+    gaussians_from_points,
+    uplift_maps,
+)
 from ..fields.decoders import Decoder
 from ..fields.store import NAME, check_place, scene_classes
 from ..fields.train import digest_tensors
@@ -215,7 +224,7 @@ def _paper(
     # the decoupled field, Sec. 3.2: Gaussians whose rendered latents follow the targets (Eq. 4)
     cameras, training = [scene.cameras[i] for i in views], with_extent(method.training, scene)
     inputs |= {"scene": digest_scene(scene, views), "config": asdict(training), "seed": run.seed}
-    start = partial(GaussianParams.from_points, scene.points, decoder.latent)
+    start = partial(gaussians_from_points, scene.points, decoder.latent)
     trained = field_stage(
         run, "field", inputs, start, partial(fit_field, cameras=cameras, targets=targets, training=training)
     )

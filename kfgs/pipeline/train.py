@@ -11,10 +11,9 @@ from typing import Any
 import torch
 
 from .._arrays import read_safetensors, save_tensors
-from .._check import as_origin
 from .._files import write_json
 from ..cameras.projection import project_points
-from ..fields import GaussianParams, Training
+from ..fields import Training
 from ..fields.train import FieldFit
 from ..fields.training import check_extent
 from ..gaussians import Gaussians
@@ -104,16 +103,16 @@ def with_extent(options: Training, scene: Scene) -> Training:
 
 
 def field_stage(
-    run: Run, name: str, inputs: dict[str, Any], start: Callable[[], GaussianParams], train: Callable[..., FieldFit]
+    run: Run, name: str, inputs: dict[str, Any], start: Callable[[], Gaussians], train: Callable[..., FieldFit]
 ) -> Stage:
     """Train a field as a stage of a run: `train`, a part of `fit_field`, from `start()`; after a kill it resumes."""
     checkpoint = run.scratch(name, inputs)
 
     def make(folder: Path) -> float:
-        started, params = time.perf_counter(), start().map(lambda value: value.to(training_device()))
-        fit = train(params, generator=run.generator(name), progress=run.progress, checkpoint=checkpoint)
-        origin = dict(zip(("origin",), origin_tensors(fit.params.origin), strict=False))
-        save_tensors(folder / "params.safetensors", fit.params.to_tensors() | origin)
+        started, gaussians = time.perf_counter(), start().to(training_device())
+        fit = train(gaussians, generator=run.generator(name), progress=run.progress, checkpoint=checkpoint)
+        origin = dict(zip(("origin",), origin_tensors(fit.gaussians.origin), strict=False))
+        save_tensors(folder / "gaussians.safetensors", fit.gaussians.tensors() | origin)
         write_json(folder / "history.json", fit.history)
         return max(0.0, fit.history[-1]["seconds"] - (time.perf_counter() - started))  # before it was killed
 
@@ -124,6 +123,5 @@ def field_stage(
 
 def stage_gaussians(stage: Stage) -> Gaussians:
     """The Gaussians that a finished stage of `field_stage` has."""
-    tensors = read_safetensors(stage.folder / "params.safetensors")[0]
-    origin = tensors.pop("origin", torch.zeros(3))
-    return GaussianParams(**tensors, origin=as_origin(origin.tolist())).activated().detach()
+    tensors = read_safetensors(stage.folder / "gaussians.safetensors")[0]
+    return Gaussians(**tensors | {"origin": tensors.pop("origin", torch.zeros(3)).tolist()})

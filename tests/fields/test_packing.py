@@ -193,7 +193,6 @@ HOSTILE = {
     "wider numbers": entry("gaussians.quats", width=2),
     "a step in words": entry("gaussians.means", step="wide"),
     "an origin out of reach": entry("gaussians.means", origin=[1e300, 0, 0]),
-    "means that need the means": entry("gaussians.means", coding="near"),
     "a missing tensor": lambda about: about["packed"].pop("gaussians.means"),
     "a tensor too many": lambda about: about["packed"].update(extra=about["packed"]["gaussians.scales"]),
     "no tensors": lambda about: about.update(packed=[]),

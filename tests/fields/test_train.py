@@ -7,9 +7,9 @@ from cases_training import SHORT as BASE
 from cases_training import blobs, changed, look_at_origin, same, scene
 from messages import tells
 
-from kfgs import rasterize
+from kfgs import Gaussians, rasterize
 from kfgs.cameras import Distortion, resize_map
-from kfgs.fields import GaussianParams, fit_field
+from kfgs.fields import fit_field, gaussians_from_points
 from kfgs.fields.loss import l1_loss
 
 CHANNELS = 3
@@ -18,11 +18,10 @@ SHORT = changed(BASE, features_rate=0.05, reset_every=25)
 
 def start(n=60, channels=CHANNELS):
     points = torch.rand(n, 3, generator=torch.Generator().manual_seed(7)) * 2.4 - 1.2
-    return GaussianParams.from_points(points, channels)
+    return gaussians_from_points(points, channels)
 
 
-def mean_loss(params, cameras, targets):
-    gaussians = params.activated()
+def mean_loss(gaussians, cameras, targets):
     return sum(
         float((rasterize(gaussians, camera).map - target).abs().mean())
         for camera, target in zip(cameras, targets, strict=True)
@@ -45,11 +44,11 @@ def test_targets_are_recovered_from_a_poor_start():
     )
     fit = fit_field(start(), cameras, targets, config)
     level = sum(float(target.abs().mean()) for target in targets) / len(targets)
-    assert mean_loss(fit.params, cameras, targets) < 0.05 * level
+    assert mean_loss(fit.gaussians, cameras, targets) < 0.05 * level
     held_out = look_at_origin(0.75)
     truth = rasterize(blobs(), held_out).map
-    assert mean_loss(fit.params, [held_out], [truth]) < 0.12 * level
-    assert len(fit.params) > 60  # densified
+    assert mean_loss(fit.gaussians, [held_out], [truth]) < 0.12 * level
+    assert len(fit.gaussians) > 60  # densified
     assert fit.history[-1]["loss"] < 0.1 * fit.history[0]["loss"]
 
 
@@ -59,7 +58,7 @@ def test_without_an_extent_that_of_the_cameras_is_used():
     centers = torch.stack([camera.center for camera in cameras]).double()
     extent = 1.1 * float((centers - centers.mean(0)).square().sum(1).sqrt().max())
     assert 1 < extent < 4
-    fits = [fit_field(start(), cameras, targets, changed(SHORT, extent=size)).params for size in (None, extent, 9.0)]
+    fits = [fit_field(start(), cameras, targets, changed(SHORT, extent=size)).gaussians for size in (None, extent, 9.0)]
     assert same(fits[0], fits[1])
     assert not same(fits[0], fits[2])
 
@@ -92,11 +91,11 @@ def test_every_view_comes_once_per_epoch_in_seeded_random_order():
 def test_equal_seeds_give_equal_bits_and_the_start_stays():
     cameras, targets = scene(3)
     first = start()
-    before = first.map(torch.Tensor.clone)
+    before = Gaussians(**{name: value.clone() for name, value in first.tensors().items()})
     fits = [fit_field(first, cameras, targets, SHORT) for _ in range(2)]
-    assert same(fits[0].params, fits[1].params)
+    assert same(fits[0].gaussians, fits[1].gaussians)
     assert same(first, before)
-    assert not fits[0].params.means.requires_grad
+    assert not fits[0].gaussians.means.requires_grad
 
 
 class StopHereError(Exception):
@@ -121,7 +120,7 @@ def test_a_resumed_fit_equals_an_undisturbed_one_bit_for_bit(tmp_path, stop_at):
     resumed = run(progress=rows.append, checkpoint=path)
     assert rows[0]["step"] == stop_at  # it did not start again
     assert set(rows[0]) == {"step", "loss", "count", "seconds"}
-    assert same(resumed.params, whole.params)
+    assert same(resumed.gaussians, whole.gaussians)
     for key in ("step", "loss", "count"):
         assert [row[key] for row in resumed.history] == [row[key] for row in whole.history]
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
@@ -131,12 +130,12 @@ def test_an_antialiased_cloud_is_trained_as_it_is_drawn(tmp_path):
     cloud = blobs().replace(scales=0.05 * blobs().scales, antialiased=True)  # smaller than a pixel
     cameras = [look_at_origin(0.5 * i) for i in range(2)]
     targets = [rasterize(cloud, camera).map for camera in cameras]
-    params, config = GaussianParams.from_gaussians(cloud), changed(SHORT, steps=2, report_every=1, start=2)
+    config = changed(SHORT, steps=2, report_every=1, start=2)
     path = tmp_path / "fit.pt"
-    fit = fit_field(params, cameras, targets, config, checkpoint=path)
+    fit = fit_field(cloud, cameras, targets, config, checkpoint=path)
     assert fit.history[0]["loss"] < 1e-6  # it draws what it began as
-    assert fit.params.antialiased
-    assert fit_field(params, cameras, targets, config, checkpoint=path).params.antialiased  # as the file has it
+    assert fit.gaussians.antialiased
+    assert fit_field(cloud, cameras, targets, config, checkpoint=path).gaussians.antialiased  # as the file has it
 
 
 def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
@@ -144,14 +143,14 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
     path = tmp_path / "fit.pt"
     short = changed(SHORT, steps=5)
     fit_field(start(), cameras, targets, short, checkpoint=path)
-    same = {"params": start(), "cameras": cameras, "targets": targets, "training": short}
+    same = {"gaussians": start(), "cameras": cameras, "targets": targets, "training": short}
     for other in (
         {"training": changed(short, features_rate=0.1)},
         {"cameras": cameras[:2], "targets": targets[:2]},
         {"cameras": [replace(camera, near=0.1) for camera in cameras]},
         {"targets": [target + 1 for target in targets]},
-        {"params": start(61)},
-        {"params": replace(start(), antialiased=True)},
+        {"gaussians": start(61)},
+        {"gaussians": start().replace(antialiased=True)},
         {"loss": lambda rendered, alpha, target: rendered.mean()},
         {"generator": torch.Generator().manual_seed(9)},
     ):
@@ -209,8 +208,8 @@ def test_opacities_are_reset_on_schedule():
     cameras, targets = scene(2)
     config = changed(SHORT, steps=10, reset_every=10, start=20)
     fit = fit_field(start(), cameras, targets, config)
-    assert fit.params.activated().opacities.max() <= 0.01 + 1e-6
-    assert fit_field(start(), cameras, targets, changed(config, reset_every=0)).params.logit_opacities.max() > -3
+    assert fit.gaussians.opacities.max() <= 0.01 + 1e-6
+    assert fit_field(start(), cameras, targets, changed(config, reset_every=0)).gaussians.opacities.max() > 0.05
 
 
 def test_a_view_without_gaussians_teaches_nothing_and_breaks_nothing():
@@ -219,7 +218,7 @@ def test_a_view_without_gaussians_teaches_nothing_and_breaks_nothing():
     target = torch.ones(24, 32, CHANNELS)
     config = changed(SHORT, steps=3, start=50)
     fit = fit_field(start(), [away], [target], config)
-    assert same(fit.params, start())
+    torch.testing.assert_close(fit.gaussians.tensors(), start().tensors())
     assert fit.history[-1]["loss"] == pytest.approx(1.0)
 
 
@@ -242,8 +241,8 @@ def test_unknown_pixels_count_nowhere():
     assert float(l1_loss(rendered, torch.ones(4, 6), holes * torch.nan).detach()) == 0.0
 
 
-def one_place(params):
-    return replace(params, means=look_at_origin(0.0).center.repeat(len(params), 1))
+def one_place(gaussians):
+    return gaussians.replace(means=look_at_origin(0.0).center.repeat(len(gaussians), 1))
 
 
 BENT = replace(look_at_origin(0.0), distortion=Distortion("brown_conrady", (0.1, 0.0, 0.0, 0.0)))
@@ -253,19 +252,19 @@ BENT = replace(look_at_origin(0.0), distortion=Distortion("brown_conrady", (0.1,
     ("change", "error", "message"),
     [
         ({"targets": []}, ValueError, ("targets:", "got 0")),
-        ({"params": start(channels=5)}, ValueError, ("targets[", "[h, w, D]", "D = 5", "got (24, 32, 3)")),
-        ({"params": start().map(lambda value: value[:0])}, TypeError, ("params:", "got no Gaussian")),
+        ({"gaussians": start(channels=5)}, ValueError, ("targets[", "[h, w, D]", "D = 5", "got (24, 32, 3)")),
+        ({"gaussians": start()[:0]}, ValueError, ("gaussians:", "got Gaussians(0 Gaussians")),
         ({"cameras": [BENT]}, ValueError, ("camera:", "got brown_conrady")),
         ({"targets": [torch.full((24, 32, 3), torch.inf)]}, FloatingPointError, ("loss:", "step 1", "got inf")),
         ({"training": changed(SHORT, prune_opacity=0.9)}, ValueError, ("training:", "got none", "step 10")),
         (
-            {"params": one_place(start(2)), "training": changed(SHORT, extent=None)}, ValueError,
+            {"gaussians": one_place(start(2)), "training": changed(SHORT, extent=None)}, ValueError,
             ("cameras", "extent of 0", "Training(extent=...)"),
         ),
     ],
 )  # fmt: skip
 def test_what_cannot_be_trained_is_named(change, error, message):
     cameras, targets = scene(1)
-    fitting = {"params": start(), "cameras": cameras, "targets": targets, "training": SHORT}
+    fitting = {"gaussians": start(), "cameras": cameras, "targets": targets, "training": SHORT}
     with pytest.raises(error, match=tells(*message)):
         fit_field(**(fitting | change))
