@@ -15,6 +15,8 @@ from .training import Densify, Training
 Raw = dict[str, Tensor]
 """What is trained, by the names of `Rates`: "means", "quats", the logarithms of "scales", the logits of "opacities", and either
 "features" or colours, "sh0" [N, 1, 3] and, above degree 0, "sh_rest" [N, K - 1, 3]: these two learn at different rates."""
+ADAM_EPS = 1e-15  # of 3DGS: tiny, because gradients of a mean over all pixels are tiny
+RESET_OPACITY = 0.01  # of 3DGS
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 SPLIT_CHILDREN = 2
 SPLIT_SHRINK = 1.6  # 0.8 times the number of children (3DGS)
@@ -61,7 +63,7 @@ class FieldOptimizer:
         """Copy `raw` and prepare Adam; the extent of `training` is known."""
         self.raw, self._training = _leaves(raw), training
         groups = [{"params": [value], "name": name} for name, value in self.raw.items()]
-        self.adam = torch.optim.Adam(groups, eps=training.rates.adam_eps, fused=True)
+        self.adam = torch.optim.Adam(groups, eps=ADAM_EPS, fused=True)
 
     def rate(self, name: str, step: int) -> float:
         """Learning rate of a parameter. That of the means falls from the first step on, and is in units of the extent."""
@@ -95,10 +97,10 @@ class FieldOptimizer:
                 self.adam.state[value] = state
             group["params"] = [value]
 
-    def lower_opacities_(self, opacity: float) -> None:
-        """The opacity reset of 3DGS: to at most `opacity`. Their moments, which belong to the old values, are forgotten."""
+    def lower_opacities_(self) -> None:
+        """The opacity reset of 3DGS: to at most `RESET_OPACITY`. Their moments, which belong to the old values, are forgotten."""
         leaf = self.raw["opacities"]
-        leaf.data.clamp_(max=math.log(opacity / (1 - opacity)))
+        leaf.data.clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
         for moment in _MOMENTS:
             if moment in self.adam.state.get(leaf, {}):
                 self.adam.state[leaf][moment].zero_()

@@ -161,7 +161,7 @@ class Trainer:
             if self.step > options.start and self.step % options.every == 0:
                 self._densify_(options)
             if options.reset_every and self.step % options.reset_every == 0:
-                self.optimizer.lower_opacities_(options.reset_opacity)
+                self.optimizer.lower_opacities_()
         self._seconds += time.perf_counter() - started
         if self.step % self._training.report_every and self.step != self._training.steps:
             return None

@@ -30,12 +30,10 @@ class Rates:
     final: float = 1.0
     """Factor on all other rates at the last step. They fall exponentially from the middle of the steps on; 1: constant, as in
     3DGS. Short schedules with high rates need it."""
-    adam_eps: float = 1e-15
-    """Adam's epsilon: tiny, because gradients of a mean over all pixels are tiny."""
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
-            check_range(name, value, 0, closed=(name not in ("means", "means_final", "final", "adam_eps"), False))
+            check_range(name, value, 0, closed=(name not in ("means", "means_final", "final"), False))
 
 
 @dataclass(frozen=True)
@@ -54,9 +52,7 @@ class Densify:
     prune_extent: float = 0.1
     """Gaussians whose largest scale exceeds this fraction of the extent are dropped, once opacities were reset."""
     reset_every: int = 3_000
-    """Steps between resets of all opacities, before `stop`; 0 = never (nor is anything pruned by size then)."""
-    reset_opacity: float = 0.01
-    """A reset lowers opacities to at most this value."""
+    """Steps between resets of all opacities to at most 0.01, before `stop`; 0 = never (nor is anything pruned by size then)."""
     maximum: int | None = None
     """The most Gaussians; those with the strongest gradients grow first. None = no limit."""
 
@@ -68,7 +64,6 @@ class Densify:
         check_range("percent_dense", self.percent_dense, 0)
         check_range("prune_extent", self.prune_extent, 0, closed=(False, False))
         check_range("prune_opacity", self.prune_opacity, 0, 1, closed=(True, False))
-        check_range("reset_opacity", self.reset_opacity, 0, 1, closed=(False, False))
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from ..gaussians import Gaussians
 from ..scenes import Scene
 
 STAGE_FILE, LOCK, DIGESTS = "stage.json", ".run.lock", "digests.json"
-STAGE_VERSION = 3
+STAGE_VERSION = 4
 """Part of every key: raised if the same inputs give another result in a new version, so that old stages are not reused."""
 
 

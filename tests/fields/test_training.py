@@ -8,7 +8,7 @@ def test_defaults_are_the_published_values():
     training = Training()
     assert (training.steps, training.render_scale, training.sh_degree_every) == (30_000, None, 1_000)
     rates = training.rates
-    assert (rates.features, rates.adam_eps, rates.means, rates.means_final) == (0.005, 1e-15, 1.6e-4, 1.6e-6)
+    assert (rates.features, rates.means, rates.means_final) == (0.005, 1.6e-4, 1.6e-6)
     others = rates.opacities, rates.scales, rates.quats, rates.sh0, rates.sh_rest
     assert others == (0.05, 0.005, 0.001, 0.0025, 0.000125)
     densify = training.densify
@@ -42,7 +42,6 @@ def test_a_limit_of_gaussians():
         (Training, {"sh_degree_every": -1}, ("sh_degree_every:", "got -1")),
         (Densify, {"reset_every": -1}, ("reset_every:", "got -1")),
         (Densify, {"maximum": 0}, ("maximum:", "got 0")),
-        (Densify, {"reset_opacity": 1.0}, ("reset_opacity:", "got 1.0")),
         (Rates, {"means": 0.0}, ("means:", "got 0.0")),
         (Rates, {"features": -1.0}, ("features:", "got -1.0")),
     ],

@@ -63,8 +63,9 @@ def test_remove_and_recolor(labelled, room, recorded):
     assert red[0] > red[1:].max() + 0.3
     score = kfgs.score_views(after, room.scene).psnr.value
     whole = kfgs.score_views(before, room.scene).psnr.value
-    assert whole == pytest.approx(recorded["PSNR of the colour field"], abs=0.2)
-    assert score == pytest.approx(recorded["PSNR of the edited field"], abs=0.3)
+    # A processor with other vectors rounds differently, and training takes another path: five seeds give 25.66 to 26.08.
+    assert whole == pytest.approx(recorded["PSNR of the colour field"], abs=0.4)
+    assert score == pytest.approx(recorded["PSNR of the edited field"], abs=0.4)
 
 
 def test_ply_round_trip(labelled, room, tmp_path):
