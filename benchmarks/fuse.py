@@ -80,7 +80,7 @@ def open_vocabulary(room: Room, field: SemanticField, words: Path) -> dict[str, 
     """The latents of a packed field against the average of all channels on its Gaussians, weighted by the pixels they fill."""
     rows = torch.nn.functional.normalize(torch.from_numpy(np.load(words)).float(), dim=1)
     exact = _average_all(room, field)
-    own = field.own_features(torch.arange(len(field)))
+    own = field.features_of(torch.arange(len(field)))
     cosine = torch.nn.functional.cosine_similarity(own, exact, dim=1)
     same = (own @ rows.T).argmax(1) == (exact @ rows.T).argmax(1)
     ones = ((camera, torch.ones(*camera.size, 1)) for camera in field.cameras)

@@ -120,7 +120,7 @@ def carried(room: Room, field: SemanticField, out: Path) -> list[Point]:
     labels = field.classify(room.classes).labels
     cloud = field.gaussians.replace(labels=labels, sh=torch.zeros(len(field), 1, 3))
     beside = out / "latents.safetensors"
-    parts = {"latents": field.features.half(), "basis": basis.half()}
+    parts = {"latents": field.latents.half(), "basis": basis.half()}
     save_file({name: value.contiguous() for name, value in parts.items()}, beside)
     points = []
     for ending in ("ply", "spz", "sog"):

@@ -74,7 +74,7 @@ def assert_same(one, other):
     assert list(ours) == list(theirs)
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)
     assert (one.fused is None) == (other.fused is None)
-    assert one.fused is None or torch.equal(one.fused.features, other.fused.features)
+    assert one.fused is None or torch.equal(one.fused.latents, other.fused.latents)
     assert_same_notes(one, other)
     assert torch.equal(one.classes.embeddings, other.classes.embeddings)
     assert one.info == other.info
@@ -104,7 +104,7 @@ def assert_within(made, back):
     assert_ellipsoids(before, after, errors)
     if before.features.numel():
         if made.fused is not None:
-            close(made.fused.features[order], back.fused.features, errors["fused.latents"])
+            close(made.fused.latents[order], back.fused.latents, errors["fused.latents"])
         close(before.features, after.features, errors["gaussians.features"])
     assert torch.equal(made.known[order], back.known)
     for ours, theirs, name in _decoders(made, back):

@@ -85,7 +85,7 @@ def make_scene(
         made = fit(scene.undistorted(), FeatureFolder(maps).of(scene), options.method, folder=run, report=say)
     if options.discard_features and options.teacher is not None:
         shutil.rmtree(maps)
-    value: dict[str, Any] = {"gaussians": len(made), "latents": made.features.shape[1], "miou": None}
+    value: dict[str, Any] = {"gaussians": len(made), "latents": made.latents.shape[1], "miou": None}
     classes = scene_classes(source) if options.text is None else load_label_set(options.text)
     if classes is None:
         return value

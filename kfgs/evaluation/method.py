@@ -133,7 +133,7 @@ class FieldMethod:
     def cosines(self, view: View, text: Tensor) -> Tensor:  # [K, D] -> [1, H, W, K]
         """The cosine of each pixel's rendered feature with each text; NaN where nothing was drawn."""
         field = self.field
-        unit = unit_embeddings(text, "text").to(field.features)
+        unit = unit_embeddings(text, "text").to(field.latents)
         with torch.no_grad():
             rendering = field.render(view.camera)
             labels, scores = field.decoder.label_pixels(rendering.map, unit, len(unit), rendering.alpha > 0)

@@ -1,13 +1,16 @@
-"""Fields of Gaussians: raw parameters, their training, and the finished semantic field (Sec. 3.2)."""
+"""The semantic field and the two ways to it: features averaged onto Gaussians (*uplift*), or Gaussians trained on maps (Sec. 3.2).
+
+*Fused* are features averaged over the views onto Gaussians, by `uplift_maps` or, of a trained field, by `fuse_views`.
+"""
 
 from .decoders import Autoencoded, Codewords, Identity, Linear
 from .examples import Box, Clicks, Mask, label_set_from_examples
 from .loss import ColorLoss
 from .merge import merge_gaussians
+from .options import Densify, Rates, Training
 from .semantic_field import SemanticField
 from .start import gaussians_from_points
 from .train import fit_field
-from .training import Densify, Rates, Training
 from .uplift import UpliftConfig, fuse_views, uplift_maps
 
 __all__ = [

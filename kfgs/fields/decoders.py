@@ -1,10 +1,17 @@
 """What a Gaussian's latent means: how it is decoded, compared with texts, and how a rendered pixel gets its class.
 
-`Linear` decodes the fused features of `uplift_maps`. The others are the three rows of Table 1: `Identity` ("just decouple"),
-`Codewords` ("decouple+ADC") and `Autoencoded` ("decouple+ADC+SC").
+`Linear` decodes the fused features of `uplift_maps`. The others are the three rows of Table 1. The class of a pixel:
 
-Blending is linear. So where a pixel's class follows from blended features, K numbers per Gaussian (`Votes`) are blended in place
-of the features, and the largest is kept while they are: nothing of [H, W, D] or [H, W, K] is in memory.
+| decoder | row | by default | with `paper` (Sec. 3.4 as printed) |
+|---|---|---|---|
+| `Linear` | - | most blended votes of its Gaussians (`divide_votes`) | class most similar to the blended feature |
+| `Identity` | just decouple | class most similar to the blended feature | the same |
+| `Codewords` | decouple+ADC | class most similar to the blended feature | class of the codeword nearest to it |
+| `Autoencoded` | decouple+ADC+SC | class of the codeword with the nearest latent | blended latent decoded, then as above |
+
+Blending is linear. So where a pixel's class follows from blended features, K numbers per Gaussian (`votes`) are blended in place
+of the features, and the largest is kept while they are: nothing of [H, W, D] or [H, W, K] is in memory. Otherwise `votes` is
+None: latents are blended, and `label_pixels` decides.
 """
 
 from __future__ import annotations
@@ -30,15 +37,12 @@ Ranks = tuple[Tensor, Tensor]  # [..., top] int64, [..., top]: the best classes 
 
 
 class Decoder(Protocol):
-    """The meaning of d numbers per Gaussian (and per rendered pixel) in a teacher's space of D channels.
-
-    With `paper`, pixels get their classes as Sec. 3.4 is printed: render the latent map, decode every pixel, quantise it with
-    the codebook (if there is one), look up. By default each decoder uses what is better or quicker and stated in its docstring.
-    """
+    """The meaning of d numbers per Gaussian (and per rendered pixel) in a teacher's space of D channels."""
 
     name: ClassVar[str]
     """For tables: the row of Table 1, or "fused"."""
     paper: bool
+    """Whether pixels get their classes as Sec. 3.4 is printed; the table above has both rules."""
 
     @property
     def dim(self) -> int:
@@ -92,7 +96,7 @@ class Decoder(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Identity(Decoder):
-    """Latents are the teacher's features themselves. A pixel takes the class most similar to its rendered feature."""
+    """Latents are the teacher's features themselves."""
 
     channels: int
     paper: bool = False
@@ -109,11 +113,7 @@ class Identity(Decoder):
 
 @dataclass(frozen=True, eq=False)
 class Linear(LinearLatents, Decoder):
-    """Latents are linear in the feature, f = B z: a cosine is one product of d numbers, and a blend means what it shows.
-
-    Each Gaussian divides one vote among the classes (`divide_votes`); a pixel takes the class with most blended votes. With
-    `paper`, it takes the class most similar to the rendered feature.
-    """
+    """Latents are linear in the feature, f = B z: a cosine is one product of d numbers, and a blend means what it shows."""
 
     paper: bool = False
     name = "fused"
@@ -166,10 +166,7 @@ class _Quantised(Decoder):
 
 @dataclass(frozen=True, eq=False)
 class Codewords(_Quantised):
-    """Latents are features near codewords of S (Sec. 3.3.1). A Gaussian has the cosines of its nearest codeword.
-
-    A pixel takes the class most similar to its rendered feature; with `paper`, that of the nearest codeword.
-    """
+    """Latents are features near codewords of S (Sec. 3.3.1)."""
 
     codebook: Codebook
     paper: bool = False
@@ -186,10 +183,9 @@ class Codewords(_Quantised):
 
 @dataclass(frozen=True, eq=False)
 class Autoencoded(_Quantised):
-    """Latents are codewords compressed by the autoencoder (Sec. 3.3.2). A Gaussian has the cosines of its nearest codeword.
+    """Latents are codewords compressed by the autoencoder (Sec. 3.3.2).
 
-    A pixel takes the codeword with the latent nearest to the rendered one, which is 900 times cheaper than decoding; with
-    `paper`, it is decoded by Psi and quantised.
+    The codeword with the nearest latent is found 900 times cheaper than by decoding a pixel.
     """
 
     codebook: Codebook

@@ -28,12 +28,12 @@ class Merged(NamedTuple):
     """The merged cloud, and the members of its Gaussians."""
 
     gaussians: Gaussians  # M, with features
-    source: Tensor  # [N] int64, the merged Gaussian of each old one; -1 = dropped
+    group: Tensor  # [N] int64, the merged Gaussian of each old one; -1 = dropped
 
     def pool(self, values: Tensor) -> Tensor:  # [N, ...] -> [M, ...]
         """Sums over the members of each merged Gaussian, for instance of their weights."""
-        kept = self.source >= 0
-        return _sum(values[kept], self.source[kept], len(self.gaussians))
+        kept = self.group >= 0
+        return _sum(values[kept], self.group[kept], len(self.gaussians))
 
 
 def merge_gaussians(
@@ -73,14 +73,14 @@ def merge_gaussians(
         rows = order[~below].sort().values
     kept, worth = gaussians.select(rows), weights[rows]
     assert kept.features is not None
-    source = torch.full_like(weights, -1, dtype=torch.int64)
+    groups = torch.full_like(weights, -1, dtype=torch.int64)
     if len(rows) <= maximum:
-        source[rows] = torch.arange(len(rows), device=rows.device)
-        return Merged(kept.replace(labels=None, sh=None), source)
+        groups[rows] = torch.arange(len(rows), device=rows.device)
+        return Merged(kept.replace(labels=None, sh=None), groups)
     kinds = spherical_kmeans(kept.features, worth, CLUSTERS, generator=generator).index
     group, count = _smallest_voxels(kept.means, kinds, worth, maximum)
-    source[rows] = group
-    return Merged(_match_moments(kept, worth, group, count), source)
+    groups[rows] = group
+    return Merged(_match_moments(kept, worth, group, count), groups)
 
 
 def _smallest_voxels(means: Tensor, kinds: Tensor, worth: Tensor, maximum: int) -> tuple[Tensor, int]:  # [n] int64, M

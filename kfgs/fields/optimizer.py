@@ -10,7 +10,7 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
 
 from ..gaussians import Gaussians
-from .training import Densify, Training
+from .options import Densify, Training
 
 Raw = dict[str, Tensor]
 """What is trained, by the names of `Rates`: "means", "quats", the logarithms of "scales", the logits of "opacities", and either
@@ -84,15 +84,15 @@ class FieldOptimizer:
     def replace_(
         self,
         raw: Raw,  # of N' Gaussians
-        source: Tensor,  # [N'] int64
+        parent: Tensor,  # [N'] int64
         fresh: Tensor,  # [N'] bool
     ) -> None:
-        """Train `raw` from now on: row i takes the moments of old row `source[i]`, or zeros where `fresh[i]`."""
+        """Train `raw` from now on: row i takes the moments of old row `parent[i]`, or zeros where `fresh[i]`."""
         self.raw = _leaves(raw)
         for group, value in zip(self.adam.param_groups, self.raw.values(), strict=True):
             if state := self.adam.state.pop(group["params"][0], None):
                 for moment in _MOMENTS:
-                    state[moment] = state[moment][source]
+                    state[moment] = state[moment][parent]
                     state[moment][fresh] = 0
                 self.adam.state[value] = state
             group["params"] = [value]
@@ -142,10 +142,10 @@ class GradientStatistics(NamedTuple):
 
 
 class Densified(NamedTuple):
-    """The new cloud, and the source of each of its rows."""
+    """The new cloud, and the Gaussian from which each of its rows comes."""
 
     raw: Raw
-    source: Tensor  # [N'] int64: row of the old cloud
+    parent: Tensor  # [N'] int64: row of the old cloud
     fresh: Tensor  # [N'] bool: a new Gaussian
 
 
@@ -189,9 +189,9 @@ def densify(
     cloned = (growing & ~large).nonzero()[:, 0]
     parents = (growing & large).nonzero()[:, 0].repeat_interleave(SPLIT_CHILDREN)
 
-    source = torch.cat([kept, cloned, parents])
-    fresh = torch.arange(len(source), device=source.device) >= len(kept)
-    grown = {name: value[source] for name, value in values.items()}
+    parent = torch.cat([kept, cloned, parents])
+    fresh = torch.arange(len(parent), device=parent.device) >= len(kept)
+    grown = {name: value[parent] for name, value in values.items()}
     if len(parents):
         first = len(kept) + len(cloned)
         means = values["means"][parents]
@@ -204,4 +204,4 @@ def densify(
     stays = grown["opacities"].sigmoid() >= options.prune_opacity
     if prune_large:
         stays &= grown["scales"].exp().amax(dim=1) <= options.prune_extent * extent
-    return Densified({name: value[stays] for name, value in grown.items()}, source[stays], fresh[stays])
+    return Densified({name: value[stays] for name, value in grown.items()}, parent[stays], fresh[stays])

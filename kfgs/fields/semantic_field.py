@@ -38,8 +38,9 @@ class SemanticField:
 
     **The rule.** The class or score of a Gaussian is that of its *fused* feature: the mean over the pixels of the training
     views that show it. A field made by `uplift_maps` has these as its latents. A trained field holds them as a second field of
-    the same Gaussians, `fused`, which answers for it. `field.paper` answers by Sec. 3.4 as printed: decode and quantise a
-    Gaussian's own latent, or a pixel's rendered one.
+    the same Gaussians, `fused`, which answers for them. A pixel is answered by rendering the field's own latents, never
+    `fused` (`decoders.py` has the rules). `field.paper` answers by Sec. 3.4 as printed: decode and quantise a Gaussian's own
+    latent, or a pixel's rendered one.
     """
 
     gaussians: Gaussians
@@ -63,8 +64,8 @@ class SemanticField:
             raise ValueError(f"fused: expected a field of the same Gaussians and teacher, got {self.fused!r}")
 
     @property
-    def features(self) -> Tensor:  # [N, d]
-        """The Gaussians' latents."""
+    def latents(self) -> Tensor:  # [N, d]
+        """What the Gaussians carry, `gaussians.features`; the decoder makes features [N, D] of them."""
         assert self.gaussians.features is not None
         return self.gaussians.features
 
@@ -76,7 +77,7 @@ class SemanticField:
     @property
     def known(self) -> Tensor:  # [N] bool
         """Which Gaussians a training view has shown; nothing is known about the others, so they have no class."""
-        return self._source.features.any(dim=1)
+        return self._source.latents.any(dim=1)
 
     @property
     def _source(self) -> SemanticField:
@@ -93,7 +94,7 @@ class SemanticField:
         return len(self.gaussians)
 
     def __repr__(self) -> str:
-        channels = f"{self.features.shape[1]} channels for {self.dim}"
+        channels = f"{self.latents.shape[1]} channels for {self.dim}"
         return f"SemanticField({self.decoder.name}: {len(self)} Gaussians, {channels})"
 
     def _facts(self) -> dict[str, Any]:
@@ -151,11 +152,11 @@ class SemanticField:
         check_rows("rows", rows, ("M",), self.dim)
         source = self._source
         with torch.no_grad():
-            return source.decoder.cosines(source.features, unit_embeddings(rows, "rows").to(source.features))
+            return source.decoder.cosines(source.latents, unit_embeddings(rows, "rows").to(source.latents))
 
-    def own_features(self, rows: Any) -> Tensor:  # [n, D]
+    def features_of(self, rows: Any) -> Tensor:  # [n, D]
         """The features of some Gaussians, all-zero if unknown. Rows and errors: see `Gaussians.select`."""
-        latents = self._source.features[as_rows("rows", rows, len(self)).to(self.features.device)]
+        latents = self._source.latents[as_rows("rows", rows, len(self)).to(self.latents.device)]
         return self._source.decode(latents) * latents.any(dim=1)[:, None]
 
     def classify(self, classes: Classes | None = None) -> Classification:
@@ -233,7 +234,7 @@ class SemanticField:
             if votes is not None:
                 return rank_votes(self.gaussians, camera, votes, top, early=early)
             rendering = self.render(camera)
-            unit = unit_embeddings(rows).to(self.features)
+            unit = unit_embeddings(rows).to(self.latents)
             labels = self.decoder.label_pixels(rendering.map, unit, top, rendering.alpha > 0)
             return Ranked(*labels, rendering.alpha)
 
@@ -244,7 +245,7 @@ class SemanticField:
 
         Without an autoencoder, the table counts no codebook; here it counts, because labelling needs it. `fused` does not.
         """
-        return semantic_storage_bytes(len(self), self.features.shape[1], 0, self.decoder.parameters)
+        return semantic_storage_bytes(len(self), self.latents.shape[1], 0, self.decoder.parameters)
 
     def save(self, path: str | Path, precision: Precision | None = None) -> None:
         """Write one file, whole or not at all; an older field is replaced.
@@ -278,12 +279,12 @@ class SemanticField:
 
     def _votes(self, rows: Tensor) -> Votes | None:
         """What the Gaussians say about some classes; that for the last text is kept."""
-        features = self.features
-        version = None if features.is_inference() else features._version  # changed in place: votes are counted again
+        latents = self.latents
+        version = None if latents.is_inference() else latents._version  # changed in place: votes are counted again
         kept = _VOTES.get(self)
-        if kept is not None and kept[0] == version is not None and torch.equal(kept[1], rows.to(kept[1])):
+        if kept is not None and version is not None and kept[0] == version and torch.equal(kept[1], rows.to(kept[1])):
             return kept[2]
-        votes = self.decoder.votes(features, unit_embeddings(rows).to(features))
+        votes = self.decoder.votes(latents, unit_embeddings(rows).to(latents))
         if votes is not None:
             _VOTES[self] = version, rows.detach().clone(), votes
         return votes

@@ -30,7 +30,7 @@ from .packing import Precision, pack, unpack
 
 SUFFIX, NAME = ".kfgs", "field.kfgs"
 KIND, VERSION = "semantic field", "1"
-ABOUT, WORDS = "description", 8 << 20  # the tensor with the JSON, and its most bytes
+DESCRIPTION, WORDS = "description", 8 << 20  # the tensor with the JSON, and its most bytes
 WHAT, AGAIN = "a field of kfgs", "copy it again, or fit the field again"
 SCENE_FILES = ("classes.json", "text.npy"), ("classes.json", "text.safetensors"), ("text.safetensors",)
 """Files of a scene folder that make a label set; the first group of which all exist is used."""
@@ -71,13 +71,13 @@ def save_field(path: str | Path, parts: Mapping[str, Any], precision: Precision 
             f"info: expected at most {WORDS} bytes of JSON with names of views, got {len(words)}; shorten it"
         )
     packed = zstandard.ZstdCompressor(level=19).compress(words)
-    tensors[ABOUT] = torch.frombuffer(bytearray(packed), dtype=torch.uint8)
+    tensors[DESCRIPTION] = torch.frombuffer(bytearray(packed), dtype=torch.uint8)
     with atomic_path(path) as temporary:
         save_tensors(temporary, tensors, {"kfgs": KIND, "version": VERSION})
 
 
-def load_field(path: str | Path, kind: Callable[..., Any]) -> Any:
-    """A field from its file; `kind` makes one of its parts, by name."""
+def load_field(path: str | Path, make: Callable[..., Any]) -> Any:
+    """A field from its file; `make` is `SemanticField`, which imports this file."""
     path = _field_file(path)
     tensors, about = _read(path)
     with reading(path, WHAT, AGAIN):
@@ -85,7 +85,7 @@ def load_field(path: str | Path, kind: Callable[..., Any]) -> Any:
             raise ValueError("its content is not what was saved")
         if "packed" in about:
             tensors = unpack(tensors, about["packed"])
-        return _from_tensors(path, tensors, about, kind)
+        return _from_tensors(path, tensors, about, make)
 
 
 def read_description(path: str | Path) -> dict[str, Any]:
@@ -138,7 +138,7 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """The tensors of a field's file, and its description."""
     tensors, _ = read_safetensors(path, WHAT, AGAIN, kfgs=(KIND, VERSION))
     with reading(path, WHAT, AGAIN):
-        packed = tensors.pop(ABOUT).numpy().tobytes()
+        packed = tensors.pop(DESCRIPTION).numpy().tobytes()
         if zstandard.get_frame_parameters(packed).content_size > WORDS:
             raise ValueError("its description is too long")
         return tensors, dict(parse_json(zstandard.ZstdDecompressor().decompress(packed, max_output_size=WORDS)))
@@ -167,7 +167,7 @@ def _to_tensors(path: Path, parts: Mapping[str, Any]) -> tuple[dict[str, Tensor]
     tensors = {f"gaussians.{name}": value for name, value in gaussians.tensors().items()}
     tensors |= parts["decoder"].to_tensors()
     if parts["fused"] is not None:
-        tensors |= {"fused.latents": parts["fused"].features, "fused.basis": parts["fused"].decoder.basis}
+        tensors |= {"fused.latents": parts["fused"].latents, "fused.basis": parts["fused"].decoder.basis}
     if cameras:
         cameras = [camera.with_origin(gaussians.origin) for camera in cameras]
         tensors["cameras.viewmats"] = torch.stack([camera.viewmat for camera in cameras])
@@ -188,7 +188,7 @@ def _to_tensors(path: Path, parts: Mapping[str, Any]) -> tuple[dict[str, Tensor]
     return {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}, about
 
 
-def _from_tensors(path: Path, tensors: dict[str, Tensor], about: dict[str, Any], kind: Callable[..., Any]) -> Any:
+def _from_tensors(path: Path, tensors: dict[str, Tensor], about: dict[str, Any], make: Callable[..., Any]) -> Any:
     """The field, which checks its parts."""
     origin, classes, fused = as_origin(about.get("origin", ORIGIN)), None, None
     cloud: dict[str, Any] = {name: tensors[f"gaussians.{name}"] for name in CLOUD if f"gaussians.{name}" in tensors}
@@ -210,6 +210,6 @@ def _from_tensors(path: Path, tensors: dict[str, Tensor], about: dict[str, Any],
         pose = tensors["cameras.viewmats"][i], tensors["cameras.Ks"][i]
         cameras.append(Camera(*pose, width, height, name, near=near, origin=origin))
     if "fused.latents" in tensors:
-        fused = kind(gaussians.replace(features=tensors["fused.latents"]), Linear(tensors["fused.basis"]))
+        fused = make(gaussians.replace(features=tensors["fused.latents"]), Linear(tensors["fused.basis"]))
     decoder = make_decoder(tensors, tensors["gaussians.features"].shape[1])
-    return kind(gaussians, decoder, tuple(cameras), classes, info, fused)
+    return make(gaussians, decoder, tuple(cameras), classes, info, fused)

@@ -25,7 +25,7 @@ from ..gaussians import Gaussians, check_gaussians
 from ..splat import rasterize
 from .loss import ColorLoss, Loss, l1_loss
 from .optimizer import FieldOptimizer, GradientStatistics, densify, to_gaussians, to_raw
-from .training import Densify, Training, check_extent
+from .options import Densify, Training, check_extent
 from .working_maps import shrink_camera, shrink_map
 
 AGAIN = "delete it to start again, or give another path"  # what to do about a checkpoint that does not fit
@@ -210,7 +210,7 @@ class Trainer:
             prune_large=0 < options.reset_every < self.step,
             generator=self._generator,
         )
-        if len(grown.source) == 0:
+        if len(grown.parent) == 0:
             raise ValueError(
                 f"training: expected some Gaussian to outlast pruning, got none at step {self.step}; raise prune_extent "
                 f"(now {options.prune_extent}) or lower prune_opacity ({options.prune_opacity}), or check extent"

@@ -2,7 +2,8 @@
 
 Each Gaussian takes the mean of the pixels that show it, weighted by its rendering weight w = T alpha. Every rendered pixel
 is a blend of Gaussians, so near a border the mean contains some of the neighbours. A few passes of the simultaneous iterative
-reconstruction technique (SIRT, Gilbert 1972) remove that: render, compare with the maps, carry the difference back.
+reconstruction technique (SIRT, Gilbert 1972) remove that: render, compare with the maps, carry the difference back. *Sums* are [2, N, d + 1]:
+over the even and over the odd views, and of d channels and, last, the weight.
 
 Training constrains only blends of Gaussians, so the latent of a single one may decode to something that no view shows. The mean
 over its pixels (`fuse_views`), computed once when a field is finished, does not have this problem.
@@ -127,7 +128,7 @@ def uplift_maps(
     with torch.no_grad(), bar, tempfile.TemporaryDirectory(prefix="kfgs_") as temporary:
         directions = (sample_latents(maps) if latents is None else latents).basis.to(cloud.means)
         views = WorkingMaps(cameras, maps, directions, config.pixels, scratch or Path(temporary))
-        sums, shown = average(cloud, views, bar)
+        sums, shown = sum_views(cloud, views, bar)
         if not bool((shown > 0).any()):
             raise ValueError(
                 "cameras: expected views that show the Gaussians, got none that does; do both share one frame?"
@@ -153,8 +154,8 @@ def uplift_maps(
     return SemanticField(fused, Linear(latents.basis), tuple(cameras), info=info)
 
 
-def average(cloud: Gaussians, views: WorkingMaps, bar: Any) -> tuple[Tensor, Tensor]:  # [2, N, d' + 1], [N]
-    """Sums of features and weights, over the even and the odd views, and the number of pixels that each Gaussian fills."""
+def sum_views(cloud: Gaussians, views: WorkingMaps, bar: Any) -> tuple[Tensor, Tensor]:  # [2, N, d' + 1], [N]
+    """The sums of features, and the number of pixels that each Gaussian fills."""
     channels, shown = views.directions.shape[1], torch.zeros_like(cloud.opacities)
     sums = cloud.means.new_zeros(2, len(cloud), channels + 1)
     for i in range(len(views)):
@@ -230,7 +231,7 @@ def fuse_views(field: SemanticField, cameras: Sequence[Camera]) -> SemanticField
         if isinstance(decoder, Codewords | Autoencoded):
             rows, weights = decoder.codebook.unit, None
         else:
-            rows, weights = unit_rows(field.features), gaussians.opacities
+            rows, weights = unit_rows(field.latents), gaussians.opacities
         latents = fit_linear_latents(rows, weights, keep=KEEP, maximum=MOST)
         table = torch.nn.functional.pad(latents.encode(rows), (0, 0, 0, 1)).to(gaussians.means)  # nothing known: zeros
 

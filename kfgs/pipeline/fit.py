@@ -21,17 +21,8 @@ from torch import Tensor
 
 from .._check import Progress, as_progress
 from .._files import check_output, folded_name, locked, real_path, write_json
-from ..fields import (
-    Autoencoded,
-    Codewords,
-    Identity,
-    SemanticField,
-    fit_field,
-    fuse_views,
-    gaussians_from_points,
-    uplift_maps,
-)
-from ..fields.decoders import Decoder
+from ..fields import SemanticField, fit_field, fuse_views, gaussians_from_points, uplift_maps
+from ..fields.decoders import Autoencoded, Codewords, Decoder, Identity
 from ..fields.store import NAME, check_place, scene_classes
 from ..fields.train import digest_tensors
 from ..formats import read_splats, write_splats

@@ -34,7 +34,7 @@ def write_preview(path: Path, field: SemanticField, scene: Scene, split: str) ->
     Views held out (split `test`) are preferred to those of `split`. Without any photograph nothing is drawn (False).
     """
     views = [i for i in scene.views("test" if scene.splits.get("test") else split) if scene.image_paths[i].is_file()]
-    count, colors, rows = min(3, len(views)), FeatureColors.fit(field.features), []
+    count, colors, rows = min(3, len(views)), FeatureColors.fit(field.latents), []
     for view in (views[(2 * k + 1) * len(views) // (2 * count)] for k in range(count)):  # not the ends, often alike
         camera = scene.cameras[view]
         camera = camera.resized(max(1, round(WIDTH * camera.height / camera.width)), WIDTH)
@@ -85,7 +85,7 @@ def write_run_report(
         "method": info["method"],
         "geometry": info.get("geometry", "trained with the field"),
         "Gaussians": f"{len(field):,}",
-        "numbers for each Gaussian's meaning": f"{field.features.shape[1]}, for {field.dim} channels of the teacher",
+        "numbers for each Gaussian's meaning": f"{field.latents.shape[1]}, for {field.dim} channels of the teacher",
         "size on disk": f"{(folder / NAME).stat().st_size / 1e6:,.1f} MB",
         "size as the paper's Table 1 counts it": f"{field.storage() / 1e6:,.1f} MB",
         "seed": info["seed"],

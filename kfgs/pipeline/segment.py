@@ -67,7 +67,7 @@ def segment_scene(
         check_truth(known, len(classes), f"truth[{stem!r}]")
     views = scene.views(split)
     labels = segment_cameras(field, [scene.cameras[i] for i in views], classes, out, progress=progress)
-    colors = FeatureColors.fit(field.features) if pictures else None
+    colors = FeatureColors.fit(field.latents) if pictures else None
     for k in evenly(len(views), pictures).tolist():
         stem, photo = scene.stem(views[k]), scene.image(views[k])
         drawn = {"truth": truth[stem]} if stem in truth else {}

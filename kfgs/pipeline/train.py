@@ -14,8 +14,8 @@ from .._arrays import read_safetensors, save_tensors
 from .._files import write_json
 from ..cameras.projection import project_points
 from ..fields import Training
+from ..fields.options import check_extent
 from ..fields.train import FieldFit
-from ..fields.training import check_extent
 from ..gaussians import Gaussians
 from ..scenes import Scene, SceneError, SfmConfig, find_points
 from ..scenes.scene import check_is_scene

@@ -92,7 +92,7 @@ class FieldMeaning:
         if not bool(chosen.any()):
             raise ValueError("selection: expected Gaussians with features, got none; select others, or raise lambda")
         rows = chosen.nonzero()[:, 0]
-        features = field.own_features(rows[:: max(1, len(rows) // MOST_COMPARED)])
+        features = field.features_of(rows[:: max(1, len(rows) // MOST_COMPARED)])
         target = torch.nn.functional.normalize(features, dim=1).mean(0)
         scores = field.query(target, self._classes, score="cosine").scores
         gamma = float(scores[chosen].quantile(1 - KEPT))

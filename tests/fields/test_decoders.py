@@ -121,7 +121,7 @@ def test_kept_votes_are_those_of_the_text():
 def test_votes_follow_features_that_are_changed_in_place():
     field = fused()
     before = field.segment(camera(), texts())
-    field.features.neg_()
+    field.latents.neg_()
     changed = fused()
     changed = replace(changed, gaussians=changed.gaussians.replace(features=-changed.features))
     after = field.segment(camera(), texts())

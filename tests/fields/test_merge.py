@@ -58,7 +58,7 @@ def test_two_equal_balls_become_their_mixture(one_kind):
     a, s, o = 0.05, 0.1, 0.3
     cloud = balls([[1 - a, 2, 3], [1 + a, 2, 3]], [[1, 0], [0.8, 0.6]], s, o)
     merged = merge_gaussians(cloud, torch.tensor([2.0, 2.0]), 1)
-    assert merged.source.tolist() == [0, 0]
+    assert merged.group.tolist() == [0, 0]
     assert merged.pool(torch.tensor([2.0, 2.0])).tolist() == [4.0]
     found = merged.gaussians
     torch.testing.assert_close(found.means, torch.tensor([[1.0, 2.0, 3.0]]))
@@ -92,7 +92,7 @@ def test_every_group_is_the_mixture_of_its_members(seed):
     ]
     spreads = covariances(merged.gaussians).double().numpy()
     for k in range(len(merged.gaussians)):
-        members = [i for i, group in enumerate(merged.source.tolist()) if group == k]
+        members = [i for i, group in enumerate(merged.group.tolist()) if group == k]
         mean, spread, opacity, feature = oracles_merge.merged(*parts, members)
         np.testing.assert_allclose(merged.gaussians.means[k].numpy(), mean, atol=2e-6)
         np.testing.assert_allclose(spreads[k], spread, atol=2e-6)
@@ -104,7 +104,7 @@ def test_what_is_few_enough_stays_as_it_is():
     cloud, weights = random_cloud(20)
     cloud = cloud.replace(sh=torch.zeros(20, 1, 3), labels=torch.zeros(20, dtype=torch.int64))
     merged = merge_gaussians(cloud, weights, 20)
-    assert merged.source.tolist() == list(range(20))
+    assert merged.group.tolist() == list(range(20))
     assert torch.equal(merged.pool(weights), weights)
     for name in ("means", "quats", "scales", "opacities", "features"):
         assert torch.equal(getattr(merged.gaussians, name), getattr(cloud, name))
@@ -117,8 +117,8 @@ def test_the_faintest_are_dropped_as_far_as_their_share_goes(monkeypatch, share,
     """Weights 1 to 10 add up to 55: a tenth of it holds 1 and 2, but not 3 as well. Of 10, none is too many."""
     monkeypatch.setattr(merge, "FAINT", share)
     cloud, _ = random_cloud(10)
-    source = merge_gaussians(cloud, torch.tensor([4.0, 2, 10, 6, 1, 8, 3, 9, 7, 5]), maximum).source
-    assert (source < 0).nonzero()[:, 0].tolist() == dropped
+    group = merge_gaussians(cloud, torch.tensor([4.0, 2, 10, 6, 1, 8, 3, 9, 7, 5]), maximum).group
+    assert (group < 0).nonzero()[:, 0].tolist() == dropped
 
 
 PLACES = {
@@ -140,10 +140,10 @@ def test_at_most_maximum_are_left_and_no_weight_is_lost(places, maximum):
     cloud = cloud.replace(means=PLACES[places](n, g), features=torch.randn(n, 30, generator=g))
     merged = merge_gaussians(cloud, weights, maximum)
     assert 1 <= len(merged.gaussians) <= maximum
-    assert (merged.source >= 0).all()
+    assert (merged.group >= 0).all()
     sums = merged.pool(weights)
     torch.testing.assert_close(sums.sum(), weights.sum())
-    assert (sums > 0).all()  # `source` is a map onto 0 ... M - 1
+    assert (sums > 0).all()  # `group` is a map onto 0 ... M - 1
     for name in ("means", "quats", "scales", "opacities", "features"):
         assert torch.isfinite(getattr(merged.gaussians, name)).all(), name
     assert (merged.gaussians.scales > 0).all()
@@ -160,7 +160,7 @@ def test_what_lies_apart_stays_apart_in_a_grid_of_more_cubes_than_numbers():
     cloud = cloud.replace(means=places[torch.arange(200) % 5])
     merged = merge_gaussians(cloud, torch.ones(200).double(), 40)
     assert len(merged.gaussians) == 5
-    torch.testing.assert_close(merged.gaussians.means[merged.source], cloud.means)
+    torch.testing.assert_close(merged.gaussians.means[merged.group], cloud.means)
 
 
 def test_kinds_that_are_not_small_are_never_merged():
@@ -169,8 +169,8 @@ def test_kinds_that_are_not_small_are_never_merged():
     cloud = balls(places.repeat(6, 1), torch.eye(2)[torch.arange(24) // 4 % 2])
     merged = merge_gaussians(cloud, torch.ones(24), 8)
     assert len(merged.gaussians) == 8
-    torch.testing.assert_close(merged.gaussians.features[merged.source], cloud.features)
-    torch.testing.assert_close(merged.gaussians.means[merged.source], cloud.means)
+    torch.testing.assert_close(merged.gaussians.features[merged.group], cloud.features)
+    torch.testing.assert_close(merged.gaussians.means[merged.group], cloud.means)
 
 
 @pytest.mark.parametrize(("light", "groups"), [(0.9, 1), (1.1, 2)])
@@ -192,7 +192,7 @@ def test_the_order_of_gaussians_does_not_matter(one_kind, seed):
     order = torch.randperm(len(cloud), generator=torch.Generator().manual_seed(seed))
     one = merge_gaussians(cloud, weights, 60)
     other = merge_gaussians(cloud.select(order), weights[order], 60)
-    assert torch.equal(other.source, one.source[order])
+    assert torch.equal(other.group, one.group[order])
     for name in ("means", "opacities", "features"):
         torch.testing.assert_close(getattr(other.gaussians, name), getattr(one.gaussians, name))
     torch.testing.assert_close(covariances(other.gaussians), covariances(one.gaussians), atol=1e-6, rtol=1e-4)

@@ -64,20 +64,20 @@ def test_every_group_follows_adam_at_its_rate():
 
 def test_moments_follow_their_gaussians():
     """Reordering and dropping Gaussians changes nothing for those that stay."""
-    source = torch.tensor([4, 0, 2])
+    parent = torch.tensor([4, 0, 2])
     plain, moved = (FieldOptimizer(params(), CONFIG) for _ in range(2))
     for optimizer in (plain, moved):
         for step in (1, 2, 3):
             give_gradients(optimizer, step)
             optimizer.step_(step)
-    moved.replace_(rows(moved.raw, source), source, torch.zeros(3, dtype=torch.bool))
+    moved.replace_(rows(moved.raw, parent), parent, torch.zeros(3, dtype=torch.bool))
     give_gradients(plain, 4)
     for name, value in moved.raw.items():
-        value.grad = plain.raw[name].grad[source]
+        value.grad = plain.raw[name].grad[parent]
     for optimizer in (plain, moved):
         optimizer.step_(4)
     for name, value in moved.raw.items():
-        assert torch.equal(value, plain.raw[name][source]), name
+        assert torch.equal(value, plain.raw[name][parent]), name
 
 
 def test_new_gaussians_start_without_moments():
@@ -85,8 +85,8 @@ def test_new_gaussians_start_without_moments():
     give_gradients(optimizer, 1)
     optimizer.step_(1)
     before = {name: value.clone() for name, value in state_tensors(optimizer).items()}
-    source, fresh = torch.tensor([0, 1, 1]), torch.tensor([False, False, True])
-    optimizer.replace_(rows(optimizer.raw, source), source, fresh)
+    parent, fresh = torch.tensor([0, 1, 1]), torch.tensor([False, False, True])
+    optimizer.replace_(rows(optimizer.raw, parent), parent, fresh)
     after = state_tensors(optimizer)
     assert torch.equal(after["features.exp_avg"][:2], before["features.exp_avg"][:2])
     assert torch.equal(after["features.exp_avg"][2], torch.zeros(6, dtype=torch.float64))
@@ -202,7 +202,7 @@ def assert_same(a, b, names=NAMES):
 def test_small_hot_gaussians_are_copied():
     start = cloud([0.05, 0.05, 0.09])
     grown = densify(start, torch.tensor([HOT, COLD, 2e-4]))
-    assert grown.source.tolist() == [0, 1, 2, 0, 2]  # the threshold itself is hot
+    assert grown.parent.tolist() == [0, 1, 2, 0, 2]  # the threshold itself is hot
     assert grown.fresh.tolist() == [False, False, False, True, True]
     assert_same(grown.raw, rows(start, [0, 1, 2, 0, 2]))
 
@@ -210,7 +210,7 @@ def test_small_hot_gaussians_are_copied():
 def test_large_hot_gaussians_become_two_smaller_ones():
     start = cloud([0.05, 0.5, 0.5])
     grown = densify(start, torch.tensor([COLD, HOT, COLD]))
-    assert grown.source.tolist() == [0, 2, 1, 1]
+    assert grown.parent.tolist() == [0, 2, 1, 1]
     assert grown.fresh.tolist() == [False, False, True, True]
     parents = rows(start, [0, 2, 1, 1])
     assert_same(grown.raw, parents, ("quats", "opacities", "features"))
@@ -234,7 +234,7 @@ def test_children_are_drawn_from_their_parent():
     grown = densify(start, torch.full((n,), HOT), seed=5)
     R = torch.tensor([[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0], [0, 0, 1]])
     expected = R @ torch.diag(torch.tensor([0.81, 0.09, 0.01])) @ R.T
-    assert len(grown.source) == 2 * n
+    assert len(grown.parent) == 2 * n
     torch.testing.assert_close(
         grown.raw["means"].mean(dim=0), start["means"][0], atol=0.02, rtol=0
     )  # 4 standard errors
@@ -244,17 +244,17 @@ def test_children_are_drawn_from_their_parent():
 def test_faint_ones_are_dropped():
     start = cloud([0.05, 0.05, 0.05], [0.004, 0.006, 0.5])
     grown = densify(start, torch.full((3,), COLD))
-    assert grown.source.tolist() == [1, 2]
-    assert len(densify(grown.raw, torch.full((2,), COLD)).source) == 2
+    assert grown.parent.tolist() == [1, 2]
+    assert len(densify(grown.raw, torch.full((2,), COLD)).parent) == 2
 
 
 def test_oversized_ones_are_dropped_only_when_asked():
     start = cloud([0.05, 1.2, 1.5])
     cold, split = torch.full((3,), COLD), torch.tensor([COLD, COLD, HOT])
-    assert len(densify(start, cold).source) == 3
-    assert densify(start, cold, prune_large=True).source.tolist() == [0]
+    assert len(densify(start, cold).parent) == 3
+    assert densify(start, cold, prune_large=True).parent.tolist() == [0]
     # The children of the third (1.5 / 1.6 < 1) are small enough to stay.
-    assert densify(start, split, prune_large=True).source.tolist() == [0, 2, 2]
+    assert densify(start, split, prune_large=True).parent.tolist() == [0, 2, 2]
 
 
 def test_a_limit_lets_the_strongest_grow_first():
@@ -262,9 +262,9 @@ def test_a_limit_lets_the_strongest_grow_first():
     gradient = torch.tensor([3e-4, 5e-4, 4e-4, 6e-4])
     limited = replace(DENSIFY, maximum=6)
     grown = densify(start, gradient, limited)
-    assert grown.source.tolist() == [0, 1, 2, 1, 3, 3]
-    assert len(densify(start, gradient, replace(DENSIFY, maximum=3)).source) == 4
-    assert len(densify(start, gradient, replace(DENSIFY, maximum=8)).source) == 8
+    assert grown.parent.tolist() == [0, 1, 2, 1, 3, 3]
+    assert len(densify(start, gradient, replace(DENSIFY, maximum=3)).parent) == 4
+    assert len(densify(start, gradient, replace(DENSIFY, maximum=8)).parent) == 8
 
 
 def test_statistics_are_means_of_ndc_gradients_over_views_that_saw_it():

@@ -164,7 +164,7 @@ def test_classify_and_its_scores(mode, rule):
 @pytest.mark.parametrize("mode", MODES)
 def test_gaussians_without_features_belong_to_no_class(mode, rule):
     made = field(mode)
-    features = made.features.clone()
+    features = made.latents.clone()
     features[1] = 0
     made = by(rule, replace(made, gaussians=made.gaussians.replace(features=features)))
     labels, scores = made.classify(embeddings())
@@ -260,8 +260,8 @@ def test_parts_must_belong_together():
 def test_some_gaussians_of_a_field():
     whole = fuse_views(field("adc", n=6), [camera()])
     part = whole.select(torch.tensor([3, 1]))
-    assert torch.equal(part.features, whole.features[[3, 1]])
-    assert torch.equal(part.fused.features, whole.fused.features[[3, 1]])
+    assert torch.equal(part.latents, whole.latents[[3, 1]])
+    assert torch.equal(part.fused.latents, whole.fused.latents[[3, 1]])
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -127,7 +127,7 @@ def test_what_decides_a_stage_makes_another(scene, maps, splat, fused, runs, tmp
 
 def test_a_splat_becomes_a_small_field_that_is_right_on_unseen_views(fused, scene, classes, room, tmp_path):
     assert len(fused) <= 1_500
-    assert fused.features.shape[1] <= 32
+    assert fused.latents.shape[1] <= 32
     labels = segment_scene(fused, scene, classes, tmp_path, pictures=1)
     truth = true_labels(scene, room / "labels", "test")
     assert score_scene(labels, truth, classes).accuracy.value > 0.75
@@ -156,7 +156,7 @@ def test_without_a_splat_gaussians_are_trained_and_a_longer_colour_fit_is_taken(
 def test_maps_may_be_a_list_in_memory_or_a_teacher(scene, maps, splat, fused, tmp_path):
     given = [maps[i] for i in range(len(maps))]
     made = fit(scene, given, Uplift(splat, SMALL), folder=tmp_path)
-    torch.testing.assert_close(made.features, fused.features, rtol=1e-3, atol=1e-3)  # a folder is read in blocks
+    torch.testing.assert_close(made.latents, fused.latents, rtol=1e-3, atol=1e-3)  # a folder is read in blocks
     _, seen = refit(scene, [one.numpy() for one in given], Uplift(splat, SMALL), folder=tmp_path)
     assert seen == {"uplift": "found"}
     extract_features(Tiny(), scene, tmp_path / "maps", split="train")
@@ -172,7 +172,7 @@ def test_the_other_rows_of_table_1(row, scene, maps, trained, runs, classes):
     short = paper(autoencoder=None, training=dataclasses.replace(FIELD, steps=40))
     method = short if row == "adc" else dataclasses.replace(short, codebook=None)
     field, seen = refit(scene, maps, method, folder=runs / "paper")  # shares the codebook with the first
-    assert field.features.shape[1] == 32
+    assert field.latents.shape[1] == 32
     assert type(field.decoder) is (Codewords if row == "adc" else Identity)
     if row == "adc":
         assert seen == {"codebook": "found", "index_maps": "found", "field": "done", "answers": "done"}

@@ -84,7 +84,7 @@ def test_features_of_a_masked_person_count_nothing(clean, crowded):
     def fused(scene):
         maps = FeatureFolder(scene.folder / "features").of(scene, "train")
         field = fit(scene, maps, method)
-        return field.decode(field.features) @ person(maps.shape[2])
+        return field.decode(field.latents) @ person(maps.shape[2])
 
     want, polluted, masked = fused(load_scene(clean)), fused(load_scene(crowded)), fused(with_masks(crowded))
     assert polluted.max() > want.max() + 0.3

@@ -141,7 +141,7 @@ def test_one_person_everywhere(browser, tmp_path, home):
 @pytest.mark.parametrize("phrase", ["1", "null"])
 def test_a_phrase_that_only_python_can_answer(browser, tmp_path, phrase):
     field = cases_explorer.field("fused")
-    words = {phrase: field.decode(field.features[20])}
+    words = {phrase: field.decode(field.latents[20])}
     meaning = FieldMeaning(field, cases_explorer.classes(), embed=words.__getitem__)
     state = Exploration(meaning, cases_explorer.cloud(field.gaussians.means[:40] + 0.05), distance=1.0)
     page = browser.new_page(viewport={"width": 800, "height": 600})
