@@ -108,7 +108,7 @@ def _average_all(room: Room, field: SemanticField) -> torch.Tensor:
     parts = []
     for start in range(0, room.maps[0].shape[-1], 63):
         found = uplift_maps(field.gaussians, field.cameras, Part(start), UpliftConfig(keep=1.0, max_latents=64))
-        parts.append(found.decode(found.features)[:, :-1])
+        parts.append(found.decode(found.latents)[:, :-1])
     return torch.cat(parts, dim=1)
 
 

@@ -60,7 +60,7 @@ fields = {}
 for name, method in methods.items():
     fields[name] = kfgs.fit(scene, maps, method, folder=runs[name])
     stages = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in fields[name].info["seconds"].items())
-    print(f"{name:6s} {fields[name].features.shape[1]:3d} channels, {len(fields[name]):6,} Gaussians; {stages}")
+    print(f"{name:6s} {fields[name].latents.shape[1]:3d} channels, {len(fields[name]):6,} Gaussians; {stages}")
 
 # %% [markdown]
 # ## One question for all

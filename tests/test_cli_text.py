@@ -119,7 +119,7 @@ def test_any_phrase_with_a_teacher_and_no_table(field, truth, names, capsys):
     said = capsys.readouterr().out
     assert "more like the query than like any of 4 negatives" in said
     field_rows, lamp = (
-        SemanticField.load(field).features.double(),
+        SemanticField.load(field).latents.double(),
         letters(["lamp", *["object", "things", "stuff", "texture"]]),
     )
     cosine = torch.nn.functional.normalize(field_rows, dim=1) @ torch.nn.functional.normalize(lamp.double(), dim=1).T

@@ -183,7 +183,7 @@ def fit(task: Task, config: CF3Config) -> Fitted:
     with clock.stage("lift"):
         found = uplift_maps(task.frozen, task.cameras, task.maps, options, generator=task.generator())
         seen = found.known
-        agreement = row_norms(found.features).where(seen, 2.0)  # the length of a mean of unit features
+        agreement = row_norms(found.latents).where(seen, 2.0)  # the length of a mean of unit features
         dropped = agreement.argsort()[: int(VARIANCE_SHARE * int(seen.sum()))]
         seen[dropped] = False
         lifted = found.gaussians.select(seen)

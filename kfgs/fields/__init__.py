@@ -1,4 +1,4 @@
-"""The semantic field and the two ways to it: features averaged onto Gaussians (*uplift*), or Gaussians trained on maps (Sec. 3.2).
+"""The semantic field and two ways to it: features averaged onto Gaussians (*uplift*), or Gaussians trained on maps (Sec. 3.2).
 
 *Fused* are features averaged over the views onto Gaussians, by `uplift_maps` or, of a trained field, by `fuse_views`.
 """

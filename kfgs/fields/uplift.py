@@ -2,8 +2,9 @@
 
 Each Gaussian takes the mean of the pixels that show it, weighted by its rendering weight w = T alpha. Every rendered pixel
 is a blend of Gaussians, so near a border the mean contains some of the neighbours. A few passes of the simultaneous iterative
-reconstruction technique (SIRT, Gilbert 1972) remove that: render, compare with the maps, carry the difference back. *Sums* are [2, N, d + 1]:
-over the even and over the odd views, and of d channels and, last, the weight.
+reconstruction technique (SIRT, Gilbert 1972) remove that: render, compare with the maps, carry the difference back.
+
+*Sums* are [2, N, d + 1]: over the even and over the odd views, of d channels and, last, of the weight.
 
 Training constrains only blends of Gaussians, so the latent of a single one may decode to something that no view shows. The mean
 over its pixels (`fuse_views`), computed once when a field is finished, does not have this problem.

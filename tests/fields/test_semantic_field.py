@@ -279,13 +279,13 @@ def test_wrong_embeddings(mode):
 def test_another_dtype_gives_the_same_answers(mode):
     one = replace(field(mode, n=8), cameras=(a_camera(),))
     other = one.to(torch.float64)
-    assert {other.gaussians.means.dtype, other.features.dtype, other.cameras[0].K.dtype} == {torch.float64}
+    assert {other.gaussians.means.dtype, other.latents.dtype, other.cameras[0].K.dtype} == {torch.float64}
     assert one.gaussians.means.dtype == torch.float32  # the field itself stays
     camera = a_camera(24, 18)
     for a, b in [(one.paper, other.paper), *([(one, other)] if mode == "fused" else [])]:
         assert b.classify(embeddings()).labels.equal(a.classify(embeddings()).labels)
         assert b.segment(camera.to(torch.float64), embeddings()).equal(a.segment(camera, embeddings()))
-    assert other.to(torch.float32).features.equal(one.features)
+    assert other.to(torch.float32).latents.equal(one.latents)
 
 
 def test_fields_with_other_latents_are_not_joined():

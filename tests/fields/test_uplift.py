@@ -373,7 +373,7 @@ def test_answers_are_those_of_the_slow_oracle(mode):
 
     expected, pixels = oracles_answers.fused(blend_weights(cloud, views()), cloud.features.double().numpy(), shown)
     found = fuse(cloud, mode, views())
-    features = found.decode(found.features)
+    features = found.decode(found.latents)
     # KEEP drops what is below 0.001 of the variation between features: at most sqrt(0.001) of each.
     np.testing.assert_allclose(features.numpy(), expected, atol=2e-5 if book is not None else 0.03)
     assert (pixels[:8] > 0.5).sum() >= 6
@@ -383,7 +383,7 @@ def test_answers_are_those_of_the_slow_oracle(mode):
 @pytest.mark.parametrize("mode", ["decouple", "adc", "adc+sc"])
 def test_what_no_view_shows_answers_nothing(mode):
     found = fuse(trained(mode), mode, views())
-    assert (found.features[-2:] == 0).all()
+    assert (found.latents[-2:] == 0).all()
 
 
 @pytest.mark.parametrize("mode", ["decouple", "adc"])
@@ -393,13 +393,13 @@ def test_what_learnt_nothing_answers_nothing(mode):
     cloud = cloud.replace(features=torch.zeros_like(cloud.features))
     features = torch.cat([torch.zeros(9, DIM), codebook().unit[:1]])  # the last, far away, has some
     found = fuse(cloud.replace(features=features), mode, views())
-    assert (found.features == 0).all()
+    assert (found.latents == 0).all()
 
 
 def test_large_views_are_rendered_small(monkeypatch):
     cloud, large = trained("adc"), [view.resized(40, 52) for view in views()]
     monkeypatch.setattr("kfgs.fields.uplift.PIXELS", 130)
-    torch.testing.assert_close(fuse(cloud, "adc", large).features, fuse(cloud, "adc", views()).features)
+    torch.testing.assert_close(fuse(cloud, "adc", large).latents, fuse(cloud, "adc", views()).latents)
 
 
 # Wrong input

@@ -61,7 +61,7 @@ def test_the_run_folder_holds_every_stage_and_the_field(trained, runs):
     loaded = SemanticField.load(run / "field.kfgs")
     assert same(loaded, trained)
     assert loaded.info["method"] == "paper"
-    assert loaded.features.shape[1] == 4
+    assert loaded.latents.shape[1] == 4
     losses = [row["loss"] for row in read_json(Run(run).finished("field")[0].folder / "history.json")]
     assert losses[-1] < 0.7 * losses[0]
 
