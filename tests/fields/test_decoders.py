@@ -123,7 +123,7 @@ def test_votes_follow_features_that_are_changed_in_place():
     before = field.segment(camera(), texts())
     field.latents.neg_()
     changed = fused()
-    changed = replace(changed, gaussians=changed.gaussians.replace(features=-changed.features))
+    changed = replace(changed, gaussians=changed.gaussians.replace(features=-changed.latents))
     after = field.segment(camera(), texts())
     assert after.equal(changed.segment(camera(), texts()))
     assert not after.equal(before)
