@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -64,28 +64,29 @@ def check_truth(target: Tensor, classes: int, name: str) -> None:  # target: [H,
 
 
 def evaluate_segmentation(
-    predict: Callable[[str], Tensor],  # stem -> labels [h, w]
+    predict: Callable[[str], Tensor] | Mapping[str, Tensor],  # stem -> labels [h, w]
     truth: Mapping[str, Path | Tensor],  # stem -> label picture, or its labels [H, W] with -1 = void
-    names: Iterable[str],
+    names: Any,
 ) -> SegmentationReport:
     """Score predicted label maps against label pictures (protocol `kfgs-pooled/1`).
 
     Args:
-        predict: gives the label map of a view by its stem, at any size; -1 counts as wrong wherever truth is known.
-        truth: one label picture per view.
-        names: class names; a label is an index into them.
+        predict: the label map of each view by its stem (mapping or function), at any size; -1 is wrong where truth is known.
+        truth: one label picture, or array, per view.
+        names: class names, or what has them (a label set); a label is an index into them.
 
     Raises:
         ValueError: if there is nothing to score, or a truth label has no name.
     """
-    names = tuple(names)
+    names = tuple(getattr(names, "names", names))
     if not truth:
         raise ValueError("truth: expected at least one label picture, got none; is the folder of labels right?")
     pooled = ConfusionMatrix(len(names))
     for stem, given in truth.items():
-        target = given if isinstance(given, Tensor) else load_label_map(given)
-        check_truth(target, len(names), f"truth[{stem!r}]" if isinstance(given, Tensor) else str(given))
-        labels = as_tensor(f"predict({stem!r})", predict(stem))
+        place = str(given) if isinstance(given, str | Path) else f"truth[{stem!r}]"
+        target = load_label_map(given) if isinstance(given, str | Path) else as_tensor(place, given)
+        check_truth(target, len(names), place)
+        labels = as_tensor(f"predict({stem!r})", predict.get(stem) if isinstance(predict, Mapping) else predict(stem))
         if labels.shape != target.shape:
             labels = resize_labels(labels, (int(target.shape[0]), int(target.shape[1])))
         pooled.update(labels, target)
