@@ -64,7 +64,7 @@ Image.fromarray(both.screenshot(return_img=True))  # or: viz.show_transfer(field
 camera = scene.cameras[scene.views("test")[3]]
 plotter = viz.make_plotter(2 * camera.height, 2 * camera.width, off_screen=True)
 actor = viz.add_cloud(plotter, semantic, style="gaussians")  # coloured by its classes
-viz.add_legend(plotter, semantic.labels, classes.names)
+viz.add_legend(plotter, semantic)
 viz.look_through(plotter, camera)
 print(actor.mapper.dataset.array_names)
 Image.fromarray(plotter.screenshot(return_img=True))  # with a display: plotter.show()

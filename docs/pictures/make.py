@@ -89,7 +89,7 @@ def draw_field(demo: Demo) -> None:
     """A photo, the Gaussians with shrunken shapes, and the classes."""
     labelled = demo.field.label(demo.words)
     dots = labelled.replace(scales=labelled.scales * 0.45, opacities=torch.full_like(labelled.opacities, 0.95))
-    gaussians = show_cloud(dots, color_by="label", names=demo.words.names)(demo.large)
+    gaussians = show_cloud(dots, color_by="label")(demo.large)
     classes = show_classes(labelled, demo.words.names)(demo.large)
     save(
         "site_field.jpg",
@@ -179,7 +179,7 @@ def draw_lambda(demo: Demo) -> None:
     target, shown, titles = demo.splat, [], []
     for distance in (0.02, 0.1, 0.8):
         carried = transfer_labels(source, target, distance).labels
-        shown.append(show_cloud(target.replace(labels=carried), color_by="label", names=demo.words.names)(demo.large))
+        shown.append(show_cloud(target.replace(labels=carried, names=source.names), color_by="label")(demo.large))
         titles.append(f"lambda {distance:.2f}: {(carried >= 0).float().mean():.0%} labelled")
     save("site_lambda.jpg", shown, titles)
 

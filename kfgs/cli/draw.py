@@ -68,7 +68,7 @@ def render(
     meaning, cameras = open_meaning(source, classes, Teacher())
     if classes.loaded is not None:
         cameras = classes.loaded.cameras
-    semantic, colors = meaning.gaussians, open_colors(source, color, meaning)
+    semantic, colors = meaning.gaussians.replace(names=meaning.names), open_colors(source, color, meaning)
     colors = None if colors is None else colors.with_origin(semantic.origin)
     if path == "orbit":
         semantic, colors = _opened(meaning.names, semantic, colors)
@@ -77,9 +77,9 @@ def render(
     walk = walk_of(semantic if colors is None else colors, cameras)
     if width is not None:
         walk = [camera.resized(max(1, round(width * camera.height / camera.width)), width) for camera in walk]
-    names, listed = (meaning.names, semantic.labels.unique()) if "labels" in words else (None, None)
+    legend = semantic if "labels" in words else None
     with tqdm(total=len(walk), desc="render", unit="frame") as bar:
-        save_animation(out, shows, walk, fps=FPS, names=names, listed=listed, progress=lambda *_: bar.update())
+        save_animation(out, shows, walk, fps=FPS, legend=legend, progress=lambda *_: bar.update())
     wrote([out])
 
 
@@ -148,7 +148,7 @@ def _show(word: str, meaning: Any, semantic: Any, colors: Any) -> Any:
     if word == "photo" and under is not None:
         return under
     if word == "labels":
-        return show_cloud(semantic, color_by="label", names=meaning.names)
+        return show_cloud(semantic, color_by="label")
     if word == "features" and semantic.features is not None:
         return show_cloud(semantic, color_by="feature")
     if word.startswith("query="):

@@ -20,7 +20,7 @@ from ..cameras.similarity import Similarity
 from ..formats.table import read_splats
 from ..gaussians import Gaussians
 from .edits import Duplicate, Edit, Extract, Move, Opacity, Recolor, Remove, transformed
-from .selection import class_name, read_object, set_fields
+from .selection import class_names, read_object, set_fields
 
 FORMAT, VERSION = "kfgs.edits", 1
 
@@ -179,11 +179,8 @@ def _in_classes_of(first: Gaussians, second: Gaussians) -> tuple[Tensor | None, 
     """
     if second.labels is None or not (first.names or second.names):
         return second.labels, first.names
-    highest = -1 if first.labels is None or not len(first) else int(first.labels.max())
-    names = [class_name(first.names, i) for i in range(max(len(first.names), highest + 1))]
-    labels = second.labels.clone()
+    names, theirs, labels = list(class_names(first)), class_names(second), second.labels.clone()
     for label in second.labels[second.labels >= 0].unique().tolist():
-        name = class_name(second.names, label)
-        names += [] if name in names else [name]
-        labels[second.labels == label] = names.index(name)
+        names += [] if theirs[label] in names else [theirs[label]]
+        labels[second.labels == label] = names.index(theirs[label])
     return labels, tuple(names)

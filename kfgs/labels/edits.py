@@ -26,7 +26,7 @@ from .selection import (
     OfIndex,
     Rule,
     Selection,
-    class_name,
+    class_names,
     plain_fields,
     read_object,
     set_fields,
@@ -92,8 +92,8 @@ def _rule(where: Any) -> Rule:
 
 
 def _present(gaussians: Gaussians) -> str:
-    labels = [] if gaussians.labels is None else gaussians.labels.tolist()
-    sizes = Counter(class_name(gaussians.names, label) for label in labels if label >= 0)
+    names, labels = class_names(gaussians), [] if gaussians.labels is None else gaussians.labels.tolist()
+    sizes = Counter(names[label] for label in labels if label >= 0)
     return f"classes present are {cut(', '.join(f'{name} ({n})' for name, n in sizes.most_common()) or 'none', 200)}"
 
 

@@ -120,9 +120,7 @@ def load_label_set(classes: str | Path, embeddings: str | Path | None = None) ->
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or not names:
         raise ValueError(f'{classes}: expected a list of class names, ["wall", "floor"], got {type(names).__name__}')
     if embeddings is None:
-        raise ValueError(
-            f"embeddings: expected an .npy file of one row per name in {classes}, got none; pass it as well"
-        )
+        raise ValueError(f"embeddings: expected an .npy file of one row per name in {classes}, got none; pass it too")
     if (path := as_path(embeddings)).suffix == SUFFIX:
         return _read_table(path).select(names)
     rows = read_array(path, "an .npy file of numbers, one embedding row per class")
@@ -207,25 +205,16 @@ def make_question(
         against = as_tensor("negatives", negatives, floating=True)
         check_rows("negatives", against, ("M",), dim)
         return torch.cat([row[None], against.to(row)])
+    check_choice("negatives", negatives, get_args(Negatives))
     rows = row.new_zeros(0, dim) if rows is None else rows
-    if negatives == "auto":
-        against = rows[_unlike(rows, row)]
-        is_class = isinstance(target, str) or len(against) < len(rows)
-        if len(against) == 0 or not is_class:
-            against = _canonical(table, words, row)
-    elif negatives == "classes":
-        against = rows[_unlike(rows, row)]
-        if len(against) == 0:
-            raise ValueError(f"negatives: expected other classes than {words!r}, got none; use 'canonical' or 'none'")
-    elif negatives == "canonical":
-        against = _canonical(table, words, row)
-        if len(against) == 0:
-            raise ValueError(
-                "negatives: expected canonical words in the table, got none; `kfgs features --words` makes some"
-            )
-    else:
-        check_choice("negatives", negatives, get_args(Negatives))
-        against = rows[:0]
+    others, canonical = rows[_unlike(rows, row)], _canonical(table, words, row)
+    of_class = isinstance(target, str) or len(others) < len(rows)
+    auto = others if of_class and len(others) else canonical
+    against = {"auto": auto, "classes": others, "canonical": canonical, "none": rows[:0]}[negatives]
+    if len(against) == 0 and negatives == "classes":
+        raise ValueError(f"negatives: expected other classes than {words!r}, got none; use 'canonical' or 'none'")
+    if len(against) == 0 and negatives == "canonical":
+        raise ValueError("negatives: expected canonical words in a table, got none; `kfgs features --words` adds some")
     return torch.cat([row[None], against.to(row)])
 
 

@@ -14,10 +14,11 @@ from .._check import as_tensor, check_range, check_shapes, check_whole
 from .._origin import to_world
 from .._rows import check_finite
 from ..cameras import Camera
-from ..gaussians import Gaussians, check_gaussians
+from ..gaussians import Gaussians
 from ..splat.views import sum_pixels
 from .components import number_parts
-from .selection import Selection
+from .selection import OfClass, Rule, Selection
+from .transfer import as_cloud
 
 LONGEST = 160  # longer side in pixels of the views compared; on room_0 shares change by at most 0.3 % of the picture
 SPECK = 0.05  # parts smaller than this share of the largest are left out
@@ -82,7 +83,8 @@ class BestView:
 class Part:
     """A part of a selection in numbers. Positions are the Gaussians' centres, in world units."""
 
-    indices: Tensor  # [n] int64, ascending
+    gaussians: Gaussians  # itself, as a cloud of n
+    indices: Tensor  # [n] int64, ascending, in the whole cloud
     score: float  # mean score of its Gaussians
     centroid: Tensor  # [3] mean position
     box: OrientedBox  # a small box around the centres
@@ -120,8 +122,8 @@ class Part:
 
 
 def connected_parts(
-    gaussians: Gaussians,
-    selection: Selection | Tensor,  # or a mask [N]
+    gaussians: Any,
+    selection: Any,
     cameras: Sequence[Camera] | None = None,
     *,
     distance: float | None = None,
@@ -131,15 +133,17 @@ def connected_parts(
     """Split a selection of these Gaussians into its connected parts ("the four chairs"), largest first.
 
     Args:
-        gaussians: the cloud.
-        selection: an empty one has no parts.
+        gaussians: a cloud or a field.
+        selection: a class name, a `Selection`, a rule or a mask [N]; an empty one has no parts.
         cameras: views without distortion, to find the best one of each part.
         distance: Gaussians at most this far apart are connected, in world units; None takes it from their spacing.
         smallest: parts with fewer Gaussians are left out; None: those below 5 % of the largest.
         most: the most parts to return.
     """
-    check_gaussians(gaussians)
-    selection = selection if isinstance(selection, Selection) else Selection.of(selection)
+    gaussians = as_cloud(gaussians)
+    rule = OfClass(selection) if isinstance(selection, str) else selection
+    rule = rule.select(gaussians) if isinstance(rule, Rule) else rule
+    selection = rule if isinstance(rule, Selection) else Selection.of(rule)
     check_shapes(("gaussians.means", gaussians.means, "N 3"), ("selection.mask", selection.mask, "N"))
     check_whole("most", most, 1)
     if distance is not None:
@@ -160,8 +164,9 @@ def connected_parts(
             best = int(shares[:, i].argmax())
             view = BestView(cameras[best].name, best, float(shares[best, i]))
         score, extent = float(selection.scores[indices].double().mean()), (points.amin(dim=0), points.amax(dim=0))
-        how, box = f"{selection.how}; part {i + 1} of {len(sizes)}", OrientedBox.around(points)
-        parts.append(Part(indices, score, points.mean(dim=0), box, extent, view, how, len(sizes)))
+        place, box = points.mean(dim=0), OrientedBox.around(points)
+        how = f"{selection.how}; part {i + 1} of {len(sizes)}"
+        parts.append(Part(gaussians[indices], indices, score, place, box, extent, view, how, len(sizes)))
     return parts
 
 

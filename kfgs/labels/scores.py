@@ -49,10 +49,6 @@ def relevancy(
         raise ValueError("negatives: expected at least one column, got none; pass what the query should not find")
     check_finite("similarity", similarity)
     check_finite("negatives", negatives)
-    return _relevancy(similarity, negatives)
-
-
-def _relevancy(similarity: Tensor, negatives: Tensor) -> Tensor:
     return torch.sigmoid(TEMPERATURE * (similarity - negatives.amax(dim=1)))
 
 
@@ -70,17 +66,15 @@ def select_by_similarity(
     room_0 (mean IoU over 18 classes with the data set's labels): cosine 0.88, relevancy 0.90.
     """
     score = score or ("cosine" if negatives is None else "relevancy")
+    check_choice("score", score, get_args(Score))
     gamma, how, scores = threshold, "given", similarity
     check_finite("similarity", similarity)
     if score == "relevancy":
         if negatives is None:
             raise ValueError("negatives: expected some for a relevancy, got none; pass words that are not meant")
-        check_finite("negatives", negatives)
-        scores = _relevancy(similarity, negatives)
+        scores = relevancy(similarity, negatives)
         if gamma is None:
             gamma, how = EVEN, f"more like the query than like any of {negatives.shape[1]} negatives"
-    elif score != "cosine":
-        check_choice("score", score, get_args(Score))
     if threshold is not None:
         check_range("threshold", threshold, -1 if score == "cosine" else 0, 1)
     known = torch.ones_like(similarity, dtype=torch.bool) if known is None else known
@@ -123,8 +117,7 @@ def similarity_threshold(scores: Tensor) -> tuple[float, str]:  # scores: [N]
         return float(median + WAY * (top - median)), how
     depth = candidates[0]
     deep = np.flatnonzero(depth >= depth.max() / 2)
-    breaks = np.flatnonzero(np.diff(deep) > 1)
-    gap = deep[breaks[-1] + 1 :] if breaks.size else deep  # the last run of neighbouring bins
+    gap = np.split(deep, np.flatnonzero(np.diff(deep) > 1) + 1)[-1]  # the last run of neighbouring bins
     floor = gap[density[gap] <= density[gap].min() + 1e-9]
     threshold, sparser = float(centres[floor].mean()), 10 ** depth[gap].max()
     return threshold, f"gap at {threshold:.3f}: {sparser:.0f} x sparser than the modes beside it ({values.size} scores)"

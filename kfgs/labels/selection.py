@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -24,7 +24,7 @@ from .._rows import check_finite
 from ..cameras.similarity import Similarity
 from ..gaussians import Gaussians
 from .components import number_parts
-from .transfer import positions
+from .transfer import as_cloud, positions
 
 T = TypeVar("T")
 
@@ -57,8 +57,7 @@ class Selection:
 
     def __post_init__(self) -> None:
         for name in ("mask", "scores"):
-            if not isinstance(getattr(self, name), Tensor):
-                object.__setattr__(self, name, as_tensor(name, getattr(self, name)))
+            object.__setattr__(self, name, as_tensor(name, getattr(self, name)))
         if self.mask.ndim != 1 or self.scores.shape != self.mask.shape:
             got = f"{tuple(self.mask.shape)} and {tuple(self.scores.shape)}"
             raise ValueError(f"mask, scores: expected [N] with the same N, got {got}; pass one score per Gaussian")
@@ -112,9 +111,9 @@ class Rule(ABC):
 
     kind: ClassVar[str]
 
-    def select(self, gaussians: Gaussians) -> Selection:
-        """Apply the rule; a ValueError if the cloud lacks the labels, class or index that it needs."""
-        return Selection.of(*self._find(gaussians))
+    def select(self, gaussians: Any) -> Selection:
+        """Apply the rule to Gaussians or a field; a ValueError if the cloud lacks the labels, class or index that it needs."""
+        return Selection.of(*self._find(as_cloud(gaussians)))
 
     @abstractmethod
     def _find(self, gaussians: Gaussians) -> tuple[Tensor, str]:
@@ -230,9 +229,11 @@ class OfIndex(Rule):
         return mask, "by index"
 
 
-def class_name(names: Sequence[str], index: int) -> str:
-    """The name of a class; one without a name is called `class 7`."""
-    return names[index] if index < len(names) else f"class {index}"
+def class_names(gaussians: Gaussians) -> tuple[str, ...]:
+    """A name for every label of a cloud: a class without a name is called `class 7`."""
+    labels, names = gaussians.labels, gaussians.names
+    count = 0 if labels is None or not len(labels) else int(labels.max()) + 1
+    return (*names, *(f"class {i}" for i in range(len(names), count)))
 
 
 KINDS: dict[str, type[Rule]] = {kind.kind: kind for kind in (OfClass, InBox, InSphere, OfIndex)}

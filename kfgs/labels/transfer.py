@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,7 +16,7 @@ from .._check import as_array, as_tensor, check_range, check_shapes
 from .._notes import Repair, tell_repairs
 from .._origin import recounted
 from .._rows import check_finite
-from ..gaussians import Gaussians, check_gaussians
+from ..gaussians import Gaussians
 
 CHUNK = 16_384  # destinations at a time
 SAMPLE = 20_000  # Gaussians measured for lambda or a spacing
@@ -55,12 +57,12 @@ class Transfer:
         )
 
 
-def transfer_labels(source: Gaussians, target: Gaussians, distance: float | None = None) -> Gaussians:
-    """Label a splat by distance: `transfer_labels(field.label(classes), read_splats("mine.ply"))`.
+def transfer_labels(source: Any, target: Gaussians, distance: float | None = None) -> Gaussians:
+    """Label a splat by distance: `transfer_labels(field, read_splats("mine.ply"))`.
 
-    The rule is that of `nearest_labels`, which also says who gave each label. The target gets new `labels`, `scores`
-    (1 - distance / lambda), and the class names of the source. Both clouds must share one frame; `kfgs.attach` finds the
-    common frame, and can label by views instead of by distance.
+    The source is a field, or labelled Gaussians; the rule is that of `nearest_labels`, which also says who gave each label.
+    The target gets new `labels`, `scores` (1 - distance / lambda), and the class names of the source. Both clouds must share
+    one frame; `kfgs.attach` finds the common frame, and can label by views instead of by distance.
 
     A ValueError if the source has no labels, a position is not finite, or the distance is not positive.
 
@@ -70,10 +72,7 @@ def transfer_labels(source: Gaussians, target: Gaussians, distance: float | None
         >>> transfer_labels(cloud, cloud.replace(means=b, labels=None), 0.4).labels.tolist()
         [0, -1]
     """
-    check_gaussians(source, "source")
-    check_gaussians(target, "target")
-    if source.labels is None:
-        raise ValueError("source: expected Gaussians with labels, got none; `SemanticField.label` gives them some")
+    source, target = as_cloud(source, "source", labelled=True), as_cloud(target, "target")
     places = recounted(target.means, target.origin, source.origin)
     carried = nearest_labels(source.means, source.labels, places, distance)
     return target.replace(labels=carried.labels, scores=carried.scores.to(target.means.dtype), names=source.names)
@@ -175,6 +174,22 @@ class Sources:
             f"{100 * COVERAGE:g} % of the destinations have a source within {reach:.3g}; the sources' spacings are "
             f"{usual:.3g} (median) and {wide:.3g} ({100 * WIDE:g} % are smaller)"
         )
+
+
+def as_cloud(value: Any, name: str = "gaussians", *, labelled: bool = False) -> Gaussians:
+    """What a person holds as a cloud: Gaussians as they are, or those of a field with the classes that it knows.
+
+    A TypeError for anything else, and a ValueError if it must be `labelled` and is not; both name the call that helps.
+    """
+    if not isinstance(value, Gaussians):
+        if not hasattr(value, "label"):
+            path = isinstance(value, str | Path)
+            calls = "SemanticField.load or read_splats opens a file" if path else "nearest_labels labels plain points"
+            raise TypeError(f"{name}: expected a SemanticField or Gaussians, got {type(value).__name__}; {calls}")
+        value = value.label() if labelled or value.classes is not None else value.gaussians
+    if labelled and value.labels is None:
+        raise ValueError(f"{name}: expected labels, got {value!r}; SemanticField.label or transfer_labels gives some")
+    return value
 
 
 def sampled(points: Array) -> Array:

@@ -15,7 +15,7 @@ from ..fields import Linear, SemanticField, fuse_views
 from ..gaussians import Gaussians
 from ..labels import LabelSet, OfClass, Selection
 from ..labels.label_set import class_rows, make_question
-from ..labels.selection import class_name
+from ..labels.selection import class_names
 
 UNIT = (0.0, 1.0)
 KEPT = 0.9  # of a selection, by the suggested gamma of what is like it
@@ -132,8 +132,7 @@ class SplatMeaning:
                 "splats.labels: expected labels [N] to ask for, got None; label it first, with `kfgs attach` or transfer_labels"
             )
         self.gaussians = splats
-        count = max(len(splats.names), int(labels.max()) + 1 if len(labels) else 0)
-        self.names = tuple(class_name(splats.names, i) for i in range(count))
+        self.names = class_names(splats)
         self.scores, self.by = torch.ones_like(self.gaussians.opacities), "the file's classes"
         if splats.scores is not None:  # scores that are not finite become the lowest finite one
             values = splats.scores.to(self.gaussians.means)

@@ -202,7 +202,7 @@ class Explorer:
             question = "" if state.asked is None else f"{state.asked.words!r}, "
             self._notes.append(add_title(plotter, f"{SIDE_NAMES[side]}: {question}{SHOW_NAMES[state.show]}"))
             if state.show == "labels" and column == 0:
-                self._notes.append(add_legend(plotter, state.labels(side), state.meaning.names))
+                self._notes.append(add_legend(plotter, labelled(state, side)))
             if state.show == "score" and column == len(state.sides) - 1:
                 scale = self._actors[column].mapper  # whose colours are given: its own table would not be used
                 scale.lookup_table.apply_cmap(COLORMAP)

@@ -11,18 +11,21 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
-from torch import Tensor
 
-from .._check import as_array, check_choice, check_range
+from .._check import as_array, check_choice
 from .._origin import to_world
 from ..cameras.camera import NEAR
 from ..gaussians import Gaussians
-from .colors import Array, CloudColors, ColorBy, FeatureColors, cloud_colors
+from ..labels.transfer import as_cloud
+from .colors import COLORMAP, Array, CloudColors, ColorBy, FeatureColors, cloud_colors
 from .gaussian_actor import as_gaussians
-from .plotter import draw_mesh, placed
+from .legends import letters
+from .plotter import draw_mesh, origin_of
 
 if TYPE_CHECKING:
     import pyvista as pv
+
+    from ..fields import SemanticField
 
 Style = Literal["points", "gaussians", "ellipsoids"]
 FAINT = 0.5  # Gaussians up to this opacity get no ellipsoid: its surface would hide what is behind
@@ -33,14 +36,16 @@ OUTER, MARGIN = 0.01, 0.05  # share of the points beyond each side of the box th
 
 def add_cloud(
     plotter: pv.Plotter,
-    gaussians: Gaussians,
+    gaussians: Gaussians | SemanticField,
     *,
-    color_by: ColorBy | Tensor | Array | None = None,
+    color_by: ColorBy = None,
     style: Style = "points",
     feature_colors: FeatureColors | None = None,
     clim: tuple[float, float] | None = None,
-    point_size: float = 4.0,
+    cmap: str = COLORMAP,
+    show_scalar_bar: bool = False,
     near: float = NEAR,
+    **options: Any,
 ) -> pv.Actor:
     """Draw a cloud as points, as anisotropic Gaussians, or as ellipsoids.
 
@@ -50,18 +55,21 @@ def add_cloud(
 
     Args:
         plotter: where to draw, in the active subplot.
-        gaussians: what to draw.
-        color_by: `label` (the palette, by the cloud's class names if it has some), `rgb` (`sh` without its dependence on the
-            view), `view` (`sh` as the camera sees it; style `gaussians` only), `opacity`, `feature`; or one value for each
-            Gaussian: integers [N] are labels, floats [N] scores (not finite: grey), [N, 3] colours. None: labels if there
+        gaussians: what to draw: a cloud, or a field with its classes.
+        color_by: `label` or `class` (the palette, by the cloud's class names), the name of one class (the others are grey),
+            `score` (of the labels), `rgb` (`sh` without its dependence on the view), `view` (`sh` as the camera sees it;
+            style `gaussians` only), `opacity`, `feature`; a `Selection` (its scores); or one value for each Gaussian:
+            integers [N] are numbers of colours, floats [N] scores (not finite: grey), [N, 3] colours. None: labels if there
             are any, else rgb, feature, opacity.
         style: `points` is quick and can be exported to HTML; `gaussians` is VTK's EWA splatting, adjusted to kfgs's
             rasteriser; `ellipsoids` are closed surfaces of one standard deviation, for at most 100,000 Gaussians; those up
             to an opacity of 0.5 are left out.
         feature_colors: the scene's projection of features to colours; None: one for this cloud alone.
-        clim: scores of the darkest and the brightest colour; None: their 1st and 99th percentile (opacity: 0, 1).
-        point_size: in pixels.
+        clim: scores of the darkest and the brightest colour; None: their 1st and 99th percentile (by name: 0, 1).
+        cmap: the colour map of scores, as matplotlib names it.
+        show_scalar_bar: whether to show the scale of scores.
         near: Gaussians up to this depth, in world units, are not drawn, as with `Camera.near`; they would be a haze.
+        options: of `plotter.add_mesh`: `name` (replaces what has this name), `opacity`, `point_size`, `pickable`, ...
 
     Raises:
         ValueError: if the cloud is empty or lacks what to colour by, or a number is out of range.
@@ -71,14 +79,14 @@ def add_cloud(
         VTK draws one cloud after the other, so Gaussians of two clouds do not mix: join the clouds first (`Gaussians.cat`).
     """
     check_choice("style", style, get_args(Style))
-    check_range("point_size", point_size, 0, closed=(False, False))
-    gaussians = placed(plotter, gaussians)
+    gaussians = as_cloud(gaussians)
+    gaussians = gaussians.with_origin(origin_of(plotter, gaussians.origin))
     if len(gaussians) == 0:
         raise ValueError("gaussians: expected at least one Gaussian to draw, got none; widen the selection")
     by_view = isinstance(color_by, str) and color_by == "view"
     if by_view and style != "gaussians":
         raise ValueError(f"color_by: expected 'rgb' for {style!r}, got 'view'; only 'gaussians' follow the camera")
-    colors = cloud_colors(gaussians, color_by, feature_colors, clim)
+    colors = cloud_colors(gaussians, color_by, feature_colors, clim, cmap)
     mesh = _ellipsoids(gaussians) if style == "ellipsoids" else _points(gaussians)
     _fill(mesh, gaussians, colors)
     last, cut = mesh.n_points - 1, int(OUTER * mesh.n_points)
@@ -87,26 +95,32 @@ def add_cloud(
     box = np.maximum(low - MARGIN * (high - low), least), np.minimum(high + MARGIN * (high - low), most)
     mesh.field_data["box"] = np.stack(box, axis=1).reshape(-1)  # x from, x to, y from, ...
     _frame_middle(plotter.renderer)
-    shared: dict[str, Any] = {"scalars": "rgb", "rgb": True}
+    drawn: dict[str, Any] = {"scalars": "rgb", "rgb": True, "lighting": style == "ellipsoids"}
     if style == "points":
-        return draw_mesh(plotter, mesh, style="points", point_size=point_size, lighting=False, **shared)
-    if style == "ellipsoids":
-        actor = draw_mesh(plotter, mesh, ambient=0.45, diffuse=0.6, **shared)
+        actor = draw_mesh(plotter, mesh, **drawn | {"style": "points", "point_size": 4.0} | options)
+    elif style == "ellipsoids":
+        actor = draw_mesh(plotter, mesh, **drawn | {"ambient": 0.45, "diffuse": 0.6} | options)
         actor.prop.interpolation = "Phong"
-        return actor
-    _add_shapes(mesh, gaussians)
-    followed = gaussians.detach() if by_view else None
-    return as_gaussians(plotter, mesh, near=near, antialiased=gaussians.antialiased, followed=followed)
+    else:
+        _add_shapes(mesh, gaussians)
+        followed = gaussians.detach() if by_view else None
+        actor = as_gaussians(plotter, mesh, near, gaussians.antialiased, followed, **drawn | options)
+    if show_scalar_bar and colors.clim is not None:
+        actor.mapper.lookup_table.apply_cmap(cmap)  # the colours are given: its own table is for the bar alone
+        actor.mapper.scalar_range = colors.clim
+        plotter.add_scalar_bar(colors.name, mapper=actor.mapper, color=letters(plotter))
+    return actor
 
 
-def to_pyvista(gaussians: Gaussians, color_by: ColorBy | Tensor | Array | None = None) -> pv.PolyData:
-    """Convert a cloud to a pyvista point cloud: one point per Gaussian, values as named arrays.
+def to_pyvista(gaussians: Gaussians | SemanticField, color_by: ColorBy = None) -> pv.PolyData:
+    """Convert a cloud, or a field with its classes, to a pyvista point cloud: one point per Gaussian, values as named arrays.
 
     Points are in the world: in float64 if the cloud has an origin. The arrays are `index`, `rgb` (uint8), `opacity`,
     `scale` (standard deviations), `quat` (w, x, y, z), and, if present, `label` and the values of `color_by` (`score`).
     `to_pyvista(cloud).plot(scalars="rgb", rgb=True)` shows it. Arguments as in `add_cloud`.
     For trimesh: `trimesh.PointCloud(points.points, colors=points["rgb"])`.
     """
+    gaussians = as_cloud(gaussians)
     colors = cloud_colors(gaussians, color_by)
     mesh = _points(gaussians)
     if any(gaussians.origin):
@@ -123,7 +137,6 @@ def recolor_cloud(
 ) -> None:
     """Change the colours, and with style `gaussians` the opacities, of a cloud that `add_cloud` drew, from the next frame on."""
     mesh = actor.mapper.dataset
-    assert len(colors) == mesh.field_data["count"][0]
     index = np.asarray(mesh["index"])
     if opacities is not None:
         mesh.point_data["opacity"] = opacities.astype(np.float32)[index]
@@ -167,10 +180,8 @@ def _ellipsoids(gaussians: Gaussians) -> pv.PolyData:
     opaque = (gaussians.opacities.detach() > FAINT).nonzero()[:, 0]
     count = len(opaque)
     if not 0 < count <= MOST:
-        raise ValueError(
-            f"gaussians: expected 1 to {MOST:,} of opacity above {FAINT:g} to draw as ellipsoids, got {count:,}; select "
-            "others, or draw points"
-        )
+        expected = f"1 to {MOST:,} of opacity above {FAINT:g} to draw as ellipsoids"
+        raise ValueError(f"gaussians: expected {expected}, got {count:,}; select others, or draw points")
     gaussians = gaussians.select(opaque).detach()
     ball = pv.Icosphere(nsub=next((times for most, times in FACES if count <= most), 0))
     corners, faces = np.array(ball.points, dtype=np.float32), np.array(ball.regular_faces)
@@ -202,6 +213,3 @@ def _fill(mesh: pv.PolyData, gaussians: Gaussians, colors: CloudColors) -> None:
     if colors.values is not None and colors.name != "opacity":
         mesh[colors.name] = colors.values[index]
     mesh["rgb"] = colors.rgb[index]
-    mesh.field_data["count"] = np.array([len(gaussians)])
-    if colors.clim is not None:
-        mesh.field_data["clim"] = np.asarray(colors.clim, dtype=np.float64)

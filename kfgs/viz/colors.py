@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,13 +11,18 @@ from torch import Tensor
 
 from .._card import short_repr
 from .._check import as_array, as_tensor, check_choice, check_range, check_shapes
-from ..gaussians import Gaussians, check_gaussians
+from ..gaussians import Gaussians
+from ..labels import OfClass, Selection
+from ..labels.selection import class_names
 from ..splat.sh import sh0_to_rgb
 from .palette import UNLABELLED, palette
 from .pictures import Array, as_bytes
 
-CloudColor = Literal["label", "rgb", "feature", "opacity"]
-ColorBy = CloudColor | Literal["view"]
+SOURCES = {
+    "label": "labels", "class": "labels", "score": "scores", "rgb": "sh", "view": "sh", "feature": "features",
+    "opacity": "opacities",
+}  # fmt: skip
+ColorBy = str | Selection | Tensor | Array | None
 COLORMAP = "cividis"  # brightness rises evenly; looks the same to colour-blind eyes
 
 
@@ -90,58 +95,46 @@ class CloudColors(NamedTuple):
 
 def cloud_colors(
     gaussians: Gaussians,
-    color_by: ColorBy | Tensor | Array | None,
+    color_by: ColorBy,
     feature_colors: FeatureColors | None = None,
     clim: tuple[float, float] | None = None,
+    cmap: str = COLORMAP,
 ) -> CloudColors:
     """Colour a cloud; arguments and errors are those of `add_cloud`."""
-    check_gaussians(gaussians)
     if color_by is None:
-        color_by = color_by_default(gaussians)
+        parts = {"label": gaussians.labels, "rgb": gaussians.sh, "feature": gaussians.features}
+        color_by = next((name for name, values in parts.items() if values is not None), "opacity")
+    color_by = color_by.scores if isinstance(color_by, Selection) else color_by
     if isinstance(color_by, str):
-        check_choice("color_by", color_by, ("view", *get_args(CloudColor)))
-        source = {"label": "labels", "rgb": "sh", "view": "sh", "feature": "features", "opacity": "opacities"}[color_by]
+        names = class_names(gaussians)
+        check_choice("color_by", color_by, (*SOURCES, *names))
+        source = SOURCES.get(color_by, "labels")
         values = getattr(gaussians, source)
         if values is None:
-            raise ValueError(
-                f"gaussians.{source}: expected them, to colour by {color_by}, got None; choose another color_by"
-            )
-        if color_by == "label":
-            return CloudColors(palette(values, names_of(gaussians)), "label", as_array(values).astype(np.int64), None)
+            got = f"got None for color_by={color_by!r}; choose another"
+            raise ValueError(f"gaussians.{source}: expected some, {got}")
+        if source == "labels":
+            if color_by not in SOURCES:
+                values = values.where(OfClass(color_by).select(gaussians).mask, -1)
+            return CloudColors(palette(values, names), "label", as_array(values).astype(np.int64), None)
         if color_by in ("rgb", "view"):
-            return CloudColors(as_bytes(sh0_to_rgb(values[:, 0].detach())), "rgb", None, None)
+            return CloudColors(as_bytes(sh0_to_rgb(values[:, 0].detach())), "sh", None, None)
         if color_by == "feature":
             return CloudColors((feature_colors or FeatureColors.fit(values))(values), "feature", None, None)
-        return _scale("opacity", as_array(values), clim or (0.0, 1.0))
+        return _scale(color_by, as_array(values), clim or (0.0, 1.0), cmap)
     values = as_array(color_by, "color_by")
     if values.ndim == 2:
         check_shapes(("gaussians", gaussians.opacities, "N"), ("color_by", values, "N 3"))
         return CloudColors(as_bytes(values), "rgb", None, None)
     check_shapes(("gaussians", gaussians.opacities, "N"), ("color_by", values, "N"))
     if np.issubdtype(values.dtype, np.floating):
-        return _scale("score", values, clim)
+        return _scale("score", values, clim, cmap)
     if not np.issubdtype(values.dtype, np.integer):
         raise TypeError(f"color_by: expected labels (integers) or scores (floats), got {values.dtype}; convert it")
     return CloudColors(palette(values), "label", values.astype(np.int64), None)
 
 
-def color_by_default(gaussians: Gaussians) -> CloudColor:
-    """The default of `color_by`: classes, else colours, else features, else opacity."""
-    if gaussians.labels is not None:
-        return "label"
-    if gaussians.sh is not None:
-        return "rgb"
-    return "opacity" if gaussians.features is None else "feature"
-
-
-def names_of(gaussians: Gaussians) -> tuple[str, ...] | None:
-    """The class names of a cloud, if each label has one."""
-    labels = gaussians.labels
-    highest = -1 if labels is None or len(labels) == 0 else int(labels.max())
-    return gaussians.names if len(gaussians.names) > highest else None
-
-
-def _scale(name: str, values: Array, clim: tuple[float, float] | None) -> CloudColors:
+def _scale(name: str, values: Array, clim: tuple[float, float] | None, cmap: str) -> CloudColors:
     """Values through the colour map, by default from their 1st to their 99th percentile; those not finite are grey."""
     from matplotlib import colormaps
 
@@ -153,5 +146,5 @@ def _scale(name: str, values: Array, clim: tuple[float, float] | None) -> CloudC
     check_range("clim[0]", clim[0], -np.inf, closed=(False, False))
     check_range("clim[1]", clim[1], clim[0], closed=(False, False))
     unit = np.where(finite, (values - clim[0]) / (clim[1] - clim[0]), 0.0)
-    rgb: Array = colormaps[COLORMAP](unit, bytes=True)[:, :3]
+    rgb: Array = colormaps[cmap](unit, bytes=True)[:, :3]
     return CloudColors(np.where(finite[:, None], rgb, np.array(UNLABELLED, np.uint8)), name, values, clim)

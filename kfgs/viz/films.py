@@ -9,23 +9,28 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
 
-from .._check import check_choice, check_range, check_shapes
+from .._check import as_array, check_range, check_shapes
 from .._files import atomic_path
 from ..cameras import Camera
-from ..gaussians import Gaussians, check_gaussians
+from ..gaussians import Gaussians
 from ..labels import Part
 from ..labels.color import parse_color
+from ..labels.selection import class_names
+from ..labels.transfer import as_cloud
 from ..scenes import Scene
 from ..splat import rasterize
-from .colors import Array, CloudColor, FeatureColors, cloud_colors, color_by_default
+from .colors import Array, ColorBy, FeatureColors, cloud_colors
 from .pictures import as_bytes, check_suffix, draw_legend, picture_grid, picture_sheet, resize_photo, save_picture
+
+if TYPE_CHECKING:
+    from ..fields import SemanticField
 
 Show = Callable[[Camera], Any]
 OUTLINE = (213, 94, 0)  # vermilion of Okabe and Ito
@@ -34,29 +39,25 @@ MOST, WIDTH = 12, 360  # parts in a sheet, and pixels of the picture of each
 
 
 def show_cloud(
-    gaussians: Gaussians,
+    gaussians: Gaussians | SemanticField,
     *,
-    color_by: CloudColor | None = None,
+    color_by: ColorBy = None,
     feature_colors: FeatureColors | None = None,
     background: str | Sequence[float] = "white",
-    names: Sequence[str] | None = None,
 ) -> Show:
-    """Make a function camera -> picture [H, W, 3] uint8 that draws a cloud with `rasterize`.
+    """Make a function camera -> picture [H, W, 3] uint8 that draws a cloud, or a field, with `rasterize`.
 
     Labels and features become one colour per Gaussian, and the colours are composited (Eq. 3 with three channels), so they
     blend at borders. `rgb` is the colour of the harmonics, which depends on the direction. `background` is a colour by name
-    or three numbers in [0, 1]; with class `names`, labels have their colours in `palette`; other arguments as in `add_cloud`.
+    or three numbers in [0, 1]; other arguments as in `add_cloud`.
     """
-    check_gaussians(gaussians)
-    color_by = color_by or color_by_default(gaussians)
-    check_choice("color_by", color_by, get_args(CloudColor))
+    gaussians = as_cloud(gaussians)
     if len(gaussians) == 0:
         raise ValueError("gaussians: expected at least one Gaussian to draw, got none; widen the selection")
     painted = gaussians.detach().replace(features=None)
-    named = gaussians if names is None else gaussians.replace(names=tuple(names))
-    rgb = cloud_colors(named, color_by, feature_colors).rgb
-    if color_by != "rgb":
-        painted = painted.replace(features=torch.from_numpy(rgb).to(gaussians.means) / 255, sh=None)
+    colors = cloud_colors(gaussians, color_by, feature_colors)
+    if colors.name != "sh":
+        painted = painted.replace(features=torch.from_numpy(colors.rgb).to(gaussians.means) / 255, sh=None)
     paper = torch.tensor(parse_color(background, "background")).to(gaussians.means)
 
     def show(camera: Camera) -> Array:
@@ -121,24 +122,22 @@ def show_photos(scene: Scene) -> Show:
 
 def save_animation(
     path: str | Path,
-    shows: Gaussians | Show | Mapping[str, Gaussians | Show],
+    shows: Any,
     cameras: Sequence[Camera],
     *,
     fps: float = 15.0,
-    names: Sequence[str] | None = None,
-    listed: Tensor | Array | None = None,  # any shape, int
+    legend: Gaussians | SemanticField | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Path:
     """Draw a cloud, or several side by side, from each camera, and write the frames as a GIF or an MP4 video.
 
     Args:
         path: a name that ends in .gif or .mp4. The file appears whole or not at all.
-        shows: Gaussians, a function camera -> picture (`show_cloud`), or several of these by title, shown side by side.
+        shows: a cloud, a field, a function camera -> picture (`show_cloud`), or several of these by title, side by side.
         cameras: one per frame (`kfgs.cameras.orbit_cameras`, `path_cameras`); all frames have the size of the first, in which
             those of other shapes are seen whole.
         fps: frames per second; at most 50 in a GIF, because browsers slow down films with shorter frames.
-        names: class names: they decide the colours of labelled Gaussians.
-        listed: the labels in a legend below every frame, with these names; None: no legend.
+        legend: the labelled cloud, or the field, whose classes are listed below every frame; None: no legend.
         progress: called after each frame with (done, all).
     """
     named = shows if isinstance(shows, Mapping) else {"": shows}
@@ -147,14 +146,16 @@ def save_animation(
             "shows, cameras: expected at least one of each, got none; kfgs.cameras.orbit_cameras makes some"
         )
     target = check_target(path, fps)
-    drawn = {t: show_cloud(show, names=names) if isinstance(show, Gaussians) else show for t, show in named.items()}
+    drawn = {title: show if callable(show) else show_cloud(show) for title, show in named.items()}
+    labelled = None if legend is None else as_cloud(legend, "legend", labelled=True)
 
     def frames() -> Iterator[Array]:
         for done, camera in enumerate(cameras, start=1):
             pictures = [as_bytes(show(camera.letterboxed(*cameras[0].size))) for show in drawn.values()]
             frame = pictures[0] if list(drawn) == [""] else picture_grid([pictures], list(drawn))
-            if names is not None and listed is not None:
-                frame = np.concatenate([frame, draw_legend(listed, names, width=frame.shape[1])])
+            if labelled is not None:
+                below = draw_legend(as_array(labelled.labels), class_names(labelled), width=frame.shape[1])
+                frame = np.concatenate([frame, below])
             yield frame
             if progress is not None:
                 progress(done, len(cameras))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
@@ -15,7 +15,7 @@ from ..cameras.camera import at_one_origin
 from .colors import Array
 from .linked import evenly
 from .pictures import as_bytes
-from .plotter import draw_mesh, placed
+from .plotter import draw_mesh, origin_of
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -25,7 +25,7 @@ PICTURE = 512  # pixels: the longest edge of a picture
 
 def add_cameras(
     plotter: pv.Plotter,
-    cameras: Sequence[Camera],
+    cameras: Any,
     *,
     images: Sequence[Tensor | Array] | Callable[[int], Tensor | Array] = (),  # each [H, W, 3] in [0, 1] or uint8
     size: float | None = None,
@@ -37,7 +37,7 @@ def add_cameras(
 
     Args:
         plotter: where to draw.
-        cameras: their distortion is ignored here.
+        cameras: a list, or a scene or a field that has some; their distortion is ignored here.
         images: pictures for the image planes: one for each camera, or a function of the camera's index (`scene.image`), called
             only for the cameras drawn. Any size; the picture is stretched to its camera's. () draws none.
         size: depth of the pyramids, world units; None: a twentieth of the extent of the cameras' positions.
@@ -53,6 +53,7 @@ def add_cameras(
     """
     import pyvista as pv
 
+    cameras = getattr(cameras, "cameras", cameras)
     if not cameras:
         raise ValueError("cameras: expected at least one camera, got none; load a scene with views")
     if not callable(images) and len(images) not in (0, len(cameras)):
@@ -61,7 +62,8 @@ def add_cameras(
     depth = size if size is not None else 0.05 * float(np.ptp(centers, axis=0).max()) or 0.2
     check_range("size", depth, 0, closed=(False, False))
     chosen = evenly(len(cameras), most)
-    edges = np.stack([_frustum(placed(plotter, cameras[i]), depth) for i in chosen])  # [C, 10, 2, 3]
+    origin = origin_of(plotter, cameras[0].origin)
+    edges = np.stack([_frustum(cameras[i].with_origin(origin), depth) for i in chosen])  # [C, 10, 2, 3]
     mesh = pv.line_segments_from_points(edges.reshape(-1, 3))
     mesh.cell_data["camera"] = np.repeat(chosen, 10)
     for i, corners in zip(chosen, edges[:, :4, 1] if callable(images) or images else (), strict=False):

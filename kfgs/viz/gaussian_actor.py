@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from ..cameras.camera import NEAR
 from ..gaussians import Gaussians
 from ..splat.engines.contract import ALPHA_MAX, ALPHA_MIN
 from ..splat.project import FIELD_OF_VIEW_MARGIN
@@ -49,10 +48,10 @@ FRAGMENT = f"{DENSITY} if (opacity*gaussian < {ALPHA_MIN:.9f}) discard; gaussian
 def as_gaussians(
     plotter: pv.Plotter,
     cloud: pv.PolyData,
-    *,
-    near: float = NEAR,
-    antialiased: bool = False,
-    followed: Gaussians | None = None,
+    near: float,
+    antialiased: bool,
+    followed: Gaussians | None,
+    **options: Any,
 ) -> pv.Actor:
     """Draw a cloud with `index`, `rgb`, `scale`, `quat` (w, x, y, z; unit) and `opacity` as Gaussians.
 
@@ -66,8 +65,9 @@ def as_gaussians(
         near: depth up to which nothing is drawn, world units (`Camera.near`).
         antialiased: what the low-pass filter widens becomes fainter (`Gaussians.antialiased`).
         followed: Gaussians whose `sh` gives `rgb` as the camera sees it, in the order of `index`; None: fixed colours.
+        options: of `plotter.add_mesh`.
     """
-    actor = draw_mesh(plotter, cloud, style="points_gaussian", scalars="rgb", rgb=True, emissive=False, lighting=False)
+    actor = draw_mesh(plotter, cloud, style="points_gaussian", emissive=False, **options)
     mapper = actor.mapper
     mapper.SetScaleArray("scale")
     mapper.SetRotationArray("quat")

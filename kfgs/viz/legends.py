@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from torch import Tensor
 
 from .._check import as_array
-from .pictures import LEGEND_INK, Array, draw_legend
+from ..gaussians import Gaussians
+from ..labels.selection import class_names
+from ..labels.transfer import as_cloud
+from .pictures import LEGEND_INK, draw_legend
 
 if TYPE_CHECKING:
     import pyvista as pv
+
+    from ..fields import SemanticField
 
 MARGIN = 10  # pixels from a corner
 DARK = 0.5  # brightness of a background; below it, letters are white
@@ -20,28 +23,24 @@ LETTERS = 14  # pixels, in windows up to 770 pixels high; higher windows have la
 SMALLEST = 9  # pixels: the smallest size that can be read
 
 
-def add_legend(
-    plotter: pv.Plotter,
-    labels: Tensor | Array,  # any shape, int
-    names: Sequence[str],
-) -> Any:
-    """List the classes present, by name and colour, in the lower left corner of the active subplot.
+def add_legend(plotter: pv.Plotter, gaussians: Gaussians | SemanticField) -> Any:
+    """List the classes of a labelled cloud, or of a field, by name and colour, in the lower left corner of the active subplot.
 
     It is a small picture: pyvista's own legend writes each name in its colour, for instance yellow on white. If the subplot
     is too low for all classes, the letters shrink to at least 9 pixels, then the list gets several columns.
 
-    Colours are those of `palette(labels, names)`, as of a cloud with these names. `plotter.remove_actor` removes what is
-    returned.
+    Colours are those in which `add_cloud` draws it. `plotter.remove_actor` removes what is returned.
 
     Raises:
-        ValueError: if there is no label, or one has no name.
+        ValueError: if there is no label.
     """
     import pyvista as pv
     from vtkmodules.vtkRenderingCore import vtkActor2D, vtkImageMapper
 
-    present = np.unique(as_array(labels, "labels"))
+    gaussians = as_cloud(gaussians, labelled=True)
+    present, names = np.unique(as_array(gaussians.labels)), class_names(gaussians)
     if present.size == 0:
-        raise ValueError("labels: expected at least one to list, got none; leave the legend out")
+        raise ValueError("gaussians: expected at least one label to list, got none; leave the legend out")
     _, bottom, _, top = plotter.renderer.GetViewport()
     room = round((top - bottom) * plotter.window_size[1])
     for size in range(max(LETTERS, round(room / 55)), SMALLEST - 1, -1):

@@ -9,17 +9,20 @@ import numpy as np
 
 from ..cameras import Camera, estimate_up
 from ..gaussians import Gaussians
+from ..labels.transfer import as_cloud
 from .clouds import add_cloud
-from .colors import Array, names_of
+from .colors import Array
 from .legends import add_legend, add_title
 from .plotter import look_through, make_plotter
 
 if TYPE_CHECKING:
     import pyvista as pv
 
+    from ..fields import SemanticField
+
 
 def linked_clouds(
-    semantic: Gaussians,
+    semantic: SemanticField | Gaussians,
     color: Gaussians,
     *,
     camera: Camera | None = None,
@@ -29,7 +32,7 @@ def linked_clouds(
     """Show the semantic cloud on the left and the colour cloud on the right; turning one turns the other.
 
     Args:
-        semantic: labelled Gaussians; if they have class names, a legend lists those present.
+        semantic: a field, or labelled Gaussians; a legend lists the classes present.
         color: Gaussians with `sh`, in the same frame.
         camera: the first view, with its proportions; None: everything but floaters.
         height: of the window, pixels.
@@ -41,13 +44,13 @@ def linked_clouds(
     Raises:
         ValueError: if a cloud is empty or lacks what it is coloured by, or the lens distorts.
     """
+    semantic, color = as_cloud(semantic, "semantic", labelled=True), as_cloud(color, "color")
     wide = 4 / 3 if camera is None else camera.width / camera.height
     plotter = make_plotter(height, 2 * round(height * wide), shape=(1, 2), off_screen=off_screen)
     try:
         add_title(plotter, "semantic field: classes")
         add_cloud(plotter, semantic, color_by="label", style="gaussians")
-        if semantic.labels is not None and (names := names_of(semantic)):
-            add_legend(plotter, semantic.labels, names)
+        add_legend(plotter, semantic)
         plotter.subplot(0, 1)
         add_title(plotter, "colour field: colours")
         add_cloud(plotter, color, color_by="rgb", style="gaussians")

@@ -54,12 +54,12 @@ _RANKS = {word: rank for row in _ROWS for rank, word in enumerate(row)}
 
 def palette(
     labels: Tensor | np.ndarray[Any, Any],  # [...] int
-    names: Sequence[str] | None = None,
+    names: Any = None,
 ) -> np.ndarray[Any, Any]:  # [..., 3] uint8
     """The colour of each label, safe for colour-blind eyes; -1 is grey. From 256 on the colours repeat.
 
-    With all class names by index, a class has the same colour in every scene (`name_slots`). Without names, label k has
-    the k-th colour.
+    With all class names by index, or what has them (a label set, a field, a cloud), a class has the same colour in every
+    scene (`name_slots`). Without names, and if it is called `class k`, label k has the k-th colour.
 
     Raises:
         TypeError: if the labels are not integers.
@@ -73,7 +73,7 @@ def palette(
         >>> bool((chair == same).all())
         True
     """
-    values = as_array(labels, "labels")
+    values, names = as_array(labels, "labels"), getattr(names, "names", names)
     if not np.issubdtype(values.dtype, np.integer):
         raise TypeError(f"labels: expected integers, got {values.dtype}; convert them first")
     values = values.astype(np.int64)
@@ -90,15 +90,17 @@ def palette(
 def name_slots(names: Sequence[str]) -> list[int]:
     """The place in `PALETTE` of each class; the order of the names has no influence.
 
-    Words of indoor scenes have a home among the first 20 colours, and words of one meaning share it (sofa, couch). Other
-    words get a home from their CRC-32. If two names of a list share a home, the first word of the row stays there, of
-    other words the first in the alphabet. The others move to the next free colour: of the first 20, then of 64, then of 256.
+    `class 7` lives at 7. Words of indoor scenes have a home among the first 20 colours, and words of one meaning share it
+    (sofa, couch). Other words get a home from their CRC-32. If two names of a list share a home, the first word of the row
+    stays there, of other words the first in the alphabet. The others move to the next free colour: of the first 20, then of
+    64, then of 256.
     """
     words = [" ".join(name.lower().replace("_", " ").replace("-", " ").split()) for name in names]
     slots: dict[int, int] = {}
     order = sorted(range(len(names)), key=lambda i: (_RANKS.get(words[i], 0), words[i], i))
     for i in order:
-        home = _HOMES.get(words[i])
+        number = words[i].removeprefix("class ")
+        home = int(number) if number.isdecimal() else _HOMES.get(words[i])
         if home is not None and home not in slots.values():
             slots[i] = home
     for i in order:

@@ -24,7 +24,7 @@ LEGEND_INK, LEGEND_PAPER = (20, 20, 20), (255, 255, 255)
 def overlay_labels(
     image: Tensor | Array,  # [H, W, 3] in [0, 1]
     labels: Tensor | Array,  # [H, W] int, -1 = none
-    names: Sequence[str] | None = None,
+    names: Any = None,
     *,
     alpha: float = 0.55,
     legend: bool = True,
@@ -37,7 +37,8 @@ def overlay_labels(
     Args:
         image: the photograph or a rendering; values outside [0, 1] are clipped.
         labels: one per pixel of the image.
-        names: class names by index: they decide the colours, and the classes present are listed under the picture.
+        names: class names by index, or what has them (a field, a cloud, a label set): they decide the colours, and the
+            classes present are listed under the picture.
         alpha: weight of the label colours, in [0, 1].
         legend: False: names decide the colours only.
 
@@ -59,7 +60,7 @@ def overlay_labels(
 
 def draw_legend(
     labels: Tensor | Array,  # any shape, int
-    names: Sequence[str],
+    names: Any,
     *,
     size: int | None = None,
     width: int | None = None,
@@ -71,7 +72,7 @@ def draw_legend(
     in columns of at most `height`.
     """
     size = int(np.clip((width or 0) / 40, 10, 22)) if size is None else size
-    present = [int(label) for label in np.unique(as_array(labels, "labels"))]
+    present, names = [int(label) for label in np.unique(as_array(labels, "labels"))], getattr(names, "names", names)
     swatches = palette(np.array(present), names)
     font = ImageFont.load_default(size=size)
     gap, line = size // 2, round(size * 1.6)
@@ -158,12 +159,9 @@ def picture_grid(
     draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(size=letters)
     for j, title in enumerate(titles):
         draw.text((GAP + j * (width + GAP) + width / 2, head / 2), title, fill=LEGEND_INK, font=font, anchor="mm")
-    drawn = np.asarray(canvas)
-    return (
-        np.concatenate([drawn, draw_legend(np.arange(len(names)), names, width=drawn.shape[1])])
-        if len(names)
-        else drawn
-    )
+    drawn = [np.asarray(canvas)]
+    drawn += [draw_legend(np.arange(len(names)), names, width=drawn[0].shape[1])] if len(names) else []
+    return np.concatenate(drawn)
 
 
 def picture_sheet(pictures: Sequence[Array], titles: Sequence[str], columns: int, *, width: int | None = None) -> Array:

@@ -9,7 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from math import atan, degrees
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -20,13 +20,11 @@ from .._origin import Origin
 from ..cameras import Camera
 from ..cameras.camera import NEAR
 from ..cameras.projection import refuse_distortion
-from ..gaussians import Gaussians, check_gaussians
 from ..splat.engines import available_engines
 
 if TYPE_CHECKING:
     import pyvista as pv
 
-Thing = TypeVar("Thing", Gaussians, Camera)
 WITHOUT_DISPLAY = {"VTK_DEFAULT_OPENGL_WINDOW": "vtkEGLRenderWindow", "PYVISTA_OFF_SCREEN": "true"}
 PROBE = """
 import pyvista as pv
@@ -82,7 +80,7 @@ def make_plotter(
     *,
     shape: tuple[int, int] = (1, 1),
     off_screen: bool | None = None,
-    background: str = "white",
+    background: str | None = None,
 ) -> pv.Plotter:
     """A pyvista plotter that works with and without a display.
 
@@ -91,7 +89,7 @@ def make_plotter(
         width: of the window, pixels.
         shape: (rows, columns) of subplots.
         off_screen: draw without a window; None: only where there is no display.
-        background: a colour that pyvista knows.
+        background: a colour that pyvista knows; None: that of pyvista's theme.
     """
     check_whole("height", height, 1)
     check_whole("width", width, 1)
@@ -105,20 +103,14 @@ def make_plotter(
     hidden = not has_display() if off_screen is None else off_screen
     options: dict[str, Any] = {"shape": shape} if shape != (1, 1) else {}
     plotter = pv.Plotter(off_screen=hidden, window_size=(width, height), **options)
-    plotter.set_background(background)
+    if background is not None:
+        plotter.set_background(background)
     return plotter
 
 
 def origin_of(plotter: pv.Plotter, first: Origin) -> Origin:
     """The origin of all that is drawn in a plotter (VTK draws float32); if nothing is yet, `first` becomes it."""
     return _origins.setdefault(plotter, first)
-
-
-def placed(plotter: pv.Plotter, thing: Thing) -> Thing:
-    """Gaussians or a camera, counted from the plotter's origin; a TypeError if it is neither."""
-    if not isinstance(thing, Camera):
-        check_gaussians(thing)
-    return thing.with_origin(origin_of(plotter, thing.origin))
 
 
 def draw_mesh(plotter: pv.Plotter, mesh: pv.PolyData, **options: Any) -> pv.Actor:
@@ -140,7 +132,7 @@ def look_through(plotter: pv.Plotter, camera: Camera) -> None:
         ValueError: if the camera's lens distorts.
     """
     refuse_distortion(camera)
-    camera = placed(plotter, camera)
+    camera = camera.with_origin(origin_of(plotter, camera.origin))
     K, E = camera.K.detach().double().cpu(), camera.viewmat.detach().double().cpu()
     fx, fy, cx, cy = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
     R, center = E[:3, :3], -E[:3, :3].T @ E[:3, 3]
@@ -160,7 +152,7 @@ def draw_view(
     camera: Camera,
     draw: Callable[[pv.Plotter], object],
     *,
-    background: str = "white",
+    background: str | None = None,
 ) -> np.ndarray[Any, Any]:  # [H, W, 3] uint8
     """Draw with pyvista what a camera sees, and return the picture. No window opens, and the plotter is closed.
 

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
-from .._check import as_array
+from .._check import as_array, check_range
 from ..cameras import Camera
-from ..gaussians import Gaussians, check_gaussians
-from ..labels import nearest_labels
+from ..gaussians import Gaussians
+from ..labels.selection import class_names
+from ..labels.transfer import Sources, as_cloud, positions
 from .clouds import add_cloud, recolor_cloud
-from .colors import Array, cloud_colors, names_of
+from .colors import Array, cloud_colors
 from .legends import add_legend, letters
 from .linked import evenly, look_over, upwards
 from .plotter import draw_mesh, make_plotter
@@ -66,12 +66,10 @@ def show_transfer(
     Raises:
         ValueError: if a cloud is empty, has no labels or no colours, or the distance is not positive.
     """
-    semantic = field.label() if hasattr(field, "label") else field
     views: Sequence[Camera] = cameras or getattr(field, "cameras", None) or ()
-    check_gaussians(semantic, "field")
-    check_gaussians(splat, "splat")
-    if semantic.labels is None or not bool((semantic.labels >= 0).any()):
-        raise ValueError(f"field: expected Gaussians with classes, got {semantic!r}; `SemanticField.label` gives them")
+    semantic, splat = as_cloud(field, "field", labelled=True), as_cloud(splat, "splat")
+    if not (as_array(semantic.labels) >= 0).any():
+        raise ValueError(f"field: expected Gaussians with a class, got none in {semantic!r}; choose other classes")
     if splat.sh is None or len(splat) == 0:
         raise ValueError(f"splat: expected Gaussians with colours, got {splat!r}; `read_splats` reads a colour cloud")
     semantic, splat = semantic.to("cpu"), splat.to("cpu").with_origin(semantic.origin)
@@ -101,28 +99,33 @@ class _Picture:
         self.plotter, self.text = plotter, {"counts": "", "picked": ""}
         self.semantic_rows, self.color_rows = rows  # which Gaussians of each cloud are drawn
         self.classes = classes = as_array(semantic.labels)
-        self.sources, targets = (as_array(cloud.means).astype(np.float64) for cloud in clouds)
-        self.distance = nearest_labels(self.sources, classes, targets, distance).distance
-        carried = nearest_labels(self.sources, classes, targets, REACH * self.distance)  # the slider's end
-        self.labels, self.distances, self.givers = map(as_array, (carried.labels, carried.distances, carried.sources))
-        known = np.flatnonzero(classes >= 0)
-        nearest = range(1, min(NEIGHBOURS, len(known)) + 1)
-        far, neighbours = cKDTree(self.sources[known]).query(targets, [*nearest], workers=-1)
-        others = classes[known][neighbours] != self.labels[:, None]
+        self.sources, targets = positions("field.means", semantic.means), as_array(splat.means).astype(np.float64)
+        known = np.isfinite(targets).all(axis=1)
+        self.color_rows = self.color_rows[known[self.color_rows]]
+        tree = Sources(self.sources, classes >= 0)
+        self.distance = tree.default_distance(targets[known])[0] if distance is None else distance
+        check_range("distance", self.distance, 0, closed=(False, False))
+        self.distances, self.givers = np.full(len(known), np.inf), np.full(len(known), -1)
+        self.distances[known], self.givers[known] = tree.nearest(
+            targets[known], REACH * self.distance
+        )  # the slider's end
+        self.labels = np.append(classes, -1)[self.givers]
+        nearest = range(1, min(NEIGHBOURS, len(tree.index)) + 1)
+        far, neighbours = tree.tree.query(np.nan_to_num(targets), [*nearest], workers=-1)
+        others = classes[tree.index[neighbours]] != self.labels[:, None]
         self.disputed = (others & (far < NEARLY * self.distances[:, None])).any(axis=1)
 
-        names = names_of(semantic)
-        self.names = [*(names or (f"class {i}" for i in range(classes.max() + 1))), "no class"]
+        self.names = [*class_names(semantic), "no class"]
         self.class_colors, self.own_colors = cloud_colors(semantic, "label").rgb, cloud_colors(splat, "rgb").rgb
         width = np.ptp(np.quantile(self.sources[self.semantic_rows], (0.02, 0.98), axis=0), axis=0).max()
         self.lifted = targets + LIFT * width * up
         above = splat.replace(means=torch.from_numpy(self.lifted).to(splat.means))
         # joined, because VTK does not mix two clouds, without what only one of them has
+        rows = [self.semantic_rows, self.color_rows]
         parts = [cloud.select(some) for cloud, some in zip((semantic, above), rows, strict=True)]
         shapes = [Gaussians(part.means, part.quats, part.scales, part.opacities, origin=part.origin) for part in parts]
         self.cloud = add_cloud(plotter, Gaussians.cat(shapes), color_by="opacity", style="gaussians")
-        if names:
-            add_legend(plotter, classes[self.semantic_rows], names)
+        add_legend(plotter, semantic.select(self.semantic_rows))
 
     def draw(self, distance: float) -> None:
         """Draw colours and lines for a lambda."""
@@ -174,7 +177,7 @@ def enclosing(gaussians: Gaussians, cameras: Sequence[Camera], up: Array) -> Arr
         return np.zeros(len(gaussians), dtype=bool)
     centers = np.stack([as_array(camera.with_origin(gaussians.origin).center) for camera in cameras]).astype(np.float64)
     middle, axes = np.median(centers, axis=0), np.vstack([np.linalg.svd(up[None])[2][1:], up])  # two level axes, and up
-    x, y, z = axes @ (as_array(gaussians.means) - middle).T
+    x, y, z = axes @ (np.nan_to_num(as_array(gaussians.means)) - middle).T
     u, v, w = axes @ (centers - middle).T  # of the cameras
     out, camera_out = np.hypot(x, y), np.hypot(u, v)
     thick, overhead = THICK * np.median(out), z[(z > w.max()) & (out < np.median(out))]

@@ -24,9 +24,9 @@ def test_edges_are_those_of_the_box(plotter):
     angle = torch.tensor(0.4)
     axes = torch.tensor([[angle.cos(), angle.sin(), 0], [-angle.sin(), angle.cos(), 0], [0, 0, 1]])
     boxes = [OrientedBox(torch.tensor([1.0, 2, 3]), axes, torch.tensor([3.0, 2, 1])), between([0] * 3, [1] * 3)]
-    mesh = data(add_boxes(plotter, boxes, labels=[5, 2]))
+    mesh = data(add_boxes(plotter, boxes))
     assert mesh["box"].tolist() == [0] * 12 + [1] * 12
-    assert mesh["label"].tolist() == [5] * 12 + [2] * 12
+    assert mesh["label"].tolist() == [0] * 12 + [1] * 12
     np.testing.assert_array_equal(mesh["rgb"], palette(mesh["label"]))
     ends = mesh.points[:24].reshape(12, 2, 3)
     local = (ends[:, 1] - ends[:, 0]) @ axes.numpy().T  # along the box's axes
@@ -56,5 +56,4 @@ def test_no_name_is_left_out_where_boxes_are_close():
 def test_what_cannot_be_boxed_is_named(plotter):
     box = between([0] * 3, [1] * 3)
     refused(lambda: add_boxes(plotter, []), "boxes:", "got none")
-    refused(lambda: add_boxes(plotter, [box], labels=[1, 2]), "labels, names:", "expected 1", "got 2 and 0")
-    refused(lambda: add_boxes(plotter, [box], names=["a", "b"]), "labels, names:", "expected 1", "got 1 and 2")
+    refused(lambda: add_boxes(plotter, [box], names=["a", "b"]), "names:", "expected 1", "got 2")

@@ -11,6 +11,7 @@ from kfgs.cameras.camera import Distortion
 from kfgs.splat.covariance import covariance_3d
 from kfgs.viz import FeatureColors, add_cloud, look_through, palette, show_cloud, to_pyvista
 from kfgs.viz.clouds import recolor_cloud
+from kfgs.viz.colors import cloud_colors
 
 C0 = 0.28209479177387814
 
@@ -46,12 +47,11 @@ def test_what_cannot_be_drawn_is_named(plotter, monkeypatch):
     draw = partial(add_cloud, plotter, gaussians)
     refused(lambda: add_cloud(plotter, gaussians[:0]), "gaussians:", "got none")
     refused(lambda: draw(style="spheres"), "style:", "'points', 'gaussians'", "got 'spheres'")
-    refused(lambda: draw(color_by="colour"), "color_by:", "got 'colour'")
+    refused(lambda: draw(color_by="colour"), "color_by:", "'rgb'", "'class 4'", "got 'colour'")
     refused(lambda: draw(color_by=torch.zeros(59)), "color_by:", "[N]", "N = 60", "got (59,)")
     refused(lambda: draw(color_by=scores.bool()), "color_by:", "got bool", error=TypeError)
     refused(lambda: draw(color_by=scores, clim=(1.0, 1.0)), "clim[1]:", "got 1.0")
     refused(lambda: draw(color_by="view"), "color_by:", "'rgb'", "'points'", "got 'view'")
-    refused(lambda: draw(point_size=-1), "point_size:", "got -1")
     refused(lambda: add_cloud(plotter, faint, style="ellipsoids"), "gaussians:", "above 0.5", "got 0")
     monkeypatch.setattr("kfgs.viz.clouds.MOST", 10)
     refused(lambda: draw(style="ellipsoids"), "gaussians:", "10", "got 29")
@@ -69,7 +69,6 @@ def test_scores_and_arrays_become_colours(plotter):
     assert dark.sum() < middle.sum() < bright.sum()
     np.testing.assert_array_equal(above, bright)
     np.testing.assert_array_equal(cloud["score"], scores)
-    assert cloud.field_data["clim"].tolist() == [0, 1]
     labels = np.array([3, -1, 0, 2, 2])
     cloud = data(add_cloud(plotter, gaussians, color_by=labels))
     np.testing.assert_array_equal(cloud["rgb"], palette(labels))
@@ -78,16 +77,15 @@ def test_scores_and_arrays_become_colours(plotter):
     np.testing.assert_array_equal(data(add_cloud(plotter, gaussians, color_by=colors))["rgb"], colors)
 
 
-def test_range_of_scores_leaves_the_outermost_out(plotter):
+def test_range_of_scores_leaves_the_outermost_out():
     gaussians = some_gaussians(1000)
     scores = torch.linspace(0, 1, 1000)
     scores[0], scores[-1] = -50, 50
-    clim = data(add_cloud(plotter, gaussians, color_by=scores)).field_data["clim"]
-    np.testing.assert_allclose(clim, [0.01, 0.99], atol=2e-3)
+    np.testing.assert_allclose(cloud_colors(gaussians, scores).clim, [0.01, 0.99], atol=2e-3)
     rare = torch.zeros(1000)
     rare[3] = 2
-    assert data(add_cloud(plotter, gaussians, color_by=rare)).field_data["clim"].tolist() == [-0.5, 2.5]
-    assert data(add_cloud(plotter, gaussians, color_by=torch.ones(1000))).field_data["clim"].tolist() == [0.5, 1.5]
+    assert cloud_colors(gaussians, rare).clim == (-0.5, 2.5)
+    assert cloud_colors(gaussians, torch.ones(1000)).clim == (0.5, 1.5)
 
 
 def test_ellipsoids_are_the_gaussians_surfaces(plotter):
@@ -135,6 +133,31 @@ def test_a_point_cloud_holds_what_the_gaussians_hold():
     np.testing.assert_array_equal(points["index"], np.arange(25))
     assert {"rgb", "score"} <= set(points.point_data)
     refused(lambda: to_pyvista("cloud.ply"), "gaussians", "str", error=TypeError)
+
+
+def test_pyvistas_own_words_pass_through(plotter):
+    gaussians = some_gaussians()
+    for style in STYLES:
+        actor = add_cloud(plotter, gaussians, style=style, name="cloud", opacity=0.25, point_size=9)
+        assert [*plotter.actors.values()] == [actor]  # that of the same name was replaced
+        assert (actor.prop.opacity, actor.prop.point_size) == (0.25, 9)
+    look_through(plotter, some_camera())
+    before = plotter.screenshot(return_img=True)
+    shown = add_cloud(plotter, gaussians, color_by="opacity", cmap="plasma", show_scalar_bar=True, name="cloud")
+    assert (plotter.screenshot(return_img=True) != before).any()  # replaced and drawn
+    assert [*plotter.scalar_bars.keys()] == ["opacity"]
+    np.testing.assert_array_equal(
+        data(shown)["rgb"], to_pyvista(gaussians, cloud_colors(gaussians, "opacity", cmap="plasma").rgb)["rgb"]
+    )
+
+
+def test_a_faint_cloud_of_gaussians_is_faint(plotter):
+    look_through(plotter, some_camera())
+    seen = []
+    for opacity in (1.0, 0.2):
+        add_cloud(plotter, some_gaussians(), style="gaussians", name="cloud", opacity=opacity)
+        seen.append(plotter.screenshot(return_img=True).astype(int).sum())
+    assert seen[1] < 0.5 * seen[0]
 
 
 STYLES = ("points", "gaussians", "ellipsoids")

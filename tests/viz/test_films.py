@@ -82,8 +82,8 @@ NAMES = ["a", "b", "c", "chair"]
 
 
 def test_a_legend_reaches_the_file(tmp_path):
-    cloud = wall().replace(opacities=torch.tensor([0.5]))
-    path = save_animation(tmp_path / "a.gif", {"field": cloud}, cameras(2, 30, 100), names=NAMES, listed=cloud.labels)
+    cloud = wall().replace(opacities=torch.tensor([0.5]), names=NAMES)
+    path = save_animation(tmp_path / "a.gif", {"field": cloud}, cameras(2, 30, 100), legend=cloud)
     frames, _ = frames_of(path)
     assert all((frame[-20:] == palette(np.array(3), NAMES)).all(-1).sum() > 20 for frame in frames)
 
@@ -133,7 +133,7 @@ def test_what_makes_no_film_is_refused(tmp_path):
     refused(lambda: save_animation(tmp_path / "a.avi", shade, cameras()), "path:", ".gif", ".mp4", "got 'a.avi'")
     refused(lambda: save_animation(tmp_path / "a.gif", shade, cameras(), fps=60), "fps:", "[0.01, 50]", "got 60")
     refused(lambda: save_animation(tmp_path / "a.gif", shade, []), "shows, cameras:", "got none")
-    refused(lambda: show_cloud(wall(), color_by="score"), "color_by:", "'label', 'rgb', 'feature'", "got 'score'")
+    refused(lambda: show_cloud(wall(), color_by="score"), "gaussians.scores:", "got None", "'score'")
     refused(lambda: show_cloud(wall(), background="paper"), "background:", "got 'paper'")
     refused(lambda: show_cloud(wall()[:0]), "gaussians:", "got none")
     assert not list(tmp_path.iterdir())

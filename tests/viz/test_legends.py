@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
-import torch
-from cases_viz import some_plotter
+from cases_viz import some_gaussians, some_plotter
 from messages import refused
 
 from kfgs.viz import add_legend, palette
@@ -20,14 +19,14 @@ def colors_in(picture, labels):
     return [bool((picture.reshape(-1, 3) == palette(np.array(label), NAMES)).all(axis=1).any()) for label in labels]
 
 
-def test_legend_can_be_removed_and_needs_names_and_labels(plotter):
-    actor = add_legend(plotter, torch.tensor([2, -1, 0, 2]), ["wall", "floor", "rug"])
+def test_legend_can_be_removed_and_needs_labels(plotter):
+    actor = add_legend(plotter, some_gaussians())
     assert plotter.screenshot(return_img=True).any()
     plotter.remove_actor(actor)
     plotter.render()
     assert not plotter.screenshot(return_img=True).any()
-    refused(lambda: add_legend(plotter, np.array([5]), ["wall"]), "names:", "got 1")
-    refused(lambda: add_legend(plotter, np.zeros(0, dtype=int), ["wall"]), "labels:", "got none")
+    refused(lambda: add_legend(plotter, some_gaussians()[:0]), "gaussians:", "got none")
+    refused(lambda: add_legend(plotter, some_gaussians().replace(labels=None)), "gaussians:", "expected labels")
 
 
 def test_column_of_bounded_height_continues_in_the_next_column():

@@ -44,7 +44,7 @@ def test_both_clouds_are_seen_by_the_same_camera():
 def test_a_missing_label_closes_the_window_and_says_so():
     gaussians = some_gaussians()
     unlabelled = gaussians.replace(labels=None)
-    refused(lambda: linked_clouds(unlabelled, gaussians, off_screen=True), "gaussians.labels:", "got None")
+    refused(lambda: linked_clouds(unlabelled, gaussians, off_screen=True), "semantic:", "expected labels")
     refused(lambda: linked_clouds(gaussians, gaussians, height=0), "height:", "got 0")
 
 
@@ -133,8 +133,8 @@ def test_what_encloses_the_cameras_is_left_out_and_nothing_of_a_thing_that_they_
 
 
 def test_what_cannot_be_shown_is_named():
-    refused(lambda: show_transfer(SRC.replace(labels=None), DST), "field:", "with classes", "SemanticField.label")
-    refused(lambda: show_transfer(SRC.replace(labels=torch.full((80,), -1)), DST), "field:", "with classes")
+    refused(lambda: show_transfer(SRC.replace(labels=None), DST), "field:", "expected labels", "SemanticField.label")
+    refused(lambda: show_transfer(SRC.replace(labels=torch.full((80,), -1)), DST), "field:", "with a class")
     refused(lambda: show_transfer(SRC, DST.replace(sh=None)), "splat:", "with colours")
     refused(lambda: show_transfer(SRC, DST[:0]), "splat:", "got Gaussians(0")
     refused(lambda: show_transfer(SRC, DST, -1.0, off_screen=True), "distance:", "got -1")
