@@ -63,7 +63,7 @@ def draw(cloud, color_by):
     return viz.draw_view(camera, lambda plotter: viz.add_cloud(plotter, cloud, color_by=color_by, style="gaussians"))
 
 
-row = [scene.image(scene.views("test")[0]), *(draw(field.gaussians, answer.scores) for answer in answers.values())]
+row = [scene.image(scene.views("test")[0]), *(draw(field, answer) for answer in answers.values())]
 Image.fromarray(viz.picture_grid([row], ["photograph", *answers], width=320))
 
 # %% [markdown]
@@ -81,10 +81,10 @@ Shown(out / "scores.png", width=560)
 
 # %% tags=["thumbnail"]
 cameras = [scene.cameras[i] for i in scene.views("train")]
-things = kfgs.connected_parts(field.gaussians, answers["relevancy"], cameras, distance=0.1)
+semantic = field.label(classes)
+things = kfgs.connected_parts(semantic, answers["relevancy"], cameras, distance=0.1)
 for number, part in enumerate(things, start=1):
     print(f"{thing} {number}: {part!r}")
-semantic = field.label(classes)
 hidden = torch.tensor([-1, *(classes.index(name) for name in shell if classes.knows(name))])
 inside = semantic.select(~torch.isin(semantic.labels, hidden))
 up = estimate_up(scene.cameras)
@@ -92,9 +92,8 @@ orbit = Orbit(frames=1, size=(450, 640), elevation_degrees=50, start_degrees=120
 
 
 def draw_things(plotter):
-    boxes = [part.box for part in things]
     viz.add_cloud(plotter, inside, style="gaussians")
-    viz.add_boxes(plotter, boxes, names=[f"{thing} {i}" for i in range(1, len(boxes) + 1)], up=up.tolist())
+    viz.add_boxes(plotter, things, up=up.tolist())
 
 
 Image.fromarray(viz.draw_view(orbit_cameras(inside.means, orbit, up=up)[0], draw_things))

@@ -47,12 +47,11 @@ print(f"{len(semantic):,} semantic Gaussians, {len(color):,} of colour")
 # %% [markdown]
 # ## Two clouds and their labels, in one line
 #
-# Below are the classes, above the colours, and lines show who gave a label to whom (notebook 5). It is a pyvista plotter:
-# `.show()` in a cell turns it, and the slider moves $\lambda$ (`pip install "pyvista[jupyter]"` makes it live in Jupyter).
+# Below are the classes, above the colours, and lines show who gave a label to whom (notebook 5). It is a pyvista plotter. In
+# Jupyter it is live: drag to turn it, move the slider for $\lambda$, and press P over a Gaussian. A web page shows a still.
 
 # %%
-both = viz.show_transfer(field, color, off_screen=True)
-Image.fromarray(both.screenshot(return_img=True))  # or: viz.show_transfer(field, color).show()
+viz.show_transfer(field, color).show()
 
 # %% [markdown]
 # ## A plotter, a cloud, a picture
@@ -94,7 +93,7 @@ Image.fromarray(viz.picture_grid([[draw(semantic, style=style) for style in styl
 # %%
 found = field.query(word, classes)
 latents = draw(semantic, color_by="feature", style="gaussians")
-scores = draw(semantic, color_by=found.scores, clim=(0, 1), style="gaussians")
+scores = draw(semantic, color_by=found, clim=(0, 1), style="gaussians")
 row = [latents, scores, draw(color, color_by="view", style="gaussians")]
 Image.fromarray(viz.picture_grid([row], ["latents", f"score of {word}", "colours"]))
 
@@ -129,14 +128,13 @@ owner, parts = torch.full((len(semantic),), -1), kfgs.connected_parts(semantic, 
 for number, part in enumerate(parts):
     owner[part.indices] = number
     print(part)
-titles = tuple(f"{word} {number}" for number in range(1, len(parts) + 1))
 shown = kfgs.transfer_labels(semantic.replace(labels=owner, names=()), color, 0.1)
 view = camera.resized(2 * camera.height, 2 * camera.width)
 
 
 def draw_parts(plotter):
     viz.add_cloud(plotter, shown, style="gaussians")
-    viz.add_boxes(plotter, [part.box for part in parts], names=titles)
+    viz.add_boxes(plotter, parts)
 
 
 Image.fromarray(viz.draw_view(view, draw_parts))

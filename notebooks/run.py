@@ -122,6 +122,7 @@ def _execute_in(notebook: Any, folder: Path, seconds: int, *, home: str, stderr:
         notebook, km=manager, timeout=seconds, resources=resources, on_cell_start=note, store_widget_state=False
     )
     environment = os.environ | {"IPYTHONDIR": home, "PYDEVD_DISABLE_FILE_VALIDATION": "1"}
+    environment["PYVISTA_JUPYTER_BACKEND"] = "static"  # a live view would end with the kernel: a file keeps its picture
     try:
         client.execute(env=environment, stderr=stderr, cleanup_kc=True)
     except CellExecutionError as error:

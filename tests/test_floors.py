@@ -42,6 +42,7 @@ THIRD_PARTY = {
     "pyvista": "kfgs/viz/",
     "vtk": "kfgs/viz/",
     "vtkmodules": "kfgs/viz/",
+    "trame_vtk": "kfgs/viz/",
     "numba": "kfgs/splat/engines/",
     "llvmlite": "kfgs/splat/engines/",
     "triton": "kfgs/splat/engines/",

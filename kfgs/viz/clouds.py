@@ -61,8 +61,8 @@ def add_cloud(
             style `gaussians` only), `opacity`, `feature`; a `Selection` (its scores); or one value for each Gaussian:
             integers [N] are numbers of colours, floats [N] scores (not finite: grey), [N, 3] colours. None: labels if there
             are any, else rgb, feature, opacity.
-        style: `points` is quick and can be exported to HTML; `gaussians` is VTK's EWA splatting, adjusted to kfgs's
-            rasteriser; `ellipsoids` are closed surfaces of one standard deviation, for at most 100,000 Gaussians; those up
+        style: `points` is quick; `gaussians` is VTK's EWA splatting, adjusted to kfgs's rasteriser (points in a page that
+            pyvista exports); `ellipsoids` are closed surfaces of one standard deviation, for at most 100,000 Gaussians; those up
             to an opacity of 0.5 are left out.
         feature_colors: the scene's projection of features to colours; None: one for this cloud alone.
         clim: scores of the darkest and the brightest colour; None: their 1st and 99th percentile (by name: 0, 1).

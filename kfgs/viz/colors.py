@@ -111,8 +111,7 @@ def cloud_colors(
         source = SOURCES.get(color_by, "labels")
         values = getattr(gaussians, source)
         if values is None:
-            got = f"got None for color_by={color_by!r}; choose another"
-            raise ValueError(f"gaussians.{source}: expected some, {got}")
+            raise ValueError(f"gaussians.{source}: expected some, got None for color_by={color_by!r}; choose another")
         if source == "labels":
             if color_by not in SOURCES:
                 values = values.where(OfClass(color_by).select(gaussians).mask, -1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -46,12 +47,7 @@ FRAGMENT = f"{DENSITY} if (opacity*gaussian < {ALPHA_MIN:.9f}) discard; gaussian
 
 
 def as_gaussians(
-    plotter: pv.Plotter,
-    cloud: pv.PolyData,
-    near: float,
-    antialiased: bool,
-    followed: Gaussians | None,
-    **options: Any,
+    plotter: pv.Plotter, cloud: pv.PolyData, near: float, antialiased: bool, followed: Gaussians | None, **options: Any
 ) -> pv.Actor:
     """Draw a cloud with `index`, `rgb`, `scale`, `quat` (w, x, y, z; unit) and `opacity` as Gaussians.
 
@@ -69,6 +65,11 @@ def as_gaussians(
     """
     actor = draw_mesh(plotter, cloud, style="points_gaussian", emissive=False, **options)
     mapper = actor.mapper
+    with suppress(ImportError):  # vtk.js has no Gaussians: without this, a page that pyvista exports lacks the cloud
+        from trame_vtk.modules.vtk.serializers import mappers, registry
+
+        registry.register_instance_serializer(mapper.GetClassName(), mappers.generic_mapper_serializer)
+        registry.register_js_class(mapper.GetClassName(), "vtkMapper")
     mapper.SetScaleArray("scale")
     mapper.SetRotationArray("quat")
     mapper.SetOpacityArray("opacity")

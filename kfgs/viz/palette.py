@@ -90,10 +90,9 @@ def palette(
 def name_slots(names: Sequence[str]) -> list[int]:
     """The place in `PALETTE` of each class; the order of the names has no influence.
 
-    `class 7` lives at 7. Words of indoor scenes have a home among the first 20 colours, and words of one meaning share it
-    (sofa, couch). Other words get a home from their CRC-32. If two names of a list share a home, the first word of the row
-    stays there, of other words the first in the alphabet. The others move to the next free colour: of the first 20, then of
-    64, then of 256.
+    The home of `class 7` is 7. Words of indoor scenes have one among the first 20 colours, shared by words of one meaning
+    (sofa, couch). Other words get one from their CRC-32. If two names of a list share a home, the first word of the row stays
+    there, of other words the first in the alphabet. Others move to the next free colour: of the first 20, of 64, of 256.
     """
     words = [" ".join(name.lower().replace("_", " ").replace("-", " ").split()) for name in names]
     slots: dict[int, int] = {}

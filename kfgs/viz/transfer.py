@@ -121,8 +121,7 @@ class _Picture:
         self.lifted = targets + LIFT * width * up
         above = splat.replace(means=torch.from_numpy(self.lifted).to(splat.means))
         # joined, because VTK does not mix two clouds, without what only one of them has
-        rows = [self.semantic_rows, self.color_rows]
-        parts = [cloud.select(some) for cloud, some in zip((semantic, above), rows, strict=True)]
+        parts = [semantic.select(self.semantic_rows), above.select(self.color_rows)]
         shapes = [Gaussians(part.means, part.quats, part.scales, part.opacities, origin=part.origin) for part in parts]
         self.cloud = add_cloud(plotter, Gaussians.cat(shapes), color_by="opacity", style="gaussians")
         add_legend(plotter, semantic.select(self.semantic_rows))

@@ -1,8 +1,10 @@
 from dataclasses import replace
 from functools import partial
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
+import pyvista as pv
 import torch
 from cases_viz import data, some_camera, some_gaussians, some_plotter
 from messages import refused, tells
@@ -14,6 +16,8 @@ from kfgs.viz.clouds import recolor_cloud
 from kfgs.viz.colors import cloud_colors
 
 C0 = 0.28209479177387814
+
+STYLES = ("points", "gaussians", "ellipsoids")
 
 
 @pytest.fixture
@@ -151,6 +155,18 @@ def test_pyvistas_own_words_pass_through(plotter):
     )
 
 
+@pytest.mark.skipif(find_spec("trame_pyvista") is None, reason="needs pyvista[jupyter]")
+@pytest.mark.parametrize("style", STYLES)
+def test_a_page_that_pyvista_exports_has_the_cloud(style, tmp_path):
+    plotter, sizes = pv.Plotter(off_screen=True), []
+    for name in ("empty", "full"):
+        plotter.trame.export_vtksz(tmp_path / f"{name}.zip")
+        sizes.append((tmp_path / f"{name}.zip").stat().st_size)
+        add_cloud(plotter, some_gaussians(500), style=style)
+    plotter.close()
+    assert sizes[1] > sizes[0] + 500 * 12  # at least the positions
+
+
 def test_a_faint_cloud_of_gaussians_is_faint(plotter):
     look_through(plotter, some_camera())
     seen = []
@@ -158,9 +174,6 @@ def test_a_faint_cloud_of_gaussians_is_faint(plotter):
         add_cloud(plotter, some_gaussians(), style="gaussians", name="cloud", opacity=opacity)
         seen.append(plotter.screenshot(return_img=True).astype(int).sum())
     assert seen[1] < 0.5 * seen[0]
-
-
-STYLES = ("points", "gaussians", "ellipsoids")
 
 
 def with_floaters(count=3):
