@@ -58,9 +58,8 @@ def add_boxes(
             classes[i], words = int(box.gaussians.labels.mode().values), class_names(box.gaussians)
             colors[i] = palette(classes[i], words)
             titles += [] if names else [f"{words[classes[i]]} {i + 1}"]
-    corners = torch.stack(
-        [(box.box if isinstance(box, Part) else box).corners.double() for box in boxes]
-    ).cpu()  # [B, 8, 3]
+    solid = [box.box if isinstance(box, Part) else box for box in boxes]
+    corners = torch.stack([box.corners.double().cpu() for box in solid])  # [B, 8, 3] in the world
     places = corners.numpy() - origin_of(plotter, choose_origin(corners.flatten(0, 1)))
     mesh = pv.line_segments_from_points(places[:, np.array(EDGES)].reshape(-1, 3).astype(np.float32))
     mesh.cell_data["box"] = np.repeat(np.arange(len(boxes)), len(EDGES))

@@ -103,8 +103,7 @@ def make_plotter(
     hidden = not has_display() if off_screen is None else off_screen
     options: dict[str, Any] = {"shape": shape} if shape != (1, 1) else {}
     plotter = pv.Plotter(off_screen=hidden, window_size=(width, height), **options)
-    if background is not None:
-        plotter.set_background(background)
+    plotter.set_background(background or pv.global_theme.background)
     return plotter
 
 

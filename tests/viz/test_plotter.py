@@ -4,6 +4,7 @@ import sys
 
 import numpy as np
 import pytest
+import pyvista as pv
 from cases_viz import some_camera, some_gaussians, some_plotter
 from messages import tells
 
@@ -74,3 +75,16 @@ def test_draw_view_is_a_plotter_that_looks_through_the_camera_and_is_closed():
     with pytest.raises(KeyError):
         draw_view(camera, fail)
     assert [window.render_window for window in used] == [None, None]
+
+
+def test_pyvistas_theme_is_kept():
+    if trouble():
+        pytest.skip(trouble())
+    dark = pv.themes.DarkTheme()
+    before, pv.global_theme.background = pv.global_theme.background, dark.background
+    try:
+        assert make_plotter(8, 8, off_screen=True).background_color == dark.background
+        assert make_plotter(8, 8, off_screen=True, background="red").background_color == "red"
+    finally:
+        pv.global_theme.background = before
+        pv.close_all()
