@@ -50,7 +50,7 @@ def test_1_cameras_and_photos_of_a_scene(scene):
 
 def test_2_a_picture_of_features_from_a_new_view(field):
     camera = kfgs.Camera.look_at((1.0, 1.0, 1.5), (0.0, 0.0, 0.5), fov_degrees=70, width=80, height=60)
-    assert viz.FeatureColors.fit(field.features)(field.render(camera).map).shape == (60, 80, 3)
+    assert viz.FeatureColors.fit(field.latents)(field.render(camera).map).shape == (60, 80, 3)
 
 
 def test_3_volume_of_each_class(field):
@@ -118,9 +118,9 @@ def test_11_my_own_network_is_a_teacher(scene, tmp_path):
 
 
 def test_12_gradients_through_a_frozen_field(field):
-    head = torch.nn.Linear(field.features.shape[1], 3)
+    head = torch.nn.Linear(field.latents.shape[1], 3)
     camera = field.cameras[0]
-    rendered = kfgs.rasterize(field.gaussians.replace(features=head(field.features)), camera).map
+    rendered = kfgs.rasterize(field.gaussians.replace(features=head(field.latents)), camera).map
     rendered.square().sum().backward()
     assert head.weight.grad.abs().sum() > 0
 
