@@ -202,5 +202,5 @@ def as_rows(name: str, which: Any, count: int) -> Tensor:  # [count] bool, or [n
 def check_gaussians(value: object, name: str = "gaussians") -> None:
     """Raise a TypeError unless `value` is a cloud of Gaussians; the message says where it is, if `value` holds one."""
     if not isinstance(value, Gaussians):
-        hint = f"pass {'its .gaussians' if hasattr(value, 'gaussians') else 'Gaussians'}"
+        hint = f"pass {'its .gaussians, or .label(), with classes' if hasattr(value, 'gaussians') else 'Gaussians'}"
         raise TypeError(f"{name}: expected Gaussians, got {type(value).__name__}; {hint}")

@@ -171,6 +171,9 @@ def test_what_a_person_holds_is_drawn(field, splat, scene, plotter):
     for opened in (viz.linked_clouds(field, splat, off_screen=True), viz.show_transfer(field, splat, off_screen=True)):
         opened.close()
     refused(lambda: viz.add_cloud(plotter, "run/"), "gaussians:", "got str", "SemanticField.load", error=TypeError)
+    refused(lambda: kfgs.explore("run/"), "source:", "SemanticField.load", error=TypeError)
+    refused(lambda: kfgs.explore(field, "my.ply"), "color:", "read_splats", error=TypeError)
+    refused(lambda: kfgs.write_splats(field, "a.ply"), "gaussians:", ".label()", error=TypeError)
     refused(lambda: viz.add_cloud(plotter, field, color_by="chairs"), "color_by:", "did you mean 'chair'")
 
 

@@ -20,6 +20,7 @@ from ..cameras import Camera
 from ..fields import SemanticField
 from ..gaussians import Gaussians
 from ..labels import LabelSet
+from ..labels.transfer import as_cloud
 from ..scenes import Scene
 from ..splat import rasterize
 from ..viz.pictures import as_bytes
@@ -103,15 +104,14 @@ def explore(
     if where == "notebook":
         require_widget()
     meaning: Meaning
-    if isinstance(source, Gaussians):
-        if classes is not None or embed is not None:
-            raise ValueError("classes, embed: expected none with a splat, which has its own, got one; leave it out")
-        meaning = SplatMeaning(source)
-    elif isinstance(source, SemanticField):
+    if isinstance(source, SemanticField):
         cameras = cameras or source.cameras
         meaning = FieldMeaning(source, classes, cameras=cameras, embed=embed)
     else:
-        raise TypeError(f"source: expected a SemanticField or Gaussians, got {type(source).__name__}; pass one")
+        meaning = SplatMeaning(as_cloud(source, "source"))
+        if classes is not None or embed is not None:
+            raise ValueError("classes, embed: expected none with a splat, which has its own, got one; leave it out")
+    color = None if color is None else as_cloud(color, "color")
     state = Exploration(meaning, color, cameras=cameras, distance=distance)
     if where in ("browser", "notebook"):
         state.set_show(state.first_show)
