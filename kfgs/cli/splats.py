@@ -207,7 +207,7 @@ def convert(
 
 def _pack(source: Path, target: Path, precision: Any) -> None:
     """Write a field again; say the error of each part, read back from the file."""
-    from ..fields.store import check_place, read_description, stream_sizes
+    from ..fields.store import check_place, read_description
 
     check_output("target", target, "a file")
     check_place(target)
@@ -215,11 +215,9 @@ def _pack(source: Path, target: Path, precision: Any) -> None:
     field.save(target, None if precision == "lossless" else precision)
     if precision != "lossless":
         about = read_description(target)
-        errors = about["info"]["rounded"][-1]["errors"]
-        for name, size in stream_sizes(target).items():
+        for name, error in about["info"]["rounded"][-1]["errors"].items():
             unit = UNITS.get(name, "of a row's typical number")
-            within = f"within {errors[name]:.3g} {unit}" if name in errors else ""
-            say(f"  {name:<32s} {size:>10,d} bytes  {within}".rstrip())
+            say(f"  {name:<32s} within {error:.3g} {unit}")
         say(f"{about['gaussians']:,} Gaussians in {target.stat().st_size / 2**20:.2f} MiB")
         say("note: neighbours now lie side by side (Morton order): indices into the old field do not fit the new one")
     wrote([target])

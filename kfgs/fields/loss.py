@@ -12,9 +12,11 @@ from torch.autograd.function import once_differentiable
 
 from .._check import check_range, check_shapes
 from ..cameras import resize_map
+from ..cameras.resample import from_bchw, to_bchw
 from ..splat.engines.table import compiled_ssim
 from ..splat.ssim import SSIM_CONSTANTS, SSIM_WINDOW, ssim_windows, window_weights
 
+MOST_SKIPPED = 2  # pixels per pixel of the target, in a row: bilinear sampling reads all of them
 Loss = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(rendered map [H, W, D], its alpha [H, W], target [h, w, D]) -> a scalar."""
 
@@ -25,6 +27,9 @@ def l1_loss(
     target: Tensor,  # [h, w, D]
 ) -> Tensor:  # []
     """Eq. 4: the rendered map F_r, resized bilinearly to the target's size, against the latent map F_l.
+
+    A map that is more than twice as large is averaged over each pixel of the target: of 640x480 to 46x34, bilinear sampling
+    reads 4 of 196 pixels, and only these would learn.
 
     The mean of the absolute differences over pixels and channels. The paper writes a norm, but its released script takes
     the mean, and learning rates and densification threshold of 3DGS are made for a mean. Pixels with NaN in any channel of
@@ -86,7 +91,10 @@ def mean_similarity(picture: Tensor, target: Tensor) -> Tensor:  # [H, W, D] x 2
 
 def _resized(rendered: Tensor, target: Tensor) -> Tensor:  # [H, W, D], [h, w, D] -> [h, w, D]
     check_shapes(("rendered", rendered, ("H", "W", target.shape[2])))  # compiled code would read beyond the smaller one
-    return resize_map(rendered, (target.shape[0], target.shape[1]))
+    size = target.shape[0], target.shape[1]
+    if rendered.shape[0] > MOST_SKIPPED * size[0] or rendered.shape[1] > MOST_SKIPPED * size[1]:
+        return from_bchw(torch.nn.functional.adaptive_avg_pool2d(to_bchw(rendered), size))
+    return resize_map(rendered, size)
 
 
 def _compiled(picture: Tensor, target: Tensor) -> Callable[..., Any] | None:

@@ -71,12 +71,12 @@ def merge_gaussians(
         order = rows[weights[rows].argsort(stable=True)]
         below = weights[order].double().cumsum(0) <= FAINT * weights.double().sum()
         rows = order[~below].sort().values
-    kept, worth = gaussians.select(rows), weights[rows]
+    kept, worth = gaussians.select(rows).replace(labels=None, sh=None), weights[rows]
     assert kept.features is not None
     groups = torch.full_like(weights, -1, dtype=torch.int64)
     if len(rows) <= maximum:
         groups[rows] = torch.arange(len(rows), device=rows.device)
-        return Merged(kept.replace(labels=None, sh=None), groups)
+        return Merged(kept, groups)
     kinds = spherical_kmeans(kept.features, worth, CLUSTERS, generator=generator).index
     group, count = _smallest_voxels(kept.means, kinds, worth, maximum)
     groups[rows] = group
@@ -146,8 +146,6 @@ def _match_moments(cloud: Gaussians, worth: Tensor, group: Tensor, count: int) -
         scales=scales.to(cloud.means),
         opacities=opacities.to(cloud.means),
         features=_sum(share.to(cloud.features) * cloud.features, group, count),
-        labels=None,
-        sh=None,
     )
 
 

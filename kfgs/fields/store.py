@@ -93,12 +93,6 @@ def read_description(path: str | Path) -> dict[str, Any]:
     return _read(_field_file(path))[1]
 
 
-def stream_sizes(path: Path) -> dict[str, int]:
-    """The bytes of each tensor in a field's file, largest first."""
-    sizes = {name: value.nbytes for name, value in read_safetensors(path)[0].items()}
-    return dict(sorted(sizes.items(), key=lambda entry: -entry[1]))
-
-
 def find_classes(scene: Path) -> LabelSet | None:
     """The label set in a scene folder; None if there is none, a ValueError or an OSError if it cannot be read."""
     for files in ([scene / name for name in names] for names in SCENE_FILES):

@@ -228,6 +228,16 @@ def test_l1_loss_is_the_mean_over_pixels_and_channels_after_the_resize():
     assert float(loss) == pytest.approx((2.0 + 1.0) / 2)
 
 
+def test_every_pixel_of_a_much_larger_map_learns_alike():
+    """At 3 x 4 the paper's bilinear sampling would read 4 of 12 pixels."""
+    rendered = torch.rand(6, 8, 2, generator=torch.Generator().manual_seed(0), requires_grad=True)
+    target = torch.full((2, 2, 2), 2.0)
+    loss = l1_loss(rendered, torch.ones(6, 8), target)
+    assert float(loss.detach()) == pytest.approx(2 - float(rendered.detach().mean()))
+    loss.backward()
+    torch.testing.assert_close(rendered.grad, torch.full((6, 8, 2), -1 / 96))
+
+
 def test_unknown_pixels_count_nowhere():
     rendered = torch.rand(4, 6, 2, generator=torch.Generator().manual_seed(0), requires_grad=True)
     target = torch.rand(4, 6, 2, generator=torch.Generator().manual_seed(1))
