@@ -23,6 +23,7 @@ from kfgs import (
     Recolor,
     Remove,
     SemanticField,
+    connected_parts,
     fit_codebook,
     load_label_set,
     load_scene,
@@ -30,6 +31,7 @@ from kfgs import (
     transfer_labels,
     viz,
 )
+from kfgs.cameras import Orbit, orbit_cameras
 from kfgs.pipeline import true_labels
 from kfgs.viz import FeatureColors
 from kfgs.viz.films import show_cloud, show_selection
@@ -206,6 +208,30 @@ def draw_landing(demo: Demo) -> None:
     save("site_landing.jpg", pictures, ["photo", "classes", "“chair”", "chairs removed, plant red"], across=2)
 
 
+def draw_pyvista(demo: Demo) -> None:
+    """The transfer of labels, and what a person puts into a plotter: a cloud, a legend, boxes and cameras."""
+    transfer = viz.show_transfer(demo.field, demo.splat, height=640, off_screen=True)
+    cloud = demo.field.label(demo.words)
+    around = torch.tensor(
+        [demo.words.index(name) for name in ("wall", "ceiling", "window blind") if demo.words.knows(name)]
+    )
+    inside = cloud[~torch.isin(cloud.labels, around) & (cloud.labels >= 0)]
+    plotter = viz.make_plotter(640, 640, off_screen=True)
+    viz.add_cloud(plotter, inside, style="gaussians")
+    viz.add_legend(plotter, inside)
+    viz.add_boxes(plotter, connected_parts(cloud, "chair"))
+    viz.add_cameras(plotter, demo.field, most=8, size=0.4)
+    (view,) = orbit_cameras(inside.means, Orbit(frames=1, size=(640, 640), elevation_degrees=45, zoom=1.2))
+    viz.look_through(plotter, view)
+    pictures = [shown.screenshot(return_img=True) for shown in (transfer, plotter)]
+    save(
+        "site_pyvista.jpg",
+        pictures,
+        ["viz.show_transfer(field, splat)", "add_cloud, add_legend, add_boxes, add_cameras"],
+        2,
+    )
+
+
 def main() -> int:
     """Draw all pictures."""
     parser = argparse.ArgumentParser(description="Draw the pictures of the site.")
@@ -220,6 +246,7 @@ def main() -> int:
         draw_gamma,
         draw_lambda,
         draw_errors,
+        draw_pyvista,
     ):
         draw(demo)
     return 0
