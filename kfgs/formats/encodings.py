@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..quant.codebook import nearest_rows
 from .values import unit_quats
 
 CODES = 256  # numbers in a codebook: an index is one byte
@@ -22,7 +23,6 @@ _PASSES = 10  # of Lloyd's algorithm on the line
 _EVEN = 64  # numbers that start evenly spaced over the whole range, so that outliers get some
 _BINS = 512  # of the density of values
 _ROW_PASSES = 4  # for rows; 10 lower the error by 1 % and take 3 times as long (100,000 rows of 45, palette 65,536)
-_BLOCK = 1 << 22  # distances at a time, 16 MiB
 
 
 def pack_smallest_three(
@@ -167,14 +167,8 @@ def _fit_means(rows: Tensor, size: int) -> tuple[Tensor, Tensor]:  # [K, D], [N]
         return rows, torch.arange(len(rows))
     means = rows[torch.arange(size) * len(rows) // size].clone()
     for _ in range(_ROW_PASSES):
-        labels = _nearest_rows(rows, means)
+        labels = nearest_rows(rows, means, euclidean=True)[0]
         counts = torch.bincount(labels, minlength=size)
         sums = torch.zeros_like(means).index_add_(0, labels, rows)
         means = torch.where(counts[:, None] > 0, sums / counts.clamp(min=1)[:, None], means)
-    return means, _nearest_rows(rows, means)
-
-
-def _nearest_rows(rows: Tensor, means: Tensor) -> Tensor:  # [N] int64
-    lengths = (means**2).sum(1)
-    blocks = rows.split(max(1, _BLOCK // len(means)))
-    return torch.cat([torch.addmm(lengths, block, means.T, alpha=-2).argmin(1) for block in blocks])
+    return means, nearest_rows(rows, means, euclidean=True)[0]

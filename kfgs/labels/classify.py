@@ -10,7 +10,7 @@ from torch import Tensor
 from .._card import short_repr
 from .._check import as_tensor, check_shapes
 from .._rows import EPS, check_directions, largest, row_norms, unit_embeddings, unit_rows
-from ..quant.codebook import Codebook
+from ..quant.codebook import Codebook, nearest_rows
 
 if TYPE_CHECKING:
     from ..quant.autoencoder import Autoencoder
@@ -80,19 +80,11 @@ def pixel_codewords(
                 codewords[pixels], leads = _best_and_lead(layers, rows[pixels])
                 pixels = pixels[~(leads > LEAD)]
             if centres is not None:
-                codewords[pixels] = nearest_codeword(rows[pixels], centres)
+                codewords[pixels] = nearest_rows(rows[pixels], centres, euclidean=True)[0]
             else:
                 features = rows[pixels] if autoencoder is None else autoencoder.decode(rows[pixels])
                 codewords[pixels] = codebook.quantize(features).masked_fill(row_norms(features) <= EPS, -1)
     return codewords.reshape(latents.shape[:-1])
-
-
-def nearest_codeword(
-    latents: Tensor,  # [N, d]
-    centres: Tensor,  # [K, d]
-) -> Tensor:  # [N] int64
-    """The codeword whose latent is nearest, argmin_k |x - c_k|^2 = argmax_k 2 x.c_k - |c_k|^2; ties go to the lowest."""
-    return largest(torch.addmm(-(centres * centres).sum(dim=-1), latents, centres.T, alpha=2))[1]
 
 
 def _score_layers(

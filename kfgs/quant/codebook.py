@@ -14,7 +14,7 @@ from .._check import as_tensor, check_shapes
 from .._rows import EPS, largest, row_norms, unit_rows
 from .store import Stored
 
-CHUNK = 1024  # features at a time: 2 MB of 512 channels stay in a core's cache, a third faster than 65,536 (measured)
+CHUNK = 4096  # rows at a time: 8 MB of 512 channels stay in a core's cache
 
 
 class Nearest(NamedTuple):
@@ -94,13 +94,30 @@ class Codebook(Stored):
         Note:
             Ties go to the lowest index. An all-zero feature gets index 0 with similarity 0.
         """
-        index, product, length = nearest_rows(self._checked(features), self.unit)
+        index, product, length = self.compare(features)
         shortest = max(EPS, torch.finfo(product.dtype).tiny)  # as in unit_rows
         return Nearest(index, (product / length.clamp_min(shortest)).to(product.dtype))
 
     def quantize(self, features: Tensor) -> Tensor:  # [..., D] -> [...] int64
         """The index map M of Eq. 5: for each feature, t = argmax_e cos(f, f_e). Ties as in `nearest`."""
-        return nearest_rows(self._checked(features), self.unit)[0]
+        return self.compare(features)[0]
+
+    def compare(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # [..., D] -> [...] int64, [...], [...]
+        """The best codeword of each feature, the product of feature and unit codeword, and the feature's length.
+
+        The length changes no argmax, so no feature is divided by it. The product has the dtype of the codewords, the length
+        at least single precision. (Products of bfloat16 are three times faster on AVX-512 BF16, but too many features would
+        have to be computed again whose two best are closer than their error.)
+        """
+        features = self._checked(features)
+        wide = torch.promote_types(torch.promote_types(features.dtype, torch.float32), self.unit.dtype)
+        parts = []
+        with torch.no_grad():
+            for part in features.reshape(-1, self.dim).split(CHUNK):
+                part = part.to(wide)
+                parts.append((*nearest_rows(part.to(self.unit.dtype), self.unit), row_norms(part)))
+        index, product, length = (torch.cat(values).view(features.shape[:-1]) for values in zip(*parts, strict=True))
+        return index, product, length
 
     def _checked(self, features: Tensor) -> Tensor:
         features = as_tensor("features", features)
@@ -113,26 +130,23 @@ class Codebook(Stored):
 
 
 def nearest_rows(
-    features: Tensor,  # [..., D]
-    unit: Tensor,  # [K, D] unit rows
-) -> tuple[Tensor, Tensor, Tensor]:  # [...] int64, [...], [...]
-    """Eq. 5: the best row of each feature, its product with the feature, and the feature's length.
+    rows: Tensor,  # [N, D]
+    targets: Tensor,  # [K, D]
+    *,
+    euclidean: bool = False,
+) -> tuple[Tensor, Tensor]:  # [N] int64, [N]
+    """The target with the largest product x.t with each row, and this product. Ties go to the lowest index.
 
-    The length changes no argmax, so no feature is divided by it. Ties go to the lowest index. The product has the dtype of
-    `unit`, the length at least single precision. (Products of bfloat16 are three times faster on AVX-512 BF16, but too many
-    features would have to be computed again whose two best are closer than their error.)
+    With unit targets it is the one in the most similar direction. `euclidean`: the nearest point, of largest x.t - |t|^2 / 2.
     """
-    K, D = unit.shape
-    rows = features.reshape(-1, D)
-    wide = torch.promote_types(torch.promote_types(features.dtype, torch.float32), unit.dtype)
-    parts = []
-    with torch.no_grad():
-        padded = torch.nn.functional.pad(unit, (0, 0, 0, -K % 16)).T  # 256 columns are quicker than 255
-        for part in rows.split(CHUNK):
-            part = part.to(wide)
-            parts.append((*largest((part.to(unit.dtype) @ padded)[:, :K]), row_norms(part)))
-    product, index, length = (torch.cat(values).view(features.shape[:-1]) for values in zip(*parts, strict=True))
-    return index, product, length
+    K, best = len(targets), []
+    columns = torch.nn.functional.pad(targets, (0, 0, 0, -K % 16 if K > 64 else 0)).T  # 256 are quicker than 255
+    offsets = -columns.square().sum(dim=0) / 2 if euclidean else None
+    for part in rows.split(CHUNK):
+        products = part @ columns if offsets is None else torch.addmm(offsets, part, columns)
+        best.append(largest(products[:, :K]))
+    number, index = (torch.cat(parts) for parts in zip(*best, strict=True))
+    return index, number
 
 
 def share_above(similarity: Tensor, alpha: float) -> float:

@@ -7,9 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .._rows import EPS, largest, row_norms, unit_rows
-
-CHUNK = 16_384  # features compared with the centres at a time
+from .._rows import EPS, row_norms, unit_rows
+from .codebook import nearest_rows
 
 
 class Cells(NamedTuple):
@@ -52,17 +51,10 @@ def cap(weights: Tensor, positive: Tensor) -> Tensor:
 
 def refine(unit: Tensor, centres: Tensor, rounds: int, *, weights: Tensor | None = None) -> Cells:
     """Rounds of averaging and assignment, from given centres; a centre that loses all its features stays where it is."""
-    cells = nearest_cells(unit, centres)
+    cells = Cells(centres, *nearest_rows(unit, centres))
     rows = unit if weights is None else unit * weights[:, None].to(unit)
     for _ in range(rounds):
         sums = torch.zeros_like(centres).index_add_(0, cells.index, rows)  # repeatable on a CPU
         centres = torch.where(row_norms(sums)[:, None] > EPS, unit_rows(sums), cells.centres)
-        cells = nearest_cells(unit, centres)
+        cells = Cells(centres, *nearest_rows(unit, centres))
     return cells
-
-
-def nearest_cells(unit: Tensor, centres: Tensor) -> Cells:
-    """Eq. 5 for unit rows. Ties go to the lowest index."""
-    best = [largest(part @ centres.T) for part in unit.split(CHUNK)]
-    similarity, index = (torch.cat(parts) for parts in zip(*best, strict=True))
-    return Cells(centres, index, similarity)

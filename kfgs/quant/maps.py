@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from .._check import as_bar, as_tensor, check_range, check_shapes, check_whole
 from .._rows import ENCODE, EPS, check_directions
-from .codebook import Codebook, nearest_rows
+from .codebook import Codebook
 from .store import Stored
 
 SAMPLES = 28_800  # rows 1::2 and columns 1::3 of a 360 x 480 map, as in the paper's experiments
@@ -161,7 +161,7 @@ def quantize_maps(
     for i in tqdm(range(len(maps)), desc="quantise", disable=not as_bar(progress)):
         feature_map = as_tensor(f"maps[{i}]", maps[i])
         check_shapes((f"maps[{i}]", feature_map, ("h", "w", codebook.dim)))
-        index, _, length = nearest_rows(feature_map, codebook.unit)
+        index, _, length = codebook.compare(feature_map)
         check_directions(f"maps[{i}]", feature_map, length, ENCODE)
         indices.append(index.masked_fill(length <= EPS, codebook.size).cpu().numpy().astype(np.uint16))
     return IndexMaps(indices, codebook.size)

@@ -95,7 +95,8 @@ def test_every_feature_gets_the_first_largest_product_whatever_the_size(size):
     features = torch.randint(-3, 4, (3_000, 8), generator=generator).half()  # many chunks
     features[0] = torch.tensor([-5.0, 0, 0, 0, 0, 0, 0, 0])
     unit = torch.cat([codewords, codewords])  # each codeword twice
-    codeword, product, length = nearest_rows(features, unit)
+    codeword, product = nearest_rows(features.double(), unit)
+    length = Codebook(unit).compare(features)[2]
     products = (features.double()[:, None] * unit).sum(dim=2)
     assert torch.equal(product, products.amax(dim=1))
     assert torch.equal(codeword, (products == product[:, None]).int().argmax(dim=1))

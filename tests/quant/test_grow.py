@@ -2,8 +2,8 @@ import pytest
 import torch
 
 from kfgs._rows import unit_rows
+from kfgs.quant.codebook import nearest_rows
 from kfgs.quant.grow import grow
-from kfgs.quant.kmeans import nearest_cells
 
 
 def mixture(counts, dim=32, noise=0.05, seed=0):
@@ -24,7 +24,7 @@ def test_as_many_codewords_as_there_are_classes_whatever_the_noise(noise):
     unit, label = mixture([400, 300, 500, 350, 450], noise=noise)
     cells, _ = run(unit)
     assert len(cells.centres) == 5
-    name = nearest_cells(torch.eye(32)[:5], cells.centres).index
+    name = nearest_rows(torch.eye(32)[:5], cells.centres)[0]
     assert torch.equal(cells.index, name[label])
 
 
@@ -42,7 +42,7 @@ def test_outliers_do_not_lead():
     outliers = unit_rows(torch.randn(10, 32, generator=generator))
     cells, _ = run(torch.cat([unit, outliers]), maximum=16)  # a cell needs 4010 / 16 / 16 = 16 features
     assert len(cells.centres) == 2
-    assert nearest_cells(torch.eye(32)[:2], cells.centres).similarity.min() > 0.999
+    assert nearest_rows(torch.eye(32)[:2], cells.centres)[1].min() > 0.999
 
 
 def test_never_more_than_the_maximum():
