@@ -142,7 +142,7 @@ def index_maps(args: argparse.Namespace) -> str:
     book = Codebook.load(args.folder / "codebook.safetensors").to(args.device)
     found = quantize_maps(MapsOn(FeatureFolder(args.folder / "maps"), args.device), book, progress=True)
     found.save(args.folder / "index_maps.safetensors")
-    return f"{found.nbytes / 1e6:.1f} MB"
+    return f"{sum(indices.nbytes for indices in found) / 1e6:.1f} MB"
 
 
 def uplift(args: argparse.Namespace) -> str:

@@ -164,7 +164,7 @@ from kfgs.quant import LatentMaps
 latent_maps = LatentMaps(index_maps, latents)
 before = len(maps) * 2 * torch.tensor(maps.shape).prod().item()  # in half precision
 sizes = {
-    "index maps": index_maps.nbytes,
+    "index maps": sum(index.nbytes for index in index_maps),
     "codebook": 4 * codebook.codewords.numel(),
     "decoder": 4 * autoencoder.decoder_parameters,
 }

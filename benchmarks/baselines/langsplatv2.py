@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from kfgs._rows import unit_rows
-from kfgs.quant.kmeans import spherical_kmeans
+from kfgs.quant.grow import spherical_kmeans
 
 from .common import FLOAT, Clock, Fitted, KeptMaps, Task, is_shown, sample_rows
 from .langsplat import nearest

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from .._check import check_shapes, check_whole
 from ..gaussians import Gaussians
-from ..quant.kmeans import spherical_kmeans
+from ..quant.grow import spherical_kmeans
 from ..splat import covariance_3d
 
 CLUSTERS = 64

@@ -29,7 +29,7 @@ from .._rows import EPS, row_norms, unit_rows
 from ..cameras import Camera, resize_map
 from ..formats.values import check_splats
 from ..gaussians import Gaussians
-from ..quant.kmeans import cap
+from ..quant.grow import cap
 from ..quant.linear import LinearLatents, fit_linear_latents
 from ..quant.maps import FeatureMaps
 from ..splat import accumulate_pixels, average_views, bin_tiles, composite, project, rasterize

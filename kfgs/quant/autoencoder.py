@@ -16,9 +16,9 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from .._card import short_repr
-from .._check import Progress, as_progress, as_tensor, check_range, check_whole
+from .._check import Progress, as_progress, check_range, check_whole
 from .._rows import row_norms, unit_rows
-from .codebook import Codebook
+from .codebook import Codebook, as_channels
 from .store import Stored
 
 CHUNK = 8192  # rows at a time: the decoder's widest layer then takes 32 MB
@@ -149,8 +149,8 @@ class Autoencoder(nn.Module, Stored):
             widths = []
             for name in ("encoder", "decoder"):
                 layers = sum(key.startswith(f"{name}.") and key.endswith(".weight") for key in tensors)
-                shapes = [tuple(tensors[f"{name}.{i}.weight"].shape) for i in range(max(layers, 1))]
-                widths.append([shapes[0][1], *(shape[0] for shape in shapes)])
+                outputs = [len(tensors[f"{name}.{i}.weight"]) for i in range(layers)]
+                widths.append([tensors[f"{name}.0.weight"].shape[1], *outputs])
             with torch.device("meta"):
                 made = cls(*widths)
             made.load_state_dict({name: tensors[name] for name in made.state_dict()}, assign=True)
@@ -288,8 +288,6 @@ def unit_latents(latents: Tensor) -> Tensor:  # [n, d]
 
 
 def _by_chunk(name: str, x: Tensor, width: int, function: Callable[[Tensor], Tensor]) -> Tensor:
-    x = as_tensor(name, x, floating=True)
-    if x.shape[-1:] != (width,):
-        raise ValueError(f"{name}: expected [..., {width}], got {tuple(x.shape)}; pass what belongs to the same scene")
+    x = as_channels(name, x, width, floating=True)
     rows = torch.cat([function(part) for part in x.reshape(-1, width).split(CHUNK)])  # one empty part of no rows
     return rows.reshape(*x.shape[:-1], rows.shape[1])

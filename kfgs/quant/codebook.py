@@ -86,7 +86,7 @@ class Codebook(Stored):
 
     def similarity(self, features: Tensor) -> Tensor:  # [..., D] -> [..., K]
         """Cosine similarity of each feature with each codeword; 0 for an all-zero feature. Differentiable."""
-        return unit_rows(self._checked(features).to(self.unit.dtype)) @ self.unit.T
+        return unit_rows(as_channels("features", features, self.dim).to(self.unit.dtype)) @ self.unit.T
 
     def nearest(self, features: Tensor) -> Nearest:  # [..., D] -> [...], [...]
         """The most similar codeword of each feature and how similar it is (Eq. 5).
@@ -109,7 +109,7 @@ class Codebook(Stored):
         at least single precision. (Products of bfloat16 are three times faster on AVX-512 BF16, but too many features would
         have to be computed again whose two best are closer than their error.)
         """
-        features = self._checked(features)
+        features = as_channels("features", features, self.dim)
         wide = torch.promote_types(torch.promote_types(features.dtype, torch.float32), self.unit.dtype)
         parts = []
         with torch.no_grad():
@@ -119,14 +119,14 @@ class Codebook(Stored):
         index, product, length = (torch.cat(values).view(features.shape[:-1]) for values in zip(*parts, strict=True))
         return index, product, length
 
-    def _checked(self, features: Tensor) -> Tensor:
-        features = as_tensor("features", features)
-        if features.shape[-1:] != (self.dim,):
-            raise ValueError(
-                f"features: expected [..., D] with D = {self.dim} (from codewords), got {tuple(features.shape)}; "
-                "pass features of the teacher that the codebook was fitted to"
-            )
-        return features
+
+def as_channels(name: str, values: Tensor, channels: int, *, floating: bool = False) -> Tensor:  # [..., channels]
+    """Features or latents as a tensor; a ValueError if their last axis does not fit what was fitted to others."""
+    values = as_tensor(name, values, floating=floating)
+    if values.shape[-1:] != (channels,):
+        got = f"{tuple(values.shape)}; pass those of the teacher and the scene that it was fitted to"
+        raise ValueError(f"{name}: expected [..., {channels}], got {got}")
+    return values
 
 
 def nearest_rows(
@@ -149,13 +149,13 @@ def nearest_rows(
     return index, number
 
 
-def share_above(similarity: Tensor, alpha: float) -> float:
-    """The share of features that are at least `alpha` similar."""
-    return float((similarity >= alpha).double().mean())
+def coverage(similarity: Tensor, alpha: float) -> dict[str, float]:
+    """How well features are represented, from their similarities [n]: those of at least `alpha` are covered."""
+    share, mean = (similarity >= alpha).double().mean(), similarity.mean(dtype=torch.float64)
+    return {"coverage": float(share), "mean_similarity": float(mean)}
 
 
 def with_report(codewords: Tensor, history: list[dict[str, Any]], nearest: Nearest, alpha: float) -> Codebook:
     """A codebook with its report, from the `nearest` codewords of the sampled features [n]."""
-    usage, similarity = torch.bincount(nearest.codeword, minlength=len(codewords)).cpu(), nearest.similarity
-    mean = float(similarity.mean(dtype=torch.float64))
-    return Codebook(codewords, CodebookReport(history, usage, share_above(similarity, alpha), mean))
+    usage = torch.bincount(nearest.codeword, minlength=len(codewords)).cpu()
+    return Codebook(codewords, CodebookReport(history, usage, **coverage(nearest.similarity, alpha)))

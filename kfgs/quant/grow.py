@@ -1,10 +1,13 @@
-"""Fit the codebook of a scene (Sec. 3.3.1). kfgs's grows on a sample: the cell represented worst splits, then k-means runs."""
+"""Fit the codebook of a scene (Sec. 3.3.1). kfgs's grows on a sample: the cell represented worst splits, then k-means runs.
+
+k-means is spherical (Dhillon & Modha 2001): a cell is a group of features that point the same way.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,8 +15,7 @@ from tqdm import tqdm
 
 from .._check import Progress, as_progress, check_range, check_shapes, check_whole
 from .._rows import ENCODE, EPS, check_directions, row_norms, unit_rows
-from .codebook import Codebook, Nearest, share_above, with_report
-from .kmeans import Cells, refine
+from .codebook import Codebook, Nearest, coverage, nearest_rows, with_report
 from .maps import SAMPLES, FeatureMaps, all_zero, read_grid
 from .paper import PaperCodebook, prune
 
@@ -58,9 +60,7 @@ class GrownCodebook:
         alpha = float(cells.similarity.sort().values[int((1 - COVERAGE) * (len(pool) - 1))])
         history: list[dict[str, Any]] = []
         for number, (size, added, similarity) in enumerate(rounds):
-            record: dict[str, Any] = {"round": number, "size": size, "added": added, "pruned": 0}
-            record |= {"coverage": share_above(similarity, alpha), "mean_similarity": float(similarity.mean())}
-            history.append(record)
+            history.append({"round": number, "size": size, "added": added, "pruned": 0} | coverage(similarity, alpha))
         history[-1] |= {"size": len(cells.centres), "pruned": pruned}
         if callable(progress):
             for record in history:
@@ -110,6 +110,55 @@ def fit_codebook(
 
     generator = generator or torch.Generator().manual_seed(0)
     return options.fit(read, count, generator, as_progress(progress))
+
+
+class Cells(NamedTuple):
+    """Centres, and the nearest centre of each feature."""
+
+    centres: Tensor  # [K, D] unit rows
+    index: Tensor  # type: ignore[assignment]  # [n] int64
+    similarity: Tensor  # [n]
+
+
+def spherical_kmeans(
+    features: Tensor,  # [n, D]
+    weights: Tensor,  # [n] >= 0
+    clusters: int,
+    *,
+    rounds: int = 10,
+    generator: torch.Generator | None = None,
+) -> Cells:
+    """Group features by direction: each joins the centre of largest cosine; a centre is the mean direction of its features.
+
+    The first centres are drawn in proportion to the weights, capped at their 0.99 quantile, so that one huge weight does not
+    draw all of them. An all-zero feature goes to group 0 and moves no centre. With fewer features than `clusters`, K is smaller.
+    A ValueError if every weighted feature is zero.
+    """
+    rows, counted = unit_rows(features), (weights > 0) & (row_norms(features) > EPS)
+    candidates = int(counted.sum())
+    if candidates == 0:
+        raise ValueError(f"features: expected a weighted nonzero row, got {len(features)} without; check the teacher")
+    capped = cap(weights, weights[counted].double()) * counted
+    generator = generator or torch.Generator().manual_seed(0)
+    first = torch.multinomial(capped.cpu().double(), min(clusters, candidates), generator=generator)
+    return refine(rows, rows[first.to(rows.device)], rounds, weights=capped)
+
+
+def cap(weights: Tensor, positive: Tensor) -> Tensor:
+    """Weights capped at the 0.99 quantile of the positive ones, so that a few wall-sized Gaussians do not decide alone."""
+    sample = positive[:: max(1, len(positive) // 100_000)]  # torch.quantile refuses more than 16 million
+    return weights.clamp_max(torch.quantile(sample, 0.99))
+
+
+def refine(unit: Tensor, centres: Tensor, rounds: int, *, weights: Tensor | None = None) -> Cells:
+    """Rounds of averaging and assignment, from given centres; a centre that loses all its features stays where it is."""
+    cells = Cells(centres, *nearest_rows(unit, centres))
+    rows = unit if weights is None else unit * weights[:, None].to(unit)
+    for _ in range(rounds):
+        sums = torch.zeros_like(centres).index_add_(0, cells.index, rows)  # repeatable on a CPU
+        centres = torch.where(row_norms(sums)[:, None] > EPS, unit_rows(sums), cells.centres)
+        cells = Cells(centres, *nearest_rows(unit, centres))
+    return cells
 
 
 def grow(

@@ -80,8 +80,8 @@ def all_zero(n: int) -> ValueError:
     return ValueError(f"maps: expected nonzero features (longer than {EPS:g}), got {n} maps without; check the teacher")
 
 
-class IndexMaps(Stored, Sequence[NDArray[Any]]):
-    """The index maps M of Eq. 5: one [h, w] array of codeword numbers per image, one or two bytes per pixel.
+class IndexMaps(Stored, list[NDArray[Any]]):
+    """The index maps M of Eq. 5: a list of one [h, w] array of codeword numbers per image, one or two bytes per pixel.
 
     The number K itself marks a hole: a pixel whose feature was all-zero, about which nothing is known. uint8 up to 255
     codewords, uint16 up to 65,535. Sizes may differ between images.
@@ -98,25 +98,15 @@ class IndexMaps(Stored, Sequence[NDArray[Any]]):
                 got = f"{indices.min()} to {indices.max()}; quantise it with the codebook of that size"
                 raise ValueError(f"maps[{i}]: expected numbers from 0 to {size} (size, a hole), got {got}")
         dtype = np.uint8 if size <= 255 else np.uint16
-        self.size, self._maps = size, [np.ascontiguousarray(indices, dtype=dtype) for indices in maps]
-
-    def __len__(self) -> int:
-        return len(self._maps)
-
-    def __getitem__(self, i: int) -> NDArray[Any]:  # type: ignore[override]  # [h, w]
-        return self._maps[i]
+        super().__init__(np.ascontiguousarray(indices, dtype=dtype) for indices in maps)
+        self.size = size
 
     def __repr__(self) -> str:
         return f"IndexMaps({len(self)} maps, {self.size} codewords)"
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes in memory."""
-        return sum(indices.nbytes for indices in self._maps)
-
     def state_dict(self) -> dict[str, Any]:
         """The maps as `map.0`, `map.1`, ..., and `size`."""
-        tensors = {f"map.{i}": torch.from_numpy(indices) for i, indices in enumerate(self._maps)}
+        tensors = {f"map.{i}": torch.from_numpy(indices) for i, indices in enumerate(self)}
         return tensors | {"size": torch.tensor(self.size)}
 
     @classmethod

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from .._check import Progress, check_range, check_whole
 from .._rows import EPS, row_norms, unit_rows
-from .codebook import Codebook, Nearest, share_above, with_report
+from .codebook import Codebook, Nearest, coverage, with_report
 from .maps import SAMPLES, all_zero
 
 BETAS = (0.9, 0.999)  # Adam's usual decay rates; the paper names none
@@ -82,10 +82,10 @@ class PaperCodebook:
                     similarities.append(similarity)
                 if seen % period == 0 or seen == maps:
                     pruned += book.step()
-            size, known = len(book.rows), torch.cat(similarities)
+            size = len(book.rows)
             record: dict[str, Any] = {"epoch": epoch, "size": size, "added": size - before + pruned, "pruned": pruned}
-            record |= {"loss": sum(losses) / len(losses), "coverage": share_above(known, self.expand_below)}
-            history.append(record | {"mean_similarity": float(known.mean(dtype=torch.float64))})
+            record |= {"loss": sum(losses) / len(losses)} | coverage(torch.cat(similarities), self.expand_below)
+            history.append(record)
             bar.set_postfix(K=size, coverage=f"{record['coverage']:.3f}")
             if callable(progress):
                 progress(dict(history[-1]))
@@ -108,11 +108,9 @@ def farthest_points(features: Tensor, count: int) -> Tensor:  # [n, D] -> [min(c
     least, pair = float("inf"), (0, 1)
     for start in range(0, len(unit) - 1, BLOCK):  # the upper triangle, one block of rows at a time
         similarity = unit[start : start + BLOCK] @ unit[start:].T  # [b, n - start], starts on the diagonal
-        square = similarity[:, : len(similarity)]
-        square.masked_fill_(torch.ones_like(square, dtype=torch.bool).tril(), torch.inf)
-        row, column = divmod(int(similarity.argmin()), similarity.shape[1])
+        row, column = divmod(int(similarity.fill_diagonal_(torch.inf).argmin()), similarity.shape[1])
         if float(similarity[row, column]) < least:
-            least, pair = float(similarity[row, column]), (start + row, start + column)
+            least, pair = float(similarity[row, column]), (start + min(row, column), start + max(row, column))
     picked = torch.tensor(pair[:count], device=rows.device)
     largest = (unit @ unit[picked].T).amax(dim=1)
     largest[picked] = torch.inf  # never twice

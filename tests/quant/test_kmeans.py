@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from kfgs.quant.kmeans import refine, spherical_kmeans
+from kfgs.quant.grow import refine, spherical_kmeans
 
 
 def generator(seed=0):
