@@ -21,7 +21,7 @@ from torch import Tensor
 
 from kfgs import SemanticField, attach, load_label_set, load_scene, read_splats
 from kfgs.cameras import Camera
-from kfgs.cameras.distortion import undistort_labels
+from kfgs.cameras.resample import undistort_labels
 from kfgs.evaluation.label_pictures import load_label_map
 from kfgs.gaussians import Gaussians
 from kfgs.labels import EditList, LabelSet, Recolor, Remove, transfer_labels

@@ -1,11 +1,9 @@
 """Posed cameras, paths of cameras, projection, lens distortion and resampling, carried by kornia."""
 
-from .bounds import robust_bounds
 from .camera import Camera, Distortion
-from .distortion import undistort
-from .paths import Orbit, estimate_up, orbit_cameras, path_cameras
+from .paths import Orbit, estimate_up, orbit_cameras, path_cameras, robust_bounds
 from .projection import from_kornia, project_points, to_kornia
-from .resample import resize_map
+from .resample import resize_map, undistort
 from .similarity import Similarity, fit_similarity
 
 __all__ = [

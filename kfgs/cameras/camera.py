@@ -187,16 +187,10 @@ class Camera:
         return replace(self, viewmat=self.viewmat.to(*args, **kwargs), K=self.K.to(*args, **kwargs))
 
 
-def at_one_origin(cameras: Sequence[Camera]) -> list[Camera]:
-    """The cameras, with all viewmats counted from the origin of the first."""
-    return [camera.with_origin(cameras[0].origin) for camera in cameras]
-
-
 def exact_rotation(name: str, matrix: Tensor) -> Tensor:  # [3, 3] -> [3, 3] float64
-    """The exact rotation nearest to a rounded one; errors name the argument `name`.
+    """The exact rotation nearest to a rounded one.
 
-    Raises:
-        ValueError: if the matrix is not finite, not orthonormal to 1e-3, or a reflection.
+    A ValueError, which names the argument `name`, if it is not finite, not orthonormal to 1e-3, or a reflection.
     """
     check_shapes((name, matrix, "3 3"))
     M = matrix.detach().double().cpu()

@@ -1,10 +1,11 @@
-"""Cameras along a smooth path through given cameras, cameras once around a scene, and the direction that is up in it."""
+"""Cameras along a smooth path through given cameras, or once around a scene: its size, and the direction that is up in it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import cos, hypot, pi, radians, sin, tan
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,10 +13,10 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
 from .._arrays import Array
-from .._check import ORIGIN, as_array, as_origin, as_tensor, check_range, check_size, check_whole
+from .._card import short_repr
+from .._check import ORIGIN, as_array, as_origin, as_tensor, check_range, check_shapes, check_size, check_whole
 from .._rows import check_finite
-from .bounds import robust_bounds
-from .camera import UP, Camera, at_one_origin, unit_vector
+from .camera import UP, Camera, unit_vector
 from .resample import fits_aspect
 
 SAME = 1e-9  # successive views closer than this, in position and direction, are the same view
@@ -40,10 +41,7 @@ def path_cameras(
 
     Returns:
         Pinhole cameras, `path_0000` and so on, with the smallest `near` of all. Focal lengths and principal points change
-        linearly between the keys.
-
-    Raises:
-        ValueError: if there are fewer than two different views.
+        linearly between the keys. A ValueError if there are fewer than two different views.
     """
     from scipy.interpolate import CubicSpline  # takes a third of a second, which every command would wait
 
@@ -51,7 +49,7 @@ def path_cameras(
     check_whole("every", every, 1)
     if size is not None:
         check_size(size)
-    cameras = at_one_origin(cameras)
+    cameras = [camera.with_origin(cameras[0].origin) for camera in cameras]
     keys = [*cameras[::every], *([cameras[-1]] if cameras and (len(cameras) - 1) % every else [])]
     if len(keys) > 1:
         moved = _durations(*_poses(keys)) > SAME
@@ -74,9 +72,8 @@ def path_cameras(
     near, origin = min(camera.near for camera in cameras), cameras[0].origin
     viewmats = np.tile(np.eye(4), (frames, 1, 1))
     viewmats[:, :3, :3], viewmats[:, :3, 3] = R, t
-    pairs = zip(torch.from_numpy(viewmats), torch.from_numpy(Ks), strict=True)
-    names = (f"path_{number:04d}" for number in range(frames))
-    return [Camera(*pair, width, height, next(names), near=near, origin=origin) for pair in pairs]
+    pairs = enumerate(zip(torch.from_numpy(viewmats), torch.from_numpy(Ks), strict=True))
+    return [Camera(*pair, width, height, f"path_{i:04d}", near=near, origin=origin) for i, pair in pairs]
 
 
 def _poses(keys: Sequence[Camera]) -> tuple[Array, Rotation]:  # [k, 3], k rotations from world to camera
@@ -120,6 +117,53 @@ class Orbit:
         check_range("elevation_degrees", self.elevation_degrees, -90, 90, closed=(False, False))
         check_range("zoom", self.zoom, 0, closed=(False, False))
         check_range("cut", self.cut, 0, 1)
+
+
+class Bounds(NamedTuple):
+    """The box of most points of a cloud, in world units."""
+
+    low: Tensor  # [3] lower corner
+    high: Tensor  # [3] upper corner
+    inside: Tensor  # [P] bool, which points lie in the box
+
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+
+def robust_bounds(points: Tensor, *, coverage: float = 0.98, margin: float = 0.1) -> Bounds:  # [P, 3]
+    """The axis-aligned box of the central `coverage` of the points along each axis, widened by `margin` of its size.
+
+    SfM clouds have points far behind every wall (in Replica's room_0, a room of about 8 m, one is 139 m away), so the
+    minimum and maximum are useless. A ValueError if there are no points.
+    """
+    check_shapes(("points", points := as_tensor("points", points), "P 3"))
+    check_range("coverage", coverage, 0, 1, closed=(False, True))
+    check_range("margin", margin, 0)
+    if len(points) == 0:
+        raise ValueError("points: expected at least one point, got none; give the scene a point cloud first")
+    ordered = points.detach().sort(0).values  # torch.quantile refuses more than 16 million values
+    last = len(points) - 1
+    left_out = int(last * (1 - coverage) / 2)
+    low, high = ordered[left_out], ordered[last - left_out]
+    pad = (high - low) * margin
+    low, high = low - pad, high + pad
+    inside = ((points.detach() >= low) & (points.detach() <= high)).all(-1)
+    return Bounds(low, high, inside)
+
+
+def camera_extent(cameras: Sequence[Camera], points: Tensor) -> float:  # [P, 3]
+    """1.1 times the largest distance of a camera from the cameras' mean, in world units: the size of a scene in 3DGS.
+
+    If all cameras stand in one place, it is the median distance to the points, or 1 without points.
+    """
+    if len(cameras) == 0:
+        raise ValueError("cameras: expected at least one view, got none; the extent of an empty scene is unknown")
+    centers = torch.stack([camera.center.detach().double().cpu() for camera in cameras])
+    mean = centers.mean(0)
+    radius = 1.1 * float((centers - mean).norm(dim=-1).max())
+    if radius > 1e-6 * (1 + float(mean.norm())):
+        return radius
+    return float((points.detach().double().cpu() - mean).norm(dim=-1).median()) if len(points) else 1.0
 
 
 def estimate_up(cameras: Sequence[Camera]) -> Tensor:  # [3] float64, unit

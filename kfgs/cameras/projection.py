@@ -1,4 +1,4 @@
-"""Convert points between the world, the frame of the camera and its pixels; and cameras to kornia's and back.
+"""Convert points between the world, the frame of the camera and its pixels (through the lens); cameras to kornia's and back.
 
 **Convention** (COLMAP's): x right, y down, z forward; the centre of the first pixel is (0.5, 0.5). The camera's matrices
 follow the dtype and device of the points.
@@ -6,18 +6,22 @@ follow the dtype and device of the points.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import reduce
 
+import numpy as np
 import torch
-from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.calibration import distort_points
+from kornia.geometry.camera import PinholeCamera, distort_points_affine, distort_points_kannala_brandt
 from kornia.geometry.conversions import convert_points_from_homogeneous
 from kornia.geometry.depth import depth_to_3d_v2
 from torch import Tensor
 
 from .._check import as_tensor, check_range, check_shapes
-from .camera import Camera, at_one_origin
-from .distortion import fold_radius, plane_to_pixel
+from .camera import Camera, Distortion
+
+MAX_SLOPE = 1e4  # |x / z| beyond which a distorted point is clamped (89.99 degrees): r^6 must not overflow float32
 
 
 def world_to_camera(camera: Camera, points: Tensor) -> Tensor:  # points: [N, 3] -> [N, 3]
@@ -39,6 +43,55 @@ def camera_to_pixel(camera: Camera, points_cam: Tensor) -> Tensor:  # points_cam
     """
     plane = convert_points_from_homogeneous(points_cam)  # finite at z = 0, where project_points_z1 is not
     return plane_to_pixel(plane, camera.K.to(points_cam), camera.distortion)
+
+
+def plane_to_pixel(
+    plane: Tensor,  # [..., 2] points (x / z, y / z)
+    K: Tensor,  # [3, 3]
+    distortion: Distortion | None = None,
+) -> Tensor:  # [..., 2]
+    """Map points of the z = 1 plane to pixels: u = fx D(x, y)_x + cx, v = fy D(x, y)_y + cy, with D the lens.
+
+    D is kornia's `distort_points` or `distort_points_kannala_brandt`, which agree with COLMAP's camera models. K decides where
+    pixel centres are. With a lens, slopes are clamped at 1e4, so that a point at the camera's side gives a large number
+    instead of NaN.
+    """
+    intrinsics = torch.stack([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
+    if distortion is None:
+        return distort_points_affine(plane, intrinsics)
+    coefficients = torch.tensor(distortion.coefficients, dtype=plane.dtype, device=plane.device)
+    plane = plane.clamp(-MAX_SLOPE, MAX_SLOPE)
+    if distortion.model == "kannala_brandt":
+        return distort_points_kannala_brandt(plane, torch.cat([intrinsics, coefficients]))
+    identity = torch.eye(3, dtype=K.dtype, device=K.device)
+    return distort_points(plane.reshape(-1, 2), K, coefficients, new_K=identity).reshape(plane.shape)
+
+
+def fold_radius(distortion: Distortion) -> float:
+    """Radius on the z = 1 plane from which the radial polynomial runs backwards (infinity if it never does).
+
+    Beyond it the model maps far off-axis points *into* the picture a second time, so they must not count as visible.
+    It is the first positive root of the derivative of the distorted radius,
+    r (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6), or for the fisheye of
+    theta (1 + k1 theta^2 + ... + k4 theta^8) with r = tan(theta); tangential terms are ignored.
+    """
+    if distortion.model == "kannala_brandt":
+        k1, k2, k3, k4 = distortion.coefficients
+        theta = math.sqrt(_first_positive_root(np.array([1, 3 * k1, 5 * k2, 7 * k3, 9 * k4])))
+        return math.tan(theta) if theta < math.pi / 2 else math.inf
+    k1, k2, _, _, k3, k4, k5, k6 = (*distortion.coefficients, 0.0, 0.0, 0.0, 0.0)[:8]
+    s = np.polynomial.Polynomial([0, 1])  # r^2
+    numerator = np.polynomial.Polynomial([1, k1, k2, k3])
+    denominator = np.polynomial.Polynomial([1, k4, k5, k6])
+    slope = (numerator + 2 * s * numerator.deriv()) * denominator - 2 * s * numerator * denominator.deriv()
+    return math.sqrt(min(_first_positive_root(slope.coef), _first_positive_root(denominator.coef)))
+
+
+def _first_positive_root(coefficients: np.ndarray) -> float:
+    """Smallest positive real root of a polynomial given from the constant term up; infinity if there is none."""
+    roots = np.polynomial.polynomial.polyroots(coefficients)
+    real = roots.real[np.abs(roots.imag) < 1e-9]
+    return float(min(real[real > 0], default=math.inf))
 
 
 def project_points(
@@ -112,10 +165,8 @@ def to_kornia(cameras: Sequence[Camera]) -> PinholeCamera:
 
     Returns:
         `intrinsics` and `extrinsics` [B, 4, 4] in the widest dtype, `height` and `width` [B] int64, counted from the origin
-        of the first camera. Names, `near` and that origin are lost. `project` does not test for front and border.
-
-    Raises:
-        ValueError: if there is no camera, or one has distortion.
+        of the first camera. Names, `near` and that origin are lost. `project` does not test for front and border. A
+        ValueError if there is no camera, or one has distortion.
 
     Example:
         >>> camera = Camera(torch.eye(4), torch.tensor([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]), 64, 48)
@@ -124,7 +175,7 @@ def to_kornia(cameras: Sequence[Camera]) -> PinholeCamera:
     """
     if not len(cameras):
         raise ValueError("cameras: expected at least one Camera, got none; select a view that the scene has")
-    cameras = at_one_origin(cameras)
+    cameras = [camera.with_origin(cameras[0].origin) for camera in cameras]
     for camera in cameras:
         refuse_distortion(camera)
     dtype = reduce(torch.promote_types, (matrix.dtype for camera in cameras for matrix in (camera.K, camera.viewmat)))

@@ -1,14 +1,19 @@
-"""Resize maps and label maps; the only file that turns [H, W, D] into kornia's [B, D, H, W] and back."""
+"""Resize maps and label maps, and remove a lens from them; the only file that turns [H, W, D] into kornia's [B, D, H, W]."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
+from kornia.geometry import create_meshgrid, remap
+from kornia.geometry.conversions import normalize_points_with_intrinsics
 from kornia.geometry.transform import resize
 from torch import Tensor
 
 from .._check import as_tensor, check_shapes, check_size
+from .camera import Camera
+from .projection import fold_radius, plane_to_pixel
 
 
 def to_bchw(map: Tensor) -> Tensor:  # [H, W, D] -> [1, D, H, W]
@@ -74,3 +79,65 @@ def fits_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Whether two (height, width) have the same aspect, up to one pixel (or cell) of rounding in the smaller one."""
     (h, w), (H, W) = sorted((size, other), key=math.prod)
     return abs(h - H * w / W) <= 1 or abs(w - W * h / H) <= 1
+
+
+def undistort(image: Tensor, camera: Camera) -> tuple[Tensor, Camera, Tensor]:  # image: [H, W, C]; also the mask [H, W]
+    """Undistort a picture or a feature map; K, pose and size stay.
+
+    Each pixel of the result looks up, bilinearly, where its ray fell in the distorted picture. kornia's `undistort_image` does
+    the same two steps (distort the grid, remap), but has no fisheye model and no mask.
+
+    Args:
+        image: any number of channels, floating point, as large as the camera says (a smaller feature map:
+            `camera.resized(h, w)`).
+        camera: the camera that took it. Without distortion the picture is returned unchanged.
+
+    Returns:
+        The picture, 0 at unrecorded pixels; the camera without distortion; and the mask of recorded pixels. Pixels beyond the
+        border of the picture, or beyond the `fold_radius` of the lens model, are not recorded. Within half a pixel of the
+        border the outermost pixel is repeated.
+    """
+    check_shapes(("image", image := as_tensor("image", image), f"{camera.height} {camera.width} C"))
+    if not image.is_floating_point():
+        raise TypeError(f"image: expected floating point, got {image.dtype}; convert it with .float() / 255")
+    if camera.distortion is None:
+        return image, camera, torch.ones(camera.size, dtype=torch.bool, device=image.device)
+    dtype = torch.promote_types(image.dtype, torch.float32)  # half precision cannot tell the pixels of a row apart
+    x, y, recorded = _source_positions(camera, dtype, image.device)
+    # with remap's default align_corners even an identity map changes the picture (kornia#4504)
+    result = remap(to_bchw(image.to(dtype)), x[None], y[None], padding_mode="border", align_corners=True)
+    result = from_bchw(result).where(recorded[..., None], 0).to(image.dtype)
+    return result, replace(camera, distortion=None), recorded
+
+
+def undistort_labels(labels: Tensor, camera: Camera) -> Tensor:  # [H, W] integer -> [H, W], dtype of labels
+    """Remove the lens from a label map: each pixel takes the label of the nearest distorted pixel, unrecorded ones -1.
+
+    Indexed directly, because kornia's `remap` takes floating point only.
+    """
+    check_shapes(("labels", labels, f"{camera.height} {camera.width}"))
+    if labels.is_floating_point() or not torch.iinfo(labels.dtype).min:
+        raise TypeError(f"labels: expected signed integers, got {labels.dtype}; convert them with .long()")
+    if camera.distortion is None:
+        return labels
+    x, y, recorded = _source_positions(camera, torch.promote_types(camera.K.dtype, torch.float32), labels.device)
+    rows = (y + 0.5).floor().long().clamp(0, camera.height - 1)
+    columns = (x + 0.5).floor().long().clamp(0, camera.width - 1)
+    return labels[rows, columns].where(recorded, -1)
+
+
+def _source_positions(
+    camera: Camera, dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor, Tensor]:  # [H, W], [H, W], [H, W] bool
+    """Where in the distorted picture each undistorted pixel lies, counting pixel *centres* from 0, and whether it does.
+
+    kornia's grid and remap put centres on integers, so K is shifted by half a pixel here.
+    """
+    assert camera.distortion is not None
+    height, width = camera.size
+    K = camera.intrinsics_at_integer_centers.to(device=device, dtype=dtype)
+    grid = create_meshgrid(height, width, normalized_coordinates=False, device=device, dtype=dtype)[0]
+    plane = normalize_points_with_intrinsics(grid, K)
+    x, y = plane_to_pixel(plane, K, camera.distortion).unbind(-1)
+    recorded = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
+    return x, y, recorded & (plane.norm(dim=-1) < fold_radius(camera.distortion))

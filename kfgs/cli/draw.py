@@ -85,7 +85,7 @@ def render(
 
 def _opened(names: Any, semantic: Any, colors: Any) -> tuple[Any, Any]:
     """Both clouds without the ceiling (of the colours, what is near it) and without what lies far outside."""
-    from ..cameras.bounds import robust_bounds
+    from ..cameras.paths import robust_bounds
 
     box = robust_bounds(semantic.means.double(), margin=0.02)
 

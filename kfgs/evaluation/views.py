@@ -9,7 +9,7 @@ from pathlib import Path
 from torch import Tensor
 
 from .._files import Names
-from ..cameras.distortion import undistort_labels
+from ..cameras.resample import undistort_labels
 from ..scenes import Scene
 from ..scenes.files import some
 from ..scenes.scene import as_taken

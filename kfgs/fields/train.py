@@ -20,7 +20,7 @@ from .._card import short_repr
 from .._check import ORIGIN, Progress, as_progress, as_tensor
 from .._files import as_path, atomic_path, digest_value
 from ..cameras import Camera
-from ..cameras.bounds import camera_extent
+from ..cameras.paths import camera_extent
 from ..gaussians import Gaussians, check_gaussians
 from ..splat import rasterize
 from .loss import ColorLoss, Loss, l1_loss

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from .._check import check_whole
 from .._files import atomic_folder
-from ..cameras.bounds import robust_bounds
+from ..cameras.paths import robust_bounds
 from .colmap_model import ColmapModel
 from .files import MAX_NUMBER, SceneError
 

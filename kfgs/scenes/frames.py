@@ -16,8 +16,8 @@ from torch import Tensor
 from .._check import as_tensor, check_shapes
 from .._files import file_stem, folded_name
 from .._rows import check_finite
-from ..cameras.bounds import robust_bounds
 from ..cameras.camera import Camera
+from ..cameras.paths import robust_bounds
 from ..cameras.similarity import Similarity, fit_similarity
 from .files import SceneError, some
 

@@ -15,9 +15,9 @@ from torch import Tensor
 from .._card import html_card
 from .._check import ORIGIN, check_shapes
 from .._files import Names, file_stem
-from ..cameras.bounds import camera_extent
 from ..cameras.camera import NEAR, Camera
-from ..cameras.distortion import undistort
+from ..cameras.paths import camera_extent
+from ..cameras.resample import undistort
 from .files import SceneError, read_alpha, read_image, read_mask, shrink_mask, some
 
 # Of the extent: 3DGS's near plane of 0.2 suits cameras 2 m apart; in smaller scenes it must be smaller.

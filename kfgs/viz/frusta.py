@@ -11,7 +11,6 @@ from torch import Tensor
 
 from .._check import as_array, check_range, check_shapes
 from ..cameras import Camera
-from ..cameras.camera import at_one_origin
 from .colors import Array
 from .linked import evenly
 from .pictures import as_bytes
@@ -58,7 +57,8 @@ def add_cameras(
         raise ValueError("cameras: expected at least one camera, got none; load a scene with views")
     if not callable(images) and len(images) not in (0, len(cameras)):
         raise ValueError(f"images: expected {len(cameras)} (one per camera), got {len(images)}; give one for each")
-    centers = np.stack([as_array(camera.center) for camera in at_one_origin(cameras)]).astype(np.float64)
+    places = [camera.with_origin(cameras[0].origin).center for camera in cameras]
+    centers = np.stack([as_array(place) for place in places]).astype(np.float64)
     depth = size if size is not None else 0.05 * float(np.ptp(centers, axis=0).max()) or 0.2
     check_range("size", depth, 0, closed=(False, False))
     chosen = evenly(len(cameras), most)

@@ -6,7 +6,7 @@ import torch
 from oracles_cameras import LENSES
 
 from kfgs.cameras import Distortion
-from kfgs.cameras.distortion import fold_radius, plane_to_pixel
+from kfgs.cameras.projection import fold_radius, plane_to_pixel
 
 K = torch.tensor([[70.0, 0.0, 50.0], [0.0, 66.0, 30.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
 

@@ -6,7 +6,7 @@ from messages import tells
 from oracles_cameras import HEIGHT, LENSES, WIDTH, colmap_camera, colmap_pixels, pixel_rays
 
 from kfgs.cameras import Camera, Distortion, undistort
-from kfgs.cameras.distortion import undistort_labels
+from kfgs.cameras.resample import undistort_labels
 
 
 def camera_of(model, dtype=torch.float64):

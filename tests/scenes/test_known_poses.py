@@ -110,7 +110,7 @@ def test_poses_that_do_not_fit_are_refused(posed: Scene) -> None:
 
 
 def test_each_lens_reaches_pycolmap(posed: Scene) -> None:
-    from kfgs.cameras.distortion import plane_to_pixel
+    from kfgs.cameras.projection import plane_to_pixel
     from kfgs.scenes.known_poses import _reconstruction
 
     pycolmap = import_pycolmap()

@@ -8,7 +8,7 @@ from colmap_models import write_picture
 from messages import tells
 
 from kfgs.cameras import Camera, Distortion
-from kfgs.cameras.distortion import undistort
+from kfgs.cameras.resample import undistort
 from kfgs.scenes import Scene, SceneError
 
 K = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
