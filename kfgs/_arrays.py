@@ -1,29 +1,45 @@
-"""Read arrays and tensors from files that others wrote: `.npy`, `.npz`, `.safetensors`; write the last.
+"""Read arrays and tensors from files that others wrote: `.npy`, `.npz`, `.safetensors`, files of `torch.save`.
 
-Nothing pickled is ever loaded, and an archive unpacks to a limited size. What is wrong with a file becomes one `FileError`.
+Nothing that a file names is run or imported, and an archive unpacks to a limited size. What is wrong with a file becomes one
+`FileError`, if it is missing a FileNotFoundError; `expected` and `advice` of all readers are parts of the messages.
 """
 
 from __future__ import annotations
 
 import json
+import re
 import struct
+import threading
+import warnings
 import zipfile
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
+from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
 
 from ._check import one_line
 from ._files import as_path
 
 Array = NDArray[Any]
 AGAIN = "copy it again, or write it again"
+SAVE = "download it again, or save the state_dict() with torch.save or as .safetensors where you trust it"
+_LOCK = threading.Lock()  # the names that torch allows are global
+_KINDS = (
+    (b"version https://git-lfs", "a Git LFS pointer, not the file itself: run `git lfs pull` where it came from"),
+    (b"<", "an HTML or XML page: the download failed, most likely behind a login"),
+    (b"{", "a JSON file, not the weights"),
+    (b"\x1f\x8b", "a gzip file: unpack it first"),
+)
 
 
 class FileError(ValueError):
@@ -36,12 +52,7 @@ def most_unpacked(packed: int) -> int:
 
 
 def read_array(path: str | Path, expected: str = "an .npy file of numbers", advice: str = AGAIN) -> Array:
-    """Map a `.npy` file into memory: values are read when they are used, and cannot be written.
-
-    Raises:
-        FileNotFoundError: if there is no such file. `expected` and `advice` are parts of the messages.
-        FileError: if it is not a `.npy` file of numbers, is damaged or cut short, or states more values than it has.
-    """
+    """Map a `.npy` file of numbers into memory: values are read when they are used, and cannot be written."""
     with reading(path, expected, advice):
         return _numbers(np.lib.format.open_memmap(as_path(path), mode="r"))
 
@@ -49,20 +60,20 @@ def read_array(path: str | Path, expected: str = "an .npy file of numbers", advi
 def read_arrays(
     path: str | Path, expected: str = "an .npz file of arrays", advice: str = AGAIN, *, most: int | None = None
 ) -> dict[str, Array]:
-    """Read all arrays of an `.npz` file, by name.
-
-    Raises:
-        FileNotFoundError: if there is no such file. `expected` and `advice` are parts of the messages.
-        FileError: if it is not an `.npz` file of numbers and texts, is damaged, or unpacks to more than `most` bytes (None:
-            what `most_unpacked` allows).
-    """
-    with reading(path, expected, advice), zipfile.ZipFile(path) as archive:
-        total = sum(entry.file_size for entry in archive.infolist())
-        most = most_unpacked(as_path(path).stat().st_size) if most is None else most
-        if total > most:
-            raise ValueError(f"it would unpack to {total} bytes, expected at most {most}")
+    """Read all arrays of numbers and texts of an `.npz` file, by name; `most` bytes (None: what `most_unpacked` allows)."""
+    with reading(path, expected, advice):
+        _check_unpacked(as_path(path), most)
         with np.load(as_path(path), allow_pickle=False) as arrays:
             return {name: _numbers(array) for name, array in arrays.items()}
+
+
+def _check_unpacked(path: Path, most: int | None = None) -> None:
+    """Raise a ValueError if a zip archive would unpack to more bytes than it may."""
+    with zipfile.ZipFile(path) as archive:
+        total = sum(entry.file_size for entry in archive.infolist())
+    most = most_unpacked(path.stat().st_size) if most is None else most
+    if total > most:
+        raise ValueError(f"it would unpack to {total} bytes, expected at most {most}")
 
 
 def _numbers(array: Any) -> Array:
@@ -81,14 +92,7 @@ def read_safetensors(
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """Read all tensors of a `.safetensors` file, and the texts of its metadata. Values are mapped, and read when used.
 
-    Args:
-        path: the file.
-        expected, advice: parts of the messages.
-        kfgs: the kind and the version that the metadata must state under "kfgs" and "version".
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        FileError: if it is another file, damaged, cut short, or of another kind or version.
+    `kfgs`: the kind and the version that the metadata must state under "kfgs" and "version".
     """
     with reading(path, expected, advice), safe_open(path, framework="pt") as file:
         metadata = dict(file.metadata() or {})
@@ -121,9 +125,7 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[st
 def reading(path: str | Path, expected: str, advice: str = AGAIN) -> Iterator[None]:
     """Turn whatever fails while a file is read, and its content checked, into a `FileError`.
 
-    Raises:
-        FileNotFoundError: if there is no such file. `expected` and `advice` are parts of the messages.
-        FileError: if the block fails. One of the block itself is raised as it is, and so is a PermissionError.
+    A FileError of the block itself is raised as it is, and so is a PermissionError. A FileNotFoundError if there is no file.
     """
     if not as_path(path).is_file():
         raise FileNotFoundError(f"{path}: no such file; expected {expected} there; {advice}")
@@ -135,3 +137,60 @@ def reading(path: str | Path, expected: str, advice: str = AGAIN) -> Iterator[No
         kind = "" if isinstance(error, ValueError | OSError) else f"{type(error).__name__}: "
         why = f"{kind}{one_line(error, 160)}".rstrip(": ")
         raise FileError(f"{path}: expected {expected}, but it cannot be read ({why}); {advice}") from error
+
+
+class _Empty:
+    """An object of an unknown class; it ignores its arguments and its state."""
+
+    def __init__(self, *_: Any) -> None: ...
+    def __setstate__(self, state: Any) -> None: ...
+
+
+class _Items:
+    """Stands for an unknown class that may derive from dict. Of all dicts, torch lets only a Counter have items and a state."""
+
+    def __new__(cls, *_: Any) -> Any:
+        return Counter()
+
+
+def read_torch(path: Path, expected: str, advice: str = SAVE) -> Any:
+    """The object in a file of `torch.save`, on the CPU. Tensors of a zip archive are views of the file.
+
+    `torch.load(weights_only=True)` refuses files that name classes it does not know, as the settings in Lightning's files do.
+    Here each of these names stands for an empty object; nothing is imported.
+    """
+    with reading(path, expected, advice):
+        with path.open("rb") as file:
+            head = file.read(64).lstrip()
+        kind = next((words for start, words in _KINDS if head.startswith(start)), None)
+        if kind is not None:
+            raise FileError(f"{path}: expected {expected}, got {kind}; {advice}")
+        zipped = head.startswith(b"PK")
+        with _LOCK, warnings.catch_warnings(), safe_globals(_stand_ins(path) if zipped else []):
+            warnings.simplefilter("ignore")  # about old storages
+            try:
+                return torch.load(path, map_location="cpu", mmap=zipped, weights_only=True)
+            except UnpicklingError as error:  # a page of text, with the reason inside
+                reason = re.split(r"\n\n|error: ", str(error).partition("\n\nCheck the documentation")[0].strip())[-1]
+                raise ValueError(f"{reason.strip()} Nothing was run") from error
+
+
+def _stand_ins(path: Path) -> list[Any]:
+    """What torch makes for each name in an archive that it does not know."""
+    _check_unpacked(path)
+    names = get_unsafe_globals_in_checkpoint(path)
+    return [_Empty, *((_Empty if name.startswith("numpy") else type(name, (_Items,), {}), name) for name in names)]
+
+
+def plain_tensor(path: Path, name: str, value: object, dtype: torch.dtype | None = torch.float32) -> Tensor:
+    """A dense tensor of a file as numbers of `dtype` (None: its own), without its graph.
+
+    A FileError if it is something else, or repeats its values by strides.
+    """
+    if not isinstance(value, Tensor) or value.layout != torch.strided or value.is_quantized or value.is_meta:
+        kind = "another kind" if isinstance(value, Tensor) else type(value).__name__
+        raise FileError(f"{path}: expected a dense tensor for {name}, got {kind}; is this another program's file?")
+    held = value.untyped_storage().nbytes() // value.element_size()
+    if value.numel() > held:  # a few bytes could fill the memory
+        raise FileError(f"{path}: {name} has {list(value.shape)} values, the file only {held}; save it contiguous")
+    return value.detach() if dtype is None else value.detach().to(dtype)

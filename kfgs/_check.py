@@ -73,13 +73,10 @@ def check_shapes(*arguments: tuple[str, Any, str | tuple[str | int, ...]]) -> di
 
 
 def as_tensor(name: str, value: Any, *, floating: bool = False) -> Tensor:
-    """A tensor as it is; a NumPy array or a list of numbers as a tensor.
+    """A tensor as it is; a NumPy array or a list of numbers as a tensor; a TypeError if it is something else.
 
     The tensor shares the memory of a NumPy array where torch can. The floats of a list get torch's default type, and so do
-    its whole numbers if `floating` numbers are required.
-
-    Raises:
-        TypeError: if it is something else, or not of floating point; the message says what to pass instead.
+    its whole numbers if `floating` numbers are required (another TypeError). The messages say what to pass instead.
     """
     if not isinstance(value, Tensor):
         value = _from_numbers(name, value, floating)
@@ -111,10 +108,7 @@ def _from_numbers(name: str, value: Any, floating: bool) -> Tensor:
 def as_array(values: Any, name: str = "values") -> np.ndarray[Any, Any]:
     """A tensor's values as a NumPy array, from any device and without its gradient; lists and arrays through NumPy.
 
-    NumPy has no bfloat16: such values become float32.
-
-    Raises:
-        TypeError: if it is a text, or one of our objects that holds tensors.
+    NumPy has no bfloat16: such values become float32. A TypeError for a text, or one of our objects that holds tensors.
     """
     if isinstance(values, Tensor):
         dense = values.detach().cpu()
@@ -198,10 +192,8 @@ def one_line(text: object, length: int = 60) -> str:
 def class_indices(name: str, names: Sequence[str], otherwise: str = "take one of these classes") -> tuple[int, ...]:
     """The labels of a class, ascending. There are several if several classes have the same name.
 
-    A name is looked up exactly, then without regard to case, if only one spelling fits.
-
-    Raises:
-        ValueError: if the name is unknown. The message offers similar names; if there are none, the advice is `otherwise`.
+    A name is looked up exactly, then without regard to case, if only one spelling fits. A ValueError if it is unknown; the
+    message offers similar names, or if there are none the advice `otherwise`.
 
     Example:
         >>> class_indices("chair", ["chair", "wall", "chair"]), class_indices("Wall", ["chair", "wall"])

@@ -27,10 +27,6 @@ UNNAMED = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)  # e
 _ENDING = re.compile(r"(?<=[^/])\.[A-Za-z][A-Za-z0-9]{1,4}$")  # .png, not the .5 of `shot.5`, which may be a stem
 
 
-class InUseError(ValueError):
-    """Another process works in a folder."""
-
-
 def as_path(path: str | Path) -> Path:
     """A path as a user wrote it, with `~` as the home folder; a ValueError for an empty text."""
     if path == "":
@@ -46,9 +42,8 @@ def real_path(path: str | Path) -> Path:
 def check_output(name: str, path: str | Path, kind: Literal["a file", "a folder"]) -> Path:
     """Check before long work that its result can be written to `path`, which need not exist; return it with `~` expanded.
 
-    Raises:
-        ValueError: if the path is empty, something of another kind is there, or a file is in place of a folder above it.
-        OSError: if it cannot be written to. The messages name the argument, `name`.
+    A ValueError if the path is empty, something of another kind is there, or a file is in place of a folder above it; an
+    OSError if it cannot be written to. The messages name the argument, `name`.
     """
     target = as_path(path)
     got = "a folder" if target.is_dir() else "a file" if target.is_file() else "a pipe or a device"
@@ -109,17 +104,14 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 @contextmanager
 def _aside(target: Path) -> Iterator[Path]:
     """A new hidden folder next to `target`, deleted in the end. Errors of writing name the target."""
+    place = Path(f"{target.parent}/{ASIDE}{os.getpid()}-{os.urandom(4).hex()}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        place = Path(f"{target.parent}/{ASIDE}{os.getpid()}-{os.urandom(4).hex()}")
         place.mkdir()
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(target)) from error
-    try:
         yield place
     except OSError as error:
         short = error.errno in UNNAMED or "requested and" in str(error)  # the last: NumPy's
-        if str(place) not in str(error.filename) and not (error.filename is None and short):
+        if place.is_dir() and str(place) not in str(error.filename) and not (error.filename is None and short):
             raise  # another file's
         raise OSError(error.errno or errno.ENOSPC, error.strerror or str(error), str(target)) from error
     except SafetensorError as error:
@@ -131,23 +123,20 @@ def _aside(target: Path) -> Iterator[Path]:
 
 @contextmanager
 def locked(folder: Path, name: str) -> Iterator[None]:
-    """Keep other processes out of a folder, which is made if it does not exist (InUseError if one is in it).
+    """Keep other processes out of a folder, which is made if it does not exist (ValueError if one is in it).
 
     `name` is that of the lock file, which stays. The system ends the lock with its process.
     """
     check_output("folder", folder, "a folder").mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / name)
     try:
-        lock.acquire(timeout=0)
+        lock = FileLock(folder / name).acquire(timeout=0)
     except Timeout as error:
-        raise InUseError(
+        raise ValueError(
             f"{folder}: expected a folder that no other process writes to, got one in use; wait until that process has "
             "ended, or name another folder"
         ) from error
-    try:
+    with lock:
         yield
-    finally:
-        lock.release()
 
 
 def write_json(path: str | Path, value: Any) -> None:
@@ -245,15 +234,14 @@ class Names:
         """The one of the names that is meant; None if there is none, or it is not clear which."""
         if name in self.names:
             return name
-        stems, folded, folded_stems, bare = self._tables
         parts = folded_name(name).split("/")
-        ways = [(stems, name)]
+        ways = [("stem", name)]
         for i in range(len(parts)):
             tail = "/".join(parts[i:])
-            ways += [(folded, tail), (folded_stems, tail), (folded_stems, _ENDING.sub("", tail))]
+            ways += [("folded", tail), ("folded stem", tail), ("folded stem", _ENDING.sub("", tail))]
         if self.bare and len(parts) == 1:
-            ways += [(bare, parts[0]), (bare, _ENDING.sub("", parts[0]))]
-        fits = next((table[word] for table, word in ways if word in table), [])
+            ways += [("bare", parts[0]), ("bare", _ENDING.sub("", parts[0]))]
+        fits = next((self._spellings[way] for way in ways if way in self._spellings), [])
         return fits[0] if len(fits) == 1 else None
 
     def find_each(self, names: Iterable[str]) -> list[str | None]:
@@ -271,14 +259,13 @@ class Names:
         return f"did you mean {keys[near[0]]!r}?" if near else "there are no names to choose from"
 
     @cached_property
-    def _tables(self) -> tuple[dict[str, list[str]], ...]:
+    def _spellings(self) -> dict[tuple[str, str], list[str]]:
         """The names by their stems, folded, by folded stems, and by folded names and stems without folders."""
-        tables: tuple[dict[str, list[str]], ...] = ({}, {}, {}, {})
+        spellings: dict[tuple[str, str], list[str]] = {}
         for name in self.names:
             stem, plain = file_stem(name), folded_name(name)
-            folded_stem = folded_name(stem)
-            bare = {plain.rpartition("/")[2], folded_stem.rpartition("/")[2]}
-            for table, words in zip(tables, ({stem}, {plain}, {folded_stem}, bare), strict=True):
-                for word in words:
-                    table.setdefault(word, []).append(name)
-        return tables
+            folded = folded_name(stem)
+            bare = (("bare", word.rpartition("/")[2]) for word in (plain, folded))
+            for spelling in {("stem", stem), ("folded", plain), ("folded stem", folded), *bare}:
+                spellings.setdefault(spelling, []).append(name)
+        return spellings

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import cache
 
 
 class Repair(str):
@@ -19,21 +20,18 @@ class Wait(str):
     """A note that something takes long; commands print it next to the progress bars."""
 
 
-_listeners: list[tuple[Callable[[str], None], bool]] = []  # whom to tell, and whether readers are strict
-_logged: set[str] = set()
+@cache  # each different note once
+def _log(note: str) -> None:
+    logging.getLogger("kfgs").log(logging.INFO if isinstance(note, Wait) else logging.WARNING, note)
+
+
+_listeners: list[tuple[Callable[[str], None], bool]] = [(_log, False)]  # the last is told; whether readers are strict
 
 
 @contextmanager
 def hear(say: Callable[[str], None], *, strict: bool = False) -> Iterator[None]:
     """Call `say` with each different note until the block ends; with `strict` readers refuse what they would leave out."""
-    told: set[str] = set()
-
-    def once(note: str) -> None:
-        if note not in told:
-            told.add(note)
-            say(note)
-
-    listener = once, strict
+    listener = cache(say), strict
     _listeners.append(listener)
     try:
         yield
@@ -43,11 +41,7 @@ def hear(say: Callable[[str], None], *, strict: bool = False) -> Iterator[None]:
 
 def tell(note: str) -> None:
     """Pass a note to the command that listens; if there is none, log it."""
-    if _listeners:
-        _listeners[-1][0](note)
-    elif note not in _logged:
-        _logged.add(note)
-        logging.getLogger("kfgs").log(logging.INFO if isinstance(note, Wait) else logging.WARNING, note)
+    _listeners[-1][0](note)
 
 
 def is_strict() -> bool:

@@ -1,6 +1,7 @@
 """Coordinates far from zero (UTM, ECEF, site grids): in memory they are float32, counted from an origin in float64.
 
-Readers parse in float64 and call `choose_origin` and `to_local`; answers and files for people pass through `to_world`.
+Readers parse in float64, and keep what `recounted` from `choose_origin` is in float32. Answers and files for people pass through
+`to_world`.
 """
 
 from __future__ import annotations
@@ -44,11 +45,6 @@ def recounted(points: Tensor, origin: Origin, other: Origin) -> Tensor:  # [...,
     """Places counted from another origin: in float64, or as they are if it is the same."""
     shift = [a - b for a, b in zip(origin, other, strict=True)]
     return points.double() + points.new_tensor(shift, dtype=torch.float64) if any(shift) else points
-
-
-def to_local(points: Tensor, origin: Origin) -> Tensor:  # [N, 3] of the world -> [N, 3] float32
-    """Places counted from an origin, in float32."""
-    return recounted(points, ORIGIN, origin).float()
 
 
 def to_world(points: Tensor, origin: Origin) -> Tensor:  # [..., 3]

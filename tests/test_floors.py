@@ -20,7 +20,7 @@ FLOORS = (
     {"_card"},
     {"_check", "_files", "_interrupts", "_notes", "_rows"},
     {"_arrays", "_origin"},
-    {"_torch_files", "gaussians", "cameras"},
+    {"gaussians", "cameras"},
     {"splat", "quant", "metrics"},
     {"formats"},
     {"scenes", "labels"},

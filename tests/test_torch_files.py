@@ -12,7 +12,7 @@ import torch
 from messages import tells
 from pickled import CONTAINERS, Call, archive, text, zip_of
 
-from kfgs._torch_files import plain_tensor, read_torch
+from kfgs._arrays import plain_tensor, read_torch
 
 GETATTR = b"cbuiltins\ngetattr\n"
 

@@ -19,9 +19,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._arrays import FileError, reading
+from .._arrays import FileError, plain_tensor, read_torch, reading
 from .._files import read_json
-from .._torch_files import plain_tensor, read_torch
 from ..cameras.similarity import Similarity
 from ..gaussians import Gaussians
 from ..splat.transform import transform_gaussians

@@ -31,7 +31,7 @@ from .._card import short_repr
 from .._check import ORIGIN
 from .._files import as_path
 from .._notes import is_strict
-from .._origin import choose_origin, describe_origin, to_local
+from .._origin import choose_origin, describe_origin, recounted
 from ..gaussians import Gaussians, check_gaussians
 from .encodings import morton_order
 from .ply_3dgs import plain_cloud
@@ -132,7 +132,7 @@ def read_rows(path: str | Path, *, strict: bool = False) -> tuple[Gaussians, Ten
     if gaussians.origin != ORIGIN:  # the file has its own
         return gaussians.replace(means=gaussians.means.float()), kept
     origin = choose_origin(gaussians.means)
-    return gaussians.replace(means=to_local(gaussians.means, origin), origin=origin), kept
+    return gaussians.replace(means=recounted(gaussians.means, ORIGIN, origin).float(), origin=origin), kept
 
 
 def write_splats(

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from .._files import read_text
 from .._notes import Repair
-from .._origin import choose_origin, describe_origin, to_local
+from .._origin import ORIGIN, choose_origin, describe_origin, recounted
 from ..cameras.camera import ROTATION_TOLERANCE, Camera, Distortion
 from ..cameras.projection import unproject_depth
 from ..cameras.resample import fits_aspect
@@ -139,7 +139,7 @@ def scene_of_poses(
     told += describe_origin(origin, "cameras and points")
     splits = {"train": list(range(len(local))), "test": []}
     with files.scene_error(f"{path}: "):  # names that do not differ
-        scene = Scene(local, paths, to_local(places, origin), colors, splits, tuple(told))
+        scene = Scene(local, paths, recounted(places, ORIGIN, origin).float(), colors, splits, tuple(told))
     return replace(scene.with_near(), masks=masks if any(masks) else None)
 
 

@@ -7,10 +7,9 @@ from typing import Any
 
 from torch import Tensor
 
-from .._arrays import read_safetensors
+from .._arrays import SAVE, plain_tensor, read_safetensors, read_torch
 from .._check import one_line
 from .._files import as_path
-from .._torch_files import SAVE, plain_tensor, read_torch
 
 _EXPECTED = "a checkpoint (.ckpt, .pt, .pth or .safetensors)"
 _STATES = ("state_dict", "model_state_dict", "model", "module", "net", "network", "params")  # usual keys

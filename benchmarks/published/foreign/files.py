@@ -9,8 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kfgs._arrays import FileError
-from kfgs._torch_files import plain_tensor, read_torch
+from kfgs._arrays import FileError, plain_tensor, read_torch
 from kfgs.formats.table import numbered_files
 from kfgs.gaussians import Gaussians
 

@@ -13,9 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kfgs._arrays import read_array
+from kfgs._arrays import read_array, read_torch
 from kfgs._files import as_path
-from kfgs._torch_files import read_torch
 from kfgs.formats.table import read_rows
 
 from .files import finite_tensor
