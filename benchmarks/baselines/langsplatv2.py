@@ -98,7 +98,7 @@ def fit(task: Task, config: LangSplatV2Config) -> Fitted:
     clock, frozen, maps, generator = Clock(), task.frozen, KeptMaps(task.maps), task.generator()
     with clock.stage("codes"):
         rows = unit_rows(sample_rows(maps, config.rows, generator))
-        codes = spherical_kmeans(rows, torch.ones(len(rows)), CODES, generator=generator).centres
+        codes = spherical_kmeans(rows, torch.ones(len(rows)), CODES, generator=generator)[0]
     model, schedule = Mixtures(len(frozen), codes, config, generator), Schedule(config.steps, config.pixels)
     with clock.stage("mixtures"):
         history = train(frozen, task.cameras, maps, model, schedule, generator=generator, progress=task.progress)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from .._check import check_shapes, check_whole
 from ..gaussians import Gaussians
-from ..quant.grow import spherical_kmeans
+from ..quant.grow import group_sums, spherical_kmeans
 from ..splat import covariance_3d
 
 CLUSTERS = 64
@@ -33,7 +33,7 @@ class Merged(NamedTuple):
     def pool(self, values: Tensor) -> Tensor:  # [N, ...] -> [M, ...]
         """Sums over the members of each merged Gaussian, for instance of their weights."""
         kept = self.group >= 0
-        return _sum(values[kept], self.group[kept], len(self.gaussians))
+        return group_sums(values[kept], self.group[kept], len(self.gaussians))
 
 
 def merge_gaussians(
@@ -77,7 +77,7 @@ def merge_gaussians(
     if len(rows) <= maximum:
         groups[rows] = torch.arange(len(rows), device=rows.device)
         return Merged(kept, groups)
-    kinds = spherical_kmeans(kept.features, worth, CLUSTERS, generator=generator).index
+    kinds = spherical_kmeans(kept.features, worth, CLUSTERS, generator=generator)[1].codeword
     group, count = _smallest_voxels(kept.means, kinds, worth, maximum)
     groups[rows] = group
     return Merged(_match_moments(kept, worth, group, count), groups)
@@ -110,8 +110,8 @@ def _groups(means: Tensor, low: Tensor, edge: float, kinds: Tensor, worth: Tenso
     cube = torch.unique(column * sides[2] + cells[:, 2], return_inverse=True)[1]
     pairs, group = torch.unique(cube * (kinds.max() + 1) + kinds, return_inverse=True)
     cube_of = pairs // (kinds.max() + 1)  # [M]
-    weight = _sum(worth, group, len(pairs))
-    share = weight / _sum(weight, cube_of, int(cube_of.max()) + 1)[cube_of]
+    weight = group_sums(worth, group, len(pairs))
+    share = weight / group_sums(weight, cube_of, int(cube_of.max()) + 1)[cube_of]
     order = weight.argsort(stable=True)
     order = order[cube_of[order].argsort(stable=True)]  # by cube, and in a cube by weight
     heaviest = order[torch.bincount(cube_of).cumsum(0) - 1]  # the last of each cube
@@ -120,32 +120,28 @@ def _groups(means: Tensor, low: Tensor, edge: float, kinds: Tensor, worth: Tenso
     return renumbered, len(left)
 
 
-def _sum(values: Tensor, group: Tensor, count: int) -> Tensor:  # [n, ...], [n] -> [M, ...]
-    return values.new_zeros(count, *values.shape[1:]).index_add_(0, group, values)
-
-
 def _match_moments(cloud: Gaussians, worth: Tensor, group: Tensor, count: int) -> Gaussians:
     """The merged Gaussian of each group."""
     assert cloud.features is not None
-    share = (worth.double() / _sum(worth.double(), group, count)[group])[:, None]  # [n, 1]
+    share = (worth.double() / group_sums(worth.double(), group, count)[group])[:, None]  # [n, 1]
     places = cloud.means.double()
-    means = _sum(share * places, group, count)
+    means = group_sums(share * places, group, count)
     away = places - means[group]
     own = covariance_3d(cloud.quats, cloud.scales).double()
     between = away[:, :, None] * away[:, None, :]
-    covariances = _sum(share[:, :, None] * (own + between), group, count)
+    covariances = group_sums(share[:, :, None] * (own + between), group, count)
     variances, axes = torch.linalg.eigh(covariances)
     smallest = torch.finfo(cloud.means.dtype).eps * variances[:, 2:]  # a flat group still has a thickness
     scales = torch.maximum(variances, smallest).sqrt()
     axes = axes * torch.linalg.det(axes).sign()[:, None, None]  # a rotation, not a reflection
-    covered = _sum(cloud.opacities.double() * _area(cloud.scales.double()), group, count)
+    covered = group_sums(cloud.opacities.double() * _area(cloud.scales.double()), group, count)
     opacities = (covered / _area(scales)).clamp(*OPACITY)
     return cloud.replace(
         means=means.to(cloud.means),
         quats=rotation_matrix_to_quaternion(axes.contiguous()).to(cloud.means),
         scales=scales.to(cloud.means),
         opacities=opacities.to(cloud.means),
-        features=_sum(share.to(cloud.features) * cloud.features, group, count),
+        features=group_sums(share.to(cloud.features) * cloud.features, group, count),
     )
 
 

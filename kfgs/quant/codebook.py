@@ -134,7 +134,7 @@ def nearest_rows(
     targets: Tensor,  # [K, D]
     *,
     euclidean: bool = False,
-) -> tuple[Tensor, Tensor]:  # [N] int64, [N]
+) -> Nearest:
     """The target with the largest product x.t with each row, and this product. Ties go to the lowest index.
 
     With unit targets it is the one in the most similar direction. `euclidean`: the nearest point, of largest x.t - |t|^2 / 2.
@@ -146,7 +146,7 @@ def nearest_rows(
         products = part @ columns if offsets is None else torch.addmm(offsets, part, columns)
         best.append(largest(products[:, :K]))
     number, index = (torch.cat(parts) for parts in zip(*best, strict=True))
-    return index, number
+    return Nearest(index, number)
 
 
 def coverage(similarity: Tensor, alpha: float) -> dict[str, float]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -53,20 +53,19 @@ class GrownCodebook:
         pool = torch.cat([unit_rows(read(i)) for i in bar])
         if len(pool) == 0:
             raise all_zero(maps)
-        cells, rounds = grow(pool, self.maximum, generator)
-        stays = prune(cells.centres, threshold=self.prune_above)
-        if pruned := len(cells.centres) - len(stays):
-            cells = refine(pool, cells.centres[stays], ROUNDS)
-        alpha = float(cells.similarity.sort().values[int((1 - COVERAGE) * (len(pool) - 1))])
+        centres, nearest, rounds = grow(pool, self.maximum, generator)
+        stays = prune(centres, threshold=self.prune_above)
+        if pruned := len(centres) - len(stays):
+            centres, nearest = refine(pool, centres[stays], ROUNDS)
+        alpha = float(nearest.similarity.sort().values[int((1 - COVERAGE) * (len(pool) - 1))])
         history: list[dict[str, Any]] = []
         for number, (size, added, similarity) in enumerate(rounds):
             history.append({"round": number, "size": size, "added": added, "pruned": 0} | coverage(similarity, alpha))
-        history[-1] |= {"size": len(cells.centres), "pruned": pruned}
+        history[-1] |= {"size": len(centres), "pruned": pruned}
         if callable(progress):
             for record in history:
                 progress(dict(record))
-        codewords = cells.centres * (CODEWORD_RMS * cells.centres.shape[1] ** 0.5)
-        return with_report(codewords, history, Nearest(cells.index, cells.similarity), alpha)
+        return with_report(centres * (CODEWORD_RMS * centres.shape[1] ** 0.5), history, nearest, alpha)
 
 
 def fit_codebook(
@@ -112,14 +111,6 @@ def fit_codebook(
     return options.fit(read, count, generator, as_progress(progress))
 
 
-class Cells(NamedTuple):
-    """Centres, and the nearest centre of each feature."""
-
-    centres: Tensor  # [K, D] unit rows
-    index: Tensor  # type: ignore[assignment]  # [n] int64
-    similarity: Tensor  # [n]
-
-
 def spherical_kmeans(
     features: Tensor,  # [n, D]
     weights: Tensor,  # [n] >= 0
@@ -127,7 +118,7 @@ def spherical_kmeans(
     *,
     rounds: int = 10,
     generator: torch.Generator | None = None,
-) -> Cells:
+) -> tuple[Tensor, Nearest]:  # [K, D] unit centres, and the nearest of each feature
     """Group features by direction: each joins the centre of largest cosine; a centre is the mean direction of its features.
 
     The first centres are drawn in proportion to the weights, capped at their 0.99 quantile, so that one huge weight does not
@@ -150,57 +141,63 @@ def cap(weights: Tensor, positive: Tensor) -> Tensor:
     return weights.clamp_max(torch.quantile(sample, 0.99))
 
 
-def refine(unit: Tensor, centres: Tensor, rounds: int, *, weights: Tensor | None = None) -> Cells:
+def refine(
+    unit: Tensor,  # [n, D] unit rows
+    centres: Tensor,  # [K, D] unit rows
+    rounds: int,
+    *,
+    weights: Tensor | None = None,  # [n]
+) -> tuple[Tensor, Nearest]:  # [K, D] unit centres, and the nearest of each feature
     """Rounds of averaging and assignment, from given centres; a centre that loses all its features stays where it is."""
-    cells = Cells(centres, *nearest_rows(unit, centres))
+    nearest = nearest_rows(unit, centres)
     rows = unit if weights is None else unit * weights[:, None].to(unit)
     for _ in range(rounds):
-        sums = torch.zeros_like(centres).index_add_(0, cells.index, rows)  # repeatable on a CPU
-        centres = torch.where(row_norms(sums)[:, None] > EPS, unit_rows(sums), cells.centres)
-        cells = Cells(centres, *nearest_rows(unit, centres))
-    return cells
+        sums = group_sums(rows, nearest.codeword, len(centres))
+        centres = torch.where(row_norms(sums)[:, None] > EPS, unit_rows(sums), centres)
+        nearest = nearest_rows(unit, centres)
+    return centres, nearest
 
 
 def grow(
     unit: Tensor,  # [n, D] unit rows
     maximum: int,
     generator: torch.Generator,
-) -> tuple[Cells, list[tuple[int, int, Tensor]]]:
+) -> tuple[Tensor, Nearest, list[tuple[int, int, Tensor]]]:  # [K, D] unit centres, the nearest of each feature, rounds
     """Start with one codeword and split cells, the least similar first, until no split pays or `maximum` is reached.
 
     A cell is split in two across its widest direction. It qualifies by its *mean* similarity, not by its number of
     features, so rare content gets codewords as readily as a wall; by at least 2 `LEAST_SHARE` n / `maximum` features,
     so that a few outliers never lead; and by a split that lowers its cosine distance by `LEAST_GAIN`, which noise
     without structure does not allow. At most half of the cells split in one round.
-
-    Returns:
-        The cells; and of each round the size after it, the codewords added, and the features' similarities [n] before.
+    Of each round the size after it, the codewords added, and the features' similarities [n] before are returned.
     """
     least = max(2.0, LEAST_SHARE * len(unit) / maximum)
-    cells = refine(unit, unit_rows(unit.sum(dim=0, keepdim=True)), 0)
+    centres, nearest = refine(unit, unit_rows(unit.sum(dim=0, keepdim=True)), 0)
     rounds: list[tuple[int, int, Tensor]] = []
     while True:
-        K = len(cells.centres)
-        halves, gain = _halves(unit, cells, least, generator)
-        pays, mean = gain >= LEAST_GAIN, _mean(cells.similarity, cells.index, K)
+        K = len(centres)
+        halves, gain = _halves(unit, centres, nearest, least, generator)
+        pays, mean = gain >= LEAST_GAIN, _mean(nearest.similarity, nearest.codeword, K)
         room = min(maximum - K, max(1, K // 2))
         chosen = mean.masked_fill(~pays, torch.inf).argsort(stable=True)[: min(room, int(pays.sum()))]
-        rounds.append((K + len(chosen), len(chosen), cells.similarity))
+        rounds.append((K + len(chosen), len(chosen), nearest.similarity))
         if len(chosen) == 0:
-            return refine(unit, cells.centres, LAST_ROUNDS), rounds
-        centres = cells.centres.clone()
+            return *refine(unit, centres, LAST_ROUNDS), rounds
+        centres = centres.clone()
         centres[chosen] = halves[0, chosen]
-        cells = refine(unit, torch.cat([centres, halves[1, chosen]]), ROUNDS)
+        centres, nearest = refine(unit, torch.cat([centres, halves[1, chosen]]), ROUNDS)
 
 
-def _halves(unit: Tensor, cells: Cells, least: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def _halves(
+    unit: Tensor, centres: Tensor, nearest: Nearest, least: float, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
     """The centres [2, K, D] of each cell's halves, and the share [K] of its cosine distance that splitting saves.
 
     Direction and halves come from every other feature, the gain from the rest: with few features in many channels, any
     split looks good on the features it was made for. The gain is 0 where a half holds fewer than `least` features.
     """
-    centres, K = cells.centres, len(cells.centres)
-    (learn, cell), (check, check_cell) = ((unit[i::2], cells.index[i::2]) for i in (0, 1))
+    K = len(centres)
+    (learn, cell), (check, check_cell) = ((unit[i::2], nearest.codeword[i::2]) for i in (0, 1))
     drawn = torch.randn(centres.shape, generator=generator, device=generator.device, dtype=torch.float64)
     direction = unit_rows(drawn.to(centres))
     inside = (learn * centres[cell]).sum(dim=1)  # u . c of the residual u - (u . c) c, which is never built whole
@@ -210,40 +207,36 @@ def _halves(unit: Tensor, cells: Cells, least: float, generator: torch.Generator
 
     for _ in range(POWER_STEPS):
         across = along(direction)
-        pull = torch.zeros_like(centres[:, 0]).index_add_(0, cell, inside * across)
-        direction = unit_rows(_sums(learn, cell, K, across) - pull[:, None] * centres)
+        pull = group_sums(inside * across, cell, K)
+        direction = unit_rows(group_sums(learn * across[:, None], cell, K) - pull[:, None] * centres)
     across = along(direction)
+    distance = _mean(1 - nearest.similarity[1::2], check_cell, K)
+
+    def split(
+        middle: Tensor,
+    ) -> tuple[Tensor, Tensor]:  # [K] -> [2, K, D], [K] halves on both sides of it, and the gain
+        side = cell + K * (across > middle[cell])
+        halves = unit_rows(group_sums(learn, side, 2 * K)).view(2, K, -1)
+        to_halves = torch.stack([(check * half[check_cell]).sum(dim=1) for half in halves])  # [2, n / 2]
+        checked = check_cell + K * to_halves.argmax(dim=0)
+        counts = torch.bincount(torch.cat([side, checked]), minlength=2 * K).view(2, K)
+        gain = 1 - _mean(1 - to_halves.amax(dim=0), check_cell, K) / distance.clamp_min(1e-12)
+        # 1e-5 is what float32 rounding leaves of the cosine distance of equal features
+        out = (counts.amin(dim=0) < least) | (distance < 1e-5) | (halves.abs().amax(dim=2) == 0).any(dim=0)
+        return halves, gain.masked_fill(out, 0)
+
     square, cube = (_mean(across**power, cell, K) for power in (2, 3))
     # In the middle, or, for a small group far out on one side, half way to it: its share of square and cube is the same
     # but for one factor, its distance.
-    middles = torch.zeros_like(square), 0.5 * cube / square.clamp_min(1e-12)
-    tried = [_try(learn, cell + K * (across > middle[cell]), check, check_cell, cells, least) for middle in middles]
-    second = tried[1][1] > tried[0][1]
-    return torch.where(second[:, None], tried[1][0], tried[0][0]), torch.where(second, tried[1][1], tried[0][1])
+    (halves, gain), (others, other_gain) = split(torch.zeros_like(square)), split(0.5 * cube / square.clamp_min(1e-12))
+    return torch.where((other_gain > gain)[:, None], others, halves), torch.maximum(gain, other_gain)
 
 
-def _try(
-    learn: Tensor, side: Tensor, check: Tensor, check_cell: Tensor, cells: Cells, least: float
-) -> tuple[Tensor, Tensor]:  # [2, K, D], [K]
-    """Halves from the features `learn`, those of cell e in half `side` = e or e + K; the gain is measured on `check`."""
-    K = len(cells.centres)
-    halves = unit_rows(_sums(learn, side, 2 * K)).view(2, K, -1)
-    to_halves = torch.stack([(check * half[check_cell]).sum(dim=1) for half in halves])  # [2, n / 2]
-    before, after = 1 - cells.similarity[1::2], 1 - to_halves.amax(dim=0)
-    checked = check_cell + K * to_halves.argmax(dim=0)
-    counts = torch.bincount(torch.cat([side, checked]), minlength=2 * K).view(2, K)
-    distance = _mean(before, check_cell, K)
-    gain = 1 - _mean(after, check_cell, K) / distance.clamp_min(1e-12)
-    # 1e-5 is what float32 rounding leaves of the cosine distance of equal features
-    out = (counts.amin(dim=0) < least) | (distance < 1e-5) | (halves.abs().amax(dim=2) == 0).any(dim=0)
-    return halves, gain.masked_fill(out, 0)
+def group_sums(values: Tensor, group: Tensor, count: int) -> Tensor:  # [n, ...], [n] int64 -> [count, ...]
+    """Sum of the values of each group, repeatable on a CPU."""
+    return values.new_zeros(count, *values.shape[1:]).index_add_(0, group, values)
 
 
-def _sums(rows: Tensor, index: Tensor, K: int, weight: Tensor | None = None) -> Tensor:  # [n, D] -> [K, D]
-    """Sum of the rows of each cell, repeatable on a CPU."""
-    return rows.new_zeros(K, rows.shape[1]).index_add_(0, index, rows if weight is None else rows * weight[:, None])
-
-
-def _mean(values: Tensor, index: Tensor, K: int) -> Tensor:  # [n] -> [K]
-    """Mean of the values of each cell; 0 for an empty one."""
-    return values.new_zeros(K).index_add_(0, index, values) / torch.bincount(index, minlength=K).clamp_min(1)
+def _mean(values: Tensor, group: Tensor, count: int) -> Tensor:  # [n] -> [count]
+    """Mean of the values of each group; 0 for an empty one."""
+    return group_sums(values, group, count) / torch.bincount(group, minlength=count).clamp_min(1)

@@ -90,7 +90,5 @@ def fit_linear_latents(
     values, vectors = principal_directions(moment)
     values = values * (values > NOISE * values[0])
     beyond = values[1:].cumsum(0)  # what the first 1, 2, ... further directions hold
-    further = 0
-    if len(beyond) and float(beyond[-1]) > 0:
-        further = int((beyond < keep * beyond[-1]).sum()) + 1  # the first that hold enough
+    further = int((beyond < keep * beyond[-1]).sum()) + 1 if bool(beyond.any()) else 0  # the first that hold enough
     return LinearLatents(vectors[:, : min(maximum or len(vectors), 1 + further)].to(features))

@@ -22,17 +22,17 @@ def run(unit, maximum=64):
 @pytest.mark.parametrize("noise", [0.02, 0.3])
 def test_as_many_codewords_as_there_are_classes_whatever_the_noise(noise):
     unit, label = mixture([400, 300, 500, 350, 450], noise=noise)
-    cells, _ = run(unit)
-    assert len(cells.centres) == 5
-    name = nearest_rows(torch.eye(32)[:5], cells.centres)[0]
-    assert torch.equal(cells.index, name[label])
+    centres, nearest, _ = run(unit)
+    assert len(centres) == 5
+    name = nearest_rows(torch.eye(32)[:5], centres).codeword
+    assert torch.equal(nearest.codeword, name[label])
 
 
 def test_rare_content_gets_its_codeword():
     unit, label = mixture([4000, 4000, 60], noise=0.3)
-    cells, _ = run(unit)
-    assert sorted(torch.bincount(cells.index).tolist()) == [60, 4000, 4000]
-    assert len(cells.index[label == 2].unique()) == 1
+    _, nearest, _ = run(unit)
+    assert sorted(torch.bincount(nearest.codeword).tolist()) == [60, 4000, 4000]
+    assert len(nearest.codeword[label == 2].unique()) == 1
 
 
 def test_outliers_do_not_lead():
@@ -40,14 +40,14 @@ def test_outliers_do_not_lead():
     unit, _ = mixture([2000, 2000], noise=0.1)
     generator = torch.Generator().manual_seed(1)
     outliers = unit_rows(torch.randn(10, 32, generator=generator))
-    cells, _ = run(torch.cat([unit, outliers]), maximum=16)  # a cell needs 4010 / 16 / 16 = 16 features
-    assert len(cells.centres) == 2
-    assert nearest_rows(torch.eye(32)[:2], cells.centres)[1].min() > 0.999
+    centres, _, _ = run(torch.cat([unit, outliers]), maximum=16)  # a cell needs 4010 / 16 / 16 = 16 features
+    assert len(centres) == 2
+    assert nearest_rows(torch.eye(32)[:2], centres).similarity.min() > 0.999
 
 
 def test_never_more_than_the_maximum():
-    cells, rounds = run(mixture([100] * 10)[0], maximum=7)
-    assert len(cells.centres) == 7
+    centres, _, rounds = run(mixture([100] * 10)[0], maximum=7)
+    assert len(centres) == 7
     assert rounds[-1][:2] == (7, 0)
 
 
@@ -55,4 +55,4 @@ def test_noise_alone_and_equal_features_are_one_cell():
     generator = torch.Generator().manual_seed(2)
     noise = unit_rows(torch.eye(64)[0] + 0.5 * torch.randn(500, 64, generator=generator) / 8)
     for unit in (noise, torch.eye(8)[:1].expand(50, 8), torch.eye(8)[:1]):
-        assert len(run(unit)[0].centres) == 1
+        assert len(run(unit)[0]) == 1
